@@ -1,0 +1,44 @@
+# Two commands: `make reproduce` and `make test`. Each sets up what it needs.
+PYTHON ?= python3
+ESTIMA := .venv/bin/estima
+FULL ?= 0
+
+.PHONY: help setup reproduce test test-all lint types format lock clean
+
+help:
+	@echo "make reproduce         figures, tables and claims into results/ (quick profile)"
+	@echo "make reproduce FULL=1  the judged profile"
+	@echo "make test              the default tests"
+	@echo "make test-all          the slow ones too"
+	@echo "make lint types        what a change must pass besides"
+
+setup:
+	@$(PYTHON) tools/bootstrap.py
+
+reproduce: setup
+	@$(ESTIMA) reproduce $(if $(filter-out 0,$(FULL)),--full)
+
+test: setup
+	@.venv/bin/python -m pytest -n 2
+
+test-all: setup
+	@.venv/bin/python -m pytest -n 2 -m "slow or not slow"
+
+lint: setup
+	@.venv/bin/ruff check .
+	@.venv/bin/ruff format --check .
+
+types: setup
+	@.venv/bin/mypy
+
+format: setup
+	@.venv/bin/ruff check --fix .
+	@.venv/bin/ruff format .
+
+# Rewrites the lock after a change of pyproject.toml; hashes only, no addresses.
+lock: setup
+	@.uv/bin/uv pip compile pyproject.toml --extra dev --generate-hashes --no-emit-index-url \
+	  --no-header --no-annotate --universal --python-version 3.11 --quiet --output-file requirements.lock
+
+clean:
+	rm -rf .venv .uv results/runs results/cache
