@@ -1,0 +1,1 @@
+"""Localization methods: one a file, each reads Frames and answers with Beliefs."""

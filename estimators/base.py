@@ -1,0 +1,151 @@
+"""What every estimator takes and gives: Prior, Belief, Estimate, and the protocol itself."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, field
+from typing import Any, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.recording import Frame, Recording
+from sim.robot import RobotGeometry
+from sim.sensors import SensorSuite
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What an estimator knows before the first Frame.
+
+    Attributes
+    ----------
+    robot, sensors
+        Believed geometry, mounting and noise.
+    mean, covariance
+        First belief, (3,) and (3, 3), m, m, rad in map; None for global localization.
+    map
+        World, OccupancyGrid or TopologicalMap, or None for SLAM.
+    """
+
+    robot: RobotGeometry
+    sensors: SensorSuite
+    mean: Array | None = None
+    covariance: Array | None = None
+    map: Any = None
+
+
+@dataclass(frozen=True)
+class Belief:
+    """What an estimator holds true after a Frame.
+
+    Attributes
+    ----------
+    mean
+        (3,) m, m, rad: base_link in map.
+    covariance
+        (3, 3).
+    extras
+        Named arrays for those who look closer: `particles` (M, 3), `log_weights` (M,), `ess`,
+        `registration_covariance` (3, 3), `associations` (K,), `landmarks` (N, 3),
+        `landmark_covariances` (N, 3, 3), `status`.
+    """
+
+    mean: Array
+    covariance: Array
+    extras: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A trajectory of beliefs.
+
+    Attributes
+    ----------
+    stamps, means, covariances
+        (T,) s, (T, 3), (T, 3, 3).
+    kind
+        `online` (each belief saw only its past) or `revised` (best lineage, batch solution).
+    step_seconds
+        (T,) computing time of each step; empty for a revised estimate.
+    map
+        What the estimator made of the world, or None.
+    extras
+        Each recorded key to its values, one a Frame.
+    status
+        `ok`, or what went wrong.
+    """
+
+    stamps: Array
+    means: Array
+    covariances: Array
+    kind: Literal["online", "revised"] = "online"
+    step_seconds: Array = field(default_factory=lambda: np.zeros(0))
+    map: Any = None
+    extras: dict[str, list[Any]] = field(default_factory=dict)
+    status: str = "ok"
+
+
+class Estimator(Protocol):
+    """A localization method. It may also have `finish() -> Estimate`, the revised trajectory."""
+
+    def reset(self, prior: Prior, rng: np.random.Generator) -> None:
+        """Forget everything and start from the prior."""
+        ...
+
+    def step(self, frame: Frame) -> Belief:
+        """Take in one Frame and answer with the belief after it."""
+        ...
+
+
+def run(
+    estimator: Estimator,
+    recording: Recording,
+    prior: Prior,
+    rng: np.random.Generator,
+    keep: Collection[str] = (),
+    on_step: Callable[[int], None] | None = None,
+) -> Estimate:
+    """Run an estimator over a recording, Frame by Frame.
+
+    Parameters
+    ----------
+    keep
+        Names of the Belief extras to record.
+    on_step
+        Called with the number of Frames done, for a progress bar.
+
+    Returns
+    -------
+    Estimate
+        The online estimate at the Frame stamps.
+    """
+    n_frames = len(recording.frame_stamps)
+    means, covariances = np.empty((n_frames, 3)), np.empty((n_frames, 3, 3))
+    seconds = np.empty(n_frames)
+    extras: dict[str, list[Any]] = {name: [] for name in keep}
+    status = "ok"
+    estimator.reset(prior, rng)
+    for i, frame in enumerate(recording.frames()):
+        begun = time.perf_counter()
+        belief = estimator.step(frame)
+        seconds[i] = time.perf_counter() - begun
+        means[i], covariances[i] = belief.mean, belief.covariance
+        for name in keep:
+            extras[name].append(belief.extras.get(name))
+        if status == "ok" and belief.extras.get("status", "ok") != "ok":
+            status = f"{belief.extras['status']} at {frame.stamp:.2f} s"
+        if on_step is not None:
+            on_step(i + 1)
+    return Estimate(
+        stamps=recording.frame_stamps.copy(),
+        means=means,
+        covariances=covariances,
+        step_seconds=seconds,
+        map=getattr(estimator, "map", None),
+        extras=extras,
+        status=status,
+    )

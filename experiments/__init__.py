@@ -1,0 +1,1 @@
+"""From a configuration to rows, tables, figures, claims and a report."""

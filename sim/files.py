@@ -1,0 +1,36 @@
+"""Writing files so that nothing half-written is ever read back."""
+
+from __future__ import annotations
+
+import os
+import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from sim.errors import InputError
+
+
+@contextmanager
+def write_whole(path: Path) -> Iterator[Path]:
+    """Give a path beside `path` to write to; move it into place if all went well.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be written: full disk, no permission, a folder in its place.
+    """
+    part = path.with_name(f".{path.stem}.{os.getpid()}.{secrets.token_hex(4)}.part{path.suffix}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield part
+        with part.open("rb+") as written:
+            os.fsync(written.fileno())
+        os.replace(part, path)
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot write ({error.strerror or error}); free some space or choose another "
+            "folder"
+        ) from error
+    finally:
+        part.unlink(missing_ok=True)

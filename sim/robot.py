@@ -1,0 +1,238 @@
+"""The differential-drive robot: geometry, the kr/kl slip law, arc odometry and its Jacobians.
+
+Wheel quantities come in pairs in the order (right, left), in metres along the ground.
+`kr` and `kl` are variances per metre: Var(encoder - ground) = k |ds| (puzzlebot2024, eq. (5);
+decristoforis2020, eq. (2)), so their unit is the metre.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sim.errors import InputError
+
+Array = NDArray[np.float64]
+
+SLIP_TIME_CONSTANT_S = 0.1
+_SMALL_ANGLE_RAD = 1e-4
+
+
+@dataclass(frozen=True)
+class DifferentialDrive:
+    """What the simulated robot is and how its wheels slip: the truth, never a belief.
+
+    Parameters
+    ----------
+    wheel_radius_m, track_m
+        Wheel radius and distance between the wheels' contact points.
+    kr, kl
+        Slip variance per metre of the right and left wheel, m.
+    bias_right, bias_left
+        Systematic part of the slip: the encoder reads (1 + bias) times the ground travel.
+    encoder_tick_m
+        Quantum of the encoder counts along the ground, m; 0 for no quantisation.
+    unmodelled_slip
+        Stress: probability per second of an event that stops a wheel from gripping (its
+        encoder runs on by `unmodelled_slip_m` while the ground travel stands). It is not
+        described by kr, kl and is 0 unless asked for.
+    unmodelled_slip_m
+        Encoder travel of one such event, m.
+    body_length_m, body_width_m, body_height_m, mass_kg
+        The body, centred over the axle.
+    max_acceleration_mps2
+        Limit of each wheel's acceleration along the ground.
+    """
+
+    wheel_radius_m: float
+    track_m: float
+    kr: float = 0.0
+    kl: float = 0.0
+    bias_right: float = 0.0
+    bias_left: float = 0.0
+    encoder_tick_m: float = 0.0
+    unmodelled_slip: float = 0.0
+    unmodelled_slip_m: float = 0.02
+    body_length_m: float = 0.18
+    body_width_m: float = 0.14
+    body_height_m: float = 0.10
+    mass_kg: float = 1.3
+    max_acceleration_mps2: float = 1.0
+
+    def __post_init__(self) -> None:
+        positive = (
+            "wheel_radius_m",
+            "track_m",
+            "body_length_m",
+            "body_width_m",
+            "body_height_m",
+            "mass_kg",
+            "max_acceleration_mps2",
+        )
+        for name in positive:
+            _require(name, getattr(self, name), strictly=True)
+        for name in ("kr", "kl", "encoder_tick_m", "unmodelled_slip", "unmodelled_slip_m"):
+            _require(name, getattr(self, name), strictly=False)
+        for name in ("bias_right", "bias_left"):
+            value = getattr(self, name)
+            if not math.isfinite(value) or value <= -0.5 or value >= 0.5:
+                raise InputError(f"robot.{name} must lie in (-0.5, 0.5), got {value}")
+
+    @property
+    def slip_variance_per_m(self) -> Array:
+        """(kr, kl), m."""
+        return np.array([self.kr, self.kl])
+
+    @property
+    def slip_bias(self) -> Array:
+        """(bias_right, bias_left)."""
+        return np.array([self.bias_right, self.bias_left])
+
+    def wheel_speeds(self, v_mps: ArrayLike, omega_radps: ArrayLike) -> Array:
+        """Ground speeds (..., 2) of the wheels for a body velocity, m/s."""
+        v, turn = np.asarray(v_mps, float), np.asarray(omega_radps, float) * self.track_m / 2.0
+        return np.stack([v + turn, v - turn], axis=-1)
+
+
+@dataclass(frozen=True)
+class RobotGeometry:
+    """What an estimator believes of the robot: the wheel radius and the track, m."""
+
+    wheel_radius_m: float
+    track_m: float
+
+    def __post_init__(self) -> None:
+        for name in ("wheel_radius_m", "track_m"):
+            value = getattr(self, name)
+            if not math.isfinite(value) or value <= 0.0:
+                raise InputError(f"prior.{name} must be a positive number of metres, got {value}")
+
+
+def _require(name: str, value: float, *, strictly: bool) -> None:
+    ok = math.isfinite(value) and (value > 0.0 if strictly else value >= 0.0)
+    if not ok:
+        wanted = "a positive number" if strictly else "zero or a positive number"
+        raise InputError(f"robot.{name} must be {wanted}, got {value}")
+
+
+def wheel_variances(travel_m: ArrayLike, kr: float, kl: float) -> Array:
+    """Variances (..., 2) m^2 of wheel increments (..., 2): k |ds| (puzzlebot2024, eq. (5))."""
+    variances: Array = np.abs(np.asarray(travel_m, float)) * np.array([kr, kl])
+    return variances
+
+
+@dataclass
+class Slip:
+    """The slip of the wheels, tick by tick, for one robot or a batch of them.
+
+    At each tick the wheel is driven at `command - correction_mps`; it rolls `rolling_m` on the
+    ground and its encoder reads that plus an error of variance k |rolling|, white over ticks.
+    The error flows back into the drive through a first-order lag, because the wheel's speed
+    loop is closed on the encoder: over times beyond the lag the encoder follows the command and
+    the ground travel wanders.
+
+    Attributes
+    ----------
+    lag_m
+        State of the lag, (..., 2) m.
+    """
+
+    variance_per_m: Array
+    bias: Array
+    dt_s: float
+    lag_m: Array
+
+    @classmethod
+    def start(cls, robot: DifferentialDrive, dt_s: float, batch: tuple[int, ...] = ()) -> Slip:
+        """Slip of a robot at rest."""
+        return cls(robot.slip_variance_per_m, robot.slip_bias, dt_s, np.zeros((*batch, 2)))
+
+    @property
+    def correction_mps(self) -> Array:
+        """Speed (..., 2) to take off the wheel command at the next tick, m/s."""
+        return self.lag_m / self.dt_s
+
+    def advance(self, rolling_m: Array, standard_normal: Array) -> Array:
+        """Encoder increment (..., 2), m, of a tick in which the wheels rolled `rolling_m`."""
+        error = self.bias * rolling_m
+        error += np.sqrt(self.variance_per_m * np.abs(rolling_m)) * standard_normal
+        self.lag_m += (self.dt_s / SLIP_TIME_CONSTANT_S) * (error - self.lag_m)
+        return rolling_m + error
+
+
+def arc_increment(travel_m: ArrayLike, track_m: float) -> Array:
+    """Relative pose (..., 3) after wheel increments (..., 2): the exact arc.
+
+    Each wheel is taken to turn evenly over the interval. The heading is not wrapped.
+    """
+    travel = np.asarray(travel_m, float)
+    forward = (travel[..., 0] + travel[..., 1]) / 2.0
+    turn = (travel[..., 0] - travel[..., 1]) / track_m
+    half = turn / 2.0
+    small = np.abs(half) < _SMALL_ANGLE_RAD
+    chord = forward * np.where(small, 1.0 - half**2 / 6.0, np.sin(half) / np.where(small, 1, half))
+    return np.stack([chord * np.cos(half), chord * np.sin(half), turn], axis=-1)
+
+
+def arc_increment_jacobian(travel_m: ArrayLike, track_m: float) -> Array:
+    """Derivative (..., 3, 2) of `arc_increment` by the increments of the right and left wheel.
+
+    For small turns it is puzzlebot2024, eq. (6), second form, with the last row's sign settled:
+    the right wheel turns the robot counter-clockwise, so it is (1/b, -1/b).
+    """
+    travel = np.asarray(travel_m, float)
+    forward = (travel[..., 0] + travel[..., 1]) / 2.0
+    half = (travel[..., 0] - travel[..., 1]) / track_m / 2.0
+    small = np.abs(half) < _SMALL_ANGLE_RAD
+    safe = np.where(small, 1.0, half)
+    sinc = np.where(small, 1.0 - half**2 / 6.0, np.sin(safe) / safe)
+    sinc_slope = np.where(small, -half / 3.0, (np.cos(safe) - np.sin(safe) / safe) / safe)
+    cos, sin = np.cos(half), np.sin(half)
+    by_forward = np.stack([sinc * cos, sinc * sin, np.zeros_like(half)], axis=-1)
+    by_half = np.stack(
+        [
+            forward * (sinc_slope * cos - sinc * sin),
+            forward * (sinc_slope * sin + sinc * cos),
+            np.full_like(half, 2.0),
+        ],
+        axis=-1,
+    )
+    right = by_forward / 2.0 + by_half / (2.0 * track_m)
+    left = by_forward / 2.0 - by_half / (2.0 * track_m)
+    return np.stack([right, left], axis=-1)
+
+
+class TravelWindow:
+    """Wheel travel |ds| of a frame, taken over a window so that encoder noise does not inflate it.
+
+    |ds| of a short interval is mostly noise when the robot crawls, and a filter that adds k |ds|
+    would overstate its variance. The net travel over at least `window_s` is shared out to the
+    frame by its duration.
+
+    Parameters
+    ----------
+    window_s
+        Shortest time over which travel is netted, s.
+    """
+
+    def __init__(self, window_s: float = 0.05) -> None:
+        self.window_s = window_s
+        self._recent: deque[tuple[float, float, float]] = deque()
+
+    def push(self, duration_s: float, travel_m: ArrayLike) -> Array:
+        """Add a frame's duration and increments (2,); return its |ds| (2,), m."""
+        right, left = (float(d) for d in np.asarray(travel_m, float))
+        if duration_s <= 0.0:
+            return np.abs([right, left])
+        self._recent.append((duration_s, right, left))
+        total_s = sum(entry[0] for entry in self._recent)
+        while total_s - self._recent[0][0] >= self.window_s - 1e-9:
+            total_s -= self._recent.popleft()[0]
+        net_right = sum(entry[1] for entry in self._recent)
+        net_left = sum(entry[2] for entry in self._recent)
+        share = duration_s / total_s
+        return np.array([abs(net_right) * share, abs(net_left) * share])

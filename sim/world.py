@@ -1,0 +1,109 @@
+"""World: upright walls, point landmarks and named places, in the frame `map` (metres)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.errors import InputError
+
+Array = NDArray[np.float64]
+
+
+def _empty(*shape: int) -> Array:
+    return np.zeros(shape)
+
+
+@dataclass(frozen=True)
+class World:
+    """What the robot drives through: vertical faces, landmarks, and a tour of free space.
+
+    Attributes
+    ----------
+    name
+        For titles and tables.
+    walls
+        (W, 4) m: x1, y1, x2, y2 of the foot of each vertical face; a box is four of them. Faces
+        have no thickness and are seen from both sides.
+    wall_z_m
+        (W, 2) m: bottom and top of each face.
+    landmarks
+        (L, 3) m: points a camera can recognise.
+    descriptors
+        (L, D) float32 unit vectors, what the camera recognises them by; D may be 0.
+    look_alike
+        (L,) bool: whether another landmark has the same descriptor.
+    places
+        Name of a place (`corridor_bare`, `room`, ...) to its rectangles (R, 4) m: x_min, y_min,
+        x_max, y_max.
+    start_pose
+        (3,) m, m, rad: where a robot starts unless told otherwise.
+    waypoints
+        (P, 2) m: a tour through free space that passes every kind of place.
+    """
+
+    name: str
+    walls: Array
+    wall_z_m: Array
+    landmarks: Array = field(default_factory=lambda: _empty(0, 3))
+    descriptors: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 0), np.float32))
+    look_alike: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))
+    places: dict[str, Array] = field(default_factory=dict)
+    start_pose: Array = field(default_factory=lambda: _empty(3))
+    waypoints: Array = field(default_factory=lambda: _empty(0, 2))
+
+    def __post_init__(self) -> None:
+        shapes = {
+            "walls": (self.walls, (len(self.walls), 4)),
+            "wall_z_m": (self.wall_z_m, (len(self.walls), 2)),
+            "landmarks": (self.landmarks, (len(self.landmarks), 3)),
+            "start_pose": (self.start_pose, (3,)),
+            "waypoints": (self.waypoints, (len(self.waypoints), 2)),
+            **{f"places.{k}": (v, (len(v), 4)) for k, v in self.places.items()},
+        }
+        for key, (values, shape) in shapes.items():
+            if np.shape(values) != shape:
+                raise InputError(
+                    f"world {self.name}: {key} must have shape {shape}, got {np.shape(values)}"
+                )
+            if not np.all(np.isfinite(values)):
+                raise InputError(f"world {self.name}: {key} must be finite numbers")
+        if len(self.descriptors) not in (0, len(self.landmarks)):
+            raise InputError(
+                f"world {self.name}: {len(self.descriptors)} descriptors for "
+                f"{len(self.landmarks)} landmarks"
+            )
+        length = np.hypot(*(self.walls[:, 2:] - self.walls[:, :2]).T)
+        for bad in np.flatnonzero(length < 1e-6):
+            raise InputError(f"world {self.name}: wall {bad} has no length; give it two ends")
+        for bad in np.flatnonzero(self.wall_z_m[:, 0] >= self.wall_z_m[:, 1]):
+            raise InputError(f"world {self.name}: wall {bad} has its top below its bottom")
+
+    @property
+    def bounds_m(self) -> Array:
+        """(4,) m: x_min, y_min, x_max, y_max of everything in the world."""
+        points = np.concatenate(
+            [self.walls[:, :2], self.walls[:, 2:], self.landmarks[:, :2], self.start_pose[None, :2]]
+        )
+        return np.concatenate([points.min(axis=0), points.max(axis=0)])
+
+    def place_of(self, points_in_world: Array) -> NDArray[np.str_]:
+        """Name of the first place that holds each point (N, 2), or an empty string."""
+        points = np.asarray(points_in_world, float)
+        names = np.full(len(points), "", dtype="U32")
+        for name, rectangles in self.places.items():
+            low, high = rectangles[:, None, :2], rectangles[:, None, 2:]
+            inside = np.any(np.all((points >= low) & (points <= high), axis=-1), axis=0)
+            names[inside & (names == "")] = name
+        return names
+
+    def clearance_m(self, point_in_world: Array) -> float:
+        """Distance from a point (2,) to the nearest wall, m; inf in an empty world."""
+        if len(self.walls) == 0:
+            return float("inf")
+        start, along = self.walls[:, :2], self.walls[:, 2:] - self.walls[:, :2]
+        offset = np.asarray(point_in_world, float)[:2] - start
+        share = np.clip(np.sum(offset * along, axis=1) / np.sum(along**2, axis=1), 0.0, 1.0)
+        return float(np.min(np.hypot(*(offset - share[:, None] * along).T)))
