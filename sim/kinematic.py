@@ -1,0 +1,190 @@
+"""The robot with ideal rolling: the same slip law as the Bullet robot, without the engine."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+
+from sim.errors import InputError
+from sim.robot import SLIP_TIME_CONSTANT_S, DifferentialDrive, arc_increment
+from sim.route import TICK_S, OpenLoop
+
+Array = NDArray[np.float64]
+
+_BLOCK_NORMALS = 2_000_000  # drawn at once, 16 MB; the bits do not depend on it
+
+
+class KinematicBody:
+    """A robot whose wheels roll exactly as driven; the body moves along exact arcs.
+
+    Parameters
+    ----------
+    robot
+        Its track is all that matters here.
+    pose
+        (3,) m, m, rad: base_link at the start.
+    dt_s
+        Length of a tick, s.
+    """
+
+    def __init__(self, robot: DifferentialDrive, pose: ArrayLike, dt_s: float = TICK_S) -> None:
+        self._track_m, self._dt_s = robot.track_m, dt_s
+        self._pose = np.array(pose, dtype=np.float64)
+
+    def step(self, wheel_speeds_mps: Array) -> Array:
+        """Advance one tick at ground speeds (2,), right and left; return the rolling (2,) m."""
+        rolling: Array = np.asarray(wheel_speeds_mps, dtype=np.float64) * self._dt_s
+        x, y, turn = arc_increment(rolling, self._track_m)
+        cos, sin = np.cos(self._pose[2]), np.sin(self._pose[2])
+        self._pose += (cos * x - sin * y, sin * x + cos * y, turn)
+        return rolling
+
+    @property
+    def pose(self) -> Array:
+        """(3,) m, m, rad: base_link in map; the heading is not wrapped."""
+        return self._pose.copy()
+
+
+@dataclass(frozen=True)
+class BatchRuns:
+    """Many runs of one route, sampled at common stamps; row 0 is the start, the last the end.
+
+    Attributes
+    ----------
+    stamps
+        (T,) s.
+    poses
+        (n, T, 3) true poses, m, m, rad; headings unwrapped.
+    encoder_m
+        (n, T, 2) encoder positions, right and left, accumulated metres.
+    ground_m
+        (n, T, 2) rolling of the wheels on the ground, accumulated metres.
+    """
+
+    stamps: Array
+    poses: Array
+    encoder_m: Array
+    ground_m: Array
+
+    @property
+    def end_poses(self) -> Array:
+        """(n, 3) true poses at the end; headings unwrapped."""
+        return self.poses[:, -1]
+
+
+def run_batch(
+    robot: DifferentialDrive,
+    route: OpenLoop,
+    n_runs: int,
+    rng: np.random.Generator,
+    *,
+    start: ArrayLike = (0.0, 0.0, 0.0),
+    nominal_track_m: float | None = None,
+    sample_s: float = 0.05,
+) -> BatchRuns:
+    """Drive a route many times with independent slip, at 300 ticks a second.
+
+    Parameters
+    ----------
+    robot
+        The true robot. Its unmodelled slip must be off.
+    start
+        (3,) common start pose.
+    nominal_track_m
+        Track by which the commands become wheel speeds; the robot's own if None.
+    sample_s
+        Time between samples, a multiple of the tick; the end is sampled in any case.
+
+    Raises
+    ------
+    InputError
+        If unmodelled slip is asked for, which only the simulator offers.
+    """
+    if robot.unmodelled_slip > 0.0:
+        raise InputError("batches know the kr/kl law only; set robot.unmodelled_slip=0")
+    if n_runs < 1:
+        raise InputError(f"n_runs must be at least 1, got {n_runs}")
+    commands_m = wheel_commands(robot, route, nominal_track_m)
+    n_ticks = len(commands_m)
+    every = max(1, round(sample_s / TICK_S))
+    sampled = np.append(np.arange(0, n_ticks, every), n_ticks)
+    poses = np.empty((n_runs, len(sampled), 3))
+    encoder_m, ground_m = np.empty((2, n_runs, len(sampled), 2))
+    block = max(1, _BLOCK_NORMALS // (2 * n_ticks))
+    for first in range(0, n_runs, block):
+        rows = slice(first, min(first + block, n_runs))
+        _roll(
+            commands_m,
+            rng.standard_normal((rows.stop - rows.start, n_ticks, 2)),
+            robot.slip_variance_per_m,
+            robot.slip_bias,
+            TICK_S / SLIP_TIME_CONSTANT_S,
+            robot.track_m,
+            every,
+            np.array(start, dtype=np.float64),
+            poses[rows],
+            encoder_m[rows],
+            ground_m[rows],
+        )
+    if robot.encoder_tick_m > 0.0:
+        encoder_m = np.floor(encoder_m / robot.encoder_tick_m) * robot.encoder_tick_m
+    return BatchRuns(sampled * TICK_S, poses, encoder_m, ground_m)
+
+
+def wheel_commands(
+    robot: DifferentialDrive, route: OpenLoop, nominal_track_m: float | None = None
+) -> Array:
+    """Commanded ground travel (N, 2) of the wheels, right and left, tick by tick, m."""
+    v_mps, omega_radps = route.profile(robot).T
+    turn_mps = omega_radps * (nominal_track_m or robot.track_m) / 2.0
+    commands: Array = np.stack([v_mps + turn_mps, v_mps - turn_mps], axis=1) * TICK_S
+    return commands
+
+
+@njit(cache=True)
+def _roll(
+    commands_m: Array,
+    normals: Array,
+    variance_per_m: Array,
+    bias: Array,
+    lag_share: float,
+    track_m: float,
+    every: int,
+    start: Array,
+    poses: Array,
+    encoder_m: Array,
+    ground_m: Array,
+) -> None:
+    """The loop of `robot.Slip` and `KinematicBody` over all runs; samples into the last three."""
+    n_ticks = len(commands_m)
+    for run in range(len(normals)):
+        x, y, heading = start
+        lag, encoder, ground = np.zeros(2), np.zeros(2), np.zeros(2)
+        rolling = np.empty(2)
+        poses[run, 0] = start
+        encoder_m[run, 0] = 0.0
+        ground_m[run, 0] = 0.0
+        row = 1
+        for tick in range(n_ticks):
+            for i in range(2):
+                rolling[i] = commands_m[tick, i] - lag[i]
+                error = bias[i] * rolling[i]
+                error += np.sqrt(variance_per_m[i] * abs(rolling[i])) * normals[run, tick, i]
+                lag[i] += lag_share * (error - lag[i])
+                encoder[i] += rolling[i] + error
+                ground[i] += rolling[i]
+            half = (rolling[0] - rolling[1]) / track_m / 2.0
+            # a tick turns by milliradians, where this series is exact to the last bit
+            chord = (rolling[0] + rolling[1]) / 2.0 * (1.0 - half**2 / 6.0 + half**4 / 120.0)
+            x += chord * np.cos(heading + half)
+            y += chord * np.sin(heading + half)
+            heading += 2.0 * half
+            if (tick + 1) % every == 0 or tick + 1 == n_ticks:
+                poses[run, row, 0], poses[run, row, 1], poses[run, row, 2] = x, y, heading
+                for i in range(2):
+                    encoder_m[run, row, i] = encoder[i]
+                    ground_m[run, row, i] = ground[i]
+                row += 1
