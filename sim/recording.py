@@ -23,6 +23,7 @@ from sim.errors import InputError
 from sim.files import write_whole
 from sim.robot import RobotGeometry
 from sim.sensors import SensorSuite, suite_from_config
+from sim.settings import build
 from sim.world import World
 
 Array = NDArray[np.float64]
@@ -367,13 +368,15 @@ def _world_arrays(world: World) -> dict[str, NDArray[Any]]:
 
 
 def _meta(recording: Recording) -> dict[str, Any]:
-    sensors = dataclasses.asdict(recording.sensors)
+    # Rebuilt from plain values, so that 100 and 100.0 Hz are the same recording.
+    sensors = suite_from_config(dataclasses.asdict(recording.sensors))
+    robot = build(RobotGeometry, dataclasses.asdict(recording.robot), "robot")
     world = recording.truth.world.name if recording.truth and recording.truth.world else None
     return {
         "format": FORMAT_VERSION,
         "status": recording.status,
-        "robot": dataclasses.asdict(recording.robot),
-        "sensors": sensors,
+        "robot": dataclasses.asdict(robot),
+        "sensors": dataclasses.asdict(sensors),
         "config": recording.config,
         "world": world,
     }

@@ -156,9 +156,14 @@ class Slip:
         """Speed (..., 2) to take off the wheel command at the next tick, m/s."""
         return self.lag_m / self.dt_s
 
-    def advance(self, rolling_m: Array, standard_normal: Array) -> Array:
-        """Encoder increment (..., 2), m, of a tick in which the wheels rolled `rolling_m`."""
-        error = self.bias * rolling_m
+    def advance(
+        self, rolling_m: Array, standard_normal: Array, extra_m: Array | float = 0.0
+    ) -> Array:
+        """Encoder increment (..., 2), m, of a tick in which the wheels rolled `rolling_m`.
+
+        `extra_m` is an encoder error from outside the law.
+        """
+        error = self.bias * rolling_m + extra_m
         error += np.sqrt(self.variance_per_m * np.abs(rolling_m)) * standard_normal
         self.lag_m += (self.dt_s / SLIP_TIME_CONSTANT_S) * (error - self.lag_m)
         return rolling_m + error

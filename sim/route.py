@@ -1,4 +1,4 @@
-"""Where the robot is told to go: open-loop commands.
+"""Where the robot is told to go: open-loop commands and way-point following.
 
 A velocity command is (v, omega): m/s forward and rad/s counter-clockwise.
 """
@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sim.errors import InputError
 from sim.robot import DifferentialDrive, arc_increment
+from sim.world import World
 
 Array = NDArray[np.float64]
 Segment = tuple[float, float, float]
@@ -49,6 +50,10 @@ class OpenLoop:
         object.__setattr__(self, "segments", tuple(_merged(self.segments)))
         if not self.segments:
             raise InputError("route.segments is empty; give at least one [v, omega, duration]")
+
+    def start(self, world: World, robot: DifferentialDrive) -> tuple[Array, Replay]:
+        """Start pose (3,) of the world, and the driver."""
+        return world.start_pose, Replay(self.profile(robot))
 
     def profile(self, robot: DifferentialDrive, dt_s: float = TICK_S) -> Array:
         """Body velocities (N, 2), m/s and rad/s: means over ticks of `dt_s`, rest included.
@@ -93,6 +98,180 @@ class OpenLoop:
             plateau_s, ramp_s, _ = _trapezoid(segment, robot)
             now_s += plateau_s + 2.0 * ramp_s
         return starts_s, now_s
+
+
+@dataclass(frozen=True)
+class Replay:
+    """Driver that plays velocities (N, 2) tick by tick."""
+
+    velocity: Array
+
+    def command(self, tick: int, pose: Array) -> Array | None:
+        """Velocity (2,) of the tick; None at the end. The pose is not looked at."""
+        return self.velocity[tick] if tick < len(self.velocity) else None
+
+    @property
+    def trouble(self) -> None:
+        """A clock cannot leave its route."""
+        return None
+
+
+@dataclass(frozen=True)
+class Tour:
+    """Way-point following by pure pursuit of the true pose.
+
+    The robot is guided by its true pose, as if someone drove it, so that slip makes the odometry
+    err but never the route.
+
+    Attributes
+    ----------
+    speed_mps
+        Cruising speed.
+    waypoints
+        (P, 2) m; None for the world's own tour.
+    distance_m
+        Where to end, counted along the tour; None for all of it. A longer distance than the tour
+        has goes round again if the tour is closed, else back and forth.
+    look_ahead_m
+        Distance of the point pursued.
+    tolerance_m
+        Distance from the tour at which the robot counts as off its route.
+    turn_rate_radps
+        Limit of the turn rate.
+    """
+
+    speed_mps: float = 0.5
+    waypoints: tuple[tuple[float, float], ...] | None = None
+    distance_m: float | None = None
+    look_ahead_m: float = 0.35
+    tolerance_m: float = 0.5
+    turn_rate_radps: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name in ("speed_mps", "look_ahead_m", "tolerance_m", "turn_rate_radps"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0.0):
+                raise InputError(f"route.{name} must be a positive number, got {value}")
+        if self.distance_m is not None and not 0.0 < self.distance_m < math.inf:
+            raise InputError(f"route.distance_m must be positive, got {self.distance_m}")
+
+    def start(self, world: World, robot: DifferentialDrive) -> tuple[Array, Pursuit]:
+        """Start pose (3,) on the first way-point, facing the second, and the driver."""
+        given = world.waypoints if self.waypoints is None else np.array(self.waypoints, float)
+        if given.ndim != 2 or given.shape[1] != 2 or len(given) < 2:
+            raise InputError(
+                f"route: world {world.name} has no tour of at least two way-points; give "
+                "route.waypoints=[[x, y], ...]"
+            )
+        path = _lengthened(given, self.distance_m)
+        first = path[1] - path[0]
+        pose = np.array([path[0, 0], path[0, 1], math.atan2(first[1], first[0])])
+        return pose, Pursuit(self, robot, path)
+
+
+class Pursuit:
+    """Driver of a Tour: pure pursuit, 50 times a second, with limited acceleration."""
+
+    def __init__(self, tour: Tour, robot: DifferentialDrive, path: Array) -> None:
+        self._tour, self._path = tour, path
+        steps = np.hypot(*np.diff(path, axis=0).T)
+        self._along_m = np.concatenate([[0.0], np.cumsum(steps)])
+        self._acceleration = 0.5 * robot.max_acceleration_mps2  # the other half is for turning
+        self._turn_acceleration = robot.max_acceleration_mps2 / robot.track_m
+        self._done_m, self._velocity = 0.0, np.zeros(2)
+        self._off_m = 0.0
+        self._rest_ticks: int | None = None
+        self._last_tick = round(300 * (4.0 * self._along_m[-1] / tour.speed_mps + 60.0))
+        self._late = False
+
+    def command(self, tick: int, pose: Array) -> Array | None:
+        """Velocity (2,) of the tick; None when the robot rests at the last way-point."""
+        if self._rest_ticks is not None:
+            self._rest_ticks -= 1
+            return None if self._rest_ticks < 0 else np.zeros(2)
+        if tick % 6:
+            return self._velocity
+        self._late = tick >= self._last_tick
+        self._project(pose)
+        left_m = self._along_m[-1] - self._done_m
+        if left_m < 0.02 and self._velocity[0] < 0.05:
+            self._rest_ticks = 60
+            return np.zeros(2)
+        self._velocity = self._limited(self._wanted(pose, left_m), 6 * TICK_S)
+        return self._velocity
+
+    @property
+    def trouble(self) -> str | None:
+        """`off_route` or `incomplete` (far too slow), else None."""
+        if self._off_m > self._tour.tolerance_m:
+            return "off_route"
+        return "incomplete" if self._late else None
+
+    def _project(self, pose: Array) -> None:
+        """Advance the progress along the path to the nearest point not far ahead."""
+        low = int(np.searchsorted(self._along_m, self._done_m, side="right")) - 1
+        ahead_m = self._done_m + 2.0 * self._tour.look_ahead_m
+        high = min(int(np.searchsorted(self._along_m, ahead_m)) + 1, len(self._path))
+        best = math.inf
+        for i in range(max(low, 0), max(high, low + 2) - 1):
+            if i + 1 >= len(self._path):
+                break
+            start, way = self._path[i], self._path[i + 1] - self._path[i]
+            length = self._along_m[i + 1] - self._along_m[i]
+            share = float(np.clip((pose[:2] - start) @ way / length**2, 0.0, 1.0))
+            at_m = self._along_m[i] + share * length
+            if not self._done_m - 1e-9 <= at_m <= ahead_m:
+                at_m = min(max(at_m, self._done_m), ahead_m)
+                share = (at_m - self._along_m[i]) / length
+            gap = float(np.hypot(*(pose[:2] - start - share * way)))
+            if gap < best - 1e-9:
+                best, done_m = gap, at_m
+        self._done_m, self._off_m = done_m, best
+
+    def _wanted(self, pose: Array, left_m: float) -> Array:
+        tour = self._tour
+        goal = self._point_at(self._done_m + tour.look_ahead_m)
+        bearing = math.atan2(goal[1] - pose[1], goal[0] - pose[0]) - pose[2]
+        bearing = math.atan2(math.sin(bearing), math.cos(bearing))
+        distance = max(float(np.hypot(*(goal - pose[:2]))), 1e-3)
+        brake = math.sqrt(2.0 * 0.8 * self._acceleration * max(left_m, 0.0))
+        if abs(bearing) > 0.6:  # too sharp for an arc: slow down and turn on the spot
+            return np.array([0.0, math.copysign(tour.turn_rate_radps, bearing)])
+        v = min(tour.speed_mps * math.cos(bearing) ** 4, brake)
+        omega = 2.0 * v * math.sin(bearing) / max(distance, 0.5 * tour.look_ahead_m)
+        limit = tour.turn_rate_radps
+        return np.array([max(v, 0.01), min(max(omega, -limit), limit)])
+
+    def _limited(self, wanted: Array, dt_s: float) -> Array:
+        most = dt_s * np.array([self._acceleration, self._turn_acceleration])
+        limited: Array = self._velocity + np.clip(wanted - self._velocity, -most, most)
+        return limited
+
+    def _point_at(self, along_m: float) -> Array:
+        columns = [np.interp(along_m, self._along_m, self._path[:, i]) for i in (0, 1)]
+        return np.array(columns)
+
+
+def _lengthened(path: Array, distance_m: float | None) -> Array:
+    """Path (P, 2) cut or repeated to the wanted length, without points that coincide."""
+    keep = np.concatenate([[True], np.hypot(*np.diff(path, axis=0).T) > 1e-6])
+    path = path[keep]
+    if distance_m is None:
+        return path
+    closed = bool(np.hypot(*(path[0] - path[-1])) < 1e-6)
+    lap = path
+    while _length(path) < distance_m:
+        lap = lap if closed else lap[::-1]
+        path = np.concatenate([path, lap[1:]])
+    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
+    last = int(np.searchsorted(along, distance_m))
+    share = (distance_m - along[last - 1]) / (along[last] - along[last - 1])
+    end = path[last - 1] + share * (path[last] - path[last - 1])
+    return np.concatenate([path[:last], end[None]])
+
+
+def _length(path: Array) -> float:
+    return float(np.sum(np.hypot(*np.diff(path, axis=0).T)))
 
 
 def chain(increments: ArrayLike, start: ArrayLike = (0.0, 0.0, 0.0)) -> Array:

@@ -225,8 +225,8 @@ class StereoCamera:
         disparity = self.focal_px * self.baseline_m / z + self.sigma_disparity_px * draws[:, 2]
         disparity = np.where(disparity > 0.0, disparity, np.nan)
         rays = np.stack([column, row, np.full_like(row, self.focal_px)], axis=-1)
-        observed = rays * (self.baseline_m / disparity[:, None])
-        return observed
+        seen: Array = rays * (self.baseline_m / disparity[:, None])
+        return seen
 
 
 @dataclass(frozen=True)

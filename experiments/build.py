@@ -1,0 +1,170 @@
+"""From the resolved configuration to the objects it names."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from estimators.base import Estimator, Prior
+from experiments.cache import cached
+from experiments.seeds import stream
+from experiments.version import ROOT
+from sim.errors import InputError
+from sim.recording import Recording, load
+from sim.robot import DifferentialDrive, RobotGeometry
+from sim.sensors import SensorSuite, suite_from_config
+from sim.settings import build
+from sim.world import World
+
+Config = dict[str, Any]
+SIMULATED_KEYS = ("world", "robot", "sensors", "route", "simulation", "seed", "world_seed")
+
+
+def make(settings: Config, where: str, **injected: Any) -> Any:
+    """Call what `_target_` names with the other keys.
+
+    Parameters
+    ----------
+    settings
+        A mapping with `_target_` (module.name) and keyword arguments.
+    where
+        Its place in the configuration, for messages.
+    injected
+        Further arguments, given by the program.
+
+    Raises
+    ------
+    InputError
+        If the target cannot be found, or a key is unknown or missing.
+    """
+    target = settings.get("_target_")
+    if not isinstance(target, str) or "." not in target:
+        raise InputError(f"{where}._target_ must name a class or function, such as mine.Mine")
+    function = _find(target, where)
+    arguments = {key: value for key, value in settings.items() if key != "_target_"}
+    known = inspect.signature(function).parameters
+    open_ended = any(p.kind is inspect.Parameter.VAR_KEYWORD for p in known.values())
+    for key in arguments:
+        if key not in known and not open_ended:
+            free = ", ".join(k for k in known if k not in injected) or "none"
+            raise InputError(f"unknown key {where}.{key} for {target}; known: {free}")
+    for name, parameter in known.items():
+        given = name in arguments or name in injected
+        if parameter.default is inspect.Parameter.empty and not given and name != "self":
+            if parameter.kind in (
+                inspect.Parameter.VAR_KEYWORD,
+                inspect.Parameter.VAR_POSITIONAL,
+            ):
+                continue
+            raise InputError(f"{where}.{name} is missing; {target} needs it")
+    try:
+        return function(**arguments, **{k: v for k, v in injected.items() if k in known})
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{where} ({target}) does not accept its values: {error}") from error
+
+
+def _find(target: str, where: str) -> Callable[..., Any]:
+    module_name, _, name = target.rpartition(".")
+    try:
+        module = importlib.import_module(module_name)
+    except ModuleNotFoundError as error:
+        raise InputError(
+            f"{where}._target_={target}: no module {error.name}; is its folder on PYTHONPATH?"
+        ) from error
+    found = getattr(module, name, None)
+    if not callable(found):
+        raise InputError(f"{where}._target_={target}: {module_name} has no class {name}")
+    return found  # type: ignore[no-any-return]
+
+
+def make_world(config: Config) -> World:
+    """World of the configuration, from its own stream."""
+    rng = stream(config["world_seed"], "world")
+    world: World = make(config["world"], "world", rng=rng)
+    return world
+
+
+def make_robot(config: Config) -> DifferentialDrive:
+    """Robot of the configuration."""
+    return build(DifferentialDrive, config["robot"], "robot")
+
+
+def make_recording(
+    config: Config, cache: Path, on_progress: Callable[[float], None] | None = None
+) -> Recording:
+    """Read, fetch from the cache, or simulate the configuration's recording."""
+    if config["recording"] is not None:
+        return load(Path(config["recording"]))
+    settings = {key: config[key] for key in SIMULATED_KEYS}
+    return cached(cache, settings, lambda: simulate(config, on_progress))
+
+
+def simulate(config: Config, on_progress: Callable[[float], None] | None = None) -> Recording:
+    """Simulate the configuration's recording."""
+    from sim.simulate import record
+
+    simulation = config["simulation"]
+    for key, allowed in (("physics", ("bullet", "kinematic")), ("rays", ("bullet", "exact"))):
+        if simulation[key] not in allowed:
+            raise InputError(
+                f"simulation.{key} must be {' or '.join(allowed)}, got {simulation[key]!r}"
+            )
+    return record(
+        make_world(config),
+        make_robot(config),
+        suite_from_config(config["sensors"]),
+        make(config["route"], "route"),
+        {axis: stream(config["seed"], axis) for axis in ("slip", "sensors")},
+        physics=simulation["physics"],
+        rays=simulation["rays"],
+        config={key: config[key] for key in SIMULATED_KEYS},
+        on_progress=on_progress,
+    )
+
+
+def make_estimator(config: Config) -> Estimator:
+    """Estimator of the configuration; anything with `reset` and `step`."""
+    estimator = make(config["estimator"], "estimator")
+    for method in ("reset", "step"):
+        if not callable(getattr(estimator, method, None)):
+            raise InputError(
+                f"estimator._target_={config['estimator']['_target_']} has no method {method}; "
+                "see estimators/base.py for the protocol"
+            )
+    return estimator  # type: ignore[no-any-return]
+
+
+def make_prior(config: Config, recording: Recording) -> Prior:
+    """What the estimator knows at the start."""
+    settings = config["prior"]
+    robot = RobotGeometry(float(settings["wheel_radius_m"]), float(settings["track_m"]))
+    if settings["map"] not in ("none", "world"):
+        raise InputError(f"prior.map must be none or world, got {settings['map']!r}")
+    world = recording.truth.world if recording.truth else None
+    if settings["map"] == "world" and world is None:
+        raise InputError("prior.map=world, but the recording has no map; set prior.map=none")
+    known_map = world if settings["map"] == "world" else None
+    sensors: SensorSuite = recording.sensors
+    if settings["start"] == "global":
+        return Prior(robot, sensors, map=known_map)
+    if settings["start"] != "tracking":
+        raise InputError(f"prior.start must be tracking or global, got {settings['start']!r}")
+    sigma = [settings["sigma_position_m"]] * 2 + [settings["sigma_heading_rad"]]
+    for key, value in zip(("sigma_position_m", "sigma_heading_rad"), sigma[1:], strict=True):
+        if not (isinstance(value, (int, float)) and 0.0 <= value < np.inf):
+            raise InputError(f"prior.{key} must be zero or positive, got {value}")
+    start = np.zeros(3)
+    if recording.truth is not None:
+        start = recording.truth_at(recording.frame_stamps[:1])[0]
+    offset = np.array(sigma) * stream(config["seed"], "prior").standard_normal(3)
+    return Prior(robot, sensors, start + offset, np.diag(np.square(sigma)), known_map)
+
+
+def default_cache() -> Path:
+    """Folder of the recordings' cache."""
+    return ROOT / "results" / "cache" / "recordings"

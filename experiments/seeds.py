@@ -1,0 +1,30 @@
+"""Independent random streams by axis, all from one study seed."""
+
+from __future__ import annotations
+
+import zlib
+
+import numpy as np
+
+from sim.errors import InputError
+
+
+def stream(seed: int, axis: str, index: int = 0) -> np.random.Generator:
+    """Generator of one axis of randomness.
+
+    Streams of different axes, names or indices are independent, and none depends on the order
+    in which they are asked for.
+
+    Parameters
+    ----------
+    seed
+        The study seed, a non-negative whole number.
+    axis
+        `world`, `route`, `slip`, `sensors`, or `estimator/NAME`.
+    index
+        Repetition.
+    """
+    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
+        raise InputError(f"seed must be a whole number from 0 on, got {seed!r}")
+    key = (zlib.crc32(axis.encode()), index)
+    return np.random.default_rng(np.random.SeedSequence(entropy=seed, spawn_key=key))
