@@ -1,0 +1,547 @@
+"""Exact ranges to the upright faces of a World, without a physics engine.
+
+The planar caster draws every face into a buffer of inverse ranges, as a depth buffer does: along
+a straight wall n . p = c the inverse range of the beam with direction d is (n . d) / c, which is
+linear in d, so a wall costs one multiply-add and one maximum for each beam between its ends.
+
+Ends are closed: a beam through the end of a face, to 1e-9 of the beam spacing, hits it. A beam
+that runs along a face hits its nearer end, and a sensor standing on a face (within 1e-12 m) has
+range 0 on all beams. In the kernels bearings are counted in beams from the first one, in
+[0, turn), where `turn` is the full circle and `phase` the first beam's angle in map, in rad.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from llvmlite import ir  # type: ignore[import-untyped]
+from numba import njit, types
+from numba.extending import intrinsic
+from numpy.typing import ArrayLike, NDArray
+
+from sim.sensors import Laser, Lidar3D
+from sim.world import World
+
+Array = NDArray[np.float64]
+
+IGNORED_NEAR_POINT_M = 0.005
+
+_LANES = 8  # beams drawn at a time; buffers over beams are padded by as many
+_BEARING_ERROR_RAD = 1e-7  # above the error of the polynomial in `_bearings`, 3.8e-8
+_END_TOLERANCE = 1e-9  # of the beam spacing; of a face's length in `visible`
+_EDGE_ON_M = 1e-6  # a face whose line passes the sensor nearer than this is drawn with care
+_TOUCHING_M = 1e-12
+
+
+class SegmentCaster:
+    """A planar laser in a World: noise-free ranges at any pose.
+
+    Parameters
+    ----------
+    world
+        Its faces that reach the height of the laser are seen, from both sides.
+    laser
+        Beams, mounting height and greatest range. The noise and the least range are left to
+        `Laser.measure`.
+    """
+
+    def __init__(self, world: World, laser: Laser) -> None:
+        z = laser.mount.z_m
+        bearings = laser.bearings_rad
+        step = float(bearings[1] - bearings[0]) if laser.n_beams > 1 else math.pi
+        directions = np.zeros((2, laser.n_beams + _LANES))
+        directions[:, : laser.n_beams] = np.cos(bearings), np.sin(bearings)
+        level = (world.wall_z_m[:, 0] <= z) & (z <= world.wall_z_m[:, 1])
+        self._prepared = (
+            _chains(world.walls[level]),
+            directions,
+            float(bearings[0]),
+            step,
+            float(laser.max_range_m),
+        )
+
+    def cast(self, T_world_sensor: ArrayLike) -> Array:
+        """Ranges (n_beams,), m, from a pose (3,) m, m, rad; +inf where nothing is in range."""
+        poses = np.array(T_world_sensor, np.float64, ndmin=2, order="C")
+        if poses.shape != (1, 3):
+            raise ValueError(f"cast needs one pose (3,), got {np.shape(T_world_sensor)}")
+        ranges: Array = _cast(poses, *self._prepared)[0]
+        return ranges
+
+    def cast_many(self, T_world_sensor: ArrayLike) -> Array:
+        """Ranges (N, n_beams), m, from poses (N, 3) m, m, rad; +inf where nothing is in range."""
+        poses = np.array(T_world_sensor, np.float64, order="C")
+        if poses.ndim != 2 or poses.shape[1] != 3:
+            raise ValueError(f"cast_many needs poses (N, 3), got {poses.shape}")
+        ranges: Array = _cast(poses, *self._prepared)
+        return ranges
+
+
+def cast_lidar(world: World, lidar: Lidar3D, T_world_sensor: ArrayLike) -> Array:
+    """Slant ranges of a 3D lidar to the faces and the ground plane z = 0.
+
+    The faces are open at the top: a beam that passes over a near face may hit the inside of a
+    far one.
+
+    Parameters
+    ----------
+    world, lidar
+        The lidar is level, at the height of its mount.
+    T_world_sensor
+        (3,) m, m, rad.
+
+    Returns
+    -------
+    Array
+        (n_rings, n_azimuths) m; +inf where nothing is in range.
+    """
+    x, y, heading = np.asarray(T_world_sensor, np.float64).tolist()
+    azimuths, elevations = lidar.azimuths_rad, lidar.elevations_rad
+    ranges: Array = _cast_lidar(
+        (x, y, heading, float(lidar.mount.z_m)),
+        np.array(world.walls.T, np.float64, order="C"),
+        np.array(world.wall_z_m.T, np.float64, order="C"),
+        np.stack([np.cos(azimuths), np.sin(azimuths)]),
+        float(azimuths[0]),
+        np.tan(elevations),
+    )
+    ranges /= np.cos(elevations)[:, None]
+    ranges[ranges > lidar.max_range_m] = np.inf
+    return ranges
+
+
+def visible(
+    world: World, origin_in_world: ArrayLike, points_in_world: ArrayLike
+) -> NDArray[np.bool_]:
+    """Whether no face of the World stands between an origin and each point.
+
+    Parameters
+    ----------
+    world
+        A face hides what lies behind it between its bottom and its top, ends included. A face
+        seen exactly along its plane hides nothing.
+    origin_in_world
+        (3,) m.
+    points_in_world
+        (N, 3) m; a face within 5 mm of the point, along the sight line, does not hide it, so
+        that points may lie on faces.
+
+    Returns
+    -------
+    NDArray[np.bool_]
+        (N,).
+    """
+    seen: NDArray[np.bool_] = _visible(
+        np.array(origin_in_world, np.float64),
+        np.array(points_in_world, np.float64, order="C").reshape(-1, 3),
+        np.array(world.walls.T, np.float64, order="C"),
+        np.array(world.wall_z_m.T, np.float64, order="C"),
+    )
+    return seen
+
+
+def _chains(walls: Array) -> Array:
+    """Faces (W, 4) strung into chains of corners, so that neighbours share the work on a corner.
+
+    Returns
+    -------
+    Array
+        (5, K), one column a corner: x, y, then of the face from this corner to the next: the
+        centre x, y and squared radius of a disc, m and m^2. Outside the disc only the side of
+        the face that has the sensor on its right can be seen; that is known of convex closed
+        chains, which are turned clockwise. It is infinite for other faces, and -1 where the
+        chain ends and no face follows.
+    """
+    starting: dict[tuple[float, float], list[int]] = {}
+    for i in range(len(walls) - 1, -1, -1):
+        starting.setdefault((walls[i, 0], walls[i, 1]), []).append(i)
+    unused = np.ones(len(walls), bool)
+    columns = []
+    for first in range(len(walls)):
+        if not unused[first]:
+            continue
+        corners = [walls[first, :2]]
+        following: int | None = first
+        while following is not None:
+            unused[following] = False
+            corners.append(walls[following, 2:])
+            candidates = starting.get((walls[following, 2], walls[following, 3]), [])
+            following = next((i for i in candidates if unused[i]), None)
+        columns.append(_chain(np.array(corners)))
+    return np.concatenate([np.zeros((5, 0)), *columns], axis=1)
+
+
+def _chain(corners: Array) -> Array:
+    """Columns (5, K) of `_chains` for one chain of corners (K, 2)."""
+    disc = np.array([0.0, 0.0, np.inf])
+    if len(corners) > 3 and np.array_equal(corners[0], corners[-1]):
+        along = np.diff(corners, axis=0)
+        ahead = np.roll(along, -1, axis=0)
+        cross = along[:, 0] * ahead[:, 1] - along[:, 1] * ahead[:, 0]
+        turns = np.arctan2(cross, np.sum(along * ahead, axis=1))
+        if abs(turns.sum()) < 7.0 and (np.all(turns > 0.0) or np.all(turns < 0.0)):
+            corners = corners[::-1] if turns[0] > 0.0 else corners
+            centre = corners[:-1].mean(axis=0)
+            radius2 = np.max(np.sum((corners - centre) ** 2, axis=1))
+            disc = np.array([*centre, radius2 * (1.0 + 1e-9)])
+    columns = np.vstack([corners.T, np.repeat(disc[:, None], len(corners), axis=1)])
+    columns[4, -1] = -1.0
+    return columns
+
+
+@intrinsic
+def _draw_block(
+    typing_context: Any, nearness: Any, cosines: Any, sines: Any, j: Any, n: Any, gx: Any, gy: Any
+) -> Any:
+    """Raise nearness[j + m] to gx cosines[j + m] + gy sines[j + m] for m < min(n, 8).
+
+    Written in the compiler's vectors: the masked loop of eight is not vectorised otherwise and
+    then takes four times as long. Buffers must reach to j + 8.
+    """
+    signature = types.void(
+        nearness, cosines, sines, types.int64, types.int64, types.float64, types.float64
+    )
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        doubles = ir.VectorType(ir.DoubleType(), _LANES)
+        integers = ir.VectorType(ir.IntType(64), _LANES)
+        index = ir.VectorType(ir.IntType(32), _LANES)
+
+        def pointer(k: int) -> Any:
+            array = context.make_array(signature.args[k])(context, builder, arguments[k])
+            return builder.bitcast(builder.gep(array.data, [arguments[3]]), doubles.as_pointer())
+
+        def spread(value: Any, kind: Any) -> Any:
+            none = ir.Constant(kind, ir.Undefined)
+            single = builder.insert_element(none, value, ir.Constant(ir.IntType(32), 0))
+            return builder.shuffle_vector(single, none, ir.Constant(index, [0] * _LANES))
+
+        fused = {"flags": ["contract"]}
+        east = builder.fmul(
+            builder.load(pointer(1), align=8), spread(arguments[5], doubles), **fused
+        )
+        north = builder.fmul(
+            builder.load(pointer(2), align=8), spread(arguments[6], doubles), **fused
+        )
+        new = builder.fadd(east, north, **fused)
+        old = builder.load(pointer(0), align=8)
+        lanes = ir.Constant(integers, list(range(_LANES)))
+        covered = builder.icmp_signed("<", lanes, spread(arguments[4], integers))
+        nearer = builder.and_(covered, builder.fcmp_ordered(">", new, old))
+        builder.store(builder.select(nearer, new, old), pointer(0), align=8)
+        return context.get_dummy_value()
+
+    return signature, generate
+
+
+@njit(cache=True, error_model="numpy")
+def _cast(
+    poses: Array,
+    chains: Array,
+    directions: Array,
+    first_rad: float,
+    step_rad: float,
+    max_range_m: float,
+) -> Array:
+    """Ranges (N, n_beams), m, from poses (N, 3)."""
+    n_beams = directions.shape[1] - _LANES
+    turn = 2.0 * math.pi / step_rad
+    tolerance = _BEARING_ERROR_RAD / step_rad + _END_TOLERANCE
+    bearing = np.empty(chains.shape[1])
+    seen = np.empty(chains.shape[1], np.uint8)
+    nearness = np.empty(directions.shape[1])  # inverse range, 1/m
+    ranges = np.empty((poses.shape[0], n_beams))
+    for i in range(poses.shape[0]):
+        x, y, heading = poses[i, 0], poses[i, 1], poses[i, 2]
+        if not math.isfinite(x + y + heading):
+            raise ValueError("a pose to cast from must be finite")
+        phase = _wrapped(heading + first_rad)
+        nearness[:] = 0.0
+        _bearings(x, y, phase, step_rad, chains[0], chains[1], bearing)
+        _mark_seen(x, y, turn, n_beams - 1.0 + tolerance, turn - tolerance, chains, bearing, seen)
+        _draw(
+            x, y, heading, phase, step_rad, tolerance, chains, bearing, seen, directions, nearness
+        )
+        _invert(nearness, max_range_m, ranges[i])
+    return ranges
+
+
+@njit(cache=True)
+def _wrapped(angle_rad: float) -> float:
+    """The angle in [-pi, pi]."""
+    return angle_rad - 2.0 * math.pi * math.floor(angle_rad / (2.0 * math.pi) + 0.5)
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _bearings(
+    x: float, y: float, phase: float, step_rad: float, px: Array, py: Array, bearing: Array
+) -> None:
+    """Bearing of each corner to 1e-7 rad, in beams.
+
+    The polynomial fits the arc tangent on [0, 1]; ends that fall so close to a beam that this
+    error matters are settled in `_draw`.
+    """
+    per_rad = 1.0 / step_rad
+    for i in range(bearing.size):
+        east, north = px[i] - x, py[i] - y
+        a, b = abs(east), abs(north)
+        q = min(a, b) / (max(a, b) + 1e-300)
+        z = q * q
+        angle = -0.00405456048014 * z + 0.0218629340369
+        angle = angle * z - 0.0559122931499
+        angle = angle * z + 0.0964219492517
+        angle = angle * z - 0.139086286357
+        angle = angle * z + 0.19946565474
+        angle = angle * z - 0.333298607693
+        angle = (angle * z + 0.999999335575) * q
+        angle = 0.5 * math.pi - angle if b > a else angle
+        angle = math.pi - angle if east < 0.0 else angle
+        angle = (-angle if north < 0.0 else angle) - phase
+        angle = angle + 2.0 * math.pi if angle < 0.0 else angle
+        bearing[i] = angle * per_rad
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _mark_seen(
+    x: float,
+    y: float,
+    turn: float,
+    last: float,
+    seam: float,
+    chains: Array,
+    bearing: Array,
+    seen: NDArray[np.uint8],
+) -> None:
+    """Mark the faces that may cover a beam from the side on which they can be seen."""
+    px, py, centre_x, centre_y, radius2 = chains[0], chains[1], chains[2], chains[3], chains[4]
+    for i in range(bearing.size - 1):
+        c = (py[i + 1] - py[i]) * (px[i] - x) + (px[i] - px[i + 1]) * (py[i] - y)
+        outside = c >= 0.0
+        begin = bearing[i] if outside else bearing[i + 1]
+        end = bearing[i + 1] if outside else bearing[i]
+        end = end + turn if end < begin else end
+        in_view = (begin <= last) | (end >= seam)
+        ox, oy = x - centre_x[i], y - centre_y[i]
+        facing = outside | (ox * ox + oy * oy <= radius2[i])
+        seen[i] = 1 if in_view & facing & (radius2[i] >= 0.0) else 0
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _draw(
+    x: float,
+    y: float,
+    heading: float,
+    phase: float,
+    step_rad: float,
+    tolerance: float,
+    chains: Array,
+    bearing: Array,
+    seen: NDArray[np.uint8],
+    directions: Array,
+    nearness: Array,
+) -> None:
+    """Draw the marked faces into `nearness`."""
+    px, py, cosines, sines = chains[0], chains[1], directions[0], directions[1]
+    turn = 2.0 * math.pi / step_rad
+    cos, sin = math.cos(heading), math.sin(heading)
+    order = np.empty(seen.size, np.int64)
+    n_seen = np.int64(0)
+    for i in range(seen.size - 1):  # without a branch, since none could be foreseen
+        order[n_seen] = i
+        n_seen += np.int64(seen[i])
+    for k in range(n_seen):
+        i = order[k]
+        ax, ay, bx, by = px[i] - x, py[i] - y, px[i + 1] - x, py[i + 1] - y
+        nx, ny = py[i + 1] - py[i], px[i] - px[i + 1]
+        c = nx * ax + ny * ay
+        begin, end = bearing[i], bearing[i + 1]
+        if c < 0.0:
+            ax, ay, bx, by = bx, by, ax, ay
+            begin, end = end, begin
+        end = end + turn if end < begin else end
+        edge_on = c * c <= _EDGE_ON_M * _EDGE_ON_M * (nx * nx + ny * ny)
+        if edge_on or end - begin > 0.75 * turn:
+            _draw_edge_on(ax, ay, bx, by, heading, phase, step_rad, directions, nearness)
+            continue
+        if abs(begin - math.floor(begin + 0.5)) < tolerance:
+            begin = _settled(begin, ax, ay, phase, step_rad)
+        if abs(end - math.floor(end + 0.5)) < tolerance:
+            end = _settled(end, bx, by, phase, step_rad)
+        begin -= _END_TOLERANCE
+        end += _END_TOLERANCE
+        per_c = 1.0 / c
+        gx, gy = (nx * cos + ny * sin) * per_c, (ny * cos - nx * sin) * per_c
+        _draw_beams(nearness, cosines, sines, begin, end, gx, gy)
+        if end >= turn:
+            _draw_beams(nearness, cosines, sines, begin - turn, end - turn, gx, gy)
+
+
+@njit(cache=True)
+def _draw_beams(
+    nearness: Array,
+    cosines: Array,
+    sines: Array,
+    begin: float,
+    end: float,
+    gx: float,
+    gy: float,
+) -> None:
+    """Draw one face into the beams from `begin` to `end`."""
+    stop = min(math.floor(end), nearness.size - _LANES - 1) + 1
+    for j in range(max(math.ceil(begin), 0), stop, _LANES):
+        _draw_block(nearness, cosines, sines, j, stop - j, gx, gy)  # type: ignore[call-arg]
+
+
+@njit(cache=True, error_model="numpy")
+def _settled(estimate: float, dx: float, dy: float, phase: float, step_rad: float) -> float:
+    """The bearing of a corner, in beams, to the last bits, next to an estimate of it."""
+    turn = 2.0 * math.pi / step_rad
+    change = (math.atan2(dy, dx) - phase) / step_rad - estimate
+    return estimate + change - turn * math.floor(change / turn + 0.5)
+
+
+@njit(cache=True, error_model="numpy")
+def _draw_edge_on(
+    ax: float,
+    ay: float,
+    bx: float,
+    by: float,
+    heading: float,
+    phase: float,
+    step_rad: float,
+    directions: Array,
+    nearness: Array,
+) -> None:
+    """Draw a face that is seen along its plane, or touched, with its range kept on the face."""
+    turn = 2.0 * math.pi / step_rad
+    last = nearness.size - _LANES - 1
+    begin, end, gx, gy, least, most = _face(ax, ay, bx, by, heading, phase, step_rad)
+    for shift in (0.0, turn):
+        start = max(math.ceil(begin - shift), 0)
+        for j in range(start, min(math.floor(end - shift), last) + 1):
+            v = directions[0, j] * gx + directions[1, j] * gy
+            nearness[j] = max(nearness[j], min(max(v, least), most))
+
+
+@njit(cache=True, error_model="numpy")
+def _face(
+    ax: float, ay: float, bx: float, by: float, heading: float, phase: float, step_rad: float
+) -> tuple[float, float, float, float, float, float]:
+    """Beams a face covers and its inverse range, whatever its place, from its ends less the sensor.
+
+    Returns
+    -------
+    tuple of float
+        begin and end in beams (begin <= end, begin < turn), widened by the tolerance; (gx, gy),
+        1/m, whose product with a beam's direction is its inverse range; the bounds to keep that
+        in. A face that touches the sensor covers all beams at inverse range inf.
+    """
+    turn = 2.0 * math.pi / step_rad
+    nx, ny = by - ay, ax - bx
+    share = (ax * ny - ay * nx) / (nx * nx + ny * ny)
+    share = min(max(share, 0.0), 1.0)
+    nearest = math.hypot(ax - share * ny, ay + share * nx)
+    if nearest <= _TOUCHING_M:
+        return 0.0, turn, 0.0, 0.0, np.inf, np.inf
+    farthest = max(math.hypot(ax, ay), math.hypot(bx, by))
+    begin = (math.atan2(ay, ax) - phase) / step_rad
+    end = (math.atan2(by, bx) - phase) / step_rad
+    c = nx * ax + ny * ay
+    if c < 0.0:
+        begin, end = end, begin
+    begin -= turn * math.floor(begin / turn)
+    end -= turn * math.floor(end / turn)
+    end = end + turn if end < begin else end
+    if end - begin > 0.75 * turn:  # edge-on, and rounding has swapped the ends
+        begin, end = end - turn, begin
+    per_c = 1.0 / c if c != 0.0 else 0.0
+    cos, sin = math.cos(heading), math.sin(heading)
+    gx, gy = (nx * cos + ny * sin) * per_c, (ny * cos - nx * sin) * per_c
+    least = 1.0 / farthest if c != 0.0 else 1.0 / nearest
+    return begin - _END_TOLERANCE, end + _END_TOLERANCE, gx, gy, least, 1.0 / nearest
+
+
+@njit(cache=True, error_model="numpy")
+def _invert(nearness: Array, max_range_m: float, ranges: Array) -> None:
+    """Ranges, m, of inverse ranges; +inf beyond the greatest range."""
+    for j in range(ranges.size):
+        r = 1.0 / nearness[j]
+        ranges[j] = r if r <= max_range_m else np.inf
+
+
+@njit(cache=True, error_model="numpy")
+def _cast_lidar(
+    pose: tuple[float, float, float, float],
+    walls: Array,
+    wall_z: Array,
+    directions: Array,
+    first_rad: float,
+    slopes: Array,
+) -> Array:
+    """Horizontal ranges (rings, azimuths), m, from x, y, heading and height z.
+
+    A ring of slope t meets a face at inverse range v if (bottom - z) v <= t <= (top - z) v.
+    """
+    x, y, heading, z = pose
+    n_azimuths, n_rings = directions.shape[1], slopes.size
+    turn = float(n_azimuths)
+    step_rad = 2.0 * math.pi / turn
+    phase = _wrapped(heading + first_rad)
+    nearness = np.empty((n_azimuths, n_rings))
+    for r in range(n_rings):
+        ground = -slopes[r] / z if slopes[r] != 0.0 else 0.0
+        nearness[:, r] = max(ground, 0.0)
+    for i in range(walls.shape[1]):
+        begin, end, gx, gy, least, most = _face(
+            walls[0, i] - x,
+            walls[1, i] - y,
+            walls[2, i] - x,
+            walls[3, i] - y,
+            heading,
+            phase,
+            step_rad,
+        )
+        bottom, top = wall_z[0, i] - z, wall_z[1, i] - z
+        for shift in (0.0, turn):
+            start = max(math.ceil(begin - shift), 0)
+            for j in range(start, min(math.floor(end - shift), n_azimuths - 1) + 1):
+                v = directions[0, j] * gx + directions[1, j] * gy
+                v = min(max(v, least), most)
+                low, high = bottom * v, top * v
+                row = nearness[j]
+                for r in range(n_rings):
+                    if (low <= slopes[r]) & (slopes[r] <= high) & (v > row[r]):
+                        row[r] = v
+    return 1.0 / nearness.T
+
+
+@njit(cache=True, error_model="numpy")
+def _visible(origin: Array, points: Array, walls: Array, wall_z: Array) -> NDArray[np.bool_]:
+    """See `visible`; walls (4, W) and wall_z (2, W).
+
+    The sight line origin + s p crosses a face a + t (b - a) at s = c / (n . p) and
+    t = (a x p) / (n . p); where n . p = 0 no comparison holds.
+    """
+    x, y, z = origin[0], origin[1], origin[2]
+    x1, y1, x2, y2 = walls[0], walls[1], walls[2], walls[3]
+    bottom, top = wall_z[0], wall_z[1]
+    seen = np.empty(points.shape[0], np.bool_)
+    for k in range(points.shape[0]):
+        px, py, pz = points[k, 0] - x, points[k, 1] - y, points[k, 2] - z
+        distance = math.sqrt(px * px + py * py + pz * pz)
+        s_most = 1.0 - IGNORED_NEAR_POINT_M / distance
+        hits = 0
+        for i in range(x1.size):
+            ax, ay = x1[i] - x, y1[i] - y
+            nx, ny = y2[i] - y1[i], x1[i] - x2[i]
+            inverse = 1.0 / (nx * px + ny * py)
+            s = (nx * ax + ny * ay) * inverse
+            t = (ax * py - ay * px) * inverse
+            height = z + s * pz
+            between = (s >= 0.0) & (s <= s_most)
+            across = (t >= -_END_TOLERANCE) & (t <= 1.0 + _END_TOLERANCE)
+            hits += between & across & (height >= bottom[i]) & (height <= top[i])
+        seen[k] = hits == 0
+    return seen
