@@ -284,6 +284,20 @@ _LOGS: dict[str, Any] = {
 }
 
 
+_UNREADABLE = (
+    OSError,
+    ValueError,
+    KeyError,
+    TypeError,
+    AttributeError,
+    EOFError,
+    MemoryError,
+    NotImplementedError,
+    zipfile.BadZipFile,
+    zlib.error,
+)  # what NumPy, zipfile and json say of files that are not what they should be
+
+
 def save(recording: Recording, path: Path) -> str:
     """Write a recording; return its checksum.
 
@@ -318,10 +332,8 @@ def load(path: Path) -> Recording:
             stored = {name: archive[name] for name in archive.files}
         meta = json.loads(stored.pop("meta").tobytes())
         checksum = meta.pop("checksum")
-    except (OSError, ValueError, KeyError, EOFError, MemoryError) as error:
+    except _UNREADABLE as error:
         raise InputError(f"{path}: truncated or not a recording ({error}); {remedy}") from error
-    except (zipfile.BadZipFile, zlib.error, NotImplementedError) as error:
-        raise InputError(f"{path}: truncated or altered ({error}); {remedy}") from error
     if meta.get("format") != FORMAT_VERSION:
         raise InputError(
             f"{path}: recording format {meta.get('format')}, this version reads {FORMAT_VERSION}; "

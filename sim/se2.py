@@ -98,7 +98,7 @@ def exp(twist: ArrayLike) -> Array:
     small = np.abs(angle) < _SMALL_ANGLE_RAD
     safe = np.where(small, 1.0, angle)
     sinc = np.where(small, 1.0 - angle**2 / 6.0, np.sin(safe) / safe)
-    cosc = np.where(small, angle / 2.0 - angle**3 / 24.0, (1.0 - np.cos(safe)) / safe)
+    cosc = np.where(small, angle / 2.0 - angle**3 / 24.0, 2.0 * np.sin(safe / 2.0) ** 2 / safe)
     x = sinc * tangent[..., 0] - cosc * tangent[..., 1]
     y = cosc * tangent[..., 0] + sinc * tangent[..., 1]
     return np.stack([x, y, wrap(angle)], axis=-1)

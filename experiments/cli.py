@@ -1,0 +1,238 @@
+"""The command `estima`. Heavy imports happen inside the commands, so that help is quick."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+app = typer.Typer(
+    help="Estima: simulate differential-drive robots, run localization on the same recordings, "
+    "sweep parameters, and judge the papers' claims.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+_PASS_ON = {
+    "allow_extra_args": True,
+    "ignore_unknown_options": True,
+    "help_option_names": ["-h", "--help"],
+}
+Overrides = Annotated[
+    list[str] | None, typer.Argument(help="Hydra overrides, such as world=office seed=3.")
+]
+
+
+@app.command(context_settings=_PASS_ON)
+def run(context: typer.Context) -> None:
+    """Make or read a recording, run an estimator over it, and write its row of results.
+
+    The arguments are Hydra's: `group=option`, `key=value`, `-m` for a sweep over values.
+
+    Examples
+    --------
+      estima run
+
+      estima run estimator=odometry world=office seed=3
+
+      estima run robot.kr=1e-4 estimator.kr=1e-5 (truth and belief apart)
+
+      estima run -m robot.kr=1e-5,1e-4 seed="range(0,5)"
+
+      estima run --config-dir mine estimator=mine (your own estimator)
+
+      estima run --cfg job (print the configuration; estima options lists the groups)
+    """
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # errors come to `main`, which tells them in a line
+    sys.argv = ["estima run", *context.args]
+    from experiments.run import application
+
+    application()
+
+
+@app.command()
+def record(
+    out: Annotated[Path, typer.Option("--out", "-o", help="File to write, .npz.")],
+    overrides: Overrides = None,
+) -> None:
+    """Simulate a recording and save it.
+
+    Example: estima record -o office.npz world=office sensors=lms291 seed=3
+    """
+    from experiments.build import simulate
+    from experiments.compose import compose
+    from experiments.console import announce_compilation, progress
+    from sim.recording import save
+
+    announce_compilation()
+    config = compose(overrides or [])
+    with progress("simulating, s") as on_progress:
+        recording = simulate(config, on_progress)
+    checksum = save(recording, out)
+    print(f"{out}: {recording.status}, {recording.duration_s:.1f} s, checksum {checksum}")
+    if recording.status != "ok":
+        raise typer.Exit(1)
+
+
+@app.command()
+def info(recording: Annotated[Path, typer.Argument(help="A recording, .npz.")]) -> None:
+    """Check a recording and tell what it holds."""
+    from experiments.describe import describe
+    from sim.recording import load
+
+    print(describe(load(recording)))
+
+
+@app.command()
+def options() -> None:
+    """List the configuration groups and their options."""
+    from experiments.version import ROOT
+
+    for group in ("world", "robot", "sensors", "route", "estimator"):
+        names = sorted(path.stem for path in (ROOT / "conf" / group).glob("*.yaml"))
+        print(f"{group:>10}: {', '.join(names)}")
+
+
+@app.command()
+def view(
+    world: Annotated[bool, typer.Option("--world", help="Draw the world of the overrides.")] = False,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Picture to write.")] = Path("world.png"),
+    overrides: Overrides = None,
+) -> None:
+    """Draw a world: walls, landmarks, places and the tour.
+
+    Example: estima view --world world=office seed=3 -o office.png
+    """
+    from experiments.build import make_world
+    from experiments.compose import compose
+    from experiments.figures.style import save_figure
+    from experiments.figures.world import world_figure
+    from sim.errors import InputError
+
+    if not world:
+        raise InputError("say what to draw: --world")
+    given = [f"world={o}" if "=" not in o else o for o in overrides or []]
+    save_figure(world_figure(make_world(compose(given))), out)
+    print(out)
+
+
+@app.command()
+def calibrate(
+    recordings: Annotated[list[Path], typer.Argument(help="Recordings with truth, .npz.")],
+    method: Annotated[
+        str, typer.Option(help="wheel-truth, or end-poses (only commands and final poses).")
+    ] = "wheel-truth",
+    joint: Annotated[
+        bool, typer.Option("--joint", help="Estimate wheel gains and the track too.")
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Estimate kr, kl (and wheel gains, track) with 95 % intervals.
+
+    Example: estima calibrate run1.npz run2.npz --joint
+    """
+    from experiments.calibrate import calibrate_recordings
+    from experiments.console import announce_compilation
+    from sim.recording import load
+
+    announce_compilation()
+    result = calibrate_recordings([load(path) for path in recordings], method, joint=joint)
+    print(result.as_json() if as_json else result.as_text())
+
+
+@app.command()
+def conform(
+    target: Annotated[str, typer.Argument(help="MODULE:CLASS of an estimator.")],
+    arguments: Annotated[
+        list[str] | None, typer.Argument(help="Its constructor's arguments, key=value.")
+    ] = None,
+) -> None:
+    """Run the checks that every estimator must pass.
+
+    Example: estima conform estimators.odometry:Odometry kr=1e-5 kl=1e-5
+    """
+    from experiments.conform import conform_target
+
+    results = conform_target(target, arguments or [])
+    for result in results:
+        print(f"{'pass' if result.passed else 'FAIL':<5}{result.name}: {result.message}")
+    if not all(result.passed for result in results):
+        raise typer.Exit(1)
+
+
+@app.command()
+def bench(
+    name: Annotated[str, typer.Argument(help="sim, ... or all.")] = "all",
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Measure speeds and accuracies on one core, beside their goals.
+
+    Example: estima bench sim --json
+    """
+    from experiments.bench import run_bench
+
+    print(run_bench(name, as_json=as_json))
+
+
+@app.command()
+def reproduce(
+    full: Annotated[bool, typer.Option("--full", help="The judged profile.")] = False,
+    paper: Annotated[str | None, typer.Option(help="Only this paper.")] = None,
+) -> None:
+    """Make the papers' figures, tables and claims, into results/.
+
+    Example: estima reproduce --paper puzzlebot2024
+    """
+    from experiments.console import announce_compilation
+    from experiments.reproduce import reproduce as reproduce_papers
+
+    announce_compilation()
+    reproduce_papers(full=full, only=paper)
+
+
+def main() -> None:
+    """Run the command line; wrong input ends in one line and code 2, a failed run in code 1."""
+    from sim.errors import InputError
+
+    try:
+        app()
+    except InputError as error:
+        _end(str(error), 2)
+    except KeyboardInterrupt:
+        _end("interrupted; what was finished is kept", 1)
+    except Exception as error:
+        told = _told(error)
+        if told is None:
+            raise
+        _end(*told)
+
+
+def _told(error: Exception) -> tuple[str, int] | None:
+    """One line and an exit code for errors that are the input's, None for faults of ours."""
+    chain: list[Any] = [error]
+    while chain[-1].__cause__ is not None:
+        chain.append(chain[-1].__cause__)
+    for link in chain:
+        kind, module = type(link).__name__, type(link).__module__
+        if kind == "InputError":
+            return str(link), 2
+        if kind == "RunFailed":
+            return f"the run failed: {link}", 1
+        if module.startswith(("hydra.", "omegaconf.")):
+            lines = [line.strip() for line in str(link).splitlines() if line.strip()]
+            return f"configuration: {' '.join(lines[:3])}; see estima run --cfg job", 2
+    return None
+
+
+def _end(message: str, code: int) -> None:
+    print(f"estima: {message}", file=sys.stderr)
+    sys.exit(code)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,73 @@
+"""Every option of the configuration composes and builds what it names."""
+
+import inspect
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from experiments.build import make, make_estimator, make_robot, make_world
+from experiments.compose import compose
+from sim.robot import DifferentialDrive
+from sim.sensors import suite_from_config
+
+CONF = Path(__file__).resolve().parent.parent / "conf"
+
+
+def options(group):
+    return sorted(path.stem for path in (CONF / group).glob("*.yaml"))
+
+
+@pytest.mark.parametrize("name", options("world"))
+def test_worlds_build_and_depend_on_their_seed_alone(name):
+    config = compose([f"world={name}", "seed=3"])
+    first, second = make_world(config), make_world(config)
+    assert np.array_equal(first.walls, second.walls)
+    assert np.array_equal(first.landmarks, second.landmarks)
+
+
+@pytest.mark.parametrize("name", options("robot"))
+def test_robots_state_every_key(name):
+    config = compose([f"robot={name}"])
+    make_robot(config)
+    assert set(config["robot"]) == set(inspect.signature(DifferentialDrive).parameters)
+
+
+@pytest.mark.parametrize("name", options("sensors"))
+def test_sensors_build_and_state_every_key(name):
+    config = compose([f"sensors={name}"])
+    suite = suite_from_config(config["sensors"])
+    assert set(config["sensors"]) == set(inspect.signature(type(suite)).parameters)
+    for kind, settings in config["sensors"].items():
+        if settings is not None:
+            known = inspect.signature(type(getattr(suite, kind))).parameters
+            assert set(settings) == set(known), kind
+
+
+@pytest.mark.parametrize("name", options("route"))
+def test_routes_build(name):
+    config = compose([f"route={name}"])
+    assert callable(make(config["route"], "route").start)
+
+
+@pytest.mark.parametrize("name", options("estimator"))
+def test_estimators_build_and_state_every_key(name):
+    config = compose([f"estimator={name}"])
+    estimator = make_estimator(config)
+    stated = set(config["estimator"]) - {"_target_"}
+    assert stated == set(inspect.signature(type(estimator)).parameters)
+
+
+def test_belief_follows_truth_unless_it_is_set():
+    config = compose(["robot.kr=3e-4"])
+    assert config["estimator"]["kr"] == config["robot"]["kr"] == 3e-4
+    config = compose(["robot.kr=3e-4", "estimator.kr=1e-5", "prior.track_m=0.2"])
+    assert (config["robot"]["kr"], config["estimator"]["kr"]) == (3e-4, 1e-5)
+    assert (config["robot"]["track_m"], config["prior"]["track_m"]) == (0.19, 0.2)
+
+
+def test_every_option_says_what_it_is():
+    for path in CONF.rglob("*.yaml"):
+        assert path.read_text().startswith("#"), f"{path.name} has no opening comment"
+        yaml.safe_load(path.read_text())

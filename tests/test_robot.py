@@ -1,0 +1,125 @@
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sim.errors import InputError
+from sim.robot import (
+    DifferentialDrive,
+    RobotGeometry,
+    Slip,
+    TravelWindow,
+    arc_increment,
+    arc_increment_jacobian,
+    wheel_variances,
+)
+
+DT_S = 1 / 300
+travel = st.tuples(st.floats(-2.0, 2.0), st.floats(-2.0, 2.0)).map(np.array)
+
+
+@given(travel)
+def test_arc_agrees_with_many_small_steps(wheels):
+    n, pose = 4000, np.zeros(3)
+    heading = (np.arange(n) + 0.5) / n * (wheels[0] - wheels[1]) / 0.4
+    forward = (wheels[0] + wheels[1]) / 2 / n
+    pose[:2] = np.sum(forward * np.cos(heading)), np.sum(forward * np.sin(heading))
+    pose[2] = (wheels[0] - wheels[1]) / 0.4
+    assert np.allclose(arc_increment(wheels, 0.4), pose, atol=2e-5)
+
+
+@given(travel)
+def test_arc_jacobian_matches_finite_differences(wheels):
+    exact, step = arc_increment_jacobian(wheels, 0.3), 1e-6
+    for i in range(2):
+        d = np.zeros(2)
+        d[i] = step
+        numeric = (arc_increment(wheels + d, 0.3) - arc_increment(wheels - d, 0.3)) / (2 * step)
+        assert np.allclose(numeric, exact[:, i], atol=1e-7)
+
+
+def test_right_wheel_turns_counter_clockwise():
+    assert arc_increment([0.1, 0.0], 0.2)[2] > 0
+    assert arc_increment_jacobian([0.1, 0.1], 0.2)[2].tolist() == pytest.approx([5.0, -5.0])
+
+
+def test_slip_law_over_a_batch():
+    """Var(encoder - ground) = k |ds|, white, uncorrelated between wheels, at any interval."""
+    robot = DifferentialDrive(0.05, 0.19, kr=1e-4, kl=3e-4)
+    rng = np.random.default_rng(1)
+    n_runs, n_ticks = 400, 600
+    slip = Slip.start(robot, DT_S, (n_runs,))
+    ground, encoder = np.zeros((n_runs, 2)), np.zeros((n_runs, 2))
+    grounds, encoders = [], []
+    for _ in range(n_ticks):
+        rolling = (0.5 - slip.correction_mps) * DT_S
+        encoder = encoder + slip.advance(rolling, rng.standard_normal((n_runs, 2)))
+        ground = ground + rolling
+        grounds.append(ground)
+        encoders.append(encoder)
+    for every in (1, 15):
+        g = np.diff(np.array(grounds)[::every], axis=0)
+        e = np.diff(np.array(encoders)[::every], axis=0) - g
+        k = np.sum(e**2, axis=(0, 1)) / np.sum(np.abs(g), axis=(0, 1))
+        assert k == pytest.approx([1e-4, 3e-4], rel=0.03)
+        flat = e.reshape(-1, 2)
+        assert abs(np.corrcoef(flat.T)[0, 1]) < 0.02
+        lag = [np.corrcoef(e[1:, :, i].ravel(), e[:-1, :, i].ravel())[0, 1] for i in (0, 1)]
+        assert np.max(np.abs(lag)) < 0.03
+    # The encoder follows the command, the ground travel wanders by about sqrt(k s).
+    wander = np.std(encoders[-1] - grounds[-1], axis=0)
+    assert wander == pytest.approx(np.sqrt(np.array([1e-4, 3e-4]) * 1.0), rel=0.12)
+    assert np.std(encoders[-1], axis=0).max() < 0.45 * wander.max()
+
+
+def test_bias_makes_the_encoder_read_more():
+    robot = DifferentialDrive(0.05, 0.19, bias_right=0.05)
+    slip = Slip.start(robot, DT_S)
+    encoder = ground = np.zeros(2)
+    for _ in range(3000):
+        rolling = (0.5 - slip.correction_mps) * DT_S
+        encoder, ground = encoder + slip.advance(rolling, np.zeros(2)), ground + rolling
+    assert (encoder / ground).tolist() == pytest.approx([1.05, 1.0])
+    assert encoder[0] == pytest.approx(5.0, rel=2e-3)  # closed on the encoder, but for the lag
+
+
+def test_travel_window_does_not_inflate_travel_by_encoder_noise():
+    """At k <= 1e-4 m and 75 Hz the sum of |ds| stays within 2 % of the distance, crawling."""
+    rng = np.random.default_rng(3)
+    dt, speed, k = 1 / 75, 0.02, 1e-4
+    true = np.full((30_000, 2), speed * dt)
+    noisy = true + np.sqrt(k * true) * rng.standard_normal(true.shape)
+    window = TravelWindow(0.05)
+    netted = sum(window.push(dt, row) for row in noisy)
+    assert netted == pytest.approx(true.sum(axis=0), rel=0.02)
+    raw = np.abs(noisy).sum(axis=0)
+    assert np.all(raw > 1.02 * netted), "the window must be what keeps the sum down"
+
+
+def test_travel_window_is_exact_for_even_motion_and_unequal_frames():
+    window = TravelWindow(0.05)
+    total = np.zeros(2)
+    for duration in [0.01, 0.03, 0.02, 0.1, 0.005] * 20:
+        total += window.push(duration, np.array([0.4, -0.2]) * duration)
+    assert total.tolist() == pytest.approx([0.4 * 3.3, 0.2 * 3.3])
+    assert window.push(0.0, np.array([0.1, -0.1])).tolist() == [0.1, 0.1]
+
+
+def test_wheel_variances_are_k_times_travel():
+    assert wheel_variances([-2.0, 1.0], 1e-4, 1e-5).tolist() == pytest.approx([2e-4, 1e-5])
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"kr": -1.0}, {"kl": math.nan}, {"track_m": 0.0}, {"bias_left": 2.0}, {"kr": math.inf}],
+)
+def test_impossible_robots_are_refused(change):
+    with pytest.raises(InputError, match=f"robot.{next(iter(change))}"):
+        DifferentialDrive(**{"wheel_radius_m": 0.05, "track_m": 0.2, **change})
+
+
+def test_impossible_beliefs_are_refused():
+    with pytest.raises(InputError, match=r"prior\.track_m"):
+        RobotGeometry(0.05, -1.0)
