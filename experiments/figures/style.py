@@ -1,0 +1,42 @@
+"""How all figures look: size, fonts, and colours that colour-blind people can tell apart."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from sim.files import write_whole
+
+# Okabe and Ito's palette.
+BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
+YELLOW, BLUE, RED, PURPLE = "#F0E442", "#0072B2", "#D55E00", "#CC79A7"
+CYCLE = (BLUE, ORANGE, GREEN, PURPLE, RED, SKY, BLACK)
+TRUTH, ESTIMATE, ODOMETRY, WALL = BLACK, BLUE, ORANGE, "#555555"
+
+_SETTINGS: dict[str, Any] = {
+    "font.size": 9.0,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.prop_cycle": mpl.cycler(color=CYCLE),
+    "legend.frameon": False,
+    "svg.hashsalt": "estima",
+}
+
+
+def figure(width_in: float, height_in: float) -> Figure:
+    """Empty page with the house style and a layout that keeps its parts apart."""
+    mpl.rcParams.update(_SETTINGS)
+    page = Figure(figsize=(width_in, height_in), layout="constrained")
+    FigureCanvasAgg(page)
+    return page
+
+
+def save_figure(page: Figure, path: Path) -> None:
+    """Write a figure whole, as the path's suffix says; the bytes do not depend on the date."""
+    metadata = {"Software": None} if path.suffix == ".png" else {"Date": None}
+    with write_whole(path) as part:
+        page.savefig(part, dpi=130, metadata=metadata)

@@ -1,0 +1,58 @@
+"""All papers' tables, figures and claims into results/: what `make reproduce` runs."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+import time
+from types import ModuleType
+
+from experiments.claims import Claim, write
+from experiments.console import progress
+from experiments.figures.style import save_figure
+from experiments.version import ROOT
+from sim.errors import InputError
+
+PAPERS = ("puzzlebot2024",)
+RESULTS = ROOT / "results"
+
+
+def reproduce(*, full: bool = False, only: str | None = None) -> None:
+    """Run the studies, judge the claims, draw the figures.
+
+    Parameters
+    ----------
+    full
+        The judged profile; else the quick one, whose verdicts are marked quick.
+    only
+        A paper's short name, or None for all of them.
+    """
+    if only is not None and only not in PAPERS:
+        raise InputError(f"--paper must be one of {', '.join(PAPERS)}, got {only!r}")
+    for paper in PAPERS if only is None else (only,):
+        begun = time.monotonic()
+        claims = reproduce_paper(_study(paper), paper, "full" if full else "quick")
+        write(claims, RESULTS / "claims.csv")
+        _print(claims)
+        print(f"{paper}: {time.monotonic() - begun:.0f} s", file=sys.stderr)
+    print(f"claims: results/claims.csv, figures: results/figures, tables: {'results/tables'}")
+
+
+def reproduce_paper(study: ModuleType, paper: str, profile: str) -> list[Claim]:
+    """Run one paper's study; write its tables and figures; return its claims."""
+    with progress(paper, 1.0) as on_progress:
+        tables = study.run(profile, RESULTS / "tables", on_progress)
+    for name, page in study.figures(tables).items():
+        save_figure(page, RESULTS / "figures" / f"{name}.png")
+    claims: list[Claim] = study.claims(tables, quick=profile == "quick")
+    return claims
+
+
+def _study(paper: str) -> ModuleType:
+    return importlib.import_module(f"experiments.studies.{paper}")
+
+
+def _print(claims: list[Claim]) -> None:
+    for claim in claims:
+        interval = f"{claim.value:.4g} [{claim.low:.4g}, {claim.high:.4g}]"
+        print(f"{claim.id}  {claim.verdict:<24} {claim.statistic}: {interval} ({claim.criterion})")

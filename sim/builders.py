@@ -1,0 +1,462 @@
+"""Worlds from a few parameters and a random stream.
+
+Each builder is a function `name(*, rng, ...) -> World`; its parameters' defaults stand in
+conf/world/<name>.yaml and nowhere else.
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.errors import InputError
+from sim.plan import Plan, box_corners
+from sim.world import World
+from sim.world_file import read_world
+
+Array = NDArray[np.float64]
+
+
+def empty(*, rng: np.random.Generator, tour_m: float) -> World:
+    """Open floor without a wall; the tour is a square of side `tour_m`."""
+    plan = Plan(tour=[(0, 0), (tour_m, 0), (tour_m, tour_m), (0, tour_m), (0, 0)])
+    return plan.world("empty", rng)
+
+
+def from_file(*, rng: np.random.Generator, path: str) -> World:
+    """Read a user's world; see `sim.world_file` for the format. Nothing of it is random."""
+    del rng
+    return read_world(Path(path))
+
+
+def room(
+    *,
+    rng: np.random.Generator,
+    length_m: float,
+    width_m: float,
+    n_objects: int,
+    n_landmarks: int,
+    look_alike_share: float,
+) -> World:
+    """Build one furnished room; the tour goes round it, 1.2 m off the walls."""
+    _positive(length_m=length_m - 3.0, width_m=width_m - 3.0)
+    plan = Plan()
+    plan.rectangle((0, 0), (length_m, width_m))
+    plan.place("room", 0, 0, length_m, width_m)
+    a, b = 1.2, (length_m - 1.2, width_m - 1.2)
+    plan.tour = [(a, a), (b[0], a), (b[0], b[1]), (a, b[1]), (a, a)]
+    plan.furnish(rng, (0, 0), (length_m, width_m), n_objects, clearance_m=0.5)
+    return plan.world("room", rng, n_landmarks=n_landmarks, look_alike_share=look_alike_share)
+
+
+def boxes(*, rng: np.random.Generator, n_boxes: int, side_m: float, n_landmarks: int) -> World:
+    """Scatter boxes in a square hall; the tour runs along its walls."""
+    plan = Plan()
+    plan.rectangle((0, 0), (side_m, side_m))
+    a, b = 1.2, side_m - 1.2
+    plan.tour = [(a, a), (b, a), (b, b), (a, b), (a, a)]
+    plan.furnish(rng, (0, 0), (side_m, side_m), n_boxes, clearance_m=0.5, tries=400)
+    return plan.world("boxes", rng, n_landmarks=n_landmarks)
+
+
+def rooms(
+    *,
+    rng: np.random.Generator,
+    n_x: int,
+    n_y: int,
+    room_m: float,
+    door_m: float,
+    objects_per_room: int,
+    n_landmarks: int,
+    on_walls_share: float,
+    look_alike_share: float,
+) -> World:
+    """Build n_x by n_y square rooms with a door between all neighbours.
+
+    The tour goes from room to room: round the outer ring, then, where there is one, round the
+    ring inside it, and back.
+    """
+    if n_x < 1 or n_y < 1 or n_x * n_y < 2:
+        raise InputError(f"world.n_x and n_y must make at least two rooms, got {n_x} x {n_y}")
+    _positive(room_m=room_m - 2.0, door_m=door_m - 0.7, wall=room_m - door_m)
+    plan = Plan()
+    plan.rectangle((0, 0), (n_x * room_m, n_y * room_m))
+    door = [(room_m / 2, door_m)]
+    for i in range(n_x):
+        for j in range(n_y):
+            x, y = i * room_m, j * room_m
+            plan.place("room", x, y, x + room_m, y + room_m)
+            if i + 1 < n_x:
+                plan.wall((x + room_m, y), (x + room_m, y + room_m), gaps=door)
+            if j + 1 < n_y:
+                plan.wall((x, y + room_m), (x + room_m, y + room_m), gaps=door)
+    plan.tour = [((i + 0.5) * room_m, (j + 0.5) * room_m) for i, j in _grid_tour(n_x, n_y)]
+    for i in range(n_x):
+        for j in range(n_y):
+            low = (i * room_m, j * room_m)
+            plan.furnish(rng, low, np.add(low, room_m).tolist(), objects_per_room)
+    return plan.world(
+        "rooms",
+        rng,
+        n_landmarks=n_landmarks,
+        on_walls_share=on_walls_share,
+        look_alike_share=look_alike_share,
+    )
+
+
+def corridor(
+    *,
+    rng: np.random.Generator,
+    bare_m: float,
+    objects_m: float,
+    second_leg_m: float,
+    width_m: float,
+    n_objects: int,
+    n_landmarks: int,
+) -> World:
+    """Build a bare stretch, a stretch with objects, a bend to the left, and a second leg."""
+    _positive(bare_m=bare_m, objects_m=objects_m, second_leg_m=second_leg_m, width_m=width_m - 1.6)
+    plan, w = Plan(), width_m
+    x1, x2 = bare_m, bare_m + objects_m
+    top = w + second_leg_m
+    ring = [(0, 0), (x2 + w, 0), (x2 + w, top), (x2, top), (x2, w), (0, w)]
+    for start, end in zip(ring, [*ring[1:], ring[0]], strict=True):
+        plan.wall(start, end)
+    plan.place("corridor_bare", 0, 0, x1, w)
+    plan.place("corridor_objects", x1, 0, x2, w)
+    plan.place("corner", x2, 0, x2 + w, w)
+    plan.place("corridor_bare", x2, w, x2 + w, top)
+    plan.tour = [(1.0, w / 2), (x2 + w / 2, w / 2), (x2 + w / 2, top - 1.0)]
+    _line_up(plan, rng, (x1, 0), (x2, w), n_objects)
+    return plan.world("corridor", rng, n_landmarks=n_landmarks)
+
+
+def office(
+    *,
+    rng: np.random.Generator,
+    corridor_m: float,
+    n_landmarks: int,
+    look_alike_share: float,
+    objects_per_room: int,
+    rooms_visited: int,
+) -> World:
+    """Build an office floor of 66 x 42 m: 21 furnished rooms on two corridor loops.
+
+    The corridors are the outer ring but for the rooms along the south side, and a passage from
+    south to north that parts it into two loops. The north corridor is bare for 40 m, without a
+    door; the west and the east one have cabinets. The rooms' widths, doors, niches and furniture
+    are random. The tour goes round the western loop, then round both, into `rooms_visited` rooms.
+    """
+    _positive(corridor_m=corridor_m - 1.8)
+    plan, c = Plan(), corridor_m
+    W, H, south = 66.0, 42.0, 9.0
+    passage = 44.0 + rng.uniform(0.0, 1.0)  # west side of the passage between the loops
+    plan.rectangle((0, 0), (W, H))
+    inner_low, inner_high = south + c, H - c
+    blocks = ((c, passage), (passage + c, W - c))
+    suites = [_Suite((0.0, south), (W, south), -1, 7, 9.0)]  # the rooms south of the ring
+    for number, (left, right) in enumerate(blocks):
+        row, column = 8.0, 9.0 if number == 0 else 0.5 * (right - left)
+        suites += [
+            _Suite((left, inner_low), (right, inner_low), 1, 5 if number == 0 else 2, row),
+            _Suite((left, inner_low + row), (left, inner_high), -1, 2, column),
+            _Suite((right, inner_low + row), (right, inner_high), 1, 2, column),
+        ]
+        plan.wall((left, inner_high), (right, inner_high))
+    visits = [visit for suite in suites for visit in suite.draw(plan, rng)]
+    mid = c / 2
+    y0, y1 = south + mid, H - mid
+    x0, xm, x1 = mid, passage + mid, W - mid
+    plan.place("corridor_bare", c, H - c, passage, H)
+    plan.place("corridor_objects", 0, inner_low, c, inner_high)
+    plan.place("corridor_objects", W - c, inner_low, W, inner_high)
+    for x in (0.0, passage, W - c):
+        for y in (south, H - c):
+            plan.place("corner", x, y, x + c, y + c)
+    loop = [(x0, y0), (xm, y0), (xm, y1), (x0, y1), (x0, y0)]
+    second = [(x1, y0), (x1, y1), (xm, y1), (xm, y0), (x0, y0)]
+    plan.tour = _with_visits([*loop, *second], visits, rng, rooms_visited)
+    for low, high in (((0, inner_low), (c, inner_high)), ((W - c, inner_low), (W, inner_high))):
+        doors = [v.door for v in visits if low[0] - 0.1 <= v.door[0] <= high[0] + 0.1]
+        _line_up(plan, rng, low, high, 7, keep_off=doors)
+    for visit in visits:
+        plan.furnish(rng, visit.low, visit.high, objects_per_room, size_m=(0.4, 1.6))
+    return plan.world("office", rng, n_landmarks=n_landmarks, look_alike_share=look_alike_share)
+
+
+def streets(
+    *, rng: np.random.Generator, n_x: int, n_y: int, block_m: float, street_m: float
+) -> World:
+    """Build blocks of terraced houses of differing width, height and setback, with few trees."""
+    return _town("streets", rng, n_x, n_y, block_m, street_m, terraced=True, trees_per_block=6)
+
+
+def campus(
+    *,
+    rng: np.random.Generator,
+    n_x: int,
+    n_y: int,
+    block_m: float,
+    street_m: float,
+    trees_per_block: int,
+) -> World:
+    """Build blocks with a few turned or L-shaped buildings among lawns and trees."""
+    return _town(
+        "campus", rng, n_x, n_y, block_m, street_m, terraced=False, trees_per_block=trees_per_block
+    )
+
+
+class _Visit:
+    """A room that can be visited: its rectangle, its door, and how to go in."""
+
+    def __init__(self, low: Array, high: Array, door: Array, inward: Array) -> None:
+        self.low, self.high = (low[0], low[1]), (high[0], high[1])
+        self.door, self.inward = door, inward
+
+
+class _Suite:
+    """A row of rooms behind a corridor's wall from start to end, on its left (1) or right (-1)."""
+
+    def __init__(
+        self,
+        start: tuple[float, float],
+        end: tuple[float, float],
+        side: int,
+        count: int,
+        depth_m: float,
+    ) -> None:
+        self._start, self._end = np.array(start), np.array(end)
+        self._side, self._count, self._depth_m = side, count, depth_m
+
+    def draw(self, plan: Plan, rng: np.random.Generator) -> list[_Visit]:
+        """Draw front, partitions and back; return the rooms."""
+        length = float(np.hypot(*(self._end - self._start)))
+        along = (self._end - self._start) / length
+        inward = self._side * np.array([-along[1], along[0]])
+        share = rng.uniform(0.85, 1.15, self._count)
+        edges = np.concatenate([[0.0], np.cumsum(share / share.sum() * length)])
+        doors = [
+            (rng.uniform(low + 1.0, high - 1.0), rng.uniform(1.0, 1.2))
+            for low, high in pairwise(edges)
+        ]
+        plan.wall(self._start.tolist(), self._end.tolist(), gaps=doors)
+        back = self._depth_m * inward
+        if self._count < 7:  # the southern row ends at the outer wall
+            plan.wall((self._start + back).tolist(), (self._end + back).tolist())
+        visits = []
+        for i, (low, high) in enumerate(pairwise(edges)):
+            foot = self._start + high * along
+            if i + 1 < self._count:
+                plan.wall(foot.tolist(), (foot + back).tolist())
+            self._niche(plan, rng, low, high, along, back)
+            corners = np.array([self._start + low * along, foot + back])
+            rectangle = np.concatenate([corners.min(axis=0), corners.max(axis=0)])
+            plan.place("room", *rectangle.tolist())
+            door = self._start + doors[i][0] * along
+            visits.append(_Visit(rectangle[:2], rectangle[2:], door, inward))
+        return visits
+
+    def _niche(
+        self,
+        plan: Plan,
+        rng: np.random.Generator,
+        low: float,
+        high: float,
+        along: Array,
+        back: Array,
+    ) -> None:
+        """Draw a stub of wall from the back or the left side: no two rooms are alike."""
+        if rng.random() < 0.5:
+            foot = self._start + rng.uniform(low + 1.0, high - 1.0) * along + back
+            end = foot - back * rng.uniform(0.1, 0.22)
+        else:
+            foot = self._start + low * along + back * rng.uniform(0.55, 0.85)
+            end = foot + along * (high - low) * rng.uniform(0.1, 0.22)
+        plan.wall(foot.tolist(), end.tolist())
+
+
+def _with_visits(
+    path: list[tuple[float, float]], visits: list[_Visit], rng: np.random.Generator, count: int
+) -> list[tuple[float, float]]:
+    """Tour along the path that looks into `count` of the rooms, in and out by the door."""
+    chosen = rng.permutation(len(visits))[:count]
+    stops: dict[int, list[tuple[float, _Visit, Array]]] = {}
+    for row in chosen:
+        visit = visits[row]
+        best: tuple[float, int, float, Array] | None = None
+        for i in range(len(path) - 1):
+            start, way = np.array(path[i]), np.subtract(path[i + 1], path[i])
+            share = float(np.clip((visit.door - start) @ way / (way @ way), 0.0, 1.0))
+            foot = start + share * way
+            gap = float(np.hypot(*(visit.door - foot)))
+            if best is None or gap < best[0] - 1e-9:
+                best = (gap, i, share, foot)
+        assert best is not None
+        stops.setdefault(best[1], []).append((best[2], visit, best[3]))
+    tour: list[tuple[float, float]] = []
+    for i, point in enumerate(path):
+        tour.append(point)
+        for _, visit, foot in sorted(stops.get(i, []), key=lambda stop: stop[0]):
+            inside = visit.door + 2.0 * visit.inward
+            through = [foot, inside, foot]
+            tour += [(float(p[0]), float(p[1])) for p in through]
+    return tour
+
+
+def _line_up(
+    plan: Plan,
+    rng: np.random.Generator,
+    low: tuple[float, float],
+    high: tuple[float, float],
+    count: int,
+    keep_off: list[Array] | None = None,
+) -> None:
+    """Put cabinets against the long walls of a straight corridor, clear of doors."""
+    long = 0 if high[0] - low[0] > high[1] - low[1] else 1
+    spots = np.linspace(low[long] + 1.0, high[long] - 1.0, count)
+    for spot in spots:
+        depth, width = rng.uniform(0.25, 0.42), rng.uniform(0.5, 1.3)
+        at_high = rng.random() < 0.5
+        across = high[1 - long] - depth / 2 - 0.01 if at_high else low[1 - long] + depth / 2 + 0.01
+        position = spot + rng.uniform(-0.5, 0.5)
+        centre = (position, across) if long == 0 else (across, position)
+        size = (width, depth) if long == 0 else (depth, width)
+        if all(abs(door[long] - position) > 1.5 for door in keep_off or []):
+            plan.box(centre, size, 0.0, rng.uniform(0.8, 1.9))
+
+
+def _grid_tour(n_x: int, n_y: int) -> list[tuple[int, int]]:
+    """Cells (i, j) to go through, neighbours in turn, ending where it began."""
+    if min(n_x, n_y) == 1:
+        line = [(i, 0) for i in range(n_x)] if n_y == 1 else [(0, j) for j in range(n_y)]
+        return [*line, *line[-2::-1]]
+    tour = _ring(0, 0, n_x - 1, n_y - 1)
+    if min(n_x, n_y) >= 4:
+        tour += [(1, 0), *_ring(1, 1, n_x - 2, n_y - 2), (1, 0), (0, 0)]
+    return tour
+
+
+def _ring(i0: int, j0: int, i1: int, j1: int) -> list[tuple[int, int]]:
+    """Cells round a rectangle of cells, from its corner and back to it, counter-clockwise."""
+    return [
+        *((i, j0) for i in range(i0, i1)),
+        *((i1, j) for j in range(j0, j1)),
+        *((i, j1) for i in range(i1, i0, -1)),
+        *((i0, j) for j in range(j1, j0, -1)),
+        (i0, j0),
+    ]
+
+
+def _town(
+    name: str,
+    rng: np.random.Generator,
+    n_x: int,
+    n_y: int,
+    block_m: float,
+    street_m: float,
+    *,
+    terraced: bool,
+    trees_per_block: int,
+) -> World:
+    """Build blocks in a grid of streets; the tour is a closed way along the streets."""
+    if n_x < 1 or n_y < 1:
+        raise InputError(f"world.n_x and n_y must be at least 1, got {n_x} and {n_y}")
+    _positive(block_m=block_m - 20.0, street_m=street_m - 6.0)
+    plan, pitch = Plan(), block_m + street_m
+    corners = [(0, 0), (n_x, 0), (n_x, n_y), (0, n_y), (0, 0)]
+    if n_x >= 3 and n_y >= 2:
+        corners = [(0, 0), (2, 0), (2, 1), (n_x, 1), (n_x, n_y), (1, n_y), (1, 1), (0, 1), (0, 0)]
+    path = [(pitch * i - street_m / 2, pitch * j - street_m / 2) for i, j in corners]
+    plan.tour = _rounded(path, radius_m=0.35 * street_m, spacing_m=4.0)
+    for i in range(n_x):
+        for j in range(n_y):
+            low = np.array([i * pitch, j * pitch])
+            if terraced:
+                _terrace(plan, rng, low, block_m)
+            else:
+                _lawn(plan, rng, low, block_m)
+            _trees(plan, rng, low, block_m, trees_per_block)
+    return plan.world(name, rng)
+
+
+def _terrace(plan: Plan, rng: np.random.Generator, low: Array, block_m: float) -> None:
+    """Houses side by side along the south and the north edge of a block."""
+    for far in (False, True):
+        x = 0.0
+        while x < block_m - 6.0:
+            width = min(rng.uniform(7.0, 16.0), block_m - x)
+            depth, setback = rng.uniform(9.0, 0.38 * block_m), rng.uniform(0.0, 2.5)
+            y = block_m - setback - depth / 2 if far else setback + depth / 2
+            centre = low + np.array([x + width / 2, y])
+            size = (width - 0.02, depth)
+            plan.prism(box_corners(centre.tolist(), size, 0.0), 0.0, rng.uniform(5.0, 16.0))
+            x += width + (rng.uniform(2.5, 6.0) if rng.random() < 0.3 else 0.0)
+
+
+def _lawn(plan: Plan, rng: np.random.Generator, low: Array, block_m: float) -> None:
+    """Two to four buildings, turned at random; some are L-shaped."""
+    for quarter in rng.permutation(4)[: rng.integers(2, 5)]:
+        room = block_m / 2
+        centre = low + room * np.array([quarter % 2 + 0.5, quarter // 2 + 0.5])
+        centre = centre + rng.uniform(-0.06, 0.06, 2) * room
+        size = rng.uniform(0.3, 0.62, 2) * room
+        yaw, top = rng.uniform(-0.5, 0.5), rng.uniform(6.0, 20.0)
+        corners = box_corners(centre.tolist(), size.tolist(), yaw)
+        if rng.random() < 0.5:  # an L: the corner that is cut out lies at a quarter of the box
+            a, b, c, d = corners
+            mid = corners.mean(axis=0)
+            corners = np.array([a, b, (b + c) / 2, mid, (c + d) / 2, d])
+        plan.prism(corners, 0.0, top)
+
+
+def _trees(plan: Plan, rng: np.random.Generator, low: Array, block_m: float, count: int) -> None:
+    """Plant trees along the edges of a block, clear of the buildings."""
+    for _ in range(count):
+        for _ in range(20):
+            along, inset = rng.uniform(2.0, block_m - 2.0), rng.uniform(0.5, 5.0)
+            edge = rng.integers(4)
+            x, y = (along, inset) if edge % 2 == 0 else (inset, along)
+            x, y = (x, block_m - y) if edge == 2 else (x, y)
+            x, y = (block_m - x, y) if edge == 3 else (x, y)
+            crown = rng.uniform(1.0, 2.2)
+            spot = low + np.array([x, y])
+            if all(math.dist(spot, d[:2]) > d[2] + crown + 0.3 for d in plan.discs):
+                height = rng.uniform(4.5, 9.0)
+                plan.tree(spot[0], spot[1], rng.uniform(0.12, 0.35), crown, height)
+                break
+
+
+def _rounded(
+    path: list[tuple[float, float]], *, radius_m: float, spacing_m: float
+) -> list[tuple[float, float]]:
+    """Closed way with each corner cut by an arc, and points about `spacing_m` apart."""
+    points = np.array(path[:-1])
+    smooth: list[Array] = []
+    for before, corner, after in zip(
+        np.roll(points, 1, axis=0), points, np.roll(points, -1, axis=0), strict=True
+    ):
+        into = (before - corner) / np.hypot(*(before - corner))
+        out = (after - corner) / np.hypot(*(after - corner))
+        t = np.linspace(0.0, 1.0, 7)[:, None]
+        a, b = corner + radius_m * into, corner + radius_m * out
+        smooth += list((1 - t) ** 2 * a + 2 * t * (1 - t) * corner + t**2 * b)
+    # Begin in the middle of a straight, so that the start does not lie in a bend.
+    ring = np.array([(smooth[-1] + smooth[0]) / 2, *smooth, (smooth[-1] + smooth[0]) / 2])
+    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(ring, axis=0).T))])
+    dense: list[tuple[float, float]] = []
+    for i in range(len(ring) - 1):
+        n = max(1, round((along[i + 1] - along[i]) / spacing_m))
+        for share in np.arange(n) / n:
+            p = ring[i] + share * (ring[i + 1] - ring[i])
+            dense.append((float(p[0]), float(p[1])))
+    return [*dense, (float(ring[-1, 0]), float(ring[-1, 1]))]
+
+
+def _positive(**margins: float) -> None:
+    for name, margin in margins.items():
+        if not margin > 0.0:
+            raise InputError(f"world.{name} is too small for a robot to pass; make it larger")

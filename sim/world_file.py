@@ -1,0 +1,174 @@
+"""A user's world, written in YAML.
+
+```yaml
+name: lab
+walls:                      # feet of upright walls, m
+  - [0, 0, 8, 0]
+  - {from: [8, 0], to: [8, 6], z: [0, 2.5]}
+boxes:
+  - {x: 2, y: 3, length: 1.0, width: 0.5, heading_deg: 30, height: 0.8}
+landmarks: [[1, 0.01, 1.2]]
+places: {room: [[0, 0, 8, 6]]}
+waypoints: [[1, 1], [7, 1], [7, 5]]
+start_pose: [1, 1, 0]       # x m, y m, heading deg; without it, the first way-point
+```
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from sim.errors import InputError
+from sim.plan import WALL_HEIGHT_M, box_corners, make_descriptors
+from sim.world import World
+
+_KEYS = ("name", "walls", "boxes", "landmarks", "places", "waypoints", "start_pose")
+_BOX_KEYS = ("x", "y", "length", "width", "heading_deg", "height")
+
+
+def read_world(path: Path) -> World:
+    """Read a world file.
+
+    Raises
+    ------
+    InputError
+        Naming the file, the entry and what it must be.
+    """
+    try:
+        document = yaml.safe_load(path.read_text())
+    except OSError as error:
+        raise InputError(f"{path}: cannot read ({error.strerror}); check world.path") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        where = getattr(error, "problem_mark", None)
+        line = f":{where.line + 1}" if where is not None else ""
+        raise InputError(f"{path}{line}: not valid YAML ({_brief(error)})") from error
+    if not isinstance(document, Mapping):
+        raise InputError(f"{path}: must hold keys such as walls, boxes, waypoints")
+    for key in document:
+        if key not in _KEYS:
+            raise InputError(f"{path}: unknown key {key!r}; known: {', '.join(_KEYS)}")
+    walls, heights = [], []
+    for i, entry in enumerate(_list(document, "walls", path)):
+        ends, z = _wall(entry, f"{path}: walls[{i}]")
+        walls.append(ends)
+        heights.append(z)
+    for i, entry in enumerate(_list(document, "boxes", path)):
+        corners, top = _box(entry, f"{path}: boxes[{i}]")
+        for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+            walls.append([*a, *b])
+            heights.append([0.0, top])
+    landmarks = _rows(document, "landmarks", 3, path)
+    waypoints = _rows(document, "waypoints", 2, path)
+    descriptors, alike = make_descriptors(np.random.default_rng(0), len(landmarks), 0.0)
+    named = document.get("places") or {}
+    if not isinstance(named, Mapping):
+        raise InputError(f"{path}: places must map names to lists of x_min, y_min, x_max, y_max")
+    places = {str(k): _rows(named, k, 4, path, prefix="places.") for k in named}
+    return World(
+        name=str(document.get("name", path.stem)),
+        walls=np.array(walls, float).reshape(-1, 4),
+        wall_z_m=np.array(heights, float).reshape(-1, 2),
+        landmarks=landmarks,
+        descriptors=descriptors,
+        look_alike=alike,
+        places=places,
+        start_pose=_start(document, waypoints, path),
+        waypoints=waypoints,
+    )
+
+
+def _start(document: Mapping[str, Any], waypoints: Any, path: Path) -> Any:
+    if document.get("start_pose") is not None:
+        x, y, degrees = _numbers(
+            document["start_pose"], 3, f"{path}: start_pose", "x, y, heading_deg"
+        )
+        return np.array([x, y, math.radians(degrees)])
+    if len(waypoints) >= 2:
+        way = waypoints[1] - waypoints[0]
+        return np.array([*waypoints[0], math.atan2(way[1], way[0])])
+    return np.zeros(3)
+
+
+def _wall(entry: Any, where: str) -> tuple[list[float], list[float]]:
+    z = [0.0, WALL_HEIGHT_M]
+    if isinstance(entry, Mapping):
+        for key in entry:
+            if key not in ("from", "to", "z"):
+                raise InputError(f"{where}: unknown key {key!r}; known: from, to, z")
+        if "from" not in entry or "to" not in entry:
+            raise InputError(f"{where} must have from: [x, y] and to: [x, y]")
+        ends = [
+            *_numbers(entry["from"], 2, f"{where}.from", "x, y"),
+            *_numbers(entry["to"], 2, f"{where}.to", "x, y"),
+        ]
+        if "z" in entry:
+            z = _numbers(entry["z"], 2, f"{where}.z", "bottom, top")
+    else:
+        ends = _numbers(entry, 4, where, "x1, y1, x2, y2")
+    if math.dist(ends[:2], ends[2:]) < 1e-6:
+        raise InputError(f"{where} has no length; give it two different ends")
+    if z[0] >= z[1]:
+        raise InputError(f"{where} has its top at or below its bottom: {z}")
+    return ends, z
+
+
+def _box(entry: Any, where: str) -> tuple[Any, float]:
+    if not isinstance(entry, Mapping):
+        raise InputError(f"{where} must be a mapping of {', '.join(_BOX_KEYS)}, got {entry!r}")
+    for key in entry:
+        if key not in _BOX_KEYS:
+            raise InputError(f"{where}: unknown key {key!r}; known: {', '.join(_BOX_KEYS)}")
+    for key in ("x", "y", "length", "width"):
+        if key not in entry:
+            raise InputError(f"{where}.{key} is missing")
+    values = {"heading_deg": 0.0, "height": WALL_HEIGHT_M, **entry}
+    numbers = {k: _number(v, f"{where}.{k}") for k, v in values.items()}
+    for key in ("length", "width", "height"):
+        if numbers[key] <= 0.0:
+            raise InputError(f"{where}.{key} must be positive, got {numbers[key]:g}")
+    corners = box_corners(
+        (numbers["x"], numbers["y"]),
+        (numbers["length"], numbers["width"]),
+        math.radians(numbers["heading_deg"]),
+    )
+    return corners, numbers["height"]
+
+
+def _list(document: Mapping[str, Any], key: Any, path: Path, prefix: str = "") -> list[Any]:
+    value = document.get(key)
+    if value is None:
+        return []
+    if not isinstance(value, list):
+        raise InputError(f"{path}: {prefix}{key} must be a list, got {value!r}")
+    return value
+
+
+def _rows(document: Mapping[str, Any], key: Any, width: int, path: Path, prefix: str = "") -> Any:
+    names = {2: "x, y", 3: "x, y, z", 4: "x_min, y_min, x_max, y_max"}[width]
+    rows = [
+        _numbers(entry, width, f"{path}: {prefix}{key}[{i}]", names)
+        for i, entry in enumerate(_list(document, key, path, prefix))
+    ]
+    return np.array(rows, float).reshape(-1, width)
+
+
+def _numbers(entry: Any, count: int, where: str, names: str) -> list[float]:
+    if not isinstance(entry, list) or len(entry) != count:
+        raise InputError(f"{where} must be {count} numbers {names}, got {entry!r}")
+    return [_number(value, where) for value in entry]
+
+
+def _number(value: Any, where: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        raise InputError(f"{where}: {value!r} is not a finite number")
+    return float(value)
+
+
+def _brief(error: Exception) -> str:
+    return " ".join(str(error).split())[:120]
