@@ -100,7 +100,9 @@ def options() -> None:
 
 @app.command()
 def view(
-    world: Annotated[bool, typer.Option("--world", help="Draw the world of the overrides.")] = False,
+    world: Annotated[
+        bool, typer.Option("--world", help="Draw the world of the overrides.")
+    ] = False,
     out: Annotated[Path, typer.Option("--out", "-o", help="Picture to write.")] = Path("world.png"),
     overrides: Overrides = None,
 ) -> None:
@@ -221,7 +223,7 @@ def _told(error: Exception) -> tuple[str, int] | None:
         kind, module = type(link).__name__, type(link).__module__
         if kind == "InputError":
             return str(link), 2
-        if kind == "RunFailed":
+        if kind == "RunFailedError":
             return f"the run failed: {link}", 1
         if module.startswith(("hydra.", "omegaconf.")):
             lines = [line.strip() for line in str(link).splitlines() if line.strip()]

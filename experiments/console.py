@@ -38,7 +38,9 @@ def progress(label: str, total: float | None = None) -> Iterator[Callable[[float
             shown["bar"] = Progress(
                 TextColumn(label),
                 BarColumn(),
-                TextColumn("{task.completed:g} of {task.total:g}" if total else "{task.completed:g}"),
+                TextColumn(
+                    "{task.completed:g} of {task.total:g}" if total else "{task.completed:g}"
+                ),
                 TimeRemainingColumn(),
                 console=Console(stderr=True),
                 transient=True,

@@ -36,7 +36,7 @@ RESULTS = ROOT / "results"
 _NOT_IN_KEY = ("study", "picture", "recording")
 
 
-class RunFailed(Exception):
+class RunFailedError(Exception):
     """A run ended badly; its row says how."""
 
 
@@ -152,7 +152,7 @@ def application(cfg: DictConfig) -> None:
         _print(rows, folder, config["picture"])
     bad = [row for row in rows if row["status"] != "ok"]
     if bad:
-        raise RunFailed(str(bad[0]["status"]))
+        raise RunFailedError(str(bad[0]["status"]))
 
 
 _SHOWN = (

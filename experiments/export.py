@@ -1,0 +1,122 @@
+"""Estimates in the shape of nav_msgs/Odometry, as CSV and JSON (puzzlebot2024, eqs. (10)-(11))."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimators.base import Estimate
+from sim import se2
+from sim.errors import InputError
+from sim.files import write_whole
+
+Array = NDArray[np.float64]
+# Places of x, y, heading in the row-major 6x6 covariance in order x, y, z, rotX, rotY, rotZ.
+PLANAR = np.ix_((0, 1, 5), (0, 1, 5))
+
+
+def covariance_6x6(covariances: Array) -> Array:
+    """Covariances (T, 6, 6) with the planar ones (T, 3, 3) in their places, zero elsewhere."""
+    full = np.zeros((len(covariances), 6, 6))
+    full[:, [[0], [1], [5]], [0, 1, 5]] = covariances
+    return full
+
+
+def odometry_records(estimate: Estimate, frame_id: str = "odom") -> list[dict[str, Any]]:
+    """One nav_msgs/Odometry-shaped record a stamp.
+
+    The twist is the mean velocity in base_link since the record before, by differences of the
+    poses; its covariance is unknown, which the message's convention writes as zeros.
+    """
+    stamps, poses = estimate.stamps, estimate.means
+    motion = se2.log(se2.between(poses[:-1], poses[1:]))
+    lapse = np.maximum(np.diff(stamps), 1e-9)[:, None]
+    twists = np.concatenate([np.zeros((1, 3)), motion / lapse])
+    records = []
+    for i, covariance in enumerate(covariance_6x6(estimate.covariances)):
+        x, y, heading = (float(v) for v in poses[i])
+        vx, vy, turn = (float(v) for v in twists[i])
+        records.append(
+            {
+                "header": {"stamp": float(stamps[i]), "frame_id": frame_id},
+                "child_frame_id": "base_link",
+                "pose": {
+                    "position": {"x": x, "y": y, "z": 0.0},
+                    "orientation": {
+                        "x": 0.0,
+                        "y": 0.0,
+                        "z": math.sin(heading / 2.0),
+                        "w": math.cos(heading / 2.0),
+                    },
+                    "covariance": covariance.ravel().tolist(),
+                },
+                "twist": {
+                    "linear": {"x": vx, "y": vy, "z": 0.0},
+                    "angular": {"x": 0.0, "y": 0.0, "z": turn},
+                    "covariance": [0.0] * 36,
+                },
+            }
+        )
+    return records
+
+
+def write_odometry_json(estimate: Estimate, path: Path) -> None:
+    """Write the records as a JSON list."""
+    with write_whole(path) as part:
+        part.write_text(json.dumps(odometry_records(estimate)))
+
+
+def write_odometry_csv(estimate: Estimate, path: Path) -> None:
+    """Write one line a record; the 36 covariances are pose.covariance.0 to .35."""
+    records = [_flat(record) for record in odometry_records(estimate)]
+    with write_whole(path) as part, part.open("w", newline="") as file:
+        writer = csv.DictWriter(file, fieldnames=list(records[0]))
+        writer.writeheader()
+        writer.writerows(records)
+
+
+def read_odometry_csv(path: Path) -> Estimate:
+    """Read what `write_odometry_csv` wrote.
+
+    Raises
+    ------
+    InputError
+        Naming the file and the line that cannot be read.
+    """
+    stamps, means, covariances = [], [], []
+    try:
+        with path.open(newline="") as file:
+            for number, row in enumerate(csv.DictReader(file), start=2):
+                try:
+                    z, w = (float(row[f"pose.orientation.{k}"]) for k in "zw")
+                    x, y = (float(row[f"pose.position.{k}"]) for k in "xy")
+                    full = [float(row[f"pose.covariance.{k}"]) for k in range(36)]
+                    stamps.append(float(row["header.stamp"]))
+                except (KeyError, TypeError, ValueError) as error:
+                    raise InputError(f"{path}:{number}: not an odometry record ({error})") from None
+                means.append([x, y, 2.0 * math.atan2(z, w)])
+                covariances.append(np.array(full).reshape(6, 6)[PLANAR])
+    except OSError as error:
+        raise InputError(f"{path}: cannot read ({error.strerror})") from error
+    poses = np.array(means, float).reshape(-1, 3)
+    poses[:, 2] = se2.wrap(poses[:, 2])
+    return Estimate(np.array(stamps), poses, np.array(covariances).reshape(-1, 3, 3))
+
+
+def _flat(tree: Any, prefix: str = "") -> dict[str, Any]:
+    if isinstance(tree, dict):
+        items = tree.items()
+    elif isinstance(tree, list):
+        items = {str(i): v for i, v in enumerate(tree)}.items()
+    else:
+        return {prefix[:-1]: repr(tree) if isinstance(tree, float) else tree}
+    flat: dict[str, Any] = {}
+    for key, value in items:
+        flat.update(_flat(value, f"{prefix}{key}."))
+    return flat

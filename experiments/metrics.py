@@ -1,0 +1,162 @@
+"""Scores of an Estimate against the truth.
+
+Poses are (T, 3) m, m, rad at the same stamps. Squares are pooled before the root is taken.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimators.base import Estimate
+from sim import se2
+from sim.errors import InputError
+from sim.recording import Recording
+
+Array = NDArray[np.float64]
+CHI2_95_2DOF = 5.991464547107979  # 95 % quantile of chi-square with two degrees of freedom
+_SINGULAR = 1e-10  # least eigenvalue of a correlation matrix that can be trusted
+RPE_DISTANCES_M = (1.0, 10.0)
+
+
+def position_errors_m(truth: Array, means: Array) -> Array:
+    """Distances (T,) between true and estimated positions, m."""
+    distance: Array = np.hypot(*(means[:, :2] - truth[:, :2]).T)
+    return distance
+
+
+def heading_errors_rad(truth: Array, means: Array) -> Array:
+    """Wrapped heading errors (T,), rad."""
+    return se2.wrap(means[:, 2] - truth[:, 2])
+
+
+def rms(errors: Array) -> float:
+    """Root mean square; NaN of nothing."""
+    return float(np.sqrt(np.mean(np.square(errors)))) if len(errors) else math.nan
+
+
+def alignment(truth: Array, means: Array) -> Array:
+    """Pose (3,) that takes the estimated positions closest to the true ones: SE(2), no scale.
+
+    It minimises the sum of squared distances (Kabsch in the plane). Without any spread in the
+    positions the rotation is left at zero.
+    """
+    centre_truth, centre_means = truth[:, :2].mean(axis=0), means[:, :2].mean(axis=0)
+    a, b = means[:, :2] - centre_means, truth[:, :2] - centre_truth
+    cross = np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+    angle = math.atan2(cross, np.sum(a * b))
+    rotated = se2.transform(np.array([0.0, 0.0, angle]), centre_means[None])[0]
+    return np.array([*(centre_truth - rotated), angle])
+
+
+def aligned(truth: Array, means: Array) -> Array:
+    """Estimated poses (T, 3) after `alignment`."""
+    return se2.compose(alignment(truth, means), means)
+
+
+def pairs_by_distance(truth: Array, distance_m: float) -> NDArray[np.int64]:
+    """Pairs (P, 2) of rows between which the truth travelled at least the distance.
+
+    Consecutive and without overlap; the first pair begins where the distance is first reached,
+    as evo pairs.
+    """
+    steps = np.hypot(*np.diff(truth[:, :2], axis=0).T)
+    rows, travelled = [], 0.0
+    for i, step in enumerate(steps):
+        travelled += float(step)
+        if travelled >= distance_m:
+            rows.append(i + 1)
+            travelled = 0.0
+    return np.array([rows[:-1], rows[1:]], dtype=np.int64).T.reshape(-1, 2)
+
+
+def relative_errors(truth: Array, means: Array, pairs: NDArray[np.int64]) -> Array:
+    """Errors (P, 3) of the motion between paired rows: true motion to estimated motion."""
+    first, second = pairs.T
+    true_motion = se2.between(truth[first], truth[second])
+    return se2.between(true_motion, se2.between(means[first], means[second]))
+
+
+def nees(truth: Array, estimate_means: Array, covariances: Array) -> Array:
+    """Normalised estimation error squared (T,); NaN where the covariance is singular.
+
+    Its mean is 3 for a consistent filter. Covariances such as the zero one of a known start say
+    nothing about errors, so those stamps are left out.
+    """
+    error = estimate_means - truth
+    error[:, 2] = se2.wrap(error[:, 2])
+    sigma = np.sqrt(np.maximum(np.diagonal(covariances, axis1=1, axis2=2), 0.0))
+    usable = np.all(sigma > 0.0, axis=1)
+    values = np.full(len(error), np.nan)
+    if not usable.any():
+        return values
+    scale = sigma[usable]
+    correlation = covariances[usable] / (scale[:, :, None] * scale[:, None, :])
+    eigenvalues, vectors = np.linalg.eigh((correlation + correlation.transpose(0, 2, 1)) / 2)
+    projected = np.einsum("tij,ti->tj", vectors, error[usable] / scale)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        squares = np.sum(projected**2 / eigenvalues, axis=1)
+    values[usable] = np.where(eigenvalues[:, 0] > _SINGULAR, squares, np.nan)
+    return values
+
+
+def ellipse_area_m2(covariances: Array) -> Array:
+    """Areas (T,) of the 95 % position ellipses, m^2: pi chi2 sqrt(det)."""
+    block = covariances[:, :2, :2]
+    determinant = block[:, 0, 0] * block[:, 1, 1] - block[:, 0, 1] * block[:, 1, 0]
+    area: Array = math.pi * CHI2_95_2DOF * np.sqrt(np.maximum(determinant, 0.0))
+    return area
+
+
+def at_distances(truth: Array, distances_m: Array) -> NDArray[np.int64]:
+    """First row at which the truth has travelled each distance; -1 where it never has."""
+    travelled = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(truth[:, :2], axis=0).T))])
+    rows = np.searchsorted(travelled, distances_m)
+    return np.where(rows < len(travelled), rows, -1)
+
+
+def score(recording: Recording, estimate: Estimate) -> dict[str, float]:
+    """Score an estimate against its recording's truth; units are in the keys.
+
+    Stamps outside the truth's span are left out. A recording without truth gives only times.
+
+    Raises
+    ------
+    InputError
+        If no stamp of the estimate lies within the truth's span.
+    """
+    steps = estimate.step_seconds
+    row = {
+        "duration_s": float(estimate.stamps[-1] - estimate.stamps[0]),
+        "step_time_us": float(1e6 * np.median(steps)) if len(steps) else math.nan,
+    }
+    if recording.truth is None:
+        return row
+    truth = recording.truth_at(estimate.stamps)
+    known = np.isfinite(truth).all(axis=1)
+    if not known.any():
+        raise InputError("no estimate lies within the truth's time span; are the clocks the same?")
+    truth, means = truth[known], estimate.means[known]
+    covariances = estimate.covariances[known]
+    fitted = aligned(truth, means)
+    values = nees(truth, means, covariances)
+    counted = np.isfinite(values)
+    row |= {
+        "distance_m": float(np.sum(np.hypot(*np.diff(truth[:, :2], axis=0).T))),
+        "ate_rmse_m": rms(position_errors_m(truth, means)),
+        "ate_aligned_rmse_m": rms(position_errors_m(truth, fitted)),
+        "heading_rmse_rad": rms(heading_errors_rad(truth, means)),
+        "heading_aligned_rmse_rad": rms(heading_errors_rad(truth, fitted)),
+        "final_position_error_m": float(position_errors_m(truth[-1:], means[-1:])[0]),
+        "final_heading_error_rad": float(abs(heading_errors_rad(truth[-1:], means[-1:])[0])),
+        "nees_mean": float(np.mean(values[counted])) if counted.any() else math.nan,
+        "nees_counted_share": float(np.mean(counted)),
+        "ellipse_area_final_m2": float(ellipse_area_m2(covariances[-1:])[0]),
+    }
+    for distance in RPE_DISTANCES_M:
+        errors = relative_errors(truth, means, pairs_by_distance(truth, distance))
+        row[f"rpe_{distance:g}m_rmse_m"] = rms(np.hypot(errors[:, 0], errors[:, 1]))
+        row[f"rpe_{distance:g}m_heading_rmse_rad"] = rms(errors[:, 2])
+    return row

@@ -1,0 +1,93 @@
+"""Rows of results: flat, one a run, units in the names; Parquet and CSV, written whole."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sim.errors import InputError
+from sim.files import write_whole
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Scalar = str | int | float | bool | None
+Row = dict[str, Scalar]
+_TEXTS = {"status", "code_version", "recording_checksum", "run_key"}
+
+
+def check_row(row: Row) -> None:
+    """Check that a row is flat and says how it ended.
+
+    Raises
+    ------
+    InputError
+        If a value is not a scalar, or the status is missing.
+    """
+    for key, value in row.items():
+        if not (value is None or isinstance(value, (str, int, float, bool))):
+            raise InputError(f"row key {key} must hold a scalar, got {type(value).__name__}")
+    for key in _TEXTS:
+        if not isinstance(row.get(key), str):
+            raise InputError(f"a row must have the text {key}")
+
+
+def to_frame(rows: Sequence[Row]) -> pd.DataFrame:
+    """Tidy table of rows; a column that some rows lack is empty there.
+
+    A column that holds numbers in some rows and text in others becomes text, since a file has
+    one type a column.
+    """
+    import pandas as pd
+
+    for row in rows:
+        check_row(row)
+    frame = pd.DataFrame(list(rows))
+    for name in frame.columns:
+        kinds = {type(v) for v in frame[name] if v is not None and v == v}
+        if str in kinds and len(kinds) > 1:
+            frame[name] = [None if v is None or v != v else str(v) for v in frame[name]]
+    return frame
+
+
+def write_rows(rows: Sequence[Row], path: Path) -> None:
+    """Write rows to `path` (.parquet or .csv), whole or not at all."""
+    write_frame(to_frame(rows), path)
+
+
+def write_frame(frame: pd.DataFrame, path: Path) -> None:
+    """Write a table to `path` (.parquet or .csv), whole or not at all."""
+    if path.suffix not in (".parquet", ".csv"):
+        raise InputError(f"{path}: tables are .parquet or .csv")
+    with write_whole(path) as part:
+        if path.suffix == ".csv":
+            frame.to_csv(part, index=False, float_format="%.10g")
+        else:
+            frame.to_parquet(part, index=False)
+
+
+def read_rows(path: Path) -> pd.DataFrame:
+    """Read a table, or all tables of a folder as one.
+
+    Raises
+    ------
+    InputError
+        If there is none, or a file cannot be read.
+    """
+    import pandas as pd
+
+    files = sorted(path.glob("*.parquet")) if path.is_dir() else [path]
+    if not files:
+        raise InputError(f"{path}: no results here; run the study first")
+    frames = []
+    for file in files:
+        try:
+            read = pd.read_csv if file.suffix == ".csv" else pd.read_parquet
+            frames.append(read(file))
+        except (OSError, ValueError) as error:
+            raise InputError(
+                f"{file}: cannot read this table ({str(error).splitlines()[0]}); delete it and "
+                "run again"
+            ) from error
+    return pd.concat(frames, ignore_index=True)
