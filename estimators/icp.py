@@ -1,0 +1,596 @@
+"""Registration of two laser scans in the plane: point-to-point and point-to-line ICP.
+
+The lines are those of `estimators.scan_lines`. Nothing is trimmed unless asked for: gates narrow
+only after the increment has settled, so the few points that hold the robot along a corridor keep
+their say.
+
+Poses `T_target_source` take points of the source scan into the frame of the target scan.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+
+from estimators.scan_lines import PreparedScan, prepare, select
+from sim.errors import InputError
+
+__all__ = ["PreparedScan", "Registration", "prepare", "register"]
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+Metric = Literal["point_to_line", "point_to_point"]
+Search = Literal["angular", "kdtree"]
+Kernel = Literal["tukey", "huber", "none"]
+
+_COARSE_POINTS = 6  # points that stand for a line of the source until the poses are close
+_GRAZING = 0.001  # squared sine below which a beam along a wall is not trusted further
+_HUBER, _TUKEY = 1.345, 6.0  # tuning constants, in standard deviations
+LEAST_OVERLAP = 0.6  # share of the source's points that must agree with the target
+LEAST_INFORMATION = 4.0  # information that the noise of the lines alone can feign, times this
+
+
+@dataclass(frozen=True)
+class Registration:
+    """A registration and all that is needed to judge it; K points of the source, in its order.
+
+    Attributes
+    ----------
+    T_target_source
+        (3,) m, m, rad: takes points of the source into the frame of the target.
+    metric
+        `point_to_line` or `point_to_point`.
+    status
+        `ok`; `empty` (a scan shows too little), `poor_overlap` (too few points agree),
+        `degenerate` (some direction is not held by the scans), `not_converged`.
+    matches
+        (K,) the target's line or point that each point was matched with, -1 for none.
+    residuals_m
+        (K,) distance to the line (signed) or to the point; NaN without a match.
+    weights
+        (K,) weight of each squared residual, 1/m^2; 0 for a point that has no say.
+    iterations, converged
+        Iterations in all, and whether the increment fell below its bound.
+    normal_matrix
+        (3, 3) sum of w J^T J of the metric's residuals by (x, y, heading).
+    information, information_noise
+        (3, 3) what the target's lines say about the pose, and the part of it that the noise of
+        their directions would feign if there were nothing to say (all walls parallel, a circle).
+    """
+
+    T_target_source: Array
+    metric: Metric
+    status: str
+    matches: Indices
+    residuals_m: Array
+    weights: Array
+    iterations: int
+    converged: bool
+    normal_matrix: Array
+    information: Array
+    information_noise: Array
+
+    @property
+    def inliers(self) -> NDArray[np.bool_]:
+        """(K,) points that had a say."""
+        return self.weights > 0.0
+
+    @property
+    def overlap(self) -> float:
+        """Share of the source's points that agree with the target."""
+        return float(np.mean(self.inliers)) if len(self.weights) else 0.0
+
+
+@njit(cache=True, error_model="numpy")
+def _nearest_line(
+    segments: Array, full_circle: bool, start: int, x: float, y: float
+) -> tuple[int, float]:
+    """Nearest segment to a point, from a guess: index, squared distance.
+
+    Segments come by rising bearing, so the walk each way ends where even the nearest point of
+    the ray to the next segment is farther than the best one.
+    """
+    n = len(segments)
+    best, best_d2 = -1, math.inf
+    for way in (1, -1):
+        k = start if way == 1 else start - 1
+        for _ in range(n):
+            if k < 0 or k >= n:
+                if not full_circle:
+                    break
+                k -= way * n
+            if best >= 0:
+                u, v = segments[k, 6 - way], segments[k, 7 - way]
+                beyond = way * (x * v - y * u)
+                if beyond > 0.0:
+                    bound = beyond * beyond if x * u + y * v > 0.0 else x * x + y * y
+                    if bound >= best_d2:
+                        break
+            n1, n2 = segments[k, 0], segments[k, 1]
+            miss = n1 * x + n2 * y - segments[k, 2]
+            along = n1 * y - n2 * x
+            over = max(segments[k, 3] - along, along - segments[k, 4], 0.0)
+            d2 = miss * miss + over * over
+            if d2 < best_d2:
+                best, best_d2 = k, d2
+            k += way
+    return best, best_d2
+
+
+@njit(cache=True, error_model="numpy")
+def _nearest_point(
+    points: Array, rays: Array, full_circle: bool, start: int, x: float, y: float
+) -> tuple[int, float]:
+    """Nearest point of a scan, from a guess, by the same walk: index, squared distance."""
+    n = len(points)
+    best, best_d2 = -1, math.inf
+    for way in (1, -1):
+        k = start if way == 1 else start - 1
+        for _ in range(n):
+            if k < 0 or k >= n:
+                if not full_circle:
+                    break
+                k -= way * n
+            u, v = rays[k, 0], rays[k, 1]
+            if best >= 0:
+                beyond = way * (x * v - y * u)
+                if beyond > 0.0:
+                    bound = beyond * beyond if x * u + y * v > 0.0 else x * x + y * y
+                    if bound >= best_d2:
+                        break
+            d2 = (points[k, 0] - x) ** 2 + (points[k, 1] - y) ** 2
+            if d2 < best_d2:
+                best, best_d2 = k, d2
+            k += way
+    return best, best_d2
+
+
+@njit(cache=True, error_model="numpy")
+def _plant_tree(points: Array) -> Indices:
+    """Order (K,) of the points such that the middle of every range splits it in x, y, x, ..."""
+    n = len(points)
+    order = np.arange(n)
+    stack = np.empty((64, 3), np.int64)
+    stack[0, 0], stack[0, 1], stack[0, 2] = 0, n, 0
+    depth = 1
+    while depth > 0:
+        depth -= 1
+        low, high, axis = stack[depth, 0], stack[depth, 1], stack[depth, 2]
+        if high - low < 2:
+            continue
+        middle = (low + high) // 2
+        select(points[:, axis], order, low, high, middle)
+        stack[depth, 0], stack[depth, 1], stack[depth, 2] = low, middle, 1 - axis
+        stack[depth + 1, 0], stack[depth + 1, 1], stack[depth + 1, 2] = middle + 1, high, 1 - axis
+        depth += 2
+    return order
+
+
+@njit(cache=True, error_model="numpy")
+def _nearest_in_tree(points: Array, order: Indices, x: float, y: float) -> tuple[int, float]:
+    """Nearest point by the k-d tree of `_plant_tree`: index, squared distance."""
+    stack = np.empty((64, 3), np.int64)
+    gaps = np.empty(64)
+    stack[0, 0], stack[0, 1], stack[0, 2], gaps[0] = 0, len(order), 0, 0.0
+    depth = 1
+    best, best_d2 = -1, math.inf
+    while depth > 0:
+        depth -= 1
+        low, high, axis = stack[depth, 0], stack[depth, 1], stack[depth, 2]
+        if low >= high or gaps[depth] >= best_d2:
+            continue
+        middle = (low + high) // 2
+        k = order[middle]
+        d2 = (points[k, 0] - x) ** 2 + (points[k, 1] - y) ** 2
+        if d2 < best_d2:
+            best, best_d2 = k, d2
+        gap = (x if axis == 0 else y) - points[k, axis]
+        # the far half first onto the stack, so that the near one is searched first
+        for near in (False, True):
+            left = (gap < 0.0) == near
+            stack[depth, 0] = low if left else middle + 1
+            stack[depth, 1] = middle if left else high
+            stack[depth, 2] = 1 - axis
+            gaps[depth] = 0.0 if near else gap * gap
+            depth += 1
+    return best, best_d2
+
+
+@njit(cache=True, error_model="numpy")
+def _heading_by_lines(
+    source: Array, source_ends: Indices, target: Array, target_ends: Indices, window: float
+) -> float:
+    """Turn of the source, within +-window, in which most of its lines agree with the target's."""
+    bins = 180
+    votes = np.zeros(bins + 1)
+    for a in range(len(source)):
+        n_a = source_ends[a, 1] - source_ends[a, 0] + 1
+        heading = math.atan2(source[a, 1], source[a, 0])
+        length_a = source[a, 4] - source[a, 3]
+        for b in range(len(target)):
+            turn = math.atan2(target[b, 1], target[b, 0]) - heading
+            turn -= 2.0 * math.pi * round(turn / (2.0 * math.pi))
+            place = (turn / window + 1.0) * bins / 2.0
+            if place < 0.0 or place >= bins:
+                continue
+            n_b = target_ends[b, 1] - target_ends[b, 0] + 1
+            length_b = target[b, 4] - target[b, 3]
+            weight = min(n_a, n_b) * min(length_a, length_b) / max(length_a, length_b)
+            left = int(place)
+            votes[left] += weight * (left + 1.0 - place)
+            votes[left + 1] += weight * (place - left)
+    best, most = bins // 2, 0.0
+    for k in range(2, bins - 1):
+        sum_here = votes[k] + 0.7 * (votes[k - 1] + votes[k + 1])
+        sum_here += 0.3 * (votes[k - 2] + votes[k + 2])
+        if sum_here > most:
+            best, most = k, sum_here
+    total, moment = 0.0, 0.0
+    for k in range(best - 2, best + 3):
+        total += votes[k]
+        moment += votes[k] * k
+    return (moment / total * 2.0 / bins - 1.0) * window if most > 0.0 else 0.0
+
+
+@njit(cache=True, error_model="numpy")
+def _representatives(line_of_point: Indices, ends: Indices) -> tuple[Indices, Array]:
+    """A few points for each line, with the number of points they stand for."""
+    chosen = np.empty(_COARSE_POINTS * len(ends), np.int64)
+    weights = np.empty(len(chosen))
+    n = 0
+    for k in range(len(ends)):
+        first, last = ends[k, 0], ends[k, 1]
+        here = min(_COARSE_POINTS, last - first + 1)
+        for j in range(here):
+            i = first + (last - first) * j // (here - 1)
+            if line_of_point[i] == k:
+                chosen[n] = i
+                weights[n] = (last - first + 1) / here
+                n += 1
+    return chosen[:n].copy(), weights[:n].copy()
+
+
+@njit(cache=True, error_model="numpy")
+def _step(normal: Array, gradient: Array, pose: Array) -> tuple[float, float]:
+    """Solve the normal equations, move the pose in place; (translation, rotation) of the move.
+
+    Directions without information get a whiff of damping: there the pose stays.
+    """
+    damping = 1e-6 * (normal[0, 0] + normal[1, 1])
+    a = math.sqrt(normal[0, 0] + damping)
+    b, c = normal[1, 0] / a, normal[2, 0] / a
+    d = math.sqrt(normal[1, 1] + damping - b * b)
+    e = (normal[2, 1] - c * b) / d
+    f = math.sqrt(max(normal[2, 2] * (1.0 + 1e-6) + damping - c * c - e * e, 1e-300))
+    y1 = -gradient[0] / a
+    y2 = (-gradient[1] - b * y1) / d
+    y3 = (-gradient[2] - c * y1 - e * y2) / f
+    turn = y3 / f
+    dy = (y2 - e * turn) / d
+    dx = (y1 - b * dy - c * turn) / a
+    pose[0] += dx
+    pose[1] += dy
+    pose[2] += turn
+    return math.hypot(dx, dy), abs(turn)
+
+
+@njit(cache=True, error_model="numpy")
+def _align(
+    points: Array, rays: Array, chosen: Indices, counts: Array, pose: Array, to_lines: bool,
+    segments: Array, target_points: Array, target_rays: Array, line_of_point: Indices,
+    full_circle: bool, order: Indices, gate: float, kernel: int, scale: float, noise: float,
+    trim: float, max_iterations: int, increment_m: float, increment_rad: float, matches: Indices,
+    residuals: Array, weights: Array,
+) -> tuple[int, bool]:  # fmt: skip
+    """Iterate from `pose`, in place, to rest under one gate; iterations, converged.
+
+    Kernel 0 none, 1 Huber, 2 Tukey: of the residual over its standard deviation `scale` times
+    the range noise, as it shows at the beam's incidence. Kernel 3 (coarse) weighs the distance
+    itself by Geman and McClure's law of width `scale`, m.
+    """
+    near = 0
+    by_tree = len(order) > 0
+    misses = np.empty(len(chosen))
+    for iteration in range(max_iterations):
+        cos, sin = math.cos(pose[2]), math.sin(pose[2])
+        for k in range(len(chosen)):
+            i = chosen[k]
+            x = cos * points[i, 0] - sin * points[i, 1] + pose[0]
+            y = sin * points[i, 0] + cos * points[i, 1] + pose[1]
+            if iteration > 0:
+                near = matches[i]
+            if by_tree:
+                near, d2 = _nearest_in_tree(target_points, order, x, y)
+                if to_lines:
+                    near = line_of_point[near]
+                    if near >= 0:
+                        n1, n2 = segments[near, 0], segments[near, 1]
+                        along = n1 * y - n2 * x
+                        over = max(segments[near, 3] - along, along - segments[near, 4], 0.0)
+                        d2 = (n1 * x + n2 * y - segments[near, 2]) ** 2 + over * over
+                    else:
+                        d2 = math.inf
+            elif to_lines:
+                near, d2 = _nearest_line(segments, full_circle, near, x, y)
+            else:
+                near, d2 = _nearest_point(target_points, target_rays, full_circle, near, x, y)
+            matches[i] = near
+            misses[k] = d2
+        limit = gate * gate
+        if trim > 0.0:
+            rank = int((1.0 - trim) * (len(chosen) - 1))
+            limit = min(limit, select(misses, np.arange(len(misses)), 0, len(misses), rank))
+        normal, gradient = np.zeros((3, 3)), np.zeros(3)
+        for k in range(len(chosen)):
+            i, j = chosen[k], matches[chosen[k]]
+            weights[i], residuals[i] = 0.0, math.nan
+            if j < 0 or misses[k] > limit:
+                continue
+            qx = cos * points[i, 0] - sin * points[i, 1]
+            qy = sin * points[i, 0] + cos * points[i, 1]
+            variance = 1.0
+            if to_lines:
+                n1, n2 = segments[j, 0], segments[j, 1]
+                miss = n1 * (qx + pose[0]) + n2 * (qy + pose[1]) - segments[j, 2]
+                if kernel < 3:
+                    facing = n1 * (cos * rays[i, 0] - sin * rays[i, 1])
+                    facing += n2 * (sin * rays[i, 0] + cos * rays[i, 1])
+                    variance = noise * noise * (facing * facing + _GRAZING)
+            else:
+                ex = qx + pose[0] - target_points[j, 0]
+                ey = qy + pose[1] - target_points[j, 1]
+                miss = math.sqrt(ex * ex + ey * ey)
+                if kernel < 3:
+                    variance = 2.0 * noise * noise
+            ratio = miss * miss / (variance * scale * scale)
+            if kernel == 3:
+                weight = 1.0 / (1.0 + ratio) ** 2
+            elif kernel == 2:
+                weight = (1.0 - ratio) ** 2 if ratio < 1.0 else 0.0
+            elif kernel == 1:
+                weight = 1.0 / math.sqrt(ratio) if ratio > 1.0 else 1.0
+            else:
+                weight = 1.0
+            weight *= counts[k] / variance
+            weights[i] = weight
+            residuals[i] = miss
+            if to_lines:
+                lever = n2 * qx - n1 * qy
+                normal[0, 0] += weight * n1 * n1
+                normal[1, 0] += weight * n1 * n2
+                normal[1, 1] += weight * n2 * n2
+                normal[2, 0] += weight * n1 * lever
+                normal[2, 1] += weight * n2 * lever
+                normal[2, 2] += weight * lever * lever
+                gradient[0] += weight * miss * n1
+                gradient[1] += weight * miss * n2
+                gradient[2] += weight * miss * lever
+            else:
+                normal[0, 0] += weight
+                normal[1, 1] += weight
+                normal[2, 0] -= weight * qy
+                normal[2, 1] += weight * qx
+                normal[2, 2] += weight * (qx * qx + qy * qy)
+                gradient[0] += weight * ex
+                gradient[1] += weight * ey
+                gradient[2] += weight * (ey * qx - ex * qy)
+        if not normal[0, 0] + normal[1, 1] > 0.0:
+            return iteration, False
+        moved, turned = _step(normal, gradient, pose)
+        if moved < increment_m and turned < increment_rad:
+            return iteration + 1, True
+    return max_iterations, False
+
+
+@njit(cache=True, error_model="numpy")
+def _judge(
+    points: Array, rays: Array, pose: Array, to_lines: bool, segments: Array,
+    line_of_point: Indices, matches: Indices, residuals: Array, weights: Array, noise: float,
+) -> tuple[Array, Array, Array]:  # fmt: skip
+    """Normal matrix of the metric; information of the target's lines, and its noise (3, 3) each."""
+    normal, information, feigned = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
+    cos, sin = math.cos(pose[2]), math.sin(pose[2])
+    for i in range(len(points)):
+        weight = weights[i]
+        if not weight > 0.0:
+            if residuals[i] != residuals[i]:
+                matches[i] = -1
+            continue
+        qx = cos * points[i, 0] - sin * points[i, 1]
+        qy = sin * points[i, 0] + cos * points[i, 1]
+        if not to_lines:
+            normal[0, 0] += weight
+            normal[1, 1] += weight
+            normal[2, 0] -= weight * qy
+            normal[2, 1] += weight * qx
+            normal[2, 2] += weight * (qx * qx + qy * qy)
+        line = matches[i] if to_lines else line_of_point[matches[i]]
+        if line < 0:
+            continue
+        n1, n2 = segments[line, 0], segments[line, 1]
+        if not to_lines:
+            facing = n1 * (cos * rays[i, 0] - sin * rays[i, 1])
+            facing += n2 * (sin * rays[i, 0] + cos * rays[i, 1])
+            weight = 1.0 / (noise * noise * (facing * facing + _GRAZING))
+        lever, turned = n2 * qx - n1 * qy, n1 * qx + n2 * qy
+        shaky = weight * segments[line, 9]
+        information[0, 0] += weight * n1 * n1
+        information[1, 0] += weight * n1 * n2
+        information[1, 1] += weight * n2 * n2
+        information[2, 0] += weight * n1 * lever
+        information[2, 1] += weight * n2 * lever
+        information[2, 2] += weight * lever * lever
+        feigned[0, 0] += shaky * n2 * n2
+        feigned[1, 0] -= shaky * n1 * n2
+        feigned[1, 1] += shaky * n1 * n1
+        feigned[2, 0] -= shaky * n2 * turned
+        feigned[2, 1] += shaky * n1 * turned
+        feigned[2, 2] += shaky * turned * turned
+    return information if to_lines else normal, information, feigned
+
+
+@njit(cache=True, error_model="numpy")
+def _register(
+    points: Array, rays: Array, source_line: Indices, source_ends: Indices,
+    source_segments: Array, target_points: Array, target_rays: Array, target_line: Indices,
+    target_ends: Indices, target_segments: Array, full_circle: bool, pose: Array, to_lines: bool,
+    by_tree: bool, stages: Array, window: float, noise: float, trim: float, increment_m: float,
+    increment_rad: float,
+) -> tuple[Indices, Array, Array, int, bool, Array, Array, Array]:  # fmt: skip
+    """All of a registration; `stages` (S, 5): gate, kernel, its scale, iterations, sparse."""
+    n = len(points)
+    matches, residuals, weights = np.zeros(n, np.int64), np.zeros(n), np.zeros(n)
+    order = _plant_tree(target_points) if by_tree else np.empty(0, np.int64)
+    if window > 0.0:
+        pose[2] += _heading_by_lines(
+            source_segments, source_ends, target_segments, target_ends, window
+        )
+    few, counts = _representatives(source_line, source_ends)
+    every, ones = np.arange(n), np.ones(n)
+    iterations, converged = 0, False
+    for s in range(len(stages)):
+        sparse = stages[s, 4] > 0.0
+        # before the last stage it is enough to come to rest within its reach
+        loose = 1.0 if s == len(stages) - 1 else (200.0 if to_lines else 10.0)
+        done, converged = _align(
+            points, rays, few if sparse else every, counts if sparse else ones, pose, to_lines,
+            target_segments, target_points, target_rays, target_line, full_circle, order,
+            stages[s, 0], int(stages[s, 1]), stages[s, 2], noise, trim, int(stages[s, 3]),
+            loose * increment_m, loose * increment_rad, matches, residuals, weights,
+        )  # fmt: skip
+        iterations += done
+    normal, information, feigned = _judge(
+        points, rays, pose, to_lines, target_segments, target_line, matches, residuals, weights,
+        noise,
+    )  # fmt: skip
+    return matches, residuals, weights, iterations, converged, normal, information, feigned
+
+
+_KERNELS = {"none": 0, "huber": 1, "tukey": 2}
+_SCALES = {"none": 1.0, "huber": _HUBER, "tukey": _TUKEY}
+
+
+def register(
+    source: PreparedScan,
+    target: PreparedScan,
+    initial: ArrayLike | None = None,
+    *,
+    metric: Metric = "point_to_line",
+    search: Search = "angular",
+    kernel: Kernel = "tukey",
+    trim: float = 0.0,
+    gate_m: float = 2.0,
+    heading_window_rad: float | None = None,
+    max_iterations: int = 100,
+    increment_m: float = 1e-5,
+    increment_rad: float = 1e-5,
+) -> Registration:
+    """Find the pose of the source scan in the frame of the target scan.
+
+    Point to line minimises sum w (n.(R p + t) - d)^2 over the lines of the target (Chen and
+    Medioni); w is one over the variance that the range noise has along the normal, so beams
+    that graze a wall, which feel its distance most finely, count most. Point to point minimises
+    sum w |R p + t - q|^2 over its nearest points (Besl and McKay).
+
+    Parameters
+    ----------
+    initial
+        (3,) first guess of T_target_source; none is needed up to some decimetres and degrees.
+    search
+        `angular`: a walk along the bearings from the last match; `kdtree`: a k-d tree of the
+        target's points.
+    kernel
+        Weight of residuals in the last stage: `tukey`, `huber`, or `none`.
+    trim
+        Share of the worst matches to leave out at every iteration. It takes the few points
+        that hold a robot along a corridor first; 0 is the sound choice.
+    gate_m
+        Widest distance of a match to begin with.
+    heading_window_rad
+        Half the range of headings searched for agreement of the scans' lines before the first
+        iteration; by default 30 degrees without an initial guess, and 0 (no search) with one.
+    max_iterations
+        Most iterations of each of the stages, whose gates narrow from one to the next.
+    increment_m, increment_rad
+        Iterations end when both parts of the increment fall below these.
+    """
+    pose = np.zeros(3) if initial is None else np.array(initial, dtype=np.float64)
+    if pose.shape != (3,) or not np.all(np.isfinite(pose)):
+        raise InputError(
+            f"an initial guess is three finite numbers (x, y, heading), got {initial!r}"
+        )
+    if metric not in ("point_to_line", "point_to_point"):
+        raise InputError(f"metric must be point_to_line or point_to_point, got {metric!r}")
+    if search not in ("angular", "kdtree"):
+        raise InputError(f"search must be angular or kdtree, got {search!r}")
+    if kernel not in _KERNELS:
+        raise InputError(f"kernel must be tukey, huber or none, got {kernel!r}")
+    if not 0.0 <= trim < 1.0:
+        raise InputError(f"trim must lie in [0, 1), got {trim}")
+    to_lines = metric == "point_to_line"
+    if len(source) < 3 or len(target) < 3 or (to_lines and len(target.lines) == 0):
+        n = len(source)
+        zero = np.zeros((3, 3))
+        return Registration(
+            pose, metric, "empty", np.full(n, -1), np.full(n, math.nan), np.zeros(n), 0, False,
+            zero, zero, zero,
+        )  # fmt: skip
+    window = heading_window_rad
+    if window is None:
+        window = math.pi / 6.0 if initial is None else 0.0
+    code, scale = float(_KERNELS[kernel]), _SCALES[kernel]
+    most = float(max_iterations)
+    if to_lines:
+        stages = np.array(
+            [
+                [gate_m, 3, 0.15 * gate_m, most, 1],
+                [0.25 * gate_m, 3, 0.05 * gate_m, most, 1],
+                [0.15 * gate_m, code, 3.0 * scale, most, 0],
+                [0.15 * gate_m, code, scale, most, 0],
+            ]
+        )
+    else:
+        stages = np.array(
+            [
+                [gate_m, 3, 0.25 * gate_m, most, 0],
+                [0.25 * gate_m, 3, 0.1 * gate_m, most, 0],
+                [0.1 * gate_m, code, scale, most, 0],
+            ]
+        )
+    noise = max(source.noise_m, target.noise_m)
+    found = _register(
+        source.points, source.rays, source.line_of_point, source.line_ends, source.segments,
+        target.points, target.rays, target.line_of_point, target.line_ends, target.segments,
+        target.full_circle, pose, to_lines, search == "kdtree", stages, window, noise, trim,
+        increment_m, increment_rad,
+    )  # fmt: skip
+    matches, residuals, weights, iterations, converged = found[:5]
+    normal, information, feigned = (_symmetric(lower) for lower in found[5:])
+    pose[2] = math.remainder(pose[2], 2.0 * math.pi)
+    status = "ok"
+    if np.count_nonzero(weights) < LEAST_OVERLAP * len(weights):
+        status = "poor_overlap"
+    elif not _positive_definite(information - LEAST_INFORMATION * feigned):
+        status = "degenerate"
+    elif not converged:
+        status = "not_converged"
+    return Registration(
+        pose, metric, status, matches, residuals, weights, iterations, converged, normal,
+        information, feigned,
+    )  # fmt: skip
+
+
+def _symmetric(lower: Array) -> Array:
+    full: Array = lower + np.tril(lower, -1).T
+    return full
+
+
+def _positive_definite(matrix: Array) -> bool:
+    (a, b, c), (_, d, e), (_, _, f) = matrix.tolist()
+    minor = a * d - b * b
+    return bool(a > 0.0 < minor and minor * f - a * e * e - d * c * c + 2.0 * b * c * e > 0.0)
