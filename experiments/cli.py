@@ -66,10 +66,9 @@ def record(
     """
     from experiments.build import simulate
     from experiments.compose import compose
-    from experiments.console import announce_compilation, progress
+    from experiments.console import progress
     from sim.recording import save
 
-    announce_compilation()
     config = compose(overrides or [])
     with progress("simulating, s") as on_progress:
         recording = simulate(config, on_progress)
@@ -139,10 +138,8 @@ def calibrate(
     Example: estima calibrate run1.npz run2.npz --joint
     """
     from experiments.calibrate import calibrate_recordings
-    from experiments.console import announce_compilation
     from sim.recording import load
 
-    announce_compilation()
     result = calibrate_recordings([load(path) for path in recordings], method, joint=joint)
     print(result.as_json() if as_json else result.as_text())
 
@@ -190,10 +187,8 @@ def reproduce(
 
     Example: estima reproduce --paper puzzlebot2024
     """
-    from experiments.console import announce_compilation
     from experiments.reproduce import reproduce as reproduce_papers
 
-    announce_compilation()
     reproduce_papers(full=full, only=paper)
 
 

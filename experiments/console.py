@@ -54,28 +54,3 @@ def progress(label: str, total: float | None = None) -> Iterator[Callable[[float
     finally:
         if shown["bar"] is not None:
             shown["bar"].stop()
-
-
-def announce_compilation() -> None:
-    """Say so once when numerical code is compiled: it takes seconds, and the next run is quick.
-
-    Costs nothing unless something is compiled: compiled code that is on disk makes no event.
-    """
-    from numba.core import event
-
-    class Announcer(event.Listener):
-        told = False
-
-        def on_start(self, event: Any) -> None:
-            if not self.told:
-                type(self).told = True
-                print(
-                    "compiling numerical code (once; later runs read it from disk)",
-                    file=sys.stderr,
-                    flush=True,
-                )
-
-        def on_end(self, event: Any) -> None:
-            pass
-
-    event.register("numba:compile", Announcer())

@@ -74,11 +74,11 @@ def write_odometry_json(estimate: Estimate, path: Path) -> None:
 
 def write_odometry_csv(estimate: Estimate, path: Path) -> None:
     """Write one line a record; the 36 covariances are pose.covariance.0 to .35."""
-    records = [_flat(record) for record in odometry_records(estimate)]
+    records = odometry_records(estimate)
     with write_whole(path) as part, part.open("w", newline="") as file:
-        writer = csv.DictWriter(file, fieldnames=list(records[0]))
-        writer.writeheader()
-        writer.writerows(records)
+        writer = csv.writer(file)
+        writer.writerow(_flat_keys(records[0]))
+        writer.writerows(_flat_values(record) for record in records)
 
 
 def read_odometry_csv(path: Path) -> Estimate:
@@ -109,14 +109,17 @@ def read_odometry_csv(path: Path) -> Estimate:
     return Estimate(np.array(stamps), poses, np.array(covariances).reshape(-1, 3, 3))
 
 
-def _flat(tree: Any, prefix: str = "") -> dict[str, Any]:
+def _flat_keys(tree: Any, prefix: str = "") -> list[str]:
+    """Dotted names of a record's leaves, in order."""
     if isinstance(tree, dict):
-        items = tree.items()
-    elif isinstance(tree, list):
-        items = {str(i): v for i, v in enumerate(tree)}.items()
-    else:
-        return {prefix[:-1]: repr(tree) if isinstance(tree, float) else tree}
-    flat: dict[str, Any] = {}
-    for key, value in items:
-        flat.update(_flat(value, f"{prefix}{key}."))
-    return flat
+        return [name for k, v in tree.items() for name in _flat_keys(v, f"{prefix}{k}.")]
+    if isinstance(tree, list):
+        return [f"{prefix}{i}" for i in range(len(tree))]
+    return [prefix[:-1]]
+
+
+def _flat_values(tree: Any) -> list[Any]:
+    """Leaves of a record, in the same order; floats print with all their digits."""
+    if isinstance(tree, dict):
+        return [leaf for value in tree.values() for leaf in _flat_values(value)]
+    return tree if isinstance(tree, list) else [tree]

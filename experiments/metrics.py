@@ -59,11 +59,10 @@ def aligned(truth: Array, means: Array) -> Array:
 def pairs_by_distance(truth: Array, distance_m: float) -> NDArray[np.int64]:
     """Pairs (P, 2) of rows between which the truth travelled at least the distance.
 
-    Consecutive and without overlap; the first pair begins where the distance is first reached,
-    as evo pairs.
+    Consecutive, without overlap, the first one from the start, as evo pairs.
     """
     steps = np.hypot(*np.diff(truth[:, :2], axis=0).T)
-    rows, travelled = [], 0.0
+    rows, travelled = [0], 0.0
     for i, step in enumerate(steps):
         travelled += float(step)
         if travelled >= distance_m:

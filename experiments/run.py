@@ -24,7 +24,7 @@ from experiments.build import (
     make_prior,
     make_recording,
 )
-from experiments.console import announce_compilation, progress
+from experiments.console import progress
 from experiments.metrics import score
 from experiments.seeds import stream
 from experiments.table import Row, write_rows
@@ -140,7 +140,6 @@ def _show(recording: Recording, estimate: Estimate, folder: Path, name: str) -> 
 @hydra.main(version_base="1.3", config_path=str(ROOT / "conf"), config_name="config")
 def application(cfg: DictConfig) -> None:
     """Run one job of Hydra's."""
-    announce_compilation()
     config: Config = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
     runtime = HydraConfig.get()
     groups = ("world", "robot", "sensors", "route", "estimator")

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 Scalar = str | int | float | bool | None
 Row = dict[str, Scalar]
-_TEXTS = {"status", "code_version", "recording_checksum", "run_key"}
+_TEXTS = ("status", "code_version", "recording_checksum", "run_key")
 
 
 def check_row(row: Row) -> None:
@@ -43,11 +43,13 @@ def to_frame(rows: Sequence[Row]) -> pd.DataFrame:
 
     for row in rows:
         check_row(row)
-    frame = pd.DataFrame(list(rows))
-    for name in frame.columns:
-        kinds = {type(v) for v in frame[name] if v is not None and v == v}
-        if str in kinds and len(kinds) > 1:
-            frame[name] = [None if v is None or v != v else str(v) for v in frame[name]]
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    columns = {}
+    for name in names:
+        values = [row.get(name) for row in rows]
+        mixed = len({isinstance(v, str) for v in values if v is not None}) > 1
+        columns[name] = [None if v is None else str(v) for v in values] if mixed else values
+    frame = pd.DataFrame(columns)
     return frame
 
 
@@ -78,7 +80,7 @@ def read_rows(path: Path) -> pd.DataFrame:
     import pandas as pd
 
     files = sorted(path.glob("*.parquet")) if path.is_dir() else [path]
-    if not files:
+    if not files or not path.exists():
         raise InputError(f"{path}: no results here; run the study first")
     frames = []
     for file in files:

@@ -48,7 +48,7 @@ MAX_RAYS = 16_000  # a batch of 16384 rays loses its last one
 _SOLVER_ITERATIONS = 80  # 50 leave 0.08 mm of side slip in a straight 2 m, 80 leave 0.03 mm
 _SETTLE_TICKS = 60
 _MOTOR_TORQUE_NM = 100.0  # ample: the command is met in one tick, the traction is the limit
-_WALLS, _GROUND, _ROBOT = 2, 4, 8  # collision groups
+_RAYS, _WALLS, _GROUND, _ROBOT = 1, 2, 4, 8  # collision groups; rays are in the engine's first
 _TIPPED_RAD = 0.1
 
 
@@ -81,7 +81,7 @@ class BulletBody:
         plane = pybullet.createCollisionShape(pybullet.GEOM_PLANE, physicsClientId=c)
         self._ground = pybullet.createMultiBody(0, plane, physicsClientId=c)
         self._grip(self._ground, -1, 1.0)
-        self._group(self._ground, -1, _GROUND, _ROBOT)
+        self._group(self._ground, -1, _GROUND, _ROBOT | _RAYS)
         self._walls = self._build_walls(world)
         self._robot = self._build_robot(robot, pose)
         self._heading = float(pose[2])
@@ -207,7 +207,7 @@ class BulletBody:
             raise InputError(f"world {world.name}: the physics engine refused its walls")
         walls: int = pybullet.createMultiBody(0, shape, physicsClientId=self._client)
         self._grip(walls, -1, 0.5)
-        self._group(walls, -1, _WALLS, _ROBOT)
+        self._group(walls, -1, _WALLS, _ROBOT | _RAYS)
         return walls
 
     def _build_robot(self, robot: DifferentialDrive, pose: Array) -> int:

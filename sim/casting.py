@@ -17,10 +17,11 @@ from typing import Any
 
 import numpy as np
 from llvmlite import ir  # type: ignore[import-untyped]
-from numba import njit, types
+from numba import types
 from numba.extending import intrinsic
 from numpy.typing import ArrayLike, NDArray
 
+from sim.compiled import njit
 from sim.sensors import Laser, Lidar3D
 from sim.world import World
 
@@ -236,7 +237,7 @@ def _draw_block(
     return signature, generate
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _cast(
     poses: Array,
     chains: Array,
@@ -268,13 +269,13 @@ def _cast(
     return ranges
 
 
-@njit(cache=True)
+@njit()
 def _wrapped(angle_rad: float) -> float:
     """The angle in [-pi, pi]."""
     return angle_rad - 2.0 * math.pi * math.floor(angle_rad / (2.0 * math.pi) + 0.5)
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@njit(error_model="numpy", fastmath={"contract"})
 def _bearings(
     x: float, y: float, phase: float, step_rad: float, px: Array, py: Array, bearing: Array
 ) -> None:
@@ -303,7 +304,7 @@ def _bearings(
         bearing[i] = angle * per_rad
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@njit(error_model="numpy", fastmath={"contract"})
 def _mark_seen(
     x: float,
     y: float,
@@ -328,7 +329,7 @@ def _mark_seen(
         seen[i] = 1 if in_view & facing & (radius2[i] >= 0.0) else 0
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@njit(error_model="numpy", fastmath={"contract"})
 def _draw(
     x: float,
     y: float,
@@ -378,7 +379,7 @@ def _draw(
             _draw_beams(nearness, cosines, sines, begin - turn, end - turn, gx, gy)
 
 
-@njit(cache=True)
+@njit()
 def _draw_beams(
     nearness: Array,
     cosines: Array,
@@ -394,7 +395,7 @@ def _draw_beams(
         _draw_block(nearness, cosines, sines, j, stop - j, gx, gy)  # type: ignore[call-arg]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _settled(estimate: float, dx: float, dy: float, phase: float, step_rad: float) -> float:
     """The bearing of a corner, in beams, to the last bits, next to an estimate of it."""
     turn = 2.0 * math.pi / step_rad
@@ -402,7 +403,7 @@ def _settled(estimate: float, dx: float, dy: float, phase: float, step_rad: floa
     return estimate + change - turn * math.floor(change / turn + 0.5)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _draw_edge_on(
     ax: float,
     ay: float,
@@ -425,7 +426,7 @@ def _draw_edge_on(
             nearness[j] = max(nearness[j], min(max(v, least), most))
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _face(
     ax: float, ay: float, bx: float, by: float, heading: float, phase: float, step_rad: float
 ) -> tuple[float, float, float, float, float, float]:
@@ -463,7 +464,7 @@ def _face(
     return begin - _END_TOLERANCE, end + _END_TOLERANCE, gx, gy, least, 1.0 / nearest
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _invert(nearness: Array, max_range_m: float, ranges: Array) -> None:
     """Ranges, m, of inverse ranges; +inf beyond the greatest range."""
     for j in range(ranges.size):
@@ -471,7 +472,7 @@ def _invert(nearness: Array, max_range_m: float, ranges: Array) -> None:
         ranges[j] = r if r <= max_range_m else np.inf
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _cast_lidar(
     pose: tuple[float, float, float, float],
     walls: Array,
@@ -517,7 +518,7 @@ def _cast_lidar(
     return 1.0 / nearness.T
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _visible(origin: Array, points: Array, walls: Array, wall_z: Array) -> NDArray[np.bool_]:
     """See `visible`; walls (4, W) and wall_z (2, W).
 

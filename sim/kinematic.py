@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from sim.compiled import njit
 from sim.errors import InputError
 from sim.robot import SLIP_TIME_CONSTANT_S, DifferentialDrive, arc_increment
 from sim.route import TICK_S, OpenLoop
@@ -144,7 +144,7 @@ def wheel_commands(
     return commands
 
 
-@njit(cache=True)
+@njit()
 def _roll(
     commands_m: Array,
     normals: Array,

@@ -103,7 +103,7 @@ def main() -> None:
         run([uv, "venv", "--quiet", "--clear", "--python", "3.11", str(VENV)], env)
     env["VIRTUAL_ENV"] = str(VENV)
     lock = str(ROOT / "requirements.lock")
-    run([uv, "pip", "sync", "--quiet", "--require-hashes", lock], env)
+    run([uv, "pip", "sync", "--quiet", "--compile-bytecode", "--require-hashes", lock], env)
     local = ["--no-deps", "--no-build-isolation", "--editable", str(ROOT)]
     run([uv, "pip", "install", "--quiet", *local], env)
     STAMP.write_text(state)

@@ -33,7 +33,7 @@ def run_figure(recording: Recording, estimate: Estimate, name: str) -> Figure:
     map_axes = left.subplots()
     world = recording.truth.world if recording.truth else None
     if world is not None:
-        draw_world(map_axes, world, landmarks=len(world.landmarks) > 0)
+        draw_world(map_axes, world, landmarks=recording.landmarks is not None)
     known = recording.truth is not None
     if known:
         truth = recording.truth_at(estimate.stamps)
@@ -45,7 +45,7 @@ def run_figure(recording: Recording, estimate: Estimate, name: str) -> Figure:
         ellipse.set(facecolor="none", edgecolor=ESTIMATE, linewidth=0.8)
         map_axes.add_patch(ellipse)
     map_axes.set(xlabel="x, m", ylabel="y, m", aspect="equal")
-    map_axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=4, frameon=False)
+    map_axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2)
     if known:
         _draw_errors(right.subplots(3, 1, sharex=True), estimate, truth)
     return page

@@ -1,0 +1,35 @@
+"""Numba's decorator for the hot loops: compiled once, kept on disk, and told when it happens."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+from numba import njit as _njit
+from numba.core import event
+
+
+class _Announcer(event.Listener):  # type: ignore[misc]
+    """Says once that code is being compiled; code that is read from disk makes no event."""
+
+    _told = False
+
+    def on_start(self, event: Any) -> None:
+        if not self._told:
+            self._told = True
+            print(
+                "compiling numerical code (once; later runs read it from disk)",
+                file=sys.stderr,
+                flush=True,
+            )
+
+    def on_end(self, event: Any) -> None:
+        """Nothing to say: what follows shows that it is done."""
+
+
+event.register("numba:compile", _Announcer())
+
+
+def njit(**options: Any) -> Any:
+    """`numba.njit` with the compiled code kept on disk."""
+    return _njit(cache=True, **options)

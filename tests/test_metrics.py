@@ -1,0 +1,127 @@
+import numpy as np
+import pytest
+from evo.core import metrics as evo_metrics
+from evo.core.metrics import PoseRelation, Unit
+from evo.core.trajectory import PoseTrajectory3D
+from hypothesis import given
+from hypothesis import strategies as st
+
+from estimators.base import Estimate
+from experiments import metrics
+from sim import se2
+
+
+def trajectories(seed=0, n=400):
+    """A wandering truth, and an estimate that drifts away from it."""
+    rng = np.random.default_rng(seed)
+    steps = np.column_stack([np.full(n, 0.1037), np.zeros(n), 0.15 * rng.standard_normal(n)])
+    drift = np.array([0.004, 0.002, 0.01]) * rng.standard_normal((n, 3))
+    truth, means = [np.zeros(3)], [np.array([0.3, -0.2, 0.1])]
+    for step, error in zip(steps, drift, strict=True):
+        truth.append(se2.compose(truth[-1], step))
+        means.append(se2.compose(means[-1], step + error))
+    return np.array(truth), np.array(means)
+
+
+def for_evo(poses):
+    quaternion = np.zeros((len(poses), 4))
+    quaternion[:, 0], quaternion[:, 3] = np.cos(poses[:, 2] / 2), np.sin(poses[:, 2] / 2)
+    positions = np.column_stack([poses[:, :2], np.zeros(len(poses))])
+    return PoseTrajectory3D(positions, quaternion, np.arange(len(poses)) * 0.1)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_ate_agrees_with_evo(seed):
+    truth, means = trajectories(seed)
+    ape = evo_metrics.APE(PoseRelation.translation_part)
+    ape.process_data((for_evo(truth), for_evo(means)))
+    ours = metrics.rms(metrics.position_errors_m(truth, means))
+    assert ours == pytest.approx(ape.get_statistic(evo_metrics.StatisticsType.rmse), abs=1e-9)
+    reference, moved = for_evo(truth), for_evo(means)
+    moved.align(reference, correct_scale=False)
+    ape.process_data((reference, moved))
+    fitted = metrics.aligned(truth, means)
+    aligned = metrics.rms(metrics.position_errors_m(truth, fitted))
+    assert aligned == pytest.approx(ape.get_statistic(evo_metrics.StatisticsType.rmse), abs=1e-9)
+    assert aligned < ours
+
+
+@pytest.mark.parametrize("delta_m", [1.0, 5.0])
+def test_rpe_agrees_with_evo(delta_m):
+    truth, means = trajectories(4)
+    relations = (
+        (PoseRelation.translation_part, lambda e: np.hypot(e[:, 0], e[:, 1])),
+        (PoseRelation.rotation_angle_rad, lambda e: e[:, 2]),
+    )
+    for relation, ours in relations:
+        rpe = evo_metrics.RPE(relation, delta_m, Unit.meters, pairs_from_reference=True)
+        rpe.process_data((for_evo(truth), for_evo(means)))
+        errors = metrics.relative_errors(truth, means, metrics.pairs_by_distance(truth, delta_m))
+        expected = rpe.get_statistic(evo_metrics.StatisticsType.rmse)
+        assert metrics.rms(ours(errors)) == pytest.approx(expected, abs=1e-7)
+        assert metrics.rms(ours(errors)) == pytest.approx(expected, abs=1e-9, rel=1e-7)
+
+
+@given(st.tuples(st.floats(-9, 9), st.floats(-9, 9), st.floats(-3, 3)).map(np.array))
+def test_aligned_errors_do_not_see_a_rigid_motion(motion):
+    truth, means = trajectories(1, 60)
+    moved = se2.compose(motion, means)
+    before, after = metrics.aligned(truth, means), metrics.aligned(truth, moved)
+    assert np.allclose(before[:, :2], after[:, :2], atol=1e-9)
+    assert np.allclose(se2.wrap(before[:, 2] - after[:, 2]), 0, atol=1e-9)
+
+
+def test_alignment_is_the_least_squares_one():
+    truth, means = trajectories(2, 100)
+    best = metrics.alignment(truth, means)
+    least = metrics.rms(metrics.position_errors_m(truth, se2.compose(best, means)))
+    for nudge in np.vstack([np.eye(3), -np.eye(3)]) * 1e-3:
+        other = se2.compose(best + nudge, means)
+        assert metrics.rms(metrics.position_errors_m(truth, other)) > least
+
+
+def test_nees_has_the_chi_square_mean_and_leaves_singular_covariances_out():
+    rng = np.random.default_rng(0)
+    root = np.array([[0.3, 0, 0], [0.1, 0.2, 0], [0.02, -0.01, 0.05]])
+    truth = rng.normal(size=(20_000, 3))
+    means = truth + rng.standard_normal((20_000, 3)) @ root.T
+    covariances = np.tile(root @ root.T, (20_000, 1, 1))
+    covariances[0] = 0.0
+    covariances[1] = np.outer([1, 1, 1], [1, 1, 1])
+    values = metrics.nees(truth, means, covariances)
+    assert np.isnan(values[:2]).all()
+    assert np.nanmean(values) == pytest.approx(3.0, abs=0.06)
+    direct = (means[5] - truth[5]) @ np.linalg.solve(covariances[5], means[5] - truth[5])
+    assert values[5] == pytest.approx(direct)
+
+
+def test_ellipse_holds_95_percent():
+    rng = np.random.default_rng(1)
+    root = np.array([[0.4, 0.0], [0.25, 0.1]])
+    area = metrics.ellipse_area_m2(np.pad(root @ root.T, ((0, 1), (0, 1)))[None])[0]
+    sample = rng.standard_normal((100_000, 2)) @ root.T
+    distance = np.sum(sample * np.linalg.solve(root @ root.T, sample.T).T, axis=1)
+    assert np.mean(distance <= metrics.CHI2_95_2DOF) == pytest.approx(0.95, abs=0.003)
+    assert area == pytest.approx(np.pi * 5.991464547 * abs(np.linalg.det(root)))
+
+
+def test_rows_at_distances():
+    truth = np.column_stack([np.arange(11) * 0.5, np.zeros(11), np.zeros(11)])
+    assert metrics.at_distances(truth, np.array([0.0, 1.0, 1.2, 5.0, 9.0])).tolist() == [
+        0,
+        2,
+        3,
+        10,
+        -1,
+    ]
+
+
+def test_score_of_a_perfect_estimate_is_zero():
+    from tests.test_recording import small_recording
+
+    recording = small_recording()
+    truth = recording.truth_at(recording.frame_stamps)
+    estimate = Estimate(recording.frame_stamps, truth, np.tile(np.eye(3), (6, 1, 1)))
+    row = metrics.score(recording, estimate)
+    for key in ("ate_rmse_m", "heading_rmse_rad", "final_position_error_m", "nees_mean"):
+        assert row[key] == pytest.approx(0.0, abs=1e-12), key

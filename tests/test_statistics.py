@@ -1,0 +1,60 @@
+import numpy as np
+import pytest
+
+from experiments import statistics
+from experiments.statistics import Interval, verdict
+
+
+def test_verdicts():
+    assert verdict(Interval(1, 0.9, 1.1), 0.8, 1.25) == "reproduced"
+    assert verdict(Interval(1, 0.7, 1.1), 0.8, 1.25) == "undecided"
+    assert verdict(Interval(2, 1.5, 2.5), 0.8, 1.25) == "not reproduced"
+    assert verdict(Interval(2, np.nan, np.nan), 0.8) == "undecided"
+
+
+@pytest.mark.parametrize("kind", ["mean", "bootstrap", "log_ratio"])
+def test_intervals_cover_the_truth_as_often_as_they_say(kind):
+    rng, hits, n = np.random.default_rng(0), 0, 400
+    for _ in range(n):
+        sample = rng.gamma(4.0, 0.25, 30)
+        if kind == "mean":
+            found, truth = statistics.mean_interval(sample), 1.0
+        elif kind == "bootstrap":
+            found = statistics.bootstrap_interval(sample, lambda v: float(v.mean()), rng, 300)
+            truth = 1.0
+        else:
+            common = rng.lognormal(size=30)
+            found = statistics.log_ratio_interval(
+                common * 2.0 * rng.lognormal(0, 0.2, 30), common * rng.lognormal(0, 0.2, 30)
+            )
+            truth = 2.0
+        hits += found.low <= truth <= found.high
+    assert 0.90 <= hits / n <= 0.98
+
+
+def test_share_interval_is_conservative():
+    rng = np.random.default_rng(1)
+    hits = rng.binomial(200, 0.95, 500)
+    covered = [statistics.share_interval(int(h), 200) for h in hits]
+    assert np.mean([c.low <= 0.95 <= c.high for c in covered]) >= 0.945
+
+
+def test_equivalence_and_trend():
+    rng = np.random.default_rng(2)
+    a = rng.lognormal(0, 0.1, 100)
+    _, p_same = statistics.equivalent(a * rng.lognormal(0.0, 0.1, 100), a, 0.25)
+    ratio, p_other = statistics.equivalent(a * rng.lognormal(0.4, 0.1, 100), a, 0.25)
+    assert p_same < 0.001
+    assert p_other > 0.5
+    assert ratio.value == pytest.approx(np.exp(0.4), rel=0.05)
+    falling = np.arange(5)[::-1] + 0.8 * rng.standard_normal((20, 5))
+    assert statistics.page_trend_p(falling) < 1e-4
+    assert statistics.page_trend_p(-falling) > 0.5
+    assert statistics.wilcoxon_p(a, 1.2 * a * rng.lognormal(0, 0.1, 100)) < 1e-6
+
+
+def test_anees_band():
+    rng = np.random.default_rng(3)
+    low, high = statistics.anees_band(20)
+    means = rng.chisquare(3, (4000, 20)).mean(axis=1) / 3
+    assert np.mean((means > low) & (means < high)) == pytest.approx(0.95, abs=0.012)
