@@ -1,0 +1,83 @@
+"""Speed of the exact rays, from random poses in the free space of a hall with random boxes."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from experiments.bench.measure import Measurement, median_time_s
+from sim.casting import SegmentCaster, cast_lidar, visible
+from sim.sensors import Laser, Lidar3D
+from sim.world import World
+
+Array = NDArray[np.float64]
+
+_HALF_HALL_M = 20.0
+_N_POSES = 500
+_GOAL_US = {30: 10.0, 300: 40.0}
+_LASER = Laser(n_beams=721, fov_rad=math.pi, max_range_m=80.0)
+
+
+def run() -> list[Measurement]:
+    """Scans in worlds of 30 and 300 boxes; a 3D cloud and lines of sight."""
+    return [m for n_boxes in _GOAL_US for m in _scans(n_boxes)] + _other_rays()
+
+
+def _scans(n_boxes: int) -> list[Measurement]:
+    world, poses = hall(n_boxes)
+    caster = SegmentCaster(world, _LASER)
+    batch = 50  # small enough for its output to stay in the processor's cache
+    batches = [(poses[i : i + batch],) for i in range(0, len(poses), batch)]
+    each = median_time_s(caster.cast, [(pose,) for pose in poses])
+    many = median_time_s(caster.cast_many, batches) / batch
+    name, faces = f"sim.scan_exact_{n_boxes}", f"721 beams, {len(world.walls)} faces"
+    return [
+        Measurement(f"{name}_us", each * 1e6, "us", _GOAL_US[n_boxes], note=f"{faces}, one call"),
+        Measurement(f"{name}_batch_us", many * 1e6, "us", note=f"{faces}, in batches of {batch}"),
+    ]
+
+
+def _other_rays() -> list[Measurement]:
+    world, poses = hall(75)
+    rng = np.random.default_rng(3)
+    points = rng.uniform([-19.0, -19.0, 0.2], [19.0, 19.0, 1.8], (800, 3))
+    lidar = Lidar3D()
+    cloud = median_time_s(lambda pose: cast_lidar(world, lidar, pose), [(p,) for p in poses[:50]])
+    origins = [(np.append(pose[:2], 0.5),) for pose in poses[:50]]
+    sight = median_time_s(lambda origin: visible(world, origin, points), origins)
+    faces = f"{len(world.walls)} faces"
+    return [
+        Measurement("sim.cloud_exact_us", cloud * 1e6, "us", note=f"16 x 720 rays, {faces}"),
+        Measurement("sim.visible_exact_us", sight * 1e6, "us", note=f"800 points, {faces}"),
+    ]
+
+
+def hall(n_boxes: int, n_poses: int = _N_POSES) -> tuple[World, Array]:
+    """A square hall of 40 m with boxes of 0.4 to 2 m, turned at random, and poses between them.
+
+    Returns
+    -------
+    World
+        Four faces a box, which may overlap, and the four of the hall.
+    Array
+        (n_poses, 3) m, m, rad; at least 0.1 m from the boxes.
+    """
+    rng = np.random.default_rng([n_boxes, 1])
+    centres = rng.uniform(-18.0, 18.0, (n_boxes, 2))
+    halves = rng.uniform(0.2, 1.0, (n_boxes, 2))
+    yaws = rng.uniform(-np.pi, np.pi, n_boxes)
+    axes = np.stack([[np.cos(yaws), np.sin(yaws)], [-np.sin(yaws), np.cos(yaws)]]).transpose(
+        2, 0, 1
+    )
+    square = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    corners = centres[:, None] + (square * halves[:, None]) @ axes
+    corners = np.concatenate([_HALF_HALL_M * square[None], corners])
+    walls = np.concatenate([corners, np.roll(corners, -1, axis=1)], axis=2).reshape(-1, 4)
+    world = World("hall", walls, np.tile([0.0, 2.0], (len(walls), 1)))
+
+    poses = rng.uniform([-19.5, -19.5, -np.pi], [19.5, 19.5, np.pi], (4 * n_poses, 3))
+    offset = np.einsum("bij,nbj->nbi", axes, poses[:, None, :2] - centres)
+    free = np.any(np.abs(offset) > halves + 0.1, axis=2).all(axis=1)
+    return world, poses[free][:n_poses]
