@@ -1,0 +1,188 @@
+"""The figures of puzzlebot2024."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from experiments.figures.run import covariance_ellipse
+from experiments.figures.style import BLACK, BLUE, CYCLE, ORANGE, figure
+from experiments.seeds import stream
+from experiments.studies.puzzlebot2024 import (
+    COVERAGE_KS,
+    JUDGED_SEED,
+    NOMINAL,
+    ideal_beliefs,
+    slipping,
+)
+from sim.kinematic import run_batch
+from sim.route import OpenLoop
+
+_SQUARE = OpenLoop(
+    tuple(leg for _ in range(3) for leg in ((0.4, 0.0, 3.0), (0.0, 0.6, np.pi / 2 / 0.6)))
+    + ((0.4, 0.0, 3.0),)
+)
+_METHODS = {
+    "wheel_truth": "wheel truth",
+    "sampled": "end poses, sampled",
+    "linearised": "end poses, linearised",
+}
+_PARAMETERS = {"kr": "$k_r$", "kl": "$k_l$"}
+
+
+def ideal_and_real(n_real: int = 40) -> Figure:
+    """Draw the report's RViz view: the ideal robot with its ellipses, and real robots."""
+    page = figure(9.0, 4.4)
+    for ax, k in zip(page.subplots(1, 2), (1e-5, 1e-4), strict=True):
+        robot = slipping(k)
+        runs = run_batch(robot, _SQUARE, n_real, stream(JUDGED_SEED, "slip"))
+        ax.plot(*runs.poses[1:, :, :2].T, color=ORANGE, lw=0.4, alpha=0.35)
+        ax.plot(*runs.poses[0, :, :2].T, color=ORANGE, lw=1.2, label="real robot (40 runs)")
+        ax.plot(*runs.end_poses[:, :2].T, ".", color=ORANGE, ms=3)
+        _, means, covariances = ideal_beliefs(_SQUARE, robot.kr, robot.kl)
+        ax.plot(*means[:, :2].T, color=BLUE, lw=1.4, label="ideal robot")
+        for i in np.linspace(0, len(means) - 1, 15).astype(int)[1:]:
+            ellipse = covariance_ellipse(means[i], covariances[i, :2, :2])
+            ellipse.set(facecolor="none", edgecolor=BLUE, linewidth=0.9)
+            ellipse.set_label("95 % ellipse" if i == len(means) - 1 else "")
+            ax.add_patch(ellipse)
+        ax.set(xlabel="x, m", ylabel="y, m", aspect="equal")
+        ax.set_title(f"$k_r$ = {robot.kr:.2g} m, $k_l$ = {robot.kl:.2g} m")
+    handles, labels = ax.get_legend_handles_labels()
+    page.legend(handles, labels, loc="outside lower center", ncols=3)
+    return page
+
+
+def ellipse_area(areas: pd.DataFrame, crossover: pd.DataFrame) -> Figure:
+    """Draw the 95 % ellipse's area against distance, and where heading takes over."""
+    page = figure(9.0, 3.8)
+    left, right = page.subplots(1, 2)
+    for i, (name, table) in enumerate(areas.groupby("manoeuvre", sort=False)):
+        for k, part in table.groupby("k_m"):
+            style = "-" if k < 5e-5 else "--"
+            label = f"{name}, k = {k:g} m"
+            left.plot(part["distance_m"], part["area_m2"], style, color=CYCLE[i], label=label)
+    left.set(xlabel="distance rolled, m", ylabel="area of the 95 % ellipse, m²", yscale="log")
+    left.set_ylim(bottom=1e-6)
+    page.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    theory = NOMINAL.track_m * np.sqrt(3.0) / 2.0
+    found = 1000 * crossover["crossover_m"].to_numpy()
+    right.hist(found, bins=8, color=BLUE, alpha=0.7)
+    right.axvline(1000 * theory, color=BLACK, lw=1.2)
+    right.annotate(
+        f"track √3 / 2 = {1000 * theory:.1f} mm",
+        (1000 * theory, 1.0),
+        xycoords=("data", "axes fraction"),
+        xytext=(4, 3),
+        textcoords="offset points",
+    )
+    right.set(xlabel="distance at which heading takes over, mm", ylabel="runs")
+    return page
+
+
+def calibration(table: pd.DataFrame) -> Figure:
+    """Draw histograms of the estimates over the truth, per method, k and arm."""
+    ks = sorted(table["k_m"].unique())
+    page = figure(9.0, 6.2)
+    axes = page.subplots(2, len(ks), sharex="row")
+    slips = table[table["parameter"].isin(_PARAMETERS)]
+    for row, joint in enumerate((False, True)):
+        for column, k in enumerate(ks):
+            ax = axes[row, column]
+            chosen = slips[(slips["joint"] == joint) & (slips["k_m"] == k)]
+            ratios = chosen["value"] / chosen["truth"]
+            edges = np.linspace(ratios.min() * 0.97, min(ratios.max() * 1.03, 3.0), 36)
+            for i, (method, label) in enumerate(_METHODS.items()):
+                values = ratios[chosen["method"] == method]
+                ax.hist(values, bins=edges, color=CYCLE[i], alpha=0.6, label=label, density=True)
+            ax.axvline(1.0, color=BLACK, lw=1.0)
+            arm = "gain and track joint" if joint else "nominal geometry"
+            ax.set_title(f"k = {k:g} m, {arm}", fontsize="small")
+            ax.set_yticks([])
+            if row == 1:
+                ax.set_xlabel("estimate of $k_r$, $k_l$ over the truth")
+        axes[row, 0].set_ylabel("density")
+    page.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    return page
+
+
+def table_1(table: pd.DataFrame) -> Figure:
+    """Print table 1 of the report, with our robots' ends and kr, kl from each case alone."""
+    page = figure(9.0, 3.4)
+    ax = page.subplots()
+    ax.axis("off")
+    header = [
+        "case",
+        "v, m/s",
+        "ω, rad/s",
+        "T, s",
+        "ideal x, m",
+        "real x, m",
+        "ideal θ, rad",
+        "real θ, rad",
+        "$k_r$, 1e-4 m",
+        "$k_l$, 1e-4 m",
+    ]
+    cells = [
+        [
+            row.case.replace("_", " "),
+            f"{row.v_mps:g}",
+            f"{row.omega_radps:g}",
+            f"{row.duration_s:g}",
+            f"{row.ideal_x_m:.2f}",
+            f"{row.real_x_mean_m:.3f} ± {row.real_x_sd_m:.3f}",
+            f"{row.ideal_heading_rad:.2f}",
+            f"{row.real_heading_mean_rad:.3f} ± {row.real_heading_sd_rad:.3f}",
+            f"{1e4 * row.kr_m:.2f} [{1e4 * row.kr_low_m:.2f}, {1e4 * row.kr_high_m:.2f}]",
+            f"{1e4 * row.kl_m:.2f} [{1e4 * row.kl_low_m:.2f}, {1e4 * row.kl_high_m:.2f}]",
+        ]
+        for row in table.itertuples()
+    ]
+    drawn = ax.table(cells, colLabels=header, loc="center", cellLoc="center")
+    drawn.auto_set_font_size(False)
+    drawn.set_fontsize(7.5)
+    drawn.auto_set_column_width(list(range(len(header))))
+    drawn.scale(1.0, 1.35)
+    for (row_number, _), cell in drawn.get_celld().items():
+        cell.set_edgecolor("#cccccc")
+        if row_number == 0:
+            cell.set_text_props(weight="bold")
+    truth = slipping(1e-4)
+    ax.set_title(
+        f"table 1, 20 runs a case; true $k_r$ = {1e4 * truth.kr:g}e-4 m, "
+        f"$k_l$ = {1e4 * truth.kl:g}e-4 m",
+        fontsize="medium",
+    )
+    return page
+
+
+def coverage(table: pd.DataFrame) -> Figure:
+    """Draw the share of true ends in the ideal robot's ellipse and ellipsoid against k."""
+    page = figure(9.0, 4.0)
+    axes = page.subplots(1, 2, sharey=True)
+    titles = {
+        "in_ellipse": "position in the 95 % ellipse",
+        "in_ellipsoid": "pose in the 95 % ellipsoid",
+    }
+    for ax, (column, title) in zip(axes, titles.items(), strict=True):
+        ax.axhspan(0.93, 0.97, color=BLACK, alpha=0.1, lw=0, label="0.93 to 0.97")
+        for i, (name, part) in enumerate(table.groupby("case", sort=False)):
+            share = part[column] / part["runs"]
+            error = 1.96 * np.sqrt(share * (1 - share) / part["runs"])
+            linear = str(name).startswith("linear")
+            ax.errorbar(
+                part["k_m"],
+                share,
+                error,
+                fmt="-o" if linear else "--s",
+                ms=3,
+                lw=1.0,
+                color=CYCLE[i % 4 if linear else (i - 4) % 5],
+                label=str(name).replace("_", " "),
+            )
+        ax.set(xlabel="k, m ($k_r$ = 1.5 k, $k_l$ = 0.5 k)", xscale="log", title=title)
+        ax.set_xlim(min(COVERAGE_KS) * 0.7, max(COVERAGE_KS) * 1.4)
+    axes[0].set_ylabel("share of runs")
+    page.legend(*axes[0].get_legend_handles_labels(), loc="outside right center")
+    return page
