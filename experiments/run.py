@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import hydra
+import numpy as np
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
@@ -124,6 +125,9 @@ def _status(recording: Recording, estimate: Estimate) -> str:
     """`ok`, or what the recording or the estimator has to report."""
     if recording.status != "ok":
         return f"recording: {recording.status}"
+    lost = np.isnan(estimate.means).any(axis=1) | np.isnan(estimate.covariances).any(axis=(1, 2))
+    if estimate.status == "ok" and lost.any():
+        return f"not a number at {estimate.stamps[np.argmax(lost)]:.2f} s"
     return estimate.status
 
 

@@ -9,7 +9,7 @@ from numba import njit as _njit
 from numba.core import event
 
 
-class _Announcer(event.Listener):  # type: ignore[misc]
+class _Announcer(event.Listener):
     """Says once that code is being compiled; code that is read from disk makes no event."""
 
     _told = False

@@ -20,8 +20,10 @@ from sim.kinematic import run_batch
 from sim.route import OpenLoop
 
 _SQUARE = OpenLoop(
-    tuple(leg for _ in range(3) for leg in ((0.4, 0.0, 3.0), (0.0, 0.6, np.pi / 2 / 0.6)))
-    + ((0.4, 0.0, 3.0),)
+    (
+        *(leg for _ in range(3) for leg in ((0.4, 0.0, 3.0), (0.0, 0.6, np.pi / 2 / 0.6))),
+        (0.4, 0.0, 3.0),
+    )
 )
 _METHODS = {
     "wheel_truth": "wheel truth",

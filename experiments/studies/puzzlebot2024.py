@@ -146,7 +146,7 @@ def crossover(n_runs: int) -> pd.DataFrame:
     rows = []
     for run_number in range(n_runs):
         rng = stream(JUDGED_SEED + run_number, "slip")
-        batch = run_batch(robot, route, 1, rng, sample_s=0.01)
+        batch = run_batch(robot, route, 1, rng, sample_s=FRAME_S)
         estimator = Odometry(k, k)
         geometry = RobotGeometry(NOMINAL.wheel_radius_m, NOMINAL.track_m)
         prior = Prior(geometry, SensorSuite(), np.zeros(3), np.zeros((3, 3)))
