@@ -31,7 +31,10 @@ Kernel = Literal["tukey", "huber", "none"]
 _COARSE_POINTS = 6  # points that stand for a line of the source until the poses are close
 _GRAZING = 0.001  # squared sine below which a beam along a wall is not trusted further
 _HUBER, _TUKEY = 1.345, 6.0  # tuning constants, in standard deviations
+_LEAST_MEMBERS = 3  # points on a line before it holds a direction
+_AGREEMENT = 6.0  # range standard deviations from a line of the other scan
 LEAST_OVERLAP = 0.6  # share of the source's points that must agree with the target
+LEAST_AGREEMENT = 0.5  # the same of those, in both scans, that speak about any one direction
 LEAST_INFORMATION = 4.0  # information that the noise of the lines alone can feign, times this
 
 
@@ -46,8 +49,9 @@ class Registration:
     metric
         `point_to_line` or `point_to_point`.
     status
-        `ok`; `empty` (a scan shows too little), `poor_overlap` (too few points agree),
-        `degenerate` (some direction is not held by the scans), `not_converged`.
+        `ok`; `empty` (a scan shows too little); `poor_overlap` (too few points agree, in all
+        or of those that speak about some direction); `degenerate` (some direction is not held
+        by the scans); `not_converged`.
     matches
         (K,) the target's line or point that each point was matched with, -1 for none.
     residuals_m
@@ -203,14 +207,19 @@ def _nearest_in_tree(points: Array, order: Indices, x: float, y: float) -> tuple
 
 @njit(cache=True, error_model="numpy")
 def _heading_by_lines(
-    source: Array, source_ends: Indices, target: Array, target_ends: Indices, window: float
+    source: Array,
+    source_ends: Indices,
+    target: Array,
+    target_ends: Indices,
+    guess: float,
+    window: float,
 ) -> float:
-    """Turn of the source, within +-window, in which most of its lines agree with the target's."""
+    """Heading of the source within +-window of a guess, in which most lines have a like one."""
     bins = 180
     votes = np.zeros(bins + 1)
     for a in range(len(source)):
         n_a = source_ends[a, 1] - source_ends[a, 0] + 1
-        heading = math.atan2(source[a, 1], source[a, 0])
+        heading = math.atan2(source[a, 1], source[a, 0]) + guess
         length_a = source[a, 4] - source[a, 3]
         for b in range(len(target)):
             turn = math.atan2(target[b, 1], target[b, 0]) - heading
@@ -234,12 +243,14 @@ def _heading_by_lines(
     for k in range(best - 2, best + 3):
         total += votes[k]
         moment += votes[k] * k
-    return (moment / total * 2.0 / bins - 1.0) * window if most > 0.0 else 0.0
+    if most > 0.0:
+        guess += (moment / total * 2.0 / bins - 1.0) * window
+    return guess
 
 
 @njit(cache=True, error_model="numpy")
 def _representatives(line_of_point: Indices, ends: Indices) -> tuple[Indices, Array]:
-    """A few points for each line, with the number of points they stand for."""
+    """A few points for each line, which together count as the root of the line's points."""
     chosen = np.empty(_COARSE_POINTS * len(ends), np.int64)
     weights = np.empty(len(chosen))
     n = 0
@@ -250,7 +261,7 @@ def _representatives(line_of_point: Indices, ends: Indices) -> tuple[Indices, Ar
             i = first + (last - first) * j // (here - 1)
             if line_of_point[i] == k:
                 chosen[n] = i
-                weights[n] = (last - first + 1) / here
+                weights[n] = math.sqrt(last - first + 1.0) / here
                 n += 1
     return chosen[:n].copy(), weights[:n].copy()
 
@@ -277,6 +288,17 @@ def _step(normal: Array, gradient: Array, pose: Array) -> tuple[float, float]:
     pose[1] += dy
     pose[2] += turn
     return math.hypot(dx, dy), abs(turn)
+
+
+@njit(cache=True, error_model="numpy")
+def _add_square(matrix: Array, weight: float, a: float, b: float, c: float) -> None:
+    """Add weight times the square of (a, b, c) to the lower half of a matrix."""
+    matrix[0, 0] += weight * a * a
+    matrix[1, 0] += weight * a * b
+    matrix[1, 1] += weight * b * b
+    matrix[2, 0] += weight * a * c
+    matrix[2, 1] += weight * b * c
+    matrix[2, 2] += weight * c * c
 
 
 @njit(cache=True, error_model="numpy")
@@ -361,12 +383,7 @@ def _align(
             residuals[i] = miss
             if to_lines:
                 lever = n2 * qx - n1 * qy
-                normal[0, 0] += weight * n1 * n1
-                normal[1, 0] += weight * n1 * n2
-                normal[1, 1] += weight * n2 * n2
-                normal[2, 0] += weight * n1 * lever
-                normal[2, 1] += weight * n2 * lever
-                normal[2, 2] += weight * lever * lever
+                _add_square(normal, weight, n1, n2, lever)
                 gradient[0] += weight * miss * n1
                 gradient[1] += weight * miss * n2
                 gradient[2] += weight * miss * lever
@@ -392,17 +409,22 @@ def _judge(
     points: Array, rays: Array, pose: Array, to_lines: bool, segments: Array,
     line_of_point: Indices, matches: Indices, residuals: Array, weights: Array, noise: float,
 ) -> tuple[Array, Array, Array]:  # fmt: skip
-    """Normal matrix of the metric; information of the target's lines, and its noise (3, 3) each."""
+    """Normal matrix of the metric, and the informations of `Registration`; lower halves."""
     normal, information, feigned = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
+    members = np.zeros(len(segments), np.int64)
+    for i in range(len(points)):
+        line = matches[i] if to_lines else line_of_point[matches[i]]
+        if weights[i] > 0.0 and line >= 0:
+            members[line] += 1
     for i in range(len(points)):
         weight = weights[i]
+        qx = cos * points[i, 0] - sin * points[i, 1]
+        qy = sin * points[i, 0] + cos * points[i, 1]
         if not weight > 0.0:
             if residuals[i] != residuals[i]:
                 matches[i] = -1
             continue
-        qx = cos * points[i, 0] - sin * points[i, 1]
-        qy = sin * points[i, 0] + cos * points[i, 1]
         if not to_lines:
             normal[0, 0] += weight
             normal[1, 1] += weight
@@ -417,38 +439,87 @@ def _judge(
             facing = n1 * (cos * rays[i, 0] - sin * rays[i, 1])
             facing += n2 * (sin * rays[i, 0] + cos * rays[i, 1])
             weight = 1.0 / (noise * noise * (facing * facing + _GRAZING))
-        lever, turned = n2 * qx - n1 * qy, n1 * qx + n2 * qy
-        shaky = weight * segments[line, 9]
-        information[0, 0] += weight * n1 * n1
-        information[1, 0] += weight * n1 * n2
-        information[1, 1] += weight * n2 * n2
-        information[2, 0] += weight * n1 * lever
-        information[2, 1] += weight * n2 * lever
-        information[2, 2] += weight * lever * lever
-        feigned[0, 0] += shaky * n2 * n2
-        feigned[1, 0] -= shaky * n1 * n2
-        feigned[1, 1] += shaky * n1 * n1
-        feigned[2, 0] -= shaky * n2 * turned
-        feigned[2, 1] += shaky * n1 * turned
-        feigned[2, 2] += shaky * turned * turned
-    return information if to_lines else normal, information, feigned
+        if to_lines:
+            _add_square(normal, weight, n1, n2, n2 * qx - n1 * qy)
+        if members[line] < _LEAST_MEMBERS:
+            continue  # a point or two may be there by chance
+        _add_square(information, weight, n1, n2, n2 * qx - n1 * qy)
+        _add_square(feigned, weight * segments[line, 9], -n2, n1, n1 * qx + n2 * qy)
+    return normal, information, feigned
+
+
+@njit(cache=True, error_model="numpy")
+def _confront(
+    points: Array, line_of_point: Indices, segments: Array, pose: Array, lever_x: float,
+    lever_y: float, turn: float, ranges: Array, rays: Array, other_line: Indices,
+    other_segments: Array, full_circle: bool, tolerance: float, agreed: Array, denied: Array,
+) -> None:  # fmt: skip
+    """See what a scan says of another one's points, and add to two sums of J J^T (3, 3).
+
+    Points on a line of the other scan agree. Those that stand well before what the beams on
+    both sides see are denied. The rest is hidden or out of view, and says nothing. J is of the
+    points' own lines, about the target's axes: turned by `turn`, with levers from a point.
+    """
+    cos, sin = math.cos(pose[2]), math.sin(pose[2])
+    c, s = math.cos(turn), math.sin(turn)
+    n = len(rays)
+    j = 0
+    for i in range(len(points)):
+        line = line_of_point[i]
+        if line < 0:
+            continue
+        x = cos * points[i, 0] - sin * points[i, 1] + pose[0]
+        y = sin * points[i, 0] + cos * points[i, 1] + pose[1]
+        # the beams on both sides: the last one was near
+        found = False
+        for _ in range(n):
+            after = j + 1 if j + 1 < n else 0
+            if rays[j, 0] * y - rays[j, 1] * x < 0.0:
+                if j == 0 and not full_circle:
+                    break
+                j = j - 1 if j > 0 else n - 1
+            elif rays[after, 0] * y - rays[after, 1] * x >= 0.0:
+                if after == 0 and not full_circle:
+                    break
+                j = after
+            else:
+                found = True
+                break
+        if not found or (after == 0 and not full_circle):
+            j = min(j, n - 2)
+            continue
+        if rays[j, 0] * x + rays[j, 1] * y <= 0.0:
+            continue
+        near = False
+        for k in (j, after):
+            other = other_line[k]
+            if other >= 0:
+                miss = other_segments[other, 0] * x + other_segments[other, 1] * y
+                near = near or abs(miss - other_segments[other, 2]) < tolerance
+        if not near and math.hypot(x, y) > min(ranges[j], ranges[after]) - 2.0 * tolerance:
+            continue
+        n1 = c * segments[line, 0] - s * segments[line, 1]
+        n2 = s * segments[line, 0] + c * segments[line, 1]
+        qx = c * (points[i, 0] - lever_x) - s * (points[i, 1] - lever_y)
+        qy = s * (points[i, 0] - lever_x) + c * (points[i, 1] - lever_y)
+        _add_square(agreed if near else denied, 1.0, n1, n2, n2 * qx - n1 * qy)
 
 
 @njit(cache=True, error_model="numpy")
 def _register(
-    points: Array, rays: Array, source_line: Indices, source_ends: Indices,
-    source_segments: Array, target_points: Array, target_rays: Array, target_line: Indices,
-    target_ends: Indices, target_segments: Array, full_circle: bool, pose: Array, to_lines: bool,
-    by_tree: bool, stages: Array, window: float, noise: float, trim: float, increment_m: float,
-    increment_rad: float,
-) -> tuple[Indices, Array, Array, int, bool, Array, Array, Array]:  # fmt: skip
+    ranges: Array, points: Array, rays: Array, source_line: Indices, source_ends: Indices,
+    source_segments: Array, target_ranges: Array, target_points: Array, target_rays: Array,
+    target_line: Indices, target_ends: Indices, target_segments: Array, full_circle: bool,
+    pose: Array, to_lines: bool, by_tree: bool, stages: Array, window: float, noise: float,
+    trim: float, increment_m: float, increment_rad: float,
+) -> tuple[Indices, Array, Array, int, bool, Array, Array, Array, Array, Array]:  # fmt: skip
     """All of a registration; `stages` (S, 5): gate, kernel, its scale, iterations, sparse."""
     n = len(points)
     matches, residuals, weights = np.zeros(n, np.int64), np.zeros(n), np.zeros(n)
     order = _plant_tree(target_points) if by_tree else np.empty(0, np.int64)
     if window > 0.0:
-        pose[2] += _heading_by_lines(
-            source_segments, source_ends, target_segments, target_ends, window
+        pose[2] = _heading_by_lines(
+            source_segments, source_ends, target_segments, target_ends, pose[2], window
         )
     few, counts = _representatives(source_line, source_ends)
     every, ones = np.arange(n), np.ones(n)
@@ -468,7 +539,22 @@ def _register(
         points, rays, pose, to_lines, target_segments, target_line, matches, residuals, weights,
         noise,
     )  # fmt: skip
-    return matches, residuals, weights, iterations, converged, normal, information, feigned
+    agreed, denied = np.zeros((3, 3)), np.zeros((3, 3))
+    tolerance = _AGREEMENT * noise
+    _confront(
+        points, source_line, source_segments, pose, 0.0, 0.0, pose[2], target_ranges, target_rays,
+        target_line, target_segments, full_circle, tolerance, agreed, denied,
+    )  # fmt: skip
+    cos, sin = math.cos(pose[2]), math.sin(pose[2])
+    back = np.array([-cos * pose[0] - sin * pose[1], sin * pose[0] - cos * pose[1], -pose[2]])
+    _confront(
+        target_points, target_line, target_segments, back, pose[0], pose[1], 0.0, ranges, rays,
+        source_line, source_segments, full_circle, tolerance, agreed, denied,
+    )  # fmt: skip
+    return (
+        matches, residuals, weights, iterations, converged, normal, information, feigned, agreed,
+        denied,
+    )  # fmt: skip
 
 
 _KERNELS = {"none": 0, "huber": 1, "tukey": 2}
@@ -548,35 +634,37 @@ def register(
     if to_lines:
         stages = np.array(
             [
-                [gate_m, 3, 0.15 * gate_m, most, 1],
-                [0.25 * gate_m, 3, 0.05 * gate_m, most, 1],
-                [0.15 * gate_m, code, 3.0 * scale, most, 0],
-                [0.15 * gate_m, code, scale, most, 0],
+                [gate_m, 3, 0.3, most, 1],
+                [min(gate_m, 0.5), 3, 0.1, most, 1],
+                [min(gate_m, 0.3), code, 3.0 * scale, most, 0],
+                [min(gate_m, 0.3), code, scale, most, 0],
             ]
         )
     else:
         stages = np.array(
             [
-                [gate_m, 3, 0.25 * gate_m, most, 0],
-                [0.25 * gate_m, 3, 0.1 * gate_m, most, 0],
-                [0.1 * gate_m, code, scale, most, 0],
+                [gate_m, 3, 0.5, most, 0],
+                [min(gate_m, 0.5), 3, 0.2, most, 0],
+                [min(gate_m, 0.2), code, scale, most, 0],
             ]
         )
     noise = max(source.noise_m, target.noise_m)
     found = _register(
-        source.points, source.rays, source.line_of_point, source.line_ends, source.segments,
-        target.points, target.rays, target.line_of_point, target.line_ends, target.segments,
-        target.full_circle, pose, to_lines, search == "kdtree", stages, window, noise, trim,
-        increment_m, increment_rad,
+        source.ranges_m, source.points, source.rays, source.line_of_point, source.line_ends,
+        source.segments, target.ranges_m, target.points, target.rays, target.line_of_point,
+        target.line_ends, target.segments, target.full_circle, pose, to_lines,
+        search == "kdtree", stages, window, noise, trim, increment_m, increment_rad,
     )  # fmt: skip
     matches, residuals, weights, iterations, converged = found[:5]
-    normal, information, feigned = (_symmetric(lower) for lower in found[5:])
+    normal, information, feigned, agreed, denied = (_symmetric(lower) for lower in found[5:])
     pose[2] = math.remainder(pose[2], 2.0 * math.pi)
     status = "ok"
     if np.count_nonzero(weights) < LEAST_OVERLAP * len(weights):
         status = "poor_overlap"
     elif not _positive_definite(information - LEAST_INFORMATION * feigned):
         status = "degenerate"
+    elif not _positive_definite((1.0 - LEAST_AGREEMENT) * agreed - LEAST_AGREEMENT * denied):
+        status = "poor_overlap"
     elif not converged:
         status = "not_converged"
     return Registration(

@@ -28,6 +28,7 @@ Covariance = Literal["censi", "censi_last", "hessian", "sampling", "unscented_ce
 FAILED = ("empty", "poor_overlap", "not_converged")
 
 _LEAST_SIGMA_M = 1e-4  # a laser without noise still has rounding
+_LEAST_GATE_M, _MOST_GATE_M = 0.5, 2.0
 _HEADING_WINDOW_RAD = math.pi / 6.0  # constant velocity misses the turns: search the headings
 # Constant velocity is not trusted further than to these standard deviations
 _GUESS_FLOOR_M, _GUESS_FLOOR_RAD, _GUESS_SHARE = 0.05, 0.05, 0.5
@@ -247,6 +248,7 @@ class IcpOdometry:
             in_laser.mean,
             metric=self.metric,
             search=self.search,
+            gate_m=self._gate_m(in_laser.covariance),
             heading_window_rad=0.0 if self.use_odometry_guess else _HEADING_WINDOW_RAD,
         )
         if found.status in FAILED:
@@ -256,6 +258,12 @@ class IcpOdometry:
         if found.status == "degenerate":
             motion = _completed(motion, found, in_laser)
         return motion.seen_from(se2.inverse(self._T_base_laser)), found.status
+
+    @staticmethod
+    def _gate_m(guess_covariance: Array) -> float:
+        """First gate of a registration: wide enough for what the guess may be wrong by."""
+        spread_m = math.sqrt(guess_covariance[0, 0] + guess_covariance[1, 1])
+        return min(_LEAST_GATE_M + 4.0 * spread_m, _MOST_GATE_M)
 
     def _covariance_of(
         self, found: Registration, source: PreparedScan, target: PreparedScan, of_guess: Array

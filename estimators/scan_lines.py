@@ -53,7 +53,8 @@ class PreparedScan:
         (L, 2) first and last point of each line.
     segments
         (L, 10) normal (2), distance m, start and end along the line m, rays to both ends (2, 2),
-        and the variance of the line's direction, rad^2.
+        and the variance of the line's direction, rad^2. A line ends at the beam next to its last
+        point, for so far it may go on.
     noise_m
         Standard deviation of the ranges about straight walls, measured in the scan itself.
     full_circle
@@ -316,18 +317,29 @@ def _segment(
 
 @njit(cache=True, error_model="numpy")
 def _describe(
-    lines: Array, information: Array, ends: Indices, rays: Array, beams: Indices, noise: float
+    lines: Array,
+    information: Array,
+    ends: Indices,
+    rays: Array,
+    beams: Indices,
+    spacing: float,
+    noise: float,
 ) -> Array:
     """Segments (L, 10) of the lines: see `PreparedScan.segments`."""
     segments = np.empty((len(lines), 10))
+    cos, sin = math.cos(spacing), math.sin(spacing)
     for k in range(len(lines)):
         m1, m2 = lines[k, 0], lines[k, 1]
         size = math.hypot(m1, m2)
         n1, n2 = m1 / size, m2 / size
         segments[k, 0], segments[k, 1], segments[k, 2] = n1, n2, 1.0 / size
         for side in range(2):
-            u, v = rays[ends[k, side], 0], rays[ends[k, side], 1]
-            segments[k, 3 + side] = (v * n1 - u * n2) / (m1 * u + m2 * v)
+            # a wall may go on as far as the next beam
+            a, b = rays[ends[k, side], 0], rays[ends[k, side], 1]
+            turn = sin if side == 1 else -sin
+            u, v = cos * a - turn * b, turn * a + cos * b
+            inverse = max(m1 * u + m2 * v, 0.3 * (m1 * a + m2 * b))
+            segments[k, 3 + side] = (v * n1 - u * n2) / inverse
             segments[k, 5 + 2 * side], segments[k, 6 + 2 * side] = u, v
         s11, s12, s22 = information[k, 0], information[k, 1], information[k, 2]
         # variance of m across itself, as an angle: covariance of m is noise^2 S^-1
@@ -363,5 +375,6 @@ def _prepare(ranges: Array, bearings: Array, max_range: float) -> _Prepared:
         points[k, 0], points[k, 1] = seen[k] * rays[k, 0], seen[k] * rays[k, 1]
     noise = _noise(seen, rays, beams)
     line_of_point, lines, information, ends = _segment(seen, rays, beams, noise)
-    segments = _describe(lines, information, ends, rays, beams, noise)
+    spacing = bearings[1] - bearings[0] if len(bearings) > 1 else 0.0
+    segments = _describe(lines, information, ends, rays, beams, spacing, noise)
     return seen, rays, points, beams, line_of_point, lines, information, ends, segments, noise
