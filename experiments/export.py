@@ -37,7 +37,7 @@ def odometry_records(estimate: Estimate, frame_id: str = "odom") -> list[dict[st
     stamps, poses = estimate.stamps, estimate.means
     motion = se2.log(se2.between(poses[:-1], poses[1:]))
     lapse = np.maximum(np.diff(stamps), 1e-9)[:, None]
-    twists = np.concatenate([np.zeros((1, 3)), motion / lapse])
+    twists = np.concatenate([np.zeros((len(stamps[:1]), 3)), motion / lapse])
     records = []
     for i, covariance in enumerate(covariance_6x6(estimate.covariances)):
         x, y, heading = (float(v) for v in poses[i])
@@ -67,14 +67,26 @@ def odometry_records(estimate: Estimate, frame_id: str = "odom") -> list[dict[st
 
 
 def write_odometry_json(estimate: Estimate, path: Path) -> None:
-    """Write the records as a JSON list."""
+    """Write the records as a JSON list.
+
+    Raises
+    ------
+    InputError
+        If the estimate is not finite: JSON has no word for that.
+    """
+    try:
+        text = json.dumps(odometry_records(estimate), allow_nan=False)
+    except ValueError:
+        raise InputError(f"{path}: the estimate is not finite; write it as CSV") from None
     with write_whole(path) as part:
-        part.write_text(json.dumps(odometry_records(estimate)))
+        part.write_text(text)
 
 
 def write_odometry_csv(estimate: Estimate, path: Path) -> None:
     """Write one line a record; the 36 covariances are pose.covariance.0 to .35."""
     records = odometry_records(estimate)
+    if not records:
+        raise InputError(f"{path}: the estimate holds no belief; nothing to write")
     with write_whole(path) as part, part.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(_flat_keys(records[0]))
@@ -102,8 +114,8 @@ def read_odometry_csv(path: Path) -> Estimate:
                     raise InputError(f"{path}:{number}: not an odometry record ({error})") from None
                 means.append([x, y, 2.0 * math.atan2(z, w)])
                 covariances.append(np.array(full).reshape(6, 6)[PLANAR])
-    except OSError as error:
-        raise InputError(f"{path}: cannot read ({error.strerror})") from error
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path}: cannot read ({error})") from error
     poses = np.array(means, float).reshape(-1, 3)
     poses[:, 2] = se2.wrap(poses[:, 2])
     return Estimate(np.array(stamps), poses, np.array(covariances).reshape(-1, 3, 3))

@@ -71,6 +71,12 @@ def pairs_by_distance(truth: Array, distance_m: float) -> NDArray[np.int64]:
     return np.array([rows[:-1], rows[1:]], dtype=np.int64).T.reshape(-1, 2)
 
 
+def pairs_by_frames(n_frames: int, delta: int) -> NDArray[np.int64]:
+    """Pairs (P, 2) of rows `delta` apart: consecutive, without overlap, as evo pairs."""
+    rows = np.arange(0, n_frames, delta, dtype=np.int64)
+    return np.stack([rows[:-1], rows[1:]], axis=1)
+
+
 def relative_errors(truth: Array, means: Array, pairs: NDArray[np.int64]) -> Array:
     """Errors (P, 3) of the motion between paired rows: true motion to estimated motion."""
     first, second = pairs.T
@@ -78,16 +84,17 @@ def relative_errors(truth: Array, means: Array, pairs: NDArray[np.int64]) -> Arr
     return se2.between(true_motion, se2.between(means[first], means[second]))
 
 
-def nees(truth: Array, estimate_means: Array, covariances: Array) -> Array:
+def nees(truth: Array, means: Array, covariances: Array) -> Array:
     """Normalised estimation error squared (T,); NaN where the covariance is singular.
 
     Its mean is 3 for a consistent filter. Covariances such as the zero one of a known start say
-    nothing about errors, so those stamps are left out.
+    nothing about errors, so those stamps are left out, as are those that are not finite.
     """
-    error = estimate_means - truth
+    error = means - truth
     error[:, 2] = se2.wrap(error[:, 2])
     sigma = np.sqrt(np.maximum(np.diagonal(covariances, axis1=1, axis2=2), 0.0))
-    usable = np.all(sigma > 0.0, axis=1)
+    usable = np.all(sigma > 0.0, axis=1) & np.isfinite(error).all(axis=1)
+    usable &= np.isfinite(covariances).all(axis=(1, 2))
     values = np.full(len(error), np.nan)
     if not usable.any():
         return values
@@ -116,10 +123,18 @@ def at_distances(truth: Array, distances_m: Array) -> NDArray[np.int64]:
     return np.where(rows < len(travelled), rows, -1)
 
 
+def nees_at_distances(truth: Array, means: Array, covariances: Array, distances_m: Array) -> Array:
+    """NEES (D,) where the truth has first travelled each distance; NaN where it never has."""
+    rows = at_distances(truth, distances_m)
+    return np.where(rows >= 0, nees(truth, means, covariances)[rows], np.nan)
+
+
 def score(recording: Recording, estimate: Estimate) -> dict[str, float]:
     """Score an estimate against its recording's truth; units are in the keys.
 
-    Stamps outside the truth's span are left out. A recording without truth gives only times.
+    Stamps outside the truth's span are left out. What does not apply has no key: all but times
+    without a truth, the error over 10 m of a shorter run, the NEES without a usable covariance.
+    NaN means that the estimate itself is not finite.
 
     Raises
     ------
@@ -127,10 +142,9 @@ def score(recording: Recording, estimate: Estimate) -> dict[str, float]:
         If no stamp of the estimate lies within the truth's span.
     """
     steps = estimate.step_seconds
-    row = {
-        "duration_s": float(estimate.stamps[-1] - estimate.stamps[0]),
-        "step_time_us": float(1e6 * np.median(steps)) if len(steps) else math.nan,
-    }
+    row = {"duration_s": float(np.ptp(estimate.stamps)) if len(estimate.stamps) else 0.0}
+    if len(steps):
+        row["step_time_us"] = float(1e6 * np.median(steps))
     if recording.truth is None:
         return row
     truth = recording.truth_at(estimate.stamps)
@@ -150,12 +164,16 @@ def score(recording: Recording, estimate: Estimate) -> dict[str, float]:
         "heading_aligned_rmse_rad": rms(heading_errors_rad(truth, fitted)),
         "final_position_error_m": float(position_errors_m(truth[-1:], means[-1:])[0]),
         "final_heading_error_rad": float(abs(heading_errors_rad(truth[-1:], means[-1:])[0])),
-        "nees_mean": float(np.mean(values[counted])) if counted.any() else math.nan,
         "nees_counted_share": float(np.mean(counted)),
         "ellipse_area_final_m2": float(ellipse_area_m2(covariances[-1:])[0]),
     }
+    if counted.any():
+        row["nees_mean"] = float(np.mean(values[counted]))
     for distance in RPE_DISTANCES_M:
-        errors = relative_errors(truth, means, pairs_by_distance(truth, distance))
+        pairs = pairs_by_distance(truth, distance)
+        if len(pairs) == 0:
+            continue
+        errors = relative_errors(truth, means, pairs)
         row[f"rpe_{distance:g}m_rmse_m"] = rms(np.hypot(errors[:, 0], errors[:, 1]))
         row[f"rpe_{distance:g}m_heading_rmse_rad"] = rms(errors[:, 2])
     return row

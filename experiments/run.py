@@ -125,9 +125,10 @@ def _status(recording: Recording, estimate: Estimate) -> str:
     """`ok`, or what the recording or the estimator has to report."""
     if recording.status != "ok":
         return f"recording: {recording.status}"
-    lost = np.isnan(estimate.means).any(axis=1) | np.isnan(estimate.covariances).any(axis=(1, 2))
-    if estimate.status == "ok" and lost.any():
-        return f"not a number at {estimate.stamps[np.argmax(lost)]:.2f} s"
+    sound = np.isfinite(estimate.means).all(axis=1)
+    sound &= np.isfinite(estimate.covariances).all(axis=(1, 2))
+    if estimate.status == "ok" and not sound.all():
+        return f"not finite at {estimate.stamps[np.argmin(sound)]:.2f} s"
     return estimate.status
 
 

@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
+from sim.errors import InputError
+
 Array = NDArray[np.float64]
 Verdict = Literal["reproduced", "not reproduced", "undecided"]
 
@@ -25,7 +27,10 @@ class Interval:
 
 
 def verdict(interval: Interval, at_least: float = -math.inf, at_most: float = math.inf) -> Verdict:
-    """Judge an interval against [at_least, at_most]: inside, wholly outside, or spanning."""
+    """Judge an interval against [at_least, at_most]: inside, wholly outside, or spanning.
+
+    An interval without bounds, for lack of data, decides nothing.
+    """
     if not (math.isfinite(interval.low) and math.isfinite(interval.high)):
         return "undecided"
     if interval.low >= at_least and interval.high <= at_most:
@@ -36,17 +41,19 @@ def verdict(interval: Interval, at_least: float = -math.inf, at_most: float = ma
 
 
 def mean_interval(values: ArrayLike) -> Interval:
-    """Mean of independent values (N,) with its t interval."""
+    """Mean of independent values (N,) with its t interval; without bounds below two values."""
     sample = np.asarray(values, float)
-    mean = float(sample.mean())
-    if len(sample) < 2:
+    mean = float(sample.mean()) if len(sample) else math.nan
+    if len(sample) < 2 or not math.isfinite(mean):
         return Interval(mean, math.nan, math.nan)
     half = float(stats.t.ppf(0.975, len(sample) - 1) * sample.std(ddof=1) / math.sqrt(len(sample)))
     return Interval(mean, mean - half, mean + half)
 
 
 def share_interval(hits: int, trials: int) -> Interval:
-    """Share of hits with its Clopper-Pearson interval."""
+    """Share of hits with its Clopper-Pearson interval; without bounds for no trial."""
+    if trials == 0:
+        return Interval(math.nan, math.nan, math.nan)
     found = stats.binomtest(hits, trials).proportion_ci(0.95, "exact")
     return Interval(hits / trials, float(found.low), float(found.high))
 
@@ -57,8 +64,13 @@ def bootstrap_interval(
     rng: np.random.Generator,
     n_resamples: int = 2000,
 ) -> Interval:
-    """Percentile bootstrap over the first axis: the recordings, with all that is nested inside."""
+    """Percentile bootstrap over the first axis: the recordings, with all that is nested inside.
+
+    Without bounds below two recordings: one says nothing of the next.
+    """
     data = np.asarray(clusters, float)
+    if len(data) < 2:
+        return Interval(statistic(data) if len(data) else math.nan, math.nan, math.nan)
     draws = rng.integers(len(data), size=(n_resamples, len(data)))
     values = np.array([statistic(data[rows]) for rows in draws])
     low, high = np.quantile(values, [0.025, 0.975])
@@ -67,15 +79,13 @@ def bootstrap_interval(
 
 def log_ratio_interval(first: ArrayLike, second: ArrayLike) -> Interval:
     """Geometric mean of the paired ratios first / second, with the t interval of its log."""
-    logs = np.log(np.asarray(first, float)) - np.log(np.asarray(second, float))
-    found = mean_interval(logs)
+    found = mean_interval(_log_ratios(first, second))
     return Interval(*(math.exp(v) for v in (found.value, found.low, found.high)))
 
 
 def wilcoxon_p(first: ArrayLike, second: ArrayLike) -> float:
     """P of the one-sided signed-rank test that first is below second in paired logs."""
-    logs = np.log(np.asarray(first, float)) - np.log(np.asarray(second, float))
-    return float(stats.wilcoxon(logs, alternative="less").pvalue)
+    return float(stats.wilcoxon(_log_ratios(first, second), alternative="less").pvalue)
 
 
 def equivalent(first: ArrayLike, second: ArrayLike, margin: float) -> tuple[Interval, float]:
@@ -83,13 +93,17 @@ def equivalent(first: ArrayLike, second: ArrayLike, margin: float) -> tuple[Inte
 
     Returns the ratio's interval at 90 %, which is what the tests ask of, and the larger p.
     """
-    logs = np.log(np.asarray(first, float)) - np.log(np.asarray(second, float))
-    n, mean, error = len(logs), float(logs.mean()), float(logs.std(ddof=1)) / math.sqrt(len(logs))
-    limit, half = math.log1p(margin), float(stats.t.ppf(0.95, n - 1)) * error
-    p_low = float(stats.t.sf((mean + limit) / error, n - 1))
-    p_high = float(stats.t.cdf((mean - limit) / error, n - 1))
+    logs = _log_ratios(first, second)
+    n, limit = len(logs), math.log1p(margin)
+    if n < 2:
+        return Interval(math.exp(logs.mean()) if n else math.nan, math.nan, math.nan), math.nan
+    mean, error = logs.mean(), logs.std(ddof=1) / math.sqrt(n)
+    half = stats.t.ppf(0.95, n - 1) * error
+    with np.errstate(divide="ignore", invalid="ignore"):  # no spread at all: p is 0 or 1
+        p_low = stats.t.sf((mean + limit) / error, n - 1)
+        p_high = stats.t.cdf((mean - limit) / error, n - 1)
     bounds = (math.exp(v) for v in (mean, mean - half, mean + half))
-    return Interval(*bounds), max(p_low, p_high)
+    return Interval(*bounds), float(max(p_low, p_high))
 
 
 def page_trend_p(rows: ArrayLike) -> float:
@@ -101,3 +115,23 @@ def anees_band(n_recordings: int, dof: int = 3) -> tuple[float, float]:
     """95 % band of the mean NEES of independent recordings, over its degrees of freedom."""
     low, high = stats.chi2.ppf([0.025, 0.975], dof * n_recordings)
     return float(low) / (dof * n_recordings), float(high) / (dof * n_recordings)
+
+
+def _log_ratios(first: ArrayLike, second: ArrayLike) -> Array:
+    """Logs (N,) of paired ratios.
+
+    Raises
+    ------
+    InputError
+        If the arms have different lengths, or a value has no logarithm.
+    """
+    above, below = np.asarray(first, float), np.asarray(second, float)
+    if above.shape != below.shape or above.ndim != 1:
+        raise InputError(f"paired arms must have equal lengths, got {above.shape}, {below.shape}")
+    for row in np.flatnonzero(~((above > 0.0) & (below > 0.0))):
+        raise InputError(
+            f"pair {row}: ratio {above[row]:g} / {below[row]:g} has no logarithm; leave out the "
+            "runs that failed, in both arms"
+        )
+    ratios: Array = np.log(above) - np.log(below)
+    return ratios

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -23,21 +24,30 @@ def check_row(row: Row) -> None:
     Raises
     ------
     InputError
-        If a value is not a scalar, or the status is missing.
+        If a value is not a scalar that a table can hold, the status is missing, or a number is
+        NaN though the status is ok.
     """
     for key, value in row.items():
         if not (value is None or isinstance(value, (str, int, float, bool))):
             raise InputError(f"row key {key} must hold a scalar, got {type(value).__name__}")
+        if isinstance(value, int) and not -(2**63) <= value < 2**63:
+            raise InputError(f"row key {key} must fit in 64 bits, got {value}")
     for key in _TEXTS:
         if not isinstance(row.get(key), str):
             raise InputError(f"a row must have the text {key}")
+    for key, value in row.items():
+        if row["status"] == "ok" and isinstance(value, float) and math.isnan(value):
+            raise InputError(
+                f"row key {key} is NaN though the status is ok; leave out what does not apply, or "
+                "say in the status what went wrong"
+            )
 
 
 def to_frame(rows: Sequence[Row]) -> pd.DataFrame:
     """Tidy table of rows; a column that some rows lack is empty there.
 
-    A column that holds numbers in some rows and text in others becomes text, since a file has
-    one type a column.
+    A column that mixes numbers, text or truth values becomes text, since a file has one type a
+    column.
     """
     import pandas as pd
 
@@ -47,10 +57,10 @@ def to_frame(rows: Sequence[Row]) -> pd.DataFrame:
     columns = {}
     for name in names:
         values = [row.get(name) for row in rows]
-        mixed = len({isinstance(v, str) for v in values if v is not None}) > 1
+        kinds = {(isinstance(v, str), isinstance(v, bool)) for v in values if v is not None}
+        mixed = len(kinds) > 1
         columns[name] = [None if v is None else str(v) for v in values] if mixed else values
-    frame = pd.DataFrame(columns)
-    return frame
+    return pd.DataFrame(columns)
 
 
 def write_rows(rows: Sequence[Row], path: Path) -> None:
@@ -85,8 +95,10 @@ def read_rows(path: Path) -> pd.DataFrame:
     frames = []
     for file in files:
         try:
-            read = pd.read_csv if file.suffix == ".csv" else pd.read_parquet
-            frames.append(read(file))
+            if file.suffix == ".csv":  # a digest such as 12e4567 is no number
+                frames.append(pd.read_csv(file, dtype=dict.fromkeys(_TEXTS, "str")))
+            else:
+                frames.append(pd.read_parquet(file))
         except (OSError, ValueError) as error:
             raise InputError(
                 f"{file}: cannot read this table ({str(error).splitlines()[0]}); delete it and "

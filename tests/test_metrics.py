@@ -6,9 +6,13 @@ from evo.core.trajectory import PoseTrajectory3D
 from hypothesis import given
 from hypothesis import strategies as st
 
-from estimators.base import Estimate
+from estimators.base import Estimate, run
+from estimators.odometry import Odometry
 from experiments import metrics
+from experiments.statistics import anees_band
 from sim import se2
+from sim.errors import InputError
+from tests import fakes
 
 
 def trajectories(seed=0, n=400):
@@ -58,8 +62,17 @@ def test_rpe_agrees_with_evo(delta_m):
         rpe.process_data((for_evo(truth), for_evo(means)))
         errors = metrics.relative_errors(truth, means, metrics.pairs_by_distance(truth, delta_m))
         expected = rpe.get_statistic(evo_metrics.StatisticsType.rmse)
-        assert metrics.rms(ours(errors)) == pytest.approx(expected, abs=1e-7)
-        assert metrics.rms(ours(errors)) == pytest.approx(expected, abs=1e-9, rel=1e-7)
+        assert metrics.rms(ours(errors)) == pytest.approx(expected, abs=1e-9)
+
+
+@pytest.mark.parametrize("delta", [1, 7, 50])
+def test_rpe_over_frames_agrees_with_evo(delta):
+    truth, means = trajectories(5)
+    rpe = evo_metrics.RPE(PoseRelation.translation_part, delta, Unit.frames)
+    rpe.process_data((for_evo(truth), for_evo(means)))
+    errors = metrics.relative_errors(truth, means, metrics.pairs_by_frames(len(truth), delta))
+    ours = np.hypot(errors[:, 0], errors[:, 1])
+    assert np.allclose(ours, rpe.error, atol=1e-9, rtol=0)
 
 
 @given(st.tuples(st.floats(-9, 9), st.floats(-9, 9), st.floats(-3, 3)).map(np.array))
@@ -114,6 +127,87 @@ def test_rows_at_distances():
         10,
         -1,
     ]
+
+
+def test_nees_at_distances_has_no_value_beyond_the_end():
+    truth = np.column_stack([np.arange(11) * 0.5, np.zeros(11), np.zeros(11)])
+    means = truth + np.column_stack([np.arange(11.0), np.zeros(11), np.zeros(11)])
+    covariances = np.tile(np.eye(3), (11, 1, 1))
+    values = metrics.nees_at_distances(truth, means, covariances, np.array([1.0, 5.0, 9.0]))
+    assert values[:2].tolist() == [4.0, 100.0]
+    assert np.isnan(values[2])
+
+
+def test_nees_leaves_out_what_is_not_finite():
+    truth, covariances = np.zeros((4, 3)), np.tile(np.eye(3), (4, 1, 1))
+    covariances[0], covariances[1, 0, 1] = np.inf, np.nan
+    means = np.ones((4, 3))
+    means[2] = np.nan
+    assert np.isnan(metrics.nees(truth, means, covariances)).tolist() == [True, True, True, False]
+
+
+def test_dead_reckoning_of_the_circle_is_consistent():
+    distances, n = np.array([1.0, 2.0]), 60
+    values = []
+    for seed in range(n):
+        recording = fakes.circle(seed, kr=1e-4, kl=3e-5)
+        prior = fakes.tracking_prior(recording, sigma=(0.0, 0.0, 0.0))
+        found = run(Odometry(1e-4, 3e-5), recording, prior, np.random.default_rng(0))
+        truth = recording.truth_at(found.stamps)
+        values.append(metrics.nees_at_distances(truth, found.means, found.covariances, distances))
+    low, high = anees_band(n)
+    for anees in np.mean(values, axis=0) / 3:
+        assert low < anees < high
+
+
+def test_score_leaves_out_what_does_not_apply_and_shows_what_is_not_finite():
+    recording = fakes.circle()  # 2.97 m
+    row = metrics.score(recording, fakes.estimate(recording))
+    assert "rpe_1m_rmse_m" in row
+    assert "rpe_10m_rmse_m" not in row
+    assert row["distance_m"] == pytest.approx(2.97, rel=1e-3)
+    assert row["step_time_us"] == pytest.approx(10.0)
+    zero = np.zeros((100, 3, 3))
+    assert "nees_mean" not in metrics.score(recording, fakes.estimate(recording, None, zero))
+    lost = recording.truth.poses.copy()
+    lost[50:] = np.nan
+    row = metrics.score(recording, fakes.estimate(recording, lost))
+    assert np.isnan(row["ate_rmse_m"])
+    assert np.isnan(row["ate_aligned_rmse_m"])
+
+
+def test_stamps_outside_the_truth_are_left_out():
+    import dataclasses
+
+    recording = fakes.circle()
+    truth = recording.truth
+    short = dataclasses.replace(truth, stamps=truth.stamps[:60], poses=truth.poses[:60])
+    means = truth.poses.copy()
+    means[60:] += 5.0
+    row = metrics.score(
+        dataclasses.replace(recording, truth=short), fakes.estimate(recording, means)
+    )
+    assert row["ate_rmse_m"] == pytest.approx(0.0, abs=1e-9)
+    apart = dataclasses.replace(truth, stamps=truth.stamps + 1e9)
+    with pytest.raises(InputError, match="clocks"):
+        metrics.score(dataclasses.replace(recording, truth=apart), fakes.estimate(recording, means))
+    without = metrics.score(
+        dataclasses.replace(recording, truth=None), fakes.estimate(recording, means)
+    )
+    assert set(without) == {"duration_s", "step_time_us"}
+
+
+def test_every_score_says_its_unit():
+    recording = fakes.circle(n_frames=400)
+    pure = {"nees_mean", "nees_counted_share"}
+    keys = set(metrics.score(recording, fakes.estimate(recording)))
+    assert {
+        *("ate_rmse_m", "ate_aligned_rmse_m", "heading_rmse_rad", "heading_aligned_rmse_rad"),
+        *("rpe_1m_rmse_m", "rpe_10m_rmse_m", "rpe_10m_heading_rmse_rad", "nees_mean"),
+        *("final_position_error_m", "final_heading_error_rad", "ellipse_area_final_m2"),
+        *("step_time_us", "distance_m", "duration_s"),
+    } <= keys
+    assert all(key in pure or key.endswith(("_m", "_rad", "_m2", "_us", "_s")) for key in keys)
 
 
 def test_score_of_a_perfect_estimate_is_zero():

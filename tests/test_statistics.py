@@ -3,6 +3,7 @@ import pytest
 
 from experiments import statistics
 from experiments.statistics import Interval, verdict
+from sim.errors import InputError
 
 
 def test_verdicts():
@@ -58,3 +59,55 @@ def test_anees_band():
     low, high = statistics.anees_band(20)
     means = rng.chisquare(3, (4000, 20)).mean(axis=1) / 3
     assert np.mean((means > low) & (means < high)) == pytest.approx(0.95, abs=0.012)
+
+
+def test_too_few_data_decide_nothing():
+    rng = np.random.default_rng(4)
+    for found in (
+        statistics.mean_interval([]),
+        statistics.mean_interval([1.0]),
+        statistics.bootstrap_interval([1.0], lambda v: float(v.mean()), rng),
+        statistics.bootstrap_interval([], lambda v: float(v.mean()), rng),
+        statistics.share_interval(0, 0),
+        statistics.log_ratio_interval([1.0], [1.0]),
+        statistics.equivalent([1.0], [1.0], 0.25)[0],
+    ):
+        assert verdict(found, 0.5, 2.0) == "undecided"
+
+
+def test_the_bootstrap_draws_whole_recordings():
+    """Repeats of one recording agree, so their number must not narrow the interval."""
+    rng = np.random.default_rng(5)
+    one_each = rng.normal(size=(25, 1))
+    nested = np.repeat(one_each, 50, axis=1)
+    widths = []
+    for data in (one_each, nested):
+        found = statistics.bootstrap_interval(
+            data, lambda v: float(v.mean()), np.random.default_rng(6)
+        )
+        widths.append(found.high - found.low)
+    assert widths[0] == pytest.approx(widths[1])
+
+
+def test_equivalence_without_spread():
+    ratio, p = statistics.equivalent([1.1, 2.2, 3.3], [1.0, 2.0, 3.0], 0.25)
+    assert ratio.value == pytest.approx(1.1)
+    assert p < 1e-6
+    assert statistics.equivalent([2.0, 4.0], [1.0, 2.0], 0.25)[1] == 1.0
+
+
+def test_equivalence_errs_as_often_as_it_says():
+    """At the margin itself, the test wrongly finds equivalence in about 5 % of samples."""
+    rng, n = np.random.default_rng(7), 600
+    p = [
+        statistics.equivalent(rng.lognormal(np.log(1.25), 0.1, 30), np.ones(30), 0.25)[1]
+        for _ in range(n)
+    ]
+    assert 0.025 < np.mean(np.array(p) < 0.05) < 0.08
+
+
+@pytest.mark.parametrize("first", [[0.0, 1.0], [np.nan, 1.0], [1.0], [-1.0, 1.0]])
+def test_ratios_without_a_logarithm_are_refused(first):
+    for function in (statistics.log_ratio_interval, statistics.wilcoxon_p):
+        with pytest.raises(InputError, match=r"logarithm|lengths"):
+            function(first, [1.0, 1.0])

@@ -1,16 +1,8 @@
-import json
-
 import numpy as np
 import pytest
 from evo.tools import file_interface
 
 from estimators.base import Estimate
-from experiments.export import (
-    odometry_records,
-    read_odometry_csv,
-    write_odometry_csv,
-    write_odometry_json,
-)
 from experiments.table import check_row, read_rows, write_rows
 from sim.errors import InputError
 from sim.formats.tum import read_tum, write_tum
@@ -49,6 +41,39 @@ def test_wrong_rows_and_files_are_refused(tmp_path):
         read_rows(tmp_path / "empty")
 
 
+def test_nan_needs_a_status():
+    with pytest.raises(InputError, match="ate_rmse_m is NaN though the status is ok"):
+        check_row({**ROW, "ate_rmse_m": float("nan")})
+    check_row({**ROW, "ate_rmse_m": float("nan"), "status": "not finite at 1.00 s"})
+    with pytest.raises(InputError, match="64 bits"):
+        check_row({**ROW, "seed": 2**70})
+
+
+@pytest.mark.parametrize("suffix", [".parquet", ".csv"])
+def test_digests_stay_text_and_mixed_columns_become_text(tmp_path, suffix):
+    rows = [
+        {**ROW, "run_key": "0012", "code_version": "12e45678901", "a": True, "b": 1},
+        {**ROW, "run_key": "0013", "code_version": "12e45678902", "a": 1.5, "b": 2.5},
+    ]
+    write_rows(rows, tmp_path / f"t{suffix}")
+    frame = read_rows(tmp_path / f"t{suffix}")
+    assert frame["run_key"].tolist() == ["0012", "0013"]
+    assert frame["code_version"].tolist() == ["12e45678901", "12e45678902"]
+    assert frame["a"].tolist() == ["True", "1.5"]
+    assert frame["b"].tolist() == [1.0, 2.5]
+
+
+def test_tables_of_a_folder_are_read_as_one(tmp_path):
+    for i in range(3):
+        write_rows([{**ROW, "n": i, f"only_{i}": 1}], tmp_path / f"{i}.parquet")
+    frame = read_rows(tmp_path)
+    assert frame["n"].tolist() == [0, 1, 2]
+    assert frame["only_1"].notna().tolist() == [False, True, False]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["0.parquet", "1.parquet", "2.parquet"]
+    with pytest.raises(InputError, match=r"\.parquet or \.csv"):
+        write_rows([ROW], tmp_path / "t.xlsx")
+
+
 def test_tum_is_lossless_and_evo_reads_it(tmp_path):
     estimate, path = an_estimate(), tmp_path / "t.tum"
     write_tum(path, estimate.stamps, estimate.means)
@@ -70,31 +95,3 @@ def test_malformed_tum_names_the_line(tmp_path, line):
     path.write_text(f"# comment\n0 0 0 0 0 0 0 1\n{line}\n")
     with pytest.raises(InputError, match=r"t\.tum:3: "):
         read_tum(path)
-
-
-def test_odometry_message_places_the_planar_covariance(tmp_path):
-    estimate = an_estimate()
-    record = odometry_records(estimate)[3]
-    flat = np.array(record["pose"]["covariance"])
-    planar = [0, 1, 5, 6, 7, 11, 30, 31, 35]
-    assert flat[planar].tolist() == estimate.covariances[3].ravel().tolist()
-    assert np.count_nonzero(flat) == 9
-    assert (record["header"]["frame_id"], record["child_frame_id"]) == ("odom", "base_link")
-    write_odometry_json(estimate, tmp_path / "o.json")
-    assert json.loads((tmp_path / "o.json").read_text())[3] == record
-    write_odometry_csv(estimate, tmp_path / "o.csv")
-    back = read_odometry_csv(tmp_path / "o.csv")
-    assert np.array_equal(back.stamps, estimate.stamps)
-    assert np.array_equal(back.covariances, estimate.covariances)
-    assert np.allclose(back.means, estimate.means, atol=1e-12)
-
-
-def test_twist_is_the_body_velocity():
-    stamps = np.arange(5) * 0.5
-    heading = 0.3 * stamps + 1.0
-    means = np.column_stack([np.sin(heading) / 0.3, -np.cos(heading) / 0.3, heading])
-    records = odometry_records(Estimate(stamps, means, np.zeros((5, 3, 3))))
-    for record in records[1:]:
-        assert record["twist"]["linear"]["x"] == pytest.approx(1.0)
-        assert record["twist"]["linear"]["y"] == pytest.approx(0.0, abs=1e-9)
-        assert record["twist"]["angular"]["z"] == pytest.approx(0.3)
