@@ -1,0 +1,120 @@
+"""Small recordings made by hand, without the simulator, for tests that need one.
+
+A robot drives a circle in a square room. Wheels, laser and landmarks are worked out from plain
+geometry here, so they also stand beside the simulator's as a second opinion.
+"""
+
+import numpy as np
+
+from estimators.base import Estimate, Prior
+from sim import se2
+from sim.recording import LandmarkLog, LaserLog, Recording, Truth, WheelLog
+from sim.robot import RobotGeometry
+from sim.sensors import Encoder, Laser, Mount, SensorSuite, StereoCamera
+from sim.world import World
+
+ROBOT = RobotGeometry(wheel_radius_m=0.05, track_m=0.19)
+HALF_ROOM_M = 4.0
+
+
+def square_room(n_landmarks=40, seed=0):
+    """A room of 8 x 8 m about the origin, with landmarks on its walls."""
+    h = HALF_ROOM_M
+    corners = np.array([[-h, -h], [h, -h], [h, h], [-h, h]])
+    walls = np.hstack([corners, np.roll(corners, -1, axis=0)])
+    rng = np.random.default_rng(seed)
+    side, along = rng.integers(4, size=n_landmarks), rng.random((n_landmarks, 1))
+    feet = walls[side, :2] + along * (walls[side, 2:] - walls[side, :2])
+    landmarks = np.column_stack([feet, rng.uniform(0.2, 1.5, n_landmarks)])
+    return World("square", walls, np.tile([0.0, 2.5], (4, 1)), landmarks=landmarks)
+
+
+def circle(
+    seed=0,
+    *,
+    n_frames=100,
+    rate_hz=10.0,
+    radius_m=1.5,
+    speed_mps=0.3,
+    start=(0.5, -1.0, 0.4),
+    kr=1e-5,
+    kl=1e-5,
+    n_beams=181,
+    sigma_range_m=0.01,
+    identifies=True,
+):
+    """A counter-clockwise circle; every Frame has a scan, every other one an image.
+
+    The encoders err by the k |ds| law at each Frame. All in one square room with finite ranges.
+    """
+    rng = np.random.default_rng(seed)
+    world = square_room()
+    stamps = np.arange(n_frames) / rate_hz
+    turn = speed_mps / radius_m * stamps
+    motion = np.column_stack([radius_m * np.sin(turn), radius_m * (1.0 - np.cos(turn)), turn])
+    poses = se2.compose(np.asarray(start, float), motion)
+    half = ROBOT.track_m / 2.0
+    travel = turn[:, None] * np.array([radius_m + half, radius_m - half])
+    steps = np.diff(travel, axis=0, prepend=travel[:1])
+    errors = np.sqrt(np.abs(steps) * [kr, kl]) * rng.standard_normal(steps.shape)
+    laser = Laser(rate_hz, n_beams, sigma_range_m=sigma_range_m, mount=Mount())
+    camera = StereoCamera(rate_hz=rate_hz / 2, identifies=identifies)
+    images = [_image(camera, pose, world.landmarks, rng) for pose in poses[::2]]
+    points = np.concatenate([p for p, _ in images])
+    ids = np.concatenate([i for _, i in images])
+    return Recording(
+        frame_stamps=stamps,
+        wheels=WheelLog(stamps, np.cumsum(steps + errors, axis=0)),
+        robot=ROBOT,
+        sensors=SensorSuite(Encoder(rate_hz), laser=laser, stereo=camera),
+        laser=LaserLog(stamps, laser.measure(room_ranges_m(laser, poses), rng)),
+        landmarks=LandmarkLog(
+            stamps[::2],
+            np.cumsum([0, *(len(i) for _, i in images)]),
+            points,
+            ids if identifies else np.zeros(0, np.int64),
+        ),
+        truth=Truth(stamps, poses, travel, ids, world),
+        config={"fake": "circle", "seed": seed},
+    )
+
+
+def room_ranges_m(laser, poses):
+    """Ranges (T, beams) to the walls of the square room: the nearest of two crossings a beam."""
+    poses = np.asarray(poses, float)
+    angles = poses[:, 2:] + laser.bearings_rad
+    with np.errstate(divide="ignore"):
+        by_x = (np.copysign(HALF_ROOM_M, np.cos(angles)) - poses[:, :1]) / np.cos(angles)
+        by_y = (np.copysign(HALF_ROOM_M, np.sin(angles)) - poses[:, 1:2]) / np.sin(angles)
+    return np.minimum(by_x, by_y)
+
+
+def _image(camera, pose, landmarks, rng):
+    """Noisy points in the camera and ids of the landmarks in view."""
+    ahead = se2.transform(se2.inverse(pose), landmarks[:, :2])
+    points = np.column_stack([-ahead[:, 1], camera.mount.z_m - landmarks[:, 2], ahead[:, 0]])
+    z = points[:, 2]
+    inside = (z > 0.1) & (np.linalg.norm(points, axis=1) < camera.max_distance_m)
+    inside &= np.abs(points[:, 0]) < z * np.tan(camera.fov_horizontal_rad / 2)
+    inside &= np.abs(points[:, 1]) < z * np.tan(camera.fov_vertical_rad / 2)
+    return camera.measure(points[inside], rng), np.flatnonzero(inside)
+
+
+def tracking_prior(recording, sigma=(0.02, 0.02, 0.01), with_map=True):
+    """The true start with a given spread."""
+    return Prior(
+        recording.robot,
+        recording.sensors,
+        recording.truth.poses[0].copy(),
+        np.diag(np.square(sigma)),
+        recording.truth.world if with_map else None,
+    )
+
+
+def estimate(recording, means=None, covariances=None):
+    """An Estimate at the Frame stamps: by default the truth, with unit covariances."""
+    stamps = recording.frame_stamps
+    means = recording.truth_at(stamps) if means is None else np.asarray(means, float)
+    if covariances is None:
+        covariances = np.tile(np.eye(3), (len(stamps), 1, 1))
+    return Estimate(stamps.copy(), means, covariances, step_seconds=np.full(len(stamps), 1e-5))
