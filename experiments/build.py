@@ -82,6 +82,15 @@ def _find(target: str, where: str) -> Callable[..., Any]:
     return found  # type: ignore[no-any-return]
 
 
+def check(config: Config) -> None:
+    """Build what is cheap to build, so that a wrong value is told before any time is spent."""
+    make_robot(config)
+    suite_from_config(config["sensors"])
+    make(config["route"], "route")
+    stream(config["seed"], "slip")
+    stream(config["world_seed"], "world")
+
+
 def make_world(config: Config) -> World:
     """World of the configuration, from its own stream."""
     rng = stream(config["world_seed"], "world")

@@ -9,6 +9,8 @@ kr + kl; the full end pose also gives kr - kl, since a wheel that slips changes 
 
 from __future__ import annotations
 
+import dataclasses
+import json
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -77,6 +79,21 @@ class CalibrationResult:
     bias_left: Measured | None
     track_m: Measured | None
     n_used: int
+
+    def as_json(self) -> str:
+        """One JSON object: each parameter with its interval, null where it was not estimated."""
+        return json.dumps(dataclasses.asdict(self), indent=2)
+
+    def as_text(self) -> str:
+        """One line a parameter."""
+        units = {"kr": "m", "kl": "m", "bias_right": "", "bias_left": "", "track_m": "m"}
+        lines = [f"{self.method.replace('_', ' ')}, from {self.n_used} samples"]
+        for name, unit in units.items():
+            found: Measured | None = getattr(self, name)
+            if found is not None:
+                interval = f"[{found.low:.4g}, {found.high:.4g}]"
+                lines.append(f"  {name:<10} {found.value:12.5g} {interval:>26} {unit}".rstrip())
+        return "\n".join(lines)
 
 
 @dataclass(frozen=True)
@@ -376,7 +393,8 @@ class _Model:
         """Coordinates (n, 3) of end poses (n, 3)."""
         if self._linearised:
             return poses
-        return _charts(poses, self._log_chart)
+        charted: Array = _charts(poses, self._log_chart)
+        return charted
 
     def moments(self, k: Array, bias: Array, track_m: float) -> tuple[Array, Array]:
         """Mean (3,) and covariance (3, 3) of the coordinates."""
@@ -384,7 +402,8 @@ class _Model:
         if self._linearised:
             return _linearised_moments(travel, k, track_m)
         scale = np.sqrt(k) * (1.0 + bias) ** -1.5
-        return _sampled_moments(travel, self._noise, scale, track_m, self._log_chart)
+        mean, covariance = _sampled_moments(travel, self._noise, scale, track_m, self._log_chart)
+        return mean, covariance
 
 
 def _knots(commands_m: Array) -> NDArray[np.int64]:

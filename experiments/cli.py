@@ -138,9 +138,14 @@ def calibrate(
     Example: estima calibrate run1.npz run2.npz --joint
     """
     from experiments.calibrate import calibrate_recordings
+    from sim.errors import InputError
     from sim.recording import load
 
-    result = calibrate_recordings([load(path) for path in recordings], method, joint=joint)
+    if method not in ("wheel-truth", "end-poses"):
+        raise InputError(f"--method must be wheel-truth or end-poses, got {method!r}")
+    loaded = [load(path) for path in recordings]
+    kind: Any = method.replace("-", "_")
+    result = calibrate_recordings(loaded, kind, geometry=joint)
     print(result.as_json() if as_json else result.as_text())
 
 
@@ -194,41 +199,12 @@ def reproduce(
 
 def main() -> None:
     """Run the command line; wrong input ends in one line and code 2, a failed run in code 1."""
-    from sim.errors import InputError
+    from experiments.console import end
 
     try:
         app()
-    except InputError as error:
-        _end(str(error), 2)
-    except KeyboardInterrupt:
-        _end("interrupted; what was finished is kept", 1)
-    except Exception as error:
-        told = _told(error)
-        if told is None:
-            raise
-        _end(*told)
-
-
-def _told(error: Exception) -> tuple[str, int] | None:
-    """One line and an exit code for errors that are the input's, None for faults of ours."""
-    chain: list[Any] = [error]
-    while chain[-1].__cause__ is not None:
-        chain.append(chain[-1].__cause__)
-    for link in chain:
-        kind, module = type(link).__name__, type(link).__module__
-        if kind == "InputError":
-            return str(link), 2
-        if kind == "RunFailedError":
-            return f"the run failed: {link}", 1
-        if module.startswith(("hydra.", "omegaconf.")):
-            lines = [line.strip() for line in str(link).splitlines() if line.strip()]
-            return f"configuration: {' '.join(lines[:3])}; see estima run --cfg job", 2
-    return None
-
-
-def _end(message: str, code: int) -> None:
-    print(f"estima: {message}", file=sys.stderr)
-    sys.exit(code)
+    except (Exception, KeyboardInterrupt) as error:
+        end(error)
 
 
 if __name__ == "__main__":

@@ -6,7 +6,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, NoReturn
 
 _QUIET_S = 2.0  # what ends sooner needs no progress
 _LINE_EVERY_S = 10.0  # where the output is a file
@@ -18,39 +18,79 @@ def progress(label: str, total: float | None = None) -> Iterator[Callable[[float
 
     Nothing is shown for the first two seconds.
     """
-    begun = time.monotonic()
-    shown: dict[str, Any] = {"bar": None, "task": None, "line": begun + _QUIET_S}
+    shown = _Progress(label, total)
+    try:
+        yield shown.update
+    finally:
+        shown.stop()
 
-    def update(done: float) -> None:
+
+class _Progress:
+    """A bar on a terminal, a line now and then elsewhere."""
+
+    def __init__(self, label: str, total: float | None) -> None:
+        self._label, self._total = label, total
+        self._begun = time.monotonic()
+        self._next_line = self._begun + _QUIET_S
+        self._bar: Any = None
+
+    def update(self, done: float) -> None:
         now = time.monotonic()
-        if now - begun < _QUIET_S:
+        if now - self._begun < _QUIET_S:
             return
-        if not sys.stderr.isatty():
-            if now >= shown["line"]:
-                shown["line"] = now + _LINE_EVERY_S
-                share = f" of {total:g}" if total else ""
-                print(f"{label}: {done:g}{share} after {now - begun:.0f} s", file=sys.stderr)
-            return
-        if shown["bar"] is None:
+        if sys.stderr.isatty():
+            self._draw(done)
+        elif now >= self._next_line:
+            self._next_line = now + _LINE_EVERY_S
+            share = f" of {self._total:g}" if self._total else ""
+            print(
+                f"{self._label}: {done:.3g}{share} after {now - self._begun:.0f} s", file=sys.stderr
+            )
+
+    def stop(self) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+
+    def _draw(self, done: float) -> None:
+        if self._bar is None:
             from rich.console import Console
             from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-            shown["bar"] = Progress(
-                TextColumn(label),
+            self._bar = Progress(
+                TextColumn(self._label),
                 BarColumn(),
-                TextColumn(
-                    "{task.completed:g} of {task.total:g}" if total else "{task.completed:g}"
-                ),
+                TextColumn("{task.completed:.3g}" + (" of {task.total:g}" if self._total else "")),
                 TimeRemainingColumn(),
                 console=Console(stderr=True),
                 transient=True,
             )
-            shown["bar"].start()
-            shown["task"] = shown["bar"].add_task(label, total=total)
-        shown["bar"].update(shown["task"], completed=done)
+            self._bar.start()
+            self._task = self._bar.add_task(self._label, total=self._total)
+        self._bar.update(self._task, completed=done)
 
-    try:
-        yield update
-    finally:
-        if shown["bar"] is not None:
-            shown["bar"].stop()
+
+def end(error: BaseException) -> NoReturn:
+    """End the program with one line for what the user can mend: code 2 for input, 1 for failures.
+
+    A fault of ours is raised again, with its trace.
+    """
+    chain: list[BaseException] = [error]
+    while (before := chain[-1].__cause__ or chain[-1].__context__) is not None:
+        chain.append(before)
+    for link in chain:
+        kind, module = type(link).__name__, type(link).__module__
+        if kind == "InputError":
+            _say(str(link), 2)
+        if kind == "RunFailedError":
+            _say(f"the run failed: {link}", 1)
+        if isinstance(link, KeyboardInterrupt):
+            _say("interrupted; what was finished is kept", 1)
+        if module.startswith(("hydra.", "omegaconf.")):
+            lines = [line.strip() for line in str(link).splitlines() if line.strip()]
+            _say(f"configuration: {' '.join(lines[:3])}; see estima run --cfg job", 2)
+    raise error
+
+
+def _say(message: str, code: int) -> NoReturn:
+    print(f"estima: {message}", file=sys.stderr)
+    sys.exit(code)

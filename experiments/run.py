@@ -1,6 +1,6 @@
 """The Hydra application: one configuration -> rows.
 
-`estima run` hands its arguments here. Rows go to results/runs/<study>/<key>.parquet, where the key
+`estima run` hands its arguments here. Rows go to results/runs/<name>/<key>.parquet, where the key
 is the digest of the resolved configuration and of the code.
 """
 
@@ -20,12 +20,13 @@ from omegaconf import DictConfig, OmegaConf
 from estimators.base import Estimate, run
 from experiments.build import (
     Config,
+    check,
     default_cache,
     make_estimator,
     make_prior,
     make_recording,
 )
-from experiments.console import progress
+from experiments.console import end, progress
 from experiments.metrics import score
 from experiments.seeds import stream
 from experiments.table import Row, write_rows
@@ -34,7 +35,7 @@ from sim.errors import InputError
 from sim.recording import Recording
 
 RESULTS = ROOT / "results"
-_NOT_IN_KEY = ("study", "picture", "recording")
+_NOT_IN_KEY = ("name", "picture", "recording")
 
 
 class RunFailedError(Exception):
@@ -65,12 +66,13 @@ def run_configuration(config: Config, choices: dict[str, str]) -> tuple[list[Row
     """
     if config["repeats"] < 1:
         raise InputError(f"repeats must be at least 1, got {config['repeats']}")
+    check(config)
     estimator = make_estimator(config)
     with progress("simulating, s") as on_progress:
         recording = make_recording(config, default_cache(), on_progress)
     prior = make_prior(config, recording)
     key = run_key(config, recording.checksum)
-    folder = RESULTS / "runs" / config["study"]
+    folder = RESULTS / "runs" / config["name"]
     rows: list[Row] = []
     name = choices.get("estimator") or config["estimator"]["_target_"]
     for repeat in range(config["repeats"]):
@@ -151,12 +153,17 @@ def application(cfg: DictConfig) -> None:
     choices = {g: str(runtime.runtime.choices.get(g)) for g in groups}
     single = runtime.mode == RunMode.RUN
     config["picture"] = config["picture"] and single
-    rows, folder = run_configuration(config, choices)
-    if single:
-        _print(rows, folder, config["picture"])
-    bad = [row for row in rows if row["status"] != "ok"]
-    if bad:
-        raise RunFailedError(str(bad[0]["status"]))
+    try:
+        rows, folder = run_configuration(config, choices)
+        if single:
+            _print(rows, folder, config["picture"])
+        bad = [row for row in rows if row["status"] != "ok"]
+        if bad:
+            raise RunFailedError(str(bad[0]["status"]))
+    except (InputError, RunFailedError) as error:
+        if not single:
+            raise
+        end(error)  # here, since Hydra would add a line of its own
 
 
 _SHOWN = (
@@ -174,9 +181,9 @@ def _print(rows: list[Row], folder: Path, picture: bool) -> None:
     head = f"{first['choice.estimator']} in {first['choice.world']}, seed {first['seed']}"
     print(f"{head}: {first['status']}")
     for key, label, unit in _SHOWN:
-        values = [row[key] for row in rows if isinstance(row.get(key), (int, float))]
+        values = [float(v) for row in rows if isinstance(v := row.get(key), (int, float))]
         if values:
-            mean = sum(float(v) for v in values) / len(values)  # type: ignore[arg-type]
+            mean = sum(values) / len(values)
             print(f"  {label:<30} {mean:10.4g} {unit}")
     for path in [folder.with_suffix(".parquet"), *([folder / "run.png"] if picture else [])]:
         print(f"  {_short(path)}")

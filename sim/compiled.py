@@ -27,7 +27,7 @@ class _Announcer(event.Listener):
         """Nothing to say: what follows shows that it is done."""
 
 
-event.register("numba:compile", _Announcer())
+event.register("numba:compile", _Announcer())  # type: ignore[no-untyped-call]
 
 
 def njit(**options: Any) -> Any:

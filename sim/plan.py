@@ -68,7 +68,7 @@ class Plan:
     def box(
         self,
         centre: Sequence[float],
-        size: Sequence[float],
+        size: Sequence[float] | Array,
         yaw_rad: float,
         top_m: float,
     ) -> None:
@@ -180,7 +180,7 @@ class Plan:
         return np.column_stack([foot, rng.uniform(0.2, np.maximum(top, 0.25))])
 
 
-def box_corners(centre: Sequence[float], size: Sequence[float], yaw_rad: float) -> Array:
+def box_corners(centre: Sequence[float], size: Sequence[float] | Array, yaw_rad: float) -> Array:
     """Corners (4, 2), m, counter-clockwise."""
     half = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * np.asarray(size) / 2
     cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)

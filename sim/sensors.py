@@ -198,7 +198,8 @@ class StereoCamera:
         slope = scale / disparity  # metres per pixel of disparity and of image coordinate
         by_disparity = np.stack([-slope * column, -slope * row, -slope * self.focal_px], axis=-1)
         if self.correlated:
-            R = by_disparity[..., :, None] * by_disparity[..., None, :] * self.sigma_disparity_px**2
+            outer = by_disparity[..., :, None] * by_disparity[..., None, :]
+            R: Array = outer * self.sigma_disparity_px**2
         else:
             R = np.zeros((*x.shape, 3, 3))
             for i in range(3):

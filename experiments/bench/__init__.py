@@ -6,7 +6,7 @@ import importlib
 
 from sim.errors import InputError
 
-SUITES = {"sim": ("casting",)}  # name -> modules of this package, each with `run()`
+SUITES = {"sim": ("recording", "casting"), "icp": ("icp",)}  # name -> modules of this package, each with `run()`
 
 
 def run_bench(name: str, *, as_json: bool) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -23,13 +25,14 @@ def covariance_ellipse(mean: Array, covariance: Array, **style: object) -> Ellip
     values, vectors = np.linalg.eigh(covariance)
     width, height = 2.0 * np.sqrt(CHI2_95_2DOF * np.maximum(values[::-1], 0.0))
     angle = np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1]))
-    return Ellipse((mean[0], mean[1]), width, height, angle=angle, **style)  # type: ignore[arg-type]
+    return Ellipse((mean[0], mean[1]), width, height, angle=angle, **style)
 
 
 def run_figure(recording: Recording, estimate: Estimate, name: str) -> Figure:
     """Map with both trajectories and 95 % ellipses; errors against time."""
     page = figure(9.0, 4.6)
-    left, right = page.subfigures(1, 2, width_ratios=(1.1, 1.0))
+    halves: Any = page.subfigures(1, 2, width_ratios=(1.1, 1.0))
+    left, right = halves
     map_axes = left.subplots()
     world = recording.truth.world if recording.truth else None
     if world is not None:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
+from cycler import cycler
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
@@ -21,7 +22,7 @@ _SETTINGS: dict[str, Any] = {
     "font.size": 9.0,
     "axes.spines.top": False,
     "axes.spines.right": False,
-    "axes.prop_cycle": mpl.cycler(color=CYCLE),
+    "axes.prop_cycle": cycler(color=CYCLE),
     "legend.frameon": False,
     "svg.hashsalt": "estima",
 }
@@ -29,7 +30,8 @@ _SETTINGS: dict[str, Any] = {
 
 def figure(width_in: float, height_in: float) -> Figure:
     """Empty page with the house style and a layout that keeps its parts apart."""
-    mpl.rcParams.update(_SETTINGS)
+    for key, value in _SETTINGS.items():
+        mpl.rcParams[key] = value  # type: ignore[index]
     page = Figure(figsize=(width_in, height_in), layout="constrained")
     FigureCanvasAgg(page)
     return page

@@ -26,7 +26,8 @@ def draw_world(
                 ax.add_patch(patch)
     high = world.wall_z_m[:, 0] > _LASER_HEIGHT_M
     for rows, style in ((~high, {"color": WALL}), (high, {"color": GREEN, "alpha": 0.5})):
-        ax.add_collection(LineCollection(world.walls[rows].reshape(-1, 2, 2), lw=0.9, **style))
+        lines = list(world.walls[rows].reshape(-1, 2, 2))
+        ax.add_collection(LineCollection(lines, lw=0.9, **style))
     if landmarks and len(world.landmarks):
         twin = world.look_alike if len(world.look_alike) else np.zeros(len(world.landmarks), bool)
         for mask, color, label in ((~twin, PURPLE, "landmark"), (twin, ORANGE, "look-alike")):

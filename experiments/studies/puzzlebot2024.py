@@ -198,9 +198,7 @@ def calibrate_once(k: float, seed: int, *, geometry: bool) -> list[CalibrationRe
     results = [from_wheel_truth(encoder, ground, turns, interval_s=0.05, geometry=geometry)]
     draws = stream(seed, "samples")
     for method in ("sampled", "linearised"):
-        results.append(
-            from_end_poses(manoeuvres, NOMINAL, draws, method=method, geometry=geometry)  # type: ignore[arg-type]
-        )
+        results.append(from_end_poses(manoeuvres, NOMINAL, draws, method=method, geometry=geometry))
     return results
 
 
@@ -327,7 +325,7 @@ def engine_check(n_runs: int, k: float = 1e-4) -> pd.DataFrame:
                     SensorSuite(),
                     TABLE_1[name],
                     {axis: stream(seed, axis) for axis in ("slip", "sensors")},
-                    physics=physics,  # type: ignore[arg-type]
+                    physics=physics,
                     rays="exact",
                 ).truth
                 assert truth is not None

@@ -1,0 +1,153 @@
+"""The command line as a user meets it: what it prints, what it leaves, and how it refuses."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+QUICK = ["simulation.physics=kinematic", "simulation.rays=exact"]
+
+
+def estima(*arguments, cwd=ROOT, **environment):
+    return subprocess.run(
+        [sys.executable, "-m", "experiments.cli", *arguments],
+        capture_output=True,
+        text=True,
+        cwd=cwd,
+        env={**os.environ, "PYTHONPATH": str(ROOT), **environment},
+        timeout=120,
+    )
+
+
+def refused(done, *words):
+    """One line on standard error that says all the words, and code 2."""
+    assert done.returncode == 2, done.stderr
+    lines = [line for line in done.stderr.splitlines() if not line.startswith("compiling")]
+    assert len(lines) == 1, done.stderr
+    for word in words:
+        assert word in lines[0]
+    assert "Traceback" not in done.stderr
+
+
+def test_help_names_every_command():
+    done = estima("--help")
+    assert done.returncode == 0
+    for command in ("run", "record", "info", "view", "calibrate", "conform", "bench", "reproduce"):
+        assert command in done.stdout
+    assert "estimator=odometry world=office seed=3" in estima("run", "--help").stdout
+
+
+def test_a_run_prints_its_errors_and_leaves_a_row(tmp_path):
+    done = estima("run", *QUICK, "seed=12", "name=test_cli", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "position RMSE" in done.stdout
+    rows = list((ROOT / "results" / "runs" / "test_cli").glob("*.parquet"))
+    assert rows
+    from experiments.table import read_rows
+
+    frame = read_rows(rows[0])
+    assert frame["status"].tolist() == ["ok"]
+    assert frame["robot.kr"].tolist() == [1e-5]
+    assert np.isfinite(frame["ate_rmse_m"]).all()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["robot.krr=1"], ["krr"]),
+        (["robto.kr=1"], ["robto"]),
+        (["estimator=odometri"], ["odometri"]),
+        (["robot.kr=-1"], ["robot.kr", "zero or a positive"]),
+        (["robot.kl=nan"], ["robot.kl"]),
+        (["estimator.kr=-1"], ["estimator.kr"]),
+        (["sensors=lms291", "sensors.laser.n_beams=0"], ["n_beams", "at least 1"]),
+        (["sensors=lms291", "sensors.laser.rate_hz=7"], ["rate_hz", "divide"]),
+        (["+estimator.gain=2"], ["estimator.gain", "known: kr, kl"]),
+        (["simulation.rays=psychic"], ["simulation.rays"]),
+        (["simulation.rays=bullet"], ["rays=exact"]),
+        (["prior.start=nowhere"], ["prior.start", "tracking"]),
+        (["prior.start=global"], ["start pose"]),
+        (["route.waypoints=[[0.05,0.05],[2,2]]"], ["overlaps a wall"]),
+        (["recording=missing.npz"], ["missing.npz"]),
+        (["world=from_file", "world.path=none.yaml"], ["none.yaml"]),
+        (["seed=-1"], ["seed"]),
+        (["seed=one"], ["seed"]),
+        (["repeats=0"], ["repeats"]),
+        (["route.speed_mps="], ["route", "must be real number"]),
+    ],
+)
+def test_bad_input_is_one_line_and_code_2(arguments, words):
+    given = [a for a in QUICK if a.split("=")[0] not in {b.split("=")[0] for b in arguments}]
+    refused(estima("run", *given, *arguments), *words)
+
+
+def test_damaged_recordings_are_refused(tmp_path):
+    path = tmp_path / "r.npz"
+    assert estima("record", "-o", str(path), *QUICK, "route=linear_1").returncode == 0
+    assert "frames" in estima("info", str(path)).stdout
+    path.write_bytes(path.read_bytes()[:-100])
+    refused(estima("info", str(path)), "r.npz", "record again")
+    refused(estima("run", f"recording={path}"), "r.npz", "record again")
+
+
+def test_calibration_from_recordings(tmp_path):
+    paths = []
+    for seed in range(3):
+        path = tmp_path / f"{seed}.npz"
+        overrides = ["route=linear_2", f"seed={seed}", "robot.kr=1e-4", "robot.kl=5e-5"]
+        assert estima("record", "-o", str(path), *QUICK, *overrides, "world=empty").returncode == 0
+        paths.append(str(path))
+    done = estima("calibrate", *paths, "--json")
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert found["kr"]["low"] < 1e-4 < found["kr"]["high"]
+    assert found["kl"]["low"] < 5e-5 < found["kl"]["high"]
+    refused(estima("calibrate", *paths, "--method", "guess"), "--method")
+
+
+def test_view_draws_a_world(tmp_path):
+    out = tmp_path / "w.png"
+    done = estima("view", "--world", "world=corridor", "-o", str(out))
+    assert done.returncode == 0, done.stderr
+    assert out.read_bytes()[:4] == b"\x89PNG"
+
+
+def test_conform_runs_by_name():
+    done = estima("conform", "estimators.odometry:Odometry", "kr=1e-5", "kl=1e-5")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stdout.count("pass") >= 8
+
+
+def test_a_users_own_estimator(tmp_path):
+    """One Python file and one YAML, anywhere on disk: the example of the README."""
+    text = (ROOT / "README.md").read_text()
+    code = text.split("```python\n")[1].split("```")[0]
+    options = text.split("```yaml\n")[1].split("```")[0]
+    (tmp_path / "mine.py").write_text(code)
+    (tmp_path / "mine" / "estimator").mkdir(parents=True)
+    (tmp_path / "mine" / "estimator" / "mine.yaml").write_text(options)
+    path = f"{tmp_path}:{ROOT}"
+    arguments = ["--config-dir", "mine", "estimator=mine", *QUICK, "name=test_cli"]
+    done = estima("run", *arguments, cwd=tmp_path, PYTHONPATH=path)
+    assert done.returncode == 0, done.stderr
+    done = estima("conform", "mine:Mine", "variance_per_step=1e-5", cwd=tmp_path, PYTHONPATH=path)
+    assert done.returncode == 0, done.stdout
+
+
+def test_a_collision_is_told_and_fails(tmp_path):
+    overrides = ["route=open_loop", "route.segments=[[0.5,0,20]]", "name=test_cli"]
+    done = estima("run", *QUICK, *overrides, cwd=tmp_path)
+    assert done.returncode == 1
+    assert "collision at" in done.stderr
+
+
+def test_a_full_disk_is_one_line(tmp_path):
+    out = tmp_path / "file"
+    out.write_text("")
+    done = estima("record", "-o", str(out / "r.npz"), *QUICK, "route=linear_1")
+    refused(done, "cannot write")
