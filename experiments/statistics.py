@@ -66,14 +66,20 @@ def bootstrap_interval(
 ) -> Interval:
     """Percentile bootstrap over the first axis: the recordings, with all that is nested inside.
 
+    The percentiles are moved outward as the t interval of as many recordings is wider than the
+    normal one; without that, twenty recordings cover the truth in 90 % of cases and not in 95 %.
+    A root mean square of strongly skewed errors is still covered too rarely (86 % for lognormal
+    errors of sigma 0.5); arms are better compared by `log_ratio_interval`.
     Without bounds below two recordings: one says nothing of the next.
     """
     data = np.asarray(clusters, float)
     if len(data) < 2:
         return Interval(statistic(data) if len(data) else math.nan, math.nan, math.nan)
-    draws = rng.integers(len(data), size=(n_resamples, len(data)))
+    n = len(data)
+    draws = rng.integers(n, size=(n_resamples, n))
     values = np.array([statistic(data[rows]) for rows in draws])
-    low, high = np.quantile(values, [0.025, 0.975])
+    reach = math.sqrt(n / (n - 1)) * stats.t.ppf([0.025, 0.975], n - 1)
+    low, high = np.quantile(values, stats.norm.cdf(reach))
     return Interval(statistic(data), float(low), float(high))
 
 

@@ -132,8 +132,26 @@ class Careful(Base):
                 raise InputError(f"this estimator needs a {name}")
 
 
+class Waiting(Base):
+    """Trusts the prior's word on its sensors, and complains when no scan has come."""
+
+    needs = frozenset({"laser"})
+
+    def reset(self, prior, rng):
+        super().reset(prior, rng)
+        self._scans, self._frames = 0, 0
+
+    def step(self, frame):
+        self._frames += 1
+        self._scans += frame.ranges_m is not None
+        if self._frames > 20 and self._scans == 0:
+            raise InputError("20 Frames without a scan; is the laser on?")
+        return super().step(frame)
+
+
 def test_a_clear_error_for_each_missing_need_passes(case):
     assert failed(Careful, case) == set()
+    assert failed(Waiting, case) == set()
 
 
 class Scattered(Base):

@@ -50,6 +50,31 @@ def test_ate_agrees_with_evo(seed):
     assert aligned < ours
 
 
+@pytest.mark.parametrize("turn", [2.5, np.pi - 0.1])
+def test_headings_agree_with_evo_on_both_sides_of_the_seam(turn):
+    truth, means = (se2.compose(np.array([0.0, 0.0, turn]), p) for p in trajectories(3))
+    ape = evo_metrics.APE(PoseRelation.rotation_angle_rad)
+    reference, moved = for_evo(truth), for_evo(means)
+    ape.process_data((reference, moved))
+    assert np.allclose(np.abs(metrics.heading_errors_rad(truth, means)), ape.error, atol=1e-9)
+    moved.align(reference, correct_scale=False)
+    ape.process_data((reference, moved))
+    aligned = metrics.heading_errors_rad(truth, metrics.aligned(truth, means))
+    assert np.allclose(np.abs(aligned), ape.error, atol=1e-7)
+    assert np.abs(means[:, 2] - truth[:, 2]).max() > np.pi  # the seam is crossed
+    values = metrics.nees(truth, means, np.tile(np.eye(3), (len(truth), 1, 1)))
+    assert values == pytest.approx(
+        metrics.position_errors_m(truth, means) ** 2 + heading_squares(truth, means)
+    )
+
+
+def heading_squares(truth, means):
+    """Squared heading errors from the angle between the heading vectors."""
+    unit = [np.column_stack([np.cos(p[:, 2]), np.sin(p[:, 2])]) for p in (truth, means)]
+    cross = unit[0][:, 0] * unit[1][:, 1] - unit[0][:, 1] * unit[1][:, 0]
+    return np.arctan2(cross, np.sum(unit[0] * unit[1], axis=1)) ** 2
+
+
 @pytest.mark.parametrize("delta_m", [1.0, 5.0])
 def test_rpe_agrees_with_evo(delta_m):
     truth, means = trajectories(4)

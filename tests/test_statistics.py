@@ -89,6 +89,16 @@ def test_the_bootstrap_draws_whole_recordings():
     assert widths[0] == pytest.approx(widths[1])
 
 
+def test_the_bootstrap_of_few_recordings_is_wide_enough():
+    rng, n, hits = np.random.default_rng(8), 500, 0
+    for _ in range(n):
+        found = statistics.bootstrap_interval(
+            rng.normal(size=8), lambda v: float(v.mean()), rng, 200
+        )
+        hits += found.low <= 0.0 <= found.high
+    assert 0.925 <= hits / n <= 0.975  # plain percentiles: 0.88
+
+
 def test_equivalence_without_spread():
     ratio, p = statistics.equivalent([1.1, 2.2, 3.3], [1.0, 2.0, 3.0], 0.25)
     assert ratio.value == pytest.approx(1.1)
