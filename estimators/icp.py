@@ -90,7 +90,7 @@ class Registration:
         return float(np.mean(self.inliers)) if len(self.weights) else 0.0
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _nearest_line(
     segments: Array, full_circle: bool, start: int, x: float, y: float
 ) -> tuple[int, float]:
@@ -126,7 +126,7 @@ def _nearest_line(
     return best, best_d2
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _nearest_point(
     points: Array, rays: Array, full_circle: bool, start: int, x: float, y: float
 ) -> tuple[int, float]:
@@ -154,7 +154,7 @@ def _nearest_point(
     return best, best_d2
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _plant_tree(points: Array) -> Indices:
     """Order (K,) of the points such that the middle of every range splits it in x, y, x, ..."""
     n = len(points)
@@ -175,7 +175,7 @@ def _plant_tree(points: Array) -> Indices:
     return order
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _nearest_in_tree(points: Array, order: Indices, x: float, y: float) -> tuple[int, float]:
     """Nearest point by the k-d tree of `_plant_tree`: index, squared distance."""
     stack = np.empty((64, 3), np.int64)
@@ -205,7 +205,7 @@ def _nearest_in_tree(points: Array, order: Indices, x: float, y: float) -> tuple
     return best, best_d2
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _heading_by_lines(
     source: Array,
     source_ends: Indices,
@@ -248,7 +248,7 @@ def _heading_by_lines(
     return guess
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _representatives(line_of_point: Indices, ends: Indices) -> tuple[Indices, Array]:
     """A few points for each line, which together count as the root of the line's points."""
     chosen = np.empty(_COARSE_POINTS * len(ends), np.int64)
@@ -266,7 +266,7 @@ def _representatives(line_of_point: Indices, ends: Indices) -> tuple[Indices, Ar
     return chosen[:n].copy(), weights[:n].copy()
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _step(normal: Array, gradient: Array, pose: Array) -> tuple[float, float]:
     """Solve the normal equations, move the pose in place; (translation, rotation) of the move.
 
@@ -290,7 +290,7 @@ def _step(normal: Array, gradient: Array, pose: Array) -> tuple[float, float]:
     return math.hypot(dx, dy), abs(turn)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _add_square(matrix: Array, weight: float, a: float, b: float, c: float) -> None:
     """Add weight times the square of (a, b, c) to the lower half of a matrix."""
     matrix[0, 0] += weight * a * a
@@ -301,7 +301,13 @@ def _add_square(matrix: Array, weight: float, a: float, b: float, c: float) -> N
     matrix[2, 2] += weight * c * c
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _mirror(matrix: Array) -> None:
+    """Fill the upper half of a matrix (3, 3) from the lower one."""
+    matrix[0, 1], matrix[0, 2], matrix[1, 2] = matrix[1, 0], matrix[2, 0], matrix[2, 1]
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _align(
     points: Array, rays: Array, chosen: Indices, counts: Array, pose: Array, to_lines: bool,
     segments: Array, target_points: Array, target_rays: Array, line_of_point: Indices,
@@ -404,7 +410,7 @@ def _align(
     return max_iterations, False
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _judge(
     points: Array, rays: Array, pose: Array, to_lines: bool, segments: Array,
     line_of_point: Indices, matches: Indices, residuals: Array, weights: Array, noise: float,
@@ -448,7 +454,7 @@ def _judge(
     return normal, information, feigned
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _confront(
     points: Array, line_of_point: Indices, segments: Array, pose: Array, lever_x: float,
     lever_y: float, turn: float, ranges: Array, rays: Array, other_line: Indices,
@@ -505,7 +511,7 @@ def _confront(
         _add_square(agreed if near else denied, 1.0, n1, n2, n2 * qx - n1 * qy)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _register(
     ranges: Array, points: Array, rays: Array, source_line: Indices, source_ends: Indices,
     source_segments: Array, target_ranges: Array, target_points: Array, target_rays: Array,
@@ -551,6 +557,9 @@ def _register(
         target_points, target_line, target_segments, back, pose[0], pose[1], 0.0, ranges, rays,
         source_line, source_segments, full_circle, tolerance, agreed, denied,
     )  # fmt: skip
+    _mirror(normal)
+    _mirror(information)
+    _mirror(feigned)
     return (
         matches, residuals, weights, iterations, converged, normal, information, feigned, agreed,
         denied,
@@ -656,7 +665,7 @@ def register(
         search == "kdtree", stages, window, noise, trim, increment_m, increment_rad,
     )  # fmt: skip
     matches, residuals, weights, iterations, converged = found[:5]
-    normal, information, feigned, agreed, denied = (_symmetric(lower) for lower in found[5:])
+    normal, information, feigned, agreed, denied = found[5:]
     pose[2] = math.remainder(pose[2], 2.0 * math.pi)
     status = "ok"
     if np.count_nonzero(weights) < LEAST_OVERLAP * len(weights):
@@ -673,12 +682,7 @@ def register(
     )  # fmt: skip
 
 
-def _symmetric(lower: Array) -> Array:
-    full: Array = lower + np.tril(lower, -1).T
-    return full
-
-
 def _positive_definite(matrix: Array) -> bool:
-    (a, b, c), (_, d, e), (_, _, f) = matrix.tolist()
+    (a, _, _), (b, d, _), (c, e, f) = matrix.tolist()  # of some only the lower half is filled
     minor = a * d - b * b
     return bool(a > 0.0 < minor and minor * f - a * e * e - d * c * c + 2.0 * b * c * e > 0.0)

@@ -6,7 +6,8 @@ import importlib
 
 from sim.errors import InputError
 
-SUITES = {"sim": ("recording", "casting"), "icp": ("icp",)}  # name -> modules of this package, each with `run()`
+# name -> modules of this package, each with `run()`
+SUITES = {"sim": ("recording", "casting"), "icp": ("icp",)}
 
 
 def run_bench(name: str, *, as_json: bool) -> str:
