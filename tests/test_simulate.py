@@ -252,3 +252,35 @@ def test_rates_must_divide_the_clock():
         drive(PUZZLEBOT, (0.1, 0, 1), physics="kinematic", sensors=SensorSuite(Encoder(7.0)))
     with pytest.raises(InputError, match="no sensor fires"):
         drive(PUZZLEBOT, (0.1, 0, 1), physics="kinematic", sensors=SensorSuite(Encoder(None)))
+
+
+@pytest.mark.slow
+@pytest.mark.bullet
+@pytest.mark.parametrize(
+    ("name", "robot", "seed"),
+    [("office", "robocom", 1000), ("office", "puzzlebot", 1), ("gil2008", "gil2008", 1001)],
+)
+def test_long_tours_are_driven_to_their_end(name, robot, seed):
+    """Whole tours with slip, through doors and past furniture, at the studies' sizes."""
+    config = compose([f"world={name}", f"robot={robot}", f"seed={seed}"])
+    recording = simulate(config)
+    assert recording.status == "ok"
+    travelled = np.sum(np.hypot(*np.diff(recording.truth.poses[:, :2], axis=0).T))
+    assert travelled > (300 if name == "office" else 140)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("world_seed", range(1000, 1020, 4))
+def test_offices_can_be_toured(world_seed):
+    """The judged studies' buildings: no tour ends in a wall, for the larger robot."""
+    config = compose(
+        [
+            "world=office",
+            "robot=robocom",
+            f"seed={world_seed}",
+            "simulation.physics=kinematic",
+            "simulation.rays=exact",
+            "sensors.encoder.rate_hz=5",
+        ]
+    )
+    assert simulate(config).status == "ok"
