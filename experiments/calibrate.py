@@ -27,10 +27,8 @@ from sim.recording import Recording
 from sim.robot import (
     SLIP_TIME_CONSTANT_S,
     DifferentialDrive,
-    arc_increment,
-    arc_increment_jacobian,
 )
-from sim.route import TICK_S, OpenLoop, chain
+from sim.route import TICK_S, OpenLoop
 
 Array = NDArray[np.float64]
 EndPoseMethod = Literal["sampled", "linearised"]
@@ -399,11 +397,13 @@ class _Model:
     def moments(self, k: Array, bias: Array, track_m: float) -> tuple[Array, Array]:
         """Mean (3,) and covariance (3, 3) of the coordinates."""
         travel = _mean_travel(self._commands_m, self._knots, bias, TICK_S / SLIP_TIME_CONSTANT_S)
+        found: tuple[Array, Array]
         if self._linearised:
-            return _linearised_moments(travel, k, track_m)
-        scale = np.sqrt(k) * (1.0 + bias) ** -1.5
-        mean, covariance = _sampled_moments(travel, self._noise, scale, track_m, self._log_chart)
-        return mean, covariance
+            found = _linearised_moments(travel, k, track_m)
+        else:
+            scale = np.sqrt(k) * (1.0 + bias) ** -1.5
+            found = _sampled_moments(travel, self._noise, scale, track_m, self._log_chart)
+        return found
 
 
 def _knots(commands_m: Array) -> NDArray[np.int64]:
@@ -446,21 +446,42 @@ def _slip_paths(
     return paths
 
 
+@njit()
 def _linearised_moments(travel: Array, k: Array, track_m: float) -> tuple[Array, Array]:
-    """Pose (3,) and analytic covariance (3, 3) after wheel travels (S, 2)."""
-    increments = arc_increment(travel, track_m)
-    poses = chain(increments)
-    cos, sin = np.cos(poses[:-1, 2]), np.sin(poses[:-1, 2])
-    zero, one = np.zeros_like(cos), np.ones_like(cos)
-    turned = np.array([[cos, -sin, zero], [sin, cos, zero], [zero, zero, one]]).transpose(2, 0, 1)
-    by_wheels = turned @ arc_increment_jacobian(travel, track_m)
-    # a turn at interval i swings all that follows about its end
-    swing = poses[-1, :2] - poses[1:, :2]
-    by_wheels[:, 0] -= swing[:, 1, None] * by_wheels[:, 2]
-    by_wheels[:, 1] += swing[:, 0, None] * by_wheels[:, 2]
-    variances = np.abs(travel) * k
-    covariance: Array = np.einsum("siw,sw,sjw->ij", by_wheels, variances, by_wheels)
-    return poses[-1], covariance
+    """Pose (3,) and analytic covariance (3, 3) after wheel travels (S, 2).
+
+    puzzlebot2024, eq. (2), with the second form of eq. (6), its last row's sign settled.
+    """
+    n_intervals = len(travel)
+    pose = np.zeros(3)
+    ends = np.empty((n_intervals, 2))
+    by_wheels = np.empty((n_intervals, 3, 2))
+    for s in range(n_intervals):
+        forward = (travel[s, 0] + travel[s, 1]) / 2.0
+        half = (travel[s, 0] - travel[s, 1]) / (2.0 * track_m)
+        cos, sin = np.cos(pose[2] + half), np.sin(pose[2] + half)
+        for w in range(2):
+            swing = (0.5 - w) * forward / track_m
+            by_wheels[s, 0, w] = cos / 2.0 - swing * sin
+            by_wheels[s, 1, w] = sin / 2.0 + swing * cos
+            by_wheels[s, 2, w] = (1.0 - 2.0 * w) / track_m
+        chord = forward * (1.0 - half**2 / 6.0 + half**4 / 120.0)
+        pose[0] += chord * cos
+        pose[1] += chord * sin
+        pose[2] += 2.0 * half
+        ends[s] = pose[:2]
+    covariance = np.zeros((3, 3))
+    for s in range(n_intervals):
+        for w in range(2):
+            column = by_wheels[s, :, w].copy()
+            # a turn swings all that follows about the interval's end
+            column[0] -= (pose[1] - ends[s, 1]) * by_wheels[s, 2, w]
+            column[1] += (pose[0] - ends[s, 0]) * by_wheels[s, 2, w]
+            variance = k[w] * abs(travel[s, w])
+            for i in range(3):
+                for j in range(3):
+                    covariance[i, j] += variance * column[i] * column[j]
+    return pose, covariance
 
 
 @njit()
@@ -571,7 +592,7 @@ def calibrate_recordings(
         raise InputError(f"method must be wheel_truth or end_poses, got {method!r}")
     groups: dict[bytes, tuple[Array, list[Array]]] = {}
     for i, recording in enumerate(recordings):
-        profile, end = _command_profile(recording, i), _end_pose(recording, i)
+        profile, end = _command_profile(recording, i), end_pose(recording, i)
         groups.setdefault(profile.tobytes(), (profile, []))[1].append(end)
     if min(len(ends) for _, ends in groups.values()) < 2:
         raise InputError(
@@ -627,8 +648,8 @@ def _command_profile(recording: Recording, i: int) -> Array:
     return profile
 
 
-def _end_pose(recording: Recording, i: int) -> Array:
-    """True end pose (3,) relative to the start; heading unwrapped."""
+def end_pose(recording: Recording, i: int = 0) -> Array:
+    """True end pose (3,) of recording number i relative to its start; heading unwrapped."""
     if recording.truth is None or len(recording.truth.poses) < 2:
         raise InputError(f"recording {i} has no true poses to calibrate from")
     poses = recording.truth.poses

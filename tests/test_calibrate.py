@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from experiments import calibrate
 from experiments.calibrate import (
     Manoeuvre,
     calibrate_recordings,
@@ -13,7 +14,7 @@ from experiments.calibrate import (
     report_gradient_descent,
 )
 from experiments.seeds import stream
-from experiments.studies.puzzlebot2024 import NOMINAL, calibrate_once, slipping
+from experiments.studies.puzzlebot2024 import NOMINAL, calibrate_once, ideal_beliefs, slipping
 from sim.errors import InputError
 from sim.kinematic import run_batch
 from sim.route import TABLE_1, OpenLoop
@@ -82,6 +83,43 @@ def test_ignoring_a_gain_error_spoils_k():
     ]
     blind = from_end_poses(runs, NOMINAL, np.random.default_rng(0), geometry=False)
     assert blind.kr.value + blind.kl.value > 1.5 * (robot.kr + robot.kl)
+
+
+@pytest.mark.parametrize("name", ["linear_2", "angular_3", "square"])
+def test_the_models_end_poses_are_those_of_the_tick_by_tick_robot(name):
+    """Two dozen knots stand for 300 ticks a second, biases and lag included."""
+    square = OpenLoop(((0.5, 0.0, 1.0), (0.0, 0.8, 2.0)) * 3)
+    route, robot = {**TABLE_1, "square": square}[name], slipping(1e-3, geometry=True)
+    rng = np.random.default_rng(4)
+    runs = run_batch(robot, route, 4000, rng, nominal_track_m=NOMINAL.track_m)
+    manoeuvre = Manoeuvre.of_route(route, NOMINAL, runs.end_poses)
+    model = calibrate._Model(manoeuvre, NOMINAL, rng, "sampled", 256)
+    seen = model.coordinates(runs.end_poses)
+    mean, covariance = model.moments(robot.slip_variance_per_m, robot.slip_bias, robot.track_m)
+    off = (seen.mean(axis=0) - mean) / np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose(off, 0.0, atol=0.06)
+    ratio = np.linalg.eigvals(np.linalg.solve(covariance, np.cov(seen.T))).real
+    np.testing.assert_allclose(ratio, 1.0, atol=0.12)
+
+
+@pytest.mark.parametrize("route", [TABLE_1["linear_2"], OpenLoop(((0.4, 0.6, 5.0),))])
+def test_the_analytic_covariance_is_that_of_the_odometry_filter(route):
+    robot = slipping(1e-4)
+    manoeuvre = Manoeuvre.of_route(route, NOMINAL, np.zeros((1, 3)))
+    model = calibrate._Model(manoeuvre, NOMINAL, np.random.default_rng(0), "linearised", 2)
+    mean, covariance = model.moments(robot.slip_variance_per_m, np.zeros(2), NOMINAL.track_m)
+    _, _, covariances = ideal_beliefs(route, robot.kr, robot.kl)
+    np.testing.assert_allclose(mean, route.ideal_end(), atol=1e-6)
+    spread = np.sqrt(np.diag(covariances[-1]))
+    np.testing.assert_allclose(
+        (covariance - covariances[-1]) / np.outer(spread, spread), 0, atol=0.01
+    )
+
+
+def test_a_plateau_has_no_turning_points():
+    for name, route in TABLE_1.items():
+        commands = NOMINAL.wheel_speeds(*route.profile(NOMINAL).T)
+        assert len(calibrate._knots(commands)) == 25, name
 
 
 def test_the_linearised_likelihood_overestimates_where_headings_scatter():

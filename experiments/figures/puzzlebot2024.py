@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from experiments.figures.run import covariance_ellipse
@@ -68,45 +69,70 @@ def ellipse_area(areas: pd.DataFrame, crossover: pd.DataFrame) -> Figure:
     left.set(xlabel="distance rolled, m", ylabel="area of the 95 % ellipse, m²", yscale="log")
     left.set_ylim(bottom=1e-6)
     page.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=3)
-    theory = NOMINAL.track_m * np.sqrt(3.0) / 2.0
-    found = 1000 * crossover["crossover_m"].to_numpy()
-    right.hist(found, bins=8, color=BLUE, alpha=0.7)
-    right.axvline(1000 * theory, color=BLACK, lw=1.2)
-    right.annotate(
-        f"track √3 / 2 = {1000 * theory:.1f} mm",
-        (1000 * theory, 1.0),
-        xycoords=("data", "axes fraction"),
-        xytext=(4, 3),
-        textcoords="offset points",
-    )
-    right.set(xlabel="distance at which heading takes over, mm", ylabel="runs")
+    _crossover(right, crossover)
     return page
+
+
+def _crossover(ax: Axes, crossover: pd.DataFrame) -> None:
+    """Draw the two spreads along a straight; they cross at track sqrt(3) / 2."""
+    _, means, covariances = ideal_beliefs(OpenLoop(((0.25, 0.0, 2.0),)), 1e-5, 1e-5)
+    distance = 1000 * means[:, 0]
+    spread = 1000 * np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
+    ax.plot(distance, spread[:, 0], color=BLUE, label="along the way: borne by translation")
+    ax.plot(distance, spread[:, 1], color=ORANGE, label="across: borne by heading")
+    theory, found = 1000 * NOMINAL.track_m * np.sqrt(3.0) / 2.0, 1000 * crossover["crossover_m"]
+    ax.axvline(theory, color=BLACK, lw=0.8, ls=":")
+    ax.annotate(
+        f"track √3 / 2 = {theory:.1f} mm\nfound in {len(found)} runs: {found.mean():.1f} mm",
+        (theory, spread[-1, 1]),
+        xytext=(6, 0),
+        textcoords="offset points",
+        va="top",
+    )
+    ax.set(xlabel="distance rolled, mm", ylabel="standard deviation, mm (k = 1e-5 m)")
+    ax.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0))
 
 
 def calibration(table: pd.DataFrame) -> Figure:
-    """Draw histograms of the estimates over the truth, per method, k and arm."""
+    """Draw the estimates over the truth by method and wheel, their mean interval and coverage."""
     ks = sorted(table["k_m"].unique())
-    page = figure(9.0, 6.2)
-    axes = page.subplots(2, len(ks), sharex="row")
-    slips = table[table["parameter"].isin(_PARAMETERS)]
-    for row, joint in enumerate((False, True)):
-        for column, k in enumerate(ks):
-            ax = axes[row, column]
-            chosen = slips[(slips["joint"] == joint) & (slips["k_m"] == k)]
-            ratios = chosen["value"] / chosen["truth"]
-            edges = np.linspace(ratios.min() * 0.97, min(ratios.max() * 1.03, 3.0), 36)
-            for i, (method, label) in enumerate(_METHODS.items()):
-                values = ratios[chosen["method"] == method]
-                ax.hist(values, bins=edges, color=CYCLE[i], alpha=0.6, label=label, density=True)
-            ax.axvline(1.0, color=BLACK, lw=1.0)
+    page = figure(9.0, 6.4)
+    axes = page.subplots(2, len(ks), sharex=True, sharey=True)
+    rows = [(method, name) for method in _METHODS for name in _PARAMETERS]
+    for joint, line in zip((False, True), axes, strict=True):
+        for ax, k in zip(line, ks, strict=True):
+            for i, (method, name) in enumerate(rows):
+                chosen = table["parameter"].eq(name) & table["method"].eq(method)
+                part = table[chosen & table["joint"].eq(joint) & table["k_m"].eq(k)]
+                _estimates(ax, part, len(rows) - 1 - i, CYCLE[i // 2])
+            ax.axvline(1.0, color=BLACK, lw=0.8)
             arm = "gain and track joint" if joint else "nominal geometry"
             ax.set_title(f"k = {k:g} m, {arm}", fontsize="small")
-            ax.set_yticks([])
-            if row == 1:
-                ax.set_xlabel("estimate of $k_r$, $k_l$ over the truth")
-        axes[row, 0].set_ylabel("density")
-    page.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    labels = [f"{_METHODS[method]}, {_PARAMETERS[name]}" for method, name in rows]
+    axes[0, 0].set(xscale="log", xlim=(0.55, 4.0), yticks=range(len(rows)))
+    axes[0, 0].set_yticklabels(labels[::-1])
+    axes[0, 0].set_xticks([0.7, 1.0, 1.5, 2.0, 3.0], ["0.7", "1", "1.5", "2", "3"])
+    axes[0, 0].minorticks_off()
+    page.supxlabel(
+        "estimate over the truth: histogram, its mean (dot), mean 95 % interval (bar); "
+        "at the right, the share of intervals that cover",
+        fontsize="medium",
+    )
     return page
+
+
+def _estimates(ax: Axes, part: pd.DataFrame, level: int, color: str) -> None:
+    """Draw one method's estimates of one wheel at a height."""
+    ratios = part["value"] / part["truth"]
+    counts, edges = np.histogram(ratios, bins=np.geomspace(0.55, 4.0, 80))
+    ax.stairs(level + 0.75 * counts / max(counts.max(), 1), edges, baseline=level, fill=True,
+              color=color, alpha=0.5)  # fmt: skip
+    ends = [float((part[end] / part["truth"]).mean()) for end in ("low", "high")]
+    ax.plot(ends, [level - 0.08] * 2, color=color, lw=2.0, solid_capstyle="butt")
+    ax.plot(ratios.mean(), level - 0.08, "o", color=BLACK, ms=3)
+    covered = ((part["low"] <= part["truth"]) & (part["truth"] <= part["high"])).mean()
+    ax.annotate(f"{covered:.2f}", (0.99, level + 0.1), xycoords=("axes fraction", "data"),
+                ha="right", fontsize="small")  # fmt: skip
 
 
 def table_1(table: pd.DataFrame) -> Figure:
@@ -133,9 +159,9 @@ def table_1(table: pd.DataFrame) -> Figure:
             f"{row.omega_radps:g}",
             f"{row.duration_s:g}",
             f"{row.ideal_x_m:.2f}",
-            f"{row.real_x_mean_m:.3f} ± {row.real_x_sd_m:.3f}",
+            f"{_plain(row.real_x_mean_m)} ± {row.real_x_sd_m:.3f}",
             f"{row.ideal_heading_rad:.2f}",
-            f"{row.real_heading_mean_rad:.3f} ± {row.real_heading_sd_rad:.3f}",
+            f"{_plain(row.real_heading_mean_rad)} ± {row.real_heading_sd_rad:.3f}",
             f"{1e4 * row.kr_m:.2f} [{1e4 * row.kr_low_m:.2f}, {1e4 * row.kr_high_m:.2f}]",
             f"{1e4 * row.kl_m:.2f} [{1e4 * row.kl_low_m:.2f}, {1e4 * row.kl_high_m:.2f}]",
         ]
@@ -157,6 +183,11 @@ def table_1(table: pd.DataFrame) -> Figure:
         fontsize="medium",
     )
     return page
+
+
+def _plain(value: float) -> str:
+    """Three decimals, without the sign of a zero."""
+    return f"{round(value, 3) + 0.0:.3f}"
 
 
 def coverage(table: pd.DataFrame) -> Figure:

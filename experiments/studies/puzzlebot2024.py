@@ -22,6 +22,8 @@ from estimators.odometry import Odometry
 from experiments.calibrate import (
     CalibrationResult,
     Manoeuvre,
+    calibrate_recordings,
+    end_pose,
     from_end_poses,
     from_wheel_truth,
     report_gradient_descent,
@@ -30,12 +32,12 @@ from experiments.claims import Claim
 from experiments.metrics import CHI2_95_2DOF, ellipse_area_m2
 from experiments.seeds import stream
 from experiments.table import write_frame
-from sim import se2
 from sim.kinematic import run_batch, wheel_commands
-from sim.recording import Frame
+from sim.recording import Frame, Recording
 from sim.robot import DifferentialDrive, RobotGeometry
 from sim.route import TABLE_1, TICK_S, OpenLoop
-from sim.sensors import SensorSuite
+from sim.sensors import Encoder, SensorSuite
+from sim.simulate import Physics
 
 Array = NDArray[np.float64]
 Tables = dict[str, pd.DataFrame]
@@ -49,11 +51,13 @@ CALIBRATION_KS = (1e-5, 1e-4, 1e-3)
 COVERAGE_KS = (1e-6, 1e-5, 3e-5, 1e-4, 3e-4, 1e-3)
 RUNS_PER_CASE = 20  # repetitions of each of the nine cases in one calibration
 GEOMETRY_ERROR = 0.05  # gain and track error of the joint arm
+_PHYSICS: tuple[Physics, ...] = ("bullet", "kinematic")
 CHI2_95_3DOF = 7.814727903251179
 FRAME_S = 0.05
 LOOPS: dict[str, OpenLoop] = {
     "straight": OpenLoop(((0.5, 0.0, 6.0),)),
     "arc": OpenLoop(((0.5, 0.4, 6.0),)),
+    "arc of one turn and a half": OpenLoop(((0.5, 1.5 * np.pi / 3.0, 6.0),)),
     "out and back": OpenLoop(((0.5, 0.0, 3.0), (-0.5, 0.0, 3.0))),
 }
 
@@ -74,13 +78,15 @@ def run(profile: Profile, out: Path, on_progress: Callable[[float], None]) -> Ta
     tables = {"areas": areas(), "crossover": crossover(20)}
     on_progress(0.05)
     tables["calibration"] = calibration(
-        200 if full else 8, lambda share: on_progress(0.05 + 0.65 * share)
+        200 if full else 5, lambda share: on_progress(0.05 + 0.65 * share)
     )
     tables["table_1"] = table_1()
     on_progress(0.75)
-    tables["coverage"] = coverage(2000 if full else 400)
+    tables["coverage"] = coverage(10_000 if full else 400)
     on_progress(0.85)
-    tables["engine"] = engine_check(40 if full else 6)
+    driven = engine_recordings(40 if full else 4)
+    tables["engine"] = engine_ends(driven)
+    tables["engine_k"] = engine_k(driven)
     tables["gradient_descent"] = gradient_descent()
     for name, frame in tables.items():
         write_frame(frame, out / f"{PAPER}_{name}.csv")
@@ -306,40 +312,65 @@ def _inside(ends: Array, route: OpenLoop, robot: DifferentialDrive) -> dict[str,
     }
 
 
-def engine_check(n_runs: int, k: float = 1e-4) -> pd.DataFrame:
-    """End poses of PyBullet's robot beside the kinematic one's, with the same noise, per case."""
+ENGINE_K = 1e-4
+Driven = dict[tuple[str, str], list[Recording]]
+
+
+def engine_recordings(n_runs: int) -> Driven:
+    """Recordings of some cases by (case, physics), with the same noise in either physics."""
     from sim.simulate import record
     from sim.world import World
 
     floor = World("open floor", np.zeros((0, 4)), np.zeros((0, 2)))
-    robot = slipping(k)
+    robot = slipping(ENGINE_K)
+    return {
+        (case, physics): [
+            record(
+                floor,
+                robot,
+                SensorSuite(Encoder(50.0)),
+                TABLE_1[case],
+                {axis: stream(JUDGED_SEED + number, axis) for axis in ("slip", "sensors")},
+                physics=physics,
+                rays="exact",
+            )
+            for number in range(n_runs)
+        ]
+        for case in ("linear_1", "linear_3", "angular_1", "angular_5")
+        for physics in _PHYSICS
+    }
+
+
+def engine_ends(driven: Driven) -> pd.DataFrame:
+    """End poses of PyBullet's robot beside the kinematic one's, per case and seed."""
     rows = []
-    for name in ("linear_1", "linear_3", "angular_1", "angular_5"):
-        for number in range(n_runs):
-            seed = JUDGED_SEED + number
-            ends = []
-            for physics in ("bullet", "kinematic"):
-                truth = record(
-                    floor,
-                    robot,
-                    SensorSuite(),
-                    TABLE_1[name],
-                    {axis: stream(seed, axis) for axis in ("slip", "sensors")},
-                    physics=physics,
-                    rays="exact",
-                ).truth
-                assert truth is not None
-                end = se2.between(truth.poses[0], truth.poses[-1])
-                end[2] = np.unwrap(truth.poses[:, 2])[-1] - truth.poses[0, 2]
-                ends.append(end)
-            row: dict[str, object] = {"case": name, "seed": seed}
-            for physics, end in zip(("bullet", "kinematic"), ends, strict=True):
+    for case in dict.fromkeys(case for case, _ in driven):
+        for number in range(len(driven[case, "bullet"])):
+            row: dict[str, object] = {"case": case, "seed": JUDGED_SEED + number}
+            for physics in _PHYSICS:
+                x, y, heading = end_pose(driven[case, physics][number])
                 row |= {
-                    f"{physics}_x_m": end[0],
-                    f"{physics}_y_m": end[1],
-                    f"{physics}_heading_rad": end[2],
+                    f"{physics}_x_m": x,
+                    f"{physics}_y_m": y,
+                    f"{physics}_heading_rad": heading,
                 }
             rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def engine_k(driven: Driven) -> pd.DataFrame:
+    """Recover kr and kl from the wheels of PyBullet's robot."""
+    runs = [run for (_, physics), part in driven.items() if physics == "bullet" for run in part]
+    found, robot = calibrate_recordings(runs, geometry=False, interval_s=0.02), slipping(ENGINE_K)
+    rows = [
+        {
+            "k_m": ENGINE_K,
+            "parameter": name,
+            "truth": getattr(robot, name),
+            **dataclasses.asdict(getattr(found, name)),
+        }
+        for name in ("kr", "kl")
+    ]
     return pd.DataFrame(rows)
 
 
@@ -368,7 +399,7 @@ def claims(tables: Tables, *, quick: bool) -> list[Claim]:
     judged = [
         *pb1(),
         *pb2(tables["areas"], tables["crossover"], NOMINAL.track_m),
-        *pb3(tables["calibration"], tables["gradient_descent"]),
+        *pb3(tables["calibration"], tables["gradient_descent"], tables["engine_k"]),
         *pb4(tables["coverage"], tables["engine"]),
     ]
     command = "estima reproduce --paper puzzlebot2024" + ("" if quick else " --full")
