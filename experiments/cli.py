@@ -147,11 +147,13 @@ def calibrate(
     kind: Any = method.replace("-", "_")
     result = calibrate_recordings(loaded, kind, geometry=joint)
     print(result.as_json() if as_json else result.as_text())
+    if not as_json:
+        print("  (puzzlebot2024's own gradient descent would return 0.5, whatever the recordings)")
 
 
 @app.command()
 def conform(
-    target: Annotated[str, typer.Argument(help="MODULE:CLASS of an estimator.")],
+    target: Annotated[str, typer.Argument(help="MODULE:CLASS (or MODULE.CLASS) of an estimator.")],
     arguments: Annotated[
         list[str] | None, typer.Argument(help="Its constructor's arguments, key=value.")
     ] = None,

@@ -293,8 +293,8 @@ def _missing(make: Make, recording: Recording, prior: Prior) -> str:
 
 def conform_target(target: str, arguments: Sequence[str]) -> list[CheckResult]:
     """Check `MODULE:CLASS` with constructor arguments key=value on a small recording of a room."""
-    module_name, _, name = target.partition(":")
-    if not name:
+    module_name, _, name = target.rpartition(":" if ":" in target else ".")
+    if not module_name:
         raise InputError(f"{target}: give MODULE:CLASS, such as estimators.odometry:Odometry")
     try:
         cls = getattr(importlib.import_module(module_name), name)
@@ -307,9 +307,11 @@ def conform_target(target: str, arguments: Sequence[str]) -> list[CheckResult]:
             raise InputError(f"{argument}: constructor arguments are key=value")
         keywords[key] = _value(value)
     try:
-        cls(**keywords)
+        cls(**keywords) if callable(cls) else None
     except TypeError as error:
         raise InputError(f"{target}: {error}; give its arguments as key=value") from error
+    if not callable(getattr(cls, "step", None)):
+        raise InputError(f"{target} has no method step; give MODULE:CLASS of an estimator")
     recording, prior = example()
     return check_estimator(lambda: cls(**keywords), recording, prior)
 

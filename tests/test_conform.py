@@ -233,10 +233,12 @@ def test_looking_ahead_is_caught(case, monkeypatch):
 
 
 def test_targets_by_name():
-    results = conform_target("estimators.odometry:Odometry", ["kr=1e-5", "kl=1e-5"])
+    results = conform_target("estimators.odometry.Odometry", ["kr=1e-5", "kl=1e-5"])
     assert all(result.passed for result in results)
     with pytest.raises(InputError, match="MODULE:CLASS"):
         conform_target("estimators.odometry", [])
+    with pytest.raises(InputError, match="MODULE:CLASS"):
+        conform_target("odometry", [])
     with pytest.raises(InputError, match="PYTHONPATH"):
         conform_target("nowhere.to:Be", [])
     with pytest.raises(InputError, match="key=value"):
