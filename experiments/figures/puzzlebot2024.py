@@ -109,9 +109,9 @@ def calibration(table: pd.DataFrame) -> Figure:
             arm = "gain and track joint" if joint else "nominal geometry"
             ax.set_title(f"k = {k:g} m, {arm}", fontsize="small")
     labels = [f"{_METHODS[method]}, {_PARAMETERS[name]}" for method, name in rows]
-    axes[0, 0].set(xscale="log", xlim=(0.55, 4.0), yticks=range(len(rows)))
+    axes[0, 0].set(xscale="log", xlim=(0.55, 6.5), yticks=range(len(rows)))
     axes[0, 0].set_yticklabels(labels[::-1])
-    axes[0, 0].set_xticks([0.7, 1.0, 1.5, 2.0, 3.0], ["0.7", "1", "1.5", "2", "3"])
+    axes[0, 0].set_xticks([0.7, 1.0, 1.5, 2.0, 3.0, 4.0], ["0.7", "1", "1.5", "2", "3", "4"])
     axes[0, 0].minorticks_off()
     page.supxlabel(
         "estimate over the truth: histogram, its mean (dot), mean 95 % interval (bar); "
@@ -124,7 +124,7 @@ def calibration(table: pd.DataFrame) -> Figure:
 def _estimates(ax: Axes, part: pd.DataFrame, level: int, color: str) -> None:
     """Draw one method's estimates of one wheel at a height."""
     ratios = part["value"] / part["truth"]
-    counts, edges = np.histogram(ratios, bins=np.geomspace(0.55, 4.0, 80))
+    counts, edges = np.histogram(ratios, bins=np.geomspace(0.55, 4.6, 86))
     ax.stairs(level + 0.75 * counts / max(counts.max(), 1), edges, baseline=level, fill=True,
               color=color, alpha=0.5)  # fmt: skip
     ends = [float((part[end] / part["truth"]).mean()) for end in ("low", "high")]

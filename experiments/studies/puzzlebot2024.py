@@ -330,13 +330,13 @@ def engine_recordings(n_runs: int) -> Driven:
                 robot,
                 SensorSuite(Encoder(50.0)),
                 TABLE_1[case],
-                {axis: stream(JUDGED_SEED + number, axis) for axis in ("slip", "sensors")},
+                {axis: stream(JUDGED_SEED + number, axis, i) for axis in ("slip", "sensors")},
                 physics=physics,
                 rays="exact",
             )
             for number in range(n_runs)
         ]
-        for case in ("linear_1", "linear_3", "angular_1", "angular_5")
+        for i, case in enumerate(("linear_1", "linear_3", "angular_1", "angular_5"))
         for physics in _PHYSICS
     }
 
