@@ -9,12 +9,13 @@ from __future__ import annotations
 import math
 from itertools import pairwise
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sim.errors import InputError
-from sim.plan import Plan, box_corners
+from sim.plan import Plan, box_corners, rectangle_corners
 from sim.world import World
 from sim.world_file import read_world
 
@@ -49,18 +50,26 @@ def room(
     plan.place("room", 0, 0, length_m, width_m)
     a, b = 1.2, (length_m - 1.2, width_m - 1.2)
     plan.tour = [(a, a), (b[0], a), (b[0], b[1]), (a, b[1]), (a, a)]
-    plan.furnish(rng, (0, 0), (length_m, width_m), n_objects, clearance_m=0.5)
+    plan.furnish(rng, (0, 0), (length_m, width_m), n_objects, size_m=(0.3, 1.0), clearance_m=0.45)
     return plan.world("room", rng, n_landmarks=n_landmarks, look_alike_share=look_alike_share)
 
 
-def boxes(*, rng: np.random.Generator, n_boxes: int, side_m: float, n_landmarks: int) -> World:
+def boxes(
+    *,
+    rng: np.random.Generator,
+    n_boxes: int,
+    side_m: float,
+    n_landmarks: int,
+    look_alike_share: float,
+) -> World:
     """Scatter boxes in a square hall; the tour runs along its walls."""
+    _positive(side_m=side_m - 3.0)
     plan = Plan()
     plan.rectangle((0, 0), (side_m, side_m))
     a, b = 1.2, side_m - 1.2
     plan.tour = [(a, a), (b, a), (b, b), (a, b), (a, a)]
-    plan.furnish(rng, (0, 0), (side_m, side_m), n_boxes, clearance_m=0.5, tries=400)
-    return plan.world("boxes", rng, n_landmarks=n_landmarks)
+    plan.furnish(rng, (0, 0), (side_m, side_m), n_boxes, clearance_m=0.5)
+    return plan.world("boxes", rng, n_landmarks=n_landmarks, look_alike_share=look_alike_share)
 
 
 def rooms(
@@ -92,8 +101,10 @@ def rooms(
             plan.place("room", x, y, x + room_m, y + room_m)
             if i + 1 < n_x:
                 plan.wall((x + room_m, y), (x + room_m, y + room_m), gaps=door)
+                plan.door((x + room_m, y + room_m / 2), (1, 0))
             if j + 1 < n_y:
                 plan.wall((x, y + room_m), (x + room_m, y + room_m), gaps=door)
+                plan.door((x + room_m / 2, y + room_m), (0, 1))
     plan.tour = [((i + 0.5) * room_m, (j + 0.5) * room_m) for i, j in _grid_tour(n_x, n_y)]
     for i in range(n_x):
         for j in range(n_y):
@@ -114,25 +125,44 @@ def corridor(
     bare_m: float,
     objects_m: float,
     second_leg_m: float,
+    curve_radius_m: float,
+    third_leg_m: float,
     width_m: float,
     n_objects: int,
     n_landmarks: int,
+    look_alike_share: float,
 ) -> World:
-    """Build a bare stretch, a stretch with objects, a bend to the left, and a second leg."""
-    _positive(bare_m=bare_m, objects_m=objects_m, second_leg_m=second_leg_m, width_m=width_m - 1.6)
-    plan, w = Plan(), width_m
+    """Build a bare stretch, one with objects, a sharp bend, a leg, a round curve, a last leg.
+
+    Both turn left. The place `corridor_bare` stops 3 m short of the end wall and of the objects;
+    the radius is that of the middle of the corridor.
+    """
+    _positive(
+        bare_m=bare_m - 6.0,
+        objects_m=objects_m,
+        second_leg_m=second_leg_m,
+        third_leg_m=third_leg_m - 1.0,
+        width_m=width_m - 1.8,
+        curve_radius_m=curve_radius_m - width_m / 2 - 0.2,
+    )
+    plan, w, r = Plan(), width_m, curve_radius_m
     x1, x2 = bare_m, bare_m + objects_m
-    top = w + second_leg_m
-    ring = [(0, 0), (x2 + w, 0), (x2 + w, top), (x2, top), (x2, w), (0, w)]
-    for start, end in zip(ring, [*ring[1:], ring[0]], strict=True):
-        plan.wall(start, end)
-    plan.place("corridor_bare", 0, 0, x1, w)
+    top, xc = w + second_leg_m, bare_m + objects_m + w / 2
+    far = xc - r - third_leg_m
+    angle = np.linspace(0.0, math.pi / 2, 13)
+    arc = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    centre = np.array([xc - r, top])
+    outer, inner = centre + (r + w / 2) * arc, centre + (r - w / 2) * arc[::-1]
+    ends = [(far, top + r + w / 2), (far, top + r - w / 2)]
+    plan.enclosure([(0, 0), (x2 + w, 0), *outer, *ends, *inner, (x2, w), (0, w)])
+    plan.place("corridor_bare", 3.0, 0, x1 - 3.0, w)
     plan.place("corridor_objects", x1, 0, x2, w)
     plan.place("corner", x2, 0, x2 + w, w)
-    plan.place("corridor_bare", x2, w, x2 + w, top)
-    plan.tour = [(1.0, w / 2), (x2 + w / 2, w / 2), (x2 + w / 2, top - 1.0)]
+    plan.place("curve", xc - r, top, x2 + w, top + r + w / 2)
+    middle = [(float(x), float(y)) for x, y in centre + r * arc]
+    plan.tour = [(1.0, w / 2), (xc, w / 2), *middle, (far + 1.0, top + r)]
     _line_up(plan, rng, (x1, 0), (x2, w), n_objects)
-    return plan.world("corridor", rng, n_landmarks=n_landmarks)
+    return plan.world("corridor", rng, n_landmarks=n_landmarks, look_alike_share=look_alike_share)
 
 
 def office(
@@ -144,14 +174,17 @@ def office(
     objects_per_room: int,
     rooms_visited: int,
 ) -> World:
-    """Build an office floor of 66 x 42 m: 21 furnished rooms on two corridor loops.
+    """Build an office floor of 66 x 42 m: 22 furnished rooms on two corridor loops.
 
     The corridors are the outer ring but for the rooms along the south side, and a passage from
     south to north that parts it into two loops. The north corridor is bare for 40 m, without a
     door; the west and the east one have cabinets. The rooms' widths, doors, niches and furniture
     are random. The tour goes round the western loop, then round both, into `rooms_visited` rooms.
     """
-    _positive(corridor_m=corridor_m - 1.8)
+    if not 1.8 < corridor_m <= 3.0:
+        raise InputError(f"world.corridor_m must lie between 1.8 and 3 m, got {corridor_m}")
+    if not 0 <= rooms_visited <= 22:
+        raise InputError(f"world.rooms_visited must lie in 0-22, got {rooms_visited}")
     plan, c = Plan(), corridor_m
     W, H, south = 66.0, 42.0, 9.0
     passage = 44.0 + rng.uniform(0.0, 1.0)  # west side of the passage between the loops
@@ -159,14 +192,20 @@ def office(
     inner_low, inner_high = south + c, H - c
     blocks = ((c, passage), (passage + c, W - c))
     suites = [_Suite((0.0, south), (W, south), -1, 7, 9.0)]  # the rooms south of the ring
+    row = 8.0
     for number, (left, right) in enumerate(blocks):
-        row, column = 8.0, 9.0 if number == 0 else 0.5 * (right - left)
+        court = number == 0  # between its columns; in the other block they stand back to back
+        column = 9.0 if court else 0.5 * (right - left)
+        mouth = inner_low + row
         suites += [
-            _Suite((left, inner_low), (right, inner_low), 1, 5 if number == 0 else 2, row),
-            _Suite((left, inner_low + row), (left, inner_high), -1, 2, column),
-            _Suite((right, inner_low + row), (right, inner_high), 1, 2, column),
+            _Suite((left, inner_low), (right, inner_low), 1, 5 if court else 2, row, "U"),
+            _Suite((left, mouth), (left, inner_high), -1, 2, column, "_"),
+            _Suite((right, mouth), (right, inner_high), 1, 2, column, "_" if court else ""),
         ]
         plan.wall((left, inner_high), (right, inner_high))
+        if court:
+            low, high = (left + column, mouth), (right - column, inner_high)
+            plan.close(rectangle_corners(low, high))
     visits = [visit for suite in suites for visit in suite.draw(plan, rng)]
     mid = c / 2
     y0, y1 = south + mid, H - mid
@@ -219,7 +258,11 @@ class _Visit:
 
 
 class _Suite:
-    """A row of rooms behind a corridor's wall from start to end, on its left (1) or right (-1)."""
+    """A row of rooms behind a corridor's wall from start to end, on its left (1) or right (-1).
+
+    `walls` says what else is drawn besides the front and the partitions: `_` the back, `U` the
+    back and both ends; the others are walls of something else.
+    """
 
     def __init__(
         self,
@@ -228,8 +271,9 @@ class _Suite:
         side: int,
         count: int,
         depth_m: float,
+        walls: Literal["", "_", "U"] = "",
     ) -> None:
-        self._start, self._end = np.array(start), np.array(end)
+        self._start, self._end, self._walls = np.array(start), np.array(end), walls
         self._side, self._count, self._depth_m = side, count, depth_m
 
     def draw(self, plan: Plan, rng: np.random.Generator) -> list[_Visit]:
@@ -245,8 +289,10 @@ class _Suite:
         ]
         plan.wall(self._start.tolist(), self._end.tolist(), gaps=doors)
         back = self._depth_m * inward
-        if self._count < 7:  # the southern row ends at the outer wall
+        if self._walls:
             plan.wall((self._start + back).tolist(), (self._end + back).tolist())
+        for end in (self._start, self._end) if self._walls == "U" else ():
+            plan.wall(end.tolist(), (end + back).tolist())
         visits = []
         for i, (low, high) in enumerate(pairwise(edges)):
             foot = self._start + high * along
@@ -257,6 +303,7 @@ class _Suite:
             rectangle = np.concatenate([corners.min(axis=0), corners.max(axis=0)])
             plan.place("room", *rectangle.tolist())
             door = self._start + doors[i][0] * along
+            plan.door(door, inward)
             visits.append(_Visit(rectangle[:2], rectangle[2:], door, inward))
         return visits
 
@@ -317,15 +364,16 @@ def _line_up(
 ) -> None:
     """Put cabinets against the long walls of a straight corridor, clear of doors."""
     long = 0 if high[0] - low[0] > high[1] - low[1] else 1
-    spots = np.linspace(low[long] + 1.0, high[long] - 1.0, count)
-    for spot in spots:
-        depth, width = rng.uniform(0.25, 0.42), rng.uniform(0.5, 1.3)
+    pitch = (high[long] - low[long] - 2.0) / max(count, 1)
+    for i in range(count):
+        depth, width = rng.uniform(0.25, 0.42), rng.uniform(0.4, 0.7) * min(pitch, 1.8)
         at_high = rng.random() < 0.5
         across = high[1 - long] - depth / 2 - 0.01 if at_high else low[1 - long] + depth / 2 + 0.01
-        position = spot + rng.uniform(-0.5, 0.5)
+        slack = min(0.5, (pitch - width) / 2 - 0.02)
+        position = low[long] + 1.0 + (i + 0.5) * pitch + rng.uniform(-slack, slack)
         centre = (position, across) if long == 0 else (across, position)
         size = (width, depth) if long == 0 else (depth, width)
-        if all(abs(door[long] - position) > 1.5 for door in keep_off or []):
+        if all(abs(door[long] - position) > 0.8 + width / 2 for door in keep_off or []):
             plan.box(centre, size, 0.0, rng.uniform(0.8, 1.9))
 
 
@@ -365,13 +413,15 @@ def _town(
     """Build blocks in a grid of streets; the tour is a closed way along the streets."""
     if n_x < 1 or n_y < 1:
         raise InputError(f"world.n_x and n_y must be at least 1, got {n_x} and {n_y}")
-    _positive(block_m=block_m - 20.0, street_m=street_m - 6.0)
+    _positive(block_m=block_m - 30.0, street_m=street_m - 6.0)
     plan, pitch = Plan(), block_m + street_m
     corners = [(0, 0), (n_x, 0), (n_x, n_y), (0, n_y), (0, 0)]
     if n_x >= 3 and n_y >= 2:
         corners = [(0, 0), (2, 0), (2, 1), (n_x, 1), (n_x, n_y), (1, n_y), (1, 1), (0, 1), (0, 0)]
     path = [(pitch * i - street_m / 2, pitch * j - street_m / 2) for i, j in corners]
     plan.tour = _rounded(path, radius_m=0.35 * street_m, spacing_m=4.0)
+    for x, y in path[:-1]:
+        plan.place("corner", *(v + d * street_m / 2 for d in (-1, 1) for v in (x, y)))
     for i in range(n_x):
         for j in range(n_y):
             low = np.array([i * pitch, j * pitch])

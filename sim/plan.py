@@ -15,19 +15,40 @@ from sim.world import World
 Array = NDArray[np.float64]
 WALL_HEIGHT_M = 2.5
 DESCRIPTOR_SIZE = 128
+_APART_M = 0.12  # between furniture and walls, and among furniture
 _PROUD_M = 0.01  # landmarks stand this far off their face, so that rays see them from its side
 
 
 @dataclass
 class Plan:
-    """What has been drawn so far, in metres."""
+    """What has been drawn so far, in metres.
+
+    Attributes
+    ----------
+    faces, heights, on_object
+        x1, y1, x2, y2 of each face; its bottom and top; whether it belongs to an object.
+    floors
+        Outlines of the ground one can stand on; none drawn means everywhere.
+    solids
+        Outline and top of what nobody can stand in: objects, courts without a door.
+    discs
+        Centre and radius about each solid.
+    places, tour
+        As in `World`.
+    approaches
+        x1, y1, x2, y2 of stretches that furniture keeps clear besides the tour: the ways
+        through the doors.
+    """
 
     faces: list[tuple[float, float, float, float]] = field(default_factory=list)
     heights: list[tuple[float, float]] = field(default_factory=list)
     on_object: list[bool] = field(default_factory=list)
+    floors: list[Array] = field(default_factory=list)
+    solids: list[tuple[Array, float]] = field(default_factory=list)
     discs: list[tuple[float, float, float]] = field(default_factory=list)
     places: dict[str, list[tuple[float, float, float, float]]] = field(default_factory=dict)
     tour: list[tuple[float, float]] = field(default_factory=list)
+    approaches: list[tuple[float, float, float, float]] = field(default_factory=list)
 
     def wall(
         self,
@@ -48,11 +69,23 @@ class Plan:
                 self._face((a[0], a[1], b[0], b[1]), (0.0, top_m), on_object=False)
             begin = max(begin, high)
 
+    def enclosure(self, corners: ArrayLike) -> None:
+        """Draw walls round a floor with corners (N, 2)."""
+        ring = np.asarray(corners, float)
+        for start, end in zip(ring, np.roll(ring, -1, axis=0), strict=True):
+            self.wall(start.tolist(), end.tolist())
+        self.floors.append(ring)
+
     def rectangle(self, low: Sequence[float], high: Sequence[float]) -> None:
-        """Draw four walls around the rectangle."""
-        corners = [(low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])]
-        for i in range(4):
-            self.wall(corners[i], corners[(i + 1) % 4])
+        """Draw four walls round a rectangular floor."""
+        self.enclosure(rectangle_corners(low, high))
+
+    def door(self, centre: ArrayLike, inward: ArrayLike) -> None:
+        """Name a door, and keep the metre before and behind it free; `inward` is a unit vector."""
+        x, y = np.asarray(centre, float).tolist()
+        a, b = np.array([x, y]) - np.asarray(inward), np.array([x, y]) + np.asarray(inward)
+        self.approaches.append((float(a[0]), float(a[1]), float(b[0]), float(b[1])))
+        self.place("door", x - 0.6, y - 0.6, x + 0.6, y + 0.6)
 
     def prism(
         self, corners: ArrayLike, bottom_m: float, top_m: float, *, on_object: bool = True
@@ -61,6 +94,12 @@ class Plan:
         ring = np.asarray(corners, float)
         for (x1, y1), (x2, y2) in zip(ring, np.roll(ring, -1, axis=0), strict=True):
             self._face((x1, y1, x2, y2), (bottom_m, top_m), on_object=on_object)
+        self.close(ring, top_m)
+
+    def close(self, corners: ArrayLike, top_m: float = WALL_HEIGHT_M) -> None:
+        """Mark ground with corners (N, 2) as solid, without drawing anything."""
+        ring = np.asarray(corners, float)
+        self.solids.append((ring, top_m))
         centre = ring.mean(axis=0)
         radius = float(np.max(np.hypot(*(ring - centre).T)))
         self.discs.append((float(centre[0]), float(centre[1]), radius))
@@ -89,27 +128,38 @@ class Plan:
         size_m: tuple[float, float] = (0.4, 1.4),
         height_m: tuple[float, float] = (0.4, 1.8),
         clearance_m: float = 0.75,
-        tries: int = 60,
+        tries: int = 600,
     ) -> None:
-        """Put up to `count` boxes of random size and turn into the rectangle.
+        """Put `count` boxes of random size and turn into the rectangle.
 
-        They keep `clearance_m` off the tour, and off walls and each other by a hand's breadth or
-        more; one that finds no room is left out.
+        They keep `clearance_m` off the tour and the doors, and a hand's breadth off walls and
+        each other.
+
+        Raises
+        ------
+        InputError
+            If so many find no room.
         """
-        for _ in range(count):
+        least, most = np.array(low, float), np.array(high, float)
+        paths = _near(self._paths(), least - clearance_m, most + clearance_m)
+        faces = _near(np.array(self.faces, float).reshape(-1, 4), least, most)
+        for placed in range(count):
             for _ in range(tries):
                 size = rng.uniform(*size_m, size=2)
-                reach = float(np.hypot(*size)) / 2
-                room_low, room_high = np.add(low, reach + 0.1), np.subtract(high, reach + 0.1)
-                if np.any(room_low >= room_high):
-                    continue
-                centre = rng.uniform(room_low, room_high)
-                clear_of_tour = self._tour_distance(centre) > reach + clearance_m
-                near = [math.dist(centre, d[:2]) > reach + d[2] + 0.15 for d in self.discs]
-                if clear_of_tour and all(near):
-                    yaw = rng.uniform(0.0, math.pi) if rng.random() < 0.6 else 0.0
-                    self.box((centre[0], centre[1]), size, yaw, rng.uniform(*height_m))
+                yaw = rng.uniform(0.0, math.pi) if rng.random() < 0.6 else 0.0
+                centre = rng.uniform(least, most)
+                corners = box_corners(centre.tolist(), size, yaw)
+                within = np.all((corners > least + _APART_M) & (corners < most - _APART_M))
+                if within and self._fits(corners, faces, paths, clearance_m):
+                    self.prism(corners, 0.0, rng.uniform(*height_m))
+                    faces = np.vstack([faces, self.faces[-4:]])
                     break
+            else:
+                width, depth = most - least
+                raise InputError(
+                    f"only {placed} of {count} objects fit into a room of {width:.1f} x "
+                    f"{depth:.1f} m; ask for fewer, or make it larger"
+                )
 
     def tree(self, x: float, y: float, trunk_m: float, crown_m: float, top_m: float) -> None:
         """Draw a tree: a trunk, and a crown from 2.2 m up."""
@@ -135,7 +185,9 @@ class Plan:
         if len(tour) >= 2:
             way = tour[1] - tour[0]
             start = np.array([tour[0, 0], tour[0, 1], math.atan2(way[1], way[0])])
-        places = {k: np.array(v, float) for k, v in self.places.items()}
+        # The smallest first, so that a door is not taken for the room it leads to.
+        names = sorted(self.places, key=lambda k: float(np.mean(_areas(self.places[k]))))
+        places = {k: np.array(self.places[k], float) for k in names}
         return World(name, walls, heights, landmarks, descriptors, alike, places, start, tour)
 
     def _face(self, ends: Sequence[float], height: tuple[float, float], *, on_object: bool) -> None:
@@ -144,40 +196,139 @@ class Plan:
         self.heights.append((float(height[0]), float(height[1])))
         self.on_object.append(on_object)
 
-    def _tour_distance(self, point: Array) -> float:
-        if len(self.tour) < 2:
-            return math.inf
-        path = np.array(self.tour)
-        start, along = path[:-1], np.diff(path, axis=0)
-        offset = point - start
-        length2 = np.maximum(np.sum(along**2, axis=1), 1e-12)
-        share = np.clip(np.sum(offset * along, axis=1) / length2, 0.0, 1.0)
-        return float(np.min(np.hypot(*(offset - share[:, None] * along).T)))
+    def _paths(self) -> Array:
+        """Stretches (N, 4) to keep clear: the tour and the ways through the doors."""
+        tour = np.array(self.tour, float).reshape(-1, 2)
+        legs = np.hstack([tour[:-1], tour[1:]])
+        return np.vstack([legs, np.array(self.approaches, float).reshape(-1, 4)])
+
+    def _fits(self, corners: Array, faces: Array, paths: Array, clearance_m: float) -> bool:
+        """Whether a convex object keeps off faces, paths and the other objects."""
+        edges = np.hstack([corners, np.roll(corners, -1, axis=0)])
+        if len(paths) and gaps_m(edges, paths).min() < clearance_m:
+            return False
+        if len(faces) and gaps_m(edges, faces).min() < _APART_M:
+            return False
+        # The outlines do not cross, but one may still lie inside the other.
+        centre = corners.mean(axis=0)
+        reach = float(np.max(np.hypot(*(corners - centre).T)))
+        return not any(
+            inside(centre[None], ring)[0] or inside(ring[:1], corners)[0]
+            for (ring, _), (x, y, radius) in zip(self.solids, self.discs, strict=True)
+            if math.dist(centre, (x, y)) < reach + radius
+        )
 
     def _landmarks(self, rng: np.random.Generator, count: int, on_walls_share: float) -> Array:
         """Landmarks (count, 3), spread over walls and objects by the faces' lengths."""
-        if count == 0:
-            return np.zeros((0, 3))
+        if count < 0:
+            raise InputError(f"world.n_landmarks must be zero or more, got {count}")
         if not 0.0 <= on_walls_share <= 1.0:
             raise InputError(f"world.on_walls_share must lie in [0, 1], got {on_walls_share}")
-        faces, heights = np.array(self.faces), np.array(self.heights)
+        if not self.faces:
+            return np.zeros((0, 3))
         objects = np.array(self.on_object)
-        length = np.hypot(*(faces[:, 2:] - faces[:, :2]).T)
-        on_walls = round(count * on_walls_share) if objects.any() else count
-        chosen = []
-        for share, mask in ((on_walls, ~objects), (count - on_walls, objects)):
-            weight = length * mask * (heights[:, 0] < 0.2)
-            if share:
-                chosen.append(rng.choice(len(faces), share, p=weight / weight.sum()))
-        rows = np.concatenate(chosen)
-        way = (faces[rows, 2:] - faces[rows, :2]) / length[rows, None]
-        along = rng.uniform(0.02, 0.98, len(rows)) * length[rows]
-        # A box is drawn counter-clockwise, so its outside is on the right of each face.
-        right = np.stack([way[:, 1], -way[:, 0]], axis=1)
-        side = np.where(objects[rows], 1.0, rng.choice([-1.0, 1.0], len(rows)))
-        foot = faces[rows, :2] + along[:, None] * way + _PROUD_M * side[:, None] * right
-        top = np.minimum(heights[rows, 1] - 0.05, 2.2)
-        return np.column_stack([foot, rng.uniform(0.2, np.maximum(top, 0.25))])
+        on_walls = round(count * on_walls_share)
+        if objects.all() or not objects.any():
+            on_walls = 0 if objects.all() else count
+        return np.concatenate(
+            [
+                self._scatter(rng, on_walls, ~objects),
+                self._scatter(rng, count - on_walls, objects),
+            ]
+        )
+
+    def _scatter(self, rng: np.random.Generator, count: int, on: NDArray[np.bool_]) -> Array:
+        """Landmarks (count, 3) just off the faces `on`, where one can stand and see them.
+
+        A point that comes to lie behind an outer wall or in an object is drawn anew.
+        """
+        faces, heights = np.array(self.faces), np.array(self.heights)
+        way = faces[:, 2:] - faces[:, :2]
+        length = np.hypot(*way.T)
+        weight = length * on * (heights[:, 0] < 0.2) * (heights[:, 1] > 0.3)
+        found = np.zeros((0, 3))
+        while len(found) < count:
+            rows = rng.choice(len(faces), count, p=weight / weight.sum())
+            right = np.stack([way[rows, 1], -way[rows, 0]], axis=1) / length[rows, None]
+            side = rng.choice([-1.0, 1.0], count)
+            along = rng.uniform(0.02, 0.98, count)
+            foot = faces[rows, :2] + along[:, None] * way[rows]
+            foot += _PROUD_M * side[:, None] * right
+            z = rng.uniform(0.2, np.minimum(heights[rows, 1] - 0.05, 2.2))
+            points = np.column_stack([foot, z])
+            found = np.concatenate([found, points[self._open(points)]])
+        return found[:count]
+
+    def _open(self, points: Array) -> NDArray[np.bool_]:
+        """Whether points (N, 3) lie over a floor, and not in an object."""
+        free = np.full(len(points), not self.floors)
+        for ring in self.floors:
+            free |= inside(points[:, :2], ring)
+        for ring, top in self.solids:
+            free &= ~(inside(points[:, :2], ring) & (points[:, 2] < top))
+        return free
+
+
+def rectangle_corners(low: Sequence[float], high: Sequence[float]) -> Array:
+    """Corners (4, 2), m, counter-clockwise."""
+    return np.array([(low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])])
+
+
+def inside(points: Array, ring: Array) -> NDArray[np.bool_]:
+    """Whether points (N, 2) lie inside the outline with corners (K, 2), by parity of crossings."""
+    within = np.zeros(len(points), bool)
+    near = np.all((points >= ring.min(axis=0)) & (points <= ring.max(axis=0)), axis=1)
+    x, y = points[near].T
+    odd = np.zeros(len(x), bool)
+    for (x1, y1), (x2, y2) in zip(ring, np.roll(ring, -1, axis=0), strict=True):
+        if y1 != y2:
+            odd ^= ((y1 > y) != (y2 > y)) & (x < x1 + (y - y1) * (x2 - x1) / (y2 - y1))
+    within[near] = odd
+    return within
+
+
+def gaps_m(first: Array, second: Array) -> Array:
+    """Distances (N, M), m, between segments (N, 4) and (M, 4); 0 where they cross."""
+    a, b = first[:, None, :], second[None, :, :]
+    apart: Array = np.minimum.reduce(
+        [
+            _to_segment(a[..., :2], b),
+            _to_segment(a[..., 2:], b),
+            _to_segment(b[..., :2], a),
+            _to_segment(b[..., 2:], a),
+        ]
+    )
+    across = (_turn(a, b[..., :2]) * _turn(a, b[..., 2:]) < 0) & (
+        _turn(b, a[..., :2]) * _turn(b, a[..., 2:]) < 0
+    )
+    return np.where(across, 0.0, apart)
+
+
+def _near(segments: Array, low: Array, high: Array) -> Array:
+    """Keep the segments (N, 4) whose bounds meet a rectangle."""
+    ends = segments.reshape(-1, 2, 2)
+    return segments[np.all((ends.max(axis=1) >= low) & (ends.min(axis=1) <= high), axis=1)]
+
+
+def _to_segment(points: Array, segments: Array) -> Array:
+    start, along = segments[..., :2], segments[..., 2:] - segments[..., :2]
+    offset = points - start
+    length2 = np.maximum(np.sum(along**2, axis=-1), 1e-12)
+    share = np.clip(np.sum(offset * along, axis=-1) / length2, 0.0, 1.0)
+    rest = offset - share[..., None] * along
+    distance: Array = np.hypot(rest[..., 0], rest[..., 1])
+    return distance
+
+
+def _turn(segments: Array, points: Array) -> Array:
+    """Positive where the points lie on the left of the segments."""
+    along, offset = segments[..., 2:] - segments[..., :2], points - segments[..., :2]
+    left: Array = along[..., 0] * offset[..., 1] - along[..., 1] * offset[..., 0]
+    return left
+
+
+def _areas(rectangles: Iterable[tuple[float, float, float, float]]) -> list[float]:
+    return [(x2 - x1) * (y2 - y1) for x1, y1, x2, y2 in rectangles]
 
 
 def box_corners(centre: Sequence[float], size: Sequence[float] | Array, yaw_rad: float) -> Array:

@@ -85,7 +85,13 @@ class World:
     def bounds_m(self) -> Array:
         """(4,) m: x_min, y_min, x_max, y_max of everything in the world."""
         points = np.concatenate(
-            [self.walls[:, :2], self.walls[:, 2:], self.landmarks[:, :2], self.start_pose[None, :2]]
+            [
+                self.walls[:, :2],
+                self.walls[:, 2:],
+                self.landmarks[:, :2],
+                self.start_pose[None, :2],
+                self.waypoints,
+            ]
         )
         return np.concatenate([points.min(axis=0), points.max(axis=0)])
 

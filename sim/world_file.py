@@ -25,7 +25,7 @@ import numpy as np
 import yaml
 
 from sim.errors import InputError
-from sim.plan import WALL_HEIGHT_M, box_corners, make_descriptors
+from sim.plan import WALL_HEIGHT_M, box_corners, gaps_m, make_descriptors
 from sim.world import World
 
 _KEYS = ("name", "walls", "boxes", "landmarks", "places", "waypoints", "start_pose")
@@ -66,10 +66,16 @@ def read_world(path: Path) -> World:
     landmarks = _rows(document, "landmarks", 3, path)
     waypoints = _rows(document, "waypoints", 2, path)
     descriptors, alike = make_descriptors(np.random.default_rng(0), len(landmarks), 0.0)
+    _check_tour(waypoints, np.array(walls, float).reshape(-1, 4), path)
     named = document.get("places") or {}
     if not isinstance(named, Mapping):
         raise InputError(f"{path}: places must map names to lists of x_min, y_min, x_max, y_max")
     places = {str(k): _rows(named, k, 4, path, prefix="places.") for k in named}
+    for name, rectangles in places.items():
+        for bad in np.flatnonzero(np.any(rectangles[:, :2] >= rectangles[:, 2:], axis=1)):
+            raise InputError(
+                f"{path}: places.{name}[{bad}] must have x_min < x_max and y_min < y_max"
+            )
     return World(
         name=str(document.get("name", path.stem)),
         walls=np.array(walls, float).reshape(-1, 4),
@@ -81,6 +87,19 @@ def read_world(path: Path) -> World:
         start_pose=_start(document, waypoints, path),
         waypoints=waypoints,
     )
+
+
+def _check_tour(waypoints: Any, walls: Any, path: Path) -> None:
+    """Refuse a tour that runs through a wall: no robot can follow it."""
+    if len(walls) == 0:
+        return
+    for i in range(len(waypoints) - 1):
+        leg = np.concatenate(waypoints[i : i + 2])[None]
+        if gaps_m(leg, walls).min() == 0.0:
+            raise InputError(
+                f"{path}: the way from waypoints[{i}] to waypoints[{i + 1}] runs through a wall or "
+                "a box; lead it round"
+            )
 
 
 def _start(document: Mapping[str, Any], waypoints: Any, path: Path) -> Any:
@@ -165,9 +184,13 @@ def _numbers(entry: Any, count: int, where: str, names: str) -> list[float]:
 
 
 def _number(value: Any, where: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+    try:  # YAML 1.1 reads 1e-3, without a point, as text
+        number = math.nan if isinstance(value, bool) else float(value)
+    except (TypeError, ValueError):
+        number = math.nan
+    if not math.isfinite(number):
         raise InputError(f"{where}: {value!r} is not a finite number")
-    return float(value)
+    return number
 
 
 def _brief(error: Exception) -> str:

@@ -8,9 +8,28 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from experiments.figures.style import CYCLE, GREEN, ORANGE, PURPLE, WALL, figure
+from experiments.figures.style import (
+    BLACK,
+    BLUE,
+    GREEN,
+    ORANGE,
+    PURPLE,
+    RED,
+    SKY,
+    WALL,
+    YELLOW,
+    figure,
+)
 from sim.world import World
 
+_PLACES = {
+    "room": SKY,
+    "corridor_bare": YELLOW,
+    "corridor_objects": GREEN,
+    "corner": RED,
+    "curve": ORANGE,
+    "door": BLACK,
+}
 _LASER_HEIGHT_M = 0.25  # faces that begin above it are drawn faintly
 
 
@@ -19,9 +38,10 @@ def draw_world(
 ) -> None:
     """Draw walls, and on request landmarks, named places and the tour, in metres."""
     if places:
-        for i, (name, rectangles) in enumerate(world.places.items()):
+        for name, rectangles in world.places.items():
             for j, (x1, y1, x2, y2) in enumerate(rectangles):
-                patch = Rectangle((x1, y1), x2 - x1, y2 - y1, color=CYCLE[i % 7], alpha=0.15, lw=0)
+                color = _PLACES.get(name, PURPLE)
+                patch = Rectangle((x1, y1), x2 - x1, y2 - y1, color=color, alpha=0.15, lw=0)
                 patch.set_label(name.replace("_", ", ") if j == 0 else "")
                 ax.add_patch(patch)
     high = world.wall_z_m[:, 0] > _LASER_HEIGHT_M
@@ -35,8 +55,8 @@ def draw_world(
                 x, y = world.landmarks[mask, :2].T
                 ax.plot(x, y, ".", color=color, ms=2.5, label=label)
     if tour and len(world.waypoints):
-        ax.plot(*world.waypoints.T, color=CYCLE[0], lw=1.0, label="tour")
-        ax.plot(*world.start_pose[:2], "o", color=CYCLE[0], ms=4, label="start")
+        ax.plot(*world.waypoints.T, color=BLUE, lw=1.0, label="tour")
+        ax.plot(*world.start_pose[:2], "o", color=BLUE, ms=4, label="start")
     ax.set(xlabel="x, m", ylabel="y, m", aspect="equal")
     ax.autoscale_view()
 
@@ -45,9 +65,11 @@ def world_figure(world: World) -> Figure:
     """One world with everything in it, and a legend above."""
     x1, y1, x2, y2 = world.bounds_m
     width, height = x2 - x1, y2 - y1
-    page = figure(9.0, float(np.clip(9.0 * height / max(width, 1.0), 3.0, 9.0)) + 0.8)
+    # What the map needs beside the labels, with room above it for title and legend.
+    page = figure(9.0, float(np.clip(8.3 * height / max(width, 1.0), 2.0, 8.3)) + 1.5)
     ax = page.subplots()
     draw_world(ax, world, places=True, tour=True)
     ax.set_title(world.name, loc="left")
-    page.legend(loc="outside upper right", ncols=5)
+    if ax.get_legend_handles_labels()[1]:
+        page.legend(loc="outside upper right", ncols=5)
     return page
