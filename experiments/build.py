@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib
 import inspect
 from collections.abc import Callable
@@ -110,6 +111,9 @@ def make_recording(
     if config["recording"] is not None:
         return load(Path(config["recording"]))
     settings = {key: config[key] for key in SIMULATED_KEYS}
+    world_file = config["world"].get("path")
+    if world_file is not None and Path(world_file).is_file():  # an edited file is another world
+        settings["world_file"] = hashlib.sha256(Path(world_file).read_bytes()).hexdigest()
     return cached(cache, settings, lambda: simulate(config, on_progress))
 
 

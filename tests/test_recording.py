@@ -261,3 +261,23 @@ print(save(simulate(config), Path(sys.argv[1])))
     assert runs[0] == runs[1]
     assert len(runs[0]) == 64
     assert load(tmp_path / "0.npz").checksum == load(tmp_path / "1.npz").checksum == runs[0]
+
+
+def test_an_edited_world_file_is_another_recording(tmp_path):
+    from experiments.build import make_recording
+    from experiments.compose import compose
+
+    path = tmp_path / "w.yaml"
+    overrides = [
+        "world=from_file",
+        f"world.path={path}",
+        "route=linear_4",
+        "simulation.physics=kinematic",
+        "simulation.rays=exact",
+    ]
+    walls = []
+    for x in (5, 6):
+        path.write_text(f"walls: [[{x}, -1, {x}, 1]]\n")
+        recording = make_recording(compose(overrides), tmp_path / "cache")
+        walls.append(recording.truth.world.walls[0, 0])
+    assert walls == [5.0, 6.0]
