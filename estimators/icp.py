@@ -29,6 +29,11 @@ Search = Literal["angular", "kdtree"]
 Kernel = Literal["tukey", "huber", "none"]
 
 _COARSE_POINTS = 6  # points that stand for a line of the source until the poses are close
+# Errors of the heading, rad, that the second and the third stage may find: they bound how far
+# those look. For the first it is that of the guess.
+_TURN_THEN, _TURN_LAST = 0.01, 0.002
+_TOLD_RAD, _GUESSED_RAD = 0.08, 0.2  # where the lines told the heading, and where not
+_NO_GAIN = 1e-4  # fall of the cost, in squared standard deviations, that is worth no iteration
 _GRAZING = 0.001  # squared sine below which a beam along a wall is not trusted further
 _HUBER, _TUKEY = 1.345, 6.0  # tuning constants, in standard deviations
 _LEAST_MEMBERS = 3  # points on a line before it holds a direction
@@ -249,16 +254,34 @@ def _heading_by_lines(
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _representatives(line_of_point: Indices, ends: Indices) -> tuple[Indices, Array]:
-    """A few points for each line, which together count as the root of the line's points."""
+def _representatives(
+    points: Array, line_of_point: Indices, ends: Indices, segments: Array
+) -> tuple[Indices, Array]:
+    """A few points for each line, which together count as the root of the line's points.
+
+    They are spaced in turn by beams and by length: a wall that runs away from the sensor has
+    its beams near it, and its lever far off.
+    """
     chosen = np.empty(_COARSE_POINTS * len(ends), np.int64)
     weights = np.empty(len(chosen))
     n = 0
     for k in range(len(ends)):
         first, last = ends[k, 0], ends[k, 1]
+        n1, n2 = segments[k, 0], segments[k, 1]
+        start = n1 * points[first, 1] - n2 * points[first, 0]
+        length = n1 * points[last, 1] - n2 * points[last, 0] - start
         here = min(_COARSE_POINTS, last - first + 1)
+        by_length = first
         for j in range(here):
             i = first + (last - first) * j // (here - 1)
+            if j % 2 == 1 and here == _COARSE_POINTS:
+                wanted = start + length * j / (here - 1)
+                while (
+                    by_length < last
+                    and n1 * points[by_length, 1] - n2 * points[by_length, 0] < wanted
+                ):
+                    by_length += 1
+                i = by_length
             if line_of_point[i] == k:
                 chosen[n] = i
                 weights[n] = math.sqrt(last - first + 1.0) / here
@@ -267,8 +290,10 @@ def _representatives(line_of_point: Indices, ends: Indices) -> tuple[Indices, Ar
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _step(normal: Array, gradient: Array, pose: Array) -> tuple[float, float]:
-    """Solve the normal equations, move the pose in place; (translation, rotation) of the move.
+def _step(normal: Array, gradient: Array, pose: Array) -> tuple[float, float, float]:
+    """Solve the normal equations and move the pose in place.
+
+    Returns the translation and rotation of the move, and by how much the cost should fall.
 
     Directions without information get a whiff of damping: there the pose stays.
     """
@@ -287,7 +312,7 @@ def _step(normal: Array, gradient: Array, pose: Array) -> tuple[float, float]:
     pose[0] += dx
     pose[1] += dy
     pose[2] += turn
-    return math.hypot(dx, dy), abs(turn)
+    return math.hypot(dx, dy), abs(turn), y1 * y1 + y2 * y2 + y3 * y3
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
@@ -311,15 +336,17 @@ def _mirror(matrix: Array) -> None:
 def _align(
     points: Array, rays: Array, chosen: Indices, counts: Array, pose: Array, to_lines: bool,
     segments: Array, target_points: Array, target_rays: Array, line_of_point: Indices,
-    full_circle: bool, order: Indices, gate: float, kernel: int, scale: float, noise: float,
-    trim: float, max_iterations: int, increment_m: float, increment_rad: float, matches: Indices,
-    residuals: Array, weights: Array,
+    full_circle: bool, order: Indices, gate: float, kernel: int, scale: float, reach: float,
+    noise: float, trim: float, max_iterations: int, increment_m: float, increment_rad: float,
+    guess: Array, matches: Indices, residuals: Array, weights: Array,
 ) -> tuple[int, bool]:  # fmt: skip
     """Iterate from `pose`, in place, to rest under one gate; iterations, converged.
 
     Kernel 0 none, 1 Huber, 2 Tukey: of the residual over its standard deviation `scale` times
     the range noise, as it shows at the beam's incidence. Kernel 3 (coarse) weighs the distance
-    itself by Geman and McClure's law of width `scale`, m.
+    itself by Geman and McClure's law of width `scale`, m. Points farther than `reach` wait: an
+    error of heading that is small near the sensor takes them to other walls. `guess` (5,) is a
+    pose, and the weights of its position and heading.
     """
     near = 0
     by_tree = len(order) > 0
@@ -328,6 +355,9 @@ def _align(
         cos, sin = math.cos(pose[2]), math.sin(pose[2])
         for k in range(len(chosen)):
             i = chosen[k]
+            if points[i, 0] ** 2 + points[i, 1] ** 2 > reach * reach:
+                matches[i], misses[k] = near, math.inf
+                continue
             x = cos * points[i, 0] - sin * points[i, 1] + pose[0]
             y = sin * points[i, 0] + cos * points[i, 1] + pose[1]
             if iteration > 0:
@@ -404,8 +434,16 @@ def _align(
                 gradient[2] += weight * (ey * qx - ex * qy)
         if not normal[0, 0] + normal[1, 1] > 0.0:
             return iteration, False
-        moved, turned = _step(normal, gradient, pose)
+        if kernel == 3:
+            for k in range(3):
+                hold = guess[4] if k == 2 else guess[3]
+                normal[k, k] += hold
+                gradient[k] += hold * (pose[k] - guess[k])
+        moved, turned, gained = _step(normal, gradient, pose)
         if moved < increment_m and turned < increment_rad:
+            return iteration + 1, True
+        # along a direction that nothing holds the pose may wander without end
+        if to_lines and gained < (_NO_GAIN * noise**2 if kernel == 3 else _NO_GAIN):
             return iteration + 1, True
     return max_iterations, False
 
@@ -516,10 +554,14 @@ def _register(
     ranges: Array, points: Array, rays: Array, source_line: Indices, source_ends: Indices,
     source_segments: Array, target_ranges: Array, target_points: Array, target_rays: Array,
     target_line: Indices, target_ends: Indices, target_segments: Array, full_circle: bool,
-    pose: Array, to_lines: bool, by_tree: bool, stages: Array, window: float, noise: float,
+    pose: Array, to_lines: bool, by_tree: bool, stages: Array, window: float, sigma_m: float,
+    sigma_rad: float, noise: float,
     trim: float, increment_m: float, increment_rad: float,
 ) -> tuple[Indices, Array, Array, int, bool, Array, Array, Array, Array, Array]:  # fmt: skip
-    """All of a registration; `stages` (S, 5): gate, kernel, its scale, iterations, sparse."""
+    """All of a registration.
+
+    Columns of `stages` (S, 6): gate, kernel, its scale, iterations, whether sparse, reach.
+    """
     n = len(points)
     matches, residuals, weights = np.zeros(n, np.int64), np.zeros(n), np.zeros(n)
     order = _plant_tree(target_points) if by_tree else np.empty(0, np.int64)
@@ -527,7 +569,8 @@ def _register(
         pose[2] = _heading_by_lines(
             source_segments, source_ends, target_segments, target_ends, pose[2], window
         )
-    few, counts = _representatives(source_line, source_ends)
+    guess = np.array([pose[0], pose[1], pose[2], (noise / sigma_m) ** 2, (noise / sigma_rad) ** 2])
+    few, counts = _representatives(points, source_line, source_ends, source_segments)
     every, ones = np.arange(n), np.ones(n)
     iterations, converged = 0, False
     for s in range(len(stages)):
@@ -537,8 +580,9 @@ def _register(
         done, converged = _align(
             points, rays, few if sparse else every, counts if sparse else ones, pose, to_lines,
             target_segments, target_points, target_rays, target_line, full_circle, order,
-            stages[s, 0], int(stages[s, 1]), stages[s, 2], noise, trim, int(stages[s, 3]),
-            loose * increment_m, loose * increment_rad, matches, residuals, weights,
+            stages[s, 0], int(stages[s, 1]), stages[s, 2], stages[s, 5], noise, trim,
+            int(stages[s, 3]), loose * increment_m, loose * increment_rad, guess, matches,
+            residuals, weights,
         )  # fmt: skip
         iterations += done
     normal, information, feigned = _judge(
@@ -580,6 +624,7 @@ def register(
     kernel: Kernel = "tukey",
     trim: float = 0.0,
     gate_m: float = 2.0,
+    gate_rad: float | None = None,
     heading_window_rad: float | None = None,
     max_iterations: int = 100,
     increment_m: float = 1e-5,
@@ -604,8 +649,11 @@ def register(
     trim
         Share of the worst matches to leave out at every iteration. It takes the few points
         that hold a robot along a corridor first; 0 is the sound choice.
-    gate_m
-        Widest distance of a match to begin with.
+    gate_m, gate_rad
+        Errors that the guess may have, as four standard deviations. The first is also the widest
+        distance of a match to begin with; both say how far the first stage may look, and hold
+        the pose to the guess where that shows nothing. By default 2 m and 0.2 rad, or 0.08 rad
+        after a search of the heading.
     heading_window_rad
         Half the range of headings searched for agreement of the scans' lines before the first
         iteration; by default 30 degrees without an initial guess, and 0 (no search) with one.
@@ -640,29 +688,30 @@ def register(
         window = math.pi / 6.0 if initial is None else 0.0
     code, scale = float(_KERNELS[kernel]), _SCALES[kernel]
     most = float(max_iterations)
-    if to_lines:
-        stages = np.array(
-            [
-                [gate_m, 3, 0.3, most, 1],
-                [min(gate_m, 0.5), 3, 0.1, most, 1],
-                [min(gate_m, 0.3), code, 3.0 * scale, most, 0],
-                [min(gate_m, 0.3), code, scale, most, 0],
-            ]
-        )
-    else:
-        stages = np.array(
-            [
-                [gate_m, 3, 0.5, most, 0],
-                [min(gate_m, 0.5), 3, 0.2, most, 0],
-                [min(gate_m, 0.2), code, scale, most, 0],
-            ]
-        )
+    if gate_rad is None:
+        gate_rad = _TOLD_RAD if window > 0.0 else _GUESSED_RAD
+    reach_m = 4.0 * gate_m / gate_rad
+    stages = np.array(
+        [
+            [gate_m, 3, 0.3, most, 1, reach_m],
+            [min(gate_m, 0.5), 3, 0.1, most, 1, 0.5 / _TURN_THEN],
+            [min(gate_m, 0.3), code, 3.0 * scale, most, 0, 0.3 / _TURN_LAST],
+            [min(gate_m, 0.3), code, scale, most, 0, math.inf],
+        ]
+        if to_lines
+        else [
+            [gate_m, 3, 0.5, most, 0, reach_m],
+            [min(gate_m, 0.5), 3, 0.2, most, 0, 0.5 / _TURN_THEN],
+            [min(gate_m, 0.2), code, scale, most, 0, math.inf],
+        ]
+    )
     noise = max(source.noise_m, target.noise_m)
     found = _register(
         source.ranges_m, source.points, source.rays, source.line_of_point, source.line_ends,
         source.segments, target.ranges_m, target.points, target.rays, target.line_of_point,
         target.line_ends, target.segments, target.full_circle, pose, to_lines,
-        search == "kdtree", stages, window, noise, trim, increment_m, increment_rad,
+        search == "kdtree", stages, window, gate_m / 4.0, gate_rad / 4.0, noise, trim, increment_m,
+        increment_rad,
     )  # fmt: skip
     matches, residuals, weights, iterations, converged = found[:5]
     normal, information, feigned, agreed, denied = found[5:]

@@ -28,7 +28,9 @@ Covariance = Literal["censi", "censi_last", "hessian", "sampling", "unscented_ce
 FAILED = ("empty", "poor_overlap", "not_converged")
 
 _LEAST_SIGMA_M = 1e-4  # a laser without noise still has rounding
+# What a guess may be wrong by, at least and at most
 _LEAST_GATE_M, _MOST_GATE_M = 0.5, 2.0
+_LEAST_GATE_RAD, _MOST_GATE_RAD = 0.02, 0.2
 _HEADING_WINDOW_RAD = math.pi / 6.0  # constant velocity misses the turns: search the headings
 # Constant velocity is not trusted further than to these standard deviations
 _GUESS_FLOOR_M, _GUESS_FLOOR_RAD, _GUESS_SHARE = 0.05, 0.05, 0.5
@@ -97,10 +99,10 @@ class IcpOdometry:
     Notes
     -----
     When a registration fails (against the reference and against the last scan), the belief moves
-    by the guess with the guess's covariance, `extras["status"]` says why, and the scan becomes
-    the new reference. Directions that the scans do not hold keep the guess and its covariance.
-    Frames without a scan move by the wheels with `use_odometry_guess`, else they repeat the last
-    belief.
+    by the guess with the guess's covariance and `extras["status"]` says why. The next scan is
+    tried against both again; after a second failure the newest scan becomes the reference.
+    Directions that the scans do not hold keep the guess and its covariance. Frames without a
+    scan move by the wheels with `use_odometry_guess`, else they repeat the last belief.
 
     Belief extras: `registration_covariance` (3, 3) of T_reference_base, `registration_status`,
     and `status` if the registration failed.
@@ -168,6 +170,7 @@ class IcpOdometry:
         start = _Gaussian(prior.mean.copy(), prior.covariance.copy())
         self._key = self._last = _Anchor(start, None)
         self._key_to_last = _STILL
+        self._lost = False
         self._wheels = _STILL  # motion since the last scan, by the wheels
         self._since_s = 0.0
         self._velocity = np.zeros(3)  # twist between the last two scans, per second
@@ -204,12 +207,15 @@ class IcpOdometry:
         failed = status in FAILED
         if failed:
             extras["status"] = status
+            self._key_to_last = self._key_to_last.then(guess)
         if self._since_s > 0.0:
             moved = se2.between(self._last.belief.mean, belief.mean)
             self._velocity = se2.log(moved) / self._since_s
         self._last = _Anchor(belief, scan)
-        if failed or self._left_key():
+        # after a single lost scan the key frame gets another chance: the scan may be at fault
+        if (failed and self._lost) or (not failed and self._left_key()):
             self._key, self._key_to_last = self._last, _STILL
+        self._lost = failed
         self._wheels, self._since_s = _STILL, 0.0
         return _belief(belief, extras)
 
@@ -242,13 +248,16 @@ class IcpOdometry:
     ) -> tuple[_Gaussian, str]:
         """Motion of base_link from the reference to the scan, and the registration's status."""
         in_laser = guess.seen_from(self._T_base_laser)
+        spread_m = math.sqrt(in_laser.covariance[0, 0] + in_laser.covariance[1, 1])
+        spread_rad = math.sqrt(in_laser.covariance[2, 2])
         found = register(
             scan,
             reference,
             in_laser.mean,
             metric=self.metric,
             search=self.search,
-            gate_m=self._gate_m(in_laser.covariance),
+            gate_m=min(_LEAST_GATE_M + 4.0 * spread_m, _MOST_GATE_M),
+            gate_rad=min(_LEAST_GATE_RAD + 4.0 * spread_rad, _MOST_GATE_RAD),
             heading_window_rad=0.0 if self.use_odometry_guess else _HEADING_WINDOW_RAD,
         )
         if found.status in FAILED:
@@ -258,12 +267,6 @@ class IcpOdometry:
         if found.status == "degenerate":
             motion = _completed(motion, found, in_laser)
         return motion.seen_from(se2.inverse(self._T_base_laser)), found.status
-
-    @staticmethod
-    def _gate_m(guess_covariance: Array) -> float:
-        """First gate of a registration: wide enough for what the guess may be wrong by."""
-        spread_m = math.sqrt(guess_covariance[0, 0] + guess_covariance[1, 1])
-        return min(_LEAST_GATE_M + 4.0 * spread_m, _MOST_GATE_M)
 
     def _covariance_of(
         self, found: Registration, source: PreparedScan, target: PreparedScan, of_guess: Array
