@@ -225,6 +225,28 @@ def test_long_walls_do_not_trap_a_wrong_heading(off, rng):
         assert found.iterations < 40  # and the free direction does not keep it going
 
 
+def test_weights_are_of_the_noise_along_the_beam(rng):
+    target, source = scan(ROOM, [0.3, 0.4, 0.7], rng), scan(ROOM, [0.35, 0.42, 0.72], rng)
+    found = register(source, target, kernel="none")
+    kept = found.inliers
+    normals = target.segments[found.matches[kept], :2]
+    turned = se2.transform([0.0, 0.0, found.T_target_source[2]], source.rays[kept])
+    variance = max(source.noise_m, target.noise_m) ** 2 * np.sum(normals * turned, axis=1) ** 2
+    facing = variance > 0.1 * variance.max()
+    ratio = found.weights[kept][facing] * variance[facing]
+    assert np.all((ratio > 0.97) & (ratio <= 1.0))
+
+
+def test_noise_of_a_wall_feigns_information_along_it(rng):
+    along = np.array([np.cos(2.2), np.sin(2.2)])
+    off = np.array([3.0 * along[1], -3.0 * along[0]])
+    wall = np.array([[*(off - 9.0 * along), *(off + 9.0 * along)]])
+    found = register(scan(wall, np.zeros(3), rng), scan(wall, np.zeros(3), rng), np.zeros(3))
+    assert found.status == "degenerate"
+    assert np.abs(np.linalg.eigh(found.information_noise[:2, :2])[1][:, 1] @ along) > 0.999
+    assert np.abs(np.linalg.eigh(found.information[:2, :2])[1][:, 1] @ along) < 0.05
+
+
 def test_outliers_do_not_move_it(rng):
     target, source = (
         scan(ROOM, [0.3, 0.4, 0.7], rng),
