@@ -14,10 +14,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from estimators.scan_lines import PreparedScan, prepare, select
+from sim.compiled import njit
 from sim.errors import InputError
 
 __all__ = ["PreparedScan", "Registration", "prepare", "register"]
@@ -95,7 +95,7 @@ class Registration:
         return float(np.mean(self.inliers)) if len(self.weights) else 0.0
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@njit(error_model="numpy", fastmath={"contract"})
 def _nearest_line(
     segments: Array, full_circle: bool, start: int, x: float, y: float
 ) -> tuple[int, float]:
@@ -131,7 +131,7 @@ def _nearest_line(
     return best, best_d2
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@njit(error_model="numpy", fastmath={"contract"})
 def _nearest_point(
     points: Array, rays: Array, full_circle: bool, start: int, x: float, y: float
 ) -> tuple[int, float]:
@@ -159,7 +159,7 @@ def _nearest_point(
     return best, best_d2
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@njit(error_model="numpy", fastmath={"contract"})
 def _plant_tree(points: Array) -> Indices:
     """Order (K,) of the points such that the middle of every range splits it in x, y, x, ..."""
     n = len(points)
@@ -180,7 +180,7 @@ def _plant_tree(points: Array) -> Indices:
     return order
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@njit(error_model="numpy", fastmath={"contract"})
 def _nearest_in_tree(points: Array, order: Indices, x: float, y: float) -> tuple[int, float]:
     """Nearest point by the k-d tree of `_plant_tree`: index, squared distance."""
     stack = np.empty((64, 3), np.int64)
@@ -210,7 +210,7 @@ def _nearest_in_tree(points: Array, order: Indices, x: float, y: float) -> tuple
     return best, best_d2
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@njit(error_model="numpy", fastmath={"contract"})
 def _heading_by_lines(
     source: Array,
     source_ends: Indices,
@@ -253,7 +253,7 @@ def _heading_by_lines(
     return guess
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@njit(error_model="numpy", fastmath={"contract"})
 def _representatives(
     points: Array, line_of_point: Indices, ends: Indices, segments: Array
 ) -> tuple[Indices, Array]:
@@ -289,7 +289,7 @@ def _representatives(
     return chosen[:n].copy(), weights[:n].copy()
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@njit(error_model="numpy", fastmath={"contract"})
 def _step(normal: Array, gradient: Array, pose: Array) -> tuple[float, float, float]:
     """Solve the normal equations and move the pose in place.
 
@@ -315,7 +315,7 @@ def _step(normal: Array, gradient: Array, pose: Array) -> tuple[float, float, fl
     return math.hypot(dx, dy), abs(turn), y1 * y1 + y2 * y2 + y3 * y3
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@njit(error_model="numpy", fastmath={"contract"})
 def _add_square(matrix: Array, weight: float, a: float, b: float, c: float) -> None:
     """Add weight times the square of (a, b, c) to the lower half of a matrix."""
     matrix[0, 0] += weight * a * a
@@ -326,13 +326,13 @@ def _add_square(matrix: Array, weight: float, a: float, b: float, c: float) -> N
     matrix[2, 2] += weight * c * c
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@njit(error_model="numpy", fastmath={"contract"})
 def _mirror(matrix: Array) -> None:
     """Fill the upper half of a matrix (3, 3) from the lower one."""
     matrix[0, 1], matrix[0, 2], matrix[1, 2] = matrix[1, 0], matrix[2, 0], matrix[2, 1]
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@njit(error_model="numpy", fastmath={"contract"})
 def _align(
     points: Array, rays: Array, chosen: Indices, counts: Array, pose: Array, to_lines: bool,
     segments: Array, target_points: Array, target_rays: Array, line_of_point: Indices,
@@ -448,7 +448,7 @@ def _align(
     return max_iterations, False
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@njit(error_model="numpy", fastmath={"contract"})
 def _judge(
     points: Array, rays: Array, pose: Array, to_lines: bool, segments: Array,
     line_of_point: Indices, matches: Indices, residuals: Array, weights: Array, noise: float,
@@ -492,7 +492,7 @@ def _judge(
     return normal, information, feigned
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@njit(error_model="numpy", fastmath={"contract"})
 def _confront(
     points: Array, line_of_point: Indices, segments: Array, pose: Array, lever_x: float,
     lever_y: float, turn: float, ranges: Array, rays: Array, other_line: Indices,
@@ -549,7 +549,7 @@ def _confront(
         _add_square(agreed if near else denied, 1.0, n1, n2, n2 * qx - n1 * qy)
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@njit(error_model="numpy", fastmath={"contract"})
 def _register(
     ranges: Array, points: Array, rays: Array, source_line: Indices, source_ends: Indices,
     source_segments: Array, target_ranges: Array, target_points: Array, target_rays: Array,

@@ -19,10 +19,10 @@ import math
 from typing import Any, Literal
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from estimators.icp import LEAST_INFORMATION, PreparedScan, Registration, prepare, register
+from sim.compiled import njit
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -32,7 +32,7 @@ Matches = Literal["held", "sliding"]
 UNKNOWN_M, UNKNOWN_RAD = 10.0, math.pi  # standard deviations of a direction nobody holds
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _censi(
     points: Array, rays: Array, pose: Array, to_lines: bool, sliding: bool, matches: Indices,
     weights: Array, residuals: Array, lines: Array, line_information: Array,

@@ -14,9 +14,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from sim.compiled import njit
 from sim.errors import InputError
 
 Array = NDArray[np.float64]
@@ -108,7 +108,7 @@ def prepare(
     return PreparedScan(bearings, *_prepare(ranges, bearings, float(max_range_m)), full)
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@njit(error_model="numpy", fastmath={"contract"})
 def select(keys: Array, order: Indices, low: int, high: int, rank: int) -> float:
     """Reorder order[low:high] so that keys[order] is at its place at `rank`, smaller before."""
     high -= 1
@@ -134,7 +134,7 @@ def select(keys: Array, order: Indices, low: int, high: int, rank: int) -> float
     return value
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@njit(error_model="numpy", fastmath={"contract"})
 def _noise(ranges: Array, rays: Array, beams: Indices) -> float:
     """Standard deviation of the ranges, from second differences of 1 / range.
 
@@ -156,7 +156,7 @@ def _noise(ranges: Array, rays: Array, beams: Indices) -> float:
     return max(median / 0.6745, _NOISE_FLOOR_M)
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@njit(error_model="numpy", fastmath={"contract"})
 def _fit(
     ranges: Array, rays: Array, line_of_point: Indices, first: int, last: int, line: int, m: Array
 ) -> tuple[float, float, float]:
@@ -183,7 +183,7 @@ def _fit(
     return s11, s12, s22
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@njit(error_model="numpy", fastmath={"contract"})
 def _segment(
     ranges: Array, rays: Array, beams: Indices, noise: float
 ) -> tuple[Indices, Array, Array, Indices]:
@@ -315,7 +315,7 @@ def _segment(
     return line_of_point, lines[:kept].copy(), information[:kept].copy(), ends[:kept].copy()
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@njit(error_model="numpy", fastmath={"contract"})
 def _describe(
     lines: Array,
     information: Array,
@@ -357,7 +357,7 @@ def _describe(
     return segments
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@njit(error_model="numpy", fastmath={"contract"})
 def _prepare(ranges: Array, bearings: Array, max_range: float) -> _Prepared:
     beams = np.empty(len(ranges), np.int64)
     n = 0

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import sys
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 from numba import njit as _njit
 from numba.core import event
+
+Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 class _Announcer(event.Listener):
@@ -30,6 +33,7 @@ class _Announcer(event.Listener):
 event.register("numba:compile", _Announcer())  # type: ignore[no-untyped-call]
 
 
-def njit(**options: Any) -> Any:
-    """`numba.njit` with the compiled code kept on disk."""
-    return _njit(cache=True, **options)
+def njit(**options: Any) -> Callable[[Function], Function]:
+    """`numba.njit` with the compiled code kept on disk; the function keeps its type."""
+    decorator: Callable[[Function], Function] = _njit(cache=True, **options)
+    return decorator

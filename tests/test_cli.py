@@ -72,6 +72,7 @@ def test_a_run_prints_its_errors_and_leaves_a_row(tmp_path):
         (["simulation.rays=bullet"], ["rays=exact"]),
         (["prior.start=nowhere"], ["prior.start", "tracking"]),
         (["prior.start=global"], ["start pose"]),
+        (["estimator=icp_odometry"], ["laser"]),
         (["route.waypoints=[[0.05,0.05],[2,2]]"], ["overlaps a wall"]),
         (["recording=missing.npz"], ["missing.npz"]),
         (["world=from_file", "world.path=none.yaml"], ["none.yaml"]),
