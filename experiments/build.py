@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import importlib
 import inspect
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -85,6 +86,16 @@ def _find(target: str, where: str) -> Callable[..., Any]:
 
 def check(config: Config) -> None:
     """Build what is cheap to build, so that a wrong value is told before any time is spent."""
+    for group in ("world", "robot", "sensors", "route", "simulation", "prior", "estimator"):
+        if not isinstance(config[group], dict):
+            raise InputError(f"{group} must hold keys, got {config[group]!r}")
+    repeats, keep, name = config["repeats"], config["keep"], config["name"]
+    if isinstance(repeats, bool) or not isinstance(repeats, int) or repeats < 1:
+        raise InputError(f"repeats must be a whole number from 1 on, got {repeats!r}")
+    if not (isinstance(keep, list) and all(isinstance(key, str) for key in keep)):
+        raise InputError(f"keep must be a list of names, such as [ess], got {keep!r}")
+    if not (isinstance(name, str) and re.fullmatch(r"[\w.-]*\w", name)):
+        raise InputError(f"name must be one word for a folder of results, got {name!r}")
     make_robot(config)
     suite_from_config(config["sensors"])
     make(config["route"], "route")

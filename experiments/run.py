@@ -64,8 +64,6 @@ def run_configuration(config: Config, choices: dict[str, str]) -> tuple[list[Row
     tuple
         Rows, and the folder that holds them.
     """
-    if config["repeats"] < 1:
-        raise InputError(f"repeats must be at least 1, got {config['repeats']}")
     check(config)
     estimator = make_estimator(config)
     with progress("simulating, s") as on_progress:

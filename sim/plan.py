@@ -140,6 +140,8 @@ class Plan:
         InputError
             If so many find no room.
         """
+        if count < 0:
+            raise InputError(f"world: the number of objects must be zero or more, got {count}")
         least, most = np.array(low, float), np.array(high, float)
         paths = _near(self._paths(), least - clearance_m, most + clearance_m)
         faces = _near(np.array(self.faces, float).reshape(-1, 4), least, most)

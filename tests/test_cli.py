@@ -79,6 +79,11 @@ def test_a_run_prints_its_errors_and_leaves_a_row(tmp_path):
         (["seed=-1"], ["seed"]),
         (["seed=one"], ["seed"]),
         (["repeats=0"], ["repeats"]),
+        (["repeats=1.5"], ["repeats", "whole number"]),
+        (["keep=3"], ["keep", "list"]),
+        (["simulation=null"], ["simulation", "must hold keys"]),
+        (["name=../../x"], ["name", "one word"]),
+        (["world.n_objects=-3"], ["objects", "zero or more"]),
         (["route.speed_mps="], ["route", "must be real number"]),
     ],
 )
