@@ -6,7 +6,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments import claims
+from experiments import claims as common
+from experiments.claims import puzzlebot2024 as claims
 from experiments.studies import puzzlebot2024 as study
 
 
@@ -153,10 +154,10 @@ def test_writing_keeps_other_papers_rows(tmp_path):
     path = tmp_path / "claims.csv"
     one = claims.pb1()[0]
     other = dataclasses.replace(one, id="XX1", paper="another")
-    claims.write([other], path)
-    claims.write([one], path)
-    claims.write([dataclasses.replace(one, value=0.5)], path)
+    common.write([other], path)
+    common.write([one], path)
+    common.write([dataclasses.replace(one, value=0.5)], path)
     frame = pd.read_csv(path)
     assert frame["paper"].tolist() == ["puzzlebot2024", "another"]
     assert frame["value"].tolist()[0] == 0.5
-    assert tuple(frame.columns) == claims.COLUMNS
+    assert tuple(frame.columns) == common.COLUMNS

@@ -394,7 +394,7 @@ def gradient_descent() -> pd.DataFrame:
 
 def claims(tables: Tables, *, quick: bool) -> list[Claim]:
     """Judge PB1-PB4 by the tables."""
-    from experiments.claims import pb1, pb2, pb3, pb4
+    from experiments.claims.puzzlebot2024 import pb1, pb2, pb3, pb4
 
     judged = [
         *pb1(),

@@ -1,85 +1,23 @@
-"""One function a claim: it reads a finished study's tables and judges by interval and criterion."""
+"""The claims PB1-PB4 of puzzlebot2024."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from experiments.claims import Claim, overall
 from experiments.statistics import (
     Interval,
     mean_interval,
     share_interval,
     verdict,
 )
-from experiments.table import read_rows, write_frame
 
 Array = NDArray[np.float64]
-COLUMNS = (
-    "id",
-    "paper",
-    "statistic",
-    "value",
-    "low",
-    "high",
-    "criterion",
-    "verdict",
-    "study",
-    "command",
-)
-
-
-@dataclass(frozen=True)
-class Claim:
-    """A paper's claim, judged.
-
-    Attributes
-    ----------
-    id, paper
-        As in the papers' list, such as PB1 and puzzlebot2024.
-    statistic
-        What was measured.
-    value, low, high
-        Its value and 95 % interval; equal where nothing is random.
-    criterion
-        What the interval is held against.
-    verdict
-        `reproduced`, `not reproduced` or `undecided`, marked `(quick)` after few repeats, and
-        followed by the reason or region where there is one to name.
-    study, command
-        Where the tables came from, and how to make them again.
-    """
-
-    id: str
-    paper: str
-    statistic: str
-    value: float
-    low: float
-    high: float
-    criterion: str
-    verdict: str
-    study: str = ""
-    command: str = ""
-
-    def completed(self, *, study: str, command: str, quick: bool) -> Claim:
-        """Add the origin, and the mark of a quick run."""
-        mark = f"{self.verdict} (quick)" if quick else self.verdict
-        return dataclasses.replace(self, study=study, command=command, verdict=mark)
-
-
-def write(claims: Sequence[Claim], path: Path) -> None:
-    """Write claims to a table; those of papers not among them keep their rows."""
-    new = pd.DataFrame([dataclasses.asdict(claim) for claim in claims], columns=list(COLUMNS))
-    if path.exists():
-        old = read_rows(path)
-        new = pd.concat([old[~old["paper"].isin(set(new["paper"]))], new], ignore_index=True)
-    write_frame(new.sort_values(["id", "statistic"], kind="stable"), path)
 
 
 def worked_matrices() -> tuple[Array, Array]:
@@ -187,7 +125,7 @@ def pb3(calibration: pd.DataFrame, descent: pd.DataFrame, engine_k: pd.DataFrame
         biases = [mean_interval(part) for _, part in relative.groupby(slips["parameter"])]
         worse = max(biases, key=lambda bias: abs(bias.value))
         claim = _within(f"relative bias, the worse of kr and kl: {where}", worse, -0.05, 0.05)
-        outcome = _overall([verdict(bias, -0.05, 0.05) for bias in biases])
+        outcome = overall([verdict(bias, -0.05, 0.05) for bias in biases])
         claims.append(dataclasses.replace(claim, verdict=outcome))
     for row in engine_k.itertuples():
         ratio = Interval(*(value / row.truth for value in (row.value, row.low, row.high)))
@@ -219,10 +157,10 @@ def pb4(coverage: pd.DataFrame, engine: pd.DataFrame) -> list[Claim]:
         worst = min(shares, key=lambda s: s.value)
         case = table.iloc[shares.index(worst)]["case"]
         outcomes = [verdict(share, 0.93, 0.97) for share in shares]
-        overall = _overall(outcomes)
-        if overall == "not reproduced" and leaves is None:
+        outcome = overall(outcomes)
+        if outcome == "not reproduced" and leaves is None:
             leaves = k
-        if overall == "reproduced" and leaves is None:
+        if outcome == "reproduced" and leaves is None:
             held = k
         within = sum(outcome == "reproduced" for outcome in outcomes)
         claims.append(
@@ -234,7 +172,7 @@ def pb4(coverage: pd.DataFrame, engine: pd.DataFrame) -> list[Claim]:
                 worst.low,
                 worst.high,
                 "every manoeuvre's interval within 0.93 and 0.97",
-                f"{overall} ({within} of {len(shares)} manoeuvres within)",
+                f"{outcome} ({within} of {len(shares)} manoeuvres within)",
             )
         )
     share = mean_interval(_engine_gap(engine))
@@ -295,10 +233,3 @@ def _within(statistic: str, found: Interval, low: float, high: float) -> Claim:
     criterion = f"within {low:g} and {high:g}"
     paper, outcome = "puzzlebot2024", verdict(found, low, high)
     return Claim("PB3", paper, statistic, found.value, found.low, found.high, criterion, outcome)
-
-
-def _overall(outcomes: Sequence[str]) -> str:
-    """One verdict of several parts that must all hold."""
-    if set(outcomes) == {"reproduced"}:
-        return "reproduced"
-    return "not reproduced" if "not reproduced" in outcomes else "undecided"
