@@ -1,0 +1,109 @@
+"""Weighted particles: log weights, effective sample size, resampling schemes.
+
+Weights are kept as logs and need no normalisation by the caller; a weight of -inf is a particle
+that the observations rule out. Weights that have all underflowed say nothing, and count as equal.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sim.errors import InputError
+
+Array = NDArray[np.float64]
+Scheme = Literal["systematic", "stratified", "residual", "multinomial"]
+SCHEMES: tuple[Scheme, ...] = ("systematic", "stratified", "residual", "multinomial")
+
+
+def underflowed(log_weights: ArrayLike) -> bool:
+    """Whether no particle has any weight left: all are -inf, or some are NaN or +inf."""
+    highest = np.max(np.asarray(log_weights, dtype=np.float64))
+    return not bool(np.isfinite(highest))
+
+
+def normalize(log_weights: ArrayLike) -> Array:
+    """Weights (M,) that sum to 1, of log weights (M,); equal ones if all have underflowed.
+
+    >>> normalize([-1000.0, -1000.0]).tolist()
+    [0.5, 0.5]
+    """
+    logs = np.asarray(log_weights, dtype=np.float64)
+    if underflowed(logs):
+        return np.full(len(logs), 1.0 / len(logs))
+    weights: Array = np.exp(logs - np.max(logs))
+    weights /= weights.sum()
+    return weights
+
+
+def effective_sample_size(log_weights: ArrayLike) -> float:
+    """1 / sum w^2 of the normalised weights: M when they are equal, 1 when one has them all."""
+    weights = normalize(log_weights)
+    return 1.0 / float(weights @ weights)
+
+
+def resample(
+    log_weights: ArrayLike, n: int, rng: np.random.Generator, scheme: Scheme = "systematic"
+) -> NDArray[np.int64]:
+    """Indices (n,), ascending, of particles drawn with replacement by their weights.
+
+    Every scheme is unbiased: particle i appears n w_i times in the mean.
+
+    Parameters
+    ----------
+    log_weights
+        (M,) log weights, not necessarily normalised.
+    n
+        Number of particles to draw.
+    scheme
+        `multinomial`: n independent draws (gil2008, sec. IV-D). `stratified`: one draw in each
+        of n equal strata. `systematic`: the same draw in every stratum. `residual`: floor(n w)
+        copies of each, the rest multinomial.
+    """
+    weights = normalize(log_weights)
+    if scheme == "systematic":
+        return _at(weights, (np.arange(n) + rng.random()) / n)
+    if scheme == "stratified":
+        return _at(weights, (np.arange(n) + rng.random(n)) / n)
+    if scheme == "multinomial":
+        return _at(weights, np.sort(rng.random(n)))
+    if scheme == "residual":
+        copies = np.floor(n * weights).astype(np.int64)
+        n_left = n - int(copies.sum())
+        if n_left > 0:
+            rest = n * weights - copies
+            drawn = _at(rest / rest.sum(), rng.random(n_left))
+            copies += np.bincount(drawn, minlength=len(weights))
+        return np.repeat(np.arange(len(weights)), copies)
+    raise InputError(f"resampling scheme must be one of {', '.join(SCHEMES)}, got {scheme!r}")
+
+
+def in_place(indices: NDArray[np.int64], n_particles: int) -> NDArray[np.int64]:
+    """The same particles in an order that moves few of them: survivors keep their own slot.
+
+    Parameters
+    ----------
+    indices
+        (M,) ancestors, as `resample` draws them, one for each of M slots.
+    n_particles
+        M.
+
+    Returns
+    -------
+    Ancestors (M,): `result[i] == i` wherever particle i survives, so that a map has to be copied
+    only where `result[i] != i`, and never onto a particle that is still to be copied from.
+    """
+    copies = np.bincount(indices, minlength=n_particles)
+    ancestors = np.arange(n_particles)
+    ancestors[copies == 0] = np.repeat(ancestors, np.maximum(copies - 1, 0))
+    return ancestors
+
+
+def _at(weights: Array, quantiles: Array) -> NDArray[np.int64]:
+    """Particles at quantiles in [0, 1) of the cumulated weights; never one of zero weight."""
+    cumulated = np.cumsum(weights)
+    drawn = np.searchsorted(cumulated, quantiles * cumulated[-1], side="right")
+    indices: NDArray[np.int64] = np.minimum(drawn, np.flatnonzero(weights)[-1])
+    return indices

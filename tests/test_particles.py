@@ -1,0 +1,116 @@
+"""Log weights, effective sample size and resampling."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from estimators.particles import (
+    SCHEMES,
+    effective_sample_size,
+    in_place,
+    normalize,
+    resample,
+    underflowed,
+)
+from sim.errors import InputError
+
+WEIGHTS = np.array([0.02, 0.4, 0.0, 0.13, 0.25, 0.2])
+
+
+def logs(weights):
+    with np.errstate(divide="ignore"):
+        return np.log(weights)
+
+
+def test_normalize_takes_any_offset():
+    np.testing.assert_allclose(normalize(logs(WEIGHTS) - 1e5), WEIGHTS, rtol=1e-9)
+    np.testing.assert_allclose(normalize(logs(WEIGHTS) + 1e5), WEIGHTS, rtol=1e-9)
+
+
+@pytest.mark.parametrize("hopeless", [-np.inf, np.nan])
+def test_weights_without_any_left_count_as_equal(hopeless):
+    spent = np.full(4, hopeless)
+    assert underflowed(spent)
+    assert not underflowed(logs(WEIGHTS))
+    assert normalize(spent).tolist() == [0.25] * 4
+    assert effective_sample_size(spent) == pytest.approx(4.0)
+    assert resample(spent, 4, np.random.default_rng(0)).tolist() == [0, 1, 2, 3]
+
+
+def test_effective_sample_size_between_one_and_all():
+    assert effective_sample_size(np.zeros(50)) == pytest.approx(50.0)
+    assert effective_sample_size(logs(np.array([0.0, 1.0, 0.0]))) == pytest.approx(1.0)
+    assert effective_sample_size(logs(WEIGHTS)) == pytest.approx(1.0 / np.sum(WEIGHTS**2))
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_resampling_is_unbiased(scheme):
+    rng = np.random.default_rng(1)
+    n, repeats = 17, 4000
+    counts = np.array(
+        [
+            np.bincount(resample(logs(WEIGHTS), n, rng, scheme), minlength=len(WEIGHTS))
+            for _ in range(repeats)
+        ]
+    )
+    assert np.all(counts.sum(axis=1) == n)
+    sigma = np.sqrt(n * WEIGHTS * (1.0 - WEIGHTS) / repeats)  # of multinomial draws, the widest
+    assert np.all(np.abs(counts.mean(axis=0) - n * WEIGHTS) <= 4.5 * sigma)
+
+
+def test_schemes_differ_in_their_spread_as_theory_says():
+    rng = np.random.default_rng(2)
+    n = 30
+    spread = {
+        scheme: np.var([np.sum(resample(logs(WEIGHTS), n, rng, scheme) == 1) for _ in range(3000)])
+        for scheme in SCHEMES
+    }
+    assert spread["multinomial"] == pytest.approx(n * 0.4 * 0.6, rel=0.12)
+    assert spread["systematic"] < 0.26  # the number of copies is floor or ceil of n w
+    assert spread["stratified"] < 0.6
+    assert spread["residual"] < 0.2 * spread["multinomial"]
+
+
+@given(st.lists(st.floats(0.0, 1.0), min_size=1, max_size=40), st.integers(1, 60), st.data())
+@settings(max_examples=60, deadline=None)
+def test_systematic_copies_are_floor_or_ceil(raw: list[float], n: int, data: st.DataObject):
+    weights = np.array(raw)
+    if weights.sum() <= 1e-6:
+        return
+    weights /= weights.sum()
+    rng = np.random.default_rng(data.draw(st.integers(0, 2**31)))
+    copies = np.bincount(resample(logs(weights), n, rng), minlength=len(weights))
+    assert np.all(np.abs(copies - n * weights) < 1.0 + 1e-9)
+    assert np.all(copies[weights == 0.0] == 0)
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_same_seed_same_indices_in_order(scheme):
+    first = resample(logs(WEIGHTS), 9, np.random.default_rng(5), scheme)
+    again = resample(logs(WEIGHTS), 9, np.random.default_rng(5), scheme)
+    assert np.array_equal(first, again)
+    assert np.all(np.diff(first) >= 0)
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_equal_weights_and_one_particle(scheme):
+    assert resample(np.array([-3.0]), 1, np.random.default_rng(0), scheme).tolist() == [0]
+    if scheme != "multinomial":
+        equal = resample(np.full(100, -7.0), 100, np.random.default_rng(3), scheme)
+        assert np.bincount(equal, minlength=100).max() <= 2
+
+
+@given(st.lists(st.integers(0, 11), min_size=12, max_size=12))
+@settings(max_examples=60, deadline=None)
+def test_survivors_keep_their_slot(drawn):
+    indices = np.array(drawn)
+    ancestors = in_place(indices, 12)
+    assert np.array_equal(np.sort(ancestors), np.sort(indices))
+    for particle in set(drawn):
+        assert ancestors[particle] == particle
+
+
+def test_unknown_scheme_is_told():
+    with pytest.raises(InputError, match="systematic, stratified, residual, multinomial"):
+        resample(np.zeros(3), 3, np.random.default_rng(0), "bootstrap")
