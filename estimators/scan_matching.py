@@ -1,0 +1,200 @@
+"""Registration of a robot's scans as its estimators use it: motions of base_link, with covariance.
+
+The guess tells how far to look, the chosen method how sure the result is, and directions that
+the scans do not hold are named.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from estimators import icp_covariance
+from estimators.base import Prior
+from estimators.gaussian import Gaussian
+from estimators.icp import Metric, PreparedScan, Registration, Search, prepare, register
+from sim import se2
+from sim.errors import InputError
+from sim.sensors import Laser
+
+Array = NDArray[np.float64]
+Covariance = Literal["censi", "censi_last", "hessian", "sampling", "unscented_censi"]
+
+FAILED = ("empty", "poor_overlap", "not_converged")
+
+_LEAST_SIGMA_M = 1e-4  # a laser without noise still has rounding
+# What a guess may be wrong by, at least and at most
+_LEAST_GATE_M, _MOST_GATE_M = 0.5, 2.0
+_LEAST_GATE_RAD, _MOST_GATE_RAD = 0.02, 0.2
+_EVERYTHING, _NOTHING = np.eye(3), np.zeros((3, 3))
+
+
+@dataclass(frozen=True)
+class Match:
+    """What a scan says of the motion of base_link since the reference's.
+
+    Attributes
+    ----------
+    motion
+        T_reference_base; the guess where the registration failed.
+    status
+        That of the `Registration`.
+    held
+        (D, 3) rows that take a motion to its D coordinates which the scans hold; the identity
+        but for degenerate pairs.
+    loose
+        (3, 3) projection onto the directions that the scans do not hold.
+    """
+
+    motion: Gaussian
+    status: str
+    held: Array
+    loose: Array
+
+    @property
+    def failed(self) -> bool:
+        """Whether it says nothing at all."""
+        return self.status in FAILED
+
+    def completed(self, guess: Gaussian) -> Gaussian:
+        """In the directions that the scans do not hold, the guess and its covariance."""
+        if self.loose is _NOTHING:
+            return self.motion
+        off = self.motion.mean - guess.mean
+        off[2] = math.remainder(off[2], 2.0 * math.pi)
+        unknown = self.motion.covariance - guess.covariance
+        covariance = self.motion.covariance - self.loose @ unknown @ self.loose.T
+        return Gaussian(self.motion.mean - self.loose @ off, (covariance + covariance.T) / 2.0)
+
+
+@dataclass(frozen=True)
+class ScanMatcher:
+    """How scans are registered, and what is believed of their noise.
+
+    Parameters
+    ----------
+    metric, search
+        As in `estimators.icp.register`.
+    covariance
+        Method of `estimators.icp_covariance`; `censi_last` counts the noise of the last scan
+        only, as decristoforis2020 prints it. Point to point by `censi` lets matches slide.
+    sigma_range_m
+        Believed range noise; None for that of the prior's laser.
+    """
+
+    metric: Metric
+    search: Search
+    covariance: Covariance
+    sigma_range_m: float | None
+
+    def __post_init__(self) -> None:
+        choices = {
+            "metric": (self.metric, ("point_to_line", "point_to_point")),
+            "search": (self.search, ("angular", "kdtree")),
+            "covariance": (
+                self.covariance,
+                ("censi", "censi_last", "hessian", "sampling", "unscented_censi"),
+            ),
+        }
+        for name, (value, allowed) in choices.items():
+            if value not in allowed:
+                raise InputError(f"estimator.{name} must be {' or '.join(allowed)}, got {value!r}")
+        if self.sigma_range_m is not None:
+            require_positive(sigma_range_m=self.sigma_range_m)
+
+    def prepare(self, ranges_m: ArrayLike, laser: Laser) -> PreparedScan:
+        """Prepare a scan of this laser."""
+        return prepare(ranges_m, laser.bearings_rad, laser.max_range_m)
+
+    def match(
+        self,
+        scan: PreparedScan,
+        reference: PreparedScan,
+        guess: Gaussian,
+        laser: Laser,
+        rng: np.random.Generator,
+        heading_window_rad: float = 0.0,
+    ) -> Match:
+        """Register a scan against a reference.
+
+        Parameters
+        ----------
+        guess
+            T_reference_base as known before.
+        laser
+            Where it sits and what it may see.
+        rng
+            For the covariance by sampling.
+        heading_window_rad
+            Half the range of headings to search, where the guess knows nothing of the turn.
+        """
+        mount = laser.mount.pose
+        in_laser, _ = guess.seen_from(mount)
+        (xx, _, _), (_, yy, _), (_, _, turn) = in_laser.covariance.tolist()
+        found = register(
+            scan,
+            reference,
+            in_laser.mean,
+            metric=self.metric,
+            search=self.search,
+            gate_m=min(_LEAST_GATE_M + 4.0 * math.sqrt(xx + yy), _MOST_GATE_M),
+            gate_rad=min(_LEAST_GATE_RAD + 4.0 * math.sqrt(turn), _MOST_GATE_RAD),
+            heading_window_rad=heading_window_rad,
+        )
+        if found.status in FAILED:
+            return Match(guess, found.status, _NOTHING[:0], _EVERYTHING)
+        sigma_m = self.sigma_m(laser)
+        R = self._covariance_of(found, scan, reference, in_laser.covariance, sigma_m, rng)
+        measured = Gaussian(found.T_target_source, R)
+        motion, to_base = measured.seen_from(se2.inverse(mount))
+        if found.status != "degenerate":
+            return Match(motion, found.status, _EVERYTHING, _NOTHING)
+        held, loose = (to_base @ part for part in icp_covariance.split_directions(found))
+        coordinates = np.linalg.inv(np.hstack([held, loose]))
+        n_held = held.shape[1]
+        return Match(motion, found.status, coordinates[:n_held], loose @ coordinates[n_held:])
+
+    def sigma_m(self, laser: Laser) -> float:
+        """Believed range noise, m."""
+        sigma = laser.sigma_range_m if self.sigma_range_m is None else self.sigma_range_m
+        return max(sigma, _LEAST_SIGMA_M)
+
+    def _covariance_of(
+        self,
+        found: Registration,
+        source: PreparedScan,
+        target: PreparedScan,
+        of_guess: Array,
+        sigma_m: float,
+        rng: np.random.Generator,
+    ) -> Array:
+        if self.covariance == "hessian":
+            return icp_covariance.hessian(found)
+        if self.covariance == "sampling":
+            return icp_covariance.sampling(found, source, target, rng, sigma_m, search=self.search)
+        if self.covariance == "unscented_censi":
+            return icp_covariance.unscented_censi(
+                found, source, target, of_guess, sigma_m, matches="sliding", search=self.search
+            )
+        scans: icp_covariance.Scans = "last" if self.covariance == "censi_last" else "both"
+        return icp_covariance.censi(found, source, target, sigma_m, scans=scans, matches="sliding")
+
+
+def tracking_start(prior: Prior, name: str) -> tuple[Gaussian, Laser]:
+    """Return the prior's pose and laser, without which the estimator `name` cannot start."""
+    if prior.sensors.laser is None:
+        raise InputError(f"{name} needs a laser; choose sensors that have one")
+    if prior.mean is None or prior.covariance is None:
+        raise InputError(f"{name} needs a start pose; set prior.start=tracking")
+    return Gaussian(prior.mean.copy(), prior.covariance.copy()), prior.sensors.laser
+
+
+def require_positive(**numbers: float) -> None:
+    """Raise an InputError that names the first key whose number is negative or not finite."""
+    for name, number in numbers.items():
+        if not (math.isfinite(number) and number >= 0.0):
+            raise InputError(f"estimator.{name} must be zero or positive, got {number}")
