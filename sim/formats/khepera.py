@@ -1,0 +1,142 @@
+"""Khepera calibration tuples: mean wheel speeds and the laser's displacement, interval by interval.
+
+Each tuple is a JSON object `{"T": s, "phi_l": rad/s, "phi_r": rad/s, "sm": [x, y, theta]}`; they
+follow one another with white space between, several on a line or one over several lines.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim import se2
+from sim.errors import InputError
+from sim.formats.text import read_bytes, read_members
+from sim.recording import Recording, Truth, WheelLog
+from sim.robot import RobotGeometry
+from sim.sensors import SensorSuite
+
+Array = NDArray[np.float64]
+
+# What a rolled radian is taken to be until it is calibrated (the robot's data sheet)
+NOMINAL_DIAMETER_M, NOMINAL_AXLE_M = 0.041, 0.0885
+
+
+@dataclass(frozen=True)
+class WheelLaserLog:
+    """Intervals in which both wheels and laser tell the motion.
+
+    Attributes
+    ----------
+    durations_s
+        (N,).
+    rolled_rad
+        (N, 2) angle the right and left wheel turned by.
+    laser_motion
+        (N, 3) displacement of the laser in its own frame, m, m, rad, by scan matching.
+    """
+
+    durations_s: Array
+    rolled_rad: Array
+    laser_motion: Array
+
+
+def read_khepera(path: Path, member: str | None = None) -> WheelLaserLog:
+    """Read tuples from a file, or from one member of a tar archive.
+
+    Raises
+    ------
+    InputError
+        Naming the file and the line that is no such tuple.
+    """
+    if member is None:
+        return parse_khepera(read_bytes(path), str(path))
+    members = read_members(path)
+    if member not in members:
+        raise InputError(f"{path}: holds no {member}; it has {', '.join(sorted(members)[:20])}")
+    return parse_khepera(members[member], f"{path}/{member}")
+
+
+def parse_khepera(data: bytes, where: str) -> WheelLaserLog:
+    """Tuples from the text of a file."""
+    try:
+        text = data.decode("ascii")
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        raise InputError(f"{where}:{line}: not ASCII text, so not a log of tuples") from None
+    decoder = json.JSONDecoder()
+    rows: list[tuple[float, ...]] = []
+    at, line, counted = 0, 1, 0
+    while True:
+        while at < len(text) and text[at].isspace():
+            at += 1
+        line += text.count("\n", counted, at)
+        counted = at
+        if at == len(text):
+            break
+        try:
+            entry, at = decoder.raw_decode(text, at)
+            rows.append(_row(entry))
+        except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
+            reason = f"{type(error).__name__}: {error}".splitlines()[0][:120]
+            raise InputError(
+                f"{where}:{line}: not a tuple of T, phi_l, phi_r, sm ({reason})"
+            ) from (None)
+    values = np.array(rows, float).reshape(-1, 6)
+    durations = values[:, 0]
+    return WheelLaserLog(durations, values[:, 1:3] * durations[:, None], values[:, 3:])
+
+
+def _row(entry: Any) -> tuple[float, ...]:
+    x, y, turn = entry["sm"]
+    row = (entry["T"], entry["phi_r"], entry["phi_l"], x, y, turn)
+    for value in row:
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise TypeError(f"{value!r} is no number")
+    numbers = tuple(float(value) for value in row)
+    if not all(math.isfinite(value) for value in numbers):
+        raise ValueError("numbers must be finite")
+    if numbers[0] <= 0.0:
+        raise ValueError("T must be positive")
+    return numbers
+
+
+def to_recording(
+    log: WheelLaserLog,
+    wheel_diameters_m: tuple[float, float] = (NOMINAL_DIAMETER_M, NOMINAL_DIAMETER_M),
+    axle_m: float = NOMINAL_AXLE_M,
+    T_base_laser: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> Recording:
+    """A Recording of the wheels, with the chained scan matches as its reference.
+
+    The stamps are sums of the intervals. A failed scan match stays in the chain.
+
+    Parameters
+    ----------
+    wheel_diameters_m
+        Of the right and left wheel.
+    T_base_laser
+        Pose of the laser on the robot, m, m, rad.
+    """
+    stamps = np.concatenate([[0.0], np.cumsum(log.durations_s)])
+    steps = log.rolled_rad * np.array(wheel_diameters_m) / 2.0
+    travel = np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
+    laser = np.broadcast_to(np.array(T_base_laser), log.laser_motion.shape)
+    motion = se2.compose(laser, se2.compose(log.laser_motion, se2.inverse(laser)))
+    poses = np.zeros((len(stamps), 3))
+    for i, step in enumerate(motion):
+        poses[i + 1] = se2.compose(poses[i], step)
+    return Recording(
+        frame_stamps=stamps,
+        wheels=WheelLog(stamps.copy(), travel),
+        robot=RobotGeometry(float(np.mean(wheel_diameters_m)) / 2.0, axle_m),
+        sensors=SensorSuite(),
+        truth=Truth(stamps.copy(), poses),
+        config={"source": "khepera"},
+    )
