@@ -6,6 +6,7 @@ that the observations rule out. Weights that have all underflowed say nothing, a
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Literal
 
 import numpy as np
@@ -99,6 +100,62 @@ def in_place(indices: NDArray[np.int64], n_particles: int) -> NDArray[np.int64]:
     ancestors = np.arange(n_particles)
     ancestors[copies == 0] = np.repeat(ancestors, np.maximum(copies - 1, 0))
     return ancestors
+
+
+class Lineages:
+    """The paths of all particles, shared where they have ancestors in common.
+
+    Ancestors without living descendants are forgotten now and then, so that memory grows with the
+    number of distinct ancestors and not with the number of particles.
+
+    Parameters
+    ----------
+    n_particles
+        M.
+    """
+
+    _PRUNE_EVERY = 64
+
+    def __init__(self, n_particles: int) -> None:
+        self._poses: list[Array] = []
+        self._parents: list[NDArray[np.int64]] = []  # row of the step before, of each row
+        self._rows = np.arange(n_particles)  # each particle's row of the last step
+
+    def __len__(self) -> int:
+        return len(self._poses)
+
+    @property
+    def n_rows(self) -> int:
+        """Poses kept."""
+        return sum(len(poses) for poses in self._poses)
+
+    def append(self, poses: Array) -> None:
+        """Add the poses (M, 3) of a step."""
+        self._parents.append(self._rows)
+        self._poses.append(poses.copy())
+        self._rows = np.arange(len(poses))
+        if len(self._poses) % self._PRUNE_EVERY == 0:
+            self._prune()
+
+    def resample(self, ancestors: NDArray[np.int64]) -> None:
+        """Let particle m descend from particle `ancestors[m]` of the last step, (M,)."""
+        self._rows = self._rows[ancestors]
+
+    def paths(self) -> Iterator[tuple[Array, NDArray[np.int64]]]:
+        """Step by step, backward: poses (R, 3) of the distinct ancestors, and rows (M,)."""
+        rows = self._rows
+        for poses, parents in zip(reversed(self._poses), reversed(self._parents), strict=True):
+            yield poses, rows
+            rows = parents[rows]
+
+    def _prune(self) -> None:
+        alive, self._rows = np.unique(self._rows, return_inverse=True)
+        for step in range(len(self._poses) - 1, -1, -1):
+            if len(alive) == len(self._poses[step]):
+                return
+            self._poses[step] = self._poses[step][alive]
+            parents = self._parents[step][alive]
+            alive, self._parents[step] = np.unique(parents, return_inverse=True)
 
 
 def _at(weights: Array, quantiles: Array) -> NDArray[np.int64]:

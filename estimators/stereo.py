@@ -118,10 +118,14 @@ class StereoModel:
         return np.array([*focal, *self.variances_px2, self.height_m, *flags], dtype=np.float64)
 
     def usable(self, points_in_camera: ArrayLike) -> NDArray[np.bool_]:
-        """Which measurements (K, 3) can be used: finite, and of a positive disparity and depth."""
+        """Which measurements (K, 3) can be used.
+
+        Those that are finite and off the lens, with a disparity above its own standard deviation.
+        """
         points = np.asarray(points_in_camera, dtype=np.float64)
-        finite = np.isfinite(points).all(axis=-1)
-        usable: NDArray[np.bool_] = finite & (points[..., 2] > LEAST_DEPTH_M / 2.0)
+        farthest = self.focal_px * self.baseline_m / math.sqrt(self.variances_px2[2])
+        depth, finite = points[..., 2], np.isfinite(points).all(axis=-1)
+        usable: NDArray[np.bool_] = finite & (depth > LEAST_DEPTH_M / 2.0) & (depth < farthest)
         return usable
 
     def axes(self, pose: ArrayLike) -> tuple[Array, Array]:

@@ -82,8 +82,8 @@ def test_where_the_noise_is_taken():
 
 def test_useless_measurements_are_refused():
     model = StereoModel.of(StereoCamera())
-    points = [[0.0, 0.0, 3.0], [0.0, 0.0, 0.0], [1.0, 0.0, -2.0], [math.nan, 0.0, 2.0]]
-    assert model.usable(points).tolist() == [True, False, False, False]
+    points = [[0.0, 0.0, 3.0], [0, 0, 0], [1.0, 0.0, -2.0], [math.nan, 0.0, 2.0], [0, 0, 1e5]]
+    assert model.usable(points).tolist() == [True, False, False, False, False]
     assert model.usable(np.zeros((0, 3))).tolist() == []
     assert np.isnan(model.from_image([0.0, 0.0, -1.0])).all()
 
