@@ -118,7 +118,13 @@ def make_robot(config: Config) -> DifferentialDrive:
 def make_recording(
     config: Config, cache: Path, on_progress: Callable[[float], None] | None = None
 ) -> Recording:
-    """Read, fetch from the cache, or simulate the configuration's recording."""
+    """Read, fetch from the cache, or simulate the configuration's recording.
+
+    A mapping in place of a path names a function that makes one.
+    """
+    if isinstance(config["recording"], dict):
+        made: Recording = make(config["recording"], "recording", config=config)
+        return made
     if config["recording"] is not None:
         return load(Path(config["recording"]))
     settings = {key: config[key] for key in SIMULATED_KEYS}
@@ -167,12 +173,7 @@ def make_prior(config: Config, recording: Recording) -> Prior:
     """What the estimator knows at the start."""
     settings = config["prior"]
     robot = RobotGeometry(float(settings["wheel_radius_m"]), float(settings["track_m"]))
-    if settings["map"] not in ("none", "world"):
-        raise InputError(f"prior.map must be none or world, got {settings['map']!r}")
-    world = recording.truth.world if recording.truth else None
-    if settings["map"] == "world" and world is None:
-        raise InputError("prior.map=world, but the recording has no map; set prior.map=none")
-    known_map = world if settings["map"] == "world" else None
+    known_map = make_map(config, recording)
     sensors: SensorSuite = recording.sensors
     if settings["start"] == "global":
         return Prior(robot, sensors, map=known_map)
@@ -187,6 +188,23 @@ def make_prior(config: Config, recording: Recording) -> Prior:
         start = recording.truth_at(recording.frame_stamps[:1])[0]
     offset = np.array(sigma) * stream(config["seed"], "prior").standard_normal(3)
     return Prior(robot, sensors, start + offset, np.diag(np.square(sigma)), known_map)
+
+
+def make_map(config: Config, recording: Recording) -> Any:
+    """Map of the prior: none, the recording's world, or what a mapping's function makes."""
+    wanted = config["prior"]["map"]
+    if isinstance(wanted, dict):
+        return make(wanted, "prior.map", config=config, recording=recording)
+    if wanted == "none":
+        return None
+    if wanted != "world":
+        raise InputError(
+            f"prior.map must be none, world or a mapping with _target_, got {wanted!r}"
+        )
+    world = recording.truth.world if recording.truth else None
+    if world is None:
+        raise InputError("prior.map=world, but the recording has no map; set prior.map=none")
+    return world
 
 
 def default_cache() -> Path:

@@ -312,7 +312,12 @@ def conform_target(target: str, arguments: Sequence[str]) -> list[CheckResult]:
         raise InputError(f"{target}: {error}; give its arguments as key=value") from error
     if not callable(getattr(cls, "step", None)):
         raise InputError(f"{target} has no method step; give MODULE:CLASS of an estimator")
-    recording, prior = example()
+    if "place" in getattr(cls, "needs", ()):
+        from experiments.places import example as place_example
+
+        recording, prior = place_example()
+    else:
+        recording, prior = example()
     return check_estimator(lambda: cls(**keywords), recording, prior)
 
 

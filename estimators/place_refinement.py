@@ -1,0 +1,153 @@
+"""From the nearest node of a topological map to a pose: registration of level slices.
+
+maximo2024, sec. 5, leaves this to future work.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimators.icp import PreparedScan, Registration, prepare, register
+from estimators.icp_covariance import censi
+from estimators.topological_map import TopologicalMap, level_slice
+from sim import se2
+from sim.errors import InputError
+from sim.sensors import Lidar3D
+
+Array = NDArray[np.float64]
+
+_TURNS = 3  # headings tried, the best of the correlation
+_HEADING_WINDOW_RAD = 0.15
+_GOOD_OVERLAP = 0.8  # no other turn or node is tried after a registration this good
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """A pose (3,) of base_link in map with its covariance (3, 3), or None of both.
+
+    The status is `ok`, or why there is no pose: that of the last registration, or `far` if it
+    leads farther from the node than two spacings.
+    """
+
+    pose: Array | None
+    covariance: Array | None
+    status: str
+
+
+class Refiner:
+    """Registers level slices of clouds with those of a map's nodes, which it keeps prepared."""
+
+    def __init__(self, known_map: TopologicalMap, lidar: Lidar3D) -> None:
+        if known_map.slices_m.shape[1] != lidar.n_azimuths:
+            raise InputError(
+                f"the map's slices have {known_map.slices_m.shape[1]} beams, the lidar has "
+                f"{lidar.n_azimuths} azimuths; build the map with this lidar or set "
+                "estimator.refine=false"
+            )
+        self._map, self._lidar = known_map, lidar
+        self._bearings = lidar.azimuths_rad
+        self._reach_m = 2.0 * max(known_map.spacing_m, 1.0)
+        self._prepared: dict[int, PreparedScan] = {}
+
+    def refine(
+        self, cloud_ranges_m: NDArray[np.float32], node: int, others: list[int]
+    ) -> Refinement:
+        """Register a cloud (rings, azimuths) with a node, or if that fails with other nodes."""
+        ranges = level_slice(self._lidar, cloud_ranges_m)
+        source = prepare(ranges, self._bearings, self._lidar.max_range_m)
+        status, best, best_node = "no heading", None, node
+        for candidate in [node, *others]:
+            if not math.isfinite(self._map.headings_rad[candidate]):
+                continue
+            found, why = self._registered(source, ranges, candidate)
+            if found is None:
+                status = why
+            elif best is None or found.overlap > best.overlap:
+                best, best_node = found, candidate
+            if best is not None and best.overlap > _GOOD_OVERLAP:
+                break
+        if best is None:
+            return Refinement(None, None, status)
+        return self._posed(best, source, best_node)
+
+    def _registered(
+        self, source: PreparedScan, ranges_m: NDArray[np.float32], node: int
+    ) -> tuple[Registration | None, str]:
+        """Best registration with a node over the likely turns, or None and why."""
+        target_m = self._map.slices_m[node]
+        target = self._prepared.get(node)
+        if target is None:
+            target = prepare(target_m, self._bearings, self._lidar.max_range_m)
+            self._prepared[node] = target
+        best, status = None, "empty"
+        for turn in likely_turns_rad(ranges_m, target_m):
+            found = register(
+                source,
+                target,
+                np.array([0.0, 0.0, turn]),
+                gate_m=max(2.0, self._reach_m / 2.0),
+                heading_window_rad=_HEADING_WINDOW_RAD,
+            )
+            if found.status != "ok":
+                status = found.status
+            elif np.hypot(*found.T_target_source[:2]) > self._reach_m:
+                status = "far"
+            elif best is None or found.overlap > best.overlap:
+                best = found
+            if best is not None and best.overlap > _GOOD_OVERLAP:
+                break
+        return best, status
+
+    def _posed(self, found: Registration, source: PreparedScan, node: int) -> Refinement:
+        """From the motion of the lidar to the pose of base_link in map."""
+        mount = self._lidar.mount.pose
+        motion = se2.compose(mount, found.T_target_source)
+        at_node = np.append(self._map.positions_m[node], self._map.headings_rad[node])
+        T_map_lidar = se2.compose(at_node, motion)
+        sensor = se2.compose(at_node, mount)
+        turn = _rotation(sensor[2])
+        R = turn @ censi(found, source, self._prepared[node]) @ turn.T
+        back = se2.inverse(mount)
+        by_lidar = se2.compose_jacobians(T_map_lidar, back)[0]
+        covariance = by_lidar @ R @ by_lidar.T
+        pose = se2.compose(T_map_lidar, back)
+        pose[2] = se2.wrap(pose[2])
+        return Refinement(pose, (covariance + covariance.T) / 2.0, "ok")
+
+
+def likely_turns_rad(
+    source_m: NDArray[np.float32], target_m: NDArray[np.float32], n_turns: int = _TURNS
+) -> list[float]:
+    """Headings of the source in the target's frame at which their outlines are most alike.
+
+    Peaks of the circular correlation of inverse ranges (A,), which count near walls most and
+    what was not seen for nothing.
+    """
+    outlines = []
+    for ranges in (source_m, target_m):
+        near = 1.0 / np.maximum(ranges.astype(np.float64), 1.0)
+        outlines.append(np.fft.rfft(near - near.mean()))
+    n = len(source_m)
+    score = np.fft.irfft(outlines[1] * np.conj(outlines[0]), n)
+    peaks = np.flatnonzero((score >= np.roll(score, 1)) & (score > np.roll(score, -1)))
+    if not len(peaks):
+        return [0.0]
+    best = peaks[np.argsort(-score[peaks], kind="stable")]
+    chosen: list[float] = []
+    for peak in best:
+        turn = math.remainder(2.0 * math.pi * float(peak) / n, 2.0 * math.pi)
+        apart = [abs(math.remainder(turn - other, 2.0 * math.pi)) for other in chosen]
+        if all(gap > _HEADING_WINDOW_RAD for gap in apart):
+            chosen.append(turn)
+        if len(chosen) == n_turns:
+            break
+    return chosen
+
+
+def _rotation(angle_rad: float) -> Array:
+    cos, sin = math.cos(angle_rad), math.sin(angle_rad)
+    return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])

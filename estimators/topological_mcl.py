@@ -1,0 +1,496 @@
+"""Monte Carlo localization among the nodes of a topological map (maximo2024).
+
+Particles sit on nodes and face a neighbour; they hop from node to node and are weighted by the
+places whose descriptors are most like the one observed.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimators import descriptors as describers
+from estimators.base import Belief, Prior
+from estimators.particles import SCHEMES, Scheme, effective_sample_size, resample
+from estimators.place_refinement import Refiner
+from estimators.topological_map import TopologicalMap, load
+from sim import se2
+from sim.errors import InputError
+from sim.recording import Frame
+from sim.robot import arc_increment
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+Weighting = Literal["M1", "M2", "M3"]
+
+_ALL_AROUND = math.pi**2 / 3.0  # variance of a heading that nobody knows, rad^2
+_MOST_HOPS = 100  # of one particle between two Frames
+_LEAST_HEADING = 0.01  # variance of the heading on an edge, rad^2
+_FACING_RAD = 0.8  # how far a robot's heading may be from its edge's
+
+
+def node_log_weights(
+    nodes_m: Array,
+    nearest_m: Array,
+    descriptor_distances: Array,
+    weighting: Weighting,
+    sigma_l_m: float,
+    sigma_m: float,
+) -> Array:
+    """Log weights (N,) of a particle at each node (maximo2024, eqs. (1)-(3)).
+
+    With v_j the way from the node to place j of the B most alike, and h_j their descriptors'
+    distances, scaled to sum to one over the B:
+
+    - M1: sum_j exp(-|v_j|^2 / sigma_l^2)
+    - M2: sum_j exp(-|v_j|^2 / sigma_l^2) exp(-h_j^2 / sigma_m^2)
+    - M3: the product of M2's terms in place of their sum.
+
+    Parameters
+    ----------
+    nodes_m, nearest_m
+        (N, 2) and (B, 2) m.
+    descriptor_distances
+        (B,) not negative, not yet scaled.
+    sigma_l_m, sigma_m
+        Spread in metres, and of the scaled distances.
+
+    Notes
+    -----
+    Eqs. (2) and (3) print Sigma_l in the descriptor's factor; the text has a Sigma_m of its own,
+    which is used here, with sigma_m as a spread. In M3 that factor is the same for every
+    particle and cancels, so M3 is a Gaussian of variance sigma_l^2 / (2 B) about the centroid of
+    the B places: one look-alike among them drags it away.
+    """
+    away = (nodes_m[:, :1] - nearest_m[:, 0]) ** 2 + (nodes_m[:, 1:] - nearest_m[:, 1]) ** 2
+    exponents = away / -(sigma_l_m**2)
+    if weighting != "M1":
+        exponents -= (_scaled(descriptor_distances) / sigma_m) ** 2
+    if weighting == "M3":
+        product: Array = exponents.sum(axis=1)
+        return product
+    highest = exponents.max(axis=1)
+    total: Array = highest + np.log(np.exp(exponents - highest[:, None]).sum(axis=1))
+    return total
+
+
+def _scaled(distances: Array) -> Array:
+    """Scale distances (B,) to sum to one; those that are all zero stay so."""
+    total = float(distances.sum())
+    return distances / total if total > 0.0 else distances
+
+
+def _normalized(log_weights: Array) -> Array:
+    """Finite log weights (M,) whose weights sum to one."""
+    shifted = log_weights - log_weights.max()
+    normal: Array = shifted - math.log(np.exp(shifted).sum())
+    return normal
+
+
+def _sums(places: Indices, values: Array, n: int) -> Array:
+    """Sum (n,) of the values at each place."""
+    sums: Array = np.asarray(np.bincount(places, values, minlength=n), np.float64)
+    return sums
+
+
+class Graph:
+    """The map's edges in both directions, in the order of their tails.
+
+    A node without neighbours has an endless edge to itself, so that every particle has one.
+
+    Attributes
+    ----------
+    tail, head, reverse
+        (F,) node numbers, and the edge that leads back.
+    length_m, heading_rad
+        (F,) from tail to head. Nodes in the same place are a hundredth of the median apart.
+    first_out, degree
+        (N,) the edges that leave node i are the `degree[i]` from `first_out[i]` on.
+    """
+
+    def __init__(self, known_map: TopologicalMap) -> None:
+        n, joined = len(known_map), known_map.edges
+        alone = np.setdiff1d(np.arange(n), joined)
+        tail = np.concatenate([joined[:, 0], joined[:, 1], alone])
+        head = np.concatenate([joined[:, 1], joined[:, 0], alone])
+        n_joined = len(joined)
+        reverse = np.concatenate(
+            [
+                np.arange(n_joined, 2 * n_joined),
+                np.arange(n_joined),
+                np.arange(2 * n_joined, len(tail)),
+            ]
+        )
+        order = np.argsort(tail, kind="stable")
+        place = np.empty(len(order), np.int64)
+        place[order] = np.arange(len(order))
+        self.tail, self.head, self.reverse = tail[order], head[order], place[reverse[order]]
+        self.first_out = np.searchsorted(self.tail, np.arange(n))
+        self.degree = np.bincount(self.tail, minlength=n)
+        way = known_map.positions_m[self.head] - known_map.positions_m[self.tail]
+        length = np.hypot(*way.T)
+        spacing = known_map.spacing_m
+        self.length_m = np.maximum(length, 0.01 * spacing) if spacing else np.full(len(way), np.inf)
+        self.length_m[self.head == self.tail] = np.inf
+        self.heading_rad = np.arctan2(way[:, 1], way[:, 0])
+        lone = self.head == self.tail
+        self.heading_rad[lone] = np.nan_to_num(known_map.headings_rad[self.tail[lone]])
+
+    def next(self, edges: Indices, uniform: Array) -> Indices:
+        """Edge after each, past its head: any but the one back, which is left for dead ends."""
+        node, back = self.head.take(edges), self.reverse.take(edges)
+        others = self.degree.take(node) - 1
+        chosen = self.first_out.take(node) + (uniform * others).astype(np.int64)
+        chosen += chosen >= back
+        onward: Indices = np.where(others > 0, chosen, back)
+        return onward
+
+    def before(self, edges: Indices, uniform: Array) -> Indices:
+        """Edge before each, for driving backwards."""
+        earlier: Indices = self.reverse[self.next(self.reverse[edges], uniform)]
+        return earlier
+
+
+class TopologicalMcl:
+    """Global localization on a topological map by the descriptors of 3D lidar clouds.
+
+    Parameters
+    ----------
+    weighting
+        M1, M2 or M3 of `node_log_weights`.
+    particles_per_node
+        Particles, over the map's nodes; they face its neighbours in turn.
+    n_nearest
+        B: how many of the map's descriptors, the most alike, have a say.
+    sigma_l_m
+        Spread about their places, m; None for the map's spacing.
+    sigma_m
+        Spread of their descriptor distances, which sum to one.
+    motion
+        `paper`: one node at every observation, whatever the wheels say. `odometry`: along the
+        graph by the wheels' travel.
+    p_stay, p_skip, p_turn
+        With `odometry`: chance at each node to be late by one, to be early by one, and to turn
+        round, since the graph's edges are not what the robot drives.
+    resampling
+        `always`, as the paper, or `ess`: when the effective sample size is below half.
+    scheme
+        As in `estimators.particles.resample`; the paper's is multinomial.
+    injection
+        Share of the particles that is put, at every observation, at the B places instead. With
+        none, a hypothesis once discarded never comes back.
+    estimate
+        `mean`: of all particles, eq. (4). `mode`: of those at the heaviest node and its
+        neighbours.
+    refine
+        Register the level slice of the cloud with that of the mode's node, if the map has
+        slices; the pose is then as good as the registration, not as the nodes' spacing.
+    map_path
+        A map's file; None for the prior's map.
+
+    Notes
+    -----
+    Without refinement the covariance is that of the particles and of an even spread over a
+    spacing, as the robot is near a node rather than on it.
+
+    Belief extras: `particles` (M, 3), `log_weights` (M,), `ess` before resampling, `mode_share`
+    of the weight at the mode, `node`, and `refinement` (`ok`, or why not) where it was tried. An
+    observation that holds NaN, or a cloud that saw nothing, is passed over with a `status`.
+    """
+
+    needs = frozenset({"place", "map"})
+    global_or_grid = True
+
+    def __init__(
+        self,
+        weighting: Weighting = "M2",
+        particles_per_node: int = 4,
+        n_nearest: int = 5,
+        sigma_l_m: float | None = None,
+        sigma_m: float = 0.1,
+        motion: Literal["odometry", "paper"] = "odometry",
+        p_stay: float = 0.1,
+        p_skip: float = 0.1,
+        p_turn: float = 0.01,
+        resampling: Literal["ess", "always"] = "ess",
+        scheme: Scheme = "systematic",
+        injection: float = 0.02,
+        estimate: Literal["mode", "mean"] = "mode",
+        refine: bool = True,
+        map_path: str | None = None,
+    ) -> None:
+        for name, value, allowed in (
+            ("weighting", weighting, ("M1", "M2", "M3")),
+            ("motion", motion, ("odometry", "paper")),
+            ("resampling", resampling, ("ess", "always")),
+            ("scheme", scheme, SCHEMES),
+            ("estimate", estimate, ("mode", "mean")),
+        ):
+            if value not in allowed:
+                raise InputError(f"estimator.{name} must be {' or '.join(allowed)}, got {value!r}")
+        for name, count in (("particles_per_node", particles_per_node), ("n_nearest", n_nearest)):
+            if count < 1:
+                raise InputError(f"estimator.{name} must be at least 1, got {count}")
+        for name, sigma in (("sigma_l_m", sigma_l_m), ("sigma_m", sigma_m)):
+            if sigma is not None and not (math.isfinite(sigma) and sigma > 0.0):
+                raise InputError(f"estimator.{name} must be a positive number, got {sigma}")
+        shares = {"p_stay": p_stay, "p_skip": p_skip, "p_turn": p_turn, "injection": injection}
+        for name, share in shares.items():
+            if not 0.0 <= share <= 1.0:
+                raise InputError(f"estimator.{name} must lie in [0, 1], got {share}")
+        if p_stay + p_skip > 1.0:
+            raise InputError("estimator.p_stay and p_skip must not exceed 1 together")
+        self.weighting, self.particles_per_node, self.n_nearest = (
+            weighting,
+            particles_per_node,
+            n_nearest,
+        )
+        self.sigma_l_m, self.sigma_m, self.motion = sigma_l_m, sigma_m, motion
+        self.p_stay, self.p_skip, self.p_turn = p_stay, p_skip, p_turn
+        self.resampling, self.scheme, self.injection = resampling, scheme, injection
+        self.estimate, self.refine, self.map_path = estimate, refine, map_path
+
+    def reset(self, prior: Prior, rng: np.random.Generator) -> None:
+        """Spread the particles over the nodes, weighted by the prior's pose if it has one."""
+        known = prior.map if self.map_path is None else load(Path(self.map_path))
+        if not isinstance(known, TopologicalMap):
+            raise InputError(
+                "topological_mcl needs a topological map; set estimator.map_path, or prior.map "
+                "to the function that makes one"
+            )
+        self._rng, self._map, self._graph = rng, known, Graph(known)
+        self._lidar, self._track_m = prior.sensors.lidar3d, prior.robot.track_m
+        self._kind = describers.KINDS.get(known.descriptor)
+        self._node_of_state = np.concatenate([self._graph.tail, self._graph.head])
+        headings = np.tile(self._graph.heading_rad, 2)
+        self._poses = np.column_stack([known.positions_m[self._node_of_state], headings])
+        self._squares = np.einsum("nd,nd->n", known.descriptors, known.descriptors)
+        self._sigma_l_m = self.sigma_l_m or known.spacing_m or 1.0
+        self._refiner = None
+        if self.refine and known.slices_m.size and self._lidar is not None:
+            self._refiner = Refiner(known, self._lidar)
+        node = np.tile(np.arange(len(known)), self.particles_per_node)
+        copy = np.repeat(np.arange(self.particles_per_node), len(known))
+        degree = self._graph.degree[node]
+        self._edge = self._graph.first_out[node] + copy % degree
+        self._along_m = np.zeros(len(node))
+        if self.motion == "odometry":  # anywhere about the node, not on it
+            reach = self._graph.length_m[self._edge] / 2.0
+            reach = np.where(np.isfinite(reach), reach, 0.0)
+            self._along_m = reach * rng.uniform(-1.0, 1.0, len(node))
+            self._cross_nodes(noisy=False)
+        self._log_weights = np.full(len(node), -math.log(len(node)))
+        if prior.mean is not None and prior.covariance is not None:
+            self._log_weights += self._log_prior(prior.mean, prior.covariance)
+        self._observed = False
+        self._belief = self._summary({})
+        self._mean = self._belief.mean.copy()
+
+    def step(self, frame: Frame) -> Belief:
+        """Move by the wheels; at an observation also weight, resample and, if asked, refine."""
+        if self.motion == "odometry":
+            self._roll(frame.wheel_increments_m)
+        descriptor, fault = self._descriptor(frame)
+        if descriptor is None:
+            if self.motion == "odometry":
+                moved = arc_increment(frame.wheel_increments_m, self._track_m)
+                self._mean = se2.compose(self._mean, moved)
+            extras = {"status": fault} if fault else {}
+            return Belief(self._mean.copy(), self._belief.covariance.copy(), extras)
+        if self.motion == "paper" and self._observed:
+            self._edge = self._graph.next(self._edge, self._rng.random(len(self._edge)))
+        self._observed = True
+        self._weigh(descriptor)
+        ess = effective_sample_size(self._log_weights)
+        if self.resampling == "always" or ess < 0.5 * len(self._edge):
+            self._resample()
+        self._belief = self._summary({"ess": ess})
+        if self._refiner is not None and frame.cloud_ranges_m is not None:
+            self._belief = self._refined(frame.cloud_ranges_m, self._belief)
+        self._mean = self._belief.mean.copy()
+        return self._belief
+
+    def _descriptor(self, frame: Frame) -> tuple[NDArray[np.float32] | None, str]:
+        """Descriptor of the Frame's place, or None and why if something is wrong with it."""
+        observed = frame.place_descriptor
+        if observed is None:
+            if frame.cloud_ranges_m is None:
+                return None, ""
+            if self._kind is None or self._lidar is None:
+                raise InputError(
+                    "the map's descriptors come from elsewhere, but the recording has clouds "
+                    "only; give it place descriptors, or build the map from clouds"
+                )
+            if not np.isfinite(frame.cloud_ranges_m).any():
+                return None, "empty cloud"
+            observed = self._kind.describe(self._lidar, frame.cloud_ranges_m)
+        size = self._map.descriptors.shape[1]
+        if observed.shape != (size,):
+            raise InputError(
+                f"the map's descriptors have {size} numbers, the recording's have shape "
+                f"{observed.shape}; describe both by the same network"
+            )
+        if not np.isfinite(observed).all():
+            return None, "descriptor not finite"
+        return observed.astype(np.float32, copy=False), ""
+
+    def _weigh(self, descriptor: NDArray[np.float32]) -> None:
+        """Find the B places most alike, inject particles there, weight all."""
+        nearest, away = self._nearest(descriptor)
+        n, rng = len(self._edge), self._rng
+        n_new = rng.binomial(n, self.injection) if self.injection > 0.0 else 0
+        if n_new:
+            slots = rng.choice(n, n_new, replace=False)
+            odds = np.zeros(len(nearest))
+            if self.weighting != "M1":
+                odds = -((_scaled(away) / self.sigma_m) ** 2)
+            node = nearest[resample(odds, n_new, rng, "multinomial")]
+            out = (rng.random(n_new) * self._graph.degree[node]).astype(np.int64)
+            self._edge[slots] = self._graph.first_out[node] + out
+            self._along_m[slots] = 0.0
+            self._log_weights = _normalized(self._log_weights)
+            self._log_weights[slots] = -math.log(n)
+        positions = self._map.positions_m
+        node = self._node_of_state.take(self._states())
+        held = np.flatnonzero(np.bincount(node, minlength=len(positions)))
+        by_node = np.empty(len(positions))
+        by_node[held] = node_log_weights(
+            positions[held], positions[nearest], away, self.weighting, self._sigma_l_m, self.sigma_m
+        )
+        self._log_weights = _normalized(self._log_weights + by_node.take(node))
+
+    def _nearest(self, descriptor: NDArray[np.float32]) -> tuple[Indices, Array]:
+        """Node numbers (B,) of the most alike descriptors, and their distances."""
+        database = self._map.descriptors
+        n_nearest = min(self.n_nearest, len(database))
+        if self._kind is not None:
+            away = self._kind.distances(descriptor, database)
+            nearest = np.argpartition(away, n_nearest - 1)[:n_nearest]
+            return nearest, away[nearest]
+        # |d - q|^2 = |d|^2 - 2 d.q + |q|^2 finds them in one product; their distances are then
+        # taken exactly
+        rough = self._squares - 2.0 * (database @ descriptor)
+        nearest = np.argpartition(rough, n_nearest - 1)[:n_nearest]
+        return nearest, describers.euclidean(descriptor, database[nearest])
+
+    def _resample(self) -> None:
+        """Draw the particles by their weights; those on the same edge are drawn as one."""
+        n = len(self._edge)
+        if self.motion == "paper":
+            mass = _sums(self._edge, np.exp(self._log_weights), len(self._graph.tail))
+            held = np.flatnonzero(mass)
+            self._edge = held[resample(np.log(mass[held]), n, self._rng, self.scheme)]
+        else:
+            kept = resample(self._log_weights, n, self._rng, self.scheme)
+            self._edge, self._along_m = self._edge.take(kept), self._along_m.take(kept)
+        self._log_weights = np.full(n, -math.log(n))
+
+    def _states(self) -> Indices:
+        """Number (M,) of each particle's edge, plus that of all edges if it is past its middle."""
+        if self.motion == "paper":
+            return self._edge
+        past = self._along_m > 0.5 * self._graph.length_m.take(self._edge)
+        states: Indices = self._edge + len(self._graph.tail) * past
+        return states
+
+    def _roll(self, wheel_increments_m: Array) -> None:
+        """Move along the edges by the wheels' mean travel."""
+        travel_m = float(wheel_increments_m.sum()) / 2.0
+        if travel_m != 0.0:
+            self._along_m += travel_m
+            self._cross_nodes(noisy=True)
+
+    def _cross_nodes(self, *, noisy: bool) -> None:
+        """Pass particles that are over an end of their edge on to the next one."""
+        graph, rng = self._graph, self._rng
+        for _ in range(_MOST_HOPS):
+            over = np.flatnonzero(self._along_m >= graph.length_m.take(self._edge))
+            under = np.flatnonzero(self._along_m < 0.0)
+            if not len(over) and not len(under):
+                return
+            old = self._edge[over]
+            self._along_m[over] -= graph.length_m[old]
+            new = graph.next(old, rng.random(len(over)))
+            if noisy and len(over):
+                chance = rng.random((2, len(over)))
+                early = chance[0] > 1.0 - self.p_skip
+                new[early] = graph.next(new[early], rng.random(int(early.sum())))
+                late = chance[0] < self.p_stay
+                new[late] = old[late]
+                turned = chance[1] < self.p_turn
+                new[turned] = graph.reverse[old[turned]]
+            self._edge[over] = new
+            self._edge[under] = graph.before(self._edge[under], rng.random(len(under)))
+            self._along_m[under] += graph.length_m[self._edge[under]]
+        self._along_m = np.clip(self._along_m, 0.0, graph.length_m[self._edge])
+
+    def _log_prior(self, mean: Array, covariance: Array) -> Array:
+        """Log densities (M,) of a first belief, as wide as the nodes are apart at least."""
+        spread = covariance[:2, :2] + self._sigma_l_m**2 * np.eye(2)
+        off = self._poses[self._states(), :2] - mean[:2]
+        turn = se2.wrap(self._graph.heading_rad[self._edge] - mean[2])
+        squares: Array = np.sum(off * np.linalg.solve(spread, off.T).T, axis=1)
+        squares += turn**2 / (covariance[2, 2] + _FACING_RAD**2)
+        return -0.5 * squares
+
+    def _summary(self, extras: dict[str, Any]) -> Belief:
+        """Mean and covariance of the particles, or of their mode.
+
+        Particles that sit on the same node and face the same way are summed first.
+        """
+        known, state = self._map, self._states()
+        mass = _sums(state, np.exp(self._log_weights), len(self._poses))
+        held = np.flatnonzero(mass)
+        shares, poses, nodes = mass[held], self._poses[held], self._node_of_state[held]
+        by_node = _sums(nodes, shares, len(known))
+        mode, mode_mass = self._mode(by_node)
+        if self.estimate == "mode":
+            near = np.zeros(len(known), bool)
+            near[self._about(mode)] = True
+            shares = shares * near[nodes]
+        shares = shares / shares.sum()
+        centre = shares @ poses[:, :2]
+        off = poses[:, :2] - centre
+        cos, sin = shares @ np.cos(poses[:, 2]), shares @ np.sin(poses[:, 2])
+        certainty = min(math.hypot(cos, sin), 1.0)
+        spread = -2.0 * math.log(certainty) if certainty > 0.0 else math.inf
+        covariance = np.zeros((3, 3))
+        covariance[:2, :2] = off.T @ (shares[:, None] * off)
+        covariance[[0, 1], [0, 1]] += known.spacing_m**2 / 12.0
+        covariance[2, 2] = min(max(spread, _LEAST_HEADING), _ALL_AROUND)
+        extras |= {
+            "mode_share": mode_mass / mass.sum(),
+            "node": mode,
+            "particles": self._poses.take(state, axis=0),
+            "log_weights": self._log_weights.copy(),
+        }
+        return Belief(np.array([*centre, math.atan2(sin, cos)]), covariance, extras)
+
+    def _mode(self, mass: Array) -> tuple[int, float]:
+        """Node with the greatest mass (N,) of itself and its neighbours, and that mass."""
+        first, second = self._map.edges.T
+        about = mass + _sums(first, mass[second], len(mass))
+        about += _sums(second, mass[first], len(mass))
+        mode = int(np.argmax(about))
+        return mode, float(about[mode])
+
+    def _about(self, node: int) -> Indices:
+        """A node and its neighbours."""
+        graph = self._graph
+        first = graph.first_out[node]
+        return np.append(graph.head[first : first + graph.degree[node]], node)
+
+    def _refined(self, cloud_ranges_m: NDArray[np.float32], belief: Belief) -> Belief:
+        """Register the cloud with the mode's node; the belief as it was if that fails."""
+        assert self._refiner is not None
+        mode = int(belief.extras["node"])
+        others = [int(i) for i in self._about(mode) if i != mode]
+        found = self._refiner.refine(cloud_ranges_m, mode, others)
+        extras = {**belief.extras, "refinement": found.status}
+        if found.pose is None or found.covariance is None:
+            return Belief(belief.mean, belief.covariance, extras)
+        return Belief(found.pose, found.covariance, extras)
