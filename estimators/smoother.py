@@ -169,7 +169,7 @@ class Smoother:
         variances = wheel_variances(spread_m, self.kr, self.kl)
         motion, _ = wheel_motion(travel, variances, self._track_m)
         self._belief = self._belief.then(motion)
-        if frame.landmarks is not None:
+        if frame.landmarks is not None and len(frame.landmarks.points_in_camera):
             if frame.landmarks.ids is None:
                 raise InputError(
                     "smoother needs to know which landmark is which; set "

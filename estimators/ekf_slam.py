@@ -1,0 +1,340 @@
+"""EKF-SLAM with stereo landmarks, the classical comparison of gil2008 (its refs. 8, 24 to 26).
+
+One Gaussian over the robot's pose and all landmarks, with all their correlations; so there is one
+association for the whole filter, and a wrong one is never taken back.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
+
+from estimators.base import Belief, Prior
+from estimators.gaussian import STILL, Gaussian, compose, wheel_motion, wrap
+from estimators.stereo import LEAST_DEPTH_M, NoiseAt, NoiseModel, StereoModel
+from sim.errors import InputError
+from sim.recording import Frame, LandmarkSet
+from sim.robot import TravelWindow, wheel_variances
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Association = Literal["known", "mahalanobis", "descriptor"]
+
+_BLIND_IMAGES = 100  # images without a landmark after which the status says so
+
+
+class EkfSlam:
+    """Extended Kalman filter over pose and landmarks.
+
+    At an image the motion since the last one is applied, the landmarks seen are associated, all of
+    them update the state at once, and those not in the map enter it with their correlations.
+
+    Parameters
+    ----------
+    association
+        `known`: by the ids that the sensor gives. `mahalanobis`: least distance below `d0`,
+        gil2008, eq. (15). `descriptor`: of those below `d0`, the one that distance and descriptor
+        together favour.
+    d0
+        Threshold of the squared Mahalanobis distance (99.9 % of three degrees of freedom).
+    noise_model, noise_at
+        As in `estimators.stereo.StereoModel.of`.
+    sigma_column_px, sigma_row_px, sigma_disparity_px, sigma_descriptor
+        Believed noise; None for that of the prior's camera.
+    kr, kl
+        Believed slip variance per metre of the wheels, m.
+    window_s
+        |ds| is netted over at least this time.
+    keep_map
+        Put the map into every Belief.
+
+    Notes
+    -----
+    Extras: `associations` (K,): for each observation, counted from 0 over the whole run, the one
+    that started its landmark, itself if it is the first, -1 if it was refused; with `keep_map` also
+    `landmarks` (N, 3) and `landmark_covariances` (N, 3, 3); `status` when an image was of no use.
+
+    A step costs O(K N^2): the whole covariance is touched.
+    """
+
+    needs = frozenset({"landmarks"})
+
+    def __init__(
+        self,
+        association: Association = "known",
+        d0: float = 16.27,
+        noise_model: NoiseModel = "camera",
+        noise_at: NoiseAt = "predicted",
+        sigma_column_px: float | None = None,
+        sigma_row_px: float | None = None,
+        sigma_disparity_px: float | None = None,
+        sigma_descriptor: float | None = None,
+        kr: float = 5e-5,
+        kl: float = 5e-5,
+        window_s: float = 0.05,
+        keep_map: bool = False,
+    ) -> None:
+        choices: dict[str, tuple[str, tuple[str, ...]]] = {
+            "association": (association, ("known", "mahalanobis", "descriptor")),
+            "noise_model": (noise_model, ("camera", "diagonal", "correlated", "image")),
+            "noise_at": (noise_at, ("predicted", "measured")),
+        }
+        for name, (value, allowed) in choices.items():
+            if value not in allowed:
+                raise InputError(f"estimator.{name} must be {' or '.join(allowed)}, got {value!r}")
+        believed = {
+            "sigma_column_px": sigma_column_px,
+            "sigma_row_px": sigma_row_px,
+            "sigma_disparity_px": sigma_disparity_px,
+            "sigma_descriptor": sigma_descriptor,
+        }
+        self._believed = {name: sigma for name, sigma in believed.items() if sigma is not None}
+        for name, number in {"kr": kr, "kl": kl, "window_s": window_s, **self._believed}.items():
+            if not (math.isfinite(number) and number >= 0.0):
+                raise InputError(f"estimator.{name} must be zero or positive, got {number}")
+        if not (math.isfinite(d0) and d0 > 0.0):
+            raise InputError(f"estimator.d0 must be positive, got {d0}")
+        self.association, self.d0 = association, d0
+        self.noise_model, self.noise_at = noise_model, noise_at
+        self.sigma_column_px, self.sigma_row_px = sigma_column_px, sigma_row_px
+        self.sigma_disparity_px, self.sigma_descriptor = sigma_disparity_px, sigma_descriptor
+        self.kr, self.kl, self.window_s, self.keep_map = kr, kl, window_s, keep_map
+
+    def reset(self, prior: Prior, rng: np.random.Generator) -> None:
+        """Start from the prior's pose, with an empty map."""
+        camera = prior.sensors.stereo
+        if camera is None:
+            raise InputError("ekf_slam needs a stereo camera; choose sensors that have one")
+        if prior.mean is None or prior.covariance is None:
+            raise InputError("ekf_slam needs a start pose; set prior.start=tracking")
+        if self.association == "known" and not camera.identifies:
+            raise InputError(
+                "the camera does not identify landmarks; set estimator.association=mahalanobis "
+                "or descriptor"
+            )
+        believed: dict[str, Any] = self._believed
+        camera = dataclasses.replace(camera, **believed)
+        self._camera = StereoModel.of(camera, self.noise_model, self.noise_at)
+        self._likeness = 1.0 / (1.0 + camera.sigma_descriptor**2)
+        # what a landmark may be predicted beyond dmax by, and still be the one that was seen
+        self._reach_m = 1.5 * camera.max_distance_m + 1.0
+        self._track_m = prior.robot.track_m
+        self._window = TravelWindow(self.window_s)
+        self._mean, self._room = prior.mean.copy(), prior.covariance.copy()
+        self._motion = STILL  # since the last image
+        self._slot_of: dict[int, int] = {}
+        self._births = np.zeros(0, np.int64)  # the observation that started each landmark
+        self._bank = np.zeros((0, 0), np.float32)  # its descriptor
+        self._n_observations, self._blind = 0, 0
+
+    def step(self, frame: Frame) -> Belief:
+        """Roll by the wheels; at an image, associate, update, and take up new landmarks."""
+        travel = frame.wheel_increments_m
+        spread_m = self._window.push(frame.duration_s, travel)
+        variances = wheel_variances(spread_m, self.kr, self.kl)
+        self._motion = self._motion.then(wheel_motion(travel, variances, self._track_m)[0])
+        extras: dict[str, Any] = {}
+        if frame.landmarks is not None:
+            self._move()
+            extras = self._see(frame.landmarks)
+        pose = Gaussian(self._mean[:3], self._covariance[:3, :3]).then(self._motion)
+        if self.keep_map:
+            extras |= {k: v for k, v in self.map.items() if k.startswith("landmark")}
+        covariance = (pose.covariance + pose.covariance.T) / 2.0
+        return Belief(pose.mean.copy(), covariance, extras)
+
+    @property
+    def map(self) -> dict[str, Array | Ints]:
+        """`landmarks` (N, 3) and `landmark_covariances` (N, 3, 3), m in map.
+
+        `origins` (N,) are the observations, counted over the run, that started them; `ids` (N,)
+        are the sensor's, if it gives any.
+        """
+        n, P = self._n_landmarks, self._covariance
+        blocks = P[3:, 3:].reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n)]
+        answer: dict[str, Array | Ints] = {
+            "landmarks": self._mean[3:].reshape(n, 3).copy(),
+            "landmark_covariances": blocks.reshape(n, 3, 3),
+            "origins": self._births.copy(),
+        }
+        if self.association == "known":
+            answer["ids"] = np.array(list(self._slot_of), dtype=np.int64)
+        return answer
+
+    @property
+    def _n_landmarks(self) -> int:
+        return len(self._mean) // 3 - 1
+
+    @property
+    def _covariance(self) -> Array:
+        """The part of the allotted room that is in use."""
+        n = len(self._mean)
+        return self._room[:n, :n]
+
+    def _move(self) -> None:
+        """Apply the motion since the last image to the pose and to its correlations."""
+        P = self._covariance
+        mean, by_pose, by_motion = compose(self._mean[:3], self._motion.mean)
+        noise = by_motion @ self._motion.covariance @ by_motion.T
+        P[:3, :3] = by_pose @ P[:3, :3] @ by_pose.T + (noise + noise.T) / 2.0
+        P[:3, 3:] = by_pose @ P[:3, 3:]
+        P[3:, :3] = P[:3, 3:].T
+        self._mean[:3] = mean
+        self._motion = STILL
+
+    def _see(self, seen: LandmarkSet) -> dict[str, Any]:
+        """Take in one image; the extras that it gives."""
+        found, status = self._usable(seen)
+        extras: dict[str, Any] = {"status": status} if status else {}
+        points = seen.points_in_camera[found]
+        associations = np.full(len(seen.points_in_camera), -1)
+        if self.association == "known" and seen.ids is not None:
+            slots = np.array([self._slot_of.get(int(i), -1) for i in seen.ids[found]], np.int64)
+        else:
+            slots = self._associate(points, self._unlikeness(seen, found))
+        old = slots >= 0
+        if old.any():
+            self._update(slots[old], points[old])
+        associations[found[old]] = self._births[slots[old]]
+        if not old.all():
+            self._create(points[~old])
+            born = self._n_observations + found[~old]
+            associations[found[~old]] = born
+            if self.association == "known" and seen.ids is not None:
+                for offset, i in enumerate(seen.ids[found[~old]]):
+                    self._slot_of[int(i)] = len(self._births) + offset
+            if self.association == "descriptor" and seen.descriptors is not None:
+                fresh = seen.descriptors[found[~old]]
+                bank = self._bank if len(self._bank) else fresh[:0]
+                self._bank = np.concatenate([bank, fresh])
+            self._births = np.concatenate([self._births, born])
+        self._n_observations += len(associations)
+        extras["associations"] = associations
+        return extras
+
+    def _usable(self, seen: LandmarkSet) -> tuple[Ints, str]:
+        """Rows of the observations that can be used, and what is wrong with the others."""
+        usable = self._camera.usable(seen.points_in_camera)
+        status = "" if usable.all() else "observation without depth refused"
+        if self.association == "known" and usable.any():
+            if seen.ids is None:
+                raise InputError("ekf_slam: observations without ids; set estimator.association")
+            first = np.zeros(len(usable), bool)
+            rows = np.flatnonzero(usable)
+            first[rows[np.unique(seen.ids[rows], return_index=True)[1]]] = True
+            if np.any(usable & ~first):
+                status = "duplicate id refused"
+            usable &= first
+        self._blind = 0 if usable.any() else self._blind + 1
+        if self._blind >= _BLIND_IMAGES:
+            status = f"no landmark in {self._blind} images"
+        return np.flatnonzero(usable), status
+
+    def _associate(self, points: Array, unlikeness: Array) -> Ints:
+        """Slot (K,) of each point, -1 for new ones; a landmark at most once an image."""
+        slots = np.full(len(points), -1)
+        if len(points) == 0 or self._n_landmarks == 0:
+            return slots
+        landmarks = self._mean[3:].reshape(-1, 3)
+        predicted = self._camera.predict(self._mean[:3], landmarks)[0]
+        near = predicted[:, 2] > LEAST_DEPTH_M
+        candidates = np.flatnonzero(near & (np.linalg.norm(predicted, axis=1) < self._reach_m))
+        if len(candidates) == 0:
+            return slots
+        spread = self._predicted_spread(candidates)
+        v, R = self._camera.innovation(predicted[None, candidates], points[:, None])
+        S = spread + R  # (K, candidates, 3, 3), or the same for all points
+        distances = np.sum(v * np.linalg.solve(S, v[..., None])[..., 0], axis=-1)
+        scores = distances + unlikeness[:, candidates]
+        refused = (distances >= self.d0) | (unlikeness[:, candidates] > 0.0)
+        scores[refused] = np.inf
+        for k, score in enumerate(scores):
+            best = int(np.argmin(score))
+            if math.isfinite(score[best]):
+                slots[k] = candidates[best]
+                scores[:, best] = np.inf
+        return slots
+
+    def _unlikeness(self, seen: LandmarkSet, found: Ints) -> Array:
+        """-2 log of the likelihood ratio (K, N) of the descriptors: the same landmark or another.
+
+        Of D independent components of unit vectors, the product of two of one landmark is
+        N(rho, 1 / D), and of two of different ones N(0, 1 / D).
+        """
+        if self.association != "descriptor":
+            return np.zeros((len(found), self._n_landmarks))
+        if seen.descriptors is None:
+            raise InputError(
+                "ekf_slam: observations without descriptors; set estimator.association=mahalanobis"
+            )
+        if self._n_landmarks == 0:
+            return np.zeros((len(found), 0))
+        products = (seen.descriptors[found] @ self._bank.T).astype(np.float64)
+        rho = self._likeness
+        unlikeness: Array = seen.descriptors.shape[1] * rho * (rho - 2.0 * products)
+        return unlikeness
+
+    def _predicted_spread(self, slots: Ints) -> Array:
+        """H P H^T (n, 3, 3) of each of these landmarks apart."""
+        P = self._covariance
+        _, of_pose, of_landmark = self._camera.predict(
+            self._mean[:3], self._mean[3:].reshape(-1, 3)[slots]
+        )
+        at = 3 + 3 * slots[:, None] + np.arange(3)
+        cross = P[:3][:, at].transpose(1, 0, 2)
+        own = P[at[:, :, None], at[:, None, :]]
+        turned = of_landmark.transpose(0, 2, 1)
+        mixed = of_pose @ cross @ turned
+        spread: Array = (
+            of_pose @ P[:3, :3] @ of_pose.transpose(0, 2, 1) + of_landmark @ own @ turned
+        )
+        return spread + mixed + mixed.transpose(0, 2, 1)
+
+    def _update(self, slots: Ints, points: Array) -> None:
+        """Kalman update by points (K, 3) of landmarks in these slots, all at once."""
+        P, n = self._covariance, 3 * len(slots)
+        predicted, of_pose, of_landmark = self._camera.predict(
+            self._mean[:3], self._mean[3:].reshape(-1, 3)[slots]
+        )
+        v, R = self._camera.innovation(predicted, points)
+        at = 3 + 3 * slots[:, None] + np.arange(3)
+        rows = P[at].reshape(len(slots), 3, -1)
+        HP = (of_pose @ P[:3] + of_landmark @ rows).reshape(n, -1)  # H has two blocks a row
+        along = HP[:, at].reshape(n, len(slots), 3).transpose(1, 0, 2)
+        S = HP[:, :3] @ of_pose.reshape(n, 3).T
+        S += (along @ of_landmark.transpose(0, 2, 1)).transpose(1, 0, 2).reshape(n, n)
+        for k in range(len(slots)):
+            S[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += R[k]
+        factor = cho_factor((S + S.T) / 2.0, lower=True)
+        self._mean += HP.T @ cho_solve(factor, v.ravel())
+        self._mean[2] = wrap(float(self._mean[2]))
+        half = solve_triangular(factor[0], HP, lower=True)
+        P -= half.T @ half  # symmetric to the last bit
+
+    def _create(self, points: Array) -> None:
+        """Append landmarks at points (K, 3), gil2008, eqs. (16)-(18), with their correlations."""
+        pose, before, n = self._mean[:3], len(self._mean), 3 * len(points)
+        placed = self._camera.place(np.tile(pose, (len(points), 1)), points)
+        predicted, of_pose, of_landmark = self._camera.predict(pose, placed)
+        # p = C (l - t(pose)) and so l = t(pose) + C^T p
+        C_T = of_landmark.transpose(0, 2, 1)
+        by_pose = -(C_T @ of_pose).reshape(n, 3)
+        R = self._camera.innovation(predicted, points)[1]
+        after = before + n
+        if after > len(self._room):
+            room = np.zeros((2 * after, 2 * after))
+            room[:before, :before] = self._covariance
+            self._room = room
+        P = self._room[:after, :after]
+        P[before:, :before] = by_pose @ P[:3, :before]
+        P[:before, before:] = P[before:, :before].T
+        own = by_pose @ P[:3, :3] @ by_pose.T
+        for k, block in enumerate(C_T @ R @ of_landmark):
+            own[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += block
+        P[before:, before:] = (own + own.T) / 2.0
+        self._mean = np.concatenate([self._mean, placed.ravel()])
