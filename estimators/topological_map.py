@@ -9,6 +9,7 @@ import dataclasses
 import zipfile
 import zlib
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -96,7 +97,7 @@ class TopologicalMap:
         """N."""
         return len(self.positions_m)
 
-    @property
+    @cached_property
     def spacing_m(self) -> float:
         """Median distance between neighbours that are apart, m; 0 if there are none."""
         ends = self.positions_m[self.edges]

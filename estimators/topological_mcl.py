@@ -383,7 +383,11 @@ class TopologicalMcl:
         if self.motion == "paper":
             mass = _sums(self._edge, np.exp(self._log_weights), len(self._graph.tail))
             held = np.flatnonzero(mass)
-            self._edge = held[resample(np.log(mass[held]), n, self._rng, self.scheme)]
+            if self.scheme == "multinomial":  # its copies of each come in one draw
+                copies = self._rng.multinomial(n, mass[held] / mass.sum())
+                self._edge = np.repeat(held, copies)
+            else:
+                self._edge = held[resample(np.log(mass[held]), n, self._rng, self.scheme)]
         else:
             kept = resample(self._log_weights, n, self._rng, self.scheme)
             self._edge, self._along_m = self._edge.take(kept), self._along_m.take(kept)

@@ -1,0 +1,73 @@
+"""Topological localization: time per node for the particle counts of maximo2024, table 2.
+
+One node is one observation of a 512-d descriptor: the B most alike of all nodes, the weights M2,
+resampling, the hop, the mean. The paper's times, on its machine, are noted beside.
+"""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+
+from estimators.base import Prior
+from estimators.topological_mcl import TopologicalMcl
+from experiments.bench.measure import Measurement
+from experiments.places import GEOMETRIES, PlaceWorld, place_world
+
+PAPER_S = {
+    "oxford": {794: 0.26, 1588: 0.36, 2382: 0.46, 3176: 0.58},
+    "umh": {272: 0.09, 544: 0.12, 816: 0.15, 1088: 0.18},
+}
+_GOAL_MS = 0.3
+_ROUNDS = 3
+
+
+def run() -> list[Measurement]:
+    """Each count, with the paper's filter; the defaults for the largest ones."""
+    results: list[Measurement] = []
+    for name, times_s in PAPER_S.items():
+        world = place_world(GEOMETRIES[name], 1000)
+        for n_particles, paper_s in times_s.items():
+            per_node = n_particles // len(world.known_map)
+            filters = {"": _paper(per_node)}
+            if n_particles == max(times_s):
+                filters["_odometry"] = TopologicalMcl(particles_per_node=per_node)
+            for suffix, estimator in filters.items():
+                results.append(
+                    Measurement(
+                        f"topological.node_{n_particles}{suffix}_ms",
+                        1e3 * _median_step_s(estimator, world),
+                        "ms",
+                        None if suffix else _GOAL_MS,
+                        note=f"{name}, 512-d; paper {1e3 * paper_s:.0f} ms",
+                    )
+                )
+    return results
+
+
+def _paper(particles_per_node: int) -> TopologicalMcl:
+    return TopologicalMcl(
+        particles_per_node=particles_per_node,
+        motion="paper",
+        resampling="always",
+        scheme="multinomial",
+        injection=0.0,
+        estimate="mean",
+    )
+
+
+def _median_step_s(estimator: TopologicalMcl, world: PlaceWorld) -> float:
+    """Median time of a step over whole runs of the route; the first run is not counted."""
+    recording = world.recording
+    frames = list(recording.frames())
+    prior = Prior(recording.robot, recording.sensors, map=world.known_map)
+    times_ns = []
+    for round_ in range(_ROUNDS):
+        estimator.reset(prior, np.random.default_rng(round_))
+        for frame in frames:
+            begun = time.perf_counter_ns()
+            estimator.step(frame)
+            if round_ > 0:
+                times_ns.append(time.perf_counter_ns() - begun)
+    return 1e-9 * float(np.median(times_ns))
