@@ -26,6 +26,7 @@ Mask = NDArray[np.bool_]
 
 _TRIM_SIGMAS = 6.0  # a scan match farther off than this has failed
 _ROUNDS = 5
+_LEAST_K = 1e-15
 
 
 @dataclass(frozen=True)
@@ -94,13 +95,19 @@ def calibrate_wheels(
         np.array([diameter_m, diameter_m, axle_m, 0.0, 0.0, yaw])
         for yaw in np.arange(8) * math.pi / 4.0 - math.pi
     ]
-    fits = [_fit(log, start, weights, np.ones(len(log.durations_s), bool)) for start in starts]
+    scale = np.array([diameter_m, diameter_m, axle_m, 0.1, 0.1, 1.0])
+    some = np.zeros(len(log.durations_s), bool)
+    some[:: max(1, len(some) // 400)] = True  # enough to choose the start by
+    fits = [_fit(log, start, weights, some, scale) for start in starts]
+    fits = [fit for fit in fits if fit.x[:3].min() > 0.0]
+    if not fits:
+        raise InputError("wheels and laser do not agree; are the wheels the right way round?")
     fit = min(fits, key=lambda found: float(found.cost))
     for _ in range(_ROUNDS):
         residual = _residual(log, fit.x)
         spread = 1.4826 * np.median(np.abs(residual), axis=0) + 1e-9
         kept = np.sqrt(np.sum((residual / spread) ** 2, axis=1)) < _TRIM_SIGMAS
-        fit = _fit(log, fit.x, 1.0 / spread, kept)
+        fit = _fit(log, fit.x, 1.0 / spread, kept, scale)
     values = fit.x.copy()
     values[5] = se2.wrap(values[5])
     unit = float(np.mean(fit.fun**2))
@@ -114,9 +121,10 @@ def calibrate_wheels(
     return WheelCalibration(right, left, axle, x, y, yaw, kept, travel, residual[:, 2])
 
 
-def _fit(log: WheelLaserLog, start: Array, weights: Array, kept: Mask) -> optimize.OptimizeResult:
+def _fit(
+    log: WheelLaserLog, start: Array, weights: Array, kept: Mask, scale: Array
+) -> optimize.OptimizeResult:
     chosen = WheelLaserLog(log.durations_s[kept], log.rolled_rad[kept], log.laser_motion[kept])
-    scale = np.array([start[0], start[1], start[2], 0.1, 0.1, 1.0])
 
     def weighted(parameters: Array) -> Array:
         return (_residual(chosen, parameters) * weights).ravel()
@@ -191,8 +199,11 @@ def slip_of_turns(
 def _law(square: Array, path: Array) -> Array:
     """(kr, kl) >= 0 that make Gaussian sums of variance path @ k most likely."""
     k = np.full(2, float(square.sum() / path.sum()))
-    for _ in range(12):  # iteratively reweighted: the score equations of the likelihood
-        weight = 1.0 / (path @ k)
-        k, _ = optimize.nnls(path * weight[:, None], square * weight)
-        k = np.maximum(k, 1e-15)
+    for _ in range(10):  # iteratively reweighted: the score equations of the likelihood
+        weight = (path @ k) ** -2.0
+        weighted = path * weight[:, None]
+        normal, right_hand = path.T @ weighted, weighted.T @ square
+        k = np.linalg.solve(normal, right_hand)
+        if k.min() <= 0.0:  # at the bound of one, the other stands alone
+            k = np.where(k > 0.0, right_hand / np.diag(normal), _LEAST_K)
     return k

@@ -88,8 +88,8 @@ def _bounded(data: bytes, path: Path, most_bytes: int) -> bytes:
 def read_members(path: Path) -> dict[str, bytes]:
     """Files of a folder or of a tar archive (plain, gzip, xz): name to contents.
 
-    Names are those of the files without their folders; contents are unpacked if they are
-    packed, and the name then loses its ending.
+    Names are those of the files without the outermost folder if there is but one; contents of a
+    folder's files are unpacked if they are packed, and the name then loses its ending.
     """
     if path.is_dir():
         files = {p: read_bytes(p) for p in sorted(path.iterdir()) if p.is_file()}
@@ -101,9 +101,12 @@ def read_members(path: Path) -> dict[str, bytes]:
             for member in archive:
                 file = archive.extractfile(member) if member.isfile() else None
                 if file is not None:
-                    members[PurePosixPath(member.name).name] = file.read()
+                    members[str(PurePosixPath(member.name))] = file.read()
     except (tarfile.TarError, OSError, EOFError, ValueError, OverflowError) as error:
         raise InputError(f"{path}: not a tar archive ({error}); give the folder itself") from error
+    folders = {name.split("/", maxsplit=1)[0] for name in members}
+    if len(folders) == 1 and all("/" in name for name in members):
+        members = {name.split("/", maxsplit=1)[1]: text for name, text in members.items()}
     return members
 
 

@@ -1,0 +1,142 @@
+"""From what logs hold to Recordings: order, gaps, wheels without encoders, instants for Frames.
+
+The rules, once for all readers:
+
+* Readings are put in the order of their stamps; of readings with the same stamp the last one
+  counts. How many stood out of order or were repeated is noted in the Recording's
+  configuration.
+* Wheel travel between two stamps is taken to be even (linear interpolation).
+* A velocity holds from its stamp to the next one, but no longer than `LONGEST_HOLD_S`: what a
+  robot did in a gap of the log is unknown, and the wheels are taken to stand.
+* Frames are at the stamps of the sensors that see the world, within the wheels' span; where
+  these are farther apart than `LONGEST_FRAME_S`, wheel stamps are put between, so that a turn is
+  not drawn into one arc.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim import se2
+from sim.errors import InputError
+from sim.recording import WheelLog
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.int64]
+Notes = dict[str, Any]
+
+LONGEST_HOLD_S = 1.5
+LONGEST_FRAME_S = 0.2
+
+
+def in_order(stamps: Array, name: str, notes: Notes) -> Rows:
+    """Rows of the readings in strictly increasing order of their stamps.
+
+    Parameters
+    ----------
+    stamps
+        (N,) s, as logged.
+    name
+        What the readings are, for the notes.
+    notes
+        Takes `<name>_backward` and `<name>_repeated` (readings moved and left out) and
+        `<name>_longest_gap_s`.
+    """
+    rows: Rows = np.argsort(stamps, kind="stable").astype(np.int64)
+    ordered = stamps[rows]
+    last_of_equal = np.append(ordered[1:] > ordered[:-1], True)[: len(rows)]
+    backward = int(np.sum(np.diff(stamps) < 0.0))
+    repeated = int(len(rows) - np.sum(last_of_equal))
+    if backward:
+        notes[f"{name}_backward"] = backward
+    if repeated:
+        notes[f"{name}_repeated"] = repeated
+    rows = rows[last_of_equal]
+    if len(rows) > 1:
+        notes[f"{name}_longest_gap_s"] = round(float(np.max(np.diff(stamps[rows]))), 6)
+    return rows
+
+
+def wheels_from_poses(stamps: Array, poses: Array, track_m: float, notes: Notes) -> WheelLog:
+    """Wheels (right, left) that drive the robot from pose to pose, (N, 3).
+
+    Between close poses it drives the arc; what little such a motion has to the side, which wheels
+    cannot make, is left out. Between poses farther apart in time than a Frame, a motion to the
+    side of more than 2 % shows that it was no arc: the robot then turns, drives straight and turns
+    again, a third of the time each, which takes it exactly there. How many such motions there
+    are, and the share of sideways motion left out, are noted.
+    """
+    motion = se2.between(poses[:-1], poses[1:])
+    twist = se2.log(motion)
+    sideways = np.abs(twist[:, 1])
+    in_legs = (sideways > 0.02 * np.abs(twist[:, 0])) & (sideways > 1e-3)
+    in_legs &= np.diff(stamps) > LONGEST_FRAME_S
+    forward, turn = [np.zeros((len(motion), 3)) for _ in (0, 1)]  # by thirds of the time
+    forward[:], turn[:] = twist[:, :1] / 3.0, twist[:, 2:] / 3.0
+    x, y, heading = motion[in_legs].T
+    backwards = x < 0.0
+    towards = np.arctan2(np.where(backwards, -y, y), np.abs(x))
+    drive = np.where(backwards, -1.0, 1.0) * np.hypot(x, y)
+    none = np.zeros_like(drive)
+    forward[in_legs] = np.stack([none, drive, none], axis=1)
+    turn[in_legs] = np.stack([towards, none, se2.wrap(heading - towards)], axis=1)
+    kept = np.ones((len(motion), 3), bool)
+    kept[~in_legs, :2] = False  # an arc needs no stamps between
+    thirds = np.stack([forward + turn * track_m / 2.0, forward - turn * track_m / 2.0], axis=-1)
+    travel = np.cumsum(thirds.reshape(-1, 2), axis=0)[kept.ravel()]
+    times = stamps[:-1, None] + np.diff(stamps)[:, None] * np.array([1.0, 2.0, 3.0]) / 3.0
+    times[:, 2] = stamps[1:]
+    if in_legs.any():
+        notes["motions_in_legs"] = int(np.sum(in_legs))
+    travelled = float(np.sum(np.abs(twist[:, 0])))
+    if travelled > 0.0:
+        notes["sideways_share"] = round(float(np.sum(sideways[~in_legs])) / travelled, 6)
+    return WheelLog(
+        np.concatenate([stamps[:1], times.ravel()[kept.ravel()]]),
+        np.concatenate([np.zeros((1, 2)), travel]),
+    )
+
+
+def wheels_from_velocities(
+    stamps: Array, velocity: Array, track_m: float, longest_hold_s: float = LONGEST_HOLD_S
+) -> WheelLog:
+    """Wheels from body velocities (N, 2), m/s and rad/s, each held to the next stamp."""
+    gaps = np.diff(stamps)
+    lasts = np.minimum(gaps, longest_hold_s)[:, None]
+    turn = velocity[:-1, 1:] * track_m / 2.0
+    steps = np.concatenate([velocity[:-1, :1] + turn, velocity[:-1, :1] - turn], axis=1) * lasts
+    travel = np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
+    late = np.flatnonzero(gaps > longest_hold_s)
+    if not len(late):
+        return WheelLog(stamps, travel)
+    # a reading at the end of each hold, so that interpolation does not spread it over the gap
+    ends = stamps[late] + longest_hold_s
+    return WheelLog(
+        np.insert(stamps, late + 1, ends), np.insert(travel, late + 1, travel[late + 1], axis=0)
+    )
+
+
+def frame_stamps(
+    wheel_stamps: Array, sensors: Sequence[Array], longest_s: float = LONGEST_FRAME_S
+) -> Array:
+    """Instants of the Frames: the sensors' stamps, and wheel stamps where those lie far apart."""
+    begin, end = wheel_stamps[0], wheel_stamps[-1]
+    seen = np.unique(np.concatenate([*sensors, [begin, end]]))
+    seen = seen[(seen >= begin) & (seen <= end)]
+    # of the wheel stamps in a wide gap, the last one in each cell of the allowed length
+    after = np.searchsorted(seen, wheel_stamps, side="right") - 1
+    cells = np.floor((wheel_stamps - seen[after]) / longest_s)
+    room = seen[np.minimum(after + 1, len(seen) - 1)] - seen[after]
+    last_in_cell = np.append((np.diff(cells) != 0.0) | (np.diff(after) != 0), True)
+    filler = wheel_stamps[last_in_cell & (room > longest_s)]
+    return np.unique(np.concatenate([seen, filler]))
+
+
+def require_readings(count: int, least: int, where: str, what: str) -> None:
+    """Refuse a log with too little in it."""
+    if count < least:
+        raise InputError(f"{where}: {count} {what}; at least {least} are needed for a recording")

@@ -1,0 +1,315 @@
+"""CARMEN logs: ODOM, FLASER and ROBOTLASER1 lines; and graphs in them, VERTEX2 and EDGE2.
+
+    ODOM x y theta tv rv accel ipc_stamp host logger_stamp
+    FLASER n r1..rn laser_x laser_y laser_theta x y theta ipc_stamp host logger_stamp
+    ROBOTLASER1 type start_angle fov resolution max_range accuracy remission_mode n r1..rn
+      m i1..im laser_x laser_y laser_theta x y theta tv rv forward_safety side_safety
+      turn_axis ipc_stamp host logger_stamp
+
+Other lines are skipped. Ranges at or beyond the maximum, and those that are not positive, are
+"nothing seen". A FLASER has no angles of its own: its beams are taken to start at -90 degrees
+and to be 180 / n degrees apart (180 / (n - 1) for an odd n), as the program that writes them does.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim import se2
+from sim.errors import InputError
+from sim.formats import assemble
+from sim.formats.text import Rows, Words, read_words
+from sim.recording import LaserLog, Recording, Truth, WheelLog
+from sim.robot import RobotGeometry
+from sim.sensors import Encoder, Laser, Mount, SensorSuite
+
+Array = NDArray[np.float64]
+Poses = Literal["odometry", "reference"]
+
+_ODOM, _FLASER, _ROBOTLASER = "ODOM", "FLASER", "ROBOTLASER1"
+_FLASER_MAX_RANGE_M = 80.0
+_MOST_BEAMS = 100_000
+NOMINAL_TRACK_M, NOMINAL_RADIUS_M = 0.33, 0.0975  # a Pioneer 2, which most of these logs are of
+
+
+@dataclass(frozen=True)
+class CarmenLog:
+    """What a CARMEN log holds, in the order of its stamps.
+
+    Attributes
+    ----------
+    odometry_stamps, odometry_poses
+        (N,) s and (N, 3) of the ODOM lines.
+    scan_stamps, scan_poses
+        (M,) s and (M, 3) poses of the robot (not of the laser) with the scans.
+    ranges_m
+        (M, n) float32, +inf where nothing was seen.
+    start_angle_rad, resolution_rad, max_range_m
+        Geometry of the scans.
+    T_base_laser
+        (3,) mounting, by the poses of laser and robot in the log.
+    edges
+        (M - 1, 3) motion from each scan's vertex to the next by the log's EDGE2 lines, NaN where
+        there is none; (0, 3) if the log is no graph.
+    is_graph
+        Whether poses are vertices of an optimised graph, not odometry.
+    notes
+        Counts of what was put in order or left out.
+    """
+
+    odometry_stamps: Array
+    odometry_poses: Array
+    scan_stamps: Array
+    scan_poses: Array
+    ranges_m: NDArray[np.float32]
+    start_angle_rad: float
+    resolution_rad: float
+    max_range_m: float
+    T_base_laser: Array
+    edges: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    is_graph: bool = False
+    notes: assemble.Notes = field(default_factory=dict)
+
+    @property
+    def laser(self) -> Laser:
+        """The scanner as a sensor."""
+        n_beams = self.ranges_m.shape[1]
+        fov = max(self.resolution_rad * (n_beams - 1), 1e-9)
+        middle = self.start_angle_rad + fov / 2.0
+        x, y, yaw = (float(v) for v in self.T_base_laser)
+        return Laser(
+            rate_hz=_rate(self.scan_stamps),
+            n_beams=n_beams,
+            fov_rad=min(fov, 2.0 * math.pi),
+            max_range_m=self.max_range_m,
+            mount=Mount(x, y, yaw_rad=float(se2.wrap(yaw + middle))),
+        )
+
+
+def read_carmen(path: Path) -> CarmenLog:
+    """Read a log, plain or packed.
+
+    Raises
+    ------
+    InputError
+        Naming the file and the line that is not as it should be, or that there are no scans.
+    """
+    return parse_carmen(read_words(path))
+
+
+def parse_carmen(words: Words) -> CarmenLog:
+    """The log in a file's words."""
+    notes: assemble.Notes = {}
+    odometry_lines = words.lines_of(_ODOM)
+    odometry = words.finite(odometry_lines, 1, 7, "ODOM")
+    order = assemble.in_order(odometry[:, 6], "odometry", notes)
+    odometry = odometry[order]
+    flaser, robotlaser = words.lines_of(_FLASER), words.lines_of(_ROBOTLASER)
+    if len(robotlaser) >= len(flaser):
+        lines, count_column = robotlaser, 8
+    else:
+        lines, count_column = flaser, 1
+    assemble.require_readings(len(lines), 1, words.where, "FLASER or ROBOTLASER1 lines")
+    counts = words.whole(lines, count_column, "the number of beams", 1, _MOST_BEAMS)
+    n_beams = int(np.bincount(counts).argmax())
+    short = np.flatnonzero(words.counts[lines] < count_column + 1 + counts)
+    if len(short):
+        raise words.error(int(lines[short[0]]), "too few words for the ranges it promises")
+    if np.any(counts != n_beams):
+        notes["scans_of_other_size"] = int(np.sum(counts != n_beams))
+        lines = lines[counts == n_beams]
+    raw = words.numbers(lines, count_column + 1, n_beams, "ranges")
+    after = count_column + 1 + n_beams
+    if count_column == 8:
+        remissions = words.whole(lines, after, "the number of remissions", 0, _MOST_BEAMS)
+        first = np.asarray(after + 1 + remissions, np.int64)
+        tail = words.finite(lines, first, 12, "poses and stamp of ROBOTLASER1")
+        stamps, laser_poses, poses = tail[:, 11], tail[:, :3], tail[:, 3:6]
+        geometry = words.finite(lines[:1], 2, 4, "geometry of ROBOTLASER1")[0]
+        start_angle, resolution, max_range = geometry[0], geometry[2], geometry[3]
+        if not (0.0 < resolution * n_beams < 2.1 * math.pi and 0.0 < max_range <= 1e4):
+            raise words.error(int(lines[0]), "impossible resolution or maximum range")
+    else:
+        tail = words.finite(lines, after, 7, "poses and stamp of FLASER")
+        stamps, laser_poses, poses = tail[:, 6], tail[:, :3], tail[:, 3:6]
+        start_angle, max_range = -math.pi / 2.0, _FLASER_MAX_RANGE_M
+        resolution = math.pi / (n_beams - n_beams % 2) if n_beams > 1 else math.pi
+    rows = assemble.in_order(stamps, "scans", notes)
+    edges = _edges(words, lines[rows])
+    return CarmenLog(
+        odometry_stamps=odometry[:, 6].copy(),
+        odometry_poses=odometry[:, :3].copy(),
+        scan_stamps=stamps[rows],
+        scan_poses=poses[rows],
+        ranges_m=seen_ranges(raw[rows], float(max_range)),
+        start_angle_rad=float(start_angle),
+        resolution_rad=float(resolution),
+        max_range_m=float(max_range),
+        T_base_laser=_mount(poses, laser_poses),
+        edges=edges,
+        is_graph=bool(len(words.lines_of("VERTEX2"))),
+        notes=notes,
+    )
+
+
+def to_recording(
+    log: CarmenLog,
+    poses: Poses | None = None,
+    track_m: float = NOMINAL_TRACK_M,
+    wheel_radius_m: float = NOMINAL_RADIUS_M,
+) -> Recording:
+    """A Recording of the log.
+
+    Parameters
+    ----------
+    poses
+        What the log's poses are: `odometry`, from which the wheels are rebuilt, or a
+        `reference`, which becomes the truth; the wheels then come from the graph's edges, or
+        stand still if there are none. None: a reference if the log is a graph.
+    track_m, wheel_radius_m
+        The robot's; the arcs are the same for any.
+
+    Raises
+    ------
+    InputError
+        If there are fewer than two readings.
+    """
+    notes = dict(log.notes)
+    if (poses or ("reference" if log.is_graph else "odometry")) == "odometry":
+        stamps = np.concatenate([log.odometry_stamps, log.scan_stamps])
+        all_poses = np.concatenate([log.odometry_poses, log.scan_poses])
+        rows = assemble.in_order(stamps, "poses", {})
+        assemble.require_readings(len(rows), 2, "CARMEN log", "poses at different stamps")
+        wheels = assemble.wheels_from_poses(stamps[rows], all_poses[rows], track_m, notes)
+        truth = None
+    else:
+        assemble.require_readings(len(log.scan_stamps), 2, "CARMEN log", "scans")
+        edges = log.edges if len(log.edges) else np.zeros((len(log.scan_stamps) - 1, 3))
+        chain = np.zeros((len(log.scan_stamps), 3))
+        if missing := int(np.sum(~np.isfinite(edges).all(axis=1))):
+            notes["edges_missing"] = missing
+        for i, edge in enumerate(np.nan_to_num(edges)):
+            chain[i + 1] = se2.compose(chain[i], edge)
+        wheels = assemble.wheels_from_poses(log.scan_stamps.copy(), chain, track_m, notes)
+        notes["wheels_from"] = "edges of the graph" if len(log.edges) else "nothing"
+        truth = Truth(log.scan_stamps.copy(), log.scan_poses.copy())
+    return scan_recording(
+        wheels,
+        log.scan_stamps,
+        log.ranges_m,
+        log.laser,
+        truth,
+        track_m,
+        wheel_radius_m,
+        {"source": "carmen", "notes": notes},
+    )
+
+
+def scan_recording(
+    wheels: WheelLog,
+    scan_stamps: Array,
+    ranges_m: NDArray[np.float32],
+    laser: Laser,
+    truth: Truth | None,
+    track_m: float,
+    wheel_radius_m: float,
+    config: assemble.Notes,
+) -> Recording:
+    """A Recording of wheels and one laser."""
+    return Recording(
+        frame_stamps=assemble.frame_stamps(wheels.stamps, [scan_stamps]),
+        wheels=wheels,
+        robot=RobotGeometry(wheel_radius_m, track_m),
+        sensors=SensorSuite(encoder=Encoder(rate_hz=None), laser=laser),
+        truth=truth,
+        laser=LaserLog(scan_stamps.copy(), ranges_m.copy()),
+        config=config,
+    )
+
+
+def seen_ranges(raw_m: Array, max_range_m: float) -> NDArray[np.float32]:
+    """Ranges with +inf where nothing was seen: at the maximum or beyond, zero, or no number."""
+    seen = (raw_m > 0.0) & (raw_m < max_range_m)
+    ranges: NDArray[np.float32] = np.where(seen, raw_m, np.inf).astype(np.float32)
+    return ranges
+
+
+def _mount(poses: Array, laser_poses: Array) -> Array:
+    """Pose of the laser on the robot: the median over the log."""
+    mounts = se2.between(poses, laser_poses)
+    first = mounts[0, 2]
+    offset = np.median(se2.wrap(mounts[:, 2] - first))
+    return np.array([*np.median(mounts[:, :2], axis=0), float(se2.wrap(first + offset))])
+
+
+def _edges(words: Words, scan_lines: Rows) -> Array:
+    """Motion between consecutive scans by EDGE2 lines; each scan follows its VERTEX2 line."""
+    vertices, edges = words.lines_of("VERTEX2"), words.lines_of("EDGE2")
+    if not len(vertices) or not len(edges) or len(scan_lines) < 2:
+        return np.zeros((0, 3))
+    above = np.searchsorted(vertices, scan_lines) - 1
+    if np.any(above < 0):
+        raise words.error(int(scan_lines[np.argmin(above)]), "a scan without its VERTEX2")
+    ids = words.finite(vertices, 1, 1, "VERTEX2")[:, 0]
+    values = words.finite(edges, 1, 5, "EDGE2")
+    motion: dict[tuple[float, float], Array] = {}
+    for row in values:
+        motion.setdefault((row[0], row[1]), row[2:])
+    chain = ids[above]
+    unknown = np.full(3, np.nan)
+    pairs = pairwise(chain)
+    return np.array([motion.get((float(a), float(b)), unknown) for a, b in pairs])
+
+
+def _rate(stamps: Array) -> float:
+    """Median rate, Hz; 1 where it cannot be told."""
+    step = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
+    return 1.0 / step if step > 1e-9 else 1.0
+
+
+def write_carmen(path: Path, recording: Recording) -> None:
+    """Write a Recording's odometry and scans as ODOM and ROBOTLASER1 lines.
+
+    What the format cannot hold (landmarks, clouds, the truth) is left out. Unseen beams are
+    written as the maximum range.
+
+    Raises
+    ------
+    InputError
+        If the recording has no laser, or the file cannot be written.
+    """
+    from sim.files import write_whole
+
+    laser, log = recording.sensors.laser, recording.laser
+    if laser is None or log is None:
+        raise InputError(f"{path}: a CARMEN log is of a laser, and this recording has none")
+    from sim.robot import arc_increment
+
+    steps = arc_increment(np.diff(recording.wheels.position_m, axis=0), recording.robot.track_m)
+    poses = np.zeros((len(recording.wheels.stamps), 3))
+    for i, step in enumerate(steps):
+        poses[i + 1] = se2.compose(poses[i], step)
+    heading = np.unwrap(poses[:, 2])
+    lines = [
+        f"ODOM {x:.17g} {y:.17g} {a:.17g} 0 0 0 {t:.17g} estima {t:.17g}"
+        for t, (x, y, a) in zip(recording.wheels.stamps, poses, strict=True)
+    ]
+    start, n_beams = float(laser.bearings_rad[0]), laser.n_beams
+    step_rad = float(np.diff(laser.bearings_rad[:2])[0]) if n_beams > 1 else laser.fov_rad
+    head = f"ROBOTLASER1 0 {start:.17g} {laser.fov_rad:.17g} {step_rad:.17g} "
+    head += f"{laser.max_range_m:.17g} {laser.sigma_range_m:.17g} 0 {n_beams}"
+    for t, scan in zip(log.stamps, log.ranges_m, strict=True):
+        at = [np.interp(t, recording.wheels.stamps, c) for c in (*poses[:, :2].T, heading)]
+        of_laser = se2.compose(np.array(at), laser.mount.pose)
+        numbers = " ".join(f"{r:.9g}" for r in np.where(np.isfinite(scan), scan, laser.max_range_m))
+        both = " ".join(f"{v:.17g}" for v in (*of_laser, *at))
+        lines.append(f"{head} {numbers} 0 {both} 0 0 0 0 0 {t:.17g} estima {t:.17g}")
+    with write_whole(path) as part:
+        part.write_text("\n".join(lines) + "\n")

@@ -1,0 +1,119 @@
+"""The Intel Research Lab log as JSON: one scan and one pose a stamp, raw or corrected.
+
+`{"map": {"<unix time>": {"range": [180 m], "x": m, "y": m, "theta": rad}}}`; the raw file's poses
+are wheel odometry, the corrected one's, at the same stamps, are those of a mapper.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.errors import InputError
+from sim.formats import assemble
+from sim.formats.carmen import NOMINAL_RADIUS_M, NOMINAL_TRACK_M, scan_recording, seen_ranges
+from sim.formats.text import read_bytes
+from sim.recording import Recording, Truth
+from sim.sensors import Laser, Mount
+
+Array = NDArray[np.float64]
+
+_NO_RETURN_M = 81.83  # what the log writes where nothing was seen
+_MOST_BEAMS = 100_000
+
+
+def parse_intel(data: bytes, where: str) -> tuple[Array, Array, Array]:
+    """Stamps (N,) s, poses (N, 3) and ranges (N, n) m, as they stand in the file.
+
+    Raises
+    ------
+    InputError
+        Naming the file and the line (of the syntax) or the stamp that is wrong.
+    """
+    try:
+        tree = json.loads(data)
+        entries = tree["map"].items()
+    except json.JSONDecodeError as error:
+        raise InputError(f"{where}:{error.lineno}: not JSON ({error.msg})") from None
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        reason = f"{type(error).__name__}: {error}"[:120]
+        raise InputError(f'{where}:1: no {{"map": {{stamp: scan}}}} in it ({reason})') from None
+    stamps, poses, ranges = [], [], []
+    for stamp, entry in entries:
+        try:
+            stamps.append(_number(float(stamp)))
+            poses.append([_number(entry[key]) for key in ("x", "y", "theta")])
+            ranges.append([_number(r) for r in entry["range"]])
+            if len(ranges[-1]) != len(ranges[0]):
+                raise ValueError(f"{len(ranges[-1])} beams, the first scan has {len(ranges[0])}")
+        except (ValueError, KeyError, TypeError, IndexError, OverflowError) as error:
+            line = data[: max(data.find(json.dumps(stamp).encode()), 0)].count(b"\n") + 1
+            reason = f"{type(error).__name__}: {error}"[:120]
+            raise InputError(f"{where}:{line}: the scan at {stamp[:40]} is wrong ({reason})") from (
+                None
+            )
+    n_beams = len(ranges[0]) if ranges else 0
+    return (
+        np.array(stamps, float),
+        np.array(poses, float).reshape(-1, 3),
+        np.array(ranges, float).reshape(len(stamps), n_beams),
+    )
+
+
+def read_intel(
+    raw: Path,
+    reference: Path | None = None,
+    track_m: float = NOMINAL_TRACK_M,
+    wheel_radius_m: float = NOMINAL_RADIUS_M,
+) -> Recording:
+    """A Recording of the raw file; the corrected file's poses, if given, are its truth.
+
+    Beams are one degree apart (180 / n) from -90 degrees on.
+    """
+    where = str(raw)
+    stamps, poses, ranges = parse_intel(read_bytes(raw), where)
+    notes: assemble.Notes = {}
+    rows = assemble.in_order(stamps, "scans", notes)
+    assemble.require_readings(len(rows), 2, where, "scans")
+    n_beams = ranges.shape[1]
+    if n_beams < 2:
+        raise InputError(f"{where}:1: scans of {n_beams} beams; at least 2 are needed")
+    stamps, poses, ranges = stamps[rows], poses[rows], ranges[rows]
+    truth = None
+    if reference is not None:
+        times, corrected, _ = parse_intel(read_bytes(reference), str(reference))
+        order = assemble.in_order(times, "reference", {})
+        truth = Truth(times[order], corrected[order])
+    wheels = assemble.wheels_from_poses(stamps, poses, track_m, notes)
+    resolution = math.pi / n_beams
+    laser = Laser(
+        rate_hz=1.0 / max(float(np.median(np.diff(stamps))), 1e-9),
+        n_beams=n_beams,
+        fov_rad=resolution * (n_beams - 1),
+        max_range_m=_NO_RETURN_M,
+        mount=Mount(yaw_rad=-resolution / 2.0),
+    )
+    return scan_recording(
+        wheels,
+        stamps,
+        seen_ranges(ranges, _NO_RETURN_M),
+        laser,
+        truth,
+        track_m,
+        wheel_radius_m,
+        {"source": "intel", "notes": notes},
+    )
+
+
+def _number(value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise TypeError(f"{str(value)[:40]!r} is no number")
+    number = float(value)
+    if not math.isfinite(number):
+        raise ValueError("numbers must be finite")
+    return number

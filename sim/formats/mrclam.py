@@ -1,0 +1,141 @@
+"""MRCLAM: robots with velocities, ranges and bearings to barcoded landmarks, and motion capture.
+
+A data set is a folder or a tar archive of `RobotN_Odometry.dat` (t v omega),
+`RobotN_Measurement.dat` (t barcode range bearing), `RobotN_Groundtruth.dat` (t x y theta),
+`Landmark_Groundtruth.dat` (subject x y sigma_x sigma_y) and `Barcodes.dat` (subject barcode).
+Subjects that have no place in the landmark file are the other robots; they and unknown barcodes
+are left out.
+
+A range r and a bearing b become the point (x, y, z) = (-r sin b, 0, r cos b) of the camera frame
+(z forward, x right, y down), with landmarks at the camera's height. The believed noise is that of
+a stereo camera whose disparity error gives the growth of the range error and whose column error
+gives that of the bearing.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.errors import InputError
+from sim.formats import assemble
+from sim.formats.text import Words, read_members, split_words
+from sim.recording import LandmarkLog, Recording, Truth
+from sim.robot import RobotGeometry
+from sim.sensors import Encoder, Mount, SensorSuite, StereoCamera
+from sim.world import World
+
+Array = NDArray[np.float64]
+
+# An iRobot Create
+TRACK_M, WHEEL_RADIUS_M = 0.258, 0.033
+# Range error 0.008 z^2 (0.1 m at 3.5 m, 0.4 m at 7 m), bearing error 1.5 degrees
+CAMERA = StereoCamera(
+    rate_hz=10.0,
+    focal_px=100.0,
+    baseline_m=1.0,
+    fov_horizontal_rad=math.radians(100.0),
+    fov_vertical_rad=math.radians(10.0),
+    max_distance_m=15.0,
+    sigma_column_px=2.6,
+    sigma_row_px=0.5,
+    sigma_disparity_px=0.8,
+    mount=Mount(z_m=0.0),
+)
+
+
+def read_mrclam(
+    path: Path, robot: int = 1, identifies: bool = True, camera: StereoCamera = CAMERA
+) -> Recording:
+    """A Recording of one robot of a data set.
+
+    Parameters
+    ----------
+    path
+        Folder or tar archive.
+    robot
+        Its number, as in the files' names.
+    identifies
+        Whether the observations carry the landmark's number (row of the landmark file).
+    camera
+        The believed noise of the observations.
+
+    Raises
+    ------
+    InputError
+        Naming the file and the line, or the file that is missing.
+    """
+    members = read_members(path)
+
+    def words(name: str) -> Words:
+        if name not in members:
+            robots = sorted(m[5:-13] for m in members if m.endswith("_Odometry.dat"))
+            raise InputError(f"{path}: holds no {name}; robots with odometry: {', '.join(robots)}")
+        return split_words(members[name], f"{path}/{name}")
+
+    odometry = words(f"Robot{robot}_Odometry.dat").table(3, "odometry")
+    measured = words(f"Robot{robot}_Measurement.dat").table(4, "measurements")
+    truth = words(f"Robot{robot}_Groundtruth.dat").table(4, "ground truth")
+    landmarks = words("Landmark_Groundtruth.dat").table(5, "landmarks")
+    barcodes = words("Barcodes.dat").table(2, "barcodes")
+
+    notes: assemble.Notes = {}
+    odometry = odometry[assemble.in_order(odometry[:, 0], "odometry", notes)]
+    truth = truth[assemble.in_order(truth[:, 0], "truth", notes)]
+    assemble.require_readings(len(odometry), 2, str(path), "odometry readings")
+    assemble.require_readings(len(truth), 2, str(path), "ground truth poses")
+    wheels = assemble.wheels_from_velocities(odometry[:, 0].copy(), odometry[:, 1:], TRACK_M)
+    ids = _landmark_rows(measured[:, 1], barcodes, landmarks[:, 0], notes)
+    log, true_ids = _observations(measured, ids, identifies, notes)
+    z_m = np.full(len(landmarks), camera.mount.z_m)
+    world = World(
+        "mrclam",
+        walls=np.zeros((0, 4)),
+        wall_z_m=np.zeros((0, 2)),
+        landmarks=np.column_stack([landmarks[:, 1:3], z_m]),
+    )
+    return Recording(
+        frame_stamps=assemble.frame_stamps(wheels.stamps, [log.stamps]),
+        wheels=wheels,
+        robot=RobotGeometry(WHEEL_RADIUS_M, TRACK_M),
+        sensors=SensorSuite(encoder=Encoder(rate_hz=None), stereo=camera),
+        truth=Truth(truth[:, 0].copy(), truth[:, 1:].copy(), landmark_ids=true_ids, world=world),
+        landmarks=log,
+        config={"source": "mrclam", "robot": robot, "notes": notes},
+    )
+
+
+def _landmark_rows(
+    codes: Array, barcodes: Array, subjects: Array, notes: assemble.Notes
+) -> NDArray[np.int64]:
+    """Row of the landmark of each barcode; -1 for other robots and codes nobody carries."""
+    subject_of = {float(code): float(subject) for subject, code in barcodes}
+    row_of = {float(subject): row for row, subject in enumerate(subjects)}
+    rows = np.array([row_of.get(subject_of.get(float(c), math.nan), -1) for c in codes], np.int64)
+    unknown = sum(float(c) not in subject_of for c in codes)
+    notes["unknown_barcodes"] = int(unknown)
+    notes["observations_of_robots"] = int(np.sum(rows < 0)) - int(unknown)
+    return rows
+
+
+def _observations(
+    measured: Array, ids: NDArray[np.int64], identifies: bool, notes: assemble.Notes
+) -> tuple[LandmarkLog, NDArray[np.int64]]:
+    """Landmark observations by image, in order, and the true ids of their rows."""
+    forward = measured[:, 2] * np.cos(measured[:, 3])
+    usable = (ids >= 0) & (forward > 0.0) & (measured[:, 2] > 0.0)
+    notes["observations_behind"] = int(np.sum((ids >= 0) & ~usable))
+    measured, ids = measured[usable], ids[usable]
+    order = np.argsort(measured[:, 0], kind="stable")
+    measured, ids = measured[order], ids[order]
+    stamps, first = np.unique(measured[:, 0], return_index=True)
+    range_m, bearing = measured[:, 2], measured[:, 3]
+    points = np.stack(
+        [-range_m * np.sin(bearing), np.zeros_like(range_m), range_m * np.cos(bearing)], axis=1
+    )
+    splits = np.append(first, len(measured)).astype(np.int64)
+    shown = ids.copy() if identifies else np.zeros(0, np.int64)
+    return LandmarkLog(stamps, splits, points, ids=shown), ids

@@ -1,0 +1,133 @@
+"""Rawseeds CSV: odometry, SICK scans, ground truth, and trajectories in the toolkit's layout.
+
+ODOMETRY_XYT   stamp, rolling counter, ticks right, ticks left, x, y, theta
+SICK_*         stamp, number of ranges, angular offset (1/4 degree), r1 .. r181
+GROUNDTRUTH    stamp, x, y, theta, and the 3 x 3 covariance row by row
+trajectories   stamp, x, y, theta
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.formats import assemble
+from sim.formats.carmen import scan_recording, seen_ranges
+from sim.formats.text import Words, read_words
+from sim.recording import Recording, Truth
+from sim.sensors import Laser, Mount
+
+Array = NDArray[np.float64]
+
+TRACK_M, WHEEL_RADIUS_M = 0.48, 0.095  # of the Robocom the sets were recorded with, nominal
+FRONT_SICK = Mount(0.08, 0.0, 0.45)
+REAR_SICK = Mount(-0.463, 0.001, 0.454, math.pi)
+_MAX_RANGE_M = 80.0
+_MOST_BEAMS = 181
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Stamps (T,) s, strictly increasing; poses (T, 3); covariances (T, 3, 3), or (0, 3, 3)."""
+
+    stamps: Array
+    poses: Array
+    covariances: Array
+
+
+def read_trajectory(path: Path) -> Trajectory:
+    """Ground truth (13 columns) or a trajectory (4 columns).
+
+    Raises
+    ------
+    InputError
+        Naming the file and the line.
+    """
+    return parse_trajectory(read_words(path))
+
+
+def parse_trajectory(words: Words) -> Trajectory:
+    """The trajectory in a file's words; stamps put in order, the last of equal ones kept."""
+    table = words.table((4, 13), "a Rawseeds trajectory")
+    table = table[assemble.in_order(table[:, 0], "poses", {})]
+    covariances = np.zeros((0, 3, 3))
+    if table.shape[1] == 13:
+        covariances = table[:, 4:].reshape(-1, 3, 3)
+    return Trajectory(table[:, 0].copy(), table[:, 1:4].copy(), covariances)
+
+
+def parse_odometry(words: Words) -> tuple[Array, Array]:
+    """Stamps (N,) s and poses (N, 3) of ODOMETRY_XYT, as they stand."""
+    table = words.table(7, "Rawseeds odometry")
+    return table[:, 0].copy(), table[:, 4:].copy()
+
+
+def parse_sick(words: Words) -> tuple[Array, Array, float, float]:
+    """Stamps (N,), ranges (N, n) m, start angle and step (rad) of a SICK file.
+
+    The offset counts quarter degrees from -90 on; steps are one degree.
+    """
+    lines = np.arange(len(words.line_numbers))
+    head = words.finite(lines, 0, 3, "stamp, count and offset")
+    counts = words.whole(lines, 1, "the number of ranges", 1, _MOST_BEAMS)
+    assemble.require_readings(len(lines), 1, words.where, "scans")
+    different = np.flatnonzero((counts != counts[0]) | (head[:, 2] != head[0, 2]))
+    if len(different):
+        raise words.error(int(different[0]), "a scan of another size or offset than the first")
+    if not 0.0 <= head[0, 2] < 4.0:
+        raise words.error(0, "the angular offset must be 0 to 3 quarter degrees")
+    ranges = words.numbers(lines, 3, int(counts[0]), "ranges")
+    start = -math.pi / 2.0 + math.radians(head[0, 2] / 4.0)
+    return head[:, 0].copy(), ranges, start, math.radians(1.0)
+
+
+def read_rawseeds(
+    odometry: Path,
+    scans: Path,
+    truth: Path | None = None,
+    mount: Mount = FRONT_SICK,
+    track_m: float = TRACK_M,
+    wheel_radius_m: float = WHEEL_RADIUS_M,
+) -> Recording:
+    """A Recording of odometry, one SICK scanner and, if there is one, a ground truth.
+
+    Parameters
+    ----------
+    mount
+        Where the scanner sits: `FRONT_SICK` or `REAR_SICK`.
+    """
+    notes: assemble.Notes = {}
+    stamps, poses = parse_odometry(read_words(odometry))
+    rows = assemble.in_order(stamps, "odometry", notes)
+    assemble.require_readings(len(rows), 2, str(odometry), "odometry readings")
+    wheels = assemble.wheels_from_poses(stamps[rows], poses[rows], track_m, notes)
+    times, ranges, start, step = parse_sick(read_words(scans))
+    rows = assemble.in_order(times, "scans", notes)
+    times, ranges = times[rows], ranges[rows]
+    fov = max(step * (ranges.shape[1] - 1), 1e-9)
+    yaw = mount.yaw_rad + start + fov / 2.0
+    laser = Laser(
+        rate_hz=75.0,
+        n_beams=ranges.shape[1],
+        fov_rad=fov,
+        max_range_m=_MAX_RANGE_M,
+        mount=Mount(mount.x_m, mount.y_m, mount.z_m, math.remainder(yaw, 2.0 * math.pi)),
+    )
+    reference = None
+    if truth is not None:
+        found = read_trajectory(truth)
+        reference = Truth(found.stamps, found.poses)
+    return scan_recording(
+        wheels,
+        times,
+        seen_ranges(ranges, _MAX_RANGE_M),
+        laser,
+        reference,
+        track_m,
+        wheel_radius_m,
+        {"source": "rawseeds", "notes": notes},
+    )
