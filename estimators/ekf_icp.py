@@ -7,6 +7,7 @@ holds the key frame's pose beside the robot's (stochastic cloning; Roumeliotis a
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import Any
 
@@ -32,15 +33,19 @@ Array = NDArray[np.float64]
 
 _PATIENCE = 2  # scans in a row that may fail before the newest becomes the key frame
 _TINY = 1e-14  # keeps the update with a noiseless measurement solvable
+# Places in the state: key frame, last scan, robot, and for the time of an update the newest scan
+_KEY, _LAST, _POSE, _NEW = (slice(3 * i, 3 * i + 3) for i in range(4))
+_ROWS = np.arange(12)
 
 
 class EkfIcp:
     """Predict by the wheels, correct by the scan's pose relative to the key frame.
 
-    Each scan is taken to show the world from an apparent pose, x * d, with an error d of its own.
-    A registration compares two apparent poses. The key frame is kept in the state as its
-    apparent pose, so the noise that all its registrations share is counted once, and so is the
-    noise that the last registration of one key frame shares with the first of the next.
+    Each scan is taken to show the world from an apparent pose, x * d, with an error d of its own
+    that it brings to all its registrations; the rest of their noise is each one's own. A
+    registration compares apparent poses, and those of the key frame and of the last scan are in
+    the state. So the noise that all registrations of a key frame share is counted once, and what
+    is left of a scan's noise when it turns from source to reference takes itself back.
 
     Parameters
     ----------
@@ -56,18 +61,21 @@ class EkfIcp:
         Travel of a wheel per encoder tick. Each increment that is not zero has a variance of
         tick^2 / 6, which overstates it over many frames, since ticks do not add up.
     gate_probability
-        Leave out registrations whose innovation is larger than this share of all should be; None
-        to use all.
+        Leave out registrations with an innovation so large that only this share of all should
+        have a larger one; None to use all. The default takes what can only be a wrong match.
     shared_noise
-        Whether the noise of the key frame's scan is modelled as shared. Without it each
-        registration counts as independent (for comparison).
+        Share of a registration's covariance that comes from the scans' own errors, half from
+        each; 0: each registration counts as independent. It shows as a correlation of minus
+        half of it between the registrations before and after a key frame.
     window_s
         |ds| is netted over at least this time.
 
     Notes
     -----
-    A registration that failed or was gated corrects nothing. After two in a row the newest scan
-    becomes the key frame. Directions that the scans do not hold are left to the wheels.
+    Where the registration with the key frame fails or is gated, the last scan is tried, and
+    becomes the key frame if it holds. Where both fail the wheels go on alone; after two such
+    scans in a row the newest becomes the key frame. Directions that the scans do not hold are
+    left to the wheels.
 
     Belief extras: `registration_covariance` (3, 3) of T_reference_base, `registration_status`,
     `nis` (the innovation squared, normalised) with `nis_dof`, and `status` if a scan was of no
@@ -88,8 +96,8 @@ class EkfIcp:
         kl: float = 1e-4,
         lateral_slip_m: float = 1e-7,
         encoder_tick_m: float = 0.0,
-        gate_probability: float | None = None,
-        shared_noise: bool = True,
+        gate_probability: float | None = 1e-9,
+        shared_noise: float = 0.7,
         window_s: float = 0.05,
     ) -> None:
         self._matcher = ScanMatcher(metric, search, covariance, sigma_range_m)
@@ -100,8 +108,11 @@ class EkfIcp:
             kl=kl,
             lateral_slip_m=lateral_slip_m,
             encoder_tick_m=encoder_tick_m,
+            shared_noise=shared_noise,
             window_s=window_s,
         )
+        if not shared_noise <= 1.0:
+            raise InputError(f"estimator.shared_noise must lie in [0, 1], got {shared_noise}")
         if gate_probability is not None and not 0.0 < gate_probability < 1.0:
             raise InputError(
                 f"estimator.gate_probability must lie between 0 and 1 or be null, "
@@ -118,12 +129,15 @@ class EkfIcp:
         self._rng, self._track_m = rng, prior.robot.track_m
         self._window = TravelWindow(self.window_s)
         self._key: PreparedScan | None = None
-        # (6,): apparent pose of the key frame, pose of base_link; both in map
-        self._mean = np.concatenate([start.mean, start.mean])
-        self._covariance = np.tile(start.covariance, (2, 2))
+        self._last: PreparedScan | None = None
+        # of the key frame's first degenerate match, as twists: as in `Match`
+        self._directions: tuple[Array, Array] | None = None
+        # (9,): apparent poses of the key frame and of the last scan, pose of base_link; in map
+        self._mean = np.tile(start.mean, 3)
+        self._covariance = np.tile(start.covariance, (3, 3))
         self._failures = 0
         share = self.gate_probability
-        self._gates = [math.inf if share is None else chdtri(d, 1.0 - share) for d in range(1, 4)]
+        self._gates = [math.inf if share is None else chdtri(d, share) for d in range(4)]
 
     def step(self, frame: Frame) -> Belief:
         """Predict by the wheels; correct by the Frame's scan, if it has one."""
@@ -131,129 +145,145 @@ class EkfIcp:
         extras: dict[str, Any] = {}
         if frame.ranges_m is not None:
             self._correct(self._matcher.prepare(frame.ranges_m, self._laser), extras)
-        return Belief(self._mean[3:].copy(), self._covariance[3:, 3:].copy(), extras)
+        return Belief(self._mean[_POSE].copy(), self._covariance[_POSE, _POSE].copy(), extras)
 
     def _predict(self, frame: Frame) -> None:
-        """Move the robot's pose by the wheels; the key frame's stays."""
+        """Move the robot's pose by the wheels; the clones stay."""
         travel = frame.wheel_increments_m
         spread_m = self._window.push(frame.duration_s, travel)
         ticks = (travel != 0.0) * (self.encoder_tick_m**2 / 6.0)
         variances = wheel_variances(spread_m, self.kr, self.kl) + ticks
         motion = wheel_motion(travel, variances, self._track_m)[0]
         motion.covariance[1, 1] += self.lateral_slip_m * float(spread_m.mean())
-        pose, by_pose, by_motion = compose(self._mean[3:], motion.mean)
-        self._mean[3:] = pose
+        self._mean[_POSE], by_pose, by_motion = compose(self._mean[_POSE], motion.mean)
         P = self._covariance
-        P[:3, 3:] = P[:3, 3:] @ by_pose.T
-        P[3:, :3] = P[:3, 3:].T
-        P[3:, 3:] = by_pose @ P[3:, 3:] @ by_pose.T + by_motion @ motion.covariance @ by_motion.T
+        P[:6, _POSE] = P[:6, _POSE] @ by_pose.T
+        P[_POSE, :6] = P[:6, _POSE].T
+        P[_POSE, _POSE] = by_pose @ P[_POSE, _POSE] @ by_pose.T
+        P[_POSE, _POSE] += by_motion @ motion.covariance @ by_motion.T
 
     def _correct(self, scan: PreparedScan, extras: dict[str, Any]) -> None:
-        """Register the scan against the key frame and take it in."""
+        """Register the scan against the key frame, or else the last scan, and take it in."""
         if len(scan) < 3:
             extras["registration_status"] = extras["status"] = "empty"
             return
-        if self._key is None:
+        if self._key is None or self._last is None:
             extras["registration_status"] = "first"
-            self._take_key(scan)
+            self._insert(self._own_noise(scan))
+            self._keep(scan, scan, (_NEW, _NEW))
             return
-        guess = self._expected()[0]
-        found = self._matcher.match(scan, self._key, guess, self._laser, self._rng)
-        status = found.status
-        if not found.failed:
-            extras["registration_covariance"] = found.motion.covariance
-            left_key = self._left_key(found.motion.mean)
-            if not self._take_in(found, left_key, extras):
-                status = "gated"
-        extras["registration_status"] = status
-        if status in ("ok", "degenerate"):
-            self._failures = 0
-            if left_key:
-                self._key = scan
-            return
-        extras["status"] = status
+        references = [(_KEY, self._key)]
+        if self._last is not self._key:
+            references.append((_LAST, self._last))
+        for place, reference in references:
+            found = self._matcher.match(
+                scan, reference, self._expected(place)[0], self._laser, self._rng
+            )
+            extras["registration_status"] = found.status
+            if found.failed:
+                continue
+            if place is _KEY:
+                found = self._as_before(found)
+            if self._take_in(found, place, extras):
+                self._failures = 0
+                left_key = self._left_key(found.motion.mean)
+                key, source = (scan, _NEW) if left_key else (reference, place)
+                self._keep(key, scan, (source, _NEW))
+                return
+            extras["registration_status"] = "gated"
+        extras["status"] = extras["registration_status"]
+        self._insert(self._own_noise(scan))
         self._failures += 1
-        if self._failures >= _PATIENCE:
-            self._take_key(scan)
-            self._failures = 0
+        lost = self._failures >= _PATIENCE
+        self._keep(scan if lost else self._key, scan, (_NEW if lost else _KEY, _NEW))
 
-    def _expected(self) -> tuple[Gaussian, Array]:
-        """Pose relative to the key frame's apparent one, and its derivative (3, 6) by the state."""
-        relative, by_key, by_pose = between(self._mean[:3], self._mean[3:])
-        H = np.hstack([by_key, by_pose])
-        return Gaussian(relative, H @ self._covariance @ H.T), H
+    def _expected(self, place: slice) -> tuple[Gaussian, Array, Array]:
+        """Pose relative to a clone's, with its covariance; its derivatives by clone and pose."""
+        relative, by_clone, by_pose = between(self._mean[place], self._mean[_POSE])
+        P = self._covariance
+        cross = by_clone @ P[place, _POSE] @ by_pose.T
+        spread = by_clone @ P[place, place] @ by_clone.T + by_pose @ P[_POSE, _POSE] @ by_pose.T
+        return Gaussian(relative, spread + cross + cross.T), by_clone, by_pose
 
-    def _take_in(self, found: Match, left_key: bool, extras: dict[str, Any]) -> bool:
-        """Correct the state; on leaving the key frame, put this scan's apparent pose in its place.
+    def _take_in(self, found: Match, place: slice, extras: dict[str, Any]) -> bool:
+        """Append the scan's apparent pose to the state, and correct it by the registration.
 
-        Returns False if the innovation lies outside the gate; the state is then as before.
+        Returns False, with the state as before, if the innovation lies outside the gate.
         """
-        expected, H = self._expected()
-        C = found.held
+        expected, by_clone, by_pose = self._expected(place)
+        C, R, share = found.held, found.motion.covariance, self.shared_noise
         off = found.motion.mean - expected.mean
         off[2] = wrap(off[2])
-        # a key frame that is not modelled as shared gives its half of the noise anew each time
-        share = 0.5 if self.shared_noise else 1.0
-        noise = C @ (share * found.motion.covariance) @ C.T
         innovation = C @ off
-        S = C @ expected.covariance @ C.T + noise
-        nis = float(innovation @ np.linalg.solve(S, innovation)) if len(innovation) else 0.0
-        extras["nis"], extras["nis_dof"] = nis, len(innovation)
-        if len(innovation) and nis > self._gates[len(innovation) - 1]:
+        extras["registration_covariance"] = R
+        # the clone's half of what is shared is in the state already
+        S = C @ (expected.covariance + (1.0 - share / 2.0) * R) @ C.T
+        nis = float(innovation @ np.linalg.solve(S, innovation)) if len(C) else 0.0
+        extras["nis"], extras["nis_dof"] = nis, len(C)
+        if nis > self._gates[len(C)]:
             return False
-        if left_key and self.shared_noise:
-            self._insert_key(_rotated(own_noise(found), self._mean[2]))
-            H = np.hstack([H[:, :3], np.zeros((3, 3)), H[:, 3:]])
-            noise = _TINY * np.eye(len(innovation))
-            mean, covariance = update(self._mean, self._covariance, innovation, C @ H, noise)
-            order = [6, 7, 8, 3, 4, 5]
-            self._set(mean[order], covariance[np.ix_(order, order)])
-            return True
-        self._set(*update(self._mean, self._covariance, innovation, C @ H, noise))
-        if left_key:
-            self._clone(np.zeros((3, 3)))
+        self._insert(_turned(share / 2.0 * found.known_covariance, self._mean[place][2]))
+        H = np.zeros((3, 12))
+        H[:, place], H[:, _NEW] = by_clone, by_pose
+        noise = (1.0 - share) * C @ R @ C.T + _TINY * np.eye(len(C))
+        self._mean, self._covariance = update(
+            self._mean, self._covariance, innovation, C @ H, noise
+        )
         return True
 
-    def _insert_key(self, noise: Array) -> None:
-        """Append this scan's apparent pose to the state (6,), with its own noise (3, 3) in map."""
-        by_state = np.vstack([np.eye(6), np.eye(6)[3:]])
-        self._mean = by_state @ self._mean
-        self._covariance = by_state @ self._covariance @ by_state.T
-        self._covariance[6:, 6:] += noise
+    def _as_before(self, found: Match) -> Match:
+        """Give a degenerate match the directions of the key frame's first such match.
 
-    def _clone(self, noise: Array) -> None:
-        """Put the robot's pose, with noise (3, 3) in map, in the place of the key frame's."""
-        self._mean = np.tile(self._mean[3:], 2)
-        self._covariance = np.tile(self._covariance[3:, 3:], (2, 2))
-        self._covariance[:3, :3] += noise
+        Each registration finds a direction that nobody holds a little differently, and what one
+        holds of the other's would add up to knowledge of it that there is not. As twists in the
+        key frame the directions are the same wherever the robot is.
+        """
+        if found.status != "degenerate":
+            return found
+        x, y, _ = found.motion.mean.tolist()
+        to_motion = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])
+        to_twist = np.array([[1.0, 0.0, y], [0.0, 1.0, -x], [0.0, 0.0, 1.0]])
+        if self._directions is None or len(self._directions[0]) != len(found.held):
+            self._directions = found.held @ to_motion, to_twist @ found.loose @ to_motion
+        held, loose = self._directions
+        return dataclasses.replace(found, held=held @ to_twist, loose=to_motion @ loose @ to_twist)
 
-    def _take_key(self, scan: PreparedScan) -> None:
-        """Make a scan that was not registered the key frame; its own noise is against itself."""
-        self._key = scan
+    def _insert(self, noise: Array) -> None:
+        """Append the newest scan's apparent pose to the state: that of base_link, and noise."""
+        self._mean = np.concatenate([self._mean, self._mean[_POSE]])
+        P = np.empty((12, 12))
+        P[:9, :9] = self._covariance
+        P[_NEW, :9] = self._covariance[_POSE]
+        P[:9, _NEW] = self._covariance[:, _POSE]
+        P[_NEW, _NEW] = self._covariance[_POSE, _POSE] + noise
+        self._covariance = P
+
+    def _keep(self, key: PreparedScan, last: PreparedScan, places: tuple[slice, slice]) -> None:
+        """Keep two of the apparent poses, and the robot's, and drop the others."""
+        if key is not self._key:
+            self._directions = None
+        self._key, self._last = key, last
+        rows = np.concatenate([_ROWS[place] for place in (*places, _POSE)])
+        self._mean, self._covariance = self._mean[rows], self._covariance[np.ix_(rows, rows)]
+        for heading in (2, 5, 8):
+            self._mean[heading] = wrap(self._mean[heading])
+
+    def _own_noise(self, scan: PreparedScan) -> Array:
+        """Shared noise (3, 3) in map of a scan that was not registered: from one against itself."""
         found = self._matcher.match(scan, scan, STILL, self._laser, self._rng)
-        noise = _rotated(own_noise(found), self._mean[5])
-        self._clone(noise if self.shared_noise and not found.failed else np.zeros((3, 3)))
+        if found.failed:
+            return np.zeros((3, 3))
+        return _turned(self.shared_noise / 2.0 * found.known_covariance, self._mean[8])
 
     def _left_key(self, motion: Array) -> bool:
         """Whether it is time for a new key frame."""
         x, y, turn = motion.tolist()
         return math.hypot(x, y) > self.keyframe_distance_m or abs(turn) > self.keyframe_turn_rad
 
-    def _set(self, mean: Array, covariance: Array) -> None:
-        mean[2], mean[5] = wrap(mean[2]), wrap(mean[5])
-        self._mean, self._covariance = mean, covariance
 
-
-def own_noise(found: Match) -> Array:
-    """Noise (3, 3) of one of the scans: half the covariance, in the directions that are held."""
-    known = np.eye(3) - found.loose
-    noise: Array = 0.5 * known @ found.motion.covariance @ known.T
-    return noise
-
-
-def _rotated(noise: Array, heading_rad: float) -> Array:
-    """Covariance (3, 3) of a pose, turned by a heading."""
+def _turned(covariance: Array, heading_rad: float) -> Array:
+    """Covariance (3, 3) of a pose in axes that are turned back by a heading."""
     cos, sin = math.cos(heading_rad), math.sin(heading_rad)
     R = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
-    turned: Array = R @ noise @ R.T
+    turned: Array = R @ covariance @ R.T
     return turned

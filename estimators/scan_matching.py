@@ -60,6 +60,15 @@ class Match:
         """Whether it says nothing at all."""
         return self.status in FAILED
 
+    @property
+    def known_covariance(self) -> Array:
+        """(3, 3) the motion's covariance without the directions that the scans do not hold."""
+        if self.loose is _NOTHING:
+            return self.motion.covariance
+        known = np.eye(3) - self.loose
+        covariance: Array = known @ self.motion.covariance @ known.T
+        return covariance
+
     def completed(self, guess: Gaussian) -> Gaussian:
         """In the directions that the scans do not hold, the guess and its covariance."""
         if self.loose is _NOTHING:

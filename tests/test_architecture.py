@@ -49,6 +49,7 @@ METHODS = {
     "odometry",
     "icp_odometry",
     "ekf_icp",
+    "ekf_icp_paper",
     "fastslam",
     "ekf_slam",
     "mcl",
