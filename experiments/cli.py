@@ -79,12 +79,50 @@ def record(
 
 
 @app.command()
-def info(recording: Annotated[Path, typer.Argument(help="A recording, .npz.")]) -> None:
-    """Check a recording and tell what it holds."""
-    from experiments.describe import describe
-    from sim.recording import load
+def info(
+    log: Annotated[list[Path], typer.Argument(help="A recording (.npz) or a log of any format.")],
+    robot: Annotated[int, typer.Option(help="Which robot of an MRCLAM set.")] = 1,
+) -> None:
+    """Check a recording or a log and tell what it holds.
 
-    print(describe(load(recording)))
+    Formats that come in several files take them all; docs/formats.md tells their order.
+    """
+    from experiments.describe import describe
+    from sim.formats.detect import read_any
+
+    print(describe(read_any(log, robot)))
+
+
+@app.command()
+def convert(
+    log: Annotated[list[Path], typer.Argument(help="A recording (.npz) or a log of any format.")],
+    out: Annotated[
+        Path,
+        typer.Option(
+            "--out", "-o", help="File to write: .npz, .mcap, .bag, .db3, .log (CARMEN), .tum."
+        ),
+    ],
+    robot: Annotated[int, typer.Option(help="Which robot of an MRCLAM set.")] = 1,
+) -> None:
+    """Convert a log to a recording, or a recording to a standard file.
+
+    The ending of the output chooses its format; without one it is a folder as `ros2 bag` writes.
+    `.tum` holds the reference trajectory.
+
+    Examples
+    --------
+      estima convert fr079.log.gz -o fr079.npz
+
+      estima convert raw.json.gz corrected.json.gz -o intel.mcap
+
+      estima convert MRCLAM_Dataset6.tar.xz --robot 3 -o robot3.npz
+    """
+    from experiments.convert import write_recording
+    from sim.formats.detect import read_any
+
+    recording = read_any(log, robot)
+    write_recording(out, recording)
+    print(f"{out}: {recording.duration_s:.1f} s, {len(recording.frame_stamps)} frames")
 
 
 @app.command()

@@ -40,6 +40,10 @@ def describe(recording: Recording) -> str:
         distance = float(np.sum(np.hypot(*np.diff(truth.poses[:, :2], axis=0).T)))
         where = f" in world {truth.world.name}" if truth.world else ""
         lines.append(f"truth       {distance:.2f} m travelled{where}")
+    if "source" in recording.config:
+        lines.append(f"source      {recording.config['source']}")
+        for name, value in recording.config.get("notes", {}).items():
+            lines.append(f"            {name.replace('_', ' ')}: {value}")
     if "seed" in recording.config:
         lines.append(f"seed        {recording.config['seed']}")
     lines.append(f"checksum    {recording.checksum}")

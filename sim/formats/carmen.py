@@ -62,6 +62,8 @@ class CarmenLog:
         Whether poses are vertices of an optimised graph, not odometry.
     notes
         Counts of what was put in order or left out.
+    where
+        The file, for messages.
     """
 
     odometry_stamps: Array
@@ -76,6 +78,7 @@ class CarmenLog:
     edges: Array = field(default_factory=lambda: np.zeros((0, 3)))
     is_graph: bool = False
     notes: assemble.Notes = field(default_factory=dict)
+    where: str = "CARMEN log"
 
     @property
     def laser(self) -> Laser:
@@ -156,6 +159,7 @@ def parse_carmen(words: Words) -> CarmenLog:
         edges=edges,
         is_graph=bool(len(words.lines_of("VERTEX2"))),
         notes=notes,
+        where=words.where,
     )
 
 
@@ -186,11 +190,11 @@ def to_recording(
         stamps = np.concatenate([log.odometry_stamps, log.scan_stamps])
         all_poses = np.concatenate([log.odometry_poses, log.scan_poses])
         rows = assemble.in_order(stamps, "poses", {})
-        assemble.require_readings(len(rows), 2, "CARMEN log", "poses at different stamps")
+        assemble.require_readings(len(rows), 2, log.where, "poses at different stamps")
         wheels = assemble.wheels_from_poses(stamps[rows], all_poses[rows], track_m, notes)
         truth = None
     else:
-        assemble.require_readings(len(log.scan_stamps), 2, "CARMEN log", "scans")
+        assemble.require_readings(len(log.scan_stamps), 2, log.where, "scans")
         edges = log.edges if len(log.edges) else np.zeros((len(log.scan_stamps) - 1, 3))
         chain = np.zeros((len(log.scan_stamps), 3))
         if missing := int(np.sum(~np.isfinite(edges).all(axis=1))):

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from sim.errors import InputError
 from sim.formats import assemble
 from sim.formats.carmen import NOMINAL_RADIUS_M, NOMINAL_TRACK_M, scan_recording, seen_ranges
-from sim.formats.text import read_bytes
+from sim.formats.text import LARGEST, read_bytes
 from sim.recording import Recording, Truth
 from sim.sensors import Laser, Mount
 
@@ -68,6 +68,7 @@ def parse_intel(data: bytes, where: str) -> tuple[Array, Array, Array]:
 def read_intel(
     raw: Path,
     reference: Path | None = None,
+    *,
     track_m: float = NOMINAL_TRACK_M,
     wheel_radius_m: float = NOMINAL_RADIUS_M,
 ) -> Recording:
@@ -114,6 +115,6 @@ def _number(value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise TypeError(f"{str(value)[:40]!r} is no number")
     number = float(value)
-    if not math.isfinite(number):
-        raise ValueError("numbers must be finite")
+    if not abs(number) < LARGEST:
+        raise ValueError(f"numbers must be finite, below {LARGEST:g}")
     return number

@@ -7,7 +7,6 @@ follow one another with white space between, several on a line or one over sever
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 
 from sim import se2
 from sim.errors import InputError
-from sim.formats.text import read_bytes, read_members
+from sim.formats.text import LARGEST, read_bytes, read_members
 from sim.recording import Recording, Truth, WheelLog
 from sim.robot import RobotGeometry
 from sim.sensors import SensorSuite
@@ -100,8 +99,8 @@ def _row(entry: Any) -> tuple[float, ...]:
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             raise TypeError(f"{value!r} is no number")
     numbers = tuple(float(value) for value in row)
-    if not all(math.isfinite(value) for value in numbers):
-        raise ValueError("numbers must be finite")
+    if not all(abs(value) < LARGEST for value in numbers):
+        raise ValueError(f"numbers must be finite, below {LARGEST:g}")
     if numbers[0] <= 0.0:
         raise ValueError("T must be positive")
     return numbers

@@ -94,6 +94,7 @@ def read_lego(
     scans: Path,
     reference: Path | None = None,
     cylinders: Path | None = None,
+    *,
     tick_m: float = TICK_M,
     track_m: float = EFFECTIVE_TRACK_M,
 ) -> Recording:

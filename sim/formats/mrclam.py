@@ -15,6 +15,7 @@ gives that of the bearing.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -68,13 +69,24 @@ def read_mrclam(
     InputError
         Naming the file and the line, or the file that is missing.
     """
-    members = read_members(path)
+    return parse_mrclam(read_members(path), str(path), robot, identifies, camera)
+
+
+def parse_mrclam(
+    members: Mapping[str, bytes],
+    where: str,
+    robot: int = 1,
+    identifies: bool = True,
+    camera: StereoCamera = CAMERA,
+) -> Recording:
+    """As `read_mrclam`, of the files' contents by their names."""
 
     def words(name: str) -> Words:
         if name not in members:
             robots = sorted(m[5:-13] for m in members if m.endswith("_Odometry.dat"))
-            raise InputError(f"{path}: holds no {name}; robots with odometry: {', '.join(robots)}")
-        return split_words(members[name], f"{path}/{name}")
+            known = ", ".join(robots[:10]).encode("unicode_escape").decode()
+            raise InputError(f"{where}: holds no {name}; robots with odometry: {known}")
+        return split_words(members[name], f"{where}/{name}")
 
     odometry = words(f"Robot{robot}_Odometry.dat").table(3, "odometry")
     measured = words(f"Robot{robot}_Measurement.dat").table(4, "measurements")
@@ -85,8 +97,8 @@ def read_mrclam(
     notes: assemble.Notes = {}
     odometry = odometry[assemble.in_order(odometry[:, 0], "odometry", notes)]
     truth = truth[assemble.in_order(truth[:, 0], "truth", notes)]
-    assemble.require_readings(len(odometry), 2, str(path), "odometry readings")
-    assemble.require_readings(len(truth), 2, str(path), "ground truth poses")
+    assemble.require_readings(len(odometry), 2, where, "odometry readings")
+    assemble.require_readings(len(truth), 2, where, "ground truth poses")
     wheels = assemble.wheels_from_velocities(odometry[:, 0].copy(), odometry[:, 1:], TRACK_M)
     ids = _landmark_rows(measured[:, 1], barcodes, landmarks[:, 0], notes)
     log, true_ids = _observations(measured, ids, identifies, notes)

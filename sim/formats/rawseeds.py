@@ -89,6 +89,7 @@ def read_rawseeds(
     odometry: Path,
     scans: Path,
     truth: Path | None = None,
+    *,
     mount: Mount = FRONT_SICK,
     track_m: float = TRACK_M,
     wheel_radius_m: float = WHEEL_RADIUS_M,

@@ -25,6 +25,7 @@ Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
 MOST_BYTES = 1 << 30  # unpacked; a small archive may promise far more
+LARGEST = 1e12  # times in microseconds and beyond are not what the formats hold
 _XZ_MEMORY = 256 << 20
 _CHUNK = 1 << 20
 _WORD, _NUMBER, _SLOW = 0, 1, 2
@@ -180,11 +181,11 @@ class Words:
         return out
 
     def finite(self, lines: Rows, column: int | Rows, n_columns: int, what: str) -> Array:
-        """As `numbers`, and they must be finite."""
+        """As `numbers`, and they must be finite, and no larger than a log has reason to hold."""
         values = self.numbers(lines, column, n_columns, what)
-        bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
+        bad = np.flatnonzero(~(np.abs(values) < LARGEST).all(axis=1))
         if len(bad):
-            raise self.error(int(lines[bad[0]]), f"{what} must be finite numbers")
+            raise self.error(int(lines[bad[0]]), f"{what} must be finite numbers below {LARGEST:g}")
         return values
 
     def whole(self, lines: Rows, column: int, what: str, least: int, most: int) -> Rows:

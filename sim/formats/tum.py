@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from sim.errors import InputError
 from sim.files import write_whole
+from sim.formats.text import read_bytes
 
 Array = NDArray[np.float64]
 
@@ -32,12 +33,20 @@ def read_tum(path: Path) -> tuple[Array, Array]:
     InputError
         Naming the file and the line that is not eight finite numbers.
     """
+    return parse_tum(read_bytes(path), str(path))
+
+
+def parse_tum(data: bytes, where: str) -> tuple[Array, Array]:
+    """As `read_tum`, of a file's contents."""
     stamps, poses = [], []
     try:
-        text = path.read_text(encoding="ascii")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot read this trajectory ({error})") from error
-    for number, line in enumerate(text.splitlines(), start=1):
+        text = data.decode("ascii")
+    except UnicodeDecodeError as error:
+        number = data.count(b"\n", 0, error.start) + 1
+        raise InputError(
+            f"{where}:{number}: cannot read this trajectory ({error.reason})"
+        ) from None
+    for number, line in enumerate(text.split("\n"), start=1):
         words = line.split("#", maxsplit=1)[0].split()
         if not words:
             continue
@@ -45,11 +54,13 @@ def read_tum(path: Path) -> tuple[Array, Array]:
             stamp, x, y, _, qx, qy, qz, qw = (float(word) for word in words)
         except ValueError:
             raise InputError(
-                f"{path}:{number}: a line must be timestamp tx ty tz qx qy qz qw"
+                f"{where}:{number}: a line must be timestamp tx ty tz qx qy qz qw"
             ) from None
         norm = qx * qx + qy * qy + qz * qz + qw * qw
         if not math.isfinite(stamp + x + y) or not 0.5 < norm < 1.5:
-            raise InputError(f"{path}:{number}: numbers must be finite, the quaternion of length 1")
+            raise InputError(
+                f"{where}:{number}: numbers must be finite, the quaternion of length 1"
+            )
         yaw = math.atan2(2.0 * (qw * qz + qx * qy), norm - 2.0 * (qy * qy + qz * qz))
         stamps.append(stamp)
         poses.append((x, y, yaw))

@@ -1,0 +1,136 @@
+"""Which format a file is in, and a Recording of it, whatever it is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from sim.errors import InputError
+from sim.formats.text import read_bytes, read_members
+from sim.recording import Recording, load
+
+KINDS = ("recording", "rosbag", "mrclam", "carmen", "intel", "khepera", "lego", "rawseeds", "wean")
+_HEAD_BYTES = 1 << 16
+
+
+def kind_of(path: Path) -> str:
+    """Format of a file or folder, by its contents.
+
+    Raises
+    ------
+    InputError
+        If it is none of `KINDS`.
+    """
+    if path.is_dir():
+        return _kind_of_names([p.name for p in path.iterdir()], path)
+    try:
+        with path.open("rb") as file:
+            head = file.read(512)
+    except OSError as error:
+        raise InputError(f"{path}: cannot read ({error.strerror})") from error
+    if head[:4] == b"PK\x03\x04":
+        return "recording"
+    if head[:13] == b"#ROSBAG V2.0\n" or head[:5] == b"\x89MCAP" or head[:15] == b"SQLite format 3":
+        return "rosbag"
+    data = read_bytes(path)
+    if data[257:262] == b"ustar":  # where tar puts its name
+        return _kind_of_names(list(read_members(path)), path)
+    return _kind_of_text(data[:_HEAD_BYTES], path)
+
+
+def _kind_of_names(names: Sequence[str], path: Path) -> str:
+    if any(name.endswith("_Odometry.dat") or name.endswith("_Odometry.dat.gz") for name in names):
+        return "mrclam"
+    if "metadata.yaml" in names:
+        return "rosbag"
+    if any(name.endswith(".tuple") for name in names):
+        return "khepera"
+    raise InputError(f"{path}: holds no log of a known format ({', '.join(sorted(names)[:5])})")
+
+
+def _kind_of_text(head: bytes, path: Path) -> str:
+    lines = [line for line in head.split(b"\n") if line.strip() and not line.startswith(b"#")]
+    first_words = {line.split()[0] for line in lines[:200]}
+    if first_words & {b"FLASER", b"ROBOTLASER1", b"ODOM", b"VERTEX2"}:
+        return "carmen"
+    if first_words and first_words <= {b"O", b"L"}:
+        return "wean"
+    if first_words and first_words <= {b"M"}:
+        return "lego"
+    if b'"sm"' in head and b'"phi_l"' in head:
+        return "khepera"
+    if head.lstrip()[:1] == b"{" and b'"map"' in head:
+        return "intel"
+    if lines and lines[0].count(b",") == 6:
+        return "rawseeds"
+    raise InputError(
+        f"{path}: not a log of a known format; known: {', '.join(KINDS)} (see docs/formats.md)"
+    )
+
+
+def read_any(paths: Sequence[Path], robot: int = 1, member: str | None = None) -> Recording:
+    """A Recording of one log.
+
+    Parameters
+    ----------
+    paths
+        The log. Some formats come in several files, in this order: Intel (raw, corrected);
+        Rawseeds (odometry, scans, ground truth); Lego (motors, scans, reference, cylinders).
+    robot
+        Which robot of an MRCLAM set.
+    member
+        Which file of an archive of Khepera tuples.
+
+    Raises
+    ------
+    InputError
+        If the format is not known, a file is missing, or cannot be read.
+    """
+    first, rest = paths[0], list(paths[1:])
+    kind = kind_of(first)
+    most = {"intel": 1, "rawseeds": 2, "lego": 3}.get(kind, 0)
+    least = {"rawseeds": 1, "lego": 1}.get(kind, 0)
+    if not least <= len(rest) <= most:
+        wanted = f"{least + 1} to {most + 1} files" if most else "one file"
+        raise InputError(f"{first}: a {kind} log is {wanted}, got {len(paths)}")
+    if kind == "recording":
+        return load(first)
+    if kind == "rosbag":
+        from sim.formats.rosbag_in import read_bag
+
+        return read_bag(first)
+    if kind == "mrclam":
+        from sim.formats.mrclam import read_mrclam
+
+        return read_mrclam(first, robot)
+    if kind == "carmen":
+        from sim.formats.carmen import read_carmen, to_recording
+
+        return to_recording(read_carmen(first))
+    if kind == "intel":
+        from sim.formats.intel import read_intel
+
+        return read_intel(first, *rest)
+    if kind == "khepera":
+        from sim.formats import khepera
+
+        if member is None and (first.is_dir() or _is_archive(first)):
+            tuples = [name for name in read_members(first) if name.endswith(".tuple")]
+            member = min(tuples, key=lambda name: (len(name), name))
+        return khepera.to_recording(khepera.read_khepera(first, member))
+    if kind == "lego":
+        from sim.formats.lego import read_lego
+
+        return read_lego(first, *rest)
+    if kind == "rawseeds":
+        from sim.formats.rawseeds import read_rawseeds
+
+        return read_rawseeds(first, *rest)
+    from sim.formats.wean import read_wean
+
+    return read_wean(first)
+
+
+def _is_archive(path: Path) -> bool:
+    """Whether a file, unpacked, is a tar archive."""
+    return read_bytes(path)[257:262] == b"ustar"
