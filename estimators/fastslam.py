@@ -16,7 +16,6 @@ from estimators.particles import (
     SCHEMES,
     Lineages,
     Scheme,
-    effective_sample_size,
     in_place,
     normalize,
     resample,
@@ -34,6 +33,7 @@ Proposal = Literal["motion", "optimal"]
 Association = Literal["known", "mahalanobis", "descriptor"]
 
 _BLIND_IMAGES = 100  # images without a landmark after which the status says so
+_PLACING = 4  # observations after which the proposal is linearised anew
 _MOST_DRIFT_RAD = 0.1  # heading spread at which motion is drawn without waiting for an image
 
 
@@ -50,8 +50,8 @@ class FastSLAM:
         M.
     proposal
         `motion`: FastSLAM 1.0, drawn from the motion model and weighted by eq. (13). `optimal`:
-        FastSLAM 2.0, drawn from the motion given the image too, linearised in the noise of the
-        motion, with the weight that this proposal is owed, p(z | x) p(x) / q(x).
+        FastSLAM 2.0, drawn from the motion given the image too, with the weight that this
+        proposal is owed, p(z | x) p(x) / q(x): how it is linearised costs particles, not truth.
     resampling
         `systematic`, `stratified`, `residual` or `multinomial`.
     ess_share
@@ -83,7 +83,7 @@ class FastSLAM:
     Notes
     -----
     Belief mean and covariance are those of the weighted particles. Extras: `particles` (M, 3),
-    `log_weights` (M,), before resampling; `ess`, of the last image; `resampled`; `best` (3,), the
+    `log_weights` (M,) and `ess`, before resampling; `resampled`; `best` (3,), the
     pose of the particle of greatest accumulated log weight, carried along the ancestry, eq. (20);
     `associations` (K,) of that particle: for each observation, counted from 0 over the whole run,
     the one that started its landmark, itself if it is the first, -1 if it was refused; with
@@ -168,28 +168,33 @@ class FastSLAM:
         camera = dataclasses.replace(camera, **believed)
         self._model = StereoModel.of(camera, self.noise_model, self.noise_at)
         self._camera = self._model.packed
+        x, y, yaw = self._model.mount
+        self._mount = np.array([x, y, math.cos(yaw), math.sin(yaw)])
         self._likeness = 1.0 / (1.0 + camera.sigma_descriptor**2)
         # what a landmark may be predicted beyond dmax by, and still be the one that was seen
         self._reach_m = 1.5 * camera.max_distance_m + 1.0
         self._rng, self._track_m = rng, prior.robot.track_m
         self._window = TravelWindow(self.window_s)
         n = self.n_particles
-        body = np.array([0.0, 0.0, prior.mean[2]])
-        turned = _rotated(prior.covariance, -float(prior.mean[2]))
-        scatter = rng.standard_normal((n, 3)) @ _root(turned).T
-        self._poses = se2.compose(prior.mean, np.zeros((n, 3)))
-        self._poses[:, :2] += se2.transform(body, scatter[:, :2])
-        self._poses[:, 2] = se2.wrap(self._poses[:, 2] + scatter[:, 2])
-        self._log_weights, self._accumulated = np.zeros(n), np.zeros(n)
-        self._maps = LandmarkMaps(n, self.maps)
+        self._maps = LandmarkMaps(n, self.maps, births=self.association != "known")
         self._state = ekf.new_state(self._maps.n_blocks)
+        # lanes beyond the last particle are moved along, and never looked at
+        self._n_lanes = self._maps.n_blocks * ekf.LANES
+        turned = _rotated(prior.covariance, -float(prior.mean[2]))
+        scatter = _root(turned) @ rng.standard_normal((3, self._n_lanes))
+        drawn = se2.compose(prior.mean, scatter.T)
+        headings = drawn[:, 2]
+        self._poses = np.stack([*drawn.T, np.cos(headings), np.sin(headings)])  # (5, lanes)
+        self._log_weights, self._accumulated = np.zeros(n), np.zeros(n)
         self._lineages = Lineages(n)
         self._rolled, self._spread = np.zeros(3), np.zeros((3, 3))  # motion not yet drawn
+        self._motion_root = np.zeros((3, 3))
+        self._rolling = False
         self._slot_of: dict[int, int] = {}
         # births: observations that started a landmark in some particle
         self._births = np.zeros(0, np.int64)
         self._bank = np.zeros((0, 0), np.float32)  # their descriptors
-        self._n_observations, self._blind, self._ess = 0, 0, float(n)
+        self._n_observations, self._blind = 0, 0
         self._stamps: list[float] = []
 
     def step(self, frame: Frame) -> Belief:
@@ -202,8 +207,7 @@ class FastSLAM:
         found, status = self._usable(frame.landmarks)
         extras: dict[str, Any] = {"status": status} if status else {}
         points = np.ascontiguousarray(frame.landmarks.points_in_camera[found])
-        normals = self._rng.standard_normal((self.n_particles, 3))
-        root = _root(self._spread)
+        normals, root = self._normals(), self._motion_root
         if self.association == "known":
             slots = self._known(frame.landmarks, found)
             self._maps.touch(slots[slots >= 0])
@@ -221,8 +225,7 @@ class FastSLAM:
         gained += self._observe(slots, points)
         associations = np.full(len(frame.landmarks.points_in_camera), -1)
         self._create(slots, points, frame.landmarks, found)
-        self._poses = poses
-        self._rolled, self._spread = np.zeros(3), np.zeros((3, 3))
+        self._poses, self._rolling = poses, False
         weights = self._log_weights + gained
         if underflowed(weights):
             extras["status"] = "weights underflowed"
@@ -233,7 +236,6 @@ class FastSLAM:
         associations[found] = self._origins(slots, best, found)
         self._n_observations += len(associations)
         extras["associations"] = associations
-        self._ess = effective_sample_size(weights)
         belief = self._answer(frame, extras)
         poor = self.ess_share >= 1.0 or self._ess < self.ess_share * self.n_particles
         if poor and len(points) > 0:
@@ -255,7 +257,7 @@ class FastSLAM:
         for i, (poses, rows) in zip(range(n - 1, -1, -1), self._lineages.paths(), strict=True):
             means[i] = poses[rows[best]]
             by_row = np.bincount(rows, weights, minlength=len(poses)).astype(np.float64)
-            covariances[i] = _moments(poses, by_row)[1]
+            covariances[i] = ekf.moments(poses, by_row)[1]
         return Estimate(np.array(self._stamps), means, covariances, kind="revised", map=self.map)
 
     @property
@@ -266,11 +268,11 @@ class FastSLAM:
         are the sensor's, if it gives any.
         """
         best = int(np.argmax(self._accumulated))
-        means, covariances, origins = self._maps.of_particle(best)
+        means, covariances, births = self._maps.of_particle(best)
         answer: dict[str, Array | Ints] = {
             "landmarks": means,
             "landmark_covariances": covariances,
-            "origins": self._births[origins],
+            "origins": self._births[births],
         }
         if self.association == "known":
             answer["ids"] = np.array(list(self._slot_of), dtype=np.int64)
@@ -287,21 +289,34 @@ class FastSLAM:
         spread_m = self._window.push(frame.duration_s, travel)
         step = arc_increment(travel, self._track_m)
         by_wheels = arc_increment_jacobian(travel, self._track_m)
-        Q = by_wheels @ np.diag(wheel_variances(spread_m, self.kr, self.kl)) @ by_wheels.T
+        root = by_wheels * np.sqrt(wheel_variances(spread_m, self.kr, self.kl))
+        Q = root @ root.T
+        if not self._rolling:
+            self._rolled, self._spread, self._rolling = step, Q, True
+            self._motion_root = np.zeros((3, 3))
+            self._motion_root[:, :2] = root
+            return
         by_pose, by_step = se2.compose_jacobians(self._rolled, step)
         self._spread = by_pose @ self._spread @ by_pose.T + by_step @ Q @ by_step.T
         self._rolled = se2.compose(self._rolled, step)
+        self._motion_root = _root(self._spread)
 
     def _draw_motion(self) -> None:
         """Draw the motion since the last image, without an image."""
-        normals = self._rng.standard_normal((self.n_particles, 3))
-        self._poses = self._move(_root(self._spread), normals)
-        self._rolled, self._spread = np.zeros(3), np.zeros((3, 3))
+        self._poses = self._move(self._motion_root, self._normals())
+        self._rolling = False
+
+    def _normals(self) -> Array:
+        """Standard normal draws (3, lanes); two rows of a single arc, which has two wheels."""
+        normals = np.zeros((3, self._n_lanes))
+        rank = 3 if np.any(self._motion_root[:, 2]) else 2
+        self._rng.standard_normal(out=normals[:rank])
+        return normals
 
     def _move(self, root: Array, normals: Array) -> Array:
         """Poses (M, 3) after the motion, and the state that belongs to them."""
-        moved, mount = np.empty_like(self._poses), self._model.mount
-        ekf.move(self._poses, self._rolled, root, normals, mount, moved, self._state)
+        moved = np.empty_like(self._poses)
+        ekf.move(self._poses, self._rolled, root, normals, self._mount, moved, self._state)
         return moved
 
     def _usable(self, seen: LandmarkSet) -> tuple[Ints, str]:
@@ -311,12 +326,11 @@ class FastSLAM:
         if self.association == "known":
             if seen.ids is None:
                 raise InputError("fastslam: observations without ids; set estimator.association")
-            first = np.zeros(len(usable), bool)
-            rows = np.flatnonzero(usable)
-            first[rows[np.unique(seen.ids[rows], return_index=True)[1]]] = True
-            if np.any(usable & ~first):
+            ids = seen.ids[usable]
+            if len(set(ids.tolist())) < len(ids):
+                first = np.flatnonzero(usable)[np.unique(ids, return_index=True)[1]]
+                usable = np.isin(np.arange(len(usable)), first)
                 status = "duplicate id refused"
-            usable &= first
         self._blind = 0 if usable.any() else self._blind + 1
         if self._blind >= _BLIND_IMAGES:
             status = f"no landmark in {self._blind} images"
@@ -325,8 +339,8 @@ class FastSLAM:
     def _known(self, seen: LandmarkSet, found: Ints) -> Ints:
         """Slots (K,) by id, -1 for new ones."""
         assert seen.ids is not None
-        self._new_ids = [int(i) for i in seen.ids[found] if int(i) not in self._slot_of]
-        return np.array([self._slot_of.get(int(i), -1) for i in seen.ids[found]], dtype=np.int64)
+        self._ids = seen.ids[found].tolist()
+        return np.array([self._slot_of.get(i, -1) for i in self._ids], dtype=np.int64)
 
     def _associate(self, points: Array, seen: LandmarkSet, found: Ints, spread: Array) -> Ints:
         """Slots (K, M) of each particle, -1 for new ones."""
@@ -343,13 +357,14 @@ class FastSLAM:
         if len(points) == 0 or self._maps.n_slots == 0:
             return slots
         maps = self._maps
-        candidates = maps.nearby(self._state, self._reach_m, self._camera)
+        candidates = maps.nearby(self._state, self._reach_m)
         maps.touch(candidates)
         ekf.associate(
             maps.data,
             candidates,
+            maps.place,
             maps.counts,
-            maps.origin,
+            maps.births,
             points,
             unlikeness,
             spread,
@@ -366,6 +381,8 @@ class FastSLAM:
         Of D independent components of unit vectors, the product of two of one landmark is
         N(rho, 1 / D), and of two of different ones N(0, 1 / D).
         """
+        if len(self._bank) == 0:
+            return np.zeros((len(descriptors), 0))
         products = (descriptors @ self._bank.T).astype(np.float64)
         rho = self._likeness
         scores: Array = descriptors.shape[1] * rho * (rho - 2.0 * products)
@@ -376,15 +393,24 @@ class FastSLAM:
         return _rotated(self._spread, -float(self._rolled[2] + self._model.mount[2]))
 
     def _propose(self, root: Array, normals: Array, slots: Ints, points: Array) -> Array:
-        """Turn normals into draws given the image; log weights (M,) that these are owed."""
-        if slots.ndim == 1:
-            old = slots >= 0
-            ekf.inform(self._maps.data, slots[old], points[old], self._state, self._camera)
-        else:
-            ekf.inform_each(self._maps.data, slots, points, self._state, self._camera)
-        owed = np.empty(self.n_particles)
-        ekf.propose(self._poses, root, self._state, normals, owed)
-        return owed
+        """Turn normals into draws given the image; log weights (M,) that these are owed.
+
+        The first few observations place the particle, and all are linearised anew there: what
+        is left to the second linearisation is a fraction of the motion's noise.
+        """
+        old = slots >= 0 if slots.ndim == 1 else (slots >= 0).any(axis=1)
+        rows, points = self._maps.rows(slots[old]), points[old]
+        inform = ekf.inform if slots.ndim == 1 else ekf.inform_each
+        maps, state, camera = self._maps.data, self._state, self._camera
+        start, owed = np.zeros_like(normals), np.empty((2, self._n_lanes))
+        if len(rows):
+            inform(maps, rows[:_PLACING], points[:_PLACING], state, camera)
+            ekf.propose(self._poses, root, state, np.zeros_like(normals), start, owed)
+            self._move(root, start)
+        inform(maps, rows, points, state, camera)
+        ekf.propose(self._poses, root, state, start, normals, owed)
+        log_owed: Array = 0.5 * owed[0] - np.log(owed[1])
+        return log_owed[: self.n_particles]
 
     def _observe(self, slots: Ints, points: Array) -> Array:
         """Update the landmarks seen again; log weights (M,), gil2008, eqs. (13) and (14)."""
@@ -393,15 +419,16 @@ class FastSLAM:
         if slots.ndim == 1:
             gained += np.count_nonzero(~old) * math.log(self.p0)
             slots, points = slots[old], points[old]
-            gained -= len(slots) * ekf.LOG_2PI_1_5
+            gained += ekf.log_scale(points, self._camera)
             update = ekf.update
         else:
-            again = np.count_nonzero(old, axis=0)
-            gained += (len(slots) - again) * math.log(self.p0) - again * ekf.LOG_2PI_1_5
+            each = np.array([ekf.log_scale(point[None], self._camera) for point in points])
+            gained += np.where(old, each[:, None], math.log(self.p0)).sum(axis=0)
             update = ekf.update_each
-        for start in range(0, len(slots), ekf.GROUP):
+        rows = self._maps.rows(slots)
+        for start in range(0, len(rows), ekf.GROUP):
             group = slice(start, start + ekf.GROUP)
-            update(self._maps.data, slots[group], points[group], self._state, self._camera)
+            update(self._maps.data, rows[group], points[group], self._state, self._camera)
             gained += ekf.summed(self._state, self.n_particles)
         return gained
 
@@ -416,10 +443,11 @@ class FastSLAM:
         at = maps.counts + np.cumsum(missing, axis=0) - 1
         maps.reserve(int(at.max()) + 1)
         begun = np.where(missing, at, -1)
-        maps.touch(np.arange(int(at[missing].min()), min(int(at.max()) + 1, maps.n_slots)))
-        ekf.create(maps.data, begun, points[rows], self._state, self._camera)
-        births = len(self._births) + np.arange(len(rows))
-        maps.origin[at[missing], np.nonzero(missing)[1]] = births[np.nonzero(missing)[0]]
+        maps.touch(np.arange(int(at[missing].min()), int(at.max()) + 1))
+        ekf.create(maps.data, maps.rows(begun), points[rows], self._state, self._camera)
+        if each:
+            row, particle = np.nonzero(missing)
+            maps.births[at[missing], particle] = len(self._births) + row
         born = self._n_observations + found[rows]
         self._births = np.concatenate([self._births, born])
         if self.association == "descriptor" and seen.descriptors is not None:
@@ -428,16 +456,16 @@ class FastSLAM:
             self._bank = fresh_ones.copy() if empty else np.concatenate([self._bank, fresh_ones])
         maps.counts = maps.counts + missing.sum(axis=0)
         if not each:
-            for offset, landmark_id in enumerate(self._new_ids):
-                self._slot_of[landmark_id] = int(begun[offset, 0])
+            for i, number in zip(rows, begun[:, 0], strict=True):
+                self._slot_of[self._ids[i]] = int(number)
 
     def _origins(self, slots: Ints, particle: int, found: Ints) -> Ints:
         """For each observation (K,) the one that started its landmark, in one particle."""
         chosen = slots if slots.ndim == 1 else slots[:, particle]
         own = self._n_observations + found
-        if len(self._maps.origin) == 0:
+        if len(self._births) == 0:
             return own
-        births = self._maps.origin[np.maximum(chosen, 0), particle]
+        births = self._maps.birth_of(np.maximum(chosen, 0), particle)
         return np.where(chosen >= 0, self._births[births], own)
 
     def _resample(self) -> None:
@@ -447,42 +475,34 @@ class FastSLAM:
         ancestors = in_place(drawn, n)
         self._maps.resample(ancestors)
         self._lineages.resample(ancestors)
-        self._poses = self._poses[ancestors]
+        self._poses[:, :n] = np.take(self._poses, ancestors, axis=1)
         self._accumulated = self._accumulated[ancestors]
         self._log_weights = np.zeros(n)
 
     def _answer(self, frame: Frame, extras: dict[str, Any]) -> Belief:
         """Moments of the particles, composed with the motion that is not yet drawn."""
-        poses = self._poses
-        if np.any(self._rolled) or np.any(self._spread):
+        poses = np.ascontiguousarray(self._poses[:3, : self.n_particles].T)
+        if self._rolling:
             poses = se2.compose(poses, self._rolled)
         self._lineages.append(poses)
         self._stamps.append(frame.stamp)
-        mean, covariance = _moments(poses, normalize(self._log_weights))
-        if np.any(self._spread):
-            before = float(se2.wrap(mean[2] - self._rolled[2]))
+        weights = normalize(self._log_weights)
+        self._ess = 1.0 / float(weights @ weights)
+        mean, covariance = ekf.moments(poses, weights)
+        if self._rolling:
+            before = float(mean[2] - self._rolled[2])
             covariance = covariance + _rotated(self._spread, before)
         best = int(np.argmax(self._accumulated))
         extras |= {
-            "particles": poses.copy(),
+            "particles": poses,
             "log_weights": self._log_weights.copy(),
             "ess": self._ess,
             "resampled": False,
-            "best": poses[best].copy(),
+            "best": poses[best],
         }
         if self.keep_map:
             extras |= {k: v for k, v in self.map.items() if k.startswith("landmark")}
         return Belief(mean, covariance, extras)
-
-
-def _moments(poses: Array, weights: Array) -> tuple[Array, Array]:
-    """Mean (3,) and covariance (3, 3) of weighted poses (M, 3); the mean heading is circular."""
-    cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    mean = np.array([*(weights @ poses[:, :2]), math.atan2(weights @ sin, weights @ cos)])
-    off = poses - mean
-    off[:, 2] = se2.wrap(off[:, 2])
-    covariance: Array = (off * weights[:, None]).T @ off
-    return mean, (covariance + covariance.T) / 2.0
 
 
 def _root(covariance: Array) -> Array:

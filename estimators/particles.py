@@ -65,7 +65,11 @@ def resample(
     """
     weights = normalize(log_weights)
     if scheme == "systematic":
-        return _at(weights, (np.arange(n) + rng.random()) / n)
+        # draws below each particle's end of the cumulated weights, all at once
+        ends = np.ceil(np.cumsum(weights) * n - rng.random())
+        ends[np.flatnonzero(weights)[-1] :] = n
+        copies = np.diff(np.clip(ends, 0, n), prepend=0.0).astype(np.int64)
+        return np.repeat(np.arange(len(weights)), copies)
     if scheme == "stratified":
         return _at(weights, (np.arange(n) + rng.random(n)) / n)
     if scheme == "multinomial":
@@ -120,6 +124,7 @@ class Lineages:
         self._poses: list[Array] = []
         self._parents: list[NDArray[np.int64]] = []  # row of the step before, of each row
         self._rows = np.arange(n_particles)  # each particle's row of the last step
+        self._n_pruned = 0
 
     def __len__(self) -> int:
         return len(self._poses)
@@ -130,9 +135,9 @@ class Lineages:
         return sum(len(poses) for poses in self._poses)
 
     def append(self, poses: Array) -> None:
-        """Add the poses (M, 3) of a step."""
+        """Add the poses (M, 3) of a step, which the caller leaves as they are."""
         self._parents.append(self._rows)
-        self._poses.append(poses.copy())
+        self._poses.append(poses)
         self._rows = np.arange(len(poses))
         if len(self._poses) % self._PRUNE_EVERY == 0:
             self._prune()
@@ -151,11 +156,12 @@ class Lineages:
     def _prune(self) -> None:
         alive, self._rows = np.unique(self._rows, return_inverse=True)
         for step in range(len(self._poses) - 1, -1, -1):
-            if len(alive) == len(self._poses[step]):
-                return
+            if step < self._n_pruned and len(alive) == len(self._poses[step]):
+                break
             self._poses[step] = self._poses[step][alive]
             parents = self._parents[step][alive]
             alive, self._parents[step] = np.unique(parents, return_inverse=True)
+        self._n_pruned = len(self._poses)
 
 
 def _at(weights: Array, quantiles: Array) -> NDArray[np.int64]:

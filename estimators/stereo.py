@@ -112,10 +112,16 @@ class StereoModel:
 
     @property
     def packed(self) -> Array:
-        """(9,) numbers for the compiled loops, in the order of `estimators.landmarks`."""
+        """(10,) numbers for the compiled loops, in the order of `estimators.landmarks`.
+
+        1 / f and 1 / (f B), the variances, the height, three flags, and the determinant of the
+        correlated R at a depth of 1 m, which grows as depth^8.
+        """
         flags = (self.correlated, self.in_image, self.at_measured)
-        focal = (self.focal_px, self.focal_px * self.baseline_m)
-        return np.array([*focal, *self.variances_px2, self.height_m, *flags], dtype=np.float64)
+        inverse = np.array([1.0, 1.0 / self.baseline_m]) / self.focal_px
+        unit = np.prod(self.variances_px2) * inverse[0] ** 4 * inverse[1] ** 2
+        values = [*inverse, *self.variances_px2, self.height_m, *flags, unit]
+        return np.array(values, dtype=np.float64)
 
     def usable(self, points_in_camera: ArrayLike) -> NDArray[np.bool_]:
         """Which measurements (K, 3) can be used.

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from estimators.particles import (
     SCHEMES,
+    Lineages,
     effective_sample_size,
     in_place,
     normalize,
@@ -114,3 +115,21 @@ def test_survivors_keep_their_slot(drawn):
 def test_unknown_scheme_is_told():
     with pytest.raises(InputError, match="systematic, stratified, residual, multinomial"):
         resample(np.zeros(3), 3, np.random.default_rng(0), "bootstrap")
+
+
+def test_lineages_are_the_paths_of_the_survivors():
+    rng = np.random.default_rng(4)
+    n, n_steps = 12, 300
+    lineages, paths = Lineages(n), np.zeros((n, 0, 3))
+    for _ in range(n_steps):
+        poses = rng.standard_normal((n, 3))
+        lineages.append(poses)
+        paths = np.concatenate([paths, poses[:, None]], axis=1)
+        if rng.random() < 0.6:
+            ancestors = rng.integers(n, size=n)
+            lineages.resample(ancestors)
+            paths = paths[ancestors]
+    traced = [poses[rows] for poses, rows in lineages.paths()][::-1]
+    assert np.array_equal(np.stack(traced, axis=1), paths)
+    assert len(lineages) == n_steps
+    assert lineages.n_rows < 0.4 * n * n_steps  # the dead are forgotten
