@@ -7,7 +7,12 @@ import importlib
 from sim.errors import InputError
 
 # name -> modules of this package, each with `run()`
-SUITES = {"sim": ("recording", "casting"), "icp": ("icp",), "topological": ("topological",)}
+SUITES = {
+    "sim": ("recording", "casting"),
+    "icp": ("icp",),
+    "fastslam": ("fastslam",),
+    "topological": ("topological",),
+}
 
 
 def run_bench(name: str, *, as_json: bool) -> str:

@@ -1,0 +1,168 @@
+"""Speed of FastSLAM: a whole step, the landmark update alone, and what either costs by size."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimators import landmarks as ekf
+from estimators.base import Prior
+from estimators.base import run as walk
+from estimators.fastslam import FastSLAM
+from estimators.stereo import StereoModel
+from experiments.bench.measure import Measurement, median_time_s
+from sim.recording import LandmarkLog, Recording, WheelLog
+from sim.robot import RobotGeometry
+from sim.sensors import Encoder, SensorSuite, StereoCamera
+
+Array = NDArray[np.float64]
+
+PAPER = StereoCamera(sigma_column_px=10.0, sigma_row_px=10.0, correlated=False)
+PIXEL = StereoCamera()
+_TRACK_M, _STEP_M, _RADIUS_M, _K_M = 0.4, 0.4, 5.0, 5e-5
+_PAPER: dict[str, Any] = {"proposal": "motion", "resampling": "multinomial", "ess_share": 1.0}
+_SIZE: dict[str, Any] = {"n_landmarks": 200, "n_seen": 20}
+_NS = (100, 200, 400, 800, 1600)
+
+
+def run_steps(
+    n_particles: int,
+    *,
+    n_landmarks: int,
+    n_seen: int,
+    n_steps: int = 400,
+    camera: StereoCamera = PAPER,
+    **options: Any,
+) -> tuple[Array, float, float]:
+    """Seconds (T,) of each step of a run, share of steps that resample, bytes a particle."""
+    recording = circling(n_landmarks, n_seen, n_steps, camera)
+    prior = Prior(recording.robot, recording.sensors, np.zeros(3), np.zeros((3, 3)))
+    estimator = FastSLAM(n_particles=n_particles, kr=_K_M, kl=_K_M, **options)
+    walk(estimator, recording.cut(40), prior, np.random.default_rng(0))
+    done = walk(estimator, recording, prior, np.random.default_rng(0), keep=("resampled",))
+    share = float(np.mean(done.extras["resampled"]))
+    return done.step_seconds, share, estimator.bytes_per_particle
+
+
+def circling(n_landmarks: int, n_seen: int, n_steps: int, camera: StereoCamera) -> Recording:
+    """Rounds in a hall with N landmarks, of which every image shows B of those ahead."""
+    rng = np.random.default_rng([n_landmarks, n_seen])
+    turn = _STEP_M / _RADIUS_M * np.arange(n_steps)
+    poses = np.stack([_RADIUS_M * np.sin(turn), _RADIUS_M * (1 - np.cos(turn)), turn], axis=1)
+    angle, radius = rng.uniform(-np.pi, np.pi, n_landmarks), rng.uniform(6.0, 9.0, n_landmarks)
+    landmarks = np.stack(
+        [
+            radius * np.cos(angle),
+            _RADIUS_M + radius * np.sin(angle),
+            rng.uniform(0, 2, n_landmarks),
+        ],
+        axis=1,
+    )
+    model = StereoModel.of(camera)
+    points, ids = [], []
+    for pose in poses:
+        seen = model.predict(pose, landmarks)[0]
+        near = np.argsort(np.where(seen[:, 2] > 1.0, seen[:, 2], np.inf))[: 3 * n_seen]
+        chosen = rng.choice(near, n_seen, replace=False)
+        points.append(camera.measure(seen[chosen], rng))
+        ids.append(chosen)
+    wheels = np.full((n_steps, 2), _STEP_M) * (1.0 + np.array([0.5, -0.5]) * _TRACK_M / _RADIUS_M)
+    wheels += math.sqrt(_K_M * _STEP_M) * rng.standard_normal(wheels.shape)
+    wheels[0] = 0.0
+    stamps = 0.8 * np.arange(n_steps, dtype=np.float64)
+    return Recording(
+        frame_stamps=stamps,
+        wheels=WheelLog(stamps, np.cumsum(wheels, axis=0)),
+        robot=RobotGeometry(0.1, _TRACK_M),
+        sensors=SensorSuite(Encoder(None), stereo=camera),
+        landmarks=LandmarkLog(
+            stamps, n_seen * np.arange(n_steps + 1), np.concatenate(points), np.concatenate(ids)
+        ),
+        config={"bench": "circling"},
+    )
+
+
+def update_ns(n_particles: int, n_landmarks: int, n_seen: int = 20) -> float:
+    """Nanoseconds of one landmark update, a particle and an observation."""
+    rng = np.random.default_rng(0)
+    maps, camera = (
+        ekf.LandmarkMaps(n_particles, "contiguous", births=False),
+        StereoModel.of(StereoCamera()),
+    )
+    points = rng.uniform([-3.0, -1.0, 2.0], [3.0, 1.0, 8.0], (n_landmarks, 3))
+    maps.reserve(n_landmarks)
+    state, packed = ekf.new_state(maps.n_blocks), camera.packed
+    poses = np.tile([[0.0], [0.0], [0.0], [1.0], [0.0]], (1, maps.n_blocks * ekf.LANES))
+    still, ahead = np.zeros((3, 3)), np.array([0.0, 0.0, 1.0, 0.0])
+    ekf.move(poses, np.zeros(3), still, poses[:3], ahead, poses.copy(), state)
+    slots = np.tile(np.arange(n_landmarks)[:, None], (1, n_particles))
+    ekf.create(maps.data, maps.rows(slots), points, state, packed)
+
+    def one_image(chosen: NDArray[np.int64]) -> None:
+        for start in range(0, n_seen, ekf.GROUP):
+            part = chosen[start : start + ekf.GROUP]
+            ekf.update(maps.data, maps.place[part], points[part], state, packed)
+
+    images = [(rng.choice(n_landmarks, n_seen, replace=False),) for _ in range(50)]
+    return 1e9 * median_time_s(one_image, images) / (n_particles * n_seen)
+
+
+def _steps() -> list[Measurement]:
+    arms: dict[str, tuple[dict[str, Any], float | None, str]] = {
+        "": ({}, 0.6, "FastSLAM 2.0, ESS < M/2"),
+        "motion_": ({"proposal": "motion"}, 0.6, "FastSLAM 1.0, ESS < M/2"),
+        "paper_": (_PAPER, None, "FastSLAM 1.0, multinomial at every image"),
+        "pixel_": ({"camera": PIXEL}, None, "FastSLAM 2.0, ESS < M/2, noise of 1 px"),
+    }
+    results = []
+    for arm, (options, goal, note) in arms.items():
+        seconds, share, _ = run_steps(1000, **_SIZE, **options)
+        name = f"fastslam.{arm}step_m1000_n200_b20"
+        mean, last = 1e3 * float(seconds.mean()), 1e3 * float(np.quantile(seconds, 0.99))
+        results += [
+            Measurement(f"{name}_ms", mean, "ms", goal, note=f"{note}; mean over all steps"),
+            Measurement(f"{name}_p99_ms", last, "ms"),
+            Measurement(f"{name}_resampled", share, "", note="share of steps that resample"),
+        ]
+    return results
+
+
+def _slope(sizes: tuple[int, ...], seconds: list[float]) -> float:
+    """Exponent of the time by size, fitted in logs."""
+    return float(np.polyfit(np.log(sizes), np.log(seconds), 1)[0])
+
+
+def _by_size() -> list[Measurement]:
+    results = []
+    ms, bs = (250, 500, 1000, 2000, 4000), (5, 10, 20, 40)
+    by_m = [float(run_steps(m, **_SIZE, n_steps=150)[0].mean()) for m in ms]
+    by_b = [float(run_steps(1000, n_landmarks=200, n_seen=b, n_steps=150)[0].mean()) for b in bs]
+    results.append(Measurement("fastslam.slope_m", _slope(ms, by_m), "", note=f"M in {ms}"))
+    results.append(Measurement("fastslam.slope_b", _slope(bs, by_b), "", note=f"B in {bs}"))
+    for maps in ("shared", "contiguous"):
+        seconds, size = [], 0.0
+        for n in _NS:
+            runs = run_steps(1000, n_landmarks=n, n_seen=20, n_steps=200, maps=maps, **_PAPER)
+            seconds.append(float(runs[0][-100:].mean()))
+            size = runs[2] if n == 200 else size
+        name = f"fastslam.slope_n_{maps}"
+        note = f"N in {_NS}, resampling at every image"
+        results.append(Measurement(name, _slope(_NS, seconds), "", note=note))
+        label = f"fastslam.memory_{maps}_n200_kib"
+        results.append(Measurement(label, size / 1024, "KiB", note="maps of one particle"))
+    return results
+
+
+def run() -> list[Measurement]:
+    """Steps, updates, slopes and memory."""
+    small, large = update_ns(1000, 200), update_ns(1000, 2000)
+    note = "a particle and an observation, M = 1000"
+    return [
+        *_steps(),
+        Measurement("fastslam.update_ns", small, "ns", 10.0, note=f"{note}, N = 200"),
+        Measurement("fastslam.update_streamed_ns", large, "ns", note=f"{note}, N = 2000"),
+        *_by_size(),
+    ]
