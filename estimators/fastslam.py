@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from estimators import landmarks as ekf
 from estimators.base import Belief, Estimate, Prior
+from estimators.gaussian import STILL, Gaussian, compose, wheel_motion
 from estimators.landmarks import LandmarkMaps, Maps
 from estimators.particles import (
     SCHEMES,
@@ -25,7 +26,7 @@ from estimators.stereo import NoiseAt, NoiseModel, StereoModel
 from sim import se2
 from sim.errors import InputError
 from sim.recording import Frame, LandmarkSet
-from sim.robot import TravelWindow, arc_increment, arc_increment_jacobian, wheel_variances
+from sim.robot import TravelWindow, wheel_variances
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -82,13 +83,13 @@ class FastSLAM:
 
     Notes
     -----
-    Belief mean and covariance are those of the weighted particles. Extras: `particles` (M, 3),
-    `log_weights` (M,) and `ess`, before resampling; `resampled`; `best` (3,), the
-    pose of the particle of greatest accumulated log weight, carried along the ancestry, eq. (20);
-    `associations` (K,) of that particle: for each observation, counted from 0 over the whole run,
-    the one that started its landmark, itself if it is the first, -1 if it was refused; with
-    `keep_map` also `landmarks` (N, 3) and `landmark_covariances` (N, 3, 3); `status` when an
-    image was of no use.
+    Belief mean and covariance are those of the weighted particles. Extras: `particles` (M, 3) and
+    `log_weights` (M,) as of the last image; `ess`; `resampled`, after these were taken; `best`
+    (3,), the pose of the particle of greatest accumulated log weight, carried along the ancestry,
+    eq. (20); at an image `associations` (K,) of that particle: for each observation, counted from
+    0 over the whole run, the one that started its landmark, itself if it is the first, -1 if it
+    was refused; with `keep_map` also `landmarks` (N, 3) and `landmark_covariances` (N, 3, 3);
+    `status` when an image was of no use.
 
     `finish` gives the path of the best particle's lineage; `map` is its map.
     """
@@ -187,61 +188,82 @@ class FastSLAM:
         self._poses = np.stack([*drawn.T, np.cos(headings), np.sin(headings)])  # (5, lanes)
         self._log_weights, self._accumulated = np.zeros(n), np.zeros(n)
         self._lineages = Lineages(n)
-        self._rolled, self._spread = np.zeros(3), np.zeros((3, 3))  # motion not yet drawn
-        self._motion_root = np.zeros((3, 3))
-        self._rolling = False
+        self._rolled = STILL  # motion not yet drawn
+        self._root = np.zeros((3, 2))  # of its covariance
+        self._take_stock()
         self._slot_of: dict[int, int] = {}
         # births: observations that started a landmark in some particle
         self._births = np.zeros(0, np.int64)
         self._bank = np.zeros((0, 0), np.float32)  # their descriptors
         self._n_observations, self._blind = 0, 0
+        # of each Frame: its stamp, the draw it follows, and the motion since
         self._stamps: list[float] = []
+        self._draws: list[int] = []
+        self._since: list[Array] = []
 
     def step(self, frame: Frame) -> Belief:
         """Roll by the wheels; at an image, draw, associate, weight, update and resample."""
         self._roll(frame)
-        if frame.landmarks is None:
-            if math.sqrt(self._spread[2, 2]) > _MOST_DRIFT_RAD:
-                self._draw_motion()
-            return self._answer(frame, {})
-        found, status = self._usable(frame.landmarks)
-        extras: dict[str, Any] = {"status": status} if status else {}
-        points = np.ascontiguousarray(frame.landmarks.points_in_camera[found])
-        normals, root = self._normals(), self._motion_root
+        extras: dict[str, Any] = {"resampled": False}
+        if frame.landmarks is not None:
+            self._see(frame.landmarks, extras)
+        elif self._rolled.covariance[2, 2] > _MOST_DRIFT_RAD**2:
+            self._poses = self._move(self._normals())
+            self._take_stock()
+        belief = self._belief.then(self._rolled)
+        best = int(np.argmax(self._accumulated))
+        extras |= {
+            "particles": self._drawn,
+            "log_weights": self._log_weights,
+            "ess": self._ess,
+            "best": compose(self._drawn[best], self._rolled.mean)[0],
+        }
+        if self.keep_map:
+            extras |= {k: v for k, v in self.map.items() if k.startswith("landmark")}
+        self._stamps.append(frame.stamp)
+        self._draws.append(len(self._lineages) - 1)
+        self._since.append(self._rolled.mean)
+        poor = self.ess_share >= 1.0 or self._ess < self.ess_share * self.n_particles
+        if poor and "associations" in extras and np.any(extras["associations"] >= 0):
+            self._resample()
+            extras["resampled"] = True
+        return Belief(belief.mean, belief.covariance, extras)
+
+    def _see(self, seen: LandmarkSet, extras: dict[str, Any]) -> None:
+        """Take in one image."""
+        found, status = self._usable(seen)
+        if status:
+            extras["status"] = status
+        points = np.ascontiguousarray(seen.points_in_camera[found])
+        normals = self._normals()
+        gained = np.zeros(self.n_particles)
         if self.association == "known":
-            slots = self._known(frame.landmarks, found)
+            slots = self._known(seen, found)
             self._maps.touch(slots[slots >= 0])
         if self.proposal == "motion" or len(points) == 0:
-            poses = self._move(root, normals)
+            poses = self._move(normals)
             if self.association != "known":
-                slots = self._associate(points, frame.landmarks, found, np.zeros((3, 3)))
-            gained = np.zeros(self.n_particles)
+                slots = self._associate(points, seen, found, np.zeros((3, 3)))
         else:
-            poses = self._move(root, np.zeros_like(normals))
+            self._move(np.zeros_like(normals))
             if self.association != "known":
-                slots = self._associate(points, frame.landmarks, found, self._seen_spread())
-            gained = self._propose(root, normals, slots, points)
-            poses = self._move(root, normals)
+                slots = self._associate(points, seen, found, self._seen_spread())
+            gained += self._propose(normals, slots, points)
+            poses = self._move(normals)
         gained += self._observe(slots, points)
-        associations = np.full(len(frame.landmarks.points_in_camera), -1)
-        self._create(slots, points, frame.landmarks, found)
-        self._poses, self._rolling = poses, False
+        self._create(slots, points, seen, found)
+        self._poses = poses
         weights = self._log_weights + gained
         if underflowed(weights):
             extras["status"] = "weights underflowed"
             weights, gained = np.zeros(self.n_particles), np.zeros(self.n_particles)
         self._log_weights = weights
-        self._accumulated += gained
+        self._accumulated = self._accumulated + gained
+        self._take_stock()
         best = int(np.argmax(self._accumulated))
-        associations[found] = self._origins(slots, best, found)
-        self._n_observations += len(associations)
-        extras["associations"] = associations
-        belief = self._answer(frame, extras)
-        poor = self.ess_share >= 1.0 or self._ess < self.ess_share * self.n_particles
-        if poor and len(points) > 0:
-            self._resample()
-            belief.extras["resampled"] = True
-        return belief
+        extras["associations"] = np.full(len(seen.points_in_camera), -1)
+        extras["associations"][found] = self._origins(slots, best, found)
+        self._n_observations += len(seen.points_in_camera)
 
     def finish(self) -> Estimate:
         """Path of the lineage of greatest accumulated weight, gil2008, eq. (20).
@@ -253,12 +275,21 @@ class FastSLAM:
         best = int(np.argmax(self._accumulated))
         weights = normalize(self._log_weights)
         n = len(self._lineages)
-        means, covariances = np.empty((n, 3)), np.empty((n, 3, 3))
-        for i, (poses, rows) in zip(range(n - 1, -1, -1), self._lineages.paths(), strict=True):
-            means[i] = poses[rows[best]]
+        drawn: list[Gaussian] = []
+        for poses, rows in self._lineages.paths():
             by_row = np.bincount(rows, weights, minlength=len(poses)).astype(np.float64)
-            covariances[i] = ekf.moments(poses, by_row)[1]
-        return Estimate(np.array(self._stamps), means, covariances, kind="revised", map=self.map)
+            drawn.append(Gaussian(poses[rows[best]], ekf.moments(poses, by_row)[1]))
+        beliefs = [
+            drawn[n - 1 - draw].then(Gaussian(since, np.zeros((3, 3))))
+            for draw, since in zip(self._draws, self._since, strict=True)
+        ]
+        return Estimate(
+            np.array(self._stamps),
+            np.array([belief.mean for belief in beliefs]),
+            np.array([belief.covariance for belief in beliefs]),
+            kind="revised",
+            map=self.map,
+        )
 
     @property
     def map(self) -> dict[str, Array | Ints]:
@@ -287,37 +318,38 @@ class FastSLAM:
         """Add the Frame's arc to the motion that is not yet drawn."""
         travel = frame.wheel_increments_m
         spread_m = self._window.push(frame.duration_s, travel)
-        step = arc_increment(travel, self._track_m)
-        by_wheels = arc_increment_jacobian(travel, self._track_m)
-        root = by_wheels * np.sqrt(wheel_variances(spread_m, self.kr, self.kl))
-        Q = root @ root.T
-        if not self._rolling:
-            self._rolled, self._spread, self._rolling = step, Q, True
-            self._motion_root = np.zeros((3, 3))
-            self._motion_root[:, :2] = root
-            return
-        by_pose, by_step = se2.compose_jacobians(self._rolled, step)
-        self._spread = by_pose @ self._spread @ by_pose.T + by_step @ Q @ by_step.T
-        self._rolled = se2.compose(self._rolled, step)
-        self._motion_root = _root(self._spread)
-
-    def _draw_motion(self) -> None:
-        """Draw the motion since the last image, without an image."""
-        self._poses = self._move(self._motion_root, self._normals())
-        self._rolling = False
+        variances = wheel_variances(spread_m, self.kr, self.kl)
+        motion, by_wheels = wheel_motion(travel, variances, self._track_m)
+        if self._rolled is STILL:
+            self._rolled, self._root = motion, by_wheels * np.sqrt(variances)
+        else:
+            self._rolled, self._root = self._rolled.then(motion), np.zeros((3, 0))
 
     def _normals(self) -> Array:
-        """Standard normal draws (3, lanes); two rows of a single arc, which has two wheels."""
+        """Standard normal draws (3, lanes); two rows for a single arc, which has two wheels."""
+        root = np.zeros((3, 3))
+        rank = self._root.shape[1] or 3
+        root[:, :rank] = self._root if rank < 3 else _root(self._rolled.covariance)
         normals = np.zeros((3, self._n_lanes))
-        rank = 3 if np.any(self._motion_root[:, 2]) else 2
         self._rng.standard_normal(out=normals[:rank])
+        self._root = root
         return normals
 
-    def _move(self, root: Array, normals: Array) -> Array:
-        """Poses (M, 3) after the motion, and the state that belongs to them."""
+    def _move(self, normals: Array) -> Array:
+        """Poses (5, lanes) after the motion, and the state that belongs to them."""
         moved = np.empty_like(self._poses)
-        ekf.move(self._poses, self._rolled, root, normals, self._mount, moved, self._state)
+        mean, mount = self._rolled.mean, self._mount
+        ekf.move(self._poses, mean, self._root, normals, mount, moved, self._state)
         return moved
+
+    def _take_stock(self) -> None:
+        """Moments of the particles as they are drawn and weighted."""
+        self._drawn = np.ascontiguousarray(self._poses[:3, : self.n_particles].T)
+        self._lineages.append(self._drawn)
+        self._rolled = STILL
+        weights = normalize(self._log_weights)
+        self._ess = 1.0 / float(weights @ weights)
+        self._belief = Gaussian(*ekf.moments(self._drawn, weights))
 
     def _usable(self, seen: LandmarkSet) -> tuple[Ints, str]:
         """Rows of the observations that can be used, and what is wrong with the others."""
@@ -390,9 +422,10 @@ class FastSLAM:
 
     def _seen_spread(self) -> Array:
         """Covariance of the motion not yet drawn, in axes of the camera after it."""
-        return _rotated(self._spread, -float(self._rolled[2] + self._model.mount[2]))
+        angle = -float(self._rolled.mean[2] + self._model.mount[2])
+        return _rotated(self._rolled.covariance, angle)
 
-    def _propose(self, root: Array, normals: Array, slots: Ints, points: Array) -> Array:
+    def _propose(self, normals: Array, slots: Ints, points: Array) -> Array:
         """Turn normals into draws given the image; log weights (M,) that these are owed.
 
         The first few observations place the particle, and all are linearised anew there: what
@@ -405,10 +438,10 @@ class FastSLAM:
         start, owed = np.zeros_like(normals), np.empty((2, self._n_lanes))
         if len(rows):
             inform(maps, rows[:_PLACING], points[:_PLACING], state, camera)
-            ekf.propose(self._poses, root, state, np.zeros_like(normals), start, owed)
-            self._move(root, start)
+            ekf.propose(self._poses, self._root, state, np.zeros_like(normals), start, owed)
+            self._move(start)
         inform(maps, rows, points, state, camera)
-        ekf.propose(self._poses, root, state, start, normals, owed)
+        ekf.propose(self._poses, self._root, state, start, normals, owed)
         log_owed: Array = 0.5 * owed[0] - np.log(owed[1])
         return log_owed[: self.n_particles]
 
@@ -476,33 +509,8 @@ class FastSLAM:
         self._maps.resample(ancestors)
         self._lineages.resample(ancestors)
         self._poses[:, :n] = np.take(self._poses, ancestors, axis=1)
-        self._accumulated = self._accumulated[ancestors]
+        self._drawn, self._accumulated = self._drawn[ancestors], self._accumulated[ancestors]
         self._log_weights = np.zeros(n)
-
-    def _answer(self, frame: Frame, extras: dict[str, Any]) -> Belief:
-        """Moments of the particles, composed with the motion that is not yet drawn."""
-        poses = np.ascontiguousarray(self._poses[:3, : self.n_particles].T)
-        if self._rolling:
-            poses = se2.compose(poses, self._rolled)
-        self._lineages.append(poses)
-        self._stamps.append(frame.stamp)
-        weights = normalize(self._log_weights)
-        self._ess = 1.0 / float(weights @ weights)
-        mean, covariance = ekf.moments(poses, weights)
-        if self._rolling:
-            before = float(mean[2] - self._rolled[2])
-            covariance = covariance + _rotated(self._spread, before)
-        best = int(np.argmax(self._accumulated))
-        extras |= {
-            "particles": poses,
-            "log_weights": self._log_weights.copy(),
-            "ess": self._ess,
-            "resampled": False,
-            "best": poses[best],
-        }
-        if self.keep_map:
-            extras |= {k: v for k, v in self.map.items() if k.startswith("landmark")}
-        return Belief(mean, covariance, extras)
 
 
 def _root(covariance: Array) -> Array:
