@@ -97,7 +97,7 @@ class EkfIcp:
         lateral_slip_m: float = 1e-7,
         encoder_tick_m: float = 0.0,
         gate_probability: float | None = 1e-9,
-        shared_noise: float = 0.7,
+        shared_noise: float = 0.75,
         window_s: float = 0.05,
     ) -> None:
         self._matcher = ScanMatcher(metric, search, covariance, sigma_range_m)
