@@ -90,6 +90,22 @@ def ring_key(lidar: Lidar3D, ranges_m: NDArray[np.float32]) -> Row:
     return row
 
 
+def _plane_axes() -> Array:
+    """Axes (64, 2, 3) in the planes that M2DP projects onto: the x axis' shadow, and across."""
+    azimuth = np.pi * np.arange(_M2DP_AZIMUTHS) / _M2DP_AZIMUTHS - np.pi / 2
+    elevation = np.pi / 2 * np.arange(_M2DP_ELEVATIONS) / _M2DP_ELEVATIONS
+    a, e = np.meshgrid(azimuth, elevation, indexing="ij")
+    normals = np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], axis=-1)
+    normals = normals.reshape(-1, 3)
+    along = np.array([1.0, 0.0, 0.0]) - normals[:, :1] * normals
+    length = np.linalg.norm(along, axis=1, keepdims=True)
+    along = np.where(length > 1e-9, along / np.maximum(length, 1e-9), [0.0, 1.0, 0.0])
+    return np.stack([along, np.cross(normals, along)], axis=1)
+
+
+_M2DP_AXES = _plane_axes()
+
+
 def m2dp(lidar: Lidar3D, ranges_m: NDArray[np.float32]) -> Row:
     """M2DP (192,): first singular vectors of the cloud's densities on 64 planes (He et al. 2016).
 
@@ -107,23 +123,8 @@ def m2dp(lidar: Lidar3D, ranges_m: NDArray[np.float32]) -> Row:
     points = points * np.where(np.sum(points**3, axis=0) < 0.0, -1.0, 1.0)
     reach = np.linalg.norm(points, axis=1).max()
     densities = np.zeros((n_planes, n_bins))
-    planes = [
-        (np.pi * p / _M2DP_AZIMUTHS - np.pi / 2, np.pi / 2 * q / _M2DP_ELEVATIONS)
-        for p in range(_M2DP_AZIMUTHS)
-        for q in range(_M2DP_ELEVATIONS)
-    ]
-    for i, (azimuth, elevation) in enumerate(planes):
-        normal = np.array(
-            [
-                np.cos(elevation) * np.cos(azimuth),
-                np.cos(elevation) * np.sin(azimuth),
-                np.sin(elevation),
-            ]
-        )
-        along = np.array([1.0, 0.0, 0.0]) - normal[0] * normal
-        size = np.linalg.norm(along)
-        along = along / size if size > 1e-9 else np.array([0.0, 1.0, 0.0])
-        u, v = points @ along, points @ np.cross(normal, along)
+    for i, axes in enumerate(_M2DP_AXES):
+        u, v = axes @ points.T
         circle = (np.sqrt(np.hypot(u, v) / reach) * _M2DP_CIRCLES).astype(int)
         sector = ((np.arctan2(v, u) + np.pi) / (2 * np.pi) * _M2DP_BINS).astype(int) % _M2DP_BINS
         cell = np.minimum(circle, _M2DP_CIRCLES - 1) * _M2DP_BINS + sector

@@ -150,13 +150,14 @@ def queries(nodes_m: Array, geometry: Geometry, rng: np.random.Generator) -> Arr
     forward = way / np.maximum(np.hypot(*way.T), 1e-9)[:, None]
     left = np.stack([-forward[:, 1], forward[:, 0]], axis=1)
     if geometry.name == "oxford":
-        sigma = 1.12 * geometry.offset_m / math.sqrt(math.pi / 2.0)
+        sigma = 1.15 * geometry.offset_m / math.sqrt(math.pi / 2.0)
         offset = np.empty((n, 2))
         offset[0] = sigma * rng.standard_normal(2)
         kept = 1.0 - geometry.drift
         for i in range(1, n):
             fresh = sigma * math.sqrt(1.0 - kept**2) * rng.standard_normal(2)
             offset[i] = kept * offset[i - 1] + fresh
+        offset *= sigma / math.sqrt(np.mean(offset**2))  # the printed size in every world
     else:
         turning = np.cumsum(geometry.drift * rng.standard_normal(n))
         angle = rng.uniform(-math.pi, math.pi) + turning
