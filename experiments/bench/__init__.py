@@ -9,7 +9,7 @@ from sim.errors import InputError
 # name -> modules of this package, each with `run()`
 SUITES = {
     "sim": ("recording", "casting"),
-    "icp": ("icp",),
+    "icp": ("icp", "ekf_icp"),
     "fastslam": ("fastslam",),
     "topological": ("topological",),
 }
