@@ -30,6 +30,7 @@ Weighting = Literal["M1", "M2", "M3"]
 _ALL_AROUND = math.pi**2 / 3.0  # variance of a heading that nobody knows, rad^2
 _MOST_HOPS = 100  # of one particle between two Frames
 _LEAST_HEADING = 0.01  # variance of the heading on an edge, rad^2
+_CARRIED_SHARE = 0.05  # error of the wheels' motion, as a share of it
 _FACING_RAD = 0.8  # how far a robot's heading may be from its edge's
 
 
@@ -188,7 +189,8 @@ class TopologicalMcl:
         neighbours.
     refine
         Register the level slice of the cloud with that of the mode's node, if the map has
-        slices; the pose is then as good as the registration, not as the nodes' spacing.
+        slices; the pose is then as good as the registration, not as the nodes' spacing. Where that
+        fails the wheels carry the last one on.
     map_path
         A map's file; None for the prior's map.
 
@@ -270,6 +272,7 @@ class TopologicalMcl:
         self._poses = np.column_stack([known.positions_m[self._node_of_state], headings])
         self._squares = np.einsum("nd,nd->n", known.descriptors, known.descriptors)
         self._sigma_l_m = self.sigma_l_m or known.spacing_m or 1.0
+        self._near_m = 1.5 * max(known.spacing_m, 1.0)
         self._refiner = None
         if self.refine and known.slices_m.size and self._lidar is not None:
             self._refiner = Refiner(known, self._lidar)
@@ -287,20 +290,17 @@ class TopologicalMcl:
         if prior.mean is not None and prior.covariance is not None:
             self._log_weights += self._log_prior(prior.mean, prior.covariance)
         self._observed = False
-        self._belief = self._summary({})
-        self._mean = self._belief.mean.copy()
+        self._belief, self._registered = self._summary({}), False
 
     def step(self, frame: Frame) -> Belief:
         """Move by the wheels; at an observation also weight, resample and, if asked, refine."""
         if self.motion == "odometry":
             self._roll(frame.wheel_increments_m)
+            self._belief = self._carried(frame.wheel_increments_m)
         descriptor, fault = self._descriptor(frame)
         if descriptor is None:
-            if self.motion == "odometry":
-                moved = arc_increment(frame.wheel_increments_m, self._track_m)
-                self._mean = se2.compose(self._mean, moved)
             extras = {"status": fault} if fault else {}
-            return Belief(self._mean.copy(), self._belief.covariance.copy(), extras)
+            return Belief(self._belief.mean.copy(), self._belief.covariance.copy(), extras)
         if self.motion == "paper" and self._observed:
             self._edge = self._graph.next(self._edge, self._rng.random(len(self._edge)))
         self._observed = True
@@ -308,11 +308,11 @@ class TopologicalMcl:
         ess = effective_sample_size(self._log_weights)
         if self.resampling == "always" or ess < 0.5 * len(self._edge):
             self._resample()
-        self._belief = self._summary({"ess": ess})
+        belief = self._summary({"ess": ess})
         if self._refiner is not None and frame.cloud_ranges_m is not None:
-            self._belief = self._refined(frame.cloud_ranges_m, self._belief)
-        self._mean = self._belief.mean.copy()
-        return self._belief
+            belief = self._refined(frame.cloud_ranges_m, belief)
+        self._belief = belief
+        return Belief(belief.mean.copy(), belief.covariance.copy(), belief.extras)
 
     def _descriptor(self, frame: Frame) -> tuple[NDArray[np.float32] | None, str]:
         """Descriptor of the Frame's place, or None and why if something is wrong with it."""
@@ -488,13 +488,32 @@ class TopologicalMcl:
         first = graph.first_out[node]
         return np.append(graph.head[first : first + graph.degree[node]], node)
 
+    def _carried(self, wheel_increments_m: Array) -> Belief:
+        """The last belief moved on by the wheels."""
+        moved = arc_increment(wheel_increments_m, self._track_m)
+        by_pose, by_motion = se2.compose_jacobians(self._belief.mean, moved)
+        sigma = _CARRIED_SHARE * math.hypot(moved[0], moved[1])
+        Q = np.diag(np.square([sigma, sigma, _CARRIED_SHARE * moved[2]]))
+        covariance = by_pose @ self._belief.covariance @ by_pose.T + by_motion @ Q @ by_motion.T
+        covariance = (covariance + covariance.T) / 2.0
+        return Belief(se2.compose(self._belief.mean, moved), covariance)
+
     def _refined(self, cloud_ranges_m: NDArray[np.float32], belief: Belief) -> Belief:
-        """Register the cloud with the mode's node; the belief as it was if that fails."""
+        """Register the cloud with the mode's node.
+
+        If that fails, the last registered pose is carried on by the wheels, as long as it stays
+        near the particles' mean; else the belief remains as it was.
+        """
         assert self._refiner is not None
         mode = int(belief.extras["node"])
         others = [int(i) for i in self._about(mode) if i != mode]
         found = self._refiner.refine(cloud_ranges_m, mode, others)
         extras = {**belief.extras, "refinement": found.status}
-        if found.pose is None or found.covariance is None:
-            return Belief(belief.mean, belief.covariance, extras)
-        return Belief(found.pose, found.covariance, extras)
+        if found.pose is not None and found.covariance is not None:
+            self._registered = True
+            return Belief(found.pose, found.covariance, extras)
+        apart = np.hypot(*(self._belief.mean[:2] - belief.mean[:2]))
+        if self._registered and self.motion == "odometry" and apart <= self._near_m:
+            return Belief(self._belief.mean, self._belief.covariance, extras)
+        self._registered = False
+        return Belief(belief.mean, belief.covariance, extras)

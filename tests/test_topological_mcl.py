@@ -132,8 +132,7 @@ def test_odometry_motion_follows_steps_of_any_length():
         n_steps = int(60.0 / travel)
         for i in range(n_steps):
             belief = estimator.step(frame(i, travel))
-        estimator._belief = estimator._summary({})
-        belief = estimator._belief
+        belief = estimator._summary({})
         assert belief.mean[0] == pytest.approx(10.0 + n_steps * travel, abs=1.5)
         for i in range(n_steps):
             estimator.step(frame(i, -travel))  # and back again, in reverse
@@ -253,6 +252,35 @@ def test_bad_settings_and_a_missing_map_are_named(tmp_path):
             started(known)
     with pytest.raises(InputError, match=r"no\.npz"):
         started(None, map_path=str(tmp_path / "no.npz"))
+
+
+def test_the_wheels_carry_a_registered_pose_over_a_gap():
+    run_ = ring_run()
+    truth = run_.truth.poses
+    known = from_recording(run_, "ring_key", 1.0)
+    known = dataclasses.replace(  # places that are told apart, in a room that looks alike
+        known, descriptor="", descriptors=known.positions_m.astype(np.float32)
+    )
+    suite = SensorSuite(lidar3d=LIDAR)
+    prior = Prior(run_.robot, suite, truth[0], np.diag([0.01, 0.01, 0.01]), known)
+    estimator = TopologicalMcl(particles_per_node=50)
+    estimator.reset(prior, np.random.default_rng(0))
+    spread = 0.0
+    blind = np.full((16, 360), 0.5, np.float32)  # all is near: no outline to register
+    for i, frame_ in enumerate(run_.frames()):
+        place = truth[i, :2].astype(np.float32)
+        cloud = blind if i in (20, 21) else frame_.cloud_ranges_m
+        seen = dataclasses.replace(frame_, cloud_ranges_m=cloud, place_descriptor=place)
+        if i == 22:
+            seen = dataclasses.replace(seen, cloud_ranges_m=None, place_descriptor=None)
+        belief = estimator.step(seen)
+        assert (belief.extras.get("refinement") == "ok") == (i not in (20, 21, 22))
+        np.testing.assert_allclose(belief.mean[:2], truth[i, :2], atol=1e-3)
+        assert abs(se2.wrap(belief.mean[2] - truth[i, 2])) < 1e-3
+        assert np.all(np.linalg.eigvalsh(belief.covariance) > 0.0)
+        if i in (20, 21, 22):  # less sure at each
+            assert np.trace(belief.covariance) > spread
+        spread = np.trace(belief.covariance)
 
 
 def test_turns_are_those_between_outlines():
