@@ -323,7 +323,10 @@ def _route(config: dict[str, Any], geometry: str, positions: str | None) -> Plac
 def recording_from_files(
     config: dict[str, Any], positions: str, descriptors: str, interval_s: float = 1.0
 ) -> Recording:
-    """Queries of one's own: positions (K, 2) and descriptors (K, D) as `.npy` or `.csv`."""
+    """Queries of one's own: positions (K, 2) and descriptors (K, D) as `.npy` or `.csv`.
+
+    The wheels go straight from each position to the next, without slip.
+    """
     places = read_array(Path(positions))
     if places.ndim != 2 or places.shape[1] != 2:
         raise InputError(f"{positions}: queries need shape (K, 2), got {places.shape}")
