@@ -13,7 +13,7 @@ from experiments.figures.style import save_figure
 from experiments.version import ROOT
 from sim.errors import InputError
 
-PAPERS = ("puzzlebot2024",)
+PAPERS = ("puzzlebot2024", "maximo2024")
 RESULTS = ROOT / "results"
 
 

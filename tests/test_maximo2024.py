@@ -153,8 +153,8 @@ def test_a_walk_reports_error_and_dispersion(world):
 
 def test_rows_of_a_world(world):
     small = study.weighting_rows(world, "umh", 5, 1)
-    assert len(small["weighting"]) == 3
-    assert len(small["dispersion"]) == 3 * (study.WITHIN + 1)
+    assert len(small["weighting"]) == 4
+    assert len(small["dispersion"]) == 4 * (study.WITHIN + 1)
     nearest = small["weighting"][0]["nearest_node_m"]
     assert nearest == pytest.approx(0.39, abs=0.02)
     starts = study.start_rows(world, "umh", 5, 3)
