@@ -1,0 +1,223 @@
+"""The likelihood field of a map for a laser: how well each place explains the end of a beam.
+
+A beam that ends at distance d from the nearest wall has the likelihood
+
+    p(d) = z_hit N(d; 0, sigma^2) + z_rand / z_max,
+
+looked up in a table over the floor. The table holds (log p(0) - log p(d)) / step in whole numbers
+of 16 bits, so that it stays in the processor's cache and a scan is a sum of integers.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from sim import se2
+from sim.compiled import njit
+from sim.errors import InputError
+from sim.sensors import Laser
+from sim.world import World
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
+
+_MOST = 65535  # of a table entry
+_CLEARANCE_M = 0.15  # where a robot's centre can be
+_MOST_CELLS = 50_000_000  # 100 MB
+
+
+@dataclass(frozen=True)
+class LikelihoodField:
+    """A table over the floor.
+
+    Attributes
+    ----------
+    table
+        (rows, columns) uint16 of y and x; its rim stands for all that lies outside.
+    origin_m
+        (2,) corner of cell (0, 0) in map.
+    cell_m
+        Side of a cell.
+    step
+        Log likelihood of one count.
+    free_cells
+        Rows and columns (F, 2) of the cells where a robot can be: the largest connected floor off
+        the walls. What is shut in, such as the inside of furniture, does not count.
+    """
+
+    table: NDArray[np.uint16]
+    origin_m: Array
+    cell_m: float
+    step: float
+    free_cells: NDArray[np.int64]
+
+    def draw(self, n: int, rng: np.random.Generator) -> Array:
+        """Poses (n, 3), uniform over the free floor and all headings."""
+        if len(self.free_cells) == 0:
+            raise InputError("the map has no floor off its walls to put particles on")
+        cells = self.free_cells[rng.integers(len(self.free_cells), size=n)]
+        places: Array = self.origin_m + (cells[:, ::-1] + rng.random((n, 2))) * self.cell_m
+        poses: Array = np.column_stack([places, rng.uniform(-math.pi, math.pi, n)])
+        return poses
+
+    def log_likelihood(self, poses: Array, ends: Floats) -> Array:
+        """Log likelihood (M,) of a scan at poses (M, 3), relative to all beams ending at walls.
+
+        Parameters
+        ----------
+        ends
+            (2, B) where the beams end in base_link, m, as from `beam_ends`.
+        """
+        counts = np.empty(len(poses), np.int64)
+        rows, columns = self.table.shape
+        _look_up(
+            np.ascontiguousarray(poses), ends, self.table.ravel(), rows, columns,
+            self.origin_m, self.cell_m, counts,
+        )  # fmt: skip
+        log_likelihood: Array = -self.step * counts.astype(np.float64)
+        return log_likelihood
+
+
+def likelihood_field(
+    world: World,
+    laser: Laser,
+    *,
+    cell_m: float = 0.05,
+    sigma_m: float = 0.1,
+    z_hit: float = 0.9,
+    z_rand: float = 0.1,
+) -> LikelihoodField:
+    """Work out the field of a world's walls at the height of the laser.
+
+    Parameters
+    ----------
+    sigma_m
+        Spread of beam ends about the walls: range noise, half a cell, and errors of the map.
+    z_hit, z_rand
+        Shares of beams that end at a wall and anywhere; z_max is the laser's greatest range.
+
+    Raises
+    ------
+    InputError
+        If no wall is at that height, or the table would be too large.
+    """
+    low, high = world.wall_z_m[:, 0], world.wall_z_m[:, 1]
+    walls = world.walls[(low <= laser.mount.z_m) & (laser.mount.z_m <= high)]
+    if len(walls) == 0:
+        raise InputError(f"world {world.name} has no wall at the laser's {laser.mount.z_m} m")
+    normal = z_hit / (sigma_m * math.sqrt(2.0 * math.pi))
+    anywhere = z_rand / laser.max_range_m
+    # Beyond this distance beams that hit are a thousandth of those that end anywhere
+    reach_m = sigma_m * math.sqrt(2.0 * math.log(max(1000.0 * normal / anywhere, math.e)))
+    reach_m = max(reach_m, 2.0 * _CLEARANCE_M)
+    ends = walls.reshape(-1, 2)
+    origin = np.floor((ends.min(axis=0) - reach_m) / cell_m) * cell_m - cell_m
+    columns, rows = np.ceil((ends.max(axis=0) + reach_m - origin) / cell_m).astype(int) + 1
+    if rows * columns > _MOST_CELLS:
+        raise InputError(
+            f"estimator.cell_m={cell_m} makes {rows * columns} cells of world {world.name}; "
+            "make it larger"
+        )
+    distances = _distances(walls, origin, cell_m, reach_m, rows, columns)
+    log_p = np.log(normal * np.exp(-0.5 * np.square(distances / sigma_m)) + anywhere)
+    at_wall, step = math.log(normal + anywhere), math.log1p(normal / anywhere) / _MOST
+    table = np.round((at_wall - log_p) / step).astype(np.uint16)
+    margin = round(reach_m / cell_m) + 1
+    return LikelihoodField(table, origin, cell_m, step, _free_cells(distances, margin))
+
+
+def _free_cells(distances_m: Array, margin: int) -> NDArray[np.int64]:
+    """Cells (F, 2) of the largest connected floor off the walls, within the walls' rectangle."""
+    inner = distances_m[margin:-margin, margin:-margin] > _CLEARANCE_M
+    labels, count = ndimage.label(inner)
+    if count == 0:
+        return np.zeros((0, 2), np.int64)
+    largest = 1 + np.argmax(np.bincount(labels[inner], minlength=count + 1)[1:])
+    return np.argwhere(labels == largest) + margin
+
+
+def beam_ends(ranges_m: Floats, laser: Laser, n_beams: int) -> Floats:
+    """Where beams end in base_link, (2, B) m: `n_beams` evenly spaced ones, less those unseen."""
+    n = min(n_beams, len(ranges_m))
+    chosen = ((np.arange(n) + 0.5) * (len(ranges_m) / n)).astype(np.int64)
+    ranges, bearings = np.asarray(ranges_m, float)[chosen], laser.bearings_rad[chosen]
+    seen = np.isfinite(ranges) & (ranges > laser.min_range_m) & (ranges < laser.max_range_m)
+    rays = np.column_stack([np.cos(bearings[seen]), np.sin(bearings[seen])])
+    ends = se2.transform(laser.mount.pose, rays * ranges[seen, None])
+    return np.ascontiguousarray(ends.T, dtype=np.float32)
+
+
+@njit()
+def _distances(
+    walls: Array, origin: Array, cell_m: float, reach_m: float, rows: int, columns: int
+) -> Array:
+    """Distance (rows, columns) of each cell's middle to the nearest wall within reach, else inf."""
+    squares = np.full((rows, columns), np.inf)
+    for w in range(len(walls)):
+        x1, y1 = walls[w, 0] - origin[0], walls[w, 1] - origin[1]
+        dx, dy = walls[w, 2] - walls[w, 0], walls[w, 3] - walls[w, 1]
+        per_square = 1.0 / (dx * dx + dy * dy)
+        first_row = max(int((min(y1, y1 + dy) - reach_m) / cell_m), 0)
+        last_row = min(int((max(y1, y1 + dy) + reach_m) / cell_m) + 1, rows)
+        first = max(int((min(x1, x1 + dx) - reach_m) / cell_m), 0)
+        last = min(int((max(x1, x1 + dx) + reach_m) / cell_m) + 1, columns)
+        for i in range(first_row, last_row):
+            y = (i + 0.5) * cell_m - y1
+            for j in range(first, last):
+                x = (j + 0.5) * cell_m - x1
+                share = min(max((x * dx + y * dy) * per_square, 0.0), 1.0)
+                square = (x - share * dx) ** 2 + (y - share * dy) ** 2
+                squares[i, j] = min(squares[i, j], square)
+    for i in range(rows):
+        for j in range(columns):
+            d = math.sqrt(squares[i, j])
+            squares[i, j] = d if d < reach_m else np.inf
+    return squares
+
+
+@njit(fastmath=True)
+def _look_up(
+    poses: Array,
+    ends: Floats,
+    table: NDArray[np.uint16],
+    rows: int,
+    columns: int,
+    origin: Array,
+    cell_m: float,
+    counts: NDArray[np.int64],
+) -> None:
+    """Sum the table over the beam ends (2, B), for every pose (M, 3).
+
+    In two passes a particle: the cells, which the compiler turns into vector instructions, then
+    the look-ups. Unsigned indices need no test for counting from the end, and four sums let the
+    processor wait for several look-ups at a time.
+    """
+    n = ends.shape[1]
+    whole = n // 4 * 4
+    x_ends, y_ends = ends[0], ends[1]
+    cells = np.empty(n, np.uint32)
+    zero, x_most, y_most = np.float32(0.0), np.float32(columns - 1), np.float32(rows - 1)
+    stride = np.int32(columns)
+    for m in range(len(poses)):
+        cos = np.float32(math.cos(poses[m, 2]) / cell_m)
+        sin = np.float32(math.sin(poses[m, 2]) / cell_m)
+        x0 = np.float32((poses[m, 0] - origin[0]) / cell_m)
+        y0 = np.float32((poses[m, 1] - origin[1]) / cell_m)
+        for b in range(n):
+            x = min(max(x0 + cos * x_ends[b] - sin * y_ends[b], zero), x_most)
+            y = min(max(y0 + sin * x_ends[b] + cos * y_ends[b], zero), y_most)
+            cells[b] = np.uint32(np.int32(y) * stride + np.int32(x))
+        first = second = third = fourth = np.uint64(0)
+        for b in range(0, whole, 4):
+            first += table[cells[b]]
+            second += table[cells[b + 1]]
+            third += table[cells[b + 2]]
+            fourth += table[cells[b + 3]]
+        for b in range(whole, n):
+            first += table[cells[b]]
+        counts[m] = first + second + third + fourth

@@ -1,0 +1,419 @@
+"""Monte Carlo localization in a known map by a laser (the starting point of maximo2024, sec. 2.1).
+
+Particles roll by the wheels, are weighted by a likelihood field, and are drawn anew. Their number
+follows the spread of the belief (KLD sampling), and when scans fit worse than they did for long,
+particles are strewn over the floor again (augmented MCL), by the scan itself (sensor resetting).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimators.base import Belief, Prior
+from estimators.gaussian import STILL, Gaussian, wheel_motion
+from estimators.likelihood_field import beam_ends, likelihood_field
+from estimators.particles import (
+    SCHEMES,
+    Scheme,
+    effective_sample_size,
+    normalize,
+    resample,
+    underflowed,
+)
+from sim import se2
+from sim.compiled import njit
+from sim.errors import InputError
+from sim.recording import Frame
+from sim.robot import TravelWindow, wheel_variances
+from sim.world import World
+
+Array = NDArray[np.float64]
+
+_BISECTIONS = 12
+_FARTHEST_M, _FARTHEST_RAD = 1.0, 0.5  # of what belongs to one hypothesis
+
+
+class Mcl:
+    """Monte Carlo localization with a likelihood field.
+
+    Parameters
+    ----------
+    n_least, n_most
+        Bounds of the number of particles; it starts with the greater one.
+    kld_error, kld_quantile
+        KLD sampling: the draw differs from the belief by at most `kld_error`, with the
+        probability that this standard normal quantile has (2.33: 99 %).
+    bin_m, bin_rad
+        Size of the bins that KLD sampling counts.
+    n_beams
+        Beams of each scan that are used, evenly spaced.
+    beam_power
+        Each beam's likelihood is raised to this power, since neighbouring beams err together and
+        particles are few for so sharp a likelihood; 1 for independent beams.
+    least_ess
+        A scan counts for less when it would leave less than this share of the particles; below
+        `ess_share`.
+    tries
+        Poses that are tried on the floor for each particle strewn there, by the scan.
+    sigma_m, z_hit, z_rand, cell_m
+        The likelihood field, see `estimators.likelihood_field`.
+    update_distance_m, update_turn_rad
+        How far the robot goes between scans that are used.
+    resampling, ess_share
+        Scheme, and share of the particles that the effective sample size must fall below.
+    jitter_m, jitter_rad
+        Spread added to each particle drawn, so that copies differ.
+    alpha_slow, alpha_fast
+        Rates of the long and the short average of a beam's likelihood; 0 for no recovery.
+    recovery_ratio
+        Particles are strewn when the short average falls below this share of the long one.
+    kr, kl
+        Believed slip variance per metre of the wheels, m; `amcl_alphas` tells what that is to
+        AMCL.
+    window_s
+        |ds| is netted over at least this time.
+
+    Notes
+    -----
+    The defaults are for finding the robot anywhere: blunt likelihoods and a jitter that widens the
+    belief to twice its error or more. A tracker that knows its error wants beam_power=1,
+    least_ess=0, sigma_m of 0.05 to 0.1, and no jitter; it is consistent then.
+
+    Without a start pose the particles are drawn by the first scan, and later ones are strewn by
+    the scan of the time: along a corridor, where long beams leave no play to the heading, a
+    uniform draw would leave none near the truth.
+
+    The mean is that of the hypothesis (particles within 1 m and 0.5 rad) of greatest weight; the
+    covariance is that of all particles about it, so it tells when there are others. Extras, of
+    the last scan used: `particles` (M, 3), `log_weights` (M,), `ess`, `hypothesis_weight`,
+    `fit`, the likelihood of a beam at the best particle, and `strewn`, the number of particles set
+    anew; `status` when a scan saw nothing.
+    """
+
+    needs = frozenset({"laser", "map"})
+    global_or_grid = True
+
+    def __init__(
+        self,
+        n_least: int = 500,
+        n_most: int = 20_000,
+        kld_error: float = 0.05,
+        kld_quantile: float = 2.33,
+        bin_m: float = 0.5,
+        bin_rad: float = 0.17,
+        n_beams: int = 60,
+        beam_power: float = 0.1,
+        least_ess: float = 0.3,
+        tries: int = 50,
+        sigma_m: float = 0.2,
+        z_hit: float = 0.9,
+        z_rand: float = 0.1,
+        cell_m: float = 0.05,
+        update_distance_m: float = 0.2,
+        update_turn_rad: float = 0.2,
+        resampling: Scheme = "systematic",
+        ess_share: float = 0.5,
+        jitter_m: float = 0.01,
+        jitter_rad: float = 0.005,
+        alpha_slow: float = 0.01,
+        alpha_fast: float = 0.2,
+        recovery_ratio: float = 0.9,
+        kr: float = 1e-4,
+        kl: float = 1e-4,
+        window_s: float = 0.05,
+    ) -> None:
+        for name, whole in {
+            "n_least": n_least,
+            "n_most": n_most,
+            "n_beams": n_beams,
+            "tries": tries,
+        }.items():
+            if isinstance(whole, bool) or not isinstance(whole, int) or whole < 1:
+                raise InputError(
+                    f"estimator.{name} must be a whole number from 1 on, got {whole!r}"
+                )
+        if n_least > n_most:
+            raise InputError(f"estimator.n_least={n_least} is above n_most={n_most}")
+        if least_ess >= ess_share:
+            raise InputError(f"estimator.least_ess={least_ess} is not below ess_share={ess_share}")
+        if resampling not in SCHEMES:
+            raise InputError(
+                f"estimator.resampling must be {' or '.join(SCHEMES)}, got {resampling!r}"
+            )
+        positive = {
+            "kld_error": kld_error,
+            "bin_m": bin_m,
+            "bin_rad": bin_rad,
+            "beam_power": beam_power,
+            "sigma_m": sigma_m,
+            "z_hit": z_hit,
+            "z_rand": z_rand,
+            "cell_m": cell_m,
+        }
+        others = {
+            "kld_quantile": kld_quantile,
+            "least_ess": least_ess,
+            "update_distance_m": update_distance_m,
+            "update_turn_rad": update_turn_rad,
+            "ess_share": ess_share,
+            "jitter_m": jitter_m,
+            "jitter_rad": jitter_rad,
+            "alpha_slow": alpha_slow,
+            "alpha_fast": alpha_fast,
+            "recovery_ratio": recovery_ratio,
+            "kr": kr,
+            "kl": kl,
+            "window_s": window_s,
+        }
+        for name, number in {**positive, **others}.items():
+            if not (math.isfinite(number) and number >= 0.0) or (name in positive and number == 0):
+                kind = "positive" if name in positive else "zero or positive"
+                raise InputError(f"estimator.{name} must be {kind}, got {number}")
+        self.n_least, self.n_most, self.n_beams = n_least, n_most, n_beams
+        self.kld_error, self.kld_quantile = kld_error, kld_quantile
+        self.bin_m, self.bin_rad, self.beam_power = bin_m, bin_rad, beam_power
+        self.least_ess, self.tries = least_ess, tries
+        self.sigma_m, self.z_hit, self.z_rand, self.cell_m = sigma_m, z_hit, z_rand, cell_m
+        self.update_distance_m, self.update_turn_rad = update_distance_m, update_turn_rad
+        self.resampling, self.ess_share = resampling, ess_share
+        self.jitter_m, self.jitter_rad = jitter_m, jitter_rad
+        self.alpha_slow, self.alpha_fast = alpha_slow, alpha_fast
+        self.recovery_ratio = recovery_ratio
+        self.kr, self.kl, self.window_s = kr, kl, window_s
+
+    def reset(self, prior: Prior, rng: np.random.Generator) -> None:
+        """Draw particles from the prior's pose, or from all the floor if there is none."""
+        if prior.sensors.laser is None:
+            raise InputError("mcl needs a laser; choose sensors that have one")
+        if not isinstance(prior.map, World):
+            raise InputError("mcl needs a map of walls; set prior.map=world")
+        self._laser, self._rng, self._track_m = prior.sensors.laser, rng, prior.robot.track_m
+        self._field = likelihood_field(
+            prior.map,
+            self._laser,
+            cell_m=self.cell_m,
+            sigma_m=self.sigma_m,
+            z_hit=self.z_hit,
+            z_rand=self.z_rand,
+        )
+        self._everywhere = prior.mean is None or prior.covariance is None
+        if prior.mean is None or prior.covariance is None:
+            self._poses = self._field.draw(self.n_most, rng)
+        else:
+            values, vectors = np.linalg.eigh(prior.covariance)
+            root = vectors * np.sqrt(np.maximum(values, 0.0))
+            self._poses = prior.mean + rng.standard_normal((self.n_most, 3)) @ root.T
+            self._poses[:, 2] = se2.wrap(self._poses[:, 2])
+        self._log_weights = np.zeros(len(self._poses))
+        self._window = TravelWindow(self.window_s)
+        self._motion = STILL  # since the last scan used
+        # A beam errs along itself by the laser's noise, and by half a cell either way
+        variance = self._laser.sigma_range_m**2 + self.cell_m**2 / 6.0
+        self._slow = self._fast = math.exp(-0.5 * variance / self.sigma_m**2)
+        self._seen = False
+        self._extras: dict[str, Any] = {}
+        self._belief = self._summed_up()
+
+    def step(self, frame: Frame) -> Belief:
+        """Roll by the wheels; with a scan from a new place, weigh and draw."""
+        travel = frame.wheel_increments_m
+        spread_m = self._window.push(frame.duration_s, travel)
+        variances = wheel_variances(spread_m, self.kr, self.kl)
+        self._motion = self._motion.then(wheel_motion(travel, variances, self._track_m)[0])
+        extras: dict[str, Any] = {}
+        if frame.ranges_m is not None and self._is_due():
+            ends = beam_ends(frame.ranges_m, self._laser, self.n_beams)
+            self._move()
+            self._seen = True
+            if ends.shape[1] == 0:
+                extras["status"] = "scan without returns"
+                self._belief = self._summed_up()
+            else:
+                self._weigh(ends)
+        now = self._belief.then(self._motion)
+        covariance = (now.covariance + now.covariance.T) / 2.0
+        return Belief(now.mean.copy(), covariance, {**self._extras, **extras})
+
+    def _is_due(self) -> bool:
+        """Whether the robot has come far enough since the last scan used."""
+        x, y, turn = self._motion.mean
+        far = math.hypot(x, y) >= self.update_distance_m or abs(turn) >= self.update_turn_rad
+        return far or not self._seen
+
+    def _move(self) -> None:
+        """Draw the motion since the last scan used, for each particle."""
+        values, vectors = np.linalg.eigh(self._motion.covariance)
+        root = vectors * np.sqrt(np.maximum(values, 0.0))
+        normals = self._rng.standard_normal(self._poses.shape)
+        self._poses = self._poses.copy()  # the last Belief keeps its own
+        _move(self._poses, self._motion.mean, root, normals)
+        self._motion = STILL
+
+    def _weigh(self, ends: NDArray[np.float32]) -> None:
+        """Weigh by one scan, sum up the belief, and draw anew if that is due."""
+        if self._everywhere:
+            self._poses, self._everywhere = self._strewn(self.n_most, ends), False
+            self._belief = self._summed_up()
+            return
+        of_scan = self._field.log_likelihood(self._poses, ends)
+        self._log_weights = self._weighed(of_scan)
+        self._belief = self._summed_up()
+        share = self._strewn_share(of_scan, ends.shape[1])
+        poor = self._extras["ess"] < self.ess_share * len(self._poses)
+        if poor or share > 0.0:
+            self._draw(share, ends)
+
+    def _weighed(self, of_scan: Array) -> Array:
+        """Log weights (M,) with a scan counted by `beam_power`, or by as much as `least_ess` lets.
+
+        The effective sample size falls as the power grows, so the power is found by bisection.
+        """
+        least = min(self.least_ess * len(of_scan), effective_sample_size(self._log_weights))
+        low, high = 0.0, self.beam_power
+        weights = self._log_weights + high * of_scan
+        if effective_sample_size(weights) < least:
+            for _ in range(_BISECTIONS):
+                middle = (low + high) / 2.0
+                weights = self._log_weights + middle * of_scan
+                if effective_sample_size(weights) < least:
+                    high = middle
+                else:
+                    low = middle
+            weights = self._log_weights + low * of_scan
+        if underflowed(weights):
+            return np.zeros(len(weights))
+        return weights - np.max(weights)
+
+    def _strewn_share(self, of_scan: Array, n_beams: int) -> float:
+        """Share of particles to strew: the short average of the fit against the long one.
+
+        The fit is the geometric mean likelihood of a beam at the particle that fits best: the mean
+        over the particles, as in augmented MCL, is poor for any belief that is still spread.
+        """
+        if self.alpha_slow == 0.0:
+            return 0.0
+        fit = math.exp(float(np.max(of_scan)) / n_beams)
+        self._slow += self.alpha_slow * (fit - self._slow)
+        self._fast += self.alpha_fast * (fit - self._fast)
+        self._extras["fit"] = fit
+        return max(0.0, 1.0 - self._fast / (self.recovery_ratio * self._slow))
+
+    def _strewn(self, n: int, ends: NDArray[np.float32]) -> Array:
+        """Poses (n, 3) over all the floor, drawn by how well the scan fits there."""
+        tries = self._field.draw(n * self.tries, self._rng)
+        log_weights = self.beam_power * self._field.log_likelihood(tries, ends)
+        return tries[resample(log_weights, n, self._rng, self.resampling)]
+
+    def _draw(self, strewn_share: float, ends: NDArray[np.float32]) -> None:
+        """Draw particles anew: as many as the bins they fall into call for."""
+        n, needed = 0, max(self.n_least, min(len(self._poses), self.n_most) // 4)
+        poses, n_strewn = self._poses, 0
+        while n < needed:
+            n = needed
+            n_strewn = int(self._rng.binomial(n, strewn_share))
+            drawn = resample(self._log_weights, n - n_strewn, self._rng, self.resampling)
+            poses = self._poses[drawn]
+            if n_strewn > 0:
+                poses = np.concatenate([poses, self._strewn(n_strewn, ends)])
+            needed = min(max(self._kld_number(poses), self.n_least), self.n_most)
+        jitter = self._rng.standard_normal(poses.shape)
+        self._poses = poses + jitter * [self.jitter_m, self.jitter_m, self.jitter_rad]
+        self._log_weights = np.zeros(n)
+        self._extras["strewn"] = n_strewn
+
+    def _kld_number(self, poses: Array) -> int:
+        """Particles that the number of bins in use calls for (Fox 2003)."""
+        k = np.count_nonzero(np.bincount(self._bins(poses)))
+        if k < 2:
+            return 1
+        a = 2.0 / (9.0 * (k - 1))
+        cube = (1.0 - a + math.sqrt(a) * self.kld_quantile) ** 3
+        return math.ceil((k - 1) / (2.0 * self.kld_error) * cube)
+
+    def _bins(self, poses: Array) -> NDArray[np.int64]:
+        """Number of the bin (M,) of each pose; what lies off the map counts to its rim."""
+        field = self._field
+        shape = np.ceil(field.cell_m * np.array(field.table.shape[::-1]) / self.bin_m).astype(int)
+        x, y = ((poses[:, i] - field.origin_m[i]) / self.bin_m for i in (0, 1))
+        heading = np.floor((poses[:, 2] + math.pi) / self.bin_rad).astype(np.int64)
+        n_headings = math.ceil(2.0 * math.pi / self.bin_rad)
+        column = np.clip(x.astype(np.int64), 0, shape[0] - 1)
+        row = np.clip(y.astype(np.int64), 0, shape[1] - 1)
+        bins: NDArray[np.int64] = (row * shape[0] + column) * n_headings + heading % n_headings
+        return bins
+
+    def _summed_up(self) -> Gaussian:
+        """Belief of the weighted particles, and its extras."""
+        weights = normalize(self._log_weights)
+        poses = self._poses
+        bins = self._bins(poses)
+        heaviest = bins == np.argmax(np.bincount(bins, weights))
+        mean = weights[heaviest] @ poses[heaviest] / weights[heaviest].sum()
+        for _ in range(2):
+            off = poses - mean
+            off[:, 2] = se2.wrap(off[:, 2])
+            near = np.hypot(off[:, 0], off[:, 1]) < _FARTHEST_M
+            near &= np.abs(off[:, 2]) < _FARTHEST_RAD
+            held = float(weights[near].sum())
+            if held > 0.0:
+                mean = mean + weights[near] @ off[near] / held
+        off = poses - mean
+        off[:, 2] = se2.wrap(off[:, 2])
+        covariance = (off * weights[:, None]).T @ off
+        mean[2] = se2.wrap(mean[2])
+        self._extras = {
+            "particles": poses,
+            "log_weights": self._log_weights,
+            "ess": effective_sample_size(self._log_weights),
+            "hypothesis_weight": held,
+            "strewn": 0,
+        }
+        return Gaussian(mean, (covariance + covariance.T) / 2.0)
+
+
+def amcl_alphas(
+    kr: float, kl: float, track_m: float, distance_m: float, turn_rad: float
+) -> tuple[float, float, float, float]:
+    """AMCL's alpha1 to alpha4 (differential model) that have the variances of kr and kl.
+
+    Slip grows with the distance, Var = k |ds|; AMCL's variances grow with its square, Var =
+    alpha ds^2. So they agree at one length of update only, the one given: a straight of
+    `distance_m` (alpha2, alpha3) and a turn on the spot of `turn_rad` (alpha1, alpha4).
+
+    Parameters
+    ----------
+    distance_m, turn_rad
+        AMCL's `update_min_d` and `update_min_a`.
+
+    Returns
+    -------
+    tuple
+        alpha1 (turn by turn), alpha2 (turn by distance, rad^2/m^2), alpha3 (distance by
+        distance), alpha4 (distance by turn, m^2/rad^2).
+    """
+    both = kr + kl
+    return (
+        both / (2.0 * track_m * turn_rad),
+        both / (2.0 * track_m**2 * distance_m),  # two of AMCL's turns share the variance
+        both / (4.0 * distance_m),
+        both * track_m / (8.0 * turn_rad),
+    )
+
+
+@njit()
+def _move(poses: Array, increment: Array, root: Array, normals: Array) -> None:
+    """Compose poses (M, 3) with the increment (3,) + root (3, 3) normals (M, 3), in place."""
+    for m in range(len(poses)):
+        a, b, c = normals[m, 0], normals[m, 1], normals[m, 2]
+        x = increment[0] + root[0, 0] * a + root[0, 1] * b + root[0, 2] * c
+        y = increment[1] + root[1, 0] * a + root[1, 1] * b + root[1, 2] * c
+        turn = increment[2] + root[2, 0] * a + root[2, 1] * b + root[2, 2] * c
+        cos, sin = math.cos(poses[m, 2]), math.sin(poses[m, 2])
+        poses[m, 0] += cos * x - sin * y
+        poses[m, 1] += sin * x + cos * y
+        heading = poses[m, 2] + turn
+        poses[m, 2] = heading - 2.0 * math.pi * math.ceil((heading - math.pi) / (2.0 * math.pi))
