@@ -12,6 +12,7 @@ SUITES = {
     "icp": ("icp", "ekf_icp"),
     "fastslam": ("fastslam",),
     "topological": ("topological",),
+    "mcl": ("mcl",),
 }
 
 
