@@ -104,7 +104,7 @@ class FastSLAM:
         ess_share: float = 0.5,
         association: Association = "known",
         d0: float = 16.27,
-        p0: float = 1e-2,
+        p0: float = 1e-3,
         noise_model: NoiseModel = "camera",
         noise_at: NoiseAt = "predicted",
         sigma_column_px: float | None = None,
