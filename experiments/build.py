@@ -127,11 +127,27 @@ def make_recording(
         return made
     if config["recording"] is not None:
         return load(Path(config["recording"]))
+    return cached(cache, recording_settings(config), lambda: simulate(config, on_progress))
+
+
+def recording_settings(config: Config) -> Config:
+    """What decides the recording's bits, beside the code: its settings, or a file's digest."""
+    if isinstance(config["recording"], dict):
+        return {"recording": config["recording"], "seed": config["seed"]}
+    if config["recording"] is not None:
+        return {"recording": _digest(Path(config["recording"]))}
     settings = {key: config[key] for key in SIMULATED_KEYS}
     world_file = config["world"].get("path")
     if world_file is not None and Path(world_file).is_file():  # an edited file is another world
-        settings["world_file"] = hashlib.sha256(Path(world_file).read_bytes()).hexdigest()
-    return cached(cache, settings, lambda: simulate(config, on_progress))
+        settings["world_file"] = _digest(Path(world_file))
+    return settings
+
+
+def _digest(path: Path) -> str:
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError as error:
+        raise InputError(f"{path}: cannot read it ({error.strerror})") from error
 
 
 def simulate(config: Config, on_progress: Callable[[float], None] | None = None) -> Recording:

@@ -49,7 +49,15 @@ def run(context: typer.Context) -> None:
       estima run --cfg job (print the configuration; estima options lists the groups)
     """
     os.environ["HYDRA_FULL_ERROR"] = "1"  # errors come to `main`, which tells them in a line
-    sys.argv = ["estima run", *context.args]
+    # a study is added to the defaults, which have none: Hydra would want a + before it
+    arguments = [f"+{a}" if a.startswith("study=") else a for a in context.args]
+    many = {"-m", "--multirun"} & set(arguments)
+    if many and not {"--hydra-help", "--cfg", "-c", "--info", "-i"} & set(arguments):
+        from experiments.sweep import sweep_arguments
+
+        sweep_arguments([a for a in arguments if a not in many])
+        return
+    sys.argv = ["estima run", *arguments]
     from experiments.run import application
 
     application()

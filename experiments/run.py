@@ -6,15 +6,17 @@ is the digest of the resolved configuration and of the code.
 
 from __future__ import annotations
 
+import functools
 import hashlib
+import importlib.util
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import hydra
 import numpy as np
 from hydra.core.hydra_config import HydraConfig
-from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from estimators.base import Estimate, run
@@ -25,6 +27,7 @@ from experiments.build import (
     make_estimator,
     make_prior,
     make_recording,
+    recording_settings,
 )
 from experiments.console import end, progress
 from experiments.metrics import score
@@ -36,20 +39,49 @@ from sim.recording import Recording
 
 RESULTS = ROOT / "results"
 _NOT_IN_KEY = ("name", "picture", "recording")
+GROUPS = ("world", "robot", "sensors", "route", "estimator")
+_FAILURES = ("error", "recording", "not finite")
 
 
 class RunFailedError(Exception):
     """A run ended badly; its row says how."""
 
 
-def run_key(config: Config, recording_checksum: str) -> str:
+def failed(status: str) -> bool:
+    """Whether a row's status tells of a failure; others only remark on what happened."""
+    return status.startswith(_FAILURES)
+
+
+def run_key(config: Config) -> str:
     """Digest of what decides a run's rows: configuration, recording, code."""
     settings = {key: value for key, value in config.items() if key not in _NOT_IN_KEY}
-    text = json.dumps([settings, recording_checksum, code_version()], sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
+    own = {target: _source_digest(target) for target in sorted(_targets(config))}
+    parts = [settings, recording_settings(config), code_version(), own]
+    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
 
 
-def run_configuration(config: Config, choices: dict[str, str]) -> tuple[list[Row], Path]:
+def _targets(tree: Any) -> set[str]:
+    """Every `_target_` of the configuration."""
+    if not isinstance(tree, dict):
+        return set()
+    here = {tree["_target_"]} if isinstance(tree.get("_target_"), str) else set()
+    return here.union(*(_targets(value) for value in tree.values()))
+
+
+@functools.cache
+def _source_digest(target: str) -> str:
+    """Digest of a target's source file; empty for the project's own, which have a version."""
+    spec = importlib.util.find_spec(target.rpartition(".")[0].partition(".")[0])
+    if spec is None or spec.origin is None or Path(spec.origin).is_relative_to(ROOT):
+        return ""
+    return hashlib.sha256(Path(spec.origin).read_bytes()).hexdigest()[:12]
+
+
+def run_configuration(
+    config: Config,
+    choices: dict[str, str],
+    fetch: Callable[[Config], Recording] | None = None,
+) -> tuple[list[Row], Path]:
     """Make the recording, run the estimator `repeats` times, write one row each.
 
     Parameters
@@ -58,6 +90,8 @@ def run_configuration(config: Config, choices: dict[str, str]) -> tuple[list[Row
         Resolved configuration, plain values.
     choices
         Name of the chosen option of each configuration group, for the rows.
+    fetch
+        Where the recording comes from; by default it is read, found in the cache or simulated.
 
     Returns
     -------
@@ -66,15 +100,14 @@ def run_configuration(config: Config, choices: dict[str, str]) -> tuple[list[Row
     """
     check(config)
     estimator = make_estimator(config)
-    with progress("simulating, s") as on_progress:
-        recording = make_recording(config, default_cache(), on_progress)
+    recording = _fetch(config) if fetch is None else fetch(config)
     prior = make_prior(config, recording)
-    key = run_key(config, recording.checksum)
+    key = run_key(config)
     folder = RESULTS / "runs" / config["name"]
     rows: list[Row] = []
     name = choices.get("estimator") or config["estimator"]["_target_"]
     for repeat in range(config["repeats"]):
-        row = _labels(config, choices, recording, key, repeat)
+        row = labels(config, choices, recording.checksum, key, repeat)
         try:
             with progress(name, len(recording.frame_stamps)) as on_step:
                 rng = stream(config["seed"], f"estimator/{name}", repeat)
@@ -92,9 +125,12 @@ def run_configuration(config: Config, choices: dict[str, str]) -> tuple[list[Row
     return rows, folder / key
 
 
-def _labels(
-    config: Config, choices: dict[str, str], recording: Recording, key: str, repeat: int
-) -> Row:
+def _fetch(config: Config) -> Recording:
+    with progress("simulating, s") as on_progress:
+        return make_recording(config, default_cache(), on_progress)
+
+
+def labels(config: Config, choices: dict[str, str], checksum: str, key: str, repeat: int) -> Row:
     """What a row says of its origin: choices, every configuration key, versions, checksum."""
     kept = {k: v for k, v in config.items() if k not in ("keep", "picture")}
     return {
@@ -103,7 +139,7 @@ def _labels(
         "repeat": repeat,
         "run_key": key,
         "code_version": code_version(),
-        "recording_checksum": recording.checksum,
+        "recording_checksum": checksum,
     }
 
 
@@ -144,23 +180,17 @@ def _show(recording: Recording, estimate: Estimate, folder: Path, name: str) -> 
 
 @hydra.main(version_base="1.3", config_path=str(ROOT / "conf"), config_name="config")
 def application(cfg: DictConfig) -> None:
-    """Run one job of Hydra's."""
+    """Run one configuration; sweeps are those of `experiments.sweep`."""
     config: Config = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
-    runtime = HydraConfig.get()
-    groups = ("world", "robot", "sensors", "route", "estimator")
-    choices = {g: str(runtime.runtime.choices.get(g)) for g in groups}
-    single = runtime.mode == RunMode.RUN
-    config["picture"] = config["picture"] and single
+    config.pop("sweeps")
+    chosen = HydraConfig.get().runtime.choices
     try:
-        rows, folder = run_configuration(config, choices)
-        if single:
-            _print(rows, folder, config["picture"])
-        bad = [row for row in rows if row["status"] != "ok"]
-        if bad:
-            raise RunFailedError(str(bad[0]["status"]))
+        rows, folder = run_configuration(config, {g: str(chosen.get(g)) for g in GROUPS})
+        _print(rows, folder, config["picture"])
+        for row in rows:
+            if failed(str(row["status"])):
+                raise RunFailedError(str(row["status"]))
     except (InputError, RunFailedError) as error:
-        if not single:
-            raise
         end(error)  # here, since Hydra would add a line of its own
 
 

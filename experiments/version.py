@@ -7,17 +7,26 @@ import hashlib
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-SIMULATION = ("sim",)  # its formats are left out: they read and write, but decide no recording
-EVERYTHING = ("sim", "estimators", "experiments")
+# Files that read and write logs are left out: they decide no simulated recording and no estimate
+SIMULATION = ("sim",)
+RUNS = (
+    "sim",
+    "estimators",
+    "experiments/build.py",
+    "experiments/metrics.py",
+    "experiments/places.py",
+    "experiments/run.py",
+    "experiments/seeds.py",
+)
 
 
 @functools.cache
-def code_version(folders: tuple[str, ...] = EVERYTHING) -> str:
-    """Return 12 hex digits of the SHA-256 over the Python files of the folders."""
+def code_version(parts: tuple[str, ...] = RUNS) -> str:
+    """Return 12 hex digits of the SHA-256 over Python files and those of folders."""
     digest = hashlib.sha256()
-    for folder in folders:
-        for path in sorted((ROOT / folder).rglob("*.py")):
-            if folders == SIMULATION and path.parent.name == "formats":
-                continue
-            digest.update(str(path.relative_to(ROOT)).encode() + b"\0" + path.read_bytes())
+    for part in parts:
+        place = ROOT / part
+        for path in [place] if place.is_file() else sorted(place.rglob("*.py")):
+            if path.parent.name != "formats":
+                digest.update(str(path.relative_to(ROOT)).encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:12]

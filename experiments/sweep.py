@@ -1,0 +1,341 @@
+"""Many runs: expand the swept values, leave out what is done, start the rest by Hydra's launcher.
+
+The runs are composed once, here, and packed into jobs; each job reads its share of the plan. So a
+run costs no composition of its own in the workers, and any of Hydra's launchers will do.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import hydra
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from omegaconf import DictConfig, OmegaConf
+
+from experiments.build import Config, default_cache, make_recording, recording_settings
+from experiments.cache import key_of
+from experiments.run import (
+    GROUPS,
+    RESULTS,
+    RunFailedError,
+    failed,
+    labels,
+    run_configuration,
+    run_key,
+)
+from experiments.table import read_rows, write_rows
+from experiments.version import ROOT
+from sim.errors import InputError
+from sim.files import write_whole
+from sim.recording import Recording
+
+_JOBS_PER_WORKER = 4  # enough to keep all busy to the end, few enough to cost little
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run of a sweep: its resolved configuration, the chosen options, its key."""
+
+    config: Config
+    choices: dict[str, str]
+    key: str
+
+
+def sweep_arguments(arguments: Sequence[str]) -> None:
+    """Sweep by a command line's arguments: overrides, and `--config-dir` with its folder."""
+    overrides, config_dir = [], None
+    rest = iter(arguments)
+    for argument in rest:
+        name, equals, value = argument.partition("=")
+        if name in ("--config-dir", "-cd"):
+            config_dir = value if equals else next(rest, None)
+            if config_dir is None or not Path(config_dir).is_dir():
+                raise InputError(f"--config-dir must name a folder, got {config_dir}")
+        elif argument.startswith("-"):
+            raise InputError(f"a sweep takes overrides and --config-dir, not {argument}")
+        else:
+            overrides.append(argument)
+    sweep(overrides, config_dir)
+
+
+def sweep(arguments: Sequence[str], config_dir: str | None = None) -> None:
+    """Run all combinations of the swept values; those that are done already are left out.
+
+    Parameters
+    ----------
+    arguments
+        Hydra's overrides. A study's `sweeps` are a list of further ones, each with its values;
+        `hydra.sweeper.params` are swept where the arguments do not say otherwise. Those of
+        `hydra/launcher` and `hydra.launcher` go to the launcher.
+    config_dir
+        A further folder of options.
+
+    Raises
+    ------
+    RunFailedError
+        If a run failed; all others are done, and the rows of the failed ones say how.
+    """
+    launching = [a for a in arguments if a.lstrip("+~").startswith(("hydra/", "hydra."))]
+    own = [a for a in arguments if a not in launching]
+    runs = list({run.key: run for run in planned(own, config_dir)}.values())
+    folder = RESULTS / "runs" / runs[0].config["name"]
+    missing = [run for run in runs if not is_done(folder, run.key)]
+    print(
+        f"{len(runs)} runs, {len(runs) - len(missing)} of them done before: {_short(folder)}",
+        file=sys.stderr,
+    )
+    if missing:
+        _launch(missing, folder, launching)
+    bad = [status for run in runs if (status := _status(folder, run.key)) is not None]
+    if bad:
+        raise RunFailedError(f"{len(bad)} of {len(runs)} runs; first: {bad[0]}")
+
+
+def planned(arguments: Sequence[str], config_dir: str | None = None) -> Iterator[Run]:
+    """Runs of all combinations, in the order of the arguments."""
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        composer = _Composer(config_dir)
+        given = OverridesParser.create().parse_overrides(list(arguments))
+        fixed = [o.input_line or "" for o in given if not o.is_sweep_override()]
+        study = compose("config", overrides=composer.extra + fixed, return_hydra_config=True)
+        params: dict[str, str] = dict(study.hydra.sweeper.get("params") or {})
+        for part in study.get("sweeps") or [{}]:
+            lines = [f"{key}={value}" for key, value in {**params, **part}.items()]
+            for overrides in combinations([*lines, *arguments]):
+                yield composer.run(overrides)
+
+
+def combinations(lines: Sequence[str]) -> Iterator[list[str]]:
+    """Every combination of the swept values; a later line replaces an earlier one of its key."""
+    choices: dict[str, list[str]] = {}
+    for override in OverridesParser.create().parse_overrides(list(lines)):
+        key = override.get_key_element()
+        if not override.is_sweep_override():
+            choices[key] = [f"{key}={override.get_value_element_as_str()}"]
+        elif override.is_discrete_sweep():
+            choices[key] = [f"{key}={value}" for value in override.sweep_string_iterator()]
+        else:
+            raise InputError(f"{override.input_line}: only lists and ranges of values can be swept")
+        if override.is_delete():
+            choices[key] = [override.input_line or key]
+    for combination in itertools.product(*choices.values()):
+        yield list(combination)
+
+
+class _Composer:
+    """Compose many configurations that share most of their choices.
+
+    Hydra composes each choice of options once; plain values are then put in place.
+    """
+
+    def __init__(self, config_dir: str | None) -> None:
+        self._bases: dict[tuple[str, ...], tuple[DictConfig, dict[str, str]]] = {}
+        self.extra = []
+        if config_dir is not None:
+            folder = Path(config_dir).resolve()
+            self.extra = [f"hydra.searchpath=[file://{folder}]"]
+
+    def run(self, overrides: list[str]) -> Run:
+        """Resolve one combination."""
+        parsed = OverridesParser.create().parse_overrides(overrides)
+        plain = [o for o in parsed if self._is_plain(o)]
+        options = tuple(o.input_line or "" for o in parsed if not self._is_plain(o))
+        if options not in self._bases:
+            cfg = compose("config", overrides=[*self.extra, *options], return_hydra_config=True)
+            choices = {g: str(cfg.hydra.runtime.choices.get(g)) for g in GROUPS}
+            OmegaConf.set_struct(cfg, False)
+            del cfg["hydra"]
+            self._bases[options] = (cfg, choices)
+        base, choices = self._bases[options]
+        cfg = base.copy()
+        OmegaConf.set_struct(cfg, True)
+        for override in plain:
+            key = override.key_or_group
+            if OmegaConf.select(cfg, key, default=_MISSING) is _MISSING:
+                raise InputError(
+                    f"unknown key {key}; see estima run --cfg job, or +{key}=... to add it"
+                )
+            OmegaConf.update(cfg, key, override.value(), merge=True)
+        config: Config = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
+        config["picture"] = False
+        config.pop("sweeps", None)
+        return Run(config, choices, run_key(config))
+
+    @staticmethod
+    def _is_plain(override: Override) -> bool:
+        """Whether it only sets a value, rather than choosing an option or adding a key."""
+        if override.is_add() or override.is_force_add() or override.is_delete():
+            return False
+        repository = GlobalHydra.instance().config_loader()
+        return not repository.get_group_options(override.key_or_group)
+
+
+_MISSING = object()
+
+
+def is_done(folder: Path, key: str) -> bool:
+    """Whether the run has rows, and none of them tells of a failure."""
+    return (folder / f"{key}.parquet").exists() and _status(folder, key) is None
+
+
+def _status(folder: Path, key: str) -> str | None:
+    """Return how a run failed; None if it did not."""
+    path = folder / f"{key}.parquet"
+    if not path.exists():
+        return "error: no row was written"
+    try:
+        statuses = read_rows(path)["status"]
+    except InputError as error:
+        return f"error: {error}"
+    return next((str(status) for status in statuses if failed(str(status))), None)
+
+
+def _launch(runs: Sequence[Run], folder: Path, launching: Sequence[str]) -> None:
+    """Write the plan, start its jobs, and show how they come along."""
+    jobs = packed(runs, _JOBS_PER_WORKER * (os.cpu_count() or 1))
+    plan = folder / "plan.json"
+    for run in runs:  # rows of an earlier failure
+        (folder / f"{run.key}.parquet").unlink(missing_ok=True)
+    text = json.dumps([[[r.config, r.choices] for r in job] for job in jobs])
+    with write_whole(plan) as part:
+        part.write_text(text)
+    sys.argv = [
+        "estima run",
+        "-m",
+        *launching,
+        f"plan={plan}",
+        f"job={','.join(str(number) for number in range(len(jobs)))}",
+    ]
+    with _Watch(folder, [run.key for run in runs]):
+        job_application()
+    plan.unlink(missing_ok=True)
+    _clear(Path(f"{plan}.jobs"))
+
+
+def packed(runs: Sequence[Run], n_jobs: int) -> list[list[Run]]:
+    """Runs in about `n_jobs` jobs; those of one recording stay together while there are enough."""
+    groups: dict[str, list[Run]] = {}
+    for run in runs:
+        groups.setdefault(_recording_key(run.config), []).append(run)
+    size = max(1, -(-len(runs) // n_jobs))
+    jobs: list[list[Run]] = []
+    for group in groups.values():
+        for low in range(0, len(group), size):
+            part = group[low : low + size]
+            if jobs and len(jobs[-1]) + len(part) <= size:
+                jobs[-1].extend(part)
+            else:
+                jobs.append(list(part))
+    return jobs
+
+
+def _recording_key(config: Config) -> str:
+    return key_of(recording_settings(config))
+
+
+@hydra.main(version_base="1.3", config_path=str(ROOT / "conf"), config_name="job")
+def job_application(cfg: DictConfig) -> None:
+    """Run one job's share of the plan; a run that fails leaves its row, and the next follows."""
+    planned_runs = json.loads(Path(cfg.plan).read_text())[cfg.job]
+    fetch = _LastRecording()
+    for config, choices in planned_runs:
+        run_and_record(config, choices, fetch)
+
+
+def run_and_record(
+    config: Config, choices: dict[str, str], fetch: Callable[[Config], Recording]
+) -> None:
+    """Run one configuration; what goes wrong becomes the status of its row."""
+    key = run_key(config)
+    path = RESULTS / "runs" / config["name"] / f"{key}.parquet"
+    try:
+        run_configuration(config, choices, fetch)
+    except Exception as error:
+        if not path.exists():
+            kind = "" if isinstance(error, InputError) else f"{type(error).__name__}: "
+            row = labels(config, choices, "", key, 0)
+            message = " ".join(str(error).split())
+            write_rows([{**row, "status": f"error: {kind}{message}"}], path)
+
+
+class _LastRecording:
+    """Keeps the last recording: the runs of a job mostly share it."""
+
+    def __init__(self) -> None:
+        self._key = ""
+        self._recording: Recording | None = None
+
+    def __call__(self, config: Config) -> Recording:
+        key = _recording_key(config)
+        if self._recording is None or key != self._key:
+            self._recording, self._key = make_recording(config, default_cache()), key
+        return self._recording
+
+
+class _Watch:
+    """Show how many runs are done and failed, at what rate, and the time that remains."""
+
+    def __init__(self, folder: Path, keys: Sequence[str]) -> None:
+        self._folder, self._keys, self._over = folder, set(keys), threading.Event()
+        self._thread = threading.Thread(target=self._watch, daemon=True)
+        self._begun = time.monotonic()
+
+    def __enter__(self) -> None:
+        self._thread.start()
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+        self._thread.join()
+
+    def _watch(self) -> None:
+        seen: set[str] = set()
+        bad, tell_after_s = 0, 2.0
+        on_terminal = sys.stderr.isatty()
+        while True:
+            over = self._over.wait(0.5)
+            there = {path.stem for path in self._folder.glob("*.parquet")} & self._keys
+            for key in there - seen:
+                bad += _status(self._folder, key) is not None
+            seen |= there
+            spent_s = time.monotonic() - self._begun
+            if (spent_s > tell_after_s or over) and seen:
+                tell_after_s = spent_s + (0.5 if on_terminal else 10.0)
+                line = _progress_line(len(seen), len(self._keys), bad, spent_s)
+                print(f"\r{line}\033[K" if on_terminal else line, file=sys.stderr,
+                      end="" if on_terminal and not over else "\n", flush=True)  # fmt: skip
+            if over:
+                return
+
+
+def _progress_line(done: int, total: int, bad: int, spent_s: float) -> str:
+    rate = done / max(spent_s, 1e-9)
+    left = (total - done) / rate
+    rest = f"{left / 60:.0f} min left" if left > 90 else f"{left:.0f} s left"
+    told = f", {bad} failed" if bad else ""
+    return f"{done} of {total} runs, {rate:.2g} a second, {rest}{told}"
+
+
+def _clear(folder: Path) -> None:
+    """Remove what the launcher left in its folder, if it is ours and plain."""
+    if folder.is_dir():
+        for path in sorted(folder.rglob("*"), reverse=True):
+            path.rmdir() if path.is_dir() else path.unlink()
+        folder.rmdir()
+
+
+def _short(path: Path) -> str:
+    try:
+        return str(path.relative_to(Path.cwd()))
+    except ValueError:
+        return str(path)
