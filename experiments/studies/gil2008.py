@@ -289,6 +289,7 @@ def runs_of(scene: Scene, arms: Sequence[Arm]) -> Iterator[tuple[str, dict[str, 
         **dataclasses.asdict(scene),
         "odometry_rmse_m": rms(position_errors_m(truth, odometry.means)),
         "odometry_slope": revisited_slope(truth, odometry.means),
+        "matching_precision": matching_precision(recording),
     }
     for arm in arms:
         thin, shown = thinned(recording, arm, stream(scene.seed, "gil2008/choice", scene.draw))
@@ -384,6 +385,18 @@ def right_share(recording: Recording, associations: Sequence[NDArray[np.int64] |
     first[np.unique(told, return_index=True)[1]] = True
     right = np.where(given == own, first, told[given] == told)
     return float(np.mean(right & (given >= 0)))
+
+
+def matching_precision(recording: Recording) -> float:
+    """Share of observations whose descriptor is nearest to that of their landmark's first one."""
+    log, truth = recording.landmarks, recording.truth
+    assert log is not None
+    assert truth is not None
+    ids, first = np.unique(truth.landmark_ids, return_index=True)
+    again = np.ones(len(truth.landmark_ids), bool)
+    again[first] = False
+    nearest = np.argmax(log.descriptors[again] @ log.descriptors[first].T, axis=1)
+    return float(np.mean(ids[nearest] == truth.landmark_ids[again]))
 
 
 def revisited(truth: Array) -> NDArray[np.bool_]:
