@@ -245,6 +245,51 @@ def reproduce(
     reproduce_papers(full=full, only=paper)
 
 
+@app.command()
+def report() -> None:
+    """Write results/report.html anew, from what the studies left in results/.
+
+    Example: estima report
+    """
+    from experiments.console import progress
+    from experiments.report import write_report
+    from experiments.reproduce import RESULTS
+
+    with progress("report", 1.0) as on_progress:
+        print(write_report(RESULTS, on_progress))
+
+
+@app.command("export-table")
+def export_table(
+    path: Annotated[Path, typer.Argument(help="A table, .csv or .parquet.")],
+    form: Annotated[str, typer.Option("--format", help="markdown, or latex (booktabs).")] = (
+        "markdown"
+    ),
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="File to write; else it is printed.")
+    ] = None,
+    digits: Annotated[int, typer.Option(min=1, max=17, help="Significant digits.")] = 4,
+) -> None:
+    """Print a table as Markdown or LaTeX.
+
+    Example: estima export-table results/tables/puzzlebot2024_coverage.csv --format latex
+    """
+    from experiments.table import read_rows
+    from experiments.table_export import FORMATS
+    from sim.errors import InputError
+    from sim.files import write_whole
+
+    if form not in FORMATS:
+        raise InputError(f"--format must be {' or '.join(FORMATS)}, got {form!r}")
+    text = FORMATS[form](read_rows(path), digits)
+    if out is None:
+        print(text, end="")
+        return
+    with write_whole(out) as part:
+        part.write_text(text)
+    print(out)
+
+
 def main() -> None:
     """Run the command line; wrong input ends in one line and code 2, a failed run in code 1."""
     from experiments.console import end

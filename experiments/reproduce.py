@@ -10,6 +10,7 @@ from types import ModuleType
 from experiments.claims import Claim, write
 from experiments.console import progress
 from experiments.figures.style import save_figure
+from experiments.report import note_provenance, write_report
 from experiments.version import ROOT
 from sim.errors import InputError
 
@@ -18,7 +19,7 @@ RESULTS = ROOT / "results"
 
 
 def reproduce(*, full: bool = False, only: str | None = None) -> None:
-    """Run the studies, judge the claims, draw the figures.
+    """Run the studies, judge the claims, draw the figures, write the report.
 
     Parameters
     ----------
@@ -30,12 +31,18 @@ def reproduce(*, full: bool = False, only: str | None = None) -> None:
     if only is not None and only not in PAPERS:
         raise InputError(f"--paper must be one of {', '.join(PAPERS)}, got {only!r}")
     for paper in PAPERS if only is None else (only,):
-        begun = time.monotonic()
-        claims = reproduce_paper(_study(paper), paper, "full" if full else "quick")
+        begun, profile = time.monotonic(), "full" if full else "quick"
+        claims = reproduce_paper(_study(paper), paper, profile)
         write(claims, RESULTS / "claims.csv")
+        seconds = time.monotonic() - begun
+        note_provenance(RESULTS, paper, profile, seconds)
         _print(claims)
-        print(f"{paper}: {time.monotonic() - begun:.0f} s", file=sys.stderr)
-    print(f"claims: results/claims.csv, figures: results/figures, tables: {'results/tables'}")
+        print(f"{paper}: {seconds:.0f} s", file=sys.stderr)
+    write_report(RESULTS)
+    print(
+        "report: results/report.html, claims: results/claims.csv, figures: results/figures, "
+        "tables: results/tables"
+    )
 
 
 def reproduce_paper(study: ModuleType, paper: str, profile: str) -> list[Claim]:

@@ -1,0 +1,266 @@
+"""The report as a file and in a real browser; tables as LaTeX and Markdown."""
+
+import re
+from html.parser import HTMLParser
+from itertools import pairwise
+
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib.figure import Figure
+
+from experiments import report
+from experiments.claims import Claim, write
+from experiments.table import write_frame
+from experiments.table_export import to_latex, to_markdown
+from sim.errors import InputError
+from tests import browser
+
+VOID = {"meta", "link", "img", "br"}
+
+
+def claim(key, verdict, statistic="a < b & c", value=0.5):
+    return Claim(key, "puzzlebot2024", statistic, value, 0.4, 0.6, "at least 0.45", verdict)
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory):
+    """What studies leave: judged claims, a figure with a caption and one without, two tables."""
+    folder = tmp_path_factory.mktemp("results")
+    claims = [
+        claim("PB1", "reproduced"),
+        claim("PB4", "reproduced (quick)"),
+        claim("PB4", "not reproduced; <b>at large k</b> (quick)", "the unfavourable", 0.25),
+        claim("ZZ9", "undecided", "of a claim that nobody described"),
+    ]
+    write(claims, folder / "claims.csv")
+    (folder / "figures").mkdir()
+    for name in ("puzzlebot2024_coverage", "puzzlebot2024_surprise"):
+        page = Figure(figsize=(6.0, 3.0))
+        page.subplots().plot([0, 1])
+        page.savefig(folder / "figures" / f"{name}.png", dpi=100)
+    small = pd.DataFrame({"case": ["a<b", "c"], "k_m": [1e-5, np.nan]})
+    write_frame(small, folder / "tables" / "puzzlebot2024_small.csv")
+    large = pd.DataFrame({"seed": np.arange(1000, 1100), "error_m": np.linspace(0, 1, 100)})
+    write_frame(large, folder / "tables" / "puzzlebot2024_large.csv")
+    report.note_provenance(folder, "puzzlebot2024", "quick", 12.3)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def text(results):
+    return report.write_report(results).read_text()
+
+
+class Outline(HTMLParser):
+    """Elements in order, with their attributes and text; fails where tags do not nest."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.elements, self._open = [], []
+        self.feed(text)
+        assert not self._open
+
+    def handle_starttag(self, tag, attributes):
+        element = {"tag": tag, "text": "", **dict(attributes)}
+        self.elements.append(element)
+        if tag not in VOID:
+            self._open.append(element)
+
+    def handle_endtag(self, tag):
+        assert self._open.pop()["tag"] == tag
+
+    def handle_data(self, data):
+        for element in self._open:
+            element["text"] += data
+
+    def all(self, *tags):
+        return [element for element in self.elements if element["tag"] in tags]
+
+
+def test_structure_that_readers_and_their_aids_rely_on(text):
+    page = Outline(text)
+    levels = [int(e["tag"][1]) for e in page.all("h1", "h2", "h3", "h4")]
+    assert levels[0] == 1
+    assert levels.count(1) == 1
+    assert all(after <= before + 1 for before, after in pairwise(levels))
+    ids = [e["id"] for e in page.elements if "id" in e]
+    assert len(ids) == len(set(ids))
+    for link in page.all("a"):
+        assert link["href"].startswith("tables/") or link["href"][1:] in ids
+    assert len(page.all("table")) == len(page.all("caption"))
+    assert all(cell["scope"] for cell in page.all("th"))
+    assert page.all("html")[0]["lang"] == "en"
+    assert [m for m in page.all("meta") if m.get("name") == "viewport"]
+    for image in page.all("img"):
+        assert len(image["alt"]) > 10
+        assert image["src"].startswith("data:image/png;base64,")
+        assert (image["width"], image["height"]) == ("600", "300")
+    assert "://" not in re.sub(r"base64,[^\"]*", "", text)  # nothing is fetched
+    assert "prefers-color-scheme: dark" in text
+
+
+def test_claims_come_first_and_the_least_favourable_statistic_speaks(text):
+    page = Outline(text)
+    rows = {e["id"]: e["text"] for e in page.all("tbody") if "id" in e}
+    assert "0.5 [0.4, 0.6]" in rows["claim-PB1"]
+    head = rows["claim-PB4"].split("PB4: all 2 statistics")[0]
+    assert "the unfavourable: 0.25 [0.4, 0.6]" in head
+    assert "mixed: 1 reproduced, 1 not reproduced (quick)" in head
+    assert "not judged yet" in rows["claim-GI8"]
+    assert "nobody described" in rows["claim-ZZ9"]
+    assert "<b>at large" not in text
+    assert text.index('id="claims"') < text.index('<h2 id="puzzlebot2024"')
+
+
+def test_a_figure_without_a_caption_still_shows(text):
+    page = Outline(text)
+    figures = {e["id"]: e["text"] for e in page.all("figure")}
+    assert figures["puzzlebot2024_surprise"].strip() == "surprise"
+    assert "PB4: mixed" in figures["puzzlebot2024_coverage"]
+    assert "Not made yet: puzzlebot2024_ideal_and_real" in page.all("main")[0]["text"]
+
+
+def test_small_tables_whole_and_large_ones_begun(text):
+    bodies = {e.get("aria-label"): e["text"] for e in Outline(text).all("div")}
+    assert "a<b1e-05c" in bodies["puzzlebot2024_small"]
+    assert "100 rows, 2 columns; the first 5" in bodies["puzzlebot2024_large"]
+    assert "seeds 1000 to 1099" in bodies["puzzlebot2024_large"]
+    assert "1005" not in bodies["puzzlebot2024_large"]
+
+
+def test_origin_and_command_are_told(text):
+    sections = {e.get("aria-labelledby"): e["text"] for e in Outline(text).all("section")}
+    assert "quick profile, 12 s" in sections["puzzlebot2024"]
+    assert "JUDGED_SEED1000" in sections["puzzlebot2024"]
+    assert "estima reproduce --paper gil2008" in sections["gil2008"]
+    assert "world: office" in sections["decristoforis2020"]  # its study's configuration
+    assert np.__version__ in sections["machine"]
+
+
+def test_an_empty_folder_gives_a_page_that_says_so(tmp_path):
+    text = report.write_report(tmp_path).read_text()
+    assert "none yet" in text
+    assert not Outline(text).all("img")
+
+
+def test_a_damaged_figure_is_named(tmp_path):
+    (tmp_path / "figures").mkdir()
+    (tmp_path / "figures" / "gil2008_8.png").write_bytes(b"nothing")
+    with pytest.raises(InputError, match=r"gil2008_8\.png: not a PNG"):
+        report.write_report(tmp_path)
+
+
+@pytest.mark.parametrize("paper", report.PAPERS)
+def test_findings_are_complete(paper):
+    about = report.findings(paper)
+    assert set(about) == {"title", "about", "claims", "figures"}
+    for name, figure in about["figures"].items():
+        assert name.startswith(f"{paper}_")
+        assert set(figure) == {"title", "alt", "paper", "claims"}
+        assert set(figure["claims"]) <= set(about["claims"])
+        assert len(figure["alt"]) > 40
+
+
+@pytest.fixture(scope="module")
+def tab(results, text):
+    if browser.find() is None:
+        pytest.skip("no Chromium on this machine")
+    with browser.page() as tab:
+        tab.shape(1280, 900)
+        tab.open((results / "report.html").as_uri())
+        yield tab
+
+
+def test_a_browser_loads_it_whole_and_without_complaint(tab):
+    assert tab.complaints() == []
+    images = tab.js("[...document.images].map(i => [i.complete, i.naturalWidth, i.alt])")
+    assert len(images) == 2
+    assert all(complete and width == 600 and alt for complete, width, alt in images)
+
+
+def test_the_keyboard_skips_to_the_claims_and_opens_details(tab):
+    tab.press("Tab")
+    assert tab.js("document.activeElement.textContent") == "Skip to the claims"
+    assert tab.js("document.activeElement.getBoundingClientRect().left") >= 0  # it is shown
+    tab.press("Enter", text="\r")
+    assert tab.js("location.hash") == "#claims"
+    tab.press("Tab")
+    assert tab.js("document.activeElement.textContent") == "PB4: all 2 statistics"
+    assert tab.js("getComputedStyle(document.activeElement).outlineStyle") == "solid"
+    tab.press("Enter", text="\r")
+    assert tab.js("document.querySelector('#claim-PB4 details').open")
+
+
+def test_what_scrolls_sideways_can_be_reached_by_keyboard(tab):
+    assert tab.js("document.querySelectorAll('.scroll').length") > 3
+    assert tab.js("[...document.querySelectorAll('.scroll')].every(e => e.tabIndex == 0)")
+
+
+@pytest.mark.parametrize("dark", [False, True])
+def test_phones_and_dark_mode(tab, dark):
+    tab.shape(360, 780, dark=dark)
+    assert tab.js("document.documentElement.scrollWidth") <= 360
+    tab.js("document.querySelectorAll('details').forEach(d => { d.open = true; })")
+    assert tab.js("document.documentElement.scrollWidth") <= 360
+    assert tab.js("document.images[0].getBoundingClientRect().width") <= 360
+    assert tab.js("parseFloat(getComputedStyle(document.body).fontSize)") >= 16
+    assert tab.js("getComputedStyle(document.images[0]).backgroundColor") == "rgb(255, 255, 255)"
+    page = tab.js("getComputedStyle(document.body).backgroundColor")
+    for name in ("body", ".quiet", ".reproduced", ".not-reproduced", ".undecided", "a"):
+        colour = tab.js(f"getComputedStyle(document.querySelector('{name}')).color")
+        assert contrast(colour, page) >= 4.5, (name, colour, page)
+    assert (luminance(page) < 0.1) == dark
+
+
+def luminance(colour):
+    parts = np.array([float(v) for v in re.findall(r"[\d.]+", colour)[:3]]) / 255.0
+    linear = np.where(parts <= 0.04045, parts / 12.92, ((parts + 0.055) / 1.055) ** 2.4)
+    return float(linear @ [0.2126, 0.7152, 0.0722])
+
+
+def contrast(first, second):
+    """Contrast ratio of WCAG 2."""
+    low, high = sorted([luminance(first), luminance(second)])
+    return (high + 0.05) / (low + 0.05)
+
+
+TABLE = pd.DataFrame(
+    {"case_name": ["a|b", "50 % & {x}\\"], "k_m": [1e-5, np.nan], "n": [3, 4], "ok": [True, False]}
+)
+
+
+def test_markdown():
+    assert to_markdown(TABLE).splitlines() == [
+        "| case_name | k_m | n | ok |",
+        "| --- | ---: | ---: | --- |",
+        r"| a\|b | 1e-05 | 3 | yes |",
+        "| 50 % & {x}\\\\ |  | 4 | no |",
+    ]
+
+
+def test_latex():
+    lines = to_latex(TABLE).splitlines()
+    assert lines[0] == r"\begin{tabular}{lrrl}"
+    assert lines[2] == r"case\_name & k\_m & n & ok \\"
+    assert lines[4] == r"a|b & $1 \times 10^{-5}$ & 3 & yes \\"
+    assert lines[5] == r"50 \% \& \{x\}\textbackslash{} &  & 4 & no \\"
+    assert "$-1.5$" in to_latex(pd.DataFrame({"x": [-1.5]}))
+    assert lines[-1] == r"\end{tabular}"
+
+
+def test_export_from_the_command_line(tmp_path):
+    from typer.testing import CliRunner
+
+    from experiments.cli import app
+
+    write_frame(TABLE[["n"]], tmp_path / "t.csv")
+    done = CliRunner().invoke(app, ["export-table", str(tmp_path / "t.csv")])
+    assert done.stdout == "| n |\n| ---: |\n| 3 |\n| 4 |\n"
+    out = tmp_path / "t.tex"
+    CliRunner().invoke(
+        app, ["export-table", str(tmp_path / "t.csv"), "--format", "latex", "-o", str(out)]
+    )
+    assert out.read_text().startswith(r"\begin{tabular}{r}")
+    wrong = CliRunner().invoke(app, ["export-table", str(tmp_path / "t.csv"), "--format", "x"])
+    assert "--format must be markdown or latex" in str(wrong.exception)
