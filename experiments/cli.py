@@ -232,6 +232,55 @@ def bench(
 
 
 @app.command()
+def table(
+    name: Annotated[str, typer.Argument(help="A sweep's name, or a folder or file of rows.")],
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="File to write, .csv or .parquet.")
+    ] = None,
+    against: Annotated[
+        str | None, typer.Option(help="Give errors relative to this estimator's, too.")
+    ] = None,
+    all_versions: Annotated[
+        bool, typer.Option("--all-versions", help="Keep rows of other versions of the code.")
+    ] = False,
+    times: Annotated[bool, typer.Option("--times", help="Keep computing times.")] = False,
+) -> None:
+    """Collect the rows of a sweep: a summary, or with -o all of them.
+
+    Example: estima table leaderboard --against smoother
+    """
+    from experiments.collect import collect, summary
+    from experiments.table import write_frame
+
+    rows = collect(name, all_versions=all_versions, times=times)
+    if out is None:
+        print(summary(rows, against).to_string(index=False, float_format=lambda v: f"{v:.4g}"))
+        return
+    write_frame(rows, out)
+    print(f"{out}: {len(rows)} rows, {len(rows.columns)} columns")
+
+
+@app.command()
+def plot(
+    name: Annotated[str, typer.Argument(help="A sweep's name, or a folder or file of rows.")],
+    x: Annotated[str, typer.Option(help="Swept setting, such as robot.kr.")],
+    y: Annotated[str, typer.Option(help="What was found.")] = "ate_rmse_m",
+    by: Annotated[str | None, typer.Option(help="One line a value of this.")] = None,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Picture to write.")] = Path("plot.png"),
+) -> None:
+    """Draw a column of a sweep against a swept setting, with 95 % intervals.
+
+    Example: estima plot run --x robot.kr --y ate_rmse_m --by choice.estimator
+    """
+    from experiments.collect import collect
+    from experiments.figures.style import save_figure
+    from experiments.figures.sweep import sweep_figure
+
+    save_figure(sweep_figure(collect(name, times=True), x, y, by), out)
+    print(out)
+
+
+@app.command()
 def reproduce(
     full: Annotated[bool, typer.Option("--full", help="The judged profile.")] = False,
     paper: Annotated[str | None, typer.Option(help="Only this paper.")] = None,

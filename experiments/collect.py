@@ -1,0 +1,105 @@
+"""Rows of a sweep as one table: of one code version, in an order that does not depend on chance."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from experiments.table import read_rows
+from experiments.version import ROOT, code_version
+from sim.errors import InputError
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+_TIMES = ("step_time_us",)  # they differ from run to run
+_ORIGIN = ("run_key", "code_version", "recording_checksum")
+_LAST_KEY = "repeat"  # columns up to it are settings, those after it what was found
+
+
+def collect(name: str, *, all_versions: bool = False, times: bool = False) -> pd.DataFrame:
+    """Read all rows of results/runs/NAME, or of a folder or file.
+
+    Parameters
+    ----------
+    name
+        A sweep's name, or a path.
+    all_versions
+        Keep the rows that other versions of the code have made; by default they are left out,
+        with a word about it.
+    times
+        Keep the columns of computing times; without them the same sweep gives the same table.
+
+    Raises
+    ------
+    InputError
+        If there are no rows, or none of this version of the code.
+    """
+    path = ROOT / "results" / "runs" / name
+    path = path if path.exists() else Path(name)
+    if not path.exists():
+        there = sorted(p.name for p in (ROOT / "results" / "runs").glob("*") if p.is_dir())
+        raise InputError(f"no sweep named {name}; there are: {', '.join(there) or 'none'}")
+    table = read_rows(path)
+    for column in ("status", *_ORIGIN):
+        if column not in table:
+            raise InputError(f"{path}: not rows of runs, column {column} is missing")
+    if not all_versions:
+        mine = table["code_version"] == code_version()
+        if not mine.any():
+            raise InputError(
+                f"{path}: all {len(table)} rows are of other versions of the code; run the sweep "
+                "again, or see them with --all-versions"
+            )
+        if not mine.all():
+            print(f"left out {int((~mine).sum())} rows of other code versions", file=sys.stderr)
+        table = table[mine]
+    if not times:
+        table = table.drop(columns=[c for c in _TIMES if c in table])
+    order = [*swept(table), "run_key", _LAST_KEY]
+    return table.sort_values(order, kind="stable", ignore_index=True)
+
+
+def swept(table: pd.DataFrame) -> list[str]:
+    """Settings that differ between the rows."""
+    settings = list(table.columns[: list(table.columns).index(_LAST_KEY)])
+    return [c for c in settings if c not in _ORIGIN and table[c].nunique(dropna=False) > 1]
+
+
+def measured(table: pd.DataFrame) -> list[str]:
+    """Columns of what the runs found."""
+    found = table.columns[list(table.columns).index(_LAST_KEY) + 1 :]
+    return [c for c in found if c not in _ORIGIN and table[c].dtype.kind in "fi"]
+
+
+def summary(table: pd.DataFrame, against: str | None = None) -> pd.DataFrame:
+    """Mean of the main errors for each combination of the swept settings but the seeds.
+
+    Parameters
+    ----------
+    against
+        An estimator's name: errors are also given relative to its, on the same recordings.
+    """
+    import numpy as np
+
+    by = [c for c in swept(table) if c not in ("seed", "world_seed", _LAST_KEY)]
+    shown = [c for c in ("ate_rmse_m", "heading_rmse_rad", "ate_aligned_rmse_m", "nees_mean",
+                         "step_time_us") if c in table]  # fmt: skip
+    if against is not None:
+        one = table[table["choice.estimator"] == against]
+        if one.empty:
+            raise InputError(f"no rows of estimator {against}")
+        reference = one.groupby("recording_checksum")["ate_rmse_m"].mean()
+        ratio = table["ate_rmse_m"] / table["recording_checksum"].map(reference)
+        column = f"ate_rmse_over_{against}"
+        table = table.assign(**{column: np.log(ratio)})
+        shown.append(column)
+    groups = table.groupby(by, dropna=False) if by else table.groupby(lambda _: "all runs")
+    found = groups[shown].mean()
+    if against is not None:
+        found[column] = np.exp(found[column])
+    found.insert(0, "runs", groups.size())
+    bad = groups["status"].agg(lambda statuses: int((statuses != "ok").sum()))
+    found.insert(1, "with_remarks", bad)
+    return found.reset_index()

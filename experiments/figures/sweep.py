@@ -1,0 +1,64 @@
+"""Any column of a sweep against any swept setting."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from experiments.figures.style import CYCLE, figure
+from experiments.statistics import mean_interval
+from sim.errors import InputError
+
+
+def sweep_figure(table: pd.DataFrame, x: str, y: str, by: str | None = None) -> Figure:
+    """Mean of `y` over the recordings, with 95 % intervals, against `x`, one line a value of `by`.
+
+    Repeats over one recording are averaged first: the recording is the unit of inference.
+
+    Raises
+    ------
+    InputError
+        If a column is not in the table, or y holds no numbers.
+    """
+    for column in filter(None, (x, y, by)):
+        if column not in table:
+            near = [c for c in table.columns if column.split(".")[-1] in c]
+            hint = f"; did you mean {', '.join(near[:4])}?" if near else ""
+            raise InputError(f"the sweep has no column {column}{hint}")
+    if table[y].dtype.kind not in "fi":
+        raise InputError(f"column {y} holds no numbers")
+    page = figure(6.5, 4.0)
+    ax = page.subplots()
+    numeric = table[x].dtype.kind in "fi"
+    names = sorted(table[x].dropna().unique())
+    place = {name: float(name) if numeric else float(i) for i, name in enumerate(names)}
+    groups = [("", table)] if by is None else list(table.groupby(by))
+    positive = numeric and min(place.values()) > 0.0
+    wide = positive and max(place.values()) > 20.0 * min(place.values())
+    for i, (label, rows) in enumerate(groups):
+        points = []
+        for name, part in rows.groupby(x):
+            values = part.groupby("recording_checksum")[y].mean().dropna()
+            if len(values):
+                points.append((place[name], mean_interval(values)))
+        at = np.array([p for p, _ in points])
+        shift = 0.0 if numeric else 0.08 * (i - (len(groups) - 1) / 2)
+        value = np.array([m.value for _, m in points])
+        low = np.array([m.low for _, m in points])
+        high = np.array([m.high for _, m in points])
+        ax.errorbar(
+            at + shift, value, yerr=[value - low, high - value], marker="o", ms=4, capsize=2,
+            ls="-" if numeric else "none", color=CYCLE[i % len(CYCLE)], label=str(label),
+        )  # fmt: skip
+    if wide:
+        ax.set_xscale("log")
+    if not numeric:
+        ax.set_xticks(range(len(names)), [str(n) for n in names], rotation=20, ha="right")
+    low_y = table[y].min()
+    if low_y > 0.0 and table[y].max() > 30.0 * low_y:
+        ax.set_yscale("log")
+    ax.set(xlabel=x, ylabel=y, title="mean over recordings, 95 % intervals")
+    if by is not None:
+        page.legend(title=by, loc="outside right upper")
+    return page

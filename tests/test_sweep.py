@@ -1,0 +1,269 @@
+"""Sweeps: what is expanded, composed and packed, and what is left after failures and kills."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from experiments import sweep
+from experiments.build import recording_settings
+from experiments.collect import collect, measured, summary, swept
+from experiments.compose import compose
+from experiments.figures.sweep import sweep_figure
+from experiments.run import run_key
+from sim.errors import InputError
+from tests.test_cli import QUICK, ROOT, estima, refused
+
+SHORT = [*QUICK, "route=linear_1"]
+
+
+def table_of(name):
+    return collect(name)
+
+
+def folder(name):
+    return ROOT / "results" / "runs" / name
+
+
+@pytest.fixture
+def name(request):
+    """Return a sweep's name of its own, cleared before and after."""
+    own = f"test_{request.node.name}".replace("[", "_").replace("]", "")
+    clear(own)
+    yield own
+    clear(own)
+
+
+def clear(name):
+    for path in sorted(folder(name).rglob("*"), reverse=True):
+        path.rmdir() if path.is_dir() else path.unlink()
+    if folder(name).exists():
+        folder(name).rmdir()
+
+
+def test_combinations_are_those_of_the_last_values():
+    found = list(sweep.combinations(["seed=range(0,3)", "robot.kr=1e-5,1e-4", "seed=7,8", "a=b"]))
+    assert found == [
+        ["seed=7", "robot.kr=1e-05", "a=b"],
+        ["seed=7", "robot.kr=0.0001", "a=b"],
+        ["seed=8", "robot.kr=1e-05", "a=b"],
+        ["seed=8", "robot.kr=0.0001", "a=b"],
+    ]
+    with pytest.raises(InputError, match="interval"):
+        list(sweep.combinations(["robot.kr=interval(0,1)"]))
+
+
+def test_the_quick_composer_resolves_as_hydra_does():
+    given = ["world=office", "estimator=ekf_icp,odometry", "sensors=lms291", "robot.kr=1e-6,2e-6"]
+    runs = list(sweep.planned([*given, "estimator.window_s=0.1", "+study=decristoforis2020_office",
+                               "seed=3,4"]))  # fmt: skip
+    assert len(runs) == 2 * 2 * 2
+    for run in runs:
+        c = run.config
+        lines = [
+            "+study=decristoforis2020_office", "world=office", "sensors=lms291",
+            f"estimator={run.choices['estimator']}", f"robot.kr={c['robot']['kr']}",
+            f"seed={c['seed']}", "estimator.window_s=0.1", "picture=false",
+        ]  # fmt: skip
+        expected = compose(lines)
+        expected.pop("sweeps")
+        assert c == expected
+        assert c["estimator"]["kr"] == c["robot"]["kr"]  # belief follows truth after the change
+    assert len({run.key for run in runs}) == 8
+
+
+def test_a_study_sweeps_its_own_values_unless_told_otherwise():
+    runs = list(sweep.planned(["+study=decristoforis2020_office"]))
+    assert len(runs) == 20 * 4
+    assert {run.config["seed"] for run in runs} == set(range(1000, 1020))
+    runs = list(sweep.planned(["+study=decristoforis2020_office", "seed=1", "estimator=odometry"]))
+    assert [run.config["seed"] for run in runs] == [1]
+
+
+def test_unknown_keys_and_options_are_refused():
+    with pytest.raises(InputError, match=r"robot\.krr"):
+        list(sweep.planned(["robot.krr=1,2"]))
+    refused(estima("run", "-m", "robot.krr=1,2"), "robot.krr")
+    refused(estima("run", "-m", "world=nowhere,room"), "nowhere")
+    refused(estima("run", "-m", "--frob", "seed=1,2"), "--frob")
+
+
+def test_keys_tell_what_decides_the_rows(tmp_path, monkeypatch):
+    config = compose([])
+    key = run_key(config)
+    assert run_key({**config, "name": "other"}) == key
+    assert run_key({**config, "seed": 5}) != key
+    mine = tmp_path / "mine_for_key.py"
+    mine.write_text("class Mine: pass\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    own = {**config, "estimator": {"_target_": "mine_for_key.Mine"}}
+    before = run_key(own)
+    mine.write_text("class Mine: x = 1\n")
+    from experiments.run import _source_digest
+
+    _source_digest.cache_clear()
+    assert run_key(own) != before
+    with pytest.raises(InputError, match=r"nowhere\.npz"):
+        recording_settings({**config, "recording": "nowhere.npz"})
+
+
+def test_packing_keeps_recordings_together():
+    config = compose([])
+    runs = [
+        sweep.Run({**config, "seed": seed, "repeats": r}, {}, f"{seed}-{r}")
+        for seed in range(6)
+        for r in (1, 2)
+    ]
+    jobs = sweep.packed(runs, 3)
+    assert sorted(run.key for job in jobs for run in job) == sorted(run.key for run in runs)
+    assert len(jobs) == 3
+    for job in jobs:
+        assert len({run.config["seed"] for run in job}) == 2
+    assert max(len(job) for job in sweep.packed(runs, 100)) == 1
+
+
+def test_failed_runs_leave_rows_and_the_rest_goes_on(name, tmp_path):
+    broken = tmp_path / "broken.py"
+    broken.write_text(
+        "from estimators.odometry import Odometry\n"
+        "class Broken(Odometry):\n"
+        "    def step(self, frame):\n"
+        "        if frame.stamp > 1.0 and self.kr > 1e-4:\n"
+        "            raise ValueError('a planted fault')\n"
+        "        return super().step(frame)\n"
+    )
+    (tmp_path / "conf" / "estimator").mkdir(parents=True)
+    option = tmp_path / "conf" / "estimator" / "broken.yaml"
+    option.write_text("_target_: broken.Broken\nkr: ${robot.kr}\nkl: ${robot.kl}\n")
+    sweep_ = ["run", "-m", "--config-dir", str(tmp_path / "conf"), *SHORT, "estimator=broken",
+              "robot.kr=1e-5,1e-3", "seed=0,1", f"name={name}"]  # fmt: skip
+    done = estima(*sweep_, PYTHONPATH=f"{ROOT}:{tmp_path}")
+    assert done.returncode == 1, done.stderr
+    assert "2 of 4 runs" in done.stderr
+    assert "a planted fault" in done.stderr
+    rows = table_of(name)
+    assert len(rows) == 4
+    assert sorted(rows["status"] == "ok") == [False, False, True, True]
+    stamps = {p: p.stat().st_mtime_ns for p in folder(name).glob("*.parquet")}
+    again = estima(*sweep_, PYTHONPATH=f"{ROOT}:{tmp_path}")
+    assert "2 of them done before" in again.stderr
+    later = {p for p in folder(name).glob("*.parquet") if p.stat().st_mtime_ns > stamps[p]}
+    assert len(later) == 2  # only what had failed
+
+
+@pytest.mark.parametrize("launcher", ["basic", "submitit_local", "ray"])
+def test_launchers_give_the_same_table(name, launcher):
+    plugin = {"submitit_local": "hydra_submitit_launcher", "ray": "hydra_ray_launcher"}
+    if launcher in plugin:
+        pytest.importorskip(f"hydra_plugins.{plugin[launcher]}", reason="an extra, not installed")
+    swept_ = [*SHORT, "seed=0,1", "robot.kr=1e-5,1e-4"]
+    first, second = f"{name}_a", f"{name}_b"
+    try:
+        for own, choice in ((first, "joblib"), (second, launcher)):
+            clear(own)
+            done = estima("run", "-m", *swept_, f"name={own}", f"hydra/launcher={choice}")
+            assert done.returncode == 0, done.stderr
+        left, right = (table_of(own).drop(columns="name") for own in (first, second))
+        pd.testing.assert_frame_equal(left, right, check_exact=True)
+    finally:
+        clear(first)
+        clear(second)
+
+
+@pytest.mark.slow
+def test_a_killed_sweep_resumes_to_the_same_table(name):
+    swept_ = [*SHORT, "seed=range(0,50)", "robot.kr=1e-5,1e-4", "estimator.window_s=0.05,0.1"]
+    whole = f"{name}_whole"
+    clear(whole)
+    rng = np.random.default_rng(0)
+    try:
+        command = [sys.executable, "-m", "experiments.cli", "run", "-m", *swept_, f"name={name}"]
+        for _ in range(5):
+            process = subprocess.Popen(
+                command, cwd=ROOT, stderr=subprocess.DEVNULL, start_new_session=True,
+                env={**os.environ, "PYTHONPATH": str(ROOT)},
+            )  # fmt: skip
+            time.sleep(float(rng.uniform(4.0, 9.0)))
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+        assert estima("run", "-m", *swept_, f"name={name}").returncode == 0
+        assert estima("run", "-m", *swept_, f"name={whole}").returncode == 0
+        for own in (name, whole):
+            rows = table_of(own).drop(columns="name")
+            rows.to_csv(folder(own) / "all.csv", index=False)
+        resumed, undisturbed = ((folder(o) / "all.csv").read_bytes() for o in (name, whole))
+        assert resumed == undisturbed
+        assert len(pd.read_csv(folder(name) / "all.csv")) == 200
+    finally:
+        clear(whole)
+
+
+def rows(n=6):
+    """Rows as a sweep leaves them."""
+    rng = np.random.default_rng(0)
+    return pd.DataFrame(
+        {
+            "choice.estimator": ["a", "b"] * n,
+            "robot.kr": np.repeat([1e-5, 1e-3], n),
+            "seed": np.tile(np.repeat(np.arange(n // 2), 2), 2),
+            "repeat": 0,
+            "run_key": [f"{i:02d}" for i in range(2 * n)],
+            "code_version": "v",
+            "recording_checksum": [f"r{i // 2}" for i in range(2 * n)],
+            "status": "ok",
+            "ate_rmse_m": np.tile([1.0, 2.0], n) * np.repeat(np.exp(rng.normal(size=n)), 2),
+            "step_time_us": rng.random(2 * n),
+        }
+    )
+
+
+def test_tables_know_settings_from_findings_and_compare_on_the_same_recordings():
+    table = rows()
+    assert swept(table) == ["choice.estimator", "robot.kr", "seed"]
+    assert measured(table) == ["ate_rmse_m", "step_time_us"]
+    found = summary(table, against="a").set_index(["choice.estimator", "robot.kr"])
+    np.testing.assert_allclose(found.loc["a", "ate_rmse_over_a"], 1.0)
+    np.testing.assert_allclose(found.loc["b", "ate_rmse_over_a"], 2.0)
+    assert (found["runs"] == 3).all()
+    with pytest.raises(InputError, match="no rows of estimator c"):
+        summary(table, against="c")
+
+
+def test_rows_of_other_code_are_left_out(tmp_path, capsys):
+    from experiments.version import code_version
+
+    table = rows()
+    table.to_parquet(tmp_path / "x.parquet")
+    with pytest.raises(InputError, match="other versions"):
+        collect(str(tmp_path))
+    assert len(collect(str(tmp_path), all_versions=True)) == len(table)
+    table.loc[:4, "code_version"] = code_version()
+    table.to_parquet(tmp_path / "x.parquet")
+    assert len(collect(str(tmp_path))) == 5
+    assert "left out 7 rows" in capsys.readouterr().err
+
+
+def test_plots_name_a_missing_column_and_average_recordings():
+    page = sweep_figure(rows(), "robot.kr", "ate_rmse_m", "choice.estimator")
+    lines = page.axes[0].get_lines()
+    assert page.axes[0].get_xscale() == "log"
+    table = rows()
+    expected = table[(table["choice.estimator"] == "a")].groupby("robot.kr")["ate_rmse_m"].mean()
+    np.testing.assert_allclose(lines[0].get_ydata(), expected)
+    with pytest.raises(InputError, match=r"robot\.krr"):
+        sweep_figure(rows(), "robot.krr", "ate_rmse_m")
+    with pytest.raises(InputError, match="no numbers"):
+        sweep_figure(rows(), "robot.kr", "status")
+
+
+def test_nothing_is_left_of_the_plan(name):
+    done = estima("run", "-m", *SHORT, "seed=0,1", f"name={name}")
+    assert done.returncode == 0, done.stderr
+    assert {path.suffix for path in folder(name).iterdir()} == {".parquet"}
+    assert not list(Path.cwd().glob("multirun*"))
