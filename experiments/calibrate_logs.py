@@ -18,7 +18,9 @@ from scipy import optimize, stats
 from experiments.calibrate import Measured
 from sim import se2
 from sim.errors import InputError
+from sim.formats.assemble import chained
 from sim.formats.khepera import WheelLaserLog
+from sim.formats.lego import GEOMETRIC_TRACK_M, SCANNER_AHEAD_M, TICK_M, TickLog
 from sim.robot import arc_increment
 
 Array = NDArray[np.float64]
@@ -207,3 +209,91 @@ def _law(square: Array, path: Array) -> Array:
         if k.min() <= 0.0:  # at the bound of one, the other stands alone
             k = np.where(k > 0.0, right_hand / np.diag(normal), _LEAST_K)
     return k
+
+
+@dataclass(frozen=True)
+class TrackCalibration:
+    """Length of a tick, effective track, start heading, with 95 % intervals, and the errors.
+
+    Attributes
+    ----------
+    tick_m, track_m
+        Ground travel per tick of either track; distance that explains the turns.
+    start
+        (3,) pose of the axle at the first reading.
+    rms_m
+        RMS distance of the scanner's positions from the reference that was fitted.
+    """
+
+    tick_m: Measured
+    track_m: Measured
+    start: Array
+    rms_m: float
+
+
+def scanner_positions(log: TickLog, tick_m: float, track_m: float, start: Array) -> Array:
+    """Positions (N, 2) of the scanner by dead reckoning of the axle from a start pose (3,)."""
+    steps = arc_increment(np.diff(log.ticks, axis=0) * tick_m, track_m)
+    axle = se2.compose(start, chained(steps))
+    ahead = SCANNER_AHEAD_M * np.stack([np.cos(axle[:, 2]), np.sin(axle[:, 2])], axis=1)
+    positions: Array = axle[:, :2] + ahead
+    return positions
+
+
+def dead_reckoning_rms_m(
+    log: TickLog, stamps: Array, positions: Array, tick_m: float, track_m: float, start: Array
+) -> float:
+    """RMS distance, m, of dead reckoning from reference positions (N, 2) at stamps (N,)."""
+    off = _off_reference(log, stamps, positions, tick_m, track_m, start)
+    return float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
+
+
+def _off_reference(
+    log: TickLog, stamps: Array, positions: Array, tick_m: float, track_m: float, start: Array
+) -> Array:
+    reached = scanner_positions(log, tick_m, track_m, start)
+    inside = (stamps >= log.stamps[0]) & (stamps <= log.stamps[-1])
+    at = np.stack([np.interp(stamps[inside], log.stamps, reached[:, i]) for i in (0, 1)], axis=1)
+    off: Array = at - positions[inside]
+    return off
+
+
+def calibrate_track(
+    log: TickLog,
+    stamps: Array,
+    positions: Array,
+    heading_rad: float,
+    tick_m: float = TICK_M,
+    track_m: float = GEOMETRIC_TRACK_M,
+) -> TrackCalibration:
+    """Fit tick, track and start heading to reference positions (N, 2) at stamps (N,).
+
+    The camera tells no heading, so the start's is fitted; its position is the reference's first.
+    Errors of dead reckoning build up: neighbours are alike, and the intervals count every
+    twentieth reading only.
+
+    Parameters
+    ----------
+    heading_rad
+        Rough heading at the start.
+    """
+
+    def start(heading: float) -> Array:
+        ahead = SCANNER_AHEAD_M * np.array([math.cos(heading), math.sin(heading)])
+        return np.array([*(positions[0] - ahead), heading])
+
+    def residual(unknowns: Array) -> Array:
+        tick, track, heading = unknowns
+        off = _off_reference(log, stamps, positions, tick * tick_m, track * track_m, start(heading))
+        flat: Array = off.ravel()
+        return flat
+
+    fit = optimize.least_squares(residual, np.array([1.0, 1.0, heading_rad]))
+    covariance = np.linalg.inv(fit.jac.T @ fit.jac) * float(np.mean(fit.fun**2)) * 20.0
+    half = float(stats.norm.ppf(0.975)) * np.sqrt(np.diag(covariance))[:2]
+    tick, track = (
+        Measured(float(v * u), float((v - h) * u), float((v + h) * u))
+        for v, h, u in zip(fit.x[:2], half, (tick_m, track_m), strict=True)
+    )
+    rms_m = float(np.sqrt(2.0 * np.mean(fit.fun**2)))
+    return TrackCalibration(tick, track, start(float(fit.x[2])), rms_m)

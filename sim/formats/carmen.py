@@ -196,11 +196,9 @@ def to_recording(
     else:
         assemble.require_readings(len(log.scan_stamps), 2, log.where, "scans")
         edges = log.edges if len(log.edges) else np.zeros((len(log.scan_stamps) - 1, 3))
-        chain = np.zeros((len(log.scan_stamps), 3))
         if missing := int(np.sum(~np.isfinite(edges).all(axis=1))):
             notes["edges_missing"] = missing
-        for i, edge in enumerate(np.nan_to_num(edges)):
-            chain[i + 1] = se2.compose(chain[i], edge)
+        chain = assemble.chained(np.nan_to_num(edges))
         wheels = assemble.wheels_from_poses(log.scan_stamps.copy(), chain, track_m, notes)
         notes["wheels_from"] = "edges of the graph" if len(log.edges) else "nothing"
         truth = Truth(log.scan_stamps.copy(), log.scan_poses.copy())
@@ -297,9 +295,7 @@ def write_carmen(path: Path, recording: Recording) -> None:
     from sim.robot import arc_increment
 
     steps = arc_increment(np.diff(recording.wheels.position_m, axis=0), recording.robot.track_m)
-    poses = np.zeros((len(recording.wheels.stamps), 3))
-    for i, step in enumerate(steps):
-        poses[i + 1] = se2.compose(poses[i], step)
+    poses = assemble.chained(steps)
     heading = np.unwrap(poses[:, 2])
     lines = [
         f"ODOM {x:.17g} {y:.17g} {a:.17g} 0 0 0 {t:.17g} estima {t:.17g}"

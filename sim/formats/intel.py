@@ -17,14 +17,14 @@ from numpy.typing import NDArray
 from sim.errors import InputError
 from sim.formats import assemble
 from sim.formats.carmen import NOMINAL_RADIUS_M, NOMINAL_TRACK_M, scan_recording, seen_ranges
-from sim.formats.text import LARGEST, read_bytes
+from sim.formats.text import LARGEST, read_bytes, read_words
 from sim.recording import Recording, Truth
 from sim.sensors import Laser, Mount
 
 Array = NDArray[np.float64]
 
 _NO_RETURN_M = 81.83  # what the log writes where nothing was seen
-_MOST_BEAMS = 100_000
+_N_THINNED_BEAMS, _THINNED_MAX_RANGE_M = 180, 50.0
 
 
 def parse_intel(data: bytes, where: str) -> tuple[Array, Array, Array]:
@@ -109,6 +109,82 @@ def read_intel(
         wheel_radius_m,
         {"source": "intel", "notes": notes},
     )
+
+
+def read_thinned_intel(
+    scans: Path,
+    odometry: Path,
+    matches: Path,
+    *,
+    track_m: float = NOMINAL_TRACK_M,
+    wheel_radius_m: float = NOMINAL_RADIUS_M,
+) -> tuple[Recording, Array]:
+    """A denser thinning of the same drive: 2726 scans with odometry between, but without clock.
+
+    Parameters
+    ----------
+    scans
+        Ranges, one scan a line, m.
+    odometry
+        `dx dy dphi` from each scan to the next.
+    matches
+        CSV of scans that also stand in a log with a clock: scan number, source, number there,
+        unix time, pose.
+
+    Returns
+    -------
+    Recording
+        With stamps of the matched scans; between them time is shared out by what the odometry
+        says the robot did (0.5 m/s and 0.8 rad/s at full speed). Matches that would make it move
+        more than three times as fast are left out.
+    Array
+        (N,) numbers of the scans whose stamps are known.
+    """
+    where = str(scans)
+    ranges = read_words(scans).table(_N_THINNED_BEAMS, "scans")
+    steps = read_words(odometry).table(3, "odometry")[: len(ranges) - 1]
+    words = read_words(matches)
+    lines = np.arange(1, len(words.line_numbers))  # the first line names the columns
+    numbers = words.whole(lines, 0, "the number of a scan", 0, len(ranges) - 1)
+    times = words.finite(lines, 3, 1, "the time of a match")[:, 0]
+    assemble.require_readings(min(len(ranges), len(steps) + 1, len(times)), 2, where, "scans")
+    effort = np.hypot(steps[:, 0], steps[:, 1]) / 0.5 + np.abs(steps[:, 2]) / 0.8 + 1e-3
+    busy_s = np.concatenate([[0.0], np.cumsum(effort)])
+    ranges = ranges[: len(busy_s)]
+    known: list[tuple[int, float]] = []
+    for number, time in sorted(zip(numbers.tolist(), times.tolist(), strict=True)):
+        if number >= len(busy_s):
+            continue
+        if known:
+            before, then = known[-1]
+            if number <= before or time - then <= 0.3 * (busy_s[number] - busy_s[before]):
+                continue
+        known.append((number, time))
+    rows, clock = np.array([k[0] for k in known]), np.array([k[1] for k in known])
+    stamps = np.interp(busy_s, busy_s[rows], clock)
+    stamps[: rows[0]] = clock[0] - (busy_s[rows[0]] - busy_s[: rows[0]])
+    stamps[rows[-1] :] = clock[-1] + (busy_s[rows[-1] :] - busy_s[rows[-1]])
+    notes: assemble.Notes = {"matches_left_out": len(numbers) - len(known)}
+    wheels = assemble.wheels_from_poses(stamps, assemble.chained(steps), track_m, notes)
+    resolution = math.pi / ranges.shape[1]
+    laser = Laser(
+        rate_hz=1.0,
+        n_beams=ranges.shape[1],
+        fov_rad=resolution * (ranges.shape[1] - 1),
+        max_range_m=_THINNED_MAX_RANGE_M,
+        mount=Mount(yaw_rad=-resolution / 2.0),
+    )
+    recording = scan_recording(
+        wheels,
+        stamps,
+        seen_ranges(ranges, _THINNED_MAX_RANGE_M),
+        laser,
+        None,
+        track_m,
+        wheel_radius_m,
+        {"source": "intel, thinned", "notes": notes},
+    )
+    return recording, rows.astype(np.int64)
 
 
 def _number(value: Any) -> float:

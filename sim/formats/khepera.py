@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from sim import se2
 from sim.errors import InputError
+from sim.formats.assemble import chained
 from sim.formats.text import LARGEST, read_bytes, read_members
 from sim.recording import Recording, Truth, WheelLog
 from sim.robot import RobotGeometry
@@ -128,9 +129,7 @@ def to_recording(
     travel = np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
     laser = np.broadcast_to(np.array(T_base_laser), log.laser_motion.shape)
     motion = se2.compose(laser, se2.compose(log.laser_motion, se2.inverse(laser)))
-    poses = np.zeros((len(stamps), 3))
-    for i, step in enumerate(motion):
-        poses[i + 1] = se2.compose(poses[i], step)
+    poses = chained(motion)
     return Recording(
         frame_stamps=stamps,
         wheels=WheelLog(stamps.copy(), travel),

@@ -109,7 +109,8 @@ def _check_tables(path: Path) -> None:
             kinds = database.execute("SELECT type, sql FROM sqlite_schema LIMIT 1000").fetchall()
         database.close()
     except sqlite3.Error as error:
-        raise InputError(f"{path}: damaged database ({error})") from error
+        reason = " ".join(str(error).split())[:200]
+        raise InputError(f"{path}: damaged database ({reason})") from error
     for kind, sql in kinds:
         if kind not in ("table", "index") or "virtual" in str(sql).lower():
             raise InputError(f"{path}: a database with a {kind} of its own is no bag")

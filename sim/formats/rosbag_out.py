@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from sim import se2
 from sim.errors import InputError
+from sim.formats.assemble import chained
 from sim.formats.rosbag import (
     ABOUT,
     CLOUD,
@@ -376,17 +377,6 @@ def covariance_6x6(planar: Array) -> Array:
     full = np.zeros((6, 6))
     full[PLANAR] = planar
     return full
-
-
-def chained(steps: Array) -> Array:
-    """Poses (N + 1, 3) from the origin on by relative motions (N, 3)."""
-    poses = np.zeros((len(steps) + 1, 3))
-    heading = np.concatenate([[0.0], np.cumsum(steps[:, 2])])
-    cos, sin = np.cos(heading[:-1]), np.sin(heading[:-1])
-    poses[1:, 0] = np.cumsum(cos * steps[:, 0] - sin * steps[:, 1])
-    poses[1:, 1] = np.cumsum(sin * steps[:, 0] + cos * steps[:, 1])
-    poses[:, 2] = se2.wrap(heading)
-    return poses
 
 
 def _times(a: Array, b: Array) -> Array:
