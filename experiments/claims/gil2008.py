@@ -37,7 +37,7 @@ ERRORS = {
 }
 NAMES = {
     "paper": "the filter as printed",
-    "2.0": "FastSLAM 2.0",
+    "fastslam2": "FastSLAM 2.0",
     "ekf_slam": "EKF-SLAM",
 }
 NOISE = {"paper": "noise of 10 px", "pixel": "noise of 1 px"}
@@ -163,7 +163,7 @@ def gi7(association: pd.DataFrame) -> list[Claim]:
     """GI7: an association of each particle's own outlives errors; descriptors make it sturdier."""
     claims = []
     for noise, table in association.groupby("noise", sort=False):
-        ours = table[(table["filter"] == "2.0") & np.isclose(table["p0"], 1e-3)]
+        ours = table[(table["filter"] == "fastslam2") & np.isclose(table["p0"], 1e-3)]
         known = ours[ours["association"] == "known"].set_index("seed")["revised_rmse_m"]
         described = ours[ours["association"] == "descriptor"]
         for _, part in described.groupby("sigma_descriptor"):

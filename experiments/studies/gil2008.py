@@ -84,8 +84,8 @@ FILTERS: dict[str, dict[str, Any]] = {
         "ess_share": 1.0,
         "noise_model": "diagonal",
     },
-    "1.0": {"proposal": "motion"},
-    "2.0": {"proposal": "optimal"},
+    "fastslam1": {"proposal": "motion"},
+    "fastslam2": {"proposal": "optimal"},
 }
 
 
@@ -447,18 +447,20 @@ def plan(profile: Profile) -> dict[Scene, list[Arm]]:
 
     for seed, noise in itertools.product(seeds, noises):
         scene, judged = Scene(seed, noise=noise), noise == "paper"
-        for m, name in itertools.product(PARTICLES, ("paper", "2.0")):
-            more = {"n_particles": m}
-            add(scene, _arm("particles", name, more, more))
+        for m, name in itertools.product(PARTICLES, ("paper", "fastslam2")):
+            if judged or name == "fastslam2":
+                add(scene, _arm("particles", name, {"n_particles": m}, {"n_particles": m}))
         add(scene, Arm("bound", (("filter", "batch"),), (), method="batch"))
-        for b, name in itertools.product(OBSERVATIONS, ("paper", "2.0") if full else ("2.0",)):
+        for b, name in itertools.product(
+            OBSERVATIONS, ("paper", "fastslam2") if full else ("fastslam2",)
+        ):
             if judged:
                 add(scene, _arm("observations", name, {"n_particles": 200}, {}, n_seen=b))
     for seed, draw in itertools.product(seeds, range(1, 5 if full else 2)):
-        for m, name in itertools.product((200, 1000), ("paper", "2.0")):
+        for m, name in itertools.product((200, 1000), ("paper", "fastslam2")):
             more = {"n_particles": m}
             add(Scene(seed, draw=draw), _arm("particles", name, more, more))
-    for m, name in itertools.product(PARTICLES, ("paper", "2.0")):
+    for m, name in itertools.product(PARTICLES, ("paper", "fastslam2")):
         more = {"n_particles": m}
         arm = _arm("repeats", name, more, more, repeats=20 if full else 5)
         add(Scene(JUDGED_SEED), arm)
@@ -473,17 +475,16 @@ def _distance_arms(add: Callable[[Scene, Arm], None], seed: int, *, full: bool) 
     more = {"n_particles": 200}
     for distance in DISTANCES_M:
         kinds: list[tuple[str, bool, str, int, Rule]] = [
-            ("2.0", True, "paper", 0, "random"),
-            ("2.0", True, "paper", FEW, "random"),
-            ("2.0", True, "paper", FEW, "nearest"),
-            ("2.0", False, "paper", 0, "random"),
-            ("2.0", False, "paper", FEW, "random"),
+            ("fastslam2", True, "paper", 0, "random"),
+            ("fastslam2", True, "paper", FEW, "random"),
+            ("fastslam2", True, "paper", FEW, "nearest"),
+            ("fastslam2", False, "paper", 0, "random"),
+            ("fastslam2", False, "paper", FEW, "random"),
         ]
         if full:
             kinds += [
                 ("paper", True, "paper", 0, "random"),
-                ("2.0", True, "pixel", 0, "random"),
-                ("2.0", False, "pixel", 0, "random"),
+                ("fastslam2", True, "pixel", 0, "random"),
             ]
         for name, occluded, noise, b, rule in kinds:
             arm = _arm("distance", name, more, {}, max_distance_m=distance, n_seen=b, rule=rule)
@@ -502,7 +503,7 @@ def _other_arms(add: Callable[[Scene, Arm], None], seed: int, *, full: bool) -> 
         def guess(association: str, p0: float, scene: Scene = scene) -> None:
             named: dict[str, Any] = {"association": association, "p0": p0}
             d0 = WIDE_D0 if association == "descriptor" else D0S[scene.noise]
-            add(scene, _arm("association", "2.0", {**more, **named, "d0": d0}, named))
+            add(scene, _arm("association", "fastslam2", {**more, **named, "d0": d0}, named))
 
         guess("descriptor", P0S[1])
         if main:
@@ -519,10 +520,10 @@ def _other_arms(add: Callable[[Scene, Arm], None], seed: int, *, full: bool) -> 
             ("systematic", "stratified", "residual", "multinomial"), (0.5, 1.0)
         ):
             settings = {"resampling": scheme, "ess_share": share}
-            add(Scene(seed), _arm("resampling", "1.0", {**more, **settings}, settings))
+            add(Scene(seed), _arm("resampling", "fastslam1", {**more, **settings}, settings))
         for sigma, at in itertools.product(NOISES_PX, ("predicted", "measured")):
             scene = Scene(seed, noise="pixel", sigma_px=sigma)
-            add(scene, _arm("noise", "2.0", {**more, "noise_at": at}, {"noise_at": at}))
+            add(scene, _arm("noise", "fastslam2", {**more, "noise_at": at}, {"noise_at": at}))
 
 
 def run(profile: Profile, out: Path, on_progress: Callable[[float], None]) -> Tables:
