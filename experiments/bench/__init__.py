@@ -13,6 +13,7 @@ SUITES = {
     "fastslam": ("fastslam",),
     "topological": ("topological",),
     "mcl": ("mcl",),
+    "formats": ("formats",),
 }
 
 
