@@ -145,27 +145,93 @@ def options() -> None:
 
 @app.command()
 def view(
+    what: Annotated[
+        list[str] | None,
+        typer.Argument(help="A recording or a log of any format, then Hydra overrides."),
+    ] = None,
+    estimate: Annotated[
+        str | None,
+        typer.Option(
+            "--estimate", "-e", help="An estimate.csv, its folder, or an estimator to run now."
+        ),
+    ] = None,
     world: Annotated[
-        bool, typer.Option("--world", help="Draw the world of the overrides.")
+        bool, typer.Option("--world", help="Draw the world of the overrides instead.")
     ] = False,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Picture to write.")] = Path("world.png"),
-    overrides: Overrides = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="File to write: .mp4, .gif or .html; a world: .png."),
+    ] = None,
+    seconds: Annotated[
+        float | None, typer.Option(help="How long it shall take [saved: 20, live: real time].")
+    ] = None,
 ) -> None:
-    """Draw a world: walls, landmarks, places and the tour.
+    """Show a run as it moves, in a window or in a file; or draw a world.
 
-    Example: estima view --world world=office seed=3 -o office.png
+    Robot, scan, particles or landmarks, truth and estimate. Without -o in PyBullet's window.
+
+    Examples
+    --------
+      estima view run.npz
+
+      estima view run.npz --estimate fastslam -o run.html
+
+      estima view run.npz --estimate mcl prior.map=world estimator.n_most=2000 -o run.mp4
+
+      estima view --world world=office seed=3 -o office.png
     """
+    from sim.errors import InputError
+
+    if world:
+        _draw_world(what or [], out or Path("world.png"))
+        return
+    if not what or "=" in what[0]:
+        raise InputError("name a recording to view, such as run.npz, or say --world")
+    if seconds is not None and not 0.0 < seconds <= 3600.0:
+        raise InputError(f"--seconds must lie between 0 and 3600, got {seconds:g}")
+    if estimate is None and len(what) > 1:
+        raise InputError(f"{what[1]}: overrides need an estimator; add --estimate NAME")
+    _show_run(Path(what[0]), estimate, what[1:], out, seconds)
+
+
+def _draw_world(overrides: list[str], out: Path) -> None:
+    """Draw walls, landmarks, places and the tour of a world."""
     from experiments.build import make_world
     from experiments.compose import compose
     from experiments.figures.style import save_figure
     from experiments.figures.world import world_figure
-    from sim.errors import InputError
 
-    if not world:
-        raise InputError("say what to draw: --world")
-    given = [f"world={o}" if "=" not in o else o for o in overrides or []]
+    given = [f"world={o}" if "=" not in o else o for o in overrides]
     save_figure(world_figure(make_world(compose(given))), out)
     print(out)
+
+
+def _show_run(
+    log: Path, source: str | None, overrides: list[str], out: Path | None, seconds: float | None
+) -> None:
+    """Save a run as an animation, or play it in a window."""
+    from experiments import live, view
+    from experiments.console import progress
+    from sim.formats.detect import read_any
+
+    if out is None:
+        live.check_display()
+    else:
+        view.check_output(out)
+    recording = read_any([log])
+    length_s = seconds or (recording.duration_s if out is None else view.SECONDS)
+    rows = view.shown_rows(recording, int(length_s * (live.FPS if out is None else view.FPS)))
+    shown = view.Run(recording, rows)
+    if source is not None:
+        with progress(source, len(recording.frame_stamps)) as on_step:
+            found, name = view.estimate_of(recording, source, overrides, rows, on_step)
+        shown = view.Run(recording, rows, found, name)
+    if out is None:
+        live.watch(shown, seconds)
+        return
+    with progress(f"drawing {out.name}", 1.0) as on_progress:
+        view.save(shown, out, on_progress)
+    print(f"{out}: {len(rows)} pictures, {len(rows) / view.FPS:.1f} s")
 
 
 @app.command()
