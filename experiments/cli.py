@@ -376,33 +376,35 @@ def report() -> None:
 
 @app.command("export-table")
 def export_table(
-    path: Annotated[Path, typer.Argument(help="A table, .csv or .parquet.")],
+    paths: Annotated[list[Path], typer.Argument(help="Tables, .csv or .parquet.")],
     form: Annotated[str, typer.Option("--format", help="markdown, or latex (booktabs).")] = (
         "markdown"
     ),
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="File to write; else it is printed.")
+        Path | None, typer.Option("--out", "-o", help="Folder to write to; else they are printed.")
     ] = None,
     digits: Annotated[int, typer.Option(min=1, max=17, help="Significant digits.")] = 4,
 ) -> None:
-    """Print a table as Markdown or LaTeX.
+    """Print tables as Markdown or LaTeX, or write them to a folder.
 
-    Example: estima export-table results/tables/puzzlebot2024_coverage.csv --format latex
+    Example: estima export-table results/tables/*.csv --format latex -o tables
     """
     from experiments.table import read_rows
-    from experiments.table_export import FORMATS
+    from experiments.table_export import FORMATS, SUFFIXES
     from sim.errors import InputError
     from sim.files import write_whole
 
     if form not in FORMATS:
         raise InputError(f"--format must be {' or '.join(FORMATS)}, got {form!r}")
-    text = FORMATS[form](read_rows(path), digits)
-    if out is None:
-        print(text, end="")
-        return
-    with write_whole(out) as part:
-        part.write_text(text)
-    print(out)
+    for path in paths:
+        text = FORMATS[form](read_rows(path), digits)
+        if out is None:
+            print(text)
+            continue
+        with write_whole(out / f"{path.stem}{SUFFIXES[form]}") as part:
+            part.write_text(text)
+    if out is not None:
+        print(f"{out}: {len(paths)} tables")
 
 
 def main() -> None:

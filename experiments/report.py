@@ -29,7 +29,7 @@ from sim.files import write_whole
 
 FINDINGS = ROOT / "experiments" / "findings"
 PAPERS = ("puzzlebot2024", "decristoforis2020", "gil2008", "maximo2024")
-SMALL_ROWS, SMALL_COLUMNS = 30, 12  # a table up to here is shown whole
+SMALL_ROWS, SMALL_COLUMNS = 60, 20  # a table up to here is shown whole
 FIRST_ROWS = 5  # of a larger one
 _OUTCOMES = ("reproduced", "not reproduced", "undecided", "shown")
 
@@ -435,7 +435,7 @@ def _machine_section(papers: Sequence[str], made: dict[str, dict[str, Any]]) -> 
     note = f"<p>Not noted for {escape(', '.join(unknown))}.</p>" if unknown else ""
     table = (
         '<table class="rows"><caption>Where the results of each paper come from</caption>'
-        f'<thead><tr><th scope="col"></th>{head}</tr></thead><tbody>{lines}</tbody></table>'
+        f"<thead><tr><td></td>{head}</tr></thead><tbody>{lines}</tbody></table>"
     )
     return (
         '<section aria-labelledby="machine"><h2 id="machine">Versions and machine</h2>'

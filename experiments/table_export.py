@@ -71,6 +71,7 @@ FORMATS: dict[str, Callable[[pd.DataFrame, int], str]] = {
     "markdown": to_markdown,
     "latex": to_latex,
 }
+SUFFIXES = {"markdown": ".md", "latex": ".tex"}
 
 
 def _cells(

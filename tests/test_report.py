@@ -256,11 +256,11 @@ def test_export_from_the_command_line(tmp_path):
 
     write_frame(TABLE[["n"]], tmp_path / "t.csv")
     done = CliRunner().invoke(app, ["export-table", str(tmp_path / "t.csv")])
-    assert done.stdout == "| n |\n| ---: |\n| 3 |\n| 4 |\n"
-    out = tmp_path / "t.tex"
+    assert done.stdout == "| n |\n| ---: |\n| 3 |\n| 4 |\n\n"
+    out = tmp_path / "exported"
     CliRunner().invoke(
         app, ["export-table", str(tmp_path / "t.csv"), "--format", "latex", "-o", str(out)]
     )
-    assert out.read_text().startswith(r"\begin{tabular}{r}")
+    assert (out / "t.tex").read_text().startswith(r"\begin{tabular}{r}")
     wrong = CliRunner().invoke(app, ["export-table", str(tmp_path / "t.csv"), "--format", "x"])
     assert "--format must be markdown or latex" in str(wrong.exception)
