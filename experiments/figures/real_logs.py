@@ -25,7 +25,7 @@ def intel(relations: pd.DataFrame, paths: pd.DataFrame) -> Figure:
     rows = paths[paths.method == "GMapping, 910 poses"]
     left.plot(rows.x_m, rows.y_m, color=BLACK, lw=0.7, label="GMapping (reference)")
     left.set(xlabel="x, m", ylabel="y, m", aspect="equal", title="Intel Research Lab")
-    left.legend(fontsize=7, loc="lower left")
+    page.legend(*left.get_legend_handles_labels(), loc="outside lower left", ncols=4, fontsize=7)
     shown = relations[(relations.log == "intel") & (relations.part == "all")]
     place = np.arange(len(shown))[::-1]
     printed = shown.method.str.contains("printed").to_numpy()
@@ -45,7 +45,9 @@ def mrclam(errors: pd.DataFrame, paths: pd.DataFrame) -> Figure:
     left, middle, right = page.subplots(1, 3, width_ratios=[1.0, 1.0, 1.1])
     methods = list(dict.fromkeys(errors.method))
     robots = sorted(errors.robot.unique())
-    for i, (method, color) in enumerate(zip(methods, (BLACK, *CYCLE, "#888888"), strict=False)):
+    for i, (method, color) in enumerate(
+        zip(methods, (BLACK, *CYCLE[:-1], "#999999"), strict=False)
+    ):
         rows = errors[errors.method == method].groupby("robot")
         shift = (i - len(methods) / 2.0) * 0.09
         at = np.searchsorted(robots, list(rows.groups)) + shift
