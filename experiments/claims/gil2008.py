@@ -86,7 +86,7 @@ def gi2(particles: pd.DataFrame, bound: pd.DataFrame) -> list[Claim]:
                 f"{what} error, M = 1000 over M = 10 (Page's p = {p:.2g}): "
                 f"{NAMES[name]}, {NOISE[noise]}"
             )
-            outcome = "reproduced" if p < 0.001 else "not reproduced"
+            outcome = _trend(p, 0.001, len(errors))
             claims.append(_claim("GI2", label, found, "Page's p below 0.001", outcome))
         best = bound[bound["noise"] == noise].set_index("seed")
         some = table[table["n_particles"] == 500].groupby("seed").first()
@@ -154,7 +154,7 @@ def gi6(observations: pd.DataFrame) -> list[Claim]:
             found = log_ratio_interval(errors[20], errors[1])
             p = page_trend_p(errors.to_numpy())
             label = f"{what} error, B = 20 over B = 1 (Page's p = {p:.2g}): {NAMES[name]}"
-            outcome = "reproduced" if p < 0.01 else "not reproduced"
+            outcome = _trend(p, 0.01, len(errors))
             claims.append(_claim("GI6", label, found, "Page's p below 0.01", outcome))
     return claims
 
@@ -220,6 +220,13 @@ def median_interval(values: Array) -> Interval:
         return Interval(float(np.median(ordered)), np.nan, np.nan)
     low, high = ordered[max(k - 1, 0)], ordered[len(ordered) - max(k, 1)]
     return Interval(float(np.median(ordered)), float(low), float(high))
+
+
+def _trend(p: float, limit: float, n_worlds: int) -> str:
+    """Judge Page's test; few worlds, or a p between the limit and 5 %, decide nothing."""
+    if p < limit:
+        return "reproduced"
+    return "undecided" if p < 0.05 or n_worlds < 20 else "not reproduced"
 
 
 def _diverged(table: pd.DataFrame) -> pd.Series[bool]:

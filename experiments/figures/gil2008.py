@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -186,26 +187,33 @@ def world_3d(recording: Recording, found: Estimate) -> Figure:
     world, log = (recording.truth.world if recording.truth else None), recording.landmarks
     assert world is not None
     assert log is not None
-    for (x1, y1, x2, y2), (bottom, top) in zip(world.walls, world.wall_z_m, strict=True):
-        ring = np.array([[x1, y1, bottom], [x2, y2, bottom], [x2, y2, top], [x1, y1, top]])
-        ax.plot(*np.vstack([ring, ring[:1]]).T, color=WALL, lw=0.4)
-    ax.plot(found.means[:, 0], found.means[:, 1], 0.0, color=ESTIMATE, lw=0.8)
     # an image that shows much, and the landmarks of it
     busiest = int(np.argmax(np.diff(log.splits)))
     ids = log.ids[slice(*log.splits[busiest : busiest + 2])]
     pose = found.means[np.searchsorted(found.stamps, log.stamps[busiest])]
     eye = np.array([pose[0], pose[1], 0.5])
+    reach = 6.0
+
+    def near(points: Array) -> NDArray[np.bool_]:
+        within: NDArray[np.bool_] = np.all(np.abs(points[..., :2] - pose[:2]) < reach, axis=-1)
+        return within
+
+    inside = near(world.walls.reshape(-1, 2, 2)).all(axis=1)
+    for (x1, y1, x2, y2), (bottom, top) in zip(
+        world.walls[inside], world.wall_z_m[inside], strict=True
+    ):
+        ring = np.array([[x1, y1, bottom], [x2, y2, bottom], [x2, y2, top], [x1, y1, top]])
+        ax.plot(*np.vstack([ring, ring[:1]]).T, color=WALL, lw=0.5)
+    along = np.where(near(found.means)[:, None], found.means[:, :2], np.nan)
+    ax.plot(along[:, 0], along[:, 1], 0.0, color=ESTIMATE, lw=1.0)
     for row in np.flatnonzero(np.isin(found.map["ids"], ids)):
         mean, covariance = found.map["landmarks"][row], found.map["landmark_covariances"][row]
         ax.plot(*_ellipsoid(mean, covariance), color=RED, lw=0.3)
         ax.plot(*np.array([eye, mean]).T, color=SKY, lw=0.5)
-    ax.plot(*found.map["landmarks"].T, ".", color=BLUE, ms=2)
-    reach = 6.0
+    ax.plot(*found.map["landmarks"][near(found.map["landmarks"])].T, ".", color=BLUE, ms=2)
     ax.set(xlim=pose[0] + np.array([-reach, reach]), ylim=pose[1] + np.array([-reach, reach]))
     ax.set(zlim=(0.0, 3.0), xlabel="x, m", ylabel="y, m", zlabel="z, m")
     ax.set_box_aspect((2.0 * reach, 2.0 * reach, 3.0))
-    for artist in ax.lines:
-        artist.set_clip_on(True)
     return page
 
 
@@ -317,7 +325,7 @@ def by_particles_over_worlds(particles: pd.DataFrame, bound: pd.DataFrame) -> Fi
             ax.axhline(level, color=_BATCH, ls=":", label="batch bound")
             ax.set(xscale="log", yscale="log")
             ax.set_title(f"{label}, {'10 px' if noise == 'paper' else '1 px'}", loc="left")
-            _plain_ticks(ax, particles["n_particles"])
+            _plain_ticks(ax, [10, 50, 200, 1000])
             _plain_y(ax)
         row[0].set_ylabel("RMS error, m")
     for ax in grid[-1]:
@@ -477,7 +485,7 @@ def _intervals(part: pd.DataFrame, by: str, column: str) -> tuple[Array, Array, 
     return x, np.exp(middle.to_numpy()), low.to_numpy(), high.to_numpy()
 
 
-def _plain_ticks(ax: Axes, values: pd.Series[Any]) -> None:
+def _plain_ticks(ax: Axes, values: Iterable[float]) -> None:
     """Ticks of a logarithmic axis at the values themselves."""
     ticks = sorted(set(values))
     ax.set_xticks(ticks, [f"{tick:g}" for tick in ticks], fontsize=8)
