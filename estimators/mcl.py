@@ -99,7 +99,7 @@ class Mcl:
 
     def __init__(
         self,
-        n_least: int = 500,
+        n_least: int = 1000,
         n_most: int = 20_000,
         kld_error: float = 0.05,
         kld_quantile: float = 2.33,
@@ -107,8 +107,8 @@ class Mcl:
         bin_rad: float = 0.17,
         n_beams: int = 60,
         beam_power: float = 0.1,
-        least_ess: float = 0.3,
-        tries: int = 50,
+        least_ess: float = 0.4,
+        tries: int = 100,
         sigma_m: float = 0.2,
         z_hit: float = 0.9,
         z_rand: float = 0.1,
