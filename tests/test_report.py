@@ -31,7 +31,7 @@ def results(tmp_path_factory):
         claim("PB1", "reproduced"),
         claim("PB4", "reproduced (quick)"),
         claim("PB4", "not reproduced; <b>at large k</b> (quick)", "the unfavourable", 0.25),
-        claim("ZZ9", "undecided", "of a claim that nobody described"),
+        claim("ZZ9", "undecided <b>at large</b>", "of a claim that nobody described"),
     ]
     write(claims, folder / "claims.csv")
     (folder / "figures").mkdir()
