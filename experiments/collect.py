@@ -15,6 +15,14 @@ if TYPE_CHECKING:
 
 _TIMES = ("step_time_us",)  # they differ from run to run
 _ORIGIN = ("run_key", "code_version", "recording_checksum")
+_MAIN = (
+    "ate_rmse_m",
+    "revised_ate_rmse_m",
+    "ate_aligned_rmse_m",
+    "heading_rmse_rad",
+    "nees_mean",
+    "step_time_us",
+)
 _LAST_KEY = "repeat"  # columns up to it are settings, those after it what was found
 
 
@@ -61,6 +69,13 @@ def collect(name: str, *, all_versions: bool = False, times: bool = False) -> pd
     return table.sort_values(order, kind="stable", ignore_index=True)
 
 
+def _best_error_m(table: pd.DataFrame) -> pd.Series[float]:
+    """Position error of the revised path where there is one, else of the online one."""
+    if "revised_ate_rmse_m" not in table:
+        return table["ate_rmse_m"]
+    return table["revised_ate_rmse_m"].fillna(table["ate_rmse_m"])
+
+
 def swept(table: pd.DataFrame) -> list[str]:
     """Settings that differ between the rows."""
     settings = list(table.columns[: list(table.columns).index(_LAST_KEY)])
@@ -79,19 +94,20 @@ def summary(table: pd.DataFrame, against: str | None = None) -> pd.DataFrame:
     Parameters
     ----------
     against
-        An estimator's name: errors are also given relative to its, on the same recordings.
+        An estimator's name: errors (of the revised paths, where there are) are also given
+        relative to its, on the same recordings.
     """
     import numpy as np
 
     by = [c for c in swept(table) if c not in ("seed", "world_seed", _LAST_KEY)]
-    shown = [c for c in ("ate_rmse_m", "heading_rmse_rad", "ate_aligned_rmse_m", "nees_mean",
-                         "step_time_us") if c in table]  # fmt: skip
+    shown = [c for c in _MAIN if c in table]
     if against is not None:
         one = table[table["choice.estimator"] == against]
         if one.empty:
             raise InputError(f"no rows of estimator {against}")
-        reference = one.groupby("recording_checksum")["ate_rmse_m"].mean()
-        ratio = table["ate_rmse_m"] / table["recording_checksum"].map(reference)
+        best = _best_error_m(table)
+        reference = best[one.index].groupby(one["recording_checksum"]).mean()
+        ratio = best / table["recording_checksum"].map(reference)
         column = f"ate_rmse_over_{against}"
         table = table.assign(**{column: np.log(ratio)})
         shown.append(column)

@@ -118,11 +118,21 @@ def run_configuration(
             rows.append({**row, "status": f"error: {type(error).__name__}: {error}"})
             write_rows(rows, folder / f"{key}.parquet")
             raise
-        rows.append({**row, "status": _status(recording, estimate), **score(recording, estimate)})
+        found = score(recording, estimate) | _revised_score(recording, estimator)
+        rows.append({**row, "status": _status(recording, estimate), **found})
         if repeat == 0 and config["picture"]:
             _show(recording, estimate, folder / key, name)
     write_rows(rows, folder / f"{key}.parquet")
     return rows, folder / key
+
+
+def _revised_score(recording: Recording, estimator: object) -> dict[str, float]:
+    """Scores of the path that the estimator gives in the end, if it gives one."""
+    finish = getattr(estimator, "finish", None)
+    if finish is None:
+        return {}
+    found = score(recording, finish())
+    return {f"revised_{k}": v for k, v in found.items() if k not in ("duration_s", "distance_m")}
 
 
 def _fetch(config: Config) -> Recording:

@@ -140,6 +140,7 @@ class _Composer:
     """
 
     def __init__(self, config_dir: str | None) -> None:
+        self._is_group: dict[str, bool] = {}
         self._bases: dict[tuple[str, ...], tuple[DictConfig, dict[str, str]]] = {}
         self.extra = []
         if config_dir is not None:
@@ -172,13 +173,15 @@ class _Composer:
         config.pop("sweeps", None)
         return Run(config, choices, run_key(config))
 
-    @staticmethod
-    def _is_plain(override: Override) -> bool:
+    def _is_plain(self, override: Override) -> bool:
         """Whether it only sets a value, rather than choosing an option or adding a key."""
         if override.is_add() or override.is_force_add() or override.is_delete():
             return False
-        repository = GlobalHydra.instance().config_loader()
-        return not repository.get_group_options(override.key_or_group)
+        key = override.key_or_group
+        if key not in self._is_group:  # slow to ask for
+            loader = GlobalHydra.instance().config_loader()
+            self._is_group[key] = bool(loader.get_group_options(key))
+        return not self._is_group[key]
 
 
 _MISSING = object()
