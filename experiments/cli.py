@@ -284,6 +284,39 @@ def conform(
 
 
 @app.command()
+def check(
+    suite: Annotated[str, typer.Option(help="Suite of conf/suite, or a .yaml file.")] = "check",
+    accept: Annotated[
+        str | None, typer.Option(help="Make this the baseline; the reason is kept in it.")
+    ] = None,
+    only: Annotated[
+        list[str] | None, typer.Option(help="An estimator; repeat it. Else all of the suite.")
+    ] = None,
+    release: Annotated[
+        bool, typer.Option("--release", help="With --accept: pin the release baseline too.")
+    ] = False,
+    junit: Annotated[Path | None, typer.Option(help="JUnit XML to write.")] = None,
+    summary: Annotated[Path | None, typer.Option(help="Markdown to write.")] = None,
+) -> None:
+    """Compare all estimators' errors with the baseline; code 1 if one is worse.
+
+    Under GitHub Actions it also annotates, and adds to the job's summary.
+
+    Examples
+    --------
+      estima check
+
+      estima check --junit check.xml
+
+      estima check --accept "descriptors of half the size: 2 % worse, twice as fast"
+    """
+    from experiments.regress_report import run_check
+
+    if run_check(suite, accept, only or [], release=release, junit=junit, summary=summary):
+        raise typer.Exit(1)
+
+
+@app.command()
 def bench(
     name: Annotated[str, typer.Argument(help="sim, ... or all.")] = "all",
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
