@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
 from estimators.base import Estimate
 from experiments.export import write_odometry_csv, write_odometry_json
 from sim.errors import InputError
@@ -59,7 +61,10 @@ def write_estimate(path: Path, estimate: Estimate, recording: Recording | None =
         from sim.formats.rosbag import Track
         from sim.formats.rosbag_out import write_bag
 
-        track = Track(estimate.stamps, estimate.means, estimate.covariances)
+        landmarks = np.zeros((0, 3))
+        if isinstance(estimate.map, dict) and "landmarks" in estimate.map:
+            landmarks = np.asarray(estimate.map["landmarks"], float)
+        track = Track(estimate.stamps, estimate.means, estimate.covariances, landmarks)
         write_bag(path, recording, {"estimate": track})
     else:
         raise InputError(

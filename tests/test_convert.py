@@ -4,6 +4,7 @@ import tarfile
 import numpy as np
 import pytest
 
+from estimators.base import Estimate
 from experiments.cli import app
 from experiments.convert import write_estimate, write_recording
 from experiments.export import read_odometry_csv
@@ -86,12 +87,9 @@ def test_convert_there_and_back(tmp_path, ending):
 @pytest.mark.parametrize("ending", [".tum", ".csv", ".mcap"])
 def test_estimates_come_back(tmp_path, ending):
     recording = fakes.circle(n_frames=8)
-    estimate = fakes.estimate_of(recording) if hasattr(fakes, "estimate_of") else None
-    if estimate is None:
-        from estimators.base import Estimate
-
-        covariances = np.tile(np.diag([0.01, 0.02, 0.03]), (8, 1, 1))
-        estimate = Estimate(recording.frame_stamps, recording.truth.poses, covariances)
+    covariances = np.tile(np.diag([0.01, 0.02, 0.03]), (8, 1, 1))
+    landmarks = {"landmarks": np.arange(6.0).reshape(2, 3)}
+    estimate = Estimate(recording.frame_stamps, recording.truth.poses, covariances, map=landmarks)
     path = tmp_path / f"estimate{ending}"
     write_estimate(path, estimate, recording)
     if ending == ".tum":
@@ -103,10 +101,22 @@ def test_estimates_come_back(tmp_path, ending):
         track = read_tracks(path)["estimate"]
         stamps, means = track.stamps, track.means
         np.testing.assert_array_equal(track.covariances, estimate.covariances)
+        np.testing.assert_array_equal(track.landmarks, landmarks["landmarks"])
     np.testing.assert_allclose(stamps, estimate.stamps, atol=1e-9)
     np.testing.assert_allclose(means, estimate.means, atol=1e-12)
     with pytest.raises(InputError, match="unknown ending"):
         write_estimate(tmp_path / "estimate.xyz", estimate)
+
+
+def test_evo_reads_our_tum(tmp_path):
+    interface = pytest.importorskip("evo.tools.file_interface")
+    recording = fakes.circle(n_frames=30)
+    write_recording(tmp_path / "truth.tum", recording)
+    found = interface.read_tum_trajectory_file(tmp_path / "truth.tum")
+    np.testing.assert_array_equal(found.timestamps, recording.truth.stamps)
+    np.testing.assert_array_equal(found.positions_xyz[:, :2], recording.truth.poses[:, :2])
+    headings = found.get_orientations_euler()[:, 2]
+    np.testing.assert_allclose(np.exp(1j * headings), np.exp(1j * recording.truth.poses[:, 2]))
 
 
 def test_the_commands(tmp_path, capsys):
