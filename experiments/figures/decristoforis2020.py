@@ -197,22 +197,29 @@ def runs(table: pd.DataFrame) -> Figure:
     rows = table[(table["rate_hz"] == 10.0) & (table["rays"] == "exact")]
     methods = [name for name in NAMES if name in set(rows["method"])]
     panels = (
-        ("ate_rmse_m", "position RMSE, m", 1.0),
-        ("heading_rmse_rad", "heading RMSE, deg", 57.29578),
-        ("nees_mean", "NEES / 3", 1.0 / 3.0),
+        ("ate_rmse_m", "believed_rmse_m", "position RMSE, m", 1.0),
+        ("heading_rmse_rad", "believed_heading_rmse_rad", "heading RMSE, deg", 57.29578),
+        ("nees_mean", None, "NEES / 3", 1.0 / 3.0),
     )
-    for ax, (column, label, unit) in zip(axes, panels, strict=True):
+    for ax, (column, believed, label, unit) in zip(axes, panels, strict=True):
         for i, method in enumerate(methods):
             values = unit * rows.loc[rows["method"] == method, column]
             spread = np.linspace(-0.2, 0.2, len(values))
             ax.plot(i + spread, values, ".", color=COLORS[method], ms=4)
             ax.plot([i - 0.3, i + 0.3], [values.median()] * 2, color=TRUTH, lw=1.2)
+            if believed is not None:
+                own = unit * rows.loc[rows["method"] == method, believed].median()
+                ax.plot(i + 0.35, own, "D", color=TRUTH, mfc="white", ms=4)
         if column == "nees_mean":
             ax.axhspan(0.8, 1.25, color=GREEN, alpha=0.2, lw=0)
         ax.set_yscale("log")
         ax.set_ylabel(label)
         ax.set_xticks(range(len(methods)), [NAMES[m] for m in methods], rotation=35, ha="right")
-    page.suptitle("one dot a recording; line: median; green: consistent", size=9)
+    page.suptitle(
+        "dot: a recording; line: median; diamond: RMSE by the method's own covariance; "
+        "green: consistent",
+        size=9,
+    )
     return page
 
 
@@ -337,30 +344,38 @@ def _grid(ax: Axes, values: pd.DataFrame) -> Any:
 
 
 def steps(table: pd.DataFrame) -> Figure:
-    """Correlation of successive registrations, and what their accumulation does."""
-    page = figure(8.5, 3.4)
-    axes: Any = page.subplots(1, 2)
+    """Registrations from scan to scan: correlation, accumulation, and the least possible error."""
+    page = figure(9.5, 3.4)
+    axes: Any = page.subplots(1, 3)
     rows = table[table["rays"] == "exact"]
-    for rate, color in ((10.0, BLUE), (75.0, ORANGE)):
+    lags = [f"correlation_lag_{lag}" for lag in range(1, 6)]
+    sums = ["nees_over_3"] + [f"accumulated_over_predicted_{w}s" for w in ("1", "10")]
+    for rate, color, shift in ((10.0, BLUE, -0.06), (75.0, ORANGE, 0.06)):
         part = rows[rows["rate_hz"] == rate]
-        lags = np.arange(1, 6)
-        values = part[[f"correlation_lag_{lag}" for lag in lags]].to_numpy()
-        shift = 0.06 if rate > 10 else -0.06
-        axes[0].errorbar(
-            lags + shift, values.mean(axis=0), yerr=2 * values.std(axis=0, ddof=0),
-            fmt="o", color=color, ms=4, label=f"{rate:g} Hz",
-        )  # fmt: skip
-        names = ["nees_over_3"] + [f"accumulated_over_predicted_{w}s" for w in ("1", "10")]
-        values = part[names].to_numpy()
-        axes[1].errorbar(
-            np.arange(3) + shift, values.mean(axis=0), yerr=2 * values.std(axis=0, ddof=0),
-            fmt="o", color=color, ms=4,
-        )  # fmt: skip
+        ratios = pd.DataFrame(
+            {
+                "x, y": part["step_error_m"] / part["step_bound_m"],
+                "heading": part["step_error_rad"] / part["step_bound_rad"],
+            }
+        )
+        for ax, values, first in (
+            (axes[0], part[lags], 1.0),
+            (axes[1], part[sums], 0.0),
+            (axes[2], ratios, 0.0),
+        ):
+            at = first + shift + np.arange(values.shape[1])
+            middle = values.median()
+            ends = [middle - values.min(), values.max() - middle]
+            ax.errorbar(at, middle, yerr=ends, fmt="o", color=color, ms=4, label=f"{rate:g} Hz")
     axes[0].axhline(0.0, color=TRUTH, lw=0.6)
-    axes[1].axhline(1.0, color=TRUTH, lw=0.6)
+    for ax in axes[1:]:
+        ax.axhline(1.0, color=TRUTH, lw=0.6)
+        ax.set_ylim(bottom=0.0)
     axes[0].set(xlabel="lag, registrations", ylabel="correlation of errors")
     axes[1].set_xticks(range(3), ["one step", "1 s", "10 s"])
     axes[1].set(ylabel="squared error over\nits covariance, / 3", xlabel="composed over")
-    axes[1].set_ylim(bottom=0.0)
+    axes[2].set_xticks([0, 1], ["x, y", "heading"])
+    axes[2].set_xlim(-0.5, 1.5)
+    axes[2].set(ylabel="RMS error of a step\nover the Fisher bound")
     page.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=2)
     return page

@@ -71,6 +71,7 @@ PLACES = {
     "room": ("office", "room"),
 }
 _WINDOWS_S = (1.0, 10.0)
+_HELD_M = 0.02
 
 
 def run(profile: Profile, out: Path, on_progress: Callable[[float], None]) -> Tables:
@@ -264,7 +265,7 @@ def _steps(
     R = np.array([estimate.extras["registration_covariance"][i + 1] for i in use])
     white = np.linalg.solve(np.linalg.cholesky(R), off[use][:, :, None])[:, :, 0]
     sound = np.sum(white**2, axis=1) < 30.0  # a wrong match says nothing of correlations
-    sound &= R[:, 0, 0] < 1.0
+    sound &= R[:, 0, 0] + R[:, 1, 1] < _HELD_M**2  # nor does a guess where nothing is held
     row: dict[str, Any] = dict(labels)
     for lag in range(1, 6):
         both = sound[lag:] & sound[:-lag] & (use[lag:] - use[:-lag] == lag)
