@@ -14,7 +14,7 @@ from experiments.report import note_provenance, write_report
 from experiments.version import ROOT
 from sim.errors import InputError
 
-PAPERS = ("puzzlebot2024", "decristoforis2020", "maximo2024")
+PAPERS = ("puzzlebot2024", "decristoforis2020", "maximo2024", "gil2008")
 LOGS = ("real_logs",)  # run only where the logs are
 RESULTS = ROOT / "results"
 
