@@ -198,8 +198,8 @@ class EkfSlam:
         else:
             slots = self._associate(points, self._unlikeness(seen, found))
         old = slots >= 0
-        if old.any():
-            self._update(slots[old], points[old])
+        if old.any() and not self._update(slots[old], points[old]):
+            extras["status"] = "update refused: the covariance has broken down"
         associations[found[old]] = self._births[slots[old]]
         if not old.all():
             self._create(points[~old])
@@ -295,8 +295,11 @@ class EkfSlam:
         )
         return spread + mixed + mixed.transpose(0, 2, 1)
 
-    def _update(self, slots: Ints, points: Array) -> None:
-        """Kalman update by points (K, 3) of landmarks in these slots, all at once."""
+    def _update(self, slots: Ints, points: Array) -> bool:
+        """Kalman update by points (K, 3) of landmarks in these slots, all at once.
+
+        Refused, with False, if rounding has left the innovation without a proper covariance.
+        """
         P, n = self._covariance, 3 * len(slots)
         predicted, of_pose, of_landmark = self._camera.predict(
             self._mean[:3], self._mean[3:].reshape(-1, 3)[slots]
@@ -310,11 +313,15 @@ class EkfSlam:
         S += (along @ of_landmark.transpose(0, 2, 1)).transpose(1, 0, 2).reshape(n, n)
         for k in range(len(slots)):
             S[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += R[k]
-        factor = cho_factor((S + S.T) / 2.0, lower=True)
+        try:
+            factor = cho_factor((S + S.T) / 2.0, lower=True)
+        except np.linalg.LinAlgError:
+            return False
         self._mean += HP.T @ cho_solve(factor, v.ravel())
         self._mean[2] = wrap(float(self._mean[2]))
         half = solve_triangular(factor[0], HP, lower=True)
         P -= half.T @ half  # symmetric to the last bit
+        return True
 
     def _create(self, points: Array) -> None:
         """Append landmarks at points (K, 3), gil2008, eqs. (16)-(18), with their correlations."""
@@ -327,7 +334,8 @@ class EkfSlam:
         R = self._camera.innovation(predicted, points)[1]
         after = before + n
         if after > len(self._room):
-            room = np.zeros((2 * after, 2 * after))
+            size = after + after // 2
+            room = np.zeros((size, size))
             room[:before, :before] = self._covariance
             self._room = room
         P = self._room[:after, :after]

@@ -211,6 +211,16 @@ def test_odd_observations_are_told_and_survived():
     assert np.abs(online.means - recording.truth.poses)[:, :2].max() < 0.15
 
 
+def test_a_broken_covariance_is_told():
+    recording = circle(0, n_frames=12)
+    filtered = EkfSlam(**WHEELS)
+    filtered.reset(tracking_prior(recording), np.random.default_rng(0))
+    frames = list(recording.frames())
+    assert "status" not in filtered.step(frames[0]).extras
+    filtered._room -= 10.0 * np.eye(len(filtered._room))
+    assert "broken" in filtered.step(frames[2]).extras["status"]
+
+
 def test_without_landmarks_it_is_dead_reckoning():
     recording = circle(3, n_frames=210, n_beams=1)
     log = recording.landmarks
