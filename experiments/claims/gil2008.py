@@ -186,7 +186,9 @@ def gi7(association: pd.DataFrame) -> list[Claim]:
             f"{both_rates[:, 0].mean():.2f} less FastSLAM's {both_rates[:, 1].mean():.2f}, both by "
             f"Mahalanobis distance: {NOISE[str(noise)]}"
         )
-        outcome = verdict(found, at_least=1e-9)
+        outcome: str = verdict(found, at_least=1e-9)
+        if np.array_equal(both_rates[:, 0], both_rates[:, 1]):
+            outcome = "undecided: both diverge in the same worlds"
         claims.append(_claim("GI7", label, found, "above 0", outcome))
     return claims
 

@@ -553,7 +553,7 @@ def run(profile: Profile, out: Path, on_progress: Callable[[float], None]) -> Ta
         for part in (arms[i : i + 40] for i in range(0, len(arms), 40))
     ]
     tables = tables_of(parts, lambda share: on_progress(0.1 + 0.85 * share))
-    tables["cost"] = cost_by_landmarks(5 if profile == "full" else 3)
+    tables["cost"] = cost_by_landmarks(5 if profile == "full" else 2)
     for name, frame in tables.items():
         write_frame(frame, out / f"{PAPER}_{name}.csv")
     on_progress(1.0)
