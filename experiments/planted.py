@@ -11,8 +11,8 @@ random the baseline's and the check's runs, apart from each other, among the see
 A check on equivalent code draws both from the sound runs of all estimators, a check on a fault
 draws the check's from the faulty runs of one.
 
-    python -m experiments.planted            # about an hour on two cores
-    python -m experiments.planted --quick    # a few minutes; rough
+    python -m experiments.planted                # about half an hour on two cores
+    python -m experiments.planted --share 0.1    # a few minutes; rough
 """
 
 from __future__ import annotations
@@ -40,6 +40,8 @@ from estimators.gaussian import Gaussian
 from estimators.scan_matching import Match, ScanMatcher
 from estimators.stereo import StereoModel
 from experiments.console import progress
+from experiments.figures.planted import detectable
+from experiments.figures.style import save_figure
 from experiments.regress import (
     ALPHA_GENERAL,
     ALPHA_REAL,
@@ -64,11 +66,12 @@ Planted = Callable[[Estimator, np.random.Generator], AbstractContextManager[Esti
 Fault = Callable[[float], Planted]  # of a size
 
 TARGET = 0.10  # worsening that faults are graded to
-_NEAR = 0.005  # of it
-_MOST_TRIALS = 9
-_RANDOM = 16  # seedings of the pool for each recording
-_FAULTY_RANDOM = 4
-_CHANGE_OF_SIZE = 4.0
+_NEAR = 0.01  # of it
+_MOST_TRIALS = 8
+_RANDOM = 10  # seedings of the pool for each recording
+_FAULTY_RANDOM = 3
+_CHANGE_OF_SIZE = 6.0
+_N_DRAWS = 20_000  # permutations in each drawn test
 _BEGIN, _END = "<!-- measured -->", "<!-- end of what was measured -->"
 
 
@@ -402,6 +405,8 @@ class Pool:
 
     Attributes
     ----------
+    suite
+        What is checked; the pool may hold fewer recordings.
     sound
         Sound runs of all estimators.
     faulty
@@ -448,23 +453,26 @@ def grade(
             low, rise_low = size, rise
         else:
             high, rise_high = size, rise
-        if not math.isfinite(high):
-            size *= _CHANGE_OF_SIZE
-        elif low == 0.0:
-            size /= _CHANGE_OF_SIZE
-        else:  # between them, as if the rise went with the size
+        if low == 0.0 or not math.isfinite(high):  # as if the rise went with the size
+            most = _CHANGE_OF_SIZE
+            times = TARGET / rise if rise > 0.0 else most
+            size *= min(max(times, 1.0 / most), most)
+        else:
             share = (TARGET - rise_low) / (rise_high - rise_low)
             size = low + min(max(share, 0.15), 0.85) * (high - low)
     assert best is not None
     return best[1], best[2]
 
 
-def fill_pool(suite: Suite, folder: Path, on_progress: Callable[[float], None]) -> Pool:
-    """Make the pool's runs, or read those that are there."""
+def fill_pool(
+    suite: Suite, share: float, folder: Path, on_progress: Callable[[float], None]
+) -> Pool:
+    """Make the pool's runs over this share of the recordings, or read those that are there."""
+    pooled = suite.resized({group: round(share * n) for group, n in suite.counts.items()})
     random = {entry.name for entry in suite.estimators if entry.repeats[0] > 1}
     n_runs = {entry.name: _RANDOM if entry.name in random else 1 for entry in suite.estimators}
     kinds = [(name, kind) for name in n_runs for kind in FAULTS.get(name, {})]
-    sound_rows = _kept(folder / "sound.parquet", lambda: run_suite(suite, n_runs, reseed=1))
+    sound_rows = _kept(folder / "sound.parquet", lambda: run_suite(pooled, n_runs, reseed=1))
     sound, faulty = arrays(sound_rows), {}
     for done, (name, kind) in enumerate(kinds, start=1):
         fault, start = FAULTS[name][kind]
@@ -472,7 +480,7 @@ def fill_pool(suite: Suite, folder: Path, on_progress: Callable[[float], None]) 
         def graded(name: str = name, fault: Fault = fault, start: float = start) -> pd.DataFrame:
             def measure(planted: Planted) -> pd.DataFrame:
                 runs = {name: _FAULTY_RANDOM if name in random else 1}
-                return run_suite(suite, runs, reseed=2, planted={name: planted})
+                return run_suite(pooled, runs, reseed=2, planted={name: planted})
 
             size, rows = grade(fault, start, measure, sound[name, "ate_rmse_m"], name)
             return rows.assign(size=size)
@@ -510,6 +518,7 @@ def draw_check(
         order = np.argsort(rng.random((len(rows), n_runs)), axis=1)
         n_faulty = 0 if of_error is None else of_error[ERRORS[0]].shape[1]
         faulty_order = np.argsort(rng.random((len(rows), n_faulty)), axis=1)
+        again = np.argsort(rng.random((len(rows), n_runs - (0 if planted else n_now))), axis=1)
         for error in ERRORS:
             runs = np.take_along_axis(pool.sound[name, error][rows], order, axis=1)
             if of_error is None:
@@ -517,10 +526,11 @@ def draw_check(
             else:
                 drawn = np.take_along_axis(of_error[error][rows], faulty_order, axis=1)
                 now, rest = drawn[:, :n_now], runs
-            for k, baseline in enumerate(("accepted", "release")):
-                then = rest[:, k * n_then : (k + 1) * n_then] if n_then > 1 else rest[:, :1]
+            others = np.take_along_axis(rest, again, axis=1)
+            for baseline, left in (("accepted", rest), ("release", others)):
+                then = left[:, :n_then]
                 sound = np.isfinite(then).all(axis=1) & np.isfinite(now).all(axis=1)
-                found = examine(then[sound], now[sound], rng)
+                found = examine(then[sound], now[sound], rng, _N_DRAWS)
                 findings.append(
                     dataclasses.replace(found, estimator=name, error=error, baseline=baseline)
                 )
@@ -555,7 +565,7 @@ def smallest(pool: Pool, fault: tuple[str, str]) -> float:
     for error in ERRORS:
         then, now = np.log(pool.sound[fault[0], error]), np.log(of_error[error])
         d = now[:, : entry.repeats[1]].mean(axis=1) - then[:, : entry.repeats[0]].mean(axis=1)
-        d, n = d[np.isfinite(d)], int(np.isfinite(d).sum())
+        d, n = d[np.isfinite(d)], pool.suite.counts[entry.recordings]
         spread = float(d.std(ddof=1)) / math.sqrt(n)
         least = (stats.t.ppf(1.0 - ALPHA_GENERAL, n - 1) + stats.norm.ppf(0.95)) * spread
         if entry.repeats[0] > 1:
@@ -645,7 +655,10 @@ def measured_text(
     """Markdown of what was measured, for docs/regression.md."""
     hits, n_checks = null
     share = share_interval(hits, n_checks)
-    counts = ", ".join(f"{n} {group}" for group, n in pool.suite.counts.items())
+    counts = ", ".join(
+        f"{len(pool.sound[entry.name, ERRORS[0]])} {entry.recordings}"
+        for entry in {e.recordings: e for e in pool.suite.estimators}.values()
+    )
     lines = [
         f"Pool: {counts} recordings; {_RANDOM} sound seedings of each estimator that draws at "
         f"random, and {_FAULTY_RANDOM} of each of its faults.",
@@ -681,6 +694,10 @@ def measured_text(
             f"{100 * row['found']:.1f} % ({100 * row['found_low']:.1f} to "
             f"{100 * row['found_high']:.1f}) | {100 * row['smallest']:.1f} % |"
         )
+    lines += [
+        "",
+        "![The worsening that 95 % of checks find, of each estimator and fault](regression.png)",
+    ]
     total, n_found = power["checks"].sum(), (power["found"] * power["checks"]).sum()
     overall = share_interval(round(n_found), int(total))
     low = power[power["found"] < 0.95]
@@ -699,7 +716,9 @@ def main() -> None:
         description="How often `estima check` alarms wrongly, and how often rightly.",
     )
     parser.add_argument("--suite", default="check")
-    parser.add_argument("--quick", action="store_true", help="a small pool and few draws")
+    parser.add_argument(
+        "--share", type=float, default=1.0, help="share of the recordings in the pool (0.1: quick)"
+    )
     parser.add_argument("--folder", type=Path, default=ROOT / "results" / "runs" / "planted")
     parser.add_argument("--variant", choices=list(VARIANTS), help=argparse.SUPPRESS)
     parser.add_argument("--out", type=Path, help=argparse.SUPPRESS)
@@ -708,23 +727,22 @@ def main() -> None:
     if given.variant:
         run_variant(given.variant, suite, given.folder).to_parquet(given.out, index=False)
         return
-    folder: Path = given.folder / ("quick" if given.quick else given.suite)
+    if not 0.05 <= given.share <= 1.0:
+        parser.error("--share must lie in 0.05..1")
+    folder: Path = given.folder / f"{Path(given.suite).stem}_{given.share:g}"
     folder.mkdir(parents=True, exist_ok=True)
-    n_null, n_power = (200, 50) if given.quick else (4000, 400)
-    if given.quick:
-        suite = suite.resized({group: count // 4 for group, count in suite.counts.items()})
+    n_null, n_power = (4000, 400) if given.share == 1.0 else (1000, 100)
     with progress("faults graded, share", 1.0) as on_progress:
-        pool = fill_pool(suite, folder, on_progress)
+        pool = fill_pool(suite, given.share, folder, on_progress)
     with progress("faults looked for, share", 1.0) as on_progress:
         power = power_table(pool, n_power, on_progress)
     hits, _ = alarms(pool, n_null, 0)
     print(f"{hits} false alarms in {n_null} checks")
     print(power.to_string(index=False))
-    if given.quick:
-        return
     with progress("conditions, share", 1.0) as on_progress:
         equal = variants(given.suite, folder, on_progress)
     write_frame(power, BASELINES / "power.csv")
+    save_figure(detectable(power, TARGET), ROOT / "docs" / "regression.png")
     text = measured_text(pool, (hits, n_null), power, equal)
     page = ROOT / "docs" / "regression.md"
     head, _, rest = page.read_text().partition(_BEGIN)
