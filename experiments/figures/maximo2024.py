@@ -76,7 +76,7 @@ def pages(tables: dict[str, pd.DataFrame]) -> dict[str, Figure]:
 
 def data(known: TopologicalMap, mapping: Recording, taking: Recording) -> Figure:
     """Figure 1: clouds at the nodes of the map and along the robot's way, seen from above."""
-    page = figure(9.0, 4.4)
+    page = figure(6.0, 5.4)
     ax = page.subplots()
     # where there is most to see within 40 m
     seen = np.convolve(np.sum(known.slices_m < 40.0, axis=1), np.ones(4), "valid")
@@ -93,10 +93,12 @@ def data(known: TopologicalMap, mapping: Recording, taking: Recording) -> Figure
         assert recording.clouds is not None
         spots = recording.truth_at(recording.clouds.stamps)[rows]
         ax.plot(*spots[:, :2].T, "x", color=colour, ms=9, mew=2, label=label)
-    middle = nodes.mean(axis=0)
-    ax.set(xlabel="x, m", ylabel="y, m", aspect="equal")
-    ax.set(xlim=middle[0] + np.array([-60, 60]), ylim=middle[1] + np.array([-28, 28]))
-    ax.legend(loc="upper right", frameon=True, framealpha=0.9)
+    # what lies within 40 m of the nodes
+    drawn = np.concatenate([line.get_xydata() for line in ax.get_lines()])
+    near = drawn[np.hypot(*(drawn - nodes.mean(axis=0)).T) < 40.0]
+    (x_min, y_min), (x_max, y_max) = near.min(axis=0) - 4.0, near.max(axis=0) + 4.0
+    ax.set(xlabel="x, m", ylabel="y, m", aspect="equal", xlim=(x_min, x_max), ylim=(y_min, y_max))
+    page.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=2)
     return page
 
 
@@ -180,10 +182,17 @@ def dispersion(table: pd.DataFrame) -> Figure:
         for ax in column:
             ax.set_yscale("log")
             ax.set_ylim(bottom=_FLOOR_M[name])
+            _plain_ticks(ax)
     axes[0, 0].set_ylabel("dispersion, m")
     axes[1, 0].set_ylabel("error, m")
     page.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return page
+
+
+def _plain_ticks(ax: Axes) -> None:
+    """Decades as plain numbers, nothing between."""
+    ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    ax.yaxis.set_minor_formatter(NullFormatter())
 
 
 def starts(worlds: dict[str, PlaceWorld]) -> Figure:
@@ -258,8 +267,7 @@ def table_1(table: pd.DataFrame, weighting: pd.DataFrame) -> Figure:
         ax.axhline(nearest, color=WALL, ls=":", lw=1, label="nearest node")
         ax.set_xticks(range(3), METHODS)
         ax.set(title=_TITLES[name], yscale="log", xlim=(-0.5, 2.6))
-        ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        ax.yaxis.set_minor_formatter(NullFormatter())
+        _plain_ticks(ax)
         low, high = ax.get_ylim()
         ax.set_ylim(min(low, 0.5 * nearest), max(high, 5.0 * nearest))
     axes[0].set_ylabel("mean error over the route, m")
