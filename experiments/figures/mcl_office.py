@@ -23,13 +23,13 @@ def found_by(starts: pd.DataFrame) -> Figure:
     left.set(
         xlabel="travel, m", ylabel="share of starts localised", ylim=(0, 1.02), xlim=(-0.5, 30)
     )
-    for i, (seed, office) in enumerate(starts.groupby("seed")):
+    offices = starts.groupby("seed")
+    for i, (_, office) in enumerate(offices):
         good = office["localised"].to_numpy(bool)
         x = office["found_m"].to_numpy(float)
         right.plot(x[good], np.full(good.sum(), i), "|", color=BLUE, ms=9)
         right.plot(np.full((~good).sum(), 31.0), np.full((~good).sum(), i), "x", color=RED, ms=5)
-        right.text(-1.0, i, str(seed), ha="right", va="center", fontsize=7)
     right.set(xlabel="travel until localised, m (x: not within 30 m)", xlim=(-0.5, 32))
-    right.set_yticks([])
-    right.set_ylabel("office (seed)", labelpad=24)
+    right.set_yticks(range(len(offices)), [str(seed) for seed in offices.groups])
+    right.set_ylabel("office, by seed")
     return page

@@ -2,7 +2,7 @@
 
 A robot drives the whole tour of each office once; starts are spread evenly along it. From each the
 filter begins without a pose and is judged over the next 40 m. `python -m
-experiments.studies.mcl_office` runs it; it takes about two minutes on two cores.
+experiments.studies.mcl_office` runs it; it takes some five minutes of processor time.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def starts(
         One row a start: `seed`, `start`; `x_m`, `y_m`, where; `localised`; `found_m`, the travel
         after which the belief is near and stays near for 10 m (infinite: never within 30 m);
         `error_m`, `error_deg` at the end; `near_share` of the Frames after it was found;
-        `particles_mean`; `step_ms`.
+        `particles_mean`.
     """
     jobs = [joblib.delayed(_starts_of)(seed, n_starts, tuple(overrides)) for seed in seeds]
     rows: list[dict[str, Any]] = []
@@ -164,16 +164,12 @@ def _start(
     rng: np.random.Generator,
 ) -> dict[str, Any]:
     """One start, at a Frame's row."""
-    import time
-
     end = int(np.searchsorted(travel_m, travel_m[row] + WITHIN_M + FOR_M + 0.5))
     assert recording.truth is not None
     estimator = make_estimator(config)
     estimator.reset(Prior(recording.robot, recording.sensors, map=recording.truth.world), rng)
     first = dataclasses.replace(frames[row], duration_s=0.0, wheel_increments_m=np.zeros(2))
-    begun = time.perf_counter()
     beliefs = [estimator.step(frame) for frame in (first, *frames[row + 1 : end])]
-    seconds = time.perf_counter() - begun
     means, poses = np.array([belief.mean for belief in beliefs]), truth[row:end]
     errors_m, errors_rad = position_errors_m(poses, means), heading_errors_rad(poses, means)
     near = (errors_m < NEAR_M) & (np.abs(errors_rad) < NEAR_RAD)
@@ -189,7 +185,6 @@ def _start(
         "error_deg": math.degrees(abs(errors_rad[-1])),
         "near_share": float(near[after].mean()) if after.any() else math.nan,
         "particles_mean": float(np.mean([len(b.extras["particles"]) for b in beliefs])),
-        "step_ms": 1e3 * seconds / len(beliefs),
     }
 
 
