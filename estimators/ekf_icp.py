@@ -3,6 +3,9 @@
 decristoforis2020 fuses both as velocities (`estimators.ekf_icp_paper`). Here registrations
 measure what they are: the pose of a scan relative to that of a key frame. The state therefore
 holds the key frame's pose beside the robot's (stochastic cloning; Roumeliotis and Burdick 2002).
+
+Errors are twists in map (an invariant filter; Barrau and Bonnabel 2017): with errors of
+coordinates, registrations would seem to tell of the absolute heading once it is unsure.
 """
 
 from __future__ import annotations
@@ -134,7 +137,9 @@ class EkfIcp:
         self._directions: tuple[Array, Array] | None = None
         # (9,): apparent poses of the key frame and of the last scan, pose of base_link; in map
         self._mean = np.tile(start.mean, 3)
-        self._covariance = np.tile(start.covariance, (3, 3))
+        # of the twists in map that take the means to the true poses
+        to_twist = _from_twist(-start.mean)
+        self._covariance = np.tile(to_twist @ start.covariance @ to_twist.T, (3, 3))
         self._failures = 0
         share = self.gate_probability
         self._gates = [math.inf if share is None else chdtri(d, share) for d in range(4)]
@@ -145,7 +150,9 @@ class EkfIcp:
         extras: dict[str, Any] = {}
         if frame.ranges_m is not None:
             self._correct(self._matcher.prepare(frame.ranges_m, self._laser), extras)
-        return Belief(self._mean[_POSE].copy(), self._covariance[_POSE, _POSE].copy(), extras)
+        by_twist = _from_twist(self._mean[_POSE])
+        covariance = by_twist @ self._covariance[_POSE, _POSE] @ by_twist.T
+        return Belief(self._mean[_POSE].copy(), (covariance + covariance.T) / 2.0, extras)
 
     def _predict(self, frame: Frame) -> None:
         """Move the robot's pose by the wheels; the clones stay."""
@@ -155,12 +162,9 @@ class EkfIcp:
         variances = wheel_variances(spread_m, self.kr, self.kl) + ticks
         motion = wheel_motion(travel, variances, self._track_m)[0]
         motion.covariance[1, 1] += self.lateral_slip_m * float(spread_m.mean())
-        self._mean[_POSE], by_pose, by_motion = compose(self._mean[_POSE], motion.mean)
-        P = self._covariance
-        P[:6, _POSE] = P[:6, _POSE] @ by_pose.T
-        P[_POSE, :6] = P[:6, _POSE].T
-        P[_POSE, _POSE] = by_pose @ P[_POSE, _POSE] @ by_pose.T
-        P[_POSE, _POSE] += by_motion @ motion.covariance @ by_motion.T
+        self._mean[_POSE], _, by_motion = compose(self._mean[_POSE], motion.mean)
+        by_motion = _from_twist(-self._mean[_POSE]) @ by_motion
+        self._covariance[_POSE, _POSE] += by_motion @ motion.covariance @ by_motion.T
 
     def _correct(self, scan: PreparedScan, extras: dict[str, Any]) -> None:
         """Register the scan against the key frame, or else the last scan, and take it in."""
@@ -197,20 +201,25 @@ class EkfIcp:
         lost = self._failures >= _PATIENCE
         self._keep(scan if lost else self._key, scan, (_NEW if lost else _KEY, _NEW))
 
-    def _expected(self, place: slice) -> tuple[Gaussian, Array, Array]:
-        """Pose relative to a clone's, with its covariance; its derivatives by clone and pose."""
-        relative, by_clone, by_pose = between(self._mean[place], self._mean[_POSE])
+    def _expected(self, place: slice) -> tuple[Gaussian, Array]:
+        """Pose relative to a clone's, with its covariance; its derivative (3, 3) by the twists.
+
+        A twist that both poses share changes nothing, so the derivative by the clone's twist is
+        minus that by the robot's: what the scans cannot tell, the filter cannot learn from them.
+        """
+        relative, _, by_pose = between(self._mean[place], self._mean[_POSE])
+        by_twist = by_pose @ _from_twist(self._mean[_POSE])
         P = self._covariance
-        cross = by_clone @ P[place, _POSE] @ by_pose.T
-        spread = by_clone @ P[place, place] @ by_clone.T + by_pose @ P[_POSE, _POSE] @ by_pose.T
-        return Gaussian(relative, spread + cross + cross.T), by_clone, by_pose
+        cross = P[place, _POSE]
+        spread = P[place, place] + P[_POSE, _POSE] - cross - cross.T
+        return Gaussian(relative, by_twist @ spread @ by_twist.T), by_twist
 
     def _take_in(self, found: Match, place: slice, extras: dict[str, Any]) -> bool:
         """Append the scan's apparent pose to the state, and correct it by the registration.
 
         Returns False, with the state as before, if the innovation lies outside the gate.
         """
-        expected, by_clone, by_pose = self._expected(place)
+        expected, by_twist = self._expected(place)
         C, R, share = found.held, found.motion.covariance, self.shared_noise
         off = found.motion.mean - expected.mean
         off[2] = wrap(off[2])
@@ -224,11 +233,11 @@ class EkfIcp:
             return False
         self._insert(_turned(share / 2.0 * found.known_covariance, self._mean[place][2]))
         H = np.zeros((3, 12))
-        H[:, place], H[:, _NEW] = by_clone, by_pose
+        H[:, place], H[:, _NEW] = -by_twist, by_twist
         noise = (1.0 - share) * C @ R @ C.T + _TINY * np.eye(len(C))
-        self._mean, self._covariance = update(
-            self._mean, self._covariance, innovation, C @ H, noise
-        )
+        twists, self._covariance = update(np.zeros(12), self._covariance, innovation, C @ H, noise)
+        for part in (_KEY, _LAST, _POSE, _NEW):
+            self._mean[part] = _moved(self._mean[part], twists[part])
         return True
 
     def _as_before(self, found: Match) -> Match:
@@ -249,13 +258,17 @@ class EkfIcp:
         return dataclasses.replace(found, held=held @ to_twist, loose=to_motion @ loose @ to_twist)
 
     def _insert(self, noise: Array) -> None:
-        """Append the newest scan's apparent pose to the state: that of base_link, and noise."""
+        """Append the newest scan's apparent pose to the state: that of base_link, and noise.
+
+        The noise (3, 3) is in the coordinates of map.
+        """
+        to_twist = _from_twist(-self._mean[_POSE])
         self._mean = np.concatenate([self._mean, self._mean[_POSE]])
         P = np.empty((12, 12))
         P[:9, :9] = self._covariance
         P[_NEW, :9] = self._covariance[_POSE]
         P[:9, _NEW] = self._covariance[:, _POSE]
-        P[_NEW, _NEW] = self._covariance[_POSE, _POSE] + noise
+        P[_NEW, _NEW] = self._covariance[_POSE, _POSE] + to_twist @ noise @ to_twist.T
         self._covariance = P
 
     def _keep(self, key: PreparedScan, last: PreparedScan, places: tuple[slice, slice]) -> None:
@@ -265,8 +278,6 @@ class EkfIcp:
         self._key, self._last = key, last
         rows = np.concatenate([_ROWS[place] for place in (*places, _POSE)])
         self._mean, self._covariance = self._mean[rows], self._covariance[np.ix_(rows, rows)]
-        for heading in (2, 5, 8):
-            self._mean[heading] = wrap(self._mean[heading])
 
     def _own_noise(self, scan: PreparedScan) -> Array:
         """Shared noise (3, 3) in map of a scan that was not registered: from one against itself."""
@@ -279,6 +290,21 @@ class EkfIcp:
         """Whether it is time for a new key frame."""
         x, y, turn = motion.tolist()
         return math.hypot(x, y) > self.keyframe_distance_m or abs(turn) > self.keyframe_turn_rad
+
+
+def _from_twist(pose: Array) -> Array:
+    """Derivative (3, 3) of exp(twist) * pose by the twist, at zero; for -pose its inverse."""
+    x, y, _ = pose.tolist()
+    return np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])
+
+
+def _moved(pose: Array, twist: Array) -> Array:
+    """Pose (3,) after a twist in map: exp(twist) * pose."""
+    u, v, turn = twist.tolist()
+    half = turn / 2.0
+    sinc = 1.0 - half * half / 6.0 if abs(half) < 1e-4 else math.sin(half) / half
+    cos, sin = sinc * math.cos(half), sinc * math.sin(half)
+    return compose(np.array([cos * u - sin * v, sin * u + cos * v, turn]), pose)[0]
 
 
 def _turned(covariance: Array, heading_rad: float) -> Array:

@@ -6,6 +6,7 @@ the scans do not hold are named.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass
 from typing import Literal
@@ -162,10 +163,20 @@ class ScanMatcher:
         motion, to_base = measured.seen_from(se2.inverse(mount))
         if found.status != "degenerate":
             return Match(motion, found.status, _EVERYTHING, _NOTHING)
-        held, loose = (to_base @ part for part in icp_covariance.split_directions(found))
-        coordinates = np.linalg.inv(np.hstack([held, loose]))
-        n_held = held.shape[1]
-        return Match(motion, found.status, coordinates[:n_held], loose @ coordinates[n_held:])
+        in_base = [to_base @ part for part in icp_covariance.split_directions(found)]
+        coordinates = np.linalg.inv(np.hstack(in_base))
+        n_held = in_base[0].shape[1]
+        held, loose = coordinates[:n_held], in_base[1] @ coordinates[n_held:]
+        match = Match(motion, found.status, held, loose)
+        # The directions themselves are unsure: along a loose one that is a little off, what the
+        # registration wandered, and the guess may be wrong by, leaks into the held ones.
+        off = coordinates[n_held:] @ (motion.mean - guess.mean)
+        spread = coordinates[n_held:] @ guess.covariance @ coordinates[n_held:].T
+        _, in_laser_loose = icp_covariance.split_directions(found)
+        feigned = in_laser_loose.T @ found.information_noise @ in_laser_loose
+        leak = float(np.trace(feigned @ (np.outer(off, off) + spread)))
+        covariance = motion.covariance + leak * match.known_covariance
+        return dataclasses.replace(match, motion=Gaussian(motion.mean, covariance))
 
     def sigma_m(self, laser: Laser) -> float:
         """Believed range noise, m."""
