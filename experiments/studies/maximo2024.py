@@ -607,7 +607,7 @@ def _campus_kidnapping(known: TopologicalMap, queries: Recording, name: str, see
     n, after = len(queries.frame_stamps), 4 * RECOVERED_WITHIN
     per_node = known.spacing_m / np.median(np.abs(np.diff(queries.wheels.position_m[:, 0])))
     draws = stream(seed, "kidnapping")
-    for trial in range(10):
+    for trial in range(25):
         before = np.arange(30) + draws.integers(0, n // 2 - 40)
         there = np.arange(after) + draws.integers(n // 2, n - after)
         part = resequenced(bare, np.concatenate([before, there]))
