@@ -12,7 +12,7 @@ from experiments.figures.style import BLACK, CYCLE, figure
 from experiments.studies.real_logs import DATA
 from sim.formats.wean import read_grid
 
-_INTEL = ("odometry, calibrated", "ICP from the wheels", "EKF, re-anchored")
+_INTEL = ("odometry, calibrated", "ICP from the wheels", "EKF of wheels and ICP")
 
 
 def intel(relations: pd.DataFrame, paths: pd.DataFrame) -> Figure:

@@ -76,22 +76,14 @@ LEGO_START_RAD = math.radians(213.0)
 TUNED_SHARE = 0.4
 INTEL_SIGMA_M, INTEL_K_M = 0.03, 1e-3
 FUSION: dict[str, Any] = {
-    "kr": 1e-3,
-    "kl": 1e-3,
+    "kr": 3e-3,
+    "kl": 3e-3,
     "sigma_range_m": 0.1,
-    "lateral_slip_m": 1e-3,
-    "keyframe_distance_m": 0.5,
-    "keyframe_turn_rad": 0.35,
+    "lateral_slip_m": 3e-3,
+    "keyframe_distance_m": 0.0,
+    "keyframe_turn_rad": 0.0,
+    "gate_probability": 1e-4,
 }
-REANCHORED: dict[str, Any] = {
-    "kr": 3e-4,
-    "kl": 3e-4,
-    "sigma_range_m": 0.03,
-    "lateral_slip_m": 1e-4,
-    "keyframe_distance_m": 0.5,
-    "keyframe_turn_rad": 0.35,
-}
-SCANS_PER_ANCHOR = 40
 # Chosen on robots 1 and 2 of MRCLAM; robots 3 to 5 judge
 TUNED_ROBOTS = (1, 2)
 CALIBRATED_S = 300.0
@@ -237,29 +229,6 @@ def calibrated_by_scans(recording: Recording, until_s: float) -> Recording:
     )
 
 
-def reanchored(estimator: Estimator, recording: Recording, n_scans: int) -> Array:
-    """Means (T, 3) of a filter that is started anew, sure of its pose, every so many scans.
-
-    Relations between near poses do not depend on how sure it is of the frame it began in. With
-    a heading that has become unsure in that frame, an EKF is linearised where it is not, and
-    takes relative measurements for news of the heading itself.
-    """
-    means = np.zeros((len(recording.frame_stamps), 3))
-    rng, sure = np.random.default_rng(0), np.diag([1e-9, 1e-9, 1e-9])
-    estimator.reset(Prior(recording.robot, recording.sensors, np.zeros(3), sure), rng)
-    count = 0
-    for i, frame in enumerate(recording.frames()):
-        belief = estimator.step(frame)
-        means[i] = belief.mean
-        count += frame.ranges_m is not None
-        if frame.ranges_m is not None and count % n_scans == 0:
-            prior = Prior(recording.robot, recording.sensors, belief.mean.copy(), sure)
-            estimator.reset(prior, rng)
-            still = dataclasses.replace(frame, wheel_increments_m=np.zeros(2), duration_s=0.0)
-            estimator.step(still)
-    return means
-
-
 def relations() -> tuple[pd.DataFrame, pd.DataFrame]:
     """The relations metric of our estimates and of the references; and the Intel paths."""
     folder = DATA / "intel_lab"
@@ -295,10 +264,6 @@ def relations() -> tuple[pd.DataFrame, pd.DataFrame]:
             "intel", name, truth, estimate.stamps, estimate.means, until_s=until_s
         )
         paths.append(_path(name, estimate.stamps, estimate.means))
-    name = "EKF, re-anchored"
-    means = reanchored(EkfIcp(**REANCHORED), calibrated, SCANS_PER_ANCHOR)
-    rows += _relation_rows("intel", name, truth, calibrated.frame_stamps, means, until_s=until_s)
-    paths.append(_path(name, calibrated.frame_stamps, means))
     assert sparse.truth is not None
     reference = sparse.truth
     rows += _relation_rows(
