@@ -505,7 +505,9 @@ def draw_check(
     pool: Pool, rng: np.random.Generator, fault: tuple[str, str] | None = None
 ) -> list[Finding]:
     """Draw a whole check against two baselines, with one fault planted or none."""
-    chosen = {group: rng.integers(count, size=count) for group, count in pool.suite.counts.items()}
+    n_pooled = {e.recordings: len(pool.sound[e.name, ERRORS[0]]) for e in pool.suite.estimators}
+    counts = pool.suite.counts
+    chosen = {group: rng.integers(n, size=counts[group]) for group, n in n_pooled.items()}
     findings = []
     for entry in pool.suite.estimators:
         name, rows = entry.name, chosen[entry.recordings]

@@ -12,7 +12,9 @@ import pytest
 from scipy import stats
 
 from experiments import regress, regress_report
-from experiments.regress import compare, exchange_p, holm
+from experiments.build import default_cache, make_recording
+from experiments.compose import compose
+from experiments.regress import exchange_p, holm
 from experiments.suite import ERRORS, fingerprint, read_suite, run_suite, suite_path
 from sim.errors import InputError
 
@@ -45,7 +47,7 @@ def table(name, errors, status="ok"):
 
 
 def verdicts(then, now, name="e"):
-    found = compare({"accepted": table(name, then)}, table(name, now), n_draws=20_000)
+    found = regress.compare({"accepted": table(name, then)}, table(name, now), n_draws=20_000)
     return {f.verdict for f in found}
 
 
@@ -98,7 +100,7 @@ def test_false_alarms_are_as_rare_as_promised():
 
 def test_exchange_agrees_with_the_exact_permutation_test():
     rng = np.random.default_rng(3)
-    for shift, tolerance in ((0.0, 0.05), (1.5, 0.002)):  # by the normal law; by drawing
+    for shift, tolerance in ((0.0, 0.05), (1.8, 0.0015)):  # by the normal law; by drawing
         then, now = 0.7 * rng.standard_normal((2, 10, 1))
         now += shift
         signs = np.array(np.meshgrid(*[[-1, 1]] * 10)).reshape(10, -1)
@@ -117,7 +119,7 @@ def test_failed_runs_alarm_and_are_told_once():
     then = table("e", np.ones((5, 1)))
     now = then.copy()
     now.loc[2, [*ERRORS, "status"]] = [math.nan] * 3 + ["ValueError: no"]
-    found = compare({"accepted": then}, now)
+    found = regress.compare({"accepted": then}, now)
     assert {f.verdict for f in found} == {"failed"}
     text = regress_report.as_text(found)
     assert text.count("1 of 5 runs fail; recording 2: ValueError: no") == 1
@@ -126,14 +128,14 @@ def test_failed_runs_alarm_and_are_told_once():
 def test_other_recordings_are_refused():
     then = table("e", np.ones((5, 1)))
     other_bits = then.assign(checksum="x", fingerprint=then["fingerprint"] * (1 + 1e-9))
-    assert {f.verdict for f in compare({"accepted": then}, other_bits)} == {"identical"}
+    assert {f.verdict for f in regress.compare({"accepted": then}, other_bits)} == {"identical"}
     for now, words in (
         (then.assign(checksum="x", fingerprint=7.0), "what simulates it has changed"),
         (then.iloc[:4], "other recordings"),
         (then.assign(estimator="f"), "does not know f"),
     ):
         with pytest.raises(InputError, match=words) as refusal:
-            compare({"accepted": then}, now)
+            regress.compare({"accepted": then}, now)
         assert "--accept" in str(refusal.value)
 
 
@@ -195,6 +197,18 @@ def test_suite_of_the_check_is_sound():
         assert entry.repeats[0] >= entry.repeats[1]
 
 
+def test_recordings_of_the_check_turn():
+    """On a straight line a wrong track, and much else, would go unseen."""
+    suite = read_suite(suite_path("check"))
+    for group, overrides in suite.overrides.items():
+        config = compose(overrides)
+        config["seed"] = config["world_seed"] = suite.first_seed
+        recording = make_recording(config, default_cache())
+        assert recording.status == "ok"
+        turned = np.abs(np.diff(np.unwrap(recording.truth.poses[:, 2]))).sum()
+        assert turned > 1.0, group
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -249,7 +263,7 @@ def findings():
         ]
     )
     baseline = pd.concat([table(name, then) for name in ("worse <&>", "better", "same")])
-    return compare({"accepted": baseline}, now)
+    return regress.compare({"accepted": baseline}, now)
 
 
 def test_reports_agree(monkeypatch, tmp_path, capsys):
