@@ -209,12 +209,12 @@ def wrong_mount(offset_m: float) -> Planted:
 
 
 def wrong_between(share: float) -> Planted:
-    """A relative pose's derivative by the first heading is too large."""
+    """The derivative of a relative heading by the robot's own is too large."""
 
     def wrap(sound: Any) -> Any:
         def between(first: Array, second: Array) -> tuple[Array, Array, Array]:
             pose, by_first, by_second = sound(first, second)
-            by_first[:2, 2] *= 1.0 + share
+            by_second[2, 2] *= 1.0 + share
             return pose, by_first, by_second
 
         return between
