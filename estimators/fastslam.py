@@ -355,7 +355,7 @@ class FastSLAM:
         """Rows of the observations that can be used, and what is wrong with the others."""
         usable = self._model.usable(seen.points_in_camera)
         status = "" if usable.all() else "observation without depth refused"
-        if self.association == "known":
+        if self.association == "known" and usable.any():
             if seen.ids is None:
                 raise InputError("fastslam: observations without ids; set estimator.association")
             ids = seen.ids[usable]
@@ -370,8 +370,7 @@ class FastSLAM:
 
     def _known(self, seen: LandmarkSet, found: Ints) -> Ints:
         """Slots (K,) by id, -1 for new ones."""
-        assert seen.ids is not None
-        self._ids = seen.ids[found].tolist()
+        self._ids = [] if seen.ids is None else seen.ids[found].tolist()
         return np.array([self._slot_of.get(i, -1) for i in self._ids], dtype=np.int64)
 
     def _associate(self, points: Array, seen: LandmarkSet, found: Ints, spread: Array) -> Ints:

@@ -323,3 +323,18 @@ def test_best_particle_carries_its_weight_along_the_ancestry(recording):
     assert resampled > 20
     assert not belief.extras["resampled"]
     assert np.array_equal(estimator.finish().means[-1], belief.extras["best"])
+
+
+@pytest.mark.parametrize("proposal", ["motion", "optimal"])
+def test_images_that_never_show_a_landmark(proposal):
+    """Without a single observation a recording holds no ids; the wheels carry on."""
+    recording = circle(n_frames=20)
+    empty = LandmarkSet(np.zeros((0, 3)), None, None)
+    estimator = FastSLAM(n_particles=20, proposal=proposal, association="known", kr=1e-5, kl=1e-5)
+    estimator.reset(tracking_prior(recording), np.random.default_rng(0))
+    for frame in recording.frames():
+        if frame.landmarks is not None:
+            frame = dataclasses.replace(frame, landmarks=empty)
+        belief = estimator.step(frame)
+    assert np.isfinite(belief.mean).all()
+    assert np.isfinite(belief.covariance).all()
