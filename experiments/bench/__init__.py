@@ -9,6 +9,7 @@ from sim.errors import InputError
 # name -> modules of this package, each with `run()`
 SUITES = {
     "sim": ("recording", "casting"),
+    "sweep": ("sweep",),
     "icp": ("icp", "ekf_icp"),
     "fastslam": ("fastslam",),
     "topological": ("topological",),

@@ -1,0 +1,131 @@
+"""What a sweep costs beside its runs, and what two workers gain."""
+
+from __future__ import annotations
+
+import shutil
+import statistics
+import subprocess
+import sys
+import time
+
+from estimators.base import run as run_estimator
+from experiments.bench.measure import Measurement, median_time_s
+from experiments.build import (
+    Config,
+    default_cache,
+    make_estimator,
+    make_prior,
+    make_recording,
+)
+from experiments.compose import compose
+from experiments.run import RESULTS, run_configuration
+from experiments.seeds import stream
+from experiments.sweep import run_and_record
+from experiments.version import ROOT
+from sim.recording import Recording
+
+_NAME = "bench_sweep"
+_SHORT = ["simulation.physics=kinematic", "simulation.rays=exact", "route=linear_1"]
+_LONG = [
+    "world=room",
+    "sensors=lms291",
+    "sensors.laser.rate_hz=10",
+    "estimator=ekf_icp",
+    "route.distance_m=40",
+    "simulation.physics=kinematic",
+    "simulation.rays=exact",
+]
+_FEW, _MANY = 10, 60
+
+
+def run() -> list[Measurement]:
+    """Overheads a run and a job, the gain of two workers, and the time of `estima --help`."""
+    try:
+        return [*_overheads(), _speedup(), _help()]
+    finally:
+        shutil.rmtree(RESULTS / "runs" / _NAME, ignore_errors=True)
+
+
+def _overheads() -> list[Measurement]:
+    config = compose([*_SHORT, f"name={_NAME}", "picture=false"])
+    config.pop("sweeps")
+    kept: list[Recording] = []
+
+    def fetch(wanted: Config) -> Recording:
+        if not kept:
+            kept.append(make_recording(wanted, default_cache()))
+        return kept[0]
+
+    run_and_record(config, {}, fetch)
+    prior = make_prior(config, kept[0])
+    estimator = make_estimator(config)
+    own_s = median_time_s(lambda: run_estimator(estimator, kept[0], prior, stream(0, "bench")))
+
+    def packed(repeats: int) -> float:
+        begun = time.process_time()
+        run_configuration({**config, "repeats": repeats}, {}, fetch)
+        return time.process_time() - begun
+
+    slopes = [(packed(_MANY) - packed(_FEW)) / (_MANY - _FEW) - own_s for _ in range(3)]
+    jobs = [(_swept_s(_MANY) - _swept_s(_FEW)) / (_MANY - _FEW) - own_s for _ in range(3)]
+    return [
+        Measurement(
+            "sweep.overhead_packed_ms",
+            1e3 * statistics.median(slopes),
+            "ms",
+            10.0,
+            note="processor time of a repeat beside the estimator's own",
+        ),
+        Measurement(
+            "sweep.overhead_job_ms",
+            1e3 * statistics.median(jobs),
+            "ms",
+            60.0,
+            note="wall time of a run of its own, from the command line, one after another",
+        ),
+    ]
+
+
+def _swept_s(n_runs: int) -> float:
+    """Wall time of a sweep over values of a belief, recording at hand, without a cached row."""
+    shutil.rmtree(RESULTS / "runs" / _NAME, ignore_errors=True)
+    values = ",".join(f"{1e-6 * (i + 1):.7g}" for i in range(n_runs))
+    return _timed(
+        ["run", "-m", *_SHORT, f"name={_NAME}", f"estimator.kr={values}", "hydra/launcher=basic"]
+    )
+
+
+def _speedup() -> Measurement:
+    seconds = {}
+    for launcher in ("basic", "joblib"):
+        for _ in range(2):  # the first makes the recordings
+            shutil.rmtree(RESULTS / "runs" / _NAME, ignore_errors=True)
+            chosen = [f"hydra/launcher={launcher}"]
+            if launcher == "joblib":
+                chosen.append("hydra.launcher.n_jobs=2")
+            seeds = "seed=range(0,24)"
+            seconds[launcher] = _timed(["run", "-m", *_LONG, f"name={_NAME}", seeds, *chosen])
+    return Measurement(
+        "sweep.speedup_two_workers",
+        seconds["basic"] / seconds["joblib"],
+        "x",
+        1.8,
+        "higher",
+        "24 runs of ekf_icp, start-up included",
+    )
+
+
+def _help() -> Measurement:
+    seconds = [_timed(["--help"]) for _ in range(7)]
+    return Measurement("cli.help_s", statistics.median(seconds), "s", 0.4)
+
+
+def _timed(arguments: list[str]) -> float:
+    begun = time.perf_counter()
+    subprocess.run(
+        [sys.executable, "-m", "experiments.cli", *arguments],
+        check=True,
+        cwd=ROOT,
+        capture_output=True,
+    )
+    return time.perf_counter() - begun
