@@ -64,6 +64,10 @@ class _Topic:
     messages: list[Any]
 
 
+# What the fields of a damaged message can lead to
+_BAD_CONTENT = (ValueError, TypeError, KeyError, IndexError, OverflowError, AttributeError)
+
+
 def read_bag(
     path: Path,
     odometry: str | None = None,
@@ -98,27 +102,36 @@ def read_bag(
         return _recording(
             path, topics, about, notes, (odometry, scan, truth), track, wheel_radius_m
         )
-    except (ValueError, TypeError, KeyError, IndexError, OverflowError, AttributeError) as error:
+    except _BAD_CONTENT as error:
         raise InputError(f"{path}: messages that do not make a recording ({error})") from error
 
 
 def read_tracks(path: Path) -> dict[str, Track]:
     """Trajectories with covariances in a bag: name of the topic, without its slash, to track."""
-    tracks = {}
     topics = _messages(path)
-    for name, topic in topics.items():
-        if topic.kind != ODOMETRY:
-            continue
-        stamps, poses = _poses(topic)
-        rows = assemble.in_order(stamps, name, {})
-        covariance = np.array([m.pose.covariance for m in topic.messages]).reshape(-1, 6, 6)
-        landmarks = np.zeros((0, 3))
-        if f"{name}/map" in topics and topics[f"{name}/map"].kind == CLOUD:
-            points = _cloud(path, topics[f"{name}/map"].messages[-1])
-            landmarks = np.stack([points[c] for c in "xyz"], axis=1).astype(np.float64)
-        planar = covariance[(slice(None), *PLANAR)]
-        tracks[name.lstrip("/")] = Track(stamps[rows], poses[rows], planar[rows], landmarks)
-    return tracks
+    try:
+        return {
+            name.lstrip("/"): _track(path, topics, name)
+            for name, topic in topics.items()
+            if topic.kind == ODOMETRY
+        }
+    except InputError:
+        raise
+    except _BAD_CONTENT as error:
+        raise InputError(f"{path}: not a bag of tracks: {error}") from error
+
+
+def _track(path: Path, topics: dict[str, _Topic], name: str) -> Track:
+    topic = topics[name]
+    stamps, poses = _poses(topic)
+    rows = assemble.in_order(stamps, name, {})
+    covariance = np.array([m.pose.covariance for m in topic.messages]).reshape(-1, 6, 6)
+    landmarks = np.zeros((0, 3))
+    if f"{name}/map" in topics and topics[f"{name}/map"].kind == CLOUD:
+        points = _cloud(path, topics[f"{name}/map"].messages[-1])
+        landmarks = np.stack([points[c] for c in "xyz"], axis=1).astype(np.float64)
+    planar = covariance[(slice(None), *PLANAR)]
+    return Track(stamps[rows], poses[rows], planar[rows], landmarks)
 
 
 def _recording(
@@ -390,7 +403,7 @@ def _quaternion(q: Any) -> Array:
 
 
 def _yaw(q: Array) -> float:
-    x, y, z, w = q
+    x, y, z, w = q.tolist()  # plain numbers overflow without a warning
     return math.atan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z)
 
 
