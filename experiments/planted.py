@@ -34,7 +34,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy import stats
 
-from estimators import ekf_icp, ekf_icp_paper, fastslam, mcl, odometry, smoother, topological_mcl
+from estimators import ekf_icp, ekf_icp_paper, fastslam, mcl, odometry, smoother
 from estimators.base import Belief, Estimator, Prior
 from estimators.gaussian import Gaussian
 from estimators.scan_matching import Match, ScanMatcher
@@ -269,14 +269,14 @@ def wrong_wheels(module: Any) -> Fault:
     return fault
 
 
-def wrong_distances(share: float) -> Planted:
-    """Distances of nodes along x count for too much."""
+def wrong_travel(share: float) -> Planted:
+    """The wheels' travel is believed too long, as by a wrong radius."""
 
-    def wrap(sound: Any) -> Any:
-        scale = np.array([1.0 + share, 1.0])
-        return lambda nodes, nearest, *rest: sound(nodes * scale, nearest * scale, *rest)
+    def change(frame: Frame, rng: np.random.Generator) -> Frame:
+        travel = (1.0 + share) * frame.wheel_increments_m
+        return dataclasses.replace(frame, wheel_increments_m=travel)
 
-    return patched((topological_mcl, "node_log_weights", wrap))
+    return changed(change)
 
 
 def inflated_wheels(module: Any) -> Fault:
@@ -361,7 +361,7 @@ FAULTS: dict[str, dict[str, tuple[Fault, float]]] = {
         "noise": (inflated_wheels(mcl), 1.0),
     },
     "topological_mcl": {
-        "derivative": (wrong_distances, 0.5),
+        "derivative": (wrong_travel, 0.2),
         "lost": (lost("place_descriptor"), 0.1),
         "noise": (noisy_descriptors, 0.3),
     },
