@@ -210,6 +210,7 @@ def _launch(runs: Sequence[Run], folder: Path, launching: Sequence[str]) -> None
     plan = folder / "plan.json"
     for run in runs:  # rows of an earlier failure
         (folder / f"{run.key}.parquet").unlink(missing_ok=True)
+        (folder / f"{run.key}.failed").unlink(missing_ok=True)
     text = json.dumps([[[r.config, r.choices] for r in job] for job in jobs])
     with write_whole(plan) as part:
         part.write_text(text)
@@ -263,13 +264,17 @@ def run_and_record(
     key = run_key(config)
     path = RESULTS / "runs" / config["name"] / f"{key}.parquet"
     try:
-        run_configuration(config, choices, fetch)
+        rows, _ = run_configuration(config, choices, fetch)
+        bad = any(failed(str(row["status"])) for row in rows)
     except Exception as error:
+        bad = True
         if not path.exists():
             kind = "" if isinstance(error, InputError) else f"{type(error).__name__}: "
             row = labels(config, choices, "", key, 0)
             message = " ".join(str(error).split())
             write_rows([{**row, "status": f"error: {kind}{message}"}], path)
+    if bad:  # for those who watch; the row says how
+        path.with_suffix(".failed").touch()
 
 
 class _LastRecording:
@@ -303,14 +308,13 @@ class _Watch:
 
     def _watch(self) -> None:
         seen: set[str] = set()
-        bad, tell_after_s = 0, 2.0
+        tell_after_s = 2.0
         on_terminal = sys.stderr.isatty()
         while True:
             over = self._over.wait(0.5)
             there = {path.stem for path in self._folder.glob("*.parquet")} & self._keys
-            for key in there - seen:
-                bad += _status(self._folder, key) is not None
             seen |= there
+            bad = len({path.stem for path in self._folder.glob("*.failed")} & self._keys)
             spent_s = time.monotonic() - self._begun
             if (spent_s > tell_after_s or over) and seen:
                 tell_after_s = spent_s + (0.5 if on_terminal else 10.0)

@@ -88,6 +88,7 @@ def read_rows(path: Path) -> pd.DataFrame:
         If there is none, or a file cannot be read.
     """
     import pandas as pd
+    import pyarrow.parquet as pq
 
     files = sorted(path.glob("*.parquet")) if path.is_dir() else [path]
     if not files or not path.exists():
@@ -98,7 +99,9 @@ def read_rows(path: Path) -> pd.DataFrame:
             if file.suffix == ".csv":  # a digest such as 12e4567 is no number
                 frames.append(pd.read_csv(file, dtype=dict.fromkeys(_TEXTS, "str")))
             else:
-                frames.append(pd.read_parquet(file))
+                # one thread: Arrow's own, started for a small file, can abort the program's end
+                read = pq.ParquetFile(file).read(use_threads=False)
+                frames.append(read.to_pandas(use_threads=False))
         except (OSError, ValueError) as error:
             raise InputError(
                 f"{file}: cannot read this table ({str(error).splitlines()[0]}); delete it and "
