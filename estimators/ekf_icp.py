@@ -21,11 +21,11 @@ from scipy.special import chdtri
 from estimators.base import Belief, Prior
 from estimators.gaussian import STILL, Gaussian, between, compose, update, wheel_motion, wrap
 from estimators.icp import Metric, PreparedScan, Search
+from estimators.options import require_positive
 from estimators.scan_matching import (
     Covariance,
     Match,
     ScanMatcher,
-    require_positive,
     tracking_start,
 )
 from sim.errors import InputError

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from estimators.base import Belief, Prior
 from estimators.gaussian import STILL, Gaussian, update, wheel_motion, wrap
 from estimators.icp import Metric, PreparedScan, Search
+from estimators.options import require_positive
 from estimators.scan_matching import (
     Covariance,
     ScanMatcher,
-    require_positive,
     tracking_start,
 )
 from sim.recording import Frame

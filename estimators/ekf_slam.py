@@ -16,6 +16,7 @@ from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from estimators.base import Belief, Prior
 from estimators.gaussian import STILL, Gaussian, compose, wheel_motion, wrap
+from estimators.options import require_choices, require_positive
 from estimators.stereo import LEAST_DEPTH_M, NoiseAt, NoiseModel, StereoModel
 from sim.errors import InputError
 from sim.recording import Frame, LandmarkSet
@@ -84,9 +85,7 @@ class EkfSlam:
             "noise_model": (noise_model, ("camera", "diagonal", "correlated", "image")),
             "noise_at": (noise_at, ("predicted", "measured")),
         }
-        for name, (value, allowed) in choices.items():
-            if value not in allowed:
-                raise InputError(f"estimator.{name} must be {' or '.join(allowed)}, got {value!r}")
+        require_choices(choices)
         believed = {
             "sigma_column_px": sigma_column_px,
             "sigma_row_px": sigma_row_px,
@@ -94,9 +93,7 @@ class EkfSlam:
             "sigma_descriptor": sigma_descriptor,
         }
         self._believed = {name: sigma for name, sigma in believed.items() if sigma is not None}
-        for name, number in {"kr": kr, "kl": kl, "window_s": window_s, **self._believed}.items():
-            if not (math.isfinite(number) and number >= 0.0):
-                raise InputError(f"estimator.{name} must be zero or positive, got {number}")
+        require_positive(kr=kr, kl=kl, window_s=window_s, **self._believed)
         if not (math.isfinite(d0) and d0 > 0.0):
             raise InputError(f"estimator.d0 must be positive, got {d0}")
         self.association, self.d0 = association, d0

@@ -13,6 +13,7 @@ from estimators import landmarks as ekf
 from estimators.base import Belief, Estimate, Prior
 from estimators.gaussian import STILL, Gaussian, compose, wheel_motion
 from estimators.landmarks import LandmarkMaps, Maps
+from estimators.options import require_choices, require_positive
 from estimators.particles import (
     SCHEMES,
     Lineages,
@@ -129,9 +130,7 @@ class FastSLAM:
             "noise_at": (noise_at, ("predicted", "measured")),
             "maps": (maps, ("shared", "contiguous")),
         }
-        for name, (value, allowed) in choices.items():
-            if value not in allowed:
-                raise InputError(f"estimator.{name} must be {' or '.join(allowed)}, got {value!r}")
+        require_choices(choices)
         believed = {
             "sigma_column_px": sigma_column_px,
             "sigma_row_px": sigma_row_px,
@@ -139,10 +138,7 @@ class FastSLAM:
             "sigma_descriptor": sigma_descriptor,
         }
         self._believed = {name: sigma for name, sigma in believed.items() if sigma is not None}
-        numbers = {"ess_share": ess_share, "kr": kr, "kl": kl, "window_s": window_s}
-        for name, number in {**numbers, **self._believed}.items():
-            if not (math.isfinite(number) and number >= 0.0):
-                raise InputError(f"estimator.{name} must be zero or positive, got {number}")
+        require_positive(ess_share=ess_share, kr=kr, kl=kl, window_s=window_s, **self._believed)
         for name, number in {"d0": d0, "p0": p0}.items():
             if not (math.isfinite(number) and number > 0.0):
                 raise InputError(f"estimator.{name} must be positive, got {number}")

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from estimators.base import Belief, Prior
 from estimators.gaussian import STILL, Gaussian, wheel_motion
 from estimators.icp import Metric, PreparedScan, Search
+from estimators.options import require_positive
 from estimators.scan_matching import (
     FAILED,
     Covariance,
     ScanMatcher,
-    require_positive,
     tracking_start,
 )
 from sim import se2

@@ -18,6 +18,7 @@ from estimators import icp_covariance
 from estimators.base import Prior
 from estimators.gaussian import Gaussian
 from estimators.icp import Metric, PreparedScan, Registration, Search, prepare, register
+from estimators.options import require_choices, require_positive
 from sim import se2
 from sim.errors import InputError
 from sim.sensors import Laser
@@ -110,9 +111,7 @@ class ScanMatcher:
                 ("censi", "censi_last", "hessian", "sampling", "unscented_censi"),
             ),
         }
-        for name, (value, allowed) in choices.items():
-            if value not in allowed:
-                raise InputError(f"estimator.{name} must be {' or '.join(allowed)}, got {value!r}")
+        require_choices(choices)
         if self.sigma_range_m is not None:
             require_positive(sigma_range_m=self.sigma_range_m)
 
@@ -211,10 +210,3 @@ def tracking_start(prior: Prior, name: str) -> tuple[Gaussian, Laser]:
     if prior.mean is None or prior.covariance is None:
         raise InputError(f"{name} needs a start pose; set prior.start=tracking")
     return Gaussian(prior.mean.copy(), prior.covariance.copy()), prior.sensors.laser
-
-
-def require_positive(**numbers: float) -> None:
-    """Raise an InputError that names the first key whose number is negative or not finite."""
-    for name, number in numbers.items():
-        if not (math.isfinite(number) and number >= 0.0):
-            raise InputError(f"estimator.{name} must be zero or positive, got {number}")

@@ -224,10 +224,10 @@ def _print(rows: list[Row], folder: Path, picture: bool) -> None:
             mean = sum(values) / len(values)
             print(f"  {label:<30} {mean:10.4g} {unit}")
     for path in [folder.with_suffix(".parquet"), *([folder / "run.png"] if picture else [])]:
-        print(f"  {_short(path)}")
+        print(f"  {short(path)}")
 
 
-def _short(path: Path) -> str:
+def short(path: Path) -> str:
     """The path as one would type it from here."""
     try:
         return str(path.relative_to(Path.cwd()))

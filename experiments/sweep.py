@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 import json
 import os
+import shutil
 import sys
 import threading
 import time
@@ -33,6 +34,7 @@ from experiments.run import (
     labels,
     run_configuration,
     run_key,
+    short,
 )
 from experiments.table import read_rows, write_rows
 from experiments.version import ROOT
@@ -92,7 +94,7 @@ def sweep(arguments: Sequence[str], config_dir: str | None = None) -> None:
     folder = RESULTS / "runs" / runs[0].config["name"]
     missing = [run for run in runs if not is_done(folder, run.key)]
     print(
-        f"{len(runs)} runs, {len(runs) - len(missing)} of them done before: {_short(folder)}",
+        f"{len(runs)} runs, {len(runs) - len(missing)} of them done before: {short(folder)}",
         file=sys.stderr,
     )
     if missing:
@@ -224,7 +226,7 @@ def _launch(runs: Sequence[Run], folder: Path, launching: Sequence[str]) -> None
     with _Watch(folder, [run.key for run in runs]):
         job_application()
     plan.unlink(missing_ok=True)
-    _clear(Path(f"{plan}.jobs"))
+    shutil.rmtree(f"{plan}.jobs", ignore_errors=True)
 
 
 def packed(runs: Sequence[Run], n_jobs: int) -> list[list[Run]]:
@@ -307,13 +309,11 @@ class _Watch:
         self._thread.join()
 
     def _watch(self) -> None:
-        seen: set[str] = set()
         tell_after_s = 2.0
         on_terminal = sys.stderr.isatty()
         while True:
             over = self._over.wait(0.5)
-            there = {path.stem for path in self._folder.glob("*.parquet")} & self._keys
-            seen |= there
+            seen = {path.stem for path in self._folder.glob("*.parquet")} & self._keys
             bad = len({path.stem for path in self._folder.glob("*.failed")} & self._keys)
             spent_s = time.monotonic() - self._begun
             if (spent_s > tell_after_s or over) and seen:
@@ -331,18 +331,3 @@ def _progress_line(done: int, total: int, bad: int, spent_s: float) -> str:
     rest = f"{left / 60:.0f} min left" if left > 90 else f"{left:.0f} s left"
     told = f", {bad} failed" if bad else ""
     return f"{done} of {total} runs, {rate:.2g} a second, {rest}{told}"
-
-
-def _clear(folder: Path) -> None:
-    """Remove what the launcher left in its folder, if it is ours and plain."""
-    if folder.is_dir():
-        for path in sorted(folder.rglob("*"), reverse=True):
-            path.rmdir() if path.is_dir() else path.unlink()
-        folder.rmdir()
-
-
-def _short(path: Path) -> str:
-    try:
-        return str(path.relative_to(Path.cwd()))
-    except ValueError:
-        return str(path)
