@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import hashlib
 import json
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -32,7 +33,8 @@ def cached(folder: Path, settings: dict[str, Any], make: Callable[[], Recording]
         if path.exists():
             try:
                 return load(path)
-            except InputError:
+            except InputError as error:
+                print(f"estima: {error}; it is made anew", file=sys.stderr)
                 path.unlink(missing_ok=True)
         recording = make()
         save(recording, path)
@@ -47,8 +49,8 @@ def _locked(path: Path) -> Iterator[None]:
         handle = path.open("w")
     except OSError as error:
         raise InputError(
-            f"{path}: cannot write to the cache ({error.strerror}); free some space or set "
-            "cache=FOLDER"
+            f"{path}: cannot write to the cache ({error.strerror}); free some space, or make "
+            f"{path.parent} a link to a larger disk"
         ) from error
     with handle:
         fcntl.flock(handle, fcntl.LOCK_EX)

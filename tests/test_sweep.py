@@ -1,6 +1,7 @@
 """Sweeps: what is expanded, composed and packed, and what is left after failures and kills."""
 
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -12,7 +13,8 @@ import pandas as pd
 import pytest
 
 from experiments import sweep
-from experiments.build import recording_settings
+from experiments.build import default_cache, recording_settings
+from experiments.cache import key_of
 from experiments.collect import collect, measured, summary, swept
 from experiments.compose import compose
 from experiments.figures.sweep import sweep_figure
@@ -202,6 +204,65 @@ def test_a_killed_sweep_resumes_to_the_same_table(name):
         assert len(pd.read_csv(folder(name) / "all.csv")) == 200
     finally:
         clear(whole)
+
+
+@pytest.mark.parametrize(
+    "full", ["results/cache", "results/runs/{name}"], ids=["recordings", "rows"]
+)
+def test_a_full_disk_ends_in_a_line_and_a_correct_re_run(name, full, tmp_path):
+    place = full.format(name=name)
+    command = shlex.join(
+        [sys.executable, "-m", "experiments.cli", "run", "-m", *SHORT, "seed=range(0,12)",
+         f"name={name}"]
+    )  # fmt: skip
+    mount = f"mkdir -p {place} && mount -t tmpfs -o size=150k estima {place}"
+    if subprocess.run(["unshare", "-rm", "sh", "-c", mount], cwd=ROOT, check=False).returncode:
+        pytest.skip("a small disk cannot be mounted here")
+    script = (
+        f"{mount}\n{command}\necho code $?\nmount -o remount,size=100m {place}\n"
+        f"{command}\necho code $?\ncp results/runs/{name}/*.parquet {tmp_path}"
+    )
+    done = subprocess.run(
+        ["unshare", "-rm", "sh", "-c", script], cwd=ROOT, capture_output=True, text=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT)}, timeout=120, check=False,
+    )  # fmt: skip
+    first, second = (int(line.split()[1]) for line in done.stdout.splitlines())
+    assert first in (1, 2), done.stderr
+    assert second == 0, done.stderr
+    told = [line for line in done.stderr.splitlines() if line.startswith("estima: ")]
+    assert len(told) == 1
+    assert "No space left on device" in told[0]
+    assert "free some space" in told[0]
+    assert "Traceback" not in done.stderr
+    clear(name)
+    assert estima("run", "-m", *SHORT, "seed=range(0,12)", f"name={name}").returncode == 0
+    pd.testing.assert_frame_equal(collect(str(tmp_path)), table_of(name), check_exact=True)
+
+
+def test_damaged_files_are_made_anew(name):
+    swept_ = ["run", "-m", *SHORT, "seed=range(90001,90005)", f"name={name}"]
+    assert estima(*swept_).returncode == 0
+    expected = table_of(name)
+    recordings = [
+        default_cache() / f"{key_of(recording_settings(compose([*SHORT, f'seed={seed}'])))}.npz"
+        for seed in range(90001, 90005)
+    ]
+    half = recordings[0].read_bytes()[:5000]
+    other = bytearray(recordings[1].read_bytes())
+    other[len(other) // 2] ^= 0x10
+    recordings[0].write_bytes(half)
+    recordings[1].write_bytes(other)
+    recordings[2].write_bytes(b"")
+    for row in folder(name).glob("*.parquet"):
+        row.write_bytes(row.read_bytes()[:-100])
+    again = estima(*swept_)
+    assert again.returncode == 0, again.stderr
+    assert "0 of them done before" in again.stderr
+    for recording in recordings[:3]:
+        assert any(
+            str(recording) in line and "made anew" in line for line in again.stderr.splitlines()
+        )
+    pd.testing.assert_frame_equal(table_of(name), expected, check_exact=True)
 
 
 def rows(n=6):
