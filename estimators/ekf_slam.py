@@ -6,7 +6,6 @@ association for the whole filter, and a wrong one is never taken back.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from typing import Any, Literal
 
@@ -17,7 +16,7 @@ from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from estimators.base import Belief, Prior
 from estimators.gaussian import STILL, Gaussian, compose, wheel_motion, wrap
 from estimators.options import require_choices, require_positive
-from estimators.stereo import LEAST_DEPTH_M, NoiseAt, NoiseModel, StereoModel
+from estimators.stereo import LEAST_DEPTH_M, NoiseAt, NoiseModel, StereoModel, slam_start
 from sim.errors import InputError
 from sim.recording import Frame, LandmarkSet
 from sim.robot import TravelWindow, wheel_variances
@@ -104,25 +103,14 @@ class EkfSlam:
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Start from the prior's pose, with an empty map."""
-        camera = prior.sensors.stereo
-        if camera is None:
-            raise InputError("ekf_slam needs a stereo camera; choose sensors that have one")
-        if prior.mean is None or prior.covariance is None:
-            raise InputError("ekf_slam needs a start pose; set prior.start=tracking")
-        if self.association == "known" and not camera.identifies:
-            raise InputError(
-                "the camera does not identify landmarks; set estimator.association=mahalanobis "
-                "or descriptor"
-            )
-        believed: dict[str, Any] = self._believed
-        camera = dataclasses.replace(camera, **believed)
+        start, camera = slam_start(prior, "ekf_slam", self.association, self._believed)
         self._camera = StereoModel.of(camera, self.noise_model, self.noise_at)
         self._likeness = 1.0 / (1.0 + camera.sigma_descriptor**2)
         # what a landmark may be predicted beyond dmax by, and still be the one that was seen
         self._reach_m = 1.5 * camera.max_distance_m + 1.0
         self._track_m = prior.robot.track_m
         self._window = TravelWindow(self.window_s)
-        self._mean, self._room = prior.mean.copy(), prior.covariance.copy()
+        self._mean, self._room = start.mean, start.covariance
         self._motion = STILL  # since the last image
         self._slot_of: dict[int, int] = {}
         self._births = np.zeros(0, np.int64)  # the observation that started each landmark

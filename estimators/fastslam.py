@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from typing import Any, Literal
 
@@ -23,7 +22,7 @@ from estimators.particles import (
     resample,
     underflowed,
 )
-from estimators.stereo import NoiseAt, NoiseModel, StereoModel
+from estimators.stereo import NoiseAt, NoiseModel, StereoModel, slam_start
 from sim import se2
 from sim.errors import InputError
 from sim.recording import Frame, LandmarkSet
@@ -151,18 +150,7 @@ class FastSLAM:
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Draw the particles from the prior, all with an empty map."""
-        camera = prior.sensors.stereo
-        if camera is None:
-            raise InputError("fastslam needs a stereo camera; choose sensors that have one")
-        if prior.mean is None or prior.covariance is None:
-            raise InputError("fastslam needs a start pose; set prior.start=tracking")
-        if self.association == "known" and not camera.identifies:
-            raise InputError(
-                "the camera does not identify landmarks; set estimator.association=mahalanobis "
-                "or descriptor"
-            )
-        believed: dict[str, Any] = self._believed
-        camera = dataclasses.replace(camera, **believed)
+        start, camera = slam_start(prior, "fastslam", self.association, self._believed)
         self._model = StereoModel.of(camera, self.noise_model, self.noise_at)
         self._camera = self._model.packed
         x, y, yaw = self._model.mount
@@ -177,9 +165,9 @@ class FastSLAM:
         self._state = ekf.new_state(self._maps.n_blocks)
         # lanes beyond the last particle are moved along, and never looked at
         self._n_lanes = self._maps.n_blocks * ekf.LANES
-        turned = _rotated(prior.covariance, -float(prior.mean[2]))
+        turned = _rotated(start.covariance, -float(start.mean[2]))
         scatter = _root(turned) @ rng.standard_normal((3, self._n_lanes))
-        drawn = se2.compose(prior.mean, scatter.T)
+        drawn = se2.compose(start.mean, scatter.T)
         headings = drawn[:, 2]
         self._poses = np.stack([*drawn.T, np.cos(headings), np.sin(headings)])  # (5, lanes)
         self._log_weights, self._accumulated = np.zeros(n), np.zeros(n)

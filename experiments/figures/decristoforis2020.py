@@ -176,7 +176,7 @@ def boxes(table: pd.DataFrame) -> Figure:
 
 def maps(world: World, points: pd.DataFrame) -> Figure:
     """Figure 5: laser points placed by each method, over the true walls."""
-    page = figure(10.0, 4.0)
+    page = figure(10.0, 2.9)
     axes: Any = page.subplots(1, 3, sharex=True, sharey=True)
     for ax, method in zip(axes, ("odometry", "icp", "fusion"), strict=True):
         draw_world(ax, world, landmarks=False)
@@ -186,7 +186,7 @@ def maps(world: World, points: pd.DataFrame) -> Figure:
         ax.plot(rows["x_m"], rows["y_m"], ",", color=TRUTH, alpha=0.8)
         ax.set_title(f"by {NAMES[method]}", fontsize="medium")
         ax.label_outer()
-    page.suptitle("laser points (black) over the true walls (red)", size=9)
+    page.suptitle("laser points (black) over the true walls (orange)", size=9)
     return page
 
 

@@ -182,7 +182,7 @@ def association_ellipses() -> Figure:
 
 def world_3d(recording: Recording, found: Estimate) -> Figure:
     """Figure 5: the world in three dimensions, with ellipsoids of the landmarks seen last."""
-    page = figure(8.0, 6.0)
+    page = figure(8.0, 4.6)
     ax: Any = page.add_subplot(projection="3d")
     world, log = (recording.truth.world if recording.truth else None), recording.landmarks
     assert world is not None
@@ -206,14 +206,15 @@ def world_3d(recording: Recording, found: Estimate) -> Figure:
         ax.plot(*np.vstack([ring, ring[:1]]).T, color=WALL, lw=0.5)
     along = np.where(near(found.means)[:, None], found.means[:, :2], np.nan)
     ax.plot(along[:, 0], along[:, 1], 0.0, color=ESTIMATE, lw=1.0)
-    for row in np.flatnonzero(np.isin(found.map["ids"], ids)):
+    seen = np.isin(found.map["ids"], ids) & near(found.map["landmarks"])
+    for row in np.flatnonzero(seen):
         mean, covariance = found.map["landmarks"][row], found.map["landmark_covariances"][row]
         ax.plot(*_ellipsoid(mean, covariance), color=RED, lw=0.3)
         ax.plot(*np.array([eye, mean]).T, color=SKY, lw=0.5)
     ax.plot(*found.map["landmarks"][near(found.map["landmarks"])].T, ".", color=BLUE, ms=2)
     ax.set(xlim=pose[0] + np.array([-reach, reach]), ylim=pose[1] + np.array([-reach, reach]))
     ax.set(zlim=(0.0, 3.0), xlabel="x, m", ylabel="y, m", zlabel="z, m")
-    ax.set_box_aspect((2.0 * reach, 2.0 * reach, 3.0))
+    ax.set_box_aspect((2.0 * reach, 2.0 * reach, 3.0), zoom=1.25)
     return page
 
 
@@ -391,10 +392,11 @@ def by_association(association: pd.DataFrame) -> Figure:
         table = association[association["noise"] == noise]
         labels = []
         keys = ["filter", "association", "p0", "sigma_descriptor"]
-        for i, ((name, how, p0, _), part) in enumerate(table.groupby(keys, sort=False)):
+        for i, ((name, how, p0, sigma), part) in enumerate(table.groupby(keys, sort=False)):
             precision = part["matching_precision"].mean()
             words = {"known": "known", "mahalanobis": f"Mahalanobis, p0 = {p0:g}"}.get(
-                str(how), f"and descriptors of {100 * precision:.0f} %"
+                str(how),
+                f"descriptors, $\\sigma$ = {sigma:g} ({100 * precision:.0f} % right alone)",
             )
             labels.append("EKF-SLAM, Mahalanobis" if name == "ekf_slam" else words)
             colour = {"known": BLACK, "mahalanobis": ORANGE}.get(str(how), GREEN)

@@ -141,7 +141,7 @@ def map_and_route(
     worlds: dict[str, PlaceWorld], known: TopologicalMap, taking: Recording, campus: str
 ) -> Figure:
     """Figure 3: the nodes of the map and the positions of the queries."""
-    page = figure(10.0, 4.8)
+    page = figure(10.0, 4.1)
     left, middle, right = page.subplots(1, 3)
     for ax, (name, world) in zip((left, middle), worlds.items(), strict=True):
         taken = world.recording.truth_at(world.recording.frame_stamps)
@@ -351,7 +351,7 @@ def campus_errors(starts_table: pd.DataFrame, clusters_table: pd.DataFrame) -> F
     left.axvline(spacing / 5.0, color=WALL, ls=":", label="a fifth of the spacing")
     left.axvline(spacing, color=WALL, ls="--", label="spacing of the nodes")
     left.set(xlabel="error once localised, m", ylabel="share of starts", xscale="log")
-    left.legend(loc="lower right", fontsize=7)
+    page.legend(*left.get_legend_handles_labels(), loc="outside lower left", ncols=4, fontsize=8)
     part = clusters_table[clusters_table["geometry"].str.startswith("campus")]
     places = np.arange(len(describers.KINDS))
     for offset, column, colour in ((-0.2, "recall_at_1", BLUE), (0.2, "recall_at_1_percent", SKY)):

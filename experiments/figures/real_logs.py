@@ -17,7 +17,7 @@ _INTEL = ("odometry, calibrated", "ICP from the wheels", "EKF of wheels and ICP"
 
 def intel(relations: pd.DataFrame, paths: pd.DataFrame) -> Figure:
     """Paths through the Intel lab, and the relations metric beside the printed figures."""
-    page = figure(10.0, 4.4)
+    page = figure(10.0, 5.2)
     left, right = page.subplots(1, 2, width_ratios=[1.1, 1.0])
     for color, name in zip((*CYCLE[1:], BLACK), _INTEL, strict=False):
         rows = paths[paths.method == name]
@@ -25,17 +25,22 @@ def intel(relations: pd.DataFrame, paths: pd.DataFrame) -> Figure:
     rows = paths[paths.method == "GMapping, 910 poses"]
     left.plot(rows.x_m, rows.y_m, color=BLACK, lw=0.7, label="GMapping (reference)")
     left.set(xlabel="x, m", ylabel="y, m", aspect="equal", title="Intel Research Lab")
-    page.legend(*left.get_legend_handles_labels(), loc="outside lower left", ncols=4, fontsize=7)
-    shown = relations[(relations.log == "intel") & (relations.part == "all")]
-    place = np.arange(len(shown))[::-1]
-    printed = shown.method.str.contains("printed").to_numpy()
-    right.barh(
-        place, shown.translation_mean_m, color=np.where(printed, "#bbbbbb", CYCLE[0]), height=0.7
-    )
-    right.set_yticks(place, shown.method, fontsize=7)
-    for y, mean in zip(place, shown.translation_mean_m, strict=True):
-        right.text(mean * 1.1, y, f"{mean:.3f}", va="center", fontsize=7)
+    page.legend(*left.get_legend_handles_labels(), loc="outside lower left", ncols=2, fontsize=7)
+    rows = relations[relations.log == "intel"]
+    methods = list(dict.fromkeys(rows.method))[::-1]
+    printed = rows.method.str.contains("printed")
+    for part, color, shift, label in (
+        (rows[(rows.part == "judged")], CYCLE[0], 0.2, "after the part tuned on (judged)"),
+        (rows[(rows.part == "all") & ~printed], "#9cc9e6", -0.2, "whole log"),
+        (rows[printed], "#bbbbbb", -0.2, "whole log, as printed"),
+    ):
+        place = [methods.index(method) + shift for method in part.method]
+        right.barh(place, part.translation_mean_m, color=color, height=0.38, label=label)
+        for y, mean in zip(place, part.translation_mean_m, strict=True):
+            right.text(mean * 1.1, y, f"{mean:.3f}", va="center", fontsize=7)
+    right.set_yticks(range(len(methods)), methods, fontsize=8)
     right.set(xscale="log", xlim=(0.02, 40.0), xlabel="mean translational error of relations, m")
+    page.legend(*right.get_legend_handles_labels(), loc="outside lower right", fontsize=7)
     return page
 
 
@@ -118,5 +123,5 @@ def wean(fits: pd.DataFrame, paths: pd.DataFrame) -> Figure:
             xlabel="x, m", ylabel="y, m", aspect="equal",
             title=f"Wean Hall, {name}: fit {row.score:.2f}, start {math.degrees(row.yaw_rad):.0f}°",
         )  # fmt: skip
-        ax.legend(fontsize=7, loc="upper right")
+    page.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=2, markerscale=6)
     return page
