@@ -293,12 +293,7 @@ def _figure(path: Path, about: dict[str, Any], claims: pd.DataFrame) -> str:
     width, height = png_size(data, path)
     words = path.stem.split("_", 1)[-1].replace("_", " ")
     title, alt = about.get("title", words), about.get("alt", f"Figure: {words}")
-    ours = [
-        f'<li><a href="#claim-{key}">{key}</a>: '
-        f'<span class="verdict {style}">{escape(verdict)}</span></li>'
-        for key in about.get("claims", [])
-        for verdict, style in [_verdict_on(claims[claims["id"] == key])]
-    ]
+    ours = [_ours(key, claims[claims["id"] == key]) for key in about.get("claims", [])]
     sides = ""
     if about.get("paper"):
         here = f"<ul>{''.join(ours)}</ul>" if ours else "<p>Shown; no claim is judged by it.</p>"
@@ -315,15 +310,22 @@ def _figure(path: Path, about: dict[str, Any], claims: pd.DataFrame) -> str:
     )
 
 
-def _verdict_on(rows: pd.DataFrame) -> tuple[str, str]:
-    """Verdict of a claim with its one statistic, or the count of several."""
-    if rows.empty:
-        return "not judged yet", "quiet"
-    verdict, style = summary(rows["verdict"].tolist())
-    if len(rows) == 1:
-        row = rows.iloc[0]
-        verdict = f"{row['verdict']}; {row['statistic']}: {interval(row)}"
-    return verdict, style
+def _ours(key: str, rows: pd.DataFrame) -> str:
+    """What came of a claim: the verdict, and the first statistic of each outcome below it."""
+    verdict, style = ("not judged yet", "quiet")
+    if not rows.empty:
+        verdict, style = summary(rows["verdict"].tolist())
+    outcomes = rows["verdict"].map(outcome)
+    first = [rows[outcomes == word].iloc[0] for word in _OUTCOMES if (outcomes == word).any()]
+    lines = "".join(
+        f"<li>{escape(row['verdict']) + ': ' if len(first) > 1 else ''}"
+        f"{escape(row['statistic'])}: {interval(row)}</li>"
+        for row in first
+    )
+    return (
+        f'<li><a href="#claim-{key}">{key}</a>: '
+        f'<span class="verdict {style}">{escape(verdict)}</span><ul>{lines}</ul></li>'
+    )
 
 
 def png_size(data: bytes, path: Path) -> tuple[int, int]:
