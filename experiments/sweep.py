@@ -330,4 +330,9 @@ def _progress_line(done: int, total: int, bad: int, spent_s: float) -> str:
     left = (total - done) / rate
     rest = f"{left / 60:.0f} min left" if left > 90 else f"{left:.0f} s left"
     told = f", {bad} failed" if bad else ""
-    return f"{done} of {total} runs, {rate:.2g} a second, {rest}{told}"
+    filled = round(_BAR_WIDTH * done / total)
+    bar = "━" * filled + "╌" * (_BAR_WIDTH - filled)
+    return f"{bar} {done} of {total} runs, {rate:.2g} a second, {rest}{told}"
+
+
+_BAR_WIDTH = 20
