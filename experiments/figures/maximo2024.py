@@ -141,7 +141,7 @@ def map_and_route(
     worlds: dict[str, PlaceWorld], known: TopologicalMap, taking: Recording, campus: str
 ) -> Figure:
     """Figure 3: the nodes of the map and the positions of the queries."""
-    page = figure(10.0, 4.1)
+    page = figure(10.0, 4.5)
     left, middle, right = page.subplots(1, 3)
     for ax, (name, world) in zip((left, middle), worlds.items(), strict=True):
         taken = world.recording.truth_at(world.recording.frame_stamps)
