@@ -343,8 +343,11 @@ def table(
         bool, typer.Option("--all-versions", help="Keep rows of other versions of the code.")
     ] = False,
     times: Annotated[bool, typer.Option("--times", help="Keep computing times.")] = False,
+    means: Annotated[
+        bool, typer.Option("--means", help="With -o: write the means that are shown without it.")
+    ] = False,
 ) -> None:
-    """Collect the rows of a sweep: a summary, or with -o all of them.
+    """Show the means of a sweep's errors, or with -o write all its rows.
 
     Example: estima table leaderboard --against smoother
     """
@@ -352,8 +355,11 @@ def table(
     from experiments.table import write_frame
 
     rows = collect(name, all_versions=all_versions, times=times)
+    if out is None or means:
+        rows = summary(rows, against)
     if out is None:
-        print(summary(rows, against).to_string(index=False, float_format=lambda v: f"{v:.4g}"))
+        text = rows.to_string(index=False, na_rep="-", float_format=lambda v: f"{v:.4g}")
+        print(text)
         return
     write_frame(rows, out)
     print(f"{out}: {len(rows)} rows, {len(rows.columns)} columns")

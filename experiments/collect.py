@@ -17,10 +17,12 @@ _TIMES = ("step_time_us",)  # they differ from run to run
 _ORIGIN = ("run_key", "code_version", "recording_checksum")
 _MAIN = (
     "ate_rmse_m",
-    "revised_ate_rmse_m",
     "ate_aligned_rmse_m",
     "heading_rmse_rad",
+    "heading_aligned_rmse_rad",
     "nees_mean",
+    "revised_ate_rmse_m",
+    "revised_ate_aligned_rmse_m",
     "step_time_us",
 )
 _LAST_KEY = "repeat"  # columns up to it are settings, those after it what was found
@@ -82,6 +84,17 @@ def swept(table: pd.DataFrame) -> list[str]:
     return [c for c in settings if c not in _ORIGIN and table[c].nunique(dropna=False) > 1]
 
 
+def telling(table: pd.DataFrame) -> list[str]:
+    """Swept settings without those that follow from earlier ones, as kl may from kr."""
+    kept: list[str] = []
+    for column in swept(table):
+        if table.groupby([*kept, column], dropna=False).ngroups > (
+            table.groupby(kept, dropna=False).ngroups if kept else 1
+        ):
+            kept.append(column)
+    return kept
+
+
 def measured(table: pd.DataFrame) -> list[str]:
     """Columns of what the runs found."""
     found = table.columns[list(table.columns).index(_LAST_KEY) + 1 :]
@@ -99,8 +112,9 @@ def summary(table: pd.DataFrame, against: str | None = None) -> pd.DataFrame:
     """
     import numpy as np
 
-    by = [c for c in swept(table) if c not in ("seed", "world_seed", _LAST_KEY)]
-    shown = [c for c in _MAIN if c in table]
+    drawn = ("seed", "world_seed", _LAST_KEY)
+    by = telling(table.drop(columns=[c for c in drawn[:2] if c in table]))
+    shown = [c for c in _MAIN if c in table and table[c].notna().any()]
     if against is not None:
         one = table[table["choice.estimator"] == against]
         if one.empty:

@@ -15,7 +15,7 @@ import pytest
 from experiments import sweep
 from experiments.build import default_cache, recording_settings
 from experiments.cache import key_of
-from experiments.collect import collect, measured, summary, swept
+from experiments.collect import collect, measured, summary, swept, telling
 from experiments.compose import compose
 from experiments.figures.sweep import sweep_figure
 from experiments.run import run_key
@@ -294,6 +294,16 @@ def test_tables_know_settings_from_findings_and_compare_on_the_same_recordings()
     assert (found["runs"] == 3).all()
     with pytest.raises(InputError, match="no rows of estimator c"):
         summary(table, against="c")
+
+
+def test_settings_that_follow_from_others_are_not_named():
+    table = rows()
+    table.insert(2, "robot.kl", 2.0 * table["robot.kr"])
+    table.insert(3, "estimator._target_", "module." + table["choice.estimator"])
+    assert telling(table) == ["choice.estimator", "robot.kr", "seed"]
+    assert list(summary(table).columns[:3]) == ["choice.estimator", "robot.kr", "runs"]
+    table["robot.kl"] = np.tile([1.0, 2.0, 2.0], 4)  # now a setting of its own
+    assert telling(table) == ["choice.estimator", "robot.kr", "robot.kl", "seed"]
 
 
 def test_rows_of_other_code_are_left_out(tmp_path, capsys):
