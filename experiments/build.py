@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import importlib
 import inspect
-import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -89,13 +88,11 @@ def check(config: Config) -> None:
     for group in ("world", "robot", "sensors", "route", "simulation", "prior", "estimator"):
         if not isinstance(config[group], dict):
             raise InputError(f"{group} must hold keys, got {config[group]!r}")
-    repeats, keep, name = config["repeats"], config["keep"], config["name"]
+    repeats, keep = config["repeats"], config["keep"]
     if isinstance(repeats, bool) or not isinstance(repeats, int) or repeats < 1:
         raise InputError(f"repeats must be a whole number from 1 on, got {repeats!r}")
     if not (isinstance(keep, list) and all(isinstance(key, str) for key in keep)):
         raise InputError(f"keep must be a list of names, such as [ess], got {keep!r}")
-    if not (isinstance(name, str) and re.fullmatch(r"[\w.-]*\w", name)):
-        raise InputError(f"name must be one word for a folder of results, got {name!r}")
     make_robot(config)
     suite_from_config(config["sensors"])
     make(config["route"], "route")
@@ -133,7 +130,8 @@ def make_recording(
 def recording_settings(config: Config) -> Config:
     """What decides the recording's bits, beside the code: its settings, or a file's digest."""
     if isinstance(config["recording"], dict):
-        return {"recording": config["recording"], "seed": config["seed"]}
+        wanted = config["recording"]
+        return {"recording": wanted, "seed": config["seed"], "files": files_digest(wanted)}
     if config["recording"] is not None:
         return {"recording": _digest(Path(config["recording"]))}
     settings = {key: config[key] for key in SIMULATED_KEYS}
@@ -141,6 +139,20 @@ def recording_settings(config: Config) -> Config:
     if world_file is not None and Path(world_file).is_file():  # an edited file is another world
         settings["world_file"] = _digest(Path(world_file))
     return settings
+
+
+def files_digest(tree: Any) -> dict[str, str]:
+    """Digest of every file that a mapping names, and of the files in each folder it names."""
+    if isinstance(tree, dict):
+        return {k: v for value in tree.values() for k, v in files_digest(value).items()}
+    if not isinstance(tree, str) or not Path(tree).name:
+        return {}
+    path = Path(tree)
+    try:
+        files = [path] if path.is_file() else sorted(path.glob("*")) if path.is_dir() else []
+    except OSError:  # too long for a path, say
+        return {}
+    return {str(file): _digest(file) for file in files if file.is_file()}
 
 
 def _digest(path: Path) -> str:

@@ -285,7 +285,9 @@ def conform(
 
 @app.command()
 def check(
-    suite: Annotated[str, typer.Option(help="Suite of conf/suite, or a .yaml file.")] = "check",
+    suite: Annotated[
+        str, typer.Option(help="Suite of conf/suite, or a .yaml file; baselines lie beside it.")
+    ] = "check",
     accept: Annotated[
         str | None, typer.Option(help="Make this the baseline; the reason is kept in it.")
     ] = None,
@@ -380,8 +382,13 @@ def plot(
     from experiments.collect import collect
     from experiments.figures.style import save_figure
     from experiments.figures.sweep import sweep_figure
+    from experiments.run import failed
 
-    save_figure(sweep_figure(collect(name, times=True), x, y, by), out)
+    rows = collect(name, times=True)
+    if bad := int(rows["status"].map(failed).sum()):
+        print(f"{bad} of {len(rows)} runs failed; they are left out", file=sys.stderr)
+        rows = rows[~rows["status"].map(failed)]
+    save_figure(sweep_figure(rows, x, y, by), out)
     print(out)
 
 
@@ -428,22 +435,9 @@ def export_table(
 
     Example: estima export-table results/tables/*.csv --format latex -o tables
     """
-    from experiments.table import read_rows
-    from experiments.table_export import FORMATS, SUFFIXES
-    from sim.errors import InputError
-    from sim.files import write_whole
+    from experiments.table_export import export
 
-    if form not in FORMATS:
-        raise InputError(f"--format must be {' or '.join(FORMATS)}, got {form!r}")
-    for path in paths:
-        text = FORMATS[form](read_rows(path), digits)
-        if out is None:
-            print(text)
-            continue
-        with write_whole(out / f"{path.stem}{SUFFIXES[form]}") as part:
-            part.write_text(text)
-    if out is not None:
-        print(f"{out}: {len(paths)} tables")
+    export(paths, form, out, digits)
 
 
 def main() -> None:
@@ -454,6 +448,13 @@ def main() -> None:
         app()
     except (Exception, KeyboardInterrupt) as error:
         end(error)
+    except SystemExit as ended:
+        if ended.code == _INTERRUPTED:
+            print("estima: interrupted; what was finished is kept", file=sys.stderr)
+        raise
+
+
+_INTERRUPTED = 128 + 2  # by SIGINT
 
 
 if __name__ == "__main__":

@@ -6,8 +6,9 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from experiments.run import failed
 from experiments.table import read_rows
-from experiments.version import ROOT, code_version
+from experiments.version import ROOT, code_version, version_with
 from sim.errors import InputError
 
 if TYPE_CHECKING:
@@ -55,8 +56,12 @@ def collect(name: str, *, all_versions: bool = False, times: bool = False) -> pd
     for column in ("status", *_ORIGIN):
         if column not in table:
             raise InputError(f"{path}: not rows of runs, column {column} is missing")
+    twice = table.duplicated(["run_key", _LAST_KEY])
+    if twice.any():
+        print(f"{path}: left out {int(twice.sum())} rows that are there twice", file=sys.stderr)
+        table = table[~twice]
     if not all_versions:
-        mine = table["code_version"] == code_version()
+        mine = _of_this_code(table)
         if not mine.any():
             raise InputError(
                 f"{path}: all {len(table)} rows are of other versions of the code; run the sweep "
@@ -69,6 +74,30 @@ def collect(name: str, *, all_versions: bool = False, times: bool = False) -> pd
         table = table.drop(columns=[c for c in _TIMES if c in table])
     order = [*swept(table), "run_key", _LAST_KEY]
     return table.sort_values(order, kind="stable", ignore_index=True)
+
+
+def _of_this_code(table: pd.DataFrame) -> pd.Series[bool]:
+    """Which rows this version of the code has made, with that of estimators from elsewhere.
+
+    Raises
+    ------
+    InputError
+        If there are rows of several versions of a file that is not to be found here.
+    """
+    mine = table["code_version"].str.partition("+")[0] == code_version()
+    targets = [column for column in table if str(column).endswith("_target_")]
+    others = table[mine & table["code_version"].str.contains("+", regex=False)]
+    for names, rows in others.groupby(targets, dropna=False) if len(others) else ():
+        found = [str(n) for n in names if isinstance(n, str) and not n.startswith(("sim.", "est"))]
+        here = version_with(found)
+        if "+" in here:
+            mine[rows.index] = rows["code_version"] == here
+        elif rows["code_version"].nunique() > 1:
+            raise InputError(
+                f"rows of several versions of an estimator (one of {', '.join(found)}) whose "
+                "source is not found; set PYTHONPATH to it, or see all with --all-versions"
+            )
+    return mine
 
 
 def _best_error_m(table: pd.DataFrame) -> pd.Series[float]:
@@ -119,6 +148,8 @@ def summary(table: pd.DataFrame, against: str | None = None) -> pd.DataFrame:
         one = table[table["choice.estimator"] == against]
         if one.empty:
             raise InputError(f"no rows of estimator {against}")
+        if own := [c for c in telling(one) if c.startswith("estimator.")]:
+            print(f"{against} is the mean over its {', '.join(own)}", file=sys.stderr)
         best = _best_error_m(table)
         reference = best[one.index].groupby(one["recording_checksum"]).mean()
         ratio = best / table["recording_checksum"].map(reference)
@@ -130,6 +161,8 @@ def summary(table: pd.DataFrame, against: str | None = None) -> pd.DataFrame:
     if against is not None:
         found[column] = np.exp(found[column])
     found.insert(0, "runs", groups.size())
-    bad = groups["status"].agg(lambda statuses: int((statuses != "ok").sum()))
-    found.insert(1, "with_remarks", bad)
-    return found.reset_index()
+    bad = groups["status"].agg(lambda statuses: int(statuses.map(failed).sum()))
+    told = groups["status"].agg(lambda statuses: int((statuses != "ok").sum()))
+    found.insert(1, "failed", bad)
+    found.insert(2, "with_remarks", told - bad)
+    return found.reset_index(drop=not by)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import textwrap
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -87,7 +88,8 @@ def end(error: BaseException) -> NoReturn:
             _say("interrupted; what was finished is kept", 1)
         if module.startswith(("hydra.", "omegaconf.")):
             lines = [line.strip() for line in str(link).splitlines() if line.strip()]
-            _say(f"configuration: {' '.join(lines[:3])}; see estima run --cfg job", 2)
+            text = textwrap.shorten(" ".join(lines), 600, placeholder=" ...")
+            _say(f"configuration: {text}; see estima run --cfg job", 2)
     raise error
 
 

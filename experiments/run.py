@@ -6,10 +6,9 @@ is the digest of the resolved configuration and of the code.
 
 from __future__ import annotations
 
-import functools
 import hashlib
-import importlib.util
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -24,6 +23,7 @@ from experiments.build import (
     Config,
     check,
     default_cache,
+    files_digest,
     make_estimator,
     make_prior,
     make_recording,
@@ -33,7 +33,7 @@ from experiments.console import end, progress
 from experiments.metrics import score
 from experiments.seeds import stream
 from experiments.table import Row, write_rows
-from experiments.version import ROOT, code_version
+from experiments.version import ROOT, version_with
 from sim.errors import InputError
 from sim.recording import Recording
 
@@ -53,10 +53,10 @@ def failed(status: str) -> bool:
 
 
 def run_key(config: Config) -> str:
-    """Digest of what decides a run's rows: configuration, recording, code."""
+    """Digest of what decides a run's rows: configuration, recording, map, code."""
     settings = {key: value for key, value in config.items() if key not in _NOT_IN_KEY}
-    own = {target: _source_digest(target) for target in sorted(_targets(config))}
-    parts = [settings, recording_settings(config), code_version(), own]
+    known_map = files_digest(config["prior"].get("map"))
+    parts = [settings, recording_settings(config), known_map, version_with(_targets(config))]
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
 
 
@@ -68,13 +68,20 @@ def _targets(tree: Any) -> set[str]:
     return here.union(*(_targets(value) for value in tree.values()))
 
 
-@functools.cache
-def _source_digest(target: str) -> str:
-    """Digest of a target's source file; empty for the project's own, which have a version."""
-    spec = importlib.util.find_spec(target.rpartition(".")[0].partition(".")[0])
-    if spec is None or spec.origin is None or Path(spec.origin).is_relative_to(ROOT):
-        return ""
-    return hashlib.sha256(Path(spec.origin).read_bytes()).hexdigest()[:12]
+def rows_folder(config: Config) -> Path:
+    """Folder of the configuration's rows.
+
+    Raises
+    ------
+    InputError
+        If the name is not one word.
+    """
+    name = config["name"]
+    if not (isinstance(name, str) and re.fullmatch(r"[\w.-]*\w", name)):
+        raise InputError(
+            f"name must be one word for a folder of results, such as slip_2, got {name!r}"
+        )
+    return RESULTS / "runs" / name
 
 
 def run_configuration(
@@ -99,11 +106,11 @@ def run_configuration(
         Rows, and the folder that holds them.
     """
     check(config)
+    folder = rows_folder(config)
     estimator = make_estimator(config)
     recording = _fetch(config) if fetch is None else fetch(config)
     prior = make_prior(config, recording)
     key = run_key(config)
-    folder = RESULTS / "runs" / config["name"]
     rows: list[Row] = []
     name = choices.get("estimator") or config["estimator"]["_target_"]
     for repeat in range(config["repeats"]):
@@ -114,7 +121,7 @@ def run_configuration(
                 estimate = run(estimator, recording, prior, rng, config["keep"], on_step)
         except InputError:
             raise
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             rows.append({**row, "status": f"error: {type(error).__name__}: {error}"})
             write_rows(rows, folder / f"{key}.parquet")
             raise
@@ -148,7 +155,7 @@ def labels(config: Config, choices: dict[str, str], checksum: str, key: str, rep
         **_flat(kept),
         "repeat": repeat,
         "run_key": key,
-        "code_version": code_version(),
+        "code_version": version_with(_targets(config)),
         "recording_checksum": checksum,
     }
 
@@ -160,6 +167,8 @@ def _flat(tree: Any, prefix: str = "") -> Row:
         name = f"{prefix}{key}"
         if isinstance(value, dict):
             flat.update(_flat(value, f"{name}."))
+        elif isinstance(value, int) and not -(2**63) <= value < 2**63:
+            flat[name] = str(value)  # wider than a column of a table
         elif value is None or isinstance(value, (bool, int, float, str)):
             flat[name] = value
         else:

@@ -6,9 +6,12 @@ run costs no composition of its own in the workers, and any of Hydra's launchers
 
 from __future__ import annotations
 
+import importlib.util
 import itertools
 import json
 import os
+import platform
+import secrets
 import shutil
 import sys
 import threading
@@ -22,16 +25,16 @@ from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from experiments.build import Config, default_cache, make_recording, recording_settings
 from experiments.cache import key_of
 from experiments.run import (
     GROUPS,
-    RESULTS,
     RunFailedError,
     failed,
     labels,
+    rows_folder,
     run_configuration,
     run_key,
     short,
@@ -88,17 +91,24 @@ def sweep(arguments: Sequence[str], config_dir: str | None = None) -> None:
     RunFailedError
         If a run failed; all others are done, and the rows of the failed ones say how.
     """
-    launching = [a for a in arguments if a.lstrip("+~").startswith(("hydra/", "hydra."))]
+    launching = [a for a in arguments if a.lstrip("+~").startswith(_LAUNCHING)]
+    _require_launcher(launching)
     own = [a for a in arguments if a not in launching]
-    runs = list({run.key: run for run in planned(own, config_dir)}.values())
-    folder = RESULTS / "runs" / runs[0].config["name"]
+    every = list(planned(own, config_dir))
+    if not every:
+        raise InputError(f"no runs: a value of {' '.join(own)} is an empty range or list")
+    folders = {rows_folder(run.config) for run in every}
+    if len(folders) > 1:
+        raise InputError("name is the folder of all the rows; a sweep has one, not several")
+    folder = folders.pop()
+    runs = list({run.key: run for run in every}.values())
     missing = [run for run in runs if not is_done(folder, run.key)]
     print(
         f"{len(runs)} runs, {len(runs) - len(missing)} of them done before: {short(folder)}",
         file=sys.stderr,
     )
     if missing:
-        _launch(missing, folder, launching)
+        _launch_all(missing, folder, launching)
     bad = [status for run in runs if (status := _status(folder, run.key)) is not None]
     if bad:
         raise RunFailedError(f"{len(bad)} of {len(runs)} runs; first: {bad[0]}")
@@ -108,6 +118,8 @@ def planned(arguments: Sequence[str], config_dir: str | None = None) -> Iterator
     """Runs of all combinations, in the order of the arguments."""
     with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
         composer = _Composer(config_dir)
+        composer.extra += [a for a in arguments if a.lstrip("+~").startswith("hydra.")]
+        arguments = [a for a in arguments if a not in composer.extra]
         given = OverridesParser.create().parse_overrides(list(arguments))
         fixed = [o.input_line or "" for o in given if not o.is_sweep_override()]
         study = compose("config", overrides=composer.extra + fixed, return_hydra_config=True)
@@ -144,7 +156,7 @@ class _Composer:
     def __init__(self, config_dir: str | None) -> None:
         self._is_group: dict[str, bool] = {}
         self._bases: dict[tuple[str, ...], tuple[DictConfig, dict[str, str]]] = {}
-        self.extra = []
+        self.extra: list[str] = []
         if config_dir is not None:
             folder = Path(config_dir).resolve()
             self.extra = [f"hydra.searchpath=[file://{folder}]"]
@@ -165,7 +177,7 @@ class _Composer:
         OmegaConf.set_struct(cfg, True)
         for override in plain:
             key = override.key_or_group
-            if OmegaConf.select(cfg, key, default=_MISSING) is _MISSING:
+            if not _has(cfg, key):
                 raise InputError(
                     f"unknown key {key}; see estima run --cfg job, or +{key}=... to add it"
                 )
@@ -186,7 +198,13 @@ class _Composer:
         return not self._is_group[key]
 
 
-_MISSING = object()
+def _has(cfg: DictConfig, key: str) -> bool:
+    """Whether the configuration has the key, be its value missing yet."""
+    parent, _, leaf = key.rpartition(".")
+    node = OmegaConf.select(cfg, parent) if parent else cfg
+    if isinstance(node, ListConfig):
+        return leaf.isdecimal() and int(leaf) < len(node)
+    return isinstance(node, DictConfig) and leaf in node.keys()  # noqa: SIM118 `in node` says no to ???
 
 
 def is_done(folder: Path, key: str) -> bool:
@@ -200,20 +218,52 @@ def _status(folder: Path, key: str) -> str | None:
     if not path.exists():
         return "error: no row was written"
     try:
-        statuses = read_rows(path)["status"]
+        rows = read_rows(path)
     except InputError as error:
         return f"error: {error}"
-    return next((str(status) for status in statuses if failed(str(status))), None)
+    if not {"status", "run_key"} <= set(rows) or (rows["run_key"] != key).any():
+        return f"error: {path} holds other rows; delete it and run again"
+    return next((str(status) for status in rows["status"] if failed(str(status))), None)
 
 
-def _launch(runs: Sequence[Run], folder: Path, launching: Sequence[str]) -> None:
-    """Write the plan, start its jobs, and show how they come along."""
+def _launch_all(runs: Sequence[Run], folder: Path, launching: Sequence[str]) -> None:
+    """Start the runs; those at which a worker died are told apart, and the rest goes on."""
+    for run in runs:  # rows of an earlier failure, and files that are no rows
+        path = folder / f"{run.key}.parquet"
+        if path.is_dir():
+            raise InputError(f"{path}: a folder in place of a table; remove it")
+        if path.exists() and not is_done(folder, run.key):
+            path.unlink(missing_ok=True)
+        path.with_suffix(".failed").unlink(missing_ok=True)
+        _begun(folder, run.key).unlink(missing_ok=True)
+    with _Watch(folder, [run.key for run in runs]):
+        left = list(runs)
+        while left:
+            died = _launch(left, folder, launching)
+            if died is None:
+                return
+            begun = [run for run in left if _begun(folder, run.key).exists()]
+            if not begun:
+                raise died
+            for run in begun:  # which of them was it?
+                if _launch([run], folder, [*launching, "hydra.launcher.n_jobs=2"]) is not None:
+                    _record_failure(run.config, run.choices, "its process died (out of memory?)")
+                _begun(folder, run.key).unlink(missing_ok=True)
+            left = [run for run in left if not (folder / f"{run.key}.parquet").exists()]
+
+
+def _launch(runs: Sequence[Run], folder: Path, launching: Sequence[str]) -> Exception | None:
+    """Write the plan and start its jobs; return the error if a process of joblib's has died."""
+    from joblib.externals.loky.process_executor import TerminatedWorkerError
+
     jobs = packed(runs, _JOBS_PER_WORKER * (os.cpu_count() or 1))
-    plan = folder / "plan.json"
-    for run in runs:  # rows of an earlier failure
-        (folder / f"{run.key}.parquet").unlink(missing_ok=True)
-        (folder / f"{run.key}.failed").unlink(missing_ok=True)
-    text = json.dumps([[[r.config, r.choices] for r in job] for job in jobs])
+    plan = folder / f"plan-{os.getpid()}-{secrets.token_hex(3)}.json"
+    text = json.dumps(
+        {
+            "planner": [platform.node(), os.getpid()],
+            "jobs": [[[r.config, r.choices] for r in job] for job in jobs],
+        }
+    )
     with write_whole(plan) as part:
         part.write_text(text)
     sys.argv = [
@@ -223,10 +273,37 @@ def _launch(runs: Sequence[Run], folder: Path, launching: Sequence[str]) -> None
         f"plan={plan}",
         f"job={','.join(str(number) for number in range(len(jobs)))}",
     ]
-    with _Watch(folder, [run.key for run in runs]):
+    try:
         job_application()
-    plan.unlink(missing_ok=True)
-    shutil.rmtree(f"{plan}.jobs", ignore_errors=True)
+    except TerminatedWorkerError as error:
+        died: Exception = error
+        return died
+    finally:
+        plan.unlink(missing_ok=True)
+        shutil.rmtree(f"{plan}.jobs", ignore_errors=True)
+    return None
+
+
+def _begun(folder: Path, key: str) -> Path:
+    """Mark of a run that is being computed."""
+    return folder / f"{key}.begun"
+
+
+_LAUNCHING = ("hydra/launcher", "hydra.launcher")
+_EXTRAS = {"submitit": "slurm", "ray": "ray"}
+
+
+def _require_launcher(launching: Sequence[str]) -> None:
+    """Check that the launcher is installed; Hydra would only say that it knows none."""
+    for argument in launching:
+        name = argument.partition("=")[2]
+        plugin = name.partition("_")[0]
+        chosen = argument.lstrip("+").startswith("hydra/launcher=") and plugin in _EXTRAS
+        if chosen and importlib.util.find_spec(f"hydra_plugins.hydra_{plugin}_launcher") is None:
+            raise InputError(
+                f"hydra/launcher={name} is an extra that is not installed: "
+                f"pip install -e .[{_EXTRAS[plugin]}]"
+            )
 
 
 def packed(runs: Sequence[Run], n_jobs: int) -> list[list[Run]]:
@@ -253,10 +330,25 @@ def _recording_key(config: Config) -> str:
 @hydra.main(version_base="1.3", config_path=str(ROOT / "conf"), config_name="job")
 def job_application(cfg: DictConfig) -> None:
     """Run one job's share of the plan; a run that fails leaves its row, and the next follows."""
-    planned_runs = json.loads(Path(cfg.plan).read_text())[cfg.job]
+    plan = json.loads(Path(cfg.plan).read_text())
+    _end_with(*plan["planner"])
     fetch = _LastRecording()
-    for config, choices in planned_runs:
+    for config, choices in plan["jobs"][cfg.job]:
         run_and_record(config, choices, fetch)
+
+
+def _end_with(node: str, planner: int) -> None:
+    """End this process when the planner is killed, if it is the planner that started it."""
+    if platform.node() != node or os.getppid() != planner or os.getpid() == planner:
+        return
+
+    def watch() -> None:
+        while os.getppid() == planner:
+            time.sleep(0.5)
+        os._exit(1)
+
+    if "planner" not in {thread.name for thread in threading.enumerate()}:
+        threading.Thread(target=watch, name="planner", daemon=True).start()
 
 
 def run_and_record(
@@ -264,19 +356,29 @@ def run_and_record(
 ) -> None:
     """Run one configuration; what goes wrong becomes the status of its row."""
     key = run_key(config)
-    path = RESULTS / "runs" / config["name"] / f"{key}.parquet"
+    path = rows_folder(config) / f"{key}.parquet"
+    mark = _begun(path.parent, key)
+    with write_whole(mark) as part:
+        part.touch()
     try:
         rows, _ = run_configuration(config, choices, fetch)
-        bad = any(failed(str(row["status"])) for row in rows)
-    except Exception as error:
-        bad = True
-        if not path.exists():
-            kind = "" if isinstance(error, InputError) else f"{type(error).__name__}: "
-            row = labels(config, choices, "", key, 0)
-            message = " ".join(str(error).split())
-            write_rows([{**row, "status": f"error: {kind}{message}"}], path)
-    if bad:  # for those who watch; the row says how
-        path.with_suffix(".failed").touch()
+        if any(failed(str(row["status"])) for row in rows):  # for those who watch
+            path.with_suffix(".failed").touch()
+    except (Exception, SystemExit) as error:
+        kind = "" if isinstance(error, InputError) else f"{type(error).__name__}: "
+        _record_failure(config, choices, kind + " ".join(str(error).split()))
+    finally:
+        mark.unlink(missing_ok=True)
+
+
+def _record_failure(config: Config, choices: dict[str, str], how: str) -> None:
+    """Leave a row that says how the run failed, unless it has left one itself."""
+    key = run_key(config)
+    path = rows_folder(config) / f"{key}.parquet"
+    if not path.exists():
+        row = labels(config, choices, "", key, 0)
+        write_rows([{**row, "status": f"error: {how}"}], path)
+    path.with_suffix(".failed").touch()
 
 
 class _LastRecording:

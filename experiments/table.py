@@ -36,10 +36,10 @@ def check_row(row: Row) -> None:
         if not isinstance(row.get(key), str):
             raise InputError(f"a row must have the text {key}")
     for key, value in row.items():
-        if row["status"] == "ok" and isinstance(value, float) and math.isnan(value):
+        if row["status"] == "ok" and isinstance(value, float) and not math.isfinite(value):
             raise InputError(
-                f"row key {key} is NaN though the status is ok; leave out what does not apply, or "
-                "say in the status what went wrong"
+                f"row key {key} is {value} though the status is ok; leave out what does not apply, "
+                "or say in the status what went wrong"
             )
 
 
@@ -103,8 +103,13 @@ def read_rows(path: Path) -> pd.DataFrame:
                 read = pq.ParquetFile(file).read(use_threads=False)
                 frames.append(read.to_pandas(use_threads=False))
         except (OSError, ValueError) as error:
+            ours = file.suffix == ".parquet" and file.parent.parent.name == "runs"
+            remedy = "delete it and run again" if ours else "a table is a .parquet or .csv file"
             raise InputError(
-                f"{file}: cannot read this table ({str(error).splitlines()[0]}); delete it and "
-                "run again"
+                f"{file}: cannot read this table ({(str(error).splitlines() or [''])[0]}); {remedy}"
             ) from error
-    return pd.concat(frames, ignore_index=True)
+    table = pd.concat(frames, ignore_index=True)
+    for column in filter(lambda name: pd.api.types.is_object_dtype(table[name]), table):
+        if len({isinstance(value, str) for value in table[column].dropna()}) > 1:  # one type
+            table[column] = table[column].map(str, na_action="ignore")
+    return table

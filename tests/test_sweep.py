@@ -13,12 +13,14 @@ import pandas as pd
 import pytest
 
 from experiments import sweep
-from experiments.build import default_cache, recording_settings
+from experiments.build import default_cache, files_digest, recording_settings
 from experiments.cache import key_of
 from experiments.collect import collect, measured, summary, swept, telling
 from experiments.compose import compose
 from experiments.figures.sweep import sweep_figure
 from experiments.run import run_key
+from experiments.table import read_rows
+from experiments.version import source_digest
 from sim.errors import InputError
 from tests.test_cli import QUICK, ROOT, estima, refused
 
@@ -101,18 +103,41 @@ def test_keys_tell_what_decides_the_rows(tmp_path, monkeypatch):
     key = run_key(config)
     assert run_key({**config, "name": "other"}) == key
     assert run_key({**config, "seed": 5}) != key
-    mine = tmp_path / "mine_for_key.py"
-    mine.write_text("class Mine: pass\n")
     monkeypatch.syspath_prepend(str(tmp_path))
-    own = {**config, "estimator": {"_target_": "mine_for_key.Mine"}}
-    before = run_key(own)
-    mine.write_text("class Mine: x = 1\n")
-    from experiments.run import _source_digest
-
-    _source_digest.cache_clear()
-    assert run_key(own) != before
+    (tmp_path / "package").mkdir()
+    for target, source, beside in (
+        ("mine_for_key.Mine", "mine_for_key.py", "helper_of_mine.py"),
+        ("package.part.Mine", "package/part.py", "package/other.py"),  # without an __init__
+    ):
+        (tmp_path / source).write_text("class Mine: pass\n")
+        own = {**config, "estimator": {"_target_": target}}
+        keys = [run_key(own)]
+        for file in (source, beside):
+            (tmp_path / file).write_text("class Mine: x = 1\n")
+            source_digest.cache_clear()
+            keys.append(run_key(own))
+        assert len(set(keys)) == 3, target
     with pytest.raises(InputError, match=r"nowhere\.npz"):
         recording_settings({**config, "recording": "nowhere.npz"})
+
+
+def test_keys_know_the_files_that_a_mapping_names(tmp_path):
+    (tmp_path / "a.npy").write_bytes(b"1")
+    named = {
+        "_target_": "experiments.places.recording_from_files",
+        "positions": f"{tmp_path}/a.npy",
+    }
+    config = compose([])
+    for changed in (
+        {**config, "recording": named},
+        {**config, "prior": {**config["prior"], "map": named}},
+        {**config, "prior": {**config["prior"], "map": {"_target_": "x", "f": str(tmp_path)}}},
+    ):
+        (tmp_path / "a.npy").write_bytes(b"1")
+        before = run_key(changed)
+        (tmp_path / "a.npy").write_bytes(b"2")
+        assert run_key(changed) != before
+    assert files_digest({"a": "none", "b": "x" * 5000, "c": ".", "d": "/"}) == {}
 
 
 def test_packing_keeps_recordings_together():
@@ -157,6 +182,154 @@ def test_failed_runs_leave_rows_and_the_rest_goes_on(name, tmp_path):
     assert "2 of them done before" in again.stderr
     later = {p for p in folder(name).glob("*.parquet") if p.stat().st_mtime_ns > stamps[p]}
     assert len(later) == 2  # only what had failed
+
+
+def own_estimator(folder, body):
+    """Files of an estimator of one's own, `how` being its option; the words to sweep it by."""
+    (folder / "own_one.py").write_text(
+        "import os, sys\n"
+        "from estimators.odometry import Odometry\n"
+        "class Own(Odometry):\n"
+        "    def __init__(self, how, **rest):\n"
+        "        super().__init__(**rest)\n"
+        "        self.how = how\n"
+        "    def step(self, frame):\n"
+        f"        {body}\n"
+        "        return super().step(frame)\n"
+    )
+    (folder / "conf" / "estimator").mkdir(parents=True, exist_ok=True)
+    (folder / "conf" / "estimator" / "own_one.yaml").write_text(
+        "_target_: own_one.Own\nhow: sound\nkr: ${robot.kr}\nkl: ${robot.kl}\n"
+        "window_s: 0.1\nintegration: arc\n"
+    )
+    return ["run", "-m", "--config-dir", str(folder / "conf"), *SHORT, "estimator=own_one"]
+
+
+@pytest.mark.parametrize(
+    ("body", "told"),
+    [("self.how == 'bad' and sys.exit(0)", "SystemExit"),
+     ("self.how == 'bad' and os._exit(3)", "process died")],
+    ids=["exits", "dies"],
+)  # fmt: skip
+def test_an_estimator_that_ends_its_process_costs_its_own_runs(name, tmp_path, body, told):
+    words = own_estimator(tmp_path, body)
+    done = estima(*words, "estimator.how=sound,bad", "seed=0,1", f"name={name}",
+                  PYTHONPATH=f"{ROOT}:{tmp_path}")  # fmt: skip
+    assert done.returncode == 1, done.stderr
+    assert "Traceback" not in done.stderr
+    assert "2 of 4 runs" in done.stderr
+    rows = table_of(name)
+    assert (rows.loc[rows["estimator.how"] == "sound", "status"] == "ok").all()
+    assert rows.loc[rows["estimator.how"] == "bad", "status"].str.contains(told).all()
+    assert len(rows) == 4
+    assert {path.suffix for path in folder(name).iterdir()} <= {".parquet", ".failed"}
+
+
+def test_rows_of_an_edited_estimator_do_not_mix(name, tmp_path, monkeypatch, capsys):
+    for body in ("pass", "frame.wheel_increments_m"):
+        words = own_estimator(tmp_path, body)
+        done = estima(*words, "seed=0,1", f"name={name}", PYTHONPATH=f"{ROOT}:{tmp_path}")
+        assert done.returncode == 0, done.stderr
+        assert "0 of them done before" in done.stderr
+    with pytest.raises(InputError, match=r"several versions.*own_one\.Own"):
+        table_of(name)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    source_digest.cache_clear()
+    assert len(table_of(name)) == 2
+    assert "left out 2 rows" in capsys.readouterr().err
+    assert len(collect(name, all_versions=True)) == 4
+
+
+def test_two_sweeps_of_one_name_at_once(name):
+    command = [sys.executable, "-m", "experiments.cli", "run", "-m", *SHORT, f"name={name}",
+               "hydra/launcher=basic"]  # fmt: skip
+    both = [
+        subprocess.Popen(
+            [*command, f"seed=range({low},{low + 15})"], cwd=ROOT, stderr=subprocess.PIPE,
+            text=True, env={**os.environ, "PYTHONPATH": str(ROOT)},
+        )
+        for low in (0, 100)
+    ]  # fmt: skip
+    for process in both:
+        _, told = process.communicate(timeout=120)
+        assert process.returncode == 0, told
+    assert sorted(table_of(name)["seed"]) == [*range(15), *range(100, 115)]
+    assert {path.suffix for path in folder(name).iterdir()} == {".parquet"}
+
+
+def test_workers_end_with_a_killed_sweep(name):
+    process = subprocess.Popen(
+        [sys.executable, "-m", "experiments.cli", "run", "-m", *SHORT, f"name={name}",
+         "seed=range(0,400)"],
+        cwd=ROOT, stderr=subprocess.PIPE, env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+    while not list(folder(name).glob("*.parquet")):
+        assert process.poll() is None
+        time.sleep(0.1)
+    process.kill()
+    # the pipe ends once nobody holds it any more
+    process.communicate(timeout=30)
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["name=a,b", "seed=0"], "one, not several"),
+        (["name=2026", "seed=0,1"], "one word"),
+        (["name=../../evil", "seed=0,1"], "one word"),
+        (["name=null", "seed=0,1"], "one word"),
+        (["seed=range(5,0)"], "empty range"),
+        (["study=maximo2024_own", "seed=0,1"], "data"),
+    ],
+)
+def test_wrong_sweeps_end_in_a_line(words, told):
+    before = set((ROOT / "results" / "runs").glob("*"))
+    done = estima("run", "-m", *SHORT[:2], *words)
+    refused(done, told)
+    assert set((ROOT / "results" / "runs").glob("*")) == before
+    assert not (ROOT / "evil").exists()
+
+
+def test_values_that_no_column_holds_fail_alone(name):
+    done = estima("run", "-m", *SHORT, "seed=1,2,99999999999999999999999", f"name={name}",
+                  "robot.kr=1e-5,oops")  # fmt: skip
+    assert done.returncode == 1, done.stderr
+    assert "Traceback" not in done.stderr
+    assert "3 of 6 runs" in done.stderr
+    rows = table_of(name)
+    assert len(rows) == 6
+    assert (rows["status"] == "ok").sum() == 3
+    out = folder(name).parent / f"{name}.csv"
+    try:
+        assert estima("table", name, "-o", str(out)).returncode == 0
+        assert len(read_rows(out)) == 6
+        plotted = estima("plot", name, "--x", "seed", "-o", str(out.with_suffix(".xyz")))
+        assert plotted.returncode == 2
+        assert "3 of 6 runs failed" in plotted.stderr
+        assert "a picture is .png" in plotted.stderr
+    finally:
+        out.unlink(missing_ok=True)
+
+
+def test_a_missing_value_can_be_given_in_a_sweep(tmp_path):
+    runs = list(sweep.planned(["+study=maximo2024_own", f"data={tmp_path}", "seed=0,1"]))
+    assert len(runs) == 2
+    assert runs[0].config["recording"]["positions"] == f"{tmp_path}/positions.npy"
+
+
+def test_files_that_are_not_the_runs_rows(name):
+    swept_ = ["run", "-m", *SHORT, "seed=0,1,2", f"name={name}"]
+    assert estima(*swept_).returncode == 0
+    expected = table_of(name)
+    first, second, third = sorted(folder(name).glob("*.parquet"))
+    first.write_bytes(second.read_bytes())
+    pd.DataFrame({"a": [1]}).to_parquet(third)
+    again = estima(*swept_)
+    assert "1 of them done before" in again.stderr
+    assert again.returncode == 0, again.stderr
+    pd.testing.assert_frame_equal(table_of(name), expected, check_exact=True)
+    expected.to_parquet(folder(name) / "all.parquet")
+    assert len(table_of(name)) == 3  # told once each
 
 
 @pytest.mark.parametrize("launcher", ["basic", "submitit_local", "ray"])
@@ -320,6 +493,19 @@ def test_rows_of_other_code_are_left_out(tmp_path, capsys):
     assert "left out 7 rows" in capsys.readouterr().err
 
 
+def test_failures_and_remarks_are_counted_apart():
+    table = rows()
+    table["status"] = ["ok", "error: x", "no scan was of use", *["ok"] * 9]
+    found = summary(table).set_index(["choice.estimator", "robot.kr"])
+    assert found["failed"].to_dict() == {
+        ("a", 1e-5): 0,
+        ("a", 1e-3): 0,
+        ("b", 1e-5): 1,
+        ("b", 1e-3): 0,
+    }
+    assert int(found["with_remarks"].sum()) == 1
+
+
 def test_plots_name_a_missing_column_and_average_recordings():
     page = sweep_figure(rows(), "robot.kr", "ate_rmse_m", "choice.estimator")
     lines = page.axes[0].get_lines()
@@ -327,6 +513,15 @@ def test_plots_name_a_missing_column_and_average_recordings():
     table = rows()
     expected = table[(table["choice.estimator"] == "a")].groupby("robot.kr")["ate_rmse_m"].mean()
     np.testing.assert_allclose(lines[0].get_ydata(), expected)
+    assert "estimator" not in page.axes[0].get_title()
+    assert "estimator" in sweep_figure(rows(), "robot.kr", "ate_rmse_m").axes[0].get_title()
+    table = table.assign(ate_rmse_m=np.tile(np.repeat([1e-4, 1.0, 10.0], 2), 2))
+    page = sweep_figure(table, "robot.kr", "ate_rmse_m")
+    geometric = np.exp(np.log(table["ate_rmse_m"]).groupby(table["robot.kr"]).mean())
+    np.testing.assert_allclose(page.axes[0].get_lines()[0].get_ydata(), geometric)
+    assert page.axes[0].get_yscale() == "log"
+    with pytest.raises(InputError, match="no run has both"):
+        sweep_figure(table.assign(**{"robot.kr": None}), "robot.kr", "ate_rmse_m")
     with pytest.raises(InputError, match=r"robot\.krr"):
         sweep_figure(rows(), "robot.krr", "ate_rmse_m")
     with pytest.raises(InputError, match="no numbers"):

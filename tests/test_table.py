@@ -42,7 +42,7 @@ def test_wrong_rows_and_files_are_refused(tmp_path):
 
 
 def test_nan_needs_a_status():
-    with pytest.raises(InputError, match="ate_rmse_m is NaN though the status is ok"):
+    with pytest.raises(InputError, match="ate_rmse_m is nan though the status is ok"):
         check_row({**ROW, "ate_rmse_m": float("nan")})
     check_row({**ROW, "ate_rmse_m": float("nan"), "status": "not finite at 1.00 s"})
     with pytest.raises(InputError, match="64 bits"):

@@ -10,6 +10,7 @@ from cycler import cycler
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from sim.errors import InputError
 from sim.files import write_whole
 
 # Okabe and Ito's palette.
@@ -39,6 +40,11 @@ def figure(width_in: float, height_in: float) -> Figure:
 
 def save_figure(page: Figure, path: Path) -> None:
     """Write a figure whole, as the path's suffix says; the bytes do not depend on the date."""
+    if path.suffix not in _SUFFIXES:
+        raise InputError(f"{path}: a picture is {', '.join(_SUFFIXES)}")
     metadata = {"Software": None} if path.suffix == ".png" else {"Date": None}
     with write_whole(path) as part:
         page.savefig(part, dpi=130, metadata=metadata)
+
+
+_SUFFIXES = (".png", ".pdf", ".svg")
