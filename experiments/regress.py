@@ -20,6 +20,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
+import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -45,9 +46,13 @@ ALPHA_REAL = 0.002  # of a whole check
 ALPHA_GENERAL = 0.05  # of one error of one estimator
 ROUNDING = 1e-6  # of an error, as a share; machines differ by less than 1e-9
 N_DRAWS = 40_000
+_MOST_WAYS = 2**15 - 1  # to exchange a recording's runs; where there are more,
+_DRAWN_WAYS = 4096  # so many are drawn
 _PLAIN = 2.0  # standard deviations
 _LEAST_ERROR = 1e-12  # an error of nothing has no logarithm
-_COLUMNS = ("estimator", "recording", "repeat", "checksum", "fingerprint", *ERRORS, "status")
+_WHICH = ("estimator", "recording", "repeat")
+_COUNT = re.compile(r"(\d+) rows")  # in a baseline's first line, so that one cut short is known
+_COLUMNS = (*_WHICH, "checksum", "fingerprint", *ERRORS, "status")
 
 
 @dataclass(frozen=True)
@@ -69,7 +74,8 @@ class Finding:
     n_recordings
         On which both ran to the end.
     ratio, low, high
-        Geometric mean of now / then over the recordings, with its 95 % t interval.
+        Geometric mean of now / then over the recordings, with its 90 % t interval: it leaves out
+        1 where a one-sided test at 0.05 tells a direction.
     p_real, p_general
         (worse, better) of either question.
     verdict
@@ -77,6 +83,8 @@ class Finding:
         result, neither worse nor better on the whole. `failed`: runs end that used not to.
     message
         What failed.
+    n_suite
+        Recordings of the suite; `n_recordings` may be fewer.
     """
 
     estimator: str
@@ -90,6 +98,7 @@ class Finding:
     p_general: tuple[float, float]
     verdict: Verdict
     message: str = ""
+    n_suite: int = 0
 
     @property
     def alarms(self) -> bool:
@@ -108,9 +117,7 @@ def exchange_p(
         (n, B) and (n, C) logs of errors.
     """
     runs, n_now = np.concatenate([now, then], axis=1), now.shape[1]
-    picks = np.array(list(itertools.combinations(range(runs.shape[1]), n_now)))
-    centred = runs - runs.mean(axis=1, keepdims=True)
-    sums = centred[:, picks].sum(axis=2)  # (n, picks); the first pick is what was seen
+    sums = _exchanged_sums(runs - runs.mean(axis=1, keepdims=True), n_now, rng)
     seen = float(sums[:, 0].sum())
     spread = math.sqrt(float(sums.var(axis=1).sum()))
     if abs(seen) <= _PLAIN * spread:  # the normal law tells well enough that there is nothing
@@ -118,10 +125,25 @@ def exchange_p(
         return above, 1.0 - above if spread > 0.0 else 1.0
     drawn = np.zeros(n_draws)
     for of_recording in sums:
-        drawn += of_recording[rng.integers(len(picks), size=n_draws, dtype=np.int16)]
+        drawn += of_recording[rng.integers(sums.shape[1], size=n_draws, dtype=np.int16)]
     slack = 1e-9 * (1.0 + abs(seen))  # sums of the same numbers in another order
     n_above, n_below = np.sum(drawn >= seen - slack), np.sum(drawn <= seen + slack)
     return float((1 + n_above) / (1 + n_draws)), float((1 + n_below) / (1 + n_draws))
+
+
+def _exchanged_sums(runs: Array, n_now: int, rng: np.random.Generator) -> Array:
+    """Sums of n_now of each recording's (n, B) runs, (n, ways); the first is of those seen."""
+    sums: Array
+    if math.comb(runs.shape[1], n_now) <= _MOST_WAYS:
+        picks = np.array(list(itertools.combinations(range(runs.shape[1]), n_now)))
+        sums = runs[:, picks].sum(axis=2)
+        return sums
+    sums = np.empty((len(runs), _DRAWN_WAYS))
+    for row, of_recording in zip(sums, runs, strict=True):
+        ways = np.tile(of_recording, (_DRAWN_WAYS, 1))
+        rng.permuted(ways[1:], axis=1, out=ways[1:])
+        row[:] = ways[:, :n_now].sum(axis=1)
+    return sums
 
 
 def general_p(differences: Array) -> tuple[float, float]:
@@ -157,7 +179,7 @@ def examine(then: Array, now: Array, rng: np.random.Generator, n_draws: int = N_
         logs_then, logs_now = logs_then[:, :shared], logs_now[:, :shared]
     differences = logs_now.mean(axis=1) - logs_then.mean(axis=1)
     n, mean = len(differences), float(differences.mean())
-    half = float(stats.t.ppf(0.975, n - 1) * differences.std(ddof=1) / math.sqrt(n))
+    half = float(stats.t.ppf(1.0 - ALPHA_GENERAL, n - 1) * differences.std(ddof=1) / math.sqrt(n))
     ratio, low, high = (math.exp(v) for v in (mean, mean - half, mean + half))
     verdict: Verdict
     p_real, p_general = (1.0, 1.0), (1.0, 1.0)
@@ -204,7 +226,13 @@ def compare(
                 rng = stream(0, f"exchange/{estimator}/{error}")
                 found = _examined(then, now, error, failure, rng, n_draws)
                 findings.append(
-                    dataclasses.replace(found, estimator=str(estimator), error=error, baseline=name)
+                    dataclasses.replace(
+                        found,
+                        estimator=str(estimator),
+                        error=error,
+                        baseline=name,
+                        n_suite=now["recording"].nunique(),
+                    )
                 )
     return judge(findings)
 
@@ -230,7 +258,7 @@ def _examined(
 
 
 def _same_recordings(estimator: str, name: str, then: pd.DataFrame, now: pd.DataFrame) -> None:
-    remedy = "; run estima check --accept REASON to start a new baseline"
+    remedy = "; check with --accept REASON to start a new baseline"
     if then.empty:
         raise InputError(f"the {name} baseline does not know {estimator}{remedy}")
     before = then.drop_duplicates("recording").set_index("recording")
@@ -238,8 +266,9 @@ def _same_recordings(estimator: str, name: str, then: pd.DataFrame, now: pd.Data
     if set(before.index) != set(after.index):
         raise InputError(f"the {name} baseline of {estimator} has other recordings{remedy}")
     after = after.loc[before.index]
-    away = np.abs(after["fingerprint"] / before["fingerprint"] - 1.0)
-    other = (away > ROUNDING) & (after["checksum"] != before["checksum"])
+    away = np.abs(after["fingerprint"] - before["fingerprint"])
+    near = away <= ROUNDING * np.abs(before["fingerprint"])  # NaN is near to nothing
+    other = ~near & (after["checksum"] != before["checksum"])
     if other.any():
         raise InputError(
             f"recording {other.idxmax()} of {estimator} is not that of the {name} baseline: what "
@@ -247,20 +276,24 @@ def _same_recordings(estimator: str, name: str, then: pd.DataFrame, now: pd.Data
         )
 
 
+def _failed(rows: pd.DataFrame) -> pd.Series:
+    """Which runs ended in an exception or in errors that are not finite."""
+    finite = np.isfinite(rows[list(ERRORS)].to_numpy(np.float64)).all(axis=1)
+    return (rows["status"] != "ok") | ~finite
+
+
+def _how(run: pd.Series) -> str:
+    return str(run["status"]) if run["status"] != "ok" else "errors that are not finite"
+
+
 def _newly_failing(then: pd.DataFrame, now: pd.DataFrame) -> str:
-    """What ends runs now, if they end more often than before by Fisher's test; else nothing."""
-    bad_then, bad_now = (
-        (t["status"] != "ok") | t[list(ERRORS)].isna().any(axis=1) for t in (then, now)
-    )
-    if not bad_now.any():
+    """What ends runs now on recordings where none of the baseline's failed; else nothing."""
+    bad = now[_failed(now)]
+    new = bad[~bad["recording"].isin(then.loc[_failed(then), "recording"])]
+    if new.empty:
         return ""
-    table = [[bad_now.sum(), (~bad_now).sum()], [bad_then.sum(), (~bad_then).sum()]]
-    more = stats.fisher_exact(table, alternative="greater").pvalue
-    if bad_then.any() and more > ALPHA_REAL:
-        return ""
-    first = now[bad_now].iloc[0]
-    reason = first["status"] if first["status"] != "ok" else "errors that are not finite"
-    return f"{bad_now.sum()} of {len(now)} runs fail; recording {first['recording']}: {reason}"
+    first = new.iloc[0]
+    return f"{len(bad)} of {len(now)} runs fail; recording {first['recording']}: {_how(first)}"
 
 
 def read_baseline(path: Path) -> Baseline:
@@ -271,28 +304,60 @@ def read_baseline(path: Path) -> Baseline:
     InputError
         If it is not there, or is no baseline.
     """
+    restore = f"restore it, e.g. git checkout -- {path}"
     try:
-        text = path.read_text()
-        rows = pd.read_csv(path, comment="#", dtype={"checksum": "str", "status": "str"})
+        text = path.read_text(encoding="utf-8")
+        texts = dict.fromkeys(("estimator", "checksum", "status"), "str")
+        rows = pd.read_csv(path, comment="#", dtype=texts, low_memory=False)
     except FileNotFoundError as error:
         raise InputError(
-            f"{path}: no baseline yet; run estima check --accept REASON to make one"
+            f"{path}: no baseline yet; check with --accept REASON to make one"
         ) from error
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot read this baseline ({error})") from error
-    missing = [name for name in _COLUMNS if name not in rows]
-    if missing:
-        raise InputError(f"{path}: a baseline has the column {missing[0]}; restore the file")
-    history = tuple(line[2:] for line in text.splitlines() if line.startswith("# "))
-    return Baseline(rows, history)
+    except OSError as error:
+        raise InputError(f"{path}: cannot read this baseline ({error.strerror})") from error
+    except ValueError as error:
+        why = str(error).splitlines()[0]
+        raise InputError(f"{path}: damaged ({why}); {restore}") from error
+    if damage := _damage(text, rows):
+        raise InputError(f"{path}: damaged ({damage}); {restore}")
+    lines = (line[2:] for line in text.splitlines() if line.startswith("# "))
+    return Baseline(rows, tuple(line for line in lines if not _COUNT.fullmatch(line)))
+
+
+def _damage(text: str, rows: pd.DataFrame) -> str:
+    """What no baseline that was written whole has; nothing if it is sound."""
+    for name in _COLUMNS:
+        if name not in rows:
+            return f"no column {name}"
+    count = _COUNT.fullmatch(text.partition("\n")[0].removeprefix("# "))
+    if not text.endswith("\n") or (count and int(count[1]) != len(rows)):
+        return f"cut short at {len(rows)} rows"
+    for name in ("recording", "repeat", "fingerprint", *ERRORS):
+        numbers = pd.to_numeric(rows[name], errors="coerce")
+        wrong = numbers.isna() & rows[name].notna()
+        if wrong.any():
+            return f"{name} {rows.loc[wrong, name].iloc[0]!r} is no number"
+        if name not in ERRORS and not np.isfinite(numbers.to_numpy(np.float64)).all():
+            return f"a row without {name}"
+    for name in ("estimator", "checksum", "status"):
+        if rows[name].isna().any():
+            return f"a row without {name}"
+    twice = rows.duplicated(list(_WHICH))
+    if twice.any():
+        which = rows.loc[twice, list(_WHICH)].iloc[0]
+        return "two rows of {}, recording {}, repeat {}".format(*which)
+    runs = rows.groupby(["estimator", "recording"]).size().groupby("estimator").nunique()
+    if (runs > 1).any():
+        return f"rows of {runs.idxmax()} are missing"
+    return ""
 
 
 def write_baseline(baseline: Baseline, path: Path) -> None:
-    """Write a baseline: its history as comments, then its rows."""
-    head = "".join(f"# {line}\n" for line in baseline.history)
+    """Write a baseline: the number of its rows and its history as comments, then its rows."""
+    head = "".join(f"# {line}\n" for line in (f"{len(baseline.rows)} rows", *baseline.history))
     table = baseline.rows[list(_COLUMNS)].to_csv(index=False, float_format="%.9g")
     with write_whole(path) as part:
-        part.write_text(head + table)
+        part.write_text(head + table, encoding="utf-8")
 
 
 def renewed(
@@ -317,11 +382,18 @@ def renewed(
     return Baseline(pd.concat([kept, fresh], ignore_index=True), (*old.history, line))
 
 
+def is_main(suite: str) -> bool:
+    """Whether this is the suite of the project's own gate, conf/suite/check.yaml."""
+    return suite_path(suite).resolve() == suite_path("check").resolve()
+
+
 def baseline_paths(suite: str) -> dict[str, Path]:
-    """Files of a suite's baselines: what was last accepted, and what is pinned at a release."""
-    stem = Path(suite).stem
-    release = "release" if stem == "check" else f"{stem}_release"
-    return {"accepted": BASELINES / f"{stem}.csv", "release": BASELINES / f"{release}.csv"}
+    """Files of a suite's baselines: what was last accepted, and what is pinned at a release.
+
+    Those of a suite other than conf/suite/check.yaml lie beside it: `mine.baselines/check.csv`.
+    """
+    folder = BASELINES if is_main(suite) else suite_path(suite).with_suffix(".baselines")
+    return {"accepted": folder / "check.csv", "release": folder / "release.csv"}
 
 
 def check(
@@ -369,15 +441,22 @@ def accept(
         raise InputError('--accept needs a reason, such as --accept "faster matching, 2 % worse"')
     whole = read_suite(suite_path(suite_name))
     suite = whole.of(only)
-    rows = run_suite(suite, repeats_of(suite, of_baseline=True), on_progress=on_progress)
     names = [entry.name for entry in suite.estimators]
+    known = [entry.name for entry in whole.estimators]
     paths = baseline_paths(suite_name)
     old = {k: read_baseline(path) if path.exists() else None for k, path in paths.items()}
-    bad = rows[rows["status"] != "ok"]
+    for key, baseline in old.items():
+        if baseline is None and len(names) < len(known):
+            raise InputError(
+                f"{paths[key]}: no baseline yet, and one of {', '.join(names)} alone would not do; "
+                "accept the whole suite, without --only"
+            )
+    rows = run_suite(suite, repeats_of(suite, of_baseline=True), on_progress=on_progress)
+    bad = rows[_failed(rows)]
     if len(bad):
         first = bad.iloc[0]
         raise InputError(
-            f"{first['estimator']} fails on recording {first['recording']} ({first['status']}); a "
+            f"{first['estimator']} fails on recording {first['recording']} ({_how(first)}); a "
             "baseline of failures guards nothing"
         )
     changes = {"accepted": names}
@@ -386,7 +465,6 @@ def accept(
         changes["release"] = names
     elif worse := _cannot_stay(pinned.rows, rows, names):
         changes["release"] = worse
-    known = [entry.name for entry in whole.estimators]
     for key, changed in changes.items():
         write_baseline(renewed(old[key], rows, changed, reason, known), paths[key])
     return [paths[key] for key in changes]

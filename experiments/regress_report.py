@@ -4,15 +4,25 @@ from __future__ import annotations
 
 import math
 import os
+import sys
+import tempfile
 import xml.etree.ElementTree as ET
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import pandas as pd
 
 from experiments.console import progress
-from experiments.regress import BASELINES, Finding, Verdict, accept, check
-from experiments.suite import ERRORS
+from experiments.regress import (
+    BASELINES,
+    Finding,
+    Verdict,
+    accept,
+    baseline_paths,
+    check,
+    is_main,
+)
+from experiments.suite import ERRORS, printable
 from sim.errors import InputError
 from sim.files import write_whole
 
@@ -38,59 +48,105 @@ def run_check(
     """Do what `estima check` does; return whether it found a worsening."""
     if release and reason is None:
         raise InputError("--release goes with --accept REASON")
+    on_github = os.environ.get("GITHUB_ACTIONS") == "true"
+    page = os.environ.get("GITHUB_STEP_SUMMARY") if on_github else None
+    for path in (junit, summary, Path(page) if page else None):
+        if path is not None and reason is None:
+            _writable(path)
+    found = smallest_found() if is_main(suite) and reason is None else {}
+    paths = baseline_paths(suite)
+    if reason is None and paths["accepted"].exists() and not paths["release"].exists():
+        print(
+            f"estima: {paths['release']}: no release baseline, so small steps can add "
+            "up unseen; pin one with --accept REASON --release",
+            file=sys.stderr,
+        )
     with progress("estimators over recordings, share", 1.0) as on_progress:
         if reason is not None:
             for path in accept(suite, reason, only, release=release, on_progress=on_progress):
                 print(path)
             return False
         findings = check(suite, only, on_progress)
-    print(as_text(findings))
+    _say(as_text(findings, found))
     if junit is not None:
         write_text(as_junit(findings), junit)
     if summary is not None:
-        write_text(as_markdown(findings), summary)
-    if os.environ.get("GITHUB_ACTIONS") == "true":
-        print(as_annotations(findings))
-        if page := os.environ.get("GITHUB_STEP_SUMMARY"):
-            with Path(page).open("a") as file:
-                file.write(as_markdown(findings))
+        write_text(as_markdown(findings, found), summary)
+    if on_github:
+        _say(as_annotations(findings))
+        if page:
+            with Path(page).open("a", encoding="utf-8") as file:
+                file.write(as_markdown(findings, found))
     return any(finding.alarms for finding in findings)
 
 
+def _writable(path: Path) -> None:
+    """Tell before a run, and not after it, that a report has no place."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("ab") if path.exists() else tempfile.TemporaryFile(dir=path.parent):
+            pass
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot write a report there ({error.strerror}); choose another place"
+        ) from error
+
+
+def _say(text: str) -> None:
+    """Print, with ? for letters that the terminal does not have."""
+    encoding = sys.stdout.encoding or "utf-8"
+    print(text.encode(encoding, "replace").decode(encoding))
+
+
 def smallest_found() -> dict[str, float]:
-    """Smallest worsening of each estimator, as a share, that is found in 95 % of checks."""
+    """Smallest worsening of each estimator, as a share, that 95 % of checks of the suite find."""
     if not POWER.exists():
         return {}
-    table = pd.read_csv(POWER, comment="#")
-    return {str(k): float(v) for k, v in table.groupby("estimator")["smallest"].max().items()}
+    try:
+        table = pd.read_csv(POWER, comment="#")
+        return {str(k): float(v) for k, v in table.groupby("estimator")["smallest"].max().items()}
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        why = str(error).splitlines()[0]
+        raise InputError(
+            f"{POWER}: damaged ({why}); restore it, e.g. git checkout -- {POWER}"
+        ) from error
 
 
 def sentence(finding: Finding) -> str:
-    """One finding in one line."""
+    """One finding in one line of printable characters."""
     who = f"{finding.estimator}, {LABELS[finding.error]} error"
     if finding.verdict == "failed":
-        return f"{finding.estimator}: {finding.message}"
+        return printable(f"{finding.estimator}: {finding.message}")
     if finding.verdict in _MEANING:
-        return f"{who}: {_MEANING[finding.verdict]}"
-    low, high = (_percent(v) for v in (finding.low, finding.high))
-    side = 0 if finding.verdict == "worse" else 1
-    return (
-        f"{who} {finding.verdict} by {_percent(finding.ratio)} (95 %: {low} to {high}; "
+        return printable(f"{who}: {_MEANING[finding.verdict]}")
+    side, ends = (0, (finding.low, finding.high))
+    if finding.verdict == "better":
+        side, ends = (1, (finding.high, finding.low))
+    by, least, most = (abs(100.0 * (ratio - 1.0)) for ratio in (finding.ratio, *ends))
+    return printable(
+        f"{who} {finding.verdict} by {by:.1f} % (90 % interval: {least:.1f} to {most:.1f} %; "
         f"{finding.n_recordings} recordings, p {finding.p_general[side]:.1g}) than the "
         f"{finding.baseline} baseline"
     )
 
 
-def as_text(findings: Sequence[Finding]) -> str:
-    """Tables for a terminal, a line for each finding that counts, and a last line."""
-    found = smallest_found()
+def as_text(findings: Sequence[Finding], found: Mapping[str, float] | None = None) -> str:
+    """Tables for a terminal, a line for each finding that counts, and a last line.
+
+    Parameters
+    ----------
+    found
+        What `smallest_found` gives, if the suite is the one it was measured on.
+    """
     lines: list[str] = []
     for baseline, rows in _tables(findings):
         heads = " ".join(f"{LABELS[error]:>9}" for error in ERRORS)
-        lines += [f"now / {baseline} baseline", f"  {'':<16} {heads}  {'finds':>7}  verdict"]
+        finds = f"{'finds':>7}  " if found else ""
+        lines += [f"now / {baseline} baseline", f"  {'':<16} {heads}  {finds}verdict"]
         for estimator, of_error, verdict in rows:
             ratios = " ".join(f"{_ratio(of_error[error]):>9}" for error in ERRORS)
-            lines.append(f"  {estimator:<16} {ratios}  {_finds(found, estimator):>7}  {verdict}")
+            finds = f"{_finds(found, estimator):>7}  " if found else ""
+            lines.append(f"  {estimator:<16} {ratios}  {finds}{verdict}{_share(of_error)}")
         lines.append("")
     lines += [sentence(f) for f in _told(findings)]
     if found:
@@ -98,20 +154,24 @@ def as_text(findings: Sequence[Finding]) -> str:
     return "\n".join([*lines, last_line(findings)])
 
 
-def as_markdown(findings: Sequence[Finding]) -> str:
+def as_markdown(findings: Sequence[Finding], found: Mapping[str, float] | None = None) -> str:
     """Give the same as Markdown, for a pull request's summary."""
-    found = smallest_found()
     lines = ["## estima check", "", last_line(findings), ""]
     lines += [*(f"- {sentence(f)}" for f in _told(findings)), ""]
     for baseline, rows in _tables(findings):
-        heads = " | ".join(LABELS[error] for error in ERRORS)
-        lines += [f"| now / {baseline} | {heads} | finds | verdict |", "| --- |" + " --- |" * 5]
+        heads = [f"now / {baseline}", *(LABELS[e] for e in ERRORS), *(["finds"] if found else [])]
+        lines += [_markdown_row([*heads, "verdict"]), _markdown_row(["---"] * (len(heads) + 1))]
         for estimator, of_error, verdict in rows:
-            ratios = " | ".join(_ratio(of_error[error]) for error in ERRORS)
+            cells = [estimator, *(_ratio(of_error[error]) for error in ERRORS)]
+            cells += [_finds(found, estimator)] if found else []
             mark = f"**{verdict}**" if verdict in ("worse", "failed") else verdict
-            lines.append(f"| {estimator} | {ratios} | {_finds(found, estimator)} | {mark} |")
+            lines.append(_markdown_row([*cells, mark + _share(of_error)]))
         lines.append("")
     return "\n".join(lines)
+
+
+def _markdown_row(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cells)} |"
 
 
 def as_annotations(findings: Sequence[Finding]) -> str:
@@ -119,7 +179,7 @@ def as_annotations(findings: Sequence[Finding]) -> str:
     lines = []
     for finding in _told(findings):
         level = "error" if finding.alarms else "notice"
-        text = sentence(finding).replace("%", "%25").replace("\r", "%0D").replace("\n", "%0A")
+        text = sentence(finding).replace("%", "%25")
         lines.append(f"::{level} title=estima check::{text}")
     return "\n".join(lines)
 
@@ -156,7 +216,7 @@ def as_junit(findings: Sequence[Finding]) -> str:
 def write_text(text: str, path: Path) -> None:
     """Write a report, whole or not at all."""
     with write_whole(path) as part:
-        part.write_text(text)
+        part.write_text(text, encoding="utf-8")
 
 
 def last_line(findings: Sequence[Finding]) -> str:
@@ -167,15 +227,15 @@ def last_line(findings: Sequence[Finding]) -> str:
     if better:
         parts.append(f"better: {', '.join(better)}")
     if alarmed:
-        parts.append('if it is meant: estima check --accept "REASON"')
+        parts.append('if it is meant: check with --accept "REASON"')
     return "; ".join(parts)
 
 
 def _told(findings: Sequence[Finding]) -> list[Finding]:
-    """Findings worth a line: alarms and improvements; an estimator that fails is told once."""
+    """Findings worth a line: alarms and improvements; a failure is told once for all baselines."""
     told, seen = [], set()
     for finding in findings:
-        key = (finding.estimator, finding.baseline, finding.message)
+        key = (finding.estimator, finding.message)
         if finding.verdict in ("worse", "better") or (finding.alarms and key not in seen):
             told.append(finding)
             seen.add(key)
@@ -200,9 +260,11 @@ def _ratio(finding: Finding) -> str:
     return "-" if math.isnan(finding.ratio) else f"{finding.ratio:.3f}"
 
 
-def _percent(ratio: float) -> str:
-    return f"{100.0 * (ratio - 1.0):+.1f} %"
+def _share(of_error: Mapping[str, Finding]) -> str:
+    """How many recordings were compared, where it is not all of them."""
+    n, n_suite = min((f.n_recordings, f.n_suite) for f in of_error.values())
+    return f" ({n} of {n_suite} recordings)" if n < n_suite else ""
 
 
-def _finds(found: dict[str, float], estimator: str) -> str:
+def _finds(found: Mapping[str, float], estimator: str) -> str:
     return f"{100.0 * found[estimator]:.1f} %" if estimator in found else "-"

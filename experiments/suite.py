@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
@@ -29,6 +30,7 @@ from sim.recording import Recording
 
 ERRORS = ("ate_rmse_m", "ate_aligned_rmse_m", "heading_rmse_rad")
 _RESEEDED = 1000  # streams of one seeding; repeats of the next start beyond them
+_UNPRINTABLE = re.compile("[^\x20-\x7e\xa0-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 _GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
 
 
@@ -111,7 +113,7 @@ def read_suite(path: Path) -> Suite:
         suite = Suite(
             told["first_seed"],
             {name: group["count"] for name, group in groups.items()},
-            {name: tuple(group["overrides"]) for name, group in groups.items()},
+            {name: _overrides(group["overrides"]) for name, group in groups.items()},
             tuple(_entry(name, given) for name, given in told["estimators"].items()),
         )
     except (KeyError, TypeError, AttributeError, ValueError) as error:
@@ -119,16 +121,22 @@ def read_suite(path: Path) -> Suite:
             f"{path}: a suite holds first_seed, recordings (count, overrides) and estimators "
             f"(recordings, repeats, overrides), as conf/suite/check.yaml does ({error!r})"
         ) from error
+    if not _is_whole(suite.first_seed, 0):
+        raise InputError(
+            f"{path}: first_seed must be a whole number from 0 on, got {suite.first_seed!r}"
+        )
+    if not suite.estimators:
+        raise InputError(f"{path}: estimators is empty; name at least one of conf/estimator")
     for name, count in suite.counts.items():
-        if isinstance(count, bool) or not isinstance(count, int) or count < 2:
+        if not _is_whole(count, 2):
             raise InputError(f"{path}: recordings.{name}.count must be 2 or more, got {count!r}")
     for entry in suite.estimators:
         if entry.recordings not in suite.counts:
             raise InputError(
                 f"{path}: estimators.{entry.name}.recordings={entry.recordings!r}; known: "
-                f"{', '.join(suite.counts)}"
+                f"{', '.join(map(str, suite.counts))}"
             )
-        if min(entry.repeats) < 1 or max(entry.repeats) > _RESEEDED:
+        if not all(_is_whole(count, 1, _RESEEDED) for count in entry.repeats):
             raise InputError(
                 f"{path}: estimators.{entry.name}.repeats must lie in 1..{_RESEEDED}, got "
                 f"{list(entry.repeats)}"
@@ -136,14 +144,25 @@ def read_suite(path: Path) -> Suite:
     return suite
 
 
-def _entry(name: str, given: dict[str, Any]) -> Entry:
-    baseline, check = (int(count) for count in given["repeats"])
-    overrides = tuple(given.get("overrides") or ())
+def _is_whole(value: Any, least: int, most: float = math.inf) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and least <= value <= most
+
+
+def _overrides(given: Any) -> tuple[str, ...]:
+    if not (isinstance(given, list) and all(isinstance(override, str) for override in given)):
+        raise TypeError(f"overrides must be a list of texts, got {given!r}")
+    return tuple(given)
+
+
+def _entry(name: Any, given: dict[str, Any]) -> Entry:
+    baseline, check = given["repeats"]
     unknown = set(given) - {"recordings", "repeats", "overrides", "revised"}
     if unknown:
-        raise KeyError(f"{name}.{sorted(unknown)[0]}")
-    revised = bool(given.get("revised", False))
-    return Entry(name, given["recordings"], (baseline, check), overrides, revised)
+        raise KeyError(f"{name}.{sorted(map(str, unknown))[0]}")
+    revised, group = given.get("revised", False), given["recordings"]
+    if not (isinstance(name, str) and isinstance(group, str) and isinstance(revised, bool)):
+        raise TypeError(f"{name}: name and recordings must be texts, revised true or false")
+    return Entry(name, group, (baseline, check), _overrides(given.get("overrides") or []), revised)
 
 
 def suite_path(name: str) -> Path:
@@ -243,11 +262,19 @@ def _run_recording(
             except InputError:
                 raise
             except Exception as error:  # the gate's business: told as a failed run
-                scores, status = {}, f"{type(error).__name__}: {error}".replace("\n", " ")
+                scores, status = (
+                    {},
+                    printable(f"{type(error).__name__}: {error}".replace("\n", " ")),
+                )
             errors = {name: scores.get(name, math.nan) for name in ERRORS}
             row = {"estimator": entry.name, "recording": seed, "repeat": repeat}
             rows.append({**row, **origin, **errors, "status": status})
     return rows
+
+
+def printable(text: str) -> str:
+    """One line of text without what XML 1.0 forbids, and what would steer a terminal."""
+    return _UNPRINTABLE.sub("?", text)
 
 
 def _finish(estimator: Estimator) -> Estimate:

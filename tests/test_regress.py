@@ -125,12 +125,52 @@ def test_failed_runs_alarm_and_are_told_once():
     assert text.count("1 of 5 runs fail; recording 2: ValueError: no") == 1
 
 
+def test_errors_that_became_infinite_alarm():
+    then = table("e", np.ones((5, 2)))
+    now = then.copy()
+    now.loc[4, ERRORS[0]] = math.inf
+    found = regress.compare({"accepted": then, "release": then}, now)
+    assert {f.verdict for f in found} == {"failed"}
+    told = "e: 1 of 10 runs fail; recording 2: errors that are not finite"
+    for report in (regress_report.as_text(found), regress_report.as_annotations(found)):
+        assert report.count(told) == 1  # of both baselines once
+    # where the baseline failed already nothing is new, and the tables say that less was compared
+    known = regress.compare({"accepted": now}, now)
+    assert {f.verdict for f in known} == {"identical"}
+    assert "identical (4 of 5 recordings)" in regress_report.as_text(known)
+    assert "identical (4 of 5 recordings)" in regress_report.as_markdown(known)
+    assert "of 5" not in regress_report.as_text(regress.compare({"accepted": then}, then))
+
+
+def test_many_runs_are_exchanged_by_drawing():
+    """20 runs can be parted in 125 970 ways, 32 in 600 million."""
+    rng = np.random.default_rng(6)
+    for n_then, n_now in ((12, 8), (16, 16)):
+        then, now = (0.2 * rng.standard_normal((6, n)) for n in (n_then, n_now))
+        assert 0.01 < exchange_p(then, now, rng, 2000)[0] < 0.99
+        assert exchange_p(then, now + 0.2, rng, 2000)[0] < 0.002
+        assert exchange_p(then, now - 0.2, rng, 2000)[1] < 0.002
+
+
+def test_ways_drawn_are_as_those_counted(monkeypatch):
+    rng = np.random.default_rng(7)
+    runs = rng.standard_exponential((3, 8))
+    counted = regress._exchanged_sums(runs, 3, rng)
+    monkeypatch.setattr(regress, "_MOST_WAYS", 0)
+    drawn = regress._exchanged_sums(runs, 3, rng)
+    assert np.allclose(drawn[:, 0], counted[:, 0], rtol=0.0, atol=1e-12)
+    for a, b in zip(counted, drawn, strict=True):
+        assert stats.ks_2samp(a, b).pvalue > 1e-3
+        assert np.isclose(b[:, None], a).any(axis=1).all()
+
+
 def test_other_recordings_are_refused():
     then = table("e", np.ones((5, 1)))
     other_bits = then.assign(checksum="x", fingerprint=then["fingerprint"] * (1 + 1e-9))
     assert {f.verdict for f in regress.compare({"accepted": then}, other_bits)} == {"identical"}
     for now, words in (
         (then.assign(checksum="x", fingerprint=7.0), "what simulates it has changed"),
+        (then.assign(checksum="x", fingerprint=math.nan), "what simulates it has changed"),
         (then.iloc[:4], "other recordings"),
         (then.assign(estimator="f"), "does not know f"),
     ):
@@ -148,10 +188,92 @@ def small(tmp_path, monkeypatch):
         f"first_seed: 5\nrecordings:\n  room:\n    count: 3\n    overrides:{overrides}\n"
         "estimators:\n  odometry: { recordings: room, repeats: [1, 1], overrides: [] }\n"
     )
-    monkeypatch.setattr(regress, "BASELINES", tmp_path / "baselines")
     monkeypatch.setattr(regress, "run_suite", partial(run_suite, n_jobs=1))
-    (tmp_path / "baselines").mkdir()
     return path
+
+
+def test_suites_of_ones_own_keep_their_baselines_apart(tmp_path):
+    main = regress.baseline_paths("check")
+    assert main == regress.baseline_paths(str(suite_path("check")))
+    assert main["accepted"] == regress.BASELINES / "check.csv"
+    names = [
+        str(tmp_path / f"{folder}{stem}.yaml")
+        for folder in ("", "o/")
+        for stem in ("check", "release", "power")
+    ]
+    files = [path for name in [*names, "check"] for path in regress.baseline_paths(name).values()]
+    assert len(set(files)) == len(files)
+    assert regress.baseline_paths(names[0])["release"] == tmp_path / "check.baselines/release.csv"
+
+
+def test_damage_is_told_from_otherness(tmp_path):
+    path, sound = tmp_path / "b.csv", table("e", np.full((4, 2), 0.25))
+    regress.write_baseline(regress.Baseline(sound, ("why",)), path)
+    text = path.read_text()
+    back = regress.read_baseline(path)
+    assert back.history == ("why",)
+    pd.testing.assert_frame_equal(back.rows, sound, check_dtype=False)
+    lines = text.splitlines(keepends=True)
+    for damaged, why in (
+        ("".join(lines[:-2]), "cut short at 6 rows"),
+        ("".join(lines[1:])[:-9], "cut short"),  # as old files, which do not say how many
+        ("".join([*lines[1:], lines[-1]]), "two rows of e, recording 3, repeat 1"),
+        ("".join(lines[1:-1]), "rows of e are missing"),
+        (text.replace("0.25", "abc", 1), "ate_rmse_m 'abc' is no number"),
+        (text.replace("c1,2", "c1,x", 1), "fingerprint 'x' is no number"),
+        (text.replace("c1,2", "c1,", 1), "a row without fingerprint"),
+        (text.replace("e,1,", "e,,", 1), "a row without recording"),
+        (text.replace("c1,2", ",2", 1), "a row without checksum"),
+        (text.replace("fingerprint", "finger"), "no column fingerprint"),
+        ("", "No columns"),
+        (text.replace("0.25", '"', 1), "EOF"),
+    ):
+        path.write_text(damaged)
+        with pytest.raises(InputError, match=f"damaged.*{why}.*git checkout -- ") as refusal:
+            regress.read_baseline(path)
+        assert "\n" not in str(refusal.value)
+        assert "--accept" not in str(refusal.value)
+
+
+def no_run(*_, **__):
+    raise AssertionError("ran")
+
+
+def test_baselines_are_read_before_the_suite_runs(small, monkeypatch):
+    monkeypatch.setattr(regress, "run_suite", no_run)
+    for path in regress.baseline_paths(str(small)).values():
+        path.parent.mkdir(exist_ok=True)
+        path.write_text("estimator\ne\n")
+    with pytest.raises(InputError, match="damaged"):
+        regress.accept(str(small), "reason")
+    with pytest.raises(InputError, match="damaged"):
+        regress.check(str(small))
+
+
+def test_one_estimator_alone_makes_no_baseline(small, monkeypatch, capsys):
+    small.write_text(small.read_text() + "  second: { recordings: room, repeats: [1, 1] }\n")
+    paths = regress.baseline_paths(str(small))
+    rows = pd.concat([table("odometry", np.ones((3, 1))), table("second", np.ones((3, 1)))])
+    accepted = regress.Baseline(rows)
+    monkeypatch.setattr(regress, "run_suite", no_run)
+    for missing in ("accepted", "release"):
+        with pytest.raises(InputError, match=f"{paths[missing].name}.*without --only"):
+            regress.accept(str(small), "reason", ["odometry"])
+        regress.write_baseline(accepted, paths["accepted"])
+    assert not paths["release"].exists()
+    # and a check says that the release is missing
+    monkeypatch.setattr(regress, "run_suite", lambda *_, **__: rows)
+    assert not regress_report.run_check(str(small), None)
+    told = capsys.readouterr().err
+    assert "release.csv: no release baseline" in told
+    assert "--accept REASON --release" in told
+
+
+def test_failures_are_not_accepted(small, monkeypatch):
+    rows = table("odometry", np.full((3, 1), math.inf))
+    monkeypatch.setattr(regress, "run_suite", lambda *_, **__: rows)
+    with pytest.raises(InputError, match=r"recording 0 \(errors that are not finite\)"):
+        regress.accept(str(small), "reason")
 
 
 def test_accept_check_worsen_accept(small, monkeypatch):
@@ -162,7 +284,7 @@ def test_accept_check_worsen_accept(small, monkeypatch):
     with pytest.raises(InputError, match="no estimator ekf; it has odometry"):
         regress.check(str(small), ["ekf"])
     written = regress.accept(str(small), "first")
-    assert [path.name for path in written] == ["small.csv", "small_release.csv"]
+    assert [path.name for path in written] == ["check.csv", "release.csv"]
     assert {f.verdict for f in regress.check(str(small))} == {"identical"}
 
     @contextmanager
@@ -187,7 +309,7 @@ def test_accept_check_worsen_accept(small, monkeypatch):
         assert [line.rsplit(": ", 1)[1] for line in history] == ["first", "longer wheels"]
     # better than the release: that stays pinned
     monkeypatch.setattr(regress, "run_suite", partial(run_suite, n_jobs=1))
-    assert [p.name for p in regress.accept(str(small), "mended")] == ["small.csv"]
+    assert [p.name for p in regress.accept(str(small), "mended")] == ["check.csv"]
 
 
 def test_suite_of_the_check_is_sound():
@@ -215,8 +337,32 @@ def test_recordings_of_the_check_turn():
         ("recordings: 3", "a suite holds"),
         ("first_seed: [", "cannot read"),
         (
-            "first_seed: 1\nrecordings: {a: {count: 1, overrides: []}}\nestimators: {}",
+            "first_seed: 1\nrecordings: {a: {count: 1, overrides: []}}\n"
+            "estimators: {odometry: {recordings: a, repeats: [1, 1]}}",
             "count must be 2",
+        ),
+        *(
+            (
+                f"first_seed: {seed}\nrecordings: {{a: {{count: 2, overrides: {group}}}}}\n"
+                f"estimators: {estimators}",
+                words,
+            )
+            for seed, group, estimators, words in (
+                ("1", "[]", "{}", "estimators is empty"),
+                ("abc", "[]", "{odometry: {recordings: a, repeats: [1, 1]}}", "first_seed must be"),
+                ("1", "[1]", "{odometry: {recordings: a, repeats: [1, 1]}}", "list of texts"),
+                ("1", "world=room", "{odometry: {recordings: a, repeats: [1, 1]}}", "list of t"),
+                (
+                    "1",
+                    "[]",
+                    "{odometry: {recordings: a, repeats: [1, 1], overrides: [1]}}",
+                    "list of texts",
+                ),
+                ("1", "[]", "{odometry: {recordings: [a], repeats: [1, 1]}}", "must be texts"),
+                ("1", "[]", "{1: {recordings: a, repeats: [1, 1]}}", "must be texts"),
+                ("1", "[]", "{odometry: {recordings: a, repeats: [1.5, 1]}}", "repeats must lie"),
+                ("1", "[]", "{odometry: {recordings: a, repeats: [x, 1]}}", "repeats must lie"),
+            )
         ),
         (
             "first_seed: 1\nrecordings: {a: {count: 2, overrides: []}}\n"
@@ -268,7 +414,13 @@ def findings():
 
 def test_reports_agree(monkeypatch, tmp_path, capsys):
     found = findings()
-    text, page = regress_report.as_text(found), regress_report.as_markdown(found)
+    finds = regress_report.smallest_found()
+    assert all(share > 0.0 for share in finds.values())
+    text, page = (
+        report(found, finds) for report in (regress_report.as_text, regress_report.as_markdown)
+    )
+    assert "finds" in text
+    assert "finds" in page
     for report in (text, page):
         assert "worse: worse <&>" in report
         assert "better: better" in report
@@ -294,3 +446,73 @@ def test_reports_agree(monkeypatch, tmp_path, capsys):
     assert ET.parse(junit).getroot().tag == "testsuites"
     with pytest.raises(InputError, match="--release goes with"):
         regress_report.run_check("check", None, release=True)
+
+
+def test_what_was_measured_on_the_main_suite_is_not_said_of_others(small, monkeypatch, capsys):
+    monkeypatch.setattr(regress_report, "check", lambda *_: findings())
+    regress_report.run_check("check", None)
+    assert "finds" in capsys.readouterr().out
+    regress_report.run_check(str(small), None)
+    assert "finds" not in capsys.readouterr().out
+    assert "finds" not in regress_report.as_markdown(findings())
+
+
+def test_the_interval_is_that_of_the_test():
+    """Beside every verdict at 0.05 stands an interval without zero, and by how much it improved."""
+    rng = np.random.default_rng(8)
+    then, p_of = of_recordings(rng, 30), {}
+    noise = 0.1 * rng.standard_normal((30, 1))
+    for shift in np.linspace(-0.06, 0.06, 61):
+        now = then * np.exp(noise - noise.mean() + shift)
+        for found in regress.compare({"accepted": table("e", then)}, table("e", now))[:1]:
+            p_of[shift] = min(found.p_general)
+            assert (found.verdict in ("worse", "better")) == (found.low > 1.0 or found.high < 1.0)
+            if found.verdict in ("worse", "better"):
+                words = regress_report.sentence(found)
+                size = 100.0 * abs(math.expm1(shift))
+                assert f"{found.verdict} by {size:.1f} % (90 % interval: " in words
+                assert "-" not in words
+    assert any(0.025 < p <= 0.05 for p in p_of.values())  # where a 95 % interval holds zero
+
+
+def test_messages_are_made_printable(small):
+    @contextmanager
+    def broken(estimator, rng):
+        raise ValueError("a\x00b\x1b[31m\ud800\ufffe\r<c> \u00e9")
+        yield estimator
+
+    now = run_suite(read_suite(small), {"odometry": 1}, planted={"odometry": broken}, n_jobs=1)
+    raw = now.assign(status="ValueError: a\x00b\x1b[31m\x85\ufffe\r<c> \u00e9")
+    then = now.assign(status="ok", **dict.fromkeys(ERRORS, 1.0))
+    found = regress.compare({"accepted": then}, raw)
+    assert regress.compare({"accepted": then}, now)[0].message == found[0].message.translate(
+        {0: "?", 0x1B: "?", 0x85: "?", 0xFFFE: "?", 13: "?"}
+    )
+    failures = ET.fromstring(regress_report.as_junit(found)).findall(".//failure")
+    assert len(failures) == 3
+    assert failures[0].get("message").endswith("ValueError: a?b?[31m???<c> \u00e9")
+    for report in (regress_report.as_text, regress_report.as_annotations):
+        assert "a?b?[31m???<c>" in report(found)
+        assert all(c.isprintable() or c == "\n" for c in report(found))
+
+
+@pytest.mark.parametrize("where", ["junit", "summary", "step"])
+def test_reports_without_a_place_are_told_before_the_run(where, tmp_path, monkeypatch):
+    monkeypatch.setattr(regress_report, "check", no_run)
+    (tmp_path / "file").touch()
+    for path in (tmp_path / "file" / "report", tmp_path):
+        options = {where: path}
+        if options.pop("step", None):
+            monkeypatch.setenv("GITHUB_ACTIONS", "true")
+            monkeypatch.setenv("GITHUB_STEP_SUMMARY", str(path))
+        with pytest.raises(InputError, match="cannot write a report there"):
+            regress_report.run_check("check", None, **options)
+
+
+def test_a_folder_is_made_for_the_job_summary(tmp_path, monkeypatch):
+    page = tmp_path / "new" / "step.md"
+    monkeypatch.setattr(regress_report, "check", lambda *_: findings())
+    monkeypatch.setenv("GITHUB_ACTIONS", "true")
+    monkeypatch.setenv("GITHUB_STEP_SUMMARY", str(page))
+    assert regress_report.run_check("check", None)
+    assert page.read_text().startswith("## estima check")
