@@ -41,7 +41,7 @@ def read_table(path: Path) -> pd.DataFrame:
         if path.suffix == ".csv" and path.is_file():
             cells = pd.read_csv(path, dtype="str", keep_default_na=False)
     except (InputError, ValueError) as error:
-        why = [*str(error.__cause__ or "no table there").splitlines(), "unreadable"][0]
+        why = [*str(error.__cause__ or "no table there").splitlines(), "unreadable"][0].rstrip(".")
         raise InputError(f"{path}: {why}; export-table needs a CSV or Parquet table") from error
     for name, column in list(frame.items()):
         gaps, filled = column.isna(), column.dropna()
