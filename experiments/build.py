@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import importlib
 import inspect
@@ -200,7 +201,9 @@ def make_estimator(config: Config) -> Estimator:
 def make_prior(config: Config, recording: Recording) -> Prior:
     """What the estimator knows at the start."""
     settings = config["prior"]
-    robot = RobotGeometry(float(settings["wheel_radius_m"]), float(settings["track_m"]))
+    believed = {key: settings[key] for key in ("wheel_radius_m", "track_m")}
+    given = {key: value for key, value in believed.items() if value is not None}
+    robot = build(RobotGeometry, dataclasses.asdict(recording.robot) | given, "prior")
     known_map = make_map(config, recording)
     sensors: SensorSuite = recording.sensors
     if settings["start"] == "global":

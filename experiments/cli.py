@@ -75,8 +75,11 @@ def record(
     from experiments.build import simulate
     from experiments.compose import compose
     from experiments.console import progress
+    from sim.errors import InputError
     from sim.recording import save
 
+    if out.suffix != ".npz":
+        raise InputError(f"-o {out}: a recording is an .npz file")
     config = compose(overrides or [])
     with progress("simulating, s") as on_progress:
         recording = simulate(config, on_progress)
@@ -126,8 +129,11 @@ def convert(
       estima convert MRCLAM_Dataset6.tar.xz --robot 3 -o robot3.npz
     """
     from experiments.convert import write_recording
+    from sim.errors import InputError
     from sim.formats.detect import read_any
 
+    if not out.name:
+        raise InputError(f"-o {out}: name the file to write, such as run.mcap")
     recording = read_any(log, robot)
     write_recording(out, recording)
     print(f"{out}: {recording.duration_s:.1f} s, {len(recording.frame_stamps)} frames")
@@ -163,7 +169,10 @@ def view(
         typer.Option("--out", "-o", help="File to write: .mp4, .gif or .html; a world: .png."),
     ] = None,
     seconds: Annotated[
-        float | None, typer.Option(help="How long it shall take [saved: 20, live: real time].")
+        float | None,
+        typer.Option(
+            help="How long it takes at the most; few Frames take less [saved: 20, live: real time]."
+        ),
     ] = None,
 ) -> None:
     """Show a run as it moves, in a window or in a file; or draw a world.
@@ -256,6 +265,11 @@ def calibrate(
     if method not in ("wheel-truth", "end-poses"):
         raise InputError(f"--method must be wheel-truth or end-poses, got {method!r}")
     loaded = [load(path) for path in recordings]
+    first: dict[str, Path] = {}
+    for path, recording in zip(recordings, loaded, strict=True):
+        if recording.checksum in first:
+            raise InputError(f"{path} is the same recording as {first[recording.checksum]}")
+        first[recording.checksum] = path
     kind: Any = method.replace("-", "_")
     result = calibrate_recordings(loaded, kind, geometry=joint)
     print(result.as_json() if as_json else result.as_text())

@@ -24,15 +24,17 @@ def describe(recording: Recording) -> str:
         f"track {recording.robot.track_m} m",
     ]
     for name, log in logs.items():
-        if log is not None:
-            lines.append(f"{name:<11} {len(log.stamps)} readings{_rate(log.stamps)}")
-    if recording.laser is not None:
-        seen = np.isfinite(recording.laser.ranges_m).mean() if recording.laser.ranges_m.size else 0
-        beams = recording.laser.ranges_m.shape[1]
-        lines.append(f"            {beams} beams, {100 * seen:.1f} % of them in range")
-    if recording.landmarks is not None:
-        mean = len(recording.landmarks.points_in_camera) / max(len(recording.landmarks.stamps), 1)
-        lines.append(f"            {mean:.1f} landmarks an image")
+        if log is None:
+            continue
+        lines.append(f"{name:<11} {len(log.stamps)} readings{_rate(log.stamps)}")
+        if log is recording.laser:
+            ranges_m = recording.laser.ranges_m
+            seen = 100 * np.isfinite(ranges_m).mean() if ranges_m.size else 0.0
+            lines.append(f"            {ranges_m.shape[1]} beams, {seen:.1f} % of them in range")
+        if log is recording.landmarks:
+            log = recording.landmarks
+            mean = len(log.points_in_camera) / max(len(log.stamps), 1)
+            lines.append(f"            {mean:.1f} landmarks an image")
     truth = recording.truth
     if truth is None:
         lines.append("truth       none")

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -144,12 +145,25 @@ def _revised_score(recording: Recording, estimator: object) -> dict[str, float]:
 
 def _fetch(config: Config) -> Recording:
     with progress("simulating, s") as on_progress:
-        return make_recording(config, default_cache(), on_progress)
+        recording = make_recording(config, default_cache(), on_progress)
+    made_with, believed = recording.config.get("robot"), config["robot"]
+    if isinstance(config["recording"], str) and isinstance(made_with, dict):
+        for key in ("kr", "kl"):
+            if key in made_with and made_with[key] != believed[key]:
+                print(
+                    f"{config['recording']} was made with robot.{key}={made_with[key]:g}; "
+                    f"{believed[key]:g} is believed unless robot.{key} or estimator.{key} is set",
+                    file=sys.stderr,
+                )
+    return recording
 
 
 def labels(config: Config, choices: dict[str, str], checksum: str, key: str, repeat: int) -> Row:
     """What a row says of its origin: choices, every configuration key, versions, checksum."""
     kept = {k: v for k, v in config.items() if k not in ("keep", "picture")}
+    if config["recording"] is not None:  # it brings its own
+        brought = ("world", "sensors", "route")
+        choices = {group: name for group, name in choices.items() if group not in brought}
     return {
         **{f"choice.{group}": name for group, name in choices.items()},
         **_flat(kept),
@@ -225,8 +239,8 @@ _SHOWN = (
 
 def _print(rows: list[Row], folder: Path, picture: bool) -> None:
     first = rows[0]
-    head = f"{first['choice.estimator']} in {first['choice.world']}, seed {first['seed']}"
-    print(f"{head}: {first['status']}")
+    where = first.get("choice.world") or first.get("recording") or "a recording"
+    print(f"{first['choice.estimator']} on {where}, seed {first['seed']}: {first['status']}")
     for key, label, unit in _SHOWN:
         values = [float(v) for row in rows if isinstance(v := row.get(key), (int, float))]
         if values:

@@ -97,7 +97,9 @@ def read_rows(path: Path) -> pd.DataFrame:
     for file in files:
         try:
             if file.suffix == ".csv":  # a digest such as 12e4567 is no number
-                frames.append(pd.read_csv(file, dtype=dict.fromkeys(_TEXTS, "str")))
+                frames.append(
+                    pd.read_csv(file, dtype=dict.fromkeys(_TEXTS, "str"), index_col=False)
+                )
             else:
                 # one thread: Arrow's own, started for a small file, can abort the program's end
                 read = pq.ParquetFile(file).read(use_threads=False)

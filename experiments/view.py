@@ -120,7 +120,10 @@ def estimate_of(
     if path.suffix == ".csv":
         if overrides:
             raise InputError(f"{overrides[0]}: overrides are for estimators that are run now")
-        return read_odometry_csv(path), "estimate"
+        estimate, stamps = read_odometry_csv(path), recording.frame_stamps
+        if not ((estimate.stamps >= stamps[0]) & (estimate.stamps <= stamps[-1])).any():
+            raise InputError(f"{path}: no stamp of it lies within the recording; is it another's?")
+        return estimate, "estimate"
     return _estimated(recording, source, overrides, set(rows.tolist()), on_step), source
 
 
@@ -136,11 +139,10 @@ def _estimated(
     from experiments.compose import compose
     from experiments.seeds import stream
 
-    robot = {
-        key: value
-        for key, value in recording.config.get("robot", {}).items()
-        if key in ("kr", "kl")
-    } | dataclasses.asdict(recording.robot)
+    made_with = recording.config.get("robot")  # of a log of many robots, the number of one
+    slip = made_with if isinstance(made_with, dict) else {}
+    robot = {k: v for k, v in slip.items() if k in ("kr", "kl")}
+    robot |= dataclasses.asdict(recording.robot)
     told = [f"robot.{key}={value}" for key, value in robot.items()]
     config = compose([f"estimator={name}", *told, *overrides])
     if "keep_map" in config["estimator"]:

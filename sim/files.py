@@ -20,6 +20,8 @@ def write_whole(path: Path) -> Iterator[Path]:
     InputError
         If the file cannot be written: full disk, no permission, a folder in its place.
     """
+    if not path.name or path.is_dir():
+        raise InputError(f"{path or '.'}: a folder; name the file to write")
     part = path.with_name(f".{path.stem}.{os.getpid()}.{secrets.token_hex(4)}.part{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

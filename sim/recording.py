@@ -327,6 +327,10 @@ def load(path: Path) -> Recording:
     remedy = "delete it and record again"
     if not path.is_file():
         raise InputError(f"{path}: no such recording; make one with `estima record`")
+    if path.suffix != ".npz" and not zipfile.is_zipfile(path):
+        raise InputError(
+            f"{path}: not a recording; make one of a log with `estima convert {path} -o FILE.npz`"
+        )
     try:
         with np.load(path, allow_pickle=False) as archive:
             stored = {name: archive[name] for name in archive.files}

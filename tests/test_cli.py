@@ -96,9 +96,20 @@ def test_damaged_recordings_are_refused(tmp_path):
     path = tmp_path / "r.npz"
     assert estima("record", "-o", str(path), *QUICK, "route=linear_1").returncode == 0
     assert "frames" in estima("info", str(path)).stdout
+    believed = estima("run", *QUICK, f"recording={path}", "name=test_cli", "picture=false")
+    assert "robot.kr" not in believed.stderr
+    assert f"odometry on {path}" in believed.stdout
+    other = ["robot=robocom", "estimator.kr=1e-5", "name=test_cli", "picture=false"]
+    believed = estima("run", *QUICK, f"recording={path}", *other)
+    assert "was made with robot.kr=1e-05" in believed.stderr
     path.write_bytes(path.read_bytes()[:-100])
     refused(estima("info", str(path)), "r.npz", "record again")
     refused(estima("run", f"recording={path}"), "r.npz", "record again")
+    log = tmp_path / "a.log"
+    log.write_text("ODOM 0 0 0 0 0 0 0 nohost 0\n")
+    refused(estima("run", f"recording={log}"), "a.log", "estima convert")
+    refused(estima("record", "-o", "."), ".npz")
+    refused(estima("convert", str(path), "-o", "."), "name the file")
 
 
 def test_calibration_from_recordings(tmp_path):
@@ -114,6 +125,7 @@ def test_calibration_from_recordings(tmp_path):
     assert found["kr"]["low"] < 1e-4 < found["kr"]["high"]
     assert found["kl"]["low"] < 5e-5 < found["kl"]["high"]
     refused(estima("calibrate", *paths, "--method", "guess"), "--method")
+    refused(estima("calibrate", paths[0], paths[1], paths[0]), "same recording")
 
 
 def test_view_draws_a_world(tmp_path):

@@ -1,5 +1,6 @@
 """Every option of the configuration composes and builds what it names."""
 
+import dataclasses
 import inspect
 from pathlib import Path
 
@@ -7,10 +8,12 @@ import numpy as np
 import pytest
 import yaml
 
-from experiments.build import make, make_estimator, make_robot, make_world
+from experiments.build import make, make_estimator, make_prior, make_robot, make_world
 from experiments.compose import compose
-from sim.robot import DifferentialDrive
+from sim.errors import InputError
+from sim.robot import DifferentialDrive, RobotGeometry
 from sim.sensors import suite_from_config
+from tests.fakes import circle
 
 CONF = Path(__file__).resolve().parent.parent / "conf"
 
@@ -65,6 +68,15 @@ def test_belief_follows_truth_unless_it_is_set():
     config = compose(["robot.kr=3e-4", "estimator.kr=1e-5", "prior.track_m=0.2"])
     assert (config["robot"]["kr"], config["estimator"]["kr"]) == (3e-4, 1e-5)
     assert (config["robot"]["track_m"], config["prior"]["track_m"]) == (0.19, 0.2)
+
+
+def test_geometry_is_believed_to_be_the_recordings_unless_it_is_set():
+    there = dataclasses.replace(circle(n_frames=3), robot=RobotGeometry(0.0975, 0.33))
+    assert make_prior(compose([]), there).robot == there.robot
+    set_apart = make_prior(compose(["prior.track_m=0.4"]), there).robot
+    assert set_apart == RobotGeometry(0.0975, 0.4)
+    with pytest.raises(InputError, match="prior"):
+        make_prior(compose(["prior.track_m=wide"]), there)
 
 
 def test_every_option_says_what_it_is():

@@ -129,6 +129,31 @@ def test_an_estimate_that_runs_away_or_is_not_finite_is_still_drawn(recording):
     assert len(list(view.pictures(run))) == 3
 
 
+def test_estimates_of_something_else_are_refused(recording, tmp_path):
+    path = tmp_path / "estimate.csv"
+    sound = believed(recording, recording.truth_at(recording.frame_stamps))
+    write_odometry_csv(sound, path)
+    head, first, *rest = path.read_text().splitlines()
+    x = head.split(",").index("pose.position.x")
+    wild = ",".join("inf" if i == x else cell for i, cell in enumerate(first.split(",")))
+    write_odometry_csv(dataclasses.replace(sound, stamps=sound.stamps + 1e6), path)
+    later = path.read_text()
+    for text, told in (
+        (later, "no stamp of it"),
+        ("\n".join([head, first, wild, *rest]), r"csv:3: .* not finite"),
+        (head, "holds no record"),
+    ):
+        path.write_text(text)
+        with pytest.raises(InputError, match=told):
+            view.estimate_of(recording, str(path), [], np.arange(3), silent)
+
+
+def test_a_robot_that_is_told_by_its_number(recording):
+    """As the logs of several robots do."""
+    numbered = dataclasses.replace(recording, config={"robot": 3})
+    assert view.estimate_of(numbered, "odometry", [], np.arange(3), silent)[1] == "odometry"
+
+
 def test_gif(run, tmp_path):
     shares = []
     view.save(run, tmp_path / "run.gif", shares.append)
