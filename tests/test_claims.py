@@ -7,8 +7,10 @@ import pandas as pd
 import pytest
 
 from experiments import claims as common
+from experiments.claims import gil2008, maximo2024, real_logs
 from experiments.claims import puzzlebot2024 as claims
 from experiments.studies import puzzlebot2024 as study
+from sim.errors import InputError
 
 
 def test_worked_matrices_come_out_and_the_misprint_does_not():
@@ -161,3 +163,118 @@ def test_writing_keeps_other_papers_rows(tmp_path):
     assert frame["paper"].tolist() == ["puzzlebot2024", "another"]
     assert frame["value"].tolist()[0] == 0.5
     assert tuple(frame.columns) == common.COLUMNS
+
+
+def test_arms_that_are_equal_or_few_decide_rightly():
+    same = np.linspace(1.0, 2.0, 20)
+    assert common.lower(same, same)[2] == "not reproduced"
+    assert common.lower(same[:1], same[:1])[2] == "undecided"
+    rng = np.random.default_rng(0)
+    spread = np.exp(0.02 * rng.standard_normal(20))
+    assert common.lower(0.8 * same * spread, same)[2] == "reproduced"
+    assert common.lower(1.2 * same * spread, same)[2] == "not reproduced"
+    ratio, _, said = common.lower(1.001 * same * spread, same)
+    assert ratio.low < 1.0 < ratio.high
+    assert ratio.low > 0.95  # hardly a gain, but the interval spans the criterion
+    assert said == "undecided"
+
+
+def test_statistics_of_a_claim_stay_in_the_order_given(tmp_path):
+    path = tmp_path / "claims.csv"
+    first = claims.pb1()[0]
+    given = [dataclasses.replace(first, statistic=s) for s in ("the headline", "a detail")]
+    common.write([dataclasses.replace(first, id="PB2"), *given], path)
+    assert common.read(path)["statistic"].tolist()[:2] == ["the headline", "a detail"]
+
+
+ROW = "PB1,puzzlebot2024,a statistic,0.5,0.4,0.6,at least 0.4,reproduced,s,c"
+
+
+@pytest.mark.parametrize(
+    ("row", "wrong"),
+    [
+        (ROW[:-20], "the last row is cut off"),
+        ("", "the last row is cut off"),
+        (f"{ROW}\n{ROW}\n", "row 3: is there twice"),
+        (f'{ROW}\nPB1,puzzlebot2024,"a sta\n', "cannot read the claims"),
+        (ROW.replace("reproduced", "Reproduced") + "\n", "row 2: verdict is 'Reproduced'"),
+        (ROW.replace("reproduced", "reproducedX") + "\n", "row 2: verdict is 'reproducedX'"),
+        (ROW.replace("reproduced", "") + "\n", "row 2: verdict is nan"),
+        (f"{ROW}\n{ROW.replace('0.5', 'abc')}\n", "row 3: value is 'abc', no number"),
+        (ROW.replace("puzzlebot2024", "") + "\n", "row 2: paper is nan"),
+        (ROW.replace("puzzlebot2024", "../evil paper") + "\n", "row 2: paper is '../evil paper'"),
+        (ROW.replace("puzzlebot2024", "a.b.c") + "\n", "row 2: paper is 'a.b.c'"),
+        (ROW.replace("PB1", "<b>") + "\n", "row 2: id is '<b>'"),
+    ],
+)
+def test_damaged_tables_are_refused_in_one_line(tmp_path, row, wrong):
+    path = tmp_path / "claims.csv"
+    path.write_text(",".join(common.COLUMNS) + "\n" * bool(row) + row)
+    with pytest.raises(InputError) as refused:
+        common.read(path)
+    line = str(refused.value)
+    assert str(path) in line
+    assert wrong in line
+    assert "git checkout" in line
+    assert "\n" not in line
+
+
+def test_a_table_without_verdicts_is_refused(tmp_path):
+    pd.DataFrame({"id": ["PB1"], "paper": ["p"]}).to_csv(tmp_path / "claims.csv", index=False)
+    with pytest.raises(InputError, match="no column statistic"):
+        common.read(tmp_path / "claims.csv")
+
+
+def test_outcomes_are_whole_words():
+    for said in ("not reproduced", "not reproduced; on land", "not reproduced: no (quick)"):
+        assert common.outcome(said) == "not reproduced"
+    assert common.outcome("reproduced (9 of 9)") == "reproduced"
+    for wrong in ("reproducedX", "Reproduced", "", "reproduced?"):
+        with pytest.raises(ValueError, match="not a verdict"):
+            common.outcome(wrong)
+
+
+def test_rl2_judges_after_the_tuned_part_and_shows_the_whole():
+    methods = ("odometry, as logged", "odometry, calibrated", "ICP alone", "ICP from the wheels")
+    rows = [
+        ("intel", method, part, mean, 0.9 * mean, 1.1 * mean)
+        for part, fused in (("judged", 0.1), ("all", 9.0))
+        for method, mean in (*((m, 1.0) for m in methods), ("EKF of wheels and ICP", fused))
+    ]
+    names = ("mean", "low", "high")
+    columns = ["log", "method", "part", *(f"translation_{name}_m" for name in names)]
+    said = real_logs.rl2(pd.DataFrame(rows, columns=columns))
+    assert [c.verdict for c in said] == ["reproduced"] * 4 + ["shown; fusion is behind"] * 4
+    assert all("the whole log" in c.statistic for c in said[4:])
+
+
+def test_rl3_wants_every_robot():
+    rows = [(r, "dead reckoning, calibrated", 1.0) for r in (1, 2, 3)]
+    rows += [(r, "good", 0.5) for r in (1, 2, 3)]
+    rows += [(1, "bad", 1.5), (2, "bad", 0.1), (3, "bad", 1.1), (3, "last", 1.1), (2, "last", 0.1)]
+    table = pd.DataFrame(rows, columns=["robot", "method", "ate_rmse_m"])
+    said = {c.statistic.split()[2]: c.verdict for c in real_logs.rl3(table)}
+    assert said == {
+        "good": "reproduced",
+        "bad": "not reproduced; not on robots 1, 3",
+        "last": "not reproduced; not on robot 3",
+    }
+
+
+def test_intervals_of_two_one_sided_tests_are_named():
+    worlds = pd.DataFrame(
+        [
+            (s, m, d, n, 1.0 + 0.01 * s)
+            for s in range(20)
+            for m in (200, 1000)
+            for d in "ab"
+            for n in (2, 4)
+        ],
+        columns=["seed", "n_particles", "draw", "per_node", "error_m"],
+    ).assign(geometry="umh", noise="paper", filter="fastslam2")
+    for column in gil2008.ERRORS:
+        worlds[column] = worlds["error_m"]
+    no_times = pd.DataFrame({"geometry": []})
+    said = [*gil2008.gi3(worlds), *maximo2024.mx2(worlds, no_times)]
+    assert len(said) == 5
+    assert all("(90 % interval)" in claim.statistic for claim in said)

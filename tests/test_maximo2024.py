@@ -41,26 +41,19 @@ def quality(fails_from=5, name="oxford", n=24):
 
 def test_mx1_follows_the_errors():
     said = claims.mx1(weighting(11.5, 9.6, 205.0), quality())
-    assert said[0].verdict == "reproduced; with shared parameters at B = 10"
-    assert said[1].verdict == "reproduced; with shared parameters M3 fails from B = 5 on"
-    said = claims.mx1(weighting(10.0, 10.0, 11.0), quality(fails_from=99))
-    assert said[0].verdict.startswith("not reproduced")
-    assert said[1].verdict == "not reproduced; with shared parameters M3 fails at no B tried"
-    assert said[1].value == 0.0
-    said = claims.mx1(weighting(0.5, 0.4, 0.44, "umh"), quality(name="umh"))
-    assert said[1].verdict.startswith("reproduced")
-    said = claims.mx1(weighting(0.5, 0.4, 0.6, "umh"), quality(name="umh"))
+    assert said[0].verdict == "reproduced; with shared parameters M3 fails from B = 5 on"
+    assert said[1].verdict == "reproduced; with shared parameters at B = 10"
+    said = claims.mx1(weighting(10.0, 10.2, 11.0), quality(fails_from=99))
+    assert said[0].verdict == "not reproduced; with shared parameters M3 fails at no B tried"
+    assert said[0].value == 0.0
     assert said[1].verdict.startswith("not reproduced")
-
-
-def test_arms_that_are_equal_or_few_decide_rightly():
-    same = np.linspace(1.0, 2.0, 20)
-    assert claims.less(same, same)[1] == "not reproduced"
-    assert claims.less(same[:1], same[:1])[1] == "undecided"
-    rng = np.random.default_rng(0)
-    noisy = same * np.exp(0.3 * rng.standard_normal(20))
-    assert claims.less(noisy, same)[1] in ("undecided", "not reproduced")
-    assert claims.less(0.8 * same * np.exp(0.02 * rng.standard_normal(20)), same)[1] == "reproduced"
+    said = claims.mx1(weighting(10.0, 10.0, 11.0), quality(fails_from=99))
+    assert said[1].low < 1.0 < said[1].high
+    assert said[1].verdict.startswith("undecided")
+    said = claims.mx1(weighting(0.5, 0.4, 0.44, "umh"), quality(name="umh"))
+    assert said[0].verdict.startswith("reproduced")
+    said = claims.mx1(weighting(0.5, 0.4, 0.6, "umh"), quality(name="umh"))
+    assert said[0].verdict.startswith("not reproduced")
 
 
 def test_mx2_wants_equal_errors_and_rising_times():
