@@ -119,9 +119,6 @@ def read_odometry_csv(path: Path) -> Estimate:
     poses = np.array(means, float).reshape(-1, 3)
     if not len(poses):
         raise InputError(f"{path}: holds no record; write it with `estima run`")
-    if not (np.isfinite(poses).all() and np.isfinite(stamps).all()):
-        line = 2 + int(np.argmin(np.isfinite(poses).all(axis=1) & np.isfinite(stamps)))
-        raise InputError(f"{path}:{line}: a number is not finite")
     poses[:, 2] = se2.wrap(poses[:, 2])
     return Estimate(np.array(stamps), poses, np.array(covariances).reshape(-1, 3, 3))
 

@@ -11,6 +11,7 @@ import json
 import re
 import sys
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -117,7 +118,9 @@ def run_configuration(
     for repeat in range(config["repeats"]):
         row = labels(config, choices, recording.checksum, key, repeat)
         try:
-            with progress(name, len(recording.frame_stamps)) as on_step:
+            # in a sweep the runs are counted, and their steps are not
+            shown = progress(name, len(recording.frame_stamps)) if fetch is None else None
+            with shown or nullcontext() as on_step:
                 rng = stream(config["seed"], f"estimator/{name}", repeat)
                 estimate = run(estimator, recording, prior, rng, config["keep"], on_step)
         except InputError:

@@ -123,6 +123,9 @@ def estimate_of(
         estimate, stamps = read_odometry_csv(path), recording.frame_stamps
         if not ((estimate.stamps >= stamps[0]) & (estimate.stamps <= stamps[-1])).any():
             raise InputError(f"{path}: no stamp of it lies within the recording; is it another's?")
+        sound = np.isfinite(estimate.means).all(axis=1)
+        if not sound.all():
+            raise InputError(f"{path}:{2 + int(np.argmin(sound))}: a pose that is not finite")
         return estimate, "estimate"
     return _estimated(recording, source, overrides, set(rows.tolist()), on_step), source
 
