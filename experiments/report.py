@@ -11,6 +11,7 @@ import importlib
 import importlib.util
 import json
 import struct
+import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
 from html import escape
@@ -21,6 +22,8 @@ import pandas as pd
 import yaml
 
 from experiments.bench.measure import machine
+from experiments.claims import OUTCOMES, outcome
+from experiments.claims import read as read_claims
 from experiments.table import read_rows
 from experiments.table_export import plain
 from experiments.version import ROOT, code_version
@@ -31,7 +34,8 @@ FINDINGS = ROOT / "experiments" / "findings"
 PAPERS = ("puzzlebot2024", "decristoforis2020", "gil2008", "maximo2024")
 SMALL_ROWS, SMALL_COLUMNS = 60, 20  # a table up to here is shown whole
 FIRST_ROWS = 5  # of a larger one
-_OUTCOMES = ("reproduced", "not reproduced", "undecided", "shown")
+# What belongs to no paper, by the start of its files' names, and the command that makes it.
+OWN = {"mcl_office": "python -m experiments.studies.mcl_office"}
 
 
 def write_report(results: Path, on_progress: Callable[[float], None] = lambda _: None) -> Path:
@@ -45,10 +49,17 @@ def write_report(results: Path, on_progress: Callable[[float], None] = lambda _:
     on_progress
         Called with the share done.
     """
-    claims = _claims(results / "claims.csv")
+    claims = read_claims(results / "claims.csv")
     papers = [*PAPERS, *sorted(set(claims["paper"]) - set(PAPERS))]
     about = {paper: findings(paper) for paper in papers}
     made = read_provenance(results)
+    missing = _without_verdict(claims, about)
+    if missing:
+        print(
+            f"{results / 'claims.csv'}: no verdict on {', '.join(missing)}, though others of the "
+            "paper have one; `git checkout results/claims.csv` or `estima reproduce`",
+            file=sys.stderr,
+        )
     sections = []
     for i, paper in enumerate(papers):
         part = claims[claims["paper"] == paper]
@@ -56,10 +67,11 @@ def write_report(results: Path, on_progress: Callable[[float], None] = lambda _:
         on_progress((i + 1) / len(papers))
     body = [
         '<a class="skip" href="#claims">Skip to the claims</a>',
-        _header(claims, about),
+        _header(claims, about, missing),
         "<main>",
         _claims_section(claims, about),
         *sections,
+        _own(results, papers),
         _machine_section(papers, made),
         "</main>",
     ]
@@ -112,8 +124,18 @@ def read_provenance(results: Path) -> dict[str, dict[str, Any]]:
     except FileNotFoundError:
         return {}
     except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot read ({error}); delete it and run again") from error
+        raise InputError(f"{path}: cannot read ({error}); {_REMEDY}") from error
+    if not isinstance(made, dict):
+        raise InputError(f"{path}: must hold an object by paper; {_REMEDY}")
+    for paper, how in made.items():
+        lacks = [key for key in _MADE if key not in how] if isinstance(how, dict) else list(_MADE)
+        if lacks:
+            raise InputError(f"{path}: {paper} does not say its {', '.join(lacks)}; {_REMEDY}")
     return made
+
+
+_MADE = ("profile", "seconds", "code_version")
+_REMEDY = "`git checkout results`, or delete it and run `estima reproduce`"
 
 
 def note_provenance(results: Path, paper: str, profile: str, seconds: float) -> None:
@@ -129,44 +151,52 @@ def note_provenance(results: Path, paper: str, profile: str, seconds: float) -> 
         part.write_text(json.dumps(dict(sorted(made.items())), indent=2) + "\n")
 
 
-def _claims(path: Path) -> pd.DataFrame:
-    """Judged claims; a table without rows if there are none yet."""
-    from experiments.claims import COLUMNS
-
-    return read_rows(path) if path.exists() else pd.DataFrame(columns=list(COLUMNS))
-
-
-def outcome(verdict: str) -> str:
-    """The verdict without its reasons: reproduced, not reproduced, undecided or shown."""
-    return next((word for word in _OUTCOMES if verdict.startswith(word)), "shown")
+def _without_verdict(claims: pd.DataFrame, about: dict[str, dict[str, Any]]) -> list[str]:
+    """Claims without a verdict of papers that have some: what a cut table would lack."""
+    judged, papers = set(claims["id"]), set(claims["paper"])
+    return [
+        key
+        for paper, page in about.items()
+        if paper in papers
+        for key in page["claims"]
+        if key not in judged
+    ]
 
 
 def summary(verdicts: Sequence[str]) -> tuple[str, str]:
     """A claim's verdict in words and its class, of the verdicts on its parts."""
     counts = Counter(outcome(verdict) for verdict in verdicts)
-    judged = sum(counts[word] for word in _OUTCOMES[:3])
+    judged = sum(counts[word] for word in OUTCOMES[:3])
     quick = " (quick)" if any(verdict.endswith("(quick)") for verdict in verdicts) else ""
-    for word in _OUTCOMES[:3]:
+    for word in OUTCOMES[:3]:
         if judged and counts[word] == judged:
             return word + quick, word.replace(" ", "-")
     if not judged:
         return "shown, not judged" + quick, "quiet"
-    parts = ", ".join(f"{counts[w]} {w}" for w in _OUTCOMES[:3] if counts[w])
+    parts = ", ".join(f"{counts[w]} {w}" for w in OUTCOMES[:3] if counts[w])
     return f"mixed: {parts}{quick}", "partly"
 
 
-def _header(claims: pd.DataFrame, about: dict[str, dict[str, Any]]) -> str:
+def _header(claims: pd.DataFrame, about: dict[str, dict[str, Any]], missing: Sequence[str]) -> str:
     counts = Counter(claims["verdict"].map(outcome))
-    tally = ", ".join(f"{counts[word]} {word}" for word in _OUTCOMES if counts[word])
+    tally = ", ".join(f"{counts[word]} {word}" for word in OUTCOMES if counts[word])
     quick = int(claims["verdict"].str.endswith("(quick)").sum()) if len(claims) else 0
     notes = [f"{len(claims)} statistics on {claims['id'].nunique()} claims: {tally or 'none yet'}."]
     if quick:
         notes.append(f"{quick} come from the quick profile, with few repeats, and are marked so.")
-    links = [("claims", "Claims"), *((p, p) for p in about), ("machine", "Versions and machine")]
+    if missing:
+        notes.append(f"No verdict on {', '.join(missing)}.")
+    links = [
+        ("claims", "Claims"),
+        *((p, p) for p in about),
+        ("own", "Our own"),
+        ("machine", "Versions and machine"),
+    ]
     items = "".join(f'<li><a href="#{key}">{escape(name)}</a></li>' for key, name in links)
     return (
         "<header><h1>The papers' claims, judged</h1>"
-        f"<p>{' '.join(notes)} Intervals are 95 %.</p>"
+        f"<p>{' '.join(notes)} Intervals, in brackets, are of 95 % unless the statistic says "
+        "otherwise.</p>"
         f'<nav aria-label="Sections"><ul>{items}</ul></nav></header>'
     )
 
@@ -180,8 +210,8 @@ def _claims_section(claims: pd.DataFrame, about: dict[str, dict[str, Any]]) -> s
     return (
         '<section aria-labelledby="claims"><h2 id="claims" tabindex="-1">Claims</h2>'
         '<table class="claims stack" role="table"><caption>What the papers say, in our words, '
-        "and what came out here. Of several statistics the least favourable stands for the claim."
-        "</caption>"
+        "and what came out here. Of several statistics the first of the worst verdict is shown; "
+        "all are below it.</caption>"
         + _stacked_head("Claim", "The paper says", "Statistic and interval", "Verdict")
         + f"{''.join(bodies)}</table></section>"
     )
@@ -199,7 +229,7 @@ def _claim(key: str, sentence: str, rows: pd.DataFrame) -> str:
             statistic = f"{escape(first['statistic'])}: {interval(first)}"
             verdict = str(first["verdict"])
         else:
-            # The least favourable row speaks for the claim.
+            # The first row of the worst verdict speaks for the claim.
             rank = rows["verdict"].map(outcome).map({w: i for i, w in enumerate(_RANK)})
             first = rows.loc[rank.idxmin()]
             statistic = f"{escape(first['statistic'])}: {interval(first)}"
@@ -237,7 +267,7 @@ def _statistics(key: str, rows: pd.DataFrame) -> str:
     )
     return (
         f'<table class="rows stack" role="table"><caption>Statistics of {key}</caption>'
-        + _stacked_head("Statistic", "Value [95 % interval]", "Criterion", "Verdict")
+        + _stacked_head("Statistic", "Value [interval]", "Criterion", "Verdict")
         + f'<tbody role="rowgroup">{lines}</tbody></table>'
     )
 
@@ -263,16 +293,7 @@ def _paper(
     made: dict[str, Any] | None,
 ) -> str:
     """A paper's figures, tables, configuration and command."""
-    names = [path.stem for path in sorted((results / "figures").glob(f"{paper}_*.png"))]
-    order = {name: i for i, name in enumerate(about["figures"])}
-    names.sort(key=lambda name: (order.get(name, len(order)), name))
-    figures = [
-        _figure(results / "figures" / f"{name}.png", about["figures"].get(name, {}), claims)
-        for name in names
-    ]
-    missing = [name for name in order if name not in names]
-    if missing:
-        figures.append(f'<p class="quiet">Not made yet: {escape(", ".join(missing))}.</p>')
+    figures = _figures(results, paper, about, claims)
     tables = [_table(path) for path in sorted((results / "tables").glob(f"{paper}_*.csv"))]
     return (
         f'<section aria-labelledby="{paper}"><h2 id="{paper}">{paper}: '
@@ -287,9 +308,52 @@ def _paper(
 _NOTHING = '<p class="quiet">None yet.</p>'
 
 
+def _figures(results: Path, study: str, about: dict[str, Any], claims: pd.DataFrame) -> list[str]:
+    """A study's figures in the order of its findings, and which are missing."""
+    names = [path.stem for path in sorted((results / "figures").glob(f"{study}_*.png"))]
+    order = {name: i for i, name in enumerate(about["figures"])}
+    names.sort(key=lambda name: (order.get(name, len(order)), name))
+    figures = [
+        _figure(results / "figures" / f"{name}.png", about["figures"].get(name, {}), claims)
+        for name in names
+    ]
+    if missing := [name for name in order if name not in names]:
+        figures.append(f'<p class="quiet">Not made yet: {escape(", ".join(missing))}.</p>')
+    return figures
+
+
+def _own(results: Path, papers: Sequence[str]) -> str:
+    """Figures and tables that belong to no paper, with the command that makes them."""
+    parts = []
+    for study, command in OWN.items():
+        about = findings(study)
+        tables = [_table(path) for path in sorted((results / "tables").glob(f"{study}_*.csv"))]
+        parts.append(
+            f"<h3>{escape(study)}: {escape(about['title'])}</h3><p>{escape(about['about'])}</p>"
+            f"{''.join(_figures(results, study, about, _NO_CLAIMS))}{''.join(tables)}"
+            f"<pre><code>{escape(command)}</code></pre>"
+        )
+    known = tuple(f"{study}_" for study in (*papers, *OWN))
+    files = [*(results / "figures").glob("*.png"), *(results / "tables").glob("*.csv")]
+    others = sorted(path.name for path in files if not path.name.startswith(known))
+    if others:
+        parts.append(f'<p class="quiet">Of no study here: {escape(", ".join(others))}.</p>')
+    return (
+        '<section aria-labelledby="own"><h2 id="own">Our own</h2>'
+        f"<p>Made apart from the papers' studies, by their own commands.</p>{''.join(parts)}"
+        "</section>"
+    )
+
+
+_NO_CLAIMS = pd.DataFrame({"id": []})
+
+
 def _figure(path: Path, about: dict[str, Any], claims: pd.DataFrame) -> str:
     """A figure with the paper's finding beside ours, which is what its claims came to."""
-    data = path.read_bytes()
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot read ({error.strerror}); {_REMEDY}") from error
     width, height = png_size(data, path)
     words = path.stem.split("_", 1)[-1].replace("_", " ")
     title, alt = about.get("title", words), about.get("alt", f"Figure: {words}")
@@ -316,7 +380,7 @@ def _ours(key: str, rows: pd.DataFrame) -> str:
     if not rows.empty:
         verdict, style = summary(rows["verdict"].tolist())
     outcomes = rows["verdict"].map(outcome)
-    first = [rows[outcomes == word].iloc[0] for word in _OUTCOMES if (outcomes == word).any()]
+    first = [rows[outcomes == word].iloc[0] for word in OUTCOMES if (outcomes == word).any()]
     lines = "".join(
         f"<li>{escape(row['verdict']) + ': ' if len(first) > 1 else ''}"
         f"{escape(row['statistic'])}: {interval(row)}</li>"
@@ -329,9 +393,11 @@ def _ours(key: str, rows: pd.DataFrame) -> str:
 
 
 def png_size(data: bytes, path: Path) -> tuple[int, int]:
-    """Width and height in pixels, from the head of a PNG file."""
+    """Width and height in pixels, from the head of a PNG file that is whole."""
     if data[:8] != b"\x89PNG\r\n\x1a\n" or len(data) < 24:
-        raise InputError(f"{path}: not a PNG; delete it and run `estima reproduce`")
+        raise InputError(f"{path}: not a PNG; {_REMEDY}")
+    if data[-8:] != b"IEND\xaeB`\x82":
+        raise InputError(f"{path}: the picture is cut off; {_REMEDY}")
     width, height = struct.unpack(">II", data[16:24])
     return width, height
 
@@ -381,8 +447,8 @@ def _redo(paper: str, claims: pd.DataFrame, made: dict[str, Any] | None) -> str:
     parts = [f"<pre><code>{escape(chr(10).join(commands))}</code></pre>"]
     if made:
         parts.append(
-            f"<p>{made['profile']} profile, {made['seconds']} s, code "
-            f"<code>{made['code_version']}</code>.</p>"
+            f"<p>{escape(str(made['profile']))} profile, {escape(str(made['seconds']))} s, code "
+            f"<code>{escape(str(made['code_version']))}</code>.</p>"
         )
     for path in sorted((ROOT / "conf" / "study").glob(f"{paper}*.yaml")):
         text = escape(path.read_text(encoding="utf-8").strip())

@@ -65,6 +65,7 @@ class Page:
         return message
 
     def open(self, address):
+        self.events = [e for e in self.events if e["method"] != "Page.loadEventFired"]
         self.call("Page.navigate", url=address)
         while not any(e["method"] == "Page.loadEventFired" for e in self.events):
             self._read()

@@ -1,5 +1,6 @@
 """The report as a file and in a real browser; tables as LaTeX and Markdown."""
 
+import json
 import re
 from html.parser import HTMLParser
 from itertools import pairwise
@@ -31,11 +32,12 @@ def results(tmp_path_factory):
         claim("PB1", "reproduced"),
         claim("PB4", "reproduced (quick)"),
         claim("PB4", "not reproduced; <b>at large k</b> (quick)", "the unfavourable", 0.25),
-        claim("ZZ9", "undecided <b>at large</b>", "of a claim that nobody described"),
+        claim("PB4", "not reproduced (quick)", "the second of the worst"),
+        claim("ZZ9", "undecided; <b>at large</b>", "of a claim that nobody described"),
     ]
     write(claims, folder / "claims.csv")
     (folder / "figures").mkdir()
-    for name in ("puzzlebot2024_coverage", "puzzlebot2024_surprise"):
+    for name in ("puzzlebot2024_coverage", "puzzlebot2024_surprise", "mcl_office_found"):
         page = Figure(figsize=(6.0, 3.0))
         page.subplots().plot([0, 1])
         page.savefig(folder / "figures" / f"{name}.png", dpi=100)
@@ -43,7 +45,12 @@ def results(tmp_path_factory):
     write_frame(small, folder / "tables" / "puzzlebot2024_small.csv")
     large = pd.DataFrame({"seed": np.arange(1000, 1100), "error_m": np.linspace(0, 1, 100)})
     write_frame(large, folder / "tables" / "puzzlebot2024_large.csv")
+    write_frame(small, folder / "tables" / "mcl_office_starts.csv")
+    write_frame(small, folder / "tables" / "nobody_knows.csv")
     report.note_provenance(folder, "puzzlebot2024", "quick", 12.3)
+    made = json.loads((folder / "provenance.json").read_text())
+    made["puzzlebot2024"] |= {"profile": "<i>quick", "cpu": "<i>fast"}
+    (folder / "provenance.json").write_text(json.dumps(made))
     return folder
 
 
@@ -100,13 +107,15 @@ def test_structure_that_readers_and_their_aids_rely_on(text):
     assert "prefers-color-scheme: dark" in text
 
 
-def test_claims_come_first_and_the_least_favourable_statistic_speaks(text):
+def test_claims_come_first_and_the_first_of_the_worst_verdict_speaks(text):
     page = Outline(text)
     rows = {e["id"]: e["text"] for e in page.all("tbody") if "id" in e}
     assert "0.5 [0.4, 0.6]" in rows["claim-PB1"]
-    head = rows["claim-PB4"].split("PB4: all 2 statistics")[0]
+    head = rows["claim-PB4"].split("PB4: all 3 statistics")[0]
     assert "the unfavourable: 0.25 [0.4, 0.6]" in head
-    assert "mixed: 1 reproduced, 1 not reproduced (quick)" in head
+    assert "mixed: 1 reproduced, 2 not reproduced (quick)" in head
+    assert "the first of the worst verdict" in page.all("caption")[0]["text"]
+    assert "of 95 % unless the statistic says otherwise" in page.all("header")[0]["text"]
     assert "not judged yet" in rows["claim-GI8"]
     assert "nobody described" in rows["claim-ZZ9"]
     assert "<b>at large" not in text
@@ -131,11 +140,42 @@ def test_small_tables_whole_and_large_ones_begun(text):
 
 def test_origin_and_command_are_told(text):
     sections = {e.get("aria-labelledby"): e["text"] for e in Outline(text).all("section")}
-    assert "quick profile, 12 s" in sections["puzzlebot2024"]
+    assert "<i>quick profile, 12 s" in sections["puzzlebot2024"]
+    assert "<i>fast" in sections["machine"]
     assert "JUDGED_SEED1000" in sections["puzzlebot2024"]
     assert "estima reproduce --paper gil2008" in sections["gil2008"]
     assert "world: office" in sections["decristoforis2020"]  # its study's configuration
     assert np.__version__ in sections["machine"]
+
+
+def test_what_belongs_to_no_paper_comes_last_with_its_command(text):
+    own = {e.get("aria-labelledby"): e["text"] for e in Outline(text).all("section")}["own"]
+    assert "python -m experiments.studies.mcl_office" in own
+    assert "mcl_office_starts (2 rows, 2 columns)" in own
+    assert "Of no study here: nobody_knows.csv." in own
+    assert text.index('id="maximo2024"') < text.index('id="mcl_office_found"')
+
+
+def test_claims_that_a_cut_table_lacks_are_named(results, capsys):
+    told = Outline(report.write_report(results).read_text()).all("header")[0]["text"]
+    assert "No verdict on PB2, PB3." in told  # of papers without any nothing is expected
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "claims.csv: no verdict on PB2, PB3" in line
+
+
+@pytest.mark.parametrize(
+    ("made", "wrong"),
+    [
+        ([], "must hold an object by paper"),
+        ({"gil2008": 3}, "gil2008 does not say its profile, seconds, code_version"),
+        ({"gil2008": {"profile": "full", "seconds": 1}}, "gil2008 does not say its code_version"),
+    ],
+)
+def test_an_origin_that_is_none_is_named(tmp_path, made, wrong):
+    (tmp_path / "provenance.json").write_text(json.dumps(made))
+    with pytest.raises(InputError, match=f"provenance.json: .*{wrong}") as refused:
+        report.write_report(tmp_path)
+    assert "\n" not in str(refused.value)
 
 
 def test_an_empty_folder_gives_a_page_that_says_so(tmp_path):
@@ -144,14 +184,23 @@ def test_an_empty_folder_gives_a_page_that_says_so(tmp_path):
     assert not Outline(text).all("img")
 
 
-def test_a_damaged_figure_is_named(tmp_path):
-    (tmp_path / "figures").mkdir()
-    (tmp_path / "figures" / "gil2008_8.png").write_bytes(b"nothing")
+def test_a_damaged_figure_is_named(tmp_path, results):
+    path = tmp_path / "figures" / "gil2008_8.png"
+    path.parent.mkdir()
+    path.write_bytes(b"nothing")
     with pytest.raises(InputError, match=r"gil2008_8\.png: not a PNG"):
+        report.write_report(tmp_path)
+    whole = (results / "figures" / "mcl_office_found.png").read_bytes()
+    path.write_bytes(whole[:2000])
+    with pytest.raises(InputError, match=r"gil2008_8\.png: the picture is cut off"):
+        report.write_report(tmp_path)
+    path.unlink()
+    path.mkdir()
+    with pytest.raises(InputError, match=r"gil2008_8\.png: cannot read \(Is a directory\)"):
         report.write_report(tmp_path)
 
 
-@pytest.mark.parametrize("paper", report.PAPERS)
+@pytest.mark.parametrize("paper", [*report.PAPERS, *report.OWN, "real_logs"])
 def test_findings_are_complete(paper):
     about = report.findings(paper)
     assert set(about) == {"title", "about", "claims", "figures"}
@@ -175,7 +224,7 @@ def tab(results, text):
 def test_a_browser_loads_it_whole_and_without_complaint(tab):
     assert tab.complaints() == []
     images = tab.js("[...document.images].map(i => [i.complete, i.naturalWidth, i.alt])")
-    assert len(images) == 2
+    assert len(images) == 3
     assert all(complete and width == 600 and alt for complete, width, alt in images)
 
 
@@ -186,7 +235,7 @@ def test_the_keyboard_skips_to_the_claims_and_opens_details(tab):
     tab.press("Enter", text="\r")
     assert tab.js("location.hash") == "#claims"
     tab.press("Tab")
-    assert tab.js("document.activeElement.textContent") == "PB4: all 2 statistics"
+    assert tab.js("document.activeElement.textContent") == "PB4: all 3 statistics"
     assert tab.js("getComputedStyle(document.activeElement).outlineStyle") == "solid"
     tab.press("Enter", text="\r")
     assert tab.js("document.querySelector('#claim-PB4 details').open")

@@ -436,24 +436,21 @@ def _arm(
 
 
 def plan(profile: Profile) -> dict[Scene, list[Arm]]:
-    """All scenes, and the arms that run over each."""
+    """All scenes, and the arms that run over each; quick, the same ones over fewer worlds."""
     full = profile == "full"
-    seeds = range(JUDGED_SEED, JUDGED_SEED + (20 if full else 3))
-    noises = ("paper", "pixel") if full else ("paper",)
+    seeds = range(JUDGED_SEED, JUDGED_SEED + (20 if full else 2))
     arms: dict[Scene, list[Arm]] = {}
 
     def add(scene: Scene, arm: Arm) -> None:
         arms.setdefault(scene, []).append(arm)
 
-    for seed, noise in itertools.product(seeds, noises):
+    for seed, noise in itertools.product(seeds, ("paper", "pixel")):
         scene, judged = Scene(seed, noise=noise), noise == "paper"
         for m, name in itertools.product(PARTICLES, ("paper", "fastslam2")):
             if judged or name == "fastslam2":
                 add(scene, _arm("particles", name, {"n_particles": m}, {"n_particles": m}))
         add(scene, Arm("bound", (("filter", "batch"),), (), method="batch"))
-        for b, name in itertools.product(
-            OBSERVATIONS, ("paper", "fastslam2") if full else ("fastslam2",)
-        ):
+        for b, name in itertools.product(OBSERVATIONS, ("paper", "fastslam2")):
             if judged:
                 add(scene, _arm("observations", name, {"n_particles": 200}, {}, n_seen=b))
     for seed, draw in itertools.product(seeds, range(1, 5 if full else 2)):
@@ -462,15 +459,16 @@ def plan(profile: Profile) -> dict[Scene, list[Arm]]:
             add(Scene(seed, draw=draw), _arm("particles", name, more, more))
     for m, name in itertools.product(PARTICLES, ("paper", "fastslam2")):
         more = {"n_particles": m}
-        arm = _arm("repeats", name, more, more, repeats=20 if full else 5)
+        arm = _arm("repeats", name, more, more, repeats=20 if full else 3)
         add(Scene(JUDGED_SEED), arm)
     for seed in seeds:
-        _distance_arms(add, seed, full=full)
-        _other_arms(add, seed, full=full)
+        _distance_arms(add, seed)
+        _association_arms(add, seed)
+        _setting_arms(add, seed)
     return arms
 
 
-def _distance_arms(add: Callable[[Scene, Arm], None], seed: int, *, full: bool) -> None:
+def _distance_arms(add: Callable[[Scene, Arm], None], seed: int) -> None:
     """Figure 9: dmax, by what is observed, with and without walls."""
     more = {"n_particles": 200}
     for distance in DISTANCES_M:
@@ -480,23 +478,20 @@ def _distance_arms(add: Callable[[Scene, Arm], None], seed: int, *, full: bool) 
             ("fastslam2", True, "paper", FEW, "nearest"),
             ("fastslam2", False, "paper", 0, "random"),
             ("fastslam2", False, "paper", FEW, "random"),
+            ("paper", True, "paper", 0, "random"),
+            ("fastslam2", True, "pixel", 0, "random"),
         ]
-        if full:
-            kinds += [
-                ("paper", True, "paper", 0, "random"),
-                ("fastslam2", True, "pixel", 0, "random"),
-            ]
         for name, occluded, noise, b, rule in kinds:
             arm = _arm("distance", name, more, {}, max_distance_m=distance, n_seen=b, rule=rule)
             add(Scene(seed, noise=noise, occluded=occluded), arm)
 
 
-def _other_arms(add: Callable[[Scene, Arm], None], seed: int, *, full: bool) -> None:
-    """Association, resampling and noise."""
+def _association_arms(add: Callable[[Scene, Arm], None], seed: int) -> None:
+    """Known association, and what distance and descriptors find."""
     more = {"n_particles": 200}
     for noise, sigma in itertools.product(("paper", "pixel"), DESCRIPTOR_SIGMAS):
         main = sigma == DESCRIPTOR_SIGMAS[1]
-        if not main and (noise == "pixel" or not full):
+        if not main and noise == "pixel":
             continue
         scene = Scene(seed, noise=noise, sigma_descriptor=sigma, alike_share=ALIKE_SHARE)
 
@@ -508,22 +503,25 @@ def _other_arms(add: Callable[[Scene, Arm], None], seed: int, *, full: bool) -> 
         guess("descriptor", P0S[1])
         if main:
             guess("known", P0S[1])
-            for p0 in P0S if full and noise == "paper" else P0S[1:2]:
+            for p0 in P0S if noise == "paper" else P0S[1:2]:
                 guess("mahalanobis", p0)
-            if full or seed == JUDGED_SEED:
-                choice = ("association", "mahalanobis")
-                label = (("filter", "ekf_slam"), choice, ("p0", P0S[1]))
-                told = (choice, ("d0", D0S[noise]))
-                add(scene, Arm("association", label, told, method="ekf_slam"))
-    if full:
-        for scheme, share in itertools.product(
-            ("systematic", "stratified", "residual", "multinomial"), (0.5, 1.0)
-        ):
-            settings = {"resampling": scheme, "ess_share": share}
-            add(Scene(seed), _arm("resampling", "fastslam1", {**more, **settings}, settings))
-        for sigma, at in itertools.product(NOISES_PX, ("predicted", "measured")):
-            scene = Scene(seed, noise="pixel", sigma_px=sigma)
-            add(scene, _arm("noise", "fastslam2", {**more, "noise_at": at}, {"noise_at": at}))
+            choice = ("association", "mahalanobis")
+            label = (("filter", "ekf_slam"), choice, ("p0", P0S[1]))
+            told = (choice, ("d0", D0S[noise]))
+            add(scene, Arm("association", label, told, method="ekf_slam"))
+
+
+def _setting_arms(add: Callable[[Scene, Arm], None], seed: int) -> None:
+    """Resampling, and where the noise is taken."""
+    more = {"n_particles": 200}
+    for scheme, share in itertools.product(
+        ("systematic", "stratified", "residual", "multinomial"), (0.5, 1.0)
+    ):
+        settings = {"resampling": scheme, "ess_share": share}
+        add(Scene(seed), _arm("resampling", "fastslam1", {**more, **settings}, settings))
+    for sigma, at in itertools.product(NOISES_PX, ("predicted", "measured")):
+        scene = Scene(seed, noise="pixel", sigma_px=sigma)
+        add(scene, _arm("noise", "fastslam2", {**more, "noise_at": at}, {"noise_at": at}))
 
 
 def run(profile: Profile, out: Path, on_progress: Callable[[float], None]) -> Tables:
