@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import textwrap
 import time
+import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, NoReturn
@@ -73,7 +74,7 @@ class _Progress:
 def end(error: BaseException) -> NoReturn:
     """End the program with one line for what the user can mend: code 2 for input, 1 for failures.
 
-    A fault of ours is raised again, with its trace.
+    A fault of ours ends with its trace and code 3.
     """
     chain: list[BaseException] = [error]
     while (before := chain[-1].__cause__ or chain[-1].__context__) is not None:
@@ -90,7 +91,8 @@ def end(error: BaseException) -> NoReturn:
             lines = [line.strip() for line in str(link).splitlines() if line.strip()]
             text = textwrap.shorten(" ".join(lines), 600, placeholder=" ...")
             _say(f"configuration: {text}; see estima run --cfg job", 2)
-    raise error
+    traceback.print_exception(error)
+    sys.exit(3)
 
 
 def _say(message: str, code: int) -> NoReturn:

@@ -110,8 +110,23 @@ def read_rows(path: Path) -> pd.DataFrame:
             raise InputError(
                 f"{file}: cannot read this table ({(str(error).splitlines() or [''])[0]}); {remedy}"
             ) from error
-    table = pd.concat(frames, ignore_index=True)
+    table = pd.concat(frames, ignore_index=True)[_merged([list(f.columns) for f in frames])]
     for column in filter(lambda name: pd.api.types.is_object_dtype(table[name]), table):
         if len({isinstance(value, str) for value in table[column].dropna()}) > 1:  # one type
             table[column] = table[column].map(str, na_action="ignore")
     return table
+
+
+def _merged(orders: Sequence[Sequence[str]]) -> list[str]:
+    """Names of all orders; one that the earlier lack follows the name that precedes it in its own.
+
+    So settings stay before what was found, also those that only some of the tables have.
+    """
+    merged: list[str] = []
+    for order in dict.fromkeys(map(tuple, orders)):
+        place = 0
+        for name in order:
+            if name not in merged:
+                merged.insert(place, name)
+            place = merged.index(name) + 1
+    return merged

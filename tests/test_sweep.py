@@ -493,6 +493,21 @@ def test_rows_of_other_code_are_left_out(tmp_path, capsys):
     assert "left out 7 rows" in capsys.readouterr().err
 
 
+def test_settings_of_some_estimators_only_are_settings(tmp_path):
+    table = rows()
+    for name, setting in (("a", None), ("b", "estimator.metric"), ("c", "estimator.n_particles")):
+        part = table[table["choice.estimator"] == "a"].assign(**{"choice.estimator": name})
+        part["run_key"] += name
+        if setting is not None:
+            part.insert(1, setting, ["p", "q"] * 3)
+            part[f"found_by_{name}"] = 1.0
+        part.to_parquet(tmp_path / f"{name}.parquet")
+    together = collect(str(tmp_path), all_versions=True)
+    assert {"estimator.metric", "estimator.n_particles"} <= set(swept(together))
+    assert {"found_by_b", "found_by_c"} <= set(measured(together))
+    assert (summary(together).groupby("choice.estimator").size() == [2, 4, 4]).all()
+
+
 def test_failures_and_remarks_are_counted_apart():
     table = rows()
     table["status"] = ["ok", "error: x", "no scan was of use", *["ok"] * 9]
