@@ -346,6 +346,14 @@ def bench(
     print(run_bench(name, as_json=as_json))
 
 
+Where = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--where", help="Rows to keep, such as estimator.metric=point_to_line; repeat it."
+    ),
+]
+
+
 @app.command()
 def table(
     name: Annotated[str, typer.Argument(help="A sweep's name, or a folder or file of rows.")],
@@ -362,15 +370,16 @@ def table(
     means: Annotated[
         bool, typer.Option("--means", help="With -o: write the means that are shown without it.")
     ] = False,
+    only: Where = None,
 ) -> None:
     """Show the means of a sweep's errors, or with -o write all its rows.
 
     Example: estima table leaderboard --against smoother
     """
-    from experiments.collect import collect, summary
+    from experiments.collect import collect, summary, where
     from experiments.table import write_frame
 
-    rows = collect(name, all_versions=all_versions, times=times)
+    rows = where(collect(name, all_versions=all_versions, times=times), only or [])
     if out is None or means:
         rows = summary(rows, against)
     if out is None:
@@ -388,17 +397,18 @@ def plot(
     y: Annotated[str, typer.Option(help="What was found.")] = "ate_rmse_m",
     by: Annotated[str | None, typer.Option(help="One line a value of this.")] = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="Picture to write.")] = Path("plot.png"),
+    only: Where = None,
 ) -> None:
     """Draw a column of a sweep against a swept setting, with 95 % intervals.
 
     Example: estima plot run --x robot.kr --y ate_rmse_m --by choice.estimator
     """
-    from experiments.collect import collect
+    from experiments.collect import collect, where
     from experiments.figures.style import save_figure
     from experiments.figures.sweep import sweep_figure
     from experiments.run import failed
 
-    rows = collect(name, times=True)
+    rows = where(collect(name, times=True), only or [])
     if bad := int(rows["status"].map(failed).sum()):
         print(f"{bad} of {len(rows)} runs failed; they are left out", file=sys.stderr)
         rows = rows[~rows["status"].map(failed)]

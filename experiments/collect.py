@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -74,6 +75,31 @@ def collect(name: str, *, all_versions: bool = False, times: bool = False) -> pd
         table = table.drop(columns=[c for c in _TIMES if c in table])
     order = [*swept(table), "run_key", _LAST_KEY]
     return table.sort_values(order, kind="stable", ignore_index=True)
+
+
+def where(table: pd.DataFrame, conditions: Sequence[str]) -> pd.DataFrame:
+    """Rows that meet conditions such as `estimator.metric=point_to_line` or `robot.kr=1e-5`.
+
+    Raises
+    ------
+    InputError
+        If a column is not there, or no row meets them.
+    """
+    import pandas as pd
+
+    for condition in conditions:
+        column, equals, wanted = condition.partition("=")
+        if not equals or column not in table:
+            raise InputError(f"--where {condition}: COLUMN=VALUE, with a column of the sweep")
+        meets = table[column].astype(str) == wanted
+        number = pd.to_numeric(wanted, errors="coerce")
+        if table[column].dtype.kind in "fi" and not pd.isna(number):
+            meets = table[column] == number
+        if not meets.any():
+            there = ", ".join(map(str, sorted(table[column].dropna().unique())[:8]))
+            raise InputError(f"--where {condition}: no such row; there are {there or 'no values'}")
+        table = table[meets]
+    return table
 
 
 def _of_this_code(table: pd.DataFrame) -> pd.Series[bool]:

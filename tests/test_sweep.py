@@ -15,7 +15,7 @@ import pytest
 from experiments import sweep
 from experiments.build import default_cache, files_digest, recording_settings
 from experiments.cache import key_of
-from experiments.collect import collect, measured, summary, swept, telling
+from experiments.collect import collect, measured, summary, swept, telling, where
 from experiments.compose import compose
 from experiments.figures.sweep import sweep_figure
 from experiments.run import run_key
@@ -506,6 +506,15 @@ def test_settings_of_some_estimators_only_are_settings(tmp_path):
     assert {"estimator.metric", "estimator.n_particles"} <= set(swept(together))
     assert {"found_by_b", "found_by_c"} <= set(measured(together))
     assert (summary(together).groupby("choice.estimator").size() == [2, 4, 4]).all()
+
+
+def test_rows_are_chosen_by_conditions():
+    table = rows()
+    assert len(where(table, ["robot.kr=0.00001"])) == 6
+    assert set(where(table, ["choice.estimator=a", "seed=2"])["seed"]) == {2}
+    for condition in ("seed", "robot.krr=1", "seed=9"):
+        with pytest.raises(InputError, match=condition):
+            where(table, [condition])
 
 
 def test_failures_and_remarks_are_counted_apart():

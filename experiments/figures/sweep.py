@@ -53,14 +53,20 @@ def sweep_figure(table: pd.DataFrame, x: str, y: str, by: str | None = None) -> 
             if len(values):
                 points.append((place[name], _interval(values.to_numpy(), logarithmic)))
         at = np.array([p for p, _ in points])
-        shift = 0.0 if numeric else 0.08 * (i - (len(groups) - 1) / 2)
+        beside = i - (len(groups) - 1) / 2  # bars of several lines would hide each other
+        if wide:
+            at = at * (max(place.values()) / min(place.values())) ** (0.006 * beside)
+        else:
+            step = 0.006 * (max(place.values()) - min(place.values())) if numeric else 0.08
+            at = at + step * beside
+        name = f"{label:g}" if isinstance(label, float) else str(label)
         value = np.array([m.value for _, m in points])
         low = np.array([m.low for _, m in points])
         high = np.array([m.high for _, m in points])
         ax.errorbar(
-            at + shift, value, yerr=[value - low, high - value],
+            at, value, yerr=[value - low, high - value],
             marker="osD^v"[i // len(CYCLE) % 5], ms=4, capsize=2,
-            ls="-" if numeric else "none", color=CYCLE[i % len(CYCLE)], label=str(label),
+            ls="-" if numeric else "none", color=CYCLE[i % len(CYCLE)], label=name,
         )  # fmt: skip
     if wide:
         ax.set_xscale("log")
