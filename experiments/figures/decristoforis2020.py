@@ -62,7 +62,7 @@ def route(world: World, paths: pd.DataFrame) -> Figure:
     for name, ((x1, y1, x2, y2), color) in areas.items():
         ax.add_patch(Rectangle((x1, y1), x2 - x1, y2 - y1, color=color, alpha=0.3, lw=0))
         ax.annotate(
-            name, ((x1 + x2) / 2, (y1 + y2) / 2), (-14.0 if x1 < 1.0 else 14.0, 0.0),
+            name, (x1 if x1 < 1.0 else x2, (y1 + y2) / 2), (-12.0 if x1 < 1.0 else 12.0, 0.0),
             textcoords="offset points", ha="center", va="center", color=color, size=13,
             weight="bold",
         )  # fmt: skip
@@ -124,7 +124,7 @@ def _draw_ellipses(
     ax.set_ylim(rows["y_m"].min() - 2.0, rows["y_m"].max() + 2.0)
 
 
-def trajectories(world: World, paths: pd.DataFrame) -> Figure:
+def trajectories(world: World, paths: pd.DataFrame, runs: pd.DataFrame) -> Figure:
     """Figure 3: trajectories of the three methods and the truth; errors against time below."""
     page = figure(9.0, 8.4)
     halves: Any = page.subfigures(2, 1, height_ratios=(2.2, 1.0))
@@ -136,6 +136,7 @@ def trajectories(world: World, paths: pd.DataFrame) -> Figure:
         style = "-" if method in ("truth", "odometry") else "--"
         x, y = wide["x_m", method], wide["y_m", method]
         ax.plot(x, y, style, color=COLORS[method], lw=1.2, label=NAMES[method])
+    ax.set_title(_of_all(runs, "ate_rmse_m", "position RMSE, m"), size=9)
     top.legend(*ax.get_legend_handles_labels(), loc="outside upper center", ncols=4)
     below = bottom.subplots()
     for method in ("odometry", "icp", "fusion"):
@@ -145,6 +146,22 @@ def trajectories(world: World, paths: pd.DataFrame) -> Figure:
         below.semilogy(wide.index, np.maximum(off, 1e-4), color=COLORS[method], lw=1.0)
     below.set(xlabel="time, s", ylabel="position error, m")
     return page
+
+
+def _of_all(runs: pd.DataFrame, column: str, words: str) -> str:
+    """What the recording drawn has by method, beside the median of all recordings."""
+    wide = _main(runs).pivot(index="seed", columns="method", values=column)
+    drawn = wide.index.min()  # the one whose paths and points are kept
+    parts = [
+        f"{NAMES[method]} {wide.loc[drawn, method]:.2f} ({wide[method].median():.2f})"
+        for method in ("odometry", "icp", "fusion")
+    ]
+    return f"seed {drawn}: {words} (median of {len(wide)} recordings): {', '.join(parts)}"
+
+
+def _main(runs: pd.DataFrame) -> pd.DataFrame:
+    """Rows at 10 Hz on exact rays."""
+    return runs[(runs["rate_hz"] == 10.0) & (runs["rays"] == "exact")]
 
 
 def boxes(table: pd.DataFrame) -> Figure:
@@ -174,9 +191,9 @@ def boxes(table: pd.DataFrame) -> Figure:
     return page
 
 
-def maps(world: World, points: pd.DataFrame) -> Figure:
+def maps(world: World, points: pd.DataFrame, runs: pd.DataFrame) -> Figure:
     """Figure 5: laser points placed by each method, over the true walls."""
-    page = figure(10.0, 2.9)
+    page = figure(10.0, 3.1)
     axes: Any = page.subplots(1, 3, sharex=True, sharey=True)
     for ax, method in zip(axes, ("odometry", "icp", "fusion"), strict=True):
         draw_world(ax, world, landmarks=False)
@@ -186,7 +203,8 @@ def maps(world: World, points: pd.DataFrame) -> Figure:
         ax.plot(rows["x_m"], rows["y_m"], ",", color=TRUTH, alpha=0.8)
         ax.set_title(f"by {NAMES[method]}", fontsize="medium")
         ax.label_outer()
-    page.suptitle("laser points (black) over the true walls (orange)", size=9)
+    means = _of_all(runs, "map_distance_m", "mean distance of points to walls, m")
+    page.suptitle(f"laser points (black) over the true walls (orange)\n{means}", size=9)
     return page
 
 
@@ -194,7 +212,7 @@ def runs(table: pd.DataFrame) -> Figure:
     """Errors and consistency of every method, one dot a recording."""
     page = figure(9.5, 3.8)
     axes: Any = page.subplots(1, 3)
-    rows = table[(table["rate_hz"] == 10.0) & (table["rays"] == "exact")]
+    rows = _main(table)
     methods = [name for name in NAMES if name in set(rows["method"])]
     panels = (
         ("ate_rmse_m", "believed_rmse_m", "position RMSE, m", 1.0),
@@ -323,7 +341,8 @@ def ordering(table: pd.DataFrame) -> Figure:
     for ax in axes[:, 0]:
         ax.set_ylabel("range noise, m")
     assert drawn is not None
-    page.colorbar(drawn, ax=axes, label="median log ratio of RMSE (blue: the first is better)")
+    label = "median log ratio of RMSE (blue: the first is better)"
+    page.colorbar(drawn, ax=axes, label=label, extend="both")
     return page
 
 
@@ -335,7 +354,7 @@ def _grid(ax: Axes, values: pd.DataFrame) -> Any:
         for j in range(values.shape[1]):
             value = values.iloc[i, j]
             ax.text(
-                j, i, f"{value:.1f}", ha="center", va="center", size=7,
+                j, i, f"{value:z.1f}", ha="center", va="center", size=7,
                 color="white" if abs(value) > 2.0 else "black",
             )  # fmt: skip
     ax.set_xticks(range(values.shape[1]), [f"{k:g}" for k in values.columns], fontsize=7)

@@ -78,11 +78,8 @@ def all_figures(tables: Tables) -> dict[str, Figure]:
         "gil2008_observations": by_observations(tables["observations"]),
         "gil2008_association": by_association(tables["association"]),
         "gil2008_cost": cost(tables["cost"]),
-    } | (
-        {"gil2008_settings": by_settings(tables["resampling"], tables["noise"])}
-        if "resampling" in tables
-        else {}
-    )
+        "gil2008_settings": by_settings(tables["resampling"], tables["noise"]),
+    }
 
 
 def example() -> tuple[Recording, dict[str, Estimate]]:
@@ -306,7 +303,11 @@ def by_particles(repeats: pd.DataFrame, bound: pd.DataFrame) -> Figure:
 
 
 def by_particles_over_worlds(particles: pd.DataFrame, bound: pd.DataFrame) -> Figure:
-    """Figure 8 over many worlds: geometric mean and 95 % interval, raw and aligned."""
+    """Figure 8 over many worlds: geometric mean and 95 % interval, raw and aligned.
+
+    Every number of particles has the same recordings: one of each world.
+    """
+    particles = particles[particles["draw"] == 0]
     noises = list(dict.fromkeys(particles["noise"]))
     page = figure(11.0, 3.2 * len(noises) + 0.6)
     columns = {
@@ -331,7 +332,9 @@ def by_particles_over_worlds(particles: pd.DataFrame, bound: pd.DataFrame) -> Fi
         row[0].set_ylabel("RMS error, m")
     for ax in grid[-1]:
         ax.set_xlabel("particles M")
-    page.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=4)
+    # the noise that most filters ran on
+    fullest = max(grid[:, 0], key=lambda ax: len(ax.get_legend_handles_labels()[0]))
+    page.legend(*fullest.get_legend_handles_labels(), loc="outside lower center", ncols=4)
     return page
 
 
@@ -386,13 +389,15 @@ def by_observations(observations: pd.DataFrame) -> Figure:
 def by_association(association: pd.DataFrame) -> Figure:
     """Error and right associations of every way to associate."""
     noises = list(dict.fromkeys(association["noise"]))
-    page = figure(10.0, 2.9 * len(noises) + 0.4)
-    grid = page.subplots(len(noises), 2, squeeze=False)
+    ways = association.groupby("noise", sort=False)[list(_WAYS)]
+    counts = [len(part.drop_duplicates()) for _, part in ways]
+    page = figure(10.0, 0.36 * sum(counts) + 1.2)
+    grid = page.subplots(len(noises), 2, squeeze=False, sharey="row", height_ratios=counts)
     for noise, (left, right) in zip(noises, grid, strict=True):
         table = association[association["noise"] == noise]
         labels = []
-        keys = ["filter", "association", "p0", "sigma_descriptor"]
-        for i, ((name, how, p0, sigma), part) in enumerate(table.groupby(keys, sort=False)):
+        parts = sorted(table.groupby(list(_WAYS)), key=lambda item: _rank(*item[0]))
+        for i, ((name, how, p0, sigma), part) in enumerate(parts):
             precision = part["matching_precision"].mean()
             words = {"known": "known", "mahalanobis": f"Mahalanobis, p0 = {p0:g}"}.get(
                 str(how),
@@ -407,14 +412,23 @@ def by_association(association: pd.DataFrame) -> Figure:
             right.barh(i, part["right_share"].mean(), color=colour, height=0.6)
         left.axvline(0.5, color=BLACK, lw=0.6, ls=":")
         left.set(yticks=range(len(labels)), yticklabels=labels, xscale="log")
-        right.set(yticks=range(len(labels)), yticklabels=[""] * len(labels), xlim=(0.0, 1.0))
-        left.invert_yaxis()
-        right.invert_yaxis()
+        left.set_ylim(len(labels) - 0.4, -0.6)  # from above; both sides share the heights
+        right.set(xlim=(0.0, 1.0))
+        right.tick_params(axis="y", left=False, labelleft=False)
         left.set_title(f"noise of {'10 px' if noise == 'paper' else '1 px'}", loc="left")
         _plain_x(left)
     grid[-1, 0].set_xlabel("path error over odometry's (each world; diamonds: RMS)")
     grid[-1, 1].set_xlabel("share of right associations")
     return page
+
+
+_WAYS = ("filter", "association", "p0", "sigma_descriptor")
+
+
+def _rank(name: str, how: str, p0: float, sigma: float) -> tuple[int, float, float]:
+    """Order of the ways: known, by descriptors, by distance, and with one association for all."""
+    order = ("known", "descriptor", "mahalanobis")
+    return (3 if name == "ekf_slam" else order.index(how)), sigma, p0
 
 
 def by_settings(resampling: pd.DataFrame, noise: pd.DataFrame) -> Figure:

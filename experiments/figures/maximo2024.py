@@ -359,8 +359,8 @@ def campus_errors(starts_table: pd.DataFrame, clusters_table: pd.DataFrame) -> F
         bars = right.bar(places + offset, heights, 0.36, color=colour, label=_RECALL[column])
         right.bar_label(bars, fmt="%.3f", fontsize=7)
     right.set_xticks(places, list(describers.KINDS))
-    right.set(ylim=(0.0, 1.3), ylabel="share of queries")
-    right.legend(loc="upper right", ncols=2)
+    right.set(ylim=(0.0, 1.0), ylabel="share of queries")
+    right.legend(loc="lower right", bbox_to_anchor=(1.0, 1.06), ncols=2)
     return page
 
 

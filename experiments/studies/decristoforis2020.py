@@ -515,9 +515,9 @@ def figures(tables: Tables) -> dict[str, Figure]:
     return {
         f"{PAPER}_1_route": draw.route(office, tables["paths"]),
         f"{PAPER}_2_ellipses": draw.ellipses(corridor, tables["ellipse_path"]),
-        f"{PAPER}_3_trajectories": draw.trajectories(office, tables["paths"]),
+        f"{PAPER}_3_trajectories": draw.trajectories(office, tables["paths"], tables["runs"]),
         f"{PAPER}_4_errors": draw.boxes(tables["boxes"]),
-        f"{PAPER}_5_maps": draw.maps(office, tables["maps"]),
+        f"{PAPER}_5_maps": draw.maps(office, tables["maps"], tables["runs"]),
         f"{PAPER}_runs": draw.runs(tables["runs"]),
         f"{PAPER}_covariances": draw.covariances(tables["covariances"]),
         f"{PAPER}_beliefs": draw.beliefs(tables["beliefs"]),

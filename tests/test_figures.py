@@ -1,0 +1,99 @@
+"""Figures show what they say: equal samples, every curve named, rows at one height."""
+
+import itertools
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from experiments.figures import decristoforis2020, gil2008, maximo2024
+
+ERRORS = ("revised_rmse_m", "revised_aligned_rmse_m", "map_rmse_m", "map_aligned_rmse_m")
+
+
+def test_figure_8_over_worlds_has_equal_samples_and_names_every_filter():
+    rows = [
+        (seed, m, noise, name, draw, 1.0 if draw == 0 else 50.0)
+        for seed, m, (noise, name) in itertools.product(
+            range(3),
+            (10, 200),
+            [("paper", "paper"), ("paper", "fastslam2"), ("pixel", "fastslam2")],
+        )
+        for draw in range(3 if m == 200 else 1)
+    ]
+    columns = ["seed", "n_particles", "noise", "filter", "draw", "error"]
+    table = pd.DataFrame(rows, columns=columns)
+    table = table.assign(**dict.fromkeys(ERRORS, table["error"]))
+    bound = table[table["draw"] == 0]
+    page = gil2008.by_particles_over_worlds(table, bound)
+    for ax in page.axes:
+        for drawn in ax.containers:
+            assert drawn.lines[0].get_ydata() == pytest.approx([1.0, 1.0])
+    named = {text.get_text() for text in page.legends[0].get_texts()}
+    assert named == {"as printed", "FastSLAM 2.0", "batch bound"}
+
+
+def test_ways_to_associate_stand_at_one_height_left_and_right():
+    ways = [
+        ("fastslam2", "mahalanobis", 1e-3, 0.9),
+        ("fastslam2", "descriptor", 1e-3, 0.9),
+        ("ekf_slam", "mahalanobis", 1e-3, 0.9),
+        ("fastslam2", "known", 1e-3, 0.9),
+    ]
+    columns = ["filter", "association", "p0", "sigma_descriptor"]
+    table = pd.concat(
+        pd.DataFrame(part, columns=columns).assign(noise=noise, seed=seed)
+        for noise, part in (("paper", ways), ("pixel", ways[:2]))
+        for seed in range(2)
+    ).assign(revised_rmse_m=1.0, odometry_rmse_m=2.0, right_share=0.5, matching_precision=0.9)
+    axes = gil2008.by_association(table).axes
+    for left, right, count in ((axes[0], axes[1], 4), (axes[2], axes[3], 2)):
+        assert left.get_ylim() == right.get_ylim()
+        heights = [bar.get_y() + bar.get_height() / 2 for bar in right.patches]
+        assert heights == pytest.approx(range(count))
+    names = [label.get_text() for label in axes[0].get_yticklabels()]
+    assert names[0] == "known"
+    assert names[-1] == "EKF-SLAM, Mahalanobis"
+
+
+def runs(errors):
+    rows = [
+        (seed, method, 10.0, "exact", (seed + 1) * value)
+        for seed in range(3)
+        for method, value in errors.items()
+    ]
+    columns = ["seed", "method", "rate_hz", "rays", "ate_rmse_m"]
+    return pd.DataFrame(rows, columns=columns)
+
+
+def test_the_recording_drawn_is_told_beside_the_median():
+    told = decristoforis2020._of_all(
+        runs({"odometry": 1.0, "icp": 0.5, "fusion": 0.1}), "ate_rmse_m", "RMSE, m"
+    )
+    assert told == (
+        "seed 0: RMSE, m (median of 3 recordings): odometry 1.00 (2.00), ICP 0.50 (1.00), "
+        "fusion 0.10 (0.20)"
+    )
+
+
+def test_the_map_of_the_order_has_no_negative_zero_and_open_ends():
+    table = pd.concat(
+        runs({"odometry": 1e4, "icp": 1.001, "fusion": 1.0, "fusion_clone": 1.0}).assign(
+            k_m=k, sigma_range_m=0.01, heading_rmse_rad=lambda t: t["ate_rmse_m"]
+        )
+        for k in (1e-6, 1e-4)
+    )
+    page = decristoforis2020.ordering(table)
+    texts = {text.get_text() for ax in page.axes for text in ax.texts}
+    assert texts == {"0.0", "-9.2"}
+    assert page.axes[-1]._colorbar.extend == "both"
+
+
+def test_shares_end_at_one():
+    starts = pd.DataFrame({"median_m": [0.1, 0.2], "rms_m": [0.2, 0.3], "spacing_m": 6.0})
+    kinds = maximo2024.describers.KINDS
+    clusters = pd.DataFrame(
+        {"geometry": "campus", "descriptor": kinds, "recall_at_1": 1.0, "recall_at_1_percent": 1.0}
+    )
+    right = maximo2024.campus_errors(starts, clusters).axes[1]
+    assert np.array_equal(right.get_ylim(), (0.0, 1.0))
