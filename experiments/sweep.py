@@ -13,6 +13,7 @@ import os
 import platform
 import secrets
 import shutil
+import signal
 import sys
 import threading
 import time
@@ -236,6 +237,8 @@ def _launch_all(runs: Sequence[Run], folder: Path, launching: Sequence[str]) -> 
             path.unlink(missing_ok=True)
         path.with_suffix(".failed").unlink(missing_ok=True)
         _begun(folder, run.key).unlink(missing_ok=True)
+    _clear_plans(folder)
+    signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGINT))  # end as by Ctrl-C
     with _Watch(folder, [run.key for run in runs]):
         left = list(runs)
         while left:
@@ -282,6 +285,20 @@ def _launch(runs: Sequence[Run], folder: Path, launching: Sequence[str]) -> Exce
         plan.unlink(missing_ok=True)
         shutil.rmtree(f"{plan}.jobs", ignore_errors=True)
     return None
+
+
+def _clear_plans(folder: Path) -> None:
+    """Remove what sweeps of this machine left that were killed."""
+    for plan in folder.glob("plan-*.json"):
+        try:
+            node, planner = json.loads(plan.read_text())["planner"]
+            if node == platform.node():
+                os.kill(planner, 0)  # is it there?
+        except ProcessLookupError:
+            plan.unlink(missing_ok=True)
+            shutil.rmtree(f"{plan}.jobs", ignore_errors=True)
+        except (OSError, ValueError, KeyError, TypeError):
+            continue
 
 
 def _begun(folder: Path, key: str) -> Path:

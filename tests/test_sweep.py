@@ -269,6 +269,25 @@ def test_workers_end_with_a_killed_sweep(name):
     process.kill()
     # the pipe ends once nobody holds it any more
     process.communicate(timeout=30)
+    assert list(folder(name).glob("plan-*"))
+    assert estima("run", "-m", *SHORT, f"name={name}", "seed=range(400,402)").returncode == 0
+    assert not list(folder(name).glob("plan-*"))
+
+
+def test_a_terminated_sweep_says_so_and_leaves_no_plan(name):
+    process = subprocess.Popen(
+        [sys.executable, "-m", "experiments.cli", "run", "-m", *SHORT, f"name={name}",
+         "seed=range(0,400)"],
+        cwd=ROOT, stderr=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+    while not list(folder(name).glob("*.parquet")):
+        assert process.poll() is None
+        time.sleep(0.1)
+    process.terminate()
+    _, told = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert told.splitlines()[-1] == "estima: interrupted; what was finished is kept"
+    assert not list(folder(name).glob("plan-*"))
 
 
 @pytest.mark.parametrize(
