@@ -35,7 +35,11 @@ PAPERS = ("puzzlebot2024", "decristoforis2020", "gil2008", "maximo2024")
 SMALL_ROWS, SMALL_COLUMNS = 60, 20  # a table up to here is shown whole
 FIRST_ROWS = 5  # of a larger one
 # What belongs to no paper, by the start of its files' names, and the command that makes it.
-OWN = {"mcl_office": "python -m experiments.studies.mcl_office"}
+OWN = {
+    "leaderboard": "estima run -m study=leaderboard",
+    "all_estimators": "estima run -m study=all_estimators",
+    "mcl_office": "python -m experiments.studies.mcl_office",
+}
 
 
 def write_report(results: Path, on_progress: Callable[[float], None] = lambda _: None) -> Path:
