@@ -77,7 +77,7 @@ def sweep_figure(table: pd.DataFrame, x: str, y: str, by: str | None = None) -> 
     pooled = [c for c in telling(table) if c not in (x, by, "seed", "world_seed")]
     over = ", ".join(["recordings", *(c.removeprefix("choice.") for c in pooled)])
     kind = "geometric mean" if logarithmic else "mean"
-    ax.set_title(textwrap.fill(f"{kind} over {over}; 95 % intervals", 70), fontsize="medium")
+    ax.set_title(textwrap.fill(f"{kind} over {over}; 95 % intervals", 62), fontsize="small")
     ax.set(xlabel=x, ylabel=y)
     if by is not None:
         page.legend(title=by, loc="outside right upper")
