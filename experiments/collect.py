@@ -114,14 +114,14 @@ def _of_this_code(table: pd.DataFrame) -> pd.Series[bool]:
     targets = [column for column in table if str(column).endswith("_target_")]
     others = table[mine & table["code_version"].str.contains("+", regex=False)]
     for names, rows in others.groupby(targets, dropna=False) if len(others) else ():
-        found = [str(n) for n in names if isinstance(n, str) and not n.startswith(("sim.", "est"))]
-        here = version_with(found)
+        given = [name for name in names if isinstance(name, str)]
+        here = version_with(given)
         if "+" in here:
             mine[rows.index] = rows["code_version"] == here
         elif rows["code_version"].nunique() > 1:
             raise InputError(
-                f"rows of several versions of an estimator (one of {', '.join(found)}) whose "
-                "source is not found; set PYTHONPATH to it, or see all with --all-versions"
+                f"rows of several versions of one of {', '.join(given)}, whose source is not found; "
+                "set PYTHONPATH to it, or see all with --all-versions"
             )
     return mine
 

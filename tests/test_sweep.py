@@ -186,7 +186,7 @@ def test_failed_runs_leave_rows_and_the_rest_goes_on(name, tmp_path):
 
 def own_estimator(folder, body):
     """Files of an estimator of one's own, `how` being its option; the words to sweep it by."""
-    (folder / "own_one.py").write_text(
+    (folder / "estuary.py").write_text(
         "import os, sys\n"
         "from estimators.odometry import Odometry\n"
         "class Own(Odometry):\n"
@@ -198,11 +198,11 @@ def own_estimator(folder, body):
         "        return super().step(frame)\n"
     )
     (folder / "conf" / "estimator").mkdir(parents=True, exist_ok=True)
-    (folder / "conf" / "estimator" / "own_one.yaml").write_text(
-        "_target_: own_one.Own\nhow: sound\nkr: ${robot.kr}\nkl: ${robot.kl}\n"
+    (folder / "conf" / "estimator" / "estuary.yaml").write_text(
+        "_target_: estuary.Own\nhow: sound\nkr: ${robot.kr}\nkl: ${robot.kl}\n"
         "window_s: 0.1\nintegration: arc\n"
     )
-    return ["run", "-m", "--config-dir", str(folder / "conf"), *SHORT, "estimator=own_one"]
+    return ["run", "-m", "--config-dir", str(folder / "conf"), *SHORT, "estimator=estuary"]
 
 
 @pytest.mark.parametrize(
@@ -231,7 +231,7 @@ def test_rows_of_an_edited_estimator_do_not_mix(name, tmp_path, monkeypatch, cap
         done = estima(*words, "seed=0,1", f"name={name}", PYTHONPATH=f"{ROOT}:{tmp_path}")
         assert done.returncode == 0, done.stderr
         assert "0 of them done before" in done.stderr
-    with pytest.raises(InputError, match=r"several versions.*own_one\.Own"):
+    with pytest.raises(InputError, match=r"several versions.*estuary\.Own"):
         table_of(name)
     monkeypatch.syspath_prepend(str(tmp_path))
     source_digest.cache_clear()
