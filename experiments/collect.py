@@ -120,8 +120,8 @@ def _of_this_code(table: pd.DataFrame) -> pd.Series[bool]:
             mine[rows.index] = rows["code_version"] == here
         elif rows["code_version"].nunique() > 1:
             raise InputError(
-                f"rows of several versions of one of {', '.join(given)}, whose source is not found; "
-                "set PYTHONPATH to it, or see all with --all-versions"
+                f"rows of several versions of one of {', '.join(given)}, whose source is not "
+                "found; set PYTHONPATH to it, or see all with --all-versions"
             )
     return mine
 
