@@ -53,12 +53,12 @@ def run(context: typer.Context) -> None:
     arguments = [f"+{a}" if a.startswith("study=") else a for a in context.args]
     many = {"-m", "--multirun"} & set(arguments)
     if many and not {"--hydra-help", "--cfg", "-c", "--info", "-i"} & set(arguments):
-        from experiments.sweep import sweep_arguments
+        from experiments.sweeps.launch import sweep_arguments
 
         sweep_arguments([a for a in arguments if a not in many])
         return
     sys.argv = ["estima run", *arguments]
-    from experiments.run import application
+    from experiments.runs.run import application
 
     application()
 
@@ -72,9 +72,9 @@ def record(
 
     Example: estima record -o office.npz world=office sensors=lms291 seed=3
     """
-    from experiments.build import simulate
-    from experiments.compose import compose
-    from experiments.console import progress
+    from experiments.runs.compose import compose
+    from experiments.runs.console import progress
+    from experiments.runs.experiment import simulate
     from sim.errors import InputError
     from sim.recording import save
 
@@ -98,7 +98,7 @@ def info(
 
     Formats that come in several files take them all; docs/formats.md tells their order.
     """
-    from experiments.describe import describe
+    from experiments.viewing.describe import describe
     from sim.formats.detect import read_any
 
     print(describe(read_any(log, robot)))
@@ -128,7 +128,7 @@ def convert(
 
       estima convert MRCLAM_Dataset6.tar.xz --robot 3 -o robot3.npz
     """
-    from experiments.convert import write_recording
+    from experiments.trajectories.convert import write_recording
     from sim.errors import InputError
     from sim.formats.detect import read_any
 
@@ -142,7 +142,7 @@ def convert(
 @app.command()
 def options() -> None:
     """List the configuration groups and their options."""
-    from experiments.version import ROOT
+    from experiments.runs.version import ROOT
 
     for group in ("world", "robot", "sensors", "route", "estimator"):
         names = sorted(path.stem for path in (ROOT / "conf" / group).glob("*.yaml"))
@@ -205,10 +205,10 @@ def view(
 
 def _draw_world(overrides: list[str], out: Path) -> None:
     """Draw walls, landmarks, places and the tour of a world."""
-    from experiments.build import make_world
-    from experiments.compose import compose
-    from experiments.figures.style import save_figure
-    from experiments.figures.world import world_figure
+    from experiments.runs.compose import compose
+    from experiments.runs.experiment import make_world
+    from experiments.viewing.style import save_figure
+    from experiments.viewing.world import world_figure
 
     given = [f"world={o}" if "=" not in o else o for o in overrides]
     save_figure(world_figure(make_world(compose(given))), out)
@@ -219,8 +219,8 @@ def _show_run(
     log: Path, source: str | None, overrides: list[str], out: Path | None, seconds: float | None
 ) -> None:
     """Save a run as an animation, or play it in a window."""
-    from experiments import live, view
-    from experiments.console import progress
+    from experiments.runs.console import progress
+    from experiments.viewing import live, view
     from sim.formats.detect import read_any
 
     if out is None:
@@ -258,7 +258,7 @@ def calibrate(
 
     Example: estima calibrate run1.npz run2.npz --joint
     """
-    from experiments.calibrate import calibrate_recordings
+    from experiments.calibration.calibrate import calibrate_recordings
     from sim.errors import InputError
     from sim.recording import load
 
@@ -288,7 +288,7 @@ def conform(
 
     Example: estima conform estimators.odometry:Odometry kr=1e-5 kl=1e-5
     """
-    from experiments.conform import conform_target
+    from experiments.gate.conform import conform_target
 
     results = conform_target(target, arguments or [])
     for result in results:
@@ -326,7 +326,7 @@ def check(
 
       estima check --accept "descriptors of half the size: 2 % worse, twice as fast"
     """
-    from experiments.regress_report import run_check
+    from experiments.gate.report import run_check
 
     if run_check(suite, accept, only or [], release=release, junit=junit, summary=summary):
         raise typer.Exit(1)
@@ -376,8 +376,8 @@ def table(
 
     Example: estima table leaderboard --against smoother
     """
-    from experiments.collect import collect, summary, where
-    from experiments.table import write_frame
+    from experiments.runs.row import write_frame
+    from experiments.sweeps.collect import collect, summary, where
 
     rows = where(collect(name, all_versions=all_versions, times=times), only or [])
     if out is None or means:
@@ -403,10 +403,10 @@ def plot(
 
     Example: estima plot run --x robot.kr --y ate_rmse_m --by choice.estimator
     """
-    from experiments.collect import collect, where
-    from experiments.figures.style import save_figure
-    from experiments.figures.sweep import sweep_figure
-    from experiments.run import failed
+    from experiments.report.plot import sweep_figure
+    from experiments.runs.run import failed
+    from experiments.sweeps.collect import collect, where
+    from experiments.viewing.style import save_figure
 
     rows = where(collect(name, times=True), only or [])
     if bad := int(rows["status"].map(failed).sum()):
@@ -425,7 +425,7 @@ def reproduce(
 
     Example: estima reproduce --paper puzzlebot2024
     """
-    from experiments.reproduce import reproduce as reproduce_papers
+    from experiments.papers.reproduce import reproduce as reproduce_papers
 
     reproduce_papers(full=full, only=paper)
 
@@ -436,9 +436,9 @@ def report() -> None:
 
     Example: estima report
     """
-    from experiments.console import progress
-    from experiments.report import write_report
-    from experiments.reproduce import RESULTS
+    from experiments.papers.reproduce import RESULTS
+    from experiments.report.page import write_report
+    from experiments.runs.console import progress
 
     with progress("report", 1.0) as on_progress:
         print(write_report(RESULTS, on_progress))
@@ -459,14 +459,14 @@ def export_table(
 
     Example: estima export-table results/tables/*.csv --format latex -o tables
     """
-    from experiments.table_export import export
+    from experiments.report.export import export
 
     export(paths, form, out, digits)
 
 
 def main() -> None:
     """Run the command line; wrong input ends in one line and code 2, a failed run in code 1."""
-    from experiments.console import end
+    from experiments.runs.console import end
 
     try:
         app()

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from experiments.build import make_world
-from experiments.compose import compose
+from experiments.runs.compose import compose
+from experiments.runs.experiment import make_world
 from sim.casting import visible
 from sim.errors import InputError
 from sim.plan import make_descriptors

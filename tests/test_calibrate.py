@@ -5,16 +5,16 @@ import dataclasses
 import numpy as np
 import pytest
 
-from experiments import calibrate
-from experiments.calibrate import (
+from experiments.calibration import calibrate
+from experiments.calibration.calibrate import (
     Manoeuvre,
     calibrate_recordings,
     from_end_poses,
     from_wheel_truth,
     report_gradient_descent,
 )
-from experiments.seeds import stream
-from experiments.studies.puzzlebot2024 import NOMINAL, calibrate_once, ideal_beliefs, slipping
+from experiments.papers.puzzlebot2024.study import NOMINAL, calibrate_once, ideal_beliefs, slipping
+from experiments.runs.seeds import stream
 from sim.errors import InputError
 from sim.kinematic import run_batch
 from sim.route import TABLE_1, OpenLoop

@@ -3,8 +3,8 @@ import math
 import numpy as np
 import pytest
 
-from experiments.calibrate_logs import calibrate_track, dead_reckoning_rms_m, scanner_positions
-from experiments.grid_match import beam_points, best_fit
+from experiments.calibration.logs import calibrate_track, dead_reckoning_rms_m, scanner_positions
+from experiments.papers.real_logs.grid_match import beam_points, best_fit
 from sim import se2
 from sim.formats.lego import TickLog, parse_motors, parse_reference
 from sim.formats.text import read_words

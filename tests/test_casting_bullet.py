@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import yaml
 
-from experiments.build import make
+from experiments.runs.experiment import make
 from sim.bullet import BulletBody
 from sim.robot import DifferentialDrive
 from sim.sensors import Laser, Lidar3D, Mount

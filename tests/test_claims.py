@@ -6,10 +6,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments import claims as common
-from experiments.claims import gil2008, maximo2024, real_logs
-from experiments.claims import puzzlebot2024 as claims
-from experiments.studies import puzzlebot2024 as study
+from experiments.papers.gil2008 import claims as gil2008
+from experiments.papers.maximo2024 import claims as maximo2024
+from experiments.papers.puzzlebot2024 import claims, study
+from experiments.papers.real_logs import claims as real_logs
+from experiments.report import claims as common
 from sim.errors import InputError
 
 

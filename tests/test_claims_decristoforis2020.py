@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments.claims import decristoforis2020 as claims
+from experiments.papers.decristoforis2020 import claims
 
 SEEDS = np.arange(1000, 1020)
 

@@ -48,7 +48,7 @@ def test_a_run_prints_its_errors_and_leaves_a_row(tmp_path):
     assert "position RMSE" in done.stdout
     rows = list((ROOT / "results" / "runs" / "test_cli").glob("*.parquet"))
     assert rows
-    from experiments.table import read_rows
+    from experiments.runs.row import read_rows
 
     frame = read_rows(rows[0])
     assert frame["status"].tolist() == ["ok"]

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import yaml
 
-from experiments.build import make, make_estimator, make_prior, make_robot, make_world
-from experiments.compose import compose
+from experiments.runs.compose import compose
+from experiments.runs.experiment import make, make_estimator, make_prior, make_robot, make_world
 from sim.errors import InputError
 from sim.robot import DifferentialDrive, RobotGeometry
 from sim.sensors import suite_from_config

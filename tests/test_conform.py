@@ -5,7 +5,7 @@ import pytest
 
 from estimators.base import Belief
 from estimators.odometry import Odometry
-from experiments.conform import check_estimator, conform_target, example
+from experiments.gate.conform import check_estimator, conform_target, example
 from sim import se2
 from sim.errors import InputError
 from tests import fakes
@@ -190,7 +190,7 @@ def test_global_ones_are_compared_in_distribution(case):
 
 
 def test_headings_at_the_seam_do_not_look_scattered():
-    from experiments.conform import _differ
+    from experiments.gate.conform import _differ
 
     rng = np.random.default_rng(0)
     draws = np.array([0.0, 0.0, np.pi]) + 0.05 * rng.standard_normal((60, 3))
@@ -220,7 +220,7 @@ class Peeker(Base):
 
 
 def test_looking_ahead_is_caught(case, monkeypatch):
-    import experiments.conform as conform
+    import experiments.gate.conform as conform
 
     plain = conform.walk
 

@@ -6,8 +6,8 @@ import pytest
 
 from estimators.base import Estimate
 from experiments.cli import app
-from experiments.convert import write_estimate, write_recording
-from experiments.export import read_odometry_csv
+from experiments.trajectories.convert import write_estimate, write_recording
+from experiments.trajectories.odometry import read_odometry_csv
 from sim.errors import InputError
 from sim.formats.detect import kind_of, read_any
 from sim.formats.rosbag_in import read_tracks

@@ -10,7 +10,7 @@ from estimators.ekf_icp import _KEY, _NEW, _POSE, EkfIcp, _from_twist, _moved
 from estimators.gaussian import STILL, Gaussian
 from estimators.odometry import Odometry
 from estimators.scan_matching import Match
-from experiments.scan_bound import cast
+from experiments.evaluation.scan_bound import cast
 from sim import se2
 from sim.errors import InputError
 from sim.recording import Frame

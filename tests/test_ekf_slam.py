@@ -8,8 +8,8 @@ import pytest
 from estimators.base import run
 from estimators.ekf_slam import EkfSlam
 from estimators.smoother import Smoother
-from experiments.conform import check_estimator
-from experiments.metrics import nees
+from experiments.evaluation.metrics import nees
+from experiments.gate.conform import check_estimator
 from sim import se2
 from sim.errors import InputError
 from sim.robot import TravelWindow, arc_increment

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from estimators.base import Estimate
-from experiments.export import (
+from experiments.trajectories.odometry import (
     odometry_records,
     read_odometry_csv,
     write_odometry_csv,

@@ -9,8 +9,8 @@ from estimators import fastslam
 from estimators.base import run
 from estimators.fastslam import FastSLAM
 from estimators.odometry import Odometry
-from experiments.conform import check_estimator
-from experiments.metrics import position_errors_m, rms
+from experiments.evaluation.metrics import position_errors_m, rms
+from experiments.gate.conform import check_estimator
 from sim.errors import InputError
 from sim.recording import Frame, LandmarkSet
 from tests.fakes import circle, tracking_prior

@@ -6,7 +6,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments.figures import decristoforis2020, gil2008, maximo2024
+from experiments.papers.decristoforis2020 import figures as decristoforis2020
+from experiments.papers.gil2008 import figures as gil2008
+from experiments.papers.maximo2024 import figures as maximo2024
 
 ERRORS = ("revised_rmse_m", "revised_aligned_rmse_m", "map_rmse_m", "map_aligned_rmse_m")
 

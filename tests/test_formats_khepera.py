@@ -4,7 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.calibrate_logs import calibrate_wheels, slip_of_turns
+from experiments.calibration.logs import calibrate_wheels, slip_of_turns
 from sim import se2
 from sim.errors import InputError
 from sim.formats.khepera import parse_khepera, read_khepera, to_recording

@@ -9,11 +9,11 @@ import pytest
 from joblib import Parallel, delayed
 
 from estimators.fastslam import FastSLAM
-from experiments.claims import gil2008 as judge
-from experiments.compose import compose
-from experiments.conform import walk
-from experiments.studies import gil2008 as study
-from experiments.studies.gil2008 import Arm, Scene
+from experiments.gate.conform import walk
+from experiments.papers.gil2008 import claims as judge
+from experiments.papers.gil2008 import study
+from experiments.papers.gil2008.study import Arm, Scene
+from experiments.runs.compose import compose
 from tests.fakes import circle, tracking_prior
 
 SEEDS = range(1000, 1020)

@@ -8,7 +8,7 @@ import pytest
 from estimators import icp
 from estimators.icp import prepare, register
 from experiments.bench.icp import BEARINGS_RAD, SIGMA_RANGE_M, pair
-from experiments.scan_bound import cast, fisher_bound, fisher_information
+from experiments.evaluation.scan_bound import cast, fisher_bound, fisher_information
 from sim import se2
 from sim.casting import SegmentCaster
 from sim.errors import InputError

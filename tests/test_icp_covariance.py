@@ -7,7 +7,7 @@ from estimators import icp_covariance
 from estimators.icp import prepare, register
 from estimators.icp_covariance import UNKNOWN_M, UNKNOWN_RAD
 from experiments.bench.icp import BEARINGS_RAD, SIGMA_RANGE_M, pair
-from experiments.scan_bound import cast
+from experiments.evaluation.scan_bound import cast
 from sim import se2
 from tests.test_icp import BARE, ROOM, circle, scan
 

@@ -7,7 +7,7 @@ import pytest
 
 from estimators.base import Prior
 from estimators.icp_odometry import IcpOdometry
-from experiments.scan_bound import cast
+from experiments.evaluation.scan_bound import cast
 from sim import se2
 from sim.errors import InputError
 from sim.recording import Frame

@@ -72,7 +72,7 @@ def test_a_scan_is_the_sum_over_its_beams():
 def test_the_true_pose_is_likeliest():
     made = field(0.05)
     pose = np.array([0.5, 0.7, 0.3])
-    from experiments.scan_bound import cast
+    from experiments.evaluation.scan_bound import cast
 
     ranges = cast(ROOM, se2.compose(pose, LASER.mount.pose), LASER.bearings_rad)[0]
     ends = beam_ends(ranges.astype(np.float32), LASER, 90)

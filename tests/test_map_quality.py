@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from experiments.map_quality import map_points, mean_map_entropy, wall_distances_m
+from experiments.evaluation.map_quality import map_points, mean_map_entropy, wall_distances_m
 from sim.errors import InputError
 from tests.fakes import circle, estimate
 

@@ -6,10 +6,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments.claims import maximo2024 as claims
-from experiments.places import GEOMETRIES, place_world
-from experiments.seeds import stream
-from experiments.studies import maximo2024 as study
+from experiments.papers.maximo2024 import claims, study
+from experiments.papers.maximo2024.places import GEOMETRIES, place_world
+from experiments.runs.seeds import stream
 
 
 @pytest.fixture(scope="module")

@@ -10,8 +10,8 @@ from scipy.stats import chi2
 from estimators.base import Prior, run
 from estimators.gaussian import wheel_motion
 from estimators.mcl import Mcl, amcl_alphas
-from experiments.conform import check_estimator
-from experiments.metrics import nees
+from experiments.evaluation.metrics import nees
+from experiments.gate.conform import check_estimator
 from sim import se2
 from sim.errors import InputError
 from sim.robot import RobotGeometry, wheel_variances

@@ -6,9 +6,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments.figures.mcl_office import found_by
-from experiments.studies import mcl_office
-from experiments.studies.mcl_office import found_after_m, localised_share
+from experiments.papers.mcl_office import study as mcl_office
+from experiments.papers.mcl_office.figures import found_by
+from experiments.papers.mcl_office.study import found_after_m, localised_share
 
 TRAVEL_M = np.arange(0.0, 40.6, 0.5)
 

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 
 from estimators.base import Estimate, run
 from estimators.odometry import Odometry
-from experiments import metrics
-from experiments.statistics import anees_band
+from experiments.evaluation import metrics
+from experiments.evaluation.statistics import anees_band
 from sim import se2
 from sim.errors import InputError
 from tests import fakes

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from estimators.descriptors import retrieval
-from experiments import places
-from experiments.build import make_prior, make_recording
-from experiments.compose import compose
-from experiments.places import GEOMETRIES, OXFORD, UMH, place_world
-from experiments.version import ROOT
+from experiments.papers.maximo2024 import places
+from experiments.papers.maximo2024.places import GEOMETRIES, OXFORD, UMH, place_world
+from experiments.runs.compose import compose
+from experiments.runs.experiment import make_prior, make_recording
+from experiments.runs.version import ROOT
 from sim.errors import InputError
 
 OXFORD_FILE = ROOT.parent / "shared" / "data" / "oxford_positions" / "positions.csv.gz"

@@ -9,11 +9,11 @@ import pandas as pd
 import pytest
 
 from estimators.base import run
-from experiments import planted
-from experiments.build import make_estimator
-from experiments.compose import compose
-from experiments.planted import FAULTS, Pool, arrays, draw_check, grade, worsening
-from experiments.suite import ERRORS, Entry, Suite, read_suite, suite_path
+from experiments.gate import faults as planted
+from experiments.gate.faults import FAULTS, Pool, arrays, draw_check, grade, worsening
+from experiments.gate.suite import ERRORS, Entry, Suite, read_suite, suite_path
+from experiments.runs.compose import compose
+from experiments.runs.experiment import make_estimator
 from tests.fakes import circle, tracking_prior
 
 KINDS = [(name, kind) for name, kinds in FAULTS.items() for kind in kinds]
@@ -27,7 +27,7 @@ def composed(*overrides):
 def estimate(name, plant, seed=0):
     """Final pose of an estimator over a circle, and of the smoother's revised trajectory."""
     if name == "topological_mcl":
-        from experiments.places import example
+        from experiments.papers.maximo2024.places import example
 
         recording, prior = example()
         recording = recording.cut(25)

@@ -8,7 +8,7 @@ import zipfile
 import numpy as np
 import pytest
 
-from experiments.cache import cached, key_of
+from experiments.runs.cache import cached, key_of
 from sim.errors import InputError
 from sim.files import write_whole
 from sim.recording import (
@@ -241,8 +241,8 @@ def test_processes_share_one_making(tmp_path):
 def test_two_processes_write_the_same_recording(tmp_path, rays):
     script = f"""
 import sys
-from experiments.compose import compose
-from experiments.build import simulate
+from experiments.runs.compose import compose
+from experiments.runs.experiment import simulate
 from sim.recording import save
 from pathlib import Path
 config = compose(["world=room", "sensors=lms291", "sensors.laser.rate_hz=10", "seed=4",
@@ -264,8 +264,8 @@ print(save(simulate(config), Path(sys.argv[1])))
 
 
 def test_an_edited_world_file_is_another_recording(tmp_path):
-    from experiments.build import make_recording
-    from experiments.compose import compose
+    from experiments.runs.compose import compose
+    from experiments.runs.experiment import make_recording
 
     path = tmp_path / "w.yaml"
     overrides = [

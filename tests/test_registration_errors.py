@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from experiments import registration_errors
-from experiments.build import make_world
-from experiments.compose import compose
-from experiments.registration_errors import measured, scenes
+from experiments.evaluation import registration_errors
+from experiments.evaluation.registration_errors import measured, scenes
+from experiments.runs.compose import compose
+from experiments.runs.experiment import make_world
 from sim import se2
 from sim.sensors import Laser, Mount
 

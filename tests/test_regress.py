@@ -11,11 +11,12 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from experiments import regress, regress_report
-from experiments.build import default_cache, make_recording
-from experiments.compose import compose
-from experiments.regress import exchange_p, holm
-from experiments.suite import ERRORS, fingerprint, read_suite, run_suite, suite_path
+from experiments.gate import compare as regress
+from experiments.gate import report as regress_report
+from experiments.gate.compare import exchange_p, holm
+from experiments.gate.suite import ERRORS, fingerprint, read_suite, run_suite, suite_path
+from experiments.runs.compose import compose
+from experiments.runs.experiment import default_cache, make_recording
 from sim.errors import InputError
 
 QUICK = [

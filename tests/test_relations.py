@@ -3,8 +3,8 @@ import math
 import numpy as np
 import pytest
 
-from experiments.association import aligned_ate_m, interpolate, nearest
-from experiments.relations import relation_errors
+from experiments.evaluation.relations import relation_errors
+from experiments.evaluation.time_sync import aligned_ate_m, interpolate, nearest
 from sim import se2
 from sim.errors import InputError
 from sim.formats.rawseeds import parse_trajectory

@@ -10,10 +10,10 @@ import pandas as pd
 import pytest
 from matplotlib.figure import Figure
 
-from experiments import report
-from experiments.claims import Claim, write
-from experiments.table import write_frame
-from experiments.table_export import to_latex, to_markdown
+from experiments.report import page as report
+from experiments.report.claims import Claim, write
+from experiments.report.export import to_latex, to_markdown
+from experiments.runs.row import write_frame
 from sim.errors import InputError
 from tests import browser
 
@@ -150,7 +150,7 @@ def test_origin_and_command_are_told(text):
 
 def test_what_belongs_to_no_paper_comes_last_with_its_command(text):
     own = {e.get("aria-labelledby"): e["text"] for e in Outline(text).all("section")}["own"]
-    assert "python -m experiments.studies.mcl_office" in own
+    assert "python -m experiments.papers.mcl_office.study" in own
     assert "mcl_office_starts (2 rows, 2 columns)" in own
     assert "Of no study here: nobody_knows.csv." in own
     assert text.index('id="maximo2024"') < text.index('id="mcl_office_found"')

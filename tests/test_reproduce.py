@@ -6,10 +6,10 @@ from types import SimpleNamespace
 import pandas as pd
 import pytest
 
-from experiments import reproduce as module
-from experiments.claims import Claim, read
-from experiments.figures.style import figure
-from experiments.table import write_frame
+from experiments.papers import reproduce as module
+from experiments.report.claims import Claim, read
+from experiments.runs.row import write_frame
+from experiments.viewing.style import figure
 from sim.errors import InputError
 
 PAPER = "gil2008"

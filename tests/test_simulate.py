@@ -5,9 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from experiments.build import make_world, simulate
-from experiments.compose import compose
-from experiments.seeds import stream
+from experiments.runs.compose import compose
+from experiments.runs.experiment import make_world, simulate
+from experiments.runs.seeds import stream
 from sim import se2
 from sim.errors import InputError
 from sim.robot import DifferentialDrive, arc_increment

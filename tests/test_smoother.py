@@ -11,8 +11,8 @@ from estimators.base import run
 from estimators.gaussian import Gaussian
 from estimators.smoother import Problem, Smoother, _between, _merged, solve
 from estimators.stereo import LEAST_DEPTH_M, StereoModel
-from experiments.conform import check_estimator
-from experiments.metrics import nees
+from experiments.evaluation.metrics import nees
+from experiments.gate.conform import check_estimator
 from sim import se2
 from sim.errors import InputError
 from sim.sensors import Mount, StereoCamera

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from experiments import statistics
-from experiments.statistics import Interval, verdict
+from experiments.evaluation import statistics
+from experiments.evaluation.statistics import Interval, verdict
 from sim.errors import InputError
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments.studies import decristoforis2020 as study
+from experiments.papers.decristoforis2020 import study
 
 pytestmark = pytest.mark.slow
 

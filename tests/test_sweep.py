@@ -12,15 +12,15 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments import sweep
-from experiments.build import default_cache, files_digest, recording_settings
-from experiments.cache import key_of
-from experiments.collect import collect, measured, summary, swept, telling, where
-from experiments.compose import compose
-from experiments.figures.sweep import sweep_figure
-from experiments.run import run_key
-from experiments.table import read_rows
-from experiments.version import source_digest
+from experiments.report.plot import sweep_figure
+from experiments.runs.cache import key_of
+from experiments.runs.compose import compose
+from experiments.runs.experiment import default_cache, files_digest, recording_settings
+from experiments.runs.row import read_rows
+from experiments.runs.run import run_key
+from experiments.runs.version import source_digest
+from experiments.sweeps import launch as sweep
+from experiments.sweeps.collect import collect, measured, summary, swept, telling, where
 from sim.errors import InputError
 from tests.test_cli import QUICK, ROOT, estima, refused
 
@@ -124,7 +124,7 @@ def test_keys_tell_what_decides_the_rows(tmp_path, monkeypatch):
 def test_keys_know_the_files_that_a_mapping_names(tmp_path):
     (tmp_path / "a.npy").write_bytes(b"1")
     named = {
-        "_target_": "experiments.places.recording_from_files",
+        "_target_": "experiments.papers.maximo2024.places.recording_from_files",
         "positions": f"{tmp_path}/a.npy",
     }
     config = compose([])
@@ -498,7 +498,7 @@ def test_settings_that_follow_from_others_are_not_named():
 
 
 def test_rows_of_other_code_are_left_out(tmp_path, capsys):
-    from experiments.version import code_version
+    from experiments.runs.version import code_version
 
     table = rows()
     table.to_parquet(tmp_path / "x.parquet")

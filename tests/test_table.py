@@ -3,7 +3,7 @@ import pytest
 from evo.tools import file_interface
 
 from estimators.base import Estimate
-from experiments.table import check_row, read_rows, write_rows
+from experiments.runs.row import check_row, read_rows, write_rows
 from sim.errors import InputError
 from sim.formats.tum import read_tum, write_tum
 

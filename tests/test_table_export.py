@@ -6,7 +6,7 @@ import sys
 import pandas as pd
 import pytest
 
-from experiments.table_export import export, read_table, to_latex, to_markdown
+from experiments.report.export import export, read_table, to_latex, to_markdown
 from sim.errors import InputError
 
 

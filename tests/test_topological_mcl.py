@@ -10,8 +10,8 @@ from estimators.base import Prior, run
 from estimators.place_refinement import Refiner, likely_turns_rad
 from estimators.topological_map import from_arrays, from_recording
 from estimators.topological_mcl import Graph, TopologicalMcl, node_log_weights
-from experiments import places
-from experiments.conform import check_estimator
+from experiments.gate.conform import check_estimator
+from experiments.papers.maximo2024 import places
 from sim import se2
 from sim.errors import InputError
 from sim.recording import Frame

@@ -15,9 +15,9 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from estimators.base import Estimate
-from experiments import live, view
 from experiments.cli import app
-from experiments.export import write_odometry_csv
+from experiments.trajectories.odometry import write_odometry_csv
+from experiments.viewing import live, view
 from sim import se2
 from sim.errors import InputError
 from sim.recording import save

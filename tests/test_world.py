@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from experiments.build import make_world
-from experiments.compose import compose
-from experiments.figures.style import save_figure
-from experiments.figures.world import draw_world, figure, world_figure
+from experiments.runs.compose import compose
+from experiments.runs.experiment import make_world
+from experiments.viewing.style import save_figure
+from experiments.viewing.world import draw_world, figure, world_figure
 from sim.errors import InputError
 from sim.world import World
 

@@ -6,9 +6,9 @@ import statistics
 
 from estimators.base import run as run_estimator
 from experiments.bench.measure import Measurement
-from experiments.build import make_estimator, make_prior, simulate
-from experiments.compose import compose
-from experiments.seeds import stream
+from experiments.runs.compose import compose
+from experiments.runs.experiment import make_estimator, make_prior, simulate
+from experiments.runs.seeds import stream
 
 _LENGTH_M = 20.0
 _GOAL = 20.0

@@ -5,7 +5,7 @@ The pairs are of 721 beams over 180 degrees with range noise of 1 cm, in furnish
 and the end wall. `small` is a motion of 5 cm and 2 degrees, `large` of 20 cm and 8 degrees.
 
 `fisher_ratio` is sqrt(median(e' F^-1 e) / 2.366) of the errors e in (x, y, heading), with F the
-least covariance that the true pair allows (`experiments.scan_bound`) and 2.366 the median of
+least covariance that the true pair allows (`evaluation.scan_bound`) and 2.366 the median of
 chi-squared with 3 degrees of freedom: an efficient estimator has 1. The bound noted beside
 `error_mm` is the root of the trace of its position. A failure is an error of
 more than 5 cm or 1 degree; failures are in all medians.
@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from estimators import icp_covariance
 from estimators.icp import Metric, PreparedScan, Registration, prepare, register
 from experiments.bench.measure import Measurement, median_time_s
-from experiments.scan_bound import cast, fisher_bound
+from experiments.evaluation.scan_bound import cast, fisher_bound
 from sim import se2
 
 Array = NDArray[np.float64]

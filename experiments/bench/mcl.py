@@ -19,7 +19,7 @@ from estimators.base import Prior
 from estimators.likelihood_field import beam_ends, likelihood_field
 from estimators.mcl import Mcl
 from experiments.bench.measure import Measurement
-from experiments.seeds import stream
+from experiments.runs.seeds import stream
 from sim import se2
 from sim.builders import office
 from sim.casting import SegmentCaster

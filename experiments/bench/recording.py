@@ -10,9 +10,9 @@ import numpy as np
 
 from experiments.bench.casting import hall
 from experiments.bench.measure import Measurement, median_time_s
-from experiments.build import make_world
-from experiments.compose import compose
-from experiments.seeds import stream
+from experiments.runs.compose import compose
+from experiments.runs.experiment import make_world
+from experiments.runs.seeds import stream
 from sim.bullet import BulletBody
 from sim.robot import DifferentialDrive
 from sim.route import OpenLoop

@@ -10,18 +10,18 @@ import time
 
 from estimators.base import run as run_estimator
 from experiments.bench.measure import Measurement, median_time_s
-from experiments.build import (
+from experiments.runs.compose import compose
+from experiments.runs.experiment import (
     Config,
     default_cache,
     make_estimator,
     make_prior,
     make_recording,
 )
-from experiments.compose import compose
-from experiments.run import RESULTS, run_configuration
-from experiments.seeds import stream
-from experiments.sweep import run_and_record
-from experiments.version import ROOT
+from experiments.runs.run import RESULTS, run_configuration
+from experiments.runs.seeds import stream
+from experiments.runs.version import ROOT
+from experiments.sweeps.launch import run_and_record
 from sim.recording import Recording
 
 _NAME = "bench_sweep"

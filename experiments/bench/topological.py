@@ -13,7 +13,7 @@ import numpy as np
 from estimators.base import Prior
 from estimators.topological_mcl import TopologicalMcl
 from experiments.bench.measure import Measurement
-from experiments.places import GEOMETRIES, PlaceWorld, place_world
+from experiments.papers.maximo2024.places import GEOMETRIES, PlaceWorld, place_world
 
 PAPER_S = {
     "oxford": {794: 0.26, 1588: 0.36, 2382: 0.46, 3176: 0.58},

@@ -1,0 +1,1 @@
+"""Robot parameters from recordings: wheel truth, end poses, real logs."""

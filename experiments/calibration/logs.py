@@ -1,0 +1,299 @@
+"""Wheel geometry, kr and kl from real logs, where the only reference is another sensor.
+
+`calibrate_wheels` finds diameters, axle and the laser's pose from wheel angles and scan matches
+(the problem of Censi et al., "Simultaneous calibration of odometry and sensor parameters"), and
+`slip_of_turns` what the wheels' noise is. `calibrate_track` finds the length of a tick and the
+effective track from ticks and an overhead camera that sees no heading.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import optimize, stats
+
+from experiments.calibration.calibrate import Measured
+from sim import se2
+from sim.errors import InputError
+from sim.formats.assemble import chained
+from sim.formats.khepera import WheelLaserLog
+from sim.formats.lego import GEOMETRIC_TRACK_M, SCANNER_AHEAD_M, TICK_M, TickLog
+from sim.robot import arc_increment
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_TRIM_SIGMAS = 6.0  # a scan match farther off than this has failed
+_ROUNDS = 5
+_LEAST_K = 1e-15
+
+
+@dataclass(frozen=True)
+class WheelCalibration:
+    """Diameters, axle and the laser's pose, with 95 % intervals, and what is left over.
+
+    Attributes
+    ----------
+    diameter_right_m, diameter_left_m, axle_m, laser_x_m, laser_y_m, laser_yaw_rad
+        The six parameters.
+    kept
+        (N,) intervals whose scan match is trusted.
+    travel_m
+        (N, 2) calibrated wheel travel.
+    turn_residual_rad
+        (N,) turn by the laser less turn by the wheels.
+    """
+
+    diameter_right_m: Measured
+    diameter_left_m: Measured
+    axle_m: Measured
+    laser_x_m: Measured
+    laser_y_m: Measured
+    laser_yaw_rad: Measured
+    kept: Mask
+    travel_m: Array
+    turn_residual_rad: Array
+
+    @property
+    def values(self) -> Array:
+        """The six parameters, (6,)."""
+        found = (
+            self.diameter_right_m,
+            self.diameter_left_m,
+            self.axle_m,
+            self.laser_x_m,
+            self.laser_y_m,
+            self.laser_yaw_rad,
+        )
+        return np.array([m.value for m in found])
+
+
+def calibrate_wheels(
+    log: WheelLaserLog, diameter_m: float = 0.04, axle_m: float = 0.1
+) -> WheelCalibration:
+    """Fit the six parameters to the laser's displacements by trimmed least squares.
+
+    Residuals are weighted with their own spread (median absolute deviation), intervals beyond
+    six of it are left out, and the fit is repeated. The laser's yaw may be anything: eight
+    headings are tried as the start.
+
+    Parameters
+    ----------
+    diameter_m, axle_m
+        Rough sizes to start from.
+
+    Raises
+    ------
+    InputError
+        If there are too few intervals, or the robot never turned.
+    """
+    if len(log.durations_s) < 12 or not np.any(log.laser_motion[:, 2]):
+        raise InputError("at least 12 intervals with turns are needed to calibrate the wheels")
+    weights = 1.0 / np.array([diameter_m / 20.0, diameter_m / 20.0, 0.05])
+    starts = [
+        np.array([diameter_m, diameter_m, axle_m, 0.0, 0.0, yaw])
+        for yaw in np.arange(8) * math.pi / 4.0 - math.pi
+    ]
+    scale = np.array([diameter_m, diameter_m, axle_m, 0.1, 0.1, 1.0])
+    some = np.zeros(len(log.durations_s), bool)
+    some[:: max(1, len(some) // 400)] = True  # enough to choose the start by
+    fits = [_fit(log, start, weights, some, scale) for start in starts]
+    fits = [fit for fit in fits if fit.x[:3].min() > 0.0]
+    if not fits:
+        raise InputError("wheels and laser do not agree; are the wheels the right way round?")
+    fit = min(fits, key=lambda found: float(found.cost))
+    for _ in range(_ROUNDS):
+        residual = _residual(log, fit.x)
+        spread = 1.4826 * np.median(np.abs(residual), axis=0) + 1e-9
+        kept = np.sqrt(np.sum((residual / spread) ** 2, axis=1)) < _TRIM_SIGMAS
+        fit = _fit(log, fit.x, 1.0 / spread, kept, scale)
+    values = fit.x.copy()
+    values[5] = se2.wrap(values[5])
+    unit = float(np.mean(fit.fun**2))
+    sigma = np.sqrt(unit * np.diag(np.linalg.inv(fit.jac.T @ fit.jac)))
+    half = float(stats.norm.ppf(0.975)) * sigma
+    right, left, axle, x, y, yaw = (
+        Measured(float(v), float(v - h), float(v + h)) for v, h in zip(values, half, strict=True)
+    )
+    residual = _residual(log, values)
+    travel = log.rolled_rad * values[:2] / 2.0
+    return WheelCalibration(right, left, axle, x, y, yaw, kept, travel, residual[:, 2])
+
+
+def _fit(
+    log: WheelLaserLog, start: Array, weights: Array, kept: Mask, scale: Array
+) -> optimize.OptimizeResult:
+    chosen = WheelLaserLog(log.durations_s[kept], log.rolled_rad[kept], log.laser_motion[kept])
+
+    def weighted(parameters: Array) -> Array:
+        return (_residual(chosen, parameters) * weights).ravel()
+
+    return optimize.least_squares(weighted, start, x_scale=scale, loss="soft_l1")
+
+
+def _residual(log: WheelLaserLog, parameters: Array) -> Array:
+    """Laser displacement seen less foreseen, (N, 3)."""
+    motion = arc_increment(log.rolled_rad * parameters[:2] / 2.0, float(parameters[2]))
+    laser = np.broadcast_to(parameters[3:], motion.shape)
+    foreseen = se2.compose(se2.inverse(laser), se2.compose(motion, laser))
+    residual: Array = log.laser_motion - foreseen
+    residual[:, 2] = se2.wrap(residual[:, 2])
+    return residual
+
+
+@dataclass(frozen=True)
+class SlipOfTurns:
+    """kr and kl, m, as blocks of so many intervals show them."""
+
+    kr: Measured
+    kl: Measured
+    block: int
+    n_blocks: int
+
+
+def slip_of_turns(
+    calibration: WheelCalibration,
+    block: int,
+    rng: np.random.Generator,
+    n_resamples: int = 1000,
+) -> SlipOfTurns:
+    """Fit the kr/kl law to the residual variance of the turns against |ds|.
+
+    A wheel error e turns the robot by e / axle, so Var(axle * residual) = kr |ds_r| + kl |ds_l|.
+    The turn is used alone: scan matching sees it to 0.1 mm of wheel travel, but distances only
+    to 0.6 mm, above any slip of 8 mm steps. Residuals are summed over blocks of consecutive
+    intervals with the same commands. Errors of the stamps and of the scans, which two neighbours
+    share with opposite signs, cancel in long blocks and do not in short ones, so the figure of a
+    block of one is an upper reading and that of long blocks what builds up as the robot drives.
+    Each command's mean residual (a bias, not noise) is taken off.
+
+    The estimate is the maximum of the likelihood of zero-mean Gaussian sums; its interval comes
+    from resampling the blocks.
+    """
+    axle = calibration.axle_m.value
+    travel, error = calibration.travel_m, calibration.turn_residual_rad * axle
+    commands = np.sign(np.round(travel / (0.02 * np.abs(travel).max())))
+    squares, paths = [], []
+    for command in np.unique(commands, axis=0):
+        rows = np.flatnonzero(np.all(commands == command, axis=1) & calibration.kept)
+        if not command.any() or len(rows) < 2 * block:
+            continue
+        off = error - error[rows].mean()
+        for run in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1):
+            whole = run[: len(run) // block * block].reshape(-1, block)
+            squares.append(off[whole].sum(axis=1) ** 2)
+            paths.append(np.abs(travel[whole]).sum(axis=1))
+    square = np.concatenate(squares) if squares else np.zeros(0)
+    if len(square) < 10:
+        raise InputError(f"only {len(square)} blocks of {block} intervals; use shorter blocks")
+    path = np.concatenate(paths)
+    k = _law(square, path)
+    picks = rng.integers(len(square), size=(n_resamples, len(square)))
+    spread = np.array([_law(square[pick], path[pick]) for pick in picks])
+    low, high = np.quantile(spread, [0.025, 0.975], axis=0)
+    kr, kl = (Measured(float(k[i]), float(low[i]), float(high[i])) for i in (0, 1))
+    return SlipOfTurns(kr, kl, block, len(square))
+
+
+def _law(square: Array, path: Array) -> Array:
+    """(kr, kl) >= 0 that make Gaussian sums of variance path @ k most likely."""
+    k = np.full(2, float(square.sum() / path.sum()))
+    for _ in range(10):  # iteratively reweighted: the score equations of the likelihood
+        weight = (path @ k) ** -2.0
+        weighted = path * weight[:, None]
+        normal, right_hand = path.T @ weighted, weighted.T @ square
+        k = np.linalg.solve(normal, right_hand)
+        if k.min() <= 0.0:  # at the bound of one, the other stands alone
+            k = np.where(k > 0.0, right_hand / np.diag(normal), _LEAST_K)
+    return k
+
+
+@dataclass(frozen=True)
+class TrackCalibration:
+    """Length of a tick, effective track, start heading, with 95 % intervals, and the errors.
+
+    Attributes
+    ----------
+    tick_m, track_m
+        Ground travel per tick of either track; distance that explains the turns.
+    start
+        (3,) pose of the axle at the first reading.
+    rms_m
+        RMS distance of the scanner's positions from the reference that was fitted.
+    """
+
+    tick_m: Measured
+    track_m: Measured
+    start: Array
+    rms_m: float
+
+
+def scanner_positions(log: TickLog, tick_m: float, track_m: float, start: Array) -> Array:
+    """Positions (N, 2) of the scanner by dead reckoning of the axle from a start pose (3,)."""
+    steps = arc_increment(np.diff(log.ticks, axis=0) * tick_m, track_m)
+    axle = se2.compose(start, chained(steps))
+    ahead = SCANNER_AHEAD_M * np.stack([np.cos(axle[:, 2]), np.sin(axle[:, 2])], axis=1)
+    positions: Array = axle[:, :2] + ahead
+    return positions
+
+
+def dead_reckoning_rms_m(
+    log: TickLog, stamps: Array, positions: Array, tick_m: float, track_m: float, start: Array
+) -> float:
+    """RMS distance, m, of dead reckoning from reference positions (N, 2) at stamps (N,)."""
+    off = _off_reference(log, stamps, positions, tick_m, track_m, start)
+    return float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
+
+
+def _off_reference(
+    log: TickLog, stamps: Array, positions: Array, tick_m: float, track_m: float, start: Array
+) -> Array:
+    reached = scanner_positions(log, tick_m, track_m, start)
+    inside = (stamps >= log.stamps[0]) & (stamps <= log.stamps[-1])
+    at = np.stack([np.interp(stamps[inside], log.stamps, reached[:, i]) for i in (0, 1)], axis=1)
+    off: Array = at - positions[inside]
+    return off
+
+
+def calibrate_track(
+    log: TickLog,
+    stamps: Array,
+    positions: Array,
+    heading_rad: float,
+    tick_m: float = TICK_M,
+    track_m: float = GEOMETRIC_TRACK_M,
+) -> TrackCalibration:
+    """Fit tick, track and start heading to reference positions (N, 2) at stamps (N,).
+
+    The camera tells no heading, so the start's is fitted; its position is the reference's first.
+    Errors of dead reckoning build up: neighbours are alike, and the intervals count every
+    twentieth reading only.
+
+    Parameters
+    ----------
+    heading_rad
+        Rough heading at the start.
+    """
+
+    def start(heading: float) -> Array:
+        ahead = SCANNER_AHEAD_M * np.array([math.cos(heading), math.sin(heading)])
+        return np.array([*(positions[0] - ahead), heading])
+
+    def residual(unknowns: Array) -> Array:
+        tick, track, heading = unknowns
+        off = _off_reference(log, stamps, positions, tick * tick_m, track * track_m, start(heading))
+        flat: Array = off.ravel()
+        return flat
+
+    fit = optimize.least_squares(residual, np.array([1.0, 1.0, heading_rad]))
+    covariance = np.linalg.inv(fit.jac.T @ fit.jac) * float(np.mean(fit.fun**2)) * 20.0
+    half = float(stats.norm.ppf(0.975)) * np.sqrt(np.diag(covariance))[:2]
+    tick, track = (
+        Measured(float(v * u), float((v - h) * u), float((v + h) * u))
+        for v, h, u in zip(fit.x[:2], half, (tick_m, track_m), strict=True)
+    )
+    rms_m = float(np.sqrt(2.0 * np.mean(fit.fun**2)))
+    return TrackCalibration(tick, track, start(float(fit.x[2])), rms_m)

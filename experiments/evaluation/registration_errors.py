@@ -1,0 +1,154 @@
+"""Errors of many noisy registrations of one pair of poses, beside every covariance of them."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from estimators import icp_covariance
+from estimators.icp import Metric, PreparedScan, Registration, prepare, register
+from experiments.evaluation.scan_bound import cast, fisher_bound
+from sim import se2
+from sim.sensors import Laser
+from sim.world import World
+
+Array = NDArray[np.float64]
+
+METRICS: tuple[Metric, ...] = ("point_to_line", "point_to_point")
+_GUESS_SIGMA = np.array([0.01, 0.01, math.radians(0.5)])
+_STEP_M, _MOST_TURN_RAD = 0.05, math.radians(3.0)
+_CLEARANCE_M = 0.35
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Two laser poses (3,) in a world's walls, and the place they are in."""
+
+    place: str
+    walls: Array
+    T_w_target: Array
+    T_w_source: Array
+
+
+def scenes(world: World, place: str, mount: Array, rng: np.random.Generator, n: int) -> list[Scene]:
+    """Poses of the laser along the world's tour inside a place, 5 cm and up to 3 degrees apart."""
+    path = _resampled(world.waypoints, 0.1)
+    inside = np.flatnonzero(world.place_of(path[:, :2]) == place)
+    found: list[Scene] = []
+    while len(found) < n:
+        base = path[rng.choice(inside)] + np.append(rng.normal(0.0, 0.1, 2), rng.normal(0.0, 0.15))
+        moved = se2.compose(base, [_STEP_M, 0.0, rng.uniform(-_MOST_TURN_RAD, _MOST_TURN_RAD)])
+        if world.clearance_m(base) > _CLEARANCE_M:
+            target, source = se2.compose(base, mount), se2.compose(moved, mount)
+            found.append(Scene(place, world.walls, target, source))
+    return found
+
+
+def measured(
+    scene: Scene, laser: Laser, rng: np.random.Generator, n_repeats: int, n_sampled: int
+) -> pd.DataFrame:
+    """Rows (metric x method): NEES over dof, determinants, errors, times.
+
+    Parameters
+    ----------
+    n_repeats, n_sampled
+        Pairs of noisy scans; those of them for which the covariance by sampling is computed.
+    """
+    bearings, sigma = laser.bearings_rad, laser.sigma_range_m
+    truth = se2.between(scene.T_w_target, scene.T_w_source)
+    bound = fisher_bound(scene.walls, scene.T_w_target, scene.T_w_source, bearings, sigma)
+    clean = [cast(scene.walls, pose, bearings)[0] for pose in (scene.T_w_target, scene.T_w_source)]
+    errors: dict[Metric, list[Array]] = {metric: [] for metric in METRICS}
+    taken_s: dict[Metric, list[float]] = {metric: [] for metric in METRICS}
+    tried: dict[tuple[Metric, str], list[tuple[float, float, float]]] = {}
+    for repeat in range(n_repeats):
+        noisy = [ranges + sigma * rng.standard_normal(len(ranges)) for ranges in clean]
+        target, source = (prepare(ranges, bearings, laser.max_range_m) for ranges in noisy)
+        guess = truth + _GUESS_SIGMA * rng.standard_normal(3)
+        for metric in METRICS:
+            begun = time.perf_counter()
+            found = register(source, target, guess, metric=metric, gate_m=0.6, gate_rad=0.06)
+            taken_s[metric].append(time.perf_counter() - begun)
+            off = found.T_target_source - truth
+            off[2] = math.remainder(off[2], 2.0 * math.pi)
+            errors[metric].append(off)
+            if found.status in ("empty", "poor_overlap", "not_converged"):
+                continue
+            for name, method in _methods(sigma, rng).items():
+                if name == "sampling" and repeat >= n_sampled:
+                    continue
+                begun = time.perf_counter()
+                covariance = method(found, source, target)
+                took = time.perf_counter() - begun
+                value = _nees_share(off, covariance, found)
+                root = float(np.linalg.det(covariance)) ** (1.0 / 6.0)
+                tried.setdefault((metric, name), []).append((value, root, took))
+    rows = []
+    for (metric, name), values in tried.items():
+        nees, root, took = np.array(values).T
+        spread = np.array(errors[metric])
+        actual = float(np.linalg.det(np.cov(spread.T))) ** (1.0 / 6.0)
+        rows.append(
+            {
+                "place": scene.place,
+                "metric": metric,
+                "method": name,
+                "nees_over_dof": float(np.mean(nees)),
+                "determinant_ratio": float(np.median(root)) / actual,
+                "time_us": 1e6 * float(np.median(took)),
+                "registration_us": 1e6 * float(np.median(taken_s[metric])),
+                "error_m": float(np.median(np.hypot(spread[:, 0], spread[:, 1]))),
+                "error_rad": float(np.median(np.abs(spread[:, 2]))),
+                "bound_m": math.sqrt(bound[0, 0] + bound[1, 1]),
+                "bound_rad": math.sqrt(bound[2, 2]),
+                "used_share": len(nees) / (n_sampled if name == "sampling" else n_repeats),
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+Method = Callable[[Registration, PreparedScan, PreparedScan], Array]
+
+
+def _methods(sigma: float, rng: np.random.Generator) -> dict[str, Method]:
+    of_guess = np.diag(np.square(_GUESS_SIGMA))
+    return {
+        "censi": lambda f, s, t: icp_covariance.censi(f, s, t, sigma),
+        "censi_sliding": lambda f, s, t: icp_covariance.censi(f, s, t, sigma, matches="sliding"),
+        "censi_last": lambda f, s, t: icp_covariance.censi(f, s, t, sigma, scans="last"),
+        "hessian": lambda f, s, t: icp_covariance.hessian(f),
+        "unscented_censi": lambda f, s, t: icp_covariance.unscented_censi(
+            f, s, t, of_guess, sigma, matches="sliding"
+        ),
+        "sampling": lambda f, s, t: icp_covariance.sampling(f, s, t, rng, sigma, n_samples=50),
+    }
+
+
+def _nees_share(error: Array, covariance: Array, found: Registration) -> float:
+    """NEES over its degrees of freedom, in the directions that the scans hold."""
+    if found.status != "degenerate":
+        return float(error @ np.linalg.solve(covariance, error)) / 3.0
+    held, loose = icp_covariance.split_directions(found)
+    if held.shape[1] == 0:
+        return math.nan
+    rows = np.linalg.inv(np.hstack([held, loose]))[: held.shape[1]]
+    part = rows @ error
+    return float(part @ np.linalg.solve(rows @ covariance @ rows.T, part)) / len(rows)
+
+
+def _resampled(waypoints: Array, spacing_m: float) -> Array:
+    """Poses (N, 3) along a polyline, facing along it."""
+    poses = []
+    for start, end in itertools.pairwise(waypoints):
+        way = end - start
+        length, heading = float(np.hypot(*way)), math.atan2(way[1], way[0])
+        for share in np.arange(0.0, 1.0, spacing_m / max(length, spacing_m)):
+            poses.append([*(start + share * way), heading])
+    return np.array(poses)

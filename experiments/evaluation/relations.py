@@ -1,0 +1,92 @@
+"""The relations metric (Kuemmerle et al. 2009, "On measuring the accuracy of SLAM algorithms").
+
+An estimate is judged by the motion between pairs of its poses whose true relation is known, so
+no common frame is needed and an early error does not weigh on all that follows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from experiments.evaluation.time_sync import interpolate, nearest
+from sim import se2
+from sim.errors import InputError
+from sim.formats.relations import Relations
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.int64]
+Association = Literal["near", "interpolated"]
+
+
+@dataclass(frozen=True)
+class RelationErrors:
+    """Errors of an estimate's relations.
+
+    Attributes
+    ----------
+    translation_m, rotation_rad
+        (N,) lengths of the errors of the relations that could be judged.
+    rows
+        (N,) which relations those are.
+    """
+
+    translation_m: Array
+    rotation_rad: Array
+    rows: Rows
+
+    def summary(self) -> dict[str, float]:
+        """Means, standard deviations and maxima, with the unit in the key."""
+        found: dict[str, float] = {"n_relations": float(len(self.rows))}
+        columns = {"translation": (self.translation_m, "m"), "rotation": (self.rotation_rad, "rad")}
+        for name, (values, unit) in columns.items():
+            found[f"{name}_mean_{unit}"] = float(np.mean(values))
+            found[f"{name}_std_{unit}"] = float(np.std(values))
+            found[f"{name}_max_{unit}"] = float(np.max(values))
+            found[f"{name}_squared_mean_{unit}2"] = float(np.mean(values**2))
+        return found
+
+
+def relation_errors(
+    relations: Relations,
+    stamps: Array,
+    poses: Array,
+    association: Association = "near",
+    tolerance_s: float = 0.05,
+) -> RelationErrors:
+    """Judge poses (T, 3) at increasing stamps (T,) by relations.
+
+    Parameters
+    ----------
+    association
+        `near` takes the pose with the nearest stamp, if it is within the tolerance at both ends
+        (0 for exact stamps); `interpolated` works the poses out at the relations' stamps, where
+        the trajectory has them between. Where a robot turns fast between sparse poses the second
+        one adds errors of its own.
+
+    Raises
+    ------
+    InputError
+        If no relation can be judged.
+    """
+    order = np.argsort(stamps, kind="stable")
+    stamps, poses = stamps[order], poses[order]
+    if len(stamps) < 2:
+        raise InputError("relations need a trajectory of at least two poses")
+    if association == "near":
+        rows = nearest(stamps, relations.stamps)
+        known = np.all(np.abs(stamps[rows] - relations.stamps) <= tolerance_s, axis=1)
+        ends = poses[rows]
+    else:
+        ends = interpolate(stamps, poses, relations.stamps)
+        known = np.isfinite(ends).all(axis=(1, 2))
+    if not known.any():
+        raise InputError("no relation has both stamps in the trajectory; are the clocks the same?")
+    motion = se2.between(ends[known, 0], ends[known, 1])
+    error = se2.between(relations.motion[known], motion)
+    return RelationErrors(
+        np.hypot(error[:, 0], error[:, 1]), np.abs(se2.wrap(error[:, 2])), np.flatnonzero(known)
+    )

@@ -1,1 +1,0 @@
-"""The papers' figures: one module a paper, one function a figure."""

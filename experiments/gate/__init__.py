@@ -1,0 +1,1 @@
+"""The regression gate: suites, baselines, comparison, planted faults, estimator conformance."""

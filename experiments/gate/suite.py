@@ -1,0 +1,316 @@
+"""A suite: estimators over fixed short recordings, one row of errors for each run.
+
+A suite is a YAML file (conf/suite/check.yaml is the one that `estima check` runs). Its recordings
+follow from their seeds, so every version of an estimator meets the same ones.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import yaml
+
+from estimators.base import Estimate, Estimator, run
+from experiments.evaluation.metrics import score
+from experiments.runs.compose import compose
+from experiments.runs.experiment import (
+    Config,
+    default_cache,
+    make_estimator,
+    make_prior,
+    make_recording,
+)
+from experiments.runs.seeds import stream
+from experiments.runs.version import ROOT
+from sim.errors import InputError
+from sim.recording import Recording
+
+ERRORS = ("ate_rmse_m", "ate_aligned_rmse_m", "heading_rmse_rad")
+_RESEEDED = 1000  # streams of one seeding; repeats of the next start beyond them
+_UNPRINTABLE = re.compile("[^\x20-\x7e\xa0-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+_GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
+
+
+@dataclass(frozen=True)
+class Entry:
+    """An estimator of a suite.
+
+    Attributes
+    ----------
+    name
+        Option of conf/estimator.
+    recordings
+        Name of the group of recordings that it reads.
+    repeats
+        Runs with streams of their own on each recording: of the baseline, and of a check.
+    overrides
+        Hydra overrides beside those of the recordings.
+    revised
+        Whether the trajectory of `finish` is judged, and not the online one.
+    """
+
+    name: str
+    recordings: str
+    repeats: tuple[int, int]
+    overrides: tuple[str, ...] = ()
+    revised: bool = False
+
+
+@dataclass(frozen=True)
+class Suite:
+    """Groups of recordings and the estimators that read them.
+
+    Attributes
+    ----------
+    first_seed
+        Seed of the first recording of each group.
+    counts, overrides
+        Of each group: how many recordings, and the Hydra overrides that make them.
+    estimators
+        In the order in which they are told.
+    """
+
+    first_seed: int
+    counts: Mapping[str, int]
+    overrides: Mapping[str, tuple[str, ...]]
+    estimators: tuple[Entry, ...] = field(default_factory=tuple)
+
+    def resized(self, counts: Mapping[str, int]) -> Suite:
+        """The same suite with other numbers of recordings."""
+        return dataclasses.replace(self, counts={**self.counts, **counts})
+
+    def of(self, names: Sequence[str]) -> Suite:
+        """Return the same suite with these estimators only; with all if none is named."""
+        known = {entry.name: entry for entry in self.estimators}
+        for name in names:
+            if name not in known:
+                raise InputError(f"the suite has no estimator {name}; it has {', '.join(known)}")
+        chosen = tuple(entry for entry in self.estimators if not names or entry.name in names)
+        return dataclasses.replace(self, estimators=chosen)
+
+
+Planted = Callable[[Estimator, np.random.Generator], AbstractContextManager[Estimator]]
+
+
+def read_suite(path: Path) -> Suite:
+    """Read a suite.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, or a key is missing, unknown or of the wrong kind.
+    """
+    try:
+        told = yaml.safe_load(path.read_text())
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        line = str(error).splitlines()[0]
+        raise InputError(f"{path}: cannot read this suite ({line})") from error
+    try:
+        groups = told["recordings"]
+        suite = Suite(
+            told["first_seed"],
+            {name: group["count"] for name, group in groups.items()},
+            {name: _overrides(group["overrides"]) for name, group in groups.items()},
+            tuple(_entry(name, given) for name, given in told["estimators"].items()),
+        )
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
+        raise InputError(
+            f"{path}: a suite holds first_seed, recordings (count, overrides) and estimators "
+            f"(recordings, repeats, overrides), as conf/suite/check.yaml does ({error!r})"
+        ) from error
+    if not _is_whole(suite.first_seed, 0):
+        raise InputError(
+            f"{path}: first_seed must be a whole number from 0 on, got {suite.first_seed!r}"
+        )
+    if not suite.estimators:
+        raise InputError(f"{path}: estimators is empty; name at least one of conf/estimator")
+    for name, count in suite.counts.items():
+        if not _is_whole(count, 2):
+            raise InputError(f"{path}: recordings.{name}.count must be 2 or more, got {count!r}")
+    for entry in suite.estimators:
+        if entry.recordings not in suite.counts:
+            raise InputError(
+                f"{path}: estimators.{entry.name}.recordings={entry.recordings!r}; known: "
+                f"{', '.join(map(str, suite.counts))}"
+            )
+        if not all(_is_whole(count, 1, _RESEEDED) for count in entry.repeats):
+            raise InputError(
+                f"{path}: estimators.{entry.name}.repeats must lie in 1..{_RESEEDED}, got "
+                f"{list(entry.repeats)}"
+            )
+    return suite
+
+
+def _is_whole(value: Any, least: int, most: float = math.inf) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and least <= value <= most
+
+
+def _overrides(given: Any) -> tuple[str, ...]:
+    if not (isinstance(given, list) and all(isinstance(override, str) for override in given)):
+        raise TypeError(f"overrides must be a list of texts, got {given!r}")
+    return tuple(given)
+
+
+def _entry(name: Any, given: dict[str, Any]) -> Entry:
+    baseline, check = given["repeats"]
+    unknown = set(given) - {"recordings", "repeats", "overrides", "revised"}
+    if unknown:
+        raise KeyError(f"{name}.{sorted(map(str, unknown))[0]}")
+    revised, group = given.get("revised", False), given["recordings"]
+    if not (isinstance(name, str) and isinstance(group, str) and isinstance(revised, bool)):
+        raise TypeError(f"{name}: name and recordings must be texts, revised true or false")
+    return Entry(name, group, (baseline, check), _overrides(given.get("overrides") or []), revised)
+
+
+def suite_path(name: str) -> Path:
+    """File of a suite by its name, or the path itself."""
+    return Path(name) if name.endswith(".yaml") else ROOT / "conf" / "suite" / f"{name}.yaml"
+
+
+def run_suite(
+    suite: Suite,
+    repeats: Mapping[str, int],
+    *,
+    reseed: int = 0,
+    planted: Mapping[str, Planted] | None = None,
+    cache: Path | None = None,
+    on_progress: Callable[[float], None] | None = None,
+    n_jobs: int = -1,
+) -> pd.DataFrame:
+    """Errors of each run: `estimator`, `recording` (seed), `repeat`, and ERRORS.
+
+    Parameters
+    ----------
+    repeats
+        Runs of each estimator on each recording; estimators that are not named are left out.
+    reseed
+        Number of the seeding of the estimators' streams.
+    planted
+        Faults planted in estimators, by name: a context that gives the faulty one.
+    cache
+        Folder of the recordings.
+    on_progress
+        Called with the share of the recordings done.
+
+    Returns
+    -------
+    pandas.DataFrame
+        Besides: `checksum`, the first digits of the recording's, `fingerprint`, a number that
+        rounding hardly moves, and `status`, `ok` or the exception that ended the run.
+    """
+    from joblib import Parallel, delayed
+
+    cache = cache or default_cache()
+    jobs = []
+    for group, count in suite.counts.items():
+        entries = [e for e in suite.estimators if e.recordings == group and e.name in repeats]
+        if not entries:
+            continue
+        configs = [_compose(suite, entry) for entry in entries]
+        for seed in range(suite.first_seed, suite.first_seed + count):
+            runs = [
+                (entry, config, repeats[entry.name], (planted or {}).get(entry.name))
+                for entry, config in zip(entries, configs, strict=True)
+            ]
+            jobs.append((seed, runs, reseed, cache))
+    done: Iterable[list[dict[str, Any]]] = Parallel(n_jobs=n_jobs, return_as="generator")(
+        delayed(_run_recording)(*job) for job in jobs
+    )
+    rows: list[dict[str, Any]] = []
+    for i, part in enumerate(done, start=1):
+        rows.extend(part)
+        if on_progress is not None:
+            on_progress(i / len(jobs))
+    return pd.DataFrame(rows)
+
+
+def _compose(suite: Suite, entry: Entry) -> Config:
+    """Configuration of an estimator over its recordings, whatever their seed."""
+    return compose(
+        [*suite.overrides[entry.recordings], f"estimator={entry.name}", *entry.overrides]
+    )
+
+
+def _run_recording(
+    seed: int,
+    runs: Sequence[tuple[Entry, Config, int, Planted | None]],
+    reseed: int,
+    cache: Path,
+) -> list[dict[str, Any]]:
+    """Rows of all runs over one recording."""
+    rows = []
+    recording: Recording | None = None
+    for entry, config, repeats, planted in runs:
+        config = {**config, "seed": seed, "world_seed": seed}
+        if recording is None:
+            recording = make_recording(config, cache)
+            origin = {"checksum": recording.checksum[:12], "fingerprint": fingerprint(recording)}
+        prior = make_prior(config, recording)
+        for repeat in range(repeats):
+            index = repeat + _RESEEDED * reseed
+            rng = stream(seed, f"estimator/{entry.name}", index)
+            plant = planted or (lambda estimator, _: nullcontext(estimator))
+            try:
+                with plant(make_estimator(config), stream(seed, "fault", index)) as estimator:
+                    estimate = run(estimator, recording, prior, rng)
+                    if entry.revised:
+                        estimate = _finish(estimator)
+                scores, status = score(recording, estimate), "ok"
+            except InputError:
+                raise
+            except Exception as error:  # the gate's business: told as a failed run
+                scores, status = (
+                    {},
+                    printable(f"{type(error).__name__}: {error}".replace("\n", " ")),
+                )
+            errors = {name: scores.get(name, math.nan) for name in ERRORS}
+            row = {"estimator": entry.name, "recording": seed, "repeat": repeat}
+            rows.append({**row, **origin, **errors, "status": status})
+    return rows
+
+
+def printable(text: str) -> str:
+    """One line of text without what XML 1.0 forbids, and what would steer a terminal."""
+    return _UNPRINTABLE.sub("?", text)
+
+
+def _finish(estimator: Estimator) -> Estimate:
+    finish = getattr(estimator, "finish", None)
+    if finish is None:
+        raise InputError(f"{type(estimator).__name__} has no finish; drop `revised` from the suite")
+    revised: Estimate = finish()
+    return revised
+
+
+def fingerprint(recording: Recording) -> float:
+    """A weighted mean over all that was measured, and the true poses.
+
+    Machines whose last bits differ make recordings whose checksums differ; their fingerprints
+    agree to a millionth all the same, and those of other recordings do not.
+    """
+    logs: list[Any] = [recording.wheels.position_m]
+    if recording.laser is not None:
+        logs.append(recording.laser.ranges_m)
+    if recording.landmarks is not None:
+        logs.append(recording.landmarks.points_in_camera)
+    if recording.places is not None:
+        logs.append(recording.places.descriptors)
+    if recording.clouds is not None:
+        logs.append(recording.clouds.ranges_m)
+    if recording.truth is not None:
+        logs.append(recording.truth.poses[:, :2])
+    total = 0.0
+    for log in logs:
+        values = np.asarray(log, np.float64).ravel()
+        weights = 0.5 + np.mod(_GOLDEN * np.arange(1, len(values) + 1), 1.0)
+        total += float(np.mean(weights * np.where(np.isfinite(values), np.abs(values), 0.0)))
+    return total

@@ -1,0 +1,1 @@
+"""EKF fusion of odometry and ICP with a covariance for ICP."""

@@ -1,0 +1,1 @@
+"""FastSLAM with stereo landmarks."""

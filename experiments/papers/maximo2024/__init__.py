@@ -1,0 +1,1 @@
+"""Topological Monte Carlo localization."""

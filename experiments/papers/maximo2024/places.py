@@ -1,0 +1,356 @@
+"""Routes of places for topological localization: geometry, synthetic descriptors, recordings.
+
+maximo2024 works on two routes whose clouds and network are not at hand. Their geometry is kept
+here, as printed or from positions that the reader has, and a synthetic field of descriptors
+stands for the network.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import gzip
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimators import descriptors as describers
+from estimators.base import Prior
+from estimators.topological_map import (
+    TopologicalMap,
+    from_arrays,
+    from_recording,
+    read_array,
+)
+from experiments.runs.seeds import stream
+from sim import se2
+from sim.errors import InputError
+from sim.recording import CloudLog, PlaceLog, Recording, Truth, WheelLog
+from sim.robot import RobotGeometry
+from sim.sensors import SensorSuite
+
+Array = NDArray[np.float64]
+
+N_STRETCHES = 40  # the paper's k-means clusters
+SIZE = 512  # of the paper's descriptors
+OXFORD_RUN = "2015-08-12-15-04-18"
+_CAR = RobotGeometry(wheel_radius_m=0.3, track_m=1.5)
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """A route as maximo2024, sec. 3 describes it, and the field of descriptors over it.
+
+    Attributes
+    ----------
+    n_nodes, spacing_m, spacing_sd_m
+        The map's, and the distance of successive nodes.
+    offset_m, offset_sd_m
+        Distance of a query to the nearest node.
+    drift
+        Share of the offset that is new from one query to the next.
+    stretch_weight, place_weight, noise_weight
+        How much of a descriptor is common to its stretch of the route, how much belongs to the
+        place, and how much is noise of the single observation.
+    place_scale_m
+        Distance over which the place's own part changes.
+    interval_s
+        Between queries.
+    """
+
+    name: str
+    n_nodes: int
+    spacing_m: float
+    spacing_sd_m: float
+    offset_m: float
+    offset_sd_m: float
+    drift: float
+    stretch_weight: float
+    place_weight: float
+    noise_weight: float
+    place_scale_m: float
+    interval_s: float
+
+
+OXFORD = Geometry("oxford", 397, 21.43, 3.19, 10.09, 5.25, 0.02, 1.0, 0.4, 0.8, 25.0, 2.56)
+UMH = Geometry("umh", 136, 2.32, 0.05, 0.39, 0.02, 0.02, 0.3, 1.0, 0.8, 3.0, 1.0)
+GEOMETRIES = {"oxford": OXFORD, "umh": UMH}
+
+
+@dataclass(frozen=True)
+class PlaceWorld:
+    """A map, the queries along its route, and what is true of both."""
+
+    geometry: Geometry
+    known_map: TopologicalMap
+    recording: Recording
+
+
+def oxford_positions(path: Path | None) -> Array | None:
+    """Positions (397, 2) m, east and north, of the paper's Oxford run, less their mean.
+
+    Parameters
+    ----------
+    path
+        The positions' `.csv.gz` with columns run_name, set, northing_m and easting_m, or None.
+
+    Raises
+    ------
+    InputError
+        If the file is there but holds something else.
+    """
+    if path is None or not path.is_file():
+        return None
+    try:
+        with gzip.open(path, "rt") as lines:
+            rows = [
+                (float(row["easting_m"]), float(row["northing_m"]))
+                for row in csv.DictReader(lines)
+                if row["run_name"] == OXFORD_RUN and row["set"] == "database"
+            ]
+    except (OSError, KeyError, ValueError, EOFError) as error:
+        raise InputError(f"{path}: not the Oxford positions ({error}); leave it out") from error
+    if len(rows) < 2:
+        raise InputError(f"{path}: no database positions of run {OXFORD_RUN}")
+    positions: Array = np.array(rows)
+    positions -= positions.mean(axis=0)
+    return positions
+
+
+def route(geometry: Geometry, rng: np.random.Generator) -> Array:
+    """Positions (N, 2) m of nodes along a generated route with the geometry's spacing."""
+    n = geometry.n_nodes
+    steps = geometry.spacing_m + geometry.spacing_sd_m * rng.standard_normal(n - 1)
+    if geometry.name == "oxford":  # streets: straights with turns at crossings
+        turn = np.zeros(n - 1)
+        at = 0
+        while (at := at + int(rng.integers(6, 20))) < n - 1:
+            turn[at] = rng.choice([-0.5, 0.5]) * math.pi * rng.uniform(0.7, 1.1)
+        turn += 0.06 * rng.standard_normal(n - 1)
+    else:  # paths among trees
+        turn = np.convolve(0.05 * rng.standard_normal(n + 8), np.ones(10), "valid")
+    heading = rng.uniform(-math.pi, math.pi) + np.cumsum(turn)
+    moves = steps[:, None] * np.stack([np.cos(heading), np.sin(heading)], axis=1)
+    return np.concatenate([np.zeros((1, 2)), np.cumsum(moves, axis=0)])
+
+
+def queries(nodes_m: Array, geometry: Geometry, rng: np.random.Generator) -> Array:
+    """Positions (N, 2) m of the queries, one a node, with the geometry's offsets.
+
+    In Oxford the offset is a plane Gaussian that changes slowly (the printed mean and deviation
+    of the distance, 10.09 and 5.25 m, are those of a Rayleigh law); in UMH it has a constant
+    length and slowly turns.
+    """
+    n = len(nodes_m)
+    way = np.gradient(nodes_m, axis=0)
+    forward = way / np.maximum(np.hypot(*way.T), 1e-9)[:, None]
+    left = np.stack([-forward[:, 1], forward[:, 0]], axis=1)
+    if geometry.name == "oxford":
+        sigma = 1.15 * geometry.offset_m / math.sqrt(math.pi / 2.0)
+        offset = np.empty((n, 2))
+        offset[0] = sigma * rng.standard_normal(2)
+        kept = 1.0 - geometry.drift
+        for i in range(1, n):
+            fresh = sigma * math.sqrt(1.0 - kept**2) * rng.standard_normal(2)
+            offset[i] = kept * offset[i - 1] + fresh
+        offset *= sigma / math.sqrt(np.mean(offset**2))  # the printed size in every world
+    else:
+        turning = np.cumsum(geometry.drift * rng.standard_normal(n))
+        angle = rng.uniform(-math.pi, math.pi) + turning
+        length = geometry.offset_m + geometry.offset_sd_m * rng.standard_normal(n)
+        offset = length[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    placed: Array = nodes_m + offset[:, :1] * forward + offset[:, 1:] * left
+    return placed
+
+
+class Field:
+    """Synthetic descriptors: a part common to a stretch, a part of the place, and noise.
+
+    The stretches, 40 along the route, crossfade into each other. The place's own part is a
+    random Fourier feature map of the position, so that it changes smoothly and never repeats.
+    """
+
+    def __init__(self, geometry: Geometry, nodes_m: Array, rng: np.random.Generator) -> None:
+        self._geometry, self._nodes_m = geometry, nodes_m
+        along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(nodes_m, axis=0).T))])
+        self._along = along / max(along[-1], 1e-9)
+        lengths = rng.uniform(0.5, 1.5, N_STRETCHES)
+        self._middles = (np.cumsum(lengths) - lengths / 2.0) / lengths.sum()
+        stretches = rng.standard_normal((N_STRETCHES, SIZE))
+        self._stretches = stretches / np.linalg.norm(stretches, axis=1, keepdims=True)
+        self._waves = rng.standard_normal((2, SIZE)) / geometry.place_scale_m
+        self._phases = rng.uniform(0.0, 2.0 * math.pi, SIZE)
+
+    def describe(self, points_m: Array, rng: np.random.Generator) -> NDArray[np.float32]:
+        """Noisy unit descriptors (K, 512) at points (K, 2)."""
+        g = self._geometry
+        gaps = np.hypot(*(points_m[:, None] - self._nodes_m[None]).transpose(2, 0, 1))
+        along = self._along[np.argmin(gaps, axis=1)]
+        width = 0.15 / N_STRETCHES
+        edges = (self._middles[1:] + self._middles[:-1]) / 2.0
+        above = 1.0 / (1.0 + np.exp(-np.clip((along[:, None] - edges) / width, -50.0, 50.0)))
+        ones, zeros = np.ones((len(along), 1)), np.zeros((len(along), 1))
+        shares = np.hstack([ones, above]) - np.hstack([above, zeros])
+        place = math.sqrt(2.0 / SIZE) * np.cos(points_m @ self._waves + self._phases)
+        noise = rng.standard_normal((len(points_m), SIZE)) / math.sqrt(SIZE)
+        whole = g.stretch_weight * (shares @ self._stretches) + g.place_weight * place
+        whole += g.noise_weight * noise
+        unit: NDArray[np.float32] = (whole / np.linalg.norm(whole, axis=1, keepdims=True)).astype(
+            np.float32
+        )
+        return unit
+
+
+def place_world(geometry: Geometry, seed: int, nodes_m: Array | None = None) -> PlaceWorld:
+    """Map and queries of one world: the route is generated unless positions are given."""
+    if nodes_m is None:
+        nodes_m = route(geometry, stream(seed, "world"))
+    rng = stream(seed, "places")
+    queries_m = queries(nodes_m, geometry, rng)
+    field = Field(geometry, nodes_m, rng)
+    known_map = from_arrays(nodes_m, field.describe(nodes_m, rng))
+    recording = query_recording(
+        queries_m, field.describe(queries_m, rng), geometry.interval_s, stream(seed, "slip")
+    )
+    return PlaceWorld(geometry, known_map, recording)
+
+
+def query_recording(
+    positions_m: Array,
+    descriptors: NDArray[np.float32],
+    interval_s: float,
+    rng: np.random.Generator,
+    k: float = 1e-4,
+) -> Recording:
+    """Recording of descriptors taken at positions (K, 2), with wheels that slip by k a metre."""
+    n = len(positions_m)
+    if descriptors.ndim != 2 or len(descriptors) != n or n < 2:
+        raise InputError(
+            f"a route of queries needs at least two positions and as many descriptors, got {n} "
+            f"and shape {descriptors.shape}"
+        )
+    moves = np.diff(positions_m, axis=0)
+    heading = np.unwrap(np.arctan2(moves[:, 1], moves[:, 0]))
+    heading = np.append(heading, heading[-1])
+    travel = np.hypot(*moves.T)[:, None] * np.ones(2)
+    travel += np.diff(heading)[:, None] * _CAR.track_m / 2.0 * np.array([1.0, -1.0])
+    wheels = travel + np.sqrt(k * np.abs(travel)) * rng.standard_normal(travel.shape)
+    stamps: Array = interval_s * np.arange(n, dtype=np.float64)
+    rolled = np.concatenate([np.zeros((1, 2)), np.cumsum(wheels, axis=0)])
+    return Recording(
+        stamps,
+        WheelLog(stamps, rolled),
+        _CAR,
+        SensorSuite(),
+        truth=Truth(stamps, np.column_stack([positions_m, se2.wrap(heading)])),
+        places=PlaceLog(stamps, np.asarray(descriptors, np.float32)),
+        config={"places": "queries along a route"},
+    )
+
+
+def resequenced(recording: Recording, rows: NDArray[np.int64]) -> Recording:
+    """The recording's observations in another order, each with the travel before it.
+
+    Rows 100, 101, ... start elsewhere on the route; a jump in the rows is a kidnapping that the
+    wheels know nothing of. Rows count the place descriptors or, without them, the clouds.
+    """
+    log = recording.places or recording.clouds
+    assert log is not None
+    stamps = log.stamps
+    rolled = np.stack(
+        [np.interp(stamps, recording.wheels.stamps, p) for p in recording.wheels.position_m.T],
+        axis=1,
+    )
+    lapses = np.diff(stamps, prepend=2.0 * stamps[0] - stamps[1])
+    steps = np.diff(rolled, axis=0, prepend=2.0 * rolled[:1] - rolled[1:2])
+    new_stamps = np.cumsum(lapses[rows])
+    places, clouds = recording.places, recording.clouds
+    return dataclasses.replace(
+        recording,
+        frame_stamps=new_stamps,
+        wheels=WheelLog(new_stamps, np.cumsum(steps[rows], axis=0)),
+        truth=Truth(new_stamps, recording.truth_at(stamps)[rows]),
+        laser=None,
+        landmarks=None,
+        commands=None,
+        places=PlaceLog(new_stamps, places.descriptors[rows]) if places else None,
+        clouds=CloudLog(new_stamps, clouds.ranges_m[rows]) if clouds else None,
+    )
+
+
+def described(recording: Recording, descriptor: str) -> Recording:
+    """The recording with a place descriptor for each of its clouds."""
+    lidar, clouds = recording.sensors.lidar3d, recording.clouds
+    if lidar is None or clouds is None:
+        raise InputError("the recording has no 3D clouds to describe; choose sensors=lidar3d")
+    kind = describers.kind(descriptor)
+    rows = np.array([kind.describe(lidar, turn) for turn in clouds.ranges_m])
+    return dataclasses.replace(recording, places=PlaceLog(clouds.stamps.copy(), rows))
+
+
+# What a configuration names under `recording` and `prior.map`.
+
+
+def route_recording(
+    config: dict[str, Any], geometry: str, positions: str | None = None
+) -> Recording:
+    """Queries of a route, by the configuration's world_seed."""
+    return _route(config, geometry, positions).recording
+
+
+def route_map(
+    config: dict[str, Any], geometry: str, positions: str | None = None
+) -> TopologicalMap:
+    """Map of the same route."""
+    return _route(config, geometry, positions).known_map
+
+
+def _route(config: dict[str, Any], geometry: str, positions: str | None) -> PlaceWorld:
+    if geometry not in GEOMETRIES:
+        raise InputError(f"geometry must be {' or '.join(GEOMETRIES)}, got {geometry!r}")
+    nodes = None
+    if positions is not None:
+        nodes = oxford_positions(Path(positions))
+        if nodes is None:
+            raise InputError(f"{positions}: no such file; set positions to null for a made route")
+    return place_world(GEOMETRIES[geometry], config["world_seed"], nodes)
+
+
+def recording_from_files(
+    config: dict[str, Any], positions: str, descriptors: str, interval_s: float = 1.0
+) -> Recording:
+    """Queries of one's own: positions (K, 2) and descriptors (K, D) as `.npy` or `.csv`.
+
+    The wheels go straight from each position to the next, without slip.
+    """
+    places = read_array(Path(positions))
+    if places.ndim != 2 or places.shape[1] != 2:
+        raise InputError(f"{positions}: queries need shape (K, 2), got {places.shape}")
+    features = read_array(Path(descriptors)).astype(np.float32)
+    return query_recording(places, features, interval_s, stream(config["seed"], "slip"), k=0.0)
+
+
+def mapping_run(
+    config: dict[str, Any],
+    seed: int,
+    spacing_m: float = 5.0,
+    descriptor: str = "scan_context",
+) -> TopologicalMap:
+    """Map from another run through the same world, whose slip and noise are those of `seed`."""
+    from experiments.runs.experiment import default_cache, make_recording
+
+    other = {**config, "seed": seed, "recording": None}
+    return from_recording(make_recording(other, default_cache()), descriptor, spacing_m)
+
+
+def example() -> tuple[Recording, Prior]:
+    """A short route with clear places, and a tracking prior with its map."""
+    world = place_world(dataclasses.replace(UMH, n_nodes=40, noise_weight=0.3), 0)
+    recording = world.recording
+    start = recording.truth_at(recording.frame_stamps[:1])[0]
+    spread = np.diag(np.square([0.5, 0.5, 0.1]))
+    return recording, Prior(_CAR, recording.sensors, start, spread, world.known_map)

@@ -1,0 +1,1 @@
+"""Monte Carlo localization in offices (ours)."""

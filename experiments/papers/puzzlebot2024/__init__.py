@@ -1,0 +1,1 @@
+"""Odometry covariance with kr and kl."""

@@ -1,0 +1,221 @@
+"""The figures of puzzlebot2024."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from experiments.papers.puzzlebot2024.study import (
+    COVERAGE_KS,
+    JUDGED_SEED,
+    NOMINAL,
+    ideal_beliefs,
+    slipping,
+)
+from experiments.runs.seeds import stream
+from experiments.viewing.run_figure import covariance_ellipse
+from experiments.viewing.style import BLACK, BLUE, CYCLE, ORANGE, figure
+from sim.kinematic import run_batch
+from sim.route import OpenLoop
+
+_SQUARE = OpenLoop(
+    (
+        *(leg for _ in range(3) for leg in ((0.4, 0.0, 3.0), (0.0, 0.6, np.pi / 2 / 0.6))),
+        (0.4, 0.0, 3.0),
+    )
+)
+_METHODS = {
+    "wheel_truth": "wheel truth",
+    "sampled": "end poses, sampled",
+    "linearised": "end poses, linearised",
+}
+_PARAMETERS = {"kr": "$k_r$", "kl": "$k_l$"}
+
+
+def ideal_and_real(n_real: int = 40) -> Figure:
+    """Draw the report's RViz view: the ideal robot with its ellipses, and real robots."""
+    page = figure(9.0, 4.4)
+    for ax, k in zip(page.subplots(1, 2), (1e-5, 1e-4), strict=True):
+        robot = slipping(k)
+        runs = run_batch(robot, _SQUARE, n_real, stream(JUDGED_SEED, "slip"))
+        ax.plot(*runs.poses[1:, :, :2].T, color=ORANGE, lw=0.4, alpha=0.35)
+        ax.plot(*runs.poses[0, :, :2].T, color=ORANGE, lw=1.2, label="real robot (40 runs)")
+        ax.plot(*runs.end_poses[:, :2].T, ".", color=ORANGE, ms=3)
+        _, means, covariances = ideal_beliefs(_SQUARE, robot.kr, robot.kl)
+        ax.plot(*means[:, :2].T, color=BLUE, lw=1.4, label="ideal robot")
+        for i in np.linspace(0, len(means) - 1, 15).astype(int)[1:]:
+            ellipse = covariance_ellipse(means[i], covariances[i, :2, :2])
+            ellipse.set(facecolor="none", edgecolor=BLUE, linewidth=0.9)
+            ellipse.set_label("95 % ellipse" if i == len(means) - 1 else "")
+            ax.add_patch(ellipse)
+        ax.set(xlabel="x, m", ylabel="y, m", aspect="equal")
+        ax.set_title(f"$k_r$ = {robot.kr:.2g} m, $k_l$ = {robot.kl:.2g} m")
+    handles, labels = ax.get_legend_handles_labels()
+    page.legend(handles, labels, loc="outside lower center", ncols=3)
+    return page
+
+
+def ellipse_area(areas: pd.DataFrame, crossover: pd.DataFrame) -> Figure:
+    """Draw the 95 % ellipse's area against distance, and where heading takes over."""
+    page = figure(9.0, 3.8)
+    left, right = page.subplots(1, 2)
+    for i, (name, table) in enumerate(areas.groupby("manoeuvre", sort=False)):
+        for k, part in table.groupby("k_m"):
+            style = "-" if k < 5e-5 else "--"
+            label = f"{name}, k = {k:g} m"
+            left.plot(part["distance_m"], part["area_m2"], style, color=CYCLE[i], label=label)
+    left.set(xlabel="distance rolled, m", ylabel="area of the 95 % ellipse, m²", yscale="log")
+    left.set_ylim(bottom=1e-6)
+    page.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    _crossover(right, crossover)
+    return page
+
+
+def _crossover(ax: Axes, crossover: pd.DataFrame) -> None:
+    """Draw the two spreads along a straight; they cross at track sqrt(3) / 2."""
+    _, means, covariances = ideal_beliefs(OpenLoop(((0.25, 0.0, 2.0),)), 1e-5, 1e-5)
+    distance = 1000 * means[:, 0]
+    spread = 1000 * np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
+    ax.plot(distance, spread[:, 0], color=BLUE, label="along the way: borne by translation")
+    ax.plot(distance, spread[:, 1], color=ORANGE, label="across: borne by heading")
+    theory, found = 1000 * NOMINAL.track_m * np.sqrt(3.0) / 2.0, 1000 * crossover["crossover_m"]
+    ax.axvline(theory, color=BLACK, lw=0.8, ls=":")
+    ax.annotate(
+        f"track √3 / 2 = {theory:.1f} mm\nfound in {len(found)} runs: {found.mean():.1f} mm",
+        (theory, spread[-1, 1]),
+        xytext=(6, 0),
+        textcoords="offset points",
+        va="top",
+    )
+    ax.set(xlabel="distance rolled, mm", ylabel="standard deviation, mm (k = 1e-5 m)")
+    ax.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0))
+
+
+def calibration(table: pd.DataFrame) -> Figure:
+    """Draw the estimates over the truth by method and wheel, their mean interval and coverage."""
+    ks = sorted(table["k_m"].unique())
+    page = figure(9.0, 6.4)
+    axes = page.subplots(2, len(ks), sharex=True, sharey=True)
+    rows = [(method, name) for method in _METHODS for name in _PARAMETERS]
+    for joint, line in zip((False, True), axes, strict=True):
+        for ax, k in zip(line, ks, strict=True):
+            for i, (method, name) in enumerate(rows):
+                chosen = table["parameter"].eq(name) & table["method"].eq(method)
+                part = table[chosen & table["joint"].eq(joint) & table["k_m"].eq(k)]
+                _estimates(ax, part, len(rows) - 1 - i, CYCLE[i // 2])
+            ax.axvline(1.0, color=BLACK, lw=0.8)
+            arm = "gain and track joint" if joint else "nominal geometry"
+            ax.set_title(f"k = {k:g} m, {arm}", fontsize="small")
+    labels = [f"{_METHODS[method]}, {_PARAMETERS[name]}" for method, name in rows]
+    axes[0, 0].set(xscale="log", xlim=(0.55, 6.5), yticks=range(len(rows)))
+    axes[0, 0].set_yticklabels(labels[::-1])
+    axes[0, 0].set_xticks([0.7, 1.0, 1.5, 2.0, 3.0, 4.0], ["0.7", "1", "1.5", "2", "3", "4"])
+    axes[0, 0].minorticks_off()
+    page.supxlabel(
+        "estimate over the truth: histogram, its mean (dot), mean 95 % interval (bar); "
+        "at the right, the share of intervals that cover",
+        fontsize="medium",
+    )
+    return page
+
+
+def _estimates(ax: Axes, part: pd.DataFrame, level: int, color: str) -> None:
+    """Draw one method's estimates of one wheel at a height."""
+    ratios = part["value"] / part["truth"]
+    counts, edges = np.histogram(ratios, bins=np.geomspace(0.55, 4.6, 86))
+    ax.stairs(level + 0.75 * counts / max(counts.max(), 1), edges, baseline=level, fill=True,
+              color=color, alpha=0.5)  # fmt: skip
+    ends = [float((part[end] / part["truth"]).mean()) for end in ("low", "high")]
+    ax.plot(ends, [level - 0.08] * 2, color=color, lw=2.0, solid_capstyle="butt")
+    ax.plot(ratios.mean(), level - 0.08, "o", color=BLACK, ms=3)
+    covered = ((part["low"] <= part["truth"]) & (part["truth"] <= part["high"])).mean()
+    ax.annotate(f"{covered:.2f}", (0.99, level + 0.1), xycoords=("axes fraction", "data"),
+                ha="right", fontsize="small")  # fmt: skip
+
+
+def table_1(table: pd.DataFrame) -> Figure:
+    """Print table 1 of the report, with our robots' ends and kr, kl from each case alone."""
+    page = figure(9.0, 3.4)
+    ax = page.subplots()
+    ax.axis("off")
+    header = [
+        "case",
+        "v, m/s",
+        "ω, rad/s",
+        "T, s",
+        "ideal x, m",
+        "real x, m",
+        "ideal θ, rad",
+        "real θ, rad",
+        "$k_r$, 1e-4 m",
+        "$k_l$, 1e-4 m",
+    ]
+    cells = [
+        [
+            row.case.replace("_", " "),
+            f"{row.v_mps:g}",
+            f"{row.omega_radps:g}",
+            f"{row.duration_s:g}",
+            f"{row.ideal_x_m:.2f}",
+            f"{_plain(row.real_x_mean_m)} ± {row.real_x_sd_m:.3f}",
+            f"{row.ideal_heading_rad:.2f}",
+            f"{_plain(row.real_heading_mean_rad)} ± {row.real_heading_sd_rad:.3f}",
+            f"{1e4 * row.kr_m:.2f} [{1e4 * row.kr_low_m:.2f}, {1e4 * row.kr_high_m:.2f}]",
+            f"{1e4 * row.kl_m:.2f} [{1e4 * row.kl_low_m:.2f}, {1e4 * row.kl_high_m:.2f}]",
+        ]
+        for row in table.itertuples()
+    ]
+    drawn = ax.table(cells, colLabels=header, loc="center", cellLoc="center")
+    drawn.auto_set_font_size(False)
+    drawn.set_fontsize(7.5)
+    drawn.auto_set_column_width(list(range(len(header))))
+    drawn.scale(1.0, 1.35)
+    for (row_number, _), cell in drawn.get_celld().items():
+        cell.set_edgecolor("#cccccc")
+        if row_number == 0:
+            cell.set_text_props(weight="bold")
+    truth = slipping(1e-4)
+    ax.set_title(
+        f"table 1, 20 runs a case; true $k_r$ = {1e4 * truth.kr:g}e-4 m, "
+        f"$k_l$ = {1e4 * truth.kl:g}e-4 m",
+        fontsize="medium",
+    )
+    return page
+
+
+def _plain(value: float) -> str:
+    """Three decimals, without the sign of a zero."""
+    return f"{round(value, 3) + 0.0:.3f}"
+
+
+def coverage(table: pd.DataFrame) -> Figure:
+    """Draw the share of true ends in the ideal robot's ellipse and ellipsoid against k."""
+    page = figure(9.0, 4.0)
+    axes = page.subplots(1, 2, sharey=True)
+    titles = {
+        "in_ellipse": "position in the 95 % ellipse",
+        "in_ellipsoid": "pose in the 95 % ellipsoid",
+    }
+    for ax, (column, title) in zip(axes, titles.items(), strict=True):
+        ax.axhspan(0.93, 0.97, color=BLACK, alpha=0.1, lw=0, label="0.93 to 0.97")
+        for i, (name, part) in enumerate(table.groupby("case", sort=False)):
+            share = part[column] / part["runs"]
+            error = 1.96 * np.sqrt(share * (1 - share) / part["runs"])
+            linear = str(name).startswith("linear")
+            ax.errorbar(
+                part["k_m"],
+                share,
+                error,
+                fmt="-o" if linear else "--s",
+                ms=3,
+                lw=1.0,
+                color=CYCLE[i % 4 if linear else (i - 4) % 5],
+                label=str(name).replace("_", " "),
+            )
+        ax.set(xlabel="k, m ($k_r$ = 1.5 k, $k_l$ = 0.5 k)", xscale="log", title=title)
+        ax.set_xlim(min(COVERAGE_KS) * 0.7, max(COVERAGE_KS) * 1.4)
+    axes[0].set_ylabel("share of runs")
+    page.legend(*axes[0].get_legend_handles_labels(), loc="outside right center")
+    return page

@@ -1,0 +1,127 @@
+"""Figures of the real logs."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from experiments.papers.real_logs.study import DATA
+from experiments.viewing.style import BLACK, CYCLE, figure
+from sim.formats.wean import read_grid
+
+_INTEL = ("odometry, calibrated", "ICP from the wheels", "EKF of wheels and ICP")
+
+
+def intel(relations: pd.DataFrame, paths: pd.DataFrame) -> Figure:
+    """Paths through the Intel lab, and the relations metric beside the printed figures."""
+    page = figure(10.0, 5.2)
+    left, right = page.subplots(1, 2, width_ratios=[1.1, 1.0])
+    for color, name in zip((*CYCLE[1:], BLACK), _INTEL, strict=False):
+        rows = paths[paths.method == name]
+        left.plot(rows.x_m, rows.y_m, color=color, lw=0.7, label=name)
+    rows = paths[paths.method == "GMapping, 910 poses"]
+    left.plot(rows.x_m, rows.y_m, color=BLACK, lw=0.7, label="GMapping (reference)")
+    left.set(xlabel="x, m", ylabel="y, m", aspect="equal", title="Intel Research Lab")
+    page.legend(*left.get_legend_handles_labels(), loc="outside lower left", ncols=2, fontsize=7)
+    rows = relations[relations.log == "intel"]
+    methods = list(dict.fromkeys(rows.method))[::-1]
+    printed = rows.method.str.contains("printed")
+    for part, color, shift, label in (
+        (rows[(rows.part == "judged")], CYCLE[0], 0.2, "after the part tuned on (judged)"),
+        (rows[(rows.part == "all") & ~printed], "#9cc9e6", -0.2, "whole log"),
+        (rows[printed], "#bbbbbb", -0.2, "whole log, as printed"),
+    ):
+        place = [methods.index(method) + shift for method in part.method]
+        right.barh(place, part.translation_mean_m, color=color, height=0.38, label=label)
+        for y, mean in zip(place, part.translation_mean_m, strict=True):
+            right.text(mean * 1.1, y, f"{mean:.3f}", va="center", fontsize=7)
+    right.set_yticks(range(len(methods)), methods, fontsize=8)
+    right.set(xscale="log", xlim=(0.02, 40.0), xlabel="mean translational error of relations, m")
+    page.legend(*right.get_legend_handles_labels(), loc="outside lower right", fontsize=7)
+    return page
+
+
+def mrclam(errors: pd.DataFrame, paths: pd.DataFrame) -> Figure:
+    """Errors and NEES of each robot, and the paths of robot 4."""
+    page = figure(11.0, 4.6)
+    left, middle, right = page.subplots(1, 3, width_ratios=[1.0, 1.0, 1.1])
+    methods = list(dict.fromkeys(errors.method))
+    robots = sorted(errors.robot.unique())
+    for i, (method, color) in enumerate(
+        zip(methods, (BLACK, *CYCLE[:-1], "#999999"), strict=False)
+    ):
+        rows = errors[errors.method == method].groupby("robot")
+        shift = (i - len(methods) / 2.0) * 0.09
+        at = np.searchsorted(robots, list(rows.groups)) + shift
+        left.plot(at, rows.ate_rmse_m.mean(), "o", ms=4, color=color, label=method)
+        middle.plot(at, rows.nees_mean.median(), "o", ms=4, color=color)
+    for ax in (left, middle):
+        ax.set_xticks(range(len(robots)), [f"R{r}" for r in robots])
+    left.set(ylabel="ATE from the true start, m", ylim=(0.0, None), title="MRCLAM 6")
+    middle.set(yscale="log", ylabel="mean NEES (3 is consistent)")
+    middle.axhline(3.0, color=BLACK, lw=0.7, ls=":")
+    for name, color in (
+        ("motion capture", BLACK),
+        ("dead reckoning, calibrated", CYCLE[1]),
+        ("FastSLAM, known, wider noise", CYCLE[0]),
+    ):
+        rows = paths[paths.method == name]
+        right.plot(rows.x_m, rows.y_m, color=color, lw=0.8, label=name)
+    right.set(xlabel="x, m", ylabel="y, m", aspect="equal", title="robot 4")
+    handles, labels = left.get_legend_handles_labels()
+    page.legend(handles, labels, loc="outside lower left", ncols=4, fontsize=7)
+    page.legend(*right.get_legend_handles_labels(), loc="outside lower right", fontsize=7)
+    return page
+
+
+def wheels(found: pd.DataFrame) -> Figure:
+    """Khepera: kr and kl by the length of the blocks that residuals are summed over."""
+    page = figure(5.5, 3.6)
+    ax = page.subplots()
+    k = found[found.block > 0]
+    for color, (log, quantity) in zip(
+        CYCLE, [(a, b) for a in ("l90", "lmov") for b in ("kr", "kl")], strict=False
+    ):
+        rows = k[(k.log == log) & (k.quantity == quantity)]
+        spread = np.abs(rows[["low", "high"]].to_numpy().T - rows.value.to_numpy())
+        ax.errorbar(
+            rows.block, rows.value, spread, color=color, marker="o", ms=3, capsize=2,
+            label=f"${quantity[0]}_{quantity[1]}$, {log}",
+        )  # fmt: skip
+    ax.set(xscale="log", yscale="log", xlabel="intervals of 0.8 s in a block", ylabel="k, m")
+    ax.set_xticks([1, 2, 4, 8, 16], ["1", "2", "4", "8", "16"])
+    ax.legend()
+    return page
+
+
+def wean(fits: pd.DataFrame, paths: pd.DataFrame) -> Figure:
+    """The map as the scans read it, with paths and beam ends."""
+    grid = read_grid(DATA / "wean_hall_mcl/wean.dat.gz")
+    names = [name for name in dict.fromkeys(paths.method) if name.startswith("log")]
+    page = figure(5.2 * len(names), 5.6)
+    side = grid.values.shape[0] * grid.cell_m
+    for ax, name in zip(np.atleast_1d(page.subplots(1, len(names))), names, strict=True):
+        ax.imshow(
+            np.ma.masked_invalid(grid.occupancy.T), origin="lower", cmap="Greys", vmin=0.0,
+            vmax=1.0, extent=(0.0, side, 0.0, side), interpolation="nearest",
+        )  # fmt: skip
+        ax.set_facecolor("#dfe6ee")
+        number = name.split()[1]
+        ends, path = paths[paths.method == f"scans {number}"], paths[paths.method == name]
+        ax.plot(ends.x_m, ends.y_m, ".", color=CYCLE[4], ms=1.2, label="beam ends")
+        ax.plot(path.x_m, path.y_m, color=CYCLE[0], lw=1.2, label="path (ICP)")
+        row = fits[(fits.log == int(number)) & (fits.one_means == "free") & ~fits.mirrored].iloc[0]
+        ax.plot(row.x_m, row.y_m, "o", color=CYCLE[0], ms=4)
+        x, y = paths.x_m[paths.method != ""], paths.y_m
+        middle = (float(x.mean()), float(y.mean()))
+        half = 1.05 * max(float(np.ptp(x)), float(np.ptp(y)), 10.0) / 2.0
+        ax.set(
+            xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half),
+            xlabel="x, m", ylabel="y, m", aspect="equal",
+            title=f"Wean Hall, {name}: fit {row.score:.2f}, start {math.degrees(row.yaw_rad):.0f}°",
+        )  # fmt: skip
+    page.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=2, markerscale=6)
+    return page

@@ -1,0 +1,70 @@
+"""What code is this: digests of the project's own source, so that results never mix silently."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import importlib.util
+from collections.abc import Iterable
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+# Files that read and write logs are left out: they decide no simulated recording and no estimate
+SIMULATION = ("sim",)
+RUNS = (
+    "sim",
+    "estimators",
+    "experiments/evaluation/metrics.py",
+    "experiments/papers/maximo2024/places.py",
+    "experiments/runs/experiment.py",
+    "experiments/runs/run.py",
+    "experiments/runs/seeds.py",
+)
+
+
+@functools.cache
+def code_version(parts: tuple[str, ...] = RUNS) -> str:
+    """Return 12 hex digits of the SHA-256 over Python files and those of folders."""
+    digest = hashlib.sha256()
+    for part in parts:
+        place = ROOT / part
+        for path in [place] if place.is_file() else sorted(place.rglob("*.py")):
+            if path.parent.name != "formats":
+                digest.update(str(path.relative_to(ROOT)).encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:12]
+
+
+def version_with(targets: Iterable[str]) -> str:
+    """Return the code's version, with a digest after a + of targets that are not the project's."""
+    found = {target: digest for target in sorted(targets) if (digest := source_digest(target))}
+    if not found:
+        return code_version()
+    return f"{code_version()}+{hashlib.sha256(repr(found).encode()).hexdigest()[:12]}"
+
+
+@functools.cache
+def source_digest(target: str) -> str:
+    """Digest of the source behind a target such as `mine.Mine`, with what lies beside it.
+
+    Of a package all its files count, of a single module those of its folder too, since it may
+    import them. Empty for what `code_version` covers, and for what is not found.
+    """
+    module, top = target.rpartition(".")[0], target.partition(".")[0]
+    if top in ("sim", "estimators"):
+        return ""
+    if top == "experiments":
+        file = f"{module.replace('.', '/')}.py"
+        files = [] if file in RUNS else [ROOT / file]
+    else:
+        spec = importlib.util.find_spec(top)
+        if spec is None:
+            return ""
+        if spec.submodule_search_locations is not None:
+            places = map(Path, spec.submodule_search_locations)
+            files = [path for place in places for path in sorted(place.rglob("*.py"))]
+        else:
+            files = sorted(Path(spec.origin).parent.glob("*.py")) if spec.origin else []
+    digest = hashlib.sha256()
+    for path in filter(Path.is_file, files):
+        digest.update(path.name.encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:12] if files else ""

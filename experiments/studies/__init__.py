@@ -1,1 +1,0 @@
-"""One module a paper: run its studies, then draw and judge what they found."""

@@ -1,0 +1,457 @@
+"""Many runs: expand the swept values, leave out what is done, start the rest by Hydra's launcher.
+
+The runs are composed once, here, and packed into jobs; each job reads its share of the plan. So a
+run costs no composition of its own in the workers, and any of Hydra's launchers will do.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import itertools
+import json
+import os
+import platform
+import secrets
+import shutil
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import hydra
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from omegaconf import DictConfig, ListConfig, OmegaConf
+
+from experiments.runs.cache import key_of
+from experiments.runs.experiment import Config, default_cache, make_recording, recording_settings
+from experiments.runs.row import read_rows, write_rows
+from experiments.runs.run import (
+    GROUPS,
+    RunFailedError,
+    failed,
+    labels,
+    rows_folder,
+    run_configuration,
+    run_key,
+    short,
+)
+from experiments.runs.version import ROOT
+from sim.errors import InputError
+from sim.files import write_whole
+from sim.recording import Recording
+
+_JOBS_PER_WORKER = 4  # enough to keep all busy to the end, few enough to cost little
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run of a sweep: its resolved configuration, the chosen options, its key."""
+
+    config: Config
+    choices: dict[str, str]
+    key: str
+
+
+def sweep_arguments(arguments: Sequence[str]) -> None:
+    """Sweep by a command line's arguments: overrides, and `--config-dir` with its folder."""
+    overrides, config_dir = [], None
+    rest = iter(arguments)
+    for argument in rest:
+        name, equals, value = argument.partition("=")
+        if name in ("--config-dir", "-cd"):
+            config_dir = value if equals else next(rest, None)
+            if config_dir is None or not Path(config_dir).is_dir():
+                raise InputError(f"--config-dir must name a folder, got {config_dir}")
+        elif argument.startswith("-"):
+            raise InputError(f"a sweep takes overrides and --config-dir, not {argument}")
+        else:
+            overrides.append(argument)
+    sweep(overrides, config_dir)
+
+
+def sweep(arguments: Sequence[str], config_dir: str | None = None) -> None:
+    """Run all combinations of the swept values; those that are done already are left out.
+
+    Parameters
+    ----------
+    arguments
+        Hydra's overrides. A study's `sweeps` are a list of further ones, each with its values;
+        `hydra.sweeper.params` are swept where the arguments do not say otherwise. Those of
+        `hydra/launcher` and `hydra.launcher` go to the launcher.
+    config_dir
+        A further folder of options.
+
+    Raises
+    ------
+    RunFailedError
+        If a run failed; all others are done, and the rows of the failed ones say how.
+    """
+    launching = [a for a in arguments if a.lstrip("+~").startswith(_LAUNCHING)]
+    _require_launcher(launching)
+    own = [a for a in arguments if a not in launching]
+    every = list(planned(own, config_dir))
+    if not every:
+        raise InputError(f"no runs: a value of {' '.join(own)} is an empty range or list")
+    folders = {rows_folder(run.config) for run in every}
+    if len(folders) > 1:
+        raise InputError("name is the folder of all the rows; a sweep has one, not several")
+    folder = folders.pop()
+    runs = list({run.key: run for run in every}.values())
+    missing = [run for run in runs if not is_done(folder, run.key)]
+    print(
+        f"{len(runs)} runs, {len(runs) - len(missing)} of them done before: {short(folder)}",
+        file=sys.stderr,
+    )
+    if missing:
+        _launch_all(missing, folder, launching)
+    bad = [status for run in runs if (status := _status(folder, run.key)) is not None]
+    if bad:
+        raise RunFailedError(f"{len(bad)} of {len(runs)} runs; first: {bad[0]}")
+
+
+def planned(arguments: Sequence[str], config_dir: str | None = None) -> Iterator[Run]:
+    """Runs of all combinations, in the order of the arguments."""
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        composer = _Composer(config_dir)
+        composer.extra += [a for a in arguments if a.lstrip("+~").startswith("hydra.")]
+        arguments = [a for a in arguments if a not in composer.extra]
+        given = OverridesParser.create().parse_overrides(list(arguments))
+        fixed = [o.input_line or "" for o in given if not o.is_sweep_override()]
+        study = compose("config", overrides=composer.extra + fixed, return_hydra_config=True)
+        params: dict[str, str] = dict(study.hydra.sweeper.get("params") or {})
+        for part in study.get("sweeps") or [{}]:
+            lines = [f"{key}={value}" for key, value in {**params, **part}.items()]
+            for overrides in combinations([*lines, *arguments]):
+                yield composer.run(overrides)
+
+
+def combinations(lines: Sequence[str]) -> Iterator[list[str]]:
+    """Every combination of the swept values; a later line replaces an earlier one of its key."""
+    choices: dict[str, list[str]] = {}
+    for override in OverridesParser.create().parse_overrides(list(lines)):
+        key = override.get_key_element()
+        if not override.is_sweep_override():
+            choices[key] = [f"{key}={override.get_value_element_as_str()}"]
+        elif override.is_discrete_sweep():
+            choices[key] = [f"{key}={value}" for value in override.sweep_string_iterator()]
+        else:
+            raise InputError(f"{override.input_line}: only lists and ranges of values can be swept")
+        if override.is_delete():
+            choices[key] = [override.input_line or key]
+    for combination in itertools.product(*choices.values()):
+        yield list(combination)
+
+
+class _Composer:
+    """Compose many configurations that share most of their choices.
+
+    Hydra composes each choice of options once; plain values are then put in place.
+    """
+
+    def __init__(self, config_dir: str | None) -> None:
+        self._is_group: dict[str, bool] = {}
+        self._bases: dict[tuple[str, ...], tuple[DictConfig, dict[str, str]]] = {}
+        self.extra: list[str] = []
+        if config_dir is not None:
+            folder = Path(config_dir).resolve()
+            self.extra = [f"hydra.searchpath=[file://{folder}]"]
+
+    def run(self, overrides: list[str]) -> Run:
+        """Resolve one combination."""
+        parsed = OverridesParser.create().parse_overrides(overrides)
+        plain = [o for o in parsed if self._is_plain(o)]
+        options = tuple(o.input_line or "" for o in parsed if not self._is_plain(o))
+        if options not in self._bases:
+            cfg = compose("config", overrides=[*self.extra, *options], return_hydra_config=True)
+            choices = {g: str(cfg.hydra.runtime.choices.get(g)) for g in GROUPS}
+            OmegaConf.set_struct(cfg, False)
+            del cfg["hydra"]
+            self._bases[options] = (cfg, choices)
+        base, choices = self._bases[options]
+        cfg = base.copy()
+        OmegaConf.set_struct(cfg, True)
+        for override in plain:
+            key = override.key_or_group
+            if not _has(cfg, key):
+                raise InputError(
+                    f"unknown key {key}; see estima run --cfg job, or +{key}=... to add it"
+                )
+            OmegaConf.update(cfg, key, override.value(), merge=True)
+        config: Config = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
+        config["picture"] = False
+        config.pop("sweeps", None)
+        return Run(config, choices, run_key(config))
+
+    def _is_plain(self, override: Override) -> bool:
+        """Whether it only sets a value, rather than choosing an option or adding a key."""
+        if override.is_add() or override.is_force_add() or override.is_delete():
+            return False
+        key = override.key_or_group
+        if key not in self._is_group:  # slow to ask for
+            loader = GlobalHydra.instance().config_loader()
+            self._is_group[key] = bool(loader.get_group_options(key))
+        return not self._is_group[key]
+
+
+def _has(cfg: DictConfig, key: str) -> bool:
+    """Whether the configuration has the key, be its value missing yet."""
+    parent, _, leaf = key.rpartition(".")
+    node = OmegaConf.select(cfg, parent) if parent else cfg
+    if isinstance(node, ListConfig):
+        return leaf.isdecimal() and int(leaf) < len(node)
+    return isinstance(node, DictConfig) and leaf in node.keys()  # noqa: SIM118 `in node` says no to ???
+
+
+def is_done(folder: Path, key: str) -> bool:
+    """Whether the run has rows, and none of them tells of a failure."""
+    return (folder / f"{key}.parquet").exists() and _status(folder, key) is None
+
+
+def _status(folder: Path, key: str) -> str | None:
+    """Return how a run failed; None if it did not."""
+    path = folder / f"{key}.parquet"
+    if not path.exists():
+        return "error: no row was written"
+    try:
+        rows = read_rows(path)
+    except InputError as error:
+        return f"error: {error}"
+    if not {"status", "run_key"} <= set(rows) or (rows["run_key"] != key).any():
+        return f"error: {path} holds other rows; delete it and run again"
+    return next((str(status) for status in rows["status"] if failed(str(status))), None)
+
+
+def _launch_all(runs: Sequence[Run], folder: Path, launching: Sequence[str]) -> None:
+    """Start the runs; those at which a worker died are told apart, and the rest goes on."""
+    for run in runs:  # rows of an earlier failure, and files that are no rows
+        path = folder / f"{run.key}.parquet"
+        if path.is_dir():
+            raise InputError(f"{path}: a folder in place of a table; remove it")
+        if path.exists() and not is_done(folder, run.key):
+            path.unlink(missing_ok=True)
+        path.with_suffix(".failed").unlink(missing_ok=True)
+        _begun(folder, run.key).unlink(missing_ok=True)
+    _clear_plans(folder)
+    signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGINT))  # end as by Ctrl-C
+    with _Watch(folder, [run.key for run in runs]):
+        left = list(runs)
+        while left:
+            died = _launch(left, folder, launching)
+            if died is None:
+                return
+            begun = [run for run in left if _begun(folder, run.key).exists()]
+            if not begun:
+                raise died
+            for run in begun:  # which of them was it?
+                if _launch([run], folder, [*launching, "hydra.launcher.n_jobs=2"]) is not None:
+                    _record_failure(run.config, run.choices, "its process died (out of memory?)")
+                _begun(folder, run.key).unlink(missing_ok=True)
+            left = [run for run in left if not (folder / f"{run.key}.parquet").exists()]
+
+
+def _launch(runs: Sequence[Run], folder: Path, launching: Sequence[str]) -> Exception | None:
+    """Write the plan and start its jobs; return the error if a process of joblib's has died."""
+    from joblib.externals.loky.process_executor import TerminatedWorkerError
+
+    jobs = packed(runs, _JOBS_PER_WORKER * (os.cpu_count() or 1))
+    plan = folder / f"plan-{os.getpid()}-{secrets.token_hex(3)}.json"
+    text = json.dumps(
+        {
+            "planner": [platform.node(), os.getpid()],
+            "jobs": [[[r.config, r.choices] for r in job] for job in jobs],
+        }
+    )
+    with write_whole(plan) as part:
+        part.write_text(text)
+    sys.argv = [
+        "estima run",
+        "-m",
+        *launching,
+        f"plan={plan}",
+        f"job={','.join(str(number) for number in range(len(jobs)))}",
+    ]
+    try:
+        job_application()
+    except TerminatedWorkerError as error:
+        died: Exception = error
+        return died
+    finally:
+        plan.unlink(missing_ok=True)
+        shutil.rmtree(f"{plan}.jobs", ignore_errors=True)
+    return None
+
+
+def _clear_plans(folder: Path) -> None:
+    """Remove what sweeps of this machine left that were killed."""
+    for plan in folder.glob("plan-*.json"):
+        try:
+            node, planner = json.loads(plan.read_text())["planner"]
+            if node == platform.node():
+                os.kill(planner, 0)  # is it there?
+        except ProcessLookupError:
+            plan.unlink(missing_ok=True)
+            shutil.rmtree(f"{plan}.jobs", ignore_errors=True)
+        except (OSError, ValueError, KeyError, TypeError):
+            continue
+
+
+def _begun(folder: Path, key: str) -> Path:
+    """Mark of a run that is being computed."""
+    return folder / f"{key}.begun"
+
+
+_LAUNCHING = ("hydra/launcher", "hydra.launcher")
+_EXTRAS = {"submitit": "slurm", "ray": "ray"}
+
+
+def _require_launcher(launching: Sequence[str]) -> None:
+    """Check that the launcher is installed; Hydra would only say that it knows none."""
+    for argument in launching:
+        name = argument.partition("=")[2]
+        plugin = name.partition("_")[0]
+        chosen = argument.lstrip("+").startswith("hydra/launcher=") and plugin in _EXTRAS
+        if chosen and importlib.util.find_spec(f"hydra_plugins.hydra_{plugin}_launcher") is None:
+            raise InputError(
+                f"hydra/launcher={name} is an extra that is not installed: "
+                f"pip install -e .[{_EXTRAS[plugin]}]"
+            )
+
+
+def packed(runs: Sequence[Run], n_jobs: int) -> list[list[Run]]:
+    """Runs in about `n_jobs` jobs; those of one recording stay together while there are enough."""
+    groups: dict[str, list[Run]] = {}
+    for run in runs:
+        groups.setdefault(_recording_key(run.config), []).append(run)
+    size = max(1, -(-len(runs) // n_jobs))
+    jobs: list[list[Run]] = []
+    for group in groups.values():
+        for low in range(0, len(group), size):
+            part = group[low : low + size]
+            if jobs and len(jobs[-1]) + len(part) <= size:
+                jobs[-1].extend(part)
+            else:
+                jobs.append(list(part))
+    return jobs
+
+
+def _recording_key(config: Config) -> str:
+    return key_of(recording_settings(config))
+
+
+@hydra.main(version_base="1.3", config_path=str(ROOT / "conf"), config_name="job")
+def job_application(cfg: DictConfig) -> None:
+    """Run one job's share of the plan; a run that fails leaves its row, and the next follows."""
+    plan = json.loads(Path(cfg.plan).read_text())
+    _end_with(*plan["planner"])
+    fetch = _LastRecording()
+    for config, choices in plan["jobs"][cfg.job]:
+        run_and_record(config, choices, fetch)
+
+
+def _end_with(node: str, planner: int) -> None:
+    """End this process when the planner is killed, if it is the planner that started it."""
+    if platform.node() != node or os.getppid() != planner or os.getpid() == planner:
+        return
+
+    def watch() -> None:
+        while os.getppid() == planner:
+            time.sleep(0.5)
+        os._exit(1)
+
+    if "planner" not in {thread.name for thread in threading.enumerate()}:
+        threading.Thread(target=watch, name="planner", daemon=True).start()
+
+
+def run_and_record(
+    config: Config, choices: dict[str, str], fetch: Callable[[Config], Recording]
+) -> None:
+    """Run one configuration; what goes wrong becomes the status of its row."""
+    key = run_key(config)
+    path = rows_folder(config) / f"{key}.parquet"
+    mark = _begun(path.parent, key)
+    with write_whole(mark) as part:
+        part.touch()
+    try:
+        rows, _ = run_configuration(config, choices, fetch)
+        if any(failed(str(row["status"])) for row in rows):  # for those who watch
+            path.with_suffix(".failed").touch()
+    except (Exception, SystemExit) as error:
+        kind = "" if isinstance(error, InputError) else f"{type(error).__name__}: "
+        _record_failure(config, choices, kind + " ".join(str(error).split()))
+    finally:
+        mark.unlink(missing_ok=True)
+
+
+def _record_failure(config: Config, choices: dict[str, str], how: str) -> None:
+    """Leave a row that says how the run failed, unless it has left one itself."""
+    key = run_key(config)
+    path = rows_folder(config) / f"{key}.parquet"
+    if not path.exists():
+        row = labels(config, choices, "", key, 0)
+        write_rows([{**row, "status": f"error: {how}"}], path)
+    path.with_suffix(".failed").touch()
+
+
+class _LastRecording:
+    """Keeps the last recording: the runs of a job mostly share it."""
+
+    def __init__(self) -> None:
+        self._key = ""
+        self._recording: Recording | None = None
+
+    def __call__(self, config: Config) -> Recording:
+        key = _recording_key(config)
+        if self._recording is None or key != self._key:
+            self._recording, self._key = make_recording(config, default_cache()), key
+        return self._recording
+
+
+class _Watch:
+    """Show how many runs are done and failed, at what rate, and the time that remains."""
+
+    def __init__(self, folder: Path, keys: Sequence[str]) -> None:
+        self._folder, self._keys, self._over = folder, set(keys), threading.Event()
+        self._thread = threading.Thread(target=self._watch, daemon=True)
+        self._begun = time.monotonic()
+
+    def __enter__(self) -> None:
+        self._thread.start()
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+        self._thread.join()
+
+    def _watch(self) -> None:
+        tell_after_s = 2.0
+        on_terminal = sys.stderr.isatty()
+        while True:
+            over = self._over.wait(0.5)
+            seen = {path.stem for path in self._folder.glob("*.parquet")} & self._keys
+            bad = len({path.stem for path in self._folder.glob("*.failed")} & self._keys)
+            spent_s = time.monotonic() - self._begun
+            if (spent_s > tell_after_s or over) and seen:
+                tell_after_s = spent_s + (0.5 if on_terminal else 10.0)
+                line = _progress_line(len(seen), len(self._keys), bad, spent_s)
+                print(f"\r{line}\033[K" if on_terminal else line, file=sys.stderr,
+                      end="" if on_terminal and not over else "\n", flush=True)  # fmt: skip
+            if over:
+                return
+
+
+def _progress_line(done: int, total: int, bad: int, spent_s: float) -> str:
+    rate = done / max(spent_s, 1e-9)
+    left = (total - done) / rate
+    rest = f"{left / 60:.0f} min left" if left > 90 else f"{left:.0f} s left"
+    told = f", {bad} failed" if bad else ""
+    filled = round(_BAR_WIDTH * done / total)
+    bar = "━" * filled + "╌" * (_BAR_WIDTH - filled)
+    return f"{bar} {done} of {total} runs, {rate:.2g} a second, {rest}{told}"
+
+
+_BAR_WIDTH = 20

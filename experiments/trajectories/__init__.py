@@ -1,0 +1,1 @@
+"""Estimates in and out of files."""

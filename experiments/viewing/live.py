@@ -1,0 +1,179 @@
+"""A run in PyBullet's window: the true robot among its walls, and the estimate beside it.
+
+The engine ends its process when it cannot open a window. So a display is asked for first, and the
+window belongs to a process of its own, whose end is told in a line.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import sys
+import time
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from experiments.viewing.view import Run, scan_points
+from sim.errors import InputError
+from sim.world import World
+
+Array = NDArray[np.float64]
+FPS = 20
+_REMEDY = "save the run instead: add -o run.html, run.gif or run.mp4"
+_HEIGHT_M = 0.1  # of the robots
+_CUT_M = 0.4  # height from which walls are not shown
+_TRAIL_EVERY = 5  # pictures a piece
+_SCAN_EVERY = 3
+_BLACK, _BLUE, _RED = (0.1, 0.1, 0.1), (0.0, 0.45, 0.7), (0.84, 0.37, 0.0)
+
+
+def check_display() -> None:
+    """Refuse to open a window where there is nothing to show it on."""
+    if sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
+        raise InputError(f"there is no display for a window (DISPLAY is not set); {_REMEDY}")
+
+
+def watch(run: Run, seconds: float | None = None) -> None:
+    """Show the run in a window until it has ended and the window is closed.
+
+    Parameters
+    ----------
+    seconds
+        How long the whole run is to take; None: as long as it took.
+
+    Raises
+    ------
+    InputError
+        If there is no display, or no window can be opened on it.
+    """
+    check_display()
+    process = multiprocessing.get_context("spawn").Process(target=_window, args=(run, seconds))
+    process.start()
+    process.join()
+    if process.exitcode:
+        raise InputError(f"the window could not be opened or was lost; {_REMEDY}")
+
+
+def _window(run: Run, seconds: float | None) -> None:
+    """Body of the window's process: play once, then wait for the window to be closed."""
+    with open(os.devnull, "w") as sink:
+        os.dup2(sink.fileno(), 1)  # the engine tells of its threads and of OpenGL
+    from sim import bullet
+
+    engine: Any = vars(bullet)["pybullet"]
+    client = engine.connect(engine.GUI)
+    if client < 0:
+        sys.exit(1)
+    try:
+        _play(engine, run, seconds)
+        while engine.isConnected(client):
+            engine.stepSimulation()
+            time.sleep(0.05)
+    except KeyboardInterrupt:
+        sys.exit(0)  # told by the process that waits
+    except engine.error:
+        if engine.isConnected(client):
+            raise  # else the window was closed, which is how one ends it
+
+
+def _play(engine: Any, run: Run, seconds: float | None) -> None:
+    """Move the robots by the clock, from the first shown Frame to the last."""
+    engine.configureDebugVisualizer(engine.COV_ENABLE_GUI, 0)
+    recording = run.recording
+    stamps = recording.frame_stamps[run.rows]
+    world = recording.truth.world if recording.truth else None
+    if world is not None and len(world.walls):
+        _build_walls(engine, world)
+    known = recording.truth is not None
+    truth = recording.truth_at(stamps) if known else np.full((len(stamps), 3), np.nan)
+    _aim(engine, run, truth)
+    radius = max(recording.robot.track_m / 2.0, 0.1)
+    bodies = {"truth": _body(engine, radius, _BLACK, 1.0)} if known else {}
+    if run.estimate is not None:
+        bodies["estimate"] = _body(engine, 1.1 * radius, _BLUE, 0.5)
+    colours = {"truth": _BLACK, "estimate": _BLUE}
+    trails: dict[str, Array] = {}
+    scan = -1
+    speed = 1.0 if seconds is None else max(stamps[-1] - stamps[0], 1e-9) / seconds
+    begun = time.monotonic()
+    for i, stamp in enumerate(stamps):
+        time.sleep(max(0.0, (stamp - stamps[0]) / speed - (time.monotonic() - begun)))
+        belief = run.belief_row(float(stamp))
+        poses = {"truth": truth[i]}
+        if run.estimate is not None and belief >= 0:
+            poses["estimate"] = run.estimate.means[belief]
+        for name, body in bodies.items():
+            pose = poses.get(name)
+            if pose is None or not np.isfinite(pose).all():
+                continue
+            turned = engine.getQuaternionFromEuler([0, 0, float(pose[2])])
+            engine.resetBasePositionAndOrientation(body, [*pose[:2], _HEIGHT_M / 2], turned)
+            before = trails.setdefault(name, pose)
+            if i % _TRAIL_EVERY == 0:
+                engine.addUserDebugLine([*before[:2], 0.02], [*pose[:2], 0.02], colours[name], 2)
+                trails[name] = pose
+        points = scan_points(run, float(stamp))[::3] if i % _SCAN_EVERY == 0 else np.zeros((0, 2))
+        if len(points):
+            raised = np.column_stack([points, np.full(len(points), 0.2)]).tolist()
+            replaced = {"replaceItemUniqueId": scan} if scan >= 0 else {}
+            scan = engine.addUserDebugPoints(raised, [_RED] * len(points), 3, **replaced)
+        engine.stepSimulation()  # lets the window take part
+
+
+def _aim(engine: Any, run: Run, truth: Array) -> None:
+    """Look at the whole way from above."""
+    ways = [truth[:, :2]]
+    if run.estimate is not None:
+        ways.append(run.estimate.means[:, :2])
+    way = np.concatenate(ways)
+    way = way[np.isfinite(way).all(axis=1)]
+    if not len(way):
+        raise InputError("this log has no truth to show; name an estimator with --estimate")
+    low, high = way.min(axis=0), way.max(axis=0)
+    middle = [*((low + high) / 2.0), 0.0]
+    reach = 1.2 * float(np.hypot(*(high - low))) + 2.0
+    engine.resetDebugVisualizerCamera(reach, 0, -65, middle)
+
+
+def _build_walls(engine: Any, world: World) -> None:
+    """All walls as one mesh that is only seen, from both of its sides; cut low, to look over."""
+    (x1, y1, x2, y2), (low, high) = world.walls.T, np.minimum(world.wall_z_m.T, _CUT_M)
+    corners = [(x1, y1, low), (x2, y2, low), (x2, y2, high), (x1, y1, high)]
+    vertices = np.stack([np.stack(corner, axis=-1) for corner in corners], axis=1)
+    faces = np.array([0, 1, 2, 0, 2, 3, 0, 2, 1, 0, 3, 2])
+    indices = 4 * np.arange(len(world.walls))[:, None] + faces
+    shape = engine.createVisualShape(
+        engine.GEOM_MESH,
+        vertices=vertices.reshape(-1, 3).tolist(),
+        indices=indices.ravel().tolist(),
+        rgbaColor=[0.55, 0.55, 0.6, 1.0],
+    )
+    engine.createMultiBody(0, -1, shape)
+
+
+def _body(engine: Any, radius_m: float, colour: tuple[float, float, float], alpha: float) -> int:
+    """A disc with a nose that shows where it heads."""
+    disc = engine.createVisualShape(
+        engine.GEOM_CYLINDER, radius=radius_m, length=_HEIGHT_M, rgbaColor=[*colour, alpha]
+    )
+    nose = engine.createVisualShape(
+        engine.GEOM_SPHERE, radius=0.4 * radius_m, rgbaColor=[*_RED, alpha]
+    )
+    body: int = engine.createMultiBody(
+        0,
+        -1,
+        disc,
+        linkMasses=[0],
+        linkCollisionShapeIndices=[-1],
+        linkVisualShapeIndices=[nose],
+        linkPositions=[[radius_m, 0, 0]],
+        linkOrientations=[[0, 0, 0, 1]],
+        linkInertialFramePositions=[[0, 0, 0]],
+        linkInertialFrameOrientations=[[0, 0, 0, 1]],
+        linkParentIndices=[0],
+        linkJointTypes=[engine.JOINT_FIXED],
+        linkJointAxis=[[0, 0, 1]],
+    )
+    return body

@@ -1,0 +1,75 @@
+"""Worlds from above."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+from experiments.viewing.style import (
+    BLACK,
+    BLUE,
+    GREEN,
+    ORANGE,
+    PURPLE,
+    RED,
+    SKY,
+    WALL,
+    YELLOW,
+    figure,
+)
+from sim.world import World
+
+_PLACES = {
+    "room": SKY,
+    "corridor_bare": YELLOW,
+    "corridor_objects": GREEN,
+    "corner": RED,
+    "curve": ORANGE,
+    "door": BLACK,
+}
+_LASER_HEIGHT_M = 0.25  # faces that begin above it are drawn faintly
+
+
+def draw_world(
+    ax: Axes, world: World, *, landmarks: bool = True, places: bool = False, tour: bool = False
+) -> None:
+    """Draw walls, and on request landmarks, named places and the tour, in metres."""
+    if places:
+        for name, rectangles in world.places.items():
+            for j, (x1, y1, x2, y2) in enumerate(rectangles):
+                color = _PLACES.get(name, PURPLE)
+                patch = Rectangle((x1, y1), x2 - x1, y2 - y1, color=color, alpha=0.15, lw=0)
+                patch.set_label(name.replace("_", ", ") if j == 0 else "")
+                ax.add_patch(patch)
+    high = world.wall_z_m[:, 0] > _LASER_HEIGHT_M
+    for rows, style in ((~high, {"color": WALL}), (high, {"color": GREEN, "alpha": 0.5})):
+        lines = list(world.walls[rows].reshape(-1, 2, 2))
+        ax.add_collection(LineCollection(lines, lw=0.9, **style))
+    if landmarks and len(world.landmarks):
+        twin = world.look_alike if len(world.look_alike) else np.zeros(len(world.landmarks), bool)
+        for mask, color, label in ((~twin, PURPLE, "landmark"), (twin, ORANGE, "look-alike")):
+            if mask.any():
+                x, y = world.landmarks[mask, :2].T
+                ax.plot(x, y, ".", color=color, ms=2.5, label=label)
+    if tour and len(world.waypoints):
+        ax.plot(*world.waypoints.T, color=BLUE, lw=1.0, label="tour")
+        ax.plot(*world.start_pose[:2], "o", color=BLUE, ms=4, label="start")
+    ax.set(xlabel="x, m", ylabel="y, m", aspect="equal")
+    ax.autoscale_view()
+
+
+def world_figure(world: World) -> Figure:
+    """One world with everything in it, and a legend above."""
+    x1, y1, x2, y2 = world.bounds_m
+    width, height = x2 - x1, y2 - y1
+    # What the map needs beside the labels, with room above it for title and legend.
+    page = figure(9.0, float(np.clip(8.3 * height / max(width, 1.0), 2.0, 8.3)) + 1.5)
+    ax = page.subplots()
+    draw_world(ax, world, places=True, tour=True)
+    ax.set_title(world.name, loc="left")
+    if ax.get_legend_handles_labels()[1]:
+        page.legend(loc="outside upper right", ncols=5)
+    return page
