@@ -5,9 +5,13 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+if TYPE_CHECKING:
+    from estimators.base import Estimate
+    from sim.recording import Recording
 
 app = typer.Typer(
     help="Estima: simulate differential-drive robots, run localization on the same recordings, "
@@ -48,7 +52,7 @@ def run(context: typer.Context) -> None:
 
       estima run --cfg job (print the configuration; estima options lists the groups)
     """
-    os.environ["HYDRA_FULL_ERROR"] = "1"  # errors come to `main`, which tells them in a line
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # errors come to `main`, which puts them in a line
     # a study is added to the defaults, which have none: Hydra would want a + before it
     arguments = [f"+{a}" if a.startswith("study=") else a for a in context.args]
     many = {"-m", "--multirun"} & set(arguments)
@@ -57,10 +61,19 @@ def run(context: typer.Context) -> None:
 
         sweep_arguments([a for a in arguments if a not in many])
         return
-    sys.argv = ["estima run", *arguments]
     from experiments.runs.run import application
 
-    application()
+    application(arguments, _draw_run)
+
+
+def _draw_run(recording: Recording, estimate: Estimate, name: str, folder: Path) -> None:
+    """Write what one looks at after a single run: a picture and the trajectory."""
+    from experiments.trajectories.odometry import write_odometry_csv
+    from experiments.viewing.run_figure import run_figure
+    from experiments.viewing.style import save_figure
+
+    write_odometry_csv(estimate, folder / "estimate.csv")
+    save_figure(run_figure(recording, estimate, name), folder / "run.png")
 
 
 @app.command()
@@ -72,17 +85,16 @@ def record(
 
     Example: estima record -o office.npz world=office sensors=lms291 seed=3
     """
-    from experiments.runs.compose import compose
     from experiments.runs.console import progress
-    from experiments.runs.experiment import simulate
+    from experiments.runs.experiment import Experiment
     from sim.errors import InputError
     from sim.recording import save
 
     if out.suffix != ".npz":
         raise InputError(f"-o {out}: a recording is an .npz file")
-    config = compose(overrides or [])
+    experiment = Experiment.compose(overrides or [])
     with progress("simulating, s") as on_progress:
-        recording = simulate(config, on_progress)
+        recording = experiment.simulate(on_progress)
     checksum = save(recording, out)
     print(f"{out}: {recording.status}, {recording.duration_s:.1f} s, checksum {checksum}")
     if recording.status != "ok":
@@ -142,10 +154,10 @@ def convert(
 @app.command()
 def options() -> None:
     """List the configuration groups and their options."""
-    from experiments.runs.version import ROOT
+    from experiments.runs.paths import CONF
 
     for group in ("world", "robot", "sensors", "route", "estimator"):
-        names = sorted(path.stem for path in (ROOT / "conf" / group).glob("*.yaml"))
+        names = sorted(path.stem for path in (CONF / group).glob("*.yaml"))
         print(f"{group:>10}: {', '.join(names)}")
 
 
@@ -205,13 +217,12 @@ def view(
 
 def _draw_world(overrides: list[str], out: Path) -> None:
     """Draw walls, landmarks, places and the tour of a world."""
-    from experiments.runs.compose import compose
-    from experiments.runs.experiment import make_world
+    from experiments.runs.experiment import Experiment
     from experiments.viewing.style import save_figure
     from experiments.viewing.world import world_figure
 
     given = [f"world={o}" if "=" not in o else o for o in overrides]
-    save_figure(world_figure(make_world(compose(given))), out)
+    save_figure(world_figure(Experiment.compose(given).world()), out)
     print(out)
 
 
@@ -404,14 +415,15 @@ def plot(
     Example: estima plot run --x robot.kr --y ate_rmse_m --by choice.estimator
     """
     from experiments.report.plot import sweep_figure
-    from experiments.runs.run import failed
+    from experiments.runs.row import Outcome
     from experiments.sweeps.collect import collect, where
     from experiments.viewing.style import save_figure
 
     rows = where(collect(name, times=True), only or [])
-    if bad := int(rows["status"].map(failed).sum()):
-        print(f"{bad} of {len(rows)} runs failed; they are left out", file=sys.stderr)
-        rows = rows[~rows["status"].map(failed)]
+    failed = rows["status"] == Outcome.FAILED
+    if failed.any():
+        print(f"{failed.sum()} of {len(rows)} runs failed; they are left out", file=sys.stderr)
+        rows = rows[~failed]
     save_figure(sweep_figure(rows, x, y, by), out)
     print(out)
 
@@ -420,14 +432,25 @@ def plot(
 def reproduce(
     full: Annotated[bool, typer.Option("--full", help="The judged profile.")] = False,
     paper: Annotated[str | None, typer.Option(help="Only this paper.")] = None,
+    figures_only: Annotated[
+        bool, typer.Option("--figures-only", help="Draw again what is in results/.")
+    ] = False,
 ) -> None:
     """Make the papers' figures, tables and claims, into results/.
 
-    Example: estima reproduce --paper puzzlebot2024
+    Examples
+    --------
+      estima reproduce --paper puzzlebot2024
+
+      estima reproduce --figures-only
     """
+    from experiments.papers.reproduce import redraw
     from experiments.papers.reproduce import reproduce as reproduce_papers
 
-    reproduce_papers(full=full, only=paper)
+    if figures_only:
+        redraw(only=paper)
+    else:
+        reproduce_papers(full=full, only=paper)
 
 
 @app.command()
@@ -436,12 +459,12 @@ def report() -> None:
 
     Example: estima report
     """
-    from experiments.papers.reproduce import RESULTS
     from experiments.report.page import write_report
     from experiments.runs.console import progress
+    from experiments.runs.paths import results
 
     with progress("report", 1.0) as on_progress:
-        print(write_report(RESULTS, on_progress))
+        print(write_report(results(), on_progress))
 
 
 @app.command("export-table")

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from experiments.runs.compose import compose
-from experiments.runs.experiment import make_world
+from experiments.runs.experiment import Experiment
 from sim.casting import visible
 from sim.errors import InputError
 from sim.plan import make_descriptors
@@ -30,7 +29,7 @@ def along(path, step_m=0.1):
 @pytest.mark.parametrize("name", WORLDS)
 def test_tours_keep_clear_of_walls(name):
     for seed in (0, 1, 50, 1003):
-        world = make_world(compose([f"world={name}", f"seed={seed}"]))
+        world = Experiment.compose([f"world={name}", f"seed={seed}"]).world()
         step = 0.1 if len(world.walls) < 700 else 0.5
         least = min(world.clearance_m(p) for p in along(world.waypoints, step))
         assert least >= CLEARANCE_M, f"seed {seed}"
@@ -42,7 +41,7 @@ def test_tours_keep_clear_of_walls(name):
 def test_office_is_the_building_asked_for():
     seen = set()
     for seed in range(3):
-        world = make_world(compose(["world=office", f"seed={seed}"]))
+        world = Experiment.compose(["world=office", f"seed={seed}"]).world()
         x1, y1, x2, y2 = world.bounds_m
         assert x2 - x1 >= 60
         assert y2 - y1 >= 40
@@ -62,10 +61,10 @@ def test_office_is_the_building_asked_for():
 def test_every_place_is_passed():
     """The tour comes through each kind of place that a world names."""
     for name in ("room", "rooms", "gil2008", "corridor", "office", "streets", "campus"):
-        world = make_world(compose([f"world={name}", "seed=6"]))
+        world = Experiment.compose([f"world={name}", "seed=6"]).world()
         passed = {str(n) for n in world.place_of(along(world.waypoints))} - {""}
         assert passed == set(world.places), name
-    corridor = make_world(compose(["world=corridor"]))
+    corridor = Experiment.compose(["world=corridor"]).world()
     x1, _, x2, _ = corridor.places["corridor_bare"][0]
     assert x2 - x1 >= 20.0
 
@@ -75,7 +74,7 @@ def test_a_robot_gets_into_every_room(name):
     """Flood the floor with discs of a robot's size from the start; each room is mostly wet."""
     cell_m, radius_m = 0.1, 0.3
     for seed in range(3, 8):
-        world = make_world(compose([f"world={name}", f"seed={seed}"]))
+        world = Experiment.compose([f"world={name}", f"seed={seed}"]).world()
         low, size = world.bounds_m[:2], world.bounds_m[2:] - world.bounds_m[:2]
         open_floor = np.ones(np.ceil(size / cell_m).astype(int) + 1, bool)
         for wall in world.walls:
@@ -93,7 +92,7 @@ def test_a_robot_gets_into_every_room(name):
 @pytest.mark.parametrize("name", ["room", "rooms", "gil2008", "corridor", "office", "boxes"])
 def test_faces_neither_cross_nor_coincide(name):
     for seed in (0, 2, 3):
-        walls = make_world(compose([f"world={name}", f"seed={seed}"])).walls
+        walls = Experiment.compose([f"world={name}", f"seed={seed}"]).world().walls
         start, way = walls[:, :2], walls[:, 2:] - walls[:, :2]
         for i in range(len(walls) - 1):
             p, r, q, s = start[i], way[i], start[i + 1 :], way[i + 1 :]
@@ -128,9 +127,9 @@ def _cross(a, b):
 def test_as_many_objects_as_asked_for_or_a_refusal(overrides, faces, message):
     if faces is None:
         with pytest.raises(InputError, match=message):
-            make_world(compose(overrides))
+            Experiment.compose(overrides).world()
     else:
-        assert len(make_world(compose(overrides)).walls) == faces
+        assert len(Experiment.compose(overrides).world().walls) == faces
 
 
 def _inside(points, rectangle):
@@ -138,7 +137,7 @@ def _inside(points, rectangle):
 
 
 def test_office_rooms_are_closed_but_for_a_door():
-    world = make_world(compose(["world=office", "seed=4"]))
+    world = Experiment.compose(["world=office", "seed=4"]).world()
     step = 0.02
     for x1, y1, x2, y2 in world.places["room"]:
         rim = along(np.array([[x1, y1], [x2, y1], [x2, y2], [x1, y2], [x1, y1]]), step)
@@ -147,7 +146,7 @@ def test_office_rooms_are_closed_but_for_a_door():
 
 
 def test_office_rooms_are_furnished_and_differ():
-    world = make_world(compose(["world=office", "seed=5"]))
+    world = Experiment.compose(["world=office", "seed=5"]).world()
     middle = (world.walls[:, :2] + world.walls[:, 2:]) / 2
     low = world.wall_z_m[:, 1] < 2.0
     views = []
@@ -159,7 +158,7 @@ def test_office_rooms_are_furnished_and_differ():
 
 
 def test_the_bare_corridor_is_bare():
-    world = make_world(compose(["world=office", "seed=2"]))
+    world = Experiment.compose(["world=office", "seed=2"]).world()
     x1, y1, x2, y2 = world.places["corridor_bare"][0]
     ends = np.concatenate([world.walls[:, :2], world.walls[:, 2:]])
     assert not _inside(ends, np.array([x1 + 0.01, y1 + 0.01, x2 - 0.01, y2 - 0.01])).any()
@@ -180,7 +179,7 @@ def test_look_alikes_have_their_share():
 
 
 def test_landmarks_stand_proud_of_their_face():
-    world = make_world(compose(["world=gil2008", "seed=0"]))
+    world = Experiment.compose(["world=gil2008", "seed=0"]).world()
     assert len(world.landmarks) == 500
     gaps = np.array([world.clearance_m(p[:2]) for p in world.landmarks])
     assert np.all(gaps < 0.0101)
@@ -191,7 +190,7 @@ def test_landmarks_stand_proud_of_their_face():
 @pytest.mark.parametrize(("name", "share"), [("room", 0.9), ("corridor", 0.9), ("gil2008", 0.85)])
 def test_landmarks_face_the_floor(name, share):
     """Most landmarks are in sight from somewhere on the tour: none is behind an outer wall."""
-    world = make_world(compose([f"world={name}", "seed=1"]))
+    world = Experiment.compose([f"world={name}", "seed=1"]).world()
     seen = np.zeros(len(world.landmarks), bool)
     for point in along(world.waypoints, 0.5):
         hidden = ~seen
@@ -200,7 +199,7 @@ def test_landmarks_face_the_floor(name, share):
 
 
 def test_landmarks_are_on_walls_and_objects_by_their_shares():
-    world = make_world(compose(["world=gil2008", "seed=1", "world.on_walls_share=0.6"]))
+    world = Experiment.compose(["world=gil2008", "seed=1", "world.on_walls_share=0.6"]).world()
     low = world.wall_z_m[:, 1] < 2.5
     rows = [int(np.argmin(_distances(world.walls, p[:2]))) for p in world.landmarks]
     assert np.mean(~low[rows]) == pytest.approx(0.6, abs=0.01)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import yaml
 
-from experiments.runs.compose import compose
 from experiments.runs.experiment import make, make_estimator, make_prior, make_robot, make_world
 from sim.errors import InputError
 from sim.robot import DifferentialDrive, RobotGeometry

@@ -13,7 +13,6 @@ from experiments.gate.conform import walk
 from experiments.papers.gil2008 import claims as judge
 from experiments.papers.gil2008 import study
 from experiments.papers.gil2008.study import Arm, Scene
-from experiments.runs.compose import compose
 from tests.fakes import circle, tracking_prior
 
 SEEDS = range(1000, 1020)

@@ -9,7 +9,6 @@ import pytest
 from estimators.descriptors import retrieval
 from experiments.papers.maximo2024 import places
 from experiments.papers.maximo2024.places import GEOMETRIES, OXFORD, UMH, place_world
-from experiments.runs.compose import compose
 from experiments.runs.experiment import make_prior, make_recording
 from experiments.runs.version import ROOT
 from sim.errors import InputError

@@ -12,7 +12,6 @@ from estimators.base import run
 from experiments.gate import faults as planted
 from experiments.gate.faults import FAULTS, Pool, arrays, draw_check, grade, worsening
 from experiments.gate.suite import ERRORS, Entry, Suite, read_suite, suite_path
-from experiments.runs.compose import compose
 from experiments.runs.experiment import make_estimator
 from tests.fakes import circle, tracking_prior
 

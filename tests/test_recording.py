@@ -241,7 +241,6 @@ def test_processes_share_one_making(tmp_path):
 def test_two_processes_write_the_same_recording(tmp_path, rays):
     script = f"""
 import sys
-from experiments.runs.compose import compose
 from experiments.runs.experiment import simulate
 from sim.recording import save
 from pathlib import Path
@@ -264,8 +263,7 @@ print(save(simulate(config), Path(sys.argv[1])))
 
 
 def test_an_edited_world_file_is_another_recording(tmp_path):
-    from experiments.runs.compose import compose
-    from experiments.runs.experiment import make_recording
+        from experiments.runs.experiment import make_recording
 
     path = tmp_path / "w.yaml"
     overrides = [

@@ -5,8 +5,7 @@ import pytest
 
 from experiments.evaluation import registration_errors
 from experiments.evaluation.registration_errors import measured, scenes
-from experiments.runs.compose import compose
-from experiments.runs.experiment import make_world
+from experiments.runs.experiment import Experiment
 from sim import se2
 from sim.sensors import Laser, Mount
 
@@ -15,7 +14,7 @@ LASER = Laser(sigma_range_m=0.01, mount=Mount(x_m=0.1))
 
 @pytest.fixture(scope="module")
 def world():
-    return make_world(compose(["world=corridor", "seed=3"]))
+    return Experiment.compose(["world=corridor", "seed=3"]).world()
 
 
 def test_scenes_lie_in_their_place(world):

@@ -15,7 +15,6 @@ from experiments.gate import compare as regress
 from experiments.gate import report as regress_report
 from experiments.gate.compare import exchange_p, holm
 from experiments.gate.suite import ERRORS, fingerprint, read_suite, run_suite, suite_path
-from experiments.runs.compose import compose
 from experiments.runs.experiment import default_cache, make_recording
 from sim.errors import InputError
 

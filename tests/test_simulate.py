@@ -5,7 +5,6 @@ import dataclasses
 import numpy as np
 import pytest
 
-from experiments.runs.compose import compose
 from experiments.runs.experiment import make_world, simulate
 from experiments.runs.seeds import stream
 from sim import se2
@@ -114,7 +113,7 @@ def test_unmodelled_slip_is_off_unless_asked_for_and_adds_up_when_it_is():
 
 
 def test_frames_come_from_every_sensor_at_its_own_rate():
-    world = make_world(compose(["world=room", "seed=0"]))
+    world = Experiment.compose(["world=room", "seed=0"]).world()
     sensors = SensorSuite(
         Encoder(20.0), Laser(rate_hz=15.0, n_beams=31), StereoCamera(rate_hz=5.0), Lidar3D(1.0)
     )
@@ -130,7 +129,7 @@ def test_frames_come_from_every_sensor_at_its_own_rate():
 
 def test_stereo_sees_what_geometry_says():
     """Every observation is near its landmark; nothing behind a wall, out of view or too far."""
-    world = make_world(compose(["world=gil2008", "seed=3"]))
+    world = Experiment.compose(["world=gil2008", "seed=3"]).world()
     camera = StereoCamera(
         rate_hz=2.0, max_distance_m=6.0, sigma_column_px=0, sigma_row_px=0, sigma_disparity_px=0
     )
@@ -158,7 +157,7 @@ def test_stereo_sees_what_geometry_says():
 
 @pytest.mark.parametrize("selection", ["nearest", "random", "spread"])
 def test_selection_keeps_b_of_them(selection):
-    world = make_world(compose(["world=gil2008", "seed=3", "world.n_landmarks=800"]))
+    world = Experiment.compose(["world=gil2008", "seed=3", "world.n_landmarks=800"]).world()
     exact = {"sigma_column_px": 0.0, "sigma_row_px": 0.0, "sigma_disparity_px": 0.0}
     camera = StereoCamera(rate_hz=1.0, max_observations=5, selection=selection, **exact)
     sensors = SensorSuite(stereo=camera)
@@ -184,7 +183,7 @@ def test_selection_keeps_b_of_them(selection):
 
 @pytest.mark.bullet
 def test_the_robot_is_not_in_its_own_scan():
-    world = make_world(compose(["world=room", "seed=0"]))
+    world = Experiment.compose(["world=room", "seed=0"]).world()
     laser = Laser(n_beams=90, fov_rad=2 * np.pi, sigma_range_m=0.0, mount=Mount(z_m=0.05))
     recording = drive(PUZZLEBOT, (0.1, 0, 1.0), sensors=SensorSuite(laser=laser), world=world)
     assert recording.laser.ranges_m.min() > 0.3

@@ -14,7 +14,6 @@ import pytest
 
 from experiments.report.plot import sweep_figure
 from experiments.runs.cache import key_of
-from experiments.runs.compose import compose
 from experiments.runs.experiment import default_cache, files_digest, recording_settings
 from experiments.runs.row import read_rows
 from experiments.runs.run import run_key

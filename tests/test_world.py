@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from experiments.runs.compose import compose
-from experiments.runs.experiment import make_world
+from experiments.runs.experiment import Experiment
 from experiments.viewing.style import save_figure
 from experiments.viewing.world import draw_world, figure, world_figure
 from sim.errors import InputError
@@ -63,7 +62,7 @@ def test_a_world_that_makes_no_sense_is_refused(fields, message):
 
 
 def test_drawing_shows_what_is_asked_for(tmp_path):
-    world = make_world(compose(["world=office", "world.n_landmarks=50"]))
+    world = Experiment.compose(["world=office", "world.n_landmarks=50"]).world()
     ax = figure(4.0, 3.0).subplots()
     draw_world(ax, world)
     labels = ax.get_legend_handles_labels()[1]

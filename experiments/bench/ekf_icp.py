@@ -6,8 +6,7 @@ import statistics
 
 from estimators.base import run as run_estimator
 from experiments.bench.measure import Measurement
-from experiments.runs.compose import compose
-from experiments.runs.experiment import make_estimator, make_prior, simulate
+from experiments.runs.experiment import Experiment
 from experiments.runs.seeds import stream
 
 _LENGTH_M = 20.0
@@ -23,15 +22,15 @@ def run() -> list[Measurement]:
         "simulation.physics=kinematic",
         f"route.distance_m={_LENGTH_M}",
     ]
-    recording = simulate(compose(office))
+    recording = Experiment.compose(office).simulate()
     results = []
     for name in ("ekf_icp", "ekf_icp_paper", "icp_odometry"):
-        config = compose([*office, f"estimator={name}"])
+        experiment = Experiment.compose([*office, f"estimator={name}"])
+        prior = experiment.prior(recording)
         factors = []
         for repeat in range(3):
             rng = stream(repeat, "bench")
-            prior = make_prior(config, recording)
-            estimate = run_estimator(make_estimator(config), recording, prior, rng)
+            estimate = run_estimator(experiment.estimator(), recording, prior, rng)
             factors.append(recording.duration_s / estimate.step_seconds.sum())
         results.append(
             Measurement(

@@ -10,8 +10,7 @@ import numpy as np
 
 from experiments.bench.casting import hall
 from experiments.bench.measure import Measurement, median_time_s
-from experiments.runs.compose import compose
-from experiments.runs.experiment import make_world
+from experiments.runs.experiment import Experiment
 from experiments.runs.seeds import stream
 from sim.bullet import BulletBody
 from sim.robot import DifferentialDrive
@@ -26,7 +25,7 @@ CIRCLE = OpenLoop(((0.1, 0.2, SIMULATED_S - 0.4),))  # a metre across, clear of 
 
 def run() -> list[Measurement]:
     """Real-time factor of a minute at 10 Hz and 721 beams among 52 faces; one Bullet scan."""
-    world = make_world(compose(["world=boxes", "world.n_boxes=12"]))
+    world = Experiment.compose(["world=boxes", "world.n_boxes=12"]).world()
     sensors = SensorSuite(Encoder(None), Laser(rate_hz=10.0))
     factors = []
     for repeat in range(3):

@@ -10,19 +10,12 @@ import time
 
 from estimators.base import run as run_estimator
 from experiments.bench.measure import Measurement, median_time_s
-from experiments.runs.compose import compose
-from experiments.runs.experiment import (
-    Config,
-    default_cache,
-    make_estimator,
-    make_prior,
-    make_recording,
-)
-from experiments.runs.run import RESULTS, run_configuration
+from experiments.runs import paths
+from experiments.runs.evaluate import evaluate
+from experiments.runs.experiment import Experiment
+from experiments.runs.row import write_rows
 from experiments.runs.seeds import stream
-from experiments.runs.version import ROOT
 from experiments.sweeps.launch import run_and_record
-from sim.recording import Recording
 
 _NAME = "bench_sweep"
 _SHORT = ["simulation.physics=kinematic", "simulation.rays=exact", "route=linear_1"]
@@ -43,27 +36,20 @@ def run() -> list[Measurement]:
     try:
         return [*_overheads(), *_speedup(), _help()]
     finally:
-        shutil.rmtree(RESULTS / "runs" / _NAME, ignore_errors=True)
+        shutil.rmtree(paths.results() / "runs" / _NAME, ignore_errors=True)
 
 
 def _overheads() -> list[Measurement]:
-    config = compose([*_SHORT, f"name={_NAME}", "picture=false"])
-    config.pop("sweeps")
-    kept: list[Recording] = []
-
-    def fetch(wanted: Config) -> Recording:
-        if not kept:
-            kept.append(make_recording(wanted, default_cache()))
-        return kept[0]
-
-    run_and_record(config, {}, fetch)
-    prior = make_prior(config, kept[0])
-    estimator = make_estimator(config)
-    own_s = median_time_s(lambda: run_estimator(estimator, kept[0], prior, stream(0, "bench")))
+    experiment = Experiment.compose([*_SHORT, f"name={_NAME}", "picture=false"])
+    recording = experiment.recording()
+    run_and_record(experiment, lambda _: recording)
+    prior, estimator = experiment.prior(recording), experiment.estimator()
+    own_s = median_time_s(lambda: run_estimator(estimator, recording, prior, stream(0, "bench")))
 
     def packed(repeats: int) -> float:
+        many = experiment.replaced(repeats=repeats)
         begun = time.process_time()
-        run_configuration({**config, "repeats": repeats}, {}, fetch)
+        write_rows(evaluate(many, recording), many.rows_folder / f"{many.key}.parquet")
         return time.process_time() - begun
 
     slopes = [(packed(_MANY) - packed(_FEW)) / (_MANY - _FEW) - own_s for _ in range(3)]
@@ -88,7 +74,7 @@ def _overheads() -> list[Measurement]:
 
 def _swept_s(n_runs: int) -> float:
     """Wall time of a sweep over values of a belief, recording at hand, without a cached row."""
-    shutil.rmtree(RESULTS / "runs" / _NAME, ignore_errors=True)
+    shutil.rmtree(paths.results() / "runs" / _NAME, ignore_errors=True)
     values = ",".join(f"{1e-6 * (i + 1):.7g}" for i in range(n_runs))
     return _timed(
         ["run", "-m", *_SHORT, f"name={_NAME}", f"estimator.kr={values}", "hydra/launcher=basic"]
@@ -101,7 +87,7 @@ def _speedup() -> list[Measurement]:
     for n_runs, goal in ((24, None), (200, 1.8)):
         seconds = {}
         for launcher in ("joblib", "joblib", "basic"):  # the first makes the recordings
-            shutil.rmtree(RESULTS / "runs" / _NAME, ignore_errors=True)
+            shutil.rmtree(paths.results() / "runs" / _NAME, ignore_errors=True)
             chosen = [f"hydra/launcher={launcher}"]
             if launcher == "joblib":
                 chosen.append("hydra.launcher.n_jobs=2")
@@ -130,7 +116,6 @@ def _timed(arguments: list[str]) -> float:
     subprocess.run(
         [sys.executable, "-m", "experiments.cli", *arguments],
         check=True,
-        cwd=ROOT,
         capture_output=True,
     )
     return time.perf_counter() - begun

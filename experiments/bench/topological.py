@@ -13,7 +13,8 @@ import numpy as np
 from estimators.base import Prior
 from estimators.topological_mcl import TopologicalMcl
 from experiments.bench.measure import Measurement
-from experiments.papers.maximo2024.places import GEOMETRIES, PlaceWorld, place_world
+from experiments.runs.experiment import Experiment
+from sim.recording import Recording
 
 PAPER_S = {
     "oxford": {794: 0.26, 1588: 0.36, 2382: 0.46, 3176: 0.58},
@@ -27,9 +28,11 @@ def run() -> list[Measurement]:
     """Each count, with the paper's filter; the defaults for the largest ones."""
     results: list[Measurement] = []
     for name, times_s in PAPER_S.items():
-        world = place_world(GEOMETRIES[name], 1000)
+        experiment = Experiment.compose([f"study=maximo2024_{name}", "seed=1000"])
+        recording = experiment.recording()
+        prior = experiment.prior(recording)
         for n_particles, paper_s in times_s.items():
-            per_node = n_particles // len(world.known_map)
+            per_node = n_particles // len(prior.map)
             filters = {"": _paper(per_node)}
             if n_particles == max(times_s):
                 filters["_odometry"] = TopologicalMcl(particles_per_node=per_node)
@@ -37,7 +40,7 @@ def run() -> list[Measurement]:
                 results.append(
                     Measurement(
                         f"topological.node_{n_particles}{suffix}_ms",
-                        1e3 * _median_step_s(estimator, world),
+                        1e3 * _median_step_s(estimator, recording, prior),
                         "ms",
                         None if suffix else _GOAL_MS,
                         note=f"{name}, 512-d; paper {1e3 * paper_s:.0f} ms",
@@ -57,11 +60,9 @@ def _paper(particles_per_node: int) -> TopologicalMcl:
     )
 
 
-def _median_step_s(estimator: TopologicalMcl, world: PlaceWorld) -> float:
+def _median_step_s(estimator: TopologicalMcl, recording: Recording, prior: Prior) -> float:
     """Median time of a step over whole runs of the route; the first run is not counted."""
-    recording = world.recording
     frames = list(recording.frames())
-    prior = Prior(recording.robot, recording.sensors, map=world.known_map)
     times_ns = []
     for round_ in range(_ROUNDS):
         estimator.reset(prior, np.random.default_rng(round_))

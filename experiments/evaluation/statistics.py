@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,7 +13,6 @@ from scipy import stats
 from sim.errors import InputError
 
 Array = NDArray[np.float64]
-Verdict = Literal["reproduced", "not reproduced", "undecided"]
 
 
 @dataclass(frozen=True)
@@ -25,19 +23,10 @@ class Interval:
     low: float
     high: float
 
-
-def verdict(interval: Interval, at_least: float = -math.inf, at_most: float = math.inf) -> Verdict:
-    """Judge an interval against [at_least, at_most]: inside, wholly outside, or spanning.
-
-    An interval without bounds, for lack of data, decides nothing.
-    """
-    if not (math.isfinite(interval.low) and math.isfinite(interval.high)):
-        return "undecided"
-    if interval.low >= at_least and interval.high <= at_most:
-        return "reproduced"
-    if interval.high < at_least or interval.low > at_most:
-        return "not reproduced"
-    return "undecided"
+    @classmethod
+    def exact(cls, value: float) -> Interval:
+        """Interval of a value that has no spread."""
+        return cls(value, value, value)
 
 
 def mean_interval(values: ArrayLike) -> Interval:

@@ -33,15 +33,22 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from experiments.gate.suite import ERRORS, Suite, read_suite, run_suite, suite_path
+from experiments.runs.paths import packaged, results
 from experiments.runs.seeds import stream
-from experiments.runs.version import ROOT, code_version
+from experiments.runs.version import code_version
 from sim.errors import InputError
 from sim.files import write_whole
 
 Array = NDArray[np.float64]
 Verdict = Literal["identical", "equal", "changed", "better", "worse", "failed"]
 
-BASELINES = ROOT / "results" / "baselines"
+
+def baseline_folder() -> Path:
+    """Folder of the main suite's baselines: that of the results, else those that came along."""
+    own = results() / "baselines"
+    return own if own.exists() else packaged("results/baselines")
+
+
 ALPHA_REAL = 0.002  # of a whole check
 ALPHA_GENERAL = 0.05  # of one error of one estimator
 ROUNDING = 1e-6  # of an error, as a share; machines differ by less than 1e-9
@@ -392,7 +399,7 @@ def baseline_paths(suite: str) -> dict[str, Path]:
 
     Those of a suite other than conf/suite/check.yaml lie beside it: `mine.baselines/check.csv`.
     """
-    folder = BASELINES if is_main(suite) else suite_path(suite).with_suffix(".baselines")
+    folder = baseline_folder() if is_main(suite) else suite_path(suite).with_suffix(".baselines")
     return {"accepted": folder / "check.csv", "release": folder / "release.csv"}
 
 

@@ -18,10 +18,12 @@ import yaml
 from numpy.typing import NDArray
 
 from estimators.base import Belief, Estimator, Prior
+from experiments.runs.experiment import Experiment
 from experiments.runs.seeds import stream
 from sim import se2
 from sim.errors import InputError
 from sim.recording import Recording
+from sim.robot import RobotGeometry
 from sim.sensors import SensorSuite
 from sim.world import World
 
@@ -313,12 +315,18 @@ def conform_target(target: str, arguments: Sequence[str]) -> list[CheckResult]:
     if not callable(getattr(cls, "step", None)):
         raise InputError(f"{target} has no method step; give MODULE:CLASS of an estimator")
     if "place" in getattr(cls, "needs", ()):
-        from experiments.papers.maximo2024.places import example as place_example
-
         recording, prior = place_example()
     else:
         recording, prior = example()
     return check_estimator(lambda: cls(**keywords), recording, prior)
+
+
+def place_example() -> tuple[Recording, Prior]:
+    """Return a route of places, and a tracking prior with its map."""
+    start = ["prior.start=tracking", "prior.sigma_position_m=0.5", "prior.sigma_heading_rad=0.1"]
+    experiment = Experiment.compose(["study=maximo2024_umh", *start])
+    recording = experiment.recording()
+    return recording, experiment.prior(recording)
 
 
 def _value(text: str) -> Any:
@@ -330,26 +338,23 @@ def _value(text: str) -> Any:
 
 def example() -> tuple[Recording, Prior]:
     """Return a short recording with all sensors in a room, and a tracking prior with its map."""
-    from experiments.runs.compose import compose
-    from experiments.runs.experiment import simulate
-    from sim.robot import RobotGeometry
-
-    config = compose(
+    experiment = Experiment.compose(
         [
             "world=room",
             "sensors=lms291",
             "sensors.laser.rate_hz=10",
             "route.distance_m=4",
             "simulation.physics=kinematic",
-            "simulation.rays=exact",
         ]
     )
-    extra = compose(["sensors=stereo_pixel"])["sensors"]
-    config["sensors"]["stereo"] = {**extra["stereo"], "rate_hz": 5.0}
-    recording = simulate(config)
+    sensors = experiment.config["sensors"]
+    stereo = Experiment.compose(["sensors=stereo_pixel"]).config["sensors"]["stereo"]
+    sensors = {**sensors, "stereo": {**stereo, "rate_hz": 5.0}}
+    experiment = experiment.replaced(sensors=sensors)
+    recording, robot = experiment.simulate(), experiment.robot()
     truth = recording.truth
     assert truth is not None
-    robot = RobotGeometry(config["robot"]["wheel_radius_m"], config["robot"]["track_m"])
     spread = np.diag(np.square([0.02, 0.02, 0.01]))
-    prior = Prior(robot, recording.sensors, truth.poses[0].copy(), spread, truth.world)
-    return recording, prior
+    believed = RobotGeometry(robot.wheel_radius_m, robot.track_m)
+    start = truth.poses[0].copy()
+    return recording, Prior(believed, recording.sensors, start, spread, truth.world)

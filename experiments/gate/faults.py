@@ -43,8 +43,8 @@ from experiments.evaluation.statistics import share_interval
 from experiments.gate.compare import (
     ALPHA_GENERAL,
     ALPHA_REAL,
-    BASELINES,
     Finding,
+    baseline_folder,
     baseline_paths,
     compare,
     examine,
@@ -54,9 +54,9 @@ from experiments.gate.compare import (
 from experiments.gate.power_figure import detectable
 from experiments.gate.suite import ERRORS, Suite, read_suite, run_suite, suite_path
 from experiments.runs.console import progress
+from experiments.runs.paths import SOURCE, results
 from experiments.runs.row import write_frame
 from experiments.runs.seeds import stream
-from experiments.runs.version import ROOT
 from experiments.viewing.style import save_figure
 from sim.files import write_whole
 from sim.recording import Frame, LandmarkSet
@@ -614,17 +614,13 @@ def power_table(pool: Pool, n_checks: int, on_progress: Callable[[float], None])
     return pd.DataFrame(rows)
 
 
-def run_variant(name: str, suite: Suite, folder: Path) -> pd.DataFrame:
-    """Whole run of a suite as equal code may give it, in this process's environment.
-
-    Recordings are made anew in a folder of their own, since their last bits change too.
-    """
+def run_variant(name: str, suite: Suite) -> pd.DataFrame:
+    """Whole run of a suite as equal code may give it, in this process's environment."""
     number = 10 + list(VARIANTS).index(name)
-    environment, reorders = VARIANTS[name]
+    reorders = VARIANTS[name][1]
     repeats = {entry.name: entry.repeats[1] for entry in suite.estimators}
     planted = dict.fromkeys(repeats, reordered) if reorders else None
-    cache = folder / f"recordings_{number}" if environment else None
-    return run_suite(suite, repeats, reseed=number, planted=planted, cache=cache)
+    return run_suite(suite, repeats, reseed=number, planted=planted)
 
 
 def variants(
@@ -632,7 +628,7 @@ def variants(
 ) -> list[dict[str, Any]]:
     """Whole checks of equal code under other conditions, each in a process of its own."""
     rows = []
-    baselines = {key: read_baseline(path).rows for key, path in baseline_paths(suite_name).items()}
+    then = {key: read_baseline(path).rows for key, path in baseline_paths(suite_name).items()}
     for done, (name, (environment, _)) in enumerate(VARIANTS.items(), start=1):
         path = folder / f"variant_{done}.parquet"
         if not path.exists():
@@ -649,12 +645,14 @@ def variants(
             ]
             compiled = {"NUMBA_CACHE_DIR": str(folder / f"compiled_{done}")}
             own = {**environment, **(compiled if "NUMBA_CPU_NAME" in environment else {})}
-            subprocess.run(command, check=True, env={**os.environ, **own}, cwd=ROOT)
+            if environment:  # the last bits of recordings change too
+                own["ESTIMA_RESULTS"] = str(folder / f"results_{done}")
+            subprocess.run(command, check=True, env={**os.environ, **own})
         rows_now = pd.read_parquet(path)
         known = rows_now["recording"].groupby(rows_now["estimator"]).max()
         of_pool = {  # the pool may hold fewer recordings
             key: rows_then[rows_then["recording"] <= rows_then["estimator"].map(known)]
-            for key, rows_then in baselines.items()
+            for key, rows_then in then.items()
         }
         found = compare(of_pool, rows_now)
         fixed = [f for f in found if f.verdict == "identical"]
@@ -750,15 +748,13 @@ def main() -> None:
     parser.add_argument(
         "--share", type=float, default=1.0, help="share of the recordings in the pool (0.1: quick)"
     )
-    parser.add_argument("--folder", type=Path, default=ROOT / "results" / "runs" / "planted")
+    parser.add_argument("--folder", type=Path, default=results() / "runs" / "planted")
     parser.add_argument("--variant", choices=list(VARIANTS), help=argparse.SUPPRESS)
     parser.add_argument("--out", type=Path, help=argparse.SUPPRESS)
     given = parser.parse_args()
     suite = read_suite(suite_path(given.suite))
     if given.variant:
-        run_variant(given.variant, pooled(suite, given.share), given.folder).to_parquet(
-            given.out, index=False
-        )
+        run_variant(given.variant, pooled(suite, given.share)).to_parquet(given.out, index=False)
         return
     if not 0.05 <= given.share <= 1.0:
         parser.error("--share must lie in 0.05..1")
@@ -772,9 +768,9 @@ def main() -> None:
     hits, _ = alarms(pool, n_null, 0)
     print(f"{hits} false alarms in {n_null} checks")
     print(power.to_string(index=False))
-    write_frame(power, BASELINES / "power.csv")
-    save_figure(detectable(power, TARGET), ROOT / "docs" / "regression.png")
-    page = ROOT / "docs" / "regression.md"
+    write_frame(power, baseline_folder() / "power.csv")
+    save_figure(detectable(power, TARGET), SOURCE / "docs" / "regression.png")
+    page = SOURCE / "docs" / "regression.md"
     _write_measured(page, measured_text(pool, (hits, n_null), power, []))
     with progress("conditions, share", 1.0) as on_progress:
         equal = variants(given.suite, given.share, folder, on_progress)

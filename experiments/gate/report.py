@@ -13,10 +13,10 @@ from pathlib import Path
 import pandas as pd
 
 from experiments.gate.compare import (
-    BASELINES,
     Finding,
     Verdict,
     accept,
+    baseline_folder,
     baseline_paths,
     check,
     is_main,
@@ -27,7 +27,6 @@ from sim.errors import InputError
 from sim.files import write_whole
 
 LABELS = {"ate_rmse_m": "position", "ate_aligned_rmse_m": "aligned", "heading_rmse_rad": "heading"}
-POWER = BASELINES / "power.csv"  # what experiments.gate.faults measured
 _RANK: tuple[Verdict, ...] = ("failed", "worse", "better", "changed", "equal", "identical")
 _MEANING = {
     "identical": "same errors to rounding",
@@ -100,15 +99,16 @@ def _say(text: str) -> None:
 
 def smallest_found() -> dict[str, float]:
     """Smallest worsening of each estimator, as a share, that 95 % of checks of the suite find."""
-    if not POWER.exists():
+    power = baseline_folder() / "power.csv"  # what experiments.gate.faults measured
+    if not power.exists():
         return {}
     try:
-        table = pd.read_csv(POWER, comment="#")
+        table = pd.read_csv(power, comment="#")
         return {str(k): float(v) for k, v in table.groupby("estimator")["smallest"].max().items()}
     except (OSError, ValueError, TypeError, KeyError) as error:
         why = str(error).splitlines()[0]
         raise InputError(
-            f"{POWER}: damaged ({why}); restore it, e.g. git checkout -- {POWER}"
+            f"{power}: damaged ({why}); restore it, e.g. git checkout -- {power}"
         ) from error
 
 

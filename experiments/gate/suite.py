@@ -10,7 +10,7 @@ import dataclasses
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,18 +19,12 @@ import numpy as np
 import pandas as pd
 import yaml
 
-from estimators.base import Estimate, Estimator, run
-from experiments.evaluation.metrics import score
-from experiments.runs.compose import compose
-from experiments.runs.experiment import (
-    Config,
-    default_cache,
-    make_estimator,
-    make_prior,
-    make_recording,
-)
+from estimators.base import Estimator
+from experiments.runs import paths
+from experiments.runs.evaluate import evaluate
+from experiments.runs.experiment import Experiment
+from experiments.runs.row import Outcome
 from experiments.runs.seeds import stream
-from experiments.runs.version import ROOT
 from sim.errors import InputError
 from sim.recording import Recording
 
@@ -173,7 +167,7 @@ def _entry(name: Any, given: dict[str, Any]) -> Entry:
 
 def suite_path(name: str) -> Path:
     """File of a suite by its name, or the path itself."""
-    return Path(name) if name.endswith(".yaml") else ROOT / "conf" / "suite" / f"{name}.yaml"
+    return Path(name) if name.endswith(".yaml") else paths.CONF / "suite" / f"{name}.yaml"
 
 
 def run_suite(
@@ -182,7 +176,6 @@ def run_suite(
     *,
     reseed: int = 0,
     planted: Mapping[str, Planted] | None = None,
-    cache: Path | None = None,
     on_progress: Callable[[float], None] | None = None,
     n_jobs: int = -1,
 ) -> pd.DataFrame:
@@ -196,8 +189,6 @@ def run_suite(
         Number of the seeding of the estimators' streams.
     planted
         Faults planted in estimators, by name: a context that gives the faulty one.
-    cache
-        Folder of the recordings.
     on_progress
         Called with the share of the recordings done.
 
@@ -209,19 +200,18 @@ def run_suite(
     """
     from joblib import Parallel, delayed
 
-    cache = cache or default_cache()
     jobs = []
     for group, count in suite.counts.items():
         entries = [e for e in suite.estimators if e.recordings == group and e.name in repeats]
         if not entries:
             continue
-        configs = [_compose(suite, entry) for entry in entries]
+        experiments = [_experiment(suite, entry, repeats) for entry in entries]
         for seed in range(suite.first_seed, suite.first_seed + count):
             runs = [
-                (entry, config, repeats[entry.name], (planted or {}).get(entry.name))
-                for entry, config in zip(entries, configs, strict=True)
+                (entry, experiment, (planted or {}).get(entry.name))
+                for entry, experiment in zip(entries, experiments, strict=True)
             ]
-            jobs.append((seed, runs, reseed, cache))
+            jobs.append((seed, runs, reseed))
     done: Iterable[list[dict[str, Any]]] = Parallel(n_jobs=n_jobs, return_as="generator")(
         delayed(_run_recording)(*job) for job in jobs
     )
@@ -233,62 +223,56 @@ def run_suite(
     return pd.DataFrame(rows)
 
 
-def _compose(suite: Suite, entry: Entry) -> Config:
-    """Configuration of an estimator over its recordings, whatever their seed."""
-    return compose(
-        [*suite.overrides[entry.recordings], f"estimator={entry.name}", *entry.overrides]
-    )
+def _experiment(suite: Suite, entry: Entry, repeats: Mapping[str, int]) -> Experiment:
+    """An estimator over its recordings, whatever their seed."""
+    overrides = [*suite.overrides[entry.recordings], f"estimator={entry.name}", *entry.overrides]
+    return Experiment.compose(overrides).replaced(repeats=repeats[entry.name])
 
 
 def _run_recording(
-    seed: int,
-    runs: Sequence[tuple[Entry, Config, int, Planted | None]],
-    reseed: int,
-    cache: Path,
+    seed: int, runs: Sequence[tuple[Entry, Experiment, Planted | None]], reseed: int
 ) -> list[dict[str, Any]]:
     """Rows of all runs over one recording."""
     rows = []
     recording: Recording | None = None
-    for entry, config, repeats, planted in runs:
-        config = {**config, "seed": seed, "world_seed": seed}
+    for entry, experiment, planted in runs:
+        experiment = experiment.replaced(seed=seed, world_seed=seed)
         if recording is None:
-            recording = make_recording(config, cache)
+            recording = experiment.recording()
             origin = {"checksum": recording.checksum[:12], "fingerprint": fingerprint(recording)}
-        prior = make_prior(config, recording)
-        for repeat in range(repeats):
-            index = repeat + _RESEEDED * reseed
-            rng = stream(seed, f"estimator/{entry.name}", index)
-            plant = planted or (lambda estimator, _: nullcontext(estimator))
-            try:
-                with plant(make_estimator(config), stream(seed, "fault", index)) as estimator:
-                    estimate = run(estimator, recording, prior, rng)
-                    if entry.revised:
-                        estimate = _finish(estimator)
-                scores, status = score(recording, estimate), "ok"
-            except InputError:
-                raise
-            except Exception as error:  # the gate's business: told as a failed run
-                scores, status = (
-                    {},
-                    printable(f"{type(error).__name__}: {error}".replace("\n", " ")),
-                )
-            errors = {name: scores.get(name, math.nan) for name in ERRORS}
-            row = {"estimator": entry.name, "recording": seed, "repeat": repeat}
-            rows.append({**row, **origin, **errors, "status": status})
+        for row in evaluate(
+            experiment,
+            recording,
+            streams=_streams(f"estimator/{entry.name}", seed, reseed),
+            planted=None if planted is None else _plant(planted, seed, reseed),
+        ):
+            prefix = "revised_" if entry.revised else ""
+            if entry.revised and row["status"] == Outcome.OK and "revised_ate_rmse_m" not in row:
+                raise InputError(f"{entry.name} has no finish; drop `revised` from the suite")
+            status = "ok"
+            collided = row["status_code"] == "recording"  # not the estimator's business
+            if row["status"] == Outcome.FAILED and not collided:
+                status = printable(f"{row['status_code']}: {row['status_detail']}")
+            which = {"estimator": entry.name, "recording": seed, "repeat": row["repeat"]}
+            errors = {name: row.get(prefix + name, math.nan) for name in ERRORS}
+            rows.append({**which, **origin, **errors, "status": status})
     return rows
+
+
+def _streams(axis: str, seed: int, reseed: int) -> Callable[[int], np.random.Generator]:
+    return lambda repeat: stream(seed, axis, repeat + _RESEEDED * reseed)
+
+
+def _plant(
+    planted: Planted, seed: int, reseed: int
+) -> Callable[[Estimator, int], AbstractContextManager[Estimator]]:
+    streams = _streams("fault", seed, reseed)
+    return lambda estimator, repeat: planted(estimator, streams(repeat))
 
 
 def printable(text: str) -> str:
     """One line of text without what XML 1.0 forbids, and what would steer a terminal."""
     return _UNPRINTABLE.sub("?", text)
-
-
-def _finish(estimator: Estimator) -> Estimate:
-    finish = getattr(estimator, "finish", None)
-    if finish is None:
-        raise InputError(f"{type(estimator).__name__} has no finish; drop `revised` from the suite")
-    revised: Estimate = finish()
-    return revised
 
 
 def fingerprint(recording: Recording) -> float:

@@ -10,16 +10,18 @@ import time
 from pathlib import Path
 from types import ModuleType
 
-from experiments.report.claims import Claim, read, write
+from experiments.evaluation.verdict import Claim, Profile
+from experiments.papers.results import Results
+from experiments.report.claims import read_claims, write_claims
 from experiments.report.page import note_provenance, read_provenance, write_report
 from experiments.runs.console import progress
-from experiments.runs.version import ROOT
+from experiments.runs.paths import results, short
 from experiments.viewing.style import save_figure
 from sim.errors import InputError
 
 PAPERS = ("puzzlebot2024", "decristoforis2020", "maximo2024", "gil2008")
 LOGS = ("real_logs",)  # run only where the logs are
-RESULTS = ROOT / "results"
+_APART = "_tuning"  # a table made on other seeds, that parameters were chosen by
 
 
 def reproduce(*, full: bool = False, only: str | None = None) -> None:
@@ -32,52 +34,67 @@ def reproduce(*, full: bool = False, only: str | None = None) -> None:
     only
         A paper's short name, or None for all of them.
     """
-    known = (*PAPERS, *LOGS)
-    if only is not None and only not in known:
-        raise InputError(f"--paper must be one of {', '.join(known)}, got {only!r}")
-    read(RESULTS / "claims.csv")  # what cannot be added to is said before hours are spent
-    profile, made = "full" if full else "quick", read_provenance(RESULTS)
-    for paper in known if only is None else (only,):
-        begun, study = time.monotonic(), _study(paper)
-        if paper in LOGS and (why := study.missing()):
+    place = results()
+    read_claims(place / "claims.csv")  # what cannot be added to is said before hours are spent
+    profile, made = Profile.FULL if full else Profile.QUICK, read_provenance(place)
+    for paper in _chosen(only):
+        begun = time.monotonic()
+        if paper in LOGS and (why := _part(paper, "study").missing()):
             print(f"{paper}: left out, {why}", file=sys.stderr)
             continue
-        if not full and made.get(paper, {}).get("profile") == "full":
+        if not full and made.get(paper, {}).get("profile") == Profile.FULL:
             print(
                 f"{paper}: replaces the judged results of {paper}; `git checkout results` brings "
                 "them back",
                 file=sys.stderr,
             )
-        claims = reproduce_paper(study, paper, profile)
-        seconds = time.monotonic() - begun
-        _print(claims)
-        print(f"{paper}: {seconds:.0f} s", file=sys.stderr)
-    write_report(RESULTS)
-    print(
-        "report: results/report.html, claims: results/claims.csv, figures: results/figures, "
-        "tables: results/tables"
-    )
+        _print(reproduce_paper(paper, profile))
+        print(f"{paper}: {time.monotonic() - begun:.0f} s", file=sys.stderr)
+    write_report(place)
+    named = {"report": "report.html", "claims": "claims.csv"}
+    named |= {kind: kind for kind in ("figures", "tables")}
+    print(", ".join(f"{what}: {short(place / name)}" for what, name in named.items()))
 
 
-def reproduce_paper(study: ModuleType, paper: str, profile: str) -> list[Claim]:
-    """Run one paper's study, and put its tables, figures, claims and origin in place.
+def redraw(only: str | None = None) -> None:
+    """Draw the figures again, from the tables and arrays that the studies left."""
+    place = results()
+    for paper in _chosen(only):
+        begun = time.monotonic()
+        if not list((place / "tables").glob(f"{paper}_*.csv")):
+            print(f"{paper}: left out, no tables in {short(place)}", file=sys.stderr)
+            continue
+        _draw(Results(place, paper))
+        print(f"{paper}: {time.monotonic() - begun:.0f} s", file=sys.stderr)
+
+
+def reproduce_paper(paper: str, profile: Profile) -> list[Claim]:
+    """Run one paper's study, and put its files, claims and origin in place.
 
     All are made apart first, so an end in between leaves the results as they were.
     """
-    begun, aside = time.monotonic(), RESULTS / "cache"  # which is not committed
+    begun, place = time.monotonic(), results()
+    aside = place / "cache"  # which is not committed
     aside.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=aside, prefix=f"{paper}-") as name:
-        folder = Path(name)
+        made = Results(Path(name), paper)
         with progress(paper, 1.0) as on_progress:
-            tables = study.run(profile, folder / "tables", on_progress)
-        for title, page in study.figures(tables).items():
-            save_figure(page, folder / "figures" / f"{title}.png")
-        claims: list[Claim] = study.claims(tables, quick=profile == "quick")
-        for kind in ("tables", "figures"):
-            _put_in_place(folder / kind, RESULTS / kind, paper)
-        write(claims, RESULTS / "claims.csv")
-        note_provenance(RESULTS, paper, profile, time.monotonic() - begun)
+            _part(paper, "study").run(profile, made, on_progress)
+        _draw(made)
+        claims: list[Claim] = _part(paper, "claims").judge(made)
+        for kind in ("tables", "arrays", "figures"):
+            _put_in_place(made.folder / kind, place / kind, paper)
+        command = f"estima reproduce --paper {paper}"
+        command += " --full" if profile is Profile.FULL else ""
+        path = place / "claims.csv"
+        write_claims(claims, path, paper=paper, profile=profile, command=command)
+        note_provenance(place, paper, profile, time.monotonic() - begun)
     return claims
+
+
+def _draw(made: Results) -> None:
+    for title, page in _part(made.paper, "figures").draw(made).items():
+        save_figure(page, made.folder / "figures" / f"{title}.png")
 
 
 def _put_in_place(new: Path, old: Path, paper: str) -> None:
@@ -97,14 +114,22 @@ def _put_in_place(new: Path, old: Path, paper: str) -> None:
         ) from error
 
 
-_APART = "_tuning"  # a table made on other seeds, that parameters were chosen by
+def _chosen(only: str | None) -> tuple[str, ...]:
+    known = (*PAPERS, *LOGS)
+    if only is not None and only not in known:
+        raise InputError(f"--paper must be one of {', '.join(known)}, got {only!r}")
+    return known if only is None else (only,)
 
 
-def _study(paper: str) -> ModuleType:
-    return importlib.import_module(f"experiments.papers.{paper}.study")
+def _part(paper: str, name: str) -> ModuleType:
+    return importlib.import_module(f"experiments.papers.{paper}.{name}")
 
 
 def _print(claims: list[Claim]) -> None:
     for claim in claims:
-        interval = f"{claim.value:.4g} [{claim.low:.4g}, {claim.high:.4g}]"
-        print(f"{claim.id}  {claim.verdict:<24} {claim.statistic}: {interval} ({claim.criterion})")
+        found = claim.found
+        interval = f"{found.value:.4g} [{found.low:.4g}, {found.high:.4g}]"
+        print(
+            f"{claim.id}  {claim.verdict.label:<15} {claim.statistic}: {interval} "
+            f"({claim.criterion})"
+        )

@@ -1,19 +1,31 @@
-"""A content-addressed cache of recordings: a sweep simulates each of them once."""
+"""A cache of recordings, addressed by what decides their bits: a sweep simulates each of them once.
+
+It holds at most $ESTIMA_CACHE_GIB (8 unless set); the recordings used longest ago go first.
+"""
 
 from __future__ import annotations
 
 import fcntl
 import hashlib
 import json
+import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from experiments.runs import paths
 from experiments.runs.version import SIMULATION, code_version
 from sim.errors import InputError
 from sim.recording import Recording, load, save
+
+_LIMIT_GIB = 8.0
+
+
+def folder() -> Path:
+    """Folder of the cached recordings."""
+    return paths.results() / "cache" / "recordings"
 
 
 def key_of(settings: dict[str, Any]) -> str:
@@ -22,23 +34,77 @@ def key_of(settings: dict[str, Any]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:24]
 
 
-def cached(folder: Path, settings: dict[str, Any], make: Callable[[], Recording]) -> Recording:
-    """Recording of the settings, from the cache or made now and kept.
+def cached(key: str, make: Callable[[], Recording]) -> Recording:
+    """Recording of the key, from the cache, or made now and kept.
 
     Safe under several processes: the second one waits for the first and reads its file. A file
-    that does not match its checksum is thrown away and made again.
+    that does not match its checksum is dropped and made again.
     """
-    path = folder / f"{key_of(settings)}.npz"
-    with _locked(path.with_suffix(".lock")):
+    path = folder() / f"{key}.npz"
+    with _locked(path):
         if path.exists():
             try:
-                return load(path)
+                recording = load(path)
+                os.utime(path)
+                return recording
             except InputError as error:
-                print(f"estima: {error}; it is made anew", file=sys.stderr)
+                print(f"estima: {error}; making it again", file=sys.stderr)
                 path.unlink(missing_ok=True)
         recording = make()
         save(recording, path)
+        trim(limit_bytes())
     return recording
+
+
+def limit_bytes() -> float:
+    """Size limit of the cache.
+
+    Raises
+    ------
+    InputError
+        If ESTIMA_CACHE_GIB is not a number from 0 on.
+    """
+    text = os.environ.get("ESTIMA_CACHE_GIB") or str(_LIMIT_GIB)
+    try:
+        limit = float(text)
+    except ValueError:
+        limit = -1.0
+    if not limit >= 0.0:
+        raise InputError(f"ESTIMA_CACHE_GIB must be a number of GiB from 0 on, got {text!r}")
+    return limit * 2**30
+
+
+def files() -> list[tuple[Path, int]]:
+    """Cached recordings and their sizes in bytes, those used longest ago first."""
+    found = []
+    for path in folder().glob("*.npz"):
+        try:
+            about = path.stat()
+        except FileNotFoundError:  # another process dropped it
+            continue
+        found.append((about.st_mtime_ns, path, about.st_size))
+    return [(path, size) for _, path, size in sorted(found)]
+
+
+def trim(most_bytes: float) -> int:
+    """Drop the recordings used longest ago until the rest fit; return how many went.
+
+    One that a process is reading or writing at this moment stays.
+    """
+    kept, dropped = files(), 0
+    excess = sum(size for _, size in kept) - most_bytes
+    for path, size in kept:
+        if excess <= 0.0:
+            break
+        with path.with_suffix(".lock").open("w") as handle:
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                continue
+            path.unlink(missing_ok=True)
+        excess -= size
+        dropped += 1
+    return dropped
 
 
 @contextmanager
@@ -46,11 +112,11 @@ def _locked(path: Path) -> Iterator[None]:
     """Hold an exclusive lock, which the system frees even if the process is killed."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle = path.open("w")
+        handle = path.with_suffix(".lock").open("w")
     except OSError as error:
         raise InputError(
-            f"{path}: cannot write to the cache ({error.strerror}); free some space, or make "
-            f"{path.parent} a link to a larger disk"
+            f"{path}: cannot write to the cache ({error.strerror}); free some space, or choose "
+            "another folder of results with ESTIMA_RESULTS"
         ) from error
     with handle:
         fcntl.flock(handle, fcntl.LOCK_EX)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import sys
 import textwrap
 import time
@@ -10,8 +11,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, NoReturn
 
+from sim.errors import InputError
+
 _QUIET_S = 2.0  # what ends sooner needs no progress
 _LINE_EVERY_S = 10.0  # where the output is a file
+
+
+class RunFailedError(Exception):
+    """A run failed; its row says how."""
 
 
 @contextmanager
@@ -74,25 +81,32 @@ class _Progress:
 def end(error: BaseException) -> NoReturn:
     """End the program with one line for what the user can mend: code 2 for input, 1 for failures.
 
-    A fault of ours ends with its trace and code 3.
+    An internal error ends with its trace and code 3.
     """
     chain: list[BaseException] = [error]
     while (before := chain[-1].__cause__ or chain[-1].__context__) is not None:
         chain.append(before)
     for link in chain:
-        kind, module = type(link).__name__, type(link).__module__
-        if kind == "InputError":
+        if isinstance(link, InputError):
             _say(str(link), 2)
-        if kind == "RunFailedError":
+        if isinstance(link, RunFailedError):
             _say(f"the run failed: {link}", 1)
         if isinstance(link, KeyboardInterrupt):
             _say("interrupted; what was finished is kept", 1)
-        if module.startswith(("hydra.", "omegaconf.")):
+        if isinstance(link, _configuration_errors()):
             lines = [line.strip() for line in str(link).splitlines() if line.strip()]
             text = textwrap.shorten(" ".join(lines), 600, placeholder=" ...")
             _say(f"configuration: {text}; see estima run --cfg job", 2)
     traceback.print_exception(error)
     sys.exit(3)
+
+
+def _configuration_errors() -> tuple[type[Exception], ...]:
+    """Errors of Hydra and OmegaConf, if they have been imported at all."""
+    if "hydra" not in sys.modules:
+        return ()
+    hydra, omegaconf = (importlib.import_module(f"{n}.errors") for n in ("hydra", "omegaconf"))
+    return (hydra.HydraException, omegaconf.OmegaConfBaseException)
 
 
 def _say(message: str, code: int) -> NoReturn:

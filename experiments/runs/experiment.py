@@ -1,145 +1,358 @@
-"""From the resolved configuration to the objects it names."""
+"""One resolved configuration, and the objects it names. Nothing else reads configuration keys."""
 
 from __future__ import annotations
 
 import dataclasses
 import hashlib
-import importlib
-import inspect
-from collections.abc import Callable
+import json
+import re
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig, OmegaConf
 
 from estimators.base import Estimator, Prior
-from experiments.runs.cache import cached
+from experiments.runs import paths
+from experiments.runs.cache import cached, key_of
+from experiments.runs.row import Row
 from experiments.runs.seeds import stream
-from experiments.runs.version import ROOT
+from experiments.runs.targets import find, make, targets
+from experiments.runs.version import version_with
 from sim.errors import InputError
 from sim.recording import Recording, load
 from sim.robot import DifferentialDrive, RobotGeometry
-from sim.sensors import SensorSuite, suite_from_config
+from sim.sensors import suite_from_config
 from sim.settings import build
 from sim.world import World
 
 Config = dict[str, Any]
-SIMULATED_KEYS = ("world", "robot", "sensors", "route", "simulation", "seed", "world_seed")
+GROUPS = ("world", "robot", "sensors", "route", "estimator")
+_MAPPINGS = (*GROUPS, "simulation", "prior")
+_SIMULATED_KEYS = ("world", "robot", "sensors", "route", "simulation", "seed", "world_seed")
+_NOT_IN_KEY = ("name", "picture", "recording")
+_PHYSICS = ("bullet", "kinematic")
+_RAYS = ("bullet", "exact")
+# What an estimator may need of the sensors: the key that must be set, and presets that set it
+_SENSORS = {
+    "laser": ("laser", "lms291, hokuyo or laser_stereo"),
+    "landmarks": ("stereo", "stereo_pixel, stereo_paper or laser_stereo"),
+    "place": ("lidar3d", "lidar3d"),
+}
 
 
-def make(settings: Config, where: str, **injected: Any) -> Any:
-    """Call what `_target_` names with the other keys.
+@dataclass(frozen=True)
+class Experiment:
+    """A world, a robot, its sensors and route, or a recording of them; and an estimator.
 
-    Parameters
+    Attributes
     ----------
-    settings
-        A mapping with `_target_` (module.name) and keyword arguments.
-    where
-        Its place in the configuration, for messages.
-    injected
-        Further arguments, given by the program.
-
-    Raises
-    ------
-    InputError
-        If the target cannot be found, or a key is unknown or missing.
+    config
+        Resolved configuration, plain values.
+    choices
+        Name of the chosen option of each configuration group.
     """
-    target = settings.get("_target_")
-    if not isinstance(target, str) or "." not in target:
-        raise InputError(f"{where}._target_ must name a class or function, such as mine.Mine")
-    function = _find(target, where)
-    arguments = {key: value for key, value in settings.items() if key != "_target_"}
-    known = inspect.signature(function).parameters
-    open_ended = any(p.kind is inspect.Parameter.VAR_KEYWORD for p in known.values())
-    for key in arguments:
-        if key not in known and not open_ended:
-            free = ", ".join(k for k in known if k not in injected) or "none"
-            raise InputError(f"unknown key {where}.{key} for {target}; known: {free}")
-    for name, parameter in known.items():
-        given = name in arguments or name in injected
-        if parameter.default is inspect.Parameter.empty and not given and name != "self":
-            if parameter.kind in (
-                inspect.Parameter.VAR_KEYWORD,
-                inspect.Parameter.VAR_POSITIONAL,
-            ):
-                continue
-            raise InputError(f"{where}.{name} is missing; {target} needs it")
-    try:
-        return function(**arguments, **{k: v for k, v in injected.items() if k in known})
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{where} ({target}) does not accept its values: {error}") from error
 
+    config: Config
+    choices: Mapping[str, str] = field(default_factory=dict)
 
-def _find(target: str, where: str) -> Callable[..., Any]:
-    module_name, _, name = target.rpartition(".")
-    try:
-        module = importlib.import_module(module_name)
-    except ModuleNotFoundError as error:
-        raise InputError(
-            f"{where}._target_={target}: no module {error.name}; is its folder on PYTHONPATH?"
-        ) from error
-    found = getattr(module, name, None)
-    if not callable(found):
-        raise InputError(f"{where}._target_={target}: {module_name} has no class {name}")
-    return found  # type: ignore[no-any-return]
+    @classmethod
+    def compose(cls, overrides: Sequence[str] = (), config_dir: Path | None = None) -> Experiment:
+        """Compose an experiment from Hydra's overrides, such as `world=office seed=3`.
 
+        Parameters
+        ----------
+        overrides
+            `group=option` and `key=value`; `study=NAME` adds a study.
+        config_dir
+            A further folder of options.
+        """
+        lines = [f"+{line}" if line.startswith("study=") else line for line in overrides]
+        if config_dir is not None:
+            lines.append(f"hydra.searchpath=[file://{config_dir.resolve()}]")
+        with initialize_config_dir(str(paths.CONF), version_base="1.3"):
+            cfg = compose("config", overrides=lines, return_hydra_config=True)
+        chosen = cfg.hydra.runtime.choices
+        OmegaConf.set_struct(cfg, False)
+        del cfg["hydra"]
+        return cls.resolved(cfg, {group: str(chosen.get(group)) for group in GROUPS})
 
-def check(config: Config) -> None:
-    """Build what is cheap to build, so that a wrong value is told before any time is spent."""
-    for group in ("world", "robot", "sensors", "route", "simulation", "prior", "estimator"):
-        if not isinstance(config[group], dict):
-            raise InputError(f"{group} must hold keys, got {config[group]!r}")
-    repeats, keep = config["repeats"], config["keep"]
-    if isinstance(repeats, bool) or not isinstance(repeats, int) or repeats < 1:
-        raise InputError(f"repeats must be a whole number from 1 on, got {repeats!r}")
-    if not (isinstance(keep, list) and all(isinstance(key, str) for key in keep)):
-        raise InputError(f"keep must be a list of names, such as [ess], got {keep!r}")
-    make_robot(config)
-    suite_from_config(config["sensors"])
-    make(config["route"], "route")
-    stream(config["seed"], "slip")
-    stream(config["world_seed"], "world")
+    @classmethod
+    def resolved(cls, cfg: DictConfig, choices: Mapping[str, str]) -> Experiment:
+        """Resolve a composed configuration."""
+        config: Config = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
+        config.pop("sweeps", None)
+        simulation = config["simulation"]
+        if isinstance(simulation, dict) and simulation.get("rays") is None:
+            kinematic = simulation.get("physics") == "kinematic"  # it has no engine to cast rays
+            simulation["rays"] = "exact" if kinematic else "bullet"
+        return cls(config, choices)
 
+    def replaced(self, **values: Any) -> Experiment:
+        """Return the experiment with other values of top-level keys, such as `seed=3`."""
+        return dataclasses.replace(self, config={**self.config, **values})
 
-def make_world(config: Config) -> World:
-    """World of the configuration, from its own stream."""
-    rng = stream(config["world_seed"], "world")
-    world: World = make(config["world"], "world", rng=rng)
-    return world
+    # What a run is called, and where its rows go
 
+    @property
+    def name(self) -> str:
+        """Folder of the rows in results/runs."""
+        return str(self.config["name"])
 
-def make_robot(config: Config) -> DifferentialDrive:
-    """Robot of the configuration."""
-    return build(DifferentialDrive, config["robot"], "robot")
+    @property
+    def estimator_name(self) -> str:
+        """The chosen option, or the class of an estimator without one."""
+        return self.choices.get("estimator") or str(self.config["estimator"]["_target_"])
 
+    @property
+    def seed(self) -> int:
+        """Seed of every stream of randomness but the world's."""
+        return int(self.config["seed"])
 
-def make_recording(
-    config: Config, cache: Path, on_progress: Callable[[float], None] | None = None
-) -> Recording:
-    """Read, fetch from the cache, or simulate the configuration's recording.
+    @property
+    def repeats(self) -> int:
+        """Runs of the estimator over the recording."""
+        return int(self.config["repeats"])
 
-    A mapping in place of a path names a function that makes one.
-    """
-    if isinstance(config["recording"], dict):
-        made: Recording = make(config["recording"], "recording", config=config)
-        return made
-    if config["recording"] is not None:
-        return load(Path(config["recording"]))
-    return cached(cache, recording_settings(config), lambda: simulate(config, on_progress))
+    @property
+    def keep(self) -> list[str]:
+        """Belief extras to record."""
+        return list(self.config["keep"])
 
+    @property
+    def picture(self) -> bool:
+        """Whether a single run is drawn."""
+        return bool(self.config["picture"])
 
-def recording_settings(config: Config) -> Config:
-    """What decides the recording's bits, beside the code: its settings, or a file's digest."""
-    if isinstance(config["recording"], dict):
-        wanted = config["recording"]
-        return {"recording": wanted, "seed": config["seed"], "files": files_digest(wanted)}
-    if config["recording"] is not None:
-        return {"recording": _digest(Path(config["recording"]))}
-    settings = {key: config[key] for key in SIMULATED_KEYS}
-    world_file = config["world"].get("path")
-    if world_file is not None and Path(world_file).is_file():  # an edited file is another world
-        settings["world_file"] = _digest(Path(world_file))
-    return settings
+    @property
+    def rows_folder(self) -> Path:
+        """Folder of the rows.
+
+        Raises
+        ------
+        InputError
+            If the name is not one word.
+        """
+        name = self.config["name"]
+        if not (isinstance(name, str) and re.fullmatch(r"[\w.-]*\w", name)):
+            raise InputError(
+                f"name must be one word for a folder of results, such as slip_2, got {name!r}"
+            )
+        return paths.results() / "runs" / name
+
+    @property
+    def key(self) -> str:
+        """Digest of what decides the rows: configuration, recording, map, code."""
+        settings = {key: value for key, value in self.config.items() if key not in _NOT_IN_KEY}
+        known_map = files_digest(self.config["prior"].get("map"))
+        parts = [settings, self._recording_settings(), known_map, self._code_version()]
+        return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
+
+    @property
+    def recording_key(self) -> str:
+        """Digest of what decides the recording's bits: its settings, or a file's; and the code."""
+        return key_of(self._recording_settings())
+
+    def labels(self, checksum: str) -> Row:
+        """What a row says of its origin: choices, every key, versions, the recording's checksum."""
+        kept = {k: v for k, v in self.config.items() if k not in ("keep", "picture")}
+        brought = ("world", "sensors", "route") if self.config["recording"] is not None else ()
+        choices = {f"choice.{g}": name for g, name in self.choices.items() if g not in brought}
+        return {
+            **choices,
+            **_flat(kept),
+            "repeat": 0,
+            "run_key": self.key,
+            "code_version": self._code_version(),
+            "recording_checksum": checksum,
+        }
+
+    def _code_version(self) -> str:
+        return version_with(targets(self.config))
+
+    # What it names
+
+    def check(self) -> None:
+        """Find what is wrong or does not fit together, before any time is spent.
+
+        Raises
+        ------
+        InputError
+            Naming the key, and the remedy.
+        """
+        config = self.config
+        for group in _MAPPINGS:
+            if not isinstance(config[group], dict):
+                raise InputError(f"{group} must hold keys, got {config[group]!r}")
+        repeats, keep = config["repeats"], config["keep"]
+        if isinstance(repeats, bool) or not isinstance(repeats, int) or repeats < 1:
+            raise InputError(f"repeats must be a whole number from 1 on, got {repeats!r}")
+        if not (isinstance(keep, list) and all(isinstance(key, str) for key in keep)):
+            raise InputError(f"keep must be a list of names, such as [ess], got {keep!r}")
+        self.robot()
+        suite_from_config(config["sensors"])
+        make(config["route"], "route")
+        stream(config["seed"], "slip")
+        stream(config["world_seed"], "world")
+        self._check_simulation()
+        self._check_needs()
+
+    def _check_simulation(self) -> None:
+        simulation = self.config["simulation"]
+        for key, allowed in (("physics", _PHYSICS), ("rays", _RAYS)):
+            if simulation[key] not in allowed:
+                raise InputError(
+                    f"simulation.{key} must be {' or '.join(allowed)}, got {simulation[key]!r}"
+                )
+        if simulation["physics"] == "kinematic" and simulation["rays"] == "bullet":
+            raise InputError(
+                "simulation.rays=bullet needs the engine; drop it, or set simulation.physics=bullet"
+            )
+
+    def _check_needs(self) -> None:
+        """Check that the estimator gets the sensors and the map it cannot do without."""
+        settings = self.config["estimator"]
+        needs = getattr(find(settings.get("_target_"), "estimator"), "needs", ())
+        for need, (sensor, presets) in _SENSORS.items():
+            simulated = self.config["recording"] is None
+            if need in needs and simulated and self.config["sensors"].get(sensor) is None:
+                raise InputError(
+                    f"estimator={self.estimator_name} needs a {sensor} sensor, and "
+                    f"sensors={self.choices.get('sensors')} has none; try sensors={presets}"
+                )
+        mapped = self.config["prior"]["map"] != "none" or settings.get("map_path")
+        if "map" in needs and not mapped:
+            raise InputError(
+                f"estimator={self.estimator_name} needs a map; set prior.map=world, or a mapping "
+                "with _target_"
+            )
+
+    def world(self) -> World:
+        """Make the world, from its own stream."""
+        rng = stream(self.config["world_seed"], "world")
+        world: World = make(self.config["world"], "world", rng=rng)
+        return world
+
+    def robot(self) -> DifferentialDrive:
+        """Make the true robot."""
+        return build(DifferentialDrive, self.config["robot"], "robot")
+
+    def estimator(self) -> Estimator:
+        """Make the estimator: anything with `reset` and `step`."""
+        estimator = make(self.config["estimator"], "estimator")
+        for method in ("reset", "step"):
+            if not callable(getattr(estimator, method, None)):
+                raise InputError(
+                    f"estimator._target_={self.config['estimator']['_target_']} has no method "
+                    f"{method}; see estimators/base.py for the protocol"
+                )
+        return estimator  # type: ignore[no-any-return]
+
+    def simulate(self, on_progress: Callable[[float], None] | None = None) -> Recording:
+        """Simulate the recording.
+
+        Parameters
+        ----------
+        on_progress
+            Called with the seconds simulated.
+        """
+        from sim.simulate import record
+
+        self._check_simulation()
+        return record(
+            self.world(),
+            self.robot(),
+            suite_from_config(self.config["sensors"]),
+            make(self.config["route"], "route"),
+            {axis: stream(self.config["seed"], axis) for axis in ("slip", "sensors")},
+            physics=self.config["simulation"]["physics"],
+            rays=self.config["simulation"]["rays"],
+            config={key: self.config[key] for key in _SIMULATED_KEYS},
+            on_progress=on_progress,
+        )
+
+    def recording(self, on_progress: Callable[[float], None] | None = None) -> Recording:
+        """Read the recording, find it in the cache, or simulate it.
+
+        A mapping in place of a path names a function that makes one.
+        """
+        wanted = self.config["recording"]
+        if isinstance(wanted, dict):
+            made: Recording = make(wanted, "recording", config=self.config)
+            return made
+        if wanted is not None:
+            recording = load(Path(wanted))
+            self._compare_slip(recording)
+            return recording
+        return cached(self.recording_key, lambda: self.simulate(on_progress))
+
+    def _compare_slip(self, recording: Recording) -> None:
+        """Warn if kr or kl are not those that the recording was made with."""
+        made_with, believed = recording.config.get("robot"), self.config["robot"]
+        if not isinstance(made_with, dict):
+            return
+        for key in ("kr", "kl"):
+            if key in made_with and made_with[key] != believed[key]:
+                print(
+                    f"{self.config['recording']} was made with robot.{key}={made_with[key]:g}; "
+                    f"{believed[key]:g} is believed unless robot.{key} or estimator.{key} is set",
+                    file=sys.stderr,
+                )
+
+    def _recording_settings(self) -> Config:
+        wanted = self.config["recording"]
+        if isinstance(wanted, dict):
+            seed = self.config["seed"]
+            return {"recording": wanted, "seed": seed, "files": files_digest(wanted)}
+        if wanted is not None:
+            return {"recording": _digest(Path(wanted))}
+        settings = {key: self.config[key] for key in _SIMULATED_KEYS}
+        world_file = self.config["world"].get("path")
+        if world_file is not None and Path(world_file).is_file():  # an edited file: another world
+            settings["world_file"] = _digest(Path(world_file))
+        return settings
+
+    def prior(self, recording: Recording) -> Prior:
+        """Return what the estimator knows at the start."""
+        settings = self.config["prior"]
+        believed = {key: settings[key] for key in ("wheel_radius_m", "track_m")}
+        given = {key: value for key, value in believed.items() if value is not None}
+        robot = build(RobotGeometry, dataclasses.asdict(recording.robot) | given, "prior")
+        known_map = self._map(recording)
+        if settings["start"] == "global":
+            return Prior(robot, recording.sensors, map=known_map)
+        if settings["start"] != "tracking":
+            raise InputError(f"prior.start must be tracking or global, got {settings['start']!r}")
+        for key in ("sigma_position_m", "sigma_heading_rad"):
+            value = settings[key]
+            if not (isinstance(value, (int, float)) and 0.0 <= value < np.inf):
+                raise InputError(f"prior.{key} must be zero or positive, got {value}")
+        sigma = np.array([settings["sigma_position_m"]] * 2 + [settings["sigma_heading_rad"]])
+        start = np.zeros(3)
+        if recording.truth is not None:
+            start = recording.truth_at(recording.frame_stamps[:1])[0]
+        offset = sigma * stream(self.config["seed"], "prior").standard_normal(3)
+        return Prior(robot, recording.sensors, start + offset, np.diag(np.square(sigma)), known_map)
+
+    def _map(self, recording: Recording) -> Any:
+        """Map of the prior: none, the recording's world, or what a mapping's function makes."""
+        wanted = self.config["prior"]["map"]
+        if isinstance(wanted, dict):
+            return make(wanted, "prior.map", config=self.config, recording=recording)
+        if wanted == "none":
+            return None
+        if wanted != "world":
+            raise InputError(
+                f"prior.map must be none, world or a mapping with _target_, got {wanted!r}"
+            )
+        world = recording.truth.world if recording.truth else None
+        if world is None:
+            raise InputError("prior.map=world, but the recording has no map; set prior.map=none")
+        return world
 
 
 def files_digest(tree: Any) -> dict[str, str]:
@@ -163,81 +376,17 @@ def _digest(path: Path) -> str:
         raise InputError(f"{path}: cannot read it ({error.strerror})") from error
 
 
-def simulate(config: Config, on_progress: Callable[[float], None] | None = None) -> Recording:
-    """Simulate the configuration's recording."""
-    from sim.simulate import record
-
-    simulation = config["simulation"]
-    for key, allowed in (("physics", ("bullet", "kinematic")), ("rays", ("bullet", "exact"))):
-        if simulation[key] not in allowed:
-            raise InputError(
-                f"simulation.{key} must be {' or '.join(allowed)}, got {simulation[key]!r}"
-            )
-    return record(
-        make_world(config),
-        make_robot(config),
-        suite_from_config(config["sensors"]),
-        make(config["route"], "route"),
-        {axis: stream(config["seed"], axis) for axis in ("slip", "sensors")},
-        physics=simulation["physics"],
-        rays=simulation["rays"],
-        config={key: config[key] for key in SIMULATED_KEYS},
-        on_progress=on_progress,
-    )
-
-
-def make_estimator(config: Config) -> Estimator:
-    """Estimator of the configuration; anything with `reset` and `step`."""
-    estimator = make(config["estimator"], "estimator")
-    for method in ("reset", "step"):
-        if not callable(getattr(estimator, method, None)):
-            raise InputError(
-                f"estimator._target_={config['estimator']['_target_']} has no method {method}; "
-                "see estimators/base.py for the protocol"
-            )
-    return estimator  # type: ignore[no-any-return]
-
-
-def make_prior(config: Config, recording: Recording) -> Prior:
-    """What the estimator knows at the start."""
-    settings = config["prior"]
-    believed = {key: settings[key] for key in ("wheel_radius_m", "track_m")}
-    given = {key: value for key, value in believed.items() if value is not None}
-    robot = build(RobotGeometry, dataclasses.asdict(recording.robot) | given, "prior")
-    known_map = make_map(config, recording)
-    sensors: SensorSuite = recording.sensors
-    if settings["start"] == "global":
-        return Prior(robot, sensors, map=known_map)
-    if settings["start"] != "tracking":
-        raise InputError(f"prior.start must be tracking or global, got {settings['start']!r}")
-    sigma = [settings["sigma_position_m"]] * 2 + [settings["sigma_heading_rad"]]
-    for key, value in zip(("sigma_position_m", "sigma_heading_rad"), sigma[1:], strict=True):
-        if not (isinstance(value, (int, float)) and 0.0 <= value < np.inf):
-            raise InputError(f"prior.{key} must be zero or positive, got {value}")
-    start = np.zeros(3)
-    if recording.truth is not None:
-        start = recording.truth_at(recording.frame_stamps[:1])[0]
-    offset = np.array(sigma) * stream(config["seed"], "prior").standard_normal(3)
-    return Prior(robot, sensors, start + offset, np.diag(np.square(sigma)), known_map)
-
-
-def make_map(config: Config, recording: Recording) -> Any:
-    """Map of the prior: none, the recording's world, or what a mapping's function makes."""
-    wanted = config["prior"]["map"]
-    if isinstance(wanted, dict):
-        return make(wanted, "prior.map", config=config, recording=recording)
-    if wanted == "none":
-        return None
-    if wanted != "world":
-        raise InputError(
-            f"prior.map must be none, world or a mapping with _target_, got {wanted!r}"
-        )
-    world = recording.truth.world if recording.truth else None
-    if world is None:
-        raise InputError("prior.map=world, but the recording has no map; set prior.map=none")
-    return world
-
-
-def default_cache() -> Path:
-    """Folder of the recordings' cache."""
-    return ROOT / "results" / "cache" / "recordings"
+def _flat(tree: Mapping[str, Any], prefix: str = "") -> Row:
+    """Flatten nested mappings to dotted keys; lists become their text."""
+    flat: Row = {}
+    for key, value in tree.items():
+        name = f"{prefix}{key}"
+        if isinstance(value, dict):
+            flat.update(_flat(value, f"{name}."))
+        elif isinstance(value, int) and not -(2**63) <= value < 2**63:
+            flat[name] = str(value)  # wider than a column of a table
+        elif value is None or isinstance(value, (bool, int, float, str)):
+            flat[name] = value
+        else:
+            flat[name] = json.dumps(value)
+    return flat

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,7 +17,55 @@ if TYPE_CHECKING:
 
 Scalar = str | int | float | bool | None
 Row = dict[str, Scalar]
-_TEXTS = ("status", "code_version", "recording_checksum", "run_key")
+_TEXTS = (
+    "status",
+    "status_code",
+    "status_detail",
+    "code_version",
+    "recording_checksum",
+    "run_key",
+)
+
+
+class Outcome(StrEnum):
+    """How a run ended."""
+
+    OK = "ok"
+    REMARK = "remark"  # it has something to report, such as a scan that was of no use
+    FAILED = "failed"
+
+
+@dataclass(frozen=True)
+class Status:
+    """How a run ended, and why.
+
+    Attributes
+    ----------
+    outcome
+        Column `status`.
+    code
+        What a program tells apart: `recording`, `estimator`, `not_finite`, or the name of the
+        exception that ended the run. Column `status_code`.
+    detail
+        One line for people. Column `status_detail`.
+    """
+
+    outcome: Outcome = Outcome.OK
+    code: str = ""
+    detail: str = ""
+
+    @classmethod
+    def of_error(cls, error: BaseException) -> Status:
+        """Status of a run that an exception ended."""
+        return cls(Outcome.FAILED, type(error).__name__, " ".join(str(error).split()))
+
+    def columns(self) -> Row:
+        """Return the columns of a row."""
+        return {
+            "status": self.outcome.value,
+            "status_code": self.code,
+            "status_detail": self.detail,
+        }
 
 
 def check_row(row: Row) -> None:
@@ -68,13 +118,13 @@ def write_rows(rows: Sequence[Row], path: Path) -> None:
     write_frame(to_frame(rows), path)
 
 
-def write_frame(frame: pd.DataFrame, path: Path) -> None:
+def write_frame(frame: pd.DataFrame, path: Path, digits: int = 10) -> None:
     """Write a table to `path` (.parquet or .csv), whole or not at all."""
     if path.suffix not in (".parquet", ".csv"):
         raise InputError(f"{path}: tables are .parquet or .csv")
     with write_whole(path) as part:
         if path.suffix == ".csv":
-            frame.to_csv(part, index=False, float_format="%.10g")
+            frame.to_csv(part, index=False, float_format=f"%.{digits}g")
         else:
             frame.to_parquet(part, index=False)
 

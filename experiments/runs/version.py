@@ -8,7 +8,8 @@ import importlib.util
 from collections.abc import Iterable
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[2]
+from experiments.runs.paths import SOURCE
+
 # Files that read and write logs are left out: they decide no simulated recording and no estimate
 SIMULATION = ("sim",)
 RUNS = (
@@ -16,9 +17,10 @@ RUNS = (
     "estimators",
     "experiments/evaluation/metrics.py",
     "experiments/papers/maximo2024/places.py",
+    "experiments/runs/evaluate.py",
     "experiments/runs/experiment.py",
-    "experiments/runs/run.py",
     "experiments/runs/seeds.py",
+    "experiments/runs/targets.py",
 )
 
 
@@ -27,10 +29,10 @@ def code_version(parts: tuple[str, ...] = RUNS) -> str:
     """Return 12 hex digits of the SHA-256 over Python files and those of folders."""
     digest = hashlib.sha256()
     for part in parts:
-        place = ROOT / part
+        place = SOURCE / part
         for path in [place] if place.is_file() else sorted(place.rglob("*.py")):
             if path.parent.name != "formats":
-                digest.update(str(path.relative_to(ROOT)).encode() + b"\0" + path.read_bytes())
+                digest.update(str(path.relative_to(SOURCE)).encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:12]
 
 
@@ -54,7 +56,7 @@ def source_digest(target: str) -> str:
         return ""
     if top == "experiments":
         file = f"{module.replace('.', '/')}.py"
-        files = [] if file in RUNS else [ROOT / file]
+        files = [] if file in RUNS else [SOURCE / file]
     else:
         spec = importlib.util.find_spec(top)
         if spec is None:

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from experiments.runs.row import read_rows
-from experiments.runs.run import failed
-from experiments.runs.version import ROOT, code_version, version_with
+from experiments.runs.paths import results
+from experiments.runs.row import Outcome, read_rows
+from experiments.runs.version import code_version, version_with
 from sim.errors import InputError
 
 if TYPE_CHECKING:
@@ -48,10 +48,10 @@ def collect(name: str, *, all_versions: bool = False, times: bool = False) -> pd
     InputError
         If there are no rows, or none of this version of the code.
     """
-    path = ROOT / "results" / "runs" / name
+    path = results() / "runs" / name
     path = path if path.exists() else Path(name)
     if not path.exists():
-        there = sorted(p.name for p in (ROOT / "results" / "runs").glob("*") if p.is_dir())
+        there = sorted(p.name for p in (results() / "runs").glob("*") if p.is_dir())
         raise InputError(f"no sweep named {name}; there are: {', '.join(there) or 'none'}")
     table = read_rows(path)
     for column in ("status", *_ORIGIN):
@@ -187,8 +187,7 @@ def summary(table: pd.DataFrame, against: str | None = None) -> pd.DataFrame:
     if against is not None:
         found[column] = np.exp(found[column])
     found.insert(0, "runs", groups.size())
-    bad = groups["status"].agg(lambda statuses: int(statuses.map(failed).sum()))
-    told = groups["status"].agg(lambda statuses: int((statuses != "ok").sum()))
-    found.insert(1, "failed", bad)
-    found.insert(2, "with_remarks", told - bad)
+    for place, outcome in enumerate((Outcome.FAILED, Outcome.REMARK), start=1):
+        count = groups["status"].agg(lambda statuses, outcome=outcome: (statuses == outcome).sum())
+        found.insert(place, outcome.value, count)
     return found.reset_index(drop=not by)

@@ -18,7 +18,6 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import hydra
@@ -28,34 +27,16 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
-from experiments.runs.cache import key_of
-from experiments.runs.experiment import Config, default_cache, make_recording, recording_settings
-from experiments.runs.row import read_rows, write_rows
-from experiments.runs.run import (
-    GROUPS,
-    RunFailedError,
-    failed,
-    labels,
-    rows_folder,
-    run_configuration,
-    run_key,
-    short,
-)
-from experiments.runs.version import ROOT
+from experiments.runs import paths
+from experiments.runs.console import RunFailedError
+from experiments.runs.evaluate import evaluate
+from experiments.runs.experiment import GROUPS, Experiment
+from experiments.runs.row import Outcome, Status, read_rows, write_rows
 from sim.errors import InputError
 from sim.files import write_whole
 from sim.recording import Recording
 
 _JOBS_PER_WORKER = 4  # enough to keep all busy to the end, few enough to cost little
-
-
-@dataclass(frozen=True)
-class Run:
-    """One run of a sweep: its resolved configuration, the chosen options, its key."""
-
-    config: Config
-    choices: dict[str, str]
-    key: str
 
 
 def sweep_arguments(arguments: Sequence[str]) -> None:
@@ -98,14 +79,14 @@ def sweep(arguments: Sequence[str], config_dir: str | None = None) -> None:
     every = list(planned(own, config_dir))
     if not every:
         raise InputError(f"no runs: a value of {' '.join(own)} is an empty range or list")
-    folders = {rows_folder(run.config) for run in every}
+    folders = {run.rows_folder for run in every}
     if len(folders) > 1:
         raise InputError("name is the folder of all the rows; a sweep has one, not several")
     folder = folders.pop()
     runs = list({run.key: run for run in every}.values())
     missing = [run for run in runs if not is_done(folder, run.key)]
     print(
-        f"{len(runs)} runs, {len(runs) - len(missing)} of them done before: {short(folder)}",
+        f"{len(runs)} runs, {len(runs) - len(missing)} of them done before: {paths.short(folder)}",
         file=sys.stderr,
     )
     if missing:
@@ -115,9 +96,9 @@ def sweep(arguments: Sequence[str], config_dir: str | None = None) -> None:
         raise RunFailedError(f"{len(bad)} of {len(runs)} runs; first: {bad[0]}")
 
 
-def planned(arguments: Sequence[str], config_dir: str | None = None) -> Iterator[Run]:
+def planned(arguments: Sequence[str], config_dir: str | None = None) -> Iterator[Experiment]:
     """Runs of all combinations, in the order of the arguments."""
-    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+    with initialize_config_dir(str(paths.CONF), version_base="1.3"):
         composer = _Composer(config_dir)
         composer.extra += [a for a in arguments if a.lstrip("+~").startswith("hydra.")]
         arguments = [a for a in arguments if a not in composer.extra]
@@ -128,7 +109,7 @@ def planned(arguments: Sequence[str], config_dir: str | None = None) -> Iterator
         for part in study.get("sweeps") or [{}]:
             lines = [f"{key}={value}" for key, value in {**params, **part}.items()]
             for overrides in combinations([*lines, *arguments]):
-                yield composer.run(overrides)
+                yield composer.experiment(overrides)
 
 
 def combinations(lines: Sequence[str]) -> Iterator[list[str]]:
@@ -162,7 +143,7 @@ class _Composer:
             folder = Path(config_dir).resolve()
             self.extra = [f"hydra.searchpath=[file://{folder}]"]
 
-    def run(self, overrides: list[str]) -> Run:
+    def experiment(self, overrides: list[str]) -> Experiment:
         """Resolve one combination."""
         parsed = OverridesParser.create().parse_overrides(overrides)
         plain = [o for o in parsed if self._is_plain(o)]
@@ -183,10 +164,7 @@ class _Composer:
                     f"unknown key {key}; see estima run --cfg job, or +{key}=... to add it"
                 )
             OmegaConf.update(cfg, key, override.value(), merge=True)
-        config: Config = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
-        config["picture"] = False
-        config.pop("sweeps", None)
-        return Run(config, choices, run_key(config))
+        return Experiment.resolved(cfg, choices).replaced(picture=False)
 
     def _is_plain(self, override: Override) -> bool:
         """Whether it only sets a value, rather than choosing an option or adding a key."""
@@ -217,17 +195,20 @@ def _status(folder: Path, key: str) -> str | None:
     """Return how a run failed; None if it did not."""
     path = folder / f"{key}.parquet"
     if not path.exists():
-        return "error: no row was written"
+        return "no row was written"
     try:
         rows = read_rows(path)
     except InputError as error:
-        return f"error: {error}"
+        return str(error)
     if not {"status", "run_key"} <= set(rows) or (rows["run_key"] != key).any():
-        return f"error: {path} holds other rows; delete it and run again"
-    return next((str(status) for status in rows["status"] if failed(str(status))), None)
+        return f"{path} holds other rows; delete it and run again"
+    failures = rows[rows["status"] == Outcome.FAILED]
+    for _, row in failures.iterrows():
+        return f"{row['status_code']}: {row['status_detail']}"
+    return None
 
 
-def _launch_all(runs: Sequence[Run], folder: Path, launching: Sequence[str]) -> None:
+def _launch_all(runs: Sequence[Experiment], folder: Path, launching: Sequence[str]) -> None:
     """Start the runs; those at which a worker died are told apart, and the rest goes on."""
     for run in runs:  # rows of an earlier failure, and files that are no rows
         path = folder / f"{run.key}.parquet"
@@ -250,12 +231,12 @@ def _launch_all(runs: Sequence[Run], folder: Path, launching: Sequence[str]) -> 
                 raise died
             for run in begun:  # which of them was it?
                 if _launch([run], folder, [*launching, "hydra.launcher.n_jobs=2"]) is not None:
-                    _record_failure(run.config, run.choices, "its process died (out of memory?)")
+                    _record_failure(run, _DIED)
                 _begun(folder, run.key).unlink(missing_ok=True)
             left = [run for run in left if not (folder / f"{run.key}.parquet").exists()]
 
 
-def _launch(runs: Sequence[Run], folder: Path, launching: Sequence[str]) -> Exception | None:
+def _launch(runs: Sequence[Experiment], folder: Path, launching: Sequence[str]) -> Exception | None:
     """Write the plan and start its jobs; return the error if a process of joblib's has died."""
     from joblib.externals.loky.process_executor import TerminatedWorkerError
 
@@ -323,13 +304,13 @@ def _require_launcher(launching: Sequence[str]) -> None:
             )
 
 
-def packed(runs: Sequence[Run], n_jobs: int) -> list[list[Run]]:
+def packed(runs: Sequence[Experiment], n_jobs: int) -> list[list[Experiment]]:
     """Runs in about `n_jobs` jobs; those of one recording stay together while there are enough."""
-    groups: dict[str, list[Run]] = {}
+    groups: dict[str, list[Experiment]] = {}
     for run in runs:
-        groups.setdefault(_recording_key(run.config), []).append(run)
+        groups.setdefault(run.recording_key, []).append(run)
     size = max(1, -(-len(runs) // n_jobs))
-    jobs: list[list[Run]] = []
+    jobs: list[list[Experiment]] = []
     for group in groups.values():
         for low in range(0, len(group), size):
             part = group[low : low + size]
@@ -340,18 +321,14 @@ def packed(runs: Sequence[Run], n_jobs: int) -> list[list[Run]]:
     return jobs
 
 
-def _recording_key(config: Config) -> str:
-    return key_of(recording_settings(config))
-
-
-@hydra.main(version_base="1.3", config_path=str(ROOT / "conf"), config_name="job")
+@hydra.main(version_base="1.3", config_path=str(paths.CONF), config_name="job")
 def job_application(cfg: DictConfig) -> None:
     """Run one job's share of the plan; a run that fails leaves its row, and the next follows."""
     plan = json.loads(Path(cfg.plan).read_text())
     _end_with(*plan["planner"])
     fetch = _LastRecording()
     for config, choices in plan["jobs"][cfg.job]:
-        run_and_record(config, choices, fetch)
+        run_and_record(Experiment(config, choices), fetch)
 
 
 def _end_with(node: str, planner: int) -> None:
@@ -368,33 +345,33 @@ def _end_with(node: str, planner: int) -> None:
         threading.Thread(target=watch, name="planner", daemon=True).start()
 
 
-def run_and_record(
-    config: Config, choices: dict[str, str], fetch: Callable[[Config], Recording]
-) -> None:
-    """Run one configuration; what goes wrong becomes the status of its row."""
-    key = run_key(config)
-    path = rows_folder(config) / f"{key}.parquet"
+def run_and_record(experiment: Experiment, fetch: Callable[[Experiment], Recording]) -> None:
+    """Run one experiment; what goes wrong becomes the status of its row."""
+    key = experiment.key
+    path = experiment.rows_folder / f"{key}.parquet"
     mark = _begun(path.parent, key)
     with write_whole(mark) as part:
         part.touch()
     try:
-        rows, _ = run_configuration(config, choices, fetch)
-        if any(failed(str(row["status"])) for row in rows):  # for those who watch
+        experiment.check()
+        rows = evaluate(experiment, fetch(experiment))
+        write_rows(rows, path)
+        if any(row["status"] == Outcome.FAILED for row in rows):  # for those who watch
             path.with_suffix(".failed").touch()
     except (Exception, SystemExit) as error:
-        kind = "" if isinstance(error, InputError) else f"{type(error).__name__}: "
-        _record_failure(config, choices, kind + " ".join(str(error).split()))
+        _record_failure(experiment, Status.of_error(error))
     finally:
         mark.unlink(missing_ok=True)
 
 
-def _record_failure(config: Config, choices: dict[str, str], how: str) -> None:
+_DIED = Status(Outcome.FAILED, "died", "its process died (out of memory?)")
+
+
+def _record_failure(experiment: Experiment, status: Status) -> None:
     """Leave a row that says how the run failed, unless it has left one itself."""
-    key = run_key(config)
-    path = rows_folder(config) / f"{key}.parquet"
+    path = experiment.rows_folder / f"{experiment.key}.parquet"
     if not path.exists():
-        row = labels(config, choices, "", key, 0)
-        write_rows([{**row, "status": f"error: {how}"}], path)
+        write_rows([{**experiment.labels(""), **status.columns()}], path)
     path.with_suffix(".failed").touch()
 
 
@@ -405,10 +382,10 @@ class _LastRecording:
         self._key = ""
         self._recording: Recording | None = None
 
-    def __call__(self, config: Config) -> Recording:
-        key = _recording_key(config)
+    def __call__(self, experiment: Experiment) -> Recording:
+        key = experiment.recording_key
         if self._recording is None or key != self._key:
-            self._recording, self._key = make_recording(config, default_cache()), key
+            self._recording, self._key = experiment.recording(), key
         return self._recording
 
 

@@ -21,6 +21,8 @@ from numpy.typing import NDArray
 
 from estimators.base import Belief, Estimate, Estimator
 from estimators.base import run as run_estimator
+from experiments.runs.experiment import Experiment
+from experiments.runs.seeds import stream
 from experiments.viewing.style import ESTIMATE, GREEN, ORANGE, RED, SKY, TRUTH, figure
 from experiments.viewing.world import draw_world
 from sim import se2
@@ -138,21 +140,18 @@ def _estimated(
     on_step: Callable[[int], None],
 ) -> Estimate:
     """Run an estimator of the configuration, with the robot that the recording tells of."""
-    from experiments.runs.compose import compose
-    from experiments.runs.experiment import make_estimator, make_prior
-    from experiments.runs.seeds import stream
-
     made_with = recording.config.get("robot")  # of a log of many robots, the number of one
     slip = made_with if isinstance(made_with, dict) else {}
     robot = {k: v for k, v in slip.items() if k in ("kr", "kl")}
     robot |= dataclasses.asdict(recording.robot)
-    told = [f"robot.{key}={value}" for key, value in robot.items()]
-    config = compose([f"estimator={name}", *told, *overrides])
-    if "keep_map" in config["estimator"]:
-        config["estimator"]["keep_map"] = True
-    estimator, prior = make_estimator(config), make_prior(config, recording)
-    rng = stream(config["seed"], f"estimator/{name}", 0)
-    return run_estimator(_Sparing(estimator, shown), recording, prior, rng, _EXTRAS, on_step)
+    given = [f"robot.{key}={value}" for key, value in robot.items()]
+    experiment = Experiment.compose([f"estimator={name}", *given, *overrides])
+    if "keep_map" in experiment.config["estimator"]:
+        settings = {**experiment.config["estimator"], "keep_map": True}
+        experiment = experiment.replaced(estimator=settings)
+    sparing = _Sparing(experiment.estimator(), shown)
+    rng = stream(experiment.seed, f"estimator/{name}", 0)
+    return run_estimator(sparing, recording, experiment.prior(recording), rng, _EXTRAS, on_step)
 
 
 class _Sparing:

@@ -1,0 +1,118 @@
+"""A paper's claim and the verdict on it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from experiments.evaluation.statistics import Interval, log_ratio_interval, wilcoxon_p
+
+_MOST_P = 0.01
+
+
+class Verdict(StrEnum):
+    """What an interval says of a criterion."""
+
+    REPRODUCED = "reproduced"
+    NOT_REPRODUCED = "not_reproduced"
+    UNDECIDED = "undecided"  # the interval spans the criterion, or the data are too few
+    SHOWN = "shown"  # there is no criterion
+
+    @property
+    def label(self) -> str:
+        """The verdict in words."""
+        return self.value.replace("_", " ")
+
+
+class Role(StrEnum):
+    """Whether a statistic decides its claim's verdict, or stands beside it."""
+
+    HEADLINE = "headline"
+    BESIDE = "beside"
+
+
+class Profile(StrEnum):
+    """The size of a study: `quick` makes every table and figure from few repeats."""
+
+    FULL = "full"
+    QUICK = "quick"
+
+
+@dataclass(frozen=True)
+class Claim:
+    """One statistic of a paper's claim, judged.
+
+    Attributes
+    ----------
+    id
+        As in the papers' list, such as PB1.
+    statistic
+        What was measured.
+    found
+        Its value and 95 % interval, unless the statistic names another level.
+    criterion
+        What the interval is held against.
+    verdict, reason
+        The verdict, and why or where it holds, if there is more to say.
+    role
+        A statistic without a criterion stands beside the claim.
+    """
+
+    id: str
+    statistic: str
+    found: Interval
+    criterion: str
+    verdict: Verdict
+    reason: str = ""
+    role: Role = Role.HEADLINE
+
+    def __post_init__(self) -> None:
+        if self.verdict is Verdict.SHOWN:
+            object.__setattr__(self, "role", Role.BESIDE)
+
+
+def judged(interval: Interval, at_least: float = -math.inf, at_most: float = math.inf) -> Verdict:
+    """Judge an interval against [at_least, at_most]: inside, wholly outside, or spanning.
+
+    An interval without bounds, for lack of data, decides nothing.
+    """
+    if not (math.isfinite(interval.low) and math.isfinite(interval.high)):
+        return Verdict.UNDECIDED
+    if interval.low >= at_least and interval.high <= at_most:
+        return Verdict.REPRODUCED
+    if interval.high < at_least or interval.low > at_most:
+        return Verdict.NOT_REPRODUCED
+    return Verdict.UNDECIDED
+
+
+def holds(condition: bool) -> Verdict:
+    """Judge a statistic that has no spread."""
+    return Verdict.REPRODUCED if condition else Verdict.NOT_REPRODUCED
+
+
+def lower(first: ArrayLike, second: ArrayLike) -> tuple[Interval, float, Verdict]:
+    """Whether paired values are lower in the first arm: their ratio, Wilcoxon's p, the verdict.
+
+    Reproduced if the median is below one and p < 0.01; not reproduced if the ratio's interval holds
+    nothing below one; undecided if it spans one, or there are fewer than two pairs.
+    """
+    above, below = np.asarray(first, float), np.asarray(second, float)
+    ratio = log_ratio_interval(above, below)
+    p = 1.0 if np.array_equal(above, below) else wilcoxon_p(above, below)
+    if len(above) < 2:
+        return ratio, p, Verdict.UNDECIDED
+    if p < _MOST_P and float(np.median(np.log(above) - np.log(below))) < 0.0:
+        return ratio, p, Verdict.REPRODUCED
+    return ratio, p, Verdict.NOT_REPRODUCED if ratio.low >= 1.0 else Verdict.UNDECIDED
+
+
+def overall(parts: Sequence[Verdict]) -> Verdict:
+    """Return the verdict on a whole whose parts must all hold."""
+    if set(parts) == {Verdict.REPRODUCED}:
+        return Verdict.REPRODUCED
+    return Verdict.NOT_REPRODUCED if Verdict.NOT_REPRODUCED in parts else Verdict.UNDECIDED

@@ -1,0 +1,126 @@
+"""The one runner: an experiment's rows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from contextlib import AbstractContextManager, nullcontext
+
+import numpy as np
+
+from estimators.base import Estimate, Estimator, Prior, run
+from experiments.evaluation.metrics import score
+from experiments.runs.experiment import Experiment
+from experiments.runs.row import Outcome, Row, Status
+from experiments.runs.seeds import stream
+from sim.errors import InputError
+from sim.recording import Recording
+
+Streams = Callable[[int], np.random.Generator]
+Planted = Callable[[Estimator, int], AbstractContextManager[Estimator]]
+
+
+def evaluate(
+    experiment: Experiment,
+    recording: Recording | None = None,
+    *,
+    streams: Streams | None = None,
+    planted: Planted | None = None,
+    on_step: Callable[[int], None] | None = None,
+    on_estimate: Callable[[int, Estimate, Estimate | None], None] | None = None,
+    on_error: Callable[[Exception | SystemExit], None] | None = None,
+) -> list[Row]:
+    """Run an experiment's estimator `repeats` times over its recording, and score each run.
+
+    Parameters
+    ----------
+    recording
+        In place of the experiment's own.
+    streams
+        The estimator's generator of each repeat; by default that of the axis `estimator/NAME`.
+    planted
+        Gives the estimator with a fault in it, as a context, for each repeat.
+    on_step
+        Called with the number of Frames done.
+    on_estimate
+        Called with the repeat, its online estimate and the revised one (or None).
+    on_error
+        Called with the exception that ended a run, which becomes its row's status.
+
+    Returns
+    -------
+    list of Row
+        One a repeat: origin, status, and the scores; those of a revised path begin with
+        `revised_`.
+
+    Raises
+    ------
+    InputError
+        If the configuration or the recording does not fit together.
+    """
+    experiment.check()
+    if recording is None:
+        recording = experiment.recording()
+    prior = experiment.prior(recording)
+    labels = experiment.labels(recording.checksum)
+    axis = f"estimator/{experiment.estimator_name}"
+    rows = []
+    for repeat in range(experiment.repeats):
+        estimator = experiment.estimator()
+        rng = streams(repeat) if streams else stream(experiment.seed, axis, repeat)
+        scores: Row = {}
+        try:
+            with planted(estimator, repeat) if planted else nullcontext(estimator) as ready:
+                online, revised = estimates(ready, recording, prior, rng, experiment.keep, on_step)
+            status = status_of(recording, online)
+            scores = scored(recording, online, revised)
+        except InputError:
+            raise
+        except (Exception, SystemExit) as error:
+            status = Status.of_error(error)
+            if on_error is not None:
+                on_error(error)
+        else:
+            if on_estimate is not None:
+                on_estimate(repeat, online, revised)
+        rows.append({**labels, "repeat": repeat, **status.columns(), **scores})
+    return rows
+
+
+def estimates(
+    estimator: Estimator,
+    recording: Recording,
+    prior: Prior,
+    rng: np.random.Generator,
+    keep: Collection[str] = (),
+    on_step: Callable[[int], None] | None = None,
+) -> tuple[Estimate, Estimate | None]:
+    """Online estimate of a run, and the revised one of an estimator that has `finish`."""
+    online = run(estimator, recording, prior, rng, keep, on_step)
+    finish = getattr(estimator, "finish", None)
+    return online, None if finish is None else finish()
+
+
+def scored(recording: Recording, online: Estimate, revised: Estimate | None) -> Row:
+    """Scores of a run as columns; those of the revised path begin with `revised_`."""
+    scores: Row = {**score(recording, online)}
+    if revised is not None:
+        found = score(recording, revised)
+        scores |= {f"revised_{k}": found[k] for k in found if k not in _OF_THE_RUN}
+    return scores
+
+
+_OF_THE_RUN = ("duration_s", "distance_m")
+
+
+def status_of(recording: Recording, online: Estimate) -> Status:
+    """How a run ended that no exception did."""
+    if recording.status != "ok":
+        return Status(Outcome.FAILED, "recording", recording.status)
+    sound = np.isfinite(online.means).all(axis=1)
+    sound &= np.isfinite(online.covariances).all(axis=(1, 2))
+    if online.status != "ok":
+        return Status(Outcome.REMARK, "estimator", online.status)
+    if not sound.all():
+        when = online.stamps[np.argmin(sound)]
+        return Status(Outcome.FAILED, "not_finite", f"not finite at {when:.2f} s")
+    return Status()

@@ -1,0 +1,33 @@
+"""Where the package keeps its own data, and where results go."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+SOURCE = Path(__file__).resolve().parents[2]  # the clone, or the site-packages of a wheel
+
+
+def packaged(name: str) -> Path:
+    """Return a folder that travels with the code: `conf`, or `results/baselines`.
+
+    A wheel holds them in experiments/packaged/, a clone at its top level.
+    """
+    inside = SOURCE / "experiments" / "packaged" / name
+    return inside if inside.exists() else SOURCE / name
+
+
+CONF = packaged("conf")
+
+
+def results() -> Path:
+    """Return the folder of results: `results` in the current folder, or $ESTIMA_RESULTS."""
+    return Path.cwd() / (os.environ.get("ESTIMA_RESULTS") or "results")
+
+
+def short(path: Path) -> str:
+    """Return the path as one would type it from here."""
+    try:
+        return str(path.relative_to(Path.cwd()))
+    except ValueError:
+        return str(path)

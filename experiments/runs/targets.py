@@ -1,0 +1,78 @@
+"""Objects that a configuration names by `_target_`."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from sim.errors import InputError
+
+
+def make(settings: Mapping[str, Any], where: str, **injected: Any) -> Any:
+    """Call what `_target_` names with the other keys.
+
+    Parameters
+    ----------
+    settings
+        A mapping with `_target_` (module.name) and keyword arguments.
+    where
+        Its place in the configuration, for messages.
+    injected
+        Further arguments, given by the program if the target asks for them.
+
+    Raises
+    ------
+    InputError
+        If the target cannot be found, or a key is unknown or missing.
+    """
+    function = find(settings.get("_target_"), where)
+    target = settings["_target_"]
+    arguments = {key: value for key, value in settings.items() if key != "_target_"}
+    known = inspect.signature(function).parameters
+    variadic = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
+    open_ended = any(p.kind is inspect.Parameter.VAR_KEYWORD for p in known.values())
+    for key in arguments:
+        if key not in known and not open_ended:
+            free = ", ".join(k for k in known if k not in injected) or "none"
+            raise InputError(f"unknown key {where}.{key} for {target}; known: {free}")
+    for name, parameter in known.items():
+        required = parameter.default is inspect.Parameter.empty and parameter.kind not in variadic
+        if required and name not in arguments and name not in injected and name != "self":
+            raise InputError(f"{where}.{name} is missing; {target} needs it")
+    try:
+        return function(**arguments, **{k: v for k, v in injected.items() if k in known})
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{where} ({target}) does not accept its values: {error}") from error
+
+
+def find(target: Any, where: str) -> Callable[..., Any]:
+    """Import the class or function that a `_target_` names.
+
+    Raises
+    ------
+    InputError
+        If there is none.
+    """
+    if not isinstance(target, str) or "." not in target:
+        raise InputError(f"{where}._target_ must name a class or function, such as mine.Mine")
+    module_name, _, name = target.rpartition(".")
+    try:
+        module = importlib.import_module(module_name)
+    except ModuleNotFoundError as error:
+        raise InputError(
+            f"{where}._target_={target}: no module {error.name}; is its folder on PYTHONPATH?"
+        ) from error
+    found = getattr(module, name, None)
+    if not callable(found):
+        raise InputError(f"{where}._target_={target}: {module_name} has no class {name}")
+    return found  # type: ignore[no-any-return]
+
+
+def targets(tree: Any) -> set[str]:
+    """Every `_target_` of a configuration."""
+    if not isinstance(tree, Mapping):
+        return set()
+    here = {tree["_target_"]} if isinstance(tree.get("_target_"), str) else set()
+    return here.union(*(targets(value) for value in tree.values()))
