@@ -37,7 +37,7 @@ format: setup
 
 # Rewrites the lock after a change of pyproject.toml; hashes only, no addresses.
 lock: setup
-	@.uv/bin/uv pip compile pyproject.toml --extra dev --generate-hashes --no-emit-index-url \
+	@.uv/bin/uv pip compile pyproject.toml --extra dev --extra docs --generate-hashes --no-emit-index-url \
 	  --no-header --no-annotate --universal --python-version 3.11 --quiet --output-file requirements.lock
 
 clean:
