@@ -45,26 +45,94 @@ def test_no_global_randomness_and_no_eval(path):
     assert "allow_pickle=True" not in text
 
 
-METHODS = {
-    "odometry",
-    "icp_odometry",
-    "ekf_icp",
-    "ekf_icp_paper",
-    "fastslam",
-    "ekf_slam",
-    "mcl",
-    "topological_mcl",
-    "smoother",
-}
+# The rooms of experiments/, from the top down; each imports only itself and rooms below it.
+ROOMS = (
+    "cli",
+    "papers",
+    "gate",
+    "bench",
+    "report",
+    "sweeps",
+    "calibration",
+    "viewing",
+    "runs",
+    "trajectories",
+    "evaluation",
+)
+
+
+def room_of(path):
+    return path.relative_to(ROOT / "experiments").parts[0].removesuffix(".py")
+
+
+def upward(path, lines):
+    """Imports of a file in experiments/ that name a room above its own, or none."""
+    room = ROOMS.index(room_of(path))
+    for name in lines:
+        parts = name.split(".")
+        if parts[0] == "experiments" and len(parts) > 1 and parts[1] in ROOMS:
+            if ROOMS.index(parts[1]) < room:
+                yield name
+        if parts[0] == "estima":
+            yield name
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "experiments").rglob("*.py")), ids=str)
+def test_imports_go_down(path):
+    if path.name != "__init__.py" or path.parent.name != "experiments":
+        assert room_of(path) in ROOMS, "a room without a place in the order"
+        assert not list(upward(path, imports(path)))
+
+
+def test_an_arrow_upward_is_seen():
+    path = ROOT / "experiments" / "runs" / "evaluate.py"
+    assert list(upward(path, ["experiments.sweeps.collect"]))
+    assert not list(upward(path, ["experiments.evaluation.metrics", "estimators.base"]))
+
+
+def test_no_circle():
+    """Modules of all folders, by the imports at their top and inside functions."""
+    modules = {
+        ".".join(p.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): p
+        for p in MODULES
+    }
+    edges = {n: {m for m in imports(p) if m in modules and m != n} for n, p in modules.items()}
+    done, open_ = set(), []
+
+    def visit(name):
+        assert name not in open_, " -> ".join([*open_[open_.index(name) :], name])
+        if name not in done:
+            open_.append(name)
+            for other in sorted(edges[name]):
+                visit(other)
+            done.add(open_.pop())
+
+    for name in sorted(edges):
+        visit(name)
+
+
+def is_method(path):
+    """Whether a module holds a class with `reset` and `step`: the protocol of an estimator."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ClassDef) and "Protocol" not in {
+            ast.unparse(b) for b in node.bases
+        }:
+            defined = {item.name for item in node.body if isinstance(item, ast.FunctionDef)}
+            if {"reset", "step"} <= defined:
+                return True
+    return False
+
+
+METHODS = {p.stem for p in (ROOT / "estimators").glob("*.py") if is_method(p)}
 
 
 def test_no_method_imports_another():
-    for path in (ROOT / "estimators").glob("*.py"):
-        if path.stem in METHODS:
-            for name in imports(path):
-                parts = name.split(".")
-                other = parts[1] if parts[0] == "estimators" and len(parts) > 1 else None
-                assert other not in METHODS - {path.stem}, f"{path.name} imports {name}"
+    assert {"odometry", "ekf_icp", "mcl", "smoother"} <= METHODS
+    for stem in METHODS:
+        for name in imports(ROOT / "estimators" / f"{stem}.py"):
+            parts = name.split(".")
+            other = parts[1] if parts[0] == "estimators" and len(parts) > 1 else None
+            assert other not in METHODS - {stem}, f"{stem}.py imports {name}"
 
 
 def test_no_addresses_or_machine_paths_in_tracked_text():

@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from experiments.runs.row import read_rows
+
 ROOT = Path(__file__).resolve().parent.parent
 QUICK = ["simulation.physics=kinematic", "simulation.rays=exact"]
 
@@ -43,14 +45,11 @@ def test_help_names_every_command():
 
 
 def test_a_run_prints_its_errors_and_leaves_a_row(tmp_path):
-    done = estima("run", *QUICK, "seed=12", "name=test_cli", cwd=tmp_path)
+    place = {"ESTIMA_RESULTS": str(tmp_path / "mine")}
+    done = estima("run", *QUICK, "seed=12", "name=test_cli", cwd=tmp_path, **place)
     assert done.returncode == 0, done.stderr
     assert "position RMSE" in done.stdout
-    rows = list((ROOT / "results" / "runs" / "test_cli").glob("*.parquet"))
-    assert rows
-    from experiments.runs.row import read_rows
-
-    frame = read_rows(rows[0])
+    frame = read_rows(next((tmp_path / "mine" / "runs" / "test_cli").glob("*.parquet")))
     assert frame["status"].tolist() == ["ok"]
     assert frame["robot.kr"].tolist() == [1e-5]
     assert np.isfinite(frame["ate_rmse_m"]).all()

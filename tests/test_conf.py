@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import yaml
 
-from experiments.runs.experiment import make, make_estimator, make_prior, make_robot, make_world
+from experiments.runs.experiment import Experiment
+from experiments.runs.targets import make
 from sim.errors import InputError
 from sim.robot import DifferentialDrive, RobotGeometry
 from sim.sensors import suite_from_config
@@ -23,22 +24,22 @@ def options(group):
 
 @pytest.mark.parametrize("name", options("world"))
 def test_worlds_build_and_depend_on_their_seed_alone(name):
-    config = compose([f"world={name}", "seed=3"])
-    first, second = make_world(config), make_world(config)
+    experiment = Experiment.compose([f"world={name}", "seed=3"])
+    first, second = experiment.world(), experiment.world()
     assert np.array_equal(first.walls, second.walls)
     assert np.array_equal(first.landmarks, second.landmarks)
 
 
 @pytest.mark.parametrize("name", options("robot"))
 def test_robots_state_every_key(name):
-    config = compose([f"robot={name}"])
-    make_robot(config)
-    assert set(config["robot"]) == set(inspect.signature(DifferentialDrive).parameters)
+    experiment = Experiment.compose([f"robot={name}"])
+    experiment.robot()
+    assert set(experiment.config["robot"]) == set(inspect.signature(DifferentialDrive).parameters)
 
 
 @pytest.mark.parametrize("name", options("sensors"))
 def test_sensors_build_and_state_every_key(name):
-    config = compose([f"sensors={name}"])
+    config = Experiment.compose([f"sensors={name}"]).config
     suite = suite_from_config(config["sensors"])
     assert set(config["sensors"]) == set(inspect.signature(type(suite)).parameters)
     for kind, settings in config["sensors"].items():
@@ -49,33 +50,34 @@ def test_sensors_build_and_state_every_key(name):
 
 @pytest.mark.parametrize("name", options("route"))
 def test_routes_build(name):
-    config = compose([f"route={name}"])
+    config = Experiment.compose([f"route={name}"]).config
     assert callable(make(config["route"], "route").start)
 
 
 @pytest.mark.parametrize("name", options("estimator"))
 def test_estimators_build_and_state_every_key(name):
-    config = compose([f"estimator={name}"])
-    estimator = make_estimator(config)
-    stated = set(config["estimator"]) - {"_target_"}
+    experiment = Experiment.compose([f"estimator={name}"])
+    estimator = experiment.estimator()
+    stated = set(experiment.config["estimator"]) - {"_target_"}
     assert stated == set(inspect.signature(type(estimator)).parameters)
 
 
 def test_belief_follows_truth_unless_it_is_set():
-    config = compose(["robot.kr=3e-4"])
+    config = Experiment.compose(["robot.kr=3e-4"]).config
     assert config["estimator"]["kr"] == config["robot"]["kr"] == 3e-4
-    config = compose(["robot.kr=3e-4", "estimator.kr=1e-5", "prior.track_m=0.2"])
+    given = ["robot.kr=3e-4", "estimator.kr=1e-5", "prior.track_m=0.2"]
+    config = Experiment.compose(given).config
     assert (config["robot"]["kr"], config["estimator"]["kr"]) == (3e-4, 1e-5)
     assert (config["robot"]["track_m"], config["prior"]["track_m"]) == (0.19, 0.2)
 
 
 def test_geometry_is_believed_to_be_the_recordings_unless_it_is_set():
     there = dataclasses.replace(circle(n_frames=3), robot=RobotGeometry(0.0975, 0.33))
-    assert make_prior(compose([]), there).robot == there.robot
-    set_apart = make_prior(compose(["prior.track_m=0.4"]), there).robot
+    assert Experiment.compose([]).prior(there).robot == there.robot
+    set_apart = Experiment.compose(["prior.track_m=0.4"]).prior(there).robot
     assert set_apart == RobotGeometry(0.0975, 0.4)
     with pytest.raises(InputError, match="prior"):
-        make_prior(compose(["prior.track_m=wide"]), there)
+        Experiment.compose(["prior.track_m=wide"]).prior(there)
 
 
 def test_every_option_says_what_it_is():

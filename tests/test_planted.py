@@ -12,7 +12,7 @@ from estimators.base import run
 from experiments.gate import faults as planted
 from experiments.gate.faults import FAULTS, Pool, arrays, draw_check, grade, worsening
 from experiments.gate.suite import ERRORS, Entry, Suite, read_suite, suite_path
-from experiments.runs.experiment import make_estimator
+from experiments.runs.experiment import Experiment
 from tests.fakes import circle, tracking_prior
 
 KINDS = [(name, kind) for name, kinds in FAULTS.items() for kind in kinds]
@@ -20,7 +20,7 @@ KINDS = [(name, kind) for name, kinds in FAULTS.items() for kind in kinds]
 
 @cache
 def composed(*overrides):
-    return compose(overrides)
+    return Experiment.compose(overrides)
 
 
 def estimate(name, plant, seed=0):
@@ -37,7 +37,7 @@ def estimate(name, plant, seed=0):
         "mcl": ["estimator.n_most=600", "estimator.n_least=300"],
         "fastslam": ["estimator.n_particles=20"],
     }
-    made = make_estimator(composed(f"estimator={name}", *small.get(name, [])))
+    made = composed(f"estimator={name}", *small.get(name, [])).estimator()
     rng = np.random.default_rng(1)
     with plant(made, np.random.default_rng(seed)) as estimator:
         found = run(estimator, recording, prior, rng)

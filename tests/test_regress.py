@@ -15,7 +15,7 @@ from experiments.gate import compare as regress
 from experiments.gate import report as regress_report
 from experiments.gate.compare import exchange_p, holm
 from experiments.gate.suite import ERRORS, fingerprint, read_suite, run_suite, suite_path
-from experiments.runs.experiment import default_cache, make_recording
+from experiments.runs.experiment import Experiment
 from sim.errors import InputError
 
 QUICK = [
@@ -195,7 +195,7 @@ def small(tmp_path, monkeypatch):
 def test_suites_of_ones_own_keep_their_baselines_apart(tmp_path):
     main = regress.baseline_paths("check")
     assert main == regress.baseline_paths(str(suite_path("check")))
-    assert main["accepted"] == regress.BASELINES / "check.csv"
+    assert main["accepted"] == regress.baseline_folder() / "check.csv"
     names = [
         str(tmp_path / f"{folder}{stem}.yaml")
         for folder in ("", "o/")
@@ -323,9 +323,8 @@ def test_recordings_of_the_check_turn():
     """On a straight line a wrong track, and much else, would go unseen."""
     suite = read_suite(suite_path("check"))
     for group, overrides in suite.overrides.items():
-        config = compose(overrides)
-        config["seed"] = config["world_seed"] = suite.first_seed
-        recording = make_recording(config, default_cache())
+        seed = suite.first_seed
+        recording = Experiment.compose(overrides).replaced(seed=seed, world_seed=seed).recording()
         assert recording.status == "ok"
         turned = np.abs(np.diff(np.unwrap(recording.truth.poses[:, 2]))).sum()
         assert turned > 1.0, group

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from experiments.runs.experiment import make_world, simulate
+from experiments.runs.experiment import Experiment
 from experiments.runs.seeds import stream
 from sim import se2
 from sim.errors import InputError
@@ -217,10 +217,10 @@ def test_leaving_the_route_is_reported():
 @pytest.mark.parametrize("name", ["rooms", "corridor", "room"])
 @pytest.mark.parametrize("robot", ["puzzlebot", "robocom"])
 def test_tours_are_driven_to_their_end(name, robot):
-    config = compose([f"world={name}", f"robot={robot}", "seed=2", "robot.kr=1e-4"])
-    recording = simulate(config)
+    experiment = Experiment.compose([f"world={name}", f"robot={robot}", "seed=2", "robot.kr=1e-4"])
+    recording = experiment.simulate()
     assert recording.status == "ok"
-    world = make_world(config)
+    world = experiment.world()
     assert np.hypot(*(recording.truth.poses[-1, :2] - world.waypoints[-1])) < 0.15
 
 
@@ -261,8 +261,8 @@ def test_rates_must_divide_the_clock():
 )
 def test_long_tours_are_driven_to_their_end(name, robot, seed):
     """Whole tours with slip, through doors and past furniture, at the studies' sizes."""
-    config = compose([f"world={name}", f"robot={robot}", f"seed={seed}"])
-    recording = simulate(config)
+    experiment = Experiment.compose([f"world={name}", f"robot={robot}", f"seed={seed}"])
+    recording = experiment.simulate()
     assert recording.status == "ok"
     travelled = np.sum(np.hypot(*np.diff(recording.truth.poses[:, :2], axis=0).T))
     assert travelled > (300 if name == "office" else 140)
@@ -272,7 +272,7 @@ def test_long_tours_are_driven_to_their_end(name, robot, seed):
 @pytest.mark.parametrize("world_seed", range(1000, 1020, 4))
 def test_offices_can_be_toured(world_seed):
     """The judged studies' buildings: no tour ends in a wall, for the larger robot."""
-    config = compose(
+    experiment = Experiment.compose(
         [
             "world=office",
             "robot=robocom",
@@ -282,4 +282,4 @@ def test_offices_can_be_toured(world_seed):
             "sensors.encoder.rate_hz=5",
         ]
     )
-    assert simulate(config).status == "ok"
+    assert experiment.simulate().status == "ok"

@@ -13,10 +13,10 @@ import pandas as pd
 import pytest
 
 from experiments.report.plot import sweep_figure
-from experiments.runs.cache import key_of
-from experiments.runs.experiment import default_cache, files_digest, recording_settings
+from experiments.runs import cache
+from experiments.runs.experiment import Experiment, files_digest
+from experiments.runs.paths import results
 from experiments.runs.row import read_rows
-from experiments.runs.run import run_key
 from experiments.runs.version import source_digest
 from experiments.sweeps import launch as sweep
 from experiments.sweeps.collect import collect, measured, summary, swept, telling, where
@@ -31,7 +31,7 @@ def table_of(name):
 
 
 def folder(name):
-    return ROOT / "results" / "runs" / name
+    return results() / "runs" / name
 
 
 @pytest.fixture
@@ -74,9 +74,7 @@ def test_the_quick_composer_resolves_as_hydra_does():
             f"estimator={run.choices['estimator']}", f"robot.kr={c['robot']['kr']}",
             f"seed={c['seed']}", "estimator.window_s=0.1", "picture=false",
         ]  # fmt: skip
-        expected = compose(lines)
-        expected.pop("sweeps")
-        assert c == expected
+        assert c == Experiment.compose(lines).config
         assert c["estimator"]["kr"] == c["robot"]["kr"]  # belief follows truth after the change
     assert len({run.key for run in runs}) == 8
 
@@ -98,10 +96,9 @@ def test_unknown_keys_and_options_are_refused():
 
 
 def test_keys_tell_what_decides_the_rows(tmp_path, monkeypatch):
-    config = compose([])
-    key = run_key(config)
-    assert run_key({**config, "name": "other"}) == key
-    assert run_key({**config, "seed": 5}) != key
+    experiment = Experiment.compose([])
+    assert experiment.replaced(name="other").key == experiment.key
+    assert experiment.replaced(seed=5).key != experiment.key
     monkeypatch.syspath_prepend(str(tmp_path))
     (tmp_path / "package").mkdir()
     for target, source, beside in (
@@ -109,15 +106,15 @@ def test_keys_tell_what_decides_the_rows(tmp_path, monkeypatch):
         ("package.part.Mine", "package/part.py", "package/other.py"),  # without an __init__
     ):
         (tmp_path / source).write_text("class Mine: pass\n")
-        own = {**config, "estimator": {"_target_": target}}
-        keys = [run_key(own)]
+        own = experiment.replaced(estimator={"_target_": target})
+        keys = [own.key]
         for file in (source, beside):
             (tmp_path / file).write_text("class Mine: x = 1\n")
             source_digest.cache_clear()
-            keys.append(run_key(own))
+            keys.append(own.key)
         assert len(set(keys)) == 3, target
     with pytest.raises(InputError, match=r"nowhere\.npz"):
-        recording_settings({**config, "recording": "nowhere.npz"})
+        _ = experiment.replaced(recording="nowhere.npz").recording_key
 
 
 def test_keys_know_the_files_that_a_mapping_names(tmp_path):
@@ -126,26 +123,23 @@ def test_keys_know_the_files_that_a_mapping_names(tmp_path):
         "_target_": "experiments.papers.maximo2024.places.recording_from_files",
         "positions": f"{tmp_path}/a.npy",
     }
-    config = compose([])
+    experiment = Experiment.compose([])
+    prior = experiment.config["prior"]
     for changed in (
-        {**config, "recording": named},
-        {**config, "prior": {**config["prior"], "map": named}},
-        {**config, "prior": {**config["prior"], "map": {"_target_": "x", "f": str(tmp_path)}}},
+        experiment.replaced(recording=named),
+        experiment.replaced(prior={**prior, "map": named}),
+        experiment.replaced(prior={**prior, "map": {"_target_": "x", "f": str(tmp_path)}}),
     ):
         (tmp_path / "a.npy").write_bytes(b"1")
-        before = run_key(changed)
+        before = changed.key
         (tmp_path / "a.npy").write_bytes(b"2")
-        assert run_key(changed) != before
+        assert changed.key != before
     assert files_digest({"a": "none", "b": "x" * 5000, "c": ".", "d": "/"}) == {}
 
 
 def test_packing_keeps_recordings_together():
-    config = compose([])
-    runs = [
-        sweep.Run({**config, "seed": seed, "repeats": r}, {}, f"{seed}-{r}")
-        for seed in range(6)
-        for r in (1, 2)
-    ]
+    experiment = Experiment.compose([])
+    runs = [experiment.replaced(seed=seed, repeats=r) for seed in range(6) for r in (1, 2)]
     jobs = sweep.packed(runs, 3)
     assert sorted(run.key for job in jobs for run in job) == sorted(run.key for run in runs)
     assert len(jobs) == 3
@@ -219,7 +213,9 @@ def test_an_estimator_that_ends_its_process_costs_its_own_runs(name, tmp_path, b
     assert "2 of 4 runs" in done.stderr
     rows = table_of(name)
     assert (rows.loc[rows["estimator.how"] == "sound", "status"] == "ok").all()
-    assert rows.loc[rows["estimator.how"] == "bad", "status"].str.contains(told).all()
+    bad = rows[rows["estimator.how"] == "bad"]
+    assert (bad["status"] == "failed").all()
+    assert (bad["status_code"] + ": " + bad["status_detail"]).str.contains(told).all()
     assert len(rows) == 4
     assert {path.suffix for path in folder(name).iterdir()} <= {".parquet", ".failed"}
 
@@ -303,8 +299,8 @@ def test_a_terminated_sweep_says_so_and_leaves_no_plan(name):
 def test_wrong_sweeps_end_in_a_line(words, told):
     done = estima("run", "-m", *SHORT[:2], *words)
     refused(done, told)
-    for never in ("results/runs/b", "results/runs/2026", "results/runs/None", "evil"):
-        assert not (ROOT / never).exists()
+    for never in ("runs/b", "runs/2026", "runs/None", "../evil"):
+        assert not (results() / never).exists()
 
 
 def test_values_that_no_column_holds_fail_alone(name):
@@ -396,11 +392,9 @@ def test_a_killed_sweep_resumes_to_the_same_table(name):
         clear(whole)
 
 
-@pytest.mark.parametrize(
-    "full", ["results/cache", "results/runs/{name}"], ids=["recordings", "rows"]
-)
+@pytest.mark.parametrize("full", ["cache", "runs/{name}"], ids=["recordings", "rows"])
 def test_a_full_disk_ends_in_a_line_and_a_correct_re_run(name, full, tmp_path):
-    place = full.format(name=name)
+    place = results() / full.format(name=name)
     command = shlex.join(
         [sys.executable, "-m", "experiments.cli", "run", "-m", *SHORT, "seed=range(0,12)",
          f"name={name}"]
@@ -410,7 +404,7 @@ def test_a_full_disk_ends_in_a_line_and_a_correct_re_run(name, full, tmp_path):
         pytest.skip("a small disk cannot be mounted here")
     script = (
         f"{mount}\n{command}\necho code $?\nmount -o remount,size=100m {place}\n"
-        f"{command}\necho code $?\ncp results/runs/{name}/*.parquet {tmp_path}"
+        f"{command}\necho code $?\ncp {folder(name)}/*.parquet {tmp_path}"
     )
     done = subprocess.run(
         ["unshare", "-rm", "sh", "-c", script], cwd=ROOT, capture_output=True, text=True,
@@ -429,12 +423,12 @@ def test_a_full_disk_ends_in_a_line_and_a_correct_re_run(name, full, tmp_path):
     pd.testing.assert_frame_equal(collect(str(tmp_path)), table_of(name), check_exact=True)
 
 
-def test_damaged_files_are_made_anew(name):
+def test_damaged_files_are_made_again(name):
     swept_ = ["run", "-m", *SHORT, "seed=range(90001,90005)", f"name={name}"]
     assert estima(*swept_).returncode == 0
     expected = table_of(name)
     recordings = [
-        default_cache() / f"{key_of(recording_settings(compose([*SHORT, f'seed={seed}'])))}.npz"
+        cache.folder() / f"{Experiment.compose([*SHORT, f'seed={seed}']).recording_key}.npz"
         for seed in range(90001, 90005)
     ]
     half = recordings[0].read_bytes()[:5000]
@@ -450,7 +444,8 @@ def test_damaged_files_are_made_anew(name):
     assert "0 of them done before" in again.stderr
     for recording in recordings[:3]:
         assert any(
-            str(recording) in line and "made anew" in line for line in again.stderr.splitlines()
+            str(recording) in line and "making it again" in line
+            for line in again.stderr.splitlines()
         )
     pd.testing.assert_frame_equal(table_of(name), expected, check_exact=True)
 
@@ -536,7 +531,7 @@ def test_rows_are_chosen_by_conditions():
 
 def test_failures_and_remarks_are_counted_apart():
     table = rows()
-    table["status"] = ["ok", "error: x", "no scan was of use", *["ok"] * 9]
+    table["status"] = ["ok", "failed", "remark", *["ok"] * 9]
     found = summary(table).set_index(["choice.estimator", "robot.kr"])
     assert found["failed"].to_dict() == {
         ("a", 1e-5): 0,
@@ -544,7 +539,7 @@ def test_failures_and_remarks_are_counted_apart():
         ("b", 1e-5): 1,
         ("b", 1e-3): 0,
     }
-    assert int(found["with_remarks"].sum()) == 1
+    assert int(found["remark"].sum()) == 1
 
 
 def test_plots_name_a_missing_column_and_average_recordings():

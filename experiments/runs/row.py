@@ -57,7 +57,7 @@ class Status:
     @classmethod
     def of_error(cls, error: BaseException) -> Status:
         """Status of a run that an exception ended."""
-        return cls(Outcome.FAILED, type(error).__name__, " ".join(str(error).split()))
+        return cls(Outcome.FAILED, type(error).__name__, str(error).replace("\n", " "))
 
     def columns(self) -> Row:
         """Return the columns of a row."""

@@ -1,0 +1,18 @@
+"""Every test writes to temporary folders: results go to one that a test run shares."""
+
+import os
+
+import pytest
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _results(tmp_path_factory, worker_id_or_none):
+    base = tmp_path_factory.getbasetemp()
+    shared = base.parent if worker_id_or_none else base
+    os.environ["ESTIMA_RESULTS"] = str(shared / "results")
+
+
+@pytest.fixture(scope="session")
+def worker_id_or_none():
+    """Return xdist's worker, or None where one process runs all the tests."""
+    return os.environ.get("PYTEST_XDIST_WORKER")
