@@ -53,8 +53,7 @@ def run(context: typer.Context) -> None:
       estima run --cfg job (print the configuration; estima options lists the groups)
     """
     os.environ["HYDRA_FULL_ERROR"] = "1"  # errors come to `main`, which puts them in a line
-    # a study is added to the defaults, which have none: Hydra would want a + before it
-    arguments = [f"+{a}" if a.startswith("study=") else a for a in context.args]
+    arguments = context.args
     many = {"-m", "--multirun"} & set(arguments)
     if many and not {"--hydra-help", "--cfg", "-c", "--info", "-i"} & set(arguments):
         from experiments.sweeps.launch import sweep_arguments
@@ -290,14 +289,21 @@ def calibrate(
 
 @app.command()
 def conform(
-    target: Annotated[str, typer.Argument(help="MODULE:CLASS (or MODULE.CLASS) of an estimator.")],
+    target: Annotated[
+        str, typer.Argument(help="An option of conf/estimator, or MODULE:CLASS of an estimator.")
+    ],
     arguments: Annotated[
-        list[str] | None, typer.Argument(help="Its constructor's arguments, key=value.")
+        list[str] | None,
+        typer.Argument(help="Overrides of the option, or the constructor's arguments, key=value."),
     ] = None,
 ) -> None:
     """Run the checks that every estimator must pass.
 
-    Example: estima conform estimators.odometry:Odometry kr=1e-5 kl=1e-5
+    Examples
+    --------
+      estima conform ekf_icp estimator.gate_probability=null
+
+      estima conform estimators.odometry:Odometry kr=1e-5 kl=1e-5
     """
     from experiments.gate.conform import conform_target
 

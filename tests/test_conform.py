@@ -2,10 +2,12 @@
 
 import numpy as np
 import pytest
+from hydra.errors import MissingConfigException
 
 from estimators.base import Belief
 from estimators.odometry import Odometry
 from experiments.gate.conform import check_estimator, conform_target, example
+from experiments.runs.paths import CONF
 from sim import se2
 from sim.errors import InputError
 from tests import fakes
@@ -237,9 +239,19 @@ def test_targets_by_name():
     assert all(result.passed for result in results)
     with pytest.raises(InputError, match="MODULE:CLASS"):
         conform_target("estimators.odometry", [])
-    with pytest.raises(InputError, match="MODULE:CLASS"):
-        conform_target("odometry", [])
+    with pytest.raises(MissingConfigException, match="nowhere"):
+        conform_target("nowhere", [])
     with pytest.raises(InputError, match="PYTHONPATH"):
         conform_target("nowhere.to:Be", [])
     with pytest.raises(InputError, match="key=value"):
         conform_target("estimators.odometry:Odometry", [])
+
+
+OPTIONS = sorted(path.stem for path in (CONF / "estimator").glob("*.yaml"))
+FEWER = {"mcl": ["estimator.n_most=1000", "estimator.n_least=300"]}  # particles; else 20 s
+
+
+@pytest.mark.parametrize("name", OPTIONS)
+def test_every_option_conforms(name):
+    results = conform_target(name, FEWER.get(name, []))
+    assert [f"{r.name}: {r.message}" for r in results if not r.passed] == []

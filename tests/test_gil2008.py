@@ -174,7 +174,7 @@ def test_the_number_of_processes_changes_no_bit():
     ["path", "particles", "distance", "observations", "resampling", "noise", "association"],
 )
 def test_studies_compose(name):
-    config = compose([f"+study=gil2008_{name}"])
+    config = compose([f"study=gil2008_{name}"])
     assert config["name"] == f"gil2008_{name}"
     assert config["sensors"]["stereo"] is not None
 

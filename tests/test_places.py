@@ -99,7 +99,7 @@ def test_wheels_tell_the_way_that_was_gone():
 
 @pytest.mark.parametrize("study", ["oxford", "umh"])
 def test_studies_compose_to_a_map_and_queries(study):
-    config = compose([f"+study=maximo2024_{study}"])
+    config = compose([f"study=maximo2024_{study}"])
     recording = make_recording(config, Path("unused"))
     known = make_prior(config, recording).map
     assert len(known) == len(recording.frame_stamps) == GEOMETRIES[study].n_nodes
@@ -115,7 +115,7 @@ def test_ones_own_arrays_run_from_one_yaml(tmp_path):
     np.save(tmp_path / "map_descriptors.npy", world.known_map.descriptors)
     np.save(tmp_path / "positions.npy", world.recording.truth.poses[:, :2])
     np.save(tmp_path / "descriptors.npy", world.recording.places.descriptors)
-    config = compose(["+study=maximo2024_own", f"data={tmp_path}"])
+    config = compose(["study=maximo2024_own", f"data={tmp_path}"])
     recording = make_recording(config, Path("unused"))
     known = make_prior(config, recording).map
     np.testing.assert_array_equal(known.descriptors, world.known_map.descriptors)

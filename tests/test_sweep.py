@@ -64,13 +64,13 @@ def test_combinations_are_those_of_the_last_values():
 
 def test_the_quick_composer_resolves_as_hydra_does():
     given = ["world=office", "estimator=ekf_icp,odometry", "sensors=lms291", "robot.kr=1e-6,2e-6"]
-    runs = list(sweep.planned([*given, "estimator.window_s=0.1", "+study=decristoforis2020_office",
+    runs = list(sweep.planned([*given, "estimator.window_s=0.1", "study=decristoforis2020_office",
                                "seed=3,4"]))  # fmt: skip
     assert len(runs) == 2 * 2 * 2
     for run in runs:
         c = run.config
         lines = [
-            "+study=decristoforis2020_office", "world=office", "sensors=lms291",
+            "study=decristoforis2020_office", "world=office", "sensors=lms291",
             f"estimator={run.choices['estimator']}", f"robot.kr={c['robot']['kr']}",
             f"seed={c['seed']}", "estimator.window_s=0.1", "picture=false",
         ]  # fmt: skip
@@ -80,10 +80,10 @@ def test_the_quick_composer_resolves_as_hydra_does():
 
 
 def test_a_study_sweeps_its_own_values_unless_told_otherwise():
-    runs = list(sweep.planned(["+study=decristoforis2020_office"]))
+    runs = list(sweep.planned(["study=decristoforis2020_office"]))
     assert len(runs) == 20 * 4
     assert {run.config["seed"] for run in runs} == set(range(1000, 1020))
-    runs = list(sweep.planned(["+study=decristoforis2020_office", "seed=1", "estimator=odometry"]))
+    runs = list(sweep.planned(["study=decristoforis2020_office", "seed=1", "estimator=odometry"]))
     assert [run.config["seed"] for run in runs] == [1]
 
 
@@ -325,7 +325,7 @@ def test_values_that_no_column_holds_fail_alone(name):
 
 
 def test_a_missing_value_can_be_given_in_a_sweep(tmp_path):
-    runs = list(sweep.planned(["+study=maximo2024_own", f"data={tmp_path}", "seed=0,1"]))
+    runs = list(sweep.planned(["study=maximo2024_own", f"data={tmp_path}", "seed=0,1"]))
     assert len(runs) == 2
     assert runs[0].config["recording"]["positions"] == f"{tmp_path}/positions.npy"
 

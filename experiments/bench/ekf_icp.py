@@ -16,7 +16,7 @@ _GOAL = 20.0
 def run() -> list[Measurement]:
     """Real-time factors of the filters at 75 Hz and 721 beams, in an office."""
     office = [
-        "+study=decristoforis2020_office",
+        "study=decristoforis2020_office",
         "seed=1000",
         "sensors.laser.rate_hz=75",
         "simulation.physics=kinematic",

@@ -294,10 +294,27 @@ def _missing(make: Make, recording: Recording, prior: Prior) -> str:
 
 
 def conform_target(target: str, arguments: Sequence[str]) -> list[CheckResult]:
-    """Check `MODULE:CLASS` with constructor arguments key=value on a small recording of a room."""
+    """Check an estimator on a small recording.
+
+    Parameters
+    ----------
+    target
+        An option of conf/estimator, or MODULE:CLASS.
+    arguments
+        Hydra overrides of the option, or the constructor's arguments, key=value.
+    """
+    by_class = ":" in target or "." in target
+    make = _of_class(target, arguments) if by_class else _of_option(target, arguments)
+    recording, prior = place_example() if "place" in getattr(make(), "needs", ()) else example()
+    return check_estimator(make, recording, prior)
+
+
+def _of_option(name: str, overrides: Sequence[str]) -> Make:
+    return Experiment.compose([f"estimator={name}", *overrides]).estimator
+
+
+def _of_class(target: str, arguments: Sequence[str]) -> Make:
     module_name, _, name = target.rpartition(":" if ":" in target else ".")
-    if not module_name:
-        raise InputError(f"{target}: give MODULE:CLASS, such as estimators.odometry:Odometry")
     try:
         cls = getattr(importlib.import_module(module_name), name)
     except (ModuleNotFoundError, AttributeError) as error:
@@ -314,11 +331,7 @@ def conform_target(target: str, arguments: Sequence[str]) -> list[CheckResult]:
         raise InputError(f"{target}: {error}; give its arguments as key=value") from error
     if not callable(getattr(cls, "step", None)):
         raise InputError(f"{target} has no method step; give MODULE:CLASS of an estimator")
-    if "place" in getattr(cls, "needs", ()):
-        recording, prior = place_example()
-    else:
-        recording, prior = example()
-    return check_estimator(lambda: cls(**keywords), recording, prior)
+    return lambda: cls(**keywords)  # type: ignore[no-any-return]
 
 
 def place_example() -> tuple[Recording, Prior]:

@@ -67,11 +67,11 @@ class Experiment:
         Parameters
         ----------
         overrides
-            `group=option` and `key=value`; `study=NAME` adds a study.
+            `group=option` and `key=value`.
         config_dir
             A further folder of options.
         """
-        lines = [f"+{line}" if line.startswith("study=") else line for line in overrides]
+        lines = list(overrides)
         if config_dir is not None:
             lines.append(f"hydra.searchpath=[file://{config_dir.resolve()}]")
         with initialize_config_dir(str(paths.CONF), version_base="1.3"):

@@ -152,7 +152,7 @@ def _in_parallel(jobs: Sequence[tuple[Any, ...]]) -> Any:
 def office_overrides(seed: int, length_m: float, rate_hz: float, rays: str) -> list[str]:
     """Overrides of one recording in an office."""
     return [
-        f"+study={PAPER}_office",
+        f"study={PAPER}_office",
         f"seed={seed}",
         f"route.distance_m={length_m}",
         f"sensors.laser.rate_hz={rate_hz}",
@@ -342,7 +342,7 @@ def _accumulated(
 
 def _closeup(seed: int, show: bool) -> Tables:
     """Ellipses of registration from scan to scan along a corridor and through a curve."""
-    overrides = [f"+study={PAPER}_corridor", f"seed={seed}"]
+    overrides = [f"study={PAPER}_corridor", f"seed={seed}"]
     config = compose(overrides)
     recording = make_recording(config, default_cache())
     truth = recording.truth_at(recording.frame_stamps)
@@ -408,7 +408,7 @@ def _ellipse_summary(path: pd.DataFrame) -> dict[str, float]:
 def _scenes(seed: int, place: str, n_repeats: int) -> Tables:
     """Many registrations of one pair of poses in a place, and all covariances of them."""
     world_name, part = PLACES[place]
-    config = compose([f"+study={PAPER}_{world_name}", f"seed={seed}"])
+    config = compose([f"study={PAPER}_{world_name}", f"seed={seed}"])
     world = make_world(config)
     laser = make_laser(config)
     rng = stream(seed, f"scenes/{place}")
@@ -516,8 +516,8 @@ def figures(tables: Tables) -> dict[str, Figure]:
     """Draw all figures of the paper, and those beside them, by file name."""
     from experiments.papers.decristoforis2020 import figures as draw
 
-    office = make_world(compose([f"+study={PAPER}_office", f"seed={JUDGED_SEED}"]))
-    corridor = make_world(compose([f"+study={PAPER}_corridor", f"seed={JUDGED_SEED}"]))
+    office = make_world(compose([f"study={PAPER}_office", f"seed={JUDGED_SEED}"]))
+    corridor = make_world(compose([f"study={PAPER}_corridor", f"seed={JUDGED_SEED}"]))
     return {
         f"{PAPER}_1_route": draw.route(office, tables["paths"]),
         f"{PAPER}_2_ellipses": draw.ellipses(corridor, tables["ellipse_path"]),

@@ -535,7 +535,7 @@ def campus_runs(name: str, seed: int) -> tuple[Recording, Recording]:
     """
     physics = "bullet" if name == "campus" else "kinematic"
     settings = [
-        "+study=maximo2024_campus",
+        "study=maximo2024_campus",
         f"world_seed={seed}",
         f"simulation.physics={physics}",
         "simulation.rays=exact",

@@ -1,0 +1,49 @@
+"""Every study of conf/study composes, fits together, and runs, at the least size."""
+
+import numpy as np
+import pytest
+
+from experiments.runs.evaluate import evaluate
+from experiments.runs.paths import CONF
+from experiments.runs.row import Outcome
+from experiments.sweeps.launch import planned
+
+STUDIES = sorted(path.stem for path in (CONF / "study").glob("*.yaml"))
+
+
+def shortened(experiment):
+    """The experiment on a few metres, with few particles."""
+    route, estimator = dict(experiment.config["route"]), dict(experiment.config["estimator"])
+    if "distance_m" in route:
+        route["distance_m"] = 4.0
+    for key, most in (("n_particles", 20), ("n_most", 300), ("n_least", 100)):
+        if key in estimator:
+            estimator[key] = min(estimator[key], most)
+    return experiment.replaced(route=route, estimator=estimator, repeats=1)
+
+
+@pytest.mark.parametrize("name", STUDIES)
+def test_each_study_runs(name, tmp_path):
+    given = []
+    if name == "maximo2024_own":
+        given = [f"data={own_places(tmp_path)}"]
+    runs = list(planned([f"study={name}", *given]))
+    by_estimator = {run.estimator_name: run for run in reversed(runs)}
+    recording = None
+    for experiment in by_estimator.values():
+        short = shortened(experiment)
+        recording = recording or short.recording()
+        rows = evaluate(short, recording)
+        assert [row["status_detail"] for row in rows if row["status"] == Outcome.FAILED] == []
+
+
+def own_places(folder):
+    """Files of positions and descriptors along a line."""
+    rng = np.random.default_rng(0)
+    line = np.column_stack([np.arange(30.0), np.zeros(30)])
+    unit = rng.standard_normal((30, 64))
+    unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+    for prefix in ("map_", ""):
+        np.save(folder / f"{prefix}positions.npy", line)
+        np.save(folder / f"{prefix}descriptors.npy", unit)
+    return folder
