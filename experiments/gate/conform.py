@@ -331,7 +331,7 @@ def _of_class(target: str, arguments: Sequence[str]) -> Make:
         raise InputError(f"{target}: {error}; give its arguments as key=value") from error
     if not callable(getattr(cls, "step", None)):
         raise InputError(f"{target} has no method step; give MODULE:CLASS of an estimator")
-    return lambda: cls(**keywords)  # type: ignore[no-any-return]
+    return lambda: cls(**keywords)
 
 
 def place_example() -> tuple[Recording, Prior]:

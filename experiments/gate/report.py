@@ -99,7 +99,7 @@ def _say(text: str) -> None:
 
 def smallest_found() -> dict[str, float]:
     """Smallest worsening of each estimator, as a share, that 95 % of checks of the suite find."""
-    power = baseline_folder() / "power.csv"  # what experiments.gate.faults measured
+    power = baseline_folder() / "power.csv"  # what experiments.gate.power measured
     if not power.exists():
         return {}
     try:
