@@ -11,6 +11,7 @@ import pandas as pd
 import pytest
 from scipy import stats
 
+from experiments.gate import baseline
 from experiments.gate import compare as regress
 from experiments.gate import report as regress_report
 from experiments.gate.compare import exchange_p, holm
@@ -188,29 +189,29 @@ def small(tmp_path, monkeypatch):
         f"first_seed: 5\nrecordings:\n  room:\n    count: 3\n    overrides:{overrides}\n"
         "estimators:\n  odometry: { recordings: room, repeats: [1, 1], overrides: [] }\n"
     )
-    monkeypatch.setattr(regress, "run_suite", partial(run_suite, n_jobs=1))
+    monkeypatch.setattr(baseline, "run_suite", partial(run_suite, n_jobs=1))
     return path
 
 
 def test_suites_of_ones_own_keep_their_baselines_apart(tmp_path):
-    main = regress.baseline_paths("check")
-    assert main == regress.baseline_paths(str(suite_path("check")))
-    assert main["accepted"] == regress.baseline_folder() / "check.csv"
+    main = baseline.baseline_paths("check")
+    assert main == baseline.baseline_paths(str(suite_path("check")))
+    assert main["accepted"] == baseline.baseline_folder() / "check.csv"
     names = [
         str(tmp_path / f"{folder}{stem}.yaml")
         for folder in ("", "o/")
         for stem in ("check", "release", "power")
     ]
-    files = [path for name in [*names, "check"] for path in regress.baseline_paths(name).values()]
+    files = [path for name in [*names, "check"] for path in baseline.baseline_paths(name).values()]
     assert len(set(files)) == len(files)
-    assert regress.baseline_paths(names[0])["release"] == tmp_path / "check.baselines/release.csv"
+    assert baseline.baseline_paths(names[0])["release"] == tmp_path / "check.baselines/release.csv"
 
 
 def test_damage_is_told_from_otherness(tmp_path):
     path, sound = tmp_path / "b.csv", table("e", np.full((4, 2), 0.25))
-    regress.write_baseline(regress.Baseline(sound, ("why",)), path)
+    baseline.write_baseline(baseline.Baseline(sound, ("why",)), path)
     text = path.read_text()
-    back = regress.read_baseline(path)
+    back = baseline.read_baseline(path)
     assert back.history == ("why",)
     pd.testing.assert_frame_equal(back.rows, sound, check_dtype=False)
     lines = text.splitlines(keepends=True)
@@ -230,7 +231,7 @@ def test_damage_is_told_from_otherness(tmp_path):
     ):
         path.write_text(damaged)
         with pytest.raises(InputError, match=f"damaged.*{why}.*git checkout -- ") as refusal:
-            regress.read_baseline(path)
+            baseline.read_baseline(path)
         assert "\n" not in str(refusal.value)
         assert "--accept" not in str(refusal.value)
 
@@ -240,29 +241,29 @@ def no_run(*_, **__):
 
 
 def test_baselines_are_read_before_the_suite_runs(small, monkeypatch):
-    monkeypatch.setattr(regress, "run_suite", no_run)
-    for path in regress.baseline_paths(str(small)).values():
+    monkeypatch.setattr(baseline, "run_suite", no_run)
+    for path in baseline.baseline_paths(str(small)).values():
         path.parent.mkdir(exist_ok=True)
         path.write_text("estimator\ne\n")
     with pytest.raises(InputError, match="damaged"):
-        regress.accept(str(small), "reason")
+        baseline.accept(str(small), "reason")
     with pytest.raises(InputError, match="damaged"):
-        regress.check(str(small))
+        baseline.check(str(small))
 
 
 def test_one_estimator_alone_makes_no_baseline(small, monkeypatch, capsys):
     small.write_text(small.read_text() + "  second: { recordings: room, repeats: [1, 1] }\n")
-    paths = regress.baseline_paths(str(small))
+    paths = baseline.baseline_paths(str(small))
     rows = pd.concat([table("odometry", np.ones((3, 1))), table("second", np.ones((3, 1)))])
-    accepted = regress.Baseline(rows)
-    monkeypatch.setattr(regress, "run_suite", no_run)
+    accepted = baseline.Baseline(rows)
+    monkeypatch.setattr(baseline, "run_suite", no_run)
     for missing in ("accepted", "release"):
         with pytest.raises(InputError, match=f"{paths[missing].name}.*without --only"):
-            regress.accept(str(small), "reason", ["odometry"])
-        regress.write_baseline(accepted, paths["accepted"])
+            baseline.accept(str(small), "reason", ["odometry"])
+        baseline.write_baseline(accepted, paths["accepted"])
     assert not paths["release"].exists()
     # and a check says that the release is missing
-    monkeypatch.setattr(regress, "run_suite", lambda *_, **__: rows)
+    monkeypatch.setattr(baseline, "run_suite", lambda *_, **__: rows)
     assert not regress_report.run_check(str(small), None)
     told = capsys.readouterr().err
     assert "release.csv: no release baseline" in told
@@ -271,21 +272,21 @@ def test_one_estimator_alone_makes_no_baseline(small, monkeypatch, capsys):
 
 def test_failures_are_not_accepted(small, monkeypatch):
     rows = table("odometry", np.full((3, 1), math.inf))
-    monkeypatch.setattr(regress, "run_suite", lambda *_, **__: rows)
+    monkeypatch.setattr(baseline, "run_suite", lambda *_, **__: rows)
     with pytest.raises(InputError, match=r"recording 0 \(errors that are not finite\)"):
-        regress.accept(str(small), "reason")
+        baseline.accept(str(small), "reason")
 
 
 def test_accept_check_worsen_accept(small, monkeypatch):
     with pytest.raises(InputError, match="needs a reason"):
-        regress.accept(str(small), " ")
+        baseline.accept(str(small), " ")
     with pytest.raises(InputError, match="no baseline yet"):
-        regress.check(str(small))
+        baseline.check(str(small))
     with pytest.raises(InputError, match="no estimator ekf; it has odometry"):
-        regress.check(str(small), ["ekf"])
-    written = regress.accept(str(small), "first")
+        baseline.check(str(small), ["ekf"])
+    written = baseline.accept(str(small), "first")
     assert [path.name for path in written] == ["check.csv", "release.csv"]
-    assert {f.verdict for f in regress.check(str(small))} == {"identical"}
+    assert {f.verdict for f in baseline.check(str(small))} == {"identical"}
 
     @contextmanager
     def fast_clock(estimator, rng):
@@ -298,18 +299,18 @@ def test_accept_check_worsen_accept(small, monkeypatch):
     def faulty(suite, repeats, **options):
         return run_suite(suite, repeats, **options, planted={"odometry": fast_clock}, n_jobs=1)
 
-    monkeypatch.setattr(regress, "run_suite", faulty)
-    found = regress.check(str(small))
+    monkeypatch.setattr(baseline, "run_suite", faulty)
+    found = baseline.check(str(small))
     assert {f.baseline for f in found if f.alarms} == {"accepted", "release"}
     # what is accepted passes from then on, against the release too, and both files say why
-    assert len(regress.accept(str(small), "longer wheels")) == 2
-    assert not any(f.alarms for f in regress.check(str(small)))
-    for path in regress.baseline_paths(str(small)).values():
-        history = regress.read_baseline(path).history
+    assert len(baseline.accept(str(small), "longer wheels")) == 2
+    assert not any(f.alarms for f in baseline.check(str(small)))
+    for path in baseline.baseline_paths(str(small)).values():
+        history = baseline.read_baseline(path).history
         assert [line.rsplit(": ", 1)[1] for line in history] == ["first", "longer wheels"]
     # better than the release: that stays pinned
-    monkeypatch.setattr(regress, "run_suite", partial(run_suite, n_jobs=1))
-    assert [p.name for p in regress.accept(str(small), "mended")] == ["check.csv"]
+    monkeypatch.setattr(baseline, "run_suite", partial(run_suite, n_jobs=1))
+    assert [p.name for p in baseline.accept(str(small), "mended")] == ["check.csv"]
 
 
 def test_suite_of_the_check_is_sound():

@@ -20,11 +20,8 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -32,21 +29,12 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy import stats
 
-from experiments.gate.suite import ERRORS, Suite, read_suite, run_suite, suite_path
-from experiments.runs.paths import packaged, results
+from experiments.gate.suite import ERRORS
 from experiments.runs.seeds import stream
-from experiments.runs.version import code_version
 from sim.errors import InputError
-from sim.files import write_whole
 
 Array = NDArray[np.float64]
 Verdict = Literal["identical", "equal", "changed", "better", "worse", "failed"]
-
-
-def baseline_folder() -> Path:
-    """Folder of the main suite's baselines: that of the results, else those that came along."""
-    own = results() / "baselines"
-    return own if own.exists() else packaged("results/baselines")
 
 
 ALPHA_REAL = 0.002  # of a whole check
@@ -57,17 +45,7 @@ _MOST_WAYS = 2**15 - 1  # to exchange a recording's runs; where there are more,
 _DRAWN_WAYS = 4096  # so many are drawn
 _PLAIN = 2.0  # standard deviations
 _LEAST_ERROR = 1e-12  # an error of nothing has no logarithm
-_WHICH = ("estimator", "recording", "repeat")
-_COUNT = re.compile(r"(\d+) rows")  # in a baseline's first line, so that one cut short is known
-_COLUMNS = (*_WHICH, "checksum", "fingerprint", *ERRORS, "status")
-
-
-@dataclass(frozen=True)
-class Baseline:
-    """Rows of a baseline and the history written over them: when, which code, which, and why."""
-
-    rows: pd.DataFrame
-    history: tuple[str, ...] = ()
+WHICH = ("estimator", "recording", "repeat")
 
 
 @dataclass(frozen=True)
@@ -283,214 +261,22 @@ def _same_recordings(estimator: str, name: str, then: pd.DataFrame, now: pd.Data
         )
 
 
-def _failed(rows: pd.DataFrame) -> pd.Series:
+def failed(rows: pd.DataFrame) -> pd.Series:
     """Which runs ended in an exception or in errors that are not finite."""
     finite = np.isfinite(rows[list(ERRORS)].to_numpy(np.float64)).all(axis=1)
     return (rows["status"] != "ok") | ~finite
 
 
-def _how(run: pd.Series) -> str:
+def how(run: pd.Series) -> str:
+    """Say how a run failed."""
     return str(run["status"]) if run["status"] != "ok" else "errors that are not finite"
 
 
 def _newly_failing(then: pd.DataFrame, now: pd.DataFrame) -> str:
     """What ends runs now on recordings where none of the baseline's failed; else nothing."""
-    bad = now[_failed(now)]
-    new = bad[~bad["recording"].isin(then.loc[_failed(then), "recording"])]
+    bad = now[failed(now)]
+    new = bad[~bad["recording"].isin(then.loc[failed(then), "recording"])]
     if new.empty:
         return ""
     first = new.iloc[0]
-    return f"{len(bad)} of {len(now)} runs fail; recording {first['recording']}: {_how(first)}"
-
-
-def read_baseline(path: Path) -> Baseline:
-    """Read a baseline.
-
-    Raises
-    ------
-    InputError
-        If it is not there, or is no baseline.
-    """
-    restore = f"restore it, e.g. git checkout -- {path}"
-    try:
-        text = path.read_text(encoding="utf-8")
-        texts = dict.fromkeys(("estimator", "checksum", "status"), "str")
-        rows = pd.read_csv(path, comment="#", dtype=texts, low_memory=False)
-    except FileNotFoundError as error:
-        raise InputError(
-            f"{path}: no baseline yet; check with --accept REASON to make one"
-        ) from error
-    except OSError as error:
-        raise InputError(f"{path}: cannot read this baseline ({error.strerror})") from error
-    except ValueError as error:
-        why = str(error).splitlines()[0]
-        raise InputError(f"{path}: damaged ({why}); {restore}") from error
-    if damage := _damage(text, rows):
-        raise InputError(f"{path}: damaged ({damage}); {restore}")
-    lines = (line[2:] for line in text.splitlines() if line.startswith("# "))
-    return Baseline(rows, tuple(line for line in lines if not _COUNT.fullmatch(line)))
-
-
-def _damage(text: str, rows: pd.DataFrame) -> str:
-    """What no baseline that was written whole has; nothing if it is sound."""
-    for name in _COLUMNS:
-        if name not in rows:
-            return f"no column {name}"
-    count = _COUNT.fullmatch(text.partition("\n")[0].removeprefix("# "))
-    if not text.endswith("\n") or (count and int(count[1]) != len(rows)):
-        return f"cut short at {len(rows)} rows"
-    for name in ("recording", "repeat", "fingerprint", *ERRORS):
-        numbers = pd.to_numeric(rows[name], errors="coerce")
-        wrong = numbers.isna() & rows[name].notna()
-        if wrong.any():
-            return f"{name} {rows.loc[wrong, name].iloc[0]!r} is no number"
-        if name not in ERRORS and not np.isfinite(numbers.to_numpy(np.float64)).all():
-            return f"a row without {name}"
-    for name in ("estimator", "checksum", "status"):
-        if rows[name].isna().any():
-            return f"a row without {name}"
-    twice = rows.duplicated(list(_WHICH))
-    if twice.any():
-        which = rows.loc[twice, list(_WHICH)].iloc[0]
-        return "two rows of {}, recording {}, repeat {}".format(*which)
-    runs = rows.groupby(["estimator", "recording"]).size().groupby("estimator").nunique()
-    if (runs > 1).any():
-        return f"rows of {runs.idxmax()} are missing"
-    return ""
-
-
-def write_baseline(baseline: Baseline, path: Path) -> None:
-    """Write a baseline: the number of its rows and its history as comments, then its rows."""
-    head = "".join(f"# {line}\n" for line in (f"{len(baseline.rows)} rows", *baseline.history))
-    table = baseline.rows[list(_COLUMNS)].to_csv(index=False, float_format="%.9g")
-    with write_whole(path) as part:
-        part.write_text(head + table, encoding="utf-8")
-
-
-def renewed(
-    old: Baseline | None,
-    rows: pd.DataFrame,
-    estimators: Iterable[str],
-    reason: str,
-    known: Iterable[str],
-) -> Baseline:
-    """Baseline with the rows of these estimators in place of its own, and why in its history.
-
-    Estimators that the suite no longer knows are dropped.
-    """
-    names = list(estimators)
-    today = datetime.now(UTC).date().isoformat()
-    line = f"{today} code {code_version()}: {', '.join(names)}: {' '.join(reason.split())}"
-    fresh = rows[rows["estimator"].isin(names)]
-    if old is None:
-        return Baseline(fresh.reset_index(drop=True), (line,))
-    kept = old.rows[~old.rows["estimator"].isin(names)]
-    kept = kept[kept["estimator"].isin(list(known))]
-    return Baseline(pd.concat([kept, fresh], ignore_index=True), (*old.history, line))
-
-
-def is_main(suite: str) -> bool:
-    """Whether this is the suite of the project's own gate, conf/suite/check.yaml."""
-    return suite_path(suite).resolve() == suite_path("check").resolve()
-
-
-def baseline_paths(suite: str) -> dict[str, Path]:
-    """Files of a suite's baselines: what was last accepted, and what is pinned at a release.
-
-    Those of a suite other than conf/suite/check.yaml lie beside it: `mine.baselines/check.csv`.
-    """
-    folder = baseline_folder() if is_main(suite) else suite_path(suite).with_suffix(".baselines")
-    return {"accepted": folder / "check.csv", "release": folder / "release.csv"}
-
-
-def check(
-    suite_name: str,
-    only: Sequence[str] = (),
-    on_progress: Callable[[float], None] | None = None,
-) -> list[Finding]:
-    """Run a suite, or some of its estimators, and compare it with its baselines.
-
-    Raises
-    ------
-    InputError
-        If the suite or a baseline cannot be used.
-    """
-    suite = read_suite(suite_path(suite_name)).of(only)
-    paths = baseline_paths(suite_name)
-    baselines = {"accepted": read_baseline(paths["accepted"]).rows}
-    if paths["release"].exists():
-        baselines["release"] = read_baseline(paths["release"]).rows
-    rows = run_suite(suite, repeats_of(suite, of_baseline=False), on_progress=on_progress)
-    return compare(baselines, rows)
-
-
-def accept(
-    suite_name: str,
-    reason: str,
-    only: Sequence[str] = (),
-    *,
-    release: bool = False,
-    on_progress: Callable[[float], None] | None = None,
-) -> list[Path]:
-    """Run a suite and make it the baseline, with the reason written into the file.
-
-    With `only` the baselines of the other estimators stay.
-
-    The release baseline stays pinned, but for estimators that are worse than it: they are what
-    the reason is given for. With `release` it is pinned anew as a whole.
-
-    Returns
-    -------
-    list of Path
-        Files written.
-    """
-    if not reason.strip():
-        raise InputError('--accept needs a reason, such as --accept "faster matching, 2 % worse"')
-    whole = read_suite(suite_path(suite_name))
-    suite = whole.of(only)
-    names = [entry.name for entry in suite.estimators]
-    known = [entry.name for entry in whole.estimators]
-    paths = baseline_paths(suite_name)
-    old = {k: read_baseline(path) if path.exists() else None for k, path in paths.items()}
-    for key, baseline in old.items():
-        if baseline is None and len(names) < len(known):
-            raise InputError(
-                f"{paths[key]}: no baseline yet, and one of {', '.join(names)} alone would not do; "
-                "accept the whole suite, without --only"
-            )
-    rows = run_suite(suite, repeats_of(suite, of_baseline=True), on_progress=on_progress)
-    bad = rows[_failed(rows)]
-    if len(bad):
-        first = bad.iloc[0]
-        raise InputError(
-            f"{first['estimator']} fails on recording {first['recording']} ({_how(first)}); a "
-            "baseline of failures guards nothing"
-        )
-    changes = {"accepted": names}
-    pinned = old["release"]
-    if release or pinned is None:
-        changes["release"] = names
-    elif worse := _cannot_stay(pinned.rows, rows, names):
-        changes["release"] = worse
-    for key, changed in changes.items():
-        write_baseline(renewed(old[key], rows, changed, reason, known), paths[key])
-    return [paths[key] for key in changes]
-
-
-def _cannot_stay(pinned: pd.DataFrame, rows: pd.DataFrame, names: Sequence[str]) -> list[str]:
-    """Estimators that are worse than the release, or cannot be compared with it any more."""
-    out = []
-    for name in names:
-        try:
-            found = compare({"release": pinned}, rows[rows["estimator"] == name])
-        except InputError:
-            out.append(name)
-            continue
-        if any(finding.alarms for finding in found):
-            out.append(name)
-    return out
-
-
-def repeats_of(suite: Suite, *, of_baseline: bool) -> dict[str, int]:
-    """Runs of each estimator on each recording."""
-    return {entry.name: entry.repeats[0 if of_baseline else 1] for entry in suite.estimators}
+    return f"{len(bad)} of {len(now)} runs fail; recording {first['recording']}: {how(first)}"

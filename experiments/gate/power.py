@@ -35,16 +35,14 @@ from scipy import stats
 
 from estimators.base import Estimator, Prior
 from experiments.evaluation.statistics import share_interval
+from experiments.gate.baseline import baseline_folder, baseline_paths, read_baseline
 from experiments.gate.compare import (
     ALPHA_GENERAL,
     ALPHA_REAL,
     Finding,
-    baseline_folder,
-    baseline_paths,
     compare,
     examine,
     judge,
-    read_baseline,
 )
 from experiments.gate.faults import FAULTS, Fault, Planted
 from experiments.gate.suite import ERRORS, Suite, read_suite, run_suite, suite_path
@@ -52,7 +50,7 @@ from experiments.runs.console import progress
 from experiments.runs.paths import SOURCE, results
 from experiments.runs.row import write_frame
 from experiments.runs.seeds import stream
-from experiments.viewing.style import WALL, figure, save_figure
+from experiments.viewing.style import BLUE, GREEN, ORANGE, WALL, figure, save_figure
 from sim.files import write_whole
 
 Array = NDArray[np.float64]

@@ -12,15 +12,8 @@ from pathlib import Path
 
 import pandas as pd
 
-from experiments.gate.compare import (
-    Finding,
-    Verdict,
-    accept,
-    baseline_folder,
-    baseline_paths,
-    check,
-    is_main,
-)
+from experiments.gate.baseline import accept, baseline_folder, baseline_paths, check, is_main
+from experiments.gate.compare import Finding, Verdict
 from experiments.gate.suite import ERRORS, printable
 from experiments.runs.console import progress
 from sim.errors import InputError
