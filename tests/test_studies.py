@@ -6,7 +6,7 @@ import pytest
 from experiments.runs.evaluate import evaluate
 from experiments.runs.paths import CONF
 from experiments.runs.row import Outcome
-from experiments.sweeps.launch import planned
+from experiments.sweeps.plan import planned
 
 STUDIES = sorted(path.stem for path in (CONF / "study").glob("*.yaml"))
 

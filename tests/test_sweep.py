@@ -18,7 +18,7 @@ from experiments.runs.experiment import Experiment, files_digest
 from experiments.runs.paths import results
 from experiments.runs.row import read_rows
 from experiments.runs.version import source_digest
-from experiments.sweeps import launch as sweep
+from experiments.sweeps import plan
 from experiments.sweeps.collect import collect, measured, summary, swept, telling, where
 from sim.errors import InputError
 from tests.test_cli import QUICK, ROOT, estima, refused
@@ -51,7 +51,7 @@ def clear(name):
 
 
 def test_combinations_are_those_of_the_last_values():
-    found = list(sweep.combinations(["seed=range(0,3)", "robot.kr=1e-5,1e-4", "seed=7,8", "a=b"]))
+    found = list(plan.combinations(["seed=range(0,3)", "robot.kr=1e-5,1e-4", "seed=7,8", "a=b"]))
     assert found == [
         ["seed=7", "robot.kr=1e-05", "a=b"],
         ["seed=7", "robot.kr=0.0001", "a=b"],
@@ -59,12 +59,12 @@ def test_combinations_are_those_of_the_last_values():
         ["seed=8", "robot.kr=0.0001", "a=b"],
     ]
     with pytest.raises(InputError, match="interval"):
-        list(sweep.combinations(["robot.kr=interval(0,1)"]))
+        list(plan.combinations(["robot.kr=interval(0,1)"]))
 
 
 def test_the_quick_composer_resolves_as_hydra_does():
     given = ["world=office", "estimator=ekf_icp,odometry", "sensors=lms291", "robot.kr=1e-6,2e-6"]
-    runs = list(sweep.planned([*given, "estimator.window_s=0.1", "study=decristoforis2020_office",
+    runs = list(plan.planned([*given, "estimator.window_s=0.1", "study=decristoforis2020_office",
                                "seed=3,4"]))  # fmt: skip
     assert len(runs) == 2 * 2 * 2
     for run in runs:
@@ -80,16 +80,16 @@ def test_the_quick_composer_resolves_as_hydra_does():
 
 
 def test_a_study_sweeps_its_own_values_unless_told_otherwise():
-    runs = list(sweep.planned(["study=decristoforis2020_office"]))
+    runs = list(plan.planned(["study=decristoforis2020_office"]))
     assert len(runs) == 20 * 4
     assert {run.config["seed"] for run in runs} == set(range(1000, 1020))
-    runs = list(sweep.planned(["study=decristoforis2020_office", "seed=1", "estimator=odometry"]))
+    runs = list(plan.planned(["study=decristoforis2020_office", "seed=1", "estimator=odometry"]))
     assert [run.config["seed"] for run in runs] == [1]
 
 
 def test_unknown_keys_and_options_are_refused():
     with pytest.raises(InputError, match=r"robot\.krr"):
-        list(sweep.planned(["robot.krr=1,2"]))
+        list(plan.planned(["robot.krr=1,2"]))
     refused(estima("run", "-m", "robot.krr=1,2"), "robot.krr")
     refused(estima("run", "-m", "world=nowhere,room"), "nowhere")
     refused(estima("run", "-m", "--frob", "seed=1,2"), "--frob")
@@ -140,12 +140,12 @@ def test_keys_know_the_files_that_a_mapping_names(tmp_path):
 def test_packing_keeps_recordings_together():
     experiment = Experiment.compose([])
     runs = [experiment.replaced(seed=seed, repeats=r) for seed in range(6) for r in (1, 2)]
-    jobs = sweep.packed(runs, 3)
+    jobs = plan.packed(runs, 3)
     assert sorted(run.key for job in jobs for run in job) == sorted(run.key for run in runs)
     assert len(jobs) == 3
     for job in jobs:
         assert len({run.config["seed"] for run in job}) == 2
-    assert max(len(job) for job in sweep.packed(runs, 100)) == 1
+    assert max(len(job) for job in plan.packed(runs, 100)) == 1
 
 
 def test_failed_runs_leave_rows_and_the_rest_goes_on(name, tmp_path):
@@ -325,7 +325,7 @@ def test_values_that_no_column_holds_fail_alone(name):
 
 
 def test_a_missing_value_can_be_given_in_a_sweep(tmp_path):
-    runs = list(sweep.planned(["study=maximo2024_own", f"data={tmp_path}", "seed=0,1"]))
+    runs = list(plan.planned(["study=maximo2024_own", f"data={tmp_path}", "seed=0,1"]))
     assert len(runs) == 2
     assert runs[0].config["recording"]["positions"] == f"{tmp_path}/positions.npy"
 

@@ -210,7 +210,7 @@ class Experiment:
                 )
         if simulation["physics"] == "kinematic" and simulation["rays"] == "bullet":
             raise InputError(
-                "simulation.rays=bullet needs the engine; drop it, or set simulation.physics=bullet"
+                "simulation.rays=bullet needs the engine; set simulation.rays=exact, or physics=bullet"
             )
 
     def _check_needs(self) -> None:
