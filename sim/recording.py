@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.errors import InputError
+from sim.errors import InputError, required
 from sim.files import write_whole
 from sim.robot import RobotGeometry
 from sim.sensors import SensorSuite, suite_from_config
@@ -200,6 +200,44 @@ class Recording:
         """Time from the first Frame to the last, s."""
         return float(self.frame_stamps[-1] - self.frame_stamps[0])
 
+    @property
+    def world(self) -> World | None:
+        """The map, or None; part of the truth."""
+        return self.truth.world if self.truth else None
+
+    # Never None: an InputError says what is missing and how to get it.
+
+    @property
+    def known_truth(self) -> Truth:
+        """The truth; InputError if there is none."""
+        return required(self.truth, "this recording has no truth to compare with")
+
+    @property
+    def known_world(self) -> World:
+        """The map; InputError if there is none."""
+        return required(self.world, "this recording has no map; use a simulated one")
+
+    @property
+    def known_laser(self) -> LaserLog:
+        """The laser scans; InputError if there are none."""
+        return required(
+            self.laser, "this recording has no laser scans; choose sensors such as sensors=hokuyo"
+        )
+
+    @property
+    def known_landmarks(self) -> LandmarkLog:
+        """The landmark observations; InputError if there are none."""
+        return required(
+            self.landmarks,
+            "this recording has no landmark observations; choose sensors such as "
+            "sensors=stereo_pixel",
+        )
+
+    @property
+    def known_clouds(self) -> CloudLog:
+        """The 3D lidar turns; InputError if there are none."""
+        return required(self.clouds, "this recording has no 3D lidar turns; choose sensors=lidar3d")
+
     def frames(self) -> Iterator[Frame]:
         """Walk through the Frames in order.
 
@@ -236,8 +274,8 @@ class Recording:
             )
 
     def _image(self, row: int) -> LandmarkSet:
-        assert self.landmarks is not None
-        log, rows = self.landmarks, slice(*self.landmarks.splits[row : row + 2])
+        log = self.known_landmarks
+        rows = slice(*log.splits[row : row + 2])
         return LandmarkSet(
             points_in_camera=log.points_in_camera[rows],
             ids=log.ids[rows] if len(log.ids) else None,
@@ -252,9 +290,7 @@ class Recording:
         InputError
             If the recording has no truth.
         """
-        if self.truth is None:
-            raise InputError("this recording has no truth to compare with")
-        poses, times = self.truth.poses, self.truth.stamps
+        poses, times = self.known_truth.poses, self.known_truth.stamps
         heading = np.unwrap(poses[:, 2])
         columns = [poses[:, 0], poses[:, 1], heading]
         out = np.stack(
@@ -387,14 +423,13 @@ def _meta(recording: Recording) -> dict[str, Any]:
     # Rebuilt from plain values, so that 100 and 100.0 Hz are the same recording.
     sensors = suite_from_config(dataclasses.asdict(recording.sensors))
     robot = build(RobotGeometry, dataclasses.asdict(recording.robot), "robot")
-    world = recording.truth.world.name if recording.truth and recording.truth.world else None
     return {
         "format": FORMAT_VERSION,
         "status": recording.status,
         "robot": dataclasses.asdict(robot),
         "sensors": dataclasses.asdict(sensors),
         "config": recording.config,
-        "world": world,
+        "world": recording.world.name if recording.world else None,
     }
 
 
