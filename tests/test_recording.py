@@ -15,6 +15,7 @@ from sim.recording import (
     CloudLog,
     LandmarkLog,
     LaserLog,
+    PlaceLog,
     Recording,
     Truth,
     WheelLog,
@@ -127,6 +128,7 @@ KNOWN = {
     "known_laser": "no laser scans; choose sensors such as sensors=hokuyo",
     "known_landmarks": "no landmark observations; choose sensors such as sensors=stereo_pixel",
     "known_clouds": "no 3D lidar turns; choose sensors=lidar3d",
+    "known_places": "no place descriptors",
 }
 
 
@@ -140,13 +142,16 @@ def test_what_is_missing_is_named(name):
 
 def test_what_is_there_is_given():
     recording = dataclasses.replace(
-        small_recording(), clouds=CloudLog(np.zeros(1), np.ones((1, 2, 3), np.float32))
+        small_recording(),
+        clouds=CloudLog(np.zeros(1), np.ones((1, 2, 3), np.float32)),
+        places=PlaceLog(np.zeros(1), np.ones((1, 4), np.float32)),
     )
     assert recording.known_truth is recording.truth
     assert recording.known_world is recording.world is recording.truth.world
     assert recording.known_laser is recording.laser
     assert recording.known_landmarks is recording.landmarks
     assert recording.known_clouds is recording.clouds
+    assert recording.known_places is recording.places
 
 
 @pytest.mark.parametrize("damage", ["cut", "flip", "empty", "text", "other_zip"])
