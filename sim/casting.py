@@ -13,12 +13,8 @@ range 0 on all beams. In the kernels bearings are counted in beams from the firs
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
-from llvmlite import ir  # type: ignore[import-untyped]
-from numba import types
-from numba.extending import intrinsic
 from numpy.typing import ArrayLike, NDArray
 
 from sim.compiled import njit
@@ -29,8 +25,6 @@ Array = NDArray[np.float64]
 
 IGNORED_NEAR_POINT_M = 0.005
 
-_LANES = 8  # beams drawn at a time; buffers over beams are padded by as many
-_BEARING_ERROR_RAD = 1e-7  # above the error of the polynomial in `_bearings`, 3.8e-8
 _END_TOLERANCE = 1e-9  # of the beam spacing; of a face's length in `visible`
 _EDGE_ON_M = 1e-6  # a face whose line passes the sensor nearer than this is drawn with care
 _TOUCHING_M = 1e-12
@@ -52,12 +46,12 @@ class SegmentCaster:
         z = laser.mount.z_m
         bearings = laser.bearings_rad
         step = float(bearings[1] - bearings[0]) if laser.n_beams > 1 else math.pi
-        directions = np.zeros((2, laser.n_beams + _LANES))
-        directions[:, : laser.n_beams] = np.cos(bearings), np.sin(bearings)
         level = (world.wall_z_m[:, 0] <= z) & (z <= world.wall_z_m[:, 1])
+        directions = np.stack([np.cos(bearings), np.sin(bearings)])
         self._prepared = (
             _chains(world.walls[level]),
             directions,
+            bool(directions[0].min() > -_END_TOLERANCE),
             float(bearings[0]),
             step,
             float(laser.max_range_m),
@@ -192,81 +186,73 @@ def _chain(corners: Array) -> Array:
     return columns
 
 
-@intrinsic
-def _draw_block(
-    typing_context: Any, nearness: Any, cosines: Any, sines: Any, j: Any, n: Any, gx: Any, gy: Any
-) -> Any:
-    """Raise nearness[j + m] to gx cosines[j + m] + gy sines[j + m] for m < min(n, 8).
-
-    Written in the compiler's vectors: the masked loop of eight is not vectorised otherwise and
-    then takes four times as long. Buffers must reach to j + 8.
-    """
-    signature = types.void(
-        nearness, cosines, sines, types.int64, types.int64, types.float64, types.float64
-    )
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        doubles = ir.VectorType(ir.DoubleType(), _LANES)
-        integers = ir.VectorType(ir.IntType(64), _LANES)
-        index = ir.VectorType(ir.IntType(32), _LANES)
-
-        def pointer(k: int) -> Any:
-            array = context.make_array(signature.args[k])(context, builder, arguments[k])
-            return builder.bitcast(builder.gep(array.data, [arguments[3]]), doubles.as_pointer())
-
-        def spread(value: Any, kind: Any) -> Any:
-            none = ir.Constant(kind, ir.Undefined)
-            single = builder.insert_element(none, value, ir.Constant(ir.IntType(32), 0))
-            return builder.shuffle_vector(single, none, ir.Constant(index, [0] * _LANES))
-
-        fused = {"flags": ["contract"]}
-        east = builder.fmul(
-            builder.load(pointer(1), align=8), spread(arguments[5], doubles), **fused
-        )
-        north = builder.fmul(
-            builder.load(pointer(2), align=8), spread(arguments[6], doubles), **fused
-        )
-        new = builder.fadd(east, north, **fused)
-        old = builder.load(pointer(0), align=8)
-        lanes = ir.Constant(integers, list(range(_LANES)))
-        covered = builder.icmp_signed("<", lanes, spread(arguments[4], integers))
-        nearer = builder.and_(covered, builder.fcmp_ordered(">", new, old))
-        builder.store(builder.select(nearer, new, old), pointer(0), align=8)
-        return context.get_dummy_value()
-
-    return signature, generate
-
-
-@njit(error_model="numpy")
+@njit(error_model="numpy", fastmath={"contract"})
 def _cast(
     poses: Array,
     chains: Array,
     directions: Array,
+    forward: bool,
     first_rad: float,
     step_rad: float,
     max_range_m: float,
 ) -> Array:
     """Ranges (N, n_beams), m, from poses (N, 3)."""
-    n_beams = directions.shape[1] - _LANES
+    px, py, cosines, sines = chains[0], chains[1], directions[0], directions[1]
     turn = 2.0 * math.pi / step_rad
-    tolerance = _BEARING_ERROR_RAD / step_rad + _END_TOLERANCE
-    bearing = np.empty(chains.shape[1])
-    seen = np.empty(chains.shape[1], np.uint8)
-    nearness = np.empty(directions.shape[1])  # inverse range, 1/m
-    ranges = np.empty((poses.shape[0], n_beams))
+    nearness = np.empty(cosines.size)  # inverse range, 1/m
+    ranges = np.empty((poses.shape[0], cosines.size))
     for i in range(poses.shape[0]):
         x, y, heading = poses[i, 0], poses[i, 1], poses[i, 2]
         if not math.isfinite(x + y + heading):
             raise ValueError("a pose to cast from must be finite")
         phase = _wrapped(heading + first_rad)
+        cos, sin = math.cos(heading), math.sin(heading)
         nearness[:] = 0.0
-        _bearings(x, y, phase, step_rad, chains[0], chains[1], bearing)
-        _mark_seen(x, y, turn, n_beams - 1.0 + tolerance, turn - tolerance, chains, bearing, seen)
-        _draw(
-            x, y, heading, phase, step_rad, tolerance, chains, bearing, seen, directions, nearness
-        )
+        bearing, corner = 0.0, -1  # of the last corner that was needed, in beams
+        for k in _faces_in_view(x, y, cos, sin, forward, chains):
+            ax, ay, bx, by = px[k] - x, py[k] - y, px[k + 1] - x, py[k + 1] - y
+            nx, ny = py[k + 1] - py[k], px[k] - px[k + 1]
+            c = nx * ax + ny * ay
+            begin = bearing if corner == k else _bearing(ax, ay, phase, step_rad)
+            bearing, corner = _bearing(bx, by, phase, step_rad), k + 1
+            end = bearing
+            if c < 0.0:
+                ax, ay, bx, by = bx, by, ax, ay
+                begin, end = end, begin
+            end = end + turn if end < begin else end
+            edge_on = c * c <= _EDGE_ON_M * _EDGE_ON_M * (nx * nx + ny * ny)
+            if edge_on or end - begin > 0.75 * turn:
+                _draw_edge_on(ax, ay, bx, by, heading, phase, step_rad, directions, nearness)
+                continue
+            begin -= _END_TOLERANCE
+            end += _END_TOLERANCE
+            per_c = 1.0 / c
+            gx, gy = (nx * cos + ny * sin) * per_c, (ny * cos - nx * sin) * per_c
+            _draw(nearness, cosines, sines, begin, end, gx, gy)
+            if end >= turn:
+                _draw(nearness, cosines, sines, begin - turn, end - turn, gx, gy)
         _invert(nearness, max_range_m, ranges[i])
     return ranges
+
+
+@njit(error_model="numpy", fastmath={"contract"})
+def _faces_in_view(
+    x: float, y: float, cos: float, sin: float, forward: bool, chains: Array
+) -> NDArray[np.int64]:
+    """Faces that may cover a beam.
+
+    Hidden are the backs of convex chains and, if all beams point forward, what lies behind.
+    """
+    px, py, centre_x, centre_y, radius2 = chains[0], chains[1], chains[2], chains[3], chains[4]
+    seen = np.zeros(px.size, np.bool_)
+    for k in range(px.size - 1):
+        ax, ay, bx, by = px[k] - x, py[k] - y, px[k + 1] - x, py[k + 1] - y
+        c = (by - ay) * ax + (ax - bx) * ay
+        ox, oy = x - centre_x[k], y - centre_y[k]
+        front = (c >= 0.0) | (ox * ox + oy * oy <= radius2[k])
+        ahead = max(cos * ax + sin * ay, cos * bx + sin * by) > -_EDGE_ON_M
+        seen[k] = front & (ahead | (not forward)) & (radius2[k] >= 0.0)
+    return np.flatnonzero(seen)
 
 
 @njit()
@@ -275,132 +261,23 @@ def _wrapped(angle_rad: float) -> float:
     return angle_rad - 2.0 * math.pi * math.floor(angle_rad / (2.0 * math.pi) + 0.5)
 
 
-@njit(error_model="numpy", fastmath={"contract"})
-def _bearings(
-    x: float, y: float, phase: float, step_rad: float, px: Array, py: Array, bearing: Array
-) -> None:
-    """Bearing of each corner to 1e-7 rad, in beams.
-
-    The polynomial fits the arc tangent on [0, 1]; ends that fall so close to a beam that this
-    error matters are settled in `_draw`.
-    """
-    per_rad = 1.0 / step_rad
-    for i in range(bearing.size):
-        east, north = px[i] - x, py[i] - y
-        a, b = abs(east), abs(north)
-        q = min(a, b) / (max(a, b) + 1e-300)
-        z = q * q
-        angle = -0.00405456048014 * z + 0.0218629340369
-        angle = angle * z - 0.0559122931499
-        angle = angle * z + 0.0964219492517
-        angle = angle * z - 0.139086286357
-        angle = angle * z + 0.19946565474
-        angle = angle * z - 0.333298607693
-        angle = (angle * z + 0.999999335575) * q
-        angle = 0.5 * math.pi - angle if b > a else angle
-        angle = math.pi - angle if east < 0.0 else angle
-        angle = (-angle if north < 0.0 else angle) - phase
-        angle = angle + 2.0 * math.pi if angle < 0.0 else angle
-        bearing[i] = angle * per_rad
+@njit(error_model="numpy")
+def _bearing(dx: float, dy: float, phase: float, step_rad: float) -> float:
+    """The bearing of a corner, in beams, in [0, turn]."""
+    angle = math.atan2(dy, dx) - phase
+    return (angle if angle >= 0.0 else angle + 2.0 * math.pi) / step_rad
 
 
-@njit(error_model="numpy", fastmath={"contract"})
-def _mark_seen(
-    x: float,
-    y: float,
-    turn: float,
-    last: float,
-    seam: float,
-    chains: Array,
-    bearing: Array,
-    seen: NDArray[np.uint8],
-) -> None:
-    """Mark the faces that may cover a beam from the side on which they can be seen."""
-    px, py, centre_x, centre_y, radius2 = chains[0], chains[1], chains[2], chains[3], chains[4]
-    for i in range(bearing.size - 1):
-        c = (py[i + 1] - py[i]) * (px[i] - x) + (px[i] - px[i + 1]) * (py[i] - y)
-        outside = c >= 0.0
-        begin = bearing[i] if outside else bearing[i + 1]
-        end = bearing[i + 1] if outside else bearing[i]
-        end = end + turn if end < begin else end
-        in_view = (begin <= last) | (end >= seam)
-        ox, oy = x - centre_x[i], y - centre_y[i]
-        facing = outside | (ox * ox + oy * oy <= radius2[i])
-        seen[i] = 1 if in_view & facing & (radius2[i] >= 0.0) else 0
-
-
-@njit(error_model="numpy", fastmath={"contract"})
+@njit(fastmath={"contract"})
 def _draw(
-    x: float,
-    y: float,
-    heading: float,
-    phase: float,
-    step_rad: float,
-    tolerance: float,
-    chains: Array,
-    bearing: Array,
-    seen: NDArray[np.uint8],
-    directions: Array,
-    nearness: Array,
-) -> None:
-    """Draw the marked faces into `nearness`."""
-    px, py, cosines, sines = chains[0], chains[1], directions[0], directions[1]
-    turn = 2.0 * math.pi / step_rad
-    cos, sin = math.cos(heading), math.sin(heading)
-    order = np.empty(seen.size, np.int64)
-    n_seen = np.int64(0)
-    for i in range(seen.size - 1):  # without a branch, since none could be foreseen
-        order[n_seen] = i
-        n_seen += np.int64(seen[i])
-    for k in range(n_seen):
-        i = order[k]
-        ax, ay, bx, by = px[i] - x, py[i] - y, px[i + 1] - x, py[i + 1] - y
-        nx, ny = py[i + 1] - py[i], px[i] - px[i + 1]
-        c = nx * ax + ny * ay
-        begin, end = bearing[i], bearing[i + 1]
-        if c < 0.0:
-            ax, ay, bx, by = bx, by, ax, ay
-            begin, end = end, begin
-        end = end + turn if end < begin else end
-        edge_on = c * c <= _EDGE_ON_M * _EDGE_ON_M * (nx * nx + ny * ny)
-        if edge_on or end - begin > 0.75 * turn:
-            _draw_edge_on(ax, ay, bx, by, heading, phase, step_rad, directions, nearness)
-            continue
-        if abs(begin - math.floor(begin + 0.5)) < tolerance:
-            begin = _settled(begin, ax, ay, phase, step_rad)
-        if abs(end - math.floor(end + 0.5)) < tolerance:
-            end = _settled(end, bx, by, phase, step_rad)
-        begin -= _END_TOLERANCE
-        end += _END_TOLERANCE
-        per_c = 1.0 / c
-        gx, gy = (nx * cos + ny * sin) * per_c, (ny * cos - nx * sin) * per_c
-        _draw_beams(nearness, cosines, sines, begin, end, gx, gy)
-        if end >= turn:
-            _draw_beams(nearness, cosines, sines, begin - turn, end - turn, gx, gy)
-
-
-@njit()
-def _draw_beams(
-    nearness: Array,
-    cosines: Array,
-    sines: Array,
-    begin: float,
-    end: float,
-    gx: float,
-    gy: float,
+    nearness: Array, cosines: Array, sines: Array, begin: float, end: float, gx: float, gy: float
 ) -> None:
     """Draw one face into the beams from `begin` to `end`."""
-    stop = min(math.floor(end), nearness.size - _LANES - 1) + 1
-    for j in range(max(math.ceil(begin), 0), stop, _LANES):
-        _draw_block(nearness, cosines, sines, j, stop - j, gx, gy)  # type: ignore[call-arg]
-
-
-@njit(error_model="numpy")
-def _settled(estimate: float, dx: float, dy: float, phase: float, step_rad: float) -> float:
-    """The bearing of a corner, in beams, to the last bits, next to an estimate of it."""
-    turn = 2.0 * math.pi / step_rad
-    change = (math.atan2(dy, dx) - phase) / step_rad - estimate
-    return estimate + change - turn * math.floor(change / turn + 0.5)
+    covered = slice(max(math.ceil(begin), 0), min(math.floor(end), nearness.size - 1) + 1)
+    row, cos, sin = nearness[covered], cosines[covered], sines[covered]
+    for j in range(row.size):
+        v = gx * cos[j] + gy * sin[j]
+        row[j] = v if v > row[j] else row[j]
 
 
 @njit(error_model="numpy")
@@ -417,7 +294,7 @@ def _draw_edge_on(
 ) -> None:
     """Draw a face that is seen along its plane, or touched, with its range kept on the face."""
     turn = 2.0 * math.pi / step_rad
-    last = nearness.size - _LANES - 1
+    last = nearness.size - 1
     begin, end, gx, gy, least, most = _face(ax, ay, bx, by, heading, phase, step_rad)
     for shift in (0.0, turn):
         start = max(math.ceil(begin - shift), 0)

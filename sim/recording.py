@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.errors import InputError
+from sim.errors import InputError, required
 from sim.files import write_whole
 from sim.robot import RobotGeometry
 from sim.sensors import SensorSuite, suite_from_config
@@ -200,6 +200,49 @@ class Recording:
         """Time from the first Frame to the last, s."""
         return float(self.frame_stamps[-1] - self.frame_stamps[0])
 
+    @property
+    def world(self) -> World | None:
+        """The map, or None; part of the truth."""
+        return self.truth.world if self.truth else None
+
+    # Never None: an InputError says what is missing and how to get it.
+
+    @property
+    def known_truth(self) -> Truth:
+        """The truth; InputError if there is none."""
+        return required(self.truth, "this recording has no truth to compare with")
+
+    @property
+    def known_world(self) -> World:
+        """The map; InputError if there is none."""
+        return required(self.world, "this recording has no map; use a simulated one")
+
+    @property
+    def known_laser(self) -> LaserLog:
+        """The laser scans; InputError if there are none."""
+        return required(
+            self.laser, "this recording has no laser scans; choose sensors such as sensors=hokuyo"
+        )
+
+    @property
+    def known_landmarks(self) -> LandmarkLog:
+        """The landmark observations; InputError if there are none."""
+        return required(
+            self.landmarks,
+            "this recording has no landmark observations; choose sensors such as "
+            "sensors=stereo_pixel",
+        )
+
+    @property
+    def known_clouds(self) -> CloudLog:
+        """The 3D lidar turns; InputError if there are none."""
+        return required(self.clouds, "this recording has no 3D lidar turns; choose sensors=lidar3d")
+
+    @property
+    def known_places(self) -> PlaceLog:
+        """The place descriptors; InputError if there are none."""
+        return required(self.places, "this recording has no place descriptors")
+
     def frames(self) -> Iterator[Frame]:
         """Walk through the Frames in order.
 
@@ -214,30 +257,22 @@ class Recording:
         increments = np.diff(position, axis=0, prepend=position[:1])
         durations = np.diff(stamps, prepend=stamps[:1])
         increments.setflags(write=False)
-        scan_rows = _rows_at(stamps, self.laser.stamps if self.laser else None)
-        image_rows = _rows_at(stamps, self.landmarks.stamps if self.landmarks else None)
-        cloud_rows = _rows_at(stamps, self.clouds.stamps if self.clouds else None)
-        place_rows = _rows_at(stamps, self.places.stamps if self.places else None)
-        for i, stamp in enumerate(stamps):
+        logs = (self.laser, self.landmarks, self.clouds, self.places)
+        rows_of_frames = np.stack([_rows_at(stamps, log) for log in logs], axis=1).tolist()
+        for i, (scan, image, turn, place) in enumerate(rows_of_frames):
             yield Frame(
-                stamp=float(stamp),
+                stamp=float(stamps[i]),
                 duration_s=float(durations[i]),
                 wheel_increments_m=increments[i],
-                ranges_m=self.laser.ranges_m[scan_rows[i]]
-                if self.laser and scan_rows[i] >= 0
-                else None,
-                landmarks=self._image(image_rows[i]) if image_rows[i] >= 0 else None,
-                cloud_ranges_m=self.clouds.ranges_m[cloud_rows[i]]
-                if self.clouds and cloud_rows[i] >= 0
-                else None,
-                place_descriptor=self.places.descriptors[place_rows[i]]
-                if self.places and place_rows[i] >= 0
-                else None,
+                ranges_m=self.known_laser.ranges_m[scan] if scan >= 0 else None,
+                landmarks=self._image(image) if image >= 0 else None,
+                cloud_ranges_m=self.known_clouds.ranges_m[turn] if turn >= 0 else None,
+                place_descriptor=self.known_places.descriptors[place] if place >= 0 else None,
             )
 
     def _image(self, row: int) -> LandmarkSet:
-        assert self.landmarks is not None
-        log, rows = self.landmarks, slice(*self.landmarks.splits[row : row + 2])
+        log = self.known_landmarks
+        rows = slice(*log.splits[row : row + 2])
         return LandmarkSet(
             points_in_camera=log.points_in_camera[rows],
             ids=log.ids[rows] if len(log.ids) else None,
@@ -252,16 +287,11 @@ class Recording:
         InputError
             If the recording has no truth.
         """
-        if self.truth is None:
-            raise InputError("this recording has no truth to compare with")
-        poses, times = self.truth.poses, self.truth.stamps
+        poses, times = self.known_truth.poses, self.known_truth.stamps
         heading = np.unwrap(poses[:, 2])
-        columns = [poses[:, 0], poses[:, 1], heading]
-        out = np.stack(
-            [np.interp(stamps, times, c, left=np.nan, right=np.nan) for c in columns], axis=1
-        )
-        out[:, 2] = np.arctan2(np.sin(out[:, 2]), np.cos(out[:, 2]))
-        return out
+        columns = (poses[:, 0], poses[:, 1], heading)
+        x, y, angle = (np.interp(stamps, times, c, left=np.nan, right=np.nan) for c in columns)
+        return np.stack([x, y, np.arctan2(np.sin(angle), np.cos(angle))], axis=1)
 
     @property
     def checksum(self) -> str:
@@ -284,6 +314,7 @@ _LOGS: dict[str, Any] = {
 }
 
 
+# What NumPy, zipfile and json raise for files that are not what they should be
 _UNREADABLE = (
     OSError,
     ValueError,
@@ -295,7 +326,7 @@ _UNREADABLE = (
     NotImplementedError,
     zipfile.BadZipFile,
     zlib.error,
-)  # what NumPy, zipfile and json say of files that are not what they should be
+)
 
 
 def save(recording: Recording, path: Path) -> str:
@@ -348,53 +379,40 @@ def load(path: Path) -> Recording:
     return _assemble(stored, meta)
 
 
-def _rows_at(frame_stamps: Array, sensor_stamps: Array | None) -> NDArray[np.int64]:
+def _rows_at(
+    frame_stamps: Array, log: LaserLog | LandmarkLog | CloudLog | PlaceLog | None
+) -> NDArray[np.int64]:
     """Row of a sensor's log that each Frame shows, -1 for none; the last of equal stamps wins."""
-    rows = np.full(len(frame_stamps), -1, dtype=np.int64)
-    if sensor_stamps is None or len(sensor_stamps) == 0:
-        return rows
-    found = np.searchsorted(sensor_stamps, frame_stamps, side="right") - 1
-    hit = (found >= 0) & (sensor_stamps[np.maximum(found, 0)] == frame_stamps)
-    rows[hit] = found[hit]
-    return rows
+    if log is None or len(log.stamps) == 0:
+        return np.full(len(frame_stamps), -1)
+    found = np.searchsorted(log.stamps, frame_stamps, side="right") - 1
+    return np.where((found >= 0) & (log.stamps[found] == frame_stamps), found, -1)
 
 
 def _arrays(recording: Recording) -> dict[str, NDArray[Any]]:
-    arrays: dict[str, NDArray[Any]] = {"frame_stamps": recording.frame_stamps}
-    for name in _LOGS:
-        log = getattr(recording, name)
-        if log is None:
-            continue
-        for f in dataclasses.fields(log):
-            value = getattr(log, f.name)
-            if isinstance(value, World):
-                arrays.update(_world_arrays(value))
-            elif value is not None:
-                arrays[f"{name}.{f.name}"] = value
+    """Every array of a recording under the name it is saved by."""
+    arrays = {"frame_stamps": recording.frame_stamps}
+    parts = {name: getattr(recording, name) for name in _LOGS} | {"world": recording.world}
+    for name, part in parts.items():
+        for field_name, value in vars(part).items() if part else ():
+            if isinstance(value, np.ndarray):
+                arrays[f"{name}.{field_name}"] = value
+    if recording.world:
+        arrays |= {f"world.places.{k}": v for k, v in recording.world.places.items()}
     return arrays
-
-
-def _world_arrays(world: World) -> dict[str, NDArray[Any]]:
-    arrays = {
-        f"world.{f.name}": getattr(world, f.name)
-        for f in dataclasses.fields(world)
-        if isinstance(getattr(world, f.name), np.ndarray)
-    }
-    return {**arrays, **{f"world.places.{k}": v for k, v in world.places.items()}}
 
 
 def _meta(recording: Recording) -> dict[str, Any]:
     # Rebuilt from plain values, so that 100 and 100.0 Hz are the same recording.
     sensors = suite_from_config(dataclasses.asdict(recording.sensors))
     robot = build(RobotGeometry, dataclasses.asdict(recording.robot), "robot")
-    world = recording.truth.world.name if recording.truth and recording.truth.world else None
     return {
         "format": FORMAT_VERSION,
         "status": recording.status,
         "robot": dataclasses.asdict(robot),
         "sensors": dataclasses.asdict(sensors),
         "config": recording.config,
-        "world": world,
+        "world": recording.world.name if recording.world else None,
     }
 
 
@@ -408,19 +426,15 @@ def _digest(arrays: dict[str, NDArray[Any]], meta: dict[str, Any]) -> str:
 
 
 def _assemble(stored: dict[str, NDArray[Any]], meta: dict[str, Any]) -> Recording:
-    world = None
-    if meta["world"] is not None:
-        prefix = "world.places."
-        fields = {k[6:]: v for k, v in stored.items() if k.startswith("world.")}
-        places = {k[len(prefix) :]: v for k, v in stored.items() if k.startswith(prefix)}
-        plain = {k: v for k, v in fields.items() if not k.startswith("places.")}
-        world = World(name=meta["world"], places=places, **plain)
-    logs: dict[str, Any] = {}
-    for name, cls in _LOGS.items():
+    def part(name: str) -> dict[str, NDArray[Any]]:
         prefix = f"{name}."
-        fields = {k[len(prefix) :]: v for k, v in stored.items() if k.startswith(prefix)}
-        if fields:
-            logs[name] = cls(**fields, world=world) if cls is Truth else cls(**fields)
+        return {k.removeprefix(prefix): v for k, v in stored.items() if k.startswith(prefix)}
+
+    logs: dict[str, Any] = {name: cls(**part(name)) for name, cls in _LOGS.items() if part(name)}
+    if meta["world"] is not None:
+        fields = {k: v for k, v in part("world").items() if not k.startswith("places.")}
+        world = World(name=meta["world"], places=part("world.places"), **fields)
+        logs["truth"] = dataclasses.replace(logs["truth"], world=world)
     return Recording(
         frame_stamps=stored["frame_stamps"],
         robot=RobotGeometry(**meta["robot"]),

@@ -125,6 +125,33 @@ def wheel_variances(travel_m: ArrayLike, kr: float, kl: float) -> Array:
     return variances
 
 
+def wheel_errors(travel_m: ArrayLike, variance_per_m: ArrayLike, rng: np.random.Generator) -> Array:
+    """Zero-mean encoder errors, m, of variance k |ds|: the slip law of `Slip` without its lag.
+
+    Parameters
+    ----------
+    travel_m
+        Wheel increments (..., 2), m, or of any other shape.
+    variance_per_m
+        k, m: one value, or (kr, kl).
+    rng
+        Gives one standard normal for each increment.
+
+    Returns
+    -------
+    Array
+        Errors of the shape of `travel_m`.
+    """
+    travel = np.asarray(travel_m, float)
+    return _scaled_errors(travel, variance_per_m, rng.standard_normal(travel.shape))
+
+
+def _scaled_errors(travel_m: Array, variance_per_m: ArrayLike, standard_normal: Array) -> Array:
+    """Encoder errors, m, of variance k |ds| from normals drawn beforehand."""
+    errors: Array = np.sqrt(variance_per_m * np.abs(travel_m)) * standard_normal
+    return errors
+
+
 @dataclass
 class Slip:
     """The slip of the wheels, tick by tick, for one robot or a batch of them.
@@ -164,7 +191,7 @@ class Slip:
         `extra_m` is an encoder error from outside the law.
         """
         error = self.bias * rolling_m + extra_m
-        error += np.sqrt(self.variance_per_m * np.abs(rolling_m)) * standard_normal
+        error += _scaled_errors(rolling_m, self.variance_per_m, standard_normal)
         self.lag_m += (self.dt_s / SLIP_TIME_CONSTANT_S) * (error - self.lag_m)
         return rolling_m + error
 

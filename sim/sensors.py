@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sim.errors import InputError
+from sim.errors import InputError, required
 from sim.settings import build
 
 Array = NDArray[np.float64]
@@ -306,6 +306,25 @@ class SensorSuite:
     laser: Laser | None = None
     stereo: StereoCamera | None = None
     lidar3d: Lidar3D | None = None
+
+    # Never None: an InputError says what is missing and how to get it.
+
+    @property
+    def known_laser(self) -> Laser:
+        """The laser; InputError if there is none."""
+        return required(self.laser, "no laser; choose sensors that have one: sensors=hokuyo")
+
+    @property
+    def known_stereo(self) -> StereoCamera:
+        """The stereo camera; InputError if there is none."""
+        return required(
+            self.stereo, "no stereo camera; choose sensors that have one: sensors=stereo_pixel"
+        )
+
+    @property
+    def known_lidar3d(self) -> Lidar3D:
+        """The 3D lidar; InputError if there is none."""
+        return required(self.lidar3d, "no 3D lidar; choose sensors that have one: sensors=lidar3d")
 
 
 def suite_from_config(config: dict[str, Any]) -> SensorSuite:

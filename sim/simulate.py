@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -34,6 +35,7 @@ from sim.world import World
 Array = NDArray[np.float64]
 Physics = Literal["bullet", "kinematic"]
 Rays = Literal["bullet", "exact"]
+_Logs = defaultdict[str, list[tuple[int, Any]]]  # of each sensor: tick and reading
 
 TICKS_PER_S = 300
 DT_S = 1.0 / TICKS_PER_S
@@ -76,24 +78,6 @@ class Route(Protocol):
         ...
 
 
-@dataclass
-class _Logs:
-    """What the sensors have measured so far."""
-
-    encoder: list[Array] = field(default_factory=list)
-    travel: list[Array] = field(default_factory=list)
-    poses: list[Array] = field(default_factory=list)
-    frame_ticks: list[int] = field(default_factory=list)
-    scans: list[NDArray[np.float32]] = field(default_factory=list)
-    scan_ticks: list[int] = field(default_factory=list)
-    clouds: list[NDArray[np.float32]] = field(default_factory=list)
-    cloud_ticks: list[int] = field(default_factory=list)
-    images: list[tuple[Array, NDArray[np.int64], NDArray[np.float32]]] = field(default_factory=list)
-    image_ticks: list[int] = field(default_factory=list)
-    commands: list[Array] = field(default_factory=list)
-    command_ticks: list[int] = field(default_factory=list)
-
-
 def record(
     world: World,
     robot: DifferentialDrive,
@@ -124,7 +108,7 @@ def record(
     Returns
     -------
     Recording
-        Its status is `ok`, or tells what went wrong and when; then the recording ends there.
+        Its status is `ok`, or names what went wrong and when; the recording then ends there.
 
     Raises
     ------
@@ -141,6 +125,7 @@ def record(
             f"the robot overlaps a wall of world {world.name} at its start "
             f"({pose[0]:.2f}, {pose[1]:.2f}); move the start pose or the wall"
         )
+    logs: _Logs = defaultdict(list)
     with contextlib.ExitStack() as stack:
         body: Body
         caster: _ExactRays | _BulletRays
@@ -154,41 +139,43 @@ def record(
             body = KinematicBody(robot, pose)
             caster = _ExactRays(world, sensors.laser)
             find_trouble = lambda: "collision" if overlaps(world, robot, body.pose) else None  # noqa: E731
-        cameras = _Landmarks(world, sensors.stereo, streams["sensors"])
-        logs = _Logs()
+        probes = _probes(world, sensors, caster, streams["sensors"])
         status = _drive(
-            robot,
-            sensors,
-            periods,
-            body,
-            driver,
-            find_trouble,
-            caster,
-            cameras,
-            streams,
-            logs,
-            on_progress,
+            robot, periods, body, driver, find_trouble, probes, streams["slip"], logs, on_progress
         )
     return _assemble(world, robot, sensors, logs, status, config or {})
 
 
+def _probes(
+    world: World, sensors: SensorSuite, rays: _ExactRays | _BulletRays, rng: np.random.Generator
+) -> dict[str, Callable[[Array], Any]]:
+    """What each sensor measures, as a function of the robot's pose."""
+    laser, stereo, lidar = sensors.laser, sensors.stereo, sensors.lidar3d
+    probes: dict[str, Callable[[Array], Any]] = {}
+    if laser:
+        probes["laser"] = lambda pose: laser.measure(rays.scan(laser, pose), rng)
+    if stereo:
+        probes["stereo"] = partial(_Landmarks(world, stereo, rng).observe, rays)
+    if lidar:
+        probes["lidar3d"] = lambda pose: lidar.measure(rays.cloud(lidar, pose), rng)
+    return probes
+
+
 def _drive(
     robot: DifferentialDrive,
-    sensors: SensorSuite,
     periods: dict[str, int],
     body: Body,
     driver: Driver,
     find_trouble: Callable[[], str | None],
-    rays: _ExactRays | _BulletRays,
-    cameras: _Landmarks,
-    streams: Mapping[str, np.random.Generator],
+    probes: dict[str, Callable[[Array], Any]],
+    rng: np.random.Generator,
     logs: _Logs,
     on_progress: Callable[[float], None] | None,
 ) -> str:
     """Run tick by tick until the route ends or something goes wrong; return the status."""
     slip = Slip.start(robot, DT_S)
-    noise = _normals(streams["slip"])
-    events = _SlipEvents(robot, streams["slip"])
+    noise = _normals(rng)
+    events = _SlipEvents(robot, rng)
     encoder, travel = np.zeros(2), np.zeros(2)
     tick, velocity = 0, np.zeros(2)
     while True:
@@ -196,34 +183,20 @@ def _drive(
         due = [name for name, period in periods.items() if tick % period == 0]
         wanted = driver.command(tick, pose)
         if due or wanted is None:
-            logs.frame_ticks.append(tick)
-            logs.encoder.append(_quantise(encoder, robot.encoder_tick_m))
-            logs.travel.append(travel.copy())
-            logs.poses.append(pose)
-        if "laser" in due:
-            assert sensors.laser is not None
-            ranges = rays.scan(sensors.laser, pose)
-            logs.scans.append(sensors.laser.measure(ranges, streams["sensors"]))
-            logs.scan_ticks.append(tick)
-        if "stereo" in due:
-            logs.images.append(cameras.observe(rays, pose))
-            logs.image_ticks.append(tick)
-        if "lidar3d" in due:
-            assert sensors.lidar3d is not None
-            cloud = rays.cloud(sensors.lidar3d, pose)
-            logs.clouds.append(sensors.lidar3d.measure(cloud, streams["sensors"]))
-            logs.cloud_ticks.append(tick)
-        if wanted is None:
-            trouble = driver.trouble
-            return "ok" if trouble is None else _told(trouble, tick, pose)
-        if tick % _CHECK_EVERY == 0:
-            trouble = find_trouble() or driver.trouble
+            counts = _quantise(encoder, robot.encoder_tick_m)
+            logs["frames"].append((tick, (counts, travel.copy(), pose)))
+        for name in due:
+            if name in probes:
+                logs[name].append((tick, probes[name](pose)))
+        if wanted is None or tick % _CHECK_EVERY == 0:
+            trouble = (find_trouble() if wanted is not None else None) or driver.trouble
             if trouble is not None:
-                return _told(trouble, tick, pose)
+                return f"{trouble} at {tick * DT_S:.2f} s near ({pose[0]:.2f}, {pose[1]:.2f})"
+        if wanted is None:
+            return "ok"
         if not np.array_equal(wanted, velocity) or tick == 0:
             velocity = wanted
-            logs.commands.append(velocity)
-            logs.command_ticks.append(tick)
+            logs["commands"].append((tick, velocity))
         if on_progress is not None and tick % TICKS_PER_S == 0:
             on_progress(tick * DT_S)
         speeds = robot.wheel_speeds(velocity[0], velocity[1]) - slip.correction_mps
@@ -346,10 +319,8 @@ def points_in_camera(camera: StereoCamera, pose: Array, points_in_world: Array) 
 class _Landmarks:
     """The stereo camera's view of the world's landmarks."""
 
-    def __init__(self, world: World, camera: StereoCamera | None, rng: np.random.Generator) -> None:
+    def __init__(self, world: World, camera: StereoCamera, rng: np.random.Generator) -> None:
         self._world, self._camera, self._rng = world, camera, rng
-        if camera is None:
-            return
         size = world.descriptors.shape[1] if world.descriptors.ndim == 2 else 0
         self._view_axes = rng.standard_normal((len(world.landmarks), size)).astype(np.float32)
         if size:
@@ -361,7 +332,6 @@ class _Landmarks:
     ) -> tuple[Array, NDArray[np.int64], NDArray[np.float32]]:
         """Points in the camera frame (K, 3), true ids (K,), descriptors (K, D)."""
         camera, landmarks = self._camera, self._world.landmarks
-        assert camera is not None
         inside = points_in_camera(camera, pose, landmarks)
         x, y, z = inside.T
         field_of_view = (
@@ -383,7 +353,6 @@ class _Landmarks:
     def _choose(self, ids: NDArray[np.int64], inside: Array) -> NDArray[np.int64]:
         """At most B of the visible landmarks, by the camera's rule."""
         camera = self._camera
-        assert camera is not None
         most = camera.max_observations
         if most == 0 or len(ids) <= most:
             return ids
@@ -406,7 +375,6 @@ class _Landmarks:
     def _describe(self, ids: NDArray[np.int64], origin: Array) -> NDArray[np.float32]:
         """Noisy descriptors: white noise, and a drift with the change of the viewing angle."""
         camera, world = self._camera, self._world
-        assert camera is not None
         if world.descriptors.size == 0:
             return np.zeros((len(ids), 0), np.float32)
         offset = world.landmarks[ids, :2] - origin[:2]
@@ -448,7 +416,7 @@ class _SlipEvents:
         return error
 
 
-def _normals(rng: np.random.Generator, block: int = 3000) -> Any:
+def _normals(rng: np.random.Generator, block: int = 3000) -> Iterator[Array]:
     """Pairs of standard normals, drawn in blocks for speed; the bits do not depend on the block."""
     while True:
         yield from rng.standard_normal((block, 2))
@@ -461,14 +429,9 @@ def _quantise(position_m: Array, tick_m: float) -> Array:
 
 def _periods(sensors: SensorSuite) -> dict[str, int]:
     """Ticks between firings of each sensor."""
-    rates = {
-        "encoder": sensors.encoder.rate_hz,
-        "laser": sensors.laser.rate_hz if sensors.laser else None,
-        "stereo": sensors.stereo.rate_hz if sensors.stereo else None,
-        "lidar3d": sensors.lidar3d.rate_hz if sensors.lidar3d else None,
-    }
     periods = {}
-    for name, rate in rates.items():
+    for name in ("encoder", "laser", "stereo", "lidar3d"):
+        rate = getattr(getattr(sensors, name), "rate_hz", None)
         if rate is None:
             continue
         ticks = TICKS_PER_S / rate
@@ -483,16 +446,6 @@ def _periods(sensors: SensorSuite) -> dict[str, int]:
     return periods
 
 
-def _wrapped(poses: list[Array]) -> Array:
-    stacked = np.array(poses)
-    stacked[:, 2] = se2.wrap(stacked[:, 2])
-    return stacked
-
-
-def _told(trouble: str, tick: int, pose: Array) -> str:
-    return f"{trouble} at {tick * DT_S:.2f} s near ({pose[0]:.2f}, {pose[1]:.2f})"
-
-
 def _assemble(
     world: World,
     robot: DifferentialDrive,
@@ -501,22 +454,28 @@ def _assemble(
     status: str,
     config: dict[str, Any],
 ) -> Recording:
-    def seconds(ticks: list[int]) -> Array:
-        stamps: Array = np.array(ticks, dtype=np.int64) / TICKS_PER_S
-        return stamps
+    def read(name: str) -> tuple[Array, list[Any]]:
+        ticks = np.array([tick for tick, _ in logs[name]], dtype=np.int64)
+        return ticks / TICKS_PER_S, [reading for _, reading in logs[name]]
 
-    stamps = seconds(logs.frame_ticks)
+    stamps, frames = read("frames")
+    encoder, travel, poses = (np.array(part) for part in zip(*frames, strict=True))
+    poses[:, 2] = se2.wrap(poses[:, 2])
+    command_stamps, commands = read("commands")
     laser = landmarks = clouds = None
     landmark_ids = np.zeros(0, np.int64)
     if sensors.laser:
-        laser = LaserLog(seconds(logs.scan_ticks), np.array(logs.scans))
+        scan_stamps, scans = read("laser")
+        laser = LaserLog(scan_stamps, np.array(scans))
     if sensors.lidar3d:
-        clouds = CloudLog(seconds(logs.cloud_ticks), np.array(logs.clouds))
+        turn_stamps, turns = read("lidar3d")
+        clouds = CloudLog(turn_stamps, np.array(turns))
     if sensors.stereo:
-        points, ids, descriptors = (list(part) for part in zip(*logs.images, strict=True))
+        image_stamps, images = read("stereo")
+        points, ids, descriptors = zip(*images, strict=True)
         landmark_ids = np.concatenate(ids)
         landmarks = LandmarkLog(
-            stamps=seconds(logs.image_ticks),
+            stamps=image_stamps,
             splits=np.cumsum([0, *(len(p) for p in points)]),
             points_in_camera=np.concatenate(points),
             ids=landmark_ids if sensors.stereo.identifies else np.zeros(0, np.int64),
@@ -524,14 +483,14 @@ def _assemble(
         )
     return Recording(
         frame_stamps=stamps,
-        wheels=WheelLog(stamps, np.array(logs.encoder)),
+        wheels=WheelLog(stamps, encoder),
         robot=RobotGeometry(robot.wheel_radius_m, robot.track_m),
         sensors=sensors,
-        truth=Truth(stamps, _wrapped(logs.poses), np.array(logs.travel), landmark_ids, world),
+        truth=Truth(stamps, poses, travel, landmark_ids, world),
         laser=laser,
         landmarks=landmarks,
         clouds=clouds,
-        commands=CommandLog(seconds(logs.command_ticks), np.array(logs.commands).reshape(-1, 2)),
+        commands=CommandLog(command_stamps, np.array(commands, float).reshape(-1, 2)),
         config=config,
         status=status,
     )

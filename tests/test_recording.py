@@ -13,8 +13,10 @@ from experiments.runs.cache import cached, files, folder, limit_bytes, trim
 from sim.errors import InputError
 from sim.files import write_whole
 from sim.recording import (
+    CloudLog,
     LandmarkLog,
     LaserLog,
+    PlaceLog,
     Recording,
     Truth,
     WheelLog,
@@ -119,6 +121,38 @@ def test_truth_is_interpolated_the_short_way_round():
     middle, outside = recording.truth_at(np.array([0.5, 2.0]))
     assert abs(abs(middle[2]) - np.pi) < 1e-12
     assert np.isnan(outside).all()
+
+
+KNOWN = {
+    "known_truth": "no truth",
+    "known_world": "no map",
+    "known_laser": "no laser scans; choose sensors such as sensors=hokuyo",
+    "known_landmarks": "no landmark observations; choose sensors such as sensors=stereo_pixel",
+    "known_clouds": "no 3D lidar turns; choose sensors=lidar3d",
+    "known_places": "no place descriptors",
+}
+
+
+@pytest.mark.parametrize("name", KNOWN)
+def test_what_is_missing_is_named(name):
+    blind = dataclasses.replace(small_recording(), truth=None, laser=None, landmarks=None)
+    assert blind.world is None
+    with pytest.raises(InputError, match=KNOWN[name]):
+        getattr(blind, name)
+
+
+def test_what_is_there_is_given():
+    recording = dataclasses.replace(
+        small_recording(),
+        clouds=CloudLog(np.zeros(1), np.ones((1, 2, 3), np.float32)),
+        places=PlaceLog(np.zeros(1), np.ones((1, 4), np.float32)),
+    )
+    assert recording.known_truth is recording.truth
+    assert recording.known_world is recording.world is recording.truth.world
+    assert recording.known_laser is recording.laser
+    assert recording.known_landmarks is recording.landmarks
+    assert recording.known_clouds is recording.clouds
+    assert recording.known_places is recording.places
 
 
 @pytest.mark.parametrize("damage", ["cut", "flip", "empty", "text", "other_zip"])

@@ -13,6 +13,7 @@ from sim.robot import (
     TravelWindow,
     arc_increment,
     arc_increment_jacobian,
+    wheel_errors,
     wheel_variances,
 )
 
@@ -72,6 +73,25 @@ def test_slip_law_over_a_batch():
     wander = np.std(encoders[-1] - grounds[-1], axis=0)
     assert wander == pytest.approx(np.sqrt(np.array([1e-4, 3e-4]) * 1.0), rel=0.12)
     assert np.std(encoders[-1], axis=0).max() < 0.45 * wander.max()
+
+
+def test_wheel_errors_have_variance_k_ds():
+    rng = np.random.default_rng(2)
+    travel = np.tile([0.04, -0.01], (50_000, 1))
+    errors = wheel_errors(travel, [1e-4, 3e-4], rng)
+    assert errors.shape == travel.shape
+    assert np.var(errors, axis=0) == pytest.approx([4e-6, 3e-6], rel=0.03)
+    assert np.abs(np.mean(errors, axis=0)).max() < 4 * np.sqrt(4e-6 / len(travel))
+
+
+def test_slip_and_wheel_errors_are_one_law():
+    """From rest, before the lag answers, a tick's encoder error is that of `wheel_errors`."""
+    robot = DifferentialDrive(0.05, 0.19, kr=1e-4, kl=3e-4)
+    rolling = np.array([0.002, -0.001])
+    normals = np.random.default_rng(4).standard_normal(2)
+    read = Slip.start(robot, DT_S).advance(rolling, normals)
+    errors = wheel_errors(rolling, robot.slip_variance_per_m, np.random.default_rng(4))
+    assert read.tolist() == (rolling + errors).tolist()
 
 
 def test_bias_makes_the_encoder_read_more():

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from sim.errors import InputError
-from sim.sensors import Laser, Lidar3D, StereoCamera, suite_from_config
+from sim.sensors import Laser, Lidar3D, SensorSuite, StereoCamera, suite_from_config
 
 POINTS = np.array([[0.5, -0.2, 2.0], [2.5, 0.4, 5.0], [-4.0, 1.0, 8.0]])
 
@@ -96,3 +96,13 @@ def test_lidar_points_have_their_ranges_and_elevations():
 def test_wrong_settings_name_their_key(settings, message):
     with pytest.raises(InputError, match=message):
         suite_from_config(settings)
+
+
+@pytest.mark.parametrize(
+    ("name", "preset"), [("laser", "hokuyo"), ("stereo", "stereo_pixel"), ("lidar3d", "lidar3d")]
+)
+def test_a_missing_sensor_is_named(name, preset):
+    with pytest.raises(InputError, match=f"choose sensors that have one: sensors={preset}"):
+        getattr(SensorSuite(), f"known_{name}")
+    suite = SensorSuite(laser=Laser(), stereo=StereoCamera(), lidar3d=Lidar3D())
+    assert getattr(suite, f"known_{name}") is getattr(suite, name)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 import time
 from collections.abc import Iterable
 from typing import Any
@@ -19,7 +18,7 @@ from estimators.fastslam import FastSLAM
 from estimators.stereo import StereoModel
 from experiments.bench.measure import Measurement, median_time_s
 from sim.recording import LandmarkLog, Recording, WheelLog
-from sim.robot import RobotGeometry
+from sim.robot import RobotGeometry, wheel_errors
 from sim.sensors import Encoder, SensorSuite, StereoCamera
 
 Array = NDArray[np.float64]
@@ -87,7 +86,7 @@ def circling(n_landmarks: int, n_seen: int, n_steps: int, camera: StereoCamera) 
         points.append(camera.measure(seen[chosen], rng))
         ids.append(chosen)
     wheels = np.full((n_steps, 2), _STEP_M) * (1.0 + np.array([0.5, -0.5]) * _TRACK_M / radius_m)
-    wheels += math.sqrt(_K_M * _STEP_M) * rng.standard_normal(wheels.shape)
+    wheels += wheel_errors(np.full(wheels.shape, _STEP_M), _K_M, rng)
     wheels[0] = 0.0
     stamps = 0.8 * np.arange(n_steps, dtype=np.float64)
     return Recording(

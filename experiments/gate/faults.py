@@ -22,6 +22,7 @@ from estimators.gaussian import Gaussian
 from estimators.scan_matching import Match, ScanMatcher
 from estimators.stereo import StereoModel
 from sim.recording import Frame, LandmarkSet
+from sim.robot import wheel_errors
 
 Array = NDArray[np.float64]
 Planted = Callable[[Estimator, np.random.Generator], AbstractContextManager[Estimator]]
@@ -100,8 +101,8 @@ def noisy_increments(k: float) -> Planted:
 
     def change(frame: Frame, rng: np.random.Generator) -> Frame:
         travel = frame.wheel_increments_m
-        noise = np.sqrt(k * np.abs(travel)) * rng.standard_normal(2)
-        return dataclasses.replace(frame, wheel_increments_m=travel + noise)
+        noisy = travel + wheel_errors(travel, k, rng)
+        return dataclasses.replace(frame, wheel_increments_m=noisy)
 
     return changed(change)
 

@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from sim.errors import InputError
+from sim.formats import carmen, khepera
+from sim.formats.intel import read_intel
+from sim.formats.lego import read_lego
+from sim.formats.mrclam import read_mrclam
+from sim.formats.rawseeds import read_rawseeds
+from sim.formats.rosbag_in import read_bag
 from sim.formats.text import read_bytes, read_members
+from sim.formats.wean import read_wean
 from sim.recording import Recording, load
 
 KINDS = ("recording", "rosbag", "mrclam", "carmen", "intel", "khepera", "lego", "rawseeds", "wean")
@@ -33,7 +40,7 @@ def kind_of(path: Path) -> str:
     if head[:13] == b"#ROSBAG V2.0\n" or head[:5] == b"\x89MCAP" or head[:15] == b"SQLite format 3":
         return "rosbag"
     data = read_bytes(path)
-    if data[257:262] == b"ustar":  # where tar puts its name
+    if _is_archive(data):
         return _kind_of_names(list(read_members(path)), path)
     return _kind_of_text(data[:_HEAD_BYTES], path)
 
@@ -53,10 +60,9 @@ def _kind_of_text(head: bytes, path: Path) -> str:
     first_words = {line.split()[0] for line in lines[:200]}
     if first_words & {b"FLASER", b"ROBOTLASER1", b"ODOM", b"VERTEX2"}:
         return "carmen"
-    if first_words and first_words <= {b"O", b"L"}:
-        return "wean"
-    if first_words and first_words <= {b"M"}:
-        return "lego"
+    for kind, keywords in (("wean", {b"O", b"L"}), ("lego", {b"M"})):
+        if first_words and first_words <= keywords:
+            return kind
     if b'"sm"' in head and b'"phi_l"' in head:
         return "khepera"
     if head.lstrip()[:1] == b"{" and b'"map"' in head:
@@ -86,51 +92,32 @@ def read_any(paths: Sequence[Path], robot: int = 1, member: str | None = None) -
     InputError
         If the format is not known, a file is missing, or cannot be read.
     """
-    first, rest = paths[0], list(paths[1:])
+    first, rest = paths[0], paths[1:]
     kind = kind_of(first)
-    most = {"intel": 1, "rawseeds": 2, "lego": 3}.get(kind, 0)
-    least = {"rawseeds": 1, "lego": 1}.get(kind, 0)
-    if not least <= len(rest) <= most:
-        wanted = f"{least + 1} to {most + 1} files" if most else "one file"
+    least, most = {"intel": (1, 2), "rawseeds": (2, 3), "lego": (2, 4)}.get(kind, (1, 1))
+    if not least <= len(paths) <= most:
+        wanted = f"{least} to {most} files" if most > 1 else "one file"
         raise InputError(f"{first}: a {kind} log is {wanted}, got {len(paths)}")
-    if kind == "recording":
-        return load(first)
-    if kind == "rosbag":
-        from sim.formats.rosbag_in import read_bag
-
-        return read_bag(first)
     if kind == "mrclam":
-        from sim.formats.mrclam import read_mrclam
-
         return read_mrclam(first, robot)
     if kind == "carmen":
-        from sim.formats.carmen import read_carmen, to_recording
-
-        return to_recording(read_carmen(first))
-    if kind == "intel":
-        from sim.formats.intel import read_intel
-
-        return read_intel(first, *rest)
+        return carmen.to_recording(carmen.read_carmen(first))
     if kind == "khepera":
-        from sim.formats import khepera
-
-        if member is None and (first.is_dir() or _is_archive(first)):
+        if member is None and (first.is_dir() or _is_archive(read_bytes(first))):
             tuples = [name for name in read_members(first) if name.endswith(".tuple")]
             member = min(tuples, key=lambda name: (len(name), name))
         return khepera.to_recording(khepera.read_khepera(first, member))
-    if kind == "lego":
-        from sim.formats.lego import read_lego
-
-        return read_lego(first, *rest)
-    if kind == "rawseeds":
-        from sim.formats.rawseeds import read_rawseeds
-
-        return read_rawseeds(first, *rest)
-    from sim.formats.wean import read_wean
-
-    return read_wean(first)
+    readers: dict[str, Callable[..., Recording]] = {
+        "recording": load,
+        "rosbag": read_bag,
+        "intel": read_intel,
+        "lego": read_lego,
+        "rawseeds": read_rawseeds,
+        "wean": read_wean,
+    }
+    return readers[kind](first, *rest)
 
 
-def _is_archive(path: Path) -> bool:
-    """Whether a file, unpacked, is a tar archive."""
-    return read_bytes(path)[257:262] == b"ustar"
+def _is_archive(data: bytes) -> bool:
+    """Whether a file, unpacked, is a tar archive: this is where tar puts its name."""
+    return data[257:262] == b"ustar"

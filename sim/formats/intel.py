@@ -91,19 +91,12 @@ def read_intel(
         order = assemble.in_order(times, "reference", {})
         truth = Truth(times[order], corrected[order])
     wheels = assemble.wheels_from_poses(stamps, poses, track_m, notes)
-    resolution = math.pi / n_beams
-    laser = Laser(
-        rate_hz=1.0 / max(float(np.median(np.diff(stamps))), 1e-9),
-        n_beams=n_beams,
-        fov_rad=resolution * (n_beams - 1),
-        max_range_m=_NO_RETURN_M,
-        mount=Mount(yaw_rad=-resolution / 2.0),
-    )
+    rate_hz = 1.0 / max(float(np.median(np.diff(stamps))), 1e-9)
     return scan_recording(
         wheels,
         stamps,
         seen_ranges(ranges, _NO_RETURN_M),
-        laser,
+        _scanner(rate_hz, n_beams, _NO_RETURN_M),
         truth,
         track_m,
         wheel_radius_m,
@@ -166,25 +159,29 @@ def read_thinned_intel(
     stamps[rows[-1] :] = clock[-1] + (busy_s[rows[-1] :] - busy_s[rows[-1]])
     notes: assemble.Notes = {"matches_left_out": len(numbers) - len(known)}
     wheels = assemble.wheels_from_poses(stamps, assemble.chained(steps), track_m, notes)
-    resolution = math.pi / ranges.shape[1]
-    laser = Laser(
-        rate_hz=1.0,
-        n_beams=ranges.shape[1],
-        fov_rad=resolution * (ranges.shape[1] - 1),
-        max_range_m=_THINNED_MAX_RANGE_M,
-        mount=Mount(yaw_rad=-resolution / 2.0),
-    )
     recording = scan_recording(
         wheels,
         stamps,
         seen_ranges(ranges, _THINNED_MAX_RANGE_M),
-        laser,
+        _scanner(1.0, ranges.shape[1], _THINNED_MAX_RANGE_M),
         None,
         track_m,
         wheel_radius_m,
         {"source": "intel, thinned", "notes": notes},
     )
     return recording, rows.astype(np.int64)
+
+
+def _scanner(rate_hz: float, n_beams: int, max_range_m: float) -> Laser:
+    """A laser whose beams are 180 / n degrees apart, from -90 degrees on."""
+    step = math.pi / n_beams
+    return Laser(
+        rate_hz=rate_hz,
+        n_beams=n_beams,
+        fov_rad=step * (n_beams - 1),
+        max_range_m=max_range_m,
+        mount=Mount(yaw_rad=-step / 2.0),
+    )
 
 
 def _number(value: Any) -> float:

@@ -1,4 +1,4 @@
-"""Files of words and numbers, read fast and within bounds: the ground of the text readers.
+"""Files of words and numbers, read within bounds: the ground of the text readers.
 
 Whatever the file holds, the memory is bounded by its size: nothing is ever allocated because a
 header promises it.
@@ -8,17 +8,19 @@ from __future__ import annotations
 
 import io
 import lzma
+import math
 import tarfile
 import zlib
-from collections.abc import Sequence
+from array import array
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.compiled import njit
 from sim.errors import InputError
 
 Array = NDArray[np.float64]
@@ -28,7 +30,6 @@ MOST_BYTES = 1 << 30  # unpacked; a small archive may promise far more
 LARGEST = 1e12  # times in microseconds and beyond are not what the formats hold
 _XZ_MEMORY = 256 << 20
 _CHUNK = 1 << 20
-_WORD, _NUMBER, _SLOW = 0, 1, 2
 
 
 def read_bytes(path: Path, most_bytes: int = MOST_BYTES) -> bytes:
@@ -39,51 +40,45 @@ def read_bytes(path: Path, most_bytes: int = MOST_BYTES) -> bytes:
     InputError
         If it cannot be read, is cut short, or unpacks to more than `most_bytes`.
     """
+    parts: list[bytes] = []
+    size = 0
     try:
         with path.open("rb") as file:
-            head = file.read(6)
-            file.seek(0)
-            if head[:2] == b"\x1f\x8b" or head == b"\xfd7zXZ\x00":
-                return _unpacked(file, head, path, most_bytes)
-            data = file.read(most_bytes + 1)
+            for part in _unpacked(file):
+                size += len(part)
+                if size > most_bytes:
+                    raise InputError(
+                        f"{path}: more than {MOST_BYTES >> 20} MiB of data; cut the log in parts"
+                    )
+                parts.append(part)
     except (OSError, EOFError, ValueError, zlib.error, lzma.LZMAError) as error:
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"{path}: cannot read ({reason}); is the file whole?") from error
-    return _bounded(data, path, most_bytes)
+    return b"".join(parts)
 
 
-def _unpacked(file: Any, head: bytes, path: Path, most_bytes: int) -> bytes:
-    """Contents of a gzip or xz stream, in steps, so that the bound holds while unpacking."""
-    parts: list[bytes] = []
-    size = 0
-    packed = b""
-    while True:
-        if head[:2] == b"\x1f\x8b":
-            gzip = zlib.decompressobj(wbits=31)
-            unpack: Any = gzip
-        else:
-            unpack = lzma.LZMADecompressor(memlimit=_XZ_MEMORY)
+def _unpacked(file: BinaryIO) -> Iterator[bytes]:
+    """Contents of a file, unpacked, in steps that are bounded whatever it unpacks to."""
+    head = file.read(6)
+    file.seek(0)
+    if head[:2] == b"\x1f\x8b":
+        start: Callable[[], Any] = partial(zlib.decompressobj, wbits=31)
+    elif head == b"\xfd7zXZ\x00":
+        start = partial(lzma.LZMADecompressor, memlimit=_XZ_MEMORY)
+    else:
+        yield from iter(partial(file.read, _CHUNK), b"")
+        return
+    packed = file.read(_CHUNK)
+    while packed.strip(b"\x00"):  # one stream may follow another, and padding the last
+        unpack = start()
         while not unpack.eof:
-            hungry = getattr(unpack, "needs_input", True)
-            if not packed and hungry:
+            if not packed and getattr(unpack, "needs_input", True):
                 packed = file.read(_CHUNK)
                 if not packed:
                     raise EOFError("it ends in the middle of its data")
-            part = unpack.decompress(packed, _CHUNK)
+            yield unpack.decompress(packed, _CHUNK)
             packed = getattr(unpack, "unconsumed_tail", b"")
-            parts.append(part)
-            size += len(part)
-            if size > most_bytes:
-                _bounded(b"", path, -1)
         packed = unpack.unused_data or file.read(_CHUNK)
-        if not packed.strip(b"\x00"):
-            return b"".join(parts)
-
-
-def _bounded(data: bytes, path: Path, most_bytes: int) -> bytes:
-    if len(data) > most_bytes:
-        raise InputError(f"{path}: more than {MOST_BYTES >> 20} MiB of data; cut the log in parts")
-    return data
 
 
 def read_members(path: Path) -> dict[str, bytes]:
@@ -123,27 +118,24 @@ class Words:
     ----------
     where
         The file's name, for messages.
-    data
-        The file as (B,) uint8.
     values
         (K,) each word as a number, NaN where it is none.
     is_number
-        (K,) uint8, 1 where it is one.
+        (K,) whether it is one.
     first
         (L + 1,) line i holds the words first[i] to first[i + 1].
-    line_starts
-        (L,) first byte of each line's first word.
     line_numbers
         (L,) counted from 1.
+    lines_by_keyword
+        Lines that begin with each word that is no number.
     """
 
     where: str
-    data: NDArray[np.uint8]
     values: Array
-    is_number: NDArray[np.uint8]
+    is_number: NDArray[np.bool_]
     first: Rows
-    line_starts: Rows
-    line_numbers: NDArray[np.int32]
+    line_numbers: Rows
+    lines_by_keyword: dict[bytes, list[int]]
 
     @property
     def counts(self) -> Rows:
@@ -156,11 +148,7 @@ class Words:
 
     def lines_of(self, keyword: str) -> Rows:
         """Lines whose first word is the keyword."""
-        if not len(self.line_numbers):
-            return np.zeros(0, np.int64)
-        wanted = np.frombuffer(keyword.encode(), np.uint8)
-        found: Rows = np.flatnonzero(_begins(self.data, self.line_starts, wanted))
-        return found
+        return np.array(self.lines_by_keyword.get(keyword.encode(), ()), np.int64)
 
     def numbers(self, lines: Rows, column: int | Rows, n_columns: int, what: str) -> Array:
         """Numbers (len(lines), n_columns) from a column on (one for all, or one a line).
@@ -174,11 +162,12 @@ class Words:
         short = np.flatnonzero(begin + n_columns > self.first[lines + 1])
         if len(short):
             raise self.error(int(lines[short[0]]), f"too few words for {what}")
-        out = np.empty((len(lines), n_columns))
-        bad = _gather(self.values, self.is_number, begin, out)
-        if bad >= 0:
-            raise self.error(int(lines[bad]), f"not a number in {what}")
-        return out
+        wanted = begin[:, None] + np.arange(n_columns)
+        bad = np.flatnonzero(~self.is_number[wanted].all(axis=1))
+        if len(bad):
+            raise self.error(int(lines[bad[0]]), f"not a number in {what}")
+        numbers: Array = self.values[wanted]
+        return numbers
 
     def finite(self, lines: Rows, column: int | Rows, n_columns: int, what: str) -> Array:
         """As `numbers`, and they must be finite, and no larger than a log has reason to hold."""
@@ -214,31 +203,45 @@ class Words:
 def split_words(data: bytes, where: str) -> Words:
     """Split text at white space, commas and semicolons; `#` begins a comment.
 
-    Numbers are read exactly, as Python's `float` reads them.
+    Numbers are read exactly, as Python's `float` reads them, but for underscores.
 
     Raises
     ------
     InputError
         If the file is binary (holds a zero byte).
     """
-    text = np.frombuffer(data, np.uint8)
-    n_words, n_lines, zero_line = _count(text)
-    if zero_line:
-        raise InputError(f"{where}:{zero_line}: holds a zero byte, so it is not a text log")
-    values, kinds = np.empty(n_words), np.empty(n_words, np.uint8)
-    first, line_starts = np.empty(n_lines + 1, np.int64), np.empty(n_lines, np.int64)
-    line_numbers = np.empty(n_lines, np.int32)
-    _fill(text, _TENS, values, kinds, first, line_starts, line_numbers)
-    slow = np.flatnonzero(kinds == _SLOW)
-    line_of = np.searchsorted(first, slow, side="right") - 1
-    for line in np.unique(line_of):
-        begin = int(line_starts[line])
-        end = data.find(b"\n", begin)
-        words = data[begin : end if end >= 0 else len(data)].split(b"#")[0].translate(_GAPS).split()
-        for i in slow[slice(*np.searchsorted(line_of, (line, line + 1)))]:
-            values[i] = float(words[i - first[line]])
-    kinds[slow] = _NUMBER
-    return Words(where, text, values, kinds, first, line_starts, line_numbers)
+    zero = data.find(b"\x00")
+    if zero >= 0:
+        line_number = data.count(b"\n", 0, zero) + 1
+        raise InputError(f"{where}:{line_number}: holds a zero byte, so it is not a text log")
+    values, first, line_numbers = array("d"), array("q"), array("q")
+    not_numbers: list[int] = []
+    lines_by_keyword: dict[bytes, list[int]] = {}
+    for line_number, line in enumerate(data.translate(_PLAIN).split(b"\n"), start=1):
+        words = line.partition(b"#")[0].split()
+        if not words:
+            continue
+        first.append(len(values))
+        line_numbers.append(line_number)
+        for word in words:
+            try:
+                values.append(float(word))
+            except ValueError:
+                if len(values) == first[-1]:
+                    lines_by_keyword.setdefault(word, []).append(len(first) - 1)
+                not_numbers.append(len(values))
+                values.append(math.nan)
+    first.append(len(values))
+    is_number = np.ones(len(values), bool)
+    is_number[not_numbers] = False
+    return Words(
+        where,
+        np.array(values),
+        is_number,
+        np.array(first, np.int64),
+        np.array(line_numbers, np.int64),
+        lines_by_keyword,
+    )
 
 
 def read_words(path: Path) -> Words:
@@ -246,171 +249,5 @@ def read_words(path: Path) -> Words:
     return split_words(read_bytes(path), str(path))
 
 
-_GAPS = bytes.maketrans(b",;", b"  ")
-_TENS: Array = np.power(10.0, np.arange(23.0))  # powers of ten that doubles hold exactly
-
-
-@njit()
-def _is_gap(byte: int) -> bool:
-    return byte == 32 or (9 <= byte <= 13) or byte == 44 or byte == 59
-
-
-@njit()
-def _count(text: NDArray[np.uint8]) -> tuple[int, int, int]:
-    """Words, lines that have any, and the first line with a zero byte (0 for none)."""
-    n_words, n_lines, line = 0, 0, 1
-    in_word, in_comment, line_has_words = False, False, False
-    for byte in text:
-        if byte == 0:
-            return 0, 0, line
-        if byte == 10:
-            line += 1
-            n_lines += line_has_words
-            in_word, in_comment, line_has_words = False, False, False
-        elif in_comment:
-            continue
-        elif byte == 35:
-            in_comment, in_word = True, False
-        elif _is_gap(byte):
-            in_word = False
-        elif not in_word:
-            in_word, line_has_words = True, True
-            n_words += 1
-    return n_words, n_lines + line_has_words, 0
-
-
-@njit()
-def _fill(
-    text: NDArray[np.uint8],
-    tens: Array,
-    values: Array,
-    kinds: NDArray[np.uint8],
-    first: Rows,
-    line_starts: Rows,
-    line_numbers: NDArray[np.int32],
-) -> None:
-    """Second pass: where the words are and what numbers they spell."""
-    n_bytes = len(text)
-    i, word, line, row = 0, 0, 1, 0
-    line_has_words = False
-    while i < n_bytes:
-        byte = text[i]
-        if byte == 10:
-            line += 1
-            line_has_words = False
-            i += 1
-        elif byte == 35:
-            while i < n_bytes and text[i] != 10:
-                i += 1
-        elif _is_gap(byte):
-            i += 1
-        else:
-            if not line_has_words:
-                first[row], line_starts[row], line_numbers[row] = word, i, line
-                row += 1
-                line_has_words = True
-            value, kind, i = _number(text, i, tens)
-            values[word], kinds[word] = value, kind
-            word += 1
-    first[row] = word
-
-
-@njit()
-def _number(text: NDArray[np.uint8], begin: int, tens: Array) -> tuple[float, int, int]:
-    """The word at `begin`: its number, its kind, and the byte after it.
-
-    Up to 2^53 and 22 decimal places one division of exact doubles is the correctly rounded
-    number; what lies beyond is left to Python.
-    """
-    n_bytes, i = len(text), begin
-    negative = text[i] == 45
-    if negative or text[i] == 43:
-        i += 1
-    mantissa, digits, places, kind = np.int64(0), 0, 0, 1
-    seen_point = False
-    while i < n_bytes:
-        byte = text[i]
-        if 48 <= byte <= 57:
-            digits += 1
-            if mantissa < 900719925474099:  # ten times this and 9 is still below 2^53
-                mantissa = mantissa * 10 + (byte - 48)
-                places += seen_point
-            else:
-                kind = 2
-        elif byte == 46 and not seen_point:
-            seen_point = True
-        else:
-            break
-        i += 1
-    exponent = 0
-    if digits > 0 and i < n_bytes and (text[i] == 101 or text[i] == 69):
-        i += 1
-        minus = i < n_bytes and text[i] == 45
-        if minus or (i < n_bytes and text[i] == 43):
-            i += 1
-        figures = 0
-        while i < n_bytes and 48 <= text[i] <= 57:
-            exponent = min(exponent * 10 + (text[i] - 48), 9999)
-            figures += 1
-            i += 1
-        if minus:
-            exponent = -exponent
-        if figures == 0:
-            digits = 0
-    end = i
-    while end < n_bytes and text[end] != 35 and not _is_gap(text[end]):
-        end += 1
-    if end != i or digits == 0:
-        special = _special(text, i if digits == 0 else end, end)
-        if special != 0.0 and i <= begin + 1:
-            return -special if negative else special, 1, end
-        return np.nan, 0, end
-    scale = exponent - places
-    if kind == 2 or scale > 22 or scale < -22:
-        return 0.0, 2, end
-    value = float(mantissa)
-    value = value * tens[scale] if scale >= 0 else value / tens[-scale]
-    return -value if negative else value, 1, end
-
-
-@njit()
-def _special(text: NDArray[np.uint8], begin: int, end: int) -> float:
-    """`inf` or `nan` in any case; 0 for anything else."""
-    if end - begin != 3:
-        return 0.0
-    a, b, c = text[begin] | 32, text[begin + 1] | 32, text[begin + 2] | 32
-    if a == 105 and b == 110 and c == 102:
-        return np.inf
-    if a == 110 and b == 97 and c == 110:
-        return np.nan
-    return 0.0
-
-
-@njit()
-def _begins(text: NDArray[np.uint8], starts: Rows, word: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Whether each of the words that start there is this word."""
-    n_bytes, length = len(text), len(word)
-    same = np.zeros(len(starts), np.bool_)
-    for k in range(len(starts)):
-        begin = starts[k]
-        end = begin + length
-        if end > n_bytes or (end < n_bytes and text[end] != 35 and not _is_gap(text[end])):
-            continue
-        same[k] = True
-        for j in range(length):
-            if text[begin + j] != word[j]:
-                same[k] = False
-                break
-    return same
-
-
-@njit()
-def _gather(values: Array, is_number: NDArray[np.uint8], begin: Rows, out: Array) -> int:
-    """Copy rows of words; the first row with a word that is no number, or -1."""
-    for row in range(len(begin)):
-        for j in range(out.shape[1]):
-            k = begin[row] + j
-            if is_number[k] != 1:
-                return row
-            out[row, j] = values[k]
-    return -1
+# Gaps are blanks; "1_0" is 10 to Python, but no number in a log, and no keyword has a "_".
+_PLAIN = bytes.maketrans(b",;_", b"  ?")

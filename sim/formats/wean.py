@@ -149,7 +149,7 @@ def parse_grid(data: bytes, where: str) -> Grid:
         raise InputError(
             f"{where}:{number}: {n_x} x {n_y} cells are promised, {len(cells.values)} are there"
         )
-    bad = np.flatnonzero((cells.is_number == 0) | ~(np.abs(cells.values) <= 1.0))
+    bad = np.flatnonzero(~cells.is_number | ~(np.abs(cells.values) <= 1.0))
     if len(bad):
         line = int(np.searchsorted(cells.first, bad[0], side="right")) - 1
         raise cells.error(line, "a cell must be -1 or a number from 0 to 1")
