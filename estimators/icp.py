@@ -17,13 +17,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from estimators.scan_lines import PreparedScan, prepare, select
+from sim.arrays import Array, Ints
 from sim.compiled import njit
 from sim.errors import InputError
 
 __all__ = ["PreparedScan", "Registration", "prepare", "register"]
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 Metric = Literal["point_to_line", "point_to_point"]
 Search = Literal["angular", "kdtree"]
 Kernel = Literal["tukey", "huber", "none"]
@@ -75,7 +74,7 @@ class Registration:
     T_target_source: Array
     metric: Metric
     status: str
-    matches: Indices
+    matches: Ints
     residuals_m: Array
     weights: Array
     iterations: int
@@ -160,7 +159,7 @@ def _nearest_point(
 
 
 @njit(error_model="numpy", fastmath={"contract"})
-def _plant_tree(points: Array) -> Indices:
+def _plant_tree(points: Array) -> Ints:
     """Order (K,) of the points such that the middle of every range splits it in x, y, x, ..."""
     n = len(points)
     order = np.arange(n)
@@ -181,7 +180,7 @@ def _plant_tree(points: Array) -> Indices:
 
 
 @njit(error_model="numpy", fastmath={"contract"})
-def _nearest_in_tree(points: Array, order: Indices, x: float, y: float) -> tuple[int, float]:
+def _nearest_in_tree(points: Array, order: Ints, x: float, y: float) -> tuple[int, float]:
     """Nearest point by the k-d tree of `_plant_tree`: index, squared distance."""
     stack = np.empty((64, 3), np.int64)
     gaps = np.empty(64)
@@ -213,9 +212,9 @@ def _nearest_in_tree(points: Array, order: Indices, x: float, y: float) -> tuple
 @njit(error_model="numpy", fastmath={"contract"})
 def _heading_by_lines(
     source: Array,
-    source_ends: Indices,
+    source_ends: Ints,
     target: Array,
-    target_ends: Indices,
+    target_ends: Ints,
     guess: float,
     window: float,
 ) -> float:
@@ -255,8 +254,8 @@ def _heading_by_lines(
 
 @njit(error_model="numpy", fastmath={"contract"})
 def _representatives(
-    points: Array, line_of_point: Indices, ends: Indices, segments: Array
-) -> tuple[Indices, Array]:
+    points: Array, line_of_point: Ints, ends: Ints, segments: Array
+) -> tuple[Ints, Array]:
     """A few points for each line, which together count as the root of the line's points.
 
     They are spaced in turn by beams and by length: a wall that runs away from the sensor has
@@ -334,11 +333,11 @@ def _mirror(matrix: Array) -> None:
 
 @njit(error_model="numpy", fastmath={"contract"})
 def _align(
-    points: Array, rays: Array, chosen: Indices, counts: Array, pose: Array, to_lines: bool,
-    segments: Array, target_points: Array, target_rays: Array, line_of_point: Indices,
-    full_circle: bool, order: Indices, gate: float, kernel: int, scale: float, reach: float,
+    points: Array, rays: Array, chosen: Ints, counts: Array, pose: Array, to_lines: bool,
+    segments: Array, target_points: Array, target_rays: Array, line_of_point: Ints,
+    full_circle: bool, order: Ints, gate: float, kernel: int, scale: float, reach: float,
     noise: float, trim: float, max_iterations: int, increment_m: float, increment_rad: float,
-    guess: Array, matches: Indices, residuals: Array, weights: Array,
+    guess: Array, matches: Ints, residuals: Array, weights: Array,
 ) -> tuple[int, bool]:  # fmt: skip
     """Iterate from `pose`, in place, to rest under one gate; iterations, converged.
 
@@ -451,7 +450,7 @@ def _align(
 @njit(error_model="numpy", fastmath={"contract"})
 def _judge(
     points: Array, rays: Array, pose: Array, to_lines: bool, segments: Array,
-    line_of_point: Indices, matches: Indices, residuals: Array, weights: Array, noise: float,
+    line_of_point: Ints, matches: Ints, residuals: Array, weights: Array, noise: float,
 ) -> tuple[Array, Array, Array]:  # fmt: skip
     """Normal matrix of the metric, and the informations of `Registration`; lower halves."""
     normal, information, feigned = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
@@ -494,8 +493,8 @@ def _judge(
 
 @njit(error_model="numpy", fastmath={"contract"})
 def _confront(
-    points: Array, line_of_point: Indices, segments: Array, pose: Array, lever_x: float,
-    lever_y: float, turn: float, ranges: Array, rays: Array, other_line: Indices,
+    points: Array, line_of_point: Ints, segments: Array, pose: Array, lever_x: float,
+    lever_y: float, turn: float, ranges: Array, rays: Array, other_line: Ints,
     other_segments: Array, full_circle: bool, tolerance: float, agreed: Array, denied: Array,
 ) -> None:  # fmt: skip
     """See what a scan says of another one's points, and add to two sums of J J^T (3, 3).
@@ -551,13 +550,13 @@ def _confront(
 
 @njit(error_model="numpy", fastmath={"contract"})
 def _register(
-    ranges: Array, points: Array, rays: Array, source_line: Indices, source_ends: Indices,
+    ranges: Array, points: Array, rays: Array, source_line: Ints, source_ends: Ints,
     source_segments: Array, target_ranges: Array, target_points: Array, target_rays: Array,
-    target_line: Indices, target_ends: Indices, target_segments: Array, full_circle: bool,
+    target_line: Ints, target_ends: Ints, target_segments: Array, full_circle: bool,
     pose: Array, to_lines: bool, by_tree: bool, stages: Array, window: float, sigma_m: float,
     sigma_rad: float, noise: float,
     trim: float, increment_m: float, increment_rad: float,
-) -> tuple[Indices, Array, Array, int, bool, Array, Array, Array, Array, Array]:  # fmt: skip
+) -> tuple[Ints, Array, Array, int, bool, Array, Array, Array, Array, Array]:  # fmt: skip
     """All of a registration.
 
     Columns of `stages` (S, 6): gate, kernel, its scale, iterations, whether sparse, reach.

@@ -19,13 +19,12 @@ import math
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from estimators.icp import LEAST_INFORMATION, PreparedScan, Registration, prepare, register
+from sim.arrays import Array, Ints
 from sim.compiled import njit
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 Scans = Literal["both", "last"]
 Matches = Literal["held", "sliding"]
 
@@ -34,9 +33,9 @@ UNKNOWN_M, UNKNOWN_RAD = 10.0, math.pi  # standard deviations of a direction nob
 
 @njit(error_model="numpy")
 def _censi(
-    points: Array, rays: Array, pose: Array, to_lines: bool, sliding: bool, matches: Indices,
+    points: Array, rays: Array, pose: Array, to_lines: bool, sliding: bool, matches: Ints,
     weights: Array, residuals: Array, lines: Array, line_information: Array,
-    line_of_target: Indices, target_points: Array, target_rays: Array,
+    line_of_target: Ints, target_points: Array, target_rays: Array,
 ) -> tuple[Array, Array, Array]:  # fmt: skip
     """Derivatives of the gradient of half the cost.
 

@@ -18,13 +18,11 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from sim import se2
+from sim.arrays import Array, Floats, Ints
 from sim.compiled import njit
 from sim.errors import InputError
 from sim.sensors import Laser
 from sim.world import World
-
-Array = NDArray[np.float64]
-Floats = NDArray[np.float32]
 
 _MOST = 65535  # of a table entry
 _CLEARANCE_M = 0.15  # where a robot's centre can be
@@ -54,7 +52,7 @@ class LikelihoodField:
     origin_m: Array
     cell_m: float
     step: float
-    free_cells: NDArray[np.int64]
+    free_cells: Ints
 
     def draw(self, n: int, rng: np.random.Generator) -> Array:
         """Poses (n, 3), uniform over the free floor and all headings."""
@@ -131,7 +129,7 @@ def likelihood_field(
     return LikelihoodField(table, origin, cell_m, step, _free_cells(distances, margin))
 
 
-def _free_cells(distances_m: Array, margin: int) -> NDArray[np.int64]:
+def _free_cells(distances_m: Array, margin: int) -> Ints:
     """Cells (F, 2) of the largest connected floor off the walls, within the walls' rectangle."""
     inner = distances_m[margin:-margin, margin:-margin] > _CLEARANCE_M
     labels, count = ndimage.label(inner)
@@ -189,7 +187,7 @@ def _look_up(
     columns: int,
     origin: Array,
     cell_m: float,
-    counts: NDArray[np.int64],
+    counts: Ints,
 ) -> None:
     """Sum the table over the beam ends (2, B), for every pose (M, 3).
 

@@ -11,27 +11,31 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimators.base import Belief, Prior
-from estimators.gaussian import STILL, Gaussian, wheel_motion
+from estimators.gaussian import STILL, Gaussian, root
 from estimators.likelihood_field import beam_ends, likelihood_field
+from estimators.options import (
+    require_choices,
+    require_counts,
+    require_laser,
+    require_non_negative,
+    require_positive,
+)
 from estimators.particles import (
-    SCHEMES,
     Scheme,
     effective_sample_size,
     normalize,
     resample,
     underflowed,
 )
+from estimators.wheels import WheelPrediction
 from sim import se2
+from sim.arrays import Array, Floats, Ints
 from sim.compiled import njit
 from sim.errors import InputError
 from sim.recording import Frame
-from sim.robot import TravelWindow, wheel_variances
 from sim.world import World
-
-Array = NDArray[np.float64]
 
 _BISECTIONS = 12
 _FARTHEST_M, _FARTHEST_RAD = 1.0, 0.5  # of what belongs to one hypothesis
@@ -126,53 +130,35 @@ class Mcl:
         kl: float = 1e-4,
         window_s: float = 0.05,
     ) -> None:
-        for name, whole in {
-            "n_least": n_least,
-            "n_most": n_most,
-            "n_beams": n_beams,
-            "tries": tries,
-        }.items():
-            if isinstance(whole, bool) or not isinstance(whole, int) or whole < 1:
-                raise InputError(
-                    f"estimator.{name} must be a whole number from 1 on, got {whole!r}"
-                )
+        self.wheels = WheelPrediction(kr, kl, window_s)
+        require_counts(n_least=n_least, n_most=n_most, n_beams=n_beams, tries=tries)
+        require_choices(resampling=(resampling, Scheme))
+        require_positive(
+            kld_error=kld_error,
+            bin_m=bin_m,
+            bin_rad=bin_rad,
+            beam_power=beam_power,
+            sigma_m=sigma_m,
+            z_hit=z_hit,
+            z_rand=z_rand,
+            cell_m=cell_m,
+        )
+        require_non_negative(
+            kld_quantile=kld_quantile,
+            least_ess=least_ess,
+            update_distance_m=update_distance_m,
+            update_turn_rad=update_turn_rad,
+            ess_share=ess_share,
+            jitter_m=jitter_m,
+            jitter_rad=jitter_rad,
+            alpha_slow=alpha_slow,
+            alpha_fast=alpha_fast,
+            recovery_ratio=recovery_ratio,
+        )
         if n_least > n_most:
             raise InputError(f"estimator.n_least={n_least} is above n_most={n_most}")
         if least_ess >= ess_share:
             raise InputError(f"estimator.least_ess={least_ess} is not below ess_share={ess_share}")
-        if resampling not in SCHEMES:
-            raise InputError(
-                f"estimator.resampling must be {' or '.join(SCHEMES)}, got {resampling!r}"
-            )
-        positive = {
-            "kld_error": kld_error,
-            "bin_m": bin_m,
-            "bin_rad": bin_rad,
-            "beam_power": beam_power,
-            "sigma_m": sigma_m,
-            "z_hit": z_hit,
-            "z_rand": z_rand,
-            "cell_m": cell_m,
-        }
-        others = {
-            "kld_quantile": kld_quantile,
-            "least_ess": least_ess,
-            "update_distance_m": update_distance_m,
-            "update_turn_rad": update_turn_rad,
-            "ess_share": ess_share,
-            "jitter_m": jitter_m,
-            "jitter_rad": jitter_rad,
-            "alpha_slow": alpha_slow,
-            "alpha_fast": alpha_fast,
-            "recovery_ratio": recovery_ratio,
-            "kr": kr,
-            "kl": kl,
-            "window_s": window_s,
-        }
-        for name, number in {**positive, **others}.items():
-            if not (math.isfinite(number) and number >= 0.0) or (name in positive and number == 0):
-                kind = "positive" if name in positive else "zero or positive"
-                raise InputError(f"estimator.{name} must be {kind}, got {number}")
         self.n_least, self.n_most, self.n_beams = n_least, n_most, n_beams
         self.kld_error, self.kld_quantile = kld_error, kld_quantile
         self.bin_m, self.bin_rad, self.beam_power = bin_m, bin_rad, beam_power
@@ -183,15 +169,13 @@ class Mcl:
         self.jitter_m, self.jitter_rad = jitter_m, jitter_rad
         self.alpha_slow, self.alpha_fast = alpha_slow, alpha_fast
         self.recovery_ratio = recovery_ratio
-        self.kr, self.kl, self.window_s = kr, kl, window_s
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Draw particles from the prior's pose, or from all the floor if there is none."""
-        if prior.sensors.laser is None:
-            raise InputError("mcl needs a laser; choose sensors that have one")
+        self._laser, self._rng = require_laser(prior, "mcl"), rng
         if not isinstance(prior.map, World):
             raise InputError("mcl needs a map of walls; set prior.map=world")
-        self._laser, self._rng, self._track_m = prior.sensors.laser, rng, prior.robot.track_m
+        self.wheels.reset(prior.robot.track_m)
         self._field = likelihood_field(
             prior.map,
             self._laser,
@@ -204,12 +188,10 @@ class Mcl:
         if prior.mean is None or prior.covariance is None:
             self._poses = self._field.draw(self.n_most, rng)
         else:
-            values, vectors = np.linalg.eigh(prior.covariance)
-            root = vectors * np.sqrt(np.maximum(values, 0.0))
-            self._poses = prior.mean + rng.standard_normal((self.n_most, 3)) @ root.T
+            normals = rng.standard_normal((self.n_most, 3))
+            self._poses = prior.mean + normals @ root(prior.covariance).T
             self._poses[:, 2] = se2.wrap(self._poses[:, 2])
         self._log_weights = np.zeros(len(self._poses))
-        self._window = TravelWindow(self.window_s)
         self._motion = STILL  # since the last scan used
         # A beam errs along itself by the laser's noise, and by half a cell either way
         variance = self._laser.sigma_range_m**2 + self.cell_m**2 / 6.0
@@ -220,10 +202,7 @@ class Mcl:
 
     def step(self, frame: Frame) -> Belief:
         """Roll by the wheels; with a scan from a new place, weigh and draw."""
-        travel = frame.wheel_increments_m
-        spread_m = self._window.push(frame.duration_s, travel)
-        variances = wheel_variances(spread_m, self.kr, self.kl)
-        self._motion = self._motion.then(wheel_motion(travel, variances, self._track_m)[0])
+        self._motion = self._motion.then(self.wheels.predict(frame))
         extras: dict[str, Any] = {}
         if frame.ranges_m is not None and self._is_due():
             ends = beam_ends(frame.ranges_m, self._laser, self.n_beams)
@@ -246,14 +225,12 @@ class Mcl:
 
     def _move(self) -> None:
         """Draw the motion since the last scan used, for each particle."""
-        values, vectors = np.linalg.eigh(self._motion.covariance)
-        root = vectors * np.sqrt(np.maximum(values, 0.0))
         normals = self._rng.standard_normal(self._poses.shape)
         self._poses = self._poses.copy()  # the last Belief keeps its own
-        _move(self._poses, self._motion.mean, root, normals)
+        _move(self._poses, self._motion.mean, root(self._motion.covariance), normals)
         self._motion = STILL
 
-    def _weigh(self, ends: NDArray[np.float32]) -> None:
+    def _weigh(self, ends: Floats) -> None:
         """Weigh by one scan, sum up the belief, and draw anew if that is due."""
         if self._everywhere:
             self._poses, self._everywhere = self._strewn(self.n_most, ends), False
@@ -302,13 +279,13 @@ class Mcl:
         self._extras["fit"] = fit
         return max(0.0, 1.0 - self._fast / (self.recovery_ratio * self._slow))
 
-    def _strewn(self, n: int, ends: NDArray[np.float32]) -> Array:
+    def _strewn(self, n: int, ends: Floats) -> Array:
         """Poses (n, 3) over all the floor, drawn by how well the scan fits there."""
         tries = self._field.draw(n * self.tries, self._rng)
         log_weights = self.beam_power * self._field.log_likelihood(tries, ends)
         return tries[resample(log_weights, n, self._rng, self.resampling)]
 
-    def _draw(self, strewn_share: float, ends: NDArray[np.float32]) -> None:
+    def _draw(self, strewn_share: float, ends: Floats) -> None:
         """Draw particles anew: as many as the bins they fall into call for."""
         n, needed = 0, max(self.n_least, min(len(self._poses), self.n_most) // 4)
         poses, n_strewn = self._poses, 0
@@ -334,7 +311,7 @@ class Mcl:
         cube = (1.0 - a + math.sqrt(a) * self.kld_quantile) ** 3
         return math.ceil((k - 1) / (2.0 * self.kld_error) * cube)
 
-    def _bins(self, poses: Array) -> NDArray[np.int64]:
+    def _bins(self, poses: Array) -> Ints:
         """Number of the bin (M,) of each pose; what lies off the map counts to its rim."""
         field = self._field
         shape = np.ceil(field.cell_m * np.array(field.table.shape[::-1]) / self.bin_m).astype(int)
@@ -343,7 +320,7 @@ class Mcl:
         n_headings = math.ceil(2.0 * math.pi / self.bin_rad)
         column = np.clip(x.astype(np.int64), 0, shape[0] - 1)
         row = np.clip(y.astype(np.int64), 0, shape[1] - 1)
-        bins: NDArray[np.int64] = (row * shape[0] + column) * n_headings + heading % n_headings
+        bins: Ints = (row * shape[0] + column) * n_headings + heading % n_headings
         return bins
 
     def _summed_up(self) -> Gaussian:

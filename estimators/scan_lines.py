@@ -14,14 +14,13 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from sim.arrays import Array, Ints
 from sim.compiled import njit
 from sim.errors import InputError
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
-_Prepared = tuple[Array, Array, Array, Indices, Indices, Array, Array, Indices, Array, float]
+_Prepared = tuple[Array, Array, Array, Ints, Ints, Array, Array, Ints, Array, float]
 
 _NOISE_FLOOR_M = 0.002  # quantised ranges can look free of noise
 _MIN_LINE_POINTS = 3
@@ -65,11 +64,11 @@ class PreparedScan:
     ranges_m: Array
     rays: Array
     points: Array
-    beams: Indices
-    line_of_point: Indices
+    beams: Ints
+    line_of_point: Ints
     lines: Array
     line_information: Array
-    line_ends: Indices
+    line_ends: Ints
     segments: Array
     noise_m: float
     full_circle: bool
@@ -109,7 +108,7 @@ def prepare(
 
 
 @njit(error_model="numpy", fastmath={"contract"})
-def select(keys: Array, order: Indices, low: int, high: int, rank: int) -> float:
+def select(keys: Array, order: Ints, low: int, high: int, rank: int) -> float:
     """Reorder order[low:high] so that keys[order] is at its place at `rank`, smaller before."""
     high -= 1
     while low < high:
@@ -135,7 +134,7 @@ def select(keys: Array, order: Indices, low: int, high: int, rank: int) -> float
 
 
 @njit(error_model="numpy", fastmath={"contract"})
-def _noise(ranges: Array, rays: Array, beams: Indices) -> float:
+def _noise(ranges: Array, rays: Array, beams: Ints) -> float:
     """Standard deviation of the ranges, from second differences of 1 / range.
 
     On a straight wall u[i-1] - 2 cos(step) u[i] + u[i+1] is zero for u = 1 / range.
@@ -158,7 +157,7 @@ def _noise(ranges: Array, rays: Array, beams: Indices) -> float:
 
 @njit(error_model="numpy", fastmath={"contract"})
 def _fit(
-    ranges: Array, rays: Array, line_of_point: Indices, first: int, last: int, line: int, m: Array
+    ranges: Array, rays: Array, line_of_point: Ints, first: int, last: int, line: int, m: Array
 ) -> tuple[float, float, float]:
     """One Gauss-Newton step of the line's fit to the ranges of its points, from m, in place."""
     s11, s12, s22, b1, b2 = 0.0, 0.0, 0.0, 0.0, 0.0
@@ -185,8 +184,8 @@ def _fit(
 
 @njit(error_model="numpy", fastmath={"contract"})
 def _segment(
-    ranges: Array, rays: Array, beams: Indices, noise: float
-) -> tuple[Indices, Array, Array, Indices]:
+    ranges: Array, rays: Array, beams: Ints, noise: float
+) -> tuple[Ints, Array, Array, Ints]:
     """Cut a scan into straight pieces: line of each point, lines, information, ends."""
     n = len(ranges)
     line_of_point = np.zeros(n, np.int64) - 1
@@ -319,9 +318,9 @@ def _segment(
 def _describe(
     lines: Array,
     information: Array,
-    ends: Indices,
+    ends: Ints,
     rays: Array,
-    beams: Indices,
+    beams: Ints,
     spacing: float,
     noise: float,
 ) -> Array:

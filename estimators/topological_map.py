@@ -17,12 +17,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from estimators import descriptors as describers
 from sim import se2
+from sim.arrays import Array, Floats, Ints
 from sim.errors import InputError
 from sim.files import write_whole
 from sim.recording import Recording
 from sim.sensors import Lidar3D
 
-Array = NDArray[np.float64]
 FORMAT_VERSION = 1
 
 
@@ -50,11 +50,11 @@ class TopologicalMap:
     """
 
     positions_m: Array
-    descriptors: NDArray[np.float32]
-    edges: NDArray[np.int64]
+    descriptors: Floats
+    edges: Ints
     descriptor: str = ""
     headings_rad: Array = field(default_factory=lambda: np.zeros(0))
-    slices_m: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 0), np.float32))
+    slices_m: Floats = field(default_factory=lambda: np.zeros((0, 0), np.float32))
 
     def __post_init__(self) -> None:
         n = len(self.positions_m)
@@ -229,7 +229,7 @@ def from_recording(
             rows.append(int(row))
     if not rows:
         raise InputError("none of the clouds of the recording has a true pose; no map can be built")
-    slices: list[NDArray[np.float32]] | None = None
+    slices: list[Floats] | None = None
     if recording.places is not None:
         features, descriptor = recording.places.descriptors[rows], ""
     else:
@@ -249,14 +249,14 @@ def from_recording(
     )
 
 
-def level_slice(lidar: Lidar3D, ranges_m: NDArray[np.float32]) -> NDArray[np.float32]:
+def level_slice(lidar: Lidar3D, ranges_m: Floats) -> Floats:
     """Horizontal ranges (A,) m of the ring nearest to level, the upper one of two: a planar scan.
 
     Rings that look down end on the ground, where there is no wall.
     """
     elevations = lidar.elevations_rad
     ring = int(np.argmin(np.abs(elevations - 1e-6)))
-    level: NDArray[np.float32] = (ranges_m[ring] * np.cos(elevations[ring])).astype(np.float32)
+    level: Floats = (ranges_m[ring] * np.cos(elevations[ring])).astype(np.float32)
     return level
 
 

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimators import descriptors as describers
 from estimators.base import Belief, Prior
@@ -19,12 +18,11 @@ from estimators.particles import SCHEMES, Scheme, effective_sample_size, resampl
 from estimators.place_refinement import Refiner
 from estimators.topological_map import TopologicalMap, load
 from sim import se2
+from sim.arrays import Array, Floats, Ints
 from sim.errors import InputError
 from sim.recording import Frame
 from sim.robot import arc_increment
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 Weighting = Literal["M1", "M2", "M3"]
 
 _ALL_AROUND = math.pi**2 / 3.0  # variance of a heading that nobody knows, rad^2
@@ -92,7 +90,7 @@ def _normalized(log_weights: Array) -> Array:
     return normal
 
 
-def _sums(places: Indices, values: Array, n: int) -> Array:
+def _sums(places: Ints, values: Array, n: int) -> Array:
     """Sum (n,) of the values at each place."""
     sums: Array = np.asarray(np.bincount(places, values, minlength=n), np.float64)
     return sums
@@ -141,18 +139,18 @@ class Graph:
         lone = self.head == self.tail
         self.heading_rad[lone] = np.nan_to_num(known_map.headings_rad[self.tail[lone]])
 
-    def next(self, edges: Indices, uniform: Array) -> Indices:
+    def next(self, edges: Ints, uniform: Array) -> Ints:
         """Edge after each, past its head: any but the one back, which is left for dead ends."""
         node, back = self.head.take(edges), self.reverse.take(edges)
         others = self.degree.take(node) - 1
         chosen = self.first_out.take(node) + (uniform * others).astype(np.int64)
         chosen += chosen >= back
-        onward: Indices = np.where(others > 0, chosen, back)
+        onward: Ints = np.where(others > 0, chosen, back)
         return onward
 
-    def before(self, edges: Indices, uniform: Array) -> Indices:
+    def before(self, edges: Ints, uniform: Array) -> Ints:
         """Edge before each, for driving backwards."""
-        earlier: Indices = self.reverse[self.next(self.reverse[edges], uniform)]
+        earlier: Ints = self.reverse[self.next(self.reverse[edges], uniform)]
         return earlier
 
 
@@ -314,7 +312,7 @@ class TopologicalMcl:
         self._belief = belief
         return Belief(belief.mean.copy(), belief.covariance.copy(), belief.extras)
 
-    def _descriptor(self, frame: Frame) -> tuple[NDArray[np.float32] | None, str]:
+    def _descriptor(self, frame: Frame) -> tuple[Floats | None, str]:
         """Descriptor of the Frame's place, or None and why if something is wrong with it."""
         observed = frame.place_descriptor
         if observed is None:
@@ -338,7 +336,7 @@ class TopologicalMcl:
             return None, "descriptor not finite"
         return observed.astype(np.float32, copy=False), ""
 
-    def _weigh(self, descriptor: NDArray[np.float32]) -> None:
+    def _weigh(self, descriptor: Floats) -> None:
         """Find the B places most alike, inject particles there, weight all."""
         nearest, away = self._nearest(descriptor)
         n, rng = len(self._edge), self._rng
@@ -363,7 +361,7 @@ class TopologicalMcl:
         )
         self._log_weights = _normalized(self._log_weights + by_node.take(node))
 
-    def _nearest(self, descriptor: NDArray[np.float32]) -> tuple[Indices, Array]:
+    def _nearest(self, descriptor: Floats) -> tuple[Ints, Array]:
         """Node numbers (B,) of the most alike descriptors, and their distances."""
         database = self._map.descriptors
         n_nearest = min(self.n_nearest, len(database))
@@ -393,12 +391,12 @@ class TopologicalMcl:
             self._edge, self._along_m = self._edge.take(kept), self._along_m.take(kept)
         self._log_weights = np.full(n, -math.log(n))
 
-    def _states(self) -> Indices:
+    def _states(self) -> Ints:
         """Number (M,) of each particle's edge, plus that of all edges if it is past its middle."""
         if self.motion == "paper":
             return self._edge
         past = self._along_m > 0.5 * self._graph.length_m.take(self._edge)
-        states: Indices = self._edge + len(self._graph.tail) * past
+        states: Ints = self._edge + len(self._graph.tail) * past
         return states
 
     def _roll(self, wheel_increments_m: Array) -> None:
@@ -482,7 +480,7 @@ class TopologicalMcl:
         mode = int(np.argmax(about))
         return mode, float(about[mode])
 
-    def _about(self, node: int) -> Indices:
+    def _about(self, node: int) -> Ints:
         """A node and its neighbours."""
         graph = self._graph
         first = graph.first_out[node]
@@ -498,7 +496,7 @@ class TopologicalMcl:
         covariance = (covariance + covariance.T) / 2.0
         return Belief(se2.compose(self._belief.mean, moved), covariance)
 
-    def _refined(self, cloud_ranges_m: NDArray[np.float32], belief: Belief) -> Belief:
+    def _refined(self, cloud_ranges_m: Floats, belief: Belief) -> Belief:
         """Register the cloud with the mode's node.
 
         If that fails, the last registered pose is carried on by the wheels, as long as it stays
