@@ -59,8 +59,7 @@ def scan_context(lidar: Lidar3D, ranges_m: Floats) -> Floats:
     """
     heights = polar_heights(lidar.points_in_sensor(ranges_m), lidar.mount.z_m)
     length = np.linalg.norm(heights, axis=0)
-    row: Floats = (heights / np.where(length > 0.0, length, 1.0)).astype(np.float32).ravel()
-    return row
+    return (heights / np.where(length > 0.0, length, 1.0)).astype(np.float32).ravel()
 
 
 def scan_context_distances(query: Floats, database: Floats) -> Array:
@@ -143,16 +142,14 @@ def _thinned(points: Array) -> Array:
     keys = (cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2]
     _, place, count = np.unique(keys, return_inverse=True, return_counts=True)
     sums = np.stack([np.bincount(place, weights=column) for column in points.T], axis=1)
-    mean: Array = sums / count[:, None]
-    return mean
+    return sums / count[:, None]
 
 
 def _all_turns(matrix: NDArray[np.floating]) -> NDArray[np.floating]:
     """(S, R, S): the columns of (R, S) turned by 0, 1, ... S - 1."""
     n = matrix.shape[1]
     columns = (np.arange(n)[None, :] + np.arange(n)[:, None]) % n
-    turned: NDArray[np.floating] = matrix[:, columns].transpose(1, 0, 2)
-    return turned
+    return matrix[:, columns].transpose(1, 0, 2)
 
 
 KINDS: dict[str, Kind] = {

@@ -279,8 +279,7 @@ def _widened(covariance: Array, registration: Registration) -> Array:
     if registration.status != "degenerate":
         return covariance
     loose = split_directions(registration)[1]
-    widened: Array = covariance + loose @ loose.T
-    return widened
+    return covariance + loose @ loose.T
 
 
 def _unknown() -> Array:

@@ -60,8 +60,7 @@ class LikelihoodField:
             raise InputError("the map has no floor off its walls to put particles on")
         cells = self.free_cells[rng.integers(len(self.free_cells), size=n)]
         places: Array = self.origin_m + (cells[:, ::-1] + rng.random((n, 2))) * self.cell_m
-        poses: Array = np.column_stack([places, rng.uniform(-math.pi, math.pi, n)])
-        return poses
+        return np.column_stack([places, rng.uniform(-math.pi, math.pi, n)])
 
     def log_likelihood(self, poses: Array, ends: Floats) -> Array:
         """Log likelihood (M,) of a scan at poses (M, 3), relative to all beams ending at walls.
@@ -77,8 +76,7 @@ class LikelihoodField:
             np.ascontiguousarray(poses), ends, self.table.ravel(), rows, columns,
             self.origin_m, self.cell_m, counts,
         )  # fmt: skip
-        log_likelihood: Array = -self.step * counts.astype(np.float64)
-        return log_likelihood
+        return -self.step * counts.astype(np.float64)
 
 
 def likelihood_field(

@@ -66,8 +66,7 @@ class Match:
         if self.loose is _NOTHING:
             return self.motion.covariance
         known = np.eye(3) - self.loose
-        covariance: Array = known @ self.motion.covariance @ known.T
-        return covariance
+        return known @ self.motion.covariance @ known.T
 
     def completed(self, guess: Gaussian) -> Gaussian:
         """In the directions that the scans do not hold, the guess and its covariance."""

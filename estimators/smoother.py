@@ -546,8 +546,7 @@ def _between(motions: list[Gaussian], ends: Array, joint: Array) -> list[Gaussia
 
 def _times(matrices: Array, vectors: Array) -> Array:
     """Products (K, m) of matrices (K, m, n) and vectors (K, n)."""
-    product: Array = (matrices @ vectors[:, :, None])[:, :, 0]
-    return product
+    return (matrices @ vectors[:, :, None])[:, :, 0]
 
 
 def _inverse(matrices: Array) -> Array:

@@ -125,8 +125,7 @@ class StereoModel:
         points = np.asarray(points_in_camera, dtype=np.float64)
         farthest = self.focal_px * self.baseline_m / math.sqrt(self.variances_px2[2])
         depth, finite = points[..., 2], np.isfinite(points).all(axis=-1)
-        usable: NDArray[np.bool_] = finite & (depth > LEAST_DEPTH_M / 2.0) & (depth < farthest)
-        return usable
+        return finite & (depth > LEAST_DEPTH_M / 2.0) & (depth < farthest)
 
     def axes(self, pose: ArrayLike) -> tuple[Array, Array]:
         """Camera position (..., 3) in map, and C (..., 3, 3) from map to camera axes."""
@@ -207,5 +206,4 @@ class StereoModel:
         column, row, disparity = np.moveaxis(np.asarray(image, dtype=np.float64), -1, 0)
         positive = np.where(disparity > 0.0, disparity, math.nan)
         rays = np.stack([column, row, np.full_like(row, self.focal_px)], axis=-1)
-        points: Array = rays * (self.baseline_m / positive)[..., None]
-        return points
+        return rays * (self.baseline_m / positive)[..., None]

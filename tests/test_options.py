@@ -44,7 +44,7 @@ def test_choices_are_those_of_the_literal():
     require_choices(kernel=("huber", kind))
     with pytest.raises(InputError, match=r"^estimator\.kernel must be one of tukey, huber, got"):
         require_choices(kernel=("flat", kind))
-    with pytest.raises(InputError, match="^kernel must"):
+    with pytest.raises(InputError, match=r"^kernel must"):
         require_choices("", kernel=(None, kind))
 
 
