@@ -151,9 +151,9 @@ class EkfIcp:
         by_motion = _from_twist(-self._mean[_POSE]) @ by_motion
         self._covariance[_POSE, _POSE] += by_motion @ motion.covariance @ by_motion.T
 
-    def _correct(self, scan: PreparedScan, extras: dict[str, Any]) -> None:
+    def _correct(self, scan: PreparedScan | None, extras: dict[str, Any]) -> None:
         """Register the scan against the key frame, or else the last scan, and take it in."""
-        if len(scan) < 3:
+        if scan is None:
             extras["registration_status"] = extras["status"] = "empty"
             return
         if self._key is None or self._last is None:

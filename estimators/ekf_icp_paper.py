@@ -116,9 +116,9 @@ class EkfIcpPaper:
         self._mean[2] = wrap(self._mean[2])
         self._covariance = F @ P @ F.T
 
-    def _correct(self, scan: PreparedScan, extras: dict[str, Any]) -> None:
+    def _correct(self, scan: PreparedScan | None, extras: dict[str, Any]) -> None:
         """Register the scan against the previous one, and take the velocity in."""
-        if len(scan) < 3:
+        if scan is None:
             extras["registration_status"] = extras["status"] = "empty"
             return
         if self._previous is None:

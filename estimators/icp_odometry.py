@@ -117,7 +117,7 @@ class IcpOdometry:
         scan = self._matcher.prepare(frame.ranges_m, self._laser)
         guess = self._guess()
         belief = self._last.belief.then(guess)
-        if len(scan) < 3:
+        if scan is None:
             return _belief(belief, {"registration_status": "empty", "status": "empty"})
         if self._last.scan is None:
             self._key = self._last = _Anchor(self._last.belief.then(self._rolled), scan)

@@ -16,7 +16,15 @@ from numpy.typing import ArrayLike
 
 from estimators import icp_covariance
 from estimators.gaussian import Gaussian
-from estimators.icp import Metric, PreparedScan, Registration, Search, prepare, register
+from estimators.icp import (
+    LEAST_POINTS,
+    Metric,
+    PreparedScan,
+    Registration,
+    Search,
+    prepare,
+    register,
+)
 from estimators.options import require_choices, require_non_negative
 from sim import se2
 from sim.arrays import Array
@@ -108,9 +116,10 @@ class ScanMatcher:
         if self.sigma_range_m is not None:
             require_non_negative(sigma_range_m=self.sigma_range_m)
 
-    def prepare(self, ranges_m: ArrayLike, laser: Laser) -> PreparedScan:
-        """Prepare a scan of this laser."""
-        return prepare(ranges_m, laser.bearings_rad, laser.max_range_m)
+    def prepare(self, ranges_m: ArrayLike, laser: Laser) -> PreparedScan | None:
+        """Prepare a scan of this laser; None if it shows too little to be registered."""
+        scan = prepare(ranges_m, laser.bearings_rad, laser.max_range_m)
+        return scan if len(scan.points) >= LEAST_POINTS else None
 
     def match(
         self,
