@@ -175,9 +175,9 @@ def _fit(ranges: Array, rays: Array, own: Ints, m: Array) -> tuple[float, float,
 
 
 @njit(forceinline=True, error_model="numpy", fastmath={"contract"})
-def _miss(m: Array, u: float, v: float, r: float) -> float:
-    """Distance by which a range r along a ray (u, v) misses a line, to first order."""
-    miss: float = r * r * (1.0 / r - m[0] * u - m[1] * v)
+def _miss(lines: Array, k: int, u: float, v: float, r: float) -> float:
+    """Distance by which a range r along a ray (u, v) misses line k, to first order."""
+    miss: float = r * r * (1.0 / r - lines[k, 0] * u - lines[k, 1] * v)
     return miss
 
 
@@ -244,7 +244,7 @@ def _segment(
         # cost of cutting after point i, up to a constant
         for i in range(start, stop):
             u, v, r = rays[i, 0], rays[i, 1], ranges[i]
-            one, two = _miss(lines[k], u, v, r), _miss(lines[k + 1], u, v, r)
+            one, two = _miss(lines, k, u, v, r), _miss(lines, k + 1, u, v, r)
             cost += min(one * one, 16.0 * noise * noise) - min(two * two, 16.0 * noise * noise)
             if cost < best_cost:
                 best, best_cost = i, cost
@@ -253,7 +253,7 @@ def _segment(
                 best = start - 1
             for i in range(start, stop):
                 on = k if i <= best else k + 1
-                miss = _miss(lines[on], rays[i, 0], rays[i, 1], ranges[i])
+                miss = _miss(lines, on, rays[i, 0], rays[i, 1], ranges[i])
                 line_of_point[i] = on if abs(miss) <= 4.0 * noise else -1
             ends[k, 1], ends[k + 1, 0] = best, best + 1
     # fit, and join neighbours that are one wall
