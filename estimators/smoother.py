@@ -7,6 +7,7 @@ complement), so that only the poses are left to factorise.
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve, lapack
 
 from estimators.base import Belief, Estimate, Prior
-from estimators.gaussian import STILL, Gaussian, compose, wrap
+from estimators.gaussian import Gaussian, compose, wrap
 from estimators.options import (
     require_choices,
     require_counts,
@@ -236,17 +237,14 @@ class Smoother:
 
     def _filled_in(self, rows: list[int], solution: Solution) -> tuple[Array, Array]:
         """Means (T, 3) and covariances (T, 3, 3) of every Frame, between the solved ones too."""
-        n = len(self._stamps)
+        n, n_poses = len(self._stamps), len(rows)
         means, covariances = np.empty((n, 3)), np.empty((n, 3, 3))
-        for pose, row in enumerate(rows):
-            block = slice(3 * pose, 3 * pose + 3)
-            means[row], covariances[row] = solution.poses[pose], solution.covariance[block, block]
+        means[rows], each = solution.poses, range(n_poses)
+        covariances[rows] = solution.covariance.reshape(n_poses, 3, n_poses, 3)[each, :, each]
         for pose, (a, b) in enumerate(itertools.pairwise(rows)):
             block = slice(3 * pose, 3 * pose + 6)
-            ends = solution.poses[pose : pose + 2]
-            between = _between(
-                self._motions[a + 1 : b + 1], ends, solution.covariance[block, block]
-            )
+            joint, ends = solution.covariance[block, block], solution.poses[pose : pose + 2]
+            between = _between(self._motions[a + 1 : b + 1], ends, joint)
             for row, belief in enumerate(between, start=a + 1):
                 means[row], covariances[row] = belief.mean, belief.covariance
         return means, covariances
@@ -351,15 +349,20 @@ class _Linearised:
     landmark_rows: Ints
     cost: float
 
-    def step(self, damping: float, splits: Ints) -> tuple[Array, Array] | None:
-        """Changes of the poses (T, 3) and landmarks (N, 3); None if it cannot be solved."""
+    def _reduced(self, damping: float, splits: Ints) -> tuple[Array, Array, Array]:
+        """Damped information of the poses without the landmarks, V^-1 and W V^-1."""
         V, S = self.V.copy(), self.H.copy()
         V[:, range(3), range(3)] *= 1.0 + damping
         S[np.diag_indices_from(S)] *= 1.0 + damping
+        V_inverse = _inverse(V)
+        WV = self.W @ V_inverse[self.landmark_rows]
+        _eliminate(S, self.W, WV, self.pose_rows, splits)
+        return S, V_inverse, WV
+
+    def step(self, damping: float, splits: Ints) -> tuple[Array, Array] | None:
+        """Changes of the poses (T, 3) and landmarks (N, 3); None if it cannot be solved."""
         try:
-            V_inverse = _inverse(V)
-            WV = self.W @ V_inverse[self.landmark_rows]
-            _eliminate(S, self.W, WV, self.pose_rows, splits)
+            S, V_inverse, WV = self._reduced(damping, splits)
             rhs = self.g.reshape(-1, 3).copy()
             np.subtract.at(rhs, self.pose_rows, _times(WV, self.h[self.landmark_rows]))
             of_poses = -cho_solve(cho_factor(S, lower=True, check_finite=False), rhs.ravel())
@@ -376,9 +379,7 @@ class _Linearised:
 
     def covariances(self, splits: Ints) -> tuple[Array, Array]:
         """Joint covariance (3 T, 3 T) of the poses, and (N, 3, 3) of each landmark."""
-        S, V_inverse = self.H.copy(), _inverse(self.V)
-        WV = self.W @ V_inverse[self.landmark_rows]
-        _eliminate(S, self.W, WV, self.pose_rows, splits)
+        S, V_inverse, WV = self._reduced(0.0, splits)
         factor = cho_factor(S, lower=True, check_finite=False)[0]
         lower = np.tril(lapack.dpotri(factor, lower=1)[0])
         covariance = lower + np.tril(lower, -1).T
@@ -440,9 +441,8 @@ class _Residuals:
         of_pose, of_landmark = by_pose.transpose(0, 2, 1), by_landmark.transpose(0, 2, 1)
         blocks = np.zeros((len(poses), 3, 3))
         np.add.at(blocks, self.pose_rows, of_pose @ by_pose)
-        for i in range(3):
-            for j in range(3):
-                H[range(i, n, 3), range(j, n, 3)] += blocks[:, i, j]
+        each = range(len(poses))
+        H.reshape(len(poses), 3, -1, 3)[each, :, each] += blocks
         np.add.at(g, self.pose_rows, _times(of_pose, seen))
         V = np.tile(_LEAST_INFORMATION * np.eye(3), (len(landmarks), 1, 1))
         h = np.zeros((len(landmarks), 3))
@@ -510,10 +510,7 @@ def _sideways(motion: Gaussian) -> Array:
 
 def _merged(motions: list[Gaussian]) -> Gaussian:
     """Several motions as one."""
-    whole = motions[0]
-    for motion in motions[1:]:
-        whole = whole.then(motion)
-    return whole
+    return functools.reduce(Gaussian.then, motions)
 
 
 def _between(motions: list[Gaussian], ends: Array, joint: Array) -> list[Gaussian]:
@@ -522,12 +519,11 @@ def _between(motions: list[Gaussian], ends: Array, joint: Array) -> list[Gaussia
     Given both ends, a pose between is the odometry from the first, corrected by its share of
     what the odometry misses the second by.
     """
-    remainders = [motions[-1]]  # from the pose between to the end
-    for motion in motions[-2:0:-1]:
-        remainders.append(motion.then(remainders[-1]))
-    poses, so_far = [], STILL
-    for motion, rest in zip(motions[:-1], reversed(remainders), strict=False):
-        so_far = so_far.then(motion)
+    # motions from the start to each pose between, and from there to the end
+    so_fars = list(itertools.accumulate(motions[:-1], Gaussian.then))
+    rests = list(itertools.accumulate(motions[:0:-1], lambda rest, motion: motion.then(rest)))
+    poses = []
+    for so_far, rest in zip(so_fars, reversed(rests), strict=True):
         at, F, by_motion = compose(ends[0], so_far.mean)
         reached, H, by_rest = compose(at, rest.mean)
         missed = ends[1] - reached
