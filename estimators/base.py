@@ -8,13 +8,11 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sim.arrays import Array
 from sim.recording import Frame, Recording
 from sim.robot import RobotGeometry
 from sim.sensors import SensorSuite
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

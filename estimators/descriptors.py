@@ -12,11 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sim.arrays import Array, Floats
 from sim.errors import InputError
 from sim.sensors import Lidar3D
-
-Array = NDArray[np.float64]
-Row = NDArray[np.float32]
 
 N_RINGS, N_SECTORS, REACH_M = 20, 60, 80.0  # of Scan Context, as published
 _M2DP_AZIMUTHS, _M2DP_ELEVATIONS, _M2DP_CIRCLES, _M2DP_BINS = 4, 16, 8, 16  # as published
@@ -27,11 +25,11 @@ _VOXEL_M = 0.5  # M2DP counts points: they are thinned first, or near ground dro
 class Kind:
     """A way to describe clouds and to compare descriptions."""
 
-    describe: Callable[[Lidar3D, NDArray[np.float32]], Row]
-    distances: Callable[[Row, Row], Array]
+    describe: Callable[[Lidar3D, Floats], Floats]
+    distances: Callable[[Floats, Floats], Array]
 
 
-def euclidean(query: Row, database: Row) -> Array:
+def euclidean(query: Floats, database: Floats) -> Array:
     """Distances (N,) from a descriptor (D,) to each of (N, D)."""
     away: Array = np.linalg.norm((database - query).astype(np.float64), axis=1)
     return away
@@ -54,18 +52,17 @@ def polar_heights(points_in_sensor: ArrayLike, sensor_height_m: float) -> Array:
     return heights.reshape(N_RINGS, N_SECTORS)
 
 
-def scan_context(lidar: Lidar3D, ranges_m: NDArray[np.float32]) -> Row:
+def scan_context(lidar: Lidar3D, ranges_m: Floats) -> Floats:
     """Scan Context (1200,): the polar heights, each sector scaled to length one.
 
     The published distance compares sectors by the cosine, so their lengths do not matter.
     """
     heights = polar_heights(lidar.points_in_sensor(ranges_m), lidar.mount.z_m)
     length = np.linalg.norm(heights, axis=0)
-    row: Row = (heights / np.where(length > 0.0, length, 1.0)).astype(np.float32).ravel()
-    return row
+    return (heights / np.where(length > 0.0, length, 1.0)).astype(np.float32).ravel()
 
 
-def scan_context_distances(query: Row, database: Row) -> Array:
+def scan_context_distances(query: Floats, database: Floats) -> Array:
     """Distances (N,) of Scan Contexts: one minus the mean cosine over sectors, at the best turn.
 
     Kim and Kim 2018, eqs. (6) and (7); sectors that are empty in either are left out. All turns
@@ -80,13 +77,13 @@ def scan_context_distances(query: Row, database: Row) -> Array:
     return np.maximum(away, 0.0)
 
 
-def ring_key(lidar: Lidar3D, ranges_m: NDArray[np.float32]) -> Row:
+def ring_key(lidar: Lidar3D, ranges_m: Floats) -> Floats:
     """Ring key (20,): share of each ring of Scan Context that is occupied.
 
     Kim and Kim 2018, eq. (8); turning the robot changes nothing but the binning.
     """
     heights = polar_heights(lidar.points_in_sensor(ranges_m), lidar.mount.z_m)
-    row: Row = np.mean(heights > 0.0, axis=1).astype(np.float32)
+    row: Floats = np.mean(heights > 0.0, axis=1).astype(np.float32)
     return row
 
 
@@ -106,7 +103,7 @@ def _plane_axes() -> Array:
 _M2DP_AXES = _plane_axes()
 
 
-def m2dp(lidar: Lidar3D, ranges_m: NDArray[np.float32]) -> Row:
+def m2dp(lidar: Lidar3D, ranges_m: Floats) -> Floats:
     """M2DP (192,): first singular vectors of the cloud's densities on 64 planes (He et al. 2016).
 
     The cloud is centred and turned to its principal axes, whose signs are those of the third
@@ -145,16 +142,14 @@ def _thinned(points: Array) -> Array:
     keys = (cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2]
     _, place, count = np.unique(keys, return_inverse=True, return_counts=True)
     sums = np.stack([np.bincount(place, weights=column) for column in points.T], axis=1)
-    mean: Array = sums / count[:, None]
-    return mean
+    return sums / count[:, None]
 
 
 def _all_turns(matrix: NDArray[np.floating]) -> NDArray[np.floating]:
     """(S, R, S): the columns of (R, S) turned by 0, 1, ... S - 1."""
     n = matrix.shape[1]
     columns = (np.arange(n)[None, :] + np.arange(n)[:, None]) % n
-    turned: NDArray[np.floating] = matrix[:, columns].transpose(1, 0, 2)
-    return turned
+    return matrix[:, columns].transpose(1, 0, 2)
 
 
 KINDS: dict[str, Kind] = {

@@ -15,24 +15,21 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from estimators.base import Belief, Prior
-from estimators.gaussian import STILL, Gaussian, between, compose, update, wheel_motion, wrap
+from estimators.gaussian import STILL, Gaussian, between, compose, rotated, update, wrap
 from estimators.icp import Metric, PreparedScan, Search
-from estimators.options import require_positive
+from estimators.options import require_laser, require_non_negative, require_shares, start_pose
 from estimators.scan_matching import (
     Covariance,
     Match,
     ScanMatcher,
-    tracking_start,
 )
+from estimators.wheels import WheelPrediction
+from sim.arrays import Array
 from sim.errors import InputError
 from sim.recording import Frame
-from sim.robot import TravelWindow, wheel_variances
-
-Array = NDArray[np.float64]
 
 _PATIENCE = 2  # scans in a row that may fail before the newest becomes the key frame
 _TINY = 1e-14  # keeps the update with a noiseless measurement solvable
@@ -104,33 +101,26 @@ class EkfIcp:
         window_s: float = 0.05,
     ) -> None:
         self._matcher = ScanMatcher(metric, search, covariance, sigma_range_m)
-        require_positive(
-            keyframe_distance_m=keyframe_distance_m,
-            keyframe_turn_rad=keyframe_turn_rad,
-            kr=kr,
-            kl=kl,
-            lateral_slip_m=lateral_slip_m,
-            encoder_tick_m=encoder_tick_m,
-            shared_noise=shared_noise,
-            window_s=window_s,
+        self.wheels = WheelPrediction(
+            kr, kl, window_s, lateral_slip_m=lateral_slip_m, encoder_tick_m=encoder_tick_m
         )
-        if not shared_noise <= 1.0:
-            raise InputError(f"estimator.shared_noise must lie in [0, 1], got {shared_noise}")
+        require_non_negative(
+            keyframe_distance_m=keyframe_distance_m, keyframe_turn_rad=keyframe_turn_rad
+        )
+        require_shares(shared_noise=shared_noise)
         if gate_probability is not None and not 0.0 < gate_probability < 1.0:
             raise InputError(
-                f"estimator.gate_probability must lie between 0 and 1 or be null, "
+                "estimator.gate_probability must lie between 0 and 1 or be null, "
                 f"got {gate_probability}"
             )
         self.keyframe_distance_m, self.keyframe_turn_rad = keyframe_distance_m, keyframe_turn_rad
-        self.kr, self.kl, self.window_s = kr, kl, window_s
-        self.lateral_slip_m, self.encoder_tick_m = lateral_slip_m, encoder_tick_m
         self.gate_probability, self.shared_noise = gate_probability, shared_noise
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Start from the prior's pose; the first scan becomes the key frame."""
-        start, self._laser = tracking_start(prior, "ekf_icp")
-        self._rng, self._track_m = rng, prior.robot.track_m
-        self._window = TravelWindow(self.window_s)
+        self._laser, self._rng = require_laser(prior, "ekf_icp"), rng
+        start = start_pose(prior, "ekf_icp")
+        self.wheels.reset(prior.robot.track_m)
         self._key: PreparedScan | None = None
         self._last: PreparedScan | None = None
         # of the key frame's first degenerate match, as twists: as in `Match`
@@ -156,19 +146,14 @@ class EkfIcp:
 
     def _predict(self, frame: Frame) -> None:
         """Move the robot's pose by the wheels; the clones stay."""
-        travel = frame.wheel_increments_m
-        spread_m = self._window.push(frame.duration_s, travel)
-        ticks = (travel != 0.0) * (self.encoder_tick_m**2 / 6.0)
-        variances = wheel_variances(spread_m, self.kr, self.kl) + ticks
-        motion = wheel_motion(travel, variances, self._track_m)[0]
-        motion.covariance[1, 1] += self.lateral_slip_m * float(spread_m.mean())
+        motion = self.wheels.predict(frame)
         self._mean[_POSE], _, by_motion = compose(self._mean[_POSE], motion.mean)
         by_motion = _from_twist(-self._mean[_POSE]) @ by_motion
         self._covariance[_POSE, _POSE] += by_motion @ motion.covariance @ by_motion.T
 
-    def _correct(self, scan: PreparedScan, extras: dict[str, Any]) -> None:
+    def _correct(self, scan: PreparedScan | None, extras: dict[str, Any]) -> None:
         """Register the scan against the key frame, or else the last scan, and take it in."""
-        if len(scan) < 3:
+        if scan is None:
             extras["registration_status"] = extras["status"] = "empty"
             return
         if self._key is None or self._last is None:
@@ -231,7 +216,7 @@ class EkfIcp:
         extras["nis"], extras["nis_dof"] = nis, len(C)
         if nis > self._gates[len(C)]:
             return False
-        self._insert(_turned(share / 2.0 * found.known_covariance, self._mean[place][2]))
+        self._insert(rotated(share / 2.0 * found.known_covariance, self._mean[place][2]))
         H = np.zeros((3, 12))
         H[:, place], H[:, _NEW] = -by_twist, by_twist
         noise = (1.0 - share) * C @ R @ C.T + _TINY * np.eye(len(C))
@@ -284,7 +269,7 @@ class EkfIcp:
         found = self._matcher.match(scan, scan, STILL, self._laser, self._rng)
         if found.failed:
             return np.zeros((3, 3))
-        return _turned(self.shared_noise / 2.0 * found.known_covariance, self._mean[8])
+        return rotated(self.shared_noise / 2.0 * found.known_covariance, self._mean[8])
 
     def _left_key(self, motion: Array) -> bool:
         """Whether it is time for a new key frame."""
@@ -305,11 +290,3 @@ def _moved(pose: Array, twist: Array) -> Array:
     sinc = 1.0 - half * half / 6.0 if abs(half) < 1e-4 else math.sin(half) / half
     cos, sin = sinc * math.cos(half), sinc * math.sin(half)
     return compose(np.array([cos * u - sin * v, sin * u + cos * v, turn]), pose)[0]
-
-
-def _turned(covariance: Array, heading_rad: float) -> Array:
-    """Covariance (3, 3) of a pose in axes that are turned back by a heading."""
-    cos, sin = math.cos(heading_rad), math.sin(heading_rad)
-    R = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
-    turned: Array = R @ covariance @ R.T
-    return turned

@@ -10,21 +10,18 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimators.base import Belief, Prior
-from estimators.gaussian import STILL, Gaussian, update, wheel_motion, wrap
+from estimators.gaussian import STILL, Gaussian, update, wrap
 from estimators.icp import Metric, PreparedScan, Search
-from estimators.options import require_positive
+from estimators.options import require_laser, require_non_negative, start_pose
 from estimators.scan_matching import (
     Covariance,
     ScanMatcher,
-    tracking_start,
 )
+from estimators.wheels import WheelPrediction
+from sim.arrays import Array
 from sim.recording import Frame
-from sim.robot import TravelWindow, wheel_variances
-
-Array = NDArray[np.float64]
 
 _FIRST_SPREAD = 1.0  # standard deviation of the unknown first velocities, m/s and rad/s
 _TINY = 1e-14  # keeps the update solvable where a measurement has no noise in some direction
@@ -79,28 +76,21 @@ class EkfIcpPaper:
         window_s: float = 0.05,
     ) -> None:
         self._matcher = ScanMatcher(metric, search, covariance, sigma_range_m)
-        require_positive(
-            kr=kr,
-            kl=kl,
-            lateral_slip_m=lateral_slip_m,
-            acceleration_noise=acceleration_noise,
-            turn_noise=turn_noise,
-            window_s=window_s,
-        )
-        self.kr, self.kl, self.lateral_slip_m, self.window_s = kr, kl, lateral_slip_m, window_s
+        self.wheels = WheelPrediction(kr, kl, window_s, lateral_slip_m=lateral_slip_m)
+        require_non_negative(acceleration_noise=acceleration_noise, turn_noise=turn_noise)
         self.acceleration_noise, self.turn_noise = acceleration_noise, turn_noise
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Start from the prior's pose, with velocities unknown."""
-        start, self._laser = tracking_start(prior, "ekf_icp_paper")
-        self._rng, self._track_m = rng, prior.robot.track_m
-        self._window = TravelWindow(self.window_s)
+        self._laser, self._rng = require_laser(prior, "ekf_icp_paper"), rng
+        start = start_pose(prior, "ekf_icp_paper")
+        self.wheels.reset(prior.robot.track_m)
         self._mean = np.concatenate([start.mean, np.zeros(3)])
         self._covariance = np.zeros((6, 6))
         self._covariance[:3, :3] = start.covariance
         self._covariance[3:, 3:] = _FIRST_SPREAD**2 * np.eye(3)
         self._previous: PreparedScan | None = None
-        self._wheels, self._since_s = STILL, 0.0  # since the previous scan
+        self._rolled, self._since_s = STILL, 0.0  # since the previous scan, by the wheels
 
     def step(self, frame: Frame) -> Belief:
         """Predict; correct by the wheels, and by the Frame's scan if it has one."""
@@ -108,7 +98,9 @@ class EkfIcpPaper:
         extras: dict[str, Any] = {}
         if dt > 0.0:
             self._predict(dt)
-            self._measure(self._roll(frame), dt, np.eye(3))
+            motion = self.wheels.predict(frame)
+            self._rolled, self._since_s = self._rolled.then(motion), self._since_s + dt
+            self._measure(motion, dt, np.eye(3))
         if frame.ranges_m is not None:
             scan = self._matcher.prepare(frame.ranges_m, self._laser)
             self._correct(scan, extras)
@@ -124,25 +116,15 @@ class EkfIcpPaper:
         self._mean[2] = wrap(self._mean[2])
         self._covariance = F @ P @ F.T
 
-    def _roll(self, frame: Frame) -> Gaussian:
-        """Motion of the Frame by the wheels; added to that since the previous scan."""
-        travel = frame.wheel_increments_m
-        spread_m = self._window.push(frame.duration_s, travel)
-        motion = wheel_motion(travel, wheel_variances(spread_m, self.kr, self.kl), self._track_m)[0]
-        motion.covariance[1, 1] += self.lateral_slip_m * float(spread_m.mean())
-        self._wheels = self._wheels.then(motion)
-        self._since_s += frame.duration_s
-        return motion
-
-    def _correct(self, scan: PreparedScan, extras: dict[str, Any]) -> None:
+    def _correct(self, scan: PreparedScan | None, extras: dict[str, Any]) -> None:
         """Register the scan against the previous one, and take the velocity in."""
-        if len(scan) < 3:
+        if scan is None:
             extras["registration_status"] = extras["status"] = "empty"
             return
         if self._previous is None:
             extras["registration_status"] = "first"
         else:
-            found = self._matcher.match(scan, self._previous, self._wheels, self._laser, self._rng)
+            found = self._matcher.match(scan, self._previous, self._rolled, self._laser, self._rng)
             extras["registration_status"] = found.status
             if found.failed:
                 extras["status"] = found.status
@@ -150,7 +132,7 @@ class EkfIcpPaper:
                 extras["registration_covariance"] = found.motion.covariance
                 if self._since_s > 0.0:
                     self._measure(found.motion, self._since_s, found.held)
-        self._previous, self._wheels, self._since_s = scan, STILL, 0.0
+        self._previous, self._rolled, self._since_s = scan, STILL, 0.0
 
     def _measure(self, motion: Gaussian, dt: float, held: Array) -> None:
         """Update by a motion over dt; `held` (D, 3) are the coordinates of it that count."""

@@ -7,25 +7,18 @@ association for the whole filter, and a wrong one is never taken back.
 from __future__ import annotations
 
 import math
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from estimators.base import Belief, Prior
-from estimators.gaussian import STILL, Gaussian, compose, wheel_motion, wrap
-from estimators.options import require_choices, require_positive
-from estimators.stereo import LEAST_DEPTH_M, NoiseAt, NoiseModel, StereoModel, slam_start
-from sim.errors import InputError
+from estimators.gaussian import STILL, Gaussian, compose, wrap
+from estimators.slam_frontend import Association, SlamFrontEnd
+from estimators.stereo import LEAST_DEPTH_M, NoiseAt, NoiseModel
+from estimators.wheels import WheelPrediction
+from sim.arrays import Array, Ints
 from sim.recording import Frame, LandmarkSet
-from sim.robot import TravelWindow, wheel_variances
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Association = Literal["known", "mahalanobis", "descriptor"]
-
-_BLIND_IMAGES = 100  # images without a landmark after which the status says so
 
 
 class EkfSlam:
@@ -56,8 +49,9 @@ class EkfSlam:
     Notes
     -----
     Extras: `associations` (K,): for each observation, counted from 0 over the whole run, the one
-    that started its landmark, itself if it is the first, -1 if it was refused; with `keep_map` also
-    `landmarks` (N, 3) and `landmark_covariances` (N, 3, 3); `status` when an image was of no use.
+    that started its landmark, itself if it is the first, -1 if it was rejected; with `keep_map`
+    also `landmarks` (N, 3) and `landmark_covariances` (N, 3, 3); `status` when an image was of no
+    use.
 
     A step costs O(K N^2): the whole covariance is touched.
     """
@@ -79,50 +73,31 @@ class EkfSlam:
         window_s: float = 0.05,
         keep_map: bool = False,
     ) -> None:
-        choices: dict[str, tuple[str, tuple[str, ...]]] = {
-            "association": (association, ("known", "mahalanobis", "descriptor")),
-            "noise_model": (noise_model, ("camera", "diagonal", "correlated", "image")),
-            "noise_at": (noise_at, ("predicted", "measured")),
-        }
-        require_choices(choices)
-        believed = {
-            "sigma_column_px": sigma_column_px,
-            "sigma_row_px": sigma_row_px,
-            "sigma_disparity_px": sigma_disparity_px,
-            "sigma_descriptor": sigma_descriptor,
-        }
-        self._believed = {name: sigma for name, sigma in believed.items() if sigma is not None}
-        require_positive(kr=kr, kl=kl, window_s=window_s, **self._believed)
-        if not (math.isfinite(d0) and d0 > 0.0):
-            raise InputError(f"estimator.d0 must be positive, got {d0}")
-        self.association, self.d0 = association, d0
-        self.noise_model, self.noise_at = noise_model, noise_at
-        self.sigma_column_px, self.sigma_row_px = sigma_column_px, sigma_row_px
-        self.sigma_disparity_px, self.sigma_descriptor = sigma_disparity_px, sigma_descriptor
-        self.kr, self.kl, self.window_s, self.keep_map = kr, kl, window_s, keep_map
+        self.wheels = WheelPrediction(kr, kl, window_s)
+        self.front_end = SlamFrontEnd(
+            "ekf_slam",
+            association,
+            d0,
+            noise_model,
+            noise_at,
+            sigma_column_px=sigma_column_px,
+            sigma_row_px=sigma_row_px,
+            sigma_disparity_px=sigma_disparity_px,
+            sigma_descriptor=sigma_descriptor,
+        )
+        self.keep_map = keep_map
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Start from the prior's pose, with an empty map."""
-        start, camera = slam_start(prior, "ekf_slam", self.association, self._believed)
-        self._camera = StereoModel.of(camera, self.noise_model, self.noise_at)
-        self._likeness = 1.0 / (1.0 + camera.sigma_descriptor**2)
-        # what a landmark may be predicted beyond dmax by, and still be the one that was seen
-        self._reach_m = 1.5 * camera.max_distance_m + 1.0
-        self._track_m = prior.robot.track_m
-        self._window = TravelWindow(self.window_s)
+        start = self.front_end.reset(prior)
+        self._camera = self.front_end.camera
+        self.wheels.reset(prior.robot.track_m)
         self._mean, self._room = start.mean, start.covariance
         self._motion = STILL  # since the last image
-        self._slot_of: dict[int, int] = {}
-        self._births = np.zeros(0, np.int64)  # the observation that started each landmark
-        self._bank = np.zeros((0, 0), np.float32)  # its descriptor
-        self._n_observations, self._blind = 0, 0
 
     def step(self, frame: Frame) -> Belief:
-        """Roll by the wheels; at an image, associate, update, and take up new landmarks."""
-        travel = frame.wheel_increments_m
-        spread_m = self._window.push(frame.duration_s, travel)
-        variances = wheel_variances(spread_m, self.kr, self.kl)
-        self._motion = self._motion.then(wheel_motion(travel, variances, self._track_m)[0])
+        """Roll by the wheels; at an image, associate, update, and add new landmarks."""
+        self._motion = self._motion.then(self.wheels.predict(frame))
         extras: dict[str, Any] = {}
         if frame.landmarks is not None:
             self._move()
@@ -142,14 +117,8 @@ class EkfSlam:
         """
         n, P = self._n_landmarks, self._covariance
         blocks = P[3:, 3:].reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n)]
-        answer: dict[str, Array | Ints] = {
-            "landmarks": self._mean[3:].reshape(n, 3).copy(),
-            "landmark_covariances": blocks.reshape(n, 3, 3),
-            "origins": self._births.copy(),
-        }
-        if self.association == "known":
-            answer["ids"] = np.array(list(self._slot_of), dtype=np.int64)
-        return answer
+        means = self._mean[3:].reshape(n, 3).copy()
+        return self.front_end.map(means, blocks.reshape(n, 3, 3), slice(n))
 
     @property
     def _n_landmarks(self) -> int:
@@ -174,51 +143,20 @@ class EkfSlam:
 
     def _see(self, seen: LandmarkSet) -> dict[str, Any]:
         """Take in one image; the extras that it gives."""
-        found, status = self._usable(seen)
-        extras: dict[str, Any] = {"status": status} if status else {}
-        points = seen.points_in_camera[found]
-        associations = np.full(len(seen.points_in_camera), -1)
-        if self.association == "known" and seen.ids is not None:
-            slots = np.array([self._slot_of.get(int(i), -1) for i in seen.ids[found]], np.int64)
+        image = self.front_end.read(seen)
+        extras: dict[str, Any] = {"status": image.status} if image.status else {}
+        if self.front_end.association == "known":
+            slots = self.front_end.known(image)
         else:
-            slots = self._associate(points, self._unlikeness(seen, found))
+            slots = self._associate(image.points, self.front_end.unlikeness(image))
         old = slots >= 0
-        if old.any() and not self._update(slots[old], points[old]):
-            extras["status"] = "update refused: the covariance has broken down"
-        associations[found[old]] = self._births[slots[old]]
+        if old.any() and not self._update(slots[old], image.points[old]):
+            extras["status"] = "update rejected: broken covariance, not positive definite"
         if not old.all():
-            self._create(points[~old])
-            born = self._n_observations + found[~old]
-            associations[found[~old]] = born
-            if self.association == "known" and seen.ids is not None:
-                for offset, i in enumerate(seen.ids[found[~old]]):
-                    self._slot_of[int(i)] = len(self._births) + offset
-            if self.association == "descriptor" and seen.descriptors is not None:
-                fresh = seen.descriptors[found[~old]]
-                bank = self._bank if len(self._bank) else fresh[:0]
-                self._bank = np.concatenate([bank, fresh])
-            self._births = np.concatenate([self._births, born])
-        self._n_observations += len(associations)
-        extras["associations"] = associations
+            self._create(image.points[~old])
+            self.front_end.start(image, ~old)
+        extras["associations"] = self.front_end.associations(image, slots)
         return extras
-
-    def _usable(self, seen: LandmarkSet) -> tuple[Ints, str]:
-        """Rows of the observations that can be used, and what is wrong with the others."""
-        usable = self._camera.usable(seen.points_in_camera)
-        status = "" if usable.all() else "observation without depth refused"
-        if self.association == "known" and usable.any():
-            if seen.ids is None:
-                raise InputError("ekf_slam: observations without ids; set estimator.association")
-            first = np.zeros(len(usable), bool)
-            rows = np.flatnonzero(usable)
-            first[rows[np.unique(seen.ids[rows], return_index=True)[1]]] = True
-            if np.any(usable & ~first):
-                status = "duplicate id refused"
-            usable &= first
-        self._blind = 0 if usable.any() else self._blind + 1
-        if self._blind >= _BLIND_IMAGES:
-            status = f"no landmark in {self._blind} images"
-        return np.flatnonzero(usable), status
 
     def _associate(self, points: Array, unlikeness: Array) -> Ints:
         """Slot (K,) of each point, -1 for new ones; a landmark at most once an image."""
@@ -228,41 +166,25 @@ class EkfSlam:
         landmarks = self._mean[3:].reshape(-1, 3)
         predicted = self._camera.predict(self._mean[:3], landmarks)[0]
         near = predicted[:, 2] > LEAST_DEPTH_M
-        candidates = np.flatnonzero(near & (np.linalg.norm(predicted, axis=1) < self._reach_m))
+        candidates = np.flatnonzero(
+            near & (np.linalg.norm(predicted, axis=1) < self.front_end.reach_m)
+        )
         if len(candidates) == 0:
             return slots
         spread = self._predicted_spread(candidates)
         v, R = self._camera.innovation(predicted[None, candidates], points[:, None])
         S = spread + R  # (K, candidates, 3, 3), or the same for all points
         distances = np.sum(v * np.linalg.solve(S, v[..., None])[..., 0], axis=-1)
-        scores = distances + unlikeness[:, candidates]
-        refused = (distances >= self.d0) | (unlikeness[:, candidates] > 0.0)
-        scores[refused] = np.inf
+        scores = np.where(distances < self.front_end.d0, distances, np.inf)
+        if unlikeness.shape[1] > 0:
+            unlike = unlikeness[:, candidates]
+            scores = np.where(unlike > 0.0, np.inf, scores + unlike)
         for k, score in enumerate(scores):
             best = int(np.argmin(score))
             if math.isfinite(score[best]):
                 slots[k] = candidates[best]
                 scores[:, best] = np.inf
         return slots
-
-    def _unlikeness(self, seen: LandmarkSet, found: Ints) -> Array:
-        """-2 log of the likelihood ratio (K, N) of the descriptors: the same landmark or another.
-
-        Of D independent components of unit vectors, the product of two of one landmark is
-        N(rho, 1 / D), and of two of different ones N(0, 1 / D).
-        """
-        if self.association != "descriptor":
-            return np.zeros((len(found), self._n_landmarks))
-        if seen.descriptors is None:
-            raise InputError(
-                "ekf_slam: observations without descriptors; set estimator.association=mahalanobis"
-            )
-        if self._n_landmarks == 0:
-            return np.zeros((len(found), 0))
-        products = (seen.descriptors[found] @ self._bank.T).astype(np.float64)
-        rho = self._likeness
-        unlikeness: Array = seen.descriptors.shape[1] * rho * (rho - 2.0 * products)
-        return unlikeness
 
     def _predicted_spread(self, slots: Ints) -> Array:
         """H P H^T (n, 3, 3) of each of these landmarks apart."""
@@ -283,7 +205,7 @@ class EkfSlam:
     def _update(self, slots: Ints, points: Array) -> bool:
         """Kalman update by points (K, 3) of landmarks in these slots, all at once.
 
-        Refused, with False, if rounding has left the innovation without a proper covariance.
+        Rejected, with False, if rounding has left the innovation without a proper covariance.
         """
         P, n = self._covariance, 3 * len(slots)
         predicted, of_pose, of_landmark = self._camera.predict(

@@ -6,15 +6,18 @@ import math
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimators import landmarks as ekf
 from estimators.base import Belief, Estimate, Prior
-from estimators.gaussian import STILL, Gaussian, compose, wheel_motion
+from estimators.gaussian import STILL, Gaussian, compose, root, rotated
 from estimators.landmarks import LandmarkMaps, Maps
-from estimators.options import require_choices, require_positive
+from estimators.options import (
+    require_choices,
+    require_counts,
+    require_non_negative,
+    require_positive,
+)
 from estimators.particles import (
-    SCHEMES,
     Lineages,
     Scheme,
     in_place,
@@ -22,18 +25,15 @@ from estimators.particles import (
     resample,
     underflowed,
 )
-from estimators.stereo import NoiseAt, NoiseModel, StereoModel, slam_start
+from estimators.slam_frontend import Association, Image, SlamFrontEnd
+from estimators.stereo import NoiseAt, NoiseModel
+from estimators.wheels import WheelPrediction
 from sim import se2
-from sim.errors import InputError
+from sim.arrays import Array, Ints
 from sim.recording import Frame, LandmarkSet
-from sim.robot import TravelWindow, wheel_variances
 
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 Proposal = Literal["motion", "optimal"]
-Association = Literal["known", "mahalanobis", "descriptor"]
 
-_BLIND_IMAGES = 100  # images without a landmark after which the status says so
 _PLACING = 4  # observations after which the proposal is linearised anew
 _MOST_DRIFT_RAD = 0.1  # heading spread at which motion is drawn without waiting for an image
 
@@ -88,7 +88,7 @@ class FastSLAM:
     (3,), the pose of the particle of greatest accumulated log weight, carried along the ancestry,
     eq. (20); at an image `associations` (K,) of that particle: for each observation, counted from
     0 over the whole run, the one that started its landmark, itself if it is the first, -1 if it
-    was refused; with `keep_map` also `landmarks` (N, 3) and `landmark_covariances` (N, 3, 3);
+    was rejected; with `keep_map` also `landmarks` (N, 3) and `landmark_covariances` (N, 3, 3);
     `status` when an image was of no use.
 
     `finish` gives the path of the best particle's lineage; `map` is its map.
@@ -117,56 +117,42 @@ class FastSLAM:
         window_s: float = 0.05,
         keep_map: bool = False,
     ) -> None:
-        if isinstance(n_particles, bool) or not isinstance(n_particles, int) or n_particles < 1:
-            raise InputError(
-                f"estimator.n_particles must be a whole number from 1 on, got {n_particles!r}"
-            )
-        choices: dict[str, tuple[str, tuple[str, ...]]] = {
-            "proposal": (proposal, ("motion", "optimal")),
-            "resampling": (resampling, SCHEMES),
-            "association": (association, ("known", "mahalanobis", "descriptor")),
-            "noise_model": (noise_model, ("camera", "diagonal", "correlated", "image")),
-            "noise_at": (noise_at, ("predicted", "measured")),
-            "maps": (maps, ("shared", "contiguous")),
-        }
-        require_choices(choices)
-        believed = {
-            "sigma_column_px": sigma_column_px,
-            "sigma_row_px": sigma_row_px,
-            "sigma_disparity_px": sigma_disparity_px,
-            "sigma_descriptor": sigma_descriptor,
-        }
-        self._believed = {name: sigma for name, sigma in believed.items() if sigma is not None}
-        require_positive(ess_share=ess_share, kr=kr, kl=kl, window_s=window_s, **self._believed)
-        for name, number in {"d0": d0, "p0": p0}.items():
-            if not (math.isfinite(number) and number > 0.0):
-                raise InputError(f"estimator.{name} must be positive, got {number}")
+        require_counts(n_particles=n_particles)
+        require_choices(
+            proposal=(proposal, Proposal), resampling=(resampling, Scheme), maps=(maps, Maps)
+        )
+        require_non_negative(ess_share=ess_share)
+        require_positive(p0=p0)
+        self.wheels = WheelPrediction(kr, kl, window_s)
+        self.front_end = SlamFrontEnd(
+            "fastslam",
+            association,
+            d0,
+            noise_model,
+            noise_at,
+            sigma_column_px=sigma_column_px,
+            sigma_row_px=sigma_row_px,
+            sigma_disparity_px=sigma_disparity_px,
+            sigma_descriptor=sigma_descriptor,
+        )
         self.n_particles, self.proposal, self.resampling = n_particles, proposal, resampling
-        self.ess_share, self.association, self.d0, self.p0 = ess_share, association, d0, p0
-        self.noise_model, self.noise_at, self.maps = noise_model, noise_at, maps
-        self.sigma_column_px, self.sigma_row_px = sigma_column_px, sigma_row_px
-        self.sigma_disparity_px, self.sigma_descriptor = sigma_disparity_px, sigma_descriptor
-        self.kr, self.kl, self.window_s, self.keep_map = kr, kl, window_s, keep_map
+        self.ess_share, self.p0, self.maps, self.keep_map = ess_share, p0, maps, keep_map
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Draw the particles from the prior, all with an empty map."""
-        start, camera = slam_start(prior, "fastslam", self.association, self._believed)
-        self._model = StereoModel.of(camera, self.noise_model, self.noise_at)
-        self._camera = self._model.packed
-        x, y, yaw = self._model.mount
+        start = self.front_end.reset(prior)
+        self._camera = self.front_end.camera.packed
+        x, y, yaw = self.front_end.camera.mount
         self._mount = np.array([x, y, math.cos(yaw), math.sin(yaw)])
-        self._likeness = 1.0 / (1.0 + camera.sigma_descriptor**2)
-        # what a landmark may be predicted beyond dmax by, and still be the one that was seen
-        self._reach_m = 1.5 * camera.max_distance_m + 1.0
-        self._rng, self._track_m = rng, prior.robot.track_m
-        self._window = TravelWindow(self.window_s)
+        self._rng = rng
+        self.wheels.reset(prior.robot.track_m)
         n = self.n_particles
-        self._maps = LandmarkMaps(n, self.maps, births=self.association != "known")
+        self._maps = LandmarkMaps(n, self.maps, births=self.front_end.association != "known")
         self._state = ekf.new_state(self._maps.n_blocks)
         # lanes beyond the last particle are moved along, and never looked at
         self._n_lanes = self._maps.n_blocks * ekf.LANES
-        turned = _rotated(start.covariance, -float(start.mean[2]))
-        scatter = _root(turned) @ rng.standard_normal((3, self._n_lanes))
+        turned = rotated(start.covariance, -float(start.mean[2]))
+        scatter = root((turned + turned.T) / 2.0) @ rng.standard_normal((3, self._n_lanes))
         drawn = se2.compose(start.mean, scatter.T)
         headings = drawn[:, 2]
         self._poses = np.stack([*drawn.T, np.cos(headings), np.sin(headings)])  # (5, lanes)
@@ -175,11 +161,6 @@ class FastSLAM:
         self._rolled = STILL  # motion not yet drawn
         self._root = np.zeros((3, 2))  # of its covariance
         self._take_stock()
-        self._slot_of: dict[int, int] = {}
-        # births: observations that started a landmark in some particle
-        self._births = np.zeros(0, np.int64)
-        self._bank = np.zeros((0, 0), np.float32)  # their descriptors
-        self._n_observations, self._blind = 0, 0
         # of each Frame: its stamp, the draw it follows, and the motion since
         self._stamps: list[float] = []
         self._draws: list[int] = []
@@ -215,27 +196,27 @@ class FastSLAM:
 
     def _see(self, seen: LandmarkSet, extras: dict[str, Any]) -> None:
         """Take in one image."""
-        found, status = self._usable(seen)
-        if status:
-            extras["status"] = status
-        points = np.ascontiguousarray(seen.points_in_camera[found])
-        normals = self._normals()
+        image = self.front_end.read(seen)
+        if image.status:
+            extras["status"] = image.status
+        points, normals = image.points, self._normals()
         gained = np.zeros(self.n_particles)
-        if self.association == "known":
-            slots = self._known(seen, found)
+        known = self.front_end.association == "known"
+        if known:
+            slots = self.front_end.known(image)
             self._maps.touch(slots[slots >= 0])
         if self.proposal == "motion" or len(points) == 0:
             poses = self._move(normals)
-            if self.association != "known":
-                slots = self._associate(points, seen, found, np.zeros((3, 3)))
+            if not known:
+                slots = self._associate(image, np.zeros((3, 3)))
         else:
             self._move(np.zeros_like(normals))
-            if self.association != "known":
-                slots = self._associate(points, seen, found, self._seen_spread())
+            if not known:
+                slots = self._associate(image, self._seen_spread())
             gained += self._propose(normals, slots, points)
             poses = self._move(normals)
         gained += self._observe(slots, points)
-        self._create(slots, points, seen, found)
+        self._create(slots, image)
         self._poses = poses
         weights = self._log_weights + gained
         if underflowed(weights):
@@ -245,9 +226,7 @@ class FastSLAM:
         self._accumulated = self._accumulated + gained
         self._take_stock()
         best = int(np.argmax(self._accumulated))
-        extras["associations"] = np.full(len(seen.points_in_camera), -1)
-        extras["associations"][found] = self._origins(slots, best, found)
-        self._n_observations += len(seen.points_in_camera)
+        extras["associations"] = self.front_end.associations(image, self._landmarks(slots, best))
 
     def finish(self) -> Estimate:
         """Path of the lineage of greatest accumulated weight, gil2008, eq. (20).
@@ -284,14 +263,7 @@ class FastSLAM:
         """
         best = int(np.argmax(self._accumulated))
         means, covariances, births = self._maps.of_particle(best)
-        answer: dict[str, Array | Ints] = {
-            "landmarks": means,
-            "landmark_covariances": covariances,
-            "origins": self._births[births],
-        }
-        if self.association == "known":
-            answer["ids"] = np.array(list(self._slot_of), dtype=np.int64)
-        return answer
+        return self.front_end.map(means, covariances, births)
 
     @property
     def bytes_per_particle(self) -> float:
@@ -300,23 +272,20 @@ class FastSLAM:
 
     def _roll(self, frame: Frame) -> None:
         """Add the Frame's arc to the motion that is not yet drawn."""
-        travel = frame.wheel_increments_m
-        spread_m = self._window.push(frame.duration_s, travel)
-        variances = wheel_variances(spread_m, self.kr, self.kl)
-        motion, by_wheels = wheel_motion(travel, variances, self._track_m)
+        motion, root_ = self.wheels.predict_with_root(frame)
         if self._rolled is STILL:
-            self._rolled, self._root = motion, by_wheels * np.sqrt(variances)
+            self._rolled, self._root = motion, root_
         else:
             self._rolled, self._root = self._rolled.then(motion), np.zeros((3, 0))
 
     def _normals(self) -> Array:
         """Standard normal draws (3, lanes); two rows for a single arc, which has two wheels."""
-        root = np.zeros((3, 3))
-        rank = self._root.shape[1] or 3
-        root[:, :rank] = self._root if rank < 3 else _root(self._rolled.covariance)
+        rolled, rank = np.zeros((3, 3)), self._root.shape[1] or 3
+        covariance = self._rolled.covariance
+        rolled[:, :rank] = self._root if rank < 3 else root((covariance + covariance.T) / 2.0)
         normals = np.zeros((3, self._n_lanes))
         self._rng.standard_normal(out=normals[:rank])
-        self._root = root
+        self._root = rolled
         return normals
 
     def _move(self, normals: Array) -> Array:
@@ -335,44 +304,14 @@ class FastSLAM:
         self._ess = 1.0 / float(weights @ weights)
         self._belief = Gaussian(*ekf.moments(self._drawn, weights))
 
-    def _usable(self, seen: LandmarkSet) -> tuple[Ints, str]:
-        """Rows of the observations that can be used, and what is wrong with the others."""
-        usable = self._model.usable(seen.points_in_camera)
-        status = "" if usable.all() else "observation without depth refused"
-        if self.association == "known" and usable.any():
-            if seen.ids is None:
-                raise InputError("fastslam: observations without ids; set estimator.association")
-            ids = seen.ids[usable]
-            if len(set(ids.tolist())) < len(ids):
-                first = np.flatnonzero(usable)[np.unique(ids, return_index=True)[1]]
-                usable = np.isin(np.arange(len(usable)), first)
-                status = "duplicate id refused"
-        self._blind = 0 if usable.any() else self._blind + 1
-        if self._blind >= _BLIND_IMAGES:
-            status = f"no landmark in {self._blind} images"
-        return np.flatnonzero(usable), status
-
-    def _known(self, seen: LandmarkSet, found: Ints) -> Ints:
-        """Slots (K,) by id, -1 for new ones."""
-        self._ids = [] if seen.ids is None else seen.ids[found].tolist()
-        return np.array([self._slot_of.get(i, -1) for i in self._ids], dtype=np.int64)
-
-    def _associate(self, points: Array, seen: LandmarkSet, found: Ints, spread: Array) -> Ints:
+    def _associate(self, image: Image, spread: Array) -> Ints:
         """Slots (K, M) of each particle, -1 for new ones."""
+        maps, points = self._maps, image.points
         slots = np.full((len(points), self.n_particles), -1)
-        if self.association == "descriptor":
-            if seen.descriptors is None:
-                raise InputError(
-                    "fastslam: observations without descriptors; set "
-                    "estimator.association=mahalanobis"
-                )
-            unlikeness = self._unlikeness(seen.descriptors[found])
-        else:
-            unlikeness = np.zeros((len(points), 0))
-        if len(points) == 0 or self._maps.n_slots == 0:
+        unlikeness = self.front_end.unlikeness(image)
+        if len(points) == 0 or maps.n_slots == 0:
             return slots
-        maps = self._maps
-        candidates = maps.nearby(self._state, self._reach_m)
+        candidates = maps.nearby(self._state, self.front_end.reach_m)
         maps.touch(candidates)
         ekf.associate(
             maps.data,
@@ -383,30 +322,17 @@ class FastSLAM:
             points,
             unlikeness,
             spread,
-            self.d0,
+            self.front_end.d0,
             self._state,
             self._camera,
             slots,
         )
         return slots
 
-    def _unlikeness(self, descriptors: NDArray[np.float32]) -> Array:
-        """-2 log of the likelihood ratio (K, births): the same landmark against another one.
-
-        Of D independent components of unit vectors, the product of two of one landmark is
-        N(rho, 1 / D), and of two of different ones N(0, 1 / D).
-        """
-        if len(self._bank) == 0:
-            return np.zeros((len(descriptors), 0))
-        products = (descriptors @ self._bank.T).astype(np.float64)
-        rho = self._likeness
-        scores: Array = descriptors.shape[1] * rho * (rho - 2.0 * products)
-        return scores
-
     def _seen_spread(self) -> Array:
         """Covariance of the motion not yet drawn, in axes of the camera after it."""
-        angle = -float(self._rolled.mean[2] + self._model.mount[2])
-        return _rotated(self._rolled.covariance, angle)
+        angle = -float(self._rolled.mean[2] + self.front_end.camera.mount[2])
+        return rotated(self._rolled.covariance, angle)
 
     def _propose(self, normals: Array, slots: Ints, points: Array) -> Array:
         """Turn normals into draws given the image; log weights (M,) that these are owed.
@@ -448,7 +374,7 @@ class FastSLAM:
             gained += ekf.summed(self._state, self.n_particles)
         return gained
 
-    def _create(self, slots: Ints, points: Array, seen: LandmarkSet, found: Ints) -> None:
+    def _create(self, slots: Ints, image: Image) -> None:
         """Start a landmark for each observation without one, gil2008, eqs. (16)-(18)."""
         maps, each = self._maps, slots.ndim == 2
         fresh = slots < 0
@@ -460,29 +386,17 @@ class FastSLAM:
         maps.reserve(int(at.max()) + 1)
         begun = np.where(missing, at, -1)
         maps.touch(np.arange(int(at[missing].min()), int(at.max()) + 1))
-        ekf.create(maps.data, maps.rows(begun), points[rows], self._state, self._camera)
+        ekf.create(maps.data, maps.rows(begun), image.points[rows], self._state, self._camera)
         if each:
             row, particle = np.nonzero(missing)
-            maps.births[at[missing], particle] = len(self._births) + row
-        born = self._n_observations + found[rows]
-        self._births = np.concatenate([self._births, born])
-        if self.association == "descriptor" and seen.descriptors is not None:
-            fresh_ones = seen.descriptors[found[rows]]
-            empty = len(self._bank) == 0
-            self._bank = fresh_ones.copy() if empty else np.concatenate([self._bank, fresh_ones])
+            maps.births[at[missing], particle] = len(self.front_end.origins) + row
+        self.front_end.start(image, rows)
         maps.counts = maps.counts + missing.sum(axis=0)
-        if not each:
-            for i, number in zip(rows, begun[:, 0], strict=True):
-                self._slot_of[self._ids[i]] = int(number)
 
-    def _origins(self, slots: Ints, particle: int, found: Ints) -> Ints:
-        """For each observation (K,) the one that started its landmark, in one particle."""
+    def _landmarks(self, slots: Ints, particle: int) -> Ints:
+        """Number (K,) of each observation's landmark in one particle, -1 for new ones."""
         chosen = slots if slots.ndim == 1 else slots[:, particle]
-        own = self._n_observations + found
-        if len(self._births) == 0:
-            return own
-        births = self._maps.birth_of(np.maximum(chosen, 0), particle)
-        return np.where(chosen >= 0, self._births[births], own)
+        return np.where(chosen >= 0, self._maps.birth_of(np.maximum(chosen, 0), particle), -1)
 
     def _resample(self) -> None:
         """Draw particles by their weights; survivors keep their place."""
@@ -494,18 +408,3 @@ class FastSLAM:
         self._poses[:, :n] = np.take(self._poses, ancestors, axis=1)
         self._drawn, self._accumulated = self._drawn[ancestors], self._accumulated[ancestors]
         self._log_weights = np.zeros(n)
-
-
-def _root(covariance: Array) -> Array:
-    """Matrix (3, 3) whose product with its transpose is the covariance, which may be singular."""
-    values, vectors = np.linalg.eigh((covariance + covariance.T) / 2.0)
-    root: Array = vectors * np.sqrt(np.maximum(values, 0.0))
-    return root
-
-
-def _rotated(covariance: Array, angle_rad: float) -> Array:
-    """Covariance (3, 3) of a pose in axes from which the old ones are turned by the angle."""
-    cos, sin = math.cos(angle_rad), math.sin(angle_rad)
-    turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
-    rotated: Array = turn @ covariance @ turn.T
-    return rotated

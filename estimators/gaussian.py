@@ -11,9 +11,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from sim.arrays import Array
 
 _SMALL_ANGLE_RAD = 1e-4
 
@@ -135,6 +134,21 @@ def update(
     left.flat[:: len(mean) + 1] += 1.0
     after = left @ covariance @ left.T + gain @ R @ gain.T
     return mean + gain @ innovation, (after + after.T) / 2.0
+
+
+def root(covariance: Array) -> Array:
+    """Matrix (3, 3) whose product with its transpose is the covariance, which may be singular."""
+    values, vectors = np.linalg.eigh(covariance)
+    columns: Array = vectors * np.sqrt(np.maximum(values, 0.0))
+    return columns
+
+
+def rotated(covariance: Array, angle_rad: float) -> Array:
+    """Covariance (3, 3) of a pose in axes from which its own are turned by the angle."""
+    cos, sin = math.cos(angle_rad), math.sin(angle_rad)
+    R = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    turned: Array = R @ covariance @ R.T
+    return turned
 
 
 def wrap(angle_rad: float) -> float:

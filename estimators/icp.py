@@ -1,8 +1,8 @@
 """Registration of two laser scans in the plane: point-to-point and point-to-line ICP.
 
 The lines are those of `estimators.scan_lines`. Nothing is trimmed unless asked for: gates narrow
-only after the increment has settled, so the few points that hold the robot along a corridor keep
-their say.
+only after the increment has settled, so the few points that hold the robot along a corridor still
+count.
 
 Poses `T_target_source` take points of the source scan into the frame of the target scan.
 """
@@ -11,19 +11,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from estimators.options import require_choices
 from estimators.scan_lines import PreparedScan, prepare, select
+from sim.arrays import Array, Ints
 from sim.compiled import njit
 from sim.errors import InputError
 
 __all__ = ["PreparedScan", "Registration", "prepare", "register"]
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 Metric = Literal["point_to_line", "point_to_point"]
 Search = Literal["angular", "kdtree"]
 Kernel = Literal["tukey", "huber", "none"]
@@ -32,15 +32,16 @@ _COARSE_POINTS = 6  # points that stand for a line of the source until the poses
 # Errors of the heading, rad, that the second and the third stage may find: they bound how far
 # those look. For the first it is that of the guess.
 _TURN_THEN, _TURN_LAST = 0.01, 0.002
-_TOLD_RAD, _GUESSED_RAD = 0.08, 0.2  # where the lines told the heading, and where not
+_SEARCHED_RAD, _GUESSED_RAD = 0.08, 0.2  # after a search of the heading, and without
 _NO_GAIN = 1e-4  # fall of the cost, in squared standard deviations, that is worth no iteration
 _GRAZING = 0.001  # squared sine below which a beam along a wall is not trusted further
 _HUBER, _TUKEY = 1.345, 6.0  # tuning constants, in standard deviations
 _LEAST_MEMBERS = 3  # points on a line before it holds a direction
 _AGREEMENT = 6.0  # range standard deviations from a line of the other scan
+LEAST_POINTS = 3  # of a scan that can be registered
 LEAST_OVERLAP = 0.6  # share of the source's points that must agree with the target
-LEAST_AGREEMENT = 0.5  # the same of those, in both scans, that speak about any one direction
-LEAST_INFORMATION = 4.0  # information that the noise of the lines alone can feign, times this
+LEAST_AGREEMENT = 0.5  # the same of those, in both scans, that bear on any one direction
+LEAST_INFORMATION = 4.0  # times the spurious information that the noise of the lines makes
 
 
 @dataclass(frozen=True)
@@ -62,20 +63,20 @@ class Registration:
     residuals_m
         (K,) distance to the line (signed) or to the point; NaN without a match.
     weights
-        (K,) weight of each squared residual, 1/m^2; 0 for a point that has no say.
+        (K,) weight of each squared residual, 1/m^2; 0 for a point that does not count.
     iterations, converged
         Iterations in all, and whether the increment fell below its bound.
     normal_matrix
         (3, 3) sum of w J^T J of the metric's residuals by (x, y, heading).
     information, information_noise
-        (3, 3) what the target's lines say about the pose, and the part of it that the noise of
-        their directions would feign if there were nothing to say (all walls parallel, a circle).
+        (3, 3) information about the pose from the target's lines, and the spurious part that the
+        noise of their directions adds even where there is none (all walls parallel, a circle).
     """
 
     T_target_source: Array
     metric: Metric
     status: str
-    matches: Indices
+    matches: Ints
     residuals_m: Array
     weights: Array
     iterations: int
@@ -86,7 +87,7 @@ class Registration:
 
     @property
     def inliers(self) -> NDArray[np.bool_]:
-        """(K,) points that had a say."""
+        """(K,) points that count."""
         return self.weights > 0.0
 
     @property
@@ -95,11 +96,87 @@ class Registration:
         return float(np.mean(self.inliers)) if len(self.weights) else 0.0
 
 
+class _Pair(NamedTuple):
+    """Two scans to register, and how.
+
+    Attributes
+    ----------
+    to_lines
+        Whether points are matched with lines of the target, or with its points.
+    tree
+        (K,) order of the target's points as a k-d tree; empty to walk along the bearings.
+    noise_m
+        Range noise of the noisier scan.
+    """
+
+    source: PreparedScan
+    target: PreparedScan
+    to_lines: bool
+    tree: Ints
+    noise_m: float
+
+
+class _Fit(NamedTuple):
+    """What the iterations write, of each point of the source (K,): see `Registration`."""
+
+    matches: Ints
+    residuals: Array
+    weights: Array
+
+
+class _Stage(NamedTuple):
+    """Iterations under one gate.
+
+    Attributes
+    ----------
+    gate_m
+        Widest distance of a match.
+    kernel, scale
+        0 none, 1 Huber, 2 Tukey: weight by the residual over `scale` times its standard
+        deviation, the range noise as it shows at the beam's incidence. 3 (coarse): Geman and
+        McClure's weight of the distance itself, of width `scale`, m.
+    reach_m
+        Points farther from the sensor wait: an error of heading that is small near the sensor
+        takes them to other walls.
+    max_iterations, increment_m, increment_rad
+        When to stop.
+    """
+
+    gate_m: float
+    kernel: int
+    scale: float
+    reach_m: float
+    max_iterations: int
+    increment_m: float
+    increment_rad: float
+
+
+@njit(forceinline=True, error_model="numpy", fastmath={"contract"})
+def _to_segment(segments: Array, k: int, x: float, y: float) -> float:
+    """Squared distance of a point from segment k."""
+    n1, n2 = segments[k, 0], segments[k, 1]
+    miss = n1 * x + n2 * y - segments[k, 2]
+    along = n1 * y - n2 * x
+    over = max(segments[k, 3] - along, along - segments[k, 4], 0.0)
+    squared: float = miss * miss + over * over
+    return squared
+
+
+@njit(forceinline=True, error_model="numpy", fastmath={"contract"})
+def _ends_walk(way: int, u: float, v: float, x: float, y: float, best_d2: float) -> bool:
+    """Whether even the nearest point of the ray (u, v) to what comes next is too far."""
+    beyond = way * (x * v - y * u)
+    if beyond <= 0.0:
+        return False
+    bound = beyond * beyond if x * u + y * v > 0.0 else x * x + y * y
+    return bound >= best_d2
+
+
 @njit(error_model="numpy", fastmath={"contract"})
 def _nearest_line(
     segments: Array, full_circle: bool, start: int, x: float, y: float
 ) -> tuple[int, float]:
-    """Nearest segment to a point, from a guess: index, squared distance.
+    """Nearest segment to a point, by a walk from a guess: index, squared distance.
 
     Segments come by rising bearing, so the walk each way ends where even the nearest point of
     the ray to the next segment is farther than the best one.
@@ -113,18 +190,10 @@ def _nearest_line(
                 if not full_circle:
                     break
                 k -= way * n
-            if best >= 0:
-                u, v = segments[k, 6 - way], segments[k, 7 - way]
-                beyond = way * (x * v - y * u)
-                if beyond > 0.0:
-                    bound = beyond * beyond if x * u + y * v > 0.0 else x * x + y * y
-                    if bound >= best_d2:
-                        break
-            n1, n2 = segments[k, 0], segments[k, 1]
-            miss = n1 * x + n2 * y - segments[k, 2]
-            along = n1 * y - n2 * x
-            over = max(segments[k, 3] - along, along - segments[k, 4], 0.0)
-            d2 = miss * miss + over * over
+            u, v = segments[k, 6 - way], segments[k, 7 - way]
+            if best >= 0 and _ends_walk(way, u, v, x, y, best_d2):
+                break
+            d2 = _to_segment(segments, k, x, y)
             if d2 < best_d2:
                 best, best_d2 = k, d2
             k += way
@@ -135,7 +204,7 @@ def _nearest_line(
 def _nearest_point(
     points: Array, rays: Array, full_circle: bool, start: int, x: float, y: float
 ) -> tuple[int, float]:
-    """Nearest point of a scan, from a guess, by the same walk: index, squared distance."""
+    """Nearest point of a scan, by the same walk: index, squared distance."""
     n = len(points)
     best, best_d2 = -1, math.inf
     for way in (1, -1):
@@ -145,13 +214,8 @@ def _nearest_point(
                 if not full_circle:
                     break
                 k -= way * n
-            u, v = rays[k, 0], rays[k, 1]
-            if best >= 0:
-                beyond = way * (x * v - y * u)
-                if beyond > 0.0:
-                    bound = beyond * beyond if x * u + y * v > 0.0 else x * x + y * y
-                    if bound >= best_d2:
-                        break
+            if best >= 0 and _ends_walk(way, rays[k, 0], rays[k, 1], x, y, best_d2):
+                break
             d2 = (points[k, 0] - x) ** 2 + (points[k, 1] - y) ** 2
             if d2 < best_d2:
                 best, best_d2 = k, d2
@@ -160,7 +224,7 @@ def _nearest_point(
 
 
 @njit(error_model="numpy", fastmath={"contract"})
-def _plant_tree(points: Array) -> Indices:
+def _plant_tree(points: Array) -> Ints:
     """Order (K,) of the points such that the middle of every range splits it in x, y, x, ..."""
     n = len(points)
     order = np.arange(n)
@@ -181,7 +245,7 @@ def _plant_tree(points: Array) -> Indices:
 
 
 @njit(error_model="numpy", fastmath={"contract"})
-def _nearest_in_tree(points: Array, order: Indices, x: float, y: float) -> tuple[int, float]:
+def _nearest_in_tree(points: Array, order: Ints, x: float, y: float) -> tuple[int, float]:
     """Nearest point by the k-d tree of `_plant_tree`: index, squared distance."""
     stack = np.empty((64, 3), np.int64)
     gaps = np.empty(64)
@@ -212,28 +276,23 @@ def _nearest_in_tree(points: Array, order: Indices, x: float, y: float) -> tuple
 
 @njit(error_model="numpy", fastmath={"contract"})
 def _heading_by_lines(
-    source: Array,
-    source_ends: Indices,
-    target: Array,
-    target_ends: Indices,
-    guess: float,
-    window: float,
+    source: PreparedScan, target: PreparedScan, guess: float, window: float
 ) -> float:
-    """Heading of the source within +-window of a guess, in which most lines have a like one."""
+    """Heading of the source within +-window of a guess at which most lines agree."""
     bins = 180
     votes = np.zeros(bins + 1)
-    for a in range(len(source)):
-        n_a = source_ends[a, 1] - source_ends[a, 0] + 1
-        heading = math.atan2(source[a, 1], source[a, 0]) + guess
-        length_a = source[a, 4] - source[a, 3]
-        for b in range(len(target)):
-            turn = math.atan2(target[b, 1], target[b, 0]) - heading
+    for a in range(len(source.segments)):
+        n_a = source.line_ends[a, 1] - source.line_ends[a, 0] + 1
+        heading = math.atan2(source.segments[a, 1], source.segments[a, 0]) + guess
+        length_a = source.segments[a, 4] - source.segments[a, 3]
+        for b in range(len(target.segments)):
+            turn = math.atan2(target.segments[b, 1], target.segments[b, 0]) - heading
             turn -= 2.0 * math.pi * round(turn / (2.0 * math.pi))
             place = (turn / window + 1.0) * bins / 2.0
             if place < 0.0 or place >= bins:
                 continue
-            n_b = target_ends[b, 1] - target_ends[b, 0] + 1
-            length_b = target[b, 4] - target[b, 3]
+            n_b = target.line_ends[b, 1] - target.line_ends[b, 0] + 1
+            length_b = target.segments[b, 4] - target.segments[b, 3]
             weight = min(n_a, n_b) * min(length_a, length_b) / max(length_a, length_b)
             left = int(place)
             votes[left] += weight * (left + 1.0 - place)
@@ -254,20 +313,19 @@ def _heading_by_lines(
 
 
 @njit(error_model="numpy", fastmath={"contract"})
-def _representatives(
-    points: Array, line_of_point: Indices, ends: Indices, segments: Array
-) -> tuple[Indices, Array]:
+def _representatives(scan: PreparedScan) -> tuple[Ints, Array]:
     """A few points for each line, which together count as the root of the line's points.
 
     They are spaced in turn by beams and by length: a wall that runs away from the sensor has
     its beams near it, and its lever far off.
     """
+    points, ends = scan.points, scan.line_ends
     chosen = np.empty(_COARSE_POINTS * len(ends), np.int64)
     weights = np.empty(len(chosen))
     n = 0
     for k in range(len(ends)):
         first, last = ends[k, 0], ends[k, 1]
-        n1, n2 = segments[k, 0], segments[k, 1]
+        n1, n2 = scan.segments[k, 0], scan.segments[k, 1]
         start = n1 * points[first, 1] - n2 * points[first, 0]
         length = n1 * points[last, 1] - n2 * points[last, 0] - start
         here = min(_COARSE_POINTS, last - first + 1)
@@ -282,7 +340,7 @@ def _representatives(
                 ):
                     by_length += 1
                 i = by_length
-            if line_of_point[i] == k:
+            if scan.line_of_point[i] == k:
                 chosen[n] = i
                 weights[n] = math.sqrt(last - first + 1.0) / here
                 n += 1
@@ -295,7 +353,7 @@ def _step(normal: Array, gradient: Array, pose: Array) -> tuple[float, float, fl
 
     Returns the translation and rotation of the move, and by how much the cost should fall.
 
-    Directions without information get a whiff of damping: there the pose stays.
+    Directions without information are slightly damped: there the pose stays.
     """
     damping = 1e-6 * (normal[0, 0] + normal[1, 1])
     a = math.sqrt(normal[0, 0] + damping)
@@ -315,7 +373,7 @@ def _step(normal: Array, gradient: Array, pose: Array) -> tuple[float, float, fl
     return math.hypot(dx, dy), abs(turn), y1 * y1 + y2 * y2 + y3 * y3
 
 
-@njit(error_model="numpy", fastmath={"contract"})
+@njit(forceinline=True, error_model="numpy", fastmath={"contract"})
 def _add_square(matrix: Array, weight: float, a: float, b: float, c: float) -> None:
     """Add weight times the square of (a, b, c) to the lower half of a matrix."""
     matrix[0, 0] += weight * a * a
@@ -326,139 +384,163 @@ def _add_square(matrix: Array, weight: float, a: float, b: float, c: float) -> N
     matrix[2, 2] += weight * c * c
 
 
-@njit(error_model="numpy", fastmath={"contract"})
-def _mirror(matrix: Array) -> None:
-    """Fill the upper half of a matrix (3, 3) from the lower one."""
-    matrix[0, 1], matrix[0, 2], matrix[1, 2] = matrix[1, 0], matrix[2, 0], matrix[2, 1]
+@njit(forceinline=True, error_model="numpy", fastmath={"contract"})
+def _add_point(matrix: Array, weight: float, qx: float, qy: float) -> None:
+    """Add the normal matrix of a point-to-point residual to the lower half of a matrix."""
+    matrix[0, 0] += weight
+    matrix[1, 1] += weight
+    matrix[2, 0] -= weight * qy
+    matrix[2, 1] += weight * qx
+    matrix[2, 2] += weight * (qx * qx + qy * qy)
+
+
+@njit(forceinline=True, error_model="numpy", fastmath={"contract"})
+def _match(
+    pair: _Pair, chosen: Ints, reach_m: float, pose: Array, first: bool, fit: _Fit, misses: Array
+) -> None:
+    """Match the chosen points (C,); `misses` (C,) become squared distances, inf without a match.
+
+    The walk starts from the last match, or at `first` from that of the point before.
+    """
+    source, target, near = pair.source, pair.target, 0
+    by_tree = len(pair.tree) > 0
+    cos, sin = math.cos(pose[2]), math.sin(pose[2])
+    for k in range(len(chosen)):
+        i = chosen[k]
+        px, py = source.points[i, 0], source.points[i, 1]
+        if px**2 + py**2 > reach_m * reach_m:
+            fit.matches[i], misses[k] = near, math.inf
+            continue
+        x, y = cos * px - sin * py + pose[0], sin * px + cos * py + pose[1]
+        if not first:
+            near = fit.matches[i]
+        if by_tree:
+            near, d2 = _nearest_in_tree(target.points, pair.tree, x, y)
+            if pair.to_lines:
+                near = target.line_of_point[near]
+                d2 = _to_segment(target.segments, near, x, y) if near >= 0 else math.inf
+        elif pair.to_lines:
+            near, d2 = _nearest_line(target.segments, target.full_circle, near, x, y)
+        else:
+            points, rays = target.points, target.rays
+            near, d2 = _nearest_point(points, rays, target.full_circle, near, x, y)
+        fit.matches[i], misses[k] = near, d2
+
+
+@njit(forceinline=True, error_model="numpy", fastmath={"contract"})
+def _variance(
+    n1: float, n2: float, u: float, v: float, cos: float, sin: float, noise_m: float
+) -> float:
+    """Variance that the range noise of a beam (u, v) makes in the distance to a line."""
+    facing = n1 * (cos * u - sin * v)
+    facing += n2 * (sin * u + cos * v)
+    return noise_m * noise_m * (facing * facing + _GRAZING)
+
+
+@njit(forceinline=True, error_model="numpy", fastmath={"contract"})
+def _weigh(kernel: int, ratio: float) -> float:
+    """Weight of a squared residual over its squared scale, by the kernels of `_Stage`."""
+    if kernel == 3:
+        return 1.0 / (1.0 + ratio) ** 2
+    if kernel == 2:
+        return (1.0 - ratio) ** 2 if ratio < 1.0 else 0.0
+    if kernel == 1:
+        return 1.0 / math.sqrt(ratio) if ratio > 1.0 else 1.0
+    return 1.0
+
+
+@njit(forceinline=True, error_model="numpy", fastmath={"contract"})
+def _linearise(
+    pair: _Pair, stage: _Stage, chosen: Ints, counts: Array, pose: Array, fit: _Fit, misses: Array,
+    limit: float,
+) -> tuple[Array, Array]:  # fmt: skip
+    """Normal equations of the chosen points whose squared miss is within a limit."""
+    source, target = pair.source, pair.target
+    cos, sin = math.cos(pose[2]), math.sin(pose[2])
+    normal, gradient = np.zeros((3, 3)), np.zeros(3)
+    for k in range(len(chosen)):
+        i, j = chosen[k], fit.matches[chosen[k]]
+        fit.weights[i], fit.residuals[i] = 0.0, math.nan
+        if j < 0 or misses[k] > limit:
+            continue
+        qx = cos * source.points[i, 0] - sin * source.points[i, 1]
+        qy = sin * source.points[i, 0] + cos * source.points[i, 1]
+        variance = 1.0
+        if pair.to_lines:
+            n1, n2 = target.segments[j, 0], target.segments[j, 1]
+            miss = n1 * (qx + pose[0]) + n2 * (qy + pose[1]) - target.segments[j, 2]
+            if stage.kernel < 3:
+                u, v = source.rays[i, 0], source.rays[i, 1]
+                variance = _variance(n1, n2, u, v, cos, sin, pair.noise_m)
+        else:
+            ex = qx + pose[0] - target.points[j, 0]
+            ey = qy + pose[1] - target.points[j, 1]
+            miss = math.sqrt(ex * ex + ey * ey)
+            if stage.kernel < 3:
+                variance = 2.0 * pair.noise_m * pair.noise_m
+        weight = _weigh(stage.kernel, miss * miss / (variance * stage.scale * stage.scale))
+        weight *= counts[k] / variance
+        fit.weights[i], fit.residuals[i] = weight, miss
+        if pair.to_lines:
+            lever = n2 * qx - n1 * qy
+            _add_square(normal, weight, n1, n2, lever)
+            gradient[0] += weight * miss * n1
+            gradient[1] += weight * miss * n2
+            gradient[2] += weight * miss * lever
+        else:
+            _add_point(normal, weight, qx, qy)
+            gradient[0] += weight * ex
+            gradient[1] += weight * ey
+            gradient[2] += weight * (ey * qx - ex * qy)
+    return normal, gradient
 
 
 @njit(error_model="numpy", fastmath={"contract"})
 def _align(
-    points: Array, rays: Array, chosen: Indices, counts: Array, pose: Array, to_lines: bool,
-    segments: Array, target_points: Array, target_rays: Array, line_of_point: Indices,
-    full_circle: bool, order: Indices, gate: float, kernel: int, scale: float, reach: float,
-    noise: float, trim: float, max_iterations: int, increment_m: float, increment_rad: float,
-    guess: Array, matches: Indices, residuals: Array, weights: Array,
+    pair: _Pair, stage: _Stage, chosen: Ints, counts: Array, trim: float, pose: Array, guess: Array,
+    fit: _Fit,
 ) -> tuple[int, bool]:  # fmt: skip
-    """Iterate from `pose`, in place, to rest under one gate; iterations, converged.
+    """Iterate from `pose`, in place, to rest in one stage; iterations, converged.
 
-    Kernel 0 none, 1 Huber, 2 Tukey: of the residual over its standard deviation `scale` times
-    the range noise, as it shows at the beam's incidence. Kernel 3 (coarse) weighs the distance
-    itself by Geman and McClure's law of width `scale`, m. Points farther than `reach` wait: an
-    error of heading that is small near the sensor takes them to other walls. `guess` (5,) is a
-    pose, and the weights of its position and heading.
+    `counts` (C,) weigh the chosen points; `guess` (5,) is a pose, and the weights of its position
+    and heading in a coarse stage.
     """
-    near = 0
-    by_tree = len(order) > 0
     misses = np.empty(len(chosen))
-    for iteration in range(max_iterations):
-        cos, sin = math.cos(pose[2]), math.sin(pose[2])
-        for k in range(len(chosen)):
-            i = chosen[k]
-            if points[i, 0] ** 2 + points[i, 1] ** 2 > reach * reach:
-                matches[i], misses[k] = near, math.inf
-                continue
-            x = cos * points[i, 0] - sin * points[i, 1] + pose[0]
-            y = sin * points[i, 0] + cos * points[i, 1] + pose[1]
-            if iteration > 0:
-                near = matches[i]
-            if by_tree:
-                near, d2 = _nearest_in_tree(target_points, order, x, y)
-                if to_lines:
-                    near = line_of_point[near]
-                    if near >= 0:
-                        n1, n2 = segments[near, 0], segments[near, 1]
-                        along = n1 * y - n2 * x
-                        over = max(segments[near, 3] - along, along - segments[near, 4], 0.0)
-                        d2 = (n1 * x + n2 * y - segments[near, 2]) ** 2 + over * over
-                    else:
-                        d2 = math.inf
-            elif to_lines:
-                near, d2 = _nearest_line(segments, full_circle, near, x, y)
-            else:
-                near, d2 = _nearest_point(target_points, target_rays, full_circle, near, x, y)
-            matches[i] = near
-            misses[k] = d2
-        limit = gate * gate
+    for iteration in range(stage.max_iterations):
+        _match(pair, chosen, stage.reach_m, pose, iteration == 0, fit, misses)
+        limit = stage.gate_m * stage.gate_m
         if trim > 0.0:
             rank = int((1.0 - trim) * (len(chosen) - 1))
             limit = min(limit, select(misses, np.arange(len(misses)), 0, len(misses), rank))
-        normal, gradient = np.zeros((3, 3)), np.zeros(3)
-        for k in range(len(chosen)):
-            i, j = chosen[k], matches[chosen[k]]
-            weights[i], residuals[i] = 0.0, math.nan
-            if j < 0 or misses[k] > limit:
-                continue
-            qx = cos * points[i, 0] - sin * points[i, 1]
-            qy = sin * points[i, 0] + cos * points[i, 1]
-            variance = 1.0
-            if to_lines:
-                n1, n2 = segments[j, 0], segments[j, 1]
-                miss = n1 * (qx + pose[0]) + n2 * (qy + pose[1]) - segments[j, 2]
-                if kernel < 3:
-                    facing = n1 * (cos * rays[i, 0] - sin * rays[i, 1])
-                    facing += n2 * (sin * rays[i, 0] + cos * rays[i, 1])
-                    variance = noise * noise * (facing * facing + _GRAZING)
-            else:
-                ex = qx + pose[0] - target_points[j, 0]
-                ey = qy + pose[1] - target_points[j, 1]
-                miss = math.sqrt(ex * ex + ey * ey)
-                if kernel < 3:
-                    variance = 2.0 * noise * noise
-            ratio = miss * miss / (variance * scale * scale)
-            if kernel == 3:
-                weight = 1.0 / (1.0 + ratio) ** 2
-            elif kernel == 2:
-                weight = (1.0 - ratio) ** 2 if ratio < 1.0 else 0.0
-            elif kernel == 1:
-                weight = 1.0 / math.sqrt(ratio) if ratio > 1.0 else 1.0
-            else:
-                weight = 1.0
-            weight *= counts[k] / variance
-            weights[i] = weight
-            residuals[i] = miss
-            if to_lines:
-                lever = n2 * qx - n1 * qy
-                _add_square(normal, weight, n1, n2, lever)
-                gradient[0] += weight * miss * n1
-                gradient[1] += weight * miss * n2
-                gradient[2] += weight * miss * lever
-            else:
-                normal[0, 0] += weight
-                normal[1, 1] += weight
-                normal[2, 0] -= weight * qy
-                normal[2, 1] += weight * qx
-                normal[2, 2] += weight * (qx * qx + qy * qy)
-                gradient[0] += weight * ex
-                gradient[1] += weight * ey
-                gradient[2] += weight * (ey * qx - ex * qy)
+        normal, gradient = _linearise(pair, stage, chosen, counts, pose, fit, misses, limit)
         if not normal[0, 0] + normal[1, 1] > 0.0:
             return iteration, False
-        if kernel == 3:
+        no_gain = _NO_GAIN
+        if stage.kernel == 3:
+            no_gain *= pair.noise_m**2
             for k in range(3):
                 hold = guess[4] if k == 2 else guess[3]
                 normal[k, k] += hold
                 gradient[k] += hold * (pose[k] - guess[k])
         moved, turned, gained = _step(normal, gradient, pose)
-        if moved < increment_m and turned < increment_rad:
+        if moved < stage.increment_m and turned < stage.increment_rad:
             return iteration + 1, True
         # along a direction that nothing holds the pose may wander without end
-        if to_lines and gained < (_NO_GAIN * noise**2 if kernel == 3 else _NO_GAIN):
+        if pair.to_lines and gained < no_gain:
             return iteration + 1, True
-    return max_iterations, False
+    return stage.max_iterations, False
 
 
 @njit(error_model="numpy", fastmath={"contract"})
-def _judge(
-    points: Array, rays: Array, pose: Array, to_lines: bool, segments: Array,
-    line_of_point: Indices, matches: Indices, residuals: Array, weights: Array, noise: float,
-) -> tuple[Array, Array, Array]:  # fmt: skip
+def _judge(pair: _Pair, pose: Array, fit: _Fit) -> tuple[Array, Array, Array]:
     """Normal matrix of the metric, and the informations of `Registration`; lower halves."""
-    normal, information, feigned = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
+    points, rays, matches, weights = pair.source.points, pair.source.rays, fit.matches, fit.weights
+    segments, line_of_point = pair.target.segments, pair.target.line_of_point
+    normal, information, spurious = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
     members = np.zeros(len(segments), np.int64)
     for i in range(len(points)):
-        line = matches[i] if to_lines else line_of_point[matches[i]]
+        line = matches[i] if pair.to_lines else line_of_point[matches[i]]
         if weights[i] > 0.0 and line >= 0:
             members[line] += 1
     for i in range(len(points)):
@@ -466,152 +548,132 @@ def _judge(
         qx = cos * points[i, 0] - sin * points[i, 1]
         qy = sin * points[i, 0] + cos * points[i, 1]
         if not weight > 0.0:
-            if residuals[i] != residuals[i]:
+            if math.isnan(fit.residuals[i]):
                 matches[i] = -1
             continue
-        if not to_lines:
-            normal[0, 0] += weight
-            normal[1, 1] += weight
-            normal[2, 0] -= weight * qy
-            normal[2, 1] += weight * qx
-            normal[2, 2] += weight * (qx * qx + qy * qy)
-        line = matches[i] if to_lines else line_of_point[matches[i]]
+        if not pair.to_lines:
+            _add_point(normal, weight, qx, qy)
+        line = matches[i] if pair.to_lines else line_of_point[matches[i]]
         if line < 0:
             continue
         n1, n2 = segments[line, 0], segments[line, 1]
-        if not to_lines:
-            facing = n1 * (cos * rays[i, 0] - sin * rays[i, 1])
-            facing += n2 * (sin * rays[i, 0] + cos * rays[i, 1])
-            weight = 1.0 / (noise * noise * (facing * facing + _GRAZING))
-        if to_lines:
+        if pair.to_lines:
             _add_square(normal, weight, n1, n2, n2 * qx - n1 * qy)
+        else:
+            weight = 1.0 / _variance(n1, n2, rays[i, 0], rays[i, 1], cos, sin, pair.noise_m)
         if members[line] < _LEAST_MEMBERS:
             continue  # a point or two may be there by chance
         _add_square(information, weight, n1, n2, n2 * qx - n1 * qy)
-        _add_square(feigned, weight * segments[line, 9], -n2, n1, n1 * qx + n2 * qy)
-    return normal, information, feigned
+        _add_square(spurious, weight * segments[line, 9], -n2, n1, n1 * qx + n2 * qy)
+    return normal, information, spurious
 
 
 @njit(error_model="numpy", fastmath={"contract"})
 def _confront(
-    points: Array, line_of_point: Indices, segments: Array, pose: Array, lever_x: float,
-    lever_y: float, turn: float, ranges: Array, rays: Array, other_line: Indices,
-    other_segments: Array, full_circle: bool, tolerance: float, agreed: Array, denied: Array,
+    scan: PreparedScan, other: PreparedScan, pose: Array, turn: float, lever: tuple[float, float],
+    tolerance: float, agreed: Array, denied: Array,
 ) -> None:  # fmt: skip
-    """See what a scan says of another one's points, and add to two sums of J J^T (3, 3).
+    """Check a scan's points against another scan, and add to two sums of J J^T (3, 3).
 
     Points on a line of the other scan agree. Those that stand well before what the beams on
-    both sides see are denied. The rest is hidden or out of view, and says nothing. J is of the
-    points' own lines, about the target's axes: turned by `turn`, with levers from a point.
+    both sides see are denied. The rest is hidden or out of view and counts for neither. J is of
+    the points' own lines, about the target's axes: turned by `turn`, with levers from a point.
     """
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
     c, s = math.cos(turn), math.sin(turn)
-    n = len(rays)
-    j = 0
-    for i in range(len(points)):
-        line = line_of_point[i]
+    rays, n, j = other.rays, len(other.rays), 0
+    for i in range(len(scan.points)):
+        line = scan.line_of_point[i]
         if line < 0:
             continue
-        x = cos * points[i, 0] - sin * points[i, 1] + pose[0]
-        y = sin * points[i, 0] + cos * points[i, 1] + pose[1]
+        px, py = scan.points[i, 0], scan.points[i, 1]
+        x, y = cos * px - sin * py + pose[0], sin * px + cos * py + pose[1]
         # the beams on both sides: the last one was near
         found = False
         for _ in range(n):
             after = j + 1 if j + 1 < n else 0
             if rays[j, 0] * y - rays[j, 1] * x < 0.0:
-                if j == 0 and not full_circle:
+                if j == 0 and not other.full_circle:
                     break
                 j = j - 1 if j > 0 else n - 1
             elif rays[after, 0] * y - rays[after, 1] * x >= 0.0:
-                if after == 0 and not full_circle:
+                if after == 0 and not other.full_circle:
                     break
                 j = after
             else:
                 found = True
                 break
-        if not found or (after == 0 and not full_circle):
+        if not found or (after == 0 and not other.full_circle):
             j = min(j, n - 2)
             continue
         if rays[j, 0] * x + rays[j, 1] * y <= 0.0:
             continue
         near = False
         for k in (j, after):
-            other = other_line[k]
-            if other >= 0:
-                miss = other_segments[other, 0] * x + other_segments[other, 1] * y
-                near = near or abs(miss - other_segments[other, 2]) < tolerance
-        if not near and math.hypot(x, y) > min(ranges[j], ranges[after]) - 2.0 * tolerance:
+            on = other.line_of_point[k]
+            if on >= 0:
+                miss = other.segments[on, 0] * x + other.segments[on, 1] * y
+                near = near or abs(miss - other.segments[on, 2]) < tolerance
+        seen_m = min(other.ranges_m[j], other.ranges_m[after])
+        if not near and math.hypot(x, y) > seen_m - 2.0 * tolerance:
             continue
-        n1 = c * segments[line, 0] - s * segments[line, 1]
-        n2 = s * segments[line, 0] + c * segments[line, 1]
-        qx = c * (points[i, 0] - lever_x) - s * (points[i, 1] - lever_y)
-        qy = s * (points[i, 0] - lever_x) + c * (points[i, 1] - lever_y)
+        n1 = c * scan.segments[line, 0] - s * scan.segments[line, 1]
+        n2 = s * scan.segments[line, 0] + c * scan.segments[line, 1]
+        qx = c * (px - lever[0]) - s * (py - lever[1])
+        qy = s * (px - lever[0]) + c * (py - lever[1])
         _add_square(agreed if near else denied, 1.0, n1, n2, n2 * qx - n1 * qy)
 
 
 @njit(error_model="numpy", fastmath={"contract"})
 def _register(
-    ranges: Array, points: Array, rays: Array, source_line: Indices, source_ends: Indices,
-    source_segments: Array, target_ranges: Array, target_points: Array, target_rays: Array,
-    target_line: Indices, target_ends: Indices, target_segments: Array, full_circle: bool,
-    pose: Array, to_lines: bool, by_tree: bool, stages: Array, window: float, sigma_m: float,
-    sigma_rad: float, noise: float,
-    trim: float, increment_m: float, increment_rad: float,
-) -> tuple[Indices, Array, Array, int, bool, Array, Array, Array, Array, Array]:  # fmt: skip
+    source: PreparedScan, target: PreparedScan, pose: Array, to_lines: bool, by_tree: bool,
+    stages: Array, window: float, sigma_m: float, sigma_rad: float, trim: float,
+    max_iterations: int, increment_m: float, increment_rad: float,
+) -> tuple[Ints, Array, Array, int, bool, Array, Array, Array, Array, Array]:  # fmt: skip
     """All of a registration.
 
-    Columns of `stages` (S, 6): gate, kernel, its scale, iterations, whether sparse, reach.
+    Columns of `stages` (S, 5): the first four of `_Stage`, and whether representatives will do.
     """
-    n = len(points)
-    matches, residuals, weights = np.zeros(n, np.int64), np.zeros(n), np.zeros(n)
-    order = _plant_tree(target_points) if by_tree else np.empty(0, np.int64)
+    n = len(source.points)
+    fit = _Fit(np.zeros(n, np.int64), np.zeros(n), np.zeros(n))
+    tree = _plant_tree(target.points) if by_tree else np.empty(0, np.int64)
+    noise = max(source.noise_m, target.noise_m)
+    pair = _Pair(source, target, to_lines, tree, noise)
     if window > 0.0:
-        pose[2] = _heading_by_lines(
-            source_segments, source_ends, target_segments, target_ends, pose[2], window
-        )
+        pose[2] = _heading_by_lines(source, target, pose[2], window)
     guess = np.array([pose[0], pose[1], pose[2], (noise / sigma_m) ** 2, (noise / sigma_rad) ** 2])
-    few, counts = _representatives(points, source_line, source_ends, source_segments)
+    few, counts = _representatives(source)
     every, ones = np.arange(n), np.ones(n)
     iterations, converged = 0, False
     for s in range(len(stages)):
         sparse = stages[s, 4] > 0.0
         # before the last stage it is enough to come to rest within its reach
         loose = 1.0 if s == len(stages) - 1 else (200.0 if to_lines else 10.0)
+        stage = _Stage(
+            stages[s, 0], int(stages[s, 1]), stages[s, 2], stages[s, 3], max_iterations,
+            loose * increment_m, loose * increment_rad,
+        )  # fmt: skip
         done, converged = _align(
-            points, rays, few if sparse else every, counts if sparse else ones, pose, to_lines,
-            target_segments, target_points, target_rays, target_line, full_circle, order,
-            stages[s, 0], int(stages[s, 1]), stages[s, 2], stages[s, 5], noise, trim,
-            int(stages[s, 3]), loose * increment_m, loose * increment_rad, guess, matches,
-            residuals, weights,
+            pair, stage, few if sparse else every, counts if sparse else ones, trim, pose, guess,
+            fit,
         )  # fmt: skip
         iterations += done
-    normal, information, feigned = _judge(
-        points, rays, pose, to_lines, target_segments, target_line, matches, residuals, weights,
-        noise,
-    )  # fmt: skip
+    normal, information, spurious = _judge(pair, pose, fit)
+    for matrix in (normal, information, spurious):
+        matrix[0, 1], matrix[0, 2], matrix[1, 2] = matrix[1, 0], matrix[2, 0], matrix[2, 1]
     agreed, denied = np.zeros((3, 3)), np.zeros((3, 3))
     tolerance = _AGREEMENT * noise
-    _confront(
-        points, source_line, source_segments, pose, 0.0, 0.0, pose[2], target_ranges, target_rays,
-        target_line, target_segments, full_circle, tolerance, agreed, denied,
-    )  # fmt: skip
+    _confront(source, target, pose, pose[2], (0.0, 0.0), tolerance, agreed, denied)
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
     back = np.array([-cos * pose[0] - sin * pose[1], sin * pose[0] - cos * pose[1], -pose[2]])
-    _confront(
-        target_points, target_line, target_segments, back, pose[0], pose[1], 0.0, ranges, rays,
-        source_line, source_segments, full_circle, tolerance, agreed, denied,
-    )  # fmt: skip
-    _mirror(normal)
-    _mirror(information)
-    _mirror(feigned)
+    _confront(target, source, back, 0.0, (pose[0], pose[1]), tolerance, agreed, denied)
     return (
-        matches, residuals, weights, iterations, converged, normal, information, feigned, agreed,
-        denied,
+        fit.matches, fit.residuals, fit.weights, iterations, converged, normal, information,
+        spurious, agreed, denied,
     )  # fmt: skip
 
 
-_KERNELS = {"none": 0, "huber": 1, "tukey": 2}
-_SCALES = {"none": 1.0, "huber": _HUBER, "tukey": _TUKEY}
+_KERNELS = {"none": (0, 1.0), "huber": (1, _HUBER), "tukey": (2, _TUKEY)}  # code, scale
 
 
 def register(
@@ -667,18 +729,13 @@ def register(
         raise InputError(
             f"an initial guess is three finite numbers (x, y, heading), got {initial!r}"
         )
-    if metric not in ("point_to_line", "point_to_point"):
-        raise InputError(f"metric must be point_to_line or point_to_point, got {metric!r}")
-    if search not in ("angular", "kdtree"):
-        raise InputError(f"search must be angular or kdtree, got {search!r}")
-    if kernel not in _KERNELS:
-        raise InputError(f"kernel must be tukey, huber or none, got {kernel!r}")
+    require_choices("", metric=(metric, Metric), search=(search, Search), kernel=(kernel, Kernel))
     if not 0.0 <= trim < 1.0:
         raise InputError(f"trim must lie in [0, 1), got {trim}")
     to_lines = metric == "point_to_line"
-    if len(source) < 3 or len(target) < 3 or (to_lines and len(target.lines) == 0):
-        n = len(source)
-        zero = np.zeros((3, 3))
+    too_few = min(len(source.points), len(target.points)) < LEAST_POINTS
+    if too_few or (to_lines and len(target.lines) == 0):
+        n, zero = len(source.points), np.zeros((3, 3))
         return Registration(
             pose, metric, "empty", np.full(n, -1), np.full(n, math.nan), np.zeros(n), 0, False,
             zero, zero, zero,
@@ -686,40 +743,35 @@ def register(
     window = heading_window_rad
     if window is None:
         window = math.pi / 6.0 if initial is None else 0.0
-    code, scale = float(_KERNELS[kernel]), _SCALES[kernel]
-    most = float(max_iterations)
+    code, scale = _KERNELS[kernel]
     if gate_rad is None:
-        gate_rad = _TOLD_RAD if window > 0.0 else _GUESSED_RAD
+        gate_rad = _SEARCHED_RAD if window > 0.0 else _GUESSED_RAD
     reach_m = 4.0 * gate_m / gate_rad
     stages = np.array(
         [
-            [gate_m, 3, 0.3, most, 1, reach_m],
-            [min(gate_m, 0.5), 3, 0.1, most, 1, 0.5 / _TURN_THEN],
-            [min(gate_m, 0.3), code, 3.0 * scale, most, 0, 0.3 / _TURN_LAST],
-            [min(gate_m, 0.3), code, scale, most, 0, math.inf],
+            [gate_m, 3, 0.3, reach_m, 1],
+            [min(gate_m, 0.5), 3, 0.1, 0.5 / _TURN_THEN, 1],
+            [min(gate_m, 0.3), code, 3.0 * scale, 0.3 / _TURN_LAST, 0],
+            [min(gate_m, 0.3), code, scale, math.inf, 0],
         ]
         if to_lines
         else [
-            [gate_m, 3, 0.5, most, 0, reach_m],
-            [min(gate_m, 0.5), 3, 0.2, most, 0, 0.5 / _TURN_THEN],
-            [min(gate_m, 0.2), code, scale, most, 0, math.inf],
+            [gate_m, 3, 0.5, reach_m, 0],
+            [min(gate_m, 0.5), 3, 0.2, 0.5 / _TURN_THEN, 0],
+            [min(gate_m, 0.2), code, scale, math.inf, 0],
         ]
     )
-    noise = max(source.noise_m, target.noise_m)
     found = _register(
-        source.ranges_m, source.points, source.rays, source.line_of_point, source.line_ends,
-        source.segments, target.ranges_m, target.points, target.rays, target.line_of_point,
-        target.line_ends, target.segments, target.full_circle, pose, to_lines,
-        search == "kdtree", stages, window, gate_m / 4.0, gate_rad / 4.0, noise, trim, increment_m,
-        increment_rad,
+        source, target, pose, to_lines, search == "kdtree", stages, window, gate_m / 4.0,
+        gate_rad / 4.0, trim, max_iterations, increment_m, increment_rad,
     )  # fmt: skip
     matches, residuals, weights, iterations, converged = found[:5]
-    normal, information, feigned, agreed, denied = found[5:]
+    normal, information, spurious, agreed, denied = found[5:]
     pose[2] = math.remainder(pose[2], 2.0 * math.pi)
     status = "ok"
     if np.count_nonzero(weights) < LEAST_OVERLAP * len(weights):
         status = "poor_overlap"
-    elif not _positive_definite(information - LEAST_INFORMATION * feigned):
+    elif not _positive_definite(information - LEAST_INFORMATION * spurious):
         status = "degenerate"
     elif not _positive_definite((1.0 - LEAST_AGREEMENT) * agreed - LEAST_AGREEMENT * denied):
         status = "poor_overlap"
@@ -727,7 +779,7 @@ def register(
         status = "not_converged"
     return Registration(
         pose, metric, status, matches, residuals, weights, iterations, converged, normal,
-        information, feigned,
+        information, spurious,
     )  # fmt: skip
 
 

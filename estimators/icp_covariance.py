@@ -19,13 +19,12 @@ import math
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from estimators.icp import LEAST_INFORMATION, PreparedScan, Registration, prepare, register
+from sim.arrays import Array, Ints
 from sim.compiled import njit
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 Scans = Literal["both", "last"]
 Matches = Literal["held", "sliding"]
 
@@ -33,10 +32,17 @@ UNKNOWN_M, UNKNOWN_RAD = 10.0, math.pi  # standard deviations of a direction nob
 
 
 @njit(error_model="numpy")
+def _add_outer(matrix: Array, weight: float, v: tuple[float, float, float]) -> None:
+    """Add weight v v^T to a matrix (3, 3)."""
+    for a in range(3):
+        for b in range(3):
+            matrix[a, b] += weight * v[a] * v[b]
+
+
+@njit(error_model="numpy")
 def _censi(
-    points: Array, rays: Array, pose: Array, to_lines: bool, sliding: bool, matches: Indices,
-    weights: Array, residuals: Array, lines: Array, line_information: Array,
-    line_of_target: Indices, target_points: Array, target_rays: Array,
+    source: PreparedScan, target: PreparedScan, pose: Array, to_lines: bool, sliding: bool,
+    matches: Ints, weights: Array, residuals: Array,
 ) -> tuple[Array, Array, Array]:  # fmt: skip
     """Derivatives of the gradient of half the cost.
 
@@ -45,16 +51,17 @@ def _censi(
     """
     A, by_source, by_target = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
+    lines, information = target.lines, target.line_information
     # the source's points of one line (or target point) share its noise: sum before squaring
-    shared = np.zeros((len(lines) if to_lines else len(target_points), 6))
-    for i in range(len(points)):
+    shared = np.zeros((len(lines) if to_lines else len(target.points), 6))
+    for i in range(len(source.points)):
         w, j = weights[i], matches[i]
         if not w > 0.0:
             continue
-        qx = cos * points[i, 0] - sin * points[i, 1]
-        qy = sin * points[i, 0] + cos * points[i, 1]
-        vx = cos * rays[i, 0] - sin * rays[i, 1]
-        vy = sin * rays[i, 0] + cos * rays[i, 1]
+        qx = cos * source.points[i, 0] - sin * source.points[i, 1]
+        qy = sin * source.points[i, 0] + cos * source.points[i, 1]
+        vx = cos * source.rays[i, 0] - sin * source.rays[i, 1]
+        vy = sin * source.rays[i, 0] + cos * source.rays[i, 1]
         x, y = qx + pose[0], qy + pose[1]
         if to_lines:
             e = residuals[i]
@@ -63,9 +70,7 @@ def _censi(
             lever, turned = n2 * qx - n1 * qy, n1 * qx + n2 * qy
             J = (n1, n2, lever)
             A[2, 2] -= w * e * turned
-            for a in range(3):
-                for b in range(3):
-                    A[a, b] += w * J[a] * J[b]
+            _add_outer(A, w, J)
             facing = n1 * vx + n2 * vy
             slide = w * e * (n2 * vx - n1 * vy)
             column = (w * facing * n1, w * facing * n2, w * facing * lever + slide)
@@ -77,7 +82,7 @@ def _censi(
                 shared[j, 2 * a] += w * (J[a] * e1 + e * T[a] * t1 / size)
                 shared[j, 2 * a + 1] += w * (J[a] * e2 + e * T[a] * t2 / size)
         elif sliding:
-            line = line_of_target[j]
+            line = target.line_of_point[j]
             if line < 0:
                 continue
             size = math.hypot(lines[line, 0], lines[line, 1])
@@ -85,40 +90,36 @@ def _censi(
             J = (n1, n2, n2 * qx - n1 * qy)
             facing = n1 * vx + n2 * vy
             column = (w * facing * J[0], w * facing * J[1], w * facing * J[2])
-            facing = n1 * target_rays[j, 0] + n2 * target_rays[j, 1]
+            facing = n1 * target.rays[j, 0] + n2 * target.rays[j, 1]
             for a in range(3):
                 shared[j, a] -= w * facing * J[a]
-                for b in range(3):
-                    A[a, b] += w * J[a] * J[b]
+            _add_outer(A, w, J)
         else:
-            ex, ey = x - target_points[j, 0], y - target_points[j, 1]
+            ex, ey = x - target.points[j, 0], y - target.points[j, 1]
             A[0, 0] += w
             A[1, 1] += w
             A[0, 2] -= w * qy
             A[1, 2] += w * qx
             A[2, 2] += w * (qx * qx + qy * qy - ex * qx - ey * qy)
             column = (w * vx, w * vy, w * (qx * vy - qy * vx + ey * vx - ex * vy))
-            u, v = target_rays[j, 0], target_rays[j, 1]
+            u, v = target.rays[j, 0], target.rays[j, 1]
             shared[j, 0] -= w * u
             shared[j, 1] -= w * v
             shared[j, 2] -= w * (qx * v - qy * u)
-        for a in range(3):
-            for b in range(3):
-                by_source[a, b] += column[a] * column[b]
+        _add_outer(by_source, 1.0, column)
     if not to_lines and not sliding:
         A[2, 0], A[2, 1] = A[0, 2], A[1, 2]
     for j in range(len(shared)):
+        if not to_lines:
+            _add_outer(by_target, 1.0, (shared[j, 0], shared[j, 1], shared[j, 2]))
+            continue
+        s11, s12, s22 = information[j, 0], information[j, 1], information[j, 2]
         for a in range(3):
             for b in range(3):
-                if to_lines:
-                    s11, s12 = line_information[j, 0], line_information[j, 1]
-                    s22 = line_information[j, 2]
-                    a1, a2 = shared[j, 2 * a], shared[j, 2 * a + 1]
-                    b1, b2 = shared[j, 2 * b], shared[j, 2 * b + 1]
-                    form = s22 * a1 * b1 - s12 * (a1 * b2 + a2 * b1) + s11 * a2 * b2
-                    by_target[a, b] += form / (s11 * s22 - s12 * s12)
-                else:
-                    by_target[a, b] += shared[j, a] * shared[j, b]
+                a1, a2 = shared[j, 2 * a], shared[j, 2 * a + 1]
+                b1, b2 = shared[j, 2 * b], shared[j, 2 * b + 1]
+                form = s22 * a1 * b1 - s12 * (a1 * b2 + a2 * b1) + s11 * a2 * b2
+                by_target[a, b] += form / (s11 * s22 - s12 * s12)
     return A, by_source, by_target
 
 
@@ -150,9 +151,8 @@ def censi(
         return _unknown()
     to_lines = registration.metric == "point_to_line"
     A, by_source, by_target = _censi(
-        source.points, source.rays, registration.T_target_source, to_lines, matches == "sliding",
-        registration.matches, registration.weights, registration.residuals_m, target.lines,
-        target.line_information, target.line_of_point, target.points, target.rays,
+        source, target, registration.T_target_source, to_lines, matches == "sliding",
+        registration.matches, registration.weights, registration.residuals_m,
     )  # fmt: skip
     noise = source.noise_m if sigma_range_m is None else sigma_range_m
     middle = noise**2 * by_source
@@ -280,8 +280,7 @@ def _widened(covariance: Array, registration: Registration) -> Array:
     if registration.status != "degenerate":
         return covariance
     loose = split_directions(registration)[1]
-    widened: Array = covariance + loose @ loose.T
-    return widened
+    return covariance + loose @ loose.T
 
 
 def _unknown() -> Array:

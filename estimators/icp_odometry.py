@@ -11,24 +11,20 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimators.base import Belief, Prior
-from estimators.gaussian import STILL, Gaussian, wheel_motion
+from estimators.gaussian import STILL, Gaussian
 from estimators.icp import Metric, PreparedScan, Search
-from estimators.options import require_positive
+from estimators.options import require_choices, require_laser, require_non_negative, start_pose
 from estimators.scan_matching import (
     FAILED,
     Covariance,
     ScanMatcher,
-    tracking_start,
 )
+from estimators.wheels import WheelPrediction
 from sim import se2
-from sim.errors import InputError
 from sim.recording import Frame
-from sim.robot import TravelWindow, wheel_variances
 
-Array = NDArray[np.float64]
 Reference = Literal["previous", "keyframe"]
 
 _HEADING_WINDOW_RAD = math.pi / 6.0  # constant velocity misses the turns: search the headings
@@ -93,47 +89,39 @@ class IcpOdometry:
         window_s: float = 0.05,
     ) -> None:
         self._matcher = ScanMatcher(metric, search, covariance, sigma_range_m)
-        if reference not in ("previous", "keyframe"):
-            raise InputError(f"estimator.reference must be previous or keyframe, got {reference!r}")
-        require_positive(
-            keyframe_distance_m=keyframe_distance_m,
-            keyframe_turn_rad=keyframe_turn_rad,
-            kr=kr,
-            kl=kl,
-            window_s=window_s,
+        self.wheels = WheelPrediction(kr, kl, window_s)
+        require_choices(reference=(reference, Reference))
+        require_non_negative(
+            keyframe_distance_m=keyframe_distance_m, keyframe_turn_rad=keyframe_turn_rad
         )
         self.reference, self.use_odometry_guess = reference, use_odometry_guess
         self.keyframe_distance_m, self.keyframe_turn_rad = keyframe_distance_m, keyframe_turn_rad
-        self.kr, self.kl, self.window_s = kr, kl, window_s
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Start from the prior's pose; the first scan becomes the reference."""
-        start, self._laser = tracking_start(prior, "icp_odometry")
-        self._rng = rng
-        self._track_m = prior.robot.track_m
-        self._window = TravelWindow(self.window_s)
-        self._key = self._last = _Anchor(start, None)
+        self._laser, self._rng = require_laser(prior, "icp_odometry"), rng
+        self._key = self._last = _Anchor(start_pose(prior, "icp_odometry"), None)
         self._key_to_last = STILL
         self._lost = False
-        self._wheels = STILL  # motion since the last scan, by the wheels
-        self._since_s = 0.0
+        self.wheels.reset(prior.robot.track_m)
+        self._rolled, self._since_s = STILL, 0.0  # since the last scan, by the wheels
         self._velocity = np.zeros(3)  # twist between the last two scans, per second
 
     def step(self, frame: Frame) -> Belief:
         """Register the Frame's scan, if it has one, and compose."""
         self._since_s += frame.duration_s
         if self.use_odometry_guess:
-            self._roll(frame)
+            self._rolled = self._rolled.then(self.wheels.predict(frame))
         if frame.ranges_m is None:
-            return _belief(self._last.belief.then(self._wheels), {})
+            return _belief(self._last.belief.then(self._rolled), {})
         scan = self._matcher.prepare(frame.ranges_m, self._laser)
         guess = self._guess()
         belief = self._last.belief.then(guess)
-        if len(scan) < 3:
+        if scan is None:
             return _belief(belief, {"registration_status": "empty", "status": "empty"})
         if self._last.scan is None:
-            self._key = self._last = _Anchor(self._last.belief.then(self._wheels), scan)
-            self._wheels, self._since_s = STILL, 0.0
+            self._key = self._last = _Anchor(self._last.belief.then(self._rolled), scan)
+            self._rolled, self._since_s = STILL, 0.0
             return _belief(self._last.belief, {"registration_status": "first"})
         extras: dict[str, Any] = {}
         references = [(self._key, self._key_to_last)]
@@ -160,20 +148,13 @@ class IcpOdometry:
         if (failed and self._lost) or (not failed and self._left_key()):
             self._key, self._key_to_last = self._last, STILL
         self._lost = failed
-        self._wheels, self._since_s = STILL, 0.0
+        self._rolled, self._since_s = STILL, 0.0
         return _belief(belief, extras)
-
-    def _roll(self, frame: Frame) -> None:
-        """Add the Frame's wheel increments to the motion since the last scan."""
-        travel = frame.wheel_increments_m
-        spread_m = self._window.push(frame.duration_s, travel)
-        variances = wheel_variances(spread_m, self.kr, self.kl)
-        self._wheels = self._wheels.then(wheel_motion(travel, variances, self._track_m)[0])
 
     def _guess(self) -> Gaussian:
         """Motion since the last scan, before this one is looked at."""
         if self.use_odometry_guess:
-            return self._wheels
+            return self._rolled
         motion = se2.exp(self._velocity * self._since_s)
         spread_m = _GUESS_FLOOR_M + _GUESS_SHARE * math.hypot(motion[0], motion[1])
         spread_rad = _GUESS_FLOOR_RAD + _GUESS_SHARE * abs(float(motion[2]))

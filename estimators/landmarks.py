@@ -23,10 +23,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from sim.arrays import Array, Ints
 from sim.compiled import njit
 
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 Maps = Literal["shared", "contiguous"]
 
 LANES = 16  # the least trip count that LLVM vectorises behind a check for overlap

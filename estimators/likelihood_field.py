@@ -18,13 +18,11 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from sim import se2
+from sim.arrays import Array, Floats, Ints
 from sim.compiled import njit
 from sim.errors import InputError
 from sim.sensors import Laser
 from sim.world import World
-
-Array = NDArray[np.float64]
-Floats = NDArray[np.float32]
 
 _MOST = 65535  # of a table entry
 _CLEARANCE_M = 0.15  # where a robot's centre can be
@@ -54,7 +52,7 @@ class LikelihoodField:
     origin_m: Array
     cell_m: float
     step: float
-    free_cells: NDArray[np.int64]
+    free_cells: Ints
 
     def draw(self, n: int, rng: np.random.Generator) -> Array:
         """Poses (n, 3), uniform over the free floor and all headings."""
@@ -62,8 +60,7 @@ class LikelihoodField:
             raise InputError("the map has no floor off its walls to put particles on")
         cells = self.free_cells[rng.integers(len(self.free_cells), size=n)]
         places: Array = self.origin_m + (cells[:, ::-1] + rng.random((n, 2))) * self.cell_m
-        poses: Array = np.column_stack([places, rng.uniform(-math.pi, math.pi, n)])
-        return poses
+        return np.column_stack([places, rng.uniform(-math.pi, math.pi, n)])
 
     def log_likelihood(self, poses: Array, ends: Floats) -> Array:
         """Log likelihood (M,) of a scan at poses (M, 3), relative to all beams ending at walls.
@@ -79,8 +76,7 @@ class LikelihoodField:
             np.ascontiguousarray(poses), ends, self.table.ravel(), rows, columns,
             self.origin_m, self.cell_m, counts,
         )  # fmt: skip
-        log_likelihood: Array = -self.step * counts.astype(np.float64)
-        return log_likelihood
+        return -self.step * counts.astype(np.float64)
 
 
 def likelihood_field(
@@ -131,7 +127,7 @@ def likelihood_field(
     return LikelihoodField(table, origin, cell_m, step, _free_cells(distances, margin))
 
 
-def _free_cells(distances_m: Array, margin: int) -> NDArray[np.int64]:
+def _free_cells(distances_m: Array, margin: int) -> Ints:
     """Cells (F, 2) of the largest connected floor off the walls, within the walls' rectangle."""
     inner = distances_m[margin:-margin, margin:-margin] > _CLEARANCE_M
     labels, count = ndimage.label(inner)
@@ -189,7 +185,7 @@ def _look_up(
     columns: int,
     origin: Array,
     cell_m: float,
-    counts: NDArray[np.int64],
+    counts: Ints,
 ) -> None:
     """Sum the table over the beam ends (2, B), for every pose (M, 3).
 

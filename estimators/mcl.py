@@ -1,8 +1,8 @@
 """Monte Carlo localization in a known map by a laser (the starting point of maximo2024, sec. 2.1).
 
-Particles roll by the wheels, are weighted by a likelihood field, and are drawn anew. Their number
-follows the spread of the belief (KLD sampling), and when scans fit worse than they did for long,
-particles are strewn over the floor again (augmented MCL), by the scan itself (sensor resetting).
+Particles roll by the wheels, are weighted by a likelihood field, and are resampled. Their number
+follows the spread of the belief (KLD sampling). When scans fit worse than their long-term average,
+particles are injected over all the floor (augmented MCL), drawn by the scan (sensor resetting).
 """
 
 from __future__ import annotations
@@ -11,27 +11,31 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimators.base import Belief, Prior
-from estimators.gaussian import STILL, Gaussian, wheel_motion
+from estimators.gaussian import STILL, Gaussian, root
 from estimators.likelihood_field import beam_ends, likelihood_field
+from estimators.options import (
+    require_choices,
+    require_counts,
+    require_laser,
+    require_non_negative,
+    require_positive,
+)
 from estimators.particles import (
-    SCHEMES,
     Scheme,
     effective_sample_size,
     normalize,
     resample,
     underflowed,
 )
+from estimators.wheels import WheelPrediction
 from sim import se2
+from sim.arrays import Array, Floats, Ints
 from sim.compiled import njit
 from sim.errors import InputError
 from sim.recording import Frame
-from sim.robot import TravelWindow, wheel_variances
 from sim.world import World
-
-Array = NDArray[np.float64]
 
 _BISECTIONS = 12
 _FARTHEST_M, _FARTHEST_RAD = 1.0, 0.5  # of what belongs to one hypothesis
@@ -58,7 +62,7 @@ class Mcl:
         A scan counts for less when it would leave less than this share of the particles; below
         `ess_share`.
     tries
-        Poses that are tried on the floor for each particle strewn there, by the scan.
+        Poses tried on the floor for each particle injected there by the scan.
     sigma_m, z_hit, z_rand, cell_m
         The likelihood field, see `estimators.likelihood_field`.
     update_distance_m, update_turn_rad
@@ -70,10 +74,9 @@ class Mcl:
     alpha_slow, alpha_fast
         Rates of the long and the short average of a beam's likelihood; 0 for no recovery.
     recovery_ratio
-        Particles are strewn when the short average falls below this share of the long one.
+        Particles are injected when the short average falls below this share of the long one.
     kr, kl
-        Believed slip variance per metre of the wheels, m; `amcl_alphas` tells what that is to
-        AMCL.
+        Believed slip variance per metre of the wheels, m; `amcl_alphas` converts them for AMCL.
     window_s
         |ds| is netted over at least this time.
 
@@ -83,15 +86,15 @@ class Mcl:
     belief to twice its error or more. A tracker that knows its error wants beam_power=1,
     least_ess=0, sigma_m of 0.05 to 0.1, and no jitter; it is consistent then.
 
-    Without a start pose the particles are drawn by the first scan, and later ones are strewn by
-    the scan of the time: along a corridor, where long beams leave no play to the heading, a
-    uniform draw would leave none near the truth.
+    Without a start pose the particles are drawn by the first scan, and later ones are injected by
+    the current one: along a corridor, where long beams fix the heading closely, a uniform draw
+    would leave none near the truth.
 
     The mean is that of the hypothesis (particles within 1 m and 0.5 rad) of greatest weight; the
-    covariance is that of all particles about it, so it tells when there are others. Extras, of
+    covariance is that of all particles about it, so it shows whether there are others. Extras, of
     the last scan used: `particles` (M, 3), `log_weights` (M,), `ess`, `hypothesis_weight`,
-    `fit`, the likelihood of a beam at the best particle, and `strewn`, the number of particles set
-    anew; `status` when a scan saw nothing.
+    `fit`, the likelihood of a beam at the best particle, and `injected`, the number of particles
+    injected; `status` when a scan saw nothing.
     """
 
     needs = frozenset({"laser", "map"})
@@ -126,53 +129,35 @@ class Mcl:
         kl: float = 1e-4,
         window_s: float = 0.05,
     ) -> None:
-        for name, whole in {
-            "n_least": n_least,
-            "n_most": n_most,
-            "n_beams": n_beams,
-            "tries": tries,
-        }.items():
-            if isinstance(whole, bool) or not isinstance(whole, int) or whole < 1:
-                raise InputError(
-                    f"estimator.{name} must be a whole number from 1 on, got {whole!r}"
-                )
+        self.wheels = WheelPrediction(kr, kl, window_s)
+        require_counts(n_least=n_least, n_most=n_most, n_beams=n_beams, tries=tries)
+        require_choices(resampling=(resampling, Scheme))
+        require_positive(
+            kld_error=kld_error,
+            bin_m=bin_m,
+            bin_rad=bin_rad,
+            beam_power=beam_power,
+            sigma_m=sigma_m,
+            z_hit=z_hit,
+            z_rand=z_rand,
+            cell_m=cell_m,
+        )
+        require_non_negative(
+            kld_quantile=kld_quantile,
+            least_ess=least_ess,
+            update_distance_m=update_distance_m,
+            update_turn_rad=update_turn_rad,
+            ess_share=ess_share,
+            jitter_m=jitter_m,
+            jitter_rad=jitter_rad,
+            alpha_slow=alpha_slow,
+            alpha_fast=alpha_fast,
+            recovery_ratio=recovery_ratio,
+        )
         if n_least > n_most:
             raise InputError(f"estimator.n_least={n_least} is above n_most={n_most}")
         if least_ess >= ess_share:
             raise InputError(f"estimator.least_ess={least_ess} is not below ess_share={ess_share}")
-        if resampling not in SCHEMES:
-            raise InputError(
-                f"estimator.resampling must be {' or '.join(SCHEMES)}, got {resampling!r}"
-            )
-        positive = {
-            "kld_error": kld_error,
-            "bin_m": bin_m,
-            "bin_rad": bin_rad,
-            "beam_power": beam_power,
-            "sigma_m": sigma_m,
-            "z_hit": z_hit,
-            "z_rand": z_rand,
-            "cell_m": cell_m,
-        }
-        others = {
-            "kld_quantile": kld_quantile,
-            "least_ess": least_ess,
-            "update_distance_m": update_distance_m,
-            "update_turn_rad": update_turn_rad,
-            "ess_share": ess_share,
-            "jitter_m": jitter_m,
-            "jitter_rad": jitter_rad,
-            "alpha_slow": alpha_slow,
-            "alpha_fast": alpha_fast,
-            "recovery_ratio": recovery_ratio,
-            "kr": kr,
-            "kl": kl,
-            "window_s": window_s,
-        }
-        for name, number in {**positive, **others}.items():
-            if not (math.isfinite(number) and number >= 0.0) or (name in positive and number == 0):
-                kind = "positive" if name in positive else "zero or positive"
-                raise InputError(f"estimator.{name} must be {kind}, got {number}")
         self.n_least, self.n_most, self.n_beams = n_least, n_most, n_beams
         self.kld_error, self.kld_quantile = kld_error, kld_quantile
         self.bin_m, self.bin_rad, self.beam_power = bin_m, bin_rad, beam_power
@@ -183,15 +168,13 @@ class Mcl:
         self.jitter_m, self.jitter_rad = jitter_m, jitter_rad
         self.alpha_slow, self.alpha_fast = alpha_slow, alpha_fast
         self.recovery_ratio = recovery_ratio
-        self.kr, self.kl, self.window_s = kr, kl, window_s
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Draw particles from the prior's pose, or from all the floor if there is none."""
-        if prior.sensors.laser is None:
-            raise InputError("mcl needs a laser; choose sensors that have one")
+        self._laser, self._rng = require_laser(prior, "mcl"), rng
         if not isinstance(prior.map, World):
             raise InputError("mcl needs a map of walls; set prior.map=world")
-        self._laser, self._rng, self._track_m = prior.sensors.laser, rng, prior.robot.track_m
+        self.wheels.reset(prior.robot.track_m)
         self._field = likelihood_field(
             prior.map,
             self._laser,
@@ -204,12 +187,10 @@ class Mcl:
         if prior.mean is None or prior.covariance is None:
             self._poses = self._field.draw(self.n_most, rng)
         else:
-            values, vectors = np.linalg.eigh(prior.covariance)
-            root = vectors * np.sqrt(np.maximum(values, 0.0))
-            self._poses = prior.mean + rng.standard_normal((self.n_most, 3)) @ root.T
+            normals = rng.standard_normal((self.n_most, 3))
+            self._poses = prior.mean + normals @ root(prior.covariance).T
             self._poses[:, 2] = se2.wrap(self._poses[:, 2])
         self._log_weights = np.zeros(len(self._poses))
-        self._window = TravelWindow(self.window_s)
         self._motion = STILL  # since the last scan used
         # A beam errs along itself by the laser's noise, and by half a cell either way
         variance = self._laser.sigma_range_m**2 + self.cell_m**2 / 6.0
@@ -219,11 +200,8 @@ class Mcl:
         self._belief = self._summed_up()
 
     def step(self, frame: Frame) -> Belief:
-        """Roll by the wheels; with a scan from a new place, weigh and draw."""
-        travel = frame.wheel_increments_m
-        spread_m = self._window.push(frame.duration_s, travel)
-        variances = wheel_variances(spread_m, self.kr, self.kl)
-        self._motion = self._motion.then(wheel_motion(travel, variances, self._track_m)[0])
+        """Roll by the wheels; with a scan from a new place, weight and resample."""
+        self._motion = self._motion.then(self.wheels.predict(frame))
         extras: dict[str, Any] = {}
         if frame.ranges_m is not None and self._is_due():
             ends = beam_ends(frame.ranges_m, self._laser, self.n_beams)
@@ -246,23 +224,21 @@ class Mcl:
 
     def _move(self) -> None:
         """Draw the motion since the last scan used, for each particle."""
-        values, vectors = np.linalg.eigh(self._motion.covariance)
-        root = vectors * np.sqrt(np.maximum(values, 0.0))
         normals = self._rng.standard_normal(self._poses.shape)
         self._poses = self._poses.copy()  # the last Belief keeps its own
-        _move(self._poses, self._motion.mean, root, normals)
+        _move(self._poses, self._motion.mean, root(self._motion.covariance), normals)
         self._motion = STILL
 
-    def _weigh(self, ends: NDArray[np.float32]) -> None:
-        """Weigh by one scan, sum up the belief, and draw anew if that is due."""
+    def _weigh(self, ends: Floats) -> None:
+        """Weight by one scan, sum up the belief, and resample if that is due."""
         if self._everywhere:
-            self._poses, self._everywhere = self._strewn(self.n_most, ends), False
+            self._poses, self._everywhere = self._drawn_by_scan(self.n_most, ends), False
             self._belief = self._summed_up()
             return
         of_scan = self._field.log_likelihood(self._poses, ends)
         self._log_weights = self._weighed(of_scan)
         self._belief = self._summed_up()
-        share = self._strewn_share(of_scan, ends.shape[1])
+        share = self._injected_share(of_scan, ends.shape[1])
         poor = self._extras["ess"] < self.ess_share * len(self._poses)
         if poor or share > 0.0:
             self._draw(share, ends)
@@ -278,18 +254,15 @@ class Mcl:
         if effective_sample_size(weights) < least:
             for _ in range(_BISECTIONS):
                 middle = (low + high) / 2.0
-                weights = self._log_weights + middle * of_scan
-                if effective_sample_size(weights) < least:
-                    high = middle
-                else:
-                    low = middle
+                poor = effective_sample_size(self._log_weights + middle * of_scan) < least
+                low, high = (low, middle) if poor else (middle, high)
             weights = self._log_weights + low * of_scan
         if underflowed(weights):
             return np.zeros(len(weights))
         return weights - np.max(weights)
 
-    def _strewn_share(self, of_scan: Array, n_beams: int) -> float:
-        """Share of particles to strew: the short average of the fit against the long one.
+    def _injected_share(self, of_scan: Array, n_beams: int) -> float:
+        """Share of particles to inject: the short average of the fit against the long one.
 
         The fit is the geometric mean likelihood of a beam at the particle that fits best: the mean
         over the particles, as in augmented MCL, is poor for any belief that is still spread.
@@ -302,28 +275,28 @@ class Mcl:
         self._extras["fit"] = fit
         return max(0.0, 1.0 - self._fast / (self.recovery_ratio * self._slow))
 
-    def _strewn(self, n: int, ends: NDArray[np.float32]) -> Array:
+    def _drawn_by_scan(self, n: int, ends: Floats) -> Array:
         """Poses (n, 3) over all the floor, drawn by how well the scan fits there."""
         tries = self._field.draw(n * self.tries, self._rng)
         log_weights = self.beam_power * self._field.log_likelihood(tries, ends)
         return tries[resample(log_weights, n, self._rng, self.resampling)]
 
-    def _draw(self, strewn_share: float, ends: NDArray[np.float32]) -> None:
-        """Draw particles anew: as many as the bins they fall into call for."""
+    def _draw(self, injected_share: float, ends: Floats) -> None:
+        """Resample to as many particles as the bins they fall into call for, and inject others."""
         n, needed = 0, max(self.n_least, min(len(self._poses), self.n_most) // 4)
-        poses, n_strewn = self._poses, 0
+        poses, n_injected = self._poses, 0
         while n < needed:
             n = needed
-            n_strewn = int(self._rng.binomial(n, strewn_share))
-            drawn = resample(self._log_weights, n - n_strewn, self._rng, self.resampling)
+            n_injected = int(self._rng.binomial(n, injected_share))
+            drawn = resample(self._log_weights, n - n_injected, self._rng, self.resampling)
             poses = self._poses[drawn]
-            if n_strewn > 0:
-                poses = np.concatenate([poses, self._strewn(n_strewn, ends)])
+            if n_injected > 0:
+                poses = np.concatenate([poses, self._drawn_by_scan(n_injected, ends)])
             needed = min(max(self._kld_number(poses), self.n_least), self.n_most)
         jitter = self._rng.standard_normal(poses.shape)
         self._poses = poses + jitter * [self.jitter_m, self.jitter_m, self.jitter_rad]
         self._log_weights = np.zeros(n)
-        self._extras["strewn"] = n_strewn
+        self._extras["injected"] = n_injected
 
     def _kld_number(self, poses: Array) -> int:
         """Particles that the number of bins in use calls for (Fox 2003)."""
@@ -334,7 +307,7 @@ class Mcl:
         cube = (1.0 - a + math.sqrt(a) * self.kld_quantile) ** 3
         return math.ceil((k - 1) / (2.0 * self.kld_error) * cube)
 
-    def _bins(self, poses: Array) -> NDArray[np.int64]:
+    def _bins(self, poses: Array) -> Ints:
         """Number of the bin (M,) of each pose; what lies off the map counts to its rim."""
         field = self._field
         shape = np.ceil(field.cell_m * np.array(field.table.shape[::-1]) / self.bin_m).astype(int)
@@ -343,7 +316,7 @@ class Mcl:
         n_headings = math.ceil(2.0 * math.pi / self.bin_rad)
         column = np.clip(x.astype(np.int64), 0, shape[0] - 1)
         row = np.clip(y.astype(np.int64), 0, shape[1] - 1)
-        bins: NDArray[np.int64] = (row * shape[0] + column) * n_headings + heading % n_headings
+        bins: Ints = (row * shape[0] + column) * n_headings + heading % n_headings
         return bins
 
     def _summed_up(self) -> Gaussian:
@@ -354,15 +327,13 @@ class Mcl:
         heaviest = bins == np.argmax(np.bincount(bins, weights))
         mean = weights[heaviest] @ poses[heaviest] / weights[heaviest].sum()
         for _ in range(2):
-            off = poses - mean
-            off[:, 2] = se2.wrap(off[:, 2])
+            off = _offsets(poses, mean)
             near = np.hypot(off[:, 0], off[:, 1]) < _FARTHEST_M
             near &= np.abs(off[:, 2]) < _FARTHEST_RAD
             held = float(weights[near].sum())
             if held > 0.0:
                 mean = mean + weights[near] @ off[near] / held
-        off = poses - mean
-        off[:, 2] = se2.wrap(off[:, 2])
+        off = _offsets(poses, mean)
         covariance = (off * weights[:, None]).T @ off
         mean[2] = se2.wrap(mean[2])
         self._extras = {
@@ -370,9 +341,16 @@ class Mcl:
             "log_weights": self._log_weights,
             "ess": effective_sample_size(self._log_weights),
             "hypothesis_weight": held,
-            "strewn": 0,
+            "injected": 0,
         }
         return Gaussian(mean, (covariance + covariance.T) / 2.0)
+
+
+def _offsets(poses: Array, mean: Array) -> Array:
+    """Poses (M, 3) less their mean (3,), headings wrapped."""
+    offsets = poses - mean
+    offsets[:, 2] = se2.wrap(offsets[:, 2])
+    return offsets
 
 
 def amcl_alphas(

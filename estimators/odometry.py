@@ -6,15 +6,16 @@ import math
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimators.base import Belief, Prior
+from estimators.gaussian import Gaussian
+from estimators.options import require_choices, start_pose
+from estimators.wheels import WheelPrediction
 from sim import se2
-from sim.errors import InputError
+from sim.arrays import Array
 from sim.recording import Frame
-from sim.robot import TravelWindow, arc_increment, arc_increment_jacobian, wheel_variances
+from sim.robot import arc_increment, arc_increment_jacobian
 
-Array = NDArray[np.float64]
 Integration = Literal["arc", "midpoint", "euler"]
 
 
@@ -38,34 +39,26 @@ class Odometry:
     def __init__(
         self, kr: float, kl: float, integration: Integration = "arc", window_s: float = 0.05
     ) -> None:
-        for name, value in (("kr", kr), ("kl", kl), ("window_s", window_s)):
-            if not (math.isfinite(value) and value >= 0.0):
-                raise InputError(f"estimator.{name} must be zero or positive, got {value}")
-        if integration not in ("arc", "midpoint", "euler"):
-            raise InputError(
-                f"estimator.integration must be arc, midpoint or euler, got {integration!r}"
-            )
-        self.kr, self.kl, self.integration, self.window_s = kr, kl, integration, window_s
+        require_choices(integration=(integration, Integration))
+        self.wheels, self.integration = WheelPrediction(kr, kl, window_s), integration
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Start from the prior's pose; dead reckoning cannot start without one."""
-        if prior.mean is None or prior.covariance is None:
-            raise InputError("odometry needs a start pose; set prior.start=tracking")
-        self._track_m = prior.robot.track_m
-        self._mean, self._covariance = prior.mean.copy(), prior.covariance.copy()
-        self._window = TravelWindow(self.window_s)
+        self._belief = start_pose(prior, "odometry")
+        self.wheels.reset(prior.robot.track_m)
 
     def step(self, frame: Frame) -> Belief:
         """Compose the Frame's arc and add its covariance."""
-        travel = frame.wheel_increments_m
-        spread_m = self._window.push(frame.duration_s, travel)
-        increment, by_wheels = relative_motion(travel, self._track_m, self.integration)
-        by_pose, by_increment = se2.compose_jacobians(self._mean, increment)
+        _, variances = self.wheels.slip(frame)
+        increment, by_wheels = relative_motion(
+            frame.wheel_increments_m, self.wheels.track_m, self.integration
+        )
+        mean, covariance = self._belief.mean, self._belief.covariance
+        H, by_increment = se2.compose_jacobians(mean, increment)
         G = by_increment @ by_wheels
-        Q = G @ np.diag(wheel_variances(spread_m, self.kr, self.kl)) @ G.T
-        self._mean = se2.compose(self._mean, increment)
-        self._covariance = by_pose @ self._covariance @ by_pose.T + Q
-        return Belief(self._mean.copy(), self._covariance.copy())
+        covariance = H @ covariance @ H.T + G @ np.diag(variances) @ G.T
+        self._belief = Gaussian(se2.compose(mean, increment), covariance)
+        return Belief(self._belief.mean.copy(), covariance.copy())
 
 
 def relative_motion(

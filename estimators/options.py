@@ -1,22 +1,69 @@
-"""Checks of estimators' options; an error names the key and what it may be."""
+"""Checks of an estimator's options and of its Prior; an error names the key and the remedy."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable
+from typing import Any, get_args
 
+from estimators.base import Prior
+from estimators.gaussian import Gaussian
 from sim.errors import InputError
+from sim.sensors import Laser, StereoCamera
 
 
-def require_choices(choices: Mapping[str, tuple[str, tuple[str, ...]]]) -> None:
-    """Raise an InputError that names the first key whose value is not among those allowed."""
-    for name, (value, allowed) in choices.items():
-        if value not in allowed:
-            raise InputError(f"estimator.{name} must be {' or '.join(allowed)}, got {value!r}")
+def require_choices(owner: str = "estimator.", /, **choices: tuple[str, Any]) -> None:
+    """Each option is given as (value, Literal type): the value must be one of the type's."""
+    for name, (value, kind) in choices.items():
+        if value not in get_args(kind):
+            allowed = ", ".join(get_args(kind))
+            raise InputError(f"{owner}{name} must be one of {allowed}, got {value!r}")
 
 
-def require_positive(**numbers: float) -> None:
-    """Raise an InputError that names the first key whose number is negative or not finite."""
-    for name, number in numbers.items():
-        if not (math.isfinite(number) and number >= 0.0):
-            raise InputError(f"estimator.{name} must be zero or positive, got {number}")
+def require_non_negative(**options: float) -> None:
+    """Each option must be a finite number, zero or more."""
+    _require(options, "zero or a positive number", lambda number: number >= 0.0)
+
+
+def require_positive(**options: float) -> None:
+    """Each option must be a finite number above zero."""
+    _require(options, "a positive number", lambda number: number > 0.0)
+
+
+def require_shares(**options: float) -> None:
+    """Each option must lie in [0, 1]."""
+    _require(options, "a number in [0, 1]", lambda number: 0.0 <= number <= 1.0)
+
+
+def require_counts(**options: int) -> None:
+    """Each option must be a whole number, one or more."""
+    for name, count in options.items():
+        if isinstance(count, bool) or not isinstance(count, int) or count < 1:
+            raise InputError(f"estimator.{name} must be a whole number, at least 1, got {count!r}")
+
+
+def _require(options: dict[str, float], wanted: str, holds: Callable[[float], bool]) -> None:
+    for name, number in options.items():
+        if not isinstance(number, int | float) or not (math.isfinite(number) and holds(number)):
+            raise InputError(f"estimator.{name} must be {wanted}, got {number}")
+
+
+def start_pose(prior: Prior, estimator: str) -> Gaussian:
+    """Copy of the prior's pose in map, without which this estimator cannot start."""
+    if prior.mean is None or prior.covariance is None:
+        raise InputError(f"{estimator} needs a start pose; set prior.start=tracking")
+    return Gaussian(prior.mean.copy(), prior.covariance.copy())
+
+
+def require_laser(prior: Prior, estimator: str) -> Laser:
+    """Return the prior's laser, without which this estimator cannot start."""
+    if prior.sensors.laser is None:
+        raise InputError(f"{estimator} needs a laser; choose sensors that have one")
+    return prior.sensors.laser
+
+
+def require_stereo(prior: Prior, estimator: str) -> StereoCamera:
+    """Return the prior's stereo camera, without which this estimator cannot start."""
+    if prior.sensors.stereo is None:
+        raise InputError(f"{estimator} needs a stereo camera; choose sensors that have one")
+    return prior.sensors.stereo

@@ -10,11 +10,11 @@ from collections.abc import Iterator
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from sim.arrays import Array, Ints
 from sim.errors import InputError
 
-Array = NDArray[np.float64]
 Scheme = Literal["systematic", "stratified", "residual", "multinomial"]
 SCHEMES: tuple[Scheme, ...] = ("systematic", "stratified", "residual", "multinomial")
 
@@ -47,7 +47,7 @@ def effective_sample_size(log_weights: ArrayLike) -> float:
 
 def resample(
     log_weights: ArrayLike, n: int, rng: np.random.Generator, scheme: Scheme = "systematic"
-) -> NDArray[np.int64]:
+) -> Ints:
     """Indices (n,), ascending, of particles drawn with replacement by their weights.
 
     Every scheme is unbiased: particle i appears n w_i times in the mean.
@@ -85,7 +85,7 @@ def resample(
     raise InputError(f"resampling scheme must be one of {', '.join(SCHEMES)}, got {scheme!r}")
 
 
-def in_place(indices: NDArray[np.int64], n_particles: int) -> NDArray[np.int64]:
+def in_place(indices: Ints, n_particles: int) -> Ints:
     """The same particles in an order that moves few of them: survivors keep their own slot.
 
     Parameters
@@ -122,7 +122,7 @@ class Lineages:
 
     def __init__(self, n_particles: int) -> None:
         self._poses: list[Array] = []
-        self._parents: list[NDArray[np.int64]] = []  # row of the step before, of each row
+        self._parents: list[Ints] = []  # row of the step before, of each row
         self._rows = np.arange(n_particles)  # each particle's row of the last step
         self._n_pruned = 0
 
@@ -142,11 +142,11 @@ class Lineages:
         if len(self._poses) % self._PRUNE_EVERY == 0:
             self._prune()
 
-    def resample(self, ancestors: NDArray[np.int64]) -> None:
+    def resample(self, ancestors: Ints) -> None:
         """Let particle m descend from particle `ancestors[m]` of the last step, (M,)."""
         self._rows = self._rows[ancestors]
 
-    def paths(self) -> Iterator[tuple[Array, NDArray[np.int64]]]:
+    def paths(self) -> Iterator[tuple[Array, Ints]]:
         """Step by step, backward: poses (R, 3) of the distinct ancestors, and rows (M,)."""
         rows = self._rows
         for poses, parents in zip(reversed(self._poses), reversed(self._parents), strict=True):
@@ -164,9 +164,9 @@ class Lineages:
         self._n_pruned = len(self._poses)
 
 
-def _at(weights: Array, quantiles: Array) -> NDArray[np.int64]:
+def _at(weights: Array, quantiles: Array) -> Ints:
     """Particles at quantiles in [0, 1) of the cumulated weights; never one of zero weight."""
     cumulated = np.cumsum(weights)
     drawn = np.searchsorted(cumulated, quantiles * cumulated[-1], side="right")
-    indices: NDArray[np.int64] = np.minimum(drawn, np.flatnonzero(weights)[-1])
+    indices: Ints = np.minimum(drawn, np.flatnonzero(weights)[-1])
     return indices

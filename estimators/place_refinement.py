@@ -9,16 +9,15 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from estimators.gaussian import rotated
 from estimators.icp import PreparedScan, Registration, prepare, register
 from estimators.icp_covariance import censi
 from estimators.topological_map import TopologicalMap, level_slice
 from sim import se2
+from sim.arrays import Array, Floats
 from sim.errors import InputError
 from sim.sensors import Lidar3D
-
-Array = NDArray[np.float64]
 
 _TURNS = 3  # headings tried, the best of the correlation
 _HEADING_WINDOW_RAD = 0.15
@@ -53,9 +52,7 @@ class Refiner:
         self._reach_m = 2.0 * max(known_map.spacing_m, 1.0)
         self._prepared: dict[int, PreparedScan] = {}
 
-    def refine(
-        self, cloud_ranges_m: NDArray[np.float32], node: int, others: list[int]
-    ) -> Refinement:
+    def refine(self, cloud_ranges_m: Floats, node: int, others: list[int]) -> Refinement:
         """Register a cloud (rings, azimuths) with a node, or if that fails with other nodes."""
         ranges = level_slice(self._lidar, cloud_ranges_m)
         source = prepare(ranges, self._bearings, self._lidar.max_range_m)
@@ -75,7 +72,7 @@ class Refiner:
         return self._posed(best, source, best_node)
 
     def _registered(
-        self, source: PreparedScan, ranges_m: NDArray[np.float32], node: int
+        self, source: PreparedScan, ranges_m: Floats, node: int
     ) -> tuple[Registration | None, str]:
         """Best registration with a node over the likely turns, or None and why."""
         target_m = self._map.slices_m[node]
@@ -109,8 +106,7 @@ class Refiner:
         at_node = np.append(self._map.positions_m[node], self._map.headings_rad[node])
         T_map_lidar = se2.compose(at_node, motion)
         sensor = se2.compose(at_node, mount)
-        turn = _rotation(sensor[2])
-        R = turn @ censi(found, source, self._prepared[node]) @ turn.T
+        R = rotated(censi(found, source, self._prepared[node]), float(sensor[2]))
         back = se2.inverse(mount)
         by_lidar = se2.compose_jacobians(T_map_lidar, back)[0]
         covariance = by_lidar @ R @ by_lidar.T
@@ -119,9 +115,7 @@ class Refiner:
         return Refinement(pose, (covariance + covariance.T) / 2.0, "ok")
 
 
-def likely_turns_rad(
-    source_m: NDArray[np.float32], target_m: NDArray[np.float32], n_turns: int = _TURNS
-) -> list[float]:
+def likely_turns_rad(source_m: Floats, target_m: Floats, n_turns: int = _TURNS) -> list[float]:
     """Headings of the source in the target's frame at which their outlines are most alike.
 
     Peaks of the circular correlation of inverse ranges (A,), which count near walls most and
@@ -146,8 +140,3 @@ def likely_turns_rad(
         if len(chosen) == n_turns:
             break
     return chosen
-
-
-def _rotation(angle_rad: float) -> Array:
-    cos, sin = math.cos(angle_rad), math.sin(angle_rad)
-    return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])

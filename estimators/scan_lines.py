@@ -11,17 +11,14 @@ at range 1 / (m.v), so 1 / range is linear in m, and every line that a sensor ca
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from sim.arrays import Array, Ints
 from sim.compiled import njit
 from sim.errors import InputError
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
-_Prepared = tuple[Array, Array, Array, Indices, Indices, Array, Array, Indices, Array, float]
 
 _NOISE_FLOOR_M = 0.002  # quantised ranges can look free of noise
 _MIN_LINE_POINTS = 3
@@ -31,8 +28,7 @@ _MERGE_GATE = 13.8  # chi-squared, 2 degrees of freedom, 99.9 %
 _SMOOTH_JOINT_RAD = 0.45  # neighbours that meet at less may be chords of one curve
 
 
-@dataclass(frozen=True)
-class PreparedScan:
+class PreparedScan(NamedTuple):
     """What registration needs of a scan; K of its N beams saw something.
 
     Attributes
@@ -65,18 +61,14 @@ class PreparedScan:
     ranges_m: Array
     rays: Array
     points: Array
-    beams: Indices
-    line_of_point: Indices
+    beams: Ints
+    line_of_point: Ints
     lines: Array
     line_information: Array
-    line_ends: Indices
+    line_ends: Ints
     segments: Array
     noise_m: float
     full_circle: bool
-
-    def __len__(self) -> int:
-        """K."""
-        return len(self.ranges_m)
 
 
 def prepare(
@@ -105,11 +97,11 @@ def prepare(
         if not steps.min() > 0.0:
             raise InputError("the bearings of a scan must rise from beam to beam; flip the scan")
         full = bool(bearings[-1] - bearings[0] + 1.5 * steps[0] > 2.0 * math.pi)
-    return PreparedScan(bearings, *_prepare(ranges, bearings, float(max_range_m)), full)
+    return _prepare(ranges, bearings, float(max_range_m), full)
 
 
 @njit(error_model="numpy", fastmath={"contract"})
-def select(keys: Array, order: Indices, low: int, high: int, rank: int) -> float:
+def select(keys: Array, order: Ints, low: int, high: int, rank: int) -> float:
     """Reorder order[low:high] so that keys[order] is at its place at `rank`, smaller before."""
     high -= 1
     while low < high:
@@ -135,7 +127,7 @@ def select(keys: Array, order: Indices, low: int, high: int, rank: int) -> float
 
 
 @njit(error_model="numpy", fastmath={"contract"})
-def _noise(ranges: Array, rays: Array, beams: Indices) -> float:
+def _noise(ranges: Array, rays: Array, beams: Ints) -> float:
     """Standard deviation of the ranges, from second differences of 1 / range.
 
     On a straight wall u[i-1] - 2 cos(step) u[i] + u[i+1] is zero for u = 1 / range.
@@ -157,14 +149,13 @@ def _noise(ranges: Array, rays: Array, beams: Indices) -> float:
 
 
 @njit(error_model="numpy", fastmath={"contract"})
-def _fit(
-    ranges: Array, rays: Array, line_of_point: Indices, first: int, last: int, line: int, m: Array
-) -> tuple[float, float, float]:
-    """One Gauss-Newton step of the line's fit to the ranges of its points, from m, in place."""
+def _fit(ranges: Array, rays: Array, own: Ints, m: Array) -> tuple[float, float, float]:
+    """One Gauss-Newton step of a line's fit to the ranges of its own points, from m, in place.
+
+    Returns the entries (1, 1), (1, 2), (2, 2) of its information.
+    """
     s11, s12, s22, b1, b2 = 0.0, 0.0, 0.0, 0.0, 0.0
-    for i in range(first, last + 1):
-        if line_of_point[i] != line:
-            continue
+    for i in own:
         u, v = rays[i, 0], rays[i, 1]
         inverse = m[0] * u + m[1] * v
         # beams nearly along the line would be given a range without end
@@ -183,27 +174,29 @@ def _fit(
     return s11, s12, s22
 
 
+@njit(forceinline=True, error_model="numpy", fastmath={"contract"})
+def _miss(lines: Array, k: int, u: float, v: float, r: float) -> float:
+    """Distance by which a range r along a ray (u, v) misses line k, to first order."""
+    miss: float = r * r * (1.0 / r - lines[k, 0] * u - lines[k, 1] * v)
+    return miss
+
+
 @njit(error_model="numpy", fastmath={"contract"})
 def _segment(
-    ranges: Array, rays: Array, beams: Indices, noise: float
-) -> tuple[Indices, Array, Array, Indices]:
+    ranges: Array, rays: Array, beams: Ints, noise: float
+) -> tuple[Ints, Array, Array, Ints]:
     """Cut a scan into straight pieces: line of each point, lines, information, ends."""
     n = len(ranges)
     line_of_point = np.zeros(n, np.int64) - 1
     lines = np.zeros((n // _MIN_LINE_POINTS + 1, 2))
     information = np.zeros((len(lines), 3))
     ends = np.zeros((len(lines), 2), np.int64)
-    n_lines = 0
-    m = np.zeros(2)
-    first = 0
+    n_lines = first = 0
     while first < n:
         # grow by recursive least squares of 1/range = m.v with weights range^4 / noise^2
         s11, s12, s22, b1, b2 = 0.0, 0.0, 0.0, 0.0, 0.0
-        recent = np.zeros(8)
-        drift = 0.0
-        count = 0
-        last = first
-        i = first
+        recent, drift, count = np.zeros(8), 0.0, 0
+        last = i = first
         skipped = 0
         while i < n and skipped < 2:
             u, v, r = rays[i, 0], rays[i, 1], ranges[i]
@@ -233,13 +226,11 @@ def _segment(
             i += 1
         det = s11 * s22 - s12 * s12
         if count < _MIN_LINE_POINTS or det <= 0.0:
-            for k in range(first, last + 1):
-                line_of_point[k] = -1
+            line_of_point[first : last + 1] = -1
             first += 1
             continue
-        lines[n_lines, 0] = (s22 * b1 - s12 * b2) / det
-        lines[n_lines, 1] = (s11 * b2 - s12 * b1) / det
-        ends[n_lines, 0], ends[n_lines, 1] = first, last
+        lines[n_lines] = (s22 * b1 - s12 * b2) / det, (s11 * b2 - s12 * b1) / det
+        ends[n_lines] = first, last
         n_lines += 1
         first = last + 1
     # a piece grown from the left runs on around a corner: give its last points to the next one
@@ -253,8 +244,7 @@ def _segment(
         # cost of cutting after point i, up to a constant
         for i in range(start, stop):
             u, v, r = rays[i, 0], rays[i, 1], ranges[i]
-            one = r * r * (1.0 / r - lines[k, 0] * u - lines[k, 1] * v)
-            two = r * r * (1.0 / r - lines[k + 1, 0] * u - lines[k + 1, 1] * v)
+            one, two = _miss(lines, k, u, v, r), _miss(lines, k + 1, u, v, r)
             cost += min(one * one, 16.0 * noise * noise) - min(two * two, 16.0 * noise * noise)
             if cost < best_cost:
                 best, best_cost = i, cost
@@ -262,32 +252,21 @@ def _segment(
             if best_cost > 0.0:
                 best = start - 1
             for i in range(start, stop):
-                line_of_point[i] = k if i <= best else k + 1
-                u, v, r = rays[i, 0], rays[i, 1], ranges[i]
-                on = line_of_point[i]
-                miss = r * r * (1.0 / r - lines[on, 0] * u - lines[on, 1] * v)
-                if abs(miss) > 4.0 * noise:
-                    line_of_point[i] = -1
+                on = k if i <= best else k + 1
+                miss = _miss(lines, on, rays[i, 0], rays[i, 1], ranges[i])
+                line_of_point[i] = on if abs(miss) <= 4.0 * noise else -1
             ends[k, 1], ends[k + 1, 0] = best, best + 1
     # fit, and join neighbours that are one wall
     kept = 0
     for k in range(n_lines):
-        while ends[k, 0] < ends[k, 1] and line_of_point[ends[k, 0]] != k:
-            ends[k, 0] += 1
-        while ends[k, 1] > ends[k, 0] and line_of_point[ends[k, 1]] != k:
-            ends[k, 1] -= 1
-        count = 0
-        for i in range(ends[k, 0], ends[k, 1] + 1):
-            count += line_of_point[i] == k
-        if count < _MIN_LINE_POINTS:
-            for i in range(ends[k, 0], ends[k, 1] + 1):
-                if line_of_point[i] == k:
-                    line_of_point[i] = -1
+        own = ends[k, 0] + np.flatnonzero(line_of_point[ends[k, 0] : ends[k, 1] + 1] == k)
+        if len(own) < _MIN_LINE_POINTS:
+            line_of_point[own] = -1
             continue
-        m[0], m[1] = lines[k, 0], lines[k, 1]
-        a11, a12, a22 = _fit(ranges, rays, line_of_point, ends[k, 0], ends[k, 1], k, m)
+        m = lines[k].copy()
+        a11, a12, a22 = _fit(ranges, rays, own, m)
         joined = False
-        if kept > 0 and beams[ends[k, 0]] - beams[ends[kept - 1, 1]] <= 3:
+        if kept > 0 and beams[own[0]] - beams[ends[kept - 1, 1]] <= 3:
             j = kept - 1
             c11, c12, c22 = information[j, 0], information[j, 1], information[j, 2]
             t11, t12, t22 = a11 + c11, a12 + c12, a22 + c22
@@ -300,18 +279,14 @@ def _segment(
             misfit = a11 * p1 * p1 + 2.0 * a12 * p1 * p2 + a22 * p2 * p2
             misfit += c11 * q1 * q1 + 2.0 * c12 * q1 * q2 + c22 * q2 * q2
             if misfit < _MERGE_GATE * noise * noise:
-                lines[j, 0], lines[j, 1] = w1, w2
-                information[j, 0], information[j, 1], information[j, 2] = t11, t12, t22
-                ends[j, 1] = ends[k, 1]
+                lines[j], information[j] = (w1, w2), (t11, t12, t22)
+                ends[j, 1] = own[-1]
                 joined = True
         if not joined:
-            lines[kept, 0], lines[kept, 1] = m[0], m[1]
-            information[kept, 0], information[kept, 1], information[kept, 2] = a11, a12, a22
-            ends[kept, 0], ends[kept, 1] = ends[k, 0], ends[k, 1]
+            lines[kept], information[kept] = m, (a11, a12, a22)
+            ends[kept] = own[0], own[-1]
             kept += 1
-        for i in range(ends[k, 0], ends[k, 1] + 1):
-            if line_of_point[i] == k:
-                line_of_point[i] = kept - 1
+        line_of_point[own] = kept - 1
     return line_of_point, lines[:kept].copy(), information[:kept].copy(), ends[:kept].copy()
 
 
@@ -319,9 +294,9 @@ def _segment(
 def _describe(
     lines: Array,
     information: Array,
-    ends: Indices,
+    ends: Ints,
     rays: Array,
-    beams: Indices,
+    beams: Ints,
     spacing: float,
     noise: float,
 ) -> Array:
@@ -358,23 +333,20 @@ def _describe(
 
 
 @njit(error_model="numpy", fastmath={"contract"})
-def _prepare(ranges: Array, bearings: Array, max_range: float) -> _Prepared:
-    beams = np.empty(len(ranges), np.int64)
-    n = 0
-    for i in range(len(ranges)):
-        if ranges[i] > 0.0 and ranges[i] <= max_range and ranges[i] < math.inf:
-            beams[n] = i
-            n += 1
-    beams = beams[:n].copy()
-    seen = np.empty(n)
-    rays, points = np.empty((n, 2)), np.empty((n, 2))
-    for k in range(n):
+def _prepare(ranges: Array, bearings: Array, max_range: float, full_circle: bool) -> PreparedScan:
+    seen = (ranges > 0.0) & (ranges <= max_range) & (ranges < math.inf)
+    beams = np.flatnonzero(seen)
+    rays, points = np.empty((len(beams), 2)), np.empty((len(beams), 2))
+    for k in range(len(beams)):
         i = beams[k]
-        seen[k] = ranges[i]
         rays[k, 0], rays[k, 1] = math.cos(bearings[i]), math.sin(bearings[i])
-        points[k, 0], points[k, 1] = seen[k] * rays[k, 0], seen[k] * rays[k, 1]
-    noise = _noise(seen, rays, beams)
-    line_of_point, lines, information, ends = _segment(seen, rays, beams, noise)
+        points[k, 0], points[k, 1] = ranges[i] * rays[k, 0], ranges[i] * rays[k, 1]
+    seen_m = ranges[beams]
+    noise = _noise(seen_m, rays, beams)
+    line_of_point, lines, information, ends = _segment(seen_m, rays, beams, noise)
     spacing = bearings[1] - bearings[0] if len(bearings) > 1 else 0.0
     segments = _describe(lines, information, ends, rays, beams, spacing, noise)
-    return seen, rays, points, beams, line_of_point, lines, information, ends, segments, noise
+    return PreparedScan(
+        bearings, seen_m, rays, points, beams, line_of_point, lines, information, ends, segments,
+        noise, full_circle,
+    )  # fmt: skip

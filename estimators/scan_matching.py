@@ -12,18 +12,24 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from estimators import icp_covariance
-from estimators.base import Prior
 from estimators.gaussian import Gaussian
-from estimators.icp import Metric, PreparedScan, Registration, Search, prepare, register
-from estimators.options import require_choices, require_positive
+from estimators.icp import (
+    LEAST_POINTS,
+    Metric,
+    PreparedScan,
+    Registration,
+    Search,
+    prepare,
+    register,
+)
+from estimators.options import require_choices, require_non_negative
 from sim import se2
-from sim.errors import InputError
+from sim.arrays import Array
 from sim.sensors import Laser
 
-Array = NDArray[np.float64]
 Covariance = Literal["censi", "censi_last", "hessian", "sampling", "unscented_censi"]
 
 FAILED = ("empty", "poor_overlap", "not_converged")
@@ -68,8 +74,7 @@ class Match:
         if self.loose is _NOTHING:
             return self.motion.covariance
         known = np.eye(3) - self.loose
-        covariance: Array = known @ self.motion.covariance @ known.T
-        return covariance
+        return known @ self.motion.covariance @ known.T
 
     def completed(self, guess: Gaussian) -> Gaussian:
         """In the directions that the scans do not hold, the guess and its covariance."""
@@ -103,21 +108,18 @@ class ScanMatcher:
     sigma_range_m: float | None
 
     def __post_init__(self) -> None:
-        choices = {
-            "metric": (self.metric, ("point_to_line", "point_to_point")),
-            "search": (self.search, ("angular", "kdtree")),
-            "covariance": (
-                self.covariance,
-                ("censi", "censi_last", "hessian", "sampling", "unscented_censi"),
-            ),
-        }
-        require_choices(choices)
+        require_choices(
+            metric=(self.metric, Metric),
+            search=(self.search, Search),
+            covariance=(self.covariance, Covariance),
+        )
         if self.sigma_range_m is not None:
-            require_positive(sigma_range_m=self.sigma_range_m)
+            require_non_negative(sigma_range_m=self.sigma_range_m)
 
-    def prepare(self, ranges_m: ArrayLike, laser: Laser) -> PreparedScan:
-        """Prepare a scan of this laser."""
-        return prepare(ranges_m, laser.bearings_rad, laser.max_range_m)
+    def prepare(self, ranges_m: ArrayLike, laser: Laser) -> PreparedScan | None:
+        """Prepare a scan of this laser; None if it shows too little to be registered."""
+        scan = prepare(ranges_m, laser.bearings_rad, laser.max_range_m)
+        return scan if len(scan.points) >= LEAST_POINTS else None
 
     def match(
         self,
@@ -201,12 +203,3 @@ class ScanMatcher:
             )
         scans: icp_covariance.Scans = "last" if self.covariance == "censi_last" else "both"
         return icp_covariance.censi(found, source, target, sigma_m, scans=scans, matches="sliding")
-
-
-def tracking_start(prior: Prior, name: str) -> tuple[Gaussian, Laser]:
-    """Return the prior's pose and laser, without which the estimator `name` cannot start."""
-    if prior.sensors.laser is None:
-        raise InputError(f"{name} needs a laser; choose sensors that have one")
-    if prior.mean is None or prior.covariance is None:
-        raise InputError(f"{name} needs a start pose; set prior.start=tracking")
-    return Gaussian(prior.mean.copy(), prior.covariance.copy()), prior.sensors.laser

@@ -7,26 +7,32 @@ complement), so that only the poses are left to factorise.
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, lapack
 
 from estimators.base import Belief, Estimate, Prior
-from estimators.gaussian import STILL, Gaussian, compose, wheel_motion, wrap
+from estimators.gaussian import Gaussian, compose, wrap
+from estimators.options import (
+    require_choices,
+    require_counts,
+    require_positive,
+    require_stereo,
+    start_pose,
+)
 from estimators.stereo import LEAST_DEPTH_M, StereoModel
+from estimators.wheels import WheelPrediction
 from sim import se2
+from sim.arrays import Array, Ints
 from sim.compiled import njit
 from sim.errors import InputError
 from sim.recording import Frame
-from sim.robot import TravelWindow, wheel_variances
 
-Array = NDArray[np.float64]
-Rows = NDArray[np.int64]
 Robust = Literal["none", "huber", "cauchy"]
 
 # What a motion and a start pose are uncertain by at least, so that both can be inverted
@@ -59,13 +65,13 @@ class Problem:
 
     prior_mean: Array
     prior_covariance: Array
-    first: Rows
-    second: Rows
+    first: Ints
+    second: Ints
     motions: Array
     motion_covariances: Array
     camera: StereoModel
-    pose_rows: Rows
-    landmark_rows: Rows
+    pose_rows: Ints
+    landmark_rows: Ints
     points_in_camera: Array
 
 
@@ -134,40 +140,26 @@ class Smoother:
         max_iterations: int = 100,
         window_s: float = 0.05,
     ) -> None:
-        for name, value in (("kr", kr), ("kl", kl), ("window_s", window_s)):
-            if not (math.isfinite(value) and value >= 0.0):
-                raise InputError(f"estimator.{name} must be zero or positive, got {value}")
-        if robust not in ("none", "huber", "cauchy"):
-            raise InputError(f"estimator.robust must be none, huber or cauchy, got {robust!r}")
-        if not (math.isfinite(robust_sigma) and robust_sigma > 0.0):
-            raise InputError(f"estimator.robust_sigma must be positive, got {robust_sigma}")
-        if max_iterations < 1:
-            raise InputError(f"estimator.max_iterations must be 1 or more, got {max_iterations}")
-        self.kr, self.kl, self.window_s = kr, kl, window_s
+        self.wheels = WheelPrediction(kr, kl, window_s)
+        require_choices(robust=(robust, Robust))
+        require_positive(robust_sigma=robust_sigma)
+        require_counts(max_iterations=max_iterations)
         self.robust, self.robust_sigma, self.max_iterations = robust, robust_sigma, max_iterations
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Start from the prior's pose, with nothing seen."""
-        if prior.sensors.stereo is None:
-            raise InputError("smoother needs a stereo camera; choose sensors that have one")
-        if prior.mean is None or prior.covariance is None:
-            raise InputError("smoother needs a start pose; set prior.start=tracking")
-        self._camera = StereoModel.of(prior.sensors.stereo)
-        self._track_m = prior.robot.track_m
-        self._start_covariance = prior.covariance + _FLOOR
-        self._belief = Gaussian(prior.mean.copy(), prior.covariance.copy())
-        self._window = TravelWindow(self.window_s)
+        self._camera = StereoModel.of(require_stereo(prior, "smoother"))
+        self._belief = start_pose(prior, "smoother")
+        self._start_covariance = self._belief.covariance + _FLOOR
+        self.wheels.reset(prior.robot.track_m)
         self._stamps: list[float] = []
         self._dead_reckoned: list[Array] = []
         self._motions: list[Gaussian] = []  # of each Frame since the one before
-        self._images: list[tuple[int, Array, Rows]] = []
+        self._images: list[tuple[int, Array, Ints]] = []
 
     def step(self, frame: Frame) -> Belief:
         """Keep what the Frame shows; the belief is dead reckoning alone."""
-        travel = frame.wheel_increments_m
-        spread_m = self._window.push(frame.duration_s, travel)
-        variances = wheel_variances(spread_m, self.kr, self.kl)
-        motion, _ = wheel_motion(travel, variances, self._track_m)
+        motion = self.wheels.predict(frame)
         self._belief = self._belief.then(motion)
         if frame.landmarks is not None and len(frame.landmarks.points_in_camera):
             if frame.landmarks.ids is None:
@@ -222,7 +214,7 @@ class Smoother:
             status=status if len(ids) else "no_landmarks",
         )
 
-    def _problem(self, rows: list[int]) -> tuple[Problem, Rows]:
+    def _problem(self, rows: list[int]) -> tuple[Problem, Ints]:
         """The problem over the Frames of these rows, and the id of each of its landmarks."""
         merged = [_merged(self._motions[a + 1 : b + 1]) for a, b in itertools.pairwise(rows)]
         pose_of = {row: pose for pose, row in enumerate(rows)}
@@ -245,17 +237,14 @@ class Smoother:
 
     def _filled_in(self, rows: list[int], solution: Solution) -> tuple[Array, Array]:
         """Means (T, 3) and covariances (T, 3, 3) of every Frame, between the solved ones too."""
-        n = len(self._stamps)
+        n, n_poses = len(self._stamps), len(rows)
         means, covariances = np.empty((n, 3)), np.empty((n, 3, 3))
-        for pose, row in enumerate(rows):
-            block = slice(3 * pose, 3 * pose + 3)
-            means[row], covariances[row] = solution.poses[pose], solution.covariance[block, block]
+        means[rows], each = solution.poses, range(n_poses)
+        covariances[rows] = solution.covariance.reshape(n_poses, 3, n_poses, 3)[each, :, each]
         for pose, (a, b) in enumerate(itertools.pairwise(rows)):
             block = slice(3 * pose, 3 * pose + 6)
-            ends = solution.poses[pose : pose + 2]
-            between = _between(
-                self._motions[a + 1 : b + 1], ends, solution.covariance[block, block]
-            )
+            joint, ends = solution.covariance[block, block], solution.poses[pose : pose + 2]
+            between = _between(self._motions[a + 1 : b + 1], ends, joint)
             for row, belief in enumerate(between, start=a + 1):
                 means[row], covariances[row] = belief.mean, belief.covariance
         return means, covariances
@@ -302,7 +291,7 @@ def _descend(
     residuals: _Residuals,
     poses: Array,
     landmarks: Array,
-    splits: Rows,
+    splits: Ints,
     in_image: bool,
     tolerance: float,
     max_iterations: int,
@@ -356,19 +345,24 @@ class _Linearised:
     V: Array
     h: Array
     W: Array
-    pose_rows: Rows
-    landmark_rows: Rows
+    pose_rows: Ints
+    landmark_rows: Ints
     cost: float
 
-    def step(self, damping: float, splits: Rows) -> tuple[Array, Array] | None:
-        """Changes of the poses (T, 3) and landmarks (N, 3); None if it cannot be solved."""
+    def _reduced(self, damping: float, splits: Ints) -> tuple[Array, Array, Array]:
+        """Damped information of the poses without the landmarks, V^-1 and W V^-1."""
         V, S = self.V.copy(), self.H.copy()
         V[:, range(3), range(3)] *= 1.0 + damping
         S[np.diag_indices_from(S)] *= 1.0 + damping
+        V_inverse = _inverse(V)
+        WV = self.W @ V_inverse[self.landmark_rows]
+        _eliminate(S, self.W, WV, self.pose_rows, splits)
+        return S, V_inverse, WV
+
+    def step(self, damping: float, splits: Ints) -> tuple[Array, Array] | None:
+        """Changes of the poses (T, 3) and landmarks (N, 3); None if it cannot be solved."""
         try:
-            V_inverse = _inverse(V)
-            WV = self.W @ V_inverse[self.landmark_rows]
-            _eliminate(S, self.W, WV, self.pose_rows, splits)
+            S, V_inverse, WV = self._reduced(damping, splits)
             rhs = self.g.reshape(-1, 3).copy()
             np.subtract.at(rhs, self.pose_rows, _times(WV, self.h[self.landmark_rows]))
             of_poses = -cho_solve(cho_factor(S, lower=True, check_finite=False), rhs.ravel())
@@ -383,11 +377,9 @@ class _Linearised:
         of_landmarks = -_times(V_inverse, rest)
         return of_poses, of_landmarks
 
-    def covariances(self, splits: Rows) -> tuple[Array, Array]:
+    def covariances(self, splits: Ints) -> tuple[Array, Array]:
         """Joint covariance (3 T, 3 T) of the poses, and (N, 3, 3) of each landmark."""
-        S, V_inverse = self.H.copy(), _inverse(self.V)
-        WV = self.W @ V_inverse[self.landmark_rows]
-        _eliminate(S, self.W, WV, self.pose_rows, splits)
+        S, V_inverse, WV = self._reduced(0.0, splits)
         factor = cho_factor(S, lower=True, check_finite=False)[0]
         lower = np.tril(lapack.dpotri(factor, lower=1)[0])
         covariance = lower + np.tril(lower, -1).T
@@ -399,8 +391,8 @@ class _Residuals:
     """Whitened residuals of a problem, its observations sorted by landmark."""
 
     problem: Problem
-    pose_rows: Rows
-    landmark_rows: Rows
+    pose_rows: Ints
+    landmark_rows: Ints
     points: Array
     robust: Robust
     robust_sigma: float
@@ -449,9 +441,8 @@ class _Residuals:
         of_pose, of_landmark = by_pose.transpose(0, 2, 1), by_landmark.transpose(0, 2, 1)
         blocks = np.zeros((len(poses), 3, 3))
         np.add.at(blocks, self.pose_rows, of_pose @ by_pose)
-        for i in range(3):
-            for j in range(3):
-                H[range(i, n, 3), range(j, n, 3)] += blocks[:, i, j]
+        each = range(len(poses))
+        H.reshape(len(poses), 3, -1, 3)[each, :, each] += blocks
         np.add.at(g, self.pose_rows, _times(of_pose, seen))
         V = np.tile(_LEAST_INFORMATION * np.eye(3), (len(landmarks), 1, 1))
         h = np.zeros((len(landmarks), 3))
@@ -519,10 +510,7 @@ def _sideways(motion: Gaussian) -> Array:
 
 def _merged(motions: list[Gaussian]) -> Gaussian:
     """Several motions as one."""
-    whole = motions[0]
-    for motion in motions[1:]:
-        whole = whole.then(motion)
-    return whole
+    return functools.reduce(Gaussian.then, motions)
 
 
 def _between(motions: list[Gaussian], ends: Array, joint: Array) -> list[Gaussian]:
@@ -531,12 +519,11 @@ def _between(motions: list[Gaussian], ends: Array, joint: Array) -> list[Gaussia
     Given both ends, a pose between is the odometry from the first, corrected by its share of
     what the odometry misses the second by.
     """
-    remainders = [motions[-1]]  # from the pose between to the end
-    for motion in motions[-2:0:-1]:
-        remainders.append(motion.then(remainders[-1]))
-    poses, so_far = [], STILL
-    for motion, rest in zip(motions[:-1], reversed(remainders), strict=False):
-        so_far = so_far.then(motion)
+    # motions from the start to each pose between, and from there to the end
+    so_fars = list(itertools.accumulate(motions[:-1], Gaussian.then))
+    rests = list(itertools.accumulate(motions[:0:-1], lambda rest, motion: motion.then(rest)))
+    poses = []
+    for so_far, rest in zip(so_fars, reversed(rests), strict=True):
         at, F, by_motion = compose(ends[0], so_far.mean)
         reached, H, by_rest = compose(at, rest.mean)
         missed = ends[1] - reached
@@ -555,8 +542,7 @@ def _between(motions: list[Gaussian], ends: Array, joint: Array) -> list[Gaussia
 
 def _times(matrices: Array, vectors: Array) -> Array:
     """Products (K, m) of matrices (K, m, n) and vectors (K, n)."""
-    product: Array = (matrices @ vectors[:, :, None])[:, :, 0]
-    return product
+    return (matrices @ vectors[:, :, None])[:, :, 0]
 
 
 def _inverse(matrices: Array) -> Array:
@@ -569,7 +555,7 @@ def _whitening(covariances: Array) -> Array:
 
 
 @njit()
-def _add_blocks(H: Array, by_first: Array, by_second: Array, first: Rows, second: Rows) -> None:
+def _add_blocks(H: Array, by_first: Array, by_second: Array, first: Ints, second: Ints) -> None:
     """Add the four blocks of each relative pose to the poses' information."""
     for k in range(len(first)):
         a, b = 3 * first[k], 3 * second[k]
@@ -587,7 +573,7 @@ def _add_blocks(H: Array, by_first: Array, by_second: Array, first: Rows, second
 
 
 @njit()
-def _eliminate(S: Array, W: Array, WV: Array, pose_rows: Rows, splits: Rows) -> None:
+def _eliminate(S: Array, W: Array, WV: Array, pose_rows: Ints, splits: Ints) -> None:
     """Take W V^-1 W^T of every landmark off the poses' information, lower triangle only."""
     for n in range(len(splits) - 1):
         for a in range(splits[n], splits[n + 1]):
@@ -605,7 +591,7 @@ def _eliminate(S: Array, W: Array, WV: Array, pose_rows: Rows, splits: Rows) -> 
 
 
 @njit()
-def _spread_of_poses(covariance: Array, WV: Array, pose_rows: Rows, splits: Rows) -> Array:
+def _spread_of_poses(covariance: Array, WV: Array, pose_rows: Ints, splits: Ints) -> Array:
     """Covariance (N, 3, 3) that landmarks have from the poses they were seen from."""
     spread = np.zeros((len(splits) - 1, 3, 3))
     half = np.empty((3, 3))

@@ -25,21 +25,17 @@ density of h, as a density of z, has the determinant of S multiplied by (Z / z_p
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from estimators.base import Prior
-from estimators.gaussian import Gaussian
-from sim.errors import InputError
+from estimators.options import require_choices
+from sim.arrays import Array
 from sim.sensors import StereoCamera
 
-Array = NDArray[np.float64]
 NoiseModel = Literal["camera", "diagonal", "correlated", "image"]
 NoiseAt = Literal["predicted", "measured"]
 
@@ -93,13 +89,7 @@ class StereoModel:
         noise_at
             Where R is taken.
         """
-        if noise_model not in ("camera", "diagonal", "correlated", "image"):
-            raise InputError(
-                "estimator.noise_model must be camera, diagonal, correlated or image, "
-                f"got {noise_model!r}"
-            )
-        if noise_at not in ("predicted", "measured"):
-            raise InputError(f"estimator.noise_at must be predicted or measured, got {noise_at!r}")
+        require_choices(noise_model=(noise_model, NoiseModel), noise_at=(noise_at, NoiseAt))
         if noise_model == "camera":
             noise_model = "image" if camera.correlated else "diagonal"
         sigma = (camera.sigma_column_px, camera.sigma_row_px, camera.sigma_disparity_px)
@@ -135,8 +125,7 @@ class StereoModel:
         points = np.asarray(points_in_camera, dtype=np.float64)
         farthest = self.focal_px * self.baseline_m / math.sqrt(self.variances_px2[2])
         depth, finite = points[..., 2], np.isfinite(points).all(axis=-1)
-        usable: NDArray[np.bool_] = finite & (depth > LEAST_DEPTH_M / 2.0) & (depth < farthest)
-        return usable
+        return finite & (depth > LEAST_DEPTH_M / 2.0) & (depth < farthest)
 
     def axes(self, pose: ArrayLike) -> tuple[Array, Array]:
         """Camera position (..., 3) in map, and C (..., 3, 3) from map to camera axes."""
@@ -217,44 +206,4 @@ class StereoModel:
         column, row, disparity = np.moveaxis(np.asarray(image, dtype=np.float64), -1, 0)
         positive = np.where(disparity > 0.0, disparity, math.nan)
         rays = np.stack([column, row, np.full_like(row, self.focal_px)], axis=-1)
-        points: Array = rays * (self.baseline_m / positive)[..., None]
-        return points
-
-
-def slam_start(
-    prior: Prior, name: str, association: str, sigmas: Mapping[str, float]
-) -> tuple[Gaussian, StereoCamera]:
-    """Return what landmark SLAM by the estimator `name` starts from.
-
-    Parameters
-    ----------
-    prior
-        What a run begins with.
-    association
-        `known` needs a camera that tells landmarks apart.
-    sigmas
-        Believed noises, by the name of the camera's attribute; the others are the true ones.
-
-    Returns
-    -------
-    tuple
-        The prior's pose in map, and the camera as it is believed to be.
-
-    Raises
-    ------
-    InputError
-        If there is no camera, no start pose, or no ids where association needs them.
-    """
-    camera = prior.sensors.stereo
-    if camera is None:
-        raise InputError(f"{name} needs a stereo camera; choose sensors that have one")
-    if prior.mean is None or prior.covariance is None:
-        raise InputError(f"{name} needs a start pose; set prior.start=tracking")
-    if association == "known" and not camera.identifies:
-        raise InputError(
-            "the camera does not identify landmarks; set estimator.association=mahalanobis "
-            "or descriptor"
-        )
-    believed: dict[str, Any] = dict(sigmas)
-    start = Gaussian(prior.mean.copy(), prior.covariance.copy())
-    return start, dataclasses.replace(camera, **believed)
+        return rays * (self.baseline_m / positive)[..., None]

@@ -17,12 +17,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from estimators import descriptors as describers
 from sim import se2
+from sim.arrays import Array, Floats, Ints
 from sim.errors import InputError
 from sim.files import write_whole
 from sim.recording import Recording
 from sim.sensors import Lidar3D
 
-Array = NDArray[np.float64]
 FORMAT_VERSION = 1
 
 
@@ -50,25 +50,23 @@ class TopologicalMap:
     """
 
     positions_m: Array
-    descriptors: NDArray[np.float32]
-    edges: NDArray[np.int64]
+    descriptors: Floats
+    edges: Ints
     descriptor: str = ""
     headings_rad: Array = field(default_factory=lambda: np.zeros(0))
-    slices_m: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 0), np.float32))
+    slices_m: Floats = field(default_factory=lambda: np.zeros((0, 0), np.float32))
 
     def __post_init__(self) -> None:
         n = len(self.positions_m)
         if n == 0:
             raise InputError("a topological map needs at least one node")
-        if self.positions_m.shape != (n, 2):
-            raise InputError(f"positions must have shape (N, 2), got {self.positions_m.shape}")
-        _demand_finite("position", self.positions_m)
+        _check_positions(self.positions_m)
         if self.descriptors.ndim != 2 or len(self.descriptors) != n or not self.descriptors.size:
             raise InputError(
                 f"descriptors must have shape ({n}, D), one row a position, "
                 f"got {self.descriptors.shape}"
             )
-        _demand_finite("descriptor", self.descriptors)
+        _check_finite("descriptor", self.descriptors)
         if self.edges.ndim != 2 or self.edges.shape[1] != 2:
             raise InputError(f"edges must have shape (E, 2), got {self.edges.shape}")
         first, second = self.edges.T
@@ -137,15 +135,11 @@ def from_arrays(
     """
     positions = np.array(positions_m, np.float64)
     features = np.array(descriptors, np.float32)
-    if positions.ndim != 2 or positions.shape[1] != 2:
-        raise InputError(f"positions must have shape (N, 2), got {positions.shape}")
-    _demand_finite("position", positions)
-    n = len(positions)
-    steps = np.hypot(*np.diff(positions, axis=0).T) if n > 1 else np.zeros(0)
-    linked = np.ones(len(steps), bool) if break_m is None else steps <= break_m
-    first = np.flatnonzero(linked)
+    _check_positions(positions)
+    steps = np.hypot(*np.diff(positions, axis=0).T)
+    first = np.flatnonzero(steps <= (np.inf if break_m is None else break_m))
     edges = np.stack([first, first + 1], axis=1)
-    if join_m is not None and n > 3:
+    if join_m is not None and len(positions) > 3:
         from scipy.spatial import cKDTree
 
         pairs = cKDTree(positions).query_pairs(join_m, output_type="ndarray")
@@ -192,8 +186,7 @@ def read_array(path: Path) -> Array:
         raise InputError(f"{path}: not a table of numbers ({reason}); give .npy or .csv") from error
     if not np.issubdtype(table.dtype, np.number):
         raise InputError(f"{path}: holds {table.dtype}, not numbers; give .npy or .csv of numbers")
-    numbers: Array = np.asarray(table, np.float64)
-    return numbers
+    return np.asarray(table, np.float64)
 
 
 def from_recording(
@@ -222,14 +215,13 @@ def from_recording(
     if log is None:
         raise InputError("a topological map needs a recording with 3D clouds or place descriptors")
     poses = recording.truth_at(log.stamps)
-    known = np.flatnonzero(np.isfinite(poses).all(axis=1))
     rows: list[int] = []
-    for row in known:
+    for row in np.flatnonzero(np.isfinite(poses).all(axis=1)):
         if not rows or np.hypot(*(poses[row, :2] - poses[rows[-1], :2])) >= spacing_m:
             rows.append(int(row))
     if not rows:
         raise InputError("none of the clouds of the recording has a true pose; no map can be built")
-    slices: list[NDArray[np.float32]] | None = None
+    slices = None
     if recording.places is not None:
         features, descriptor = recording.places.descriptors[rows], ""
     else:
@@ -249,14 +241,14 @@ def from_recording(
     )
 
 
-def level_slice(lidar: Lidar3D, ranges_m: NDArray[np.float32]) -> NDArray[np.float32]:
+def level_slice(lidar: Lidar3D, ranges_m: Floats) -> Floats:
     """Horizontal ranges (A,) m of the ring nearest to level, the upper one of two: a planar scan.
 
     Rings that look down end on the ground, where there is no wall.
     """
     elevations = lidar.elevations_rad
     ring = int(np.argmin(np.abs(elevations - 1e-6)))
-    level: NDArray[np.float32] = (ranges_m[ring] * np.cos(elevations[ring])).astype(np.float32)
+    level: Floats = (ranges_m[ring] * np.cos(elevations[ring])).astype(np.float32)
     return level
 
 
@@ -304,7 +296,13 @@ def load(path: str | Path) -> TopologicalMap:
         raise InputError(f"{path}: {error}") from error
 
 
-def _demand_finite(what: str, values: NDArray[np.floating]) -> None:
+def _check_positions(positions_m: Array) -> None:
+    if positions_m.ndim != 2 or positions_m.shape[1] != 2:
+        raise InputError(f"positions must have shape (N, 2), got {positions_m.shape}")
+    _check_finite("position", positions_m)
+
+
+def _check_finite(what: str, values: NDArray[np.floating]) -> None:
     bad = ~np.isfinite(values).all(axis=tuple(range(1, values.ndim)))
     if bad.any():
         raise InputError(f"{what} {int(np.argmax(bad))} of the map holds NaN or inf; leave it out")

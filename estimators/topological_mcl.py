@@ -11,21 +11,28 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimators import descriptors as describers
 from estimators.base import Belief, Prior
-from estimators.particles import SCHEMES, Scheme, effective_sample_size, resample
+from estimators.options import (
+    require_choices,
+    require_counts,
+    require_positive,
+    require_shares,
+)
+from estimators.particles import Scheme, effective_sample_size, resample
 from estimators.place_refinement import Refiner
 from estimators.topological_map import TopologicalMap, load
 from sim import se2
+from sim.arrays import Array, Floats, Ints
 from sim.errors import InputError
 from sim.recording import Frame
 from sim.robot import arc_increment
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 Weighting = Literal["M1", "M2", "M3"]
+Motion = Literal["odometry", "paper"]
+Resampling = Literal["ess", "always"]
+Summary = Literal["mode", "mean"]
 
 _ALL_AROUND = math.pi**2 / 3.0  # variance of a heading that nobody knows, rad^2
 _MOST_HOPS = 100  # of one particle between two Frames
@@ -92,10 +99,9 @@ def _normalized(log_weights: Array) -> Array:
     return normal
 
 
-def _sums(places: Indices, values: Array, n: int) -> Array:
+def _sums(places: Ints, values: Array, n: int) -> Array:
     """Sum (n,) of the values at each place."""
-    sums: Array = np.asarray(np.bincount(places, values, minlength=n), np.float64)
-    return sums
+    return np.asarray(np.bincount(places, values, minlength=n), np.float64)
 
 
 class Graph:
@@ -118,41 +124,31 @@ class Graph:
         alone = np.setdiff1d(np.arange(n), joined)
         tail = np.concatenate([joined[:, 0], joined[:, 1], alone])
         head = np.concatenate([joined[:, 1], joined[:, 0], alone])
-        n_joined = len(joined)
-        reverse = np.concatenate(
-            [
-                np.arange(n_joined, 2 * n_joined),
-                np.arange(n_joined),
-                np.arange(2 * n_joined, len(tail)),
-            ]
-        )
         order = np.argsort(tail, kind="stable")
-        place = np.empty(len(order), np.int64)
-        place[order] = np.arange(len(order))
-        self.tail, self.head, self.reverse = tail[order], head[order], place[reverse[order]]
+        self.tail, self.head = tail[order], head[order]
+        # the k-th edge by (tail, head) leads back along the k-th by (head, tail)
+        self.reverse = np.empty(len(order), np.int64)
+        self.reverse[np.lexsort((self.head, self.tail))] = np.lexsort((self.tail, self.head))
         self.first_out = np.searchsorted(self.tail, np.arange(n))
         self.degree = np.bincount(self.tail, minlength=n)
         way = known_map.positions_m[self.head] - known_map.positions_m[self.tail]
-        length = np.hypot(*way.T)
-        spacing = known_map.spacing_m
-        self.length_m = np.maximum(length, 0.01 * spacing) if spacing else np.full(len(way), np.inf)
-        self.length_m[self.head == self.tail] = np.inf
-        self.heading_rad = np.arctan2(way[:, 1], way[:, 0])
         lone = self.head == self.tail
+        self.length_m = np.maximum(np.hypot(*way.T), 0.01 * known_map.spacing_m)
+        self.length_m[lone | (known_map.spacing_m == 0.0)] = np.inf
+        self.heading_rad = np.arctan2(way[:, 1], way[:, 0])
         self.heading_rad[lone] = np.nan_to_num(known_map.headings_rad[self.tail[lone]])
 
-    def next(self, edges: Indices, uniform: Array) -> Indices:
+    def next(self, edges: Ints, uniform: Array) -> Ints:
         """Edge after each, past its head: any but the one back, which is left for dead ends."""
         node, back = self.head.take(edges), self.reverse.take(edges)
         others = self.degree.take(node) - 1
         chosen = self.first_out.take(node) + (uniform * others).astype(np.int64)
         chosen += chosen >= back
-        onward: Indices = np.where(others > 0, chosen, back)
-        return onward
+        return np.where(others > 0, chosen, back)
 
-    def before(self, edges: Indices, uniform: Array) -> Indices:
+    def before(self, edges: Ints, uniform: Array) -> Ints:
         """Edge before each, for driving backwards."""
-        earlier: Indices = self.reverse[self.next(self.reverse[edges], uniform)]
+        earlier: Ints = self.reverse[self.next(self.reverse[edges], uniform)]
         return earlier
 
 
@@ -214,43 +210,33 @@ class TopologicalMcl:
         n_nearest: int = 5,
         sigma_l_m: float | None = None,
         sigma_m: float = 0.1,
-        motion: Literal["odometry", "paper"] = "odometry",
+        motion: Motion = "odometry",
         p_stay: float = 0.1,
         p_skip: float = 0.1,
         p_turn: float = 0.01,
-        resampling: Literal["ess", "always"] = "ess",
+        resampling: Resampling = "ess",
         scheme: Scheme = "systematic",
         injection: float = 0.02,
-        estimate: Literal["mode", "mean"] = "mode",
+        estimate: Summary = "mode",
         refine: bool = True,
         map_path: str | None = None,
     ) -> None:
-        for name, value, allowed in (
-            ("weighting", weighting, ("M1", "M2", "M3")),
-            ("motion", motion, ("odometry", "paper")),
-            ("resampling", resampling, ("ess", "always")),
-            ("scheme", scheme, SCHEMES),
-            ("estimate", estimate, ("mode", "mean")),
-        ):
-            if value not in allowed:
-                raise InputError(f"estimator.{name} must be {' or '.join(allowed)}, got {value!r}")
-        for name, count in (("particles_per_node", particles_per_node), ("n_nearest", n_nearest)):
-            if count < 1:
-                raise InputError(f"estimator.{name} must be at least 1, got {count}")
-        for name, sigma in (("sigma_l_m", sigma_l_m), ("sigma_m", sigma_m)):
-            if sigma is not None and not (math.isfinite(sigma) and sigma > 0.0):
-                raise InputError(f"estimator.{name} must be a positive number, got {sigma}")
-        shares = {"p_stay": p_stay, "p_skip": p_skip, "p_turn": p_turn, "injection": injection}
-        for name, share in shares.items():
-            if not 0.0 <= share <= 1.0:
-                raise InputError(f"estimator.{name} must lie in [0, 1], got {share}")
+        require_choices(
+            weighting=(weighting, Weighting),
+            motion=(motion, Motion),
+            resampling=(resampling, Resampling),
+            scheme=(scheme, Scheme),
+            estimate=(estimate, Summary),
+        )
+        require_counts(particles_per_node=particles_per_node, n_nearest=n_nearest)
+        require_positive(sigma_m=sigma_m)
+        if sigma_l_m is not None:
+            require_positive(sigma_l_m=sigma_l_m)
+        require_shares(p_stay=p_stay, p_skip=p_skip, p_turn=p_turn, injection=injection)
         if p_stay + p_skip > 1.0:
             raise InputError("estimator.p_stay and p_skip must not exceed 1 together")
-        self.weighting, self.particles_per_node, self.n_nearest = (
-            weighting,
-            particles_per_node,
-            n_nearest,
-        )
+        self.weighting, self.n_nearest = weighting, n_nearest
+        self.particles_per_node = particles_per_node
         self.sigma_l_m, self.sigma_m, self.motion = sigma_l_m, sigma_m, motion
         self.p_stay, self.p_skip, self.p_turn = p_stay, p_skip, p_turn
         self.resampling, self.scheme, self.injection = resampling, scheme, injection
@@ -276,14 +262,12 @@ class TopologicalMcl:
         self._refiner = None
         if self.refine and known.slices_m.size and self._lidar is not None:
             self._refiner = Refiner(known, self._lidar)
-        node = np.tile(np.arange(len(known)), self.particles_per_node)
-        copy = np.repeat(np.arange(self.particles_per_node), len(known))
-        degree = self._graph.degree[node]
-        self._edge = self._graph.first_out[node] + copy % degree
+        copy, node = np.indices((self.particles_per_node, len(known))).reshape(2, -1)
+        self._edge = self._graph.first_out[node] + copy % self._graph.degree[node]
         self._along_m = np.zeros(len(node))
         if self.motion == "odometry":  # anywhere about the node, not on it
             reach = self._graph.length_m[self._edge] / 2.0
-            reach = np.where(np.isfinite(reach), reach, 0.0)
+            reach[np.isinf(reach)] = 0.0
             self._along_m = reach * rng.uniform(-1.0, 1.0, len(node))
             self._cross_nodes(noisy=False)
         self._log_weights = np.full(len(node), -math.log(len(node)))
@@ -314,7 +298,7 @@ class TopologicalMcl:
         self._belief = belief
         return Belief(belief.mean.copy(), belief.covariance.copy(), belief.extras)
 
-    def _descriptor(self, frame: Frame) -> tuple[NDArray[np.float32] | None, str]:
+    def _descriptor(self, frame: Frame) -> tuple[Floats | None, str]:
         """Descriptor of the Frame's place, or None and why if something is wrong with it."""
         observed = frame.place_descriptor
         if observed is None:
@@ -338,7 +322,7 @@ class TopologicalMcl:
             return None, "descriptor not finite"
         return observed.astype(np.float32, copy=False), ""
 
-    def _weigh(self, descriptor: NDArray[np.float32]) -> None:
+    def _weigh(self, descriptor: Floats) -> None:
         """Find the B places most alike, inject particles there, weight all."""
         nearest, away = self._nearest(descriptor)
         n, rng = len(self._edge), self._rng
@@ -363,7 +347,7 @@ class TopologicalMcl:
         )
         self._log_weights = _normalized(self._log_weights + by_node.take(node))
 
-    def _nearest(self, descriptor: NDArray[np.float32]) -> tuple[Indices, Array]:
+    def _nearest(self, descriptor: Floats) -> tuple[Ints, Array]:
         """Node numbers (B,) of the most alike descriptors, and their distances."""
         database = self._map.descriptors
         n_nearest = min(self.n_nearest, len(database))
@@ -393,12 +377,12 @@ class TopologicalMcl:
             self._edge, self._along_m = self._edge.take(kept), self._along_m.take(kept)
         self._log_weights = np.full(n, -math.log(n))
 
-    def _states(self) -> Indices:
+    def _states(self) -> Ints:
         """Number (M,) of each particle's edge, plus that of all edges if it is past its middle."""
         if self.motion == "paper":
             return self._edge
         past = self._along_m > 0.5 * self._graph.length_m.take(self._edge)
-        states: Indices = self._edge + len(self._graph.tail) * past
+        states: Ints = self._edge + len(self._graph.tail) * past
         return states
 
     def _roll(self, wheel_increments_m: Array) -> None:
@@ -460,8 +444,8 @@ class TopologicalMcl:
         centre = shares @ poses[:, :2]
         off = poses[:, :2] - centre
         cos, sin = shares @ np.cos(poses[:, 2]), shares @ np.sin(poses[:, 2])
-        certainty = min(math.hypot(cos, sin), 1.0)
-        spread = -2.0 * math.log(certainty) if certainty > 0.0 else math.inf
+        certainty = min(math.hypot(cos, sin), 1.0)  # of the heading; 0 where it is unknown
+        spread = -2.0 * math.log(max(certainty, 1e-300))
         covariance = np.zeros((3, 3))
         covariance[:2, :2] = off.T @ (shares[:, None] * off)
         covariance[[0, 1], [0, 1]] += known.spacing_m**2 / 12.0
@@ -482,10 +466,9 @@ class TopologicalMcl:
         mode = int(np.argmax(about))
         return mode, float(about[mode])
 
-    def _about(self, node: int) -> Indices:
+    def _about(self, node: int) -> Ints:
         """A node and its neighbours."""
-        graph = self._graph
-        first = graph.first_out[node]
+        graph, first = self._graph, self._graph.first_out[node]
         return np.append(graph.head[first : first + graph.degree[node]], node)
 
     def _carried(self, wheel_increments_m: Array) -> Belief:
@@ -495,10 +478,9 @@ class TopologicalMcl:
         sigma = _CARRIED_SHARE * math.hypot(moved[0], moved[1])
         Q = np.diag(np.square([sigma, sigma, _CARRIED_SHARE * moved[2]]))
         covariance = by_pose @ self._belief.covariance @ by_pose.T + by_motion @ Q @ by_motion.T
-        covariance = (covariance + covariance.T) / 2.0
-        return Belief(se2.compose(self._belief.mean, moved), covariance)
+        return Belief(se2.compose(self._belief.mean, moved), (covariance + covariance.T) / 2.0)
 
-    def _refined(self, cloud_ranges_m: NDArray[np.float32], belief: Belief) -> Belief:
+    def _refined(self, cloud_ranges_m: Floats, belief: Belief) -> Belief:
         """Register the cloud with the mode's node.
 
         If that fails, the last registered pose is carried on by the wheels, as long as it stays

@@ -203,7 +203,7 @@ def test_odd_observations_are_told_and_survived():
     prior = dataclasses.replace(tracking_prior(recording), covariance=np.zeros((3, 3)))
     online = follow(EkfSlam(**WHEELS), dataclasses.replace(recording, landmarks=odd), prior)
     images = [s for s in online.extras["status"] if s is not None]
-    assert images == ["observation without depth refused", "duplicate id refused"]
+    assert images == ["observation without depth rejected", "duplicate id rejected"]
     births = joined(online)
     assert births[first] == first
     assert list(births[first + 1 : first + 4]) == [-1, -1, -1]

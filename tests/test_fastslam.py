@@ -240,7 +240,7 @@ def test_nothing_in_sight_for_a_hundred_images(recording, proposal, association)
     assert all(np.isfinite(belief.mean).all() for belief in beliefs)
 
 
-def test_duplicate_ids_and_useless_points_are_refused_and_told(recording):
+def test_duplicate_ids_and_useless_points_are_rejected_and_reported(recording):
     good, again = [0.1, 0.0, 2.0], [0.4, 0.0, 2.5]
     estimator, beliefs = stepped(
         recording,
@@ -252,9 +252,9 @@ def test_duplicate_ids_and_useless_points_are_refused_and_told(recording):
         ],
     )
     assert [belief.extras.get("status") for belief in beliefs] == [
-        "duplicate id refused",
-        "observation without depth refused",
-        "observation without depth refused",
+        "duplicate id rejected",
+        "observation without depth rejected",
+        "observation without depth rejected",
         None,
     ]
     assert [belief.extras["associations"].tolist() for belief in beliefs] == [

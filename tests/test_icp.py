@@ -119,7 +119,7 @@ def test_searches_find_the_nearest(rng):
             # before the sensor: what is behind a half-circle of beams is beyond the walk
             x, y = rng.uniform(-4.0 if full else 0.05, 4.0), rng.uniform(-4.0, 4.0)
             d2 = np.sum((target.points - (x, y)) ** 2, axis=1)
-            start = int(rng.integers(len(target)))
+            start = int(rng.integers(len(target.points)))
             assert icp._nearest_in_tree(target.points, order, x, y)[1] == pytest.approx(d2.min())
             walked = icp._nearest_point(target.points, target.rays, full, start, x, y)
             assert walked[1] == pytest.approx(d2.min())

@@ -54,9 +54,8 @@ def gradient_of(found, target):
 def test_derivatives(metric, rng):
     found, source, target = registered(ROOM, [0.05, 0.02, 0.03], rng, metric)
     A, by_source, by_target = icp_covariance._censi(
-        source.points, source.rays, found.T_target_source, metric == "point_to_line", False,
-        found.matches, found.weights, found.residuals_m, target.lines, target.line_information,
-        target.line_of_point, target.points, target.rays,
+        source, target, found.T_target_source, metric == "point_to_line", False, found.matches,
+        found.weights, found.residuals_m,
     )  # fmt: skip
     gradient = gradient_of(found, target)
     pose, step = found.T_target_source, 1e-6
@@ -69,7 +68,7 @@ def test_derivatives(metric, rng):
     np.testing.assert_allclose(A, np.stack(slope, axis=1), rtol=1e-5, atol=1e-6 * A.max())
 
     B = []
-    for i in range(len(source)):
+    for i in range(len(source.points)):
         ahead, behind = source.ranges_m.copy(), source.ranges_m.copy()
         ahead[i] += step
         behind[i] -= step
@@ -89,7 +88,7 @@ def test_derivatives(metric, rng):
             expected += G @ np.linalg.inv([[s11, s12], [s12, s22]]) @ G.T
     else:
         B = []
-        for i in range(len(target)):
+        for i in range(len(target.points)):
             ahead, behind = target.ranges_m.copy(), target.ranges_m.copy()
             ahead[i] += step
             behind[i] -= step

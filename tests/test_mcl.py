@@ -97,8 +97,8 @@ def test_carried_off(recovery):
     assert off_m[:40].max() < 0.15
     if recovery:
         assert off_m[-30:].max() < 0.2
-        assert max(b.extras["strewn"] for b in beliefs[40:]) > 0
-        assert max(b.extras["strewn"] for b in beliefs[:40]) == 0
+        assert max(b.extras["injected"] for b in beliefs[40:]) > 0
+        assert max(b.extras["injected"] for b in beliefs[:40]) == 0
     else:
         assert off_m[40:].min() > 0.5
 

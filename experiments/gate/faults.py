@@ -16,7 +16,7 @@ from unittest import mock
 import numpy as np
 from numpy.typing import NDArray
 
-from estimators import ekf_icp, ekf_icp_paper, fastslam, mcl, odometry, smoother
+from estimators import ekf_icp, ekf_icp_paper, odometry, wheels
 from estimators.base import Belief, Estimator, Prior
 from estimators.gaussian import Gaussian
 from estimators.scan_matching import Match, ScanMatcher
@@ -204,23 +204,19 @@ def wrong_prediction(share: float) -> Planted:
     return patched((StereoModel, "predict", wrap))
 
 
-def wrong_wheels(module: Any) -> Fault:
+def wrong_wheels(share: float) -> Planted:
     """The heading's row of the motion's derivative by the wheels is too large."""
+    scale = np.array([1.0, 1.0, 1.0 + share])
 
-    def fault(share: float) -> Planted:
-        scale = np.array([1.0, 1.0, 1.0 + share])
+    def wrap(sound: Any) -> Any:
+        def wheel_motion(*arguments: Any) -> tuple[Gaussian, Array]:
+            motion, by_wheels = sound(*arguments)
+            covariance = scale[:, None] * motion.covariance * scale
+            return Gaussian(motion.mean, covariance), scale[:, None] * by_wheels
 
-        def wrap(sound: Any) -> Any:
-            def wheel_motion(*arguments: Any) -> tuple[Gaussian, Array]:
-                motion, by_wheels = sound(*arguments)
-                covariance = scale[:, None] * motion.covariance * scale
-                return Gaussian(motion.mean, covariance), scale[:, None] * by_wheels
+        return wheel_motion
 
-            return wheel_motion
-
-        return patched((module, "wheel_motion", wrap))
-
-    return fault
+    return patched((wheels, "wheel_motion", wrap))
 
 
 def wrong_travel(share: float) -> Planted:
@@ -233,16 +229,13 @@ def wrong_travel(share: float) -> Planted:
     return changed(change)
 
 
-def inflated_wheels(module: Any) -> Fault:
+def inflated_wheels(share: float) -> Planted:
     """The slip of the wheels is believed too large."""
 
-    def fault(share: float) -> Planted:
-        def wrap(sound: Any) -> Any:
-            return lambda *arguments: (1.0 + share) * sound(*arguments)
+    def wrap(sound: Any) -> Any:
+        return lambda *arguments: (1.0 + share) * sound(*arguments)
 
-        return patched((module, "wheel_variances", wrap))
-
-    return fault
+    return patched((wheels, "wheel_variances", wrap))
 
 
 def inflated_registration(share: float) -> Planted:
@@ -300,19 +293,19 @@ FAULTS: dict[str, dict[str, tuple[Fault, float]]] = {
         "noise": (inflated_camera, 2.0),
     },
     "smoother": {
-        "derivative": (wrong_wheels(smoother), 1.0),
+        "derivative": (wrong_wheels, 1.0),
         "lost": (lost_landmarks, 0.2),
         "noise": (inflated_camera, 2.0),
     },
     "fastslam": {
-        "derivative": (wrong_wheels(fastslam), 0.5),
+        "derivative": (wrong_wheels, 0.5),
         "lost": (lost_landmarks, 0.2),
         "noise": (inflated_camera, 2.0),
     },
     "mcl": {
-        "derivative": (wrong_wheels(mcl), 0.5),
+        "derivative": (wrong_wheels, 0.5),
         "lost": (lost("ranges_m"), 0.3),
-        "noise": (inflated_wheels(mcl), 1.0),
+        "noise": (inflated_wheels, 1.0),
     },
     "topological_mcl": {
         "derivative": (wrong_travel, 0.2),

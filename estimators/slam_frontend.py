@@ -1,0 +1,222 @@
+"""What landmark SLAM does with an image before any filter: which observations, of which landmarks.
+
+Shared by `estimators.ekf_slam` and `estimators.fastslam`, whose filters choose landmarks by
+distance themselves.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimators.base import Prior
+from estimators.gaussian import Gaussian
+from estimators.options import (
+    require_choices,
+    require_non_negative,
+    require_positive,
+    require_stereo,
+    start_pose,
+)
+from estimators.stereo import NoiseAt, NoiseModel, StereoModel
+from sim.arrays import Array, Floats, Ints
+from sim.errors import InputError
+from sim.recording import LandmarkSet
+
+Association = Literal["known", "mahalanobis", "descriptor"]
+
+_BLIND_IMAGES = 100  # images without a landmark after which the status says so
+
+
+@dataclass(frozen=True)
+class Image:
+    """The K observations of an image that can be used.
+
+    Attributes
+    ----------
+    points
+        (K, 3) m in the camera frame.
+    numbers
+        (K,) their numbers among all observations of the run, counted from 0.
+    ids, descriptors
+        (K,) and (K, D); None where the sensor gives none.
+    used
+        (A,) which of all the image's observations these are.
+    status
+        What is wrong with the others; empty if nothing is.
+    """
+
+    points: Array
+    numbers: Ints
+    ids: Ints | None
+    descriptors: Floats | None
+    used: NDArray[np.bool_]
+    status: str
+
+
+class SlamFrontEnd:
+    """The believed camera, the usable observations, and where each landmark came from.
+
+    Landmarks are numbered in the order in which observations start them. Two unit descriptors of
+    D independent components have a product of N(rho, 1 / D) if they are of one landmark, rho =
+    1 / (1 + sigma_descriptor^2), and of N(0, 1 / D) if not; twice the log of the ratio of these
+    densities is what speaks for the same landmark.
+
+    Parameters
+    ----------
+    estimator
+        Name of the estimator, for error messages.
+    association
+        `known`: by the ids that the sensor gives. `mahalanobis`: the filter takes the landmark of
+        least distance below `d0`. `descriptor`: of those, the one that distance and descriptor
+        together favour.
+    d0
+        Threshold of the squared Mahalanobis distance.
+    noise_model, noise_at
+        As in `estimators.stereo.StereoModel.of`.
+    sigmas
+        Believed noise, by the camera's attribute; None for the prior's camera's own.
+
+    Attributes
+    ----------
+    camera
+        What is believed of the camera.
+    reach_m
+        Distance within which a predicted landmark may be one that was seen.
+    origins
+        (N,) number of the observation that started each landmark.
+    """
+
+    def __init__(
+        self,
+        estimator: str,
+        association: Association,
+        d0: float,
+        noise_model: NoiseModel,
+        noise_at: NoiseAt,
+        **sigmas: float | None,
+    ) -> None:
+        require_choices(
+            association=(association, Association),
+            noise_model=(noise_model, NoiseModel),
+            noise_at=(noise_at, NoiseAt),
+        )
+        self._sigmas = {name: sigma for name, sigma in sigmas.items() if sigma is not None}
+        require_non_negative(**self._sigmas)
+        require_positive(d0=d0)
+        self.association, self.d0 = association, d0
+        self._estimator, self._noise_model, self._noise_at = estimator, noise_model, noise_at
+
+    def reset(self, prior: Prior) -> Gaussian:
+        """Forget all landmarks; return the prior's pose in map.
+
+        Raises
+        ------
+        InputError
+            If there is no camera, no start pose, or no ids where association needs them.
+        """
+        camera = require_stereo(prior, self._estimator)
+        start = start_pose(prior, self._estimator)
+        if self.association == "known" and not camera.identifies:
+            raise InputError(
+                "the camera does not identify landmarks; set estimator.association=mahalanobis "
+                "or descriptor"
+            )
+        camera = dataclasses.replace(camera, **self._sigmas)  # type: ignore[arg-type]
+        self.camera = StereoModel.of(camera, self._noise_model, self._noise_at)
+        # a landmark may be predicted beyond dmax and still be the one that was seen
+        self.reach_m = 1.5 * camera.max_distance_m + 1.0
+        self._rho = 1.0 / (1.0 + camera.sigma_descriptor**2)
+        self.origins = np.zeros(0, np.int64)
+        self._landmark_of_id: dict[int, int] = {}
+        self._descriptors = np.zeros((0, 0), np.float32)  # of each landmark's first observation
+        self._n_observations, self._n_blind = 0, 0
+        return start
+
+    def read(self, seen: LandmarkSet) -> Image:
+        """Return the observations of an image that can be used; of duplicate ids the first."""
+        used = self.camera.usable(seen.points_in_camera)
+        status = "" if used.all() else "observation without depth rejected"
+        if self.association == "known" and used.any():
+            if seen.ids is None:
+                raise InputError(
+                    f"{self._estimator}: observations without ids; set "
+                    "estimator.association=mahalanobis or descriptor"
+                )
+            rows = np.flatnonzero(used)
+            first = np.unique(seen.ids[rows], return_index=True)[1]
+            if len(first) < len(rows):
+                used, status = np.isin(np.arange(len(used)), rows[first]), "duplicate id rejected"
+        self._n_blind = 0 if used.any() else self._n_blind + 1
+        if self._n_blind >= _BLIND_IMAGES:
+            status = f"no landmark in {self._n_blind} images"
+        numbers = self._n_observations + np.flatnonzero(used)
+        self._n_observations += len(used)
+        ids = None if seen.ids is None else seen.ids[used]
+        descriptors = None if seen.descriptors is None else seen.descriptors[used]
+        points = np.ascontiguousarray(seen.points_in_camera[used])
+        return Image(points, numbers, ids, descriptors, used, status)
+
+    def known(self, image: Image) -> Ints:
+        """Landmark (K,) of each id, -1 for new ones."""
+        ids = [] if image.ids is None else image.ids.tolist()
+        return np.array([self._landmark_of_id.get(i, -1) for i in ids], np.int64)
+
+    def unlikeness(self, image: Image) -> Array:
+        """-2 log of the likelihood ratio (K, N): same landmark against another, by descriptor.
+
+        (K, 0) unless association is by descriptor.
+        """
+        if self.association != "descriptor":
+            return np.zeros((len(image.points), 0))
+        if image.descriptors is None:
+            raise InputError(
+                f"{self._estimator}: observations without descriptors; set "
+                "estimator.association=mahalanobis"
+            )
+        if len(self.origins) == 0:
+            return np.zeros((len(image.points), 0))
+        products = (image.descriptors @ self._descriptors.T).astype(np.float64)
+        unlikeness: Array = image.descriptors.shape[1] * self._rho * (self._rho - 2.0 * products)
+        return unlikeness
+
+    def start(self, image: Image, rows: Ints | NDArray[np.bool_]) -> None:
+        """Number the landmarks that these of the image's observations start."""
+        n = len(self.origins)
+        self.origins = np.concatenate([self.origins, image.numbers[rows]])
+        if self.association == "known" and image.ids is not None:
+            self._landmark_of_id |= {i: n + k for k, i in enumerate(image.ids[rows].tolist())}
+        if self.association == "descriptor" and image.descriptors is not None:
+            fresh = image.descriptors[rows]
+            self._descriptors = np.concatenate([self._descriptors, fresh]) if n else fresh
+
+    def associations(self, image: Image, landmarks: Ints) -> Ints:
+        """For each observation of an image, used or not, the one that started its landmark.
+
+        `landmarks` (K,) are -1 for observations that start one; rejected observations get -1.
+        """
+        origins = np.full(len(image.used), -1)
+        old = landmarks >= 0
+        origins[image.used] = image.numbers
+        origins[np.flatnonzero(image.used)[old]] = self.origins[landmarks[old]]
+        return origins
+
+    def map(
+        self, means: Array, covariances: Array, landmarks: Ints | slice
+    ) -> dict[str, Array | Ints]:
+        """`landmarks` (N, 3) and `landmark_covariances` (N, 3, 3), with `origins` and `ids` (N,).
+
+        `ids` are the sensor's, and are there under known association only.
+        """
+        made: dict[str, Array | Ints] = {
+            "landmarks": means,
+            "landmark_covariances": covariances,
+            "origins": self.origins[landmarks].copy(),
+        }
+        if self.association == "known":
+            made["ids"] = np.array(list(self._landmark_of_id), dtype=np.int64)
+        return made

@@ -1,0 +1,87 @@
+"""The motion of a Frame as its wheel encoders predict it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from estimators.gaussian import Gaussian, wheel_motion
+from estimators.options import require_non_negative
+from sim.arrays import Array
+from sim.recording import Frame
+from sim.robot import TravelWindow, wheel_variances
+
+
+class WheelPrediction:
+    """Relative pose of base_link over a Frame, with the covariance of the wheels' slip.
+
+    The increments ds = (right, left) turn evenly over the Frame, so base_link moves along the arc
+    u = f(ds) (`sim.robot.arc_increment`). Slip has a variance proportional to the travel
+    (puzzlebot2024, eq. (5); decristoforis2020, eq. (2)) and reaches the pose by G = df/dds
+    (puzzlebot2024, eq. (6), for the exact arc):
+
+        Q = G diag(kr |ds_r| + q_r, kl |ds_l| + q_l) G^T + diag(0, s (|ds_r| + |ds_l|) / 2, 0)
+
+    where q is tick^2 / 6 for a wheel that moved, else 0, and s is `lateral_slip_m`.
+    `Gaussian.then` composes the motion with a belief: H Sigma H^T + G Q G^T (puzzlebot2024,
+    eqs. (2) and (5)).
+
+    Parameters
+    ----------
+    kr, kl
+        Believed slip variance per metre of the right and left wheel, m.
+    window_s
+        |ds| is the net travel over at least this time, shared out to the Frame, so that encoder
+        noise does not inflate it (`sim.robot.TravelWindow`).
+    lateral_slip_m
+        Variance per metre of sideways slip, m.
+    encoder_tick_m
+        Travel of a wheel per encoder tick, m. Ticks do not add up over Frames, so q overstates
+        their variance over many.
+    """
+
+    def __init__(
+        self,
+        kr: float,
+        kl: float,
+        window_s: float = 0.05,
+        *,
+        lateral_slip_m: float = 0.0,
+        encoder_tick_m: float = 0.0,
+    ) -> None:
+        require_non_negative(
+            kr=kr,
+            kl=kl,
+            window_s=window_s,
+            lateral_slip_m=lateral_slip_m,
+            encoder_tick_m=encoder_tick_m,
+        )
+        self.kr, self.kl, self.window_s = kr, kl, window_s
+        self.lateral_slip_m, self.encoder_tick_m = lateral_slip_m, encoder_tick_m
+
+    def reset(self, track_m: float) -> None:
+        """Forget the travel so far; the wheels are believed to be this far apart."""
+        self.track_m = track_m
+        self._window = TravelWindow(self.window_s)
+
+    def slip(self, frame: Frame) -> tuple[Array, Array]:
+        """Travel |ds| (2,) m over the window, and variances (2,) m^2 of the Frame's increments.
+
+        This and the methods below take every Frame once, in order.
+        """
+        travel_m = self._window.push(frame.duration_s, frame.wheel_increments_m)
+        variances = wheel_variances(travel_m, self.kr, self.kl)
+        if self.encoder_tick_m:
+            variances += (frame.wheel_increments_m != 0.0) * (self.encoder_tick_m**2 / 6.0)
+        return travel_m, variances
+
+    def predict(self, frame: Frame) -> Gaussian:
+        """Motion of base_link over the Frame."""
+        return self.predict_with_root(frame)[0]
+
+    def predict_with_root(self, frame: Frame) -> tuple[Gaussian, Array]:
+        """Motion over the Frame, and the root (3, 2) of what the wheels add to its covariance."""
+        travel_m, variances = self.slip(frame)
+        motion, by_wheels = wheel_motion(frame.wheel_increments_m, variances, self.track_m)
+        if self.lateral_slip_m:
+            motion.covariance[1, 1] += self.lateral_slip_m * float(travel_m.mean())
+        return motion, by_wheels * np.sqrt(variances)

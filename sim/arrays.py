@@ -1,0 +1,10 @@
+"""Names of the array types that functions take and give."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Floats = NDArray[np.float32]
