@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
 from experiments.evaluation.statistics import (
@@ -27,6 +27,8 @@ from experiments.evaluation.statistics import (
 from experiments.evaluation.verdict import Claim, Verdict, judged
 from experiments.papers.gil2008.settings import P0
 from experiments.papers.results import Results
+
+Array = NDArray[np.float64]
 
 POSITION = "revised_ate_rmse_m"
 ERRORS = {
@@ -88,7 +90,7 @@ def gi1(particles: pd.DataFrame) -> list[Claim]:
 
 def gi2(particles: pd.DataFrame, bound: pd.DataFrame) -> list[Claim]:
     """GI2: more particles, less error; and how far from the best possible."""
-    claims = []
+    claims: list[Claim] = []
     first = particles[particles["draw"] == 0]
     for (noise, name), table in first.groupby(["noise", "filter"], sort=False):
         where = f"{NAMES[name]}, {NOISE[noise]}"
@@ -96,7 +98,7 @@ def gi2(particles: pd.DataFrame, bound: pd.DataFrame) -> list[Claim]:
         best = bound[bound["noise"] == noise].set_index("seed")
         some = table[table["n_particles"] == 500].groupby("seed").first()
         for column, what in list(ERRORS.items())[:2]:
-            found = median_interval((some[column] / best[column]).dropna())
+            found = median_interval((some[column] / best[column]).dropna().to_numpy())
             label = f"{what} error at M = 500 over the batch bound, median of worlds: {where}"
             claims.append(Claim("GI2", label, found, f"{SHOWN} (ours: 2)", Verdict.SHOWN))
     return claims
@@ -172,7 +174,8 @@ def gi7(association: pd.DataFrame) -> list[Claim]:
                 f"{100 * right:.0f} % are right: {NOISE[noise]}"
             )
             both = pd.concat([part.set_index("seed")[POSITION], known], axis=1, join="inner")
-            claims.append(_equivalence("GI7", label, *both.to_numpy().T, 0.25))
+            guessed, true = both.to_numpy().T
+            claims.append(_equivalence("GI7", label, guessed, true, 0.25))
         guessed = ours[ours["association"] == "mahalanobis"].set_index("seed")
         single = table[table["filter"] == "ekf_slam"].set_index("seed")
         rates = [p["ate_rmse_m"] > 0.5 * p["odometry_rmse_m"] for p in (single, guessed)]
@@ -208,7 +211,7 @@ def gi8(cost: pd.DataFrame) -> list[Claim]:
     return [*claims, Claim("GI8", label, least, SHOWN, Verdict.SHOWN)]
 
 
-def median_interval(values: ArrayLike) -> Interval:
+def median_interval(values: Array) -> Interval:
     """Median with its distribution-free interval of at least 95 %."""
     found = stats.quantile_test(values, p=0.5).confidence_interval(0.95)
     return Interval(float(np.median(values)), float(found.low), float(found.high))
@@ -246,7 +249,7 @@ def _shown_if_nearest(claim: Claim, kind: Kind) -> Claim:
 def _trends(
     claim_id: str, table: pd.DataFrame, by: str, symbol: str, limit: float, where: str
 ) -> Iterator[Claim]:
-    """Judge by Page's test that the errors fall; few worlds, or p just below 5 %, decide nothing."""
+    """Judge by Page's test that errors fall; few worlds, or p from the limit to 5 %, are undecided."""
     for column, what in ERRORS.items():
         errors = pooled(table, column, by)
         first, last = errors.columns[0], errors.columns[-1]

@@ -105,7 +105,12 @@ def thinned(recording: Recording, config: Config) -> Recording:
     Landmarks are kept by their true distance. One random order decides for every B, so fewer
     observations are a subset of more.
     """
-    log, truth, camera, scene = recording.landmarks, recording.truth, _camera(config), Scene.of(config)
+    log, truth, camera, scene = (
+        recording.landmarks,
+        recording.truth,
+        _camera(config),
+        Scene.of(config),
+    )
     assert log is not None
     assert truth is not None
     rng = stream(scene.seed, "gil2008/choice", scene.draw)

@@ -116,9 +116,7 @@ def rows_of(runs: Sequence[Run]) -> list[tuple[str, Row]]:
         labels = labels_of(table, experiment)
         shown = common | labels | _shown(seen)
         for repeat in range(experiment.repeats):
-            rng = stream(
-                scene.seed, f"estimator/{table}/{labels}", 100 * scene.draw + repeat
-            )
+            rng = stream(scene.seed, f"estimator/{table}/{labels}", 100 * scene.draw + repeat)
             rows.append((table, {**shown, "repeat": repeat, **one_run(experiment, seen, rng)}))
     return rows
 
@@ -176,7 +174,11 @@ def write_arrays(out: Results) -> None:
     assert truth.world is not None
     prior = path.prior(recording)
     estimated = {}
-    for name, choice in (("odometry", "odometry"), ("fastslam2", "fastslam"), ("batch", "smoother")):
+    for name, choice in (
+        ("odometry", "odometry"),
+        ("fastslam2", "fastslam"),
+        ("batch", "smoother"),
+    ):
         estimator = Experiment.compose(["study=gil2008", f"estimator={choice}"]).estimator()
         rng = stream(path.seed, "example")
         online, revised = estimates(estimator, recording, prior, rng)
@@ -200,9 +202,7 @@ def write_arrays(out: Results) -> None:
         "landmark_covariances": best.map["landmark_covariances"],
         **placed,
         "image_pose": best.means[np.searchsorted(best.stamps, log.stamps[busiest])],
-        "in_image": np.isin(
-            best.map["ids"], log.ids[slice(*log.splits[busiest : busiest + 2])]
-        ),
+        "in_image": np.isin(best.map["ids"], log.ids[slice(*log.splits[busiest : busiest + 2])]),
     }
     out.write_arrays("path", **{name: _single(values) for name, values in pictured.items()})
     line, particles = particles_along_a_motion(stream(path.seed, "figure"))
