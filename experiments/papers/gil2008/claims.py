@@ -249,7 +249,7 @@ def _shown_if_nearest(claim: Claim, kind: Kind) -> Claim:
 def _trends(
     claim_id: str, table: pd.DataFrame, by: str, symbol: str, limit: float, where: str
 ) -> Iterator[Claim]:
-    """Judge by Page's test that errors fall; few worlds, or p from the limit to 5 %, are undecided."""
+    """Judge by Page's test that errors fall; few worlds or p up to 5 % are undecided."""
     for column, what in ERRORS.items():
         errors = pooled(table, column, by)
         first, last = errors.columns[0], errors.columns[-1]

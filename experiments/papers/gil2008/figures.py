@@ -13,6 +13,7 @@ from matplotlib.ticker import LogLocator
 from numpy.typing import NDArray
 
 from experiments.evaluation.metrics import rms
+from experiments.papers.gil2008.claims import pooled
 from experiments.papers.results import Results
 from experiments.viewing.run_figure import covariance_ellipse
 from experiments.viewing.style import (
@@ -141,9 +142,8 @@ def world_3d(run: Arrays) -> Figure:
     eye = np.array([pose[0], pose[1], 0.5])
     reach = 6.0
 
-    def near(points: Array) -> NDArray[np.bool_]:
-        within: NDArray[np.bool_] = np.all(np.abs(points[..., :2] - pose[:2]) < reach, axis=-1)
-        return within
+    def near(points: Array) -> Any:
+        return np.all(np.abs(points[..., :2] - pose[:2]) < reach, axis=-1)
 
     inside = near(run["walls"].reshape(-1, 2, 2)).all(axis=1)
     for (x1, y1, x2, y2), (bottom, top) in zip(
@@ -182,9 +182,8 @@ def components(run: Arrays) -> Figure:
     page = figure(10.0, 6.5)
     truth, along = run["truth"], run["travelled_m"]
     axes = page.subplots(3, 2, sharex=True)
-    for i, (name, (left, right)) in enumerate(
-        zip(("x, m", "y, m", "heading, rad"), axes, strict=True)
-    ):
+    for i, name in enumerate(("x, m", "y, m", "heading, rad")):
+        left, right = axes[i]
         straighten = np.unwrap if i == 2 else np.asarray
         for key, colour, label in (
             ("odometry", ODOMETRY, "odometry"),
@@ -195,9 +194,7 @@ def components(run: Arrays) -> Figure:
             error = se2.wrap(error) if i == 2 else error
             if key != "batch":
                 left.plot(along, straighten(run[key][:, i]), color=colour, lw=1.0)
-            right.plot(
-                along, se2.wrap(error) if i == 2 else error, color=colour, lw=1.0, label=label
-            )
+            right.plot(along, error, color=colour, lw=1.0, label=label)
         left.plot(along, straighten(truth[:, i]), color=TRUTH, lw=1.0, label="truth")
         low, high = right.get_ylim()
         right.fill_between(
@@ -222,10 +219,9 @@ def by_particles(repeats: pd.DataFrame, bound: pd.DataFrame) -> Figure:
         for j, (name, part) in enumerate(repeats.groupby("filter", sort=False)):
             colour, marker, words = _FILTERS[str(name)]
             groups = part.groupby("n_particles")[column]
-            ms = np.array(list(groups.groups)) * (1.0 + 0.06 * j)
             ax.errorbar(
-                ms, groups.mean(), 2.0 * groups.std(), marker=marker, color=colour,
-                label=words, capsize=2.5, lw=1.0, ms=4,
+                groups.mean().index * (1.0 + 0.06 * j), groups.mean(), 2.0 * groups.std(),
+                marker=marker, color=colour, label=words, capsize=2.5, lw=1.0, ms=4,
             )  # fmt: skip
         ax.axhline(float(best[column].iloc[0]), color=_BATCH, ls=":", label="batch bound")
         ax.set(xscale="log", xlabel="particles M", ylabel=label, ylim=(0.0, None))
@@ -243,22 +239,20 @@ def by_particles_over_worlds(particles: pd.DataFrame, bound: pd.DataFrame) -> Fi
     Every number of particles has the same recordings: one of each world.
     """
     particles = particles[particles["draw"] == 0]
-    noises = list(dict.fromkeys(particles["noise"]))
-    page = figure(11.0, 3.2 * len(noises) + 0.6)
+    by_noise = list(particles.groupby("noise", sort=False))
+    page = figure(11.0, 3.2 * len(by_noise) + 0.6)
     columns = {
         _PATH: "path",
         "revised_ate_aligned_rmse_m": "path, aligned",
         _MAP: "map",
         "map_aligned_rmse_m": "map, aligned",
     }
-    grid = page.subplots(len(noises), 4, squeeze=False, sharex=True)
-    for noise, row in zip(noises, grid, strict=True):
+    grid = page.subplots(len(by_noise), 4, squeeze=False, sharex=True)
+    for (noise, table), row in zip(by_noise, grid, strict=True):
+        best = np.log(bound[bound["noise"] == noise][list(columns)]).mean()
         for ax, (column, label) in zip(row, columns.items(), strict=True):
-            table = particles[particles["noise"] == noise]
-            for name, part in table.groupby("filter", sort=False):
-                _over_worlds(ax, part, "n_particles", column, str(name))
-            best = bound[bound["noise"] == noise][column]
-            ax.axhline(np.exp(np.log(best).mean()), color=_BATCH, ls=":", label="batch bound")
+            _by_filter(ax, table, "n_particles", column)
+            ax.axhline(np.exp(best[column]), color=_BATCH, ls=":", label="batch bound")
             ax.set(xscale="log", yscale="log")
             ax.set_title(f"{label}, {_NOISE[noise]}", loc="left")
             _plain_ticks(ax, [10, 50, 200, 1000])
@@ -289,10 +283,10 @@ def by_distance(distance: pd.DataFrame) -> Figure:
     for ax, (column, label) in zip(axes, _BOTH, strict=True):
         for kind, (colour, line, words) in kinds.items():
             if kind in parts:
-                part = parts[kind]
-                x, middle, low, high = _intervals(part, "max_distance_m", column)
-                ax.plot(x, middle, line, marker="o", ms=3.5, color=colour, label=words)
-                ax.fill_between(x, low, high, color=colour, alpha=0.08, lw=0)
+                middle, bars = _intervals(parts[kind], "max_distance_m", column)
+                ax.plot(middle, line, marker="o", ms=3.5, color=colour, label=words)
+                band = (middle - bars[0], middle + bars[1])
+                ax.fill_between(middle.index, *band, color=colour, alpha=0.08, lw=0)
         ax.axvline(10.0, color=BLACK, lw=0.6, ls=":")
         ax.set(xlabel="dmax, m", ylabel=label, yscale="log")
         _plain_log(ax.yaxis)
@@ -304,8 +298,7 @@ def by_observations(observations: pd.DataFrame) -> Figure:
     """Error against the most observations of an image."""
     page = figure(9.0, 3.8)
     for ax, (column, label) in zip(page.subplots(1, 2), _BOTH, strict=True):
-        for name, part in observations.groupby("filter", sort=False):
-            _over_worlds(ax, part, "n_seen", column, str(name))
+        _by_filter(ax, observations, "n_seen", column)
         ax.set(xscale="log", yscale="log", xlabel="most observations B", ylabel=label)
         _plain_ticks(ax, observations["n_seen"])
         _plain_log(ax.yaxis)
@@ -313,26 +306,31 @@ def by_observations(observations: pd.DataFrame) -> Figure:
     return page
 
 
+_WAYS = {
+    "known": (BLACK, "known"),
+    "descriptor": (GREEN, "descriptors, $\\sigma$ = {sigma:g} ({alone:.0f} % right alone)"),
+    "mahalanobis": (ORANGE, "Mahalanobis, p0 = {p0:g}"),
+    "ekf_slam": (RED, "EKF-SLAM, Mahalanobis"),
+}
+
+
 def by_association(association: pd.DataFrame) -> Figure:
     """Error and right associations of every way to associate."""
-    noises = list(dict.fromkeys(association["noise"]))
-    ways = association.groupby("noise", sort=False)[list(_WAYS)]
-    counts = [len(part.drop_duplicates()) for _, part in ways]
+    way = association["association"].where(association["filter"] != "ekf_slam", "ekf_slam")
+    association = association.assign(way=pd.Categorical(way, list(_WAYS)))
+    by_noise = [
+        (noise, list(table.groupby(["way", "sigma_descriptor", "p0"], observed=True)))
+        for noise, table in association.groupby("noise", sort=False)
+    ]
+    counts = [len(ways) for _, ways in by_noise]
     page = figure(10.0, 0.36 * sum(counts) + 1.2)
-    grid = page.subplots(len(noises), 2, squeeze=False, sharey="row", height_ratios=counts)
-    for noise, (left, right) in zip(noises, grid, strict=True):
-        table = association[association["noise"] == noise]
+    grid = page.subplots(len(counts), 2, squeeze=False, sharey="row", height_ratios=counts)
+    for (noise, ways), (left, right) in zip(by_noise, grid, strict=True):
         labels = []
-        parts = sorted(table.groupby(list(_WAYS)), key=lambda item: _rank(*item[0]))
-        for i, ((name, how, p0, sigma), part) in enumerate(parts):
-            precision = part["matching_precision"].mean()
-            words = {"known": "known", "mahalanobis": f"Mahalanobis, p0 = {p0:g}"}.get(
-                str(how),
-                f"descriptors, $\\sigma$ = {sigma:g} ({100 * precision:.0f} % right alone)",
-            )
-            labels.append("EKF-SLAM, Mahalanobis" if name == "ekf_slam" else words)
-            colour = {"known": BLACK, "mahalanobis": ORANGE}.get(str(how), GREEN)
-            colour = RED if name == "ekf_slam" else colour
+        for i, ((name, sigma, p0), part) in enumerate(ways):
+            colour, words = _WAYS[name]
+            alone = 100 * part["matching_precision"].mean()
+            labels.append(words.format(sigma=sigma, p0=p0, alone=alone))
             ratio = part[_PATH] / part["odometry_rmse_m"]
             left.plot(ratio, np.full(len(part), i), "|", color=colour, ms=8, alpha=0.6)
             left.plot(rms(ratio.to_numpy()), i, "D", color=colour, ms=5)
@@ -349,41 +347,25 @@ def by_association(association: pd.DataFrame) -> Figure:
     return page
 
 
-_WAYS = ("filter", "association", "p0", "sigma_descriptor")
-
-
-def _rank(name: str, how: str, p0: float, sigma: float) -> tuple[int, float, float]:
-    """Order of the ways: known, by descriptors, by distance, and with one association for all."""
-    order = ("known", "descriptor", "mahalanobis")
-    return (3 if name == "ekf_slam" else order.index(how)), sigma, p0
-
-
 def by_settings(resampling: pd.DataFrame, noise: pd.DataFrame) -> Figure:
     """Resampling schemes, and where R is taken, by noise."""
     page = figure(10.0, 3.8)
     left, right = page.subplots(1, 2)
-    schemes = ("multinomial", "residual", "stratified", "systematic")
     for j, (share, words) in enumerate(((1.0, "at every image"), (0.5, "ESS < M/2"))):
         part = resampling[resampling["ess_share"] == share]
-        for i, scheme in enumerate(schemes):
-            logs = np.log(part[part["resampling"] == scheme]["revised_ate_aligned_rmse_m"])
-            middle, half = np.exp(logs.mean()), 2.0 * logs.sem()
-            bars = [[-middle * np.expm1(-half)], [middle * np.expm1(half)]]
-            left.errorbar(
-                i + 0.2 * j - 0.1, middle, bars, marker="os"[j], color=(ORANGE, BLUE)[j],
-                capsize=3, label=words if i == 0 else None,
-            )  # fmt: skip
-    left.set(xticks=range(len(schemes)), xticklabels=schemes, ylim=(0.0, None))
+        middle, bars = _intervals(part, "resampling", "revised_ate_aligned_rmse_m")
+        left.errorbar(
+            np.arange(len(middle)) + 0.2 * j - 0.1, middle, bars, marker="os"[j],
+            color=(ORANGE, BLUE)[j], ls="none", capsize=3, label=words,
+        )  # fmt: skip
+    left.set(xticks=range(len(middle)), xticklabels=middle.index, ylim=(0.0, None))
     left.set_ylabel("RMS of the path, aligned, m")
     left.set_title("FastSLAM 1.0, M = 200", loc="left")
     left.legend()
     for at, colour in (("predicted", BLUE), ("measured", RED)):
-        part = noise[noise["noise_at"] == at]
-        x, middle, low, high = _intervals(part, "sigma_px", _PATH)
-        right.errorbar(
-            x, middle, [middle - low, high - middle], marker="o", color=colour, capsize=3,
-            label=f"R at the {at} point",
-        )  # fmt: skip
+        middle, bars = _intervals(noise[noise["noise_at"] == at], "sigma_px", _PATH)
+        style: dict[str, Any] = {"marker": "o", "color": colour, "capsize": 3}
+        right.errorbar(middle.index, middle, bars, label=f"R at the {at} point", **style)
     right.set(xscale="log", yscale="log", xlabel="noise of column and row, px")
     right.set_ylabel("RMS of the path, m")
     right.set_title("FastSLAM 2.0, M = 200", loc="left")
@@ -410,22 +392,20 @@ def cost(table: pd.DataFrame) -> Figure:
     return page
 
 
-def _over_worlds(ax: Axes, part: pd.DataFrame, by: str, column: str, name: str) -> None:
-    colour, marker, words = _FILTERS[name]
-    x, middle, low, high = _intervals(part, by, column)
-    bars = [middle - low, high - middle]
-    ax.errorbar(x, middle, bars, marker=marker, color=colour, label=words, capsize=2.5, ms=4)
+def _by_filter(ax: Axes, table: pd.DataFrame, by: str, column: str) -> None:
+    """Draw a column over worlds against `by`, one line a filter."""
+    for name, part in table.groupby("filter", sort=False):
+        colour, marker, words = _FILTERS[str(name)]
+        middle, bars = _intervals(part, by, column)
+        style: dict[str, Any] = {"marker": marker, "color": colour, "capsize": 2.5, "ms": 4}
+        ax.errorbar(middle.index, middle, bars, label=words, **style)
 
 
-def _intervals(part: pd.DataFrame, by: str, column: str) -> tuple[Array, Array, Array, Array]:
-    """Values of `by`; geometric mean over worlds of a column's RMS, and 95 % interval."""
-    squares = (part[column] ** 2).groupby([part[by], part["seed"]]).mean()
-    logs = 0.5 * np.log(squares)
-    groups = logs.groupby(level=0)
-    middle, half = groups.mean(), 2.0 * groups.sem().fillna(0.0)
-    low, high = np.exp(middle - half), np.exp(middle + half)
-    x = np.array(middle.index, float)
-    return x, np.exp(middle.to_numpy()), low.to_numpy(), high.to_numpy()
+def _intervals(part: pd.DataFrame, by: str, column: str) -> tuple[pd.Series[float], Array]:
+    """Geometric mean (K,) over worlds of a column's RMS, and (2, K) down and up to 95 %."""
+    logs = np.log(pooled(part, column, by))
+    middle, half = np.exp(logs.mean()), 2.0 * logs.sem().fillna(0.0)
+    return middle, np.array([-middle * np.expm1(-half), middle * np.expm1(half)])
 
 
 def _plain_ticks(ax: Axes, values: Iterable[float]) -> None:
@@ -448,8 +428,7 @@ def _ellipsoid(mean: Array, covariance: Array) -> Array:
     ball = np.stack([np.cos(turn) * np.cos(lift), np.sin(turn) * np.cos(lift), np.sin(lift)])
     values, vectors = np.linalg.eigh(covariance)
     axes = _CHI_95_3D * vectors * np.sqrt(np.maximum(values, 0.0))
-    gap = np.full((3, ball.shape[1], 1), np.nan)
-    surface = np.concatenate([np.einsum("ij,jkl->ikl", axes, ball), gap], axis=2)
+    surface = np.pad(np.tensordot(axes, ball, 1), [(0, 0), (0, 0), (0, 1)], constant_values=np.nan)
     wire: Array = mean[:, None] + surface.reshape(3, -1)
     return wire
 

@@ -72,20 +72,22 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
         on_progress(0.95 * number / len(jobs))
     for table, part in rows.items():
         out.write_table(table, pd.DataFrame(part))
-    out.write_table("cost", cost_by_landmarks(settings.COST_REPEATS[profile]))
+    out.write_table("cost", cost_by_landmarks(settings.SIZES[profile].n_timings))
     write_arrays(out)
     on_progress(1.0)
 
 
 def plan(profile: Profile) -> list[Run]:
-    """All runs; quick, the same ones over fewer worlds."""
-    full = profile is Profile.FULL
-    runs = []
+    """All runs; quick, the same ones over fewer worlds, with fewer repeats."""
+    size, runs = settings.SIZES[profile], []
     for table in settings.LABELS:
-        fewer = () if full else settings.QUICK_BY_TABLE.get(table, settings.QUICK)
-        for experiment in planned([f"+study=gil2008_{table}", *fewer]):
-            if full or experiment.config["recording"]["draw"] < settings.QUICK_DRAWS:
-                runs.append((table, experiment))
+        n_worlds = 1 if table == "repeats" else size.n_worlds
+        for one in planned([f"+study=gil2008_{table}", f"seed={settings.SEED}"]):
+            if one.config["recording"]["draw"] < size.n_draws:
+                repeats = min(one.repeats, size.n_repeats)
+                for seed in range(settings.SEED, settings.SEED + n_worlds):  # slow to compose each
+                    run = one.replaced(seed=seed, world_seed=seed, repeats=repeats)
+                    runs.append((table, run))
     return runs
 
 
