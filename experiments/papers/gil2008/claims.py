@@ -67,9 +67,8 @@ def pooled(table: pd.DataFrame, column: str, by: str) -> pd.DataFrame:
     return squares.unstack(by).dropna() ** 0.5
 
 
-def gi1(particles: pd.DataFrame) -> list[Claim]:
+def gi1(particles: pd.DataFrame) -> Iterator[Claim]:
     """GI1: against odometry the error of SLAM stays bounded."""
-    claims = []
     enough = particles[particles["n_particles"] >= 50]
     for (noise, name), table in enough.groupby(["noise", "filter"], sort=False):
         ratios = {}
@@ -79,34 +78,32 @@ def gi1(particles: pd.DataFrame) -> list[Claim]:
         m, worst = max(ratios.items(), key=lambda item: item[1].high)
         where = f"{NAMES[name]}, {NOISE[noise]}"
         label = f"error of SLAM over odometry's, the worst of M >= 50 (M = {m}): {where}"
-        claims.append(Claim("GI1", label, worst, "below 0.5", judged(worst, at_most=0.5)))
+        yield Claim("GI1", label, worst, "below 0.5", judged(worst, at_most=0.5))
         growth = mean_interval(1e3 * table.groupby("seed")["slope"].mean().dropna())
         label = f"growth of the error over revisited ground, mm per m of path: {where}"
-        claims.append(Claim("GI1", label, growth, "not above 0", judged(growth, at_most=0.0)))
+        yield Claim("GI1", label, growth, "not above 0", judged(growth, at_most=0.0))
     own = mean_interval(particles.groupby("seed")["odometry_rmse_m"].mean())
-    label = "RMS position error of odometry, m (the paper: 3)"
-    return [*claims, Claim("GI1", label, own, SHOWN, Verdict.SHOWN)]
+    yield Claim(
+        "GI1", "RMS position error of odometry, m (the paper: 3)", own, SHOWN, Verdict.SHOWN
+    )
 
 
-def gi2(particles: pd.DataFrame, bound: pd.DataFrame) -> list[Claim]:
+def gi2(particles: pd.DataFrame, bound: pd.DataFrame) -> Iterator[Claim]:
     """GI2: more particles, less error; and how far from the best possible."""
-    claims: list[Claim] = []
     first = particles[particles["draw"] == 0]
     for (noise, name), table in first.groupby(["noise", "filter"], sort=False):
         where = f"{NAMES[name]}, {NOISE[noise]}"
-        claims += _trends("GI2", table, "n_particles", "M", 0.001, where)
+        yield from _trends("GI2", table, "n_particles", "M", 0.001, where)
         best = bound[bound["noise"] == noise].set_index("seed")
         some = table[table["n_particles"] == 500].groupby("seed").first()
         for column, what in list(ERRORS.items())[:2]:
             found = median_interval((some[column] / best[column]).dropna().to_numpy())
             label = f"{what} error at M = 500 over the batch bound, median of worlds: {where}"
-            claims.append(Claim("GI2", label, found, f"{SHOWN} (ours: 2)", Verdict.SHOWN))
-    return claims
+            yield Claim("GI2", label, found, f"{SHOWN} (ours: 2)", Verdict.SHOWN)
 
 
-def gi3(particles: pd.DataFrame) -> list[Claim]:
+def gi3(particles: pd.DataFrame) -> Iterator[Claim]:
     """GI3: nothing significant is gained past 200 particles."""
-    claims = []
     table = particles[(particles["noise"] == "paper") & particles["n_particles"].isin([200, 1000])]
     for name, part in table.groupby("filter", sort=False):
         for column, what in ERRORS.items():
@@ -115,26 +112,21 @@ def gi3(particles: pd.DataFrame) -> list[Claim]:
                 f"{what} error, M = 200 over M = 1000, {len(part) // 2} recordings in "
                 f"{len(errors)} worlds (90 % interval): {NAMES[name]}"
             )
-            claims.append(_equivalence("GI3", label, errors[200], errors[1000], 0.25))
-    return claims
+            yield _equivalence("GI3", label, errors[200], errors[1000], 0.25)
 
 
-def gi4(distance: pd.DataFrame) -> list[Claim]:
+def gi4(distance: pd.DataFrame) -> Iterator[Claim]:
     """GI4: the error falls with dmax."""
-    claims = []
-    for kind, part in _kinds(distance):
-        if kind.occluded:
-            errors = pooled(part, POSITION, "max_distance_m")
-            found = log_ratio_interval(errors[3], errors[10])
-            label = f"position error, dmax = 3 m over 10 m: {kind.words}"
-            claim = Claim("GI4", label, found, "above 1.5", judged(found, at_least=1.5))
-            claims.append(_shown_if_nearest(claim, kind))
-    return claims
+    for kind, part in _kinds(distance[distance["occluded"]]):
+        errors = pooled(part, POSITION, "max_distance_m")
+        found = log_ratio_interval(errors[3], errors[10])
+        label = f"position error, dmax = 3 m over 10 m: {kind.words}"
+        claim = Claim("GI4", label, found, "above 1.5", judged(found, at_least=1.5))
+        yield _shown_if_nearest(claim, kind)
 
 
-def gi5(distance: pd.DataFrame) -> list[Claim]:
+def gi5(distance: pd.DataFrame) -> Iterator[Claim]:
     """GI5: nothing significant is gained past 10 m, because of the noise of far landmarks."""
-    claims = []
     for kind, part in _kinds(distance):
         far = float(part[part["max_distance_m"] == 20]["share_beyond_10_m"].mean())
         errors = pooled(part, POSITION, "max_distance_m")
@@ -144,24 +136,18 @@ def gi5(distance: pd.DataFrame) -> list[Claim]:
         )
         claim = _equivalence("GI5", label, errors[10], errors[20], 0.30)
         if far < 0.1:
-            reason = "too few far observations"
-            claim = dataclasses.replace(claim, verdict=Verdict.UNDECIDED, reason=reason)
-        claims.append(_shown_if_nearest(claim, kind))
-    return claims
+            claim = _undecided(claim, "too few far observations")
+        yield _shown_if_nearest(claim, kind)
 
 
-def gi6(observations: pd.DataFrame) -> list[Claim]:
+def gi6(observations: pd.DataFrame) -> Iterator[Claim]:
     """GI6: the error against the number of observations of an image."""
-    return [
-        claim
-        for name, table in observations.groupby("filter", sort=False)
-        for claim in _trends("GI6", table, "n_seen", "B", 0.01, NAMES[name])
-    ]
+    for name, table in observations.groupby("filter", sort=False):
+        yield from _trends("GI6", table, "n_seen", "B", 0.01, NAMES[name])
 
 
-def gi7(association: pd.DataFrame) -> list[Claim]:
+def gi7(association: pd.DataFrame) -> Iterator[Claim]:
     """GI7: an association of each particle's own outlives errors; descriptors make it sturdier."""
-    claims = []
     for noise, table in association.groupby("noise", sort=False):
         ours = table[(table["filter"] == "fastslam2") & np.isclose(table["p0"], P0)]
         known = ours[ours["association"] == "known"].set_index("seed")[POSITION]
@@ -174,8 +160,7 @@ def gi7(association: pd.DataFrame) -> list[Claim]:
                 f"{100 * right:.0f} % are right: {NOISE[noise]}"
             )
             both = pd.concat([part.set_index("seed")[POSITION], known], axis=1, join="inner")
-            guessed, true = both.to_numpy().T
-            claims.append(_equivalence("GI7", label, guessed, true, 0.25))
+            yield _equivalence("GI7", label, both.iloc[:, 0], both.iloc[:, 1], 0.25)
         guessed = ours[ours["association"] == "mahalanobis"].set_index("seed")
         single = table[table["filter"] == "ekf_slam"].set_index("seed")
         rates = [p["ate_rmse_m"] > 0.5 * p["odometry_rmse_m"] for p in (single, guessed)]
@@ -188,15 +173,12 @@ def gi7(association: pd.DataFrame) -> list[Claim]:
         )
         claim = Claim("GI7", label, found, "above 0", judged(found, at_least=1e-9))
         if np.array_equal(ekf, fastslam):
-            reason = "both diverge in the same worlds"
-            claim = dataclasses.replace(claim, verdict=Verdict.UNDECIDED, reason=reason)
-        claims.append(claim)
-    return claims
+            claim = _undecided(claim, "both diverge in the same worlds")
+        yield claim
 
 
-def gi8(cost: pd.DataFrame) -> list[Claim]:
+def gi8(cost: pd.DataFrame) -> Iterator[Claim]:
     """GI8: time of a step against N, with shared and with contiguous maps."""
-    claims = []
     bands = {"shared": (-np.inf, 0.3), "contiguous": (0.8, 1.2)}
     for maps, table in cost.groupby("maps", sort=False):
         repeats = table.groupby("repeat")
@@ -204,11 +186,11 @@ def gi8(cost: pd.DataFrame) -> list[Claim]:
         low, high = bands[maps]
         label = f"exponent of N in the time of a step, {maps} maps, resampling at every image"
         criterion = f"below {high:g}" if low < 0 else f"within {low:g} and {high:g}"
-        claims.append(Claim("GI8", label, found, criterion, judged(found, low, high)))
+        yield Claim("GI8", label, found, criterion, judged(found, low, high))
     wide = cost.groupby(["n_landmarks", "maps"])["step_ms"].median().unstack("maps")
     least = Interval.exact(float((wide["contiguous"] / wide["shared"]).iloc[0]))
     label = "time of a step, contiguous over shared, at the least N: shared is faster from there on"
-    return [*claims, Claim("GI8", label, least, SHOWN, Verdict.SHOWN)]
+    yield Claim("GI8", label, least, SHOWN, Verdict.SHOWN)
 
 
 def median_interval(values: Array) -> Interval:
@@ -237,6 +219,10 @@ class Kind(NamedTuple):
 def _kinds(distance: pd.DataFrame) -> Iterator[tuple[Kind, pd.DataFrame]]:
     for key, part in distance.groupby(list(Kind._fields), sort=False):
         yield Kind(*key), part
+
+
+def _undecided(claim: Claim, reason: str) -> Claim:
+    return dataclasses.replace(claim, verdict=Verdict.UNDECIDED, reason=reason)
 
 
 def _shown_if_nearest(claim: Claim, kind: Kind) -> Claim:
