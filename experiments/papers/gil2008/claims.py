@@ -147,7 +147,7 @@ def gi6(observations: pd.DataFrame) -> Iterator[Claim]:
 
 
 def gi7(association: pd.DataFrame) -> Iterator[Claim]:
-    """GI7: an association of each particle's own outlives errors; descriptors make it sturdier."""
+    """GI7: each particle's own association survives errors; descriptors make it more robust."""
     for noise, table in association.groupby("noise", sort=False):
         ours = table[(table["filter"] == "fastslam2") & np.isclose(table["p0"], P0)]
         known = ours[ours["association"] == "known"].set_index("seed")[POSITION]

@@ -90,7 +90,7 @@ def corrected(run: Arrays) -> Figure:
     world = _world(run)
     for ax, name, colour, title in zip(
         page.subplots(1, 2, sharex=True, sharey=True),
-        ("odometry", "fastslam2"),
+        ("odometry", "fastslam"),
         (ODOMETRY, BLUE),
         ("placed by odometry", "placed from the path of FastSLAM"),
         strict=True,
@@ -118,14 +118,12 @@ def association_ellipses() -> Figure:
     """Figure 4: a measurement between two landmarks, and what either distance says."""
     page = figure(5.5, 4.0)
     ax = page.subplots()
-    model = np.array([[0.05, 0.02], [0.02, 0.09]])
     means = np.array([[0.0, 0.0], [1.1, 0.5]])
-    spreads = [model, np.array([[0.06, -0.03], [-0.03, 0.05]])]
+    spreads = np.array([[[0.05, 0.02], [0.02, 0.09]], [[0.06, -0.03], [-0.03, 0.05]]])
     z, R = np.array([0.62, 0.12]), np.array([[0.16, 0.03], [0.03, 0.03]])
     for name, mean, spread, colour in zip("AB", means, spreads, (BLUE, GREEN), strict=True):
         ax.add_patch(covariance_ellipse(mean, spread, fill=False, color=colour, lw=1.5))
-        v = z - mean
-        d = float(v @ np.linalg.solve(spread + R, v))
+        d = (z - mean) @ np.linalg.solve(spread + R, z - mean)
         ax.plot(*mean, "o", color=colour, label=f"landmark {name}, distance {d:.1f}")
     ax.add_patch(covariance_ellipse(z, R, fill=False, color=RED, lw=1.5, ls="--"))
     ax.plot(*z, "x", color=RED, label="measurement")
@@ -138,9 +136,8 @@ def world_3d(run: Arrays) -> Figure:
     """Figure 5: the world in three dimensions, with ellipsoids of the landmarks of one image."""
     page = figure(8.0, 4.6)
     ax: Any = page.add_subplot(projection="3d")
-    pose, landmarks = run["image_pose"], run["landmarks"]
+    pose, landmarks, reach = run["image_pose"], run["landmarks"], 6.0
     eye = np.array([pose[0], pose[1], 0.5])
-    reach = 6.0
 
     def near(points: Array) -> Any:
         return np.all(np.abs(points[..., :2] - pose[:2]) < reach, axis=-1)
@@ -151,11 +148,12 @@ def world_3d(run: Arrays) -> Figure:
     ):
         ring = np.array([[x1, y1, bottom], [x2, y2, bottom], [x2, y2, top], [x1, y1, top]])
         ax.plot(*np.vstack([ring, ring[:1]]).T, color=WALL, lw=0.5)
-    means = run["fastslam2"]
+    means = run["fastslam"]
     ax.plot(*np.where(near(means), means[:, :2].T, np.nan), 0.0, color=ESTIMATE, lw=1.0)
-    for row in np.flatnonzero(run["in_image"] & near(landmarks)):
-        mean = landmarks[row]
-        ax.plot(*_ellipsoid(mean, run["landmark_covariances"][row]), color=RED, lw=0.3)
+    pictured = run["in_image"] & near(landmarks)
+    covariances = run["landmark_covariances"][pictured]
+    for mean, covariance in zip(landmarks[pictured], covariances, strict=True):
+        ax.plot(*_ellipsoid(mean, covariance), color=RED, lw=0.3)
         ax.plot(*np.array([eye, mean]).T, color=SKY, lw=0.5)
     ax.plot(*landmarks[near(landmarks)].T, ".", color=BLUE, ms=2)
     ax.set(xlim=pose[0] + np.array([-reach, reach]), ylim=pose[1] + np.array([-reach, reach]))
@@ -171,7 +169,7 @@ def path(run: Arrays) -> Figure:
     draw_world(ax, _world(run))
     ax.plot(*run["truth"][:, :2].T, color=TRUTH, lw=1.2, label="truth")
     ax.plot(*run["odometry"][:, :2].T, "--", color=ODOMETRY, lw=1.2, label="odometry")
-    best = run["fastslam2"][::12]
+    best = run["fastslam"][::12]
     ax.plot(*best[:, :2].T, "s", color=ESTIMATE, ms=2.5, mfc="none", label="FastSLAM, M = 200")
     page.legend(loc="outside upper center", ncols=3)
     return page
@@ -187,12 +185,12 @@ def components(run: Arrays) -> Figure:
         straighten = np.unwrap if i == 2 else np.asarray
         for key, colour, label in (
             ("odometry", ODOMETRY, "odometry"),
-            ("fastslam2", ESTIMATE, "FastSLAM, M = 200"),
-            ("batch", _BATCH, "batch"),
+            ("fastslam", ESTIMATE, "FastSLAM, M = 200"),
+            ("smoother", _BATCH, "batch"),
         ):
             error = run[key][:, i] - truth[:, i]
             error = se2.wrap(error) if i == 2 else error
-            if key != "batch":
+            if key != "smoother":
                 left.plot(along, straighten(run[key][:, i]), color=colour, lw=1.0)
             right.plot(along, error, color=colour, lw=1.0, label=label)
         left.plot(along, straighten(truth[:, i]), color=TRUTH, lw=1.0, label="truth")
@@ -226,9 +224,10 @@ def by_particles(repeats: pd.DataFrame, bound: pd.DataFrame) -> Figure:
         ax.axhline(float(best[column].iloc[0]), color=_BATCH, ls=":", label="batch bound")
         ax.set(xscale="log", xlabel="particles M", ylabel=label, ylim=(0.0, None))
         _plain_ticks(ax, repeats["n_particles"])
-    odometry = float(repeats["odometry_rmse_m"].iloc[0])
-    count = int(repeats["repeat"].max()) + 1
-    page.suptitle(f"one recording, {count} runs each; odometry errs by {odometry:.1f} m")
+    page.suptitle(
+        f"one recording, {repeats['repeat'].max() + 1} runs each; odometry errs by "
+        f"{repeats['odometry_rmse_m'][0]:.1f} m"
+    )
     page.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=4)
     return page
 

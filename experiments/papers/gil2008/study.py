@@ -78,16 +78,20 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
 
 
 def plan(profile: Profile) -> list[Run]:
-    """All runs; quick, the same ones over fewer worlds, with fewer repeats."""
+    """All runs; quick, the same ones over fewer worlds, with fewer repeats.
+
+    They are composed for one world: the others differ in their seed alone.
+    """
     size, runs = settings.SIZES[profile], []
     for table in settings.LABELS:
         n_worlds = 1 if table == "repeats" else size.n_worlds
         for one in planned([f"+study=gil2008_{table}", f"seed={settings.SEED}"]):
             if one.config["recording"]["draw"] < size.n_draws:
                 repeats = min(one.repeats, size.n_repeats)
-                for seed in range(settings.SEED, settings.SEED + n_worlds):  # slow to compose each
-                    run = one.replaced(seed=seed, world_seed=seed, repeats=repeats)
-                    runs.append((table, run))
+                runs += [
+                    (table, one.replaced(seed=seed, world_seed=seed, repeats=repeats))
+                    for seed in range(settings.SEED, settings.SEED + n_worlds)
+                ]
     return runs
 
 
@@ -176,21 +180,16 @@ def write_arrays(out: Results) -> None:
     assert truth.world is not None
     prior = path.prior(recording)
     estimated = {}
-    for name, choice in (
-        ("odometry", "odometry"),
-        ("fastslam2", "fastslam"),
-        ("batch", "smoother"),
-    ):
-        estimator = Experiment.compose(["study=gil2008", f"estimator={choice}"]).estimator()
-        rng = stream(path.seed, "example")
-        online, revised = estimates(estimator, recording, prior, rng)
+    for name in ("odometry", "fastslam", "smoother"):
+        estimator = Experiment.compose(["study=gil2008", f"estimator={name}"]).estimator()
+        online, revised = estimates(estimator, recording, prior, stream(path.seed, "example"))
         estimated[name] = revised or online
-    best, along = estimated["fastslam2"], recording.truth_at(recording.frame_stamps)
+    best, along = estimated["fastslam"], recording.truth_at(recording.frame_stamps)
     rows = np.repeat(np.searchsorted(best.stamps, log.stamps), np.diff(log.splits))
     model = StereoModel.of(camera)
     placed = {
         f"placed_by_{name}": model.place(estimated[name].means[rows], log.points_in_camera)[:, :2]
-        for name in ("odometry", "fastslam2")
+        for name in ("odometry", "fastslam")
     }
     busiest = int(np.argmax(np.diff(log.splits)))
     pictured = {
