@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from experiments.papers.gil2008.settings import FARTHEST_M
 from experiments.runs.experiment import Config, Experiment
 from experiments.runs.seeds import stream
+from sim.errors import InputError
 from sim.recording import LandmarkLog, Recording, WheelLog
 from sim.sensors import StereoCamera, suite_from_config
 from sim.simulate import _ExactRays, _Landmarks
@@ -56,11 +57,11 @@ class Scene:
     @classmethod
     def of(cls, config: Config) -> Scene:
         """Read a configuration, and its `recording`."""
-        camera = config["sensors"]["stereo"]
+        camera = _camera(config)
         return cls(
             seed=config["seed"],
-            noise="pixel" if camera["correlated"] else "paper",
-            sigma_descriptor=camera["sigma_descriptor"],
+            noise="pixel" if camera.correlated else "paper",
+            sigma_descriptor=camera.sigma_descriptor,
             **{key: value for key, value in config["recording"].items() if key != "_target_"},
         )
 
@@ -80,7 +81,8 @@ def whole(config: Config) -> Recording:
     # the noise of descriptors alone leaves the images as they are
     rng = stream(scene.seed, f"gil2008/images/{dataclasses.replace(scene, sigma_descriptor=0.0)}")
     world = _alike(driven.truth.world, scene.alike_share, rng)
-    camera = dataclasses.replace(camera, max_distance_m=FARTHEST_M, max_observations=0)
+    farthest_m = max(FARTHEST_M, camera.max_distance_m)
+    camera = dataclasses.replace(camera, max_distance_m=farthest_m, max_observations=0)
     eye = _Landmarks(world, camera, rng)
     rays: Any = _ExactRays(world, None) if scene.occluded else _NoWalls()
     stamps = driven.landmarks.stamps
@@ -105,12 +107,8 @@ def thinned(recording: Recording, config: Config) -> Recording:
     Landmarks are kept by their true distance. One random order decides for every B, so fewer
     observations are a subset of more.
     """
-    log, truth, camera, scene = (
-        recording.landmarks,
-        recording.truth,
-        _camera(config),
-        Scene.of(config),
-    )
+    log, truth = recording.landmarks, recording.truth
+    camera, scene = _camera(config), Scene.of(config)
     assert log is not None
     assert truth is not None
     rng = stream(scene.seed, "gil2008/choice", scene.draw)
@@ -152,14 +150,18 @@ def landmark_distances_m(recording: Recording) -> Array:
 
 def _drive(config: Config) -> Experiment:
     """Drive of a configuration's robot; whatever its camera, it is the same one."""
-    camera = StereoCamera(rate_hz=config["sensors"]["stereo"]["rate_hz"])
+    camera = StereoCamera(rate_hz=_camera(config).rate_hz)
     sensors = {**config["sensors"], "stereo": dataclasses.asdict(camera)}
     return Experiment({**config, "recording": None, "sensors": sensors})
 
 
 def _camera(config: Config) -> StereoCamera:
     camera = suite_from_config(config["sensors"]).stereo
-    assert camera is not None
+    if camera is None or camera.selection == "spread":
+        raise InputError(
+            "gil2008 needs a stereo camera whose selection is random or nearest; try "
+            "sensors=stereo_paper"
+        )
     return camera
 
 
