@@ -10,7 +10,12 @@ from experiments.papers.decristoforis2020 import figures as decristoforis2020
 from experiments.papers.gil2008 import figures as gil2008
 from experiments.papers.maximo2024 import figures as maximo2024
 
-ERRORS = ("revised_rmse_m", "revised_aligned_rmse_m", "map_rmse_m", "map_aligned_rmse_m")
+ERRORS = (
+    "revised_ate_rmse_m",
+    "revised_ate_aligned_rmse_m",
+    "map_rmse_m",
+    "map_aligned_rmse_m",
+)
 
 
 def test_figure_8_over_worlds_has_equal_samples_and_names_every_filter():
@@ -47,7 +52,7 @@ def test_ways_to_associate_stand_at_one_height_left_and_right():
         pd.DataFrame(part, columns=columns).assign(noise=noise, seed=seed)
         for noise, part in (("paper", ways), ("pixel", ways[:2]))
         for seed in range(2)
-    ).assign(revised_rmse_m=1.0, odometry_rmse_m=2.0, right_share=0.5, matching_precision=0.9)
+    ).assign(revised_ate_rmse_m=1.0, odometry_rmse_m=2.0, right_share=0.5, matching_precision=0.9)
     axes = gil2008.by_association(table).axes
     for left, right, count in ((axes[0], axes[1], 4), (axes[2], axes[3], 2)):
         assert left.get_ylim() == right.get_ylim()

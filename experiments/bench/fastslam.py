@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -17,6 +16,7 @@ from estimators.base import run as walk
 from estimators.fastslam import FastSLAM
 from estimators.stereo import StereoModel
 from experiments.bench.measure import Measurement, median_time_s
+from experiments.evaluation.statistics import log_log_slope
 from sim.recording import LandmarkLog, Recording, WheelLog
 from sim.robot import RobotGeometry, wheel_errors
 from sim.sensors import Encoder, SensorSuite, StereoCamera
@@ -158,21 +158,16 @@ def cost_by_landmarks(n_repeats: int) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def slope(sizes: Iterable[float], times: Iterable[float]) -> float:
-    """Exponent of the time by size, fitted in logs."""
-    return float(np.polyfit(np.log(list(sizes)), np.log(list(times)), 1)[0])
-
-
 def _by_size() -> list[Measurement]:
     ms, bs = (250, 500, 1000, 2000, 4000), (5, 10, 20, 40)
     by_m = [float(run_steps(m, **_SIZE, n_steps=150)[0].mean()) for m in ms]
     by_b = [float(run_steps(1000, n_landmarks=200, n_seen=b, n_steps=150)[0].mean()) for b in bs]
     results = [
-        Measurement("fastslam.slope_m", slope(ms, by_m), "", note=f"M in {ms}"),
-        Measurement("fastslam.slope_b", slope(bs, by_b), "", note=f"B in {bs}"),
+        Measurement("fastslam.slope_m", log_log_slope(ms, by_m), "", note=f"M in {ms}"),
+        Measurement("fastslam.slope_b", log_log_slope(bs, by_b), "", note=f"B in {bs}"),
     ]
     for maps, part in cost_by_landmarks(1).groupby("maps"):
-        exponent = slope(part["n_landmarks"], part["step_ms"])
+        exponent = log_log_slope(part["n_landmarks"], part["step_ms"])
         note = f"N in {_NS}, resampling at every image"
         results.append(Measurement(f"fastslam.slope_n_{maps}", exponent, "", note=note))
         size = run_steps(1000, **_SIZE, n_steps=100, maps=maps)[2]

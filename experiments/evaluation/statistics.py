@@ -106,6 +106,11 @@ def page_trend_p(rows: ArrayLike) -> float:
     return float(stats.page_trend_test(-np.asarray(rows, float)).pvalue)
 
 
+def log_log_slope(x: ArrayLike, y: ArrayLike) -> float:
+    """Exponent of the power law y = c x^a fitted to positive values (N,) in logs."""
+    return float(np.polyfit(np.log(x), np.log(y), 1)[0])
+
+
 def anees_band(n_recordings: int, dof: int = 3) -> tuple[float, float]:
     """95 % band of the mean NEES of independent recordings, over its degrees of freedom."""
     low, high = stats.chi2.ppf([0.025, 0.975], dof * n_recordings)

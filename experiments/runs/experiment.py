@@ -305,12 +305,11 @@ class Experiment:
 
     def _recording_settings(self) -> Config:
         wanted = self.config["recording"]
-        if isinstance(wanted, dict):
-            seed = self.config["seed"]
-            return {"recording": wanted, "seed": seed, "files": files_digest(wanted)}
+        settings = {key: self.config[key] for key in _SIMULATED_KEYS}
+        if isinstance(wanted, dict):  # its function may read all of the settings
+            return {**settings, "recording": wanted, "files": files_digest(wanted)}
         if wanted is not None:
             return {"recording": _digest(Path(wanted))}
-        settings = {key: self.config[key] for key in _SIMULATED_KEYS}
         world_file = self.config["world"].get("path")
         if world_file is not None and Path(world_file).is_file():  # an edited file: another world
             settings["world_file"] = _digest(Path(world_file))

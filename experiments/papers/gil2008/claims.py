@@ -8,30 +8,32 @@ best particle, as the paper has them, raw and rigidly aligned.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
-from experiments.bench.fastslam import slope
 from experiments.evaluation.statistics import (
     Interval,
     equivalent,
+    log_log_slope,
     log_ratio_interval,
     mean_interval,
     page_trend_p,
-    verdict,
 )
-from experiments.report.claims import Claim
+from experiments.evaluation.verdict import Claim, Verdict, judged
+from experiments.papers.gil2008.settings import P0
+from experiments.papers.results import Results
 
 Array = NDArray[np.float64]
 
-PAPER = "gil2008"
+POSITION = "revised_ate_rmse_m"
 ERRORS = {
-    "revised_rmse_m": "position",
-    "revised_aligned_rmse_m": "aligned position",
+    POSITION: "position",
+    "revised_ate_aligned_rmse_m": "aligned position",
     "map_rmse_m": "map",
     "map_aligned_rmse_m": "aligned map",
 }
@@ -41,240 +43,219 @@ NAMES = {
     "ekf_slam": "EKF-SLAM",
 }
 NOISE = {"paper": "noise of 10 px", "pixel": "noise of 1 px"}
+SHOWN = "shown, not judged"
 
 
-def pooled(table: pd.DataFrame, column: str, by: Sequence[str]) -> pd.DataFrame:
-    """Root of the mean square of a column, one row a world and one column a value of `by`."""
-    squares = table[column] ** 2
-    wide = squares.groupby([table["seed"], *(table[name] for name in by)]).mean().unstack(by)
-    return wide.dropna() ** 0.5
-
-
-def gi1(particles: pd.DataFrame) -> list[Claim]:
-    """GI1: against odometry the error of SLAM stays bounded."""
-    claims = []
-    judged = particles[particles["n_particles"] >= 50]
-    for (noise, name), table in judged.groupby(["noise", "filter"], sort=False):
-        ratios = {}
-        for m, part in table.groupby("n_particles"):
-            ours = pooled(part, "revised_rmse_m", ["filter"])[name]
-            ratios[m] = log_ratio_interval(ours, pooled(part, "odometry_rmse_m", ["filter"])[name])
-        m, worst = max(ratios.items(), key=lambda item: item[1].high)
-        where = f"{NAMES[name]}, {NOISE[noise]}"
-        label = f"error of SLAM over odometry's, the worst of M >= 50 (M = {m}): {where}"
-        claims.append(_claim("GI1", label, worst, "below 0.5", verdict(worst, at_most=0.5)))
-        slopes = table.groupby("seed")["slope"].mean().dropna()
-        found = mean_interval(1e3 * slopes)
-        label = f"growth of the error over revisited ground, mm per m of path: {where}"
-        claims.append(_claim("GI1", label, found, "not above 0", verdict(found, at_most=0.0)))
-    own = particles.groupby("seed")["odometry_rmse_m"].mean()
-    label = "RMS position error of odometry, m (the paper: 3)"
-    claims.append(_claim("GI1", label, mean_interval(own), "shown, not judged", "shown"))
-    return claims
-
-
-def gi2(particles: pd.DataFrame, bound: pd.DataFrame) -> list[Claim]:
-    """GI2: more particles, less error; and how far from the best possible."""
-    claims = []
-    first = particles[particles["draw"] == 0]
-    for (noise, name), table in first.groupby(["noise", "filter"], sort=False):
-        for column, what in ERRORS.items():
-            errors = pooled(table, column, ["n_particles"])
-            found = log_ratio_interval(errors[1000], errors[10])
-            p = page_trend_p(errors.to_numpy())
-            label = (
-                f"{what} error, M = 1000 over M = 10 (Page's p = {p:.2g}): "
-                f"{NAMES[name]}, {NOISE[noise]}"
-            )
-            outcome = _trend(p, 0.001, len(errors))
-            claims.append(_claim("GI2", label, found, "Page's p below 0.001", outcome))
-        best = bound[bound["noise"] == noise].set_index("seed")
-        some = table[table["n_particles"] == 500].groupby("seed").first()
-        for column in list(ERRORS)[:2]:
-            ratios = (some[column] / best[column]).dropna()
-            label = (
-                f"{ERRORS[column]} error at M = 500 over the batch bound, median of worlds: "
-                f"{NAMES[name]}, {NOISE[noise]}"
-            )
-            found = median_interval(ratios.to_numpy())
-            claims.append(_claim("GI2", label, found, "shown, not judged (ours: 2)", "shown"))
-    return claims
-
-
-def gi3(particles: pd.DataFrame) -> list[Claim]:
-    """GI3: nothing significant is gained past 200 particles."""
-    claims = []
-    table = particles[(particles["noise"] == "paper") & particles["n_particles"].isin([200, 1000])]
-    for name, part in table.groupby("filter", sort=False):
-        for column, what in ERRORS.items():
-            errors = pooled(part, column, ["n_particles"])
-            n = len(part) // 2
-            label = (
-                f"{what} error, M = 200 over M = 1000, {n} recordings in {len(errors)} worlds "
-                f"(90 % interval): {NAMES[name]}"
-            )
-            claims.append(_equivalence("GI3", label, errors[200], errors[1000], 0.25))
-    return claims
-
-
-def gi4(distance: pd.DataFrame) -> list[Claim]:
-    """GI4: the error falls with dmax."""
+def judge(made: Results) -> list[Claim]:
+    """Judge GI1-GI8 by the tables."""
+    particles, distance = made.table("particles"), made.table("distance")
     return [
-        _claim("GI4", *_distances(part, key, 3.0, 10.0, at_least=1.5))
-        for key, part in _kinds(distance)
-        if key[1]
+        *gi1(particles),
+        *gi2(particles, made.table("bound")),
+        *gi3(particles),
+        *gi4(distance),
+        *gi5(distance),
+        *gi6(made.table("observations")),
+        *gi7(made.table("association")),
+        *gi8(made.table("cost")),
     ]
 
 
-def gi5(distance: pd.DataFrame) -> list[Claim]:
+def pooled(table: pd.DataFrame, column: str, by: str) -> pd.DataFrame:
+    """Root of the mean square of a column, one row a world and one column a value of `by`."""
+    squares = (table[column] ** 2).groupby([table["seed"], table[by]]).mean()
+    return squares.unstack(by).dropna() ** 0.5
+
+
+def gi1(particles: pd.DataFrame) -> Iterator[Claim]:
+    """GI1: against odometry the error of SLAM stays bounded."""
+    enough = particles[particles["n_particles"] >= 50]
+    for (noise, name), table in enough.groupby(["noise", "filter"], sort=False):
+        ratios = {}
+        for m, part in table.groupby("n_particles"):
+            ours, odometry = (pooled(part, c, "filter") for c in (POSITION, "odometry_rmse_m"))
+            ratios[m] = log_ratio_interval(ours[name], odometry[name])
+        m, worst = max(ratios.items(), key=lambda item: item[1].high)
+        where = f"{NAMES[name]}, {NOISE[noise]}"
+        label = f"error of SLAM over odometry's, the worst of M >= 50 (M = {m}): {where}"
+        yield Claim("GI1", label, worst, "below 0.5", judged(worst, at_most=0.5))
+        growth = mean_interval(1e3 * table.groupby("seed")["slope"].mean().dropna())
+        label = f"growth of the error over revisited ground, mm per m of path: {where}"
+        yield Claim("GI1", label, growth, "not above 0", judged(growth, at_most=0.0))
+    own = mean_interval(particles.groupby("seed")["odometry_rmse_m"].mean())
+    yield Claim(
+        "GI1", "RMS position error of odometry, m (the paper: 3)", own, SHOWN, Verdict.SHOWN
+    )
+
+
+def gi2(particles: pd.DataFrame, bound: pd.DataFrame) -> Iterator[Claim]:
+    """GI2: more particles, less error; and how far from the best possible."""
+    first = particles[particles["draw"] == 0]
+    for (noise, name), table in first.groupby(["noise", "filter"], sort=False):
+        where = f"{NAMES[name]}, {NOISE[noise]}"
+        yield from _trends("GI2", table, "n_particles", "M", 0.001, where)
+        best = bound[bound["noise"] == noise].set_index("seed")
+        some = table[table["n_particles"] == 500].groupby("seed").first()
+        for column, what in list(ERRORS.items())[:2]:
+            found = median_interval((some[column] / best[column]).dropna().to_numpy())
+            label = f"{what} error at M = 500 over the batch bound, median of worlds: {where}"
+            yield Claim("GI2", label, found, f"{SHOWN} (ours: 2)", Verdict.SHOWN)
+
+
+def gi3(particles: pd.DataFrame) -> Iterator[Claim]:
+    """GI3: nothing significant is gained past 200 particles."""
+    table = particles[(particles["noise"] == "paper") & particles["n_particles"].isin([200, 1000])]
+    for name, part in table.groupby("filter", sort=False):
+        for column, what in ERRORS.items():
+            errors = pooled(part, column, "n_particles")
+            label = (
+                f"{what} error, M = 200 over M = 1000, {len(part) // 2} recordings in "
+                f"{len(errors)} worlds (90 % interval): {NAMES[name]}"
+            )
+            yield _equivalence("GI3", label, errors[200], errors[1000], 0.25)
+
+
+def gi4(distance: pd.DataFrame) -> Iterator[Claim]:
+    """GI4: the error falls with dmax."""
+    for kind, part in _kinds(distance[distance["occluded"]]):
+        errors = pooled(part, POSITION, "max_distance_m")
+        found = log_ratio_interval(errors[3], errors[10])
+        label = f"position error, dmax = 3 m over 10 m: {kind.words}"
+        claim = Claim("GI4", label, found, "above 1.5", judged(found, at_least=1.5))
+        yield _shown_if_nearest(claim, kind)
+
+
+def gi5(distance: pd.DataFrame) -> Iterator[Claim]:
     """GI5: nothing significant is gained past 10 m, because of the noise of far landmarks."""
-    claims = []
-    for key, part in _kinds(distance):
-        far = float(part[part["max_distance_m"] == 20.0]["share_beyond_10_m"].mean())
-        errors = pooled(part, "revised_rmse_m", ["max_distance_m"])
+    for kind, part in _kinds(distance):
+        far = float(part[part["max_distance_m"] == 20]["share_beyond_10_m"].mean())
+        errors = pooled(part, POSITION, "max_distance_m")
         label = (
             f"position error, dmax = 10 m over 20 m, {100 * far:.0f} % of observations beyond "
-            f"10 m (90 % interval): {_kind(key)}"
+            f"10 m (90 % interval): {kind.words}"
         )
-        claim = _equivalence("GI5", label, errors[10.0], errors[20.0], 0.30)
-        if key[4] == "nearest":
-            claim = dataclasses.replace(claim, criterion="shown, not judged", verdict="shown")
-        elif far < 0.1:
-            claim = dataclasses.replace(claim, verdict="undecided: too few far observations")
-        claims.append(claim)
-    return claims
+        claim = _equivalence("GI5", label, errors[10], errors[20], 0.30)
+        if far < 0.1:
+            claim = _undecided(claim, "too few far observations")
+        yield _shown_if_nearest(claim, kind)
 
 
-def gi6(observations: pd.DataFrame) -> list[Claim]:
+def gi6(observations: pd.DataFrame) -> Iterator[Claim]:
     """GI6: the error against the number of observations of an image."""
-    claims = []
     for name, table in observations.groupby("filter", sort=False):
-        for column, what in ERRORS.items():
-            errors = pooled(table, column, ["n_seen"])
-            found = log_ratio_interval(errors[20], errors[1])
-            p = page_trend_p(errors.to_numpy())
-            label = f"{what} error, B = 20 over B = 1 (Page's p = {p:.2g}): {NAMES[name]}"
-            outcome = _trend(p, 0.01, len(errors))
-            claims.append(_claim("GI6", label, found, "Page's p below 0.01", outcome))
-    return claims
+        yield from _trends("GI6", table, "n_seen", "B", 0.01, NAMES[name])
 
 
-def gi7(association: pd.DataFrame) -> list[Claim]:
-    """GI7: an association of each particle's own outlives errors; descriptors make it sturdier."""
-    claims = []
+def gi7(association: pd.DataFrame) -> Iterator[Claim]:
+    """GI7: each particle's own association survives errors; descriptors make it more robust."""
     for noise, table in association.groupby("noise", sort=False):
-        ours = table[(table["filter"] == "fastslam2") & np.isclose(table["p0"], 1e-3)]
-        known = ours[ours["association"] == "known"].set_index("seed")["revised_rmse_m"]
+        ours = table[(table["filter"] == "fastslam2") & np.isclose(table["p0"], P0)]
+        known = ours[ours["association"] == "known"].set_index("seed")[POSITION]
         described = ours[ours["association"] == "descriptor"]
         for _, part in described.groupby("sigma_descriptor"):
-            errors = part.set_index("seed")["revised_rmse_m"]
             right, alone = part["right_share"].mean(), part["matching_precision"].mean()
             label = (
                 f"position error by distance and descriptor over known association (90 % "
                 f"interval); descriptors alone match {100 * alone:.0f} %, together "
-                f"{100 * right:.0f} % are right: {NOISE[str(noise)]}"
+                f"{100 * right:.0f} % are right: {NOISE[noise]}"
             )
-            both = pd.concat([errors, known], axis=1, join="inner").to_numpy()
-            claims.append(_equivalence("GI7", label, both[:, 0], both[:, 1], 0.25))
+            both = pd.concat([part.set_index("seed")[POSITION], known], axis=1, join="inner")
+            yield _equivalence("GI7", label, both.iloc[:, 0], both.iloc[:, 1], 0.25)
         guessed = ours[ours["association"] == "mahalanobis"].set_index("seed")
         single = table[table["filter"] == "ekf_slam"].set_index("seed")
-        rates = [_diverged(part) for part in (single, guessed)]
-        both_rates = pd.concat(rates, axis=1, join="inner").to_numpy(float)
-        found = mean_interval(both_rates[:, 0] - both_rates[:, 1])
+        rates = [p["ate_rmse_m"] > 0.5 * p["odometry_rmse_m"] for p in (single, guessed)]
+        ekf, fastslam = pd.concat(rates, axis=1, join="inner").to_numpy(float).T
+        found = mean_interval(ekf - fastslam)
         label = (
-            "share of runs that diverge (half of odometry's error or more), EKF-SLAM's "
-            f"{both_rates[:, 0].mean():.2f} less FastSLAM's {both_rates[:, 1].mean():.2f}, both by "
-            f"Mahalanobis distance: {NOISE[str(noise)]}"
+            f"share of runs that diverge (half of odometry's error or more), EKF-SLAM's "
+            f"{ekf.mean():.2f} less FastSLAM's {fastslam.mean():.2f}, both by Mahalanobis "
+            f"distance: {NOISE[noise]}"
         )
-        outcome: str = verdict(found, at_least=1e-9)
-        if np.array_equal(both_rates[:, 0], both_rates[:, 1]):
-            outcome = "undecided: both diverge in the same worlds"
-        claims.append(_claim("GI7", label, found, "above 0", outcome))
-    return claims
+        claim = Claim("GI7", label, found, "above 0", judged(found, at_least=1e-9))
+        if np.array_equal(ekf, fastslam):
+            claim = _undecided(claim, "both diverge in the same worlds")
+        yield claim
 
 
-def gi8(cost: pd.DataFrame) -> list[Claim]:
+def gi8(cost: pd.DataFrame) -> Iterator[Claim]:
     """GI8: time of a step against N, with shared and with contiguous maps."""
-    claims = []
     bands = {"shared": (-np.inf, 0.3), "contiguous": (0.8, 1.2)}
     for maps, table in cost.groupby("maps", sort=False):
-        slopes = [
-            slope(part["n_landmarks"], part["step_ms"]) for _, part in table.groupby("repeat")
-        ]
-        low, high = bands[str(maps)]
-        found = mean_interval(slopes)
+        repeats = table.groupby("repeat")
+        found = mean_interval([log_log_slope(p["n_landmarks"], p["step_ms"]) for _, p in repeats])
+        low, high = bands[maps]
         label = f"exponent of N in the time of a step, {maps} maps, resampling at every image"
         criterion = f"below {high:g}" if low < 0 else f"within {low:g} and {high:g}"
-        claims.append(_claim("GI8", label, found, criterion, verdict(found, low, high)))
+        yield Claim("GI8", label, found, criterion, judged(found, low, high))
     wide = cost.groupby(["n_landmarks", "maps"])["step_ms"].median().unstack("maps")
-    ratio = wide["contiguous"] / wide["shared"]
+    least = Interval.exact(float((wide["contiguous"] / wide["shared"]).iloc[0]))
     label = "time of a step, contiguous over shared, at the least N: shared is faster from there on"
-    least = Interval(*[float(ratio.iloc[0])] * 3)
-    claims.append(_claim("GI8", label, least, "shown, not judged", "shown"))
-    return claims
+    yield Claim("GI8", label, least, SHOWN, Verdict.SHOWN)
 
 
 def median_interval(values: Array) -> Interval:
     """Median with its distribution-free interval of at least 95 %."""
-    ordered = np.sort(values)
-    k = int(stats.binom.ppf(0.025, len(ordered), 0.5))
-    if len(ordered) < 6:
-        return Interval(float(np.median(ordered)), np.nan, np.nan)
-    low, high = ordered[max(k - 1, 0)], ordered[len(ordered) - max(k, 1)]
-    return Interval(float(np.median(ordered)), float(low), float(high))
+    found = stats.quantile_test(values, p=0.5).confidence_interval(0.95)
+    return Interval(float(np.median(values)), float(found.low), float(found.high))
 
 
-def _trend(p: float, limit: float, n_worlds: int) -> str:
-    """Judge Page's test; few worlds, or a p between the limit and 5 %, decide nothing."""
-    if p < limit:
-        return "reproduced"
-    return "undecided" if p < 0.05 or n_worlds < 20 else "not reproduced"
+class Kind(NamedTuple):
+    """Runs that differ in dmax alone."""
+
+    filter: str
+    occluded: bool
+    noise: str
+    n_seen: int
+    rule: str
+
+    @property
+    def words(self) -> str:
+        """What a statistic calls them."""
+        seen = f"{self.n_seen} {self.rule}" if self.n_seen else "all visible"
+        walls = "behind walls" if self.occluded else "no walls"
+        return f"{NAMES[self.filter]}, {seen}, {walls}, {NOISE[self.noise]}"
 
 
-def _diverged(table: pd.DataFrame) -> pd.Series[bool]:
-    return table["online_rmse_m"] > 0.5 * table["odometry_rmse_m"]
+def _kinds(distance: pd.DataFrame) -> Iterator[tuple[Kind, pd.DataFrame]]:
+    for key, part in distance.groupby(list(Kind._fields), sort=False):
+        yield Kind(*key), part
 
 
-Kind = tuple[str, bool, str, int, str]
+def _undecided(claim: Claim, reason: str) -> Claim:
+    return dataclasses.replace(claim, verdict=Verdict.UNDECIDED, reason=reason)
 
 
-def _kinds(distance: pd.DataFrame) -> list[tuple[Kind, pd.DataFrame]]:
-    """Parts of the table that differ in dmax alone."""
-    by = ["filter", "occluded", "noise", "n_seen", "rule"]
-    return [
-        ((str(f), bool(o), str(n), int(b), str(r)), part)
-        for (f, o, n, b, r), part in distance.groupby(by, sort=False)
-    ]
+def _shown_if_nearest(claim: Claim, kind: Kind) -> Claim:
+    """The nearest landmarks are our addition, which no claim is about."""
+    if kind.rule != "nearest":
+        return claim
+    return dataclasses.replace(claim, criterion=SHOWN, verdict=Verdict.SHOWN, reason="")
 
 
-def _kind(key: Kind) -> str:
-    name, occluded, noise, n_seen, rule = key
-    seen = f"{n_seen} {rule}" if n_seen else "all visible"
-    walls = "behind walls" if occluded else "no walls"
-    return f"{NAMES[name]}, {seen}, {walls}, {NOISE[noise]}"
-
-
-def _distances(
-    part: pd.DataFrame, key: Kind, near: float, far: float, at_least: float
-) -> tuple[str, Interval, str, str]:
-    errors = pooled(part, "revised_rmse_m", ["max_distance_m"])
-    found = log_ratio_interval(errors[near], errors[far])
-    label = f"position error, dmax = {near:g} m over {far:g} m: {_kind(key)}"
-    if key[4] == "nearest":
-        return label, found, "shown, not judged", "shown"
-    return label, found, f"above {at_least:g}", verdict(found, at_least=at_least)
+def _trends(
+    claim_id: str, table: pd.DataFrame, by: str, symbol: str, limit: float, where: str
+) -> Iterator[Claim]:
+    """Judge by Page's test that errors fall; few worlds or p up to 5 % are undecided."""
+    for column, what in ERRORS.items():
+        errors = pooled(table, column, by)
+        first, last = errors.columns[0], errors.columns[-1]
+        p = page_trend_p(errors)
+        verdict = Verdict.NOT_REPRODUCED
+        if p < limit:
+            verdict = Verdict.REPRODUCED
+        elif p < 0.05 or len(errors) < 20:
+            verdict = Verdict.UNDECIDED
+        label = (
+            f"{what} error, {symbol} = {last} over {symbol} = {first} (Page's p = {p:.2g}): {where}"
+        )
+        found = log_ratio_interval(errors[last], errors[first])
+        yield Claim(claim_id, label, found, f"Page's p below {limit:g}", verdict)
 
 
 def _equivalence(
-    claim_id: str, label: str, first: Array | pd.Series[float], second: object, margin: float
+    claim_id: str, label: str, first: ArrayLike, second: ArrayLike, margin: float
 ) -> Claim:
     """Judge two one-sided tests that the paired ratio lies within 1 / (1 + m) and 1 + m."""
-    found, _ = equivalent(np.asarray(first, float), np.asarray(second, float), margin)
-    outcome = verdict(found, 1.0 / (1.0 + margin), 1.0 + margin)
-    return _claim(
-        claim_id, label, found, f"within {1 / (1 + margin):.2g} and {1 + margin:g}", outcome
-    )
-
-
-def _claim(claim_id: str, label: str, found: Interval, criterion: str, outcome: str) -> Claim:
-    return Claim(claim_id, PAPER, label, found.value, found.low, found.high, criterion, outcome)
+    found, _ = equivalent(first, second, margin)
+    low, high = 1.0 / (1.0 + margin), 1.0 + margin
+    return Claim(claim_id, label, found, f"within {low:.2g} and {high:g}", judged(found, low, high))

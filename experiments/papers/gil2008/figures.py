@@ -9,27 +9,13 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Ellipse
+from matplotlib.ticker import LogLocator
 from numpy.typing import NDArray
 
-from estimators.base import Estimate, run
-from estimators.odometry import Odometry
-from estimators.stereo import StereoModel
 from experiments.evaluation.metrics import rms
-from experiments.papers.gil2008.study import (
-    JUDGED_SEED,
-    K_M,
-    Arm,
-    Scene,
-    estimated,
-    options,
-    prior_of,
-    recorded,
-    revisited,
-    thinned,
-    travelled_m,
-)
-from experiments.runs.seeds import stream
+from experiments.papers.gil2008.claims import pooled
+from experiments.papers.results import Results
+from experiments.viewing.run_figure import covariance_ellipse
 from experiments.viewing.style import (
     BLACK,
     BLUE,
@@ -46,11 +32,10 @@ from experiments.viewing.style import (
 )
 from experiments.viewing.world import draw_world
 from sim import se2
-from sim.recording import Recording
-from sim.robot import arc_increment
+from sim.world import World
 
 Array = NDArray[np.float64]
-Tables = dict[str, pd.DataFrame]
+Arrays = dict[str, Any]
 
 _FILTERS = {
     "paper": (ORANGE, "o", "as printed"),
@@ -58,99 +43,71 @@ _FILTERS = {
     "fastslam2": (BLUE, "s", "FastSLAM 2.0"),
 }
 _BATCH = PURPLE
-_CHI_95_2D, _CHI_95_3D = 2.4477, 2.7955
+_NOISE = {"paper": "10 px", "pixel": "1 px"}
+_CHI_95_3D = 2.7955
+_PATH, _MAP = "revised_ate_rmse_m", "map_rmse_m"
+_BOTH = ((_PATH, "RMS of the path, m"), (_MAP, "RMS of the map, m"))
 
 
-def all_figures(tables: Tables) -> dict[str, Figure]:
+def draw(made: Results) -> dict[str, Figure]:
     """Draw every figure, by file name."""
-    recording, runs = example()
+    run, bound = made.arrays("path"), made.table("bound")
     return {
-        "gil2008_1_maps": maps(recording, runs["fastslam2"]),
-        "gil2008_2_corrected": corrected(recording, runs),
-        "gil2008_3_particles": particles_along_a_motion(),
+        "gil2008_1_maps": maps(run),
+        "gil2008_2_corrected": corrected(run),
+        "gil2008_3_particles": particles_along_a_motion(made.arrays("motion")),
         "gil2008_4_association": association_ellipses(),
-        "gil2008_5_world": world_3d(recording, runs["fastslam2"]),
-        "gil2008_6_path": path(recording, runs),
-        "gil2008_7_components": components(recording, runs),
-        "gil2008_8_particles": by_particles(tables["repeats"], tables["bound"]),
-        "gil2008_8_worlds": by_particles_over_worlds(tables["particles"], tables["bound"]),
-        "gil2008_9_distance": by_distance(tables["distance"]),
-        "gil2008_observations": by_observations(tables["observations"]),
-        "gil2008_association": by_association(tables["association"]),
-        "gil2008_cost": cost(tables["cost"]),
-        "gil2008_settings": by_settings(tables["resampling"], tables["noise"]),
+        "gil2008_5_world": world_3d(run),
+        "gil2008_6_path": path(run),
+        "gil2008_7_components": components(run),
+        "gil2008_8_particles": by_particles(made.table("repeats"), bound),
+        "gil2008_8_worlds": by_particles_over_worlds(made.table("particles"), bound),
+        "gil2008_9_distance": by_distance(made.table("distance")),
+        "gil2008_observations": by_observations(made.table("observations")),
+        "gil2008_association": by_association(made.table("association")),
+        "gil2008_cost": cost(made.table("cost")),
+        "gil2008_settings": by_settings(made.table("resampling"), made.table("noise")),
     }
 
 
-def example() -> tuple[Recording, dict[str, Estimate]]:
-    """One recording, and its estimates by dead reckoning, FastSLAM 2.0 and batch."""
-    arm = Arm("example", (), options("fastslam2", n_particles=200))
-    recording, _ = thinned(recorded(Scene(JUDGED_SEED)), arm, stream(JUDGED_SEED, "choice"))
-    batch = Arm("example", (), (), method="batch")
-    odometry = run(Odometry(K_M, K_M), recording, prior_of(recording), stream(0, "odometry"))
-    runs = {"odometry": odometry}
-    runs["fastslam2"] = estimated(recording, arm, stream(JUDGED_SEED, "example"))[1]
-    runs["batch"] = estimated(recording, batch, stream(JUDGED_SEED, "example"))[1]
-    return recording, runs
-
-
-def maps(recording: Recording, found: Estimate) -> Figure:
+def maps(run: Arrays) -> Figure:
     """Figure 1: the rooms, and the landmarks as the best particle maps them."""
     page = figure(10.0, 4.9)
     left, right = page.subplots(1, 2, sharex=True, sharey=True)
-    world = recording.truth.world if recording.truth else None
-    assert world is not None
-    draw_world(left, world, landmarks=False)
+    draw_world(left, _world(run))
     left.set_title("walls and objects", loc="left")
-    for mean, covariance in zip(
-        found.map["landmarks"], found.map["landmark_covariances"], strict=True
-    ):
-        right.add_patch(_ellipse(mean[:2], covariance[:2, :2], color=SKY, alpha=0.4, lw=0))
-    right.plot(*found.map["landmarks"][:, :2].T, ".", color=BLUE, ms=3)
+    for mean, covariance in zip(run["landmarks"], run["landmark_covariances"], strict=True):
+        right.add_patch(covariance_ellipse(mean, covariance[:2, :2], color=SKY, alpha=0.4, lw=0))
+    right.plot(*run["landmarks"][:, :2].T, ".", color=BLUE, ms=3)
     right.set(xlabel="x, m", ylabel="y, m", aspect="equal")
     right.set_title("map of landmarks, with 95 % ellipses", loc="left")
     return page
 
 
-def corrected(recording: Recording, runs: dict[str, Estimate]) -> Figure:
+def corrected(run: Arrays) -> Figure:
     """Figure 2: landmarks placed by odometry, against the map of SLAM."""
     page = figure(10.0, 4.9)
-    world = recording.truth.world if recording.truth else None
-    log = recording.landmarks
-    assert world is not None
-    assert log is not None
-    assert recording.sensors.stereo is not None
-    model = StereoModel.of(recording.sensors.stereo)
-    image = np.repeat(np.arange(len(log.stamps)), np.diff(log.splits))
-    rows = np.searchsorted(recording.frame_stamps, log.stamps)
-    for ax, name, title in zip(
+    world = _world(run)
+    for ax, name, colour, title in zip(
         page.subplots(1, 2, sharex=True, sharey=True),
-        ("odometry", "fastslam2"),
+        ("odometry", "fastslam"),
+        (ODOMETRY, BLUE),
         ("placed by odometry", "placed from the path of FastSLAM"),
         strict=True,
     ):
-        draw_world(ax, world, landmarks=False)
-        placed = model.place(runs[name].means[rows][image], log.points_in_camera)
-        ax.plot(*placed[:, :2].T, ".", color=ODOMETRY if name == "odometry" else BLUE, ms=1.5)
+        draw_world(ax, world)
+        ax.plot(*run[f"placed_by_{name}"].T, ".", color=colour, ms=1.5)
         ax.set_title(title, loc="left")
         ax.set(xlim=world.bounds_m[[0, 2]] + [-4, 4], ylim=world.bounds_m[[1, 3]] + [-4, 4])
     return page
 
 
-def particles_along_a_motion() -> Figure:
+def particles_along_a_motion(motion: Arrays) -> Figure:
     """Figure 3: particles drawn along a motion; the noise is ten times the study's."""
     page = figure(6.0, 4.0)
     ax = page.subplots()
-    rng, k, track_m = stream(JUDGED_SEED, "figure"), 5e-4, 0.4
-    steps = np.array([[0.4, 0.4]] * 10 + [[0.48, 0.32]] * 8 + [[0.4, 0.4]] * 10)
-    poses, line = np.zeros((300, 3)), [np.zeros(3)]
-    for i, step in enumerate(steps):
-        noisy = step + np.sqrt(k * step) * rng.standard_normal((len(poses), 2))
-        poses = se2.compose(poses, arc_increment(noisy, track_m))
-        line.append(se2.compose(line[-1], arc_increment(step, track_m)))
-        if i % 7 == 6:
-            ax.plot(*poses[:, :2].T, ".", color=BLUE, ms=1.5)
-    ax.plot(*np.array(line)[:, :2].T, color=BLACK, label="odometry")
+    ax.plot(*motion["particles"][..., :2].T, ".", color=BLUE, ms=1.5)
+    ax.plot(*motion["line"][:, :2].T, color=BLACK, label="odometry")
     ax.plot([], [], ".", color=BLUE, label="particles")
     ax.set(xlabel="x, m", ylabel="y, m", aspect="equal")
     ax.legend()
@@ -161,143 +118,116 @@ def association_ellipses() -> Figure:
     """Figure 4: a measurement between two landmarks, and what either distance says."""
     page = figure(5.5, 4.0)
     ax = page.subplots()
-    model = np.array([[0.05, 0.02], [0.02, 0.09]])
     means = np.array([[0.0, 0.0], [1.1, 0.5]])
-    spreads = [model, np.array([[0.06, -0.03], [-0.03, 0.05]])]
+    spreads = np.array([[[0.05, 0.02], [0.02, 0.09]], [[0.06, -0.03], [-0.03, 0.05]]])
     z, R = np.array([0.62, 0.12]), np.array([[0.16, 0.03], [0.03, 0.03]])
     for name, mean, spread, colour in zip("AB", means, spreads, (BLUE, GREEN), strict=True):
-        ax.add_patch(_ellipse(mean, spread, fill=False, color=colour, lw=1.5))
-        v = z - mean
-        d = float(v @ np.linalg.solve(spread + R, v))
+        ax.add_patch(covariance_ellipse(mean, spread, fill=False, color=colour, lw=1.5))
+        d = (z - mean) @ np.linalg.solve(spread + R, z - mean)
         ax.plot(*mean, "o", color=colour, label=f"landmark {name}, distance {d:.1f}")
-    ax.add_patch(_ellipse(z, R, fill=False, color=RED, lw=1.5, ls="--"))
+    ax.add_patch(covariance_ellipse(z, R, fill=False, color=RED, lw=1.5, ls="--"))
     ax.plot(*z, "x", color=RED, label="measurement")
     ax.set(xlabel="x, m", ylabel="y, m", aspect="equal", xlim=(-0.9, 1.9), ylim=(-1.0, 1.9))
     ax.legend(loc="upper left")
     return page
 
 
-def world_3d(recording: Recording, found: Estimate) -> Figure:
-    """Figure 5: the world in three dimensions, with ellipsoids of the landmarks seen last."""
+def world_3d(run: Arrays) -> Figure:
+    """Figure 5: the world in three dimensions, with ellipsoids of the landmarks of one image."""
     page = figure(8.0, 4.6)
     ax: Any = page.add_subplot(projection="3d")
-    world, log = (recording.truth.world if recording.truth else None), recording.landmarks
-    assert world is not None
-    assert log is not None
-    # an image that shows much, and the landmarks of it
-    busiest = int(np.argmax(np.diff(log.splits)))
-    ids = log.ids[slice(*log.splits[busiest : busiest + 2])]
-    pose = found.means[np.searchsorted(found.stamps, log.stamps[busiest])]
+    pose, landmarks, reach = run["image_pose"], run["landmarks"], 6.0
     eye = np.array([pose[0], pose[1], 0.5])
-    reach = 6.0
 
-    def near(points: Array) -> NDArray[np.bool_]:
-        within: NDArray[np.bool_] = np.all(np.abs(points[..., :2] - pose[:2]) < reach, axis=-1)
-        return within
+    def near(points: Array) -> Any:
+        return np.all(np.abs(points[..., :2] - pose[:2]) < reach, axis=-1)
 
-    inside = near(world.walls.reshape(-1, 2, 2)).all(axis=1)
+    inside = near(run["walls"].reshape(-1, 2, 2)).all(axis=1)
     for (x1, y1, x2, y2), (bottom, top) in zip(
-        world.walls[inside], world.wall_z_m[inside], strict=True
+        run["walls"][inside], run["wall_z_m"][inside], strict=True
     ):
         ring = np.array([[x1, y1, bottom], [x2, y2, bottom], [x2, y2, top], [x1, y1, top]])
         ax.plot(*np.vstack([ring, ring[:1]]).T, color=WALL, lw=0.5)
-    along = np.where(near(found.means)[:, None], found.means[:, :2], np.nan)
-    ax.plot(along[:, 0], along[:, 1], 0.0, color=ESTIMATE, lw=1.0)
-    seen = np.isin(found.map["ids"], ids) & near(found.map["landmarks"])
-    for row in np.flatnonzero(seen):
-        mean, covariance = found.map["landmarks"][row], found.map["landmark_covariances"][row]
+    means = run["fastslam"]
+    ax.plot(*np.where(near(means), means[:, :2].T, np.nan), 0.0, color=ESTIMATE, lw=1.0)
+    pictured = run["in_image"] & near(landmarks)
+    covariances = run["landmark_covariances"][pictured]
+    for mean, covariance in zip(landmarks[pictured], covariances, strict=True):
         ax.plot(*_ellipsoid(mean, covariance), color=RED, lw=0.3)
         ax.plot(*np.array([eye, mean]).T, color=SKY, lw=0.5)
-    ax.plot(*found.map["landmarks"][near(found.map["landmarks"])].T, ".", color=BLUE, ms=2)
+    ax.plot(*landmarks[near(landmarks)].T, ".", color=BLUE, ms=2)
     ax.set(xlim=pose[0] + np.array([-reach, reach]), ylim=pose[1] + np.array([-reach, reach]))
     ax.set(zlim=(0.0, 3.0), xlabel="x, m", ylabel="y, m", zlabel="z, m")
     ax.set_box_aspect((2.0 * reach, 2.0 * reach, 3.0), zoom=1.25)
     return page
 
 
-def path(recording: Recording, runs: dict[str, Estimate]) -> Figure:
+def path(run: Arrays) -> Figure:
     """Figure 6: true path, odometry and the best particle's path."""
     page = figure(6.6, 6.4)
     ax = page.subplots()
-    world = recording.truth.world if recording.truth else None
-    assert world is not None
-    draw_world(ax, world, landmarks=False)
-    truth = recording.truth_at(recording.frame_stamps)
-    ax.plot(*truth[:, :2].T, color=TRUTH, lw=1.2, label="truth")
-    ax.plot(*runs["odometry"].means[:, :2].T, "--", color=ODOMETRY, lw=1.2, label="odometry")
-    best = runs["fastslam2"].means[::12]
+    draw_world(ax, _world(run))
+    ax.plot(*run["truth"][:, :2].T, color=TRUTH, lw=1.2, label="truth")
+    ax.plot(*run["odometry"][:, :2].T, "--", color=ODOMETRY, lw=1.2, label="odometry")
+    best = run["fastslam"][::12]
     ax.plot(*best[:, :2].T, "s", color=ESTIMATE, ms=2.5, mfc="none", label="FastSLAM, M = 200")
     page.legend(loc="outside upper center", ncols=3)
     return page
 
 
-def components(recording: Recording, runs: dict[str, Estimate]) -> Figure:
+def components(run: Arrays) -> Figure:
     """Figure 7: the pose's components by distance, and their errors."""
     page = figure(10.0, 6.5)
-    truth = recording.truth_at(recording.frame_stamps)
-    along = travelled_m(truth)
-    again = revisited(truth[::4])
+    truth, along = run["truth"], run["travelled_m"]
     axes = page.subplots(3, 2, sharex=True)
-    for i, (left, right) in enumerate(axes):
-        name, unit = ("x", "y", "heading")[i], ("m", "m", "rad")[i]
+    for i, name in enumerate(("x, m", "y, m", "heading, rad")):
+        left, right = axes[i]
+        straighten = np.unwrap if i == 2 else np.asarray
         for key, colour, label in (
             ("odometry", ODOMETRY, "odometry"),
-            ("fastslam2", ESTIMATE, "FastSLAM, M = 200"),
-            ("batch", _BATCH, "batch"),
+            ("fastslam", ESTIMATE, "FastSLAM, M = 200"),
+            ("smoother", _BATCH, "batch"),
         ):
-            values = runs[key].means[:, i]
-            error = values - truth[:, i]
-            if i == 2:
-                values, error = np.unwrap(values), se2.wrap(error)
-            if key != "batch":
-                left.plot(along, values, color=colour, lw=1.0)
-            right.plot(along, error, color=colour, lw=1.0, label=label if i == 0 else "")
-        true = np.unwrap(truth[:, 2]) if i == 2 else truth[:, i]
-        left.plot(along, true, color=TRUTH, lw=1.0, label="truth" if i == 0 else "")
+            error = run[key][:, i] - truth[:, i]
+            error = se2.wrap(error) if i == 2 else error
+            if key != "smoother":
+                left.plot(along, straighten(run[key][:, i]), color=colour, lw=1.0)
+            right.plot(along, error, color=colour, lw=1.0, label=label)
+        left.plot(along, straighten(truth[:, i]), color=TRUTH, lw=1.0, label="truth")
         low, high = right.get_ylim()
         right.fill_between(
-            along[::4],
-            low,
-            high,
-            where=again.tolist(),
-            color=SKY,
-            alpha=0.2,
-            lw=0,
-            label="revisited ground" if i == 0 else "",
-        )
+            along[::4], low, high, where=run["revisited"], color=SKY, alpha=0.2, lw=0,
+            label="revisited ground",
+        )  # fmt: skip
         right.set_ylim(low, high)
-        left.set_ylabel(f"{name}, {unit}")
-        right.set_ylabel(f"error of {name}, {unit}")
+        left.set_ylabel(name)
+        right.set_ylabel(f"error of {name}")
     for ax in axes[-1]:
         ax.set_xlabel("path travelled, m")
-    handles, labels = axes[0, 1].get_legend_handles_labels()
-    truth_handles = axes[0, 0].get_legend_handles_labels()
-    page.legend(
-        truth_handles[0] + handles, truth_handles[1] + labels, loc="outside upper center", ncols=5
-    )
+    handles = [handle for ax in axes[0] for handle in ax.get_legend_handles_labels()[0]]
+    page.legend(handles=handles, loc="outside upper center", ncols=5)
     return page
 
 
 def by_particles(repeats: pd.DataFrame, bound: pd.DataFrame) -> Figure:
     """Figure 8, the paper's design: one recording, the filter repeated; bars of 2 sigma."""
     page = figure(9.0, 4.0)
-    best = bound[(bound["seed"] == JUDGED_SEED) & (bound["noise"] == "paper")]
-    columns = (("revised_rmse_m", "RMS of the path, m"), ("map_rmse_m", "RMS of the map, m"))
-    for ax, (column, label) in zip(page.subplots(1, 2), columns, strict=True):
+    best = bound[(bound["seed"] == repeats["seed"][0]) & (bound["noise"] == "paper")]
+    for ax, (column, label) in zip(page.subplots(1, 2), _BOTH, strict=True):
         for j, (name, part) in enumerate(repeats.groupby("filter", sort=False)):
             colour, marker, words = _FILTERS[str(name)]
             groups = part.groupby("n_particles")[column]
-            ms = np.array(list(groups.groups)) * (1.0 + 0.06 * j)
             ax.errorbar(
-                ms, groups.mean(), 2.0 * groups.std(), marker=marker, color=colour,
-                label=words, capsize=2.5, lw=1.0, ms=4,
+                groups.mean().index * (1.0 + 0.06 * j), groups.mean(), 2.0 * groups.std(),
+                marker=marker, color=colour, label=words, capsize=2.5, lw=1.0, ms=4,
             )  # fmt: skip
         ax.axhline(float(best[column].iloc[0]), color=_BATCH, ls=":", label="batch bound")
         ax.set(xscale="log", xlabel="particles M", ylabel=label, ylim=(0.0, None))
         _plain_ticks(ax, repeats["n_particles"])
-    odometry = float(repeats["odometry_rmse_m"].iloc[0])
-    count = int(repeats["repeat"].max()) + 1
-    page.suptitle(f"one recording, {count} runs each; odometry errs by {odometry:.1f} m")
+    page.suptitle(
+        f"one recording, {repeats['repeat'].max() + 1} runs each; odometry errs by "
+        f"{repeats['odometry_rmse_m'][0]:.1f} m"
+    )
     page.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=4)
     return page
 
@@ -308,27 +238,24 @@ def by_particles_over_worlds(particles: pd.DataFrame, bound: pd.DataFrame) -> Fi
     Every number of particles has the same recordings: one of each world.
     """
     particles = particles[particles["draw"] == 0]
-    noises = list(dict.fromkeys(particles["noise"]))
-    page = figure(11.0, 3.2 * len(noises) + 0.6)
+    by_noise = list(particles.groupby("noise", sort=False))
+    page = figure(11.0, 3.2 * len(by_noise) + 0.6)
     columns = {
-        "revised_rmse_m": "path",
-        "revised_aligned_rmse_m": "path, aligned",
-        "map_rmse_m": "map",
+        _PATH: "path",
+        "revised_ate_aligned_rmse_m": "path, aligned",
+        _MAP: "map",
         "map_aligned_rmse_m": "map, aligned",
     }
-    grid = page.subplots(len(noises), 4, squeeze=False, sharex=True)
-    for noise, row in zip(noises, grid, strict=True):
+    grid = page.subplots(len(by_noise), 4, squeeze=False, sharex=True)
+    for (noise, table), row in zip(by_noise, grid, strict=True):
+        best = np.log(bound[bound["noise"] == noise][list(columns)]).mean()
         for ax, (column, label) in zip(row, columns.items(), strict=True):
-            table = particles[particles["noise"] == noise]
-            for name, part in table.groupby("filter", sort=False):
-                _over_worlds(ax, part, "n_particles", column, str(name))
-            best = bound[bound["noise"] == noise][column]
-            level = float(np.exp(np.log(best).mean()))
-            ax.axhline(level, color=_BATCH, ls=":", label="batch bound")
+            _by_filter(ax, table, "n_particles", column)
+            ax.axhline(np.exp(best[column]), color=_BATCH, ls=":", label="batch bound")
             ax.set(xscale="log", yscale="log")
-            ax.set_title(f"{label}, {'10 px' if noise == 'paper' else '1 px'}", loc="left")
+            ax.set_title(f"{label}, {_NOISE[noise]}", loc="left")
             _plain_ticks(ax, [10, 50, 200, 1000])
-            _plain_y(ax)
+            _plain_log(ax.yaxis)
         row[0].set_ylabel("RMS error, m")
     for ax in grid[-1]:
         ax.set_xlabel("particles M")
@@ -341,33 +268,27 @@ def by_particles_over_worlds(particles: pd.DataFrame, bound: pd.DataFrame) -> Fi
 def by_distance(distance: pd.DataFrame) -> Figure:
     """Figure 9: dmax, by filter, choice of observations, walls and noise."""
     page = figure(10.5, 4.4)
-    kinds = (
-        ("fastslam2", True, "paper", 0, "random", BLUE, "-", "all visible"),
-        ("paper", True, "paper", 0, "random", ORANGE, "-", "all visible, as printed"),
-        ("fastslam2", True, "paper", 8, "random", GREEN, "-", "8 at random"),
-        ("fastslam2", True, "paper", 8, "nearest", SKY, "-", "8 nearest"),
-        ("fastslam2", False, "paper", 0, "random", BLUE, "--", "all, no walls"),
-        ("fastslam2", False, "paper", 8, "random", GREEN, "--", "8 at random, no walls"),
-        ("fastslam2", True, "pixel", 0, "random", PURPLE, "-", "all visible, 1 px"),
-    )
-    columns = (("revised_rmse_m", "RMS of the path, m"), ("map_rmse_m", "RMS of the map, m"))
+    kinds = {
+        ("fastslam2", True, "paper", 0, "random"): (BLUE, "-", "all visible"),
+        ("paper", True, "paper", 0, "random"): (ORANGE, "-", "all visible, as printed"),
+        ("fastslam2", True, "paper", 8, "random"): (GREEN, "-", "8 at random"),
+        ("fastslam2", True, "paper", 8, "nearest"): (SKY, "-", "8 nearest"),
+        ("fastslam2", False, "paper", 0, "random"): (BLUE, "--", "all, no walls"),
+        ("fastslam2", False, "paper", 8, "random"): (GREEN, "--", "8 at random, no walls"),
+        ("fastslam2", True, "pixel", 0, "random"): (PURPLE, "-", "all visible, 1 px"),
+    }
+    parts = dict(list(distance.groupby(["filter", "occluded", "noise", "n_seen", "rule"])))
     axes = page.subplots(1, 2, sharex=True)
-    for ax, (column, label) in zip(axes, columns, strict=True):
-        for name, occluded, noise, n_seen, rule, colour, line, words in kinds:
-            part = distance[
-                (distance["filter"] == name)
-                & (distance["occluded"] == occluded)
-                & (distance["noise"] == noise)
-                & (distance["n_seen"] == n_seen)
-                & (distance["rule"] == rule)
-            ]
-            if len(part):
-                x, middle, low, high = _intervals(part, "max_distance_m", column)
-                ax.plot(x, middle, line, marker="o", ms=3.5, color=colour, label=words)
-                ax.fill_between(x, low, high, color=colour, alpha=0.08, lw=0)
+    for ax, (column, label) in zip(axes, _BOTH, strict=True):
+        for kind, (colour, line, words) in kinds.items():
+            if kind in parts:
+                middle, bars = _intervals(parts[kind], "max_distance_m", column)
+                ax.plot(middle, line, marker="o", ms=3.5, color=colour, label=words)
+                band = (middle - bars[0], middle + bars[1])
+                ax.fill_between(middle.index, *band, color=colour, alpha=0.08, lw=0)
         ax.axvline(10.0, color=BLACK, lw=0.6, ls=":")
         ax.set(xlabel="dmax, m", ylabel=label, yscale="log")
-        _plain_y(ax)
+        _plain_log(ax.yaxis)
     page.legend(*axes[0].get_legend_handles_labels(), loc="outside right center")
     return page
 
@@ -375,38 +296,41 @@ def by_distance(distance: pd.DataFrame) -> Figure:
 def by_observations(observations: pd.DataFrame) -> Figure:
     """Error against the most observations of an image."""
     page = figure(9.0, 3.8)
-    columns = (("revised_rmse_m", "RMS of the path, m"), ("map_rmse_m", "RMS of the map, m"))
-    for ax, (column, label) in zip(page.subplots(1, 2), columns, strict=True):
-        for name, part in observations.groupby("filter", sort=False):
-            _over_worlds(ax, part, "n_seen", column, str(name))
+    for ax, (column, label) in zip(page.subplots(1, 2), _BOTH, strict=True):
+        _by_filter(ax, observations, "n_seen", column)
         ax.set(xscale="log", yscale="log", xlabel="most observations B", ylabel=label)
         _plain_ticks(ax, observations["n_seen"])
-        _plain_y(ax)
+        _plain_log(ax.yaxis)
     page.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=2)
     return page
 
 
+_WAYS = {
+    "known": (BLACK, "known"),
+    "descriptor": (GREEN, "descriptors, $\\sigma$ = {sigma:g} ({alone:.0f} % right alone)"),
+    "mahalanobis": (ORANGE, "Mahalanobis, p0 = {p0:g}"),
+    "ekf_slam": (RED, "EKF-SLAM, Mahalanobis"),
+}
+
+
 def by_association(association: pd.DataFrame) -> Figure:
     """Error and right associations of every way to associate."""
-    noises = list(dict.fromkeys(association["noise"]))
-    ways = association.groupby("noise", sort=False)[list(_WAYS)]
-    counts = [len(part.drop_duplicates()) for _, part in ways]
+    way = association["association"].where(association["filter"] != "ekf_slam", "ekf_slam")
+    association = association.assign(way=pd.Categorical(way, list(_WAYS)))
+    by_noise = [
+        (noise, list(table.groupby(["way", "sigma_descriptor", "p0"], observed=True)))
+        for noise, table in association.groupby("noise", sort=False)
+    ]
+    counts = [len(ways) for _, ways in by_noise]
     page = figure(10.0, 0.36 * sum(counts) + 1.2)
-    grid = page.subplots(len(noises), 2, squeeze=False, sharey="row", height_ratios=counts)
-    for noise, (left, right) in zip(noises, grid, strict=True):
-        table = association[association["noise"] == noise]
+    grid = page.subplots(len(counts), 2, squeeze=False, sharey="row", height_ratios=counts)
+    for (noise, ways), (left, right) in zip(by_noise, grid, strict=True):
         labels = []
-        parts = sorted(table.groupby(list(_WAYS)), key=lambda item: _rank(*item[0]))
-        for i, ((name, how, p0, sigma), part) in enumerate(parts):
-            precision = part["matching_precision"].mean()
-            words = {"known": "known", "mahalanobis": f"Mahalanobis, p0 = {p0:g}"}.get(
-                str(how),
-                f"descriptors, $\\sigma$ = {sigma:g} ({100 * precision:.0f} % right alone)",
-            )
-            labels.append("EKF-SLAM, Mahalanobis" if name == "ekf_slam" else words)
-            colour = {"known": BLACK, "mahalanobis": ORANGE}.get(str(how), GREEN)
-            colour = RED if name == "ekf_slam" else colour
-            ratio = part["revised_rmse_m"] / part["odometry_rmse_m"]
+        for i, ((name, sigma, p0), part) in enumerate(ways):
+            colour, words = _WAYS[name]
+            alone = 100 * part["matching_precision"].mean()
+            labels.append(words.format(sigma=sigma, p0=p0, alone=alone))
+            ratio = part[_PATH] / part["odometry_rmse_m"]
             left.plot(ratio, np.full(len(part), i), "|", color=colour, ms=8, alpha=0.6)
             left.plot(rms(ratio.to_numpy()), i, "D", color=colour, ms=5)
             right.barh(i, part["right_share"].mean(), color=colour, height=0.6)
@@ -415,53 +339,37 @@ def by_association(association: pd.DataFrame) -> Figure:
         left.set_ylim(len(labels) - 0.4, -0.6)  # from above; both sides share the heights
         right.set(xlim=(0.0, 1.0))
         right.tick_params(axis="y", left=False, labelleft=False)
-        left.set_title(f"noise of {'10 px' if noise == 'paper' else '1 px'}", loc="left")
-        _plain_x(left)
+        left.set_title(f"noise of {_NOISE[noise]}", loc="left")
+        _plain_log(left.xaxis)
     grid[-1, 0].set_xlabel("path error over odometry's (each world; diamonds: RMS)")
     grid[-1, 1].set_xlabel("share of right associations")
     return page
-
-
-_WAYS = ("filter", "association", "p0", "sigma_descriptor")
-
-
-def _rank(name: str, how: str, p0: float, sigma: float) -> tuple[int, float, float]:
-    """Order of the ways: known, by descriptors, by distance, and with one association for all."""
-    order = ("known", "descriptor", "mahalanobis")
-    return (3 if name == "ekf_slam" else order.index(how)), sigma, p0
 
 
 def by_settings(resampling: pd.DataFrame, noise: pd.DataFrame) -> Figure:
     """Resampling schemes, and where R is taken, by noise."""
     page = figure(10.0, 3.8)
     left, right = page.subplots(1, 2)
-    schemes = ("multinomial", "residual", "stratified", "systematic")
     for j, (share, words) in enumerate(((1.0, "at every image"), (0.5, "ESS < M/2"))):
         part = resampling[resampling["ess_share"] == share]
-        for i, scheme in enumerate(schemes):
-            logs = np.log(part[part["resampling"] == scheme]["revised_aligned_rmse_m"])
-            middle, half = np.exp(logs.mean()), 2.0 * logs.sem()
-            bars = [[-middle * np.expm1(-half)], [middle * np.expm1(half)]]
-            left.errorbar(
-                i + 0.2 * j - 0.1, middle, bars, marker="os"[j], color=(ORANGE, BLUE)[j],
-                capsize=3, label=words if i == 0 else None,
-            )  # fmt: skip
-    left.set(xticks=range(len(schemes)), xticklabels=schemes, ylim=(0.0, None))
+        middle, bars = _intervals(part, "resampling", "revised_ate_aligned_rmse_m")
+        left.errorbar(
+            np.arange(len(middle)) + 0.2 * j - 0.1, middle, bars, marker="os"[j],
+            color=(ORANGE, BLUE)[j], ls="none", capsize=3, label=words,
+        )  # fmt: skip
+    left.set(xticks=range(len(middle)), xticklabels=middle.index, ylim=(0.0, None))
     left.set_ylabel("RMS of the path, aligned, m")
     left.set_title("FastSLAM 1.0, M = 200", loc="left")
     left.legend()
     for at, colour in (("predicted", BLUE), ("measured", RED)):
-        part = noise[noise["noise_at"] == at]
-        x, middle, low, high = _intervals(part, "sigma_px", "revised_rmse_m")
-        right.errorbar(
-            x, middle, [middle - low, high - middle], marker="o", color=colour, capsize=3,
-            label=f"R at the {at} point",
-        )  # fmt: skip
+        middle, bars = _intervals(noise[noise["noise_at"] == at], "sigma_px", _PATH)
+        style: dict[str, Any] = {"marker": "o", "color": colour, "capsize": 3}
+        right.errorbar(middle.index, middle, bars, label=f"R at the {at} point", **style)
     right.set(xscale="log", yscale="log", xlabel="noise of column and row, px")
     right.set_ylabel("RMS of the path, m")
     right.set_title("FastSLAM 2.0, M = 200", loc="left")
     _plain_ticks(right, noise["sigma_px"])
-    _plain_y(right)
+    _plain_log(right.yaxis)
     right.legend()
     return page
 
@@ -478,27 +386,25 @@ def cost(table: pd.DataFrame) -> Figure:
     ax.set(xscale="log", yscale="log", xlabel="landmarks N", ylabel="time of a step, ms")
     ax.set_title("M = 1000, B = 20, resampling at every image", loc="left")
     _plain_ticks(ax, table["n_landmarks"])
-    _plain_y(ax)
+    _plain_log(ax.yaxis)
     ax.legend()
     return page
 
 
-def _over_worlds(ax: Axes, part: pd.DataFrame, by: str, column: str, name: str) -> None:
-    colour, marker, words = _FILTERS[name]
-    x, middle, low, high = _intervals(part, by, column)
-    bars = [middle - low, high - middle]
-    ax.errorbar(x, middle, bars, marker=marker, color=colour, label=words, capsize=2.5, ms=4)
+def _by_filter(ax: Axes, table: pd.DataFrame, by: str, column: str) -> None:
+    """Draw a column over worlds against `by`, one line a filter."""
+    for name, part in table.groupby("filter", sort=False):
+        colour, marker, words = _FILTERS[str(name)]
+        middle, bars = _intervals(part, by, column)
+        style: dict[str, Any] = {"marker": marker, "color": colour, "capsize": 2.5, "ms": 4}
+        ax.errorbar(middle.index, middle, bars, label=words, **style)
 
 
-def _intervals(part: pd.DataFrame, by: str, column: str) -> tuple[Array, Array, Array, Array]:
-    """Values of `by`; geometric mean over worlds of a column's RMS, and 95 % interval."""
-    squares = (part[column] ** 2).groupby([part[by], part["seed"]]).mean()
-    logs = 0.5 * np.log(squares)
-    groups = logs.groupby(level=0)
-    middle, half = groups.mean(), 2.0 * groups.sem().fillna(0.0)
-    low, high = np.exp(middle - half), np.exp(middle + half)
-    x = np.array(middle.index, float)
-    return x, np.exp(middle.to_numpy()), low.to_numpy(), high.to_numpy()
+def _intervals(part: pd.DataFrame, by: str, column: str) -> tuple[pd.Series[float], Array]:
+    """Geometric mean (K,) over worlds of a column's RMS, and (2, K) down and up to 95 %."""
+    logs = np.log(pooled(part, column, by))
+    middle, half = np.exp(logs.mean()), 2.0 * logs.sem().fillna(0.0)
+    return middle, np.array([-middle * np.expm1(-half), middle * np.expm1(half)])
 
 
 def _plain_ticks(ax: Axes, values: Iterable[float]) -> None:
@@ -508,29 +414,11 @@ def _plain_ticks(ax: Axes, values: Iterable[float]) -> None:
     ax.minorticks_off()
 
 
-def _plain_y(ax: Axes) -> None:
-    _plain(ax.yaxis)
-
-
-def _plain_x(ax: Axes) -> None:
-    _plain(ax.xaxis)
-
-
-def _plain(axis: Any) -> None:
+def _plain_log(axis: Any) -> None:
     """Numbers without powers of ten on a logarithmic axis, at 1, 2 and 5."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axis.set_minor_formatter(NullFormatter())
-
-
-def _ellipse(mean: Array, covariance: Array, **style: Any) -> Ellipse:
-    """Contour of 95 % of a Gaussian in the plane."""
-    values, vectors = np.linalg.eigh(covariance)
-    width, height = 2.0 * _CHI_95_2D * np.sqrt(np.maximum(values, 0.0))
-    angle = np.degrees(np.arctan2(vectors[1, 0], vectors[0, 0]))
-    return Ellipse((float(mean[0]), float(mean[1])), width, height, angle=angle, **style)
+    axis.set_major_formatter("{x:g}")
+    axis.set_minor_formatter("")
 
 
 def _ellipsoid(mean: Array, covariance: Array) -> Array:
@@ -539,7 +427,10 @@ def _ellipsoid(mean: Array, covariance: Array) -> Array:
     ball = np.stack([np.cos(turn) * np.cos(lift), np.sin(turn) * np.cos(lift), np.sin(lift)])
     values, vectors = np.linalg.eigh(covariance)
     axes = _CHI_95_3D * vectors * np.sqrt(np.maximum(values, 0.0))
-    gap = np.full((3, ball.shape[1], 1), np.nan)
-    surface = np.concatenate([np.einsum("ij,jkl->ikl", axes, ball), gap], axis=2)
+    surface = np.pad(np.tensordot(axes, ball, 1), [(0, 0), (0, 0), (0, 1)], constant_values=np.nan)
     wire: Array = mean[:, None] + surface.reshape(3, -1)
     return wire
+
+
+def _world(run: Arrays) -> World:
+    return World("gil2008", run["walls"], run["wall_z_m"])

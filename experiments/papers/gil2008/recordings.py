@@ -1,0 +1,192 @@
+"""The recordings of gil2008: one drive through each world, with images drawn over it.
+
+A world is driven through once. What else a run needs is drawn over the true path: further wheel
+errors by the law of k |ds|, and images by the simulator's own camera. Images hold every landmark
+within 20 m; a run keeps those within its dmax, and B of them, so runs share their noise.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from experiments.papers.gil2008.settings import FARTHEST_M
+from experiments.runs.experiment import Config, Experiment
+from experiments.runs.seeds import stream
+from sim.errors import InputError
+from sim.recording import LandmarkLog, Recording, WheelLog
+from sim.sensors import StereoCamera, suite_from_config
+from sim.simulate import _ExactRays, _Landmarks
+from sim.world import World
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What a recording's images and wheel errors are drawn by. Its text names their stream.
+
+    Attributes
+    ----------
+    seed
+        Of the world and the drive through it.
+    draw
+        0: the drive's own wheel errors; others are drawn over the same path.
+    noise
+        `paper`: X, Y and Z drawn apart. `pixel`: drawn in the image.
+    occluded
+        Whether walls hide landmarks.
+    sigma_px
+        Standard deviation, px, of images with noise of their own; None for those that all share.
+    sigma_descriptor, alike_share
+        Noise of the descriptors; share of landmarks that have another one's.
+    """
+
+    seed: int
+    draw: int = 0
+    noise: str = "paper"
+    occluded: bool = True
+    sigma_px: float | None = None
+    sigma_descriptor: float = 0.05
+    alike_share: float = 0.0
+
+    @classmethod
+    def of(cls, config: Config) -> Scene:
+        """Read a configuration, and its `recording`."""
+        camera = _camera(config)
+        return cls(
+            seed=config["seed"],
+            noise="pixel" if camera.correlated else "paper",
+            sigma_descriptor=camera.sigma_descriptor,
+            **{key: value for key, value in config["recording"].items() if key != "_target_"},
+        )
+
+
+def recorded(config: Config, **_scene: Any) -> Recording:
+    """Make the recording of a configuration; `Scene.of` reads the keys of its `recording`."""
+    return thinned(whole(config), config)
+
+
+def whole(config: Config) -> Recording:
+    """Recording of a configuration's scene: all landmarks within 20 m in every image, with ids."""
+    scene, camera = Scene.of(config), _camera(config)
+    driven = _drive(config).recording()
+    assert driven.truth is not None
+    assert driven.truth.world is not None
+    assert driven.landmarks is not None
+    # the noise of descriptors alone leaves the images as they are
+    rng = stream(scene.seed, f"gil2008/images/{dataclasses.replace(scene, sigma_descriptor=0.0)}")
+    world = _alike(driven.truth.world, scene.alike_share, rng)
+    farthest_m = max(FARTHEST_M, camera.max_distance_m)
+    camera = dataclasses.replace(camera, max_distance_m=farthest_m, max_observations=0)
+    eye = _Landmarks(world, camera, rng)
+    rays: Any = _ExactRays(world, None) if scene.occluded else _NoWalls()
+    stamps = driven.landmarks.stamps
+    images = [eye.observe(rays, pose) for pose in driven.truth_at(stamps)]
+    points, ids, descriptors = (list(part) for part in zip(*images, strict=True))
+    true_ids = np.concatenate(ids)
+    splits = np.cumsum([0, *map(len, ids)])
+    return dataclasses.replace(
+        driven,
+        landmarks=LandmarkLog(
+            stamps, splits, np.concatenate(points), true_ids, np.concatenate(descriptors)
+        ),
+        wheels=driven.wheels if scene.draw == 0 else _wheels(driven, scene, config),
+        sensors=dataclasses.replace(driven.sensors, stereo=camera),
+        truth=dataclasses.replace(driven.truth, landmark_ids=true_ids, world=world),
+    )
+
+
+def thinned(recording: Recording, config: Config) -> Recording:
+    """Recording as a configuration's camera gives it.
+
+    Landmarks are kept by their true distance. One random order decides for every B, so fewer
+    observations are a subset of more.
+    """
+    log, truth = recording.landmarks, recording.truth
+    camera, scene = _camera(config), Scene.of(config)
+    assert log is not None
+    assert truth is not None
+    rng = stream(scene.seed, "gil2008/choice", scene.draw)
+    image = np.repeat(np.arange(len(log.stamps)), np.diff(log.splits))
+    distance = landmark_distances_m(recording)
+    order = distance if camera.selection == "nearest" else rng.random(len(distance))
+    kept = distance <= camera.max_distance_m
+    if camera.max_observations:
+        ranked = np.lexsort((order, ~kept, image))
+        rank = np.empty(len(image), np.int64)
+        rank[ranked] = np.arange(len(image)) - log.splits[image[ranked]]
+        kept &= rank < camera.max_observations
+    return dataclasses.replace(
+        recording,
+        landmarks=dataclasses.replace(
+            log,
+            splits=np.concatenate([[0], np.cumsum(kept)])[log.splits],
+            points_in_camera=log.points_in_camera[kept],
+            ids=log.ids[kept] if camera.identifies else np.zeros(0, np.int64),
+            descriptors=log.descriptors[kept],
+        ),
+        sensors=dataclasses.replace(recording.sensors, stereo=camera),
+        truth=dataclasses.replace(truth, landmark_ids=truth.landmark_ids[kept]),
+    )
+
+
+def landmark_distances_m(recording: Recording) -> Array:
+    """True distance (K,) from the camera to the landmark of each observation, m."""
+    log, truth, camera = recording.landmarks, recording.truth, recording.sensors.stereo
+    assert log is not None
+    assert camera is not None
+    assert truth is not None
+    assert truth.world is not None
+    where = np.repeat(recording.truth_at(log.stamps), np.diff(log.splits), axis=0)
+    where[:, 2] = camera.mount.z_m
+    distance: Array = np.linalg.norm(truth.world.landmarks[truth.landmark_ids] - where, axis=1)
+    return distance
+
+
+def _drive(config: Config) -> Experiment:
+    """Drive of a configuration's robot; whatever its camera, it is the same one."""
+    camera = StereoCamera(rate_hz=_camera(config).rate_hz)
+    sensors = {**config["sensors"], "stereo": dataclasses.asdict(camera)}
+    return Experiment({**config, "recording": None, "sensors": sensors})
+
+
+def _camera(config: Config) -> StereoCamera:
+    camera = suite_from_config(config["sensors"]).stereo
+    if camera is None or camera.selection == "spread":
+        raise InputError(
+            "gil2008 needs a stereo camera whose selection is random or nearest; try "
+            "sensors=stereo_paper"
+        )
+    return camera
+
+
+class _NoWalls:
+    """Rays that nothing stops."""
+
+    def sees(self, origin: Array, points: Array) -> NDArray[np.bool_]:
+        return np.ones(len(points), np.bool_)
+
+
+def _wheels(driven: Recording, scene: Scene, config: Config) -> WheelLog:
+    """Encoders with other errors over the same true travel, by the law of k |ds|."""
+    assert driven.truth is not None
+    robot = Experiment(config).robot()
+    rng = stream(scene.seed, "gil2008/wheels", scene.draw)
+    ground = np.diff(driven.truth.wheel_travel_m, axis=0, prepend=0.0)
+    error = np.sqrt([robot.kr, robot.kl] * np.abs(ground)) * rng.standard_normal(ground.shape)
+    return WheelLog(driven.truth.stamps, np.cumsum(ground + error, axis=0))
+
+
+def _alike(world: World, share: float, rng: np.random.Generator) -> World:
+    """World in which a share of the landmarks has the descriptor of another one of them."""
+    n = 2 * round(share * len(world.landmarks) / 2)
+    first, second = rng.permutation(len(world.landmarks))[:n].reshape(2, -1)
+    descriptors, twins = world.descriptors.copy(), np.zeros(len(world.landmarks), bool)
+    descriptors[second] = descriptors[first]
+    twins[[*first, *second]] = True
+    return dataclasses.replace(world, descriptors=descriptors, look_alike=twins)

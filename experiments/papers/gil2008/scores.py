@@ -1,0 +1,95 @@
+"""What gil2008 measures of a run beside its path: map, associations, error over known ground."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimators.base import Estimate
+from experiments.evaluation.metrics import alignment, position_errors_m, rms
+from experiments.papers.gil2008.settings import LAG_M, WITHIN_M
+from experiments.runs.row import Row
+from sim import se2
+from sim.recording import Recording
+
+Array = NDArray[np.float64]
+KEEP = ("associations", "resampled")  # Belief extras that `filter_scores` reads
+
+
+def map_scores(recording: Recording, found: Any) -> Row:
+    """RMS distances of the map's landmarks from the true ones, raw and aligned in the plane."""
+    if not isinstance(found, dict) or len(found.get("ids", ())) < 2:
+        return {}
+    assert recording.truth is not None
+    assert recording.truth.world is not None
+    true, made = recording.truth.world.landmarks[found["ids"]], found["landmarks"]
+    fitted = np.column_stack([se2.transform(alignment(true, made), made[:, :2]), made[:, 2]])
+    return {
+        "n_landmarks": len(true),
+        "map_rmse_m": rms(np.linalg.norm(made - true, axis=1)),
+        "map_aligned_rmse_m": rms(np.linalg.norm(fitted - true, axis=1)),
+    }
+
+
+def filter_scores(recording: Recording, online: Estimate) -> Row:
+    """Shares of right associations, and of images at which a particle filter resampled."""
+    given = online.extras["associations"]
+    rows = [i for i, associations in enumerate(given) if associations is not None]
+    if not rows:
+        return {}
+    scores: Row = {"right_share": right_share(recording, [given[i] for i in rows])}
+    resampled = [online.extras["resampled"][i] for i in rows]
+    if None not in resampled:
+        scores["resampled_share"] = float(np.mean(resampled))
+    return scores
+
+
+def right_share(recording: Recording, associations: Sequence[NDArray[np.int64]]) -> float:
+    """Share of observations given to the landmark they are of.
+
+    An observation that starts a landmark is right if that one had not been seen before.
+    """
+    assert recording.truth is not None
+    true = recording.truth.landmark_ids
+    given = np.concatenate(associations)
+    first = np.zeros(len(true), bool)
+    first[np.unique(true, return_index=True)[1]] = True
+    right = np.where(given == np.arange(len(true)), first, true[given] == true)
+    return float(np.mean(right & (given >= 0)))
+
+
+def matching_precision(recording: Recording) -> float:
+    """Share of observations whose descriptor is nearest to that of their landmark's first one."""
+    log, truth = recording.landmarks, recording.truth
+    assert log is not None
+    assert truth is not None
+    ids, first = np.unique(truth.landmark_ids, return_index=True)
+    again = np.delete(np.arange(len(truth.landmark_ids)), first)
+    nearest = np.argmax(log.descriptors[again] @ log.descriptors[first].T, axis=1)
+    return float(np.mean(ids[nearest] == truth.landmark_ids[again]))
+
+
+def travelled_m(truth: Array) -> Array:
+    """Path (T,) behind the robot, m."""
+    steps = np.hypot(*np.diff(truth[:, :2], axis=0).T)
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def revisited(truth: Array) -> NDArray[np.bool_]:
+    """Rows (T,) where the robot is within a metre of where it was at least 20 m of path ago."""
+    travelled = travelled_m(truth)
+    near = np.hypot(*(truth[:, None, :2] - truth[None, :, :2]).transpose(2, 0, 1)) < WITHIN_M
+    answer: NDArray[np.bool_] = np.any(near & (travelled[:, None] - travelled > LAG_M), axis=1)
+    return answer
+
+
+def revisited_slope(truth: Array, means: Array) -> float:
+    """Growth of the position error by distance over revisited ground, m per m."""
+    rows = np.flatnonzero(revisited(truth[::4])) * 4
+    if len(rows) < 10:
+        return float("nan")
+    errors = position_errors_m(truth, means)
+    return float(np.polyfit(travelled_m(truth)[rows], errors[rows], 1)[0])

@@ -1,0 +1,35 @@
+"""Constants of the gil2008 studies; what is configuration stands in conf/study/gil2008*.yaml."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from experiments.evaluation.verdict import Profile
+
+
+class Size(NamedTuple):
+    """How many worlds, repeats of a run, draws of the wheel errors, and repeats of the timing."""
+
+    n_worlds: int
+    n_repeats: int
+    n_draws: int
+    n_timings: int
+
+
+# Each study's table, and the estimator's keys that name its rows
+LABELS: dict[str, tuple[str, ...]] = {
+    "particles": ("n_particles",),
+    "bound": (),
+    "observations": (),
+    "repeats": ("n_particles",),
+    "distance": (),
+    "association": ("association", "p0"),
+    "resampling": ("resampling", "ess_share"),
+    "noise": ("noise_at",),
+}
+SIZES = {Profile.FULL: Size(20, 20, 5, 5), Profile.QUICK: Size(2, 3, 2, 2)}
+SEED = 1000  # of the first world
+P0 = 1e-3  # names the row of an estimator that has none
+FARTHEST_M = 20.0  # images are drawn with all landmarks within
+LAG_M = 20.0  # ground is revisited when the robot was there at least this much path ago
+WITHIN_M = 1.0  # and this near
