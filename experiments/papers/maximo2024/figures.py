@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from typing import Any
 
 import numpy as np
@@ -29,6 +28,7 @@ Arrays = dict[str, NDArray[Any]]
 
 _COLOUR = {"M1": ORANGE, "M2": BLUE, "M3": GREEN}
 _FLOOR_M = {"oxford": 1.0, "oxford_real": 1.0, "umh": 0.03, "campus": 0.1, "campus_quick": 0.1}
+_RECALL = {"recall_at_1": "recall@1", "recall_at_1_percent": "recall@1 %"}
 
 
 def draw(made: Results) -> dict[str, Figure]:
@@ -100,25 +100,20 @@ def map_and_route(drawn: dict[str, Arrays]) -> Figure:
 
 def dispersion(table: pd.DataFrame) -> Figure:
     """Figure 4: dispersion of the particles by step, and the error below it."""
-    names = geometries(table)
-    page = figure(2.6 * len(names) + 0.6, 5.0)
-    axes = page.subplots(2, len(names), sharex=True, squeeze=False)
-    for (row, value), (column, name) in itertools.product(
-        enumerate(("dispersion_m", "error_m")), enumerate(names)
-    ):
-        ax = axes[row, column]
-        for method in METHODS:
-            part = table[(table["geometry"] == name) & (table["method"] == method)]
-            steps = part.pivot_table(index="step", columns="seed", values=value)
-            spread = np.quantile(steps, [0.1, 0.5, 0.9], axis=1)
-            low, middle, high = np.maximum(spread, _FLOOR_M[name])
-            ax.plot(steps.index, middle, color=_COLOUR[method], label=method)
-            ax.fill_between(steps.index, low, high, color=_COLOUR[method], alpha=0.15, lw=0)
-        _log_scale(ax, bottom=_FLOOR_M[name])
-        axes[0, column].set(title=NAMES[name])
-        axes[1, column].set(xlabel="step")
-    axes[0, 0].set(ylabel="dispersion, m")
-    axes[1, 0].set(ylabel="error, m")
+    page, columns = _columns(table, 2.6, 0.6, 5.0, n_rows=2)
+    for axes, name, part in columns:
+        for ax, value in zip(axes, ("dispersion_m", "error_m"), strict=True):
+            steps = part.groupby(["method", "step"])[value].quantile([0.1, 0.5, 0.9]).unstack()
+            for method in METHODS:
+                spread = steps.clip(lower=_FLOOR_M[name]).loc[method]
+                ax.plot(spread[0.5], color=_COLOUR[method], label=method)
+                between = (spread.index, spread[0.1], spread[0.9])
+                ax.fill_between(*between, color=_COLOUR[method], alpha=0.15, lw=0)
+            _log_scale(ax, bottom=_FLOOR_M[name])
+        axes[0].set(title=NAMES[name])
+        axes[1].set(xlabel="step")
+    columns[0][0][0].set(ylabel="dispersion, m")
+    columns[0][0][1].set(ylabel="error, m")
     return _with_legend(page, 3)
 
 
@@ -158,14 +153,11 @@ def particles(route: Arrays) -> Figure:
 
 def table_1(table: pd.DataFrame, weighting: pd.DataFrame) -> Figure:
     """Table 1: error of each method in each world, beside the paper's."""
-    names = geometries(table)
-    page = figure(2.5 * len(names) + 0.5, 3.9)
-    axes = page.subplots(1, len(names), sharey=False, squeeze=False)[0]
+    page, columns = _columns(table, 2.5, 0.5, 3.9)
     worlds = weighting.groupby(["geometry", "method", "seed"])["error_m"].mean()
-    table = table.set_index(["geometry", "method"])
-    for ax, name in zip(axes, names, strict=True):
+    for (ax,), name, part in columns:
         for i, method in enumerate(METHODS):
-            errors, row = worlds[name, method], table.loc[name, method]
+            errors, row = worlds[name, method], part.set_index("method").loc[method]
             spread = np.linspace(-0.18, 0.18, len(errors)) if len(errors) > 1 else np.zeros(1)
             label = "a world (mean of its repeats)" if i == 1 else ""
             ax.plot(i + spread, errors, ".", color=_COLOUR[method], ms=4, label=label)
@@ -173,14 +165,14 @@ def table_1(table: pd.DataFrame, weighting: pd.DataFrame) -> Figure:
             if np.isfinite(row["paper_m"]):
                 bar = {"fmt": "D", "color": RED, "ms": 5, "label": "paper" * (i == 0)}
                 ax.errorbar(i + 0.3, row["paper_m"], yerr=row["paper_sd_m"], **bar)
-        nearest = float(table.loc[name, "nearest_node_m"].iloc[0])
+        nearest = float(part["nearest_node_m"].iloc[0])
         ax.axhline(nearest, color=WALL, ls=":", lw=1, label="nearest node")
         ax.set_xticks(range(3), METHODS)
         ax.set(title=NAMES[name], xlim=(-0.5, 2.6))
         _log_scale(ax)
         low, high = ax.get_ylim()
         ax.set_ylim(min(low, 0.5 * nearest), max(high, 5.0 * nearest))
-    axes[0].set(ylabel="mean error over the route, m")
+    page.axes[0].set(ylabel="mean error over the route, m")
     return _with_legend(page, 4)
 
 
@@ -204,11 +196,10 @@ def table_2(table: pd.DataFrame) -> Figure:
 
 def quality(table: pd.DataFrame) -> Figure:
     """Where M3 fails: share of worlds, by the descriptors' noise and B, parameters shared."""
-    names = list(table["geometry"].unique())
-    page = figure(4.6 * len(names), 3.4)
-    for ax, name in zip(page.subplots(1, len(names), squeeze=False)[0], names, strict=True):
+    page, columns = _columns(table, 4.6, 0.0, 3.4)
+    for (ax,), name, part in columns:
         shares = m3_failures(table, name)
-        recall = table[table["geometry"] == name].groupby("noise_weight")["recall_at_1"].mean()
+        recall = part.groupby("noise_weight")["recall_at_1"].mean()
         ax.imshow(shares, cmap="Blues", vmin=0.0, vmax=1.4, aspect="auto", origin="lower")
         for (i, j), share in np.ndenumerate(shares):
             ax.text(j, i, f"{share:.2f}", ha="center", va="center")
@@ -222,13 +213,9 @@ def quality(table: pd.DataFrame) -> Figure:
 
 def kidnapping(table: pd.DataFrame) -> Figure:
     """Share of kidnapped robots recovered by the node, with injection and without."""
-    known = table[table["known_before"]]
-    names = geometries(known)
-    page = figure(2.6 * len(names) + 0.5, 3.4)
-    axes = page.subplots(1, len(names), sharey=True, squeeze=False)[0]
+    page, columns = _columns(table[table["known_before"]], 2.6, 0.5, 3.4, sharey=True)
     at = np.linspace(0.0, 1.5 * RECOVERED_WITHIN, 200)
-    for ax, name in zip(axes, names, strict=True):
-        part = known[known["geometry"] == name]
+    for (ax,), name, part in columns:
         for injects, trials in part.groupby(part["injection"] > 0.0):
             steps = np.sort(trials["settled_at"].fillna(np.inf))
             shares = np.searchsorted(steps, at, side="right") / len(steps)
@@ -236,7 +223,7 @@ def kidnapping(table: pd.DataFrame) -> Figure:
             ax.plot(at, shares, color=BLUE if injects else ORANGE, label=label)
         ax.axvline(RECOVERED_WITHIN, color=WALL, ls=":", lw=1)
         ax.set(xlabel="nodes since the kidnapping", title=NAMES[name], ylim=(-0.03, 1.03))
-    axes[0].set(ylabel="share recovered")
+    page.axes[0].set(ylabel="share recovered")
     return _with_legend(page, 2)
 
 
@@ -249,22 +236,32 @@ def campus_errors(starts_table: pd.DataFrame, clusters_table: pd.DataFrame) -> F
     spacing = float(starts_table["spacing_m"].mean())
     left.axvline(spacing / 5.0, color=WALL, ls=":", label="a fifth of the spacing")
     left.axvline(spacing, color=WALL, ls="--", label="spacing of the nodes")
-    left.set(xlabel="error once localised, m", ylabel="share of starts", xscale="log")
+    left.set(xlabel="error once localized, m", ylabel="share of starts", xscale="log")
     page.legend(*left.get_legend_handles_labels(), loc="outside lower left", ncols=4, fontsize=8)
     part = clusters_table[clusters_table["geometry"].str.startswith("campus")]
-    recall = part.groupby("descriptor")[["recall_at_1", "recall_at_1_percent"]].mean()
-    places = np.arange(len(describers.KINDS))
-    for offset, column, colour, label in (
-        (-0.2, "recall_at_1", BLUE, "recall@1"),
-        (0.2, "recall_at_1_percent", SKY, "recall@1 %"),
-    ):
-        heights = recall.loc[list(describers.KINDS), column]
-        bars = right.bar(places + offset, heights, 0.36, color=colour, label=label)
+    recall = part.groupby("descriptor")[list(_RECALL)].mean().loc[list(describers.KINDS)]
+    recall.rename(columns=_RECALL).plot.bar(ax=right, color=[BLUE, SKY], width=0.76, rot=0)
+    for bars in right.containers:
         right.bar_label(bars, fmt="%.3f", fontsize=7)
-    right.set_xticks(places, list(describers.KINDS))
-    right.set(ylim=(0.0, 1.0), ylabel="share of queries")
+    right.set(xlabel="", ylim=(0.0, 1.0), ylabel="share of queries")
     right.legend(loc="lower right", bbox_to_anchor=(1.0, 1.06), ncols=2)
     return page
+
+
+def _columns(
+    table: pd.DataFrame,
+    width_in: float,
+    margin_in: float,
+    height_in: float,
+    n_rows: int = 1,
+    sharey: bool = False,
+) -> tuple[Figure, list[tuple[Any, str, pd.DataFrame]]]:
+    """Page with a column for each geometry; the column's axes, the geometry and its rows."""
+    names = geometries(table)
+    page = figure(width_in * len(names) + margin_in, height_in)
+    axes = page.subplots(n_rows, len(names), sharex=n_rows > 1, sharey=sharey, squeeze=False).T
+    parts = [table[table["geometry"] == name] for name in names]
+    return page, list(zip(axes, names, parts, strict=True))
 
 
 def _plan(ax: Axes, **settings: Any) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,8 @@ from sim.robot import RobotGeometry
 from sim.sensors import SensorSuite
 
 Array = NDArray[np.float64]
+# Noisy unit descriptors (K, 512) at points (K, 2) m
+Describe = Callable[[Array, np.random.Generator], NDArray[np.float32]]
 
 N_STRETCHES = 40  # the paper's k-means clusters
 SIZE = 512  # of the paper's descriptors
@@ -161,38 +164,34 @@ def queries(nodes_m: Array, geometry: Geometry, rng: np.random.Generator) -> Arr
     return placed
 
 
-class Field:
+def field(geometry: Geometry, nodes_m: Array, rng: np.random.Generator) -> Describe:
     """Synthetic descriptors: a part common to a stretch, a part of the place, and noise.
 
     The stretches, 40 along the route, crossfade into each other. The place's own part is a
     random Fourier feature map of the position, so that it changes smoothly and never repeats.
     """
+    g = geometry
+    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(nodes_m, axis=0).T))])
+    along /= max(along[-1], 1e-9)
+    lengths = rng.uniform(0.5, 1.5, N_STRETCHES)
+    middles = (np.cumsum(lengths) - lengths / 2.0) / lengths.sum()
+    edges, width = (middles[1:] + middles[:-1]) / 2.0, 0.15 / N_STRETCHES
+    stretches = rng.standard_normal((N_STRETCHES, SIZE))
+    stretches /= np.linalg.norm(stretches, axis=1, keepdims=True)
+    waves = rng.standard_normal((2, SIZE)) / g.place_scale_m
+    phases = rng.uniform(0.0, 2.0 * math.pi, SIZE)
 
-    def __init__(self, geometry: Geometry, nodes_m: Array, rng: np.random.Generator) -> None:
-        self._geometry, self._nodes_m = geometry, nodes_m
-        along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(nodes_m, axis=0).T))])
-        self._along = along / max(along[-1], 1e-9)
-        lengths = rng.uniform(0.5, 1.5, N_STRETCHES)
-        self._middles = (np.cumsum(lengths) - lengths / 2.0) / lengths.sum()
-        stretches = rng.standard_normal((N_STRETCHES, SIZE))
-        self._stretches = stretches / np.linalg.norm(stretches, axis=1, keepdims=True)
-        self._waves = rng.standard_normal((2, SIZE)) / geometry.place_scale_m
-        self._phases = rng.uniform(0.0, 2.0 * math.pi, SIZE)
-
-    def describe(self, points_m: Array, rng: np.random.Generator) -> NDArray[np.float32]:
-        """Noisy unit descriptors (K, 512) at points (K, 2)."""
-        g = self._geometry
-        along = self._along[np.argmin(gaps_m(points_m, self._nodes_m), axis=1)]
-        width = 0.15 / N_STRETCHES
-        edges = (self._middles[1:] + self._middles[:-1]) / 2.0
-        above = 1.0 / (1.0 + np.exp(-np.clip((along[:, None] - edges) / width, -50.0, 50.0)))
+    def describe(points_m: Array, rng: np.random.Generator) -> NDArray[np.float32]:
+        here = along[np.argmin(gaps_m(points_m, nodes_m), axis=1)]
+        above = 1.0 / (1.0 + np.exp(-np.clip((here[:, None] - edges) / width, -50.0, 50.0)))
         shares = -np.diff(above, axis=1, prepend=1.0, append=0.0)
-        place = math.sqrt(2.0 / SIZE) * np.cos(points_m @ self._waves + self._phases)
+        place = math.sqrt(2.0 / SIZE) * np.cos(points_m @ waves + phases)
         noise = rng.standard_normal((len(points_m), SIZE)) / math.sqrt(SIZE)
-        whole = g.stretch_weight * (shares @ self._stretches) + g.place_weight * place
+        whole = g.stretch_weight * (shares @ stretches) + g.place_weight * place
         whole += g.noise_weight * noise
-        whole /= np.linalg.norm(whole, axis=1, keepdims=True)
-        return np.asarray(whole, np.float32)
+        return np.asarray(whole / np.linalg.norm(whole, axis=1, keepdims=True), np.float32)
+
+    return describe
 
 
 def place_world(geometry: Geometry, seed: int, nodes_m: Array | None = None) -> PlaceWorld:
@@ -201,12 +200,11 @@ def place_world(geometry: Geometry, seed: int, nodes_m: Array | None = None) -> 
         nodes_m = route(geometry, stream(seed, "world"))
     rng = stream(seed, "places")
     queries_m = queries(nodes_m, geometry, rng)
-    field = Field(geometry, nodes_m, rng)
-    known_map = from_arrays(nodes_m, field.describe(nodes_m, rng))
-    recording = query_recording(
-        queries_m, field.describe(queries_m, rng), geometry.interval_s, stream(seed, "slip")
-    )
-    return PlaceWorld(known_map, recording)
+    describe = field(geometry, nodes_m, rng)
+    known_map = from_arrays(nodes_m, describe(nodes_m, rng))
+    seen = describe(queries_m, rng)
+    slip = stream(seed, "slip")
+    return PlaceWorld(known_map, query_recording(queries_m, seen, geometry.interval_s, slip))
 
 
 def query_recording(

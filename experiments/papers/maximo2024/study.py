@@ -66,9 +66,9 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
     """
     campus = "campus" if profile is Profile.FULL else "campus_quick"
     oxford = "oxford_real" if POSITIONS.is_file() else "oxford"
-    counts = dict.fromkeys(["oxford", "umh", oxford], N_WORLDS[profile])
+    routes = dict.fromkeys(["oxford", "umh", oxford])  # each once
     jobs = [(campus, JUDGED_SEED + i) for i in range(N_CAMPUSES[profile])]
-    jobs += [(name, JUDGED_SEED + i) for name, count in counts.items() for i in range(count)]
+    jobs += [(name, JUDGED_SEED + i) for name in routes for i in range(N_WORLDS[profile])]
     parts = Parallel(n_jobs=-1, return_as="generator")(
         delayed(_rows)(name, seed, profile) for name, seed in jobs
     )
@@ -78,8 +78,7 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
             labelled = ({"geometry": name, "seed": seed, **row} for row in found)
             rows.setdefault(table, []).extend(labelled)
         on_progress(done / len(jobs))
-    tables = {name: pd.DataFrame(found) for name, found in rows.items()}
-    tables["times"] = times()
+    tables = {name: pd.DataFrame(found) for name, found in rows.items()} | {"times": times()}
     tables["table_1"] = table_1(tables["weighting"])
     tables["table_2"] = table_2(tables["particles"], tables["times"])
     for name, table in tables.items():
@@ -93,14 +92,16 @@ def _rows(name: str, seed: int, profile: Profile) -> dict[str, Rows]:
         return campus_rows(name, seed, N_REPEATS[profile])
     case = case_of(name, seed)
     settings, tolerance_m = options(case), TOLERANCE * case.known_map.spacing_m
-    tables = weighting_rows(case, N_REPEATS[profile])
-    tables["starts"] = [
-        {"start": start, "settled_at": settled}
-        for start, settled, _ in starts(case, N_STARTS[profile], settings, tolerance_m)
-    ]
-    settings["estimate"] = "mode"
-    tables["kidnapping"] = kidnapping_rows(case, settings, 0.05, 5, RECOVERED_WITHIN + HELD)
-    tables["clusters"] = [cluster_row(case.known_map, case.recording, "synthetic", seed)]
+    by_mode = settings | {"estimate": "mode"}
+    tables = {
+        **weighting_rows(case, N_REPEATS[profile]),
+        "starts": [
+            {"start": start, "settled_at": settled}
+            for start, settled, _ in starts(case, N_STARTS[profile], settings, tolerance_m)
+        ],
+        "kidnapping": kidnapping_rows(case, by_mode, 0.05, 5, RECOVERED_WITHIN + HELD),
+        "clusters": [cluster_row(case.known_map, case.recording, "synthetic", seed)],
+    }
     if name in GEOMETRIES:  # not again on the real positions
         tables["particles"] = particle_rows(case, N_REPEATS[profile])
         if seed < JUDGED_SEED + N_QUALITY_WORLDS[profile]:
@@ -128,11 +129,12 @@ def table_1(weighting: pd.DataFrame) -> pd.DataFrame:
     Beside them the paper's.
     """
     table = _over_worlds(weighting, "method")
-    keys = [(name.removesuffix("_real"), method) for name, method in table.index]
-    printed = [PRINTED_1.get(key, (math.nan, math.nan)) for key in keys]
-    table[["paper_m", "paper_sd_m"]] = printed
-    nearest = weighting.groupby(table.index.names)["nearest_node_m"].mean()
-    return table.assign(nearest_node_m=nearest).reset_index()
+    table[["paper_m", "paper_sd_m"]] = [
+        PRINTED_1.get((name.removesuffix("_real"), method), (math.nan, math.nan))
+        for name, method in table.index
+    ]
+    table["nearest_node_m"] = weighting.groupby(table.index.names)["nearest_node_m"].mean()
+    return table.reset_index()
 
 
 def table_2(particles: pd.DataFrame, taken: pd.DataFrame) -> pd.DataFrame:

@@ -287,14 +287,12 @@ def _retrieval(known_map: TopologicalMap, recording: Recording) -> dict[str, flo
 def cluster_labels(known_map: TopologicalMap, seed: int) -> NDArray[np.int64]:
     """Label (N,) of each node by k-means with 40 clusters, of the best of five starts."""
     features = known_map.descriptors.astype(np.float64)
-    n_clusters, least, best = min(N_STRETCHES, len(features)), math.inf, np.zeros(0, np.int64)
-    for start in range(5):
-        rng = stream(seed, "clusters", start)
-        centres, labels = kmeans2(features, n_clusters, minit="++", seed=rng)
-        cost = float(np.sum((features - centres[labels]) ** 2))
-        if cost < least:
-            least, best = cost, labels.astype(np.int64)
-    return best
+    n_clusters = min(N_STRETCHES, len(features))
+    streams = [stream(seed, "clusters", start) for start in range(5)]
+    found = [kmeans2(features, n_clusters, minit="++", seed=rng) for rng in streams]
+    costs = [np.sum((features - centres[labels]) ** 2) for centres, labels in found]
+    labels: NDArray[np.int64] = found[int(np.argmin(costs))][1].astype(np.int64)
+    return labels
 
 
 def cluster_row(known_map: TopologicalMap, recording: Recording, descriptor: str, seed: int) -> Row:
