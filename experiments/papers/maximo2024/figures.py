@@ -177,7 +177,7 @@ def table_1(table: pd.DataFrame, weighting: pd.DataFrame) -> Figure:
 
 
 def table_2(table: pd.DataFrame) -> Figure:
-    """Table 2: error and time a node by the number of particles, beside the paper's."""
+    """Table 2: error and time per node by the number of particles, beside the paper's."""
     page = figure(9.0, 5.4)
     here, paper = {"fmt": "o-", "color": BLUE}, {"fmt": "D--", "color": RED}
     for (upper, lower), (name, part) in zip(

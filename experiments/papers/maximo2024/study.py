@@ -1,6 +1,6 @@
 """The study of maximo2024: weightings M1-M3, particles, starts, kidnapping, clouds of a campus.
 
-The route is the unit of inference: each world is a route (or the real Oxford positions) with
+The route is the unit of inference. Each world is a route, or the real Oxford positions, with
 queries and descriptors of its own. Parameters are chosen on seeds below 100 by `tune`, and judged
 on seeds from 1000 on.
 """
@@ -93,7 +93,7 @@ def _rows(name: str, seed: int, profile: Profile) -> dict[str, Rows]:
     case = case_of(name, seed)
     settings, tolerance_m = options(case), TOLERANCE * case.known_map.spacing_m
     by_mode = settings | {"estimate": "mode"}
-    tables = {
+    tables: dict[str, Rows] = {
         **weighting_rows(case, N_REPEATS[profile]),
         "starts": [
             {"start": start, "settled_at": settled}
@@ -110,7 +110,7 @@ def _rows(name: str, seed: int, profile: Profile) -> dict[str, Rows]:
 
 
 def times() -> pd.DataFrame:
-    """Table 2: time a node on one core, undisturbed by the other jobs."""
+    """Table 2: time per node on one core, after the other jobs have ended."""
     from experiments.bench.topological import PAPER_S
     from experiments.bench.topological import run as measure
 
