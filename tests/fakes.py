@@ -4,9 +4,12 @@ A robot drives a circle in a square room. Wheels, laser and landmarks are worked
 geometry here, so they also stand beside the simulator's as a second opinion.
 """
 
+import dataclasses
+
 import numpy as np
 
 from estimators.base import Estimate, Prior
+from experiments.papers.maximo2024.places import UMH, place_world
 from sim import se2
 from sim.recording import LandmarkLog, LaserLog, Recording, Truth, WheelLog
 from sim.robot import RobotGeometry
@@ -118,3 +121,12 @@ def estimate(recording, means=None, covariances=None):
     if covariances is None:
         covariances = np.tile(np.eye(3), (len(stamps), 1, 1))
     return Estimate(stamps.copy(), means, covariances, step_seconds=np.full(len(stamps), 1e-5))
+
+
+def place_route():
+    """A short route with clear places, and a tracking prior with its map."""
+    world = place_world(dataclasses.replace(UMH, n_nodes=40, noise_weight=0.3), 0)
+    recording = world.recording
+    start = recording.truth_at(recording.frame_stamps[:1])[0]
+    spread = np.diag(np.square([0.5, 0.5, 0.1]))
+    return recording, Prior(recording.robot, recording.sensors, start, spread, world.known_map)

@@ -174,7 +174,7 @@ def test_plans_are_within_their_means(monkeypatch):
         return table, json.dumps({**run.config, **other})
 
     bound = {json.dumps(run.config) for table, run in full if table == "bound"}
-    assert bound == {json.dumps(run.config) for run in planned(["+study=gil2008_bound"])}
+    assert bound == {json.dumps(run.config) for run in planned(["study=gil2008_bound"])}
 
     # the quick one leaves out worlds and repeats, but nothing that is judged or drawn
     assert {kind(*run) for run in full} == {kind(*run) for run in quick}

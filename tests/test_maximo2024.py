@@ -6,14 +6,15 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments.papers.maximo2024 import claims, study
-from experiments.papers.maximo2024.places import GEOMETRIES, place_world
+from experiments.papers.maximo2024 import claims, settings, study, worlds
+from experiments.papers.results import Results
+from experiments.runs.paths import SOURCE
 from experiments.runs.seeds import stream
 
 
 @pytest.fixture(scope="module")
-def world():
-    return place_world(GEOMETRIES["umh"], 5)
+def case():
+    return worlds.case_of("umh", 5)
 
 
 def weighting(m1, m2, m3, name="oxford", n=24, seed=0, column="error_m"):
@@ -40,19 +41,22 @@ def quality(fails_from=5, name="oxford", n=24):
 
 def test_mx1_follows_the_errors():
     said = claims.mx1(weighting(11.5, 9.6, 205.0), quality())
-    assert said[0].verdict == "reproduced; with shared parameters M3 fails from B = 5 on"
-    assert said[1].verdict == "reproduced; with shared parameters at B = 10"
+    assert said[0].verdict == "reproduced"
+    assert said[0].reason == "with shared parameters M3 fails from B = 5 on"
+    assert said[1].verdict == "reproduced"
+    assert said[1].reason == "with shared parameters at B = 10"
     said = claims.mx1(weighting(10.0, 10.2, 11.0), quality(fails_from=99))
-    assert said[0].verdict == "not reproduced; with shared parameters M3 fails at no B tried"
-    assert said[0].value == 0.0
-    assert said[1].verdict.startswith("not reproduced")
+    assert said[0].verdict == "not_reproduced"
+    assert said[0].reason == "with shared parameters M3 fails at no B tried"
+    assert said[0].found.value == 0.0
+    assert said[1].verdict == "not_reproduced"
     said = claims.mx1(weighting(10.0, 10.0, 11.0), quality(fails_from=99))
-    assert said[1].low < 1.0 < said[1].high
-    assert said[1].verdict.startswith("undecided")
+    assert said[1].found.low < 1.0 < said[1].found.high
+    assert said[1].verdict == "undecided"
     said = claims.mx1(weighting(0.5, 0.4, 0.44, "umh"), quality(name="umh"))
-    assert said[0].verdict.startswith("reproduced")
+    assert said[0].verdict == "reproduced"
     said = claims.mx1(weighting(0.5, 0.4, 0.6, "umh"), quality(name="umh"))
-    assert said[0].verdict.startswith("not reproduced")
+    assert said[0].verdict == "not_reproduced"
 
 
 def test_mx2_wants_equal_errors_and_rising_times():
@@ -71,19 +75,19 @@ def test_mx2_wants_equal_errors_and_rising_times():
     worse = table.assign(error_m=table["error_m"] * np.where(table["per_node"] == 2, 1.3, 1.0))
     flat = times.assign(time_s=[2e-4, 1e-4])
     said = claims.mx2(worse, flat)
-    assert [c.verdict for c in said] == ["not reproduced", "not reproduced"]
+    assert [c.verdict for c in said] == ["not_reproduced", "not_reproduced"]
     assert "with 2 particles" in said[0].statistic
 
 
 def test_mx3_to_mx5_follow_their_tables():
     spread = weighting(5.0, 2.0, 1.0, column="dispersion_m").assign(step=10)
-    assert claims.mx3(spread, quality())[0].verdict.startswith("reproduced")
+    assert claims.mx3(spread, quality())[0].verdict == "reproduced"
     assert claims.mx3(spread.assign(step=9), quality()) == []
     starts = pd.DataFrame({"geometry": "umh", "settled_at": [3.0] * 200})
     assert claims.mx4(starts)[0].verdict == "reproduced"
     late = starts.assign(settled_at=[3.0] * 100 + [np.nan] * 60 + [41.0] * 40)
-    assert claims.mx4(late)[0].verdict == "not reproduced"
-    assert claims.mx4(late)[0].value == 0.5
+    assert claims.mx4(late)[0].verdict == "not_reproduced"
+    assert claims.mx4(late)[0].found.value == 0.5
     clusters = pd.DataFrame(
         {"geometry": "umh", "descriptor": "m2dp", "contiguous": [0.9, 0.92, 0.91]}
     )
@@ -96,9 +100,9 @@ def test_our_own_claims_follow_their_tables():
         {"seed": [1, 1, 2, 2] * 60, "settled_at": 2.0, "spacing_m": 5.0, "rms_m": 0.1}
     )
     starts["rms_m"] += 0.01 * (starts["seed"] == 1)
-    assert claims.mx6(starts)[0].verdict == "reproduced"
-    assert claims.mx7(starts)[0].verdict == "reproduced"
-    assert claims.mx7(starts.assign(rms_m=starts["rms_m"] * 20))[0].verdict == "not reproduced"
+    assert claims.mx6(starts).verdict == "reproduced"
+    assert claims.mx7(starts).verdict == "reproduced"
+    assert claims.mx7(starts.assign(rms_m=starts["rms_m"] * 20)).verdict == "not_reproduced"
     trials = pd.DataFrame(
         {
             "geometry": "umh",
@@ -109,66 +113,80 @@ def test_our_own_claims_follow_their_tables():
     )
     assert [c.verdict for c in claims.mx8(trials)] == ["reproduced", "reproduced"]
     slow = trials.assign(settled_at=25.0)
-    assert [c.verdict for c in claims.mx8(slow)] == ["reproduced", "not reproduced"]
+    assert [c.verdict for c in claims.mx8(slow)] == ["reproduced", "not_reproduced"]
 
 
 def test_settling_has_to_last():
     errors = np.array([9.0, 0.0, 9.0, *([1.0] * 10), 9.0])
-    assert study.settled_at(errors, 2.0) == 3.0
-    assert math.isnan(study.settled_at(errors[:-2], 2.0))
-    assert math.isnan(study.settled_at(errors, 0.5))
+    assert worlds.settled_at(errors, 2.0) == 3.0
+    assert math.isnan(worlds.settled_at(errors[:-2], 2.0))
+    assert math.isnan(worlds.settled_at(errors, 0.5))
 
 
 def test_parameters_are_the_best_of_the_tuning():
-    table = pd.read_csv(study.ROOT / "results" / "tables" / "maximo2024_tuning.csv")
-    for (name, method), chosen in study.TUNED.items():
+    table = Results(SOURCE / "results", "maximo2024").table("tuning")
+    for (name, method), chosen in settings.TUNED.items():
         part = table[(table["geometry"] == name) & (table["method"] == method)]
         best = part.loc[part["error_m"].idxmin()]
         assert (best["sigma_l"], best["sigma_m"], best["n_nearest"]) == chosen
 
 
-def test_a_walk_reports_error_and_dispersion(world):
-    settings = study.options("umh", "M2", world.known_map.spacing_m)
-    walk = study.localize(
-        world.known_map, world.recording, settings, stream(5, "test"), keep=(3,), n_steps=30
-    )
-    assert len(walk.errors_m) == len(walk.means) == 30
-    truth = world.recording.truth.poses[:30, :2]
-    np.testing.assert_allclose(walk.errors_m, np.hypot(*(walk.means[:, :2] - truth).T))
-    cloud = walk.particles[3]
-    away = np.hypot(*(cloud[:, :2] - walk.means[3, :2]).T)
+def test_a_walk_reports_error_and_dispersion(case):
+    part = case.recording.cut(30)
+    walk = worlds.localize(case, worlds.options(case), stream(5, "test"), part)
+    means = walk.estimate.means
+    assert len(walk.errors_m) == len(means) == 30
+    truth = case.recording.truth.poses[:30, :2]
+    np.testing.assert_allclose(walk.errors_m, np.hypot(*(means[:, :2] - truth).T))
+    cloud = walk.estimate.extras["particles"][3]
+    away = np.hypot(*(cloud[:, :2] - means[3, :2]).T)
     assert walk.dispersions_m[3] == pytest.approx(away.mean())
-    np.testing.assert_allclose(cloud[:, :2].mean(axis=0), walk.means[3, :2])  # eq. (4)
+    np.testing.assert_allclose(cloud[:, :2].mean(axis=0), means[3, :2])  # eq. (4)
     assert walk.errors_m[10:].mean() < 1.0
-    assert not walk.refined.any()
+    assert not any(walk.estimate.extras["refinement"])
 
 
-def test_rows_of_a_world(world):
-    small = study.weighting_rows(world, "umh", 5, 1)
+def test_rows_of_a_world(case):
+    small = worlds.weighting_rows(case, 1)
     assert len(small["weighting"]) == 4
-    assert len(small["dispersion"]) == 4 * (study.WITHIN + 1)
+    assert len(small["dispersion"]) == 4 * (settings.WITHIN + 1)
     nearest = small["weighting"][0]["nearest_node_m"]
     assert nearest == pytest.approx(0.39, abs=0.02)
-    starts = study.start_rows(world, "umh", 5, 3)
-    assert [row["start"] for row in starts] == [0, 42, 85]
-    assert all(row["settled_at"] <= 40 for row in starts)
-    stolen = pd.DataFrame(study.kidnapping_rows(world, "umh", 5, 2))
+    chosen = worlds.options(case)
+    runs = worlds.starts(case, 3, chosen, settings.TOLERANCE * case.known_map.spacing_m)
+    assert [start for start, _, _ in runs] == [0, 42, 85]
+    assert all(settled <= 40 for _, settled, _ in runs)
+    chosen["estimate"] = "mode"
+    stolen = pd.DataFrame(worlds.kidnapping_rows(case, chosen, 0.05, 2, 30))
     back = stolen.groupby("injection")["settled_at"].max()
-    assert back[0.05] <= study.RECOVERED_WITHIN
+    assert back[0.05] <= settings.RECOVERED_WITHIN
     assert math.isnan(back[0.0])
 
 
-def test_labels_of_clusters_are_stretches(world):
-    row = study.cluster_row(world.known_map, world.recording, "umh", "synthetic", 5)
+def test_labels_of_clusters_are_stretches(case):
+    row = worlds.cluster_row(case.known_map, case.recording, "synthetic", 5)
     assert row["contiguous"] > 0.8
     assert row["recall_at_1"] > 0.95
-    labels = study.cluster_labels(world.known_map, 5)
+    labels = worlds.cluster_labels(case.known_map, 5)
     assert 30 <= len(np.unique(labels)) <= 40
 
 
-def test_the_study_adds_up_to_the_papers_tables(world):
-    rows = study.weighting_rows(world, "umh", 5, 2)["weighting"]
-    table = study.table_1(pd.DataFrame(rows)).set_index("method")
+def test_the_study_adds_up_to_the_papers_tables(case):
+    rows = worlds.weighting_rows(case, 2)["weighting"]
+    table = study.table_1(pd.DataFrame(rows).assign(geometry="umh", seed=5)).set_index("method")
     m2 = [row["error_m"] for row in rows if row["method"] == "M2"]
     assert table.loc["M2", "error_m"] == pytest.approx(np.mean(m2))
     assert table.loc["M3", "paper_m"] == 0.44
+
+
+def test_the_filter_of_the_study_is_the_one_as_printed(case):
+    estimator = case.experiment.estimator()
+    assert (estimator.motion, estimator.resampling, estimator.scheme) == (
+        "paper",
+        "always",
+        "multinomial",
+    )
+    assert (estimator.injection, estimator.estimate, estimator.refine) == (0.0, "mean", False)
+    noisy = worlds.case_of("umh", 5, "recording.noise_weight=1.6")
+    np.testing.assert_array_equal(noisy.known_map.positions_m, case.known_map.positions_m)
+    assert not np.array_equal(noisy.known_map.descriptors, case.known_map.descriptors)

@@ -1,7 +1,6 @@
 """The routes of maximo2024: their printed figures, their descriptors, and reordered recordings."""
 
 import gzip
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,11 +8,9 @@ import pytest
 from estimators.descriptors import retrieval
 from experiments.papers.maximo2024 import places
 from experiments.papers.maximo2024.places import GEOMETRIES, OXFORD, UMH, place_world
-from experiments.runs.experiment import make_prior, make_recording
-from experiments.runs.version import ROOT
+from experiments.papers.maximo2024.settings import POSITIONS
+from experiments.runs.experiment import Experiment
 from sim.errors import InputError
-
-OXFORD_FILE = ROOT.parent / "shared" / "data" / "oxford_positions" / "positions.csv.gz"
 
 
 def measured(world):
@@ -39,9 +36,9 @@ def test_generated_routes_have_the_printed_figures(name):
 
 
 def test_the_real_oxford_positions():
-    if not OXFORD_FILE.exists():
+    if not POSITIONS.exists():
         pytest.skip("the positions of RobotCar are not shipped; see docs for where they go")
-    nodes = places.oxford_positions(OXFORD_FILE)
+    nodes = places.oxford_positions(POSITIONS)
     assert nodes.shape == (397, 2)
     steps = np.hypot(*np.diff(nodes, axis=0).T)
     assert steps.mean() == pytest.approx(21.45, abs=0.01)
@@ -50,7 +47,7 @@ def test_the_real_oxford_positions():
     assert nearest.mean() == pytest.approx(10.09, rel=0.15)
 
 
-def test_a_wrong_positions_file_is_told(tmp_path):
+def test_a_wrong_positions_file_is_an_input_error(tmp_path):
     assert places.oxford_positions(None) is None
     assert places.oxford_positions(tmp_path / "none.gz") is None
     path = tmp_path / "positions.csv.gz"
@@ -99,14 +96,14 @@ def test_wheels_tell_the_way_that_was_gone():
 
 @pytest.mark.parametrize("study", ["oxford", "umh"])
 def test_studies_compose_to_a_map_and_queries(study):
-    config = compose([f"study=maximo2024_{study}"])
-    recording = make_recording(config, Path("unused"))
-    known = make_prior(config, recording).map
+    experiment = Experiment.compose([f"study=maximo2024_{study}"])
+    recording = experiment.recording()
+    known = experiment.prior(recording).map
     assert len(known) == len(recording.frame_stamps) == GEOMETRIES[study].n_nodes
     with pytest.raises(InputError, match="geometry"):
-        places.route_map(config, "rome")
+        places.route_map(experiment.config, "rome")
     with pytest.raises(InputError, match="no such file"):
-        places.route_map(config, "oxford", "nowhere.csv.gz")
+        places.route_map(experiment.config, "oxford", "nowhere.csv.gz")
 
 
 def test_ones_own_arrays_run_from_one_yaml(tmp_path):
@@ -115,11 +112,11 @@ def test_ones_own_arrays_run_from_one_yaml(tmp_path):
     np.save(tmp_path / "map_descriptors.npy", world.known_map.descriptors)
     np.save(tmp_path / "positions.npy", world.recording.truth.poses[:, :2])
     np.save(tmp_path / "descriptors.npy", world.recording.places.descriptors)
-    config = compose(["study=maximo2024_own", f"data={tmp_path}"])
-    recording = make_recording(config, Path("unused"))
-    known = make_prior(config, recording).map
+    experiment = Experiment.compose(["study=maximo2024_own", f"data={tmp_path}"])
+    recording = experiment.recording()
+    known = experiment.prior(recording).map
     np.testing.assert_array_equal(known.descriptors, world.known_map.descriptors)
     np.testing.assert_allclose(recording.truth.poses[:, :2], world.recording.truth.poses[:, :2])
     np.save(tmp_path / "descriptors.npy", np.ones((3, 512)))
     with pytest.raises(InputError, match="as many descriptors"):
-        make_recording(config, Path("unused"))
+        experiment.recording()

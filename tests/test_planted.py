@@ -14,7 +14,7 @@ from experiments.gate.faults import FAULTS
 from experiments.gate.power import Pool, arrays, draw_check, grade, worsening
 from experiments.gate.suite import ERRORS, Entry, Suite, read_suite, suite_path
 from experiments.runs.experiment import Experiment
-from tests.fakes import circle, tracking_prior
+from tests.fakes import circle, place_route, tracking_prior
 
 KINDS = [(name, kind) for name, kinds in FAULTS.items() for kind in kinds]
 
@@ -27,9 +27,7 @@ def composed(*overrides):
 def estimate(name, plant, seed=0):
     """Final pose of an estimator over a circle, and of the smoother's revised trajectory."""
     if name == "topological_mcl":
-        from experiments.papers.maximo2024.places import example
-
-        recording, prior = example()
+        recording, prior = place_route()
         recording = recording.cut(25)
     else:
         recording = circle(n_frames=30)

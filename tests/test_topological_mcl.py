@@ -17,6 +17,7 @@ from sim.errors import InputError
 from sim.recording import Frame
 from sim.robot import RobotGeometry
 from sim.sensors import SensorSuite
+from tests.fakes import place_route
 from tests.test_topological_map import LIDAR, ring_run
 
 PAPER = {
@@ -160,7 +161,7 @@ def test_stay_and_skip_spread_the_particles_without_bias():
 
 @pytest.mark.parametrize("options", [{}, PAPER], ids=["default", "paper"])
 def test_localizes_globally_on_a_clear_route(options):
-    recording, prior = places.example()
+    recording, prior = place_route()
     lost = dataclasses.replace(prior, mean=None, covariance=None)
     found = run(TopologicalMcl(**options), recording, lost, np.random.default_rng(0), ["ess"])
     errors = np.hypot(*(found.means[:, :2] - recording.truth.poses[:, :2]).T)
@@ -172,7 +173,7 @@ def test_localizes_globally_on_a_clear_route(options):
 
 
 def test_conforms():
-    recording, prior = places.example()
+    recording, prior = place_route()
     for options in ({}, PAPER, {"weighting": "M3", "scheme": "residual", "n_nearest": 2}):
         results = check_estimator(lambda o=options: TopologicalMcl(**o), recording, prior)
         assert not [r for r in results if not r.passed]
@@ -180,7 +181,7 @@ def test_conforms():
 
 @pytest.mark.parametrize("injection", [0.05, 0.0])
 def test_a_kidnapped_robot_is_found_again_with_injection_only(injection):
-    recording, prior = places.example()
+    recording, prior = place_route()
     rows = np.concatenate([np.arange(12), np.arange(25, 40)])
     taken = places.resequenced(recording, rows)
     lost = dataclasses.replace(prior, mean=None, covariance=None)

@@ -10,7 +10,7 @@ import time
 
 import numpy as np
 
-from estimators.base import Prior
+from estimators.base import Estimator, Prior
 from estimators.topological_mcl import TopologicalMcl
 from experiments.bench.measure import Measurement
 from experiments.runs.experiment import Experiment
@@ -33,7 +33,8 @@ def run() -> list[Measurement]:
         prior = experiment.prior(recording)
         for n_particles, paper_s in times_s.items():
             per_node = n_particles // len(prior.map)
-            filters = {"": _paper(per_node)}
+            printed = {**experiment.config["estimator"], "particles_per_node": per_node}
+            filters = {"": experiment.replaced(estimator=printed).estimator()}
             if n_particles == max(times_s):
                 filters["_odometry"] = TopologicalMcl(particles_per_node=per_node)
             for suffix, estimator in filters.items():
@@ -49,18 +50,7 @@ def run() -> list[Measurement]:
     return results
 
 
-def _paper(particles_per_node: int) -> TopologicalMcl:
-    return TopologicalMcl(
-        particles_per_node=particles_per_node,
-        motion="paper",
-        resampling="always",
-        scheme="multinomial",
-        injection=0.0,
-        estimate="mean",
-    )
-
-
-def _median_step_s(estimator: TopologicalMcl, recording: Recording, prior: Prior) -> float:
+def _median_step_s(estimator: Estimator, recording: Recording, prior: Prior) -> float:
     """Median time of a step over whole runs of the route; the first run is not counted."""
     frames = list(recording.frames())
     times_ns = []

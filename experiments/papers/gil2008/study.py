@@ -85,7 +85,7 @@ def plan(profile: Profile) -> list[Run]:
     size, runs = settings.SIZES[profile], []
     for table in settings.LABELS:
         n_worlds = 1 if table == "repeats" else size.n_worlds
-        for one in planned([f"+study=gil2008_{table}", f"seed={settings.SEED}"]):
+        for one in planned([f"study=gil2008_{table}", f"seed={settings.SEED}"]):
             if one.config["recording"]["draw"] < size.n_draws:
                 repeats = min(one.repeats, size.n_repeats)
                 runs += [

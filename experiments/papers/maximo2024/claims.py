@@ -3,114 +3,133 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 
 from experiments.evaluation.statistics import (
     Interval,
-    Verdict,
     equivalent,
     log_ratio_interval,
     mean_interval,
     share_interval,
-    verdict,
 )
-from experiments.papers.maximo2024.study import (
-    RECOVERED_WITHIN,
-    WITHIN,
-)
-from experiments.report.claims import Claim, lower, overall
+from experiments.evaluation.verdict import Claim, Verdict, holds, judged, lower, overall
+from experiments.papers.maximo2024.settings import NAMES, RECOVERED_WITHIN, WITHIN
+from experiments.papers.results import Results
 
-PAPER = "maximo2024"
-_NAMES = {
-    "oxford": "Oxford, made route",
-    "oxford_real": "Oxford, real positions",
-    "umh": "UMH",
-    "campus": "campus clouds",
-    "campus_quick": "campus clouds",
+_LEAST_M = 1e-3  # added to what may be zero, before a logarithm
+_MX8 = {
+    False: ("without", "at most 0.5", {"at_most": 0.5}),
+    True: ("with", "at least 0.95", {"at_least": 0.95}),
 }
 
 
-def judge(tables: dict[str, pd.DataFrame]) -> list[Claim]:
+def judge(made: Results) -> list[Claim]:
     """All claims of a finished study."""
+    quality = made.table("quality")
     return [
-        *mx1(tables["weighting"], tables["quality"]),
-        *mx2(tables["particles"], tables["times"]),
-        *mx3(tables["dispersion"], tables["quality"]),
-        *mx4(tables["starts"]),
-        *mx5(tables["clusters"]),
-        *mx6(tables["campus_starts"]),
-        *mx7(tables["campus_starts"]),
-        *mx8(tables["kidnapping"]),
+        *mx1(made.table("weighting"), quality),
+        *mx2(made.table("particles"), made.table("times")),
+        *mx3(made.table("dispersion"), quality),
+        *mx4(made.table("starts")),
+        *mx5(made.table("clusters")),
+        mx6(made.table("campus_starts")),
+        mx7(made.table("campus_starts")),
+        *mx8(made.table("kidnapping")),
     ]
 
 
-def _claim(id_: str, statistic: str, found: Interval, criterion: str, outcome: str) -> Claim:
-    return Claim(id_, PAPER, statistic, found.value, found.low, found.high, criterion, outcome)
-
-
-def _ordered(table: pd.DataFrame) -> list[str]:
+def geometries(table: pd.DataFrame) -> list[str]:
     """Geometries of a table, the paper's before our own."""
-    return [name for name in _NAMES if name in set(table["geometry"])]
+    return [name for name in NAMES if name in set(table["geometry"])]
 
 
-def _by_world(table: pd.DataFrame, name: str, column: str, by: str = "method") -> pd.DataFrame:
+def _by_world(table: pd.DataFrame, column: str, by: str = "method") -> pd.DataFrame:
     """Mean over repeats: a row a world, a column a value of `by`."""
-    part = table[table["geometry"] == name]
-    return part.pivot_table(index="seed", columns=by, values=column, aggfunc="mean")
+    return table.pivot_table(index="seed", columns=by, values=column, aggfunc="mean")
 
 
 def mx1(weighting: pd.DataFrame, quality: pd.DataFrame) -> list[Claim]:
     """MX1: M2 is the best weighting; M3 fails on Oxford and holds on UMH.
 
-    Each method has the parameters that suit it best. Where M3 fails with parameters that the
-    methods share is named beside.
+    Each method has the parameters that suit it best. The reason says where M3 fails with
+    parameters that the methods share.
     """
-    failures, gains = [], []
-    for name in _ordered(weighting):
-        errors = _by_world(weighting, name, "error_m")
-        ratio, p, outcome = lower(errors["M2"], errors["M1"])
-        gains.append(
-            _claim(
-                "MX1",
-                f"error of M2 over M1, {_NAMES[name]}",
-                ratio,
-                f"below 1 by Wilcoxon, p < 0.01 (p = {p:.2g})",
-                outcome + _where_less(quality, name, "error_m"),
-            )
-        )
+    claims = []
+    for name in geometries(weighting):
+        errors = _by_world(weighting[weighting["geometry"] == name], "error_m")
         if name.startswith("oxford"):
-            failed = errors["M3"] > 5.0 * errors["M2"]
-            share = share_interval(int(failed.sum()), len(failed))
-            failures.append(
-                _claim(
-                    "MX1",
-                    f"share of worlds with M3 worse than 5 times M2, {_NAMES[name]}",
-                    share,
-                    "at least 0.8",
-                    verdict(share, at_least=0.8) + _where_m3_fails(quality, "oxford"),
-                )
+            share = _share(
+                "MX1",
+                f"share of worlds with M3 worse than 5 times M2, {NAMES[name]}",
+                errors["M3"] > 5.0 * errors["M2"],
+                "at least 0.8",
+                at_least=0.8,
             )
+            claims.append(replace(share, reason=_where_m3_fails(quality, "oxford")))
         if name == "umh":
             ratio, p = equivalent(errors["M3"], errors["M2"], 0.25)
-            failures.append(
-                _claim(
+            claims.append(
+                Claim(
                     "MX1",
                     "error of M3 over M2, UMH (90 % interval)",
                     ratio,
                     "within 25 % by two one-sided tests",
-                    _equal(ratio, p, 0.25) + _where_m3_fails(quality, "umh"),
+                    _equal(ratio, p, 0.25),
+                    _where_m3_fails(quality, "umh"),
                 )
             )
-    return failures + gains
+    return claims + _m2_below_m1("MX1", "error", weighting, quality)
+
+
+def mx3(dispersion: pd.DataFrame, quality: pd.DataFrame) -> list[Claim]:
+    """MX3: M2 concentrates faster than M1: its dispersion at step 10."""
+    at_10 = dispersion[dispersion["step"] == 10]
+    # all on one node is zero
+    at_10 = at_10.assign(dispersion_m=at_10["dispersion_m"] + _LEAST_M)
+    return _m2_below_m1("MX3", "dispersion", at_10, quality, " at step 10")
+
+
+def _m2_below_m1(
+    id_: str, what: str, table: pd.DataFrame, quality: pd.DataFrame, at: str = ""
+) -> list[Claim]:
+    """Judge on each geometry whether M2 is below M1; the reason: where with shared parameters."""
+    claims = []
+    for name in geometries(table):
+        worlds = _by_world(table[table["geometry"] == name], f"{what}_m")
+        ratio, p, verdict = lower(worlds["M2"], worlds["M1"])
+        claims.append(
+            Claim(
+                id_,
+                f"{what} of M2 over M1{at}, {NAMES[name]}",
+                ratio,
+                f"below 1 by Wilcoxon, p < 0.01 (p = {p:.2g})",
+                verdict,
+                _where_less(quality[quality["geometry"] == name], f"{what}_m"),
+            )
+        )
+    return claims
+
+
+def _where_less(quality: pd.DataFrame, column: str) -> str:
+    """Name the B at which M2 is below M1 when both have the same parameters, at a noise of 0.8."""
+    part = quality[quality["noise_weight"] == 0.8]
+    found = []
+    for n_nearest, rows in part.groupby("n_nearest"):
+        worlds = _by_world(rows, column) + _LEAST_M
+        if lower(worlds["M2"], worlds["M1"])[2] is Verdict.REPRODUCED:
+            found.append(str(n_nearest))
+    where = f"B = {', '.join(found)}" if found else "no B tried"
+    return "" if part.empty else f"with shared parameters at {where}"
 
 
 def _equal(ratio: Interval, p: float, margin: float) -> Verdict:
     """Equivalent, surely different, or undecided."""
     if p < 0.05:
-        return "reproduced"
-    return verdict(ratio, at_least=1.0 / (1.0 + margin), at_most=1.0 + margin)
+        return Verdict.REPRODUCED
+    return judged(ratio, at_least=1.0 / (1.0 + margin), at_most=1.0 + margin)
 
 
 def m3_failures(quality: pd.DataFrame, name: str) -> pd.DataFrame:
@@ -118,108 +137,66 @@ def m3_failures(quality: pd.DataFrame, name: str) -> pd.DataFrame:
     part = quality[quality["geometry"] == name]
     keys = ["noise_weight", "n_nearest", "seed"]
     errors = part.pivot_table(index=keys, columns="method", values="error_m")
-    failed = (errors["M3"] > 5.0 * errors["M2"]).groupby(keys[:2]).mean()
-    return failed.unstack()
-
-
-def _where_less(quality: pd.DataFrame, name: str, column: str) -> str:
-    """Name the B at which M2 is below M1 when both have the same parameters, at a noise of 0.8."""
-    part = quality[(quality["geometry"] == name) & (quality["noise_weight"] == 0.8)]
-    if part.empty:
-        return ""
-    found = [
-        str(n)
-        for n, rows in part.groupby("n_nearest")
-        if lower(
-            *(rows.pivot_table(index="seed", columns="method", values=column) + 1e-3)[["M2", "M1"]]
-            .to_numpy()
-            .T
-        )[2]
-        == "reproduced"
-    ]
-    if not found:
-        return "; with shared parameters at no B tried"
-    return f"; with shared parameters at B = {', '.join(found)}"
+    return (errors["M3"] > 5.0 * errors["M2"]).groupby(keys[:2]).mean().unstack()
 
 
 def _where_m3_fails(quality: pd.DataFrame, name: str) -> str:
     """Name the least B at which M3 fails in 80 % of worlds, at the paper-like noise of 0.8."""
     shares = m3_failures(quality, name).loc[0.8]
-    failing = [int(n) for n, share in shares.items() if share >= 0.8]
-    if not failing:
-        return "; with shared parameters M3 fails at no B tried"
-    return f"; with shared parameters M3 fails from B = {min(failing)} on"
+    failing = shares.index[shares >= 0.8]
+    where = f"from B = {failing.min()} on" if len(failing) else "at no B tried"
+    return f"with shared parameters M3 fails {where}"
 
 
 def mx2(particles: pd.DataFrame, times: pd.DataFrame) -> list[Claim]:
     """MX2: the error does not depend on the number of particles, the time grows with it."""
     claims = []
-    for name in particles["geometry"].unique():
-        errors = _by_world(particles, name, "error_m", "per_node")
-        parts = {n: equivalent(errors[n], errors[4], 0.05) for n in errors.columns if n != 4}
-        worst = max(parts, key=lambda n: abs(math.log(parts[n][0].value)))
-        outcomes = [_equal(ratio, p, 0.05) for ratio, p in parts.values()]
+    for name, part in particles.groupby("geometry", sort=False):
+        errors = _by_world(part, "error_m", "per_node")
+        ratios = {n: equivalent(errors[n], errors[4], 0.05) for n in errors.columns if n != 4}
+        worst = max(ratios, key=lambda n: abs(math.log(ratios[n][0].value)))
         claims.append(
-            _claim(
+            Claim(
                 "MX2",
-                f"error with {worst} particles a node over that with 4, the worst, {_NAMES[name]} "
+                f"error with {worst} particles a node over that with 4, the worst, {NAMES[name]} "
                 "(90 % interval)",
-                parts[worst][0],
+                ratios[worst][0],
                 "within 5 % by two one-sided tests, for 2, 6 and 8",
-                overall(outcomes),
+                overall([_equal(ratio, p, 0.05) for ratio, p in ratios.values()]),
             )
         )
     for name, part in times.groupby("geometry", sort=False):
-        ordered = part.sort_values("particles")
-        rising = bool(np.all(np.diff(ordered["time_s"]) > 0.0))
-        slowest = float((ordered["time_s"] / ordered["paper_s"]).max())
-        found = Interval(slowest, slowest, slowest)
+        rising = bool(np.all(np.diff(part.sort_values("particles")["time_s"]) > 0.0))
+        slowest = float((part["time_s"] / part["paper_s"]).max())
         claims.append(
-            _claim(
+            Claim(
                 "MX2",
-                f"time a node over the paper's, the largest, {_NAMES[name]}",
-                found,
+                f"time a node over the paper's, the largest, {NAMES[name]}",
+                Interval.exact(slowest),
                 "below 0.1, and rising with the particles",
-                "reproduced" if rising and slowest < 0.1 else "not reproduced",
+                holds(rising and slowest < 0.1),
             )
         )
     return claims
 
 
-def mx3(dispersion: pd.DataFrame, quality: pd.DataFrame) -> list[Claim]:
-    """MX3: M2 concentrates faster than M1: its dispersion at step 10."""
-    claims = []
-    at_10 = dispersion[dispersion["step"] == 10]
-    for name in _ordered(at_10):
-        spread = _by_world(at_10, name, "dispersion_m") + 1e-3  # all on one node is zero
-        ratio, p, outcome = lower(spread["M2"], spread["M1"])
-        claims.append(
-            _claim(
-                "MX3",
-                f"dispersion of M2 over M1 at step 10, {_NAMES[name]}",
-                ratio,
-                f"below 1 by Wilcoxon, p < 0.01 (p = {p:.2g})",
-                outcome + _where_less(quality, name, "dispersion_m"),
-            )
-        )
-    return claims
+def _share(id_: str, statistic: str, hits: pd.Series, criterion: str, **bounds: float) -> Claim:
+    share = share_interval(int(hits.sum()), len(hits))
+    return Claim(id_, statistic, share, criterion, judged(share, **bounds))
 
 
 def mx4(starts: pd.DataFrame) -> list[Claim]:
     """MX4: any starting node works."""
-    claims = []
-    for name, part in starts.groupby("geometry", sort=False):
-        share = share_interval(int((part["settled_at"] <= WITHIN).sum()), len(part))
-        claims.append(
-            _claim(
-                "MX4",
-                f"share of starts that M2 localises within {WITHIN} steps, {_NAMES[name]}",
-                share,
-                "lower bound above 0.95",
-                verdict(share, at_least=0.95),
-            )
+    return [
+        _share(
+            "MX4",
+            f"share of starts that M2 localises within {WITHIN} steps, {NAMES[name]}",
+            part["settled_at"] <= WITHIN,
+            "lower bound above 0.95",
+            at_least=0.95,
         )
-    return claims
+        for name, part in starts.groupby("geometry", sort=False)
+    ]
 
 
 def mx5(clusters: pd.DataFrame) -> list[Claim]:
@@ -228,70 +205,50 @@ def mx5(clusters: pd.DataFrame) -> list[Claim]:
     On the synthetic field this only says that the field was made so. Scan Context is left out:
     it turns with the robot, and k-means does not know.
     """
-    claims = []
-    judged = clusters[clusters["descriptor"] != "scan_context"]
-    for (name, descriptor), part in judged.groupby(["geometry", "descriptor"], sort=False):
-        found = mean_interval(part["contiguous"])
-        kind = "" if descriptor == "synthetic" else f", {descriptor}"
-        claims.append(
-            _claim(
-                "MX5",
-                f"share of nodes with a route neighbour in their cluster, {_NAMES[name]}{kind}",
-                found,
-                "above 0.8",
-                verdict(found, at_least=0.8),
-            )
+    asked = clusters[clusters["descriptor"] != "scan_context"]
+    shares = asked.groupby(["geometry", "descriptor"], sort=False)["contiguous"]
+    return [
+        Claim(
+            "MX5",
+            f"share of nodes with a route neighbour in their cluster, {NAMES[name]}"
+            + (f", {descriptor}" if descriptor != "synthetic" else ""),
+            mean_interval(part),
+            "above 0.8",
+            judged(mean_interval(part), at_least=0.8),
         )
-    return claims
+        for (name, descriptor), part in shares
+    ]
 
 
-def mx6(starts: pd.DataFrame) -> list[Claim]:
+def mx6(starts: pd.DataFrame) -> Claim:
     """Our own: global localization on simulated clouds."""
-    share = share_interval(int((starts["settled_at"] <= WITHIN).sum()), len(starts))
-    return [
-        _claim(
-            "MX6",
-            "share of starts localised on campus clouds (our own)",
-            share,
-            "at least 0.95",
-            verdict(share, at_least=0.95),
-        )
-    ]
+    return _share(
+        "MX6",
+        "share of starts localised on campus clouds (our own)",
+        starts["settled_at"] <= WITHIN,
+        "at least 0.95",
+        at_least=0.95,
+    )
 
 
-def mx7(starts: pd.DataFrame) -> list[Claim]:
+def mx7(starts: pd.DataFrame) -> Claim:
     """Our own, the paper's future work: registration brings the error below the spacing."""
-    known = starts[np.isfinite(starts["rms_m"])]
-    worlds = known.groupby("seed")[["spacing_m", "rms_m"]].mean()
+    worlds = starts.dropna(subset="rms_m").groupby("seed")[["spacing_m", "rms_m"]].mean()
     ratio = log_ratio_interval(worlds["spacing_m"], worlds["rms_m"])
-    return [
-        _claim(
-            "MX7",
-            "node spacing over RMS error with refinement, campus clouds (our own)",
-            ratio,
-            "at least 5",
-            verdict(ratio, at_least=5.0),
-        )
-    ]
+    statistic = "node spacing over RMS error with refinement, campus clouds (our own)"
+    return Claim("MX7", statistic, ratio, "at least 5", judged(ratio, at_least=5.0))
 
 
 def mx8(kidnapping: pd.DataFrame) -> list[Claim]:
     """Our own: a kidnapped robot is found again with injection, and not without."""
-    claims = []
     known = kidnapping[kidnapping["known_before"]]
-    for name, part in known.groupby("geometry", sort=False):
-        for injects, trials in part.groupby(part["injection"] > 0.0):
-            back = trials["settled_at"] <= RECOVERED_WITHIN
-            how = "with" if injects else "without"
-            share = share_interval(int(back.sum()), len(back))
-            claims.append(
-                _claim(
-                    "MX8",
-                    f"share recovered within {RECOVERED_WITHIN} nodes {how} injection, "
-                    f"{_NAMES[str(name)]} (our own)",
-                    share,
-                    "at least 0.95" if injects else "at most 0.5",
-                    verdict(share, at_least=0.95) if injects else verdict(share, at_most=0.5),
-                )
-            )
+    back = known["settled_at"] <= RECOVERED_WITHIN
+    claims = []
+    for (name, injects), trials in back.groupby(
+        [known["geometry"], known["injection"] > 0.0], sort=False
+    ):
+        how, criterion, bounds = _MX8[injects]
+        statistic = f"share recovered within {RECOVERED_WITHIN} nodes {how} injection, "
+        statistic += f"{NAMES[name]} (our own)"
+        claims.append(_share("MX8", statistic, trials, criterion, **bounds))
     return claims

@@ -7,25 +7,21 @@ stands for the network.
 
 from __future__ import annotations
 
-import csv
 import dataclasses
-import gzip
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 
 from estimators import descriptors as describers
-from estimators.base import Prior
-from estimators.topological_map import (
-    TopologicalMap,
-    from_arrays,
-    from_recording,
-    read_array,
-)
+from estimators.topological_map import TopologicalMap, from_arrays, from_recording, read_array
+from experiments.runs.experiment import Experiment
 from experiments.runs.seeds import stream
 from sim import se2
 from sim.errors import InputError
@@ -34,6 +30,8 @@ from sim.robot import RobotGeometry
 from sim.sensors import SensorSuite
 
 Array = NDArray[np.float64]
+# Noisy unit descriptors (K, 512) at points (K, 2) m
+Describe = Callable[[Array, np.random.Generator], NDArray[np.float32]]
 
 N_STRETCHES = 40  # the paper's k-means clusters
 SIZE = 512  # of the paper's descriptors
@@ -83,11 +81,16 @@ GEOMETRIES = {"oxford": OXFORD, "umh": UMH}
 
 @dataclass(frozen=True)
 class PlaceWorld:
-    """A map, the queries along its route, and what is true of both."""
+    """A map, and the queries along its route."""
 
-    geometry: Geometry
     known_map: TopologicalMap
     recording: Recording
+
+
+def gaps_m(points_m: Array, nodes_m: Array) -> Array:
+    """Distances (K, N) m of points (K, 2) to nodes (N, 2)."""
+    gaps: Array = np.hypot(*(points_m[:, None] - nodes_m[None]).transpose(2, 0, 1))
+    return gaps
 
 
 def oxford_positions(path: Path | None) -> Array | None:
@@ -106,17 +109,13 @@ def oxford_positions(path: Path | None) -> Array | None:
     if path is None or not path.is_file():
         return None
     try:
-        with gzip.open(path, "rt") as lines:
-            rows = [
-                (float(row["easting_m"]), float(row["northing_m"]))
-                for row in csv.DictReader(lines)
-                if row["run_name"] == OXFORD_RUN and row["set"] == "database"
-            ]
+        table = pd.read_csv(path, compression="gzip", float_precision="round_trip")
+        chosen = table[(table["run_name"] == OXFORD_RUN) & (table["set"] == "database")]
+        positions = np.array(chosen[["easting_m", "northing_m"]], np.float64, order="C")
     except (OSError, KeyError, ValueError, EOFError) as error:
         raise InputError(f"{path}: not the Oxford positions ({error}); leave it out") from error
-    if len(rows) < 2:
+    if len(positions) < 2:
         raise InputError(f"{path}: no database positions of run {OXFORD_RUN}")
-    positions: Array = np.array(rows)
     positions -= positions.mean(axis=0)
     return positions
 
@@ -148,15 +147,13 @@ def queries(nodes_m: Array, geometry: Geometry, rng: np.random.Generator) -> Arr
     n = len(nodes_m)
     way = np.gradient(nodes_m, axis=0)
     forward = way / np.maximum(np.hypot(*way.T), 1e-9)[:, None]
-    left = np.stack([-forward[:, 1], forward[:, 0]], axis=1)
+    left = forward[:, ::-1] * [-1.0, 1.0]
     if geometry.name == "oxford":
         sigma = 1.15 * geometry.offset_m / math.sqrt(math.pi / 2.0)
-        offset = np.empty((n, 2))
-        offset[0] = sigma * rng.standard_normal(2)
         kept = 1.0 - geometry.drift
-        for i in range(1, n):
-            fresh = sigma * math.sqrt(1.0 - kept**2) * rng.standard_normal(2)
-            offset[i] = kept * offset[i - 1] + fresh
+        fresh = np.full((n, 1), sigma * math.sqrt(1.0 - kept**2))
+        fresh[0] = sigma
+        offset = lfilter([1.0], [1.0, -kept], fresh * rng.standard_normal((n, 2)), axis=0)
         offset *= sigma / math.sqrt(np.mean(offset**2))  # the printed size in every world
     else:
         turning = np.cumsum(geometry.drift * rng.standard_normal(n))
@@ -167,42 +164,34 @@ def queries(nodes_m: Array, geometry: Geometry, rng: np.random.Generator) -> Arr
     return placed
 
 
-class Field:
+def field(geometry: Geometry, nodes_m: Array, rng: np.random.Generator) -> Describe:
     """Synthetic descriptors: a part common to a stretch, a part of the place, and noise.
 
     The stretches, 40 along the route, crossfade into each other. The place's own part is a
     random Fourier feature map of the position, so that it changes smoothly and never repeats.
     """
+    g = geometry
+    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(nodes_m, axis=0).T))])
+    along /= max(along[-1], 1e-9)
+    lengths = rng.uniform(0.5, 1.5, N_STRETCHES)
+    middles = (np.cumsum(lengths) - lengths / 2.0) / lengths.sum()
+    edges, width = (middles[1:] + middles[:-1]) / 2.0, 0.15 / N_STRETCHES
+    stretches = rng.standard_normal((N_STRETCHES, SIZE))
+    stretches /= np.linalg.norm(stretches, axis=1, keepdims=True)
+    waves = rng.standard_normal((2, SIZE)) / g.place_scale_m
+    phases = rng.uniform(0.0, 2.0 * math.pi, SIZE)
 
-    def __init__(self, geometry: Geometry, nodes_m: Array, rng: np.random.Generator) -> None:
-        self._geometry, self._nodes_m = geometry, nodes_m
-        along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(nodes_m, axis=0).T))])
-        self._along = along / max(along[-1], 1e-9)
-        lengths = rng.uniform(0.5, 1.5, N_STRETCHES)
-        self._middles = (np.cumsum(lengths) - lengths / 2.0) / lengths.sum()
-        stretches = rng.standard_normal((N_STRETCHES, SIZE))
-        self._stretches = stretches / np.linalg.norm(stretches, axis=1, keepdims=True)
-        self._waves = rng.standard_normal((2, SIZE)) / geometry.place_scale_m
-        self._phases = rng.uniform(0.0, 2.0 * math.pi, SIZE)
-
-    def describe(self, points_m: Array, rng: np.random.Generator) -> NDArray[np.float32]:
-        """Noisy unit descriptors (K, 512) at points (K, 2)."""
-        g = self._geometry
-        gaps = np.hypot(*(points_m[:, None] - self._nodes_m[None]).transpose(2, 0, 1))
-        along = self._along[np.argmin(gaps, axis=1)]
-        width = 0.15 / N_STRETCHES
-        edges = (self._middles[1:] + self._middles[:-1]) / 2.0
-        above = 1.0 / (1.0 + np.exp(-np.clip((along[:, None] - edges) / width, -50.0, 50.0)))
-        ones, zeros = np.ones((len(along), 1)), np.zeros((len(along), 1))
-        shares = np.hstack([ones, above]) - np.hstack([above, zeros])
-        place = math.sqrt(2.0 / SIZE) * np.cos(points_m @ self._waves + self._phases)
+    def describe(points_m: Array, rng: np.random.Generator) -> NDArray[np.float32]:
+        here = along[np.argmin(gaps_m(points_m, nodes_m), axis=1)]
+        above = 1.0 / (1.0 + np.exp(-np.clip((here[:, None] - edges) / width, -50.0, 50.0)))
+        shares = -np.diff(above, axis=1, prepend=1.0, append=0.0)
+        place = math.sqrt(2.0 / SIZE) * np.cos(points_m @ waves + phases)
         noise = rng.standard_normal((len(points_m), SIZE)) / math.sqrt(SIZE)
-        whole = g.stretch_weight * (shares @ self._stretches) + g.place_weight * place
+        whole = g.stretch_weight * (shares @ stretches) + g.place_weight * place
         whole += g.noise_weight * noise
-        unit: NDArray[np.float32] = (whole / np.linalg.norm(whole, axis=1, keepdims=True)).astype(
-            np.float32
-        )
-        return unit
+        return np.asarray(whole / np.linalg.norm(whole, axis=1, keepdims=True), np.float32)
+
+    return describe
 
 
 def place_world(geometry: Geometry, seed: int, nodes_m: Array | None = None) -> PlaceWorld:
@@ -211,12 +200,11 @@ def place_world(geometry: Geometry, seed: int, nodes_m: Array | None = None) -> 
         nodes_m = route(geometry, stream(seed, "world"))
     rng = stream(seed, "places")
     queries_m = queries(nodes_m, geometry, rng)
-    field = Field(geometry, nodes_m, rng)
-    known_map = from_arrays(nodes_m, field.describe(nodes_m, rng))
-    recording = query_recording(
-        queries_m, field.describe(queries_m, rng), geometry.interval_s, stream(seed, "slip")
-    )
-    return PlaceWorld(geometry, known_map, recording)
+    describe = field(geometry, nodes_m, rng)
+    known_map = from_arrays(nodes_m, describe(nodes_m, rng))
+    seen = describe(queries_m, rng)
+    slip = stream(seed, "slip")
+    return PlaceWorld(known_map, query_recording(queries_m, seen, geometry.interval_s, slip))
 
 
 def query_recording(
@@ -296,28 +284,47 @@ def described(recording: Recording, descriptor: str) -> Recording:
 
 
 def route_recording(
-    config: dict[str, Any], geometry: str, positions: str | None = None
+    config: dict[str, Any],
+    geometry: str,
+    positions: str | None = None,
+    noise_weight: float | None = None,
 ) -> Recording:
-    """Queries of a route, by the configuration's world_seed."""
-    return _route(config, geometry, positions).recording
+    """Queries of a route, by the configuration's world_seed.
+
+    Parameters
+    ----------
+    geometry
+        `oxford` or `umh`.
+    positions
+        File of `oxford_positions`; None: the route is generated.
+    noise_weight
+        Of the descriptors; None: the geometry's own.
+    """
+    return _route(config, geometry, positions, noise_weight).recording
 
 
 def route_map(
-    config: dict[str, Any], geometry: str, positions: str | None = None
+    config: dict[str, Any],
+    geometry: str,
+    positions: str | None = None,
+    noise_weight: float | None = None,
 ) -> TopologicalMap:
     """Map of the same route."""
-    return _route(config, geometry, positions).known_map
+    return _route(config, geometry, positions, noise_weight).known_map
 
 
-def _route(config: dict[str, Any], geometry: str, positions: str | None) -> PlaceWorld:
-    if geometry not in GEOMETRIES:
-        raise InputError(f"geometry must be {' or '.join(GEOMETRIES)}, got {geometry!r}")
-    nodes = None
-    if positions is not None:
-        nodes = oxford_positions(Path(positions))
-        if nodes is None:
-            raise InputError(f"{positions}: no such file; set positions to null for a made route")
-    return place_world(GEOMETRIES[geometry], config["world_seed"], nodes)
+def _route(
+    config: dict[str, Any], name: str, positions: str | None, noise_weight: float | None
+) -> PlaceWorld:
+    if name not in GEOMETRIES:
+        raise InputError(f"geometry must be {' or '.join(GEOMETRIES)}, got {name!r}")
+    geometry = GEOMETRIES[name]
+    if noise_weight is not None:
+        geometry = dataclasses.replace(geometry, noise_weight=noise_weight)
+    nodes = oxford_positions(Path(positions)) if positions is not None else None
+    if positions is not None and nodes is None:
+        raise InputError(f"{positions}: no such file; set positions to null for a made route")
+    return place_world(geometry, config["world_seed"], nodes)
 
 
 def recording_from_files(
@@ -341,16 +348,5 @@ def mapping_run(
     descriptor: str = "scan_context",
 ) -> TopologicalMap:
     """Map from another run through the same world, whose slip and noise are those of `seed`."""
-    from experiments.runs.experiment import default_cache, make_recording
-
-    other = {**config, "seed": seed, "recording": None}
-    return from_recording(make_recording(other, default_cache()), descriptor, spacing_m)
-
-
-def example() -> tuple[Recording, Prior]:
-    """A short route with clear places, and a tracking prior with its map."""
-    world = place_world(dataclasses.replace(UMH, n_nodes=40, noise_weight=0.3), 0)
-    recording = world.recording
-    start = recording.truth_at(recording.frame_stamps[:1])[0]
-    spread = np.diag(np.square([0.5, 0.5, 0.1]))
-    return recording, Prior(_CAR, recording.sensors, start, spread, world.known_map)
+    other = Experiment(config).replaced(seed=seed, recording=None)
+    return from_recording(other.recording(), descriptor, spacing_m)

@@ -1,0 +1,66 @@
+"""Constants of the study of maximo2024: sizes, seeds, chosen parameters, what the paper prints."""
+
+from __future__ import annotations
+
+from experiments.evaluation.verdict import Profile
+from experiments.runs.paths import SOURCE
+
+# The Oxford positions of the paper, if they are at hand
+POSITIONS = SOURCE.parent / "shared" / "data" / "oxford_positions" / "positions.csv.gz"
+# Geometries of the tables, the paper's first; the quick profile's campus is kinematic
+NAMES = {
+    "oxford": "Oxford, made route",
+    "oxford_real": "Oxford, real positions",
+    "umh": "UMH",
+    "campus": "campus clouds",
+    "campus_quick": "campus clouds",
+}
+JUDGED_SEED = 1000  # seeds 0-99 are for tuning
+
+N_WORLDS = {Profile.FULL: 24, Profile.QUICK: 3}  # of each route
+N_QUALITY_WORLDS = {Profile.FULL: 20, Profile.QUICK: 2}
+N_CAMPUSES = {Profile.FULL: 4, Profile.QUICK: 1}
+N_REPEATS = {Profile.FULL: 10, Profile.QUICK: 2}  # in each world
+N_STARTS = {Profile.FULL: 20, Profile.QUICK: 10}
+
+METHODS = ("M1", "M2", "M3")
+# sigma_l in node spacings, sigma_m, B: the least mean error of each method, by `study.tune`
+TUNED = {
+    ("oxford", "M1"): (4.0, 0.1, 2),
+    ("oxford", "M2"): (4.0, 0.1, 2),
+    ("oxford", "M3"): (4.0, 0.1, 1),
+    ("umh", "M1"): (2.0, 0.1, 2),
+    ("umh", "M2"): (2.0, 0.4, 2),
+    ("umh", "M3"): (2.0, 0.1, 2),
+}
+GRID_SIGMA_L = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
+GRID_SIGMA_M = (0.05, 0.1, 0.2, 0.4)
+GRID_B = (1, 2, 3, 5, 10, 20)
+PER_NODE = (2, 4, 6, 8)  # particles, table 2
+# The map over descriptor quality: noise weights; sigma_l in spacings and sigma_m of all methods
+QUALITIES = (0.4, 0.8, 1.2, 1.6)
+SHARED_SIGMA = (2.0, 0.1)
+QUALITY_STEPS = 136
+
+TOLERANCE = 1.5  # spacings: an estimate this near is right
+HELD = 10  # steps that it has to stay so
+WITHIN = 40  # steps to localize in
+RECOVERED_WITHIN = 20  # nodes
+KIDNAPPED_AFTER = 30  # steps
+CAMPUS_SHIFT_M = 1.0  # from the map's lane to the queries'
+
+ITERATIONS = (0, 5, 10, 21)  # of figure 6
+DRAWN_DESCRIPTOR = "m2dp"  # of the campus
+# Tables 1 and 2: mean error and deviation, m
+PRINTED_1 = {
+    ("oxford", "M1"): (11.54, 0.38),
+    ("oxford", "M2"): (9.61, 0.26),
+    ("oxford", "M3"): (205.79, 38.88),
+    ("umh", "M1"): (1.72, 0.38),
+    ("umh", "M2"): (0.40, 0.01),
+    ("umh", "M3"): (0.44, 0.01),
+}
+PRINTED_2 = {
+    "oxford": {794: (9.62, 1.09), 1588: (9.73, 0.32), 2382: (9.73, 0.31), 3176: (9.25, 0.45)},
+    "umh": {272: (0.40, 0.03), 544: (0.42, 0.02), 816: (0.42, 0.03), 1088: (0.41, 0.01)},
+}

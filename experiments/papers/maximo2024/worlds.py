@@ -1,0 +1,382 @@
+"""One world of the study: a map and queries, the filter's runs in it, and their rows.
+
+A world is a route with a synthetic field of descriptors, or a campus with simulated clouds.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.cluster.vq import kmeans2
+
+from estimators import descriptors as describers
+from estimators.base import Estimate, Prior, run
+from estimators.topological_map import TopologicalMap, from_recording
+from experiments.papers.maximo2024.places import N_STRETCHES, UMH, described, gaps_m, resequenced
+from experiments.papers.maximo2024.settings import (
+    CAMPUS_SHIFT_M,
+    GRID_B,
+    HELD,
+    KIDNAPPED_AFTER,
+    METHODS,
+    PER_NODE,
+    POSITIONS,
+    QUALITIES,
+    QUALITY_STEPS,
+    RECOVERED_WITHIN,
+    SHARED_SIGMA,
+    TOLERANCE,
+    TUNED,
+    WITHIN,
+)
+from experiments.runs.experiment import Experiment
+from experiments.runs.row import Row
+from experiments.runs.seeds import stream
+from sim.recording import Recording
+
+Array = NDArray[np.float64]
+Rows = list[Row]
+
+
+@dataclass(frozen=True)
+class Case:
+    """One world of a geometry: the filter's experiment, the map and the queries.
+
+    Attributes
+    ----------
+    name, seed
+        Geometry, and the seed of its world and noise.
+    experiment
+        Composed from conf/study/maximo2024_*.yaml.
+    """
+
+    name: str
+    seed: int
+    experiment: Experiment
+    known_map: TopologicalMap
+    recording: Recording
+
+
+def case_of(name: str, seed: int, *overrides: str) -> Case:
+    """World of a route; `oxford_real` stands on the real positions."""
+    lines = [f"study=maximo2024_{name.removesuffix('_real')}", f"seed={seed}", *overrides]
+    if name == "oxford_real":
+        lines.append(f"positions='{POSITIONS}'")
+    experiment = Experiment.compose(lines)
+    recording = experiment.recording()
+    return Case(name, seed, experiment, experiment.prior(recording).map, recording)
+
+
+def options(
+    case: Case, method: str = "M2", parameters: tuple[float, float, int] | None = None
+) -> dict[str, Any]:
+    """Keys of the estimator: a method with the parameters chosen for its geometry, or others.
+
+    The campus takes those of UMH, untuned, in its own spacings.
+
+    Parameters
+    ----------
+    parameters
+        sigma_l in node spacings, sigma_m, B.
+    """
+    like = "oxford" if case.name.startswith("oxford") else "umh"
+    sigma_l, sigma_m, n_nearest = parameters or TUNED[like, method]
+    return {
+        "weighting": method,
+        "sigma_l_m": sigma_l * case.known_map.spacing_m,
+        "sigma_m": sigma_m,
+        "n_nearest": n_nearest,
+    }
+
+
+@dataclass(frozen=True)
+class Walk:
+    """A filter's run: errors (T,) m, dispersions (T,) m, and the estimate itself."""
+
+    errors_m: Array
+    dispersions_m: Array
+    estimate: Estimate
+
+
+def localize(
+    case: Case,
+    settings: dict[str, Any],
+    rng: np.random.Generator,
+    recording: Recording | None = None,
+) -> Walk:
+    """Localize globally; the dispersion is the particles' mean distance from the estimate.
+
+    Parameters
+    ----------
+    settings
+        Keys of the estimator in place of the experiment's.
+    recording
+        In place of the case's own.
+    """
+    taken = case.recording if recording is None else recording
+    estimator = {**case.experiment.config["estimator"], **settings}
+    estimate = run(
+        case.experiment.replaced(estimator=estimator).estimator(),
+        taken,
+        Prior(taken.robot, taken.sensors, map=case.known_map),
+        rng,
+        keep=("particles", "log_weights", "refinement"),
+    )
+    errors = np.hypot(*(estimate.means - taken.truth_at(taken.frame_stamps))[:, :2].T)
+    spread, extras = np.empty(len(errors)), estimate.extras
+    for i, (cloud, logs) in enumerate(zip(extras["particles"], extras["log_weights"], strict=True)):
+        weights = np.exp(logs)
+        away = np.hypot(*(cloud[:, :2] - estimate.means[i, :2]).T)
+        spread[i] = weights @ away / weights.sum()
+    return Walk(errors, spread, estimate)
+
+
+def settled_at(errors_m: Array, tolerance_m: float) -> float:
+    """First step from which the error stays within the tolerance for `HELD` steps, or NaN."""
+    if len(errors_m) < HELD:
+        return math.nan
+    right = (errors_m <= tolerance_m).astype(int)
+    first = np.flatnonzero(np.convolve(right, np.ones(HELD, int), "valid") == HELD)
+    return float(first[0]) if len(first) else math.nan
+
+
+def weighting_rows(case: Case, n_repeats: int) -> dict[str, Rows]:
+    """Table 1 and figure 4: errors of each method over the whole route, and dispersions.
+
+    `M2_mode` is M2 with the mode's mean as its estimate in place of eq. (4).
+    """
+    errors: Rows = []
+    steps: Rows = []
+    taken = case.recording.truth_at(case.recording.frame_stamps)[:, :2]
+    # what a topological estimate cannot beat
+    nearest = float(gaps_m(taken, case.known_map.positions_m).min(axis=1).mean())
+    for method in (*METHODS, "M2_mode"):
+        settings = options(case, method[:2])
+        settings |= {"estimate": "mode"} if method == "M2_mode" else {}
+        walks = _repeated(case, settings, "estimator/topological_mcl", n_repeats)
+        label = {"method": method}
+        errors += [label | row | {"nearest_node_m": nearest} for row in _errors(walks)]
+        dispersion = np.mean([walk.dispersions_m[: WITHIN + 1] for walk in walks], axis=0)
+        error = np.mean([walk.errors_m[: WITHIN + 1] for walk in walks], axis=0)
+        steps += [
+            label | {"step": i, "dispersion_m": float(dispersion[i]), "error_m": float(error[i])}
+            for i in range(WITHIN + 1)
+        ]
+    return {"weighting": errors, "dispersion": steps}
+
+
+def particle_rows(case: Case, n_repeats: int) -> Rows:
+    """Table 2: errors of M2 by the number of particles a node."""
+    rows: Rows = []
+    for per_node in PER_NODE:
+        settings = options(case) | {"particles_per_node": per_node}
+        walks = _repeated(case, settings, f"estimator/{per_node}", n_repeats)
+        label = {"per_node": per_node, "particles": per_node * len(case.known_map)}
+        rows += [label | row for row in _errors(walks)]
+    return rows
+
+
+def _repeated(case: Case, settings: dict[str, Any], axis: str, n_repeats: int) -> list[Walk]:
+    return [localize(case, settings, stream(case.seed, axis, i)) for i in range(n_repeats)]
+
+
+def _errors(walks: list[Walk]) -> Rows:
+    """Mean errors of each repeat, and of its part after the search."""
+    return [
+        {
+            "repeat": repeat,
+            "error_m": float(walk.errors_m.mean()),
+            "late_error_m": float(walk.errors_m[WITHIN:].mean()),
+        }
+        for repeat, walk in enumerate(walks)
+    ]
+
+
+def starts(
+    case: Case, n_starts: int, settings: dict[str, Any], tolerance_m: float
+) -> list[tuple[int, float, Walk]]:
+    """Figure 5: starts all along the route, the step at which each is localized, and its run."""
+    runs = []
+    length = WITHIN + HELD
+    last = len(case.recording.frame_stamps) - length - 1
+    for start in map(int, np.linspace(0, last, n_starts)):
+        part = resequenced(case.recording, np.arange(start, start + length))
+        walk = localize(case, settings, stream(case.seed, "estimator/starts", start), part)
+        runs.append((start, settled_at(walk.errors_m, tolerance_m), walk))
+    return runs
+
+
+def kidnapping_rows(
+    case: Case,
+    settings: dict[str, Any],
+    injection: float,
+    n_trials: int,
+    n_after: int,
+    queries_per_node: float = 1.0,
+) -> Rows:
+    """Carry the robot off and see whether the filter finds it, without and with injection.
+
+    Parameters
+    ----------
+    n_after
+        Queries after the kidnapping.
+    """
+    rows: Rows = []
+    n, tolerance_m = len(case.recording.frame_stamps), TOLERANCE * case.known_map.spacing_m
+    draws = stream(case.seed, "kidnapping")
+    for trial in range(n_trials):
+        before = np.arange(KIDNAPPED_AFTER) + draws.integers(0, n // 2 - 40)
+        there = np.arange(n_after) + draws.integers(n // 2, n - n_after)
+        part = resequenced(case.recording, np.concatenate([before, there]))
+        for share in (0.0, injection):
+            rng = stream(case.seed, "estimator/kidnapping", trial)
+            errors = localize(case, settings | {"injection": share}, rng, part).errors_m
+            rows.append(
+                {
+                    "trial": trial,
+                    "injection": share,
+                    "known_before": bool(errors[KIDNAPPED_AFTER - 1] <= tolerance_m),
+                    "settled_at": settled_at(errors[KIDNAPPED_AFTER:], tolerance_m)
+                    / queries_per_node,
+                }
+            )
+    return rows
+
+
+def quality_rows(name: str, seed: int) -> Rows:
+    """Map of M1-M3 over the descriptors' noise and B, with the same sigmas for all methods."""
+    rows: Rows = []
+    for noise in QUALITIES:
+        case = case_of(name, seed, f"recording.noise_weight={noise}")
+        recall = _retrieval(case.known_map, case.recording)["recall_at_1"]
+        part = case.recording.cut(QUALITY_STEPS)
+        for n_nearest, method in itertools.product(GRID_B, METHODS):
+            settings = options(case, method, (*SHARED_SIGMA, n_nearest))
+            rng = stream(seed, "estimator/quality")
+            walk = localize(case, settings | {"particles_per_node": 2}, rng, part)
+            rows.append(
+                {
+                    "noise_weight": noise,
+                    "recall_at_1": recall,
+                    "n_nearest": n_nearest,
+                    "method": method,
+                    "error_m": float(walk.errors_m.mean()),
+                    "dispersion_m": float(walk.dispersions_m[10]),
+                }
+            )
+    return rows
+
+
+def _retrieval(known_map: TopologicalMap, recording: Recording) -> dict[str, float]:
+    """Retrieval quality; right is a node within 25 m in Oxford, else within 1.5 spacings."""
+    assert recording.places is not None
+    kind = describers.KINDS.get(known_map.descriptor)
+    compare = kind.distances if kind else describers.euclidean
+    rows = recording.places.descriptors
+    distances = np.array([compare(row, known_map.descriptors) for row in rows])
+    here = recording.truth_at(recording.places.stamps)[:, :2]
+    within_m = 25.0 if known_map.spacing_m > 15.0 else 1.5 * known_map.spacing_m
+    return describers.retrieval(distances, gaps_m(here, known_map.positions_m), within_m)
+
+
+def cluster_labels(known_map: TopologicalMap, seed: int) -> NDArray[np.int64]:
+    """Label (N,) of each node by k-means with 40 clusters, of the best of five starts."""
+    features = known_map.descriptors.astype(np.float64)
+    n_clusters = min(N_STRETCHES, len(features))
+    streams = [stream(seed, "clusters", start) for start in range(5)]
+    found = [kmeans2(features, n_clusters, minit="++", seed=rng) for rng in streams]
+    costs = [np.sum((features - centres[labels]) ** 2) for centres, labels in found]
+    labels: NDArray[np.int64] = found[int(np.argmin(costs))][1].astype(np.int64)
+    return labels
+
+
+def cluster_row(known_map: TopologicalMap, recording: Recording, descriptor: str, seed: int) -> Row:
+    """Figure 2: share of nodes with a route neighbour in their cluster; retrieval beside."""
+    same = np.diff(cluster_labels(known_map, seed)) == 0
+    beside = np.append(same, False) | np.append(False, same)
+    return {
+        "descriptor": descriptor,
+        "nodes": len(known_map),
+        "contiguous": float(beside.mean()),
+        **_retrieval(known_map, recording),
+    }
+
+
+# A campus
+
+
+def campus_runs(name: str, seed: int) -> tuple[Experiment, Experiment]:
+    """Mapping run and query run through one campus, the queries one lane to the left.
+
+    `campus` is driven by PyBullet, `campus_quick` by the kinematic robot.
+    """
+    physics = "bullet" if name == "campus" else "kinematic"
+    mapping = Experiment.compose(
+        ["study=maximo2024_campus", f"seed={seed}", f"simulation.physics={physics}"]
+    )
+    way = mapping.world().waypoints
+    along = np.gradient(way, axis=0)
+    along[[0, -1]] = way[1] - way[-2]  # the tour is closed
+    left = along[:, ::-1] * [-1.0, 1.0] / np.hypot(*along.T)[:, None]
+    lane = (way + CAMPUS_SHIFT_M * left).tolist()
+    route = {**mapping.config["route"], "waypoints": lane}
+    return mapping, mapping.replaced(seed=seed + 500, route=route)  # the same world_seed
+
+
+def campus_rows(name: str, seed: int, n_repeats: int) -> dict[str, Rows]:
+    """All that is judged on simulated clouds, in one campus."""
+    mapping, taking = campus_runs(name, seed)
+    mapped, taken = mapping.recording(), taking.recording()
+    settings, cases, clusters = mapping.config["prior"]["map"], {}, []
+    for descriptor in describers.KINDS:
+        known = from_recording(mapped, descriptor, settings["spacing_m"])
+        fine = from_recording(mapped, descriptor, UMH.spacing_m)
+        queries = described(taken, descriptor)
+        row = cluster_row(fine, queries, descriptor, seed)
+        clusters.append({**row, **_retrieval(known, queries)})
+        cases[descriptor] = Case(name, seed, taking, known, queries)
+    case = cases[settings["descriptor"]]
+    travel_m = np.median(np.abs(np.diff(taken.wheels.position_m[:, 0])))
+    per_node = float(case.known_map.spacing_m / travel_m)
+    bare = replace(case, recording=replace(case.recording, clouds=None))
+    return {
+        **weighting_rows(_one_query_a_node(bare), n_repeats),
+        "clusters": clusters,
+        "campus_starts": _campus_starts(case),
+        "kidnapping": kidnapping_rows(bare, {}, 0.02, 25, 4 * RECOVERED_WITHIN, per_node),
+    }
+
+
+def _one_query_a_node(case: Case) -> Case:
+    """As the paper has it: one query a node, the filter as printed, nothing tuned for it."""
+    poses = case.recording.truth_at(case.recording.frame_stamps)
+    gone = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T))])
+    rows = np.unique(np.searchsorted(gone, np.arange(0.0, gone[-1], case.known_map.spacing_m)))
+    printed = Experiment.compose(["estimator=topological_mcl_paper"]).config["estimator"]
+    experiment = case.experiment.replaced(estimator=printed)
+    return replace(case, experiment=experiment, recording=resequenced(case.recording, rows))
+
+
+def _campus_starts(case: Case) -> Rows:
+    """Default filter from 60 starts: when it is localized, and how well where it refines."""
+    rows: Rows = []
+    spacing_m = case.known_map.spacing_m
+    for start, settled, walk in starts(case, 60, {}, spacing_m):
+        after = walk.errors_m[int(settled) :] if math.isfinite(settled) else np.array([math.nan])
+        refined = [state == "ok" for state in walk.estimate.extras["refinement"]]
+        rows.append(
+            {
+                "start": start,
+                "spacing_m": spacing_m,
+                "settled_at": settled,
+                "rms_m": float(np.sqrt(np.mean(after**2))),
+                "median_m": float(np.median(after)),
+                "refined": float(np.mean(refined)),
+            }
+        )
+    return rows
