@@ -71,9 +71,10 @@ def dc3(ellipses: pd.DataFrame) -> list[Claim]:
     claims = []
     for bend in ("curve", "corner"):
         before = ellipses[f"long_before_{bend}_m"]
-        grown = log_ratio_interval(ellipses[f"long_in_{bend}_m"], before)
-        typical = log_ratio_interval(ellipses[f"long_median_in_{bend}_m"], before)
-        after = log_ratio_interval(ellipses[f"long_after_{bend}_m"], before)
+        grown, typical, after = (
+            log_ratio_interval(ellipses[f"long_{part}_{bend}_m"], before)
+            for part in ("in", "median_in", "after")
+        )
         turned = mean_interval(ellipses[f"turned_in_{bend}_deg"])
         claims += [
             _at_least("DC3", f"largest long axis in the {bend} over before", grown, 1.5),
@@ -115,20 +116,21 @@ def dc4(covariances: pd.DataFrame) -> list[Claim]:
 
 def dc5(metrics: pd.DataFrame) -> list[Claim]:
     """DC5: point to line has the lower error and the lower time, over the same pairs."""
-    claims = []
-    for kind, table in metrics.groupby("class"):
-        wide = table.pivot(index="seed", columns="metric")
-        for what, column in (
-            ("position error", "error_m"),
-            ("heading error", "error_rad"),
-            ("time", "time_us"),
-        ):
-            ratio = log_ratio_interval(
-                wide[column, "point_to_line"], wide[column, "point_to_point"]
-            )
-            statistic = f"{what}, point to line over point to point, {kind}"
-            claims.append(_at_most("DC5", statistic, ratio, 1.0))
-    return claims
+    wide = metrics.pivot(index=["class", "seed"], columns="metric")
+    measures = (("position error", "error_m"), ("heading error", "error_rad"), ("time", "time_us"))
+    return [
+        _at_most(
+            "DC5",
+            f"{what}, point to line over point to point, {kind}",
+            log_ratio_interval(
+                wide.loc[kind, (column, "point_to_line")],
+                wide.loc[kind, (column, "point_to_point")],
+            ),
+            1.0,
+        )
+        for kind in wide.index.unique("class")
+        for what, column in measures
+    ]
 
 
 def dc6(runs: pd.DataFrame) -> list[Claim]:
@@ -146,7 +148,7 @@ def dc6(runs: pd.DataFrame) -> list[Claim]:
 
 def judged_runs(runs: pd.DataFrame) -> pd.DataFrame:
     """Rows at 10 Hz on exact rays."""
-    return runs[(runs["rate_hz"] == 10.0) & (runs["rays"] == "exact")]
+    return runs.query("rate_hz == 10.0 and rays == 'exact'")
 
 
 def _paired(table: pd.DataFrame, column: str, first: str, second: str) -> tuple[Array, Array]:

@@ -101,15 +101,14 @@ def ellipses(corridor: Arrays, path: pd.DataFrame) -> Figure:
     top, bottom = page.subfigures(2, 1, height_ratios=(1.9, 1.0))  # type: ignore[misc]
     left, right = top.subplots(1, 2, width_ratios=(1.0, 1.25))
     scale = 0.6 / (2.45 * path["long_m"].quantile(0.9))
-    _draw_ellipses(left, corridor, path, "curve", scale, spacing_m=0.75)
-    left.set_title(f"A: a curve (ellipses {scale:.0f} times their size)", fontsize="medium")
+    title = f"A: a curve (ellipses {scale:.0f} times their size)"
+    _draw_ellipses(left, corridor, path, "curve", scale, 0.75, title)
     for column, color, label in (
         ("long_m", BLUE, "long axis"),
         ("short_m", ORANGE, "short axis"),
     ):
         right.semilogy(path["distance_m"], 1e3 * path[column], color=color, lw=1.0, label=label)
     low, high = right.get_ylim()
-    right.set_ylim(low, 2.5 * high)
     for place, color, name, raised in (
         ("corridor_bare", ORANGE, "bare", 2.2),
         ("corridor_objects", GREEN, "objects", 2.2),
@@ -120,16 +119,23 @@ def ellipses(corridor: Arrays, path: pd.DataFrame) -> Figure:
         right.axvspan(inside.min(), inside.max(), color=color, alpha=0.12, lw=0)
         middle = (inside.min() + inside.max()) / 2
         right.text(middle, raised * high, name, ha="center", va="top", size=8)
-    right.set(xlabel="distance, m", ylabel="standard deviation of a step, mm")
+    right.set(
+        xlabel="distance, m", ylabel="standard deviation of a step, mm", ylim=(low, 2.5 * high)
+    )
     right.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
-    below = bottom.subplots()
-    _draw_ellipses(below, corridor, path, "corridor", scale, spacing_m=1.0)
-    below.set_title(f"B: a corridor, bare and with objects ({scale:.0f} times)", fontsize="medium")
+    title = f"B: a corridor, bare and with objects ({scale:.0f} times)"
+    _draw_ellipses(bottom.subplots(), corridor, path, "corridor", scale, 1.0, title)
     return page
 
 
 def _draw_ellipses(
-    ax: Axes, corridor: Arrays, path: pd.DataFrame, place: str, scale: float, spacing_m: float
+    ax: Axes,
+    corridor: Arrays,
+    path: pd.DataFrame,
+    place: str,
+    scale: float,
+    spacing_m: float,
+    title: str,
 ) -> None:
     """Draw the enlarged ellipses of the places whose names begin so, one every `spacing_m`."""
     rows = path[path["place"].str.startswith(place, na=False)]
@@ -141,8 +147,11 @@ def _draw_ellipses(
         covariance = np.array([[row["xx_m2"], row["xy_m2"]], [row["xy_m2"], row["yy_m2"]]])
         style = {"facecolor": "none", "edgecolor": BLUE, "linewidth": 0.9}
         ax.add_patch(covariance_ellipse(row[["x_m", "y_m"]], scale**2 * covariance, **style))
-    ax.set_xlim(rows["x_m"].min() - 2.0, rows["x_m"].max() + 2.0)
-    ax.set_ylim(rows["y_m"].min() - 2.0, rows["y_m"].max() + 2.0)
+    ax.set(
+        xlim=(rows["x_m"].min() - 2.0, rows["x_m"].max() + 2.0),
+        ylim=(rows["y_m"].min() - 2.0, rows["y_m"].max() + 2.0),
+    )
+    ax.set_title(title, fontsize="medium")
 
 
 def trajectories(office: Arrays, table: pd.DataFrame) -> Figure:
@@ -187,9 +196,7 @@ def boxes(table: pd.DataFrame) -> Figure:
         for patch, line, method in zip(drawn["boxes"], drawn["medians"], rows.index, strict=True):
             patch.set(facecolor=COLORS[method], alpha=0.6)
             line.set_color(TRUTH)
-        ax.set_yscale("log")
-        ax.set_ylim(bottom=stats["q1"].min() / 10)
-        ax.set_ylabel(label)
+        ax.set(yscale="log", ylabel=label, ylim=(stats["q1"].min() / 10, None))
     page.suptitle("all recordings; box: quartiles, whiskers: 1.5 times their distance", size=9)
     return page
 
@@ -230,8 +237,7 @@ def runs(table: pd.DataFrame) -> Figure:
             if believed is not None:
                 middle = unit * own[believed].median()
                 ax.plot(i + 0.35, middle, "D", color=TRUTH, mfc="white", ms=4)
-        ax.set_yscale("log")
-        ax.set_ylabel(label)
+        ax.set(yscale="log", ylabel=label)
         ax.set_xticks(range(len(methods)), [NAMES[m] for m in methods], rotation=35, ha="right")
     axes[-1].axhspan(*CONSISTENT, color=GREEN, alpha=0.2, lw=0)
     page.suptitle(
@@ -258,23 +264,24 @@ def covariances(table: pd.DataFrame) -> Figure:
             ax.errorbar(
                 found["value"], heights, xerr=reach, fmt="o", ms=4, color=color, label=place
             )
-        ax.set_xscale("log")
-        ax.set(xlabel="NEES / dof", title=metric.replace("_", " "))
+        ax.set(xscale="log", xlabel="NEES / dof", title=metric.replace("_", " "))
     times = table.groupby(["metric", "method"])["time_us"].median().unstack("metric")
     for metric, marker, fill in zip(METRICS, "os", (TRUTH, "none"), strict=True):
         times_axes.plot(
             times.loc[list(_METHODS), metric], range(len(_METHODS)), marker,
             color=TRUTH, mfc=fill, label=metric.replace("_", " "),
         )  # fmt: skip
-    times_axes.set_xscale("log")
-    times_axes.set(xlabel="time, us", title="time of one")
+    times_axes.set(xscale="log", xlabel="time, us", title="time of one")
     times_axes.legend(loc="upper right", fontsize=7)
     for ax in (*axes, times_axes):
         ax.set_yticks(range(len(_METHODS)), [])
         ax.invert_yaxis()
-    axes[0].set_yticklabels([m.replace("_", " ") for m in _METHODS])
-    axes[0].set_xlim(0.4, 5.0)
-    axes[0].set_xticks([0.5, 1.0, 2.0, 4.0], ["0.5", "1", "2", "4"])
+    axes[0].set(
+        xlim=(0.4, 5.0),
+        xticks=[0.5, 1.0, 2.0, 4.0],
+        xticklabels=["0.5", "1", "2", "4"],
+        yticklabels=[m.replace("_", " ") for m in _METHODS],
+    )
     axes[0].minorticks_off()
     page.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=4)
     return page
@@ -296,9 +303,9 @@ def beliefs(table: pd.DataFrame) -> Figure:
             ax.plot(mean.value, i, "o", color=TRUTH, ms=5)
     axes[0].axvline(1.0, color=TRUTH, lw=0.6)
     axes[1].axvspan(*CONSISTENT, color=GREEN, alpha=0.2, lw=0)
-    axes[0].set_yticks(range(len(names)), names)
-    axes[0].invert_yaxis()
     axes[0].set(xscale="log", xlabel="position RMSE over that of right beliefs")
+    axes[0].set(yticks=range(len(names)), yticklabels=names)
+    axes[0].invert_yaxis()
     axes[1].set(xscale="log", xlabel="NEES / 3")
     page.suptitle("clone filter; dots: recordings, black: geometric mean with 95 %", size=9)
     return page
@@ -317,9 +324,8 @@ def ordering(table: pd.DataFrame) -> Figure:
             median = (wide[better] - wide[worse]).groupby(level=cells).median().unstack("k_m")
             drawn = _grid(ax, median)
             ax.set_title(f"{what}: {NAMES[better]} over {NAMES[worse]}", fontsize=8)
-        row[0].set_ylabel("range noise, m")
-    for ax in axes[-1]:
-        ax.set_xlabel("kr = kl, m")
+            ax.set(xlabel="kr = kl, m", ylabel="range noise, m")
+            ax.label_outer()
     label = "median log ratio of RMSE (blue: the first is better)"
     page.colorbar(drawn, ax=axes, label=label, extend="both")
     return page
@@ -362,10 +368,9 @@ def steps(table: pd.DataFrame) -> Figure:
         ax.axhline(1.0, color=TRUTH, lw=0.6)
         ax.set_ylim(bottom=0.0)
     axes[0].set(xlabel="lag, registrations", ylabel="correlation of errors")
-    axes[1].set_xticks(range(3), ["one step", "1 s", "10 s"])
     axes[1].set(ylabel="squared error over\nits covariance, / 3", xlabel="composed over")
-    axes[2].set_xticks([0, 1], ["x, y", "heading"])
-    axes[2].set_xlim(-0.5, 1.5)
+    axes[1].set(xticks=range(3), xticklabels=["one step", "1 s", "10 s"])
+    axes[2].set(xlim=(-0.5, 1.5), xticks=[0, 1], xticklabels=["x, y", "heading"])
     axes[2].set(ylabel="RMS error of a step\nover the Fisher bound")
     page.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=2)
     return page

@@ -16,7 +16,6 @@ from experiments.papers.decristoforis2020.settings import HELD_M, WINDOWS_S
 from experiments.runs.row import Row
 from sim import se2
 from sim.recording import Recording
-from sim.sensors import Laser
 from sim.world import World
 
 Array = NDArray[np.float64]
@@ -57,25 +56,17 @@ def step_errors(recording: Recording, world: World, estimate: Estimate) -> Row:
         n = round(window_s * laser.rate_hz)
         row[f"accumulated_over_predicted_{window_s:g}s"] = _accumulated(steps, truth, n)
     chosen = use[sound][:: max(1, int(sound.sum()) // 40)]
-    bounds = np.array([_step_bound(laser, world, truth[i], truth[i + 1]) for i in chosen])
-    row["step_error_m"] = float(np.sqrt(np.mean(np.sum(off[chosen, :2] ** 2, axis=1))))
-    row["step_bound_m"] = float(np.sqrt(np.mean(bounds[:, 0, 0] + bounds[:, 1, 1])))
-    row["step_error_rad"] = float(np.sqrt(np.mean(off[chosen, 2] ** 2)))
-    row["step_bound_rad"] = float(np.sqrt(np.mean(bounds[:, 2, 2])))
-    return row
-
-
-def _step_bound(laser: Laser, world: World, first: Array, second: Array) -> Array:
-    """Least covariance (3, 3) of the laser's motion between two poses of base_link."""
-    mount = laser.mount.pose
-    return fisher_bound(
-        world.walls,
-        se2.compose(first, mount),
-        se2.compose(second, mount),
-        laser.bearings_rad,
-        laser.sigma_range_m,
-        laser.max_range_m,
+    scanned = se2.compose(truth, laser.mount.pose)
+    noise = laser.bearings_rad, laser.sigma_range_m, laser.max_range_m
+    bounds = np.array(
+        [fisher_bound(world.walls, scanned[i], scanned[i + 1], *noise) for i in chosen]
     )
+    return row | {
+        "step_error_m": float(np.sqrt(np.mean(np.sum(off[chosen, :2] ** 2, axis=1)))),
+        "step_bound_m": float(np.sqrt(np.mean(bounds[:, 0, 0] + bounds[:, 1, 1]))),
+        "step_error_rad": float(np.sqrt(np.mean(off[chosen, 2] ** 2))),
+        "step_bound_rad": float(np.sqrt(np.mean(bounds[:, 2, 2]))),
+    }
 
 
 def _accumulated(steps: dict[int, Gaussian], truth: Array, n: int) -> float:

@@ -73,18 +73,18 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
         Called with the share done.
     """
     jobs = _jobs(profile is Profile.FULL, out)
-    total, done = sum(cost for cost, _, _ in jobs), 0.0
+    done = np.cumsum([cost for cost, _, _ in jobs])
     parts: dict[str, list[pd.DataFrame]] = {}
     calls = (joblib.delayed(function)(*arguments) for _, function, arguments in jobs)
     found = joblib.Parallel(n_jobs=-1, return_as="generator")(calls)
-    for (cost, _, _), tables in zip(jobs, found, strict=True):
+    for share, tables in zip(done / done[-1], found, strict=True):
         for name, frame in tables.items():
             parts.setdefault(name, []).append(frame)
-        done += cost
-        on_progress(done / total)
+        on_progress(share)
     whole = {name: pd.concat(frames, ignore_index=True) for name, frames in parts.items()}
     whole["boxes"] = _boxes(whole.pop("errors"))
     whole["covariances"] = whole["covariances"].sort_values(["metric", "method", "place", "seed"])
+    whole["ordering"] = whole["ordering"][[*_NOISE, "ate_rmse_m", "heading_rmse_rad"]]
     for name, frame in whole.items():
         out.write_table(name, frame)
 
@@ -97,15 +97,18 @@ def _jobs(full: bool, out: Results) -> list[Job]:
     drives = _planned("methods", n, *short)
     fast = _planned("methods", 5 if full else 1, *shorter, "sensors.laser.rate_hz=75.0")
     engine = _planned("methods", 3 if full else 1, *shorter, "simulation.rays=bullet")
-    corridors = _planned("corridor", n)
+    first, *others = _planned("corridor", n)
     noise = [] if full else ["robot.kr=1e-6,1e-4", "sensors.laser.sigma_range_m=0.01"]
     return [
         *((drive, _drive, [group]) for group in drives),
         *((check, _drive, [_only(CHECKED, group)]) for group in fast + engine),
-        *((drive, _wrong_beliefs, [group]) for group in _planned("beliefs", n, *short)),
+        *(
+            (drive, _scored, ["beliefs", _BELIEF, group])
+            for group in _planned("beliefs", n, *short)
+        ),
         (0.1 * drive, _drawn_office, [_only(PAPERS_OWN, drives[0]), out]),
-        *((0.05, _closeup, group) for group in corridors),
-        (0.05, _drawn_corridor, [*corridors[0], out]),
+        (0.05, _closeup, [*first, out]),
+        *((0.05, _closeup, group) for group in others),
         *((0.025, _scenes, [seed, p, 60 if full else 10]) for seed in seeds for p in PLACES),
         *(
             (0.004, _metrics, [seed, kind])
@@ -113,7 +116,7 @@ def _jobs(full: bool, out: Results) -> list[Job]:
             for kind in PAIRS
         ),
         *(
-            (0.025, _ordering, [_only(CHECKED, group)])
+            (0.025, _scored, ["ordering", _NOISE, _only(CHECKED, group)])
             for group in _planned("ordering", 4 if full else 1, *noise)
         ),
     ]
@@ -151,12 +154,14 @@ def _run(
     squares = nees_at_distances(truth, estimate.means, estimate.covariances, np.array(NEES_AT_M))
     variances = np.mean(np.diagonal(estimate.covariances, axis1=1, axis2=2), axis=0)
     labels = experiment.labels(checksum="")
-    row = {name: found[key] for name, key in origin.items()}
-    row |= {key: value for key, value in found.items() if key not in labels}
-    row |= {f"nees_{d:g}m": float(v) for d, v in zip(NEES_AT_M, squares, strict=True)}
-    row["believed_rmse_m"] = float(np.sqrt(variances[0] + variances[1]))
-    row["believed_heading_rmse_rad"] = float(np.sqrt(variances[2]))
-    row["realtime_factor"] = float(np.ptp(estimate.stamps) / estimate.step_seconds.sum())
+    row: Row = {
+        **{name: found[key] for name, key in origin.items()},
+        **{key: value for key, value in found.items() if key not in labels},
+        **{f"nees_{d:g}m": float(v) for d, v in zip(NEES_AT_M, squares, strict=True)},
+        "believed_rmse_m": float(np.sqrt(variances[0] + variances[1])),
+        "believed_heading_rmse_rad": float(np.sqrt(variances[2])),
+        "realtime_factor": float(np.ptp(estimate.stamps) / estimate.step_seconds.sum()),
+    }
     return row, estimate
 
 
@@ -172,31 +177,22 @@ def _drive(group: Sequence[Experiment]) -> Tables:
             points = map_points(recording, estimate)
             row["map_distance_m"] = float(wall_distances_m(points, world).mean())
             row["map_entropy"] = mean_map_entropy(points, stream(experiment.seed, "map"))
+        origin = {key: row[key] for key in ("seed", "rate_hz", "rays")}
         if row["method"] == "icp":
-            origin = {key: row[key] for key in ("seed", "rate_hz", "rays")}
             steps.append(origin | step_errors(recording, world, estimate))
-        if row["method"] in PAPERS_OWN and row["rate_hz"] == 10.0 and row["rays"] == "exact":
-            off = {
-                "method": row["method"],
-                "position_m": position_errors_m(truth, estimate.means),
-                "heading_rad": np.abs(heading_errors_rad(truth, estimate.means)),
-            }
-            errors.append(pd.DataFrame(off)[::50])
-    tables = {"runs": pd.DataFrame(runs), "steps": pd.DataFrame(steps)}
-    return tables | ({"errors": pd.concat(errors)} if errors else {})
+        off = {
+            "method": row["method"],
+            "position_m": position_errors_m(truth, estimate.means),
+            "heading_rad": np.abs(heading_errors_rad(truth, estimate.means)),
+        }
+        errors.append(pd.DataFrame(origin | off)[::50])
+    return {"runs": pd.DataFrame(runs), "steps": pd.DataFrame(steps), "errors": pd.concat(errors)}
 
 
-def _wrong_beliefs(group: Sequence[Experiment]) -> Tables:
-    """Error and NEES of the clone filter that believes wrong kr, kl and range noise."""
+def _scored(table: str, origin: dict[str, str], group: Sequence[Experiment]) -> Tables:
+    """Scores of runs over one recording, as rows of a table with their origin."""
     recording = group[0].recording()
-    return {"beliefs": pd.DataFrame([_run(e, recording, _BELIEF)[0] for e in group])}
-
-
-def _ordering(group: Sequence[Experiment]) -> Tables:
-    """Errors of the methods at one slip and one range noise."""
-    recording = group[0].recording()
-    rows = pd.DataFrame([_run(e, recording, _NOISE)[0] for e in group])
-    return {"ordering": rows[[*_NOISE, "ate_rmse_m", "heading_rmse_rad"]]}
+    return {table: pd.DataFrame([_run(e, recording, origin)[0] for e in group])}
 
 
 def _drawn_office(group: Sequence[Experiment], out: Results) -> Tables:
@@ -221,25 +217,19 @@ def _drawn_office(group: Sequence[Experiment], out: Results) -> Tables:
     return {}
 
 
-def _closeup(experiment: Experiment) -> Tables:
-    """Ellipses of registration from scan to scan along a corridor and through its bends."""
-    path = _ellipses_along(experiment)
-    return {"ellipses": pd.DataFrame([{"seed": experiment.seed, **ellipse_summary(path)}])}
+def _closeup(experiment: Experiment, out: Results | None = None) -> Tables:
+    """Ellipses of registration from scan to scan along a corridor and through its bends.
 
-
-def _drawn_corridor(experiment: Experiment, out: Results) -> Tables:
-    """Keep the walls and ellipses of a corridor for its figure."""
-    world = experiment.world()
-    out.write_arrays("corridor", walls=world.walls, wall_z_m=world.wall_z_m)
-    return {"ellipse_path": _ellipses_along(experiment)}
-
-
-def _ellipses_along(experiment: Experiment) -> pd.DataFrame:
-    recording = experiment.recording()
+    With `out`, keep what the figure draws of them.
+    """
+    recording, world = experiment.recording(), experiment.world()
     _, estimate = _run(experiment, recording, {})
-    path = ellipse_path(recording, experiment.world(), estimate)
-    path.insert(0, "seed", experiment.seed)
-    return path
+    path = ellipse_path(recording, world, estimate)
+    tables = {"ellipses": pd.DataFrame([{"seed": experiment.seed, **ellipse_summary(path)}])}
+    if out is not None:
+        out.write_arrays("corridor", walls=world.walls, wall_z_m=world.wall_z_m)
+        tables["ellipse_path"] = pd.DataFrame({"seed": experiment.seed, **path})
+    return tables
 
 
 def _scenes(seed: int, place: str, n_repeats: int) -> Tables:
@@ -279,11 +269,12 @@ def _metrics(seed: int, kind: str) -> Tables:
 
 def _boxes(errors: pd.DataFrame) -> pd.DataFrame:
     """Quartiles and whiskers (1.5 times the quartiles' distance) of the pooled errors."""
-    rows = []
-    for method in PAPERS_OWN:
-        for name in ("position_m", "heading_rad"):
-            values = errors.loc[errors["method"] == method, name].to_numpy()
-            (box,) = boxplot_stats(values)
-            rows.append({"method": method, "error": name, "n": len(values), **box})
+    of = errors.query("rate_hz == 10.0 and rays == 'exact'").groupby("method")
+    samples = [
+        (method, name, of.get_group(method)[name].to_numpy())
+        for method in PAPERS_OWN
+        for name in ("position_m", "heading_rad")
+    ]
+    rows = [{"method": m, "error": e, "n": len(v), **boxplot_stats(v)[0]} for m, e, v in samples]
     kept = ["method", "error", "n", "whislo", "q1", "med", "q3", "whishi", "mean"]
     return pd.DataFrame(rows)[kept]

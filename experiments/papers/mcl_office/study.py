@@ -56,8 +56,12 @@ def localised_share(table: pd.DataFrame) -> pd.DataFrame:
     """Share of starts localised: its exact binomial interval, and the bootstrap over offices."""
     hits = table["localised"].to_numpy(bool)
     offices = table.pivot(index="seed", columns="start", values="localised").to_numpy(float)
-    by_office = bootstrap_interval(offices, lambda a: float(a.mean()), np.random.default_rng(0))
-    shares = pd.DataFrame([share_interval(int(hits.sum()), len(hits)), by_office])
+    shares = pd.DataFrame(
+        [
+            share_interval(int(hits.sum()), len(hits)),
+            bootstrap_interval(offices, lambda a: float(a.mean()), np.random.default_rng(0)),
+        ]
+    )
     shares.insert(0, "independent", ["starts", "offices"])
     return shares.assign(median_found_m=table["found_m"].median())
 
@@ -96,8 +100,7 @@ def starts(experiment: Experiment, n_starts: int) -> list[Row]:
     if recording.status != "ok":
         raise RunFailedError(f"seed {experiment.seed}: the drive ended early: {recording.status}")
     truth = recording.truth_at(recording.frame_stamps)
-    steps = np.hypot(*np.diff(truth[:, :2], axis=0).T)
-    travel_m = np.concatenate([[0.0], np.cumsum(steps)])
+    travel_m = np.insert(np.cumsum(np.hypot(*np.diff(truth[:, :2], axis=0).T)), 0, 0.0)
     last_m = travel_m[-1] - WITHIN_M - FOR_M - 1.0
     first_rows = np.searchsorted(travel_m, (np.arange(n_starts) + 0.5) / n_starts * last_m)
     return [
