@@ -134,7 +134,7 @@ def dc5(metrics: pd.DataFrame) -> list[Claim]:
 
 
 def dc6(runs: pd.DataFrame) -> list[Claim]:
-    """DC6: the map by fusion is the truest, the one by odometry the most deformed."""
+    """DC6: the map by fusion is the most accurate, the one by odometry the most distorted."""
     table = judged_runs(runs).assign(sharpness=lambda rows: np.exp(rows["map_entropy"]))
     return [
         _lower("DC6", f"{what}, {better} over {worse}", *_paired(table, column, better, worse))

@@ -142,11 +142,11 @@ def _draw_ellipses(
     _draw_walls(ax, corridor)
     ax.plot(path["x_m"], path["y_m"], color=TRUTH, lw=0.6)
     along = rows["distance_m"].to_numpy()
-    for i in np.searchsorted(along, np.arange(along[0], along[-1], spacing_m)):
-        row = rows.iloc[i]
-        covariance = np.array([[row["xx_m2"], row["xy_m2"]], [row["xy_m2"], row["yy_m2"]]])
-        style = {"facecolor": "none", "edgecolor": BLUE, "linewidth": 0.9}
-        ax.add_patch(covariance_ellipse(row[["x_m", "y_m"]], scale**2 * covariance, **style))
+    drawn = rows.iloc[np.searchsorted(along, np.arange(along[0], along[-1], spacing_m))]
+    squares_m2 = drawn[["xx_m2", "xy_m2", "xy_m2", "yy_m2"]].to_numpy().reshape(-1, 2, 2)
+    style = {"facecolor": "none", "edgecolor": BLUE, "linewidth": 0.9}
+    for mean, covariance in zip(drawn[["x_m", "y_m"]].to_numpy(), squares_m2, strict=True):
+        ax.add_patch(covariance_ellipse(mean, scale**2 * covariance, **style))
     ax.set(
         xlim=(rows["x_m"].min() - 2.0, rows["x_m"].max() + 2.0),
         ylim=(rows["y_m"].min() - 2.0, rows["y_m"].max() + 2.0),

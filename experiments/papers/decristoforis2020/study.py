@@ -45,7 +45,7 @@ from sim.recording import Recording
 
 Array = NDArray[np.float64]
 Tables = dict[str, pd.DataFrame]
-Job = tuple[float, Callable[..., Tables], Sequence[Any]]  # its cost, what it calls, and with what
+Job = tuple[float, Callable[..., Tables], Sequence[Any]]  # cost, function, arguments
 
 _RUN = {
     "seed": "seed",
@@ -123,7 +123,7 @@ def _jobs(full: bool, out: Results) -> list[Job]:
 
 
 def _planned(study: str, n_seeds: int, *overrides: str) -> list[list[Experiment]]:
-    """Runs of conf/study/decristoforis2020_*.yaml; those over one recording are together."""
+    """Experiments of conf/study/decristoforis2020_*.yaml, grouped by recording."""
     seeds = f"seed=range({JUDGED_SEED},{JUDGED_SEED + n_seeds})"
     groups: dict[str, list[Experiment]] = {}
     for experiment in planned([f"+study=decristoforis2020_{study}", seeds, *overrides]):
@@ -138,10 +138,15 @@ def _only(methods: Sequence[str], group: Sequence[Experiment]) -> list[Experimen
 def _run(
     experiment: Experiment, recording: Recording, origin: dict[str, str]
 ) -> tuple[Row, Estimate]:
-    """One run: its origin under short names and its scores; and its estimate.
+    """Evaluate one run.
 
-    The scores are those of every run, the NEES at fixed distances, and what the belief says of
-    the errors.
+    Returns
+    -------
+    row
+        Origin under short names, status, scores; also the NEES at fixed distances, the RMSE that
+        the belief expects, and the real-time factor.
+    estimate
+        The online one.
     """
     seen: list[Estimate] = []
     (found,) = evaluate(
@@ -166,7 +171,7 @@ def _run(
 
 
 def _drive(group: Sequence[Experiment]) -> Tables:
-    """All methods over one recording: scores, maps, steps of registration, errors by the way."""
+    """All methods over one recording: scores, maps, steps of registration, errors along it."""
     recording, world = group[0].recording(), group[0].world()
     truth = recording.truth_at(recording.frame_stamps)
     runs, steps, errors = [], [], []
@@ -196,7 +201,7 @@ def _scored(table: str, origin: dict[str, str], group: Sequence[Experiment]) -> 
 
 
 def _drawn_office(group: Sequence[Experiment], out: Results) -> Tables:
-    """Keep what figures draw of a drive: walls, areas, paths at one pose a second, map points."""
+    """Write what the figures draw: walls, areas, paths at one pose a second, map points."""
     recording, world = group[0].recording(), group[0].world()
     stamps = recording.frame_stamps
     keep = np.flatnonzero(np.diff(np.floor(stamps), prepend=-1.0) > 0)
@@ -220,7 +225,7 @@ def _drawn_office(group: Sequence[Experiment], out: Results) -> Tables:
 def _closeup(experiment: Experiment, out: Results | None = None) -> Tables:
     """Ellipses of registration from scan to scan along a corridor and through its bends.
 
-    With `out`, keep what the figure draws of them.
+    With `out`, also write what the figure draws.
     """
     recording, world = experiment.recording(), experiment.world()
     _, estimate = _run(experiment, recording, {})

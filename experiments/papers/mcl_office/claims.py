@@ -1,4 +1,4 @@
-"""No claim of a paper's is judged by the study of localization in offices."""
+"""The study of localization in offices judges no claim."""
 
 from __future__ import annotations
 
@@ -7,5 +7,5 @@ from experiments.papers.results import Results
 
 
 def judge(_made: Results) -> list[Claim]:
-    """Judge nothing: the study is our own."""
+    """Return no claims: the study is our own."""
     return []
