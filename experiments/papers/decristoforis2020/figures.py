@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from experiments.evaluation.registration_errors import METRICS
 from experiments.evaluation.statistics import log_ratio_interval
-from experiments.papers.decristoforis2020.claims import judged_runs
+from experiments.papers.decristoforis2020.claims import judged_runs, nees_intervals
 from experiments.papers.decristoforis2020.settings import CONSISTENT, PAPERS_OWN, PLACES
 from experiments.papers.results import Results
 from experiments.viewing.run_figure import covariance_ellipse
@@ -176,11 +176,11 @@ def _of_all(table: pd.DataFrame, column: str, words: str) -> str:
     """What the recording drawn has by method, beside the median of all recordings."""
     wide = judged_runs(table).pivot(index="seed", columns="method", values=column)
     drawn = wide.index.min()  # the one whose paths and points are kept
-    parts = [
+    parts = ", ".join(
         f"{NAMES[method]} {wide.loc[drawn, method]:.2f} ({wide[method].median():.2f})"
         for method in PAPERS_OWN
-    ]
-    return f"seed {drawn}: {words} (median of {len(wide)} recordings): {', '.join(parts)}"
+    )
+    return f"seed {drawn}: {words} (median of {len(wide)} recordings): {parts}"
 
 
 def boxes(table: pd.DataFrame) -> Figure:
@@ -252,13 +252,11 @@ def covariances(table: pd.DataFrame) -> Figure:
     """NEES of every covariance by metric and place, and its time."""
     page = figure(9.5, 4.6)
     *axes, times_axes = page.subplots(1, 3, width_ratios=(1.2, 1.2, 0.8))
-    values = table.dropna(subset="nees_over_dof").set_index(["metric", "place", "method"])
-    nees = dict(iter(values["nees_over_dof"].groupby(level=[0, 1, 2])))
+    nees = nees_intervals(table)
     for ax, metric in zip(axes, METRICS, strict=True):
         ax.axvspan(*CONSISTENT, color=GREEN, alpha=0.2, lw=0)
         for j, (place, color) in enumerate(zip(PLACES, (BLUE, RED, ORANGE, GREEN), strict=True)):
-            own = [nees[metric, place, method] for method in _METHODS]
-            found = pd.DataFrame([log_ratio_interval(v, np.ones(len(v))) for v in own])
+            found = pd.DataFrame([nees[metric, place, method] for method in _METHODS])
             reach = [found["value"] - found["low"], found["high"] - found["value"]]
             heights = np.arange(len(_METHODS)) + 0.16 * (j - 1.5)
             ax.errorbar(
