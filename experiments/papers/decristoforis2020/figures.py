@@ -301,8 +301,12 @@ def beliefs(table: pd.DataFrame) -> Figure:
             ax.plot(mean.value, i, "o", color=TRUTH, ms=5)
     axes[0].axvline(1.0, color=TRUTH, lw=0.6)
     axes[1].axvspan(*CONSISTENT, color=GREEN, alpha=0.2, lw=0)
-    axes[0].set(xscale="log", xlabel="position RMSE over that of right beliefs")
-    axes[0].set(yticks=range(len(names)), yticklabels=names)
+    axes[0].set(
+        xscale="log",
+        xlabel="position RMSE over that of right beliefs",
+        yticks=range(len(names)),
+        yticklabels=names,
+    )
     axes[0].invert_yaxis()
     axes[1].set(xscale="log", xlabel="NEES / 3")
     page.suptitle("clone filter; dots: recordings, black: geometric mean with 95 %", size=9)
@@ -366,9 +370,17 @@ def steps(table: pd.DataFrame) -> Figure:
         ax.axhline(1.0, color=TRUTH, lw=0.6)
         ax.set_ylim(bottom=0.0)
     axes[0].set(xlabel="lag, registrations", ylabel="correlation of errors")
-    axes[1].set(ylabel="squared error over\nits covariance, / 3", xlabel="composed over")
-    axes[1].set(xticks=range(3), xticklabels=["one step", "1 s", "10 s"])
-    axes[2].set(xlim=(-0.5, 1.5), xticks=[0, 1], xticklabels=["x, y", "heading"])
-    axes[2].set(ylabel="RMS error of a step\nover the Fisher bound")
+    axes[1].set(
+        xlabel="composed over",
+        ylabel="squared error over\nits covariance, / 3",
+        xticks=range(3),
+        xticklabels=["one step", "1 s", "10 s"],
+    )
+    axes[2].set(
+        ylabel="RMS error of a step\nover the Fisher bound",
+        xlim=(-0.5, 1.5),
+        xticks=[0, 1],
+        xticklabels=["x, y", "heading"],
+    )
     page.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=2)
     return page

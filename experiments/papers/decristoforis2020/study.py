@@ -12,7 +12,6 @@ import joblib
 import numpy as np
 import pandas as pd
 from matplotlib.cbook import boxplot_stats
-from numpy.typing import NDArray
 
 from estimators.base import Estimate
 from estimators.icp import prepare, register
@@ -43,7 +42,6 @@ from experiments.runs.seeds import stream
 from experiments.sweeps.launch import planned
 from sim.recording import Recording
 
-Array = NDArray[np.float64]
 Tables = dict[str, pd.DataFrame]
 Job = tuple[float, Callable[..., Tables], Sequence[Any]]  # cost, function, arguments
 
