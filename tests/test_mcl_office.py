@@ -6,9 +6,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments.papers.mcl_office import study as mcl_office
-from experiments.papers.mcl_office.figures import found_by
-from experiments.papers.mcl_office.study import found_after_m, localised_share
+from experiments.papers import reproduce
+from experiments.papers.mcl_office import claims
+from experiments.papers.mcl_office.figures import draw, found_by
+from experiments.papers.mcl_office.study import found_after_m, localised_share, starts
+from experiments.papers.results import Results
+from experiments.runs.experiment import Experiment
 
 TRAVEL_M = np.arange(0.0, 40.6, 0.5)
 
@@ -51,7 +54,8 @@ def table():
 
 
 def test_share_with_its_intervals():
-    exact, by_office = localised_share(table())
+    shares = localised_share(table()).set_index("independent")
+    exact, by_office = shares.loc["starts"], shares.loc["offices"]
     assert exact.value == by_office.value == pytest.approx(0.95)
     assert exact.low == pytest.approx(0.861, abs=2e-3)  # Clopper and Pearson, 57 of 60
     assert by_office.low == pytest.approx(0.95)  # every office has 19 of 20
@@ -64,11 +68,23 @@ def test_figure_ends_at_the_share():
     assert steps[-1] == pytest.approx(0.95)
 
 
+def test_it_runs_only_when_named():
+    assert "mcl_office" not in reproduce._chosen(None)
+    assert reproduce._chosen("mcl_office") == ("mcl_office",)
+
+
+def test_the_figure_comes_from_disk_and_nothing_is_judged(tmp_path):
+    made = Results(tmp_path, "mcl_office")
+    made.write_table("starts", table())
+    assert list(draw(made)) == ["mcl_office_found"]
+    assert claims.judge(made) == []
+
+
 @pytest.mark.slow
 def test_starts_in_a_short_drive(tmp_path, monkeypatch):
-    monkeypatch.setattr(mcl_office, "default_cache", lambda: tmp_path)
-    rows = mcl_office._starts_of(7, 2, ("route.distance_m=45",))
-    again = mcl_office._starts_of(7, 2, ("route.distance_m=45",))
+    monkeypatch.setenv("ESTIMA_RESULTS", str(tmp_path))
+    office = Experiment.compose(["study=mcl_office", "seed=7", "route.distance_m=45"])
+    rows, again = starts(office, 2), starts(office, 2)
     assert [row["start"] for row in rows] == [0, 1]
     for row, same in zip(rows, again, strict=True):
         assert row["found_m"] == same["found_m"]

@@ -1,59 +1,87 @@
-"""The studies of decristoforis2020 in small: every part runs, and its tables can be drawn."""
+"""The studies of decristoforis2020 in small: every part runs, and is judged and drawn from disk."""
 
+import functools
+
+import joblib
 import numpy as np
-import pandas as pd
 import pytest
 
-from experiments.papers.decristoforis2020 import study
+from experiments.evaluation.verdict import Profile
+from experiments.papers.decristoforis2020 import claims, figures, study
+from experiments.papers.decristoforis2020.settings import CHECKED, JUDGED_SEED, PAPERS_OWN, PLACES
+from experiments.papers.results import Results
 
 pytestmark = pytest.mark.slow
 
 
-@pytest.fixture(scope="module")
-def tables():
-    seed = study.JUDGED_SEED
-    methods = tuple(study.METHODS)
-    parts = [
-        study._office(seed, 15.0, 10.0, "exact", methods, True, True),
-        study._office(seed + 1, 15.0, 10.0, "exact", methods, True, False),
-        study._office(seed, 3.0, 75.0, "exact", ("icp", "fusion_clone"), False, False),
-        study._closeup(seed, True),
-        study._closeup(seed + 1, False),
-        *(study._scenes(s, p, 4) for s in (seed, seed + 1) for p in study.PLACES),
-        *(study._metrics(s, "room_small") for s in (seed, seed + 1)),
-        *(study._ordering(s, 1e-6, 0.01) for s in (seed, seed + 1)),
+def small(_full, out):
+    """Jobs of every kind over two short drives."""
+    short = functools.partial(study._planned, "methods", 2, "route.distance_m=15.0")
+    drives = short()
+    fast = study._planned("methods", 1, "route.distance_m=3.0", "sensors.laser.rate_hz=75.0")
+    beliefs = study._planned("beliefs", 2, "route.distance_m=15.0")
+    corridors = study._planned("corridor", 2)
+    noise = ["robot.kr=1e-6", "sensors.laser.sigma_range_m=0.01"]
+    seeds = (JUDGED_SEED, JUDGED_SEED + 1)
+    return [
+        *((1.0, study._drive, [group]) for group in drives),
+        (1.0, study._drive, [study._only(("icp", "fusion_clone"), fast[0])]),
+        *((1.0, study._wrong_beliefs, [group]) for group in beliefs),
+        (1.0, study._drawn_office, [study._only(PAPERS_OWN, drives[0]), out]),
+        (1.0, study._closeup, [*corridors[0], out]),
+        (1.0, study._closeup, corridors[1]),
+        *((1.0, study._scenes, [seed, place, 4]) for seed in seeds for place in PLACES),
+        *((1.0, study._metrics, [seed, "room_small"]) for seed in seeds),
+        *(
+            (1.0, study._ordering, [study._only(CHECKED, group)])
+            for group in study._planned("ordering", 2, *noise)
+        ),
     ]
-    names = dict.fromkeys(name for part in parts for name in part)
-    found = {
-        name: pd.concat([p[name] for p in parts if name in p], ignore_index=True) for name in names
-    }
-    found["boxes"] = study._boxes(found.pop("errors"))
-    return found
 
 
-def test_errors_and_beliefs_are_sane(tables):
-    runs = tables["runs"].set_index(["rate_hz", "seed", "method"])
-    for seed in (study.JUDGED_SEED, study.JUDGED_SEED + 1):
-        assert runs.loc[(10.0, seed, "fusion_clone"), "ate_rmse_m"] < 0.02
-        assert runs.loc[(10.0, seed, "fusion"), "ate_rmse_m"] < 0.05
-    assert (tables["beliefs"].groupby("belief").size() == 2).all()
-    right = tables["beliefs"].query("belief == 'right'").set_index("seed")["ate_rmse_m"]
-    clone = tables["runs"].query("method == 'fusion_clone' and rate_hz == 10.0")
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("results")
+    out, shares = Results(folder, "decristoforis2020"), []
+    with pytest.MonkeyPatch.context() as patch, joblib.parallel_config("sequential"):
+        patch.setenv("ESTIMA_RESULTS", str(folder))
+        patch.setattr(study, "_jobs", small)
+        study.run(Profile.QUICK, out, shares.append)
+    assert shares == sorted(shares)
+    assert shares[-1] == pytest.approx(1.0)
+    return out
+
+
+def test_errors_and_beliefs_are_sane(made):
+    runs, beliefs = made.table("runs"), made.table("beliefs")
+    by_method = runs.set_index(["rate_hz", "seed", "method"])
+    for seed in (JUDGED_SEED, JUDGED_SEED + 1):
+        assert by_method.loc[(10.0, seed, "fusion_clone"), "ate_rmse_m"] < 0.02
+        assert by_method.loc[(10.0, seed, "fusion"), "ate_rmse_m"] < 0.05
+    assert (beliefs.groupby("belief").size() == 2).all()
+    right = beliefs.query("belief == 'right'").set_index("seed")["ate_rmse_m"]
+    clone = runs.query("method == 'fusion_clone' and rate_hz == 10.0")
     np.testing.assert_allclose(right, clone.set_index("seed")["ate_rmse_m"], rtol=1e-9)
 
 
-def test_steps_know_their_bound(tables):
-    steps = tables["steps"]
+def test_steps_know_their_bound(made):
+    steps = made.table("steps")
     assert (steps["correlation_lag_1"] < -0.2).all()
     assert (steps["step_error_rad"] > 0.5 * steps["step_bound_rad"]).all()
     assert (steps["accumulated_over_predicted_1s"] < 1.0).all()
 
 
-def test_everything_can_be_judged_and_drawn(tables):
-    claims = study.claims(tables, quick=True)
-    assert {c.id for c in claims} == {"DC1", "DC2", "DC3", "DC4", "DC5", "DC6"}
-    assert all(c.verdict.endswith("(quick)") for c in claims)
-    pages = study.figures(tables)
+def test_everything_can_be_judged_and_drawn(made):
+    judged = claims.judge(made)
+    assert {c.id for c in judged} == {"DC1", "DC2", "DC3", "DC4", "DC5", "DC6"}
+    pages = figures.draw(made)
     assert len(pages) == 10
     for page in pages.values():
         page.canvas.draw()
+
+
+def test_the_quick_profile_has_a_job_of_every_kind(tmp_path):
+    quick = study._jobs(False, Results(tmp_path, "decristoforis2020"))
+    assert {function for _, function, _ in quick} == {f for _, f, _ in small(False, None)}
+    drives = [arguments[0] for _, function, arguments in quick if function is study._drive]
+    assert [len(group) for group in drives] == [5, 5, 5, 5, 4, 4]

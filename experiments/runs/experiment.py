@@ -26,7 +26,7 @@ from experiments.runs.version import version_with
 from sim.errors import InputError
 from sim.recording import Recording, load
 from sim.robot import DifferentialDrive, RobotGeometry
-from sim.sensors import suite_from_config
+from sim.sensors import SensorSuite, suite_from_config
 from sim.settings import build
 from sim.world import World
 
@@ -194,7 +194,7 @@ class Experiment:
         if not (isinstance(keep, list) and all(isinstance(key, str) for key in keep)):
             raise InputError(f"keep must be a list of names, such as [ess], got {keep!r}")
         self.robot()
-        suite_from_config(config["sensors"])
+        self.sensors()
         make(config["route"], "route")
         stream(config["seed"], "slip")
         stream(config["world_seed"], "world")
@@ -241,6 +241,10 @@ class Experiment:
         """Make the true robot."""
         return build(DifferentialDrive, self.config["robot"], "robot")
 
+    def sensors(self) -> SensorSuite:
+        """Make the sensors."""
+        return suite_from_config(self.config["sensors"])
+
     def estimator(self) -> Estimator:
         """Make the estimator: anything with `reset` and `step`."""
         estimator = make(self.config["estimator"], "estimator")
@@ -266,7 +270,7 @@ class Experiment:
         return record(
             self.world(),
             self.robot(),
-            suite_from_config(self.config["sensors"]),
+            self.sensors(),
             make(self.config["route"], "route"),
             {axis: stream(self.config["seed"], axis) for axis in ("slip", "sensors")},
             physics=self.config["simulation"]["physics"],

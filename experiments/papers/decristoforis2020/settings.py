@@ -1,0 +1,16 @@
+"""Constants of the studies; the rest is in conf/study/decristoforis2020_*.yaml."""
+
+JUDGED_SEED = 1000  # seeds 0-99 are for tuning
+PAPERS_OWN = ("odometry", "icp", "fusion")
+CHECKED = (*PAPERS_OWN, "fusion_clone")  # also run at other rates, rays and noise
+NEES_AT_M = (5.0, 20.0, 50.0, 100.0, 200.0, 290.0)
+CONSISTENT = (0.8, 1.25)  # NEES over its degrees of freedom
+PLACES = {  # where pairs of scans are taken: study, and place of its world
+    "corridor": ("corridor", "corridor_bare"),
+    "corner": ("corridor", "corner"),
+    "curve": ("corridor", "curve"),
+    "room": ("office", "room"),
+}
+PAIRS = ("room_small", "room_large", "corridor_small", "corridor_large")  # of bench.icp
+WINDOWS_S = (1.0, 10.0)  # over which steps of registration are composed
+HELD_M = 0.02  # standard deviation of a step above which the walls leave a direction free

@@ -1,0 +1,145 @@
+"""Registration from scan to scan: what its steps err by, and the shape of its ellipses."""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from estimators.base import Estimate
+from estimators.gaussian import STILL, Gaussian
+from experiments.evaluation.scan_bound import fisher_bound
+from experiments.papers.decristoforis2020.settings import HELD_M, WINDOWS_S
+from experiments.runs.row import Row
+from sim import se2
+from sim.recording import Recording
+from sim.world import World
+
+Array = NDArray[np.float64]
+
+
+def step_errors(recording: Recording, world: World, estimate: Estimate) -> Row:
+    """Correlation of successive errors, their accumulation, and their size beside its bound.
+
+    Errors are in the axes of the reference, and whitened by the registration's own covariance.
+    Steps whose match is wrong, or that the walls do not hold in some direction, are left out.
+
+    Returns
+    -------
+    Row
+        `correlation_lag_1` to `_5`; `nees_over_3` of one step, and of all in 1 s and 10 s as
+        `accumulated_over_predicted_`; RMS `step_error_` and `step_bound_`, m and rad.
+    """
+    truth = recording.truth_at(recording.frame_stamps)
+    laser = recording.sensors.laser
+    assert laser is not None
+    motions, true_motions = (se2.between(p[:-1], p[1:]) for p in (estimate.means, truth))
+    off = motions - true_motions
+    off[:, 2] = se2.wrap(off[:, 2])
+    found = estimate.extras["registration_covariance"][1:]
+    use = np.array([i for i, C in enumerate(found) if C is not None])
+    R = np.array([found[i] for i in use])
+    white = np.linalg.solve(np.linalg.cholesky(R), off[use][:, :, None])[:, :, 0]
+    sound = np.sum(white**2, axis=1) < 30.0  # a wrong match says nothing of correlations
+    sound &= R[:, 0, 0] + R[:, 1, 1] < HELD_M**2  # nor does a guess where nothing is held
+    row: Row = {}
+    for lag in range(1, 6):
+        both = sound[lag:] & sound[:-lag] & (use[lag:] - use[:-lag] == lag)
+        product = np.sum(white[lag:][both] * white[:-lag][both])
+        row[f"correlation_lag_{lag}"] = float(product / np.sum(white[:-lag][both] ** 2))
+    row["nees_over_3"] = float(np.mean(np.sum(white[sound] ** 2, axis=1)) / 3.0)
+    steps = {int(i): Gaussian(motions[i], C) for i, C in zip(use[sound], R[sound], strict=True)}
+    for window_s in WINDOWS_S:
+        n = round(window_s * laser.rate_hz)
+        row[f"accumulated_over_predicted_{window_s:g}s"] = _accumulated(steps, truth, n)
+    chosen = use[sound][:: max(1, int(sound.sum()) // 40)]
+    scanned = se2.compose(truth, laser.mount.pose)
+    noise = laser.bearings_rad, laser.sigma_range_m, laser.max_range_m
+    bounds = np.array(
+        [fisher_bound(world.walls, scanned[i], scanned[i + 1], *noise) for i in chosen]
+    )
+    return row | {
+        "step_error_m": float(np.sqrt(np.mean(np.sum(off[chosen, :2] ** 2, axis=1)))),
+        "step_bound_m": float(np.sqrt(np.mean(bounds[:, 0, 0] + bounds[:, 1, 1]))),
+        "step_error_rad": float(np.sqrt(np.mean(off[chosen, 2] ** 2))),
+        "step_bound_rad": float(np.sqrt(np.mean(bounds[:, 2, 2]))),
+    }
+
+
+def _accumulated(steps: dict[int, Gaussian], truth: Array, n: int) -> float:
+    """NEES over 3 of n successive steps composed, each taken as independent of the others."""
+    values = []
+    for first in range(0, len(truth) - n, n):
+        window = range(first, first + n)
+        if not all(i in steps for i in window):
+            continue
+        total = functools.reduce(Gaussian.then, (steps[i] for i in window), STILL)
+        off = total.mean - se2.between(truth[first], truth[first + n])
+        off[2] = se2.wrap(off[2])
+        values.append(float(off @ np.linalg.solve(total.covariance, off)) / 3.0)
+    return float(np.mean(values)) if values else math.nan
+
+
+def ellipse_path(recording: Recording, world: World, estimate: Estimate) -> pd.DataFrame:
+    """Ellipse of each registration, in the axes of the map, along the true path.
+
+    Returns
+    -------
+    DataFrame
+        One row a registration: `distance_m` driven, `place`, true pose; covariance `xx_m2`,
+        `xy_m2`, `yy_m2`; standard deviations along the axes `long_m`, `short_m`, and the
+        `direction_rad` of the long one.
+    """
+    truth = recording.truth_at(recording.frame_stamps)
+    rolled = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(truth[:, :2], axis=0).T))])
+    found = estimate.extras["registration_covariance"]
+    use = np.array([i for i, C in enumerate(found) if C is not None])
+    cos, sin = np.cos(truth[use - 1, 2]), np.sin(truth[use - 1, 2])
+    R = np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], -2)
+    in_map = R @ np.array([found[i][:2, :2] for i in use]) @ R.transpose(0, 2, 1)
+    values, vectors = np.linalg.eigh(in_map)
+    return pd.DataFrame(
+        {
+            "distance_m": rolled[use],
+            "place": world.place_of(truth[use, :2]),
+            "x_m": truth[use, 0],
+            "y_m": truth[use, 1],
+            "heading_rad": truth[use, 2],
+            "xx_m2": in_map[:, 0, 0],
+            "xy_m2": in_map[:, 0, 1],
+            "yy_m2": in_map[:, 1, 1],
+            "long_m": np.sqrt(values[:, 1]),
+            "short_m": np.sqrt(values[:, 0]),
+            "direction_rad": np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1]),
+        }
+    )
+
+
+def ellipse_summary(path: pd.DataFrame) -> Row:
+    """What DC2 and DC3 ask of the ellipses along one path."""
+    bare, objects = (path[path["place"] == f"corridor_{name}"] for name in ("bare", "objects"))
+    tilt = np.abs(np.remainder(bare["direction_rad"] + math.pi / 2.0, math.pi) - math.pi / 2.0)
+    row: Row = {
+        "axis_ratio_bare": float((bare["long_m"] / bare["short_m"]).median()),
+        "tilt_bare_deg": float(np.degrees(tilt.median())),
+        "long_bare_m": float(bare["long_m"].median()),
+        "long_objects_m": float(objects["long_m"].median()),
+    }
+    for bend in ("curve", "corner"):
+        inside = path[path["place"] == bend]
+        start, end = inside["distance_m"].iloc[0], inside["distance_m"].iloc[-1]
+        before = path[path["distance_m"].between(start - 3.0, start - 0.5)]
+        after = path[path["distance_m"].between(end + 0.5, end + 3.0)]
+        smooth = inside["long_m"].rolling(5, center=True, min_periods=1).median()
+        turned = inside["direction_rad"][smooth.idxmax()] - before["direction_rad"].iloc[0]
+        row |= {
+            f"long_before_{bend}_m": float(before["long_m"].median()),
+            f"long_in_{bend}_m": float(smooth.max()),
+            f"long_median_in_{bend}_m": float(inside["long_m"].median()),
+            f"long_after_{bend}_m": float(after["long_m"].median()),
+            f"turned_in_{bend}_deg": math.degrees(abs(math.remainder(turned, math.pi))),
+        }
+    return row
