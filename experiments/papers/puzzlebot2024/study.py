@@ -328,11 +328,7 @@ def engine_recordings(*overrides: str) -> list[Drive]:
     """Drive some manoeuvres by PyBullet's robot and by the kinematic one."""
     study = ["+study=puzzlebot2024_engine", *overrides]
     bullet, kinematic = (
-        list(
-            planned(
-                ["+study=puzzlebot2024_engine", f"simulation.physics={physics}", f"seed={seeds}"]
-            )
-        )
+        list(planned([*study, f"simulation.physics={physics}"]))
         for physics in ("bullet", "kinematic")
     )
     cases = list(dict.fromkeys(run.choices["route"] for run in bullet))
