@@ -5,15 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from experiments.calibration import calibrate
-from experiments.calibration.calibrate import (
-    Manoeuvre,
-    calibrate_recordings,
-    from_end_poses,
-    from_wheel_truth,
-    report_gradient_descent,
-)
-from experiments.papers.puzzlebot2024.study import NOMINAL, calibrate_once, ideal_beliefs, slipping
+from experiments.calibration.calibrate import calibrate_recordings
+from experiments.calibration.end_pose_model import EndPoseModel, knots
+from experiments.calibration.end_poses import Manoeuvre, from_end_poses
+from experiments.calibration.wheel_truth import from_wheel_truth
+from experiments.papers.puzzlebot2024.descent import report_gradient_descent
+from experiments.papers.puzzlebot2024.settings import NOMINAL
+from experiments.papers.puzzlebot2024.study import Arm, arms, calibrate_once, ideal
 from experiments.runs.seeds import stream
 from sim.errors import InputError
 from sim.kinematic import run_batch
@@ -21,6 +19,13 @@ from sim.route import TABLE_1, OpenLoop
 from sim.sensors import Encoder, SensorSuite
 from sim.simulate import record
 from sim.world import World
+
+
+def slipping(k, geometry=False):
+    """The robot with kr = 1.5 k, kl = 0.5 k, and on request errors of 5 % in gains and track."""
+    errors = {"bias_right": 0.05, "bias_left": -0.05, "track_m": 1.05 * NOMINAL.track_m}
+    return dataclasses.replace(NOMINAL, kr=1.5 * k, kl=0.5 * k, **(errors if geometry else {}))
+
 
 OPEN = World("open", np.zeros((0, 4)), np.zeros((0, 2)))
 
@@ -55,14 +60,14 @@ def test_wheel_truth_finds_both_wheels_at_any_k(k):
 def test_wheel_truth_on_the_engines_recordings():
     robot = slipping(1e-4)
     found = calibrate_recordings(recordings(robot, 3, OpenLoop(((0.5, 0.2, 15.0),)), "bullet"))
-    assert found.kr.covers(robot.kr)
-    assert found.kl.covers(robot.kl)
+    assert found.kr.low <= robot.kr <= found.kr.high
+    assert found.kl.low <= robot.kl <= found.kl.high
     assert found.track_m.value == pytest.approx(0.19, rel=1e-3)
 
 
 def test_gain_and_track_errors_are_found_jointly():
     robot = slipping(1e-4, geometry=True)
-    for result in calibrate_once(1e-4, 3, geometry=True)[:2]:
+    for result in calibrate_once(Arm(3, robot, TABLE_1))[:2]:
         assert result.kr.value == pytest.approx(robot.kr, rel=0.35)
         assert result.bias_right.value == pytest.approx(0.05, abs=0.01)
         assert result.bias_left.value == pytest.approx(-0.05, abs=0.01)
@@ -92,8 +97,7 @@ def test_the_models_end_poses_are_those_of_the_tick_by_tick_robot(name):
     route, robot = {**TABLE_1, "square": square}[name], slipping(1e-3, geometry=True)
     rng = np.random.default_rng(4)
     runs = run_batch(robot, route, 4000, rng, nominal_track_m=NOMINAL.track_m)
-    manoeuvre = Manoeuvre.of_route(route, NOMINAL, runs.end_poses)
-    model = calibrate._Model(manoeuvre, NOMINAL, rng, "sampled", 256)
+    model = EndPoseModel(route.profile(NOMINAL), NOMINAL, rng, "sampled", 256)
     seen = model.coordinates(runs.end_poses)
     mean, covariance = model.moments(robot.slip_variance_per_m, robot.slip_bias, robot.track_m)
     off = (seen.mean(axis=0) - mean) / np.sqrt(np.diag(covariance))
@@ -105,10 +109,10 @@ def test_the_models_end_poses_are_those_of_the_tick_by_tick_robot(name):
 @pytest.mark.parametrize("route", [TABLE_1["linear_2"], OpenLoop(((0.4, 0.6, 5.0),))])
 def test_the_analytic_covariance_is_that_of_the_odometry_filter(route):
     robot = slipping(1e-4)
-    manoeuvre = Manoeuvre.of_route(route, NOMINAL, np.zeros((1, 3)))
-    model = calibrate._Model(manoeuvre, NOMINAL, np.random.default_rng(0), "linearised", 2)
+    profile = route.profile(NOMINAL)
+    model = EndPoseModel(profile, NOMINAL, np.random.default_rng(0), "linearised", 2)
     mean, covariance = model.moments(robot.slip_variance_per_m, np.zeros(2), NOMINAL.track_m)
-    _, _, covariances = ideal_beliefs(route, robot.kr, robot.kl)
+    covariances = ideal(route, robot.kr, robot.kl).covariances
     np.testing.assert_allclose(mean, route.ideal_end(), atol=1e-6)
     spread = np.sqrt(np.diag(covariances[-1]))
     np.testing.assert_allclose(
@@ -119,12 +123,12 @@ def test_the_analytic_covariance_is_that_of_the_odometry_filter(route):
 def test_a_plateau_has_no_turning_points():
     for name, route in TABLE_1.items():
         commands = NOMINAL.wheel_speeds(*route.profile(NOMINAL).T)
-        assert len(calibrate._knots(commands)) == 25, name
+        assert len(knots(commands)) == 25, name
 
 
 def test_the_linearised_likelihood_overestimates_where_headings_scatter():
-    sampled, linearised = calibrate_once(1e-3, 2, geometry=False)[1:]
     truth = slipping(1e-3)
+    sampled, linearised = calibrate_once(Arm(2, truth, TABLE_1))[1:]
     assert linearised.kl.value > 1.4 * truth.kl
     assert sampled.kl.value == pytest.approx(truth.kl, rel=0.35)
 
@@ -160,3 +164,11 @@ def test_refusals_name_the_remedy():
         from_wheel_truth(np.ones((9, 2)), np.ones((9, 2)), interval_s=0.001)
     with pytest.raises(InputError, match="never rolled"):
         from_wheel_truth(np.ones((9, 2)), np.zeros((9, 2)), interval_s=0.05)
+
+
+def test_the_studies_are_composed_of_table_1_and_robots_that_differ_in_slip():
+    for arm in arms("coverage"):
+        assert arm.routes == TABLE_1
+        assert vars(arm.robot) == pytest.approx(vars(slipping(arm.k_m)))
+    for arm in arms("calibration"):
+        assert vars(arm.robot) == pytest.approx(vars(slipping(arm.k_m, arm.joint)))

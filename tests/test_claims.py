@@ -6,11 +6,15 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from experiments.evaluation.statistics import Interval
+from experiments.evaluation.verdict import Profile, Verdict, lower
 from experiments.papers.gil2008 import claims as gil2008
 from experiments.papers.maximo2024 import claims as maximo2024
 from experiments.papers.puzzlebot2024 import claims, study
+from experiments.papers.puzzlebot2024.descent import gradient_descent
+from experiments.papers.puzzlebot2024.settings import NOMINAL
 from experiments.papers.real_logs import claims as real_logs
-from experiments.report import claims as common
+from experiments.report.claims import COLUMNS, read_claims, write_claims
 from sim.errors import InputError
 
 
@@ -24,20 +28,20 @@ def test_worked_matrices_come_out_and_the_misprint_does_not():
 def test_pb1_fails_on_a_wrong_sign(monkeypatch):
     first, second = claims.worked_matrices()
     monkeypatch.setattr(claims, "worked_matrices", lambda: (first, second * [1, -1, 1]))
-    assert claims.pb1()[0].verdict == "not reproduced"
+    assert claims.pb1()[0].verdict == "not_reproduced"
 
 
 def test_areas_grow_on_straights_and_arcs_and_shrink_on_the_way_back():
-    areas, crossover = study.areas(), study.crossover(3)
-    judged = claims.pb2(areas, crossover, study.NOMINAL.track_m)
+    areas, crossover = study.areas(), study.crossover("seed=range(1000,1003)")
+    judged = claims.pb2(areas, crossover, NOMINAL.track_m)
     by_name = {c.statistic.rsplit(", ", 1)[-1]: c for c in judged}
     assert by_name["straight"].verdict == by_name["arc"].verdict == "reproduced"
-    assert by_name["out and back"].value > 0
+    assert by_name["out and back"].found.value > 0
     assert judged[-1].verdict == "reproduced"
-    wrong = claims.pb2(areas, crossover, 1.1 * study.NOMINAL.track_m)
-    assert wrong[-1].verdict == "not reproduced"
+    wrong = claims.pb2(areas, crossover, 1.1 * NOMINAL.track_m)
+    assert wrong[-1].verdict == "not_reproduced"
     shrinking = areas.assign(area_m2=areas["area_m2"].to_numpy()[::-1])
-    assert claims.pb2(shrinking, crossover, 0.19)[0].verdict == "not reproduced"
+    assert claims.pb2(shrinking, crossover, 0.19)[0].verdict == "not_reproduced"
 
 
 def calibrated(n, offset=0.0, half=0.1):
@@ -67,7 +71,7 @@ def pb3(table):
     return {c.statistic.split(":")[0]: c for c in claims.pb3(table, DESCENT, ENGINE_K)}
 
 
-DESCENT = study.gradient_descent()
+DESCENT = gradient_descent()
 COVERAGE = "coverage of the 95 % intervals of kr and kl"
 BIAS = "relative bias, the worse of kr and kl"
 
@@ -76,17 +80,17 @@ def test_pb3_judges_coverage_and_bias():
     good = pb3(calibrated(200))
     assert good[COVERAGE].verdict == good[BIAS].verdict == "reproduced"
     biased = pb3(calibrated(200, offset=0.2))
-    assert biased[COVERAGE].verdict == biased[BIAS].verdict == "not reproduced"
-    assert pb3(calibrated(200, half=0.02))[COVERAGE].verdict == "not reproduced"
-    assert "1/2" in good["the report's gradient descent"].verdict
+    assert biased[COVERAGE].verdict == biased[BIAS].verdict == "not_reproduced"
+    assert pb3(calibrated(200, half=0.02))[COVERAGE].verdict == "not_reproduced"
+    assert "1/2" in good["the report's gradient descent"].reason
 
 
 def test_opposite_biases_of_the_wheels_do_not_cancel():
     table = calibrated(200)
     table["value"] += np.where(table["parameter"] == "kr", 0.1, -0.1)
     judged = pb3(table)[BIAS]
-    assert judged.verdict == "not reproduced"
-    assert abs(judged.value) == pytest.approx(0.1, abs=0.02)
+    assert judged.verdict == "not_reproduced"
+    assert abs(judged.found.value) == pytest.approx(0.1, abs=0.02)
 
 
 def test_pb3_judges_the_gains_and_the_track_of_the_joint_arm_apart():
@@ -94,7 +98,7 @@ def test_pb3_judges_the_gains_and_the_track_of_the_joint_arm_apart():
     geometry = table.assign(parameter="track_m", low=2.0, high=3.0)
     judged = pb3(pd.concat([table, geometry], ignore_index=True))
     assert judged[COVERAGE].verdict == "reproduced"
-    assert judged["coverage of the 95 % intervals of gains and track"].verdict == "not reproduced"
+    assert judged["coverage of the 95 % intervals of gains and track"].verdict == "not_reproduced"
 
 
 def test_pb4_names_the_k_at_which_the_band_is_left():
@@ -109,13 +113,12 @@ def test_pb4_names_the_k_at_which_the_band_is_left():
     )
     engine = ends(0.0)
     judged = claims.pb4(coverage, engine)
-    assert [c.verdict.split(" (")[0] for c in judged[:3]] == [
-        "reproduced",
-        "reproduced",
-        "not reproduced",
+    assert [c.verdict for c in judged[:3]] == ["reproduced", "reproduced", "not_reproduced"]
+    assert [c.reason for c in judged[1:3]] == [
+        "2 of 2 manoeuvres within",
+        "0 of 2 manoeuvres within",
     ]
-    assert judged[-1].value == judged[-1].high == 1e-3
-    assert judged[-1].low == 1e-4
+    assert judged[-1].found == Interval(1e-3, 1e-4, 1e-3)
     assert judged[-1].verdict == "reproduced"
 
 
@@ -132,11 +135,11 @@ def ends(gap_m):
 def test_the_engines_gap_is_held_against_the_spread_of_its_own_case():
     coverage = pd.DataFrame([{"case": "a", "k_m": 1e-4, "runs": 4000, "in_ellipse": 3800}])
     assert claims.pb4(coverage, ends(1e-6))[1].verdict == "reproduced"
-    assert claims.pb4(coverage, ends(2e-4))[1].verdict == "not reproduced"
+    assert claims.pb4(coverage, ends(2e-4))[1].verdict == "not_reproduced"
 
 
 def test_coverage_is_95_percent_where_the_first_order_holds():
-    table = study.coverage(300)
+    table = study.coverage(study.arms("coverage")[:1], 300)
     small = table[table["k_m"] == 1e-6]
     assert small["in_ellipse"].sum() / small["runs"].sum() == pytest.approx(0.95, abs=0.015)
     assert small["in_ellipsoid"].sum() / small["runs"].sum() == pytest.approx(0.95, abs=0.015)
@@ -144,7 +147,7 @@ def test_coverage_is_95_percent_where_the_first_order_holds():
 
 @pytest.mark.bullet
 def test_the_engine_and_the_kinematic_robot_end_together():
-    driven = study.engine_recordings(2)
+    driven = study.engine_recordings("seed=range(1000,1002)")
     engine = study.engine_ends(driven)
     gap = np.hypot(*(engine[f"bullet_{c}_m"] - engine[f"kinematic_{c}_m"] for c in "xy"))
     assert gap.max() < 3e-4
@@ -153,28 +156,31 @@ def test_the_engine_and_the_kinematic_robot_end_together():
     assert (k["value"] / k["truth"]).to_numpy() == pytest.approx(1.0, abs=0.2)
 
 
+def write(judged, path, paper="puzzlebot2024"):
+    write_claims(judged, path, paper=paper, profile=Profile.FULL, command="estima reproduce")
+
+
 def test_writing_keeps_other_papers_rows(tmp_path):
     path = tmp_path / "claims.csv"
     one = claims.pb1()[0]
-    other = dataclasses.replace(one, id="XX1", paper="another")
-    common.write([other], path)
-    common.write([one], path)
-    common.write([dataclasses.replace(one, value=0.5)], path)
+    write([dataclasses.replace(one, id="XX1")], path, "another")
+    write([one], path)
+    write([dataclasses.replace(one, found=Interval.exact(0.5))], path)
     frame = pd.read_csv(path)
     assert frame["paper"].tolist() == ["puzzlebot2024", "another"]
     assert frame["value"].tolist()[0] == 0.5
-    assert tuple(frame.columns) == common.COLUMNS
+    assert tuple(frame.columns) == COLUMNS
 
 
 def test_arms_that_are_equal_or_few_decide_rightly():
     same = np.linspace(1.0, 2.0, 20)
-    assert common.lower(same, same)[2] == "not reproduced"
-    assert common.lower(same[:1], same[:1])[2] == "undecided"
+    assert lower(same, same)[2] == "not_reproduced"
+    assert lower(same[:1], same[:1])[2] == "undecided"
     rng = np.random.default_rng(0)
     spread = np.exp(0.02 * rng.standard_normal(20))
-    assert common.lower(0.8 * same * spread, same)[2] == "reproduced"
-    assert common.lower(1.2 * same * spread, same)[2] == "not reproduced"
-    ratio, _, said = common.lower(1.001 * same * spread, same)
+    assert lower(0.8 * same * spread, same)[2] == "reproduced"
+    assert lower(1.2 * same * spread, same)[2] == "not_reproduced"
+    ratio, _, said = lower(1.001 * same * spread, same)
     assert ratio.low < 1.0 < ratio.high
     assert ratio.low > 0.95  # hardly a gain, but the interval spans the criterion
     assert said == "undecided"
@@ -184,11 +190,11 @@ def test_statistics_of_a_claim_stay_in_the_order_given(tmp_path):
     path = tmp_path / "claims.csv"
     first = claims.pb1()[0]
     given = [dataclasses.replace(first, statistic=s) for s in ("the headline", "a detail")]
-    common.write([dataclasses.replace(first, id="PB2"), *given], path)
-    assert common.read(path)["statistic"].tolist()[:2] == ["the headline", "a detail"]
+    write([dataclasses.replace(first, id="PB2"), *given], path)
+    assert read_claims(path)["statistic"].tolist()[:2] == ["the headline", "a detail"]
 
 
-ROW = "PB1,puzzlebot2024,a statistic,0.5,0.4,0.6,at least 0.4,reproduced,s,c"
+ROW = "PB1,puzzlebot2024,headline,a statistic,0.5,0.4,0.6,at least 0.4,reproduced,,full,s,c"
 
 
 @pytest.mark.parametrize(
@@ -196,12 +202,12 @@ ROW = "PB1,puzzlebot2024,a statistic,0.5,0.4,0.6,at least 0.4,reproduced,s,c"
     [
         (ROW[:-20], "the last row is cut off"),
         ("", "the last row is cut off"),
-        (f"{ROW}\n{ROW}\n", "row 3: is there twice"),
+        (f"{ROW}\n{ROW}\n", "row 3: a duplicate"),
         (f'{ROW}\nPB1,puzzlebot2024,"a sta\n', "cannot read the claims"),
         (ROW.replace("reproduced", "Reproduced") + "\n", "row 2: verdict is 'Reproduced'"),
         (ROW.replace("reproduced", "reproducedX") + "\n", "row 2: verdict is 'reproducedX'"),
         (ROW.replace("reproduced", "") + "\n", "row 2: verdict is nan"),
-        (f"{ROW}\n{ROW.replace('0.5', 'abc')}\n", "row 3: value is 'abc', no number"),
+        (f"{ROW}\n{ROW.replace('0.5', 'abc')}\n", "row 3: value is 'abc', not a number"),
         (ROW.replace("puzzlebot2024", "") + "\n", "row 2: paper is nan"),
         (ROW.replace("puzzlebot2024", "../evil paper") + "\n", "row 2: paper is '../evil paper'"),
         (ROW.replace("puzzlebot2024", "a.b.c") + "\n", "row 2: paper is 'a.b.c'"),
@@ -210,9 +216,9 @@ ROW = "PB1,puzzlebot2024,a statistic,0.5,0.4,0.6,at least 0.4,reproduced,s,c"
 )
 def test_damaged_tables_are_refused_in_one_line(tmp_path, row, wrong):
     path = tmp_path / "claims.csv"
-    path.write_text(",".join(common.COLUMNS) + "\n" * bool(row) + row)
+    path.write_text(",".join(COLUMNS) + "\n" * bool(row) + row)
     with pytest.raises(InputError) as refused:
-        common.read(path)
+        read_claims(path)
     line = str(refused.value)
     assert str(path) in line
     assert wrong in line
@@ -223,16 +229,14 @@ def test_damaged_tables_are_refused_in_one_line(tmp_path, row, wrong):
 def test_a_table_without_verdicts_is_refused(tmp_path):
     pd.DataFrame({"id": ["PB1"], "paper": ["p"]}).to_csv(tmp_path / "claims.csv", index=False)
     with pytest.raises(InputError, match="no column statistic"):
-        common.read(tmp_path / "claims.csv")
+        read_claims(tmp_path / "claims.csv")
 
 
-def test_outcomes_are_whole_words():
-    for said in ("not reproduced", "not reproduced; on land", "not reproduced: no (quick)"):
-        assert common.outcome(said) == "not reproduced"
-    assert common.outcome("reproduced (9 of 9)") == "reproduced"
-    for wrong in ("reproducedX", "Reproduced", "", "reproduced?"):
-        with pytest.raises(ValueError, match="not a verdict"):
-            common.outcome(wrong)
+def test_verdicts_are_whole_words():
+    assert Verdict("not_reproduced").label == "not reproduced"
+    for wrong in ("reproducedX", "Reproduced", "not reproduced", "", "reproduced?"):
+        with pytest.raises(ValueError, match="not a valid Verdict"):
+            Verdict(wrong)
 
 
 def test_rl2_judges_after_the_tuned_part_and_shows_the_whole():
@@ -245,7 +249,8 @@ def test_rl2_judges_after_the_tuned_part_and_shows_the_whole():
     names = ("mean", "low", "high")
     columns = ["log", "method", "part", *(f"translation_{name}_m" for name in names)]
     said = real_logs.rl2(pd.DataFrame(rows, columns=columns))
-    assert [c.verdict for c in said] == ["reproduced"] * 4 + ["shown; fusion is behind"] * 4
+    assert [c.verdict for c in said] == ["reproduced"] * 4 + ["shown"] * 4
+    assert [c.reason for c in said] == [""] * 4 + ["fusion is behind"] * 4
     assert all("the whole log" in c.statistic for c in said[4:])
 
 
@@ -254,11 +259,11 @@ def test_rl3_wants_every_robot():
     rows += [(r, "good", 0.5) for r in (1, 2, 3)]
     rows += [(1, "bad", 1.5), (2, "bad", 0.1), (3, "bad", 1.1), (3, "last", 1.1), (2, "last", 0.1)]
     table = pd.DataFrame(rows, columns=["robot", "method", "ate_rmse_m"])
-    said = {c.statistic.split()[2]: c.verdict for c in real_logs.rl3(table)}
+    said = {c.statistic.split()[2]: (c.verdict, c.reason) for c in real_logs.rl3(table)}
     assert said == {
-        "good": "reproduced",
-        "bad": "not reproduced; not on robots 1, 3",
-        "last": "not reproduced; not on robot 3",
+        "good": ("reproduced", ""),
+        "bad": ("not_reproduced", "not on robots 1, 3"),
+        "last": ("not_reproduced", "not on robot 3"),
     }
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize, stats
 
-from experiments.calibration.calibrate import Measured
+from experiments.evaluation.statistics import Interval
 from sim import se2
 from sim.errors import InputError
 from sim.formats.assemble import chained
@@ -47,12 +47,12 @@ class WheelCalibration:
         (N,) turn by the laser less turn by the wheels.
     """
 
-    diameter_right_m: Measured
-    diameter_left_m: Measured
-    axle_m: Measured
-    laser_x_m: Measured
-    laser_y_m: Measured
-    laser_yaw_rad: Measured
+    diameter_right_m: Interval
+    diameter_left_m: Interval
+    axle_m: Interval
+    laser_x_m: Interval
+    laser_y_m: Interval
+    laser_yaw_rad: Interval
     kept: Mask
     travel_m: Array
     turn_residual_rad: Array
@@ -116,7 +116,7 @@ def calibrate_wheels(
     sigma = np.sqrt(unit * np.diag(np.linalg.inv(fit.jac.T @ fit.jac)))
     half = float(stats.norm.ppf(0.975)) * sigma
     right, left, axle, x, y, yaw = (
-        Measured(float(v), float(v - h), float(v + h)) for v, h in zip(values, half, strict=True)
+        Interval(float(v), float(v - h), float(v + h)) for v, h in zip(values, half, strict=True)
     )
     residual = _residual(log, values)
     travel = log.rolled_rad * values[:2] / 2.0
@@ -148,8 +148,8 @@ def _residual(log: WheelLaserLog, parameters: Array) -> Array:
 class SlipOfTurns:
     """kr and kl, m, as blocks of so many intervals show them."""
 
-    kr: Measured
-    kl: Measured
+    kr: Interval
+    kl: Interval
     block: int
     n_blocks: int
 
@@ -194,7 +194,7 @@ def slip_of_turns(
     picks = rng.integers(len(square), size=(n_resamples, len(square)))
     spread = np.array([_law(square[pick], path[pick]) for pick in picks])
     low, high = np.quantile(spread, [0.025, 0.975], axis=0)
-    kr, kl = (Measured(float(k[i]), float(low[i]), float(high[i])) for i in (0, 1))
+    kr, kl = (Interval(float(k[i]), float(low[i]), float(high[i])) for i in (0, 1))
     return SlipOfTurns(kr, kl, block, len(square))
 
 
@@ -225,8 +225,8 @@ class TrackCalibration:
         RMS distance of the scanner's positions from the reference that was fitted.
     """
 
-    tick_m: Measured
-    track_m: Measured
+    tick_m: Interval
+    track_m: Interval
     start: Array
     rms_m: float
 
@@ -292,7 +292,7 @@ def calibrate_track(
     covariance = np.linalg.inv(fit.jac.T @ fit.jac) * float(np.mean(fit.fun**2)) * 20.0
     half = float(stats.norm.ppf(0.975)) * np.sqrt(np.diag(covariance))[:2]
     tick, track = (
-        Measured(float(v * u), float((v - h) * u), float((v + h) * u))
+        Interval(float(v * u), float((v - h) * u), float((v + h) * u))
         for v, h, u in zip(fit.x[:2], half, (tick_m, track_m), strict=True)
     )
     rms_m = float(np.sqrt(2.0 * np.mean(fit.fun**2)))

@@ -256,13 +256,23 @@ class Experiment:
                 )
         return estimator  # type: ignore[no-any-return]
 
-    def simulate(self, on_progress: Callable[[float], None] | None = None) -> Recording:
+    def route(self) -> Any:
+        """Make the route: anything with `start`, as in `sim.simulate.Route`."""
+        return make(self.config["route"], "route")
+
+    def simulate(
+        self,
+        on_progress: Callable[[float], None] | None = None,
+        streams: Mapping[str, np.random.Generator] | None = None,
+    ) -> Recording:
         """Simulate the recording.
 
         Parameters
         ----------
         on_progress
             Called with the seconds simulated.
+        streams
+            Generators `slip` and `sensors`, in place of the seed's own.
         """
         from sim.simulate import record
 
@@ -271,8 +281,8 @@ class Experiment:
             self.world(),
             self.robot(),
             self.sensors(),
-            make(self.config["route"], "route"),
-            {axis: stream(self.config["seed"], axis) for axis in ("slip", "sensors")},
+            self.route(),
+            streams or {axis: stream(self.config["seed"], axis) for axis in ("slip", "sensors")},
             physics=self.config["simulation"]["physics"],
             rays=self.config["simulation"]["rays"],
             config={key: self.config[key] for key in _SIMULATED_KEYS},

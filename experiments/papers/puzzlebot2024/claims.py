@@ -9,15 +9,25 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from experiments.evaluation.statistics import (
-    Interval,
-    mean_interval,
-    share_interval,
-    verdict,
-)
-from experiments.report.claims import Claim, overall
+from experiments.evaluation.statistics import Interval, mean_interval, share_interval
+from experiments.evaluation.verdict import Claim, Verdict, holds, judged, overall
+from experiments.papers.puzzlebot2024.settings import NOMINAL
+from experiments.papers.results import Results
 
 Array = NDArray[np.float64]
+
+PRINTED_1 = ((0.5, 0.01, 0.01), (0.01, 0.5, 0.01), (0.01, 0.01, 0.2))
+PRINTED_2 = ((0.9998, 0.0207, 0.0180), (0.0207, 1.0040, 0.0399), (0.0180, 0.0399, 0.4000))
+
+
+def judge(made: Results) -> list[Claim]:
+    """Judge PB1-PB4 by the tables."""
+    return [
+        *pb1(),
+        *pb2(made.table("areas"), made.table("crossover"), NOMINAL.track_m),
+        *pb3(made.table("calibration"), made.table("gradient_descent"), made.table("engine_k")),
+        *pb4(made.table("coverage"), made.table("engine")),
+    ]
 
 
 def worked_matrices() -> tuple[Array, Array]:
@@ -29,18 +39,9 @@ def worked_matrices() -> tuple[Array, Array]:
     """
     Q = np.array([[0.5, 0.01, 0.01], [0.01, 0.5, 0.01], [0.01, 0.01, 0.2]])
     v, w, dt = 1.0, 1.0, 0.1
-    sigma, steps = np.zeros((3, 3)), []
-    for step in range(2):
-        theta = step * w * dt
-        H = np.eye(3)
-        H[0, 2], H[1, 2] = -dt * v * math.sin(theta), dt * v * math.cos(theta)
-        sigma = H @ sigma @ H.T + Q
-        steps.append(sigma)
-    return steps[0], steps[1]
-
-
-PRINTED_1 = ((0.5, 0.01, 0.01), (0.01, 0.5, 0.01), (0.01, 0.01, 0.2))
-PRINTED_2 = ((0.9998, 0.0207, 0.0180), (0.0207, 1.0040, 0.0399), (0.0180, 0.0399, 0.4000))
+    H = np.eye(3)
+    H[:2, 2] = -dt * v * math.sin(w * dt), dt * v * math.cos(w * dt)
+    return Q, H @ Q @ H.T + Q
 
 
 def pb1() -> list[Claim]:
@@ -50,19 +51,8 @@ def pb1() -> list[Claim]:
         float(np.abs(first - PRINTED_1).max()) / 0.005,
         float(np.abs(second - PRINTED_2).max()) / 0.00005,
     )
-    found = Interval(worst, worst, worst)
-    return [
-        Claim(
-            "PB1",
-            "puzzlebot2024",
-            "largest deviation of Sigma_1 and Sigma_2, in half units of the last printed digit",
-            found.value,
-            found.low,
-            found.high,
-            "at most 1",
-            verdict(found, at_most=1.0),
-        )
-    ]
+    statistic = "largest deviation of Sigma_1 and Sigma_2, in half units of the last printed digit"
+    return [Claim("PB1", statistic, Interval.exact(worst), "at most 1", holds(worst <= 1.0))]
 
 
 def pb2(areas: pd.DataFrame, crossover: pd.DataFrame, track_m: float) -> list[Claim]:
@@ -70,135 +60,101 @@ def pb2(areas: pd.DataFrame, crossover: pd.DataFrame, track_m: float) -> list[Cl
     claims = []
     for name, table in areas.groupby("manoeuvre", sort=False):
         steps = np.concatenate([np.diff(part["area_m2"]) for _, part in table.groupby("k_m")])
-        size = float(table["area_m2"].max())
-        shrinking = float(np.mean(steps < -1e-9 * size))
-        found = Interval(shrinking, shrinking, shrinking)
-        once = name != "out and back"
-        claims.append(
-            Claim(
-                "PB2",
-                "puzzlebot2024",
-                f"share of steps in which the 95 % ellipse shrinks, {name}",
-                found.value,
-                found.low,
-                found.high,
-                "0" if once else "shown, not judged",
-                verdict(found, at_most=0.0) if once else "shown: it shrinks on the way back",
-            )
-        )
-    theory = track_m * math.sqrt(3.0) / 2.0
-    ratio = mean_interval(crossover["crossover_m"] / theory)
-    claims.append(
-        Claim(
-            "PB2",
-            "puzzlebot2024",
-            "distance at which heading-borne spread overtakes, over track sqrt(3) / 2",
-            ratio.value,
-            ratio.low,
-            ratio.high,
-            "within 0.98 and 1.02",
-            verdict(ratio, 0.98, 1.02),
-        )
-    )
-    return claims
+        shrinking = float(np.mean(steps < -1e-9 * table["area_m2"].max()))
+        statistic = f"share of steps in which the 95 % ellipse shrinks, {name}"
+        found, verdict = Interval.exact(shrinking), holds(shrinking <= 0.0)
+        if name == "out and back":
+            shown = ("shown, not judged", Verdict.SHOWN, "it shrinks on the way back")
+            claims.append(Claim("PB2", statistic, found, *shown))
+        else:
+            claims.append(Claim("PB2", statistic, found, "0", verdict))
+    ratio = mean_interval(crossover["crossover_m"] / (track_m * math.sqrt(3.0) / 2.0))
+    statistic = "distance at which heading-borne spread overtakes, over track sqrt(3) / 2"
+    return [*claims, _within("PB2", statistic, ratio, 0.98, 1.02)]
 
 
 def pb3(calibration: pd.DataFrame, descent: pd.DataFrame, engine_k: pd.DataFrame) -> list[Claim]:
     """PB3: kr, kl from open-loop runs, per method, k and arm: coverage and relative bias.
 
-    The biases of kr and kl are judged apart, since opposite ones would cancel; the worse is told.
+    The biases of kr and kl are judged apart, since opposite ones would cancel; the worse is shown.
     """
     claims = []
     for (method, joint, k), table in calibration.groupby(["method", "joint", "k_m"], sort=False):
         where = f"{method}, k = {k:g} m, {'gain and track joint' if joint else 'nominal geometry'}"
-        slips = table[table["parameter"].isin(["kr", "kl"])]
-        judged = [("coverage of the 95 % intervals of kr and kl", slips)]
+        is_slip = table["parameter"].isin(["kr", "kl"])
+        slips, parts = table[is_slip], {"kr and kl": table[is_slip]}
         if joint:
-            judged.append(
-                ("coverage of the 95 % intervals of gains and track", table.drop(slips.index))
-            )
-        for label, part in judged:
-            covered = (part["low"] <= part["truth"]) & (part["truth"] <= part["high"])
-            share = _clustered_share(covered, part["seed"])
-            claims.append(_within(f"{label}: {where}", share, 0.90, 0.99))
+            parts["gains and track"] = table[~is_slip]
+        for names, part in parts.items():
+            share = _clustered_share(part["truth"].between(part["low"], part["high"]), part["seed"])
+            label = f"coverage of the 95 % intervals of {names}: {where}"
+            claims.append(_within("PB3", label, share, 0.90, 0.99))
         relative = slips["value"] / slips["truth"] - 1.0
         biases = [mean_interval(part) for _, part in relative.groupby(slips["parameter"])]
         worse = max(biases, key=lambda bias: abs(bias.value))
-        claim = _within(f"relative bias, the worse of kr and kl: {where}", worse, -0.05, 0.05)
-        outcome = overall([verdict(bias, -0.05, 0.05) for bias in biases])
-        claims.append(dataclasses.replace(claim, verdict=outcome))
+        claim = _within(
+            "PB3", f"relative bias, the worse of kr and kl: {where}", worse, -0.05, 0.05
+        )
+        verdict = overall([judged(bias, -0.05, 0.05) for bias in biases])
+        claims.append(dataclasses.replace(claim, verdict=verdict))
     for row in engine_k.itertuples():
         ratio = Interval(*(value / row.truth for value in (row.value, row.low, row.high)))
         label = (
             f"{row.parameter} of PyBullet's robot by wheel truth, over the truth, k = {row.k_m:g} m"
         )
-        claims.append(_within(label, ratio, 0.95, 1.05))
-    worst = float(np.abs(descent["k_in_the_end"] - 0.5).max())
-    claims.append(
+        claims.append(_within("PB3", label, ratio, 0.95, 1.05))
+    return [
+        *claims,
         Claim(
             "PB3",
-            "puzzlebot2024",
             "the report's gradient descent: largest distance of its limit from 1/2, any data",
-            worst,
-            worst,
-            worst,
+            Interval.exact(float(np.abs(descent["k_in_the_end"] - 0.5).max())),
             "an estimator of kr, kl would depend on the data",
-            "not reproduced: it returns 1/2 whatever the data",
-        )
-    )
-    return claims
+            Verdict.NOT_REPRODUCED,
+            "it returns 1/2 whatever the data",
+        ),
+    ]
 
 
 def pb4(coverage: pd.DataFrame, engine: pd.DataFrame) -> list[Claim]:
     """PB4: the true end lies in the ideal robot's 95 % ellipse, per k; and where that ends."""
-    claims, leaves, held = [], None, 0.0
+    claims, verdicts = [], {}
     for k, table in coverage.groupby("k_m"):
         shares = [share_interval(int(row.in_ellipse), int(row.runs)) for row in table.itertuples()]
-        worst = min(shares, key=lambda s: s.value)
-        case = table.iloc[shares.index(worst)]["case"]
-        outcomes = [verdict(share, 0.93, 0.97) for share in shares]
-        outcome = overall(outcomes)
-        if outcome == "not reproduced" and leaves is None:
-            leaves = k
-        if outcome == "reproduced" and leaves is None:
-            held = k
-        within = sum(outcome == "reproduced" for outcome in outcomes)
+        worst = int(np.argmin([share.value for share in shares]))
+        parts = [judged(share, 0.93, 0.97) for share in shares]
+        verdicts[k] = overall(parts)
         claims.append(
             Claim(
                 "PB4",
-                "puzzlebot2024",
-                f"least share of ends in the 95 % ellipse over nine manoeuvres ({case}), k = {k:g}",
-                worst.value,
-                worst.low,
-                worst.high,
+                "least share of ends in the 95 % ellipse over nine manoeuvres "
+                f"({table.iloc[worst]['case']}), k = {k:g}",
+                shares[worst],
                 "every manoeuvre's interval within 0.93 and 0.97",
-                f"{outcome} ({within} of {len(shares)} manoeuvres within)",
+                verdicts[k],
+                f"{parts.count(Verdict.REPRODUCED)} of {len(parts)} manoeuvres within",
             )
         )
-    share = mean_interval(_engine_gap(engine))
+    gap = mean_interval(_engine_gap(engine))
     claims.append(
         Claim(
             "PB4",
-            "puzzlebot2024",
             "distance of PyBullet's end from the kinematic robot's, same noise, over the spread",
-            share.value,
-            share.low,
-            share.high,
+            gap,
             "below 0.05: the kinematic robot stands for PyBullet's",
-            verdict(share, at_most=0.05),
+            judged(gap, at_most=0.05),
         )
     )
-    if leaves is not None:
+    left = [k for k, verdict in verdicts.items() if verdict is Verdict.NOT_REPRODUCED]
+    if left:
+        within = [k for k, v in verdicts.items() if v is Verdict.REPRODUCED and k < left[0]]
         claims.append(
             Claim(
                 "PB4",
-                "puzzlebot2024",
                 "least k at which a manoeuvre leaves the band, m (low: the last with all in it)",
-                leaves,
-                held,
-                leaves,
+                Interval(left[0], max(within, default=0.0), left[0]),
                 "above 1e-4",
-                "reproduced" if leaves > 1e-4 * (1 + 1e-9) else "not reproduced",
+                holds(left[0] > 1e-4 * (1 + 1e-9)),
             )
         )
     return claims
@@ -228,8 +184,6 @@ def _clustered_share(hits: pd.Series[bool], seeds: pd.Series[int]) -> Interval:
     return dataclasses.replace(share_interval(round(share * trials), trials), value=share)
 
 
-def _within(statistic: str, found: Interval, low: float, high: float) -> Claim:
-    """Judge a statistic of PB3 by a band."""
-    criterion = f"within {low:g} and {high:g}"
-    paper, outcome = "puzzlebot2024", verdict(found, low, high)
-    return Claim("PB3", paper, statistic, found.value, found.low, found.high, criterion, outcome)
+def _within(claim: str, statistic: str, found: Interval, low: float, high: float) -> Claim:
+    """Judge a statistic by a band."""
+    return Claim(claim, statistic, found, f"within {low:g} and {high:g}", judged(found, low, high))

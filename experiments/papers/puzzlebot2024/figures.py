@@ -2,30 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
-from experiments.papers.puzzlebot2024.study import (
-    COVERAGE_KS,
-    JUDGED_SEED,
-    NOMINAL,
-    ideal_beliefs,
-    slipping,
-)
-from experiments.runs.seeds import stream
+from experiments.papers.puzzlebot2024.settings import CALIBRATION_RUNS, NOMINAL, TABLE_1_K_M
+from experiments.papers.results import Results
 from experiments.viewing.run_figure import covariance_ellipse
 from experiments.viewing.style import BLACK, BLUE, CYCLE, ORANGE, figure
-from sim.kinematic import run_batch
-from sim.route import OpenLoop
 
-_SQUARE = OpenLoop(
-    (
-        *(leg for _ in range(3) for leg in ((0.4, 0.0, 3.0), (0.0, 0.6, np.pi / 2 / 0.6))),
-        (0.4, 0.0, 3.0),
-    )
-)
+Arrays = Mapping[str, NDArray[Any]]
+
 _METHODS = {
     "wheel_truth": "wheel truth",
     "sampled": "end poses, sampled",
@@ -34,30 +26,40 @@ _METHODS = {
 _PARAMETERS = {"kr": "$k_r$", "kl": "$k_l$"}
 
 
-def ideal_and_real(n_real: int = 40) -> Figure:
+def draw(made: Results) -> dict[str, Figure]:
+    """Draw all figures of the paper, by file name."""
+    return {
+        "puzzlebot2024_ideal_and_real": ideal_and_real(made.arrays("square")),
+        "puzzlebot2024_ellipse_area": ellipse_area(
+            made.table("areas"), made.table("crossover"), made.arrays("straight")
+        ),
+        "puzzlebot2024_calibration": calibration(made.table("calibration")),
+        "puzzlebot2024_table_1": table_1(made.table("table_1")),
+        "puzzlebot2024_coverage": coverage(made.table("coverage")),
+    }
+
+
+def ideal_and_real(square: Arrays) -> Figure:
     """Draw the report's RViz view: the ideal robot with its ellipses, and real robots."""
-    page = figure(9.0, 4.4)
-    for ax, k in zip(page.subplots(1, 2), (1e-5, 1e-4), strict=True):
-        robot = slipping(k)
-        runs = run_batch(robot, _SQUARE, n_real, stream(JUDGED_SEED, "slip"))
-        ax.plot(*runs.poses[1:, :, :2].T, color=ORANGE, lw=0.4, alpha=0.35)
-        ax.plot(*runs.poses[0, :, :2].T, color=ORANGE, lw=1.2, label="real robot (40 runs)")
-        ax.plot(*runs.end_poses[:, :2].T, ".", color=ORANGE, ms=3)
-        _, means, covariances = ideal_beliefs(_SQUARE, robot.kr, robot.kl)
-        ax.plot(*means[:, :2].T, color=BLUE, lw=1.4, label="ideal robot")
+    page, means = figure(9.0, 4.4), square["ideal_m"]
+    parts = (square[name] for name in ("kr_kl_m", "real_m", "covariances_m2"))
+    for ax, (kr, kl), real, covariances in zip(page.subplots(1, 2), *parts, strict=True):
+        ax.plot(*real[1:].T, color=ORANGE, lw=0.4, alpha=0.35)
+        ax.plot(*real[0].T, color=ORANGE, lw=1.2, label=f"real robot ({len(real)} runs)")
+        ax.plot(*real[:, -1].T, ".", color=ORANGE, ms=3)
+        ax.plot(*means.T, color=BLUE, lw=1.4, label="ideal robot")
         for i in np.linspace(0, len(means) - 1, 15).astype(int)[1:]:
-            ellipse = covariance_ellipse(means[i], covariances[i, :2, :2])
+            ellipse = covariance_ellipse(means[i], covariances[i])
             ellipse.set(facecolor="none", edgecolor=BLUE, linewidth=0.9)
             ellipse.set_label("95 % ellipse" if i == len(means) - 1 else "")
             ax.add_patch(ellipse)
         ax.set(xlabel="x, m", ylabel="y, m", aspect="equal")
-        ax.set_title(f"$k_r$ = {robot.kr:.2g} m, $k_l$ = {robot.kl:.2g} m")
-    handles, labels = ax.get_legend_handles_labels()
-    page.legend(handles, labels, loc="outside lower center", ncols=3)
+        ax.set_title(f"$k_r$ = {kr:.2g} m, $k_l$ = {kl:.2g} m")
+    page.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return page
 
 
-def ellipse_area(areas: pd.DataFrame, crossover: pd.DataFrame) -> Figure:
+def ellipse_area(areas: pd.DataFrame, crossover: pd.DataFrame, straight: Arrays) -> Figure:
     """Draw the 95 % ellipse's area against distance, and where heading takes over."""
     page = figure(9.0, 3.8)
     left, right = page.subplots(1, 2)
@@ -69,15 +71,13 @@ def ellipse_area(areas: pd.DataFrame, crossover: pd.DataFrame) -> Figure:
     left.set(xlabel="distance rolled, m", ylabel="area of the 95 % ellipse, m²", yscale="log")
     left.set_ylim(bottom=1e-6)
     page.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=3)
-    _crossover(right, crossover)
+    _crossover(right, crossover, straight)
     return page
 
 
-def _crossover(ax: Axes, crossover: pd.DataFrame) -> None:
+def _crossover(ax: Axes, crossover: pd.DataFrame, straight: Arrays) -> None:
     """Draw the two spreads along a straight; they cross at track sqrt(3) / 2."""
-    _, means, covariances = ideal_beliefs(OpenLoop(((0.25, 0.0, 2.0),)), 1e-5, 1e-5)
-    distance = 1000 * means[:, 0]
-    spread = 1000 * np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
+    distance, spread = (1000.0 * straight[name] for name in ("distance_m", "sigma_m"))
     ax.plot(distance, spread[:, 0], color=BLUE, label="along the way: borne by translation")
     ax.plot(distance, spread[:, 1], color=ORANGE, label="across: borne by heading")
     theory, found = 1000 * NOMINAL.track_m * np.sqrt(3.0) / 2.0, 1000 * crossover["crossover_m"]
@@ -130,7 +130,7 @@ def _estimates(ax: Axes, part: pd.DataFrame, level: int, color: str) -> None:
     ends = [float((part[end] / part["truth"]).mean()) for end in ("low", "high")]
     ax.plot(ends, [level - 0.08] * 2, color=color, lw=2.0, solid_capstyle="butt")
     ax.plot(ratios.mean(), level - 0.08, "o", color=BLACK, ms=3)
-    covered = ((part["low"] <= part["truth"]) & (part["truth"] <= part["high"])).mean()
+    covered = part["truth"].between(part["low"], part["high"]).mean()
     ax.annotate(f"{covered:.2f}", (0.99, level + 0.1), xycoords=("axes fraction", "data"),
                 ha="right", fontsize="small")  # fmt: skip
 
@@ -140,18 +140,10 @@ def table_1(table: pd.DataFrame) -> Figure:
     page = figure(9.0, 3.4)
     ax = page.subplots()
     ax.axis("off")
-    header = [
-        "case",
-        "v, m/s",
-        "ω, rad/s",
-        "T, s",
-        "ideal x, m",
-        "real x, m",
-        "ideal θ, rad",
-        "real θ, rad",
-        "$k_r$, 1e-4 m",
-        "$k_l$, 1e-4 m",
-    ]
+    header = (
+        "case", "v, m/s", "ω, rad/s", "T, s", "ideal x, m", "real x, m", "ideal θ, rad",
+        "real θ, rad", "$k_r$, 1e-4 m", "$k_l$, 1e-4 m",
+    )  # fmt: skip
     cells = [
         [
             row.case.replace("_", " "),
@@ -176,10 +168,9 @@ def table_1(table: pd.DataFrame) -> Figure:
         cell.set_edgecolor("#cccccc")
         if row_number == 0:
             cell.set_text_props(weight="bold")
-    truth = slipping(1e-4)
     ax.set_title(
-        f"table 1, 20 runs a case; true $k_r$ = {1e4 * truth.kr:g}e-4 m, "
-        f"$k_l$ = {1e4 * truth.kl:g}e-4 m",
+        f"table 1, {CALIBRATION_RUNS} runs a case; true $k_r$ = {1.5e4 * TABLE_1_K_M:g}e-4 m, "
+        f"$k_l$ = {0.5e4 * TABLE_1_K_M:g}e-4 m",
         fontsize="medium",
     )
     return page
@@ -215,7 +206,7 @@ def coverage(table: pd.DataFrame) -> Figure:
                 label=str(name).replace("_", " "),
             )
         ax.set(xlabel="k, m ($k_r$ = 1.5 k, $k_l$ = 0.5 k)", xscale="log", title=title)
-        ax.set_xlim(min(COVERAGE_KS) * 0.7, max(COVERAGE_KS) * 1.4)
+        ax.set_xlim(table["k_m"].min() * 0.7, table["k_m"].max() * 1.4)
     axes[0].set_ylabel("share of runs")
     page.legend(*axes[0].get_legend_handles_labels(), loc="outside right center")
     return page

@@ -7,273 +7,275 @@ subset is driven by PyBullet too, and both are compared.
 from __future__ import annotations
 
 import dataclasses
-import math
-from collections.abc import Callable
-from pathlib import Path
-from typing import Literal
+import itertools
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
+import joblib
 import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from scipy import stats
 
-from estimators.base import Prior
+from estimators.base import Estimate, Prior
+from estimators.base import run as run_estimator
 from estimators.odometry import Odometry
-from experiments.calibration.calibrate import (
-    CalibrationResult,
-    Manoeuvre,
-    calibrate_recordings,
-    end_pose,
-    from_end_poses,
-    from_wheel_truth,
-    report_gradient_descent,
+from experiments.calibration.calibrate import calibrate_recordings, end_pose
+from experiments.calibration.end_poses import Manoeuvre, from_end_poses
+from experiments.calibration.result import CalibrationResult
+from experiments.calibration.wheel_truth import from_wheel_truth
+from experiments.evaluation.metrics import ellipse_area_m2
+from experiments.evaluation.verdict import Profile
+from experiments.papers.puzzlebot2024.descent import gradient_descent
+from experiments.papers.puzzlebot2024.settings import (
+    AREA_K_M,
+    CALIBRATION_RUNS,
+    CALIBRATIONS,
+    COVERAGE_RUNS,
+    ENGINE_OVERRIDES,
+    LOOPS,
+    NOMINAL,
+    SQUARE_RUNS,
+    TABLE_1_K_M,
 )
-from experiments.evaluation.metrics import CHI2_95_2DOF, ellipse_area_m2
-from experiments.report.claims import Claim
-from experiments.runs.row import write_frame
+from experiments.papers.results import Results
+from experiments.runs.experiment import Experiment
+from experiments.runs.row import Row
 from experiments.runs.seeds import stream
-from sim.kinematic import run_batch, wheel_commands
-from sim.recording import Frame, Recording
+from experiments.sweeps.launch import planned
+from sim.kinematic import BatchRuns, run_batch
+from sim.recording import Recording, WheelLog
 from sim.robot import DifferentialDrive, RobotGeometry
-from sim.route import TABLE_1, TICK_S, OpenLoop
-from sim.sensors import Encoder, SensorSuite
-from sim.simulate import Physics
+from sim.route import OpenLoop
+from sim.sensors import SensorSuite
 
 Array = NDArray[np.float64]
-Tables = dict[str, pd.DataFrame]
-Profile = Literal["quick", "full"]
-
-PAPER = "puzzlebot2024"
-NOMINAL = DifferentialDrive(wheel_radius_m=0.05, track_m=0.19)
-JUDGED_SEED = 1000  # seeds 0-99 are for tuning
-RATIOS = (1.5, 0.5)  # kr and kl over k: they differ, so that one cannot pass for the other
-CALIBRATION_KS = (1e-5, 1e-4, 1e-3)
-COVERAGE_KS = (1e-6, 1e-5, 3e-5, 1e-4, 3e-4, 1e-3)
-RUNS_PER_CASE = 20  # repetitions of each of the nine cases in one calibration
-GEOMETRY_ERROR = 0.05  # gain and track error of the joint arm
-_PHYSICS: tuple[Physics, ...] = ("bullet", "kinematic")
-CHI2_95_3DOF = 7.814727903251179
-FRAME_S = 0.05
-LOOPS: dict[str, OpenLoop] = {
-    "straight": OpenLoop(((0.5, 0.0, 6.0),)),
-    "arc": OpenLoop(((0.5, 0.4, 6.0),)),
-    "arc of one turn and a half": OpenLoop(((0.5, 1.5 * np.pi / 3.0, 6.0),)),
-    "out and back": OpenLoop(((0.5, 0.0, 3.0), (-0.5, 0.0, 3.0))),
-}
+Routes = Mapping[str, OpenLoop]
 
 
-def run(profile: Profile, out: Path, on_progress: Callable[[float], None]) -> Tables:
-    """Run all studies of the paper and write their tables to `out`.
+def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) -> None:
+    """Run all studies of the paper, and write their tables and arrays.
 
     Parameters
     ----------
     profile
         `quick`: few repetitions; `full`: what the claims are judged by.
-    out
-        Folder of the tables.
     on_progress
         Called with the share done.
     """
-    full = profile == "full"
-    tables = {"areas": areas(), "crossover": crossover(20)}
+    out.write_table("areas", areas())
+    out.write_table("crossover", crossover())
+    out.write_arrays("square", **square())
+    out.write_arrays("straight", **straight())
     on_progress(0.05)
-    tables["calibration"] = calibration(
-        200 if full else 5, lambda share: on_progress(0.05 + 0.65 * share)
+    calibrated = calibration(
+        arms("calibration"), CALIBRATIONS[profile], lambda share: on_progress(0.05 + 0.65 * share)
     )
-    tables["table_1"] = table_1()
+    out.write_table("calibration", calibrated)
+    covered = arms("coverage")
+    out.write_table("table_1", table_1(next(a for a in covered if a.k_m == TABLE_1_K_M)))
     on_progress(0.75)
-    tables["coverage"] = coverage(10_000 if full else 400)
+    out.write_table("coverage", coverage(covered, COVERAGE_RUNS[profile]))
     on_progress(0.85)
-    driven = engine_recordings(40 if full else 4)
-    tables["engine"] = engine_ends(driven)
-    tables["engine_k"] = engine_k(driven)
-    tables["gradient_descent"] = gradient_descent()
-    for name, frame in tables.items():
-        write_frame(frame, out / f"{PAPER}_{name}.csv")
+    driven = engine_recordings(*ENGINE_OVERRIDES[profile])
+    out.write_table("engine", engine_ends(driven))
+    out.write_table("engine_k", engine_k(driven))
+    out.write_table("gradient_descent", gradient_descent())
     on_progress(1.0)
-    return tables
 
 
-def slipping(k: float, *, geometry: bool = False) -> DifferentialDrive:
-    """Return the robot with kr = 1.5 k, kl = 0.5 k, and on request 5 % gain and track errors."""
-    robot = dataclasses.replace(NOMINAL, kr=RATIOS[0] * k, kl=RATIOS[1] * k)
-    if geometry:
-        robot = dataclasses.replace(
-            robot,
-            bias_right=GEOMETRY_ERROR,
-            bias_left=-GEOMETRY_ERROR,
-            track_m=(1.0 + GEOMETRY_ERROR) * NOMINAL.track_m,
-        )
-    return robot
+@dataclass(frozen=True)
+class Arm:
+    """A robot that drives several manoeuvres, all from one seed.
+
+    Attributes
+    ----------
+    routes
+        The manoeuvres by name.
+    """
+
+    seed: int
+    robot: DifferentialDrive
+    routes: Routes
+
+    @property
+    def k_m(self) -> float:
+        """The k of kr = 1.5 k and kl = 0.5 k, m."""
+        return 2.0 * self.robot.kl
+
+    @property
+    def joint(self) -> bool:
+        """Whether the robot's gains and track err too, and are to be estimated."""
+        return bool(self.robot.slip_bias.any())
 
 
-def ideal_beliefs(
-    route: OpenLoop, kr: float, kl: float, frame_s: float = FRAME_S
-) -> tuple[Array, Array, Array]:
-    """Stamps (T,), poses (T, 3) and covariances (T, 3, 3) that the commands alone promise."""
-    commands = np.concatenate([np.zeros((1, 2)), np.cumsum(wheel_commands(NOMINAL, route), 0)])
-    every = round(frame_s / TICK_S)
-    rows = np.unique(np.append(np.arange(0, len(commands), every), len(commands) - 1))
-    estimator = Odometry(kr, kl)
-    geometry = RobotGeometry(NOMINAL.wheel_radius_m, NOMINAL.track_m)
-    prior = Prior(geometry, SensorSuite(), np.zeros(3), np.zeros((3, 3)))
-    estimator.reset(prior, np.random.default_rng(0))
-    stamps = rows * TICK_S
-    increments = np.diff(commands[rows], axis=0, prepend=commands[:1])
-    lapses = np.diff(stamps, prepend=stamps[:1])
-    beliefs = [
-        estimator.step(Frame(float(t), float(dt), step))
-        for t, dt, step in zip(stamps, lapses, increments, strict=True)
+def arms(study: str) -> list[Arm]:
+    """All robots of a study, each with all manoeuvres."""
+    runs = planned([f"+study=puzzlebot2024_{study}"])
+    return [
+        Arm(seed, robot, {part.choices["route"]: part.route() for part in parts})
+        for (seed, robot), parts in itertools.groupby(runs, lambda run: (run.seed, run.robot()))
     ]
-    means = np.array([belief.mean for belief in beliefs])
-    return stamps, means, np.array([belief.covariance for belief in beliefs])
+
+
+def ideal(route: OpenLoop, kr: float, kl: float) -> Estimate:
+    """What the commands alone promise: dead reckoning of a robot that does not slip."""
+    return dead_reckoning(run_batch(NOMINAL, route, 1, np.random.default_rng(0)), kr, kl)
+
+
+def dead_reckoning(batch: BatchRuns, kr: float, kl: float) -> Estimate:
+    """Odometry from the origin over the first run, with the nominal geometry."""
+    geometry = RobotGeometry(NOMINAL.wheel_radius_m, NOMINAL.track_m)
+    wheels = WheelLog(batch.stamps, batch.encoder_m[0])
+    recording = Recording(batch.stamps, wheels, geometry, SensorSuite())
+    prior = Prior(geometry, SensorSuite(), np.zeros(3), np.zeros((3, 3)))
+    return run_estimator(Odometry(kr, kl), recording, prior, np.random.default_rng(0))
 
 
 def areas() -> pd.DataFrame:
     """Area of the 95 % ellipse against the distance rolled, on each loop and each k."""
     parts = []
-    for k in (1e-5, 1e-4):
-        for name, route in LOOPS.items():
-            stamps, means, covariances = ideal_beliefs(route, k, k)
-            rolled = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(means[:, :2], axis=0).T))])
-            columns = {"distance_m": rolled, "area_m2": ellipse_area_m2(covariances)}
-            parts.append(pd.DataFrame({"manoeuvre": name, "k_m": k, "stamp_s": stamps, **columns}))
+    for k, (name, route) in itertools.product(AREA_K_M, LOOPS.items()):
+        promised = ideal(route, k, k)
+        steps = np.hypot(*np.diff(promised.means[:, :2], axis=0).T)
+        rolled = np.concatenate([[0.0], np.cumsum(steps)])
+        columns = {"distance_m": rolled, "area_m2": ellipse_area_m2(promised.covariances)}
+        labels = {"manoeuvre": name, "k_m": k, "stamp_s": promised.stamps}
+        parts.append(pd.DataFrame(labels | columns))
     return pd.concat(parts, ignore_index=True)
 
 
-def crossover(n_runs: int) -> pd.DataFrame:
+def crossover(*overrides: str) -> pd.DataFrame:
     """Distance at which the heading-borne spread overtakes the translation-borne one.
 
     On a straight along x the filter's variance along x is borne by translation and the one along
     y by heading. The wheels' readings are noisy, so each run gives its own distance.
     """
-    k = 1e-5
-    route, robot = OpenLoop(((0.25, 0.0, 2.0),)), dataclasses.replace(NOMINAL, kr=k, kl=k)
     rows = []
-    for run_number in range(n_runs):
-        rng = stream(JUDGED_SEED + run_number, "slip")
-        batch = run_batch(robot, route, 1, rng, sample_s=FRAME_S)
-        estimator = Odometry(k, k)
-        geometry = RobotGeometry(NOMINAL.wheel_radius_m, NOMINAL.track_m)
-        prior = Prior(geometry, SensorSuite(), np.zeros(3), np.zeros((3, 3)))
-        estimator.reset(prior, rng)
-        increments = np.diff(batch.encoder_m[0], axis=0)
-        beliefs = [
-            estimator.step(Frame(float(t), float(dt), step))
-            for t, dt, step in zip(batch.stamps[1:], np.diff(batch.stamps), increments, strict=True)
-        ]
-        sigma = np.array([belief.covariance for belief in beliefs])
-        heading = np.array([belief.mean[2] for belief in beliefs])
+    for experiment in planned(["+study=puzzlebot2024_crossover", *overrides]):
+        robot = experiment.robot()
+        batch = run_batch(robot, experiment.route(), 1, stream(experiment.seed, "slip"))
+        believed = dead_reckoning(batch, robot.kr, robot.kl)
+        heading = believed.means[1:, 2]
+        ahead = np.stack([np.cos(heading), np.sin(heading)], axis=1)
+        left = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
+        sigma = believed.covariances[1:, :2, :2]
+        along, across = (np.einsum("ti,tij,tj->t", u, sigma, u) for u in (ahead, left))
         distance = batch.encoder_m[0, 1:].mean(axis=1)
-        along, across = _along_and_across(sigma, heading)
-        crossed = int(np.argmax(across > along))
-        ratio = np.log(across[crossed - 1 : crossed + 1] / along[crossed - 1 : crossed + 1])
-        share = -ratio[0] / (ratio[1] - ratio[0])
-        at = distance[crossed - 1] + share * (distance[crossed] - distance[crossed - 1])
-        rows.append({"seed": JUDGED_SEED + run_number, "crossover_m": float(at)})
+        rows.append({"seed": experiment.seed, "crossover_m": _crossing(distance, across / along)})
     return pd.DataFrame(rows)
 
 
-def _along_and_across(covariances: Array, heading: Array) -> tuple[Array, Array]:
-    """Variances along and across the heading, m^2."""
-    cos, sin = np.cos(heading), np.sin(heading)
-    xx, yy, xy = covariances[:, 0, 0], covariances[:, 1, 1], covariances[:, 0, 1]
-    along = cos**2 * xx + sin**2 * yy + 2 * cos * sin * xy
-    across = sin**2 * xx + cos**2 * yy - 2 * cos * sin * xy
-    return along, across
+def _crossing(distance: Array, ratio: Array) -> float:
+    """Distance at which a ratio first passes one, interpolated in its logarithm."""
+    crossed = int(np.argmax(ratio > 1.0))
+    around = slice(crossed - 1, crossed + 1)
+    return float(np.interp(0.0, np.log(ratio[around]), distance[around]))
 
 
-def calibrate_once(k: float, seed: int, *, geometry: bool) -> list[CalibrationResult]:
-    """Calibrate by all methods on one set of runs: the nine cases, 20 times each."""
-    rng = stream(seed, "slip")
-    robot = slipping(k, geometry=geometry)
-    batches = {
-        name: run_batch(robot, route, RUNS_PER_CASE, rng, nominal_track_m=NOMINAL.track_m)
-        for name, route in TABLE_1.items()
+def square() -> dict[str, NDArray[np.float32]]:
+    """Paths (2, n, T, 2) of real robots around the square, and the ideal one's ellipses."""
+    robots = arms("square")
+    route = robots[0].routes["open_loop"]
+    real = [
+        run_batch(a.robot, route, SQUARE_RUNS, stream(a.seed, "slip"), sample_s=0.1).poses
+        for a in robots
+    ]
+    promised = [ideal(route, a.robot.kr, a.robot.kl) for a in robots]
+    drawn = {
+        "kr_kl_m": [a.robot.slip_variance_per_m for a in robots],
+        "real_m": np.array(real)[..., :2],
+        "ideal_m": promised[0].means[:, :2],
+        "covariances_m2": [p.covariances[:, :2, :2] for p in promised],
     }
-    encoder, ground, turns = (
-        np.concatenate([np.diff(getattr(b, n), axis=1).reshape(-1, 2) for b in batches.values()])
-        if n != "poses"
-        else np.concatenate([np.diff(b.poses[..., 2], axis=1).ravel() for b in batches.values()])
-        for n in ("encoder_m", "ground_m", "poses")
-    )
+    return {name: np.asarray(values, np.float32) for name, values in drawn.items()}
+
+
+def straight() -> dict[str, Array]:
+    """Standard deviations (T, 2) along and across the way of the crossover, m."""
+    experiment = Experiment.compose(["study=puzzlebot2024_crossover"])
+    promised = ideal(experiment.route(), experiment.robot().kr, experiment.robot().kl)
+    variances = np.diagonal(promised.covariances, axis1=1, axis2=2)[:, :2]
+    return {"distance_m": promised.means[:, 0], "sigma_m": np.sqrt(variances)}
+
+
+def calibrate_once(arm: Arm) -> list[CalibrationResult]:
+    """Calibrate by all methods on one set of runs: each manoeuvre 20 times."""
+    rng, draws = stream(arm.seed, "slip"), stream(arm.seed, "samples")
+    batches = {
+        name: run_batch(arm.robot, route, CALIBRATION_RUNS, rng, nominal_track_m=NOMINAL.track_m)
+        for name, route in arm.routes.items()
+    }
     manoeuvres = [
-        Manoeuvre.of_route(TABLE_1[name], NOMINAL, batch.end_poses)
-        for name, batch in batches.items()
+        Manoeuvre.of_route(route, NOMINAL, batches[name].end_poses)
+        for name, route in arm.routes.items()
     ]
-    results = [from_wheel_truth(encoder, ground, turns, interval_s=0.05, geometry=geometry)]
-    draws = stream(seed, "samples")
-    for method in ("sampled", "linearised"):
-        results.append(from_end_poses(manoeuvres, NOMINAL, draws, method=method, geometry=geometry))
-    return results
+    return [
+        from_batches(list(batches.values()), geometry=arm.joint),
+        from_end_poses(manoeuvres, NOMINAL, draws, method="sampled", geometry=arm.joint),
+        from_end_poses(manoeuvres, NOMINAL, draws, method="linearised", geometry=arm.joint),
+    ]
 
 
-def calibration(n_repetitions: int, on_progress: Callable[[float], None]) -> pd.DataFrame:
-    """Repeat the calibration at each k, without and with gain and track errors, on both cores."""
-    from joblib import Parallel, delayed
+def from_batches(batches: list[BatchRuns], *, geometry: bool) -> CalibrationResult:
+    """Calibrate by the wheel truth of many runs."""
+    encoder = np.concatenate([np.diff(b.encoder_m, axis=1).reshape(-1, 2) for b in batches])
+    ground = np.concatenate([np.diff(b.ground_m, axis=1).reshape(-1, 2) for b in batches])
+    turns = np.concatenate([np.diff(b.poses[..., 2], axis=1).ravel() for b in batches])
+    return from_wheel_truth(encoder, ground, turns, interval_s=0.05, geometry=geometry)
 
-    jobs = [
-        (k, geometry, JUDGED_SEED + repetition)
+
+def calibration(
+    robots: list[Arm], n_repetitions: int, on_progress: Callable[[float], None]
+) -> pd.DataFrame:
+    """Repeat the calibration of each robot, on all cores."""
+    repeated = [
+        dataclasses.replace(arm, seed=arm.seed + repetition)
         for repetition in range(n_repetitions)
-        for geometry in (False, True)
-        for k in CALIBRATION_KS
+        for arm in robots
     ]
-    calls = (delayed(_calibration_rows)(*job) for job in jobs)
-    rows: list[dict[str, object]] = []
-    for done, part in enumerate(Parallel(n_jobs=-1, return_as="generator")(calls), start=1):
+    calls = (joblib.delayed(_calibration_rows)(arm) for arm in repeated)
+    rows: list[Row] = []
+    for done, part in enumerate(joblib.Parallel(n_jobs=-1, return_as="generator")(calls), start=1):
         rows += part
-        on_progress(done / len(jobs))
+        on_progress(done / len(repeated))
     return pd.DataFrame(rows)
 
 
-def _calibration_rows(k: float, geometry: bool, seed: int) -> list[dict[str, object]]:
-    robot = slipping(k, geometry=geometry)
-    rows: list[dict[str, object]] = []
-    for result in calibrate_once(k, seed, geometry=geometry):
-        for name in ("kr", "kl", "bias_right", "bias_left", "track_m"):
-            measured = getattr(result, name)
-            if measured is None:
-                continue
-            rows.append(
-                {
-                    "k_m": k,
-                    "joint": geometry,
-                    "seed": seed,
-                    "method": result.method,
-                    "parameter": name,
-                    "truth": getattr(robot, name),
-                    "value": measured.value,
-                    "low": measured.low,
-                    "high": measured.high,
-                }
-            )
-    return rows
+def _calibration_rows(arm: Arm) -> list[Row]:
+    labels: Row = {"k_m": arm.k_m, "joint": arm.joint, "seed": arm.seed}
+    return [
+        labels
+        | {"method": result.method, "parameter": name, "truth": getattr(arm.robot, name)}
+        | dataclasses.asdict(interval)
+        for result in calibrate_once(arm)
+        for name, interval in result.found.items()
+    ]
 
 
-def table_1(k: float = 1e-4, seed: int = JUDGED_SEED) -> pd.DataFrame:
+def table_1(arm: Arm) -> pd.DataFrame:
     """Table 1: what each case promises, where the robot ends, and kr, kl from that case alone."""
-    rng, robot = stream(seed, "slip"), slipping(k)
+    rng = stream(arm.seed, "slip")
     rows = []
-    for name, route in TABLE_1.items():
-        batch = run_batch(robot, route, RUNS_PER_CASE, rng)
+    for name, route in arm.routes.items():
+        batch = run_batch(arm.robot, route, CALIBRATION_RUNS, rng)
+        found = from_batches([batch], geometry=False)
         v, omega, duration = route.segments[0]
-        encoder = np.diff(batch.encoder_m, axis=1).reshape(-1, 2)
-        ground = np.diff(batch.ground_m, axis=1).reshape(-1, 2)
-        found = from_wheel_truth(encoder, ground, interval_s=0.05, geometry=False)
-        ideal, real = route.ideal_end(), batch.end_poses
+        promised, mean = route.ideal_end(), batch.end_poses.mean(axis=0)
+        spread = batch.end_poses.std(axis=0, ddof=1)
         rows.append(
             {
                 "case": name,
                 "v_mps": v,
                 "omega_radps": omega,
                 "duration_s": duration,
-                "ideal_x_m": ideal[0],
-                "ideal_heading_rad": ideal[2],
-                "real_x_mean_m": real[:, 0].mean(),
-                "real_x_sd_m": real[:, 0].std(ddof=1),
-                "real_y_sd_m": real[:, 1].std(ddof=1),
-                "real_heading_mean_rad": real[:, 2].mean(),
-                "real_heading_sd_rad": real[:, 2].std(ddof=1),
+                "ideal_x_m": promised[0],
+                "ideal_heading_rad": promised[2],
+                "real_x_mean_m": mean[0],
+                "real_x_sd_m": spread[0],
+                "real_y_sd_m": spread[1],
+                "real_heading_mean_rad": mean[2],
+                "real_heading_sd_rad": spread[2],
                 "kr_m": found.kr.value,
                 "kr_low_m": found.kr.low,
                 "kr_high_m": found.kr.high,
@@ -285,135 +287,80 @@ def table_1(k: float = 1e-4, seed: int = JUDGED_SEED) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def coverage(n_runs: int) -> pd.DataFrame:
+def coverage(robots: list[Arm], n_runs: int) -> pd.DataFrame:
     """Count true end positions in the ideal robot's 95 % ellipse, and poses in its ellipsoid."""
-    rows = []
-    for k in COVERAGE_KS:
-        robot = slipping(k)
-        for name, route in TABLE_1.items():
-            rng = stream(JUDGED_SEED, f"slip/{name}/{k:g}")
-            ends = run_batch(robot, route, n_runs, rng, sample_s=1.0).end_poses
-            rows.append({"case": name, "k_m": k, **_inside(ends, route, robot)})
-    return pd.DataFrame(rows)
-
-
-def _inside(ends: Array, route: OpenLoop, robot: DifferentialDrive) -> dict[str, int]:
-    """Number of runs, and of those within the ellipse and the ellipsoid."""
-    _, _, covariances = ideal_beliefs(route, robot.kr, robot.kl)
-    error, covariance = ends - route.ideal_end(), covariances[-1]
-    flat = np.linalg.solve(covariance[:2, :2], error[:, :2].T).T
-    ellipse = np.sum(error[:, :2] * flat, axis=1) <= CHI2_95_2DOF
-    pose = np.linalg.solve(covariance, error.T).T
-    ellipsoid = np.sum(error * pose, axis=1) <= CHI2_95_3DOF
-    return {
-        "runs": len(ends),
-        "in_ellipse": int(ellipse.sum()),
-        "in_ellipsoid": int(ellipsoid.sum()),
-    }
-
-
-ENGINE_K = 1e-4
-Driven = dict[tuple[str, str], list[Recording]]
-
-
-def engine_recordings(n_runs: int) -> Driven:
-    """Recordings of some cases by (case, physics), with the same noise in either physics."""
-    from sim.simulate import record
-    from sim.world import World
-
-    floor = World("open floor", np.zeros((0, 4)), np.zeros((0, 2)))
-    robot = slipping(ENGINE_K)
-    return {
-        (case, physics): [
-            record(
-                floor,
-                robot,
-                SensorSuite(Encoder(50.0)),
-                TABLE_1[case],
-                {axis: stream(JUDGED_SEED + number, axis, i) for axis in ("slip", "sensors")},
-                physics=physics,
-                rays="exact",
-            )
-            for number in range(n_runs)
-        ]
-        for i, case in enumerate(("linear_1", "linear_3", "angular_1", "angular_5"))
-        for physics in _PHYSICS
-    }
-
-
-def engine_ends(driven: Driven) -> pd.DataFrame:
-    """End poses of PyBullet's robot beside the kinematic one's, per case and seed."""
-    rows = []
-    for case in dict.fromkeys(case for case, _ in driven):
-        for number in range(len(driven[case, "bullet"])):
-            row: dict[str, object] = {"case": case, "seed": JUDGED_SEED + number}
-            for physics in _PHYSICS:
-                x, y, heading = end_pose(driven[case, physics][number])
-                row |= {
-                    f"{physics}_x_m": x,
-                    f"{physics}_y_m": y,
-                    f"{physics}_heading_rad": heading,
+    rows: list[Row] = []
+    for arm in robots:
+        for name, route in arm.routes.items():
+            rng = stream(arm.seed, f"slip/{name}/{arm.k_m:g}")
+            ends = run_batch(arm.robot, route, n_runs, rng, sample_s=1.0).end_poses
+            covariance = ideal(route, arm.robot.kr, arm.robot.kl).covariances[-1]
+            error = ends - route.ideal_end()
+            rows.append(
+                {
+                    "case": name,
+                    "k_m": arm.k_m,
+                    "runs": n_runs,
+                    "in_ellipse": _inside(error[:, :2], covariance[:2, :2]),
+                    "in_ellipsoid": _inside(error, covariance),
                 }
-            rows.append(row)
+            )
     return pd.DataFrame(rows)
 
 
-def engine_k(driven: Driven) -> pd.DataFrame:
+def _inside(error: Array, covariance: Array) -> int:
+    """How many errors (n, D) lie in the 95 % ellipsoid of a covariance (D, D)."""
+    squares = np.sum(error * np.linalg.solve(covariance, error.T).T, axis=1)
+    return int(np.sum(squares <= stats.chi2.ppf(0.95, error.shape[1])))
+
+
+@dataclass(frozen=True)
+class Drive:
+    """One manoeuvre driven by both robots with the same noise."""
+
+    case: str
+    seed: int
+    bullet: Recording
+    kinematic: Recording
+
+
+def engine_recordings(*overrides: str) -> list[Drive]:
+    """Drive some manoeuvres by PyBullet's robot and by the kinematic one."""
+    study = ["+study=puzzlebot2024_engine", *overrides]
+    bullet, kinematic = (
+        list(planned([*study, f"simulation.physics={physics}"]))
+        for physics in ("bullet", "kinematic")
+    )
+    cases = list(dict.fromkeys(run.choices["route"] for run in bullet))
+    driven = []
+    for pair in zip(bullet, kinematic, strict=True):
+        case, seed = pair[0].choices["route"], pair[0].seed
+        recordings = [
+            run.simulate(
+                streams={a: stream(seed, a, cases.index(case)) for a in ("slip", "sensors")}
+            )
+            for run in pair
+        ]
+        driven.append(Drive(case, seed, *recordings))
+    return driven
+
+
+def engine_ends(driven: list[Drive]) -> pd.DataFrame:
+    """End poses of PyBullet's robot beside the kinematic one's, per case and seed."""
+    names = ("x_m", "y_m", "heading_rad")
+    columns = [f"{physics}_{name}" for physics in ("bullet", "kinematic") for name in names]
+    rows = [(d.case, d.seed, *end_pose(d.bullet), *end_pose(d.kinematic)) for d in driven]
+    return pd.DataFrame(rows, columns=["case", "seed", *columns])
+
+
+def engine_k(driven: list[Drive]) -> pd.DataFrame:
     """Recover kr and kl from the wheels of PyBullet's robot."""
-    runs = [run for (_, physics), part in driven.items() if physics == "bullet" for run in part]
-    found, robot = calibrate_recordings(runs, geometry=False, interval_s=0.02), slipping(ENGINE_K)
+    runs = [drive.bullet for drive in driven]
+    found = calibrate_recordings(runs, geometry=False, interval_s=0.02)
+    robot = Experiment.compose(["study=puzzlebot2024_engine"]).robot()
     rows = [
-        {
-            "k_m": ENGINE_K,
-            "parameter": name,
-            "truth": getattr(robot, name),
-            **dataclasses.asdict(getattr(found, name)),
-        }
-        for name in ("kr", "kl")
+        {"k_m": 2.0 * robot.kl, "parameter": name, "truth": getattr(robot, name)}
+        | dataclasses.asdict(interval)
+        for name, interval in found.found.items()
     ]
     return pd.DataFrame(rows)
-
-
-def gradient_descent() -> pd.DataFrame:
-    """Run the report's own procedure on its example data and on others: it goes to 1/2."""
-    cases = {
-        "report, kl: 2.445 to 2.347 m in 5 s": (2.445330811, 2.34674, 5.0),
-        "report, kr: 2.312 to 1.064 rad in 3 s": (2.312493295, 1.06419, 3.0),
-        "1 to 2 m in 2 s": (1.0, 2.0, 2.0),
-        "1 to 6 m in 2 s": (1.0, 6.0, 2.0),
-    }
-    rows = []
-    for name, (ideal, real, time_s) in cases.items():
-        after_100 = report_gradient_descent(ideal, real, time_s)
-        rate = (ideal - real) ** 2 / time_s**2
-        steps = math.ceil(30.0 / (0.08 * rate))
-        limit = report_gradient_descent(ideal, real, time_s, n_iterations=min(steps, 10**6))[-1]
-        rows.append({"data": name, "k_after_100": after_100[-1], "k_in_the_end": limit})
-    return pd.DataFrame(rows)
-
-
-def claims(tables: Tables, *, quick: bool) -> list[Claim]:
-    """Judge PB1-PB4 by the tables."""
-    from experiments.papers.puzzlebot2024.claims import pb1, pb2, pb3, pb4
-
-    judged = [
-        *pb1(),
-        *pb2(tables["areas"], tables["crossover"], NOMINAL.track_m),
-        *pb3(tables["calibration"], tables["gradient_descent"], tables["engine_k"]),
-        *pb4(tables["coverage"], tables["engine"]),
-    ]
-    command = "estima reproduce --paper puzzlebot2024" + ("" if quick else " --full")
-    return [claim.completed(study=PAPER, command=command, quick=quick) for claim in judged]
-
-
-def figures(tables: Tables) -> dict[str, Figure]:
-    """Draw all figures of the paper, by file name."""
-    from experiments.papers.puzzlebot2024 import figures as draw
-
-    return {
-        "puzzlebot2024_ideal_and_real": draw.ideal_and_real(),
-        "puzzlebot2024_ellipse_area": draw.ellipse_area(tables["areas"], tables["crossover"]),
-        "puzzlebot2024_calibration": draw.calibration(tables["calibration"]),
-        "puzzlebot2024_table_1": draw.table_1(tables["table_1"]),
-        "puzzlebot2024_coverage": draw.coverage(tables["coverage"]),
-    }

@@ -1,0 +1,190 @@
+"""Where open-loop runs end if kr, kl, encoder gains and track are so and so."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.compiled import njit
+from sim.errors import InputError
+from sim.robot import SLIP_TIME_CONSTANT_S, DifferentialDrive
+from sim.route import TICK_S
+
+Array = NDArray[np.float64]
+Ticks = NDArray[np.int64]
+EndPoseMethod = Literal["sampled", "linearised"]
+
+_KNOTS = 24
+_LOG_CHART_UP_TO_RAD = 4.5  # beyond it the logarithm nears its pole at 2 pi
+
+
+class EndPoseModel:
+    """End poses of one manoeuvre as the candidates would have them.
+
+    The wheels roll between two dozen knots: what the command and the biases make them roll, less
+    sqrt(k) times the slip's Brownian motion over the travel, delayed by the lag of the wheels'
+    speed loop as in `sim.robot.Slip`. Within an interval the path is an arc.
+
+    Parameters
+    ----------
+    profile
+        (N, 2) commanded body velocities at ticks of 1/300 s, m/s and rad/s.
+    nominal
+        The robot that the commands were meant for.
+    rng
+        For the samples; unused by `linearised`.
+    """
+
+    def __init__(
+        self,
+        profile: Array,
+        nominal: DifferentialDrive,
+        rng: np.random.Generator,
+        method: EndPoseMethod,
+        n_samples: int,
+    ) -> None:
+        if method not in ("sampled", "linearised"):
+            raise InputError(f"method must be sampled or linearised, got {method!r}")
+        self._commands_m = nominal.wheel_speeds(*profile.T) * TICK_S
+        self._knots = knots(self._commands_m)
+        self._log_chart = abs(float(profile[:, 1].sum() * TICK_S)) < _LOG_CHART_UP_TO_RAD
+        self._linearised = method == "linearised"
+        if not self._linearised:
+            self._noise = _slip_paths(self._commands_m, self._knots, n_samples, rng)
+
+    def coordinates(self, poses: Array) -> Array:
+        """Coordinates (n, 3) of end poses (n, 3)."""
+        return poses if self._linearised else _charted(poses, self._log_chart)
+
+    def moments(self, k: Array, bias: Array, track_m: float) -> tuple[Array, Array]:
+        """Mean (3,) and covariance (3, 3) of the coordinates."""
+        travel = _mean_travel(self._commands_m, self._knots, bias, TICK_S / SLIP_TIME_CONSTANT_S)
+        if self._linearised:
+            return _linearised_moments(travel, k, track_m)
+        scale = np.sqrt(k) * (1.0 + bias) ** -1.5
+        return _sampled_moments(travel, self._noise, scale, track_m, self._log_chart)
+
+
+def knots(commands_m: Array) -> Ticks:
+    """Ticks (S + 1,) that cut the run: evenly, and where the robot comes to rest between moves."""
+    speed = np.abs(commands_m).max(axis=1)
+    # a rounded plateau is no turning point: a minimum must lie below its surroundings clearly
+    change = np.diff(speed) / max(float(speed.max()), 1e-12)
+    turning_points = np.flatnonzero((change[:-1] <= 0.0) & (change[1:] > 1e-6)) + 1
+    even = np.linspace(0, len(commands_m), _KNOTS + 1).round().astype(np.int64)
+    return np.unique(np.concatenate([even, turning_points]))
+
+
+def _slip_paths(commands_m: Array, knots: Ticks, n_samples: int, rng: np.random.Generator) -> Array:
+    """Slip (n, S, 2) of the ground travel between knots for k = 1, in m^(1/2).
+
+    The encoder error of a tick, of variance |ds|, reaches the ground through the lag: by tick n
+    the share 1 - (1 - a)^(n - m) of the error of tick m has. So the increments are normal with a
+    covariance known beforehand. The samples come in antithetic pairs and are whitened: their
+    first two moments are exact, and the sampling error is left to the arcs' curvature alone.
+    """
+    n_intervals = len(knots) - 1
+    half = max(n_samples // 2, 2 * n_intervals + 2)
+    z = rng.standard_normal((half, 2 * n_intervals))
+    z = np.linalg.solve(np.linalg.cholesky(z.T @ z / half), z.T).T
+    z = np.concatenate([z, -z]).reshape(2 * half, n_intervals, 2)
+    ticks = np.arange(len(commands_m))
+    keep = 1.0 - TICK_S / SLIP_TIME_CONSTANT_S
+    settled = 1.0 - keep ** np.maximum(knots[:, None] - 1 - ticks[None, :], 0)
+    response = np.diff(settled, axis=0)  # (S, N): what tick m's error moves in each interval
+    paths = np.empty_like(z)
+    for i in (0, 1):
+        covariance = (response * np.abs(commands_m[:, i])) @ response.T
+        values, vectors = np.linalg.eigh(covariance)
+        paths[:, :, i] = z[:, :, i] @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
+    return paths
+
+
+@njit()
+def _mean_travel(commands_m: Array, knots: Ticks, bias: Array, lag_share: float) -> Array:
+    """Ground travel (S, 2) between knots without noise, through the lag of `sim.robot.Slip`."""
+    travel = np.zeros((len(knots) - 1, 2))
+    for i in range(2):
+        lag = 0.0
+        for s in range(len(knots) - 1):
+            for tick in range(knots[s], knots[s + 1]):
+                rolling = commands_m[tick, i] - lag
+                lag += lag_share * (bias[i] * rolling - lag)
+                travel[s, i] += rolling
+    return travel
+
+
+@njit()
+def _linearised_moments(travel: Array, k: Array, track_m: float) -> tuple[Array, Array]:
+    """Pose (3,) and analytic covariance (3, 3) after wheel travels (S, 2).
+
+    puzzlebot2024, eq. (2), with the second form of eq. (6), its last row's sign settled.
+    """
+    n_intervals = len(travel)
+    pose = np.zeros(3)
+    ends = np.empty((n_intervals, 2))
+    by_wheels = np.empty((n_intervals, 3, 2))
+    for s in range(n_intervals):
+        forward = (travel[s, 0] + travel[s, 1]) / 2.0
+        half = (travel[s, 0] - travel[s, 1]) / (2.0 * track_m)
+        cos, sin = np.cos(pose[2] + half), np.sin(pose[2] + half)
+        for w in range(2):
+            swing = (0.5 - w) * forward / track_m
+            by_wheels[s, 0, w] = cos / 2.0 - swing * sin
+            by_wheels[s, 1, w] = sin / 2.0 + swing * cos
+            by_wheels[s, 2, w] = (1.0 - 2.0 * w) / track_m
+        chord = forward * (1.0 - half**2 / 6.0 + half**4 / 120.0)
+        pose += np.array([chord * cos, chord * sin, 2.0 * half])
+        ends[s] = pose[:2]
+    covariance = np.zeros((3, 3))
+    for s in range(n_intervals):
+        for w in range(2):
+            column = by_wheels[s, :, w].copy()
+            # a turn swings all that follows about the interval's end
+            column[0] -= (pose[1] - ends[s, 1]) * by_wheels[s, 2, w]
+            column[1] += (pose[0] - ends[s, 0]) * by_wheels[s, 2, w]
+            covariance += k[w] * abs(travel[s, w]) * np.outer(column, column)
+    return pose, covariance
+
+
+@njit()
+def _charted(poses: Array, log_chart: bool) -> Array:
+    """Coordinates (n, 3) in which end poses (n, 3) are nearly normal.
+
+    The position is turned back by half the heading, so the crescent of a straight run becomes a
+    blob; the logarithm also divides by the chord's shortening, which makes it exact for a steady
+    slip but has a pole at 2 pi.
+    """
+    charted = np.empty_like(poses)
+    for n, (x, y, heading) in enumerate(poses):
+        half = heading / 2.0
+        cos, sin = np.cos(half), np.sin(half)
+        stretch = half / sin if log_chart and abs(half) > 1e-4 else 1.0
+        charted[n] = stretch * (cos * x + sin * y), stretch * (cos * y - sin * x), heading
+    return charted
+
+
+@njit(fastmath=True)
+def _sampled_moments(
+    travel: Array, noise: Array, scale: Array, track_m: float, log_chart: bool
+) -> tuple[Array, Array]:
+    """Mean (3,) and covariance (3, 3) of the coordinates of simulated end poses."""
+    n_samples, n_intervals = noise.shape[0], noise.shape[1]
+    ends = np.empty((n_samples, 3))
+    for n in range(n_samples):
+        x, y, heading = 0.0, 0.0, 0.0
+        for s in range(n_intervals):
+            right = travel[s, 0] - scale[0] * noise[n, s, 0]
+            left = travel[s, 1] - scale[1] * noise[n, s, 1]
+            half = (right - left) / (2.0 * track_m)
+            chord = 0.5 * (right + left) * (1.0 - half**2 / 6.0 + half**4 / 120.0)
+            x += chord * np.cos(heading + half)
+            y += chord * np.sin(heading + half)
+            heading += 2.0 * half
+        ends[n] = x, y, heading
+    charted = _charted(ends, log_chart)
+    mean = charted.sum(axis=0) / n_samples
+    off = charted - mean
+    return mean, off.T @ off / n_samples

@@ -1,0 +1,31 @@
+"""Constants of the studies of puzzlebot2024 that are no configuration of a run."""
+
+from __future__ import annotations
+
+import math
+
+from experiments.evaluation.verdict import Profile
+from sim.robot import DifferentialDrive
+from sim.route import OpenLoop
+
+NOMINAL = DifferentialDrive(wheel_radius_m=0.05, track_m=0.19)  # conf/robot/puzzlebot, no slip
+CALIBRATIONS = {Profile.QUICK: 5, Profile.FULL: 200}  # of each robot, from its seed on
+COVERAGE_RUNS = {Profile.QUICK: 400, Profile.FULL: 10_000}
+ENGINE_OVERRIDES = {Profile.QUICK: ["seed=range(1000,1004)"], Profile.FULL: []}
+CALIBRATION_RUNS = 20  # repetitions of each of the nine manoeuvres in one calibration
+SQUARE_RUNS = 40
+TABLE_1_K_M = 1e-4
+AREA_K_M = (1e-5, 1e-4)
+LOOPS = {
+    "straight": OpenLoop(((0.5, 0.0, 6.0),)),
+    "arc": OpenLoop(((0.5, 0.4, 6.0),)),
+    "arc of one turn and a half": OpenLoop(((0.5, 1.5 * math.pi / 3.0, 6.0),)),
+    "out and back": OpenLoop(((0.5, 0.0, 3.0), (-0.5, 0.0, 3.0))),
+}
+# The report's two examples and two of ours: ideal and real end, m or rad, and time, s
+DESCENTS = {
+    "report, kl: 2.445 to 2.347 m in 5 s": (2.445330811, 2.34674, 5.0),
+    "report, kr: 2.312 to 1.064 rad in 3 s": (2.312493295, 1.06419, 3.0),
+    "1 to 2 m in 2 s": (1.0, 2.0, 2.0),
+    "1 to 6 m in 2 s": (1.0, 6.0, 2.0),
+}
