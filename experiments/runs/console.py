@@ -1,4 +1,4 @@
-"""What people see in the terminal: progress, and a word when something is compiled."""
+"""What people see in the terminal: progress, and the one line that ends a failed command."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import sys
 import textwrap
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, NoReturn
 
@@ -22,60 +22,89 @@ class RunFailedError(Exception):
 
 
 @contextmanager
-def progress(label: str, total: float | None = None) -> Iterator[Callable[[float], None]]:
-    """Give a function that takes the amount done; it shows a bar, or lines where there is none.
+def progress(
+    label: str, total: float | None = None, unit: str = "", *, summary: bool = False
+) -> Iterator[Progress]:
+    """Give a function that takes the amount done, and how much of it failed.
 
-    Nothing is shown for the first two seconds.
+    It shows a bar on a terminal, and a line now and then elsewhere. Nothing is shown for the first
+    two seconds.
+
+    Parameters
+    ----------
+    total
+        The amount when all is done; None if nobody knows.
+    unit
+        What is counted, such as runs; then their rate is shown too.
+    summary
+        Leave the last state as a line, even if all took less than two seconds.
     """
-    shown = _Progress(label, total)
+    shown = Progress(label, total, unit)
     try:
-        yield shown.update
+        yield shown
     finally:
-        shown.stop()
+        shown.stop(summary)
 
 
-class _Progress:
+class Progress:
     """A bar on a terminal, a line now and then elsewhere."""
 
-    def __init__(self, label: str, total: float | None) -> None:
-        self._label, self._total = label, total
+    def __init__(self, label: str, total: float | None, unit: str) -> None:
+        self._label, self._total, self._unit = label, total, unit
         self._begun = time.monotonic()
         self._next_line = self._begun + _QUIET_S
+        self._line = self._printed = ""
         self._bar: Any = None
 
-    def update(self, done: float) -> None:
+    def __call__(self, done: float, failed: int = 0) -> None:
+        """Show that so much is done, and how much of it failed."""
         now = time.monotonic()
-        if now - self._begun < _QUIET_S:
+        self._line = self._state(done, failed, now - self._begun)
+        if now < self._next_line:
             return
         if sys.stderr.isatty():
             self._draw(done)
-        elif now >= self._next_line:
+        else:
             self._next_line = now + _LINE_EVERY_S
-            share = f" of {self._total:g}" if self._total else ""
-            print(
-                f"{self._label}: {done:.3g}{share} after {now - self._begun:.0f} s", file=sys.stderr
-            )
+            self._print()
 
-    def stop(self) -> None:
+    def stop(self, summary: bool = False) -> None:
+        """Remove the bar; leave the last state as a line if it is wanted."""
         if self._bar is not None:
             self._bar.stop()
+        if summary and self._line != self._printed:
+            self._print()
+
+    def _state(self, done: float, failed: int, spent_s: float) -> str:
+        amount = f"{done:.3g}" if isinstance(done, float) else str(done)
+        parts = [f"{amount} of {self._total:g}" if self._total else amount]
+        if self._unit:
+            parts[0] += f" {self._unit}"
+            parts.append(f"{done / max(spent_s, 1e-9):.2g} a second")
+        else:
+            parts[0] += f" after {spent_s:.0f} s"
+        if self._total and 0 < done < self._total:
+            left_s = (self._total - done) * spent_s / done
+            parts.append(f"{left_s / 60:.0f} min left" if left_s > 90 else f"{left_s:.0f} s left")
+        if failed:
+            parts.append(f"{failed} failed")
+        return ": ".join(filter(None, [self._label, ", ".join(parts)]))
+
+    def _print(self) -> None:
+        print(self._line, file=sys.stderr, flush=True)
+        self._printed = self._line
 
     def _draw(self, done: float) -> None:
         if self._bar is None:
             from rich.console import Console
-            from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+            from rich.progress import BarColumn, TextColumn
+            from rich.progress import Progress as Bar
 
-            self._bar = Progress(
-                TextColumn(self._label),
-                BarColumn(),
-                TextColumn("{task.completed:.3g}" + (" of {task.total:g}" if self._total else "")),
-                TimeRemainingColumn(),
-                console=Console(stderr=True),
-                transient=True,
-            )
+            columns = (BarColumn(20), TextColumn("{task.description}", markup=False))
+            self._bar = Bar(*columns, console=Console(stderr=True), transient=True)
+            self._task = self._bar.add_task("", total=self._total)
             self._bar.start()
-            self._task = self._bar.add_task(self._label, total=self._total)
-        self._bar.update(self._task, completed=done)
+        self._bar.update(self._task, completed=done, description=self._line)
 
 
 def end(error: BaseException) -> NoReturn:
