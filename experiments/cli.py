@@ -406,7 +406,7 @@ def table(
 
     Example: estima table leaderboard --against smoother
     """
-    from experiments.runs.columns import heading
+    from experiments.runs.columns import title
     from experiments.runs.row import write_frame
     from experiments.sweeps.collect import collect, summary, where
 
@@ -414,7 +414,7 @@ def table(
     if out is None or means:
         rows = summary(rows, against)
     if out is None:
-        shown = rows.rename(columns=heading)
+        shown = rows.rename(columns=lambda column: title(column, short=True))
         print(shown.to_string(index=False, na_rep="-", float_format=lambda v: f"{v:.4g}"))
         return
     write_frame(rows, out)

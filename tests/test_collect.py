@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 from experiments.report.plot import sweep_figure
-from experiments.runs.columns import COLUMNS, ORIGIN, REPEAT, STATUS, is_setting
+from experiments.runs.columns import COLUMNS, ORIGIN, REPEAT, STATUS, is_setting, title
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from experiments.sweeps.collect import collect, measured, summary, swept, telling, where
@@ -143,7 +143,8 @@ def test_columns_say_their_unit():
     for name, column in COLUMNS.items():
         unit = name.rpartition("_")[2] if column.unit else ""
         assert column.unit.replace("^", "") == unit
-        assert column.title.endswith(column.unit)
+        assert title(name).endswith(column.unit)
+    assert title("ate_rmse_m", short=True) == "ATE, m"
     page = sweep_figure(rows(), "robot.kr", "ate_rmse_m")
     assert page.axes[0].get_ylabel() == "position RMSE, m"
     assert page.axes[0].get_xlabel() == "robot.kr"

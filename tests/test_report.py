@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from html.parser import HTMLParser
 from itertools import pairwise
 
@@ -14,9 +15,8 @@ from experiments.evaluation.statistics import Interval
 from experiments.evaluation.verdict import Claim, Profile, Verdict
 from experiments.report import contents
 from experiments.report import page as report
-from experiments.report.claims import read_claims, write_claims
+from experiments.report.claims import note_provenance, read_claims, write_claims
 from experiments.report.export import to_latex, to_markdown
-from experiments.report.provenance import note_provenance
 from experiments.runs.row import write_frame
 from sim.errors import InputError
 from tests import browser
@@ -153,10 +153,20 @@ def test_origin_and_command_are_told(text):
     sections = {e.get("aria-labelledby"): e["text"] for e in Outline(text).all("section")}
     assert "<i>quick profile, 12 s" in sections["puzzlebot2024"]
     assert "<i>fast" in sections["machine"]
-    assert "JUDGED_SEED1000" in sections["puzzlebot2024"]
     assert "estima reproduce --paper gil2008" in sections["gil2008"]
     assert "world: office" in sections["decristoforis2020"]  # its study's configuration
     assert np.__version__ in sections["machine"]
+
+
+def test_constants_are_printed_as_they_are_written(results, tmp_path, monkeypatch):
+    (tmp_path / "puzzlebot2024").mkdir()
+    source = "JUDGED_SEED = 1000  # seeds below 100 are for tuning"
+    (tmp_path / "puzzlebot2024" / "settings.py").write_text(source)
+    monkeypatch.setattr(contents, "_FOLDER", tmp_path)
+    copied = shutil.copytree(results, tmp_path / "results")
+    page = Outline(report.write_report(copied).read_text())
+    sections = {e.get("aria-labelledby"): e["text"] for e in page.all("section")}
+    assert f"puzzlebot2024/settings.py{source}" in sections["puzzlebot2024"]
 
 
 def test_what_belongs_to_no_paper_comes_last_with_its_command(text):

@@ -34,16 +34,6 @@ class Column:
     scale: Literal["linear", "log"] = "log"
     better: Literal["lower", "higher"] | None = "lower"
 
-    @property
-    def title(self) -> str:
-        """Label and unit."""
-        return f"{self.label}, {self.unit}" if self.unit else self.label
-
-    @property
-    def heading(self) -> str:
-        """Symbol and unit."""
-        return f"{self.symbol}, {self.unit}" if self.unit else self.symbol
-
 
 _OF_THE_RUN = {
     "duration_s": Column("duration", "t", "s", "linear", None),
@@ -90,14 +80,13 @@ def is_setting(name: str) -> bool:
     return "." in name or name in _SETTINGS
 
 
-def title(name: str) -> str:
-    """Label and unit of a metric; any other column's own name."""
-    return COLUMNS[name].title if name in COLUMNS else name
-
-
-def heading(name: str) -> str:
-    """Symbol and unit of a metric; any other column's own name."""
-    return COLUMNS[name].heading if name in COLUMNS else name
+def title(name: str, *, short: bool = False) -> str:
+    """Label (or symbol) and unit of a metric; any other column's own name."""
+    if name not in COLUMNS:
+        return name
+    column = COLUMNS[name]
+    words = column.symbol if short else column.label
+    return f"{words}, {column.unit}" if column.unit else words
 
 
 def as_text() -> str:

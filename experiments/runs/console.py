@@ -7,7 +7,7 @@ import sys
 import textwrap
 import time
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, NoReturn
 
@@ -24,11 +24,11 @@ class RunFailedError(Exception):
 @contextmanager
 def progress(
     label: str, total: float | None = None, unit: str = "", *, summary: bool = False
-) -> Iterator[Progress]:
-    """Give a function that takes the amount done, and how much of it failed.
+) -> Iterator[Callable[..., None]]:
+    """Give a function that takes the amount done, and how many of it failed (by default none).
 
-    It shows a bar on a terminal, and a line now and then elsewhere. Nothing is shown for the first
-    two seconds.
+    It draws a bar on a terminal, and prints a line now and then elsewhere. Nothing is shown for
+    the first two seconds.
 
     Parameters
     ----------
@@ -39,72 +39,58 @@ def progress(
     summary
         Leave the last state as a line, even if all took less than two seconds.
     """
-    shown = Progress(label, total, unit)
-    try:
-        yield shown
-    finally:
-        shown.stop(summary)
+    begun = time.monotonic()
+    next_line, line, printed = begun + _QUIET_S, "", ""
+    bar = _bar(total) if sys.stderr.isatty() else None
 
-
-class Progress:
-    """A bar on a terminal, a line now and then elsewhere."""
-
-    def __init__(self, label: str, total: float | None, unit: str) -> None:
-        self._label, self._total, self._unit = label, total, unit
-        self._begun = time.monotonic()
-        self._next_line = self._begun + _QUIET_S
-        self._line = self._printed = ""
-        self._bar: Any = None
-
-    def __call__(self, done: float, failed: int = 0) -> None:
-        """Show that so much is done, and how much of it failed."""
+    def update(done: float, failed: int = 0) -> None:
+        nonlocal next_line, line, printed
         now = time.monotonic()
-        self._line = self._state(done, failed, now - self._begun)
-        if now < self._next_line:
+        line = _state(label, done, total, unit, failed, now - begun)
+        if now < next_line:
             return
-        if sys.stderr.isatty():
-            self._draw(done)
-        else:
-            self._next_line = now + _LINE_EVERY_S
-            self._print()
+        if bar is not None:
+            bar.start()
+            bar.update(bar.task_ids[0], completed=done, description=line)
+            return
+        next_line, printed = now + _LINE_EVERY_S, line
+        print(line, file=sys.stderr, flush=True)
 
-    def stop(self, summary: bool = False) -> None:
-        """Remove the bar; leave the last state as a line if it is wanted."""
-        if self._bar is not None:
-            self._bar.stop()
-        if summary and self._line != self._printed:
-            self._print()
+    try:
+        yield update
+    finally:
+        if bar is not None:
+            bar.stop()
+        if summary and line != printed:
+            print(line, file=sys.stderr, flush=True)
 
-    def _state(self, done: float, failed: int, spent_s: float) -> str:
-        amount = f"{done:.3g}" if isinstance(done, float) else str(done)
-        parts = [f"{amount} of {self._total:g}" if self._total else amount]
-        if self._unit:
-            parts[0] += f" {self._unit}"
-            parts.append(f"{done / max(spent_s, 1e-9):.2g} a second")
-        else:
-            parts[0] += f" after {spent_s:.0f} s"
-        if self._total and 0 < done < self._total:
-            left_s = (self._total - done) * spent_s / done
-            parts.append(f"{left_s / 60:.0f} min left" if left_s > 90 else f"{left_s:.0f} s left")
-        if failed:
-            parts.append(f"{failed} failed")
-        return ": ".join(filter(None, [self._label, ", ".join(parts)]))
 
-    def _print(self) -> None:
-        print(self._line, file=sys.stderr, flush=True)
-        self._printed = self._line
+def _bar(total: float | None) -> Any:
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn
 
-    def _draw(self, done: float) -> None:
-        if self._bar is None:
-            from rich.console import Console
-            from rich.progress import BarColumn, TextColumn
-            from rich.progress import Progress as Bar
+    columns = (BarColumn(20), TextColumn("{task.description}", markup=False))
+    bar = Progress(*columns, console=Console(stderr=True), transient=True)
+    bar.add_task("", total=total)
+    return bar
 
-            columns = (BarColumn(20), TextColumn("{task.description}", markup=False))
-            self._bar = Bar(*columns, console=Console(stderr=True), transient=True)
-            self._task = self._bar.add_task("", total=self._total)
-            self._bar.start()
-        self._bar.update(self._task, completed=done, description=self._line)
+
+def _state(
+    label: str, done: float, total: float | None, unit: str, failed: int, spent_s: float
+) -> str:
+    amount = f"{done:.3g}" if isinstance(done, float) else str(done)
+    parts = [f"{amount} of {total:g}" if total else amount]
+    if unit:
+        parts[0] += f" {unit}"
+        parts.append(f"{done / max(spent_s, 1e-9):.2g} a second")
+    else:
+        parts[0] += f" after {spent_s:.0f} s"
+    if total and 0 < done < total:
+        left_s = (total - done) * spent_s / done
+        parts.append(f"{left_s / 60:.0f} min left" if left_s > 90 else f"{left_s:.0f} s left")
+    if failed:
+        parts.append(f"{failed} failed")
+    return ": ".join(filter(None, [label, ", ".join(parts)]))
 
 
 def end(error: BaseException) -> NoReturn:
