@@ -151,13 +151,32 @@ def convert(
 
 
 @app.command()
-def options() -> None:
-    """List the configuration groups and their options."""
-    from experiments.runs.paths import CONF
+def options(
+    group: Annotated[
+        str | None, typer.Argument(help="world, robot, ..., study; or metrics.")
+    ] = None,
+) -> None:
+    """List the configuration groups and their options, or the metrics of a run.
 
-    for group in ("world", "robot", "sensors", "route", "estimator"):
-        names = sorted(path.stem for path in (CONF / group).glob("*.yaml"))
-        print(f"{group:>10}: {', '.join(names)}")
+    Examples
+    --------
+      estima options estimator
+
+      estima options metrics
+    """
+    from experiments.runs.columns import as_text
+    from experiments.runs.paths import CONF
+    from sim.errors import InputError
+
+    groups = ("world", "robot", "sensors", "route", "estimator", "study")
+    if group == "metrics":
+        print(as_text())
+        return
+    if group not in (None, *groups):
+        raise InputError(f"no group {group}; there are: {', '.join(groups)}, metrics")
+    for name in groups if group is None else (group,):
+        names = sorted(path.stem for path in (CONF / name).glob("*.yaml"))
+        print(f"{name:>10}: {', '.join(names)}")
 
 
 @app.command()
@@ -393,6 +412,7 @@ def table(
 
     Example: estima table leaderboard --against smoother
     """
+    from experiments.runs.columns import title
     from experiments.runs.row import write_frame
     from experiments.sweeps.collect import collect, summary, where
 
@@ -400,8 +420,8 @@ def table(
     if out is None or means:
         rows = summary(rows, against)
     if out is None:
-        text = rows.to_string(index=False, na_rep="-", float_format=lambda v: f"{v:.4g}")
-        print(text)
+        shown = rows.rename(columns=lambda column: title(column, short=True))
+        print(shown.to_string(index=False, na_rep="-", float_format=lambda v: f"{v:.4g}"))
         return
     write_frame(rows, out)
     print(f"{out}: {len(rows)} rows, {len(rows.columns)} columns")

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from html.parser import HTMLParser
 from itertools import pairwise
 
@@ -10,8 +11,11 @@ import pandas as pd
 import pytest
 from matplotlib.figure import Figure
 
+from experiments.evaluation.statistics import Interval
+from experiments.evaluation.verdict import Claim, Profile, Verdict
+from experiments.report import contents
 from experiments.report import page as report
-from experiments.report.claims import Claim, write
+from experiments.report.claims import note_provenance, read_claims, write_claims
 from experiments.report.export import to_latex, to_markdown
 from experiments.runs.row import write_frame
 from sim.errors import InputError
@@ -20,22 +24,29 @@ from tests import browser
 VOID = {"meta", "link", "img", "br"}
 
 
-def claim(key, verdict, statistic="a < b & c", value=0.5):
-    return Claim(key, "puzzlebot2024", statistic, value, 0.4, 0.6, "at least 0.45", verdict)
+def claim(key, verdict, statistic="a < b & c", value=0.5, reason=""):
+    found = Interval(value, 0.4, 0.6)
+    return Claim(key, statistic, found, "at least 0.45", Verdict(verdict), reason)
 
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory):
     """What studies leave: judged claims, a figure with a caption and one without, two tables."""
     folder = tmp_path_factory.mktemp("results")
-    claims = [
-        claim("PB1", "reproduced"),
-        claim("PB4", "reproduced (quick)"),
-        claim("PB4", "not reproduced; <b>at large k</b> (quick)", "the unfavourable", 0.25),
-        claim("PB4", "not reproduced (quick)", "the second of the worst"),
-        claim("ZZ9", "undecided; <b>at large</b>", "of a claim that nobody described"),
+    quick = [
+        claim("PB4", "reproduced"),
+        claim("PB4", "not_reproduced", "the unfavourable", 0.25, "<b>at large k</b>"),
+        claim("PB4", "not_reproduced", "the second of the worst"),
     ]
-    write(claims, folder / "claims.csv")
+    full = [
+        claim("PB1", "reproduced"),
+        claim("ZZ9", "undecided", "of a claim that nobody described", reason="<b>at large</b>"),
+    ]
+    path, command = folder / "claims.csv", "estima reproduce"
+    write_claims(full, path, paper="puzzlebot2024", profile=Profile.FULL, command=command)
+    one = read_claims(path)
+    write_claims(quick, path, paper="puzzlebot2024", profile=Profile.QUICK, command=command)
+    write_frame(pd.concat([one, read_claims(path)]), path)
     (folder / "figures").mkdir()
     for name in ("puzzlebot2024_coverage", "puzzlebot2024_surprise", "mcl_office_found"):
         page = Figure(figsize=(6.0, 3.0))
@@ -47,7 +58,7 @@ def results(tmp_path_factory):
     write_frame(large, folder / "tables" / "puzzlebot2024_large.csv")
     write_frame(small, folder / "tables" / "mcl_office_starts.csv")
     write_frame(small, folder / "tables" / "nobody_knows.csv")
-    report.note_provenance(folder, "puzzlebot2024", "quick", 12.3)
+    note_provenance(folder, "puzzlebot2024", "quick", 12.3)
     made = json.loads((folder / "provenance.json").read_text())
     made["puzzlebot2024"] |= {"profile": "<i>quick", "cpu": "<i>fast"}
     (folder / "provenance.json").write_text(json.dumps(made))
@@ -142,15 +153,25 @@ def test_origin_and_command_are_told(text):
     sections = {e.get("aria-labelledby"): e["text"] for e in Outline(text).all("section")}
     assert "<i>quick profile, 12 s" in sections["puzzlebot2024"]
     assert "<i>fast" in sections["machine"]
-    assert "JUDGED_SEED1000" in sections["puzzlebot2024"]
     assert "estima reproduce --paper gil2008" in sections["gil2008"]
     assert "world: office" in sections["decristoforis2020"]  # its study's configuration
     assert np.__version__ in sections["machine"]
 
 
+def test_constants_are_printed_as_they_are_written(results, tmp_path, monkeypatch):
+    (tmp_path / "puzzlebot2024").mkdir()
+    source = "JUDGED_SEED = 1000  # seeds below 100 are for tuning"
+    (tmp_path / "puzzlebot2024" / "settings.py").write_text(source)
+    monkeypatch.setattr(contents, "_FOLDER", tmp_path)
+    copied = shutil.copytree(results, tmp_path / "results")
+    page = Outline(report.write_report(copied).read_text())
+    sections = {e.get("aria-labelledby"): e["text"] for e in page.all("section")}
+    assert f"puzzlebot2024/settings.py{source}" in sections["puzzlebot2024"]
+
+
 def test_what_belongs_to_no_paper_comes_last_with_its_command(text):
     own = {e.get("aria-labelledby"): e["text"] for e in Outline(text).all("section")}["own"]
-    assert "python -m experiments.papers.mcl_office.study" in own
+    assert "estima reproduce --paper mcl_office" in own
     assert "mcl_office_starts (2 rows, 2 columns)" in own
     assert "Of no study here: nobody_knows.csv." in own
     assert text.index('id="maximo2024"') < text.index('id="mcl_office_found"')
@@ -200,9 +221,9 @@ def test_a_damaged_figure_is_named(tmp_path, results):
         report.write_report(tmp_path)
 
 
-@pytest.mark.parametrize("paper", [*report.PAPERS, *report.OWN, "real_logs"])
+@pytest.mark.parametrize("paper", [*contents.PAPERS, *contents.OWN, "real_logs"])
 def test_findings_are_complete(paper):
-    about = report.findings(paper)
+    about = contents.findings(paper)
     assert set(about) == {"title", "about", "claims", "figures"}
     for name, figure in about["figures"].items():
         assert name.startswith(f"{paper}_")
@@ -281,10 +302,10 @@ TABLE = pd.DataFrame(
 
 def test_markdown():
     assert to_markdown(TABLE).splitlines() == [
-        "| case_name | k_m | n | ok |",
-        "| --- | ---: | ---: | --- |",
-        r"| a\|b | 1e-05 | 3 | yes |",
-        "| 50 % & {x}\\\\ |  | 4 | no |",
+        r"| case_name    |   k_m |   n | ok   |",
+        r"|:-------------|------:|----:|:-----|",
+        r"| a\|b         | 1e-05 |   3 | yes  |",
+        r"| 50 % & {x}\\ |       |   4 | no   |",
     ]
 
 
@@ -305,7 +326,7 @@ def test_export_from_the_command_line(tmp_path):
 
     write_frame(TABLE[["n"]], tmp_path / "t.csv")
     done = CliRunner().invoke(app, ["export-table", str(tmp_path / "t.csv")])
-    assert done.stdout == "| n |\n| ---: |\n| 3 |\n| 4 |\n\n"
+    assert done.stdout == "|   n |\n|----:|\n|   3 |\n|   4 |\n\n"
     out = tmp_path / "exported"
     CliRunner().invoke(
         app, ["export-table", str(tmp_path / "t.csv"), "--format", "latex", "-o", str(out)]

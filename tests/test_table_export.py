@@ -1,4 +1,4 @@
-"""Exported tables hold what their files hold, and wrong ones are told in a line."""
+"""Exported tables hold what their files hold, and wrong ones end in one line."""
 
 import io
 import sys
@@ -14,16 +14,23 @@ def test_cells_are_shown_as_they_are_written(tmp_path):
     path = tmp_path / "t.csv"
     path.write_text("n,name,x,none,ok\n123456,NA,1.23456,NA,True\n,None,NA,NA,\n7,,2,NA,False\n")
     assert to_markdown(read_table(path)).splitlines()[1:] == [
-        "| ---: | --- | ---: | --- | --- |",
-        "| 123456 | NA | 1.235 | NA | yes |",
-        "|  | None |  | NA |  |",
-        "| 7 |  | 2 | NA | no |",
+        "|-------:|:-------|------:|:-------|:-----|",
+        "| 123456 | NA     | 1.235 | NA     | yes  |",
+        "|        | None   |       | NA     |      |",
+        "|      7 |        |     2 | NA     | no   |",
     ]
     pd.DataFrame({"n": pd.array([123456, None], "Int64"), "x": [1e20, None]}).to_parquet(
         tmp_path / "t.parquet"
     )
     rows = to_markdown(read_table(tmp_path / "t.parquet")).splitlines()[1:]
-    assert rows == ["| ---: | ---: |", "| 123456 | 1e+20 |", "|  |  |"]
+    assert rows == ["|-------:|------:|", "| 123456 | 1e+20 |", "|        |       |"]
+
+
+def test_metrics_are_named_with_their_unit():
+    frame = pd.DataFrame({"ate_rmse_m": [0.5], "revised_nees_mean": [3.0], "k_m": [1e-5]})
+    assert to_markdown(frame).splitlines()[0] == (
+        "|   position RMSE, m |   mean NEES (3 when consistent), revised path |   k_m |"
+    )
 
 
 def test_brackets_are_no_arguments_of_the_row_before():

@@ -5,14 +5,13 @@ from __future__ import annotations
 import dataclasses
 import io
 import json
-import os
-import platform
 import statistics
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal
+
+from experiments.runs.machine import machine
 
 
 @dataclass(frozen=True)
@@ -81,33 +80,6 @@ def median_time_s(
             times_ns.append(time.perf_counter_ns() - begun)
         rounds += 1
     return statistics.median(times_ns) * 1e-9
-
-
-def machine() -> dict[str, str | int]:
-    """Processor, core count and versions; nothing that names the computer or its user."""
-    import numba
-    import numpy as np
-
-    return {
-        "cpu": _cpu_model(),
-        "cores": os.cpu_count() or 1,
-        "system": platform.system(),
-        "architecture": platform.machine(),
-        "python": platform.python_version(),
-        "numpy": np.__version__,
-        "numba": numba.__version__,
-    }
-
-
-def _cpu_model() -> str:
-    """The processor's own name, from the kernel where it tells; else the platform's word."""
-    try:
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    except OSError:
-        pass
-    return platform.processor() or platform.machine()
 
 
 def as_json(results: list[Measurement]) -> str:

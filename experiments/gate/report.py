@@ -15,6 +15,7 @@ import pandas as pd
 from experiments.gate.baseline import accept, baseline_folder, baseline_paths, check, is_main
 from experiments.gate.compare import Finding, Verdict
 from experiments.gate.suite import ERRORS, printable
+from experiments.report.export import to_markdown
 from experiments.runs.console import progress
 from sim.errors import InputError
 from sim.files import write_whole
@@ -152,19 +153,19 @@ def as_markdown(findings: Sequence[Finding], found: Mapping[str, float] | None =
     lines = ["## estima check", "", last_line(findings), ""]
     lines += [*(f"- {sentence(f)}" for f in _told(findings)), ""]
     for baseline, rows in _tables(findings):
-        heads = [f"now / {baseline}", *(LABELS[e] for e in ERRORS), *(["finds"] if found else [])]
-        lines += [_markdown_row([*heads, "verdict"]), _markdown_row(["---"] * (len(heads) + 1))]
+        table = []
         for estimator, of_error, verdict in rows:
-            cells = [estimator, *(_ratio(of_error[error]) for error in ERRORS)]
-            cells += [_finds(found, estimator)] if found else []
             mark = f"**{verdict}**" if verdict in ("worse", "failed") else verdict
-            lines.append(_markdown_row([*cells, mark + _share(of_error)]))
-        lines.append("")
+            table.append(
+                {
+                    f"now / {baseline}": estimator,
+                    **{LABELS[error]: _ratio(of_error[error]) for error in ERRORS},
+                    **({"finds": _finds(found, estimator)} if found else {}),
+                    "verdict": mark + _share(of_error),
+                }
+            )
+        lines.append(to_markdown(pd.DataFrame(table)))
     return "\n".join(lines)
-
-
-def _markdown_row(cells: Sequence[str]) -> str:
-    return f"| {' | '.join(cells)} |"
 
 
 def as_annotations(findings: Sequence[Finding]) -> str:

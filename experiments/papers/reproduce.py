@@ -12,8 +12,13 @@ from types import ModuleType
 
 from experiments.evaluation.verdict import Claim, Profile
 from experiments.papers.results import Results
-from experiments.report.claims import read_claims, write_claims
-from experiments.report.page import note_provenance, read_provenance, write_report
+from experiments.report.claims import (
+    note_provenance,
+    read_claims,
+    read_provenance,
+    write_claims,
+)
+from experiments.report.page import write_report
 from experiments.runs.console import progress
 from experiments.runs.paths import results, short
 from experiments.viewing.style import save_figure

@@ -1,9 +1,11 @@
-"""The table of judged claims, results/claims.csv: written by the studies, read by the report."""
+"""What studies leave for the report beside tables and figures: judged claims, and their origin.
+
+The claims are the rows of results/claims.csv; results/provenance.json says how they were made.
+"""
 
 from __future__ import annotations
 
-import dataclasses
-import re
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,8 +14,11 @@ import numpy as np
 import pandas as pd
 
 from experiments.evaluation.verdict import Claim, Profile, Role, Verdict
+from experiments.runs.machine import machine
 from experiments.runs.row import read_rows, write_frame
+from experiments.runs.version import code_version
 from sim.errors import InputError
+from sim.files import write_whole
 
 _NUMBERS = ("value", "low", "high")
 _ENUMS = {"role": Role, "verdict": Verdict, "profile": Profile}
@@ -30,7 +35,15 @@ COLUMNS = (
     "study",
     "command",
 )
-_REMEDY = "`git checkout results/claims.csv`, or delete it and run `estima reproduce`"
+# What the texts must match, and what that is in words
+_TEXTS = {
+    "id": (r"\w+", "a word"),
+    "paper": (r"[a-z][a-z0-9_]*", "a paper's short name"),
+    "statistic": (r"(?s).+", "a text"),
+    **{name: ("|".join(kind), f"one of {', '.join(kind)}") for name, kind in _ENUMS.items()},
+}
+_ORIGIN = ("profile", "seconds", "code_version")
+_REMEDY = "restore it by `git checkout`, or delete it and run `estima reproduce`"
 
 
 def write_claims(
@@ -40,17 +53,8 @@ def write_claims(
 
     The statistics of a claim stay in the order given: the paper's headline first.
     """
-    rows = [
-        {
-            **dataclasses.asdict(claim),
-            **dataclasses.asdict(claim.found),
-            "paper": paper,
-            "profile": profile,
-            "study": paper,
-            "command": command,
-        }
-        for claim in claims
-    ]
+    origin = {"paper": paper, "profile": profile, "study": paper, "command": command}
+    rows = [{**vars(claim), **vars(claim.found), **origin} for claim in claims]
     new = pd.DataFrame(rows, columns=list(COLUMNS)).astype(dict.fromkeys(_ENUMS, "str"))
     if path.exists():
         old = read_claims(path)
@@ -78,26 +82,54 @@ def read_claims(path: Path) -> pd.DataFrame:
         if name not in table:
             raise InputError(f"{path}: no column {name}; {_REMEDY}")
     table["reason"] = table["reason"].fillna("")
-    for number, (_, row) in enumerate(table.iterrows(), start=2):
-        if wrong := _fault(row):
-            raise InputError(f"{path}, row {number}: {wrong}; {_REMEDY}")
+    for name in (*_TEXTS, *_NUMBERS):
+        pattern, wanted = _TEXTS.get(name, ("", "a number"))
+        if pattern:
+            good = table[name].astype("str").str.fullmatch(pattern, na=False)
+        else:
+            good = pd.to_numeric(table[name], errors="coerce").notna() | table[name].isna()
+        if not good.all():
+            row = int(np.argmin(good))
+            cell = f"{name} is {table[name].tolist()[row]!r}, not {wanted}"
+            raise InputError(f"{path}, row {row + 2}: {cell}; {_REMEDY}")
     duplicates = np.flatnonzero(table.duplicated(["paper", "id", "statistic"]))
     if len(duplicates):
         raise InputError(f"{path}, row {duplicates[0] + 2}: a duplicate; {_REMEDY}")
     return table.astype(dict.fromkeys(_NUMBERS, float))
 
 
-def _fault(row: pd.Series[Any]) -> str:
-    """What is wrong with a row of the table of claims, if anything."""
-    for name, pattern in (("id", r"\w+"), ("paper", r"[a-z][a-z0-9_]*"), ("statistic", r"(?s).+")):
-        if not re.fullmatch(pattern, str(row[name])) or pd.isna(row[name]):
-            return f"{name} is {row[name]!r}"
-    for name in _NUMBERS:
-        try:
-            float(row[name])
-        except ValueError:
-            return f"{name} is {row[name]!r}, not a number"
-    for name, kind in _ENUMS.items():
-        if row[name] not in list(kind):
-            return f"{name} is {row[name]!r}, none of {', '.join(kind)}"
-    return ""
+def note_provenance(results: Path, paper: str, profile: str, seconds: float) -> None:
+    """Keep how a paper's results were made, beside them."""
+    made = read_provenance(results)
+    made[paper] = {"profile": profile, "seconds": round(seconds), **this_code()}
+    with write_whole(results / "provenance.json") as part:
+        part.write_text(json.dumps(dict(sorted(made.items())), indent=2) + "\n")
+
+
+def this_code() -> dict[str, Any]:
+    """Version of the code, and the machine it runs on."""
+    return {"code_version": code_version(), **machine()}
+
+
+def read_provenance(results: Path) -> dict[str, dict[str, Any]]:
+    """How each paper's results were made: profile, duration, code, machine; empty if unknown.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, or a paper lacks a key.
+    """
+    path = results / "provenance.json"
+    try:
+        made: dict[str, dict[str, Any]] = json.loads(path.read_text())
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot read ({error}); {_REMEDY}") from error
+    if not isinstance(made, dict):
+        raise InputError(f"{path}: must hold an object by paper; {_REMEDY}")
+    for paper, how in made.items():
+        missing = [key for key in _ORIGIN if not isinstance(how, dict) or key not in how]
+        if missing:
+            raise InputError(f"{path}: {paper} does not say its {', '.join(missing)}; {_REMEDY}")
+    return made

@@ -5,24 +5,24 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import numpy as np
+import pandas as pd
 
+from experiments.runs.columns import title
 from experiments.runs.row import read_rows
 from sim.errors import InputError
 from sim.files import write_whole
 
-if TYPE_CHECKING:
-    import pandas as pd
-
-_LATEX = {
-    "\\": r"\textbackslash{}",
-    "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}",
-    **{character: f"\\{character}" for character in "&%$#_{}"},
-}
-_LATEX_SPECIAL = re.compile("|".join(re.escape(character) for character in _LATEX))
+_LATEX = str.maketrans(
+    {
+        "\\": r"\textbackslash{}",
+        "~": r"\textasciitilde{}",
+        "^": r"\textasciicircum{}",
+        **{character: f"\\{character}" for character in "&%$#_{}"},
+    }
+)
+_MARKDOWN = str.maketrans({"\\": r"\\", "|": r"\|"})
 
 
 def read_table(path: Path) -> pd.DataFrame:
@@ -33,8 +33,6 @@ def read_table(path: Path) -> pd.DataFrame:
     InputError
         If it is not there, or neither CSV nor Parquet.
     """
-    import pandas as pd
-
     try:
         frame = read_rows(path)
         cells = None
@@ -56,52 +54,49 @@ def read_table(path: Path) -> pd.DataFrame:
 
 def plain(value: Any, digits: int = 4) -> str:
     """A cell in words: numbers with so many significant digits, nothing where there is none."""
-    if value is None or (isinstance(value, (float, np.floating)) and np.isnan(value)):
+    if pd.isna(value):
         return ""
-    if isinstance(value, (bool, np.bool_)):
+    if isinstance(value, bool):
         return "yes" if value else "no"
-    if isinstance(value, (float, np.floating)):
-        return f"{value:.{digits}g}"
-    return str(value)
+    return f"{value:.{digits}g}" if isinstance(value, float) else str(value)
+
+
+def as_text(frame: pd.DataFrame, digits: int = 4) -> pd.DataFrame:
+    """Every cell as `plain` says it, under headings with units."""
+    cells = frame.set_axis([title(str(name)) for name in frame], axis=1).astype(object)
+    return cells.map(lambda value: " ".join(plain(value, digits).split()))
+
+
+def numeric(frame: pd.DataFrame) -> list[bool]:
+    """Whether each column holds numbers."""
+    return [dtype.kind in "iuf" for dtype in frame.dtypes]
 
 
 def to_markdown(frame: pd.DataFrame, digits: int = 4) -> str:
     """Pipe table; columns of numbers are set to the right."""
-
-    def escaped(text: str) -> str:
-        return " ".join(text.replace("\\", "\\\\").replace("|", "\\|").split())
-
-    head, rows = _cells(frame, digits, escaped)
-    rule = ["---:" if number else "---" for number in _numeric(frame)]
-    return "".join(f"| {' | '.join(row)} |\n" for row in (head, rule, *rows))
+    cells = as_text(frame, digits).map(lambda text: text.translate(_MARKDOWN))
+    table: str = cells.rename(columns=lambda name: name.translate(_MARKDOWN)).to_markdown(
+        index=False,
+        tablefmt="pipe",
+        disable_numparse=True,
+        colalign=["right" if number else "left" for number in numeric(frame)],
+    )
+    return table + "\n"
 
 
 def to_latex(frame: pd.DataFrame, digits: int = 4) -> str:
     """A `tabular` that needs `booktabs`; numbers such as 1e-05 become powers of ten."""
+    cells = as_text(frame, digits).map(_latex).rename(columns=_latex)
+    columns = "".join("r" if number else "l" for number in numeric(frame))
+    table: str = cells.style.hide(axis="index").to_latex(column_format=columns, hrules=True)
+    return re.sub(r"(?m)^(?=[*\[])", "{}", table)  # \\ would take it as its argument
 
-    def escaped(text: str) -> str:
-        power = re.fullmatch(r"(-?[\d.]+)e([+-]\d+)", text)
-        if power:
-            return rf"${power[1]} \times 10^{{{int(power[2])}}}$"
-        if re.fullmatch(r"-[\d.]+", text):
-            return f"${text}$"
-        return " ".join(_LATEX_SPECIAL.sub(lambda m: _LATEX[m[0]], text).split())
 
-    head, rows = _cells(frame, digits, escaped)
-    for row in (head, *rows):
-        if row and row[0].startswith(("[", "*")):  # \\ would take it as its argument
-            row[0] = "{}" + row[0]
-    columns = "".join("r" if number else "l" for number in _numeric(frame))
-    lines = [
-        rf"\begin{{tabular}}{{{columns}}}",
-        r"\toprule",
-        " & ".join(head) + r" \\",
-        r"\midrule",
-        *(" & ".join(row) + r" \\" for row in rows),
-        r"\bottomrule",
-        r"\end{tabular}",
-    ]
-    return "\n".join(lines) + "\n"
+def _latex(text: str) -> str:
+    power = re.fullmatch(r"(-?[\d.]+)e([+-]\d+)", text)
+    if power:
+        return rf"${power[1]} \times 10^{{{int(power[2])}}}$"
+    return f"${text}$" if re.fullmatch(r"-[\d.]+", text) else text.translate(_LATEX)
 
 
 FORMATS: dict[str, Callable[[pd.DataFrame, int], str]] = {
@@ -121,44 +116,27 @@ def export(paths: Sequence[Path], form: str, out: Path | None, digits: int) -> N
     """
     if form not in FORMATS:
         raise InputError(f"--format must be {' or '.join(FORMATS)}, got {form!r}")
-    sources: dict[str, Path] = {}
+    if out is None:
+        for path in paths:
+            _show(FORMATS[form](read_table(path), digits), path)
+        return
+    sources: dict[Path, Path] = {}
     for path in paths:
-        name = f"{path.stem}{SUFFIXES[form]}"
-        if out is not None and name in sources:
-            raise InputError(f"{sources[name]} and {path} would both become {out / name}")
-        sources[name] = path
-    for path in paths:
-        text = FORMATS[form](read_table(path), digits)
-        if out is None:
-            try:
-                print(text)
-            except UnicodeEncodeError as error:
-                raise InputError(
-                    f"{path}: the output's encoding, {error.encoding}, lacks "
-                    f"{text[error.start]!a}; write files with -o, or set PYTHONIOENCODING=utf-8"
-                ) from error
-            continue
-        with write_whole(out / f"{path.stem}{SUFFIXES[form]}") as part:
-            part.write_text(text, encoding="utf-8")
-    if out is not None:
-        print(f"{out}: {len(paths)} tables")
+        target = out / f"{path.stem}{SUFFIXES[form]}"
+        if target in sources:
+            raise InputError(f"{sources[target]} and {path} would both become {target}")
+        sources[target] = path
+    for target, path in sources.items():
+        with write_whole(target) as part:
+            part.write_text(FORMATS[form](read_table(path), digits), encoding="utf-8")
+    print(f"{out}: {len(paths)} tables")
 
 
-def _cells(
-    frame: pd.DataFrame, digits: int, escaped: Callable[[str], str]
-) -> tuple[list[str], list[list[str]]]:
-    """Header and rows as escaped text. Columns are taken one by one: a row would mix types."""
-    head = [escaped(str(name)) for name in frame.columns]
-    columns = [
-        [
-            escaped(plain(value, digits))
-            for value in column.astype(object).where(column.notna(), None)
-        ]
-        for column in (frame.iloc[:, i] for i in range(frame.shape[1]))
-    ]
-    return head, [list(row) for row in zip(*columns, strict=True)]
-
-
-def _numeric(frame: pd.DataFrame) -> list[bool]:
-    """Whether each column holds numbers."""
-    return [dtype.kind in "iuf" for dtype in frame.dtypes]
+def _show(text: str, path: Path) -> None:
+    try:
+        print(text)
+    except UnicodeEncodeError as error:
+        raise InputError(
+            f"{path}: the output's encoding, {error.encoding}, lacks {text[error.start]!a}; write "
+            "files with -o, or set PYTHONIOENCODING=utf-8"
+        ) from error

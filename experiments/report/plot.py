@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import textwrap
 
 import numpy as np
@@ -10,10 +9,15 @@ import pandas as pd
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from experiments.evaluation.statistics import Interval, mean_interval
-from experiments.sweeps.collect import telling
+from experiments.evaluation.statistics import mean_interval
+from experiments.runs.columns import COLUMNS, title
+from experiments.sweeps.collect import measured, telling
 from experiments.viewing.style import CYCLE, figure
 from sim.errors import InputError
+
+_WIDE_X, _WIDE_Y = 20.0, 30.0  # an axis that spans more than this factor is logarithmic
+_BESIDE = 0.006  # between the bars of two lines, which would hide each other: share of the axis
+_BESIDE_WORD = 0.08  # the same among words, which stand 1 apart
 
 
 def sweep_figure(table: pd.DataFrame, x: str, y: str, by: str | None = None) -> Figure:
@@ -33,40 +37,36 @@ def sweep_figure(table: pd.DataFrame, x: str, y: str, by: str | None = None) -> 
             hint = f"; did you mean {', '.join(near[:4])}?" if near else ""
             raise InputError(f"the sweep has no column {column}{hint}")
     if table[y].dtype.kind not in "fi":
-        raise InputError(f"column {y} holds no numbers")
+        raise InputError(f"column {y} holds no numbers; there are {', '.join(measured(table))}")
     if table[[x, y]].dropna().empty:
         raise InputError(f"no run has both {x} and {y}")
     page = figure(6.5, 4.0)
     ax = page.subplots()
-    low_y, high_y = table[y].min(), table[y].max()
-    logarithmic = low_y > 0.0 and high_y > 30.0 * low_y
+    scale = COLUMNS[y].scale if y in COLUMNS else "log"
+    logarithmic = scale == "log" and _spans(table[y], _WIDE_Y)
     numeric = table[x].dtype.kind in "fi"
     names = sorted(table[x].dropna().unique())
     place = {name: float(name) if numeric else float(i) for i, name in enumerate(names)}
+    wide = numeric and _spans(table[x], _WIDE_X)
     groups = [("", table)] if by is None else list(table.groupby(by))
-    positive = numeric and min(place.values()) > 0.0
-    wide = positive and max(place.values()) > 20.0 * min(place.values())
     for i, (label, rows) in enumerate(groups):
-        points = []
-        for name, part in rows.groupby(x):
-            values = part.groupby("recording_checksum")[y].mean().dropna()
-            if len(values):
-                points.append((place[name], _interval(values.to_numpy(), logarithmic)))
-        at = np.array([p for p, _ in points])
-        beside = i - (len(groups) - 1) / 2  # bars of several lines would hide each other
+        means = rows.groupby([x, "recording_checksum"])[y].mean().dropna()
+        points = {
+            place[name]: _interval(values.to_numpy(), logarithmic)
+            for name, values in means.groupby(level=0)
+        }
+        value, low, high = np.array(list(points.values())).reshape(-1, 3).T
+        at = np.array(list(points))
+        beside = i - (len(groups) - 1) / 2
         if wide:
-            at = at * (max(place.values()) / min(place.values())) ** (0.006 * beside)
+            at *= (names[-1] / names[0]) ** (_BESIDE * beside)
         else:
-            step = 0.006 * (max(place.values()) - min(place.values())) if numeric else 0.08
-            at = at + step * beside
-        name = f"{label:g}" if isinstance(label, float) else str(label)
-        value = np.array([m.value for _, m in points])
-        low = np.array([m.low for _, m in points])
-        high = np.array([m.high for _, m in points])
+            at += beside * (_BESIDE * (names[-1] - names[0]) if numeric else _BESIDE_WORD)
         ax.errorbar(
             at, value, yerr=[value - low, high - value],
             marker="osD^v"[i // len(CYCLE) % 5], ms=4, capsize=2,
-            ls="-" if numeric else "none", color=CYCLE[i % len(CYCLE)], label=name,
+            ls="-" if numeric else "none", color=CYCLE[i % len(CYCLE)],
+            label=f"{label:g}" if isinstance(label, float) else str(label),
         )  # fmt: skip
     if wide:
         ax.set_xscale("log")
@@ -78,15 +78,19 @@ def sweep_figure(table: pd.DataFrame, x: str, y: str, by: str | None = None) -> 
     over = ", ".join(["recordings", *(c.removeprefix("choice.") for c in pooled)])
     kind = "geometric mean" if logarithmic else "mean"
     ax.set_title(textwrap.fill(f"{kind} over {over}; 95 % intervals", 62), fontsize="small")
-    ax.set(xlabel=x, ylabel=y)
+    ax.set(xlabel=title(x), ylabel=title(y))
     if by is not None:
-        page.legend(title=by, loc="outside right upper")
+        page.legend(title=title(by), loc="outside right upper")
     return page
 
 
-def _interval(values: NDArray[np.float64], logarithmic: bool) -> Interval:
-    """Mean with its interval, or the geometric mean with that of the logarithms."""
-    if not logarithmic:
-        return mean_interval(values)
-    of_logs = mean_interval(np.log(values))
-    return Interval(*(math.exp(v) for v in (of_logs.value, of_logs.low, of_logs.high)))
+def _spans(values: pd.Series[float], factor: float) -> bool:
+    """Whether positive values differ by more than a factor."""
+    return bool(values.min() > 0.0 and values.max() > factor * values.min())
+
+
+def _interval(values: NDArray[np.float64], logarithmic: bool) -> tuple[float, float, float]:
+    """Mean and the bounds of its interval; those of the logarithms where they are drawn."""
+    found = mean_interval(np.log(values) if logarithmic else values)
+    bounds = np.array([found.value, found.low, found.high])
+    return tuple(np.exp(bounds) if logarithmic else bounds)

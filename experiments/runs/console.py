@@ -1,4 +1,4 @@
-"""What people see in the terminal: progress, and a word when something is compiled."""
+"""What people see in the terminal: progress, and the one line that ends a failed command."""
 
 from __future__ import annotations
 
@@ -22,60 +22,75 @@ class RunFailedError(Exception):
 
 
 @contextmanager
-def progress(label: str, total: float | None = None) -> Iterator[Callable[[float], None]]:
-    """Give a function that takes the amount done; it shows a bar, or lines where there is none.
+def progress(
+    label: str, total: float | None = None, unit: str = "", *, summary: bool = False
+) -> Iterator[Callable[..., None]]:
+    """Give a function that takes the amount done, and how many of it failed (by default none).
 
-    Nothing is shown for the first two seconds.
+    It draws a bar on a terminal, and prints a line now and then elsewhere. Nothing is shown for
+    the first two seconds.
+
+    Parameters
+    ----------
+    total
+        The amount when all is done; None if nobody knows.
+    unit
+        What is counted, such as runs; then their rate is shown too.
+    summary
+        Leave the last state as a line, even if all took less than two seconds.
     """
-    shown = _Progress(label, total)
-    try:
-        yield shown.update
-    finally:
-        shown.stop()
+    begun = time.monotonic()
+    next_line, line, printed = begun + _QUIET_S, "", ""
+    bar = _bar(total) if sys.stderr.isatty() else None
 
-
-class _Progress:
-    """A bar on a terminal, a line now and then elsewhere."""
-
-    def __init__(self, label: str, total: float | None) -> None:
-        self._label, self._total = label, total
-        self._begun = time.monotonic()
-        self._next_line = self._begun + _QUIET_S
-        self._bar: Any = None
-
-    def update(self, done: float) -> None:
+    def update(done: float, failed: int = 0) -> None:
+        nonlocal next_line, line, printed
         now = time.monotonic()
-        if now - self._begun < _QUIET_S:
+        line = _state(label, done, total, unit, failed, now - begun)
+        if now < next_line:
             return
-        if sys.stderr.isatty():
-            self._draw(done)
-        elif now >= self._next_line:
-            self._next_line = now + _LINE_EVERY_S
-            share = f" of {self._total:g}" if self._total else ""
-            print(
-                f"{self._label}: {done:.3g}{share} after {now - self._begun:.0f} s", file=sys.stderr
-            )
+        if bar is not None:
+            bar.start()
+            bar.update(bar.task_ids[0], completed=done, description=line)
+            return
+        next_line, printed = now + _LINE_EVERY_S, line
+        print(line, file=sys.stderr, flush=True)
 
-    def stop(self) -> None:
-        if self._bar is not None:
-            self._bar.stop()
+    try:
+        yield update
+    finally:
+        if bar is not None:
+            bar.stop()
+        if summary and line != printed:
+            print(line, file=sys.stderr, flush=True)
 
-    def _draw(self, done: float) -> None:
-        if self._bar is None:
-            from rich.console import Console
-            from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-            self._bar = Progress(
-                TextColumn(self._label),
-                BarColumn(),
-                TextColumn("{task.completed:.3g}" + (" of {task.total:g}" if self._total else "")),
-                TimeRemainingColumn(),
-                console=Console(stderr=True),
-                transient=True,
-            )
-            self._bar.start()
-            self._task = self._bar.add_task(self._label, total=self._total)
-        self._bar.update(self._task, completed=done)
+def _bar(total: float | None) -> Any:
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn
+
+    columns = (BarColumn(20), TextColumn("{task.description}", markup=False))
+    bar = Progress(*columns, console=Console(stderr=True), transient=True)
+    bar.add_task("", total=total)
+    return bar
+
+
+def _state(
+    label: str, done: float, total: float | None, unit: str, failed: int, spent_s: float
+) -> str:
+    amount = f"{done:.3g}" if isinstance(done, float) else str(done)
+    parts = [f"{amount} of {total:g}" if total else amount]
+    if unit:
+        parts[0] += f" {unit}"
+        parts.append(f"{done / max(spent_s, 1e-9):.2g} a second")
+    else:
+        parts[0] += f" after {spent_s:.0f} s"
+    if total and 0 < done < total:
+        left_s = (total - done) * spent_s / done
+        parts.append(f"{left_s / 60:.0f} min left" if left_s > 90 else f"{left_s:.0f} s left")
+    if failed:
+        parts.append(f"{failed} failed")
+    return ": ".join(filter(None, [label, ", ".join(parts)]))
 
 
 def end(error: BaseException) -> NoReturn:

@@ -13,6 +13,7 @@ from omegaconf import DictConfig
 
 from estimators.base import Estimate
 from experiments.runs import paths
+from experiments.runs.columns import COLUMNS
 from experiments.runs.console import RunFailedError, end, progress
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import GROUPS, Experiment
@@ -78,12 +79,12 @@ def application(arguments: Sequence[str], draw: Draw) -> None:
 
 
 _SHOWN = (
-    ("distance_m", "travelled", "m"),
-    ("ate_rmse_m", "position RMSE", "m"),
-    ("heading_rmse_rad", "heading RMSE", "rad"),
-    ("final_position_error_m", "final position error", "m"),
-    ("nees_mean", "mean NEES (3 when consistent)", ""),
-    ("step_time_us", "time per step", "us"),
+    "distance_m",
+    "ate_rmse_m",
+    "heading_rmse_rad",
+    "final_position_error_m",
+    "nees_mean",
+    "step_time_us",
 )
 
 
@@ -91,10 +92,10 @@ def _print(rows: Sequence[Row], files: Sequence[Path]) -> None:
     first = rows[0]
     where = first.get("choice.world") or first.get("recording") or "a recording"
     print(f"{first['choice.estimator']} on {where}, seed {first['seed']}: {first['status']}")
-    for key, label, unit in _SHOWN:
-        values = [float(v) for row in rows if isinstance(v := row.get(key), (int, float))]
+    for name in _SHOWN:
+        values = [float(v) for row in rows if isinstance(v := row.get(name), (int, float))]
         if values:
             mean = sum(values) / len(values)
-            print(f"  {label:<30} {mean:10.4g} {unit}")
+            print(f"  {COLUMNS[name].label:<30} {mean:10.4g} {COLUMNS[name].unit}")
     for path in files:
         print(f"  {paths.short(path)}")

@@ -1,4 +1,4 @@
-"""Rows of a sweep as one table: of one code version, in an order that does not depend on chance."""
+"""Rows of a sweep as one table: of one code version, in an order that is always the same."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from experiments.runs.columns import ORIGIN, REPEAT, is_setting
 from experiments.runs.paths import results
 from experiments.runs.row import Outcome, read_rows
 from experiments.runs.version import code_version, version_with
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 _TIMES = ("step_time_us",)  # they differ from run to run
-_ORIGIN = ("run_key", "code_version", "recording_checksum")
+_DRAWN = ("seed", "world_seed")  # what `summary` averages over
 _MAIN = (
     "ate_rmse_m",
     "ate_aligned_rmse_m",
@@ -27,7 +28,7 @@ _MAIN = (
     "revised_ate_aligned_rmse_m",
     "step_time_us",
 )
-_LAST_KEY = "repeat"  # columns up to it are settings, those after it what was found
+_COUNTED = {"failed": Outcome.FAILED, "with_remarks": Outcome.REMARK}
 
 
 def collect(name: str, *, all_versions: bool = False, times: bool = False) -> pd.DataFrame:
@@ -38,8 +39,8 @@ def collect(name: str, *, all_versions: bool = False, times: bool = False) -> pd
     name
         A sweep's name, or a path.
     all_versions
-        Keep the rows that other versions of the code have made; by default they are left out,
-        with a word about it.
+        Keep the rows that other versions of the code have made; by default they are dropped,
+        with a warning.
     times
         Keep the columns of computing times; without them the same sweep gives the same table.
 
@@ -48,19 +49,19 @@ def collect(name: str, *, all_versions: bool = False, times: bool = False) -> pd
     InputError
         If there are no rows, or none of this version of the code.
     """
-    path = results() / "runs" / name
-    path = path if path.exists() else Path(name)
-    if not path.exists():
-        there = sorted(p.name for p in (results() / "runs").glob("*") if p.is_dir())
+    runs = results() / "runs"
+    path = next((p for p in (runs / name, Path(name)) if p.exists()), None)
+    if path is None:
+        there = sorted(p.name for p in runs.glob("*") if p.is_dir())
         raise InputError(f"no sweep named {name}; there are: {', '.join(there) or 'none'}")
     table = read_rows(path)
-    for column in ("status", *_ORIGIN):
+    for column in ("status", REPEAT, *ORIGIN):
         if column not in table:
             raise InputError(f"{path}: not rows of runs, column {column} is missing")
-    twice = table.duplicated(["run_key", _LAST_KEY])
-    if twice.any():
-        print(f"{path}: left out {int(twice.sum())} rows that are there twice", file=sys.stderr)
-        table = table[~twice]
+    duplicate = table.duplicated(["run_key", REPEAT])
+    if duplicate.any():
+        print(f"{path}: dropped {duplicate.sum()} duplicate rows", file=sys.stderr)
+        table = table[~duplicate]
     if not all_versions:
         mine = _of_this_code(table)
         if not mine.any():
@@ -69,11 +70,11 @@ def collect(name: str, *, all_versions: bool = False, times: bool = False) -> pd
                 "again, or see them with --all-versions"
             )
         if not mine.all():
-            print(f"left out {int((~mine).sum())} rows of other code versions", file=sys.stderr)
+            print(f"left out {(~mine).sum()} rows of other code versions", file=sys.stderr)
         table = table[mine]
     if not times:
-        table = table.drop(columns=[c for c in _TIMES if c in table])
-    order = [*swept(table), "run_key", _LAST_KEY]
+        table = table.drop(columns=list(_TIMES), errors="ignore")
+    order = [*swept(table), "run_key", REPEAT]
     return table.sort_values(order, kind="stable", ignore_index=True)
 
 
@@ -126,34 +127,27 @@ def _of_this_code(table: pd.DataFrame) -> pd.Series[bool]:
     return mine
 
 
-def _best_error_m(table: pd.DataFrame) -> pd.Series[float]:
-    """Position error of the revised path where there is one, else of the online one."""
-    if "revised_ate_rmse_m" not in table:
-        return table["ate_rmse_m"]
-    return table["revised_ate_rmse_m"].fillna(table["ate_rmse_m"])
-
-
 def swept(table: pd.DataFrame) -> list[str]:
     """Settings that differ between the rows."""
-    settings = list(table.columns[: list(table.columns).index(_LAST_KEY)])
-    return [c for c in settings if c not in _ORIGIN and table[c].nunique(dropna=False) > 1]
+    return [c for c in table if is_setting(c) and table[c].nunique(dropna=False) > 1]
 
 
 def telling(table: pd.DataFrame) -> list[str]:
     """Swept settings without those that follow from earlier ones, as kl may from kr."""
     kept: list[str] = []
+    n_groups = 1
     for column in swept(table):
-        if table.groupby([*kept, column], dropna=False).ngroups > (
-            table.groupby(kept, dropna=False).ngroups if kept else 1
-        ):
+        finer = table.groupby([*kept, column], dropna=False).ngroups
+        if finer > n_groups:
             kept.append(column)
+            n_groups = finer
     return kept
 
 
 def measured(table: pd.DataFrame) -> list[str]:
-    """Columns of what the runs found."""
-    found = table.columns[list(table.columns).index(_LAST_KEY) + 1 :]
-    return [c for c in found if c not in _ORIGIN and table[c].dtype.kind in "fi"]
+    """Results of the runs: columns of numbers that are neither settings nor origin."""
+    numbers = table.select_dtypes(["integer", "floating"])
+    return [c for c in numbers if not is_setting(c) and c not in (REPEAT, *ORIGIN)]
 
 
 def summary(table: pd.DataFrame, against: str | None = None) -> pd.DataFrame:
@@ -167,27 +161,34 @@ def summary(table: pd.DataFrame, against: str | None = None) -> pd.DataFrame:
     """
     import numpy as np
 
-    drawn = ("seed", "world_seed", _LAST_KEY)
-    by = telling(table.drop(columns=[c for c in drawn[:2] if c in table]))
+    by = telling(table.drop(columns=list(_DRAWN), errors="ignore"))
     shown = [c for c in _MAIN if c in table and table[c].notna().any()]
     if against is not None:
-        one = table[table["choice.estimator"] == against]
-        if one.empty:
-            raise InputError(f"no rows of estimator {against}")
-        if own := [c for c in telling(one) if c.startswith("estimator.")]:
-            print(f"{against} is the mean over its {', '.join(own)}", file=sys.stderr)
-        best = _best_error_m(table)
-        reference = best[one.index].groupby(one["recording_checksum"]).mean()
-        ratio = best / table["recording_checksum"].map(reference)
         column = f"ate_rmse_over_{against}"
-        table = table.assign(**{column: np.log(ratio)})
+        table = table.assign(**{column: np.log(_error_ratio(table, against))})
         shown.append(column)
     groups = table.groupby(by, dropna=False) if by else table.groupby(lambda _: "all runs")
     found = groups[shown].mean()
     if against is not None:
         found[column] = np.exp(found[column])
     found.insert(0, "runs", groups.size())
-    for place, outcome in enumerate((Outcome.FAILED, Outcome.REMARK), start=1):
-        count = groups["status"].agg(lambda statuses, outcome=outcome: (statuses == outcome).sum())
-        found.insert(place, outcome.value, count)
+    for place, (name, outcome) in enumerate(_COUNTED.items(), start=1):
+        found.insert(place, name, groups["status"].agg(lambda s, o=outcome: (s == o).sum()))
     return found.reset_index(drop=not by)
+
+
+def _error_ratio(table: pd.DataFrame, against: str) -> pd.Series[float]:
+    """Position error over the mean one of an estimator on the same recording.
+
+    That of the revised path where there is one, else of the online one.
+    """
+    one = table[table["choice.estimator"] == against]
+    if one.empty:
+        raise InputError(f"no rows of estimator {against}")
+    if own := [c for c in telling(one) if c.startswith("estimator.")]:
+        print(f"{against} is the mean over its {', '.join(own)}", file=sys.stderr)
+    error = table["ate_rmse_m"]
+    if "revised_ate_rmse_m" in table:
+        error = table["revised_ate_rmse_m"].fillna(error)
+    reference = error[one.index].groupby(one["recording_checksum"]).mean()
+    return error / table["recording_checksum"].map(reference)

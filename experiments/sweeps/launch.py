@@ -23,7 +23,7 @@ import hydra
 from omegaconf import DictConfig
 
 from experiments.runs import paths
-from experiments.runs.console import RunFailedError
+from experiments.runs.console import RunFailedError, progress
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome, Status, read_rows, write_rows
@@ -284,7 +284,6 @@ class _Watch:
     def __init__(self, folder: Path, keys: Sequence[str]) -> None:
         self._folder, self._keys, self._over = folder, set(keys), threading.Event()
         self._thread = threading.Thread(target=self._watch, daemon=True)
-        self._begun = time.monotonic()
 
     def __enter__(self) -> None:
         self._thread.start()
@@ -294,30 +293,12 @@ class _Watch:
         self._thread.join()
 
     def _watch(self) -> None:
-        tell_after_s = 2.0
-        on_terminal = sys.stderr.isatty()
-        while True:
-            over = self._over.wait(0.5)
-            seen = {path.stem for path in self._folder.glob("*.parquet")} & self._keys
-            bad = len({path.stem for path in self._folder.glob("*.failed")} & self._keys)
-            spent_s = time.monotonic() - self._begun
-            if (spent_s > tell_after_s or over) and seen:
-                tell_after_s = spent_s + (0.5 if on_terminal else 10.0)
-                line = _progress_line(len(seen), len(self._keys), bad, spent_s)
-                print(f"\r{line}\033[K" if on_terminal else line, file=sys.stderr,
-                      end="" if on_terminal and not over else "\n", flush=True)  # fmt: skip
-            if over:
-                return
+        with progress("", len(self._keys), "runs", summary=True) as on_progress:
+            over = False
+            while not over:
+                over = self._over.wait(0.5)
+                if done := self._count("parquet"):
+                    on_progress(done, self._count("failed"))
 
-
-def _progress_line(done: int, total: int, bad: int, spent_s: float) -> str:
-    rate = done / max(spent_s, 1e-9)
-    left = (total - done) / rate
-    rest = f"{left / 60:.0f} min left" if left > 90 else f"{left:.0f} s left"
-    told = f", {bad} failed" if bad else ""
-    filled = round(_BAR_WIDTH * done / total)
-    bar = "━" * filled + "╌" * (_BAR_WIDTH - filled)
-    return f"{bar} {done} of {total} runs, {rate:.2g} a second, {rest}{told}"
-
-
-_BAR_WIDTH = 20
+    def _count(self, suffix: str) -> int:
+        return len({path.stem for path in self._folder.glob(f"*.{suffix}")} & self._keys)

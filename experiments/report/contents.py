@@ -1,0 +1,196 @@
+"""What the report shows, read from results/ into plain data."""
+
+from __future__ import annotations
+
+import base64
+import struct
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import yaml
+
+from experiments.evaluation.verdict import Profile, Verdict
+from experiments.report.claims import read_claims, read_provenance, this_code
+from experiments.report.export import as_text, numeric
+from experiments.runs.paths import CONF, SOURCE
+from experiments.runs.row import read_rows
+from sim.errors import InputError
+
+Entry = Mapping[str, Any]
+PAPERS = ("puzzlebot2024", "decristoforis2020", "gil2008", "maximo2024")
+# What belongs to no paper, by the start of its files' names, and the commands that make it.
+OWN = {
+    "leaderboard": ["estima run -m study=leaderboard"],
+    "all_estimators": ["estima run -m study=all_estimators"],
+    "mcl_office": ["estima reproduce --paper mcl_office"],
+}
+SMALL_ROWS, SMALL_COLUMNS = 60, 20  # a table up to here is shown whole
+FIRST_ROWS = 5  # of a larger one
+_FOLDER = SOURCE / "experiments" / "papers"
+_WORST_FIRST = (Verdict.NOT_REPRODUCED, Verdict.UNDECIDED, Verdict.REPRODUCED, Verdict.SHOWN)
+_REMEDY = "restore it by `git checkout`, or delete it and run `estima reproduce`"
+
+
+def contents(results: Path, on_progress: Callable[[float], None]) -> dict[str, Any]:
+    """Read all that the report shows, by its names in the templates."""
+    table = read_claims(results / "claims.csv")
+    made = read_provenance(results)
+    papers = [*PAPERS, *sorted(set(table["paper"]) - set(PAPERS))]
+    about = {name: findings(name) for name in (*papers, *OWN)}
+    claims = judged_claims(table, about)
+    commands = {name: [f"estima reproduce --paper {name}"] for name in papers} | OWN
+    commands |= {str(k): list(v.unique()) for k, v in table.groupby("paper")["command"]}
+    studies = {}
+    for done, (name, page) in enumerate(about.items(), start=1):
+        studies[name] = {**study(results, name, page, claims), "commands": commands[name]}
+        on_progress(done / len(about))
+    known = tuple(f"{name}_" for name in about)
+    files = [*(results / "figures").glob("*.png"), *(results / "tables").glob("*.csv")]
+    origins = made | {"this page": this_code()}
+    counts = Counter(table["verdict"])
+    return {
+        "claims": claims,
+        "n_statistics": len(table),
+        "n_judged": table["id"].nunique(),
+        "tally": [f"{counts[verdict]} {verdict.label}" for verdict in Verdict if counts[verdict]],
+        "n_quick": int((table["profile"] == Profile.QUICK).sum()),
+        # what a cut table would lack: claims without a verdict of papers that have some
+        "missing": [
+            key
+            for paper in dict.fromkeys(table["paper"])
+            for key in about[paper]["claims"]
+            if not claims[key]["statistics"]
+        ],
+        "papers": [studies[name] for name in papers],
+        "own": [studies[name] for name in OWN],
+        "others": sorted(path.name for path in files if not path.name.startswith(known)),
+        "made": made,
+        "origins": origins,
+        "details": list(dict.fromkeys(key for how in origins.values() for key in how)),
+        "unknown": [paper for paper in papers if paper not in made],
+    }
+
+
+def findings(name: str) -> dict[str, Any]:
+    """What a paper says, in our words: `title`, `about`, `claims` by id, `figures` by file name."""
+    empty = {"title": name, "about": "", "claims": {}, "figures": {}}
+    path = _FOLDER / name / "findings.yaml"
+    if not path.exists():
+        return empty
+    try:
+        return {**empty, **yaml.safe_load(path.read_text(encoding="utf-8"))}
+    except yaml.YAMLError as error:
+        raise InputError(f"{path}: not YAML ({str(error).splitlines()[0]})") from error
+
+
+def judged_claims(table: pd.DataFrame, about: Mapping[str, Entry]) -> Mapping[str, Entry]:
+    """Every claim by its id: those with a sentence in their order, then the others.
+
+    Each has its `statistics`, the rows of the table; the `worst` of them, which speaks for it; the
+    first of each verdict as `examples`; its `verdict` in words, and its `style` on the page.
+    """
+    sentences = {key: text for page in about.values() for key, text in page["claims"].items()}
+    rows: dict[str, list[Entry]] = {key: [] for key in sentences}
+    for row in table.sort_values("id", kind="stable").to_dict("records"):
+        rows.setdefault(row["id"], []).append({**row, "verdict": Verdict(row["verdict"])})
+    claims = {}
+    for key, statistics in rows.items():
+        first = {row["verdict"]: row for row in reversed(statistics)}
+        claims[key] = {
+            "id": key,
+            "sentence": sentences.get(key, ""),
+            "statistics": statistics,
+            "worst": next((first[verdict] for verdict in _WORST_FIRST if verdict in first), None),
+            "examples": [first[verdict] for verdict in Verdict if verdict in first],
+            **verdict_on(statistics),
+        }
+    return claims
+
+
+def verdict_on(statistics: Sequence[Entry]) -> dict[str, str]:
+    """Verdict on a claim in words, and its style; what is only shown does not count."""
+    found = Counter(row["verdict"] for row in statistics)
+    counts = {v: found[v] for v in Verdict if found[v] and v is not Verdict.SHOWN}
+    quick = " (quick)" if any(row["profile"] == Profile.QUICK for row in statistics) else ""
+    if len(counts) > 1:
+        parts = ", ".join(f"{n} {verdict.label}" for verdict, n in counts.items())
+        return {"verdict": f"mixed: {parts}{quick}", "style": "partly"}
+    for verdict in counts:
+        return {"verdict": verdict.label + quick, "style": verdict.value}
+    words = f"shown, not judged{quick}" if statistics else "not judged yet"
+    return {"verdict": words, "style": "quiet"}
+
+
+def study(results: Path, name: str, about: Entry, claims: Mapping[str, Entry]) -> Entry:
+    """Read a study's figures in the order of its findings, its tables and its settings."""
+    there = {path.stem: path for path in sorted((results / "figures").glob(f"{name}_*.png"))}
+    described = [figure for figure in about["figures"] if figure in there]
+    settings = [*sorted((CONF / "study").glob(f"{name}*.yaml")), _FOLDER / name / "settings.py"]
+    return {
+        "name": name,
+        "about": about,
+        "figures": [
+            picture(there[figure], about["figures"].get(figure, {}), claims)
+            for figure in dict.fromkeys([*described, *there])
+        ],
+        "missing": [figure for figure in about["figures"] if figure not in there],
+        "tables": [table(path) for path in sorted((results / "tables").glob(f"{name}_*.csv"))],
+        "settings": {
+            "/".join(path.parts[-3:]): path.read_text(encoding="utf-8").strip()
+            for path in settings
+            if path.exists()
+        },
+    }
+
+
+def picture(path: Path, about: Entry, claims: Mapping[str, Entry]) -> Entry:
+    """Read a figure; one without findings is named after its file.
+
+    Raises
+    ------
+    InputError
+        If it is not a whole PNG.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot read ({error.strerror}); {_REMEDY}") from error
+    if data[:8] != b"\x89PNG\r\n\x1a\n" or len(data) < 24:
+        raise InputError(f"{path}: not a PNG; {_REMEDY}")
+    if data[-8:] != b"IEND\xaeB`\x82":
+        raise InputError(f"{path}: the picture is cut off; {_REMEDY}")
+    width, height = struct.unpack(">II", data[16:24])
+    words = path.stem.split("_", 1)[-1].replace("_", " ")
+    return {
+        "title": words,
+        "alt": f"Figure: {words}",
+        "paper": "",
+        **about,
+        "name": path.stem,
+        "claims": [claims[key] for key in about.get("claims", [])],
+        "width": width,
+        "height": height,
+        "png": base64.b64encode(data).decode(),
+    }
+
+
+def table(path: Path) -> Entry:
+    """Read a table: whole if it is small, else its first rows."""
+    frame = read_rows(path)
+    small = len(frame) <= SMALL_ROWS and frame.shape[1] <= SMALL_COLUMNS
+    shown = as_text(frame if small else frame.head(FIRST_ROWS))
+    note = "" if small else f"; the first {len(shown)}, the rest in the file"
+    if "seed" in frame and len(frame):
+        low, high = frame["seed"].min(), frame["seed"].max()
+        note += f"; seed {low}" if low == high else f"; seeds {low} to {high}"
+    return {
+        "name": path.stem,
+        "size": f"{len(frame)} rows, {frame.shape[1]} columns",
+        "note": note,
+        "head": list(shown.columns),
+        "numeric": numeric(frame),
+        "cells": shown.to_numpy().tolist(),
+    }

@@ -1,0 +1,97 @@
+"""Columns of results: what a metric is called, its unit, and how tables and plots show it.
+
+The one schema of rows: a column is a setting, a metric, a status or an origin by its name.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class Column:
+    """A metric, as `evaluation.metrics.score` gives it.
+
+    Attributes
+    ----------
+    label
+        In words, for the axes of plots.
+    symbol
+        In short, for the headings of wide tables.
+    unit
+        Empty for a number without one.
+    scale
+        Axis on which it is drawn when it spans decades.
+    better
+        Which direction is better; None where neither is.
+    """
+
+    label: str
+    symbol: str
+    unit: str = ""
+    scale: Literal["linear", "log"] = "log"
+    better: Literal["lower", "higher"] | None = "lower"
+
+
+_OF_THE_RUN = {
+    "duration_s": Column("duration", "t", "s", "linear", None),
+    "distance_m": Column("distance travelled", "d", "m", "linear", None),
+}
+_OF_THE_PATH = {
+    "step_time_us": Column("time per step", "step", "us"),
+    "ate_rmse_m": Column("position RMSE", "ATE", "m"),
+    "ate_aligned_rmse_m": Column("position RMSE after alignment", "ATE aligned", "m"),
+    "heading_rmse_rad": Column("heading RMSE", "heading", "rad"),
+    "heading_aligned_rmse_rad": Column("heading RMSE after alignment", "heading aligned", "rad"),
+    "final_position_error_m": Column("final position error", "final ATE", "m"),
+    "final_heading_error_rad": Column("final heading error", "final heading", "rad"),
+    "nees_counted_share": Column(
+        "share of stamps with a usable covariance", "NEES counted", "", "linear", "higher"
+    ),
+    "ellipse_area_final_m2": Column(
+        "area of the final 95 % ellipse", "ellipse", "m^2", better=None
+    ),
+    "nees_mean": Column("mean NEES (3 when consistent)", "NEES", better=None),
+    "rpe_1m_rmse_m": Column("position RMSE over 1 m", "RPE 1 m", "m"),
+    "rpe_1m_heading_rmse_rad": Column("heading RMSE over 1 m", "RPE heading 1 m", "rad"),
+    "rpe_10m_rmse_m": Column("position RMSE over 10 m", "RPE 10 m", "m"),
+    "rpe_10m_heading_rmse_rad": Column("heading RMSE over 10 m", "RPE heading 10 m", "rad"),
+}
+COLUMNS = {
+    **_OF_THE_RUN,
+    **_OF_THE_PATH,
+    **{
+        f"revised_{name}": dataclasses.replace(
+            column, label=f"{column.label}, revised path", symbol=f"{column.symbol} revised"
+        )
+        for name, column in _OF_THE_PATH.items()
+    },
+}
+STATUS = ("status", "status_code", "status_detail")
+REPEAT = "repeat"  # counts the runs of an estimator over one recording
+ORIGIN = ("run_key", "code_version", "recording_checksum")
+_SETTINGS = ("seed", "world_seed", "repeats", "recording", "name")
+
+
+def is_setting(name: str) -> bool:
+    """Whether a column is a key of the configuration: a dotted one, or one at its top."""
+    return "." in name or name in _SETTINGS
+
+
+def title(name: str, *, short: bool = False) -> str:
+    """Label (or symbol) and unit of a metric; any other column's own name."""
+    if name not in COLUMNS:
+        return name
+    column = COLUMNS[name]
+    words = column.symbol if short else column.label
+    return f"{words}, {column.unit}" if column.unit else words
+
+
+def as_text() -> str:
+    """List the metrics: name, unit, which direction is better, what it is."""
+    lines = [("column", "unit", "better", "")]
+    lines += [(name, c.unit, c.better or "", c.label) for name, c in COLUMNS.items()]
+    widths = [max(map(len, cells)) for cells in zip(*lines, strict=True)]
+    return "\n".join("  ".join(map(str.ljust, cells, widths)).rstrip() for cells in lines)

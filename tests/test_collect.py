@@ -1,0 +1,150 @@
+"""Rows of sweeps as tables, means and plots; the schema that they share."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from experiments.report.plot import sweep_figure
+from experiments.runs.columns import COLUMNS, ORIGIN, REPEAT, STATUS, is_setting, title
+from experiments.runs.evaluate import evaluate
+from experiments.runs.experiment import Experiment
+from experiments.sweeps.collect import collect, measured, summary, swept, telling, where
+from sim.errors import InputError
+
+
+def rows(n=6):
+    """Rows as a sweep leaves them."""
+    rng = np.random.default_rng(0)
+    return pd.DataFrame(
+        {
+            "choice.estimator": ["a", "b"] * n,
+            "robot.kr": np.repeat([1e-5, 1e-3], n),
+            "seed": np.tile(np.repeat(np.arange(n // 2), 2), 2),
+            "repeat": 0,
+            "run_key": [f"{i:02d}" for i in range(2 * n)],
+            "code_version": "v",
+            "recording_checksum": [f"r{i // 2}" for i in range(2 * n)],
+            "status": "ok",
+            "ate_rmse_m": np.tile([1.0, 2.0], n) * np.repeat(np.exp(rng.normal(size=n)), 2),
+            "step_time_us": rng.random(2 * n),
+        }
+    )
+
+
+def test_tables_know_settings_from_findings_and_compare_on_the_same_recordings():
+    table = rows()
+    assert swept(table) == ["choice.estimator", "robot.kr", "seed"]
+    assert measured(table) == ["ate_rmse_m", "step_time_us"]
+    found = summary(table, against="a").set_index(["choice.estimator", "robot.kr"])
+    np.testing.assert_allclose(found.loc["a", "ate_rmse_over_a"], 1.0)
+    np.testing.assert_allclose(found.loc["b", "ate_rmse_over_a"], 2.0)
+    assert (found["runs"] == 3).all()
+    with pytest.raises(InputError, match="no rows of estimator c"):
+        summary(table, against="c")
+
+
+def test_settings_that_follow_from_others_are_not_named():
+    table = rows()
+    table.insert(2, "robot.kl", 2.0 * table["robot.kr"])
+    table.insert(3, "estimator._target_", "module." + table["choice.estimator"])
+    assert telling(table) == ["choice.estimator", "robot.kr", "seed"]
+    assert list(summary(table).columns[:3]) == ["choice.estimator", "robot.kr", "runs"]
+    table["robot.kl"] = np.tile([1.0, 2.0, 2.0], 4)  # now a setting of its own
+    assert telling(table) == ["choice.estimator", "robot.kr", "robot.kl", "seed"]
+
+
+def test_rows_of_other_code_are_left_out(tmp_path, capsys):
+    from experiments.runs.version import code_version
+
+    table = rows()
+    table.to_parquet(tmp_path / "x.parquet")
+    with pytest.raises(InputError, match="other versions"):
+        collect(str(tmp_path))
+    assert len(collect(str(tmp_path), all_versions=True)) == len(table)
+    table.loc[:4, "code_version"] = code_version()
+    table.to_parquet(tmp_path / "x.parquet")
+    assert len(collect(str(tmp_path))) == 5
+    assert "left out 7 rows" in capsys.readouterr().err
+
+
+def test_settings_of_some_estimators_only_are_settings(tmp_path):
+    table = rows()
+    for name, setting in (("a", None), ("b", "estimator.metric"), ("c", "estimator.n_particles")):
+        part = table[table["choice.estimator"] == "a"].assign(**{"choice.estimator": name})
+        part["run_key"] += name
+        if setting is not None:
+            part.insert(1, setting, ["p", "q"] * 3)
+            part[f"found_by_{name}"] = 1.0
+        part.to_parquet(tmp_path / f"{name}.parquet")
+    together = collect(str(tmp_path), all_versions=True)
+    assert {"estimator.metric", "estimator.n_particles"} <= set(swept(together))
+    assert {"found_by_b", "found_by_c"} <= set(measured(together))
+    assert (summary(together).groupby("choice.estimator").size() == [2, 4, 4]).all()
+
+
+def test_rows_are_chosen_by_conditions():
+    table = rows()
+    assert len(where(table, ["robot.kr=0.00001"])) == 6
+    assert set(where(table, ["choice.estimator=a", "seed=2"])["seed"]) == {2}
+    for condition in ("seed", "robot.krr=1", "seed=9"):
+        with pytest.raises(InputError, match=condition):
+            where(table, [condition])
+
+
+def test_failures_and_remarks_are_counted_apart():
+    table = rows()
+    table["status"] = ["ok", "failed", "remark", *["ok"] * 9]
+    found = summary(table).set_index(["choice.estimator", "robot.kr"])
+    assert found["failed"].to_dict() == {
+        ("a", 1e-5): 0,
+        ("a", 1e-3): 0,
+        ("b", 1e-5): 1,
+        ("b", 1e-3): 0,
+    }
+    assert int(found["with_remarks"].sum()) == 1
+
+
+def test_plots_name_a_missing_column_and_average_recordings():
+    page = sweep_figure(rows(), "robot.kr", "ate_rmse_m", "choice.estimator")
+    lines = page.axes[0].get_lines()
+    assert page.axes[0].get_xscale() == "log"
+    table = rows()
+    expected = table[(table["choice.estimator"] == "a")].groupby("robot.kr")["ate_rmse_m"].mean()
+    np.testing.assert_allclose(lines[0].get_ydata(), expected)
+    assert "estimator" not in page.axes[0].get_title()
+    assert "estimator" in sweep_figure(rows(), "robot.kr", "ate_rmse_m").axes[0].get_title()
+    table = table.assign(ate_rmse_m=np.tile(np.repeat([1e-4, 1.0, 10.0], 2), 2))
+    page = sweep_figure(table, "robot.kr", "ate_rmse_m")
+    geometric = np.exp(np.log(table["ate_rmse_m"]).groupby(table["robot.kr"]).mean())
+    np.testing.assert_allclose(page.axes[0].get_lines()[0].get_ydata(), geometric)
+    assert page.axes[0].get_yscale() == "log"
+    with pytest.raises(InputError, match="no run has both"):
+        sweep_figure(table.assign(**{"robot.kr": None}), "robot.kr", "ate_rmse_m")
+    with pytest.raises(InputError, match=r"robot\.krr"):
+        sweep_figure(rows(), "robot.krr", "ate_rmse_m")
+    with pytest.raises(InputError, match="no numbers"):
+        sweep_figure(rows(), "robot.kr", "status")
+
+
+def test_every_column_of_a_row_is_in_the_schema():
+    overrides = ["world=rooms", "robot=robocom", "sensors=stereo_pixel", "estimator=smoother"]
+    overrides += ["simulation.physics=kinematic", "route.distance_m=12"]
+    experiment = Experiment.compose(overrides)
+    (row,) = evaluate(experiment, experiment.simulate())
+    others = {name for name in row if not is_setting(name)} - {REPEAT, *STATUS, *ORIGIN}
+    assert others <= set(COLUMNS)
+    assert {"ate_rmse_m", "rpe_10m_rmse_m", "revised_nees_mean", "step_time_us"} <= others
+    assert set(experiment.config) - {"keep", "picture"} <= {
+        name.partition(".")[0] for name in row if is_setting(name)
+    }
+
+
+def test_columns_say_their_unit():
+    for name, column in COLUMNS.items():
+        unit = name.rpartition("_")[2] if column.unit else ""
+        assert column.unit.replace("^", "") == unit
+        assert title(name).endswith(column.unit)
+    assert title("ate_rmse_m", short=True) == "ATE, m"
+    page = sweep_figure(rows(), "robot.kr", "ate_rmse_m")
+    assert page.axes[0].get_ylabel() == "position RMSE, m"
+    assert page.axes[0].get_xlabel() == "robot.kr"

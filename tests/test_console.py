@@ -1,0 +1,53 @@
+"""Progress as a bar on a terminal, and as lines elsewhere."""
+
+import io
+import re
+
+import pytest
+
+from experiments.runs import console
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """Seconds that pass only when the test says so."""
+    now = [0.0]
+    monkeypatch.setattr(console.time, "monotonic", lambda: now[0])
+    return now
+
+
+def test_lines_elsewhere_say_amount_rate_failures_and_time_left(clock, capsys):
+    with console.progress("", 400, "runs", summary=True) as on_progress:
+        for clock[0], done in ((1.0, 20), (4.0, 80), (5.0, 100), (15.0, 300)):
+            on_progress(done, failed=done // 100)
+    assert capsys.readouterr().err.splitlines() == [
+        "80 of 400 runs, 20 a second, 16 s left",
+        "300 of 400 runs, 20 a second, 5 s left, 3 failed",
+    ]
+    with console.progress("simulating, s") as on_progress:
+        clock[0] += 3.0
+        on_progress(12.3456)
+    assert capsys.readouterr().err == "simulating, s: 12.3 after 3 s\n"
+
+
+def test_what_ends_soon_leaves_at_most_a_summary(clock, capsys):
+    for summary in (False, True):
+        with console.progress("drawing", 1.0, summary=summary) as on_progress:
+            clock[0] += 1.0
+            on_progress(1.0)
+        assert capsys.readouterr().err == "drawing: 1 of 1 after 1 s\n" * summary
+
+
+def test_a_terminal_gets_a_bar_and_then_the_summary(clock, monkeypatch):
+    monkeypatch.setattr("sys.stderr", Terminal())
+    with console.progress("", 4, "runs", summary=True) as on_progress:
+        clock[0] += 200.0
+        on_progress(1)
+    text = re.sub(r"\x1b\[[\d;?]*[a-zA-Z]", "", console.sys.stderr.getvalue())
+    assert "━" in text
+    assert text.endswith("1 of 4 runs, 0.005 a second, 10 min left\n")
