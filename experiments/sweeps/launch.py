@@ -53,6 +53,7 @@ def sweep_arguments(arguments: Sequence[str]) -> None:
             raise InputError(f"a sweep takes overrides and --config-dir, not {argument}")
         else:
             overrides.append(argument)
+    signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGINT))  # end as by Ctrl-C
     sweep(overrides, config_dir)
 
 
@@ -219,7 +220,6 @@ def _launch_all(runs: Sequence[Experiment], folder: Path, launching: Sequence[st
         path.with_suffix(".failed").unlink(missing_ok=True)
         _begun(folder, run.key).unlink(missing_ok=True)
     _clear_plans(folder)
-    signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGINT))  # end as by Ctrl-C
     with _Watch(folder, [run.key for run in runs]):
         left = list(runs)
         while left:
@@ -250,6 +250,7 @@ def _launch(runs: Sequence[Experiment], folder: Path, launching: Sequence[str]) 
     )
     with write_whole(plan) as part:
         part.write_text(text)
+    arguments = sys.argv
     sys.argv = [
         "estima run",
         "-m",
@@ -263,6 +264,7 @@ def _launch(runs: Sequence[Experiment], folder: Path, launching: Sequence[str]) 
         died: Exception = error
         return died
     finally:
+        sys.argv = arguments
         plan.unlink(missing_ok=True)
         shutil.rmtree(f"{plan}.jobs", ignore_errors=True)
     return None
