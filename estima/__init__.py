@@ -86,7 +86,7 @@ class Run:
     row: Row
 
     def plot(self, path: str | Path | None = None) -> Figure:
-        """Draw the trajectory, and its errors against time; of the revised estimate if there is one.
+        """Draw the trajectory, revised if there is one, and its errors against time.
 
         Parameters
         ----------

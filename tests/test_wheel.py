@@ -143,13 +143,28 @@ def test_a_sweep_by_the_command_and_by_the_api(installed):
     assert "3 of them done before" in done.stderr
 
 
+def test_options_of_ones_own_in_such_a_folder(installed):
+    estima, folder, _ = installed
+    (folder / "eigene" / "robot").mkdir(parents=True)
+    option = "defaults: [puzzlebot]\nkr: 3.0e-5\n"
+    (folder / "eigene" / "robot" / "own.yaml").write_text(option)
+    for many in ([], ["-m"]):
+        given = [*many, "--config-dir", "eigene", *QUICK, "robot=own", "name=own", "picture=false"]
+        code, said = estima("run", *given)
+        assert code == 0, said
+
+
 def test_the_gate_takes_the_baselines_of_the_wheel_or_of_the_folder(installed, tmp_path):
     estima, _, _ = installed
     code, said = estima("check", "--only", "odometry", cwd=tmp_path)
     assert code == 0, said
     assert "identical" in said
-    (tmp_path / "results" / "baselines").mkdir()
-    (tmp_path / "results" / "baselines" / "check.csv").write_text("damaged\n")
+    own = tmp_path / "results" / "baselines"
+    code, said = estima("check", "--only", "odometry", "--accept", "mine", cwd=tmp_path)
+    assert code == 0, said
+    assert said.split() == ["results/baselines/check.csv"]
+    assert sorted(path.name for path in own.iterdir()) == ["check.csv", "power.csv", "release.csv"]
+    own.joinpath("check.csv").write_text("damaged\n")
     code, said = estima("check", "--only", "odometry", cwd=tmp_path)
     assert code == 2
     assert str(tmp_path / "results" / "baselines" / "check.csv") in said

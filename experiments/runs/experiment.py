@@ -76,7 +76,8 @@ class Experiment:
         """
         lines = [f"+{line}" if line.startswith("study=") else line for line in overrides]
         if config_dir is not None:
-            lines.append(f"hydra.searchpath=[file://{config_dir.resolve()}]")
+            folder = paths.quoted(f"file://{config_dir.resolve()}")
+            lines.append(f"hydra.searchpath=[{folder}]")
         with initialize_config_dir(str(paths.CONF), version_base="1.3"):
             cfg = compose("config", overrides=lines, return_hydra_config=True)
         chosen = cfg.hydra.runtime.choices
