@@ -120,7 +120,8 @@ def simulate(*overrides: str) -> Recording:
 
     Examples
     --------
-    >>> recording = simulate("simulation.physics=kinematic", "route=linear_1")
+    >>> import estima
+    >>> recording = estima.simulate("simulation.physics=kinematic", "route=linear_1")
     >>> recording.status, recording.duration_s
     ('ok', 2.7)
     """
@@ -144,7 +145,8 @@ def load(*paths: str | Path, robot: int = 1) -> Recording:
 
     Examples
     --------
-    >>> load("missing.log")
+    >>> import estima
+    >>> estima.load("missing.log")
     Traceback (most recent call last):
     sim.errors.InputError: missing.log: cannot read (No such file or directory)
     """
@@ -180,12 +182,13 @@ def run(*given: Any, estimator: str | Estimator | None = None) -> Run:
 
     Examples
     --------
+    >>> import estima
     >>> quick = ("simulation.physics=kinematic", "route=linear_1")
-    >>> recording = simulate(*quick)
-    >>> found = run(recording, "estimator.kr=1e-4", estimator="odometry")
+    >>> recording = estima.simulate(*quick)
+    >>> found = estima.run(recording, "estimator.kr=1e-4", estimator="odometry")
     >>> found.row["estimator.kr"], found.row["ate_rmse_m"] < 0.05
     (0.0001, True)
-    >>> run(*quick, estimator="ekf_icp")
+    >>> estima.run(*quick, estimator="ekf_icp")
     Traceback (most recent call last):
     sim.errors.InputError: estimator=ekf_icp needs a laser sensor, and sensors=encoder has none; try sensors=lms291, hokuyo or laser_stereo
     """  # noqa: E501 the message is one line
@@ -230,8 +233,9 @@ def score(recording: Recording, estimate: Estimate) -> dict[str, float]:
 
     Examples
     --------
-    >>> recording = simulate("simulation.physics=kinematic", "route=linear_1")
-    >>> scores = score(recording, run(recording).online)
+    >>> import estima
+    >>> recording = estima.simulate("simulation.physics=kinematic", "route=linear_1")
+    >>> scores = estima.score(recording, estima.run(recording).online)
     >>> sorted(scores)[:2], scores["distance_m"] > 0.5
     (['ate_aligned_rmse_m', 'ate_rmse_m'], True)
     """
@@ -262,7 +266,8 @@ def sweep(*overrides: str, name: str | None = None) -> pd.DataFrame:
 
     Examples
     --------
-    >>> table = sweep(
+    >>> import estima
+    >>> table = estima.sweep(
     ...     "simulation.physics=kinematic", "route=linear_1", "robot.kr=1e-5,1e-4",
     ...     "seed=range(0,2)", "hydra/launcher=basic",
     ... )
@@ -276,9 +281,8 @@ def sweep(*overrides: str, name: str | None = None) -> pd.DataFrame:
     own = f"sweep_{hashlib.sha256(repr(overrides).encode()).hexdigest()[:8]}"
     named = [line.partition("=")[2] for line in overrides if line.startswith("name=")]
     folder = name or (named or [own])[-1]
-    lines = [f"+{line}" if line.startswith("study=") else line for line in overrides]
     try:
-        launch.sweep([*lines, f"name={folder}"])
+        launch.sweep([*overrides, f"name={folder}"])
     except RunFailedError as error:
         warnings.warn(str(error), stacklevel=2)
     return collect(folder)
@@ -311,9 +315,10 @@ def plot(
 
     Examples
     --------
+    >>> import estima
     >>> quick = ("simulation.physics=kinematic", "route=linear_1", "hydra/launcher=basic")
-    >>> table = sweep(*quick, "robot.kr=1e-5,1e-4", "seed=range(0,2)")
-    >>> plot(table, x="robot.kr", y="ate_rmse_m").axes[0].get_xlabel()
+    >>> table = estima.sweep(*quick, "robot.kr=1e-5,1e-4", "seed=range(0,2)")
+    >>> estima.plot(table, x="robot.kr", y="ate_rmse_m").axes[0].get_xlabel()
     'robot.kr'
     """
     from experiments.report.plot import sweep_figure

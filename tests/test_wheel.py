@@ -162,8 +162,8 @@ def test_the_gate_takes_the_baselines_of_the_wheel_or_of_the_folder(installed, t
     own = tmp_path / "results" / "baselines"
     code, said = estima("check", "--only", "odometry", "--accept", "mine", cwd=tmp_path)
     assert code == 0, said
-    assert said.split() == ["results/baselines/check.csv"]
-    assert sorted(path.name for path in own.iterdir()) == ["check.csv", "power.csv", "release.csv"]
+    assert {"check.csv", "release.csv"} <= {path.name for path in own.iterdir()}
+    assert "site-packages" not in said
     own.joinpath("check.csv").write_text("damaged\n")
     code, said = estima("check", "--only", "odometry", cwd=tmp_path)
     assert code == 2

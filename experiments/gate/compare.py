@@ -21,7 +21,6 @@ import dataclasses
 import itertools
 import math
 import re
-import shutil
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -473,10 +472,6 @@ def accept(
         changes["release"] = names
     elif worse := _cannot_stay(pinned.rows, rows, names):
         changes["release"] = worse
-    own = results() / "baselines"
-    if is_main(suite_name) and not own.exists():  # those of the package are not changed
-        shutil.copytree(paths["accepted"].parent, own)
-        paths = baseline_paths(suite_name)
     for key, changed in changes.items():
         write_baseline(renewed(old[key], rows, changed, reason, known), paths[key])
     return [paths[key] for key in changes]
