@@ -3,7 +3,7 @@ PYTHON ?= python3
 ESTIMA := .venv/bin/estima
 FULL ?= 0
 
-.PHONY: help setup reproduce test test-all lint types format lock clean
+.PHONY: help setup reproduce test test-all lint types format docs lock clean
 
 help:
 	@echo "make reproduce         figures, tables and claims into results/ (quick profile)"
@@ -11,6 +11,7 @@ help:
 	@echo "make test              the default tests"
 	@echo "make test-all          the slow ones too"
 	@echo "make lint types        what a change must pass besides"
+	@echo "make docs              the documentation, into site/"
 
 setup:
 	@$(PYTHON) tools/bootstrap.py
@@ -35,10 +36,13 @@ format: setup
 	@.venv/bin/ruff check --fix .
 	@.venv/bin/ruff format .
 
+docs: setup
+	@NO_MKDOCS_2_WARNING=1 .venv/bin/mkdocs build --strict --quiet
+
 # Rewrites the lock after a change of pyproject.toml; hashes only, no addresses.
 lock: setup
 	@.uv/bin/uv pip compile pyproject.toml --extra dev --extra docs --generate-hashes --no-emit-index-url \
 	  --no-header --no-annotate --universal --python-version 3.11 --quiet --output-file requirements.lock
 
 clean:
-	rm -rf .venv .uv results/runs results/cache
+	rm -rf .venv .uv site results/runs results/cache

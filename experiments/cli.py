@@ -32,6 +32,39 @@ Overrides = Annotated[
 ]
 
 
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        from experiments.runs.version import code_version
+
+        print(f"estima {version('estima')}, code {code_version()}")
+        raise typer.Exit
+
+
+@app.callback()
+def options_of_all(
+    results: Annotated[
+        Path | None,
+        typer.Option(
+            "--results",
+            envvar="ESTIMA_RESULTS",
+            file_okay=False,
+            help="Folder of results; `results` unless set. Before or after the command's name.",
+        ),
+    ] = None,
+    _: Annotated[
+        bool,
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="Print the version."
+        ),
+    ] = False,
+) -> None:
+    """Set what holds for all commands."""
+    if results is not None:
+        os.environ["ESTIMA_RESULTS"] = str(results.absolute())
+
+
 @app.command(context_settings=_PASS_ON)
 def run(context: typer.Context) -> None:
     """Make or read a recording, run an estimator over it, and write its row of results.
@@ -481,16 +514,43 @@ def reproduce(
 
 @app.command()
 def report() -> None:
-    """Write results/report.html anew, from what the studies left in results/.
+    """Write results/report.html from what the studies left in results/.
 
     Example: estima report
     """
-    from experiments.report.page import write_report
     from experiments.runs.console import progress
-    from experiments.runs.paths import results
+    from experiments.runs.paths import results, short
+    from sim.errors import InputError
+
+    if not any((results() / name).exists() for name in ("claims.csv", "figures", "tables")):
+        raise InputError(
+            f"{short(results())}: no claims, figures or tables to report; `estima reproduce` makes "
+            "them, and `estima table NAME` shows a sweep"
+        )
+    from experiments.report.page import write_report
 
     with progress("report", 1.0) as on_progress:
         print(write_report(results(), on_progress))
+
+
+@app.command()
+def cache(
+    clear: Annotated[bool, typer.Option("--clear", help="Delete the recordings.")] = False,
+) -> None:
+    """Show the cache of simulated recordings, or clear it.
+
+    ESTIMA_CACHE_GIB sets its limit; the recordings used longest ago go first.
+
+    Example: estima cache --clear
+    """
+    from experiments.runs.cache import files, folder, limit_bytes, trim
+    from experiments.runs.paths import short
+
+    if clear:
+        print(f"{trim(0.0)} recordings deleted")
+    kept = files()
+    size, limit = sum(size for _, size in kept) / 2**30, limit_bytes() / 2**30
+    print(f"{short(folder())}: {len(kept)} recordings, {size:.2f} of {limit:g} GiB")
 
 
 @app.command("export-table")
@@ -518,13 +578,26 @@ def main() -> None:
     from experiments.runs.console import end
 
     try:
-        app()
+        app(_results_first(sys.argv[1:]))
     except (Exception, KeyboardInterrupt) as error:
         end(error)
     except SystemExit as ended:
         if ended.code == _INTERRUPTED:
             print("estima: interrupted; what was finished is kept", file=sys.stderr)
         raise
+
+
+def _results_first(arguments: list[str]) -> list[str]:
+    """Arguments with `--results DIR` before the command's name, since it may stand anywhere."""
+    from sim.errors import InputError
+
+    for i, argument in enumerate(arguments):
+        if argument.partition("=")[0] == "--results":
+            n_words = 1 if "=" in argument else 2
+            if i + n_words > len(arguments):
+                raise InputError("--results must name a folder")
+            return [*arguments[i : i + n_words], *arguments[:i], *arguments[i + n_words :]]
+    return arguments
 
 
 _INTERRUPTED = 128 + 2  # by SIGINT

@@ -55,10 +55,13 @@ class Experiment:
         Resolved configuration, plain values.
     choices
         Name of the chosen option of each configuration group.
+    own_estimator
+        An object in place of the configured estimator; see `using`.
     """
 
     config: Config
     choices: Mapping[str, str] = field(default_factory=dict)
+    own_estimator: Estimator | None = None
 
     @classmethod
     def compose(cls, overrides: Sequence[str] = (), config_dir: Path | None = None) -> Experiment:
@@ -73,7 +76,8 @@ class Experiment:
         """
         lines = list(overrides)
         if config_dir is not None:
-            lines.append(f"hydra.searchpath=[file://{config_dir.resolve()}]")
+            folder = paths.quoted(f"file://{config_dir.resolve()}")
+            lines.append(f"hydra.searchpath=[{folder}]")
         with initialize_config_dir(str(paths.CONF), version_base="1.3"):
             cfg = compose("config", overrides=lines, return_hydra_config=True)
         chosen = cfg.hydra.runtime.choices
@@ -95,6 +99,20 @@ class Experiment:
     def replaced(self, **values: Any) -> Experiment:
         """Return the experiment with other values of top-level keys, such as `seed=3`."""
         return dataclasses.replace(self, config={**self.config, **values})
+
+    def using(self, estimator: Estimator) -> Experiment:
+        """Return the experiment with an estimator that is no option of the configuration."""
+        kind = type(estimator)
+        return dataclasses.replace(
+            self.replaced(estimator={"class": f"{kind.__module__}.{kind.__qualname__}"}),
+            choices={**self.choices, "estimator": kind.__name__},
+            own_estimator=estimator,
+        )
+
+    def over(self, recording: Recording) -> Experiment:
+        """Return the experiment over a recording in memory, which is known by its checksum."""
+        self._compare_slip(recording)
+        return self.replaced(recording={"checksum": recording.checksum})
 
     # What a run is called, and where its rows go
 
@@ -215,8 +233,8 @@ class Experiment:
 
     def _check_needs(self) -> None:
         """Check that the estimator gets the sensors and the map it cannot do without."""
-        settings = self.config["estimator"]
-        needs = getattr(find(settings.get("_target_"), "estimator"), "needs", ())
+        settings, method = self.config["estimator"], self.own_estimator
+        needs = getattr(method or find(settings.get("_target_"), "estimator"), "needs", ())
         for need, (sensor, presets) in _SENSORS.items():
             simulated = self.config["recording"] is None
             if need in needs and simulated and self.config["sensors"].get(sensor) is None:
@@ -247,14 +265,14 @@ class Experiment:
 
     def estimator(self) -> Estimator:
         """Make the estimator: anything with `reset` and `step`."""
-        estimator = make(self.config["estimator"], "estimator")
+        estimator: Estimator = self.own_estimator or make(self.config["estimator"], "estimator")
         for method in ("reset", "step"):
             if not callable(getattr(estimator, method, None)):
                 raise InputError(
-                    f"estimator._target_={self.config['estimator']['_target_']} has no method "
-                    f"{method}; see estimators/base.py for the protocol"
+                    f"estimator {type(estimator).__name__} has no method {method}; "
+                    "see estimators/base.py for the protocol"
                 )
-        return estimator  # type: ignore[no-any-return]
+        return estimator
 
     def route(self) -> Any:
         """Make the route: anything with `start`, as in `sim.simulate.Route`."""
@@ -310,9 +328,10 @@ class Experiment:
         if not isinstance(made_with, dict):
             return
         for key in ("kr", "kl"):
-            if key in made_with and made_with[key] != believed[key]:
+            asked = key in made_with and key in self.config["estimator"]
+            if asked and made_with[key] != believed[key]:
                 print(
-                    f"{self.config['recording']} was made with robot.{key}={made_with[key]:g}; "
+                    f"the recording was made with robot.{key}={made_with[key]:g}; "
                     f"{believed[key]:g} is believed unless robot.{key} or estimator.{key} is set",
                     file=sys.stderr,
                 )

@@ -31,3 +31,8 @@ def short(path: Path) -> str:
         return str(path.relative_to(Path.cwd()))
     except ValueError:
         return str(path)
+
+
+def quoted(text: object) -> str:
+    """Return the text as a value of a Hydra override, whatever letters a path has."""
+    return "'" + str(text).replace("'", "\\'") + "'"

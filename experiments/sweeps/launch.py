@@ -49,6 +49,7 @@ def sweep_arguments(arguments: Sequence[str]) -> None:
             raise InputError(f"a sweep takes overrides and --config-dir, not {argument}")
         else:
             overrides.append(argument)
+    signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGINT))  # end as by Ctrl-C
     sweep(overrides, config_dir)
 
 
@@ -125,7 +126,6 @@ def _launch_all(runs: Sequence[Experiment], folder: Path, launching: Sequence[st
         path.with_suffix(".failed").unlink(missing_ok=True)
         _begun(folder, run.key).unlink(missing_ok=True)
     _clear_plans(folder)
-    signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGINT))  # end as by Ctrl-C
     with _Watch(folder, [run.key for run in runs]):
         left = list(runs)
         while left:
@@ -156,11 +156,12 @@ def _launch(runs: Sequence[Experiment], folder: Path, launching: Sequence[str]) 
     )
     with write_whole(plan) as part:
         part.write_text(text)
+    arguments = sys.argv
     sys.argv = [
         "estima run",
         "-m",
         *launching,
-        f"plan={plan}",
+        f"plan={paths.quoted(plan)}",
         f"job={','.join(str(number) for number in range(len(jobs)))}",
     ]
     try:
@@ -169,6 +170,7 @@ def _launch(runs: Sequence[Experiment], folder: Path, launching: Sequence[str]) 
         died: Exception = error
         return died
     finally:
+        sys.argv = arguments
         plan.unlink(missing_ok=True)
         shutil.rmtree(f"{plan}.jobs", ignore_errors=True)
     return None

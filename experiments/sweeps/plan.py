@@ -61,8 +61,8 @@ class _Composer:
         self._bases: dict[tuple[str, ...], tuple[DictConfig, dict[str, str]]] = {}
         self.extra: list[str] = []
         if config_dir is not None:
-            folder = Path(config_dir).resolve()
-            self.extra = [f"hydra.searchpath=[file://{folder}]"]
+            folder = paths.quoted(f"file://{Path(config_dir).resolve()}")
+            self.extra = [f"hydra.searchpath=[{folder}]"]
 
     def experiment(self, overrides: list[str]) -> Experiment:
         """Resolve one combination."""
