@@ -70,10 +70,8 @@ def upward(path, lines):
     room = ROOMS.index(room_of(path))
     for name in lines:
         parts = name.split(".")
-        if parts[0] == "experiments" and len(parts) > 1 and parts[1] in ROOMS:
-            if ROOMS.index(parts[1]) < room:
-                yield name
-        if parts[0] == "estima":
+        inside = parts[0] == "experiments" and len(parts) > 1 and parts[1] in ROOMS
+        if parts[0] == "estima" or (inside and ROOMS.index(parts[1]) < room):
             yield name
 
 

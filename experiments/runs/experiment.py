@@ -227,9 +227,7 @@ class Experiment:
                     f"simulation.{key} must be {' or '.join(allowed)}, got {simulation[key]!r}"
                 )
         if simulation["physics"] == "kinematic" and simulation["rays"] == "bullet":
-            raise InputError(
-                "simulation.rays=bullet needs the engine; set simulation.rays=exact, or physics=bullet"
-            )
+            raise InputError("simulation.rays=bullet needs the engine; set simulation.rays=exact")
 
     def _check_needs(self) -> None:
         """Check that the estimator gets the sensors and the map it cannot do without."""

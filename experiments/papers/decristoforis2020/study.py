@@ -39,7 +39,7 @@ from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
 from experiments.runs.seeds import stream
-from experiments.sweeps.launch import planned
+from experiments.sweeps.plan import planned
 from sim.recording import Recording
 
 Tables = dict[str, pd.DataFrame]

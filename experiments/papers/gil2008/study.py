@@ -27,7 +27,7 @@ from experiments.runs.evaluate import estimates, scored, status_of
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
 from experiments.runs.seeds import stream
-from experiments.sweeps.launch import planned
+from experiments.sweeps.plan import planned
 from sim import se2
 from sim.recording import Recording
 from sim.robot import arc_increment

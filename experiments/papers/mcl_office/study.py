@@ -24,7 +24,7 @@ from experiments.runs.console import RunFailedError
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
 from experiments.runs.seeds import stream
-from experiments.sweeps.launch import planned
+from experiments.sweeps.plan import planned
 from sim.recording import Recording
 
 Array = NDArray[np.float64]

@@ -42,7 +42,7 @@ from experiments.papers.results import Results
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
 from experiments.runs.seeds import stream
-from experiments.sweeps.launch import planned
+from experiments.sweeps.plan import planned
 from sim.kinematic import BatchRuns, run_batch
 from sim.recording import Recording, WheelLog
 from sim.robot import DifferentialDrive, RobotGeometry
