@@ -25,6 +25,7 @@ from estimators.scan_matching import (
     Covariance,
     Match,
     ScanMatcher,
+    moved_beyond,
 )
 from estimators.wheels import WheelPrediction
 from sim.arrays import Array
@@ -175,7 +176,9 @@ class EkfIcp:
                 found = self._as_before(found)
             if self._take_in(found, place, extras):
                 self._failures = 0
-                left_key = self._left_key(found.motion.mean)
+                left_key = moved_beyond(
+                    found.motion.mean, self.keyframe_distance_m, self.keyframe_turn_rad
+                )
                 key, source = (scan, _NEW) if left_key else (reference, place)
                 self._keep(key, scan, (source, _NEW))
                 return
@@ -270,11 +273,6 @@ class EkfIcp:
         if found.failed:
             return np.zeros((3, 3))
         return rotated(self.shared_noise / 2.0 * found.known_covariance, self._mean[8])
-
-    def _left_key(self, motion: Array) -> bool:
-        """Whether it is time for a new key frame."""
-        x, y, turn = motion.tolist()
-        return math.hypot(x, y) > self.keyframe_distance_m or abs(turn) > self.keyframe_turn_rad
 
 
 def _from_twist(pose: Array) -> Array:

@@ -129,11 +129,6 @@ class Lineages:
     def __len__(self) -> int:
         return len(self._poses)
 
-    @property
-    def n_rows(self) -> int:
-        """Poses kept."""
-        return sum(len(poses) for poses in self._poses)
-
     def append(self, poses: Array) -> None:
         """Add the poses (M, 3) of a step, which the caller leaves as they are."""
         self._parents.append(self._rows)

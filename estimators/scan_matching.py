@@ -87,6 +87,12 @@ class Match:
         return Gaussian(self.motion.mean - self.loose @ off, (covariance + covariance.T) / 2.0)
 
 
+def moved_beyond(motion: Array, distance_m: float, turn_rad: float) -> bool:
+    """Whether a motion (3,) has left a key frame by more than either threshold."""
+    x, y, turn = motion.tolist()
+    return math.hypot(x, y) > distance_m or abs(turn) > turn_rad
+
+
 @dataclass(frozen=True)
 class ScanMatcher:
     """How scans are registered, and what is believed of their noise.
