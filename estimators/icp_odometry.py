@@ -64,9 +64,9 @@ class IcpOdometry:
     Notes
     -----
     When a registration fails (against the reference and against the last scan), the belief moves
-    by the guess with the guess's covariance and `extras["status"]` says why. The next scan is
-    tried against both again; after a second failure the newest scan becomes the reference.
-    Directions that the scans do not hold keep the guess and its covariance. Frames without a
+    by the guess with the guess's covariance and `extras["status"]` gives the reason. The next scan
+    is tried against both again; after a second failure the newest scan becomes the reference.
+    Directions that the scans do not constrain keep the guess and its covariance. Frames without a
     scan move by the wheels with `use_odometry_guess`, else they repeat the last belief.
 
     Belief extras: `registration_covariance` (3, 3) of T_reference_base, `registration_status`,

@@ -1,7 +1,7 @@
 """Weighted particles: log weights, effective sample size, resampling schemes.
 
 Weights are kept as logs and need no normalisation by the caller; a weight of -inf is a particle
-that the observations rule out. Weights that have all underflowed say nothing, and count as equal.
+that the observations rule out. Weights that have all underflowed count as equal.
 """
 
 from __future__ import annotations
