@@ -5,7 +5,7 @@ measure what they are: the pose of a scan relative to that of a key frame. The s
 holds the key frame's pose beside the robot's (stochastic cloning; Roumeliotis and Burdick 2002).
 
 Errors are twists in map (an invariant filter; Barrau and Bonnabel 2017): with errors of
-coordinates, registrations would seem to tell of the absolute heading once it is unsure.
+coordinates, registrations would spuriously inform the absolute heading once it is uncertain.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from estimators.scan_matching import (
     Covariance,
     Match,
     ScanMatcher,
+    moved_beyond,
 )
 from estimators.wheels import WheelPrediction
 from sim.arrays import Array
@@ -41,16 +42,16 @@ _ROWS = np.arange(12)
 class EkfIcp:
     """Predict by the wheels, correct by the scan's pose relative to the key frame.
 
-    Each scan is taken to show the world from an apparent pose, x * d, with an error d of its own
-    that it brings to all its registrations; the rest of their noise is each one's own. A
+    Each scan is modelled as seen from an apparent pose, x * d, whose error d enters all its
+    registrations; the rest of the noise is independent from one registration to the next. A
     registration compares apparent poses, and those of the key frame and of the last scan are in
-    the state. So the noise that all registrations of a key frame share is counted once, and what
-    is left of a scan's noise when it turns from source to reference takes itself back.
+    the state. So the noise that all registrations of a key frame share is counted once, and a
+    scan's error cancels when it turns from source to reference.
 
     Parameters
     ----------
     metric, search, covariance, sigma_range_m
-        As in `estimators.scan_matching.ScanMatcher`; either scan bears half of the covariance.
+        As in `estimators.scan_matching.ScanMatcher`; each scan contributes half of the covariance.
     keyframe_distance_m, keyframe_turn_rad
         How far the robot goes before it takes a new key frame.
     kr, kl
@@ -58,28 +59,26 @@ class EkfIcp:
     lateral_slip_m
         Variance per metre of the sideways slip, m.
     encoder_tick_m
-        Travel of a wheel per encoder tick. Each increment that is not zero has a variance of
-        tick^2 / 6, which overstates it over many frames, since ticks do not add up.
+        Travel of a wheel per encoder tick, m: see `estimators.wheels.WheelPrediction`.
     gate_probability
-        Leave out registrations with an innovation so large that only this share of all should
-        have a larger one; None to use all. The default takes what can only be a wrong match.
+        Reject a registration if only this share of all should have a larger innovation; None to
+        use all. The default rejects only what must be a wrong match.
     shared_noise
         Share of a registration's covariance that comes from the scans' own errors, half from
-        each; 0: each registration counts as independent. It shows as a correlation of minus
-        half of it between the registrations before and after a key frame.
+        each; 0: registrations are independent. Registrations before and after a key frame then
+        correlate by minus half of it.
     window_s
         |ds| is netted over at least this time.
 
     Notes
     -----
     Where the registration with the key frame fails or is gated, the last scan is tried, and
-    becomes the key frame if it holds. Where both fail the wheels go on alone; after two such
-    scans in a row the newest becomes the key frame. Directions that the scans do not hold are
-    left to the wheels.
+    becomes the key frame if it succeeds. Where both fail only the wheels are used; after two such
+    scans in a row the newest becomes the key frame. Directions that the scans do not constrain
+    are left to the wheels.
 
     Belief extras: `registration_covariance` (3, 3) of T_reference_base, `registration_status`,
-    `nis` (the innovation squared, normalised) with `nis_dof`, and `status` if a scan was of no
-    use.
+    `nis` (normalised innovation squared) with `nis_dof`, and `status` if a scan was not used.
     """
 
     needs = frozenset({"laser"})
@@ -175,7 +174,9 @@ class EkfIcp:
                 found = self._as_before(found)
             if self._take_in(found, place, extras):
                 self._failures = 0
-                left_key = self._left_key(found.motion.mean)
+                left_key = moved_beyond(
+                    found.motion.mean, self.keyframe_distance_m, self.keyframe_turn_rad
+                )
                 key, source = (scan, _NEW) if left_key else (reference, place)
                 self._keep(key, scan, (source, _NEW))
                 return
@@ -190,7 +191,7 @@ class EkfIcp:
         """Pose relative to a clone's, with its covariance; its derivative (3, 3) by the twists.
 
         A twist that both poses share changes nothing, so the derivative by the clone's twist is
-        minus that by the robot's: what the scans cannot tell, the filter cannot learn from them.
+        minus that by the robot's: the filter learns nothing that the scans do not measure.
         """
         relative, _, by_pose = between(self._mean[place], self._mean[_POSE])
         by_twist = by_pose @ _from_twist(self._mean[_POSE])
@@ -228,9 +229,9 @@ class EkfIcp:
     def _as_before(self, found: Match) -> Match:
         """Give a degenerate match the directions of the key frame's first such match.
 
-        Each registration finds a direction that nobody holds a little differently, and what one
-        holds of the other's would add up to knowledge of it that there is not. As twists in the
-        key frame the directions are the same wherever the robot is.
+        Each registration finds slightly different unconstrained directions, and together they
+        would seem to constrain them. As twists in the key frame the directions are the same
+        wherever the robot is.
         """
         if found.status != "degenerate":
             return found
@@ -270,11 +271,6 @@ class EkfIcp:
         if found.failed:
             return np.zeros((3, 3))
         return rotated(self.shared_noise / 2.0 * found.known_covariance, self._mean[8])
-
-    def _left_key(self, motion: Array) -> bool:
-        """Whether it is time for a new key frame."""
-        x, y, turn = motion.tolist()
-        return math.hypot(x, y) > self.keyframe_distance_m or abs(turn) > self.keyframe_turn_rad
 
 
 def _from_twist(pose: Array) -> Array:

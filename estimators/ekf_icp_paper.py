@@ -54,10 +54,10 @@ class EkfIcpPaper:
     Increments are expressed in the axes of the robot at their end, where the heading of the
     observation is. The change of velocity acts from the beginning of a step, so that a velocity
     measured over the step corrects the whole of it. A registration that failed corrects nothing;
-    directions that the scans do not hold are left to the wheels.
+    directions that the scans do not constrain are left to the wheels.
 
     Belief extras: `registration_covariance` (3, 3) of the motion since the previous scan,
-    `registration_status`, and `status` if a scan was of no use.
+    `registration_status`, and `status` if a scan was not used.
     """
 
     needs = frozenset({"laser"})

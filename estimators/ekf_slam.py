@@ -50,8 +50,8 @@ class EkfSlam:
     -----
     Extras: `associations` (K,): for each observation, counted from 0 over the whole run, the one
     that started its landmark, itself if it is the first, -1 if it was rejected; with `keep_map`
-    also `landmarks` (N, 3) and `landmark_covariances` (N, 3, 3); `status` when an image was of no
-    use.
+    also `landmarks` (N, 3) and `landmark_covariances` (N, 3, 3); `status` when an image was not
+    used.
 
     A step costs O(K N^2): the whole covariance is touched.
     """

@@ -34,7 +34,7 @@ from sim.recording import Frame, LandmarkSet
 
 Proposal = Literal["motion", "optimal"]
 
-_PLACING = 4  # observations after which the proposal is linearised anew
+_PLACING = 4  # observations after which the proposal is linearised again
 _MOST_DRIFT_RAD = 0.1  # heading spread at which motion is drawn without waiting for an image
 
 
@@ -51,8 +51,8 @@ class FastSLAM:
         M.
     proposal
         `motion`: FastSLAM 1.0, drawn from the motion model and weighted by eq. (13). `optimal`:
-        FastSLAM 2.0, drawn from the motion given the image too, with the weight that this
-        proposal is owed, p(z | x) p(x) / q(x): how it is linearised costs particles, not truth.
+        FastSLAM 2.0, drawn from the motion given the image too, with the importance weight
+        p(z | x) p(x) / q(x): a poor linearisation lowers the effective sample size, without bias.
     resampling
         `systematic`, `stratified`, `residual` or `multinomial`.
     ess_share
@@ -89,7 +89,7 @@ class FastSLAM:
     eq. (20); at an image `associations` (K,) of that particle: for each observation, counted from
     0 over the whole run, the one that started its landmark, itself if it is the first, -1 if it
     was rejected; with `keep_map` also `landmarks` (N, 3) and `landmark_covariances` (N, 3, 3);
-    `status` when an image was of no use.
+    `status` when an image was not used.
 
     `finish` gives the path of the best particle's lineage; `map` is its map.
     """
@@ -231,9 +231,8 @@ class FastSLAM:
     def finish(self) -> Estimate:
         """Path of the lineage of greatest accumulated weight, gil2008, eq. (20).
 
-        The covariances are those of all weighted lineages. Where these have one ancestor in
-        common they are zero, which says that the particles have died out, not that the path is
-        known so well.
+        The covariances are those of all weighted lineages. They are zero where all lineages share
+        one ancestor: a sign of particle depletion, not of a path known exactly.
         """
         best = int(np.argmax(self._accumulated))
         weights = normalize(self._log_weights)
@@ -335,10 +334,10 @@ class FastSLAM:
         return rotated(self._rolled.covariance, angle)
 
     def _propose(self, normals: Array, slots: Ints, points: Array) -> Array:
-        """Turn normals into draws given the image; log weights (M,) that these are owed.
+        """Turn normals into draws given the image; their log importance weights (M,).
 
-        The first few observations place the particle, and all are linearised anew there: what
-        is left to the second linearisation is a fraction of the motion's noise.
+        The first few observations place the particle, and all are linearised again there: the
+        second linearisation only has to hold over a fraction of the motion's noise.
         """
         old = slots >= 0 if slots.ndim == 1 else (slots >= 0).any(axis=1)
         rows, points = self._maps.rows(slots[old]), points[old]

@@ -28,7 +28,7 @@ from sim.compiled import njit
 Scans = Literal["both", "last"]
 Matches = Literal["held", "sliding"]
 
-UNKNOWN_M, UNKNOWN_RAD = 10.0, math.pi  # standard deviations of a direction nobody holds
+UNKNOWN_M, UNKNOWN_RAD = 10.0, math.pi  # standard deviations of an unconstrained direction
 
 
 @njit(error_model="numpy")
@@ -248,16 +248,16 @@ def unscented_censi(
 def split_directions(registration: Registration) -> tuple[Array, Array]:
     """Directions of the pose that the scans hold (3, 3 - D), and do not hold (3, D), D = 0 to 3.
 
-    Not held are those in which the information of the target's lines is less than 4 times what
-    the noise of their directions alone would feign. A column has length one in units of
+    Not held are those in which the information of the target's lines is less than 4 times the
+    spurious part that the noise of their directions adds. A column has length one in units of
     `UNKNOWN_M` and `UNKNOWN_RAD`; all are orthogonal in the information.
     """
     unit = np.array([UNKNOWN_M, UNKNOWN_M, UNKNOWN_RAD])
     information = registration.information * np.outer(unit, unit)
-    feigned = registration.information_noise * np.outer(unit, unit)
+    spurious = registration.information_noise * np.outer(unit, unit)
     least = (1e-12 * np.trace(information) + 1e-300) * np.eye(3)
     root = np.linalg.inv(np.linalg.cholesky(information + least))
-    share, basis = np.linalg.eigh(root @ (feigned + least) @ root.T)
+    share, basis = np.linalg.eigh(root @ (spurious + least) @ root.T)
     directions = root.T @ basis
     directions /= np.linalg.norm(directions, axis=0)
     loose = share > 1.0 / LEAST_INFORMATION

@@ -20,6 +20,7 @@ from estimators.scan_matching import (
     FAILED,
     Covariance,
     ScanMatcher,
+    moved_beyond,
 )
 from estimators.wheels import WheelPrediction
 from sim import se2
@@ -63,9 +64,9 @@ class IcpOdometry:
     Notes
     -----
     When a registration fails (against the reference and against the last scan), the belief moves
-    by the guess with the guess's covariance and `extras["status"]` says why. The next scan is
-    tried against both again; after a second failure the newest scan becomes the reference.
-    Directions that the scans do not hold keep the guess and its covariance. Frames without a
+    by the guess with the guess's covariance and `extras["status"]` gives the reason. The next scan
+    is tried against both again; after a second failure the newest scan becomes the reference.
+    Directions that the scans do not constrain keep the guess and its covariance. Frames without a
     scan move by the wheels with `use_odometry_guess`, else they repeat the last belief.
 
     Belief extras: `registration_covariance` (3, 3) of T_reference_base, `registration_status`,
@@ -144,8 +145,11 @@ class IcpOdometry:
             moved = se2.between(self._last.belief.mean, belief.mean)
             self._velocity = se2.log(moved) / self._since_s
         self._last = _Anchor(belief, scan)
+        left_key = self.reference == "previous" or moved_beyond(
+            self._key_to_last.mean, self.keyframe_distance_m, self.keyframe_turn_rad
+        )
         # after a single lost scan the key frame gets another chance: the scan may be at fault
-        if (failed and self._lost) or (not failed and self._left_key()):
+        if (failed and self._lost) or (not failed and left_key):
             self._key, self._key_to_last = self._last, STILL
         self._lost = failed
         self._rolled, self._since_s = STILL, 0.0
@@ -159,13 +163,6 @@ class IcpOdometry:
         spread_m = _GUESS_FLOOR_M + _GUESS_SHARE * math.hypot(motion[0], motion[1])
         spread_rad = _GUESS_FLOOR_RAD + _GUESS_SHARE * abs(float(motion[2]))
         return Gaussian(motion, np.diag([spread_m**2, spread_m**2, spread_rad**2]))
-
-    def _left_key(self) -> bool:
-        """Whether it is time for a new key frame."""
-        if self.reference == "previous":
-            return True
-        x, y, turn = self._key_to_last.mean
-        return math.hypot(x, y) > self.keyframe_distance_m or abs(turn) > self.keyframe_turn_rad
 
     def _matched(
         self, scan: PreparedScan, reference: PreparedScan, guess: Gaussian

@@ -5,7 +5,7 @@ of 6 unique entries in map axes. In memory come slots, then blocks of `LANES` pa
 nine numbers: an observation of the slot that all particles share runs through memory once, and a
 vector unit works on as many particles as it is wide.
 
-The update, gil2008, eqs. (3)-(8), is worked out in map axes, where G = 1 (see
+The update, gil2008, eqs. (3)-(8), is computed in map axes, where G = 1 (see
 `estimators.stereo`): S = P + C^T R C, K = P S^-1, and P - K P for the covariance, of which only the
 upper half is computed, so that it stays symmetric. Weights are those of eq. (13).
 
@@ -294,7 +294,7 @@ def _corrected(
 
 @njit(forceinline=True, **_FLOATS)
 def _informed(L: Array, S: Array, j: int, mx: float, my: float, mz: float, camera: Array) -> None:
-    """Add what one observation says of the pose of lane j: H^T S^-1 H and H^T S^-1 v.
+    """Add one observation's information on the pose of lane j: H^T S^-1 H and H^T S^-1 v.
 
     In map axes H = [[-1, 0, dy], [0, -1, -dx], [0, 0, 0]], with d from base_link to the landmark.
     """
@@ -337,7 +337,7 @@ def _informed(L: Array, S: Array, j: int, mx: float, my: float, mz: float, camer
 def update(maps: Array, rows: Ints, points: Array, state: Array, camera: Array) -> None:
     """Update rows (K,), the same in all particles, by points (K, 3) in the camera frame.
 
-    Starts the state's sums anew. K is at most `GROUP`, so that the product of determinants, each
+    Resets the state's sums first. K is at most `GROUP`, so that the product of determinants, each
     over that of R at the measured point, stays within a double.
     """
     state[:, _DISTANCE * LANES : (_DISTANCE + 1) * LANES] = 0.0
@@ -353,7 +353,7 @@ def update(maps: Array, rows: Ints, points: Array, state: Array, camera: Array) 
 
 @njit(**_FLOATS)
 def inform(maps: Array, rows: Ints, points: Array, state: Array, camera: Array) -> None:
-    """Add up what points (K, 3) of rows (K,) say of every particle's pose."""
+    """Sum the information of points (K, 3) of rows (K,) on every particle's pose."""
     state[:, _INFORMATION * LANES :] = 0.0
     for i in range(len(rows)):
         mx, my, mz = points[i, 0], points[i, 1], points[i, 2]
@@ -479,7 +479,7 @@ def propose(
 
     With the motion's noise `root` x, x ~ N(0, 1), and the state's information I and i on the pose,
     taken at x0 = `start` (3, lanes), x given the image is N(m, P): P^-1 = 1 + B^T I B,
-    m = P (B^T i + B^T I B x0), B = dpose/dx. The weight that a draw is owed, p(x) / q(x), is
+    m = P (B^T i + B^T I B x0), B = dpose/dx. A draw's importance weight, p(x) / q(x), is
     exp(owed[0] / 2) / owed[1], `owed` (2, lanes).
     """
     for block in range(len(state)):
@@ -561,7 +561,7 @@ def associate(
     births
         (N, M) what `unlikeness` (K, births) is looked up by.
     unlikeness
-        Added to the distance when choosing; a landmark is refused where it is positive. (K, 0)
+        Added to the distance when choosing; a landmark is rejected where it is positive. (K, 0)
         to choose by distance alone.
     spread
         (3, 3) covariance of the pose yet to be drawn, in axes of the camera.
@@ -651,7 +651,7 @@ def _gather(
     spare: int,
     ancestry: NDArray[np.int32],
 ) -> int:
-    """Write slots anew, into the spare row, with the numbers of each particle's ancestor.
+    """Rewrite slots, each into the spare row, with the numbers of each particle's ancestor.
 
     `maps` is (rows, numbers); the slots come latest epoch first. Returns the row that is spare in
     the end.

@@ -13,7 +13,7 @@ from sim.sensors import Laser, StereoCamera
 
 
 def require_choices(owner: str = "estimator.", /, **choices: tuple[str, Any]) -> None:
-    """Each option is given as (value, Literal type): the value must be one of the type's."""
+    """Each option is given as (value, Literal): the value must be one of the Literal's."""
     for name, (value, kind) in choices.items():
         if value not in get_args(kind):
             allowed = ", ".join(get_args(kind))

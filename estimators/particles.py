@@ -1,7 +1,7 @@
 """Weighted particles: log weights, effective sample size, resampling schemes.
 
 Weights are kept as logs and need no normalisation by the caller; a weight of -inf is a particle
-that the observations rule out. Weights that have all underflowed say nothing, and count as equal.
+that the observations rule out. Weights that have all underflowed count as equal.
 """
 
 from __future__ import annotations
@@ -128,11 +128,6 @@ class Lineages:
 
     def __len__(self) -> int:
         return len(self._poses)
-
-    @property
-    def n_rows(self) -> int:
-        """Poses kept."""
-        return sum(len(poses) for poses in self._poses)
 
     def append(self, poses: Array) -> None:
         """Add the poses (M, 3) of a step, which the caller leaves as they are."""

@@ -56,57 +56,44 @@ class Refiner:
         """Register a cloud (rings, azimuths) with a node, or if that fails with other nodes."""
         ranges = level_slice(self._lidar, cloud_ranges_m)
         source = prepare(ranges, self._bearings, self._lidar.max_range_m)
-        status, best, best_node = "no heading", None, node
+        best, best_node, status = None, node, "no heading"
         for candidate in [node, *others]:
             if not math.isfinite(self._map.headings_rad[candidate]):
                 continue
-            found, why = self._registered(source, ranges, candidate)
-            if found is None:
-                status = why
-            elif best is None or found.overlap > best.overlap:
-                best, best_node = found, candidate
-            if best is not None and best.overlap > _GOOD_OVERLAP:
-                break
+            for turn in likely_turns_rad(ranges, self._map.slices_m[candidate]):
+                found = register(
+                    source,
+                    self._target(candidate),
+                    np.array([0.0, 0.0, turn]),
+                    gate_m=max(2.0, self._reach_m / 2.0),
+                    heading_window_rad=_HEADING_WINDOW_RAD,
+                )
+                if found.status != "ok":
+                    status = found.status
+                elif np.hypot(*found.T_target_source[:2]) > self._reach_m:
+                    status = "far"
+                elif best is None or found.overlap > best.overlap:
+                    best, best_node = found, candidate
+                    if best.overlap > _GOOD_OVERLAP:
+                        return self._posed(best, source, best_node)
         if best is None:
             return Refinement(None, None, status)
         return self._posed(best, source, best_node)
 
-    def _registered(
-        self, source: PreparedScan, ranges_m: Floats, node: int
-    ) -> tuple[Registration | None, str]:
-        """Best registration with a node over the likely turns, or None and why."""
-        target_m = self._map.slices_m[node]
-        target = self._prepared.get(node)
-        if target is None:
-            target = prepare(target_m, self._bearings, self._lidar.max_range_m)
-            self._prepared[node] = target
-        best, status = None, "empty"
-        for turn in likely_turns_rad(ranges_m, target_m):
-            found = register(
-                source,
-                target,
-                np.array([0.0, 0.0, turn]),
-                gate_m=max(2.0, self._reach_m / 2.0),
-                heading_window_rad=_HEADING_WINDOW_RAD,
-            )
-            if found.status != "ok":
-                status = found.status
-            elif np.hypot(*found.T_target_source[:2]) > self._reach_m:
-                status = "far"
-            elif best is None or found.overlap > best.overlap:
-                best = found
-            if best is not None and best.overlap > _GOOD_OVERLAP:
-                break
-        return best, status
+    def _target(self, node: int) -> PreparedScan:
+        """Return a node's slice, prepared when it is first asked for."""
+        if node not in self._prepared:
+            ranges_m, reach_m = self._map.slices_m[node], self._lidar.max_range_m
+            self._prepared[node] = prepare(ranges_m, self._bearings, reach_m)
+        return self._prepared[node]
 
     def _posed(self, found: Registration, source: PreparedScan, node: int) -> Refinement:
         """From the motion of the lidar to the pose of base_link in map."""
         mount = self._lidar.mount.pose
-        motion = se2.compose(mount, found.T_target_source)
         at_node = np.append(self._map.positions_m[node], self._map.headings_rad[node])
-        T_map_lidar = se2.compose(at_node, motion)
-        sensor = se2.compose(at_node, mount)
-        R = rotated(censi(found, source, self._prepared[node]), float(sensor[2]))
+        T_map_lidar = se2.compose(at_node, se2.compose(mount, found.T_target_source))
+        heading = float(se2.compose(at_node, mount)[2])
+        R = rotated(censi(found, source, self._prepared[node]), heading)
         back = se2.inverse(mount)
         by_lidar = se2.compose_jacobians(T_map_lidar, back)[0]
         covariance = by_lidar @ R @ by_lidar.T
@@ -130,9 +117,8 @@ def likely_turns_rad(source_m: Floats, target_m: Floats, n_turns: int = _TURNS) 
     peaks = np.flatnonzero((score >= np.roll(score, 1)) & (score > np.roll(score, -1)))
     if not len(peaks):
         return [0.0]
-    best = peaks[np.argsort(-score[peaks], kind="stable")]
     chosen: list[float] = []
-    for peak in best:
+    for peak in peaks[np.argsort(-score[peaks], kind="stable")]:
         turn = math.remainder(2.0 * math.pi * float(peak) / n, 2.0 * math.pi)
         apart = [abs(math.remainder(turn - other, 2.0 * math.pi)) for other in chosen]
         if all(gap > _HEADING_WINDOW_RAD for gap in apart):

@@ -1,7 +1,7 @@
 """Registration of a robot's scans as its estimators use it: motions of base_link, with covariance.
 
-The guess tells how far to look, the chosen method how sure the result is, and directions that
-the scans do not hold are named.
+The guess sets how far to look, the chosen method the covariance; directions that the scans do
+not constrain are reported.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ Covariance = Literal["censi", "censi_last", "hessian", "sampling", "unscented_ce
 FAILED = ("empty", "poor_overlap", "not_converged")
 
 _LEAST_SIGMA_M = 1e-4  # a laser without noise still has rounding
-# What a guess may be wrong by, at least and at most
+# Bounds of the error that a guess is assumed to have
 _LEAST_GATE_M, _MOST_GATE_M = 0.5, 2.0
 _LEAST_GATE_RAD, _MOST_GATE_RAD = 0.02, 0.2
 _EVERYTHING, _NOTHING = np.eye(3), np.zeros((3, 3))
@@ -43,7 +43,7 @@ _EVERYTHING, _NOTHING = np.eye(3), np.zeros((3, 3))
 
 @dataclass(frozen=True)
 class Match:
-    """What a scan says of the motion of base_link since the reference's.
+    """The motion of base_link from the reference scan to another, as registered.
 
     Attributes
     ----------
@@ -65,7 +65,7 @@ class Match:
 
     @property
     def failed(self) -> bool:
-        """Whether it says nothing at all."""
+        """Whether the registration is of no use."""
         return self.status in FAILED
 
     @property
@@ -85,6 +85,12 @@ class Match:
         unknown = self.motion.covariance - guess.covariance
         covariance = self.motion.covariance - self.loose @ unknown @ self.loose.T
         return Gaussian(self.motion.mean - self.loose @ off, (covariance + covariance.T) / 2.0)
+
+
+def moved_beyond(motion: Array, distance_m: float, turn_rad: float) -> bool:
+    """Whether a motion (3,) has left a key frame by more than either threshold."""
+    x, y, turn = motion.tolist()
+    return math.hypot(x, y) > distance_m or abs(turn) > turn_rad
 
 
 @dataclass(frozen=True)
@@ -169,13 +175,13 @@ class ScanMatcher:
         n_held = in_base[0].shape[1]
         held, loose = coordinates[:n_held], in_base[1] @ coordinates[n_held:]
         match = Match(motion, found.status, held, loose)
-        # The directions themselves are unsure: along a loose one that is a little off, what the
-        # registration wandered, and the guess may be wrong by, leaks into the held ones.
+        # The directions themselves are uncertain: along a loose one that is slightly off, the
+        # error of the registration and of the guess leaks into the held ones.
         off = coordinates[n_held:] @ (motion.mean - guess.mean)
         spread = coordinates[n_held:] @ guess.covariance @ coordinates[n_held:].T
         _, in_laser_loose = icp_covariance.split_directions(found)
-        feigned = in_laser_loose.T @ found.information_noise @ in_laser_loose
-        leak = float(np.trace(feigned @ (np.outer(off, off) + spread)))
+        spurious = in_laser_loose.T @ found.information_noise @ in_laser_loose
+        leak = float(np.trace(spurious @ (np.outer(off, off) + spread)))
         covariance = motion.covariance + leak * match.known_covariance
         return dataclasses.replace(match, motion=Gaussian(motion.mean, covariance))
 

@@ -29,7 +29,7 @@ from sim.recording import LandmarkSet
 
 Association = Literal["known", "mahalanobis", "descriptor"]
 
-_BLIND_IMAGES = 100  # images without a landmark after which the status says so
+_BLIND_IMAGES = 100  # images without a landmark after which the status reports it
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class SlamFrontEnd:
     Landmarks are numbered in the order in which observations start them. Two unit descriptors of
     D independent components have a product of N(rho, 1 / D) if they are of one landmark, rho =
     1 / (1 + sigma_descriptor^2), and of N(0, 1 / D) if not; twice the log of the ratio of these
-    densities is what speaks for the same landmark.
+    densities is the evidence for the same landmark.
 
     Parameters
     ----------

@@ -500,7 +500,7 @@ def _sideways(motion: Gaussian) -> Array:
     """Covariance (3, 3) that slip adds within a Frame because it is spread along the way.
 
     The arc takes each wheel to turn evenly. A heading that wanders by the variance s^2 over the
-    way d also leaves it sideways, by d^2 s^2 / 12 beyond what the heading at the end tells.
+    way d also leaves it sideways, by d^2 s^2 / 12 beyond what the final heading accounts for.
     """
     x, y, turn = motion.mean
     normal = np.array([-math.sin(turn / 2.0), math.cos(turn / 2.0), 0.0])

@@ -3,7 +3,7 @@
 A landmark l lies at p = C(s) (l - t(s)) in the camera frame (x right, y down, z forward), where
 C turns map axes into camera axes and t is the camera's position at robot pose s. The measurement
 z = (X, Y, Z) is that point with noise (gil2008, eq. (9)), so dz/dl = C is orthonormal, and an
-update may be worked out in map axes: with G = 1, v = t + C^T z - l and C^T R C for R.
+update may be computed in map axes: with G = 1, v = t + C^T z - l and C^T R C for R.
 
 R at a point p of depth z follows from eqs. (10)-(12). With the correlations that a shared disparity
 error makes it is

@@ -203,7 +203,7 @@ def from_recording(
         A run with 3D clouds, or with place descriptors of one's own, and with its true poses
         (GPS, in the paper).
     descriptor
-        Name of `estimators.descriptors.KINDS`; of no use if the run has place descriptors.
+        Name of `estimators.descriptors.KINDS`; ignored if the run has place descriptors.
     spacing_m
         Least distance between successive nodes.
     join_m

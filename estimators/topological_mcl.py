@@ -34,7 +34,7 @@ Motion = Literal["odometry", "paper"]
 Resampling = Literal["ess", "always"]
 Summary = Literal["mode", "mean"]
 
-_ALL_AROUND = math.pi**2 / 3.0  # variance of a heading that nobody knows, rad^2
+_ALL_AROUND = math.pi**2 / 3.0  # variance of an unknown heading, rad^2
 _MOST_HOPS = 100  # of one particle between two Frames
 _LEAST_HEADING = 0.01  # variance of the heading on an edge, rad^2
 _CARRIED_SHARE = 0.05  # error of the wheels' motion, as a share of it
@@ -162,13 +162,13 @@ class TopologicalMcl:
     particles_per_node
         Particles, over the map's nodes; they face its neighbours in turn.
     n_nearest
-        B: how many of the map's descriptors, the most alike, have a say.
+        B: how many of the map's most similar descriptors count.
     sigma_l_m
         Spread about their places, m; None for the map's spacing.
     sigma_m
         Spread of their descriptor distances, which sum to one.
     motion
-        `paper`: one node at every observation, whatever the wheels say. `odometry`: along the
+        `paper`: one node at every observation, regardless of the wheels. `odometry`: along the
         graph by the wheels' travel.
     p_stay, p_skip, p_turn
         With `odometry`: chance at each node to be late by one, to be early by one, and to turn
