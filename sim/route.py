@@ -14,6 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from sim.errors import InputError
 from sim.robot import DifferentialDrive, arc_increment
+from sim.se2 import chain
+from sim.settings import check_numbers
 from sim.world import World
 
 Array = NDArray[np.float64]
@@ -45,8 +47,7 @@ class OpenLoop:
     rest_s: float = 0.2
 
     def __post_init__(self) -> None:
-        if not math.isfinite(self.rest_s) or self.rest_s < 0.0:
-            raise InputError(f"route.rest_s must be zero or positive, got {self.rest_s}")
+        check_numbers("route", self, not_negative=("rest_s",))
         object.__setattr__(self, "segments", tuple(_merged(self.segments)))
         if not self.segments:
             raise InputError("route.segments is empty; give at least one [v, omega, duration]")
@@ -60,7 +61,7 @@ class OpenLoop:
 
         Being means, they add up to the promised distance and angle exactly.
         """
-        starts_s, end_s = self._schedule(robot)
+        *starts_s, end_s = self.edges_s(robot)
         n_ticks = math.ceil((end_s + self.rest_s) / dt_s - 1e-9)
         edges_s = dt_s * np.arange(n_ticks + 1, dtype=np.float64)
         velocity = np.zeros((n_ticks, 2))
@@ -70,18 +71,11 @@ class OpenLoop:
             velocity[first:] += np.diff(held_s)[:, None] / dt_s * np.array(segment[:2])
         return velocity
 
-    def starts_s(self, robot: DifferentialDrive) -> Array:
-        """Time (S,) at which each segment begins, s."""
-        return np.array(self._schedule(robot)[0])
-
-    def ideal_poses(
-        self, robot: DifferentialDrive, dt_s: float = TICK_S, start: ArrayLike = (0.0, 0.0, 0.0)
-    ) -> Array:
-        """Poses (N + 1, 3) that the commands promise at the tick edges; headings unwrapped."""
-        velocity = self.profile(robot, dt_s)
-        # track 2: wheel travels are then v + omega and v - omega
-        travel = dt_s * np.stack([velocity[:, 0] + velocity[:, 1], velocity[:, 0] - velocity[:, 1]])
-        return chain(arc_increment(travel.T, 2.0), start)
+    def edges_s(self, robot: DifferentialDrive) -> Array:
+        """Times (S + 1,) at which the segments begin and the last one ends, s."""
+        ramps = [_trapezoid(segment, robot) for segment in self.segments]
+        lasts_s = [plateau_s + 2.0 * ramp_s for plateau_s, ramp_s, _ in ramps]
+        return np.concatenate([[0.0], np.cumsum(lasts_s)])
 
     def ideal_end(self, start: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
         """Pose (3,) that the commands promise at the end; heading unwrapped."""
@@ -89,15 +83,6 @@ class OpenLoop:
         travel = np.stack([v + omega, v - omega], axis=1) * duration_s[:, None]
         last: Array = chain(arc_increment(travel, 2.0), start)[-1]
         return last
-
-    def _schedule(self, robot: DifferentialDrive) -> tuple[list[float], float]:
-        """Start of each segment and end of the last one, s."""
-        starts_s, now_s = [], 0.0
-        for segment in self.segments:
-            starts_s.append(now_s)
-            plateau_s, ramp_s, _ = _trapezoid(segment, robot)
-            now_s += plateau_s + 2.0 * ramp_s
-        return starts_s, now_s
 
 
 @dataclass(frozen=True)
@@ -148,10 +133,9 @@ class Tour:
     turn_rate_radps: float = 1.0
 
     def __post_init__(self) -> None:
-        for name in ("speed_mps", "look_ahead_m", "tolerance_m", "turn_rate_radps"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0.0):
-                raise InputError(f"route.{name} must be a positive number, got {value}")
+        check_numbers(
+            "route", self, ("speed_mps", "look_ahead_m", "tolerance_m", "turn_rate_radps")
+        )
         if self.distance_m is not None and not 0.0 < self.distance_m < math.inf:
             raise InputError(f"route.distance_m must be positive, got {self.distance_m}")
 
@@ -272,18 +256,6 @@ def _lengthened(path: Array, distance_m: float | None) -> Array:
 
 def _length(path: Array) -> float:
     return float(np.sum(np.hypot(*np.diff(path, axis=0).T)))
-
-
-def chain(increments: ArrayLike, start: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
-    """Poses (N + 1, 3) from relative poses (N, 3) and a start pose; headings unwrapped."""
-    steps, first = np.asarray(increments, float), np.asarray(start, float)
-    heading = first[2] + np.concatenate([[0.0], np.cumsum(steps[:, 2])])
-    cos, sin = np.cos(heading[:-1]), np.sin(heading[:-1])
-    moves = np.stack([cos * steps[:, 0] - sin * steps[:, 1], sin * steps[:, 0] + cos * steps[:, 1]])
-    poses = np.empty((len(steps) + 1, 3))
-    poses[0, :2], poses[1:, :2] = first[:2], first[:2] + np.cumsum(moves.T, axis=0)
-    poses[:, 2] = heading
-    return poses
 
 
 def _merged(segments: Iterable[Iterable[float]]) -> list[Segment]:

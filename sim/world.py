@@ -12,10 +12,6 @@ from sim.errors import InputError
 Array = NDArray[np.float64]
 
 
-def _empty(*shape: int) -> Array:
-    return np.zeros(shape)
-
-
 @dataclass(frozen=True)
 class World:
     """What the robot drives through: vertical faces, landmarks, and a tour of free space.
@@ -39,7 +35,7 @@ class World:
         Name of a place (`corridor_bare`, `room`, ...) to its rectangles (R, 4) m: x_min, y_min,
         x_max, y_max.
     start_pose
-        (3,) m, m, rad: where a robot starts unless told otherwise.
+        (3,) m, m, rad: where a robot starts unless its route says otherwise.
     waypoints
         (P, 2) m: a tour through free space that passes every kind of place.
     """
@@ -47,12 +43,12 @@ class World:
     name: str
     walls: Array
     wall_z_m: Array
-    landmarks: Array = field(default_factory=lambda: _empty(0, 3))
+    landmarks: Array = field(default_factory=lambda: np.zeros((0, 3)))
     descriptors: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 0), np.float32))
     look_alike: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))
     places: dict[str, Array] = field(default_factory=dict)
-    start_pose: Array = field(default_factory=lambda: _empty(3))
-    waypoints: Array = field(default_factory=lambda: _empty(0, 2))
+    start_pose: Array = field(default_factory=lambda: np.zeros(3))
+    waypoints: Array = field(default_factory=lambda: np.zeros((0, 2)))
 
     def __post_init__(self) -> None:
         shapes = {

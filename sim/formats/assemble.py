@@ -121,13 +121,9 @@ def wheels_from_velocities(
 
 
 def chained(steps: Array) -> Array:
-    """Poses (N + 1, 3) from the origin on by relative motions (N, 3)."""
-    poses = np.zeros((len(steps) + 1, 3))
-    heading = np.concatenate([[0.0], np.cumsum(steps[:, 2])])
-    cos, sin = np.cos(heading[:-1]), np.sin(heading[:-1])
-    poses[1:, 0] = np.cumsum(cos * steps[:, 0] - sin * steps[:, 1])
-    poses[1:, 1] = np.cumsum(sin * steps[:, 0] + cos * steps[:, 1])
-    poses[:, 2] = se2.wrap(heading)
+    """Poses (N + 1, 3) from the origin on by relative motions (N, 3); headings wrapped."""
+    poses = se2.chain(steps)
+    poses[:, 2] = se2.wrap(poses[:, 2])
     return poses
 
 
