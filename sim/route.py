@@ -1,4 +1,4 @@
-"""Where the robot is told to go: open-loop commands and way-point following.
+"""Where the robot is sent: open-loop commands and way-point following.
 
 A velocity command is (v, omega): m/s forward and rad/s counter-clockwise.
 """
@@ -16,7 +16,7 @@ from sim.errors import InputError
 from sim.robot import DifferentialDrive, arc_increment
 from sim.se2 import chain
 from sim.settings import check_numbers
-from sim.world import World
+from sim.world import World, facing_second
 
 Array = NDArray[np.float64]
 Segment = tuple[float, float, float]
@@ -148,9 +148,7 @@ class Tour:
                 "route.waypoints=[[x, y], ...]"
             )
         path = _lengthened(given, self.distance_m)
-        first = path[1] - path[0]
-        pose = np.array([path[0, 0], path[0, 1], math.atan2(first[1], first[0])])
-        return pose, Pursuit(self, robot, path)
+        return facing_second(path), Pursuit(self, robot, path)
 
 
 class Pursuit:
@@ -158,8 +156,7 @@ class Pursuit:
 
     def __init__(self, tour: Tour, robot: DifferentialDrive, path: Array) -> None:
         self._tour, self._path = tour, path
-        steps = np.hypot(*np.diff(path, axis=0).T)
-        self._along_m = np.concatenate([[0.0], np.cumsum(steps)])
+        self._along_m = _along_m(path)
         self._acceleration = 0.5 * robot.max_acceleration_mps2  # the other half is for turning
         self._turn_acceleration = robot.max_acceleration_mps2 / robot.track_m
         self._done_m, self._velocity = 0.0, np.zeros(2)
@@ -197,9 +194,7 @@ class Pursuit:
         ahead_m = self._done_m + 2.0 * self._tour.look_ahead_m
         high = min(int(np.searchsorted(self._along_m, ahead_m)) + 1, len(self._path))
         best = math.inf
-        for i in range(max(low, 0), max(high, low + 2) - 1):
-            if i + 1 >= len(self._path):
-                break
+        for i in range(low, min(max(high, low + 2), len(self._path)) - 1):
             start, way = self._path[i], self._path[i + 1] - self._path[i]
             length = self._along_m[i + 1] - self._along_m[i]
             share = float(np.clip((pose[:2] - start) @ way / length**2, 0.0, 1.0))
@@ -244,18 +239,19 @@ def _lengthened(path: Array, distance_m: float | None) -> Array:
         return path
     closed = bool(np.hypot(*(path[0] - path[-1])) < 1e-6)
     lap = path
-    while _length(path) < distance_m:
+    while _along_m(path)[-1] < distance_m:
         lap = lap if closed else lap[::-1]
         path = np.concatenate([path, lap[1:]])
-    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
+    along = _along_m(path)
     last = int(np.searchsorted(along, distance_m))
     share = (distance_m - along[last - 1]) / (along[last] - along[last - 1])
     end = path[last - 1] + share * (path[last] - path[last - 1])
     return np.concatenate([path[:last], end[None]])
 
 
-def _length(path: Array) -> float:
-    return float(np.sum(np.hypot(*np.diff(path, axis=0).T)))
+def _along_m(path: Array) -> Array:
+    """Distance (P,) along a path (P, 2) to each of its points, m."""
+    return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
 
 
 def _merged(segments: Iterable[Iterable[float]]) -> list[Segment]:

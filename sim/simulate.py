@@ -49,12 +49,10 @@ class Body(Protocol):
 
     def step(self, wheel_speeds_mps: Array) -> Array:
         """Advance one tick; return the wheels' rolling (2,) m."""
-        ...
 
     @property
     def pose(self) -> Array:
         """(3,) m, m, rad."""
-        ...
 
 
 class Driver(Protocol):
@@ -62,12 +60,10 @@ class Driver(Protocol):
 
     def command(self, tick: int, pose: Array) -> Array | None:
         """Body velocity (2,) m/s, rad/s for the tick, or None when the route is done."""
-        ...
 
     @property
     def trouble(self) -> str | None:
         """`off_route` or `incomplete` if the route was not kept, else None."""
-        ...
 
 
 class Route(Protocol):
@@ -75,7 +71,6 @@ class Route(Protocol):
 
     def start(self, world: World, robot: DifferentialDrive) -> tuple[Array, Driver]:
         """Start pose (3,) and the driver."""
-        ...
 
 
 def record(
@@ -233,7 +228,7 @@ def overlaps(world: World, robot: DifferentialDrive, pose: Array) -> bool:
 
 
 class _ExactRays:
-    """The caster of `sim.casting`, loaded only where it is used: it brings a compiler along."""
+    """The caster of `sim.casting`, imported only where it is used: it needs a compiler."""
 
     def __init__(self, world: World, laser: Laser | None) -> None:
         self._world = world
@@ -396,7 +391,7 @@ class _Landmarks:
 
 
 class _SlipEvents:
-    """The stress that kr and kl do not describe: a wheel's encoder runs on by some centimetres."""
+    """Slip that kr and kl do not describe: a wheel's encoder runs on by some centimetres."""
 
     def __init__(self, robot: DifferentialDrive, rng: np.random.Generator) -> None:
         self._chance = robot.unmodelled_slip * DT_S

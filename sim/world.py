@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -10,6 +11,13 @@ from numpy.typing import NDArray
 from sim.errors import InputError
 
 Array = NDArray[np.float64]
+
+
+def facing_second(waypoints: Array) -> Array:
+    """Pose (3,) on the first of the way-points (P, 2), facing the second."""
+    x, y = waypoints[0]
+    along = waypoints[1] - waypoints[0]
+    return np.array([x, y, math.atan2(along[1], along[0])])
 
 
 @dataclass(frozen=True)

@@ -42,9 +42,7 @@ def test_ideal_poses_end_where_the_arcs_end(name):
     start = np.array([1.0, -2.0, 0.4])
     v, omega = ROUTES[name].profile(ROBOT).T
     travel = TICK_S * np.stack([v + omega, v - omega], axis=1)
-    poses = chain(
-        arc_increment(travel, 2.0), start
-    )
+    poses = chain(arc_increment(travel, 2.0), start)
     np.testing.assert_allclose(poses[-1], ROUTES[name].ideal_end(start), atol=1e-9)
     np.testing.assert_array_equal(poses[0], start)
 

@@ -61,7 +61,7 @@ class CarmenLog:
     is_graph
         Whether poses are vertices of an optimised graph, not odometry.
     notes
-        Counts of what was put in order or left out.
+        Counts of what was reordered or dropped.
     where
         The file, for messages.
     """
@@ -271,7 +271,7 @@ def _edges(words: Words, scan_lines: Rows) -> Array:
 
 
 def _rate(stamps: Array) -> float:
-    """Median rate, Hz; 1 where it cannot be told."""
+    """Median rate, Hz; 1 for a single stamp."""
     step = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
     return 1.0 / step if step > 1e-9 else 1.0
 

@@ -1,4 +1,4 @@
-"""What a hostile bag must not do: unpack to more than the memory holds, or bring code along."""
+"""What a hostile bag must not do: unpack to more than the memory holds, or run code."""
 
 from __future__ import annotations
 

@@ -50,7 +50,7 @@ from sim.sensors import Encoder, Laser, Mount, SensorSuite, suite_from_config
 from sim.settings import build
 from sim.world import World
 
-NOMINAL_TRACK_M, NOMINAL_RADIUS_M = 0.3, 0.1  # of a robot that the bag says nothing of
+NOMINAL_TRACK_M, NOMINAL_RADIUS_M = 0.3, 0.1  # of a robot that the bag does not describe
 _BASES = ("base_link", "base_footprint", "base")
 _MOST_MESSAGES = 20_000_000
 
@@ -78,8 +78,8 @@ def read_bag(
 ) -> Recording:
     """A Recording of a ROS 1 bag, a folder of a ROS 2 bag, or an MCAP file.
 
-    Wheel travel is taken as it is where /wheels tells it, else rebuilt from odometry, else from
-    the transform odom -> base_link. The laser's mounting comes from the transforms.
+    Wheel travel comes from /wheels where there is such a topic, else from odometry, else from the
+    transform odom -> base_link. The laser's mounting comes from the transforms.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ def read_bag(
         Topics; None for `/odom`, `/scan` and `/ground_truth`, or else the topic of that type with
         most messages (for the truth: none).
     track_m, wheel_radius_m
-        The robot's, where the bag does not tell.
+        The robot's, where the bag does not give it.
 
     Raises
     ------
@@ -186,21 +186,21 @@ def _recording(
 
 
 def _about(path: Path, topics: dict[str, _Topic]) -> dict[str, Any]:
-    """What a bag of ours says of itself; empty for another's."""
+    """What `write_bag` noted about the recording; empty for any other bag."""
     topic = topics.get(ABOUT)
     if topic is None or topic.kind != STRING:
         return {}
     try:
-        told = json.loads(topic.messages[0].data)
-        robot = build(RobotGeometry, told["robot"], "robot")
+        written = json.loads(topic.messages[0].data)
+        robot = build(RobotGeometry, written["robot"], "robot")
         return {
             "robot": robot,
             "track_m": robot.track_m,
-            "sensors": dict(told["sensors"]),
-            "config": dict(told["config"]),
-            "status": told["status"],
-            "frames": seconds(np.array(told["frame_stamps_ns"], np.int64)),
-            "world": told["world"],
+            "sensors": dict(written["sensors"]),
+            "config": dict(written["config"]),
+            "status": written["status"],
+            "frames": seconds(np.array(written["frame_stamps_ns"], np.int64)),
+            "world": written["world"],
         }
     except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         raise InputError(f"{path}: {ABOUT} is not as it was written ({error})") from error
@@ -495,7 +495,7 @@ def _messages(path: Path) -> dict[str, _Topic]:
                 topic.messages.append(deserialize(data, connection.msgtype))
     except InputError:
         raise
-    # the library tells of damaged files in exceptions of many kinds
+    # the library reports damaged files by exceptions of many kinds
     except Exception as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split())[:200]
         raise InputError(f"{path}: damaged or not a bag ({reason})") from error

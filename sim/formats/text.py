@@ -203,7 +203,7 @@ class Words:
 def split_words(data: bytes, where: str) -> Words:
     """Split text at white space, commas and semicolons; `#` begins a comment.
 
-    Numbers are read exactly, as Python's `float` reads them, but for underscores.
+    Numbers are read exactly, as Python's `float` reads them, except that underscores are refused.
 
     Raises
     ------
