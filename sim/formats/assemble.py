@@ -126,6 +126,11 @@ def chained(steps: Array) -> Array:
     return poses
 
 
+def rate_hz(stamps: Array) -> float:
+    """Median rate of stamps (N,) s, strictly increasing; 1 Hz for a single one."""
+    return 1.0 / max(float(np.median(np.diff(stamps))), 1e-9) if len(stamps) > 1 else 1.0
+
+
 def frame_stamps(
     wheel_stamps: Array, sensors: Sequence[Array], longest_s: float = LONGEST_FRAME_S
 ) -> Array:
