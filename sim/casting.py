@@ -69,8 +69,7 @@ class SegmentCaster:
         poses = np.array(T_world_sensor, np.float64, order="C")
         if poses.ndim != 2 or poses.shape[1] != 3:
             raise ValueError(f"cast_many needs poses (N, 3), got {poses.shape}")
-        ranges: Array = _cast(poses, *self._prepared)
-        return ranges
+        return _cast(poses, *self._prepared)
 
 
 def cast_lidar(world: World, lidar: Lidar3D, T_world_sensor: ArrayLike) -> Array:
@@ -127,13 +126,12 @@ def visible(
     NDArray[np.bool_]
         (N,).
     """
-    seen: NDArray[np.bool_] = _visible(
+    return _visible(
         np.array(origin_in_world, np.float64),
         np.array(points_in_world, np.float64, order="C").reshape(-1, 3),
         np.array(world.walls.T, np.float64, order="C"),
         np.array(world.wall_z_m.T, np.float64, order="C"),
     )
-    return seen
 
 
 def _chains(walls: Array) -> Array:

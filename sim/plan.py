@@ -310,8 +310,7 @@ def _to_segment(points: Array, segments: Array) -> Array:
 def _turn(segments: Array, points: Array) -> Array:
     """Positive where the points lie on the left of the segments."""
     along, offset = segments[..., 2:] - segments[..., :2], points - segments[..., :2]
-    left: Array = along[..., 0] * offset[..., 1] - along[..., 1] * offset[..., 0]
-    return left
+    return along[..., 0] * offset[..., 1] - along[..., 1] * offset[..., 0]
 
 
 def _mean_area(rectangles: Array) -> float:
@@ -329,8 +328,7 @@ def box_corners(centre: Sequence[float], size: Sequence[float] | Array, yaw_rad:
 def regular(centre: Sequence[float], radius_m: float, sides: int) -> Array:
     """Corners (sides, 2) of a regular polygon, m, counter-clockwise."""
     angle = 2.0 * math.pi * np.arange(sides) / sides
-    corners: Array = np.asarray(centre) + radius_m * np.stack([np.cos(angle), np.sin(angle)], 1)
-    return corners
+    return np.asarray(centre) + radius_m * np.stack([np.cos(angle), np.sin(angle)], 1)
 
 
 def make_descriptors(

@@ -140,8 +140,7 @@ def wheel_errors(travel_m: ArrayLike, variance_per_m: ArrayLike, rng: np.random.
 
 def _scaled_errors(travel_m: Array, variance_per_m: ArrayLike, standard_normal: Array) -> Array:
     """Encoder errors, m, of variance k |ds| from normals drawn beforehand."""
-    errors: Array = np.sqrt(variance_per_m * np.abs(travel_m)) * standard_normal
-    return errors
+    return np.sqrt(variance_per_m * np.abs(travel_m)) * standard_normal
 
 
 @dataclass

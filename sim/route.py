@@ -223,8 +223,7 @@ class Pursuit:
 
     def _limited(self, wanted: Array, dt_s: float) -> Array:
         most = dt_s * np.array([self._acceleration, self._turn_acceleration])
-        limited: Array = self._velocity + np.clip(wanted - self._velocity, -most, most)
-        return limited
+        return self._velocity + np.clip(wanted - self._velocity, -most, most)
 
     def _point_at(self, along_m: float) -> Array:
         columns = [np.interp(along_m, self._along_m, self._path[:, i]) for i in (0, 1)]

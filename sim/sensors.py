@@ -223,8 +223,7 @@ class StereoCamera:
         disparity = self.focal_px * self.baseline_m / z + self.sigma_disparity_px * draws[:, 2]
         disparity = np.where(disparity > 0.0, disparity, np.nan)
         rays = np.stack([column, row, np.full_like(row, self.focal_px)], axis=-1)
-        seen: Array = rays * (self.baseline_m / disparity[:, None])
-        return seen
+        return rays * (self.baseline_m / disparity[:, None])
 
 
 @dataclass(frozen=True)
@@ -295,8 +294,7 @@ def _measured(
     ranges = np.asarray(true_ranges_m, float)
     noisy = np.maximum(ranges + sensor.sigma_range_m * rng.standard_normal(ranges.shape), 0.0)
     seen = (ranges >= sensor.min_range_m) & (ranges <= sensor.max_range_m)
-    measured: NDArray[np.float32] = np.where(seen, noisy, np.inf).astype(np.float32)
-    return measured
+    return np.where(seen, noisy, np.inf).astype(np.float32)
 
 
 @dataclass(frozen=True)

@@ -284,8 +284,7 @@ class _BulletRays:
 
     def _ranges(self, starts: Array, way: Array, reach_m: float, *, ground: bool) -> Array:
         share = self._bullet.cast(starts, starts + reach_m * way, ground=ground)
-        ranges: Array = np.where(share < 1.0, share * reach_m, np.inf)
-        return ranges
+        return np.where(share < 1.0, share * reach_m, np.inf)
 
 
 def sensor_pose(sensor: Laser | Lidar3D | StereoCamera, pose: Array) -> Array:
@@ -355,8 +354,7 @@ class _Landmarks:
             order = np.argsort(np.linalg.norm(inside[ids], axis=1), kind="stable")
             return ids[order[:most]]
         if camera.selection == "random":
-            chosen: NDArray[np.int64] = self._rng.choice(ids, most, replace=False)
-            return chosen
+            return self._rng.choice(ids, most, replace=False)
         # Farthest-point choice over the image: each next landmark is the one farthest, in
         # pixels, from those already taken.
         pixels = inside[ids, :2] / inside[ids, 2:]
@@ -407,8 +405,7 @@ class _SlipEvents:
         self._left[begins] = _SLIP_EVENT_TICKS
         active = self._left > 0
         self._left[active] -= 1
-        error: Array = np.where(active, self._step_m * np.sign(rolling_m), 0.0)
-        return error
+        return np.where(active, self._step_m * np.sign(rolling_m), 0.0)
 
 
 def _normals(rng: np.random.Generator, block: int = 3000) -> Iterator[Array]:

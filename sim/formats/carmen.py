@@ -239,8 +239,7 @@ def scan_recording(
 def seen_ranges(raw_m: Array, max_range_m: float) -> NDArray[np.float32]:
     """Ranges with +inf where nothing was seen: at the maximum or beyond, zero, or no number."""
     seen = (raw_m > 0.0) & (raw_m < max_range_m)
-    ranges: NDArray[np.float32] = np.where(seen, raw_m, np.inf).astype(np.float32)
-    return ranges
+    return np.where(seen, raw_m, np.inf).astype(np.float32)
 
 
 def _mount(poses: Array, laser_poses: Array) -> Array:

@@ -91,5 +91,4 @@ def nanoseconds(stamp: float) -> int:
 
 def seconds(counts: NDArray[np.int64]) -> Array:
     """Seconds of nanoseconds."""
-    found: Array = (counts // 10**9) + (counts % 10**9) / 1e9
-    return found
+    return (counts // 10**9) + (counts % 10**9) / 1e9
