@@ -88,6 +88,6 @@ def test_tick_length_does_not_change_the_promise():
         ((0.5, 0.0, 1.0), r"segments\[0\]"),
     ],
 )
-def test_bad_segments_are_told_by_their_place(segments, word):
+def test_bad_segments_are_named_by_their_place(segments, word):
     with pytest.raises(InputError, match=word):
         OpenLoop(segments)

@@ -271,7 +271,7 @@ def _edges(words: Words, scan_lines: Rows) -> Array:
 def write_carmen(path: Path, recording: Recording) -> None:
     """Write a Recording's odometry and scans as ODOM and ROBOTLASER1 lines.
 
-    What the format cannot hold (landmarks, clouds, the truth) is left out. Unseen beams are
+    What the format cannot hold (landmarks, clouds, the truth) is dropped. Unseen beams are
     written as the maximum range.
 
     Raises

@@ -128,7 +128,7 @@ def read_thinned_intel(
     Recording
         With stamps of the matched scans; between them time is shared out by what the odometry
         says the robot did (0.5 m/s and 0.8 rad/s at full speed). Matches that would make it move
-        more than three times as fast are left out.
+        more than three times as fast are dropped.
     Array
         (N,) numbers of the scans whose stamps are known.
     """

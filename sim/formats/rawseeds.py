@@ -51,7 +51,7 @@ def read_trajectory(path: Path) -> Trajectory:
 
 
 def parse_trajectory(words: Words) -> Trajectory:
-    """The trajectory in a file's words; stamps put in order, the last of equal ones kept."""
+    """The trajectory in a file's words; sorted by stamp, the last of equal stamps kept."""
     table = words.table((4, 13), "a Rawseeds trajectory")
     table = table[assemble.in_order(table[:, 0], "poses", {})]
     covariances = np.zeros((0, 3, 3))

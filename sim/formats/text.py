@@ -112,7 +112,7 @@ def _bare(name: str) -> str:
 
 @dataclass(frozen=True)
 class Words:
-    """The words of a text file, line by line; lines without words are left out.
+    """The words of a text file, line by line; blank lines are dropped.
 
     Attributes
     ----------
