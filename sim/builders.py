@@ -1,15 +1,16 @@
 """Worlds from a few parameters and a random stream.
 
-Each builder is a function `name(*, rng, ...) -> World`; its parameters' defaults stand in
+Each builder is a function `name(*, rng, ...) -> World`; its parameters' defaults are in
 conf/world/<name>.yaml and nowhere else.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +30,7 @@ def empty(*, rng: np.random.Generator, tour_m: float) -> World:
 
 
 def from_file(*, rng: np.random.Generator, path: str) -> World:
-    """Read a user's world; see `sim.world_file` for the format. Nothing of it is random."""
+    """Read a user's world; see `sim.world_file` for the format. Nothing in it is random."""
     del rng
     return read_world(Path(path))
 
@@ -191,22 +192,22 @@ def office(
     plan.rectangle((0, 0), (W, H))
     inner_low, inner_high = south + c, H - c
     blocks = ((c, passage), (passage + c, W - c))
-    suites = [_Suite((0.0, south), (W, south), -1, 7, 9.0)]  # the rooms south of the ring
+    suites: list[Any] = [(((0.0, south), (W, south)), -1, 7, 9.0)]  # the rooms south of the ring
     row = 8.0
     for number, (left, right) in enumerate(blocks):
         court = number == 0  # between its columns; in the other block they stand back to back
         column = 9.0 if court else 0.5 * (right - left)
         mouth = inner_low + row
         suites += [
-            _Suite((left, inner_low), (right, inner_low), 1, 5 if court else 2, row, "U"),
-            _Suite((left, mouth), (left, inner_high), -1, 2, column, "_"),
-            _Suite((right, mouth), (right, inner_high), 1, 2, column, "_" if court else ""),
+            (((left, inner_low), (right, inner_low)), 1, 5 if court else 2, row, "U"),
+            (((left, mouth), (left, inner_high)), -1, 2, column, "_"),
+            (((right, mouth), (right, inner_high)), 1, 2, column, "_" if court else ""),
         ]
         plan.wall((left, inner_high), (right, inner_high))
         if court:
             low, high = (left + column, mouth), (right - column, inner_high)
             plan.close(rectangle_corners(low, high))
-    visits = [visit for suite in suites for visit in suite.draw(plan, rng)]
+    rooms = [room for suite in suites for room in _suite(plan, rng, *suite)]
     mid = c / 2
     y0, y1 = south + mid, H - mid
     x0, xm, x1 = mid, passage + mid, W - mid
@@ -218,12 +219,12 @@ def office(
             plan.place("corner", x, y, x + c, y + c)
     loop = [(x0, y0), (xm, y0), (xm, y1), (x0, y1), (x0, y0)]
     second = [(x1, y0), (x1, y1), (xm, y1), (xm, y0), (x0, y0)]
-    plan.tour = _with_visits([*loop, *second], visits, rng, rooms_visited)
+    plan.tour = _with_visits([*loop, *second], rooms, rng, rooms_visited)
     for low, high in (((0, inner_low), (c, inner_high)), ((W - c, inner_low), (W, inner_high))):
-        doors = [v.door for v in visits if low[0] - 0.1 <= v.door[0] <= high[0] + 0.1]
+        doors = [r.door for r in rooms if low[0] - 0.1 <= r.door[0] <= high[0] + 0.1]
         _line_up(plan, rng, low, high, 7, keep_off=doors)
-    for visit in visits:
-        plan.furnish(rng, visit.low, visit.high, objects_per_room, size_m=(0.4, 1.6))
+    for room in rooms:
+        plan.furnish(rng, room.low, room.high, objects_per_room, size_m=(0.4, 1.6))
     return plan.world("office", rng, n_landmarks=n_landmarks, look_alike_share=look_alike_share)
 
 
@@ -231,7 +232,7 @@ def streets(
     *, rng: np.random.Generator, n_x: int, n_y: int, block_m: float, street_m: float
 ) -> World:
     """Build blocks of terraced houses of differing width, height and setback, with few trees."""
-    return _town("streets", rng, n_x, n_y, block_m, street_m, terraced=True, trees_per_block=6)
+    return _town("streets", rng, n_x, n_y, block_m, street_m, _terrace, trees_per_block=6)
 
 
 def campus(
@@ -244,113 +245,103 @@ def campus(
     trees_per_block: int,
 ) -> World:
     """Build blocks with a few turned or L-shaped buildings among lawns and trees."""
-    return _town(
-        "campus", rng, n_x, n_y, block_m, street_m, terraced=False, trees_per_block=trees_per_block
-    )
+    return _town("campus", rng, n_x, n_y, block_m, street_m, _lawn, trees_per_block)
 
 
-class _Visit:
+class _Room(NamedTuple):
     """A room that can be visited: its rectangle, its door, and how to go in."""
 
-    def __init__(self, low: Array, high: Array, door: Array, inward: Array) -> None:
-        self.low, self.high = (low[0], low[1]), (high[0], high[1])
-        self.door, self.inward = door, inward
+    low: Array
+    high: Array
+    door: Array
+    inward: Array
 
 
-class _Suite:
-    """A row of rooms behind a corridor's wall from start to end, on its left (1) or right (-1).
+def _suite(
+    plan: Plan,
+    rng: np.random.Generator,
+    ends: tuple[tuple[float, float], tuple[float, float]],
+    side: int,
+    count: int,
+    depth_m: float,
+    walls: Literal["", "_", "U"] = "",
+) -> list[_Room]:
+    """Draw a row of rooms behind a corridor's wall, on its left (side 1) or right (-1).
 
     `walls` says what else is drawn besides the front and the partitions: `_` the back, `U` the
     back and both ends; the others are walls of something else.
     """
+    start, end = np.array(ends)
+    length = float(np.hypot(*(end - start)))
+    along = (end - start) / length
+    inward = side * np.array([-along[1], along[0]])
+    share = rng.uniform(0.85, 1.15, count)
+    edges = np.concatenate([[0.0], np.cumsum(share / share.sum() * length)])
+    doors = [
+        (rng.uniform(low + 1.0, high - 1.0), rng.uniform(1.0, 1.2)) for low, high in pairwise(edges)
+    ]
+    plan.wall(start, end, gaps=doors)
+    back = depth_m * inward
+    if walls:
+        plan.wall(start + back, end + back)
+    for corner in (start, end) if walls == "U" else ():
+        plan.wall(corner, corner + back)
+    rooms = []
+    for i, (low, high) in enumerate(pairwise(edges)):
+        near, far = start + low * along, start + high * along
+        if i + 1 < count:
+            plan.wall(far, far + back)
+        _niche(plan, rng, start, (low, high), along, back)
+        corners = np.array([near, far + back])
+        lowest, highest = corners.min(axis=0), corners.max(axis=0)
+        plan.place("room", *lowest, *highest)
+        door = start + doors[i][0] * along
+        plan.door(door, inward)
+        rooms.append(_Room(lowest, highest, door, inward))
+    return rooms
 
-    def __init__(
-        self,
-        start: tuple[float, float],
-        end: tuple[float, float],
-        side: int,
-        count: int,
-        depth_m: float,
-        walls: Literal["", "_", "U"] = "",
-    ) -> None:
-        self._start, self._end, self._walls = np.array(start), np.array(end), walls
-        self._side, self._count, self._depth_m = side, count, depth_m
 
-    def draw(self, plan: Plan, rng: np.random.Generator) -> list[_Visit]:
-        """Draw front, partitions and back; return the rooms."""
-        length = float(np.hypot(*(self._end - self._start)))
-        along = (self._end - self._start) / length
-        inward = self._side * np.array([-along[1], along[0]])
-        share = rng.uniform(0.85, 1.15, self._count)
-        edges = np.concatenate([[0.0], np.cumsum(share / share.sum() * length)])
-        doors = [
-            (rng.uniform(low + 1.0, high - 1.0), rng.uniform(1.0, 1.2))
-            for low, high in pairwise(edges)
-        ]
-        plan.wall(self._start.tolist(), self._end.tolist(), gaps=doors)
-        back = self._depth_m * inward
-        if self._walls:
-            plan.wall((self._start + back).tolist(), (self._end + back).tolist())
-        for end in (self._start, self._end) if self._walls == "U" else ():
-            plan.wall(end.tolist(), (end + back).tolist())
-        visits = []
-        for i, (low, high) in enumerate(pairwise(edges)):
-            foot = self._start + high * along
-            if i + 1 < self._count:
-                plan.wall(foot.tolist(), (foot + back).tolist())
-            self._niche(plan, rng, low, high, along, back)
-            corners = np.array([self._start + low * along, foot + back])
-            rectangle = np.concatenate([corners.min(axis=0), corners.max(axis=0)])
-            plan.place("room", *rectangle.tolist())
-            door = self._start + doors[i][0] * along
-            plan.door(door, inward)
-            visits.append(_Visit(rectangle[:2], rectangle[2:], door, inward))
-        return visits
-
-    def _niche(
-        self,
-        plan: Plan,
-        rng: np.random.Generator,
-        low: float,
-        high: float,
-        along: Array,
-        back: Array,
-    ) -> None:
-        """Draw a stub of wall from the back or the left side: no two rooms are alike."""
-        if rng.random() < 0.5:
-            foot = self._start + rng.uniform(low + 1.0, high - 1.0) * along + back
-            end = foot - back * rng.uniform(0.1, 0.22)
-        else:
-            foot = self._start + low * along + back * rng.uniform(0.55, 0.85)
-            end = foot + along * (high - low) * rng.uniform(0.1, 0.22)
-        plan.wall(foot.tolist(), end.tolist())
+def _niche(
+    plan: Plan,
+    rng: np.random.Generator,
+    start: Array,
+    edges: tuple[float, float],
+    along: Array,
+    back: Array,
+) -> None:
+    """Draw a stub of wall from the back or the left side: no two rooms are alike."""
+    low, high = edges
+    if rng.random() < 0.5:
+        foot = start + rng.uniform(low + 1.0, high - 1.0) * along + back
+        end = foot - back * rng.uniform(0.1, 0.22)
+    else:
+        foot = start + low * along + back * rng.uniform(0.55, 0.85)
+        end = foot + along * (high - low) * rng.uniform(0.1, 0.22)
+    plan.wall(foot, end)
 
 
 def _with_visits(
-    path: list[tuple[float, float]], visits: list[_Visit], rng: np.random.Generator, count: int
+    path: list[tuple[float, float]], rooms: list[_Room], rng: np.random.Generator, count: int
 ) -> list[tuple[float, float]]:
     """Tour along the path that looks into `count` of the rooms, in and out by the door."""
-    chosen = rng.permutation(len(visits))[:count]
-    stops: dict[int, list[tuple[float, _Visit, Array]]] = {}
-    for row in chosen:
-        visit = visits[row]
-        best: tuple[float, int, float, Array] | None = None
-        for i in range(len(path) - 1):
-            start, way = np.array(path[i]), np.subtract(path[i + 1], path[i])
-            share = float(np.clip((visit.door - start) @ way / (way @ way), 0.0, 1.0))
-            foot = start + share * way
-            gap = float(np.hypot(*(visit.door - foot)))
-            if best is None or gap < best[0] - 1e-9:
-                best = (gap, i, share, foot)
-        assert best is not None
-        stops.setdefault(best[1], []).append((best[2], visit, best[3]))
-    tour: list[tuple[float, float]] = []
-    for i, point in enumerate(path):
+    chosen = [rooms[row] for row in rng.permutation(len(rooms))[:count]]
+    stops: list[list[tuple[float, _Room, Array]]] = [[] for _ in path]
+    for room in chosen:
+        feet = []
+        for start, end in pairwise(np.array(path)):
+            way = end - start
+            share = float(np.clip((room.door - start) @ way / (way @ way), 0.0, 1.0))
+            feet.append((share, start + share * way))
+        # to 1e-9 m, so that of a stretch that is passed twice the first pass counts
+        gaps = [round(float(np.hypot(*(room.door - foot))), 9) for _, foot in feet]
+        leg = int(np.argmin(gaps))
+        stops[leg].append((feet[leg][0], room, feet[leg][1]))
+    tour = []
+    for point, visits in zip(path, stops, strict=True):
         tour.append(point)
-        for _, visit, foot in sorted(stops.get(i, []), key=lambda stop: stop[0]):
-            inside = visit.door + 2.0 * visit.inward
-            through = [foot, inside, foot]
-            tour += [(float(p[0]), float(p[1])) for p in through]
+        for _, room, foot in sorted(visits, key=lambda stop: stop[0]):
+            inside = room.door + 2.0 * room.inward
+            tour += [(float(x), float(y)) for x, y in (foot, inside, foot)]
     return tour
 
 
@@ -374,7 +365,7 @@ def _line_up(
         centre = (position, across) if long == 0 else (across, position)
         size = (width, depth) if long == 0 else (depth, width)
         if all(abs(door[long] - position) > 0.8 + width / 2 for door in keep_off or []):
-            plan.box(centre, size, 0.0, rng.uniform(0.8, 1.9))
+            plan.prism(box_corners(centre, size, 0.0), 0.0, rng.uniform(0.8, 1.9))
 
 
 def _grid_tour(n_x: int, n_y: int) -> list[tuple[int, int]]:
@@ -406,8 +397,7 @@ def _town(
     n_y: int,
     block_m: float,
     street_m: float,
-    *,
-    terraced: bool,
+    build: Callable[[Plan, np.random.Generator, Array, float], None],
     trees_per_block: int,
 ) -> World:
     """Build blocks in a grid of streets; the tour is a closed way along the streets."""
@@ -425,10 +415,7 @@ def _town(
     for i in range(n_x):
         for j in range(n_y):
             low = np.array([i * pitch, j * pitch])
-            if terraced:
-                _terrace(plan, rng, low, block_m)
-            else:
-                _lawn(plan, rng, low, block_m)
+            build(plan, rng, low, block_m)
             _trees(plan, rng, low, block_m, trees_per_block)
     return plan.world(name, rng)
 
@@ -468,12 +455,10 @@ def _trees(plan: Plan, rng: np.random.Generator, low: Array, block_m: float, cou
     for _ in range(count):
         for _ in range(20):
             along, inset = rng.uniform(2.0, block_m - 2.0), rng.uniform(0.5, 5.0)
-            edge = rng.integers(4)
-            x, y = (along, inset) if edge % 2 == 0 else (inset, along)
-            x, y = (x, block_m - y) if edge == 2 else (x, y)
-            x, y = (block_m - x, y) if edge == 3 else (x, y)
+            far = block_m - inset
+            by_edge = ((along, inset), (inset, along), (along, far), (far, along))
+            spot = low + by_edge[rng.integers(4)]
             crown = rng.uniform(1.0, 2.2)
-            spot = low + np.array([x, y])
             if all(math.dist(spot, d[:2]) > d[2] + crown + 0.3 for d in plan.discs):
                 height = rng.uniform(4.5, 9.0)
                 plan.tree(spot[0], spot[1], rng.uniform(0.12, 0.35), crown, height)
@@ -496,14 +481,11 @@ def _rounded(
         smooth += list((1 - t) ** 2 * a + 2 * t * (1 - t) * corner + t**2 * b)
     # Begin in the middle of a straight, so that the start does not lie in a bend.
     ring = np.array([(smooth[-1] + smooth[0]) / 2, *smooth, (smooth[-1] + smooth[0]) / 2])
-    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(ring, axis=0).T))])
-    dense: list[tuple[float, float]] = []
-    for i in range(len(ring) - 1):
-        n = max(1, round((along[i + 1] - along[i]) / spacing_m))
-        for share in np.arange(n) / n:
-            p = ring[i] + share * (ring[i + 1] - ring[i])
-            dense.append((float(p[0]), float(p[1])))
-    return [*dense, (float(ring[-1, 0]), float(ring[-1, 1]))]
+    dense = []
+    for a, b in pairwise(ring):
+        n = max(1, round(math.dist(a, b) / spacing_m))
+        dense += [a + share * (b - a) for share in np.arange(n) / n]
+    return [(float(x), float(y)) for x, y in [*dense, ring[-1]]]
 
 
 def _positive(**margins: float) -> None:

@@ -79,9 +79,8 @@ class BulletBody:
             physicsClientId=c,
         )
         plane = pybullet.createCollisionShape(pybullet.GEOM_PLANE, physicsClientId=c)
-        self._ground = pybullet.createMultiBody(0, plane, physicsClientId=c)
-        self._grip(self._ground, -1, 1.0)
-        self._group(self._ground, -1, _GROUND, _ROBOT | _RAYS)
+        ground = pybullet.createMultiBody(0, plane, physicsClientId=c)
+        self._surface(ground, -1, 1.0, _GROUND, _ROBOT | _RAYS)
         self._walls = self._build_walls(world)
         self._robot = self._build_robot(robot, pose)
         self._heading = float(pose[2])
@@ -170,7 +169,8 @@ class BulletBody:
         right, left = pybullet.getJointStates(self._robot, (0, 1), physicsClientId=self._client)
         return np.array([right[0], left[0]])
 
-    def _grip(self, body: int, link: int, friction: float) -> None:
+    def _surface(self, body: int, link: int, friction: float, group: int, mask: int) -> None:
+        """Friction of a link, and what it collides with."""
         pybullet.changeDynamics(
             body,
             link,
@@ -183,8 +183,6 @@ class BulletBody:
             jointDamping=0.0,
             physicsClientId=self._client,
         )
-
-    def _group(self, body: int, link: int, group: int, mask: int) -> None:
         pybullet.setCollisionFilterGroupMask(body, link, group, mask, physicsClientId=self._client)
 
     def _build_walls(self, world: World) -> int | None:
@@ -206,8 +204,7 @@ class BulletBody:
         if shape < 0:
             raise InputError(f"world {world.name}: the physics engine refused its walls")
         walls: int = pybullet.createMultiBody(0, shape, physicsClientId=self._client)
-        self._grip(walls, -1, 0.5)
-        self._group(walls, -1, _WALLS, _ROBOT | _RAYS)
+        self._surface(walls, -1, 0.5, _WALLS, _ROBOT | _RAYS)
         return walls
 
     def _build_robot(self, robot: DifferentialDrive, pose: Array) -> int:
@@ -252,6 +249,5 @@ class BulletBody:
             physicsClientId=c,
         )
         for link, friction in ((-1, 0.0), (0, 1.0), (1, 1.0), (2, 0.0), (3, 0.0)):
-            self._grip(body, link, friction)
-            self._group(body, link, _ROBOT, _WALLS | _GROUND)
+            self._surface(body, link, friction, _ROBOT, _WALLS | _GROUND)
         return body

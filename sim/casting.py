@@ -59,10 +59,9 @@ class SegmentCaster:
 
     def cast(self, T_world_sensor: ArrayLike) -> Array:
         """Ranges (n_beams,), m, from a pose (3,) m, m, rad; +inf where nothing is in range."""
-        poses = np.array(T_world_sensor, np.float64, ndmin=2, order="C")
-        if poses.shape != (1, 3):
+        if np.size(T_world_sensor) != 3:
             raise ValueError(f"cast needs one pose (3,), got {np.shape(T_world_sensor)}")
-        ranges: Array = _cast(poses, *self._prepared)[0]
+        ranges: Array = self.cast_many(np.reshape(T_world_sensor, (1, 3)))[0]
         return ranges
 
     def cast_many(self, T_world_sensor: ArrayLike) -> Array:
@@ -70,8 +69,7 @@ class SegmentCaster:
         poses = np.array(T_world_sensor, np.float64, order="C")
         if poses.ndim != 2 or poses.shape[1] != 3:
             raise ValueError(f"cast_many needs poses (N, 3), got {poses.shape}")
-        ranges: Array = _cast(poses, *self._prepared)
-        return ranges
+        return _cast(poses, *self._prepared)
 
 
 def cast_lidar(world: World, lidar: Lidar3D, T_world_sensor: ArrayLike) -> Array:
@@ -128,13 +126,12 @@ def visible(
     NDArray[np.bool_]
         (N,).
     """
-    seen: NDArray[np.bool_] = _visible(
+    return _visible(
         np.array(origin_in_world, np.float64),
         np.array(points_in_world, np.float64, order="C").reshape(-1, 3),
         np.array(world.walls.T, np.float64, order="C"),
         np.array(world.wall_z_m.T, np.float64, order="C"),
     )
-    return seen
 
 
 def _chains(walls: Array) -> Array:
@@ -231,7 +228,9 @@ def _cast(
             _draw(nearness, cosines, sines, begin, end, gx, gy)
             if end >= turn:
                 _draw(nearness, cosines, sines, begin - turn, end - turn, gx, gy)
-        _invert(nearness, max_range_m, ranges[i])
+        for j in range(nearness.size):
+            r = 1.0 / nearness[j]
+            ranges[i, j] = r if r <= max_range_m else np.inf
     return ranges
 
 
@@ -339,14 +338,6 @@ def _face(
     gx, gy = (nx * cos + ny * sin) * per_c, (ny * cos - nx * sin) * per_c
     least = 1.0 / farthest if c != 0.0 else 1.0 / nearest
     return begin - _END_TOLERANCE, end + _END_TOLERANCE, gx, gy, least, 1.0 / nearest
-
-
-@njit(error_model="numpy")
-def _invert(nearness: Array, max_range_m: float, ranges: Array) -> None:
-    """Ranges, m, of inverse ranges; +inf beyond the greatest range."""
-    for j in range(ranges.size):
-        r = 1.0 / nearness[j]
-        ranges[j] = r if r <= max_range_m else np.inf
 
 
 @njit(error_model="numpy")

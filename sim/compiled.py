@@ -1,4 +1,4 @@
-"""Numba's decorator for the hot loops: compiled once, kept on disk, and told when it happens."""
+"""Numba's decorator for the hot loops: compiled once, cached on disk, announced when it happens."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 class _Announcer(event.Listener):
-    """Says once that code is being compiled; code that is read from disk makes no event."""
+    """Announces, once, that code is being compiled; code read from the cache makes no event."""
 
-    _told = False
+    _announced = False
 
     def on_start(self, event: Any) -> None:
-        if not self._told:
-            self._told = True
+        if not self._announced:
+            self._announced = True
             print(
                 "compiling numerical code (once; later runs read it from disk)",
                 file=sys.stderr,
@@ -27,13 +27,13 @@ class _Announcer(event.Listener):
             )
 
     def on_end(self, event: Any) -> None:
-        """Nothing to say: what follows shows that it is done."""
+        """Nothing: the output that follows shows that it is done."""
 
 
 event.register("numba:compile", _Announcer())  # type: ignore[no-untyped-call]
 
 
 def njit(**options: Any) -> Callable[[Function], Function]:
-    """`numba.njit` with the compiled code kept on disk; the function keeps its type."""
+    """`numba.njit` with the compiled code cached on disk; the function keeps its type."""
     decorator: Callable[[Function], Function] = _njit(cache=True, **options)
     return decorator

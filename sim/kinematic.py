@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -138,10 +139,8 @@ def wheel_commands(
     robot: DifferentialDrive, route: OpenLoop, nominal_track_m: float | None = None
 ) -> Array:
     """Commanded ground travel (N, 2) of the wheels, right and left, tick by tick, m."""
-    v_mps, omega_radps = route.profile(robot).T
-    turn_mps = omega_radps * (nominal_track_m or robot.track_m) / 2.0
-    commands: Array = np.stack([v_mps + turn_mps, v_mps - turn_mps], axis=1) * TICK_S
-    return commands
+    nominal = dataclasses.replace(robot, track_m=nominal_track_m or robot.track_m)
+    return nominal.wheel_speeds(*route.profile(robot).T) * TICK_S
 
 
 @njit()

@@ -1,4 +1,4 @@
-"""A plan on which builders draw: walls, boxes, doors, objects kept off a tour, landmarks."""
+"""A plan on which builders draw: walls, boxes, doors, objects clear of the tour, landmarks."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sim.errors import InputError
-from sim.world import World
+from sim.world import World, facing_second
 
 Array = NDArray[np.float64]
 WALL_HEIGHT_M = 2.5
@@ -30,7 +30,7 @@ class Plan:
     floors
         Outlines of the ground one can stand on; none drawn means everywhere.
     solids
-        Outline and top of what nobody can stand in: objects, courts without a door.
+        Outline and top of what fills the ground: objects, courts without a door.
     discs
         Centre and radius about each solid.
     places, tour
@@ -40,7 +40,7 @@ class Plan:
         through the doors.
     """
 
-    faces: list[tuple[float, float, float, float]] = field(default_factory=list)
+    faces: list[tuple[float, ...]] = field(default_factory=list)
     heights: list[tuple[float, float]] = field(default_factory=list)
     on_object: list[bool] = field(default_factory=list)
     floors: list[Array] = field(default_factory=list)
@@ -48,12 +48,12 @@ class Plan:
     discs: list[tuple[float, float, float]] = field(default_factory=list)
     places: dict[str, list[tuple[float, float, float, float]]] = field(default_factory=dict)
     tour: list[tuple[float, float]] = field(default_factory=list)
-    approaches: list[tuple[float, float, float, float]] = field(default_factory=list)
+    approaches: list[tuple[float, ...]] = field(default_factory=list)
 
     def wall(
         self,
-        start: Sequence[float],
-        end: Sequence[float],
+        start: ArrayLike,
+        end: ArrayLike,
         *,
         top_m: float = WALL_HEIGHT_M,
         gaps: Iterable[tuple[float, float]] = (),
@@ -73,7 +73,7 @@ class Plan:
         """Draw walls round a floor with corners (N, 2)."""
         ring = np.asarray(corners, float)
         for start, end in zip(ring, np.roll(ring, -1, axis=0), strict=True):
-            self.wall(start.tolist(), end.tolist())
+            self.wall(start, end)
         self.floors.append(ring)
 
     def rectangle(self, low: Sequence[float], high: Sequence[float]) -> None:
@@ -82,9 +82,8 @@ class Plan:
 
     def door(self, centre: ArrayLike, inward: ArrayLike) -> None:
         """Name a door, and keep the metre before and behind it free; `inward` is a unit vector."""
-        x, y = np.asarray(centre, float).tolist()
-        a, b = np.array([x, y]) - np.asarray(inward), np.array([x, y]) + np.asarray(inward)
-        self.approaches.append((float(a[0]), float(a[1]), float(b[0]), float(b[1])))
+        x, y = middle = np.asarray(centre, float)
+        self.approaches.append((*(middle - inward), *(middle + inward)))
         self.place("door", x - 0.6, y - 0.6, x + 0.6, y + 0.6)
 
     def prism(
@@ -104,16 +103,6 @@ class Plan:
         radius = float(np.max(np.hypot(*(ring - centre).T)))
         self.discs.append((float(centre[0]), float(centre[1]), radius))
 
-    def box(
-        self,
-        centre: Sequence[float],
-        size: Sequence[float] | Array,
-        yaw_rad: float,
-        top_m: float,
-    ) -> None:
-        """Draw a box of length and width `size`, turned by `yaw_rad`."""
-        self.prism(box_corners(centre, size, yaw_rad), 0.0, top_m)
-
     def place(self, name: str, x1: float, y1: float, x2: float, y2: float) -> None:
         """Name a rectangle."""
         self.places.setdefault(name, []).append((x1, y1, x2, y2))
@@ -121,8 +110,8 @@ class Plan:
     def furnish(
         self,
         rng: np.random.Generator,
-        low: Sequence[float],
-        high: Sequence[float],
+        low: ArrayLike,
+        high: ArrayLike,
         count: int,
         *,
         size_m: tuple[float, float] = (0.4, 1.4),
@@ -138,7 +127,7 @@ class Plan:
         Raises
         ------
         InputError
-            If so many find no room.
+            If there is no room for so many.
         """
         if count < 0:
             raise InputError(f"world: the number of objects must be zero or more, got {count}")
@@ -183,19 +172,15 @@ class Plan:
         landmarks = self._landmarks(rng, n_landmarks, on_walls_share)
         descriptors, alike = make_descriptors(rng, len(landmarks), look_alike_share)
         tour = np.array(self.tour, float).reshape(-1, 2)
-        start = np.zeros(3)
-        if len(tour) >= 2:
-            way = tour[1] - tour[0]
-            start = np.array([tour[0, 0], tour[0, 1], math.atan2(way[1], way[0])])
+        start = facing_second(tour) if len(tour) >= 2 else np.zeros(3)
         # The smallest first, so that a door is not taken for the room it leads to.
-        names = sorted(self.places, key=lambda k: float(np.mean(_areas(self.places[k]))))
-        places = {k: np.array(self.places[k], float) for k in names}
+        places = {k: np.array(v, float) for k, v in self.places.items()}
+        places = dict(sorted(places.items(), key=lambda item: _mean_area(item[1])))
         return World(name, walls, heights, landmarks, descriptors, alike, places, start, tour)
 
     def _face(self, ends: Sequence[float], height: tuple[float, float], *, on_object: bool) -> None:
-        x1, y1, x2, y2 = (float(v) for v in ends)
-        self.faces.append((x1, y1, x2, y2))
-        self.heights.append((float(height[0]), float(height[1])))
+        self.faces.append(tuple(map(float, ends)))
+        self.heights.append(height)
         self.on_object.append(on_object)
 
     def _paths(self) -> Array:
@@ -242,7 +227,7 @@ class Plan:
     def _scatter(self, rng: np.random.Generator, count: int, on: NDArray[np.bool_]) -> Array:
         """Landmarks (count, 3) just off the faces `on`, where one can stand and see them.
 
-        A point that comes to lie behind an outer wall or in an object is drawn anew.
+        A point that comes to lie behind an outer wall or in an object is drawn again.
         """
         faces, heights = np.array(self.faces), np.array(self.heights)
         way = faces[:, 2:] - faces[:, :2]
@@ -325,12 +310,11 @@ def _to_segment(points: Array, segments: Array) -> Array:
 def _turn(segments: Array, points: Array) -> Array:
     """Positive where the points lie on the left of the segments."""
     along, offset = segments[..., 2:] - segments[..., :2], points - segments[..., :2]
-    left: Array = along[..., 0] * offset[..., 1] - along[..., 1] * offset[..., 0]
-    return left
+    return along[..., 0] * offset[..., 1] - along[..., 1] * offset[..., 0]
 
 
-def _areas(rectangles: Iterable[tuple[float, float, float, float]]) -> list[float]:
-    return [(x2 - x1) * (y2 - y1) for x1, y1, x2, y2 in rectangles]
+def _mean_area(rectangles: Array) -> float:
+    return float(np.mean(np.prod(rectangles[:, 2:] - rectangles[:, :2], axis=1)))
 
 
 def box_corners(centre: Sequence[float], size: Sequence[float] | Array, yaw_rad: float) -> Array:
@@ -344,8 +328,7 @@ def box_corners(centre: Sequence[float], size: Sequence[float] | Array, yaw_rad:
 def regular(centre: Sequence[float], radius_m: float, sides: int) -> Array:
     """Corners (sides, 2) of a regular polygon, m, counter-clockwise."""
     angle = 2.0 * math.pi * np.arange(sides) / sides
-    corners: Array = np.asarray(centre) + radius_m * np.stack([np.cos(angle), np.sin(angle)], 1)
-    return corners
+    return np.asarray(centre) + radius_m * np.stack([np.cos(angle), np.sin(angle)], 1)
 
 
 def make_descriptors(

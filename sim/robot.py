@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sim.errors import InputError
+from sim.settings import check_numbers
 
 Array = NDArray[np.float64]
 
@@ -64,19 +65,20 @@ class DifferentialDrive:
     max_acceleration_mps2: float = 1.0
 
     def __post_init__(self) -> None:
-        positive = (
-            "wheel_radius_m",
-            "track_m",
-            "body_length_m",
-            "body_width_m",
-            "body_height_m",
-            "mass_kg",
-            "max_acceleration_mps2",
+        check_numbers(
+            "robot",
+            self,
+            (
+                "wheel_radius_m",
+                "track_m",
+                "body_length_m",
+                "body_width_m",
+                "body_height_m",
+                "mass_kg",
+                "max_acceleration_mps2",
+            ),
+            ("kr", "kl", "encoder_tick_m", "unmodelled_slip", "unmodelled_slip_m"),
         )
-        for name in positive:
-            _require(name, getattr(self, name), strictly=True)
-        for name in ("kr", "kl", "encoder_tick_m", "unmodelled_slip", "unmodelled_slip_m"):
-            _require(name, getattr(self, name), strictly=False)
         for name in ("bias_right", "bias_left"):
             value = getattr(self, name)
             if not math.isfinite(value) or value <= -0.5 or value >= 0.5:
@@ -106,17 +108,7 @@ class RobotGeometry:
     track_m: float
 
     def __post_init__(self) -> None:
-        for name in ("wheel_radius_m", "track_m"):
-            value = getattr(self, name)
-            if not math.isfinite(value) or value <= 0.0:
-                raise InputError(f"prior.{name} must be a positive number of metres, got {value}")
-
-
-def _require(name: str, value: float, *, strictly: bool) -> None:
-    ok = math.isfinite(value) and (value > 0.0 if strictly else value >= 0.0)
-    if not ok:
-        wanted = "a positive number" if strictly else "zero or a positive number"
-        raise InputError(f"robot.{name} must be {wanted}, got {value}")
+        check_numbers("prior", self, ("wheel_radius_m", "track_m"))
 
 
 def wheel_variances(travel_m: ArrayLike, kr: float, kl: float) -> Array:
@@ -148,8 +140,7 @@ def wheel_errors(travel_m: ArrayLike, variance_per_m: ArrayLike, rng: np.random.
 
 def _scaled_errors(travel_m: Array, variance_per_m: ArrayLike, standard_normal: Array) -> Array:
     """Encoder errors, m, of variance k |ds| from normals drawn beforehand."""
-    errors: Array = np.sqrt(variance_per_m * np.abs(travel_m)) * standard_normal
-    return errors
+    return np.sqrt(variance_per_m * np.abs(travel_m)) * standard_normal
 
 
 @dataclass

@@ -1,4 +1,4 @@
-"""Where the robot is told to go: open-loop commands and way-point following.
+"""Where the robot is sent: open-loop commands and way-point following.
 
 A velocity command is (v, omega): m/s forward and rad/s counter-clockwise.
 """
@@ -14,7 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from sim.errors import InputError
 from sim.robot import DifferentialDrive, arc_increment
-from sim.world import World
+from sim.se2 import chain
+from sim.settings import check_numbers
+from sim.world import World, facing_second
 
 Array = NDArray[np.float64]
 Segment = tuple[float, float, float]
@@ -45,8 +47,7 @@ class OpenLoop:
     rest_s: float = 0.2
 
     def __post_init__(self) -> None:
-        if not math.isfinite(self.rest_s) or self.rest_s < 0.0:
-            raise InputError(f"route.rest_s must be zero or positive, got {self.rest_s}")
+        check_numbers("route", self, not_negative=("rest_s",))
         object.__setattr__(self, "segments", tuple(_merged(self.segments)))
         if not self.segments:
             raise InputError("route.segments is empty; give at least one [v, omega, duration]")
@@ -60,7 +61,7 @@ class OpenLoop:
 
         Being means, they add up to the promised distance and angle exactly.
         """
-        starts_s, end_s = self._schedule(robot)
+        *starts_s, end_s = self.edges_s(robot)
         n_ticks = math.ceil((end_s + self.rest_s) / dt_s - 1e-9)
         edges_s = dt_s * np.arange(n_ticks + 1, dtype=np.float64)
         velocity = np.zeros((n_ticks, 2))
@@ -70,18 +71,11 @@ class OpenLoop:
             velocity[first:] += np.diff(held_s)[:, None] / dt_s * np.array(segment[:2])
         return velocity
 
-    def starts_s(self, robot: DifferentialDrive) -> Array:
-        """Time (S,) at which each segment begins, s."""
-        return np.array(self._schedule(robot)[0])
-
-    def ideal_poses(
-        self, robot: DifferentialDrive, dt_s: float = TICK_S, start: ArrayLike = (0.0, 0.0, 0.0)
-    ) -> Array:
-        """Poses (N + 1, 3) that the commands promise at the tick edges; headings unwrapped."""
-        velocity = self.profile(robot, dt_s)
-        # track 2: wheel travels are then v + omega and v - omega
-        travel = dt_s * np.stack([velocity[:, 0] + velocity[:, 1], velocity[:, 0] - velocity[:, 1]])
-        return chain(arc_increment(travel.T, 2.0), start)
+    def edges_s(self, robot: DifferentialDrive) -> Array:
+        """Times (S + 1,) at which the segments begin and the last one ends, s."""
+        ramps = [_trapezoid(segment, robot) for segment in self.segments]
+        lasts_s = [plateau_s + 2.0 * ramp_s for plateau_s, ramp_s, _ in ramps]
+        return np.concatenate([[0.0], np.cumsum(lasts_s)])
 
     def ideal_end(self, start: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
         """Pose (3,) that the commands promise at the end; heading unwrapped."""
@@ -89,15 +83,6 @@ class OpenLoop:
         travel = np.stack([v + omega, v - omega], axis=1) * duration_s[:, None]
         last: Array = chain(arc_increment(travel, 2.0), start)[-1]
         return last
-
-    def _schedule(self, robot: DifferentialDrive) -> tuple[list[float], float]:
-        """Start of each segment and end of the last one, s."""
-        starts_s, now_s = [], 0.0
-        for segment in self.segments:
-            starts_s.append(now_s)
-            plateau_s, ramp_s, _ = _trapezoid(segment, robot)
-            now_s += plateau_s + 2.0 * ramp_s
-        return starts_s, now_s
 
 
 @dataclass(frozen=True)
@@ -148,10 +133,9 @@ class Tour:
     turn_rate_radps: float = 1.0
 
     def __post_init__(self) -> None:
-        for name in ("speed_mps", "look_ahead_m", "tolerance_m", "turn_rate_radps"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0.0):
-                raise InputError(f"route.{name} must be a positive number, got {value}")
+        check_numbers(
+            "route", self, ("speed_mps", "look_ahead_m", "tolerance_m", "turn_rate_radps")
+        )
         if self.distance_m is not None and not 0.0 < self.distance_m < math.inf:
             raise InputError(f"route.distance_m must be positive, got {self.distance_m}")
 
@@ -164,9 +148,7 @@ class Tour:
                 "route.waypoints=[[x, y], ...]"
             )
         path = _lengthened(given, self.distance_m)
-        first = path[1] - path[0]
-        pose = np.array([path[0, 0], path[0, 1], math.atan2(first[1], first[0])])
-        return pose, Pursuit(self, robot, path)
+        return facing_second(path), Pursuit(self, robot, path)
 
 
 class Pursuit:
@@ -174,8 +156,7 @@ class Pursuit:
 
     def __init__(self, tour: Tour, robot: DifferentialDrive, path: Array) -> None:
         self._tour, self._path = tour, path
-        steps = np.hypot(*np.diff(path, axis=0).T)
-        self._along_m = np.concatenate([[0.0], np.cumsum(steps)])
+        self._along_m = _along_m(path)
         self._acceleration = 0.5 * robot.max_acceleration_mps2  # the other half is for turning
         self._turn_acceleration = robot.max_acceleration_mps2 / robot.track_m
         self._done_m, self._velocity = 0.0, np.zeros(2)
@@ -213,9 +194,7 @@ class Pursuit:
         ahead_m = self._done_m + 2.0 * self._tour.look_ahead_m
         high = min(int(np.searchsorted(self._along_m, ahead_m)) + 1, len(self._path))
         best = math.inf
-        for i in range(max(low, 0), max(high, low + 2) - 1):
-            if i + 1 >= len(self._path):
-                break
+        for i in range(low, min(max(high, low + 2), len(self._path)) - 1):
             start, way = self._path[i], self._path[i + 1] - self._path[i]
             length = self._along_m[i + 1] - self._along_m[i]
             share = float(np.clip((pose[:2] - start) @ way / length**2, 0.0, 1.0))
@@ -244,8 +223,7 @@ class Pursuit:
 
     def _limited(self, wanted: Array, dt_s: float) -> Array:
         most = dt_s * np.array([self._acceleration, self._turn_acceleration])
-        limited: Array = self._velocity + np.clip(wanted - self._velocity, -most, most)
-        return limited
+        return self._velocity + np.clip(wanted - self._velocity, -most, most)
 
     def _point_at(self, along_m: float) -> Array:
         columns = [np.interp(along_m, self._along_m, self._path[:, i]) for i in (0, 1)]
@@ -260,30 +238,19 @@ def _lengthened(path: Array, distance_m: float | None) -> Array:
         return path
     closed = bool(np.hypot(*(path[0] - path[-1])) < 1e-6)
     lap = path
-    while _length(path) < distance_m:
+    while _along_m(path)[-1] < distance_m:
         lap = lap if closed else lap[::-1]
         path = np.concatenate([path, lap[1:]])
-    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
+    along = _along_m(path)
     last = int(np.searchsorted(along, distance_m))
     share = (distance_m - along[last - 1]) / (along[last] - along[last - 1])
     end = path[last - 1] + share * (path[last] - path[last - 1])
     return np.concatenate([path[:last], end[None]])
 
 
-def _length(path: Array) -> float:
-    return float(np.sum(np.hypot(*np.diff(path, axis=0).T)))
-
-
-def chain(increments: ArrayLike, start: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
-    """Poses (N + 1, 3) from relative poses (N, 3) and a start pose; headings unwrapped."""
-    steps, first = np.asarray(increments, float), np.asarray(start, float)
-    heading = first[2] + np.concatenate([[0.0], np.cumsum(steps[:, 2])])
-    cos, sin = np.cos(heading[:-1]), np.sin(heading[:-1])
-    moves = np.stack([cos * steps[:, 0] - sin * steps[:, 1], sin * steps[:, 0] + cos * steps[:, 1]])
-    poses = np.empty((len(steps) + 1, 3))
-    poses[0, :2], poses[1:, :2] = first[:2], first[:2] + np.cumsum(moves.T, axis=0)
-    poses[:, 2] = heading
-    return poses
+def _along_m(path: Array) -> Array:
+    """Distance (P,) along a path (P, 2) to each of its points, m."""
+    return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
 
 
 def _merged(segments: Iterable[Iterable[float]]) -> list[Segment]:

@@ -56,6 +56,16 @@ def transform(T_a_b: ArrayLike, points_in_b: ArrayLike) -> Array:
     return np.stack([x, y], axis=-1)
 
 
+def chain(increments: ArrayLike, start: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
+    """Poses (N + 1, 3) from relative poses (N, 3) and a start pose; headings unwrapped."""
+    steps, first = np.asarray(increments, float), np.asarray(start, float)
+    heading = first[2] + np.concatenate([[0.0], np.cumsum(steps[:, 2])])
+    cos, sin = np.cos(heading[:-1]), np.sin(heading[:-1])
+    moves = np.stack([cos * steps[:, 0] - sin * steps[:, 1], sin * steps[:, 0] + cos * steps[:, 1]])
+    positions = np.concatenate([np.zeros((1, 2)), np.cumsum(moves.T, axis=0)])
+    return np.column_stack([first[:2] + positions, heading])
+
+
 def compose_jacobians(T_a_b: ArrayLike, T_b_c: ArrayLike) -> tuple[Array, Array]:
     """Derivatives (..., 3, 3) of `compose` by its first and second argument."""
     first, second = np.asarray(T_a_b, dtype=np.float64), np.asarray(T_b_c, dtype=np.float64)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sim.errors import InputError, required
-from sim.settings import build
+from sim.settings import build, check_numbers
 
 Array = NDArray[np.float64]
 
@@ -29,8 +29,9 @@ class Mount:
     yaw_rad: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("x_m", "y_m", "z_m", "yaw_rad"):
-            _check_finite("mount", name, getattr(self, name))
+        for name, value in vars(self).items():
+            if not math.isfinite(value):
+                raise InputError(f"sensors.mount.{name} must be a finite number, got {value}")
 
     @property
     def pose(self) -> Array:
@@ -46,7 +47,7 @@ class Encoder:
 
     def __post_init__(self) -> None:
         if self.rate_hz is not None:
-            _check_positive("encoder", "rate_hz", self.rate_hz)
+            check_numbers("sensors.encoder", self, ("rate_hz",))
 
 
 @dataclass(frozen=True)
@@ -76,14 +77,13 @@ class Laser:
     mount: Mount = field(default_factory=Mount)
 
     def __post_init__(self) -> None:
-        _check_positive("laser", "rate_hz", self.rate_hz)
+        check_numbers(
+            "sensors.laser", self, ("rate_hz", "max_range_m"), ("min_range_m", "sigma_range_m")
+        )
         if self.n_beams < 1:
             raise InputError(f"sensors.laser.n_beams must be at least 1, got {self.n_beams}")
         if not 0.0 < self.fov_rad <= 2.0 * math.pi:
             raise InputError(f"sensors.laser.fov_rad must lie in (0, 2 pi], got {self.fov_rad}")
-        _check_positive("laser", "max_range_m", self.max_range_m)
-        _check_not_negative("laser", "min_range_m", self.min_range_m)
-        _check_not_negative("laser", "sigma_range_m", self.sigma_range_m)
 
     @property
     def bearings_rad(self) -> Array:
@@ -95,12 +95,7 @@ class Laser:
 
     def measure(self, true_ranges_m: ArrayLike, rng: np.random.Generator) -> NDArray[np.float32]:
         """Noisy ranges (..., n_beams), float32; +inf where nothing is in range."""
-        ranges = np.asarray(true_ranges_m, float)
-        noise = rng.standard_normal(ranges.shape)
-        noisy = np.maximum(ranges + self.sigma_range_m * noise, 0.0)
-        seen = (ranges >= self.min_range_m) & (ranges <= self.max_range_m)
-        measured: NDArray[np.float32] = np.where(seen, noisy, np.inf).astype(np.float32)
-        return measured
+        return _measured(self, true_ranges_m, rng)
 
 
 Selection = Literal["nearest", "random", "spread"]
@@ -160,8 +155,18 @@ class StereoCamera:
     mount: Mount = field(default_factory=lambda: Mount(z_m=0.5))
 
     def __post_init__(self) -> None:
-        for name in ("rate_hz", "focal_px", "baseline_m", "max_distance_m"):
-            _check_positive("stereo", name, getattr(self, name))
+        check_numbers(
+            "sensors.stereo",
+            self,
+            ("rate_hz", "focal_px", "baseline_m", "max_distance_m"),
+            (
+                "sigma_column_px",
+                "sigma_row_px",
+                "sigma_disparity_px",
+                "sigma_descriptor",
+                "sigma_view_descriptor",
+            ),
+        )
         for name in ("fov_horizontal_rad", "fov_vertical_rad"):
             if not 0.0 < getattr(self, name) < math.pi:
                 value = getattr(self, name)
@@ -176,14 +181,6 @@ class StereoCamera:
                 "sensors.stereo.selection must be nearest, random or spread, "
                 f"got {self.selection!r}"
             )
-        for name in (
-            "sigma_column_px",
-            "sigma_row_px",
-            "sigma_disparity_px",
-            "sigma_descriptor",
-            "sigma_view_descriptor",
-        ):
-            _check_not_negative("stereo", name, getattr(self, name))
 
     def covariance(self, points_in_camera: ArrayLike) -> Array:
         """Covariance R (..., 3, 3), m^2, of observations of points (..., 3) by eqs. (10)-(12).
@@ -226,8 +223,7 @@ class StereoCamera:
         disparity = self.focal_px * self.baseline_m / z + self.sigma_disparity_px * draws[:, 2]
         disparity = np.where(disparity > 0.0, disparity, np.nan)
         rays = np.stack([column, row, np.full_like(row, self.focal_px)], axis=-1)
-        seen: Array = rays * (self.baseline_m / disparity[:, None])
-        return seen
+        return rays * (self.baseline_m / disparity[:, None])
 
 
 @dataclass(frozen=True)
@@ -245,15 +241,14 @@ class Lidar3D:
     mount: Mount = field(default_factory=lambda: Mount(z_m=1.5))
 
     def __post_init__(self) -> None:
-        for name in ("rate_hz", "max_range_m"):
-            _check_positive("lidar3d", name, getattr(self, name))
+        check_numbers(
+            "sensors.lidar3d", self, ("rate_hz", "max_range_m"), ("min_range_m", "sigma_range_m")
+        )
         for name in ("n_rings", "n_azimuths"):
             if getattr(self, name) < 1:
                 raise InputError(
                     f"sensors.lidar3d.{name} must be at least 1, got {getattr(self, name)}"
                 )
-        for name in ("min_range_m", "sigma_range_m"):
-            _check_not_negative("lidar3d", name, getattr(self, name))
         low, high = self.elevation_min_rad, self.elevation_max_rad
         if not -math.pi / 2 < low <= high < math.pi / 2:
             raise InputError(
@@ -273,13 +268,7 @@ class Lidar3D:
 
     def measure(self, true_ranges_m: ArrayLike, rng: np.random.Generator) -> NDArray[np.float32]:
         """Noisy ranges (n_rings, n_azimuths), float32; +inf where nothing is in range."""
-        ranges = np.asarray(true_ranges_m, float)
-        noisy = ranges + self.sigma_range_m * rng.standard_normal(ranges.shape)
-        seen = (ranges >= self.min_range_m) & (ranges <= self.max_range_m)
-        measured: NDArray[np.float32] = np.where(seen, np.maximum(noisy, 0.0), np.inf).astype(
-            np.float32
-        )
-        return measured
+        return _measured(self, true_ranges_m, rng)
 
     def points_in_sensor(self, ranges_m: ArrayLike) -> Array:
         """Cartesian points (N, 3), m, of the finite ranges (n_rings, n_azimuths)."""
@@ -296,6 +285,16 @@ class Lidar3D:
         seen = np.isfinite(ranges)
         points: Array = directions[seen] * ranges[seen][:, None]
         return points
+
+
+def _measured(
+    sensor: Laser | Lidar3D, true_ranges_m: ArrayLike, rng: np.random.Generator
+) -> NDArray[np.float32]:
+    """Ranges with Gaussian noise, float32; +inf outside the sensor's limits."""
+    ranges = np.asarray(true_ranges_m, float)
+    noisy = np.maximum(ranges + sensor.sigma_range_m * rng.standard_normal(ranges.shape), 0.0)
+    seen = (ranges >= sensor.min_range_m) & (ranges <= sensor.max_range_m)
+    return np.where(seen, noisy, np.inf).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -352,18 +351,3 @@ def suite_from_config(config: dict[str, Any]) -> SensorSuite:
             fields["mount"] = build(Mount, fields["mount"], f"sensors.{name}.mount")
         sensors[name] = build(kinds[name], fields, f"sensors.{name}")
     return SensorSuite(**sensors)
-
-
-def _check_finite(sensor: str, name: str, value: float) -> None:
-    if not math.isfinite(value):
-        raise InputError(f"sensors.{sensor}.{name} must be a finite number, got {value}")
-
-
-def _check_positive(sensor: str, name: str, value: float) -> None:
-    if not (math.isfinite(value) and value > 0.0):
-        raise InputError(f"sensors.{sensor}.{name} must be a positive number, got {value}")
-
-
-def _check_not_negative(sensor: str, name: str, value: float) -> None:
-    if not (math.isfinite(value) and value >= 0.0):
-        raise InputError(f"sensors.{sensor}.{name} must be zero or positive, got {value}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from typing import Any, TypeVar
 
@@ -41,6 +42,23 @@ def build(cls: type[T], settings: Mapping[str, Any], where: str) -> T:
         if bare and name not in values:
             raise InputError(f"{where}.{name} is missing")
     return cls(**values)
+
+
+def check_numbers(
+    where: str, settings: object, positive: tuple[str, ...] = (), not_negative: tuple[str, ...] = ()
+) -> None:
+    """Check that attributes are finite and positive, or at least not negative.
+
+    Raises
+    ------
+    InputError
+        Naming the first attribute that is not, as `where.name`.
+    """
+    for name in (*positive, *not_negative):
+        value = getattr(settings, name)
+        wanted = "a positive number" if name in positive else "zero or a positive number"
+        if not (math.isfinite(value) and (value > 0.0 or (value == 0.0 and name in not_negative))):
+            raise InputError(f"{where}.{name} must be {wanted}, got {value}")
 
 
 def _checked(value: Any, annotation: str, where: str) -> Any:

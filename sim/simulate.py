@@ -49,12 +49,10 @@ class Body(Protocol):
 
     def step(self, wheel_speeds_mps: Array) -> Array:
         """Advance one tick; return the wheels' rolling (2,) m."""
-        ...
 
     @property
     def pose(self) -> Array:
         """(3,) m, m, rad."""
-        ...
 
 
 class Driver(Protocol):
@@ -62,12 +60,10 @@ class Driver(Protocol):
 
     def command(self, tick: int, pose: Array) -> Array | None:
         """Body velocity (2,) m/s, rad/s for the tick, or None when the route is done."""
-        ...
 
     @property
     def trouble(self) -> str | None:
         """`off_route` or `incomplete` if the route was not kept, else None."""
-        ...
 
 
 class Route(Protocol):
@@ -75,7 +71,6 @@ class Route(Protocol):
 
     def start(self, world: World, robot: DifferentialDrive) -> tuple[Array, Driver]:
         """Start pose (3,) and the driver."""
-        ...
 
 
 def record(
@@ -233,7 +228,7 @@ def overlaps(world: World, robot: DifferentialDrive, pose: Array) -> bool:
 
 
 class _ExactRays:
-    """The caster of `sim.casting`, loaded only where it is used: it brings a compiler along."""
+    """The caster of `sim.casting`, imported only where it is used: it needs a compiler."""
 
     def __init__(self, world: World, laser: Laser | None) -> None:
         self._world = world
@@ -289,8 +284,7 @@ class _BulletRays:
 
     def _ranges(self, starts: Array, way: Array, reach_m: float, *, ground: bool) -> Array:
         share = self._bullet.cast(starts, starts + reach_m * way, ground=ground)
-        ranges: Array = np.where(share < 1.0, share * reach_m, np.inf)
-        return ranges
+        return np.where(share < 1.0, share * reach_m, np.inf)
 
 
 def sensor_pose(sensor: Laser | Lidar3D | StereoCamera, pose: Array) -> Array:
@@ -360,8 +354,7 @@ class _Landmarks:
             order = np.argsort(np.linalg.norm(inside[ids], axis=1), kind="stable")
             return ids[order[:most]]
         if camera.selection == "random":
-            chosen: NDArray[np.int64] = self._rng.choice(ids, most, replace=False)
-            return chosen
+            return self._rng.choice(ids, most, replace=False)
         # Farthest-point choice over the image: each next landmark is the one farthest, in
         # pixels, from those already taken.
         pixels = inside[ids, :2] / inside[ids, 2:]
@@ -396,7 +389,7 @@ class _Landmarks:
 
 
 class _SlipEvents:
-    """The stress that kr and kl do not describe: a wheel's encoder runs on by some centimetres."""
+    """Slip that kr and kl do not describe: a wheel's encoder runs on by some centimetres."""
 
     def __init__(self, robot: DifferentialDrive, rng: np.random.Generator) -> None:
         self._chance = robot.unmodelled_slip * DT_S
@@ -412,8 +405,7 @@ class _SlipEvents:
         self._left[begins] = _SLIP_EVENT_TICKS
         active = self._left > 0
         self._left[active] -= 1
-        error: Array = np.where(active, self._step_m * np.sign(rolling_m), 0.0)
-        return error
+        return np.where(active, self._step_m * np.sign(rolling_m), 0.0)
 
 
 def _normals(rng: np.random.Generator, block: int = 3000) -> Iterator[Array]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,8 +13,11 @@ from sim.errors import InputError
 Array = NDArray[np.float64]
 
 
-def _empty(*shape: int) -> Array:
-    return np.zeros(shape)
+def facing_second(waypoints: Array) -> Array:
+    """Pose (3,) on the first of the way-points (P, 2), facing the second."""
+    x, y = waypoints[0]
+    along = waypoints[1] - waypoints[0]
+    return np.array([x, y, math.atan2(along[1], along[0])])
 
 
 @dataclass(frozen=True)
@@ -39,7 +43,7 @@ class World:
         Name of a place (`corridor_bare`, `room`, ...) to its rectangles (R, 4) m: x_min, y_min,
         x_max, y_max.
     start_pose
-        (3,) m, m, rad: where a robot starts unless told otherwise.
+        (3,) m, m, rad: where a robot starts unless its route says otherwise.
     waypoints
         (P, 2) m: a tour through free space that passes every kind of place.
     """
@@ -47,12 +51,12 @@ class World:
     name: str
     walls: Array
     wall_z_m: Array
-    landmarks: Array = field(default_factory=lambda: _empty(0, 3))
+    landmarks: Array = field(default_factory=lambda: np.zeros((0, 3)))
     descriptors: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 0), np.float32))
     look_alike: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))
     places: dict[str, Array] = field(default_factory=dict)
-    start_pose: Array = field(default_factory=lambda: _empty(3))
-    waypoints: Array = field(default_factory=lambda: _empty(0, 2))
+    start_pose: Array = field(default_factory=lambda: np.zeros(3))
+    waypoints: Array = field(default_factory=lambda: np.zeros((0, 2)))
 
     def __post_init__(self) -> None:
         shapes = {

@@ -26,7 +26,7 @@ import yaml
 
 from sim.errors import InputError
 from sim.plan import WALL_HEIGHT_M, box_corners, gaps_m, make_descriptors
-from sim.world import World
+from sim.world import World, facing_second
 
 _KEYS = ("name", "walls", "boxes", "landmarks", "places", "waypoints", "start_pose")
 _BOX_KEYS = ("x", "y", "length", "width", "heading_deg", "height")
@@ -50,9 +50,7 @@ def read_world(path: Path) -> World:
         raise InputError(f"{path}{line}: not valid YAML ({_brief(error)})") from error
     if not isinstance(document, Mapping):
         raise InputError(f"{path}: must hold keys such as walls, boxes, waypoints")
-    for key in document:
-        if key not in _KEYS:
-            raise InputError(f"{path}: unknown key {key!r}; known: {', '.join(_KEYS)}")
+    _check_keys(document, _KEYS, str(path))
     walls, heights = [], []
     for i, entry in enumerate(_list(document, "walls", path)):
         ends, z = _wall(entry, f"{path}: walls[{i}]")
@@ -109,17 +107,14 @@ def _start(document: Mapping[str, Any], waypoints: Any, path: Path) -> Any:
         )
         return np.array([x, y, math.radians(degrees)])
     if len(waypoints) >= 2:
-        way = waypoints[1] - waypoints[0]
-        return np.array([*waypoints[0], math.atan2(way[1], way[0])])
+        return facing_second(waypoints)
     return np.zeros(3)
 
 
 def _wall(entry: Any, where: str) -> tuple[list[float], list[float]]:
     z = [0.0, WALL_HEIGHT_M]
     if isinstance(entry, Mapping):
-        for key in entry:
-            if key not in ("from", "to", "z"):
-                raise InputError(f"{where}: unknown key {key!r}; known: from, to, z")
+        _check_keys(entry, ("from", "to", "z"), where)
         if "from" not in entry or "to" not in entry:
             raise InputError(f"{where} must have from: [x, y] and to: [x, y]")
         ends = [
@@ -140,9 +135,7 @@ def _wall(entry: Any, where: str) -> tuple[list[float], list[float]]:
 def _box(entry: Any, where: str) -> tuple[Any, float]:
     if not isinstance(entry, Mapping):
         raise InputError(f"{where} must be a mapping of {', '.join(_BOX_KEYS)}, got {entry!r}")
-    for key in entry:
-        if key not in _BOX_KEYS:
-            raise InputError(f"{where}: unknown key {key!r}; known: {', '.join(_BOX_KEYS)}")
+    _check_keys(entry, _BOX_KEYS, where)
     for key in ("x", "y", "length", "width"):
         if key not in entry:
             raise InputError(f"{where}.{key} is missing")
@@ -157,6 +150,12 @@ def _box(entry: Any, where: str) -> tuple[Any, float]:
         math.radians(numbers["heading_deg"]),
     )
     return corners, numbers["height"]
+
+
+def _check_keys(entry: Mapping[Any, Any], known: tuple[str, ...], where: str) -> None:
+    for key in entry:
+        if key not in known:
+            raise InputError(f"{where}: unknown key {key!r}; known: {', '.join(known)}")
 
 
 def _list(document: Mapping[str, Any], key: Any, path: Path, prefix: str = "") -> list[Any]:

@@ -1,4 +1,4 @@
-"""Builders keep their promises over many seeds; a user's world file is read or told apart."""
+"""Builders keep their promises over many seeds; a user's world file is read or refused."""
 
 from itertools import pairwise
 from pathlib import Path

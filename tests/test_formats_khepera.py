@@ -44,7 +44,7 @@ def test_known_wheels_are_found():
 
 
 def test_known_slip_is_found():
-    # a longer log, so that the two wheels are told apart
+    # a longer log, so that the two wheels can be distinguished
     log = parse_khepera(tuples(np.random.default_rng(2), n=3000), "log")
     found = slip_of_turns(calibrate_wheels(log), 1, np.random.default_rng(0), 100)
     assert found.kr.low <= 2e-6 <= found.kr.high

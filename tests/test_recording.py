@@ -216,7 +216,7 @@ def test_failed_writes_leave_nothing(tmp_path):
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
-def test_a_full_disk_is_told_in_one_line(tmp_path, monkeypatch):
+def test_a_full_disk_is_reported_in_one_line(tmp_path, monkeypatch):
     real = np.savez
 
     def savez_to_full_disk(file, **arrays):

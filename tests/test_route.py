@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from sim.errors import InputError
-from sim.robot import DifferentialDrive
+from sim.robot import DifferentialDrive, arc_increment
 from sim.route import TABLE_1, TICK_S, OpenLoop
+from sim.se2 import chain
 
 ROBOT = DifferentialDrive(wheel_radius_m=0.05, track_m=0.18)
 ROUTES = {
@@ -39,7 +40,9 @@ def test_wheels_stay_within_the_acceleration(name):
 @pytest.mark.parametrize("name", ROUTES)
 def test_ideal_poses_end_where_the_arcs_end(name):
     start = np.array([1.0, -2.0, 0.4])
-    poses = ROUTES[name].ideal_poses(ROBOT, start=start)
+    v, omega = ROUTES[name].profile(ROBOT).T
+    travel = TICK_S * np.stack([v + omega, v - omega], axis=1)
+    poses = chain(arc_increment(travel, 2.0), start)
     np.testing.assert_allclose(poses[-1], ROUTES[name].ideal_end(start), atol=1e-9)
     np.testing.assert_array_equal(poses[0], start)
 
@@ -58,7 +61,7 @@ def test_same_velocity_joins_and_another_passes_through_rest():
     joined = OpenLoop(((0.5, 0.0, 1.0), (0.5, 0.0, 1.0)))
     np.testing.assert_allclose(joined.profile(ROBOT), TABLE_1["linear_1"].profile(ROBOT))
     mixed = OpenLoop(((0.5, 0.0, 1.0), (0.5, 0.5, 1.0)))
-    second_s = mixed.starts_s(ROBOT)[1]
+    second_s = mixed.edges_s(ROBOT)[1]
     assert second_s == pytest.approx(1.5)
     tick = round(second_s / TICK_S)
     assert np.abs(mixed.profile(ROBOT)[tick - 1 : tick + 1, 0]).max() < 0.5 * TICK_S * 2
@@ -85,6 +88,6 @@ def test_tick_length_does_not_change_the_promise():
         ((0.5, 0.0, 1.0), r"segments\[0\]"),
     ],
 )
-def test_bad_segments_are_told_by_their_place(segments, word):
+def test_bad_segments_are_named_by_their_place(segments, word):
     with pytest.raises(InputError, match=word):
         OpenLoop(segments)

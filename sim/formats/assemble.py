@@ -1,10 +1,9 @@
 """From what logs hold to Recordings: order, gaps, wheels without encoders, instants for Frames.
 
-The rules, once for all readers:
+The rules for all readers:
 
-* Readings are put in the order of their stamps; of readings with the same stamp the last one
-  counts. How many stood out of order or were repeated is noted in the Recording's
-  configuration.
+* Readings are sorted by their stamps; of readings with the same stamp the last one counts. The
+  Recording's configuration notes how many were out of order or duplicates.
 * Wheel travel between two stamps is taken to be even (linear interpolation).
 * A velocity holds from its stamp to the next one, but no longer than `LONGEST_HOLD_S`: what a
   robot did in a gap of the log is unknown, and the wheels are taken to stand.
@@ -43,7 +42,7 @@ def in_order(stamps: Array, name: str, notes: Notes) -> Rows:
     name
         What the readings are, for the notes.
     notes
-        Takes `<name>_backward` and `<name>_repeated` (readings moved and left out) and
+        Takes `<name>_backward` and `<name>_repeated` (readings moved and dropped) and
         `<name>_longest_gap_s`.
     """
     rows: Rows = np.argsort(stamps, kind="stable").astype(np.int64)
@@ -64,11 +63,11 @@ def in_order(stamps: Array, name: str, notes: Notes) -> Rows:
 def wheels_from_poses(stamps: Array, poses: Array, track_m: float, notes: Notes) -> WheelLog:
     """Wheels (right, left) that drive the robot from pose to pose, (N, 3).
 
-    Between close poses it drives the arc; what little such a motion has to the side, which wheels
-    cannot make, is left out. Between poses farther apart in time than a Frame, a motion to the
+    Between close poses it drives the arc; its small sideways part, which wheels
+    cannot make, is dropped. Between poses farther apart in time than a Frame, a motion to the
     side of more than 2 % shows that it was no arc: the robot then turns, drives straight and turns
     again, a third of the time each, which takes it exactly there. How many such motions there
-    are, and the share of sideways motion left out, are noted.
+    are, and the share of sideways motion dropped, are noted.
     """
     motion = se2.between(poses[:-1], poses[1:])
     twist = se2.log(motion)
@@ -121,14 +120,15 @@ def wheels_from_velocities(
 
 
 def chained(steps: Array) -> Array:
-    """Poses (N + 1, 3) from the origin on by relative motions (N, 3)."""
-    poses = np.zeros((len(steps) + 1, 3))
-    heading = np.concatenate([[0.0], np.cumsum(steps[:, 2])])
-    cos, sin = np.cos(heading[:-1]), np.sin(heading[:-1])
-    poses[1:, 0] = np.cumsum(cos * steps[:, 0] - sin * steps[:, 1])
-    poses[1:, 1] = np.cumsum(sin * steps[:, 0] + cos * steps[:, 1])
-    poses[:, 2] = se2.wrap(heading)
+    """Poses (N + 1, 3) from the origin on by relative motions (N, 3); headings wrapped."""
+    poses = se2.chain(steps)
+    poses[:, 2] = se2.wrap(poses[:, 2])
     return poses
+
+
+def rate_hz(stamps: Array) -> float:
+    """Median rate of stamps (N,) s, strictly increasing; 1 Hz for a single one."""
+    return 1.0 / max(float(np.median(np.diff(stamps))), 1e-9) if len(stamps) > 1 else 1.0
 
 
 def frame_stamps(

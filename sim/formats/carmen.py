@@ -24,10 +24,11 @@ from numpy.typing import NDArray
 
 from sim import se2
 from sim.errors import InputError
+from sim.files import write_whole
 from sim.formats import assemble
 from sim.formats.text import Rows, Words, read_words
 from sim.recording import LaserLog, Recording, Truth, WheelLog
-from sim.robot import RobotGeometry
+from sim.robot import RobotGeometry, arc_increment
 from sim.sensors import Encoder, Laser, Mount, SensorSuite
 
 Array = NDArray[np.float64]
@@ -61,7 +62,7 @@ class CarmenLog:
     is_graph
         Whether poses are vertices of an optimised graph, not odometry.
     notes
-        Counts of what was put in order or left out.
+        Counts of what was reordered or dropped.
     where
         The file, for messages.
     """
@@ -88,7 +89,7 @@ class CarmenLog:
         middle = self.start_angle_rad + fov / 2.0
         x, y, yaw = (float(v) for v in self.T_base_laser)
         return Laser(
-            rate_hz=_rate(self.scan_stamps),
+            rate_hz=assemble.rate_hz(self.scan_stamps),
             n_beams=n_beams,
             fov_rad=min(fov, 2.0 * math.pi),
             max_range_m=self.max_range_m,
@@ -122,9 +123,8 @@ def parse_carmen(words: Words) -> CarmenLog:
     assemble.require_readings(len(lines), 1, words.where, "FLASER or ROBOTLASER1 lines")
     counts = words.whole(lines, count_column, "the number of beams", 1, _MOST_BEAMS)
     n_beams = int(np.bincount(counts).argmax())
-    short = np.flatnonzero(words.counts[lines] < count_column + 1 + counts)
-    if len(short):
-        raise words.error(int(lines[short[0]]), "too few words for the ranges it promises")
+    short = words.counts[lines] < count_column + 1 + counts
+    words.refuse(short, lines, "too few words for the ranges it promises")
     if np.any(counts != n_beams):
         notes["scans_of_other_size"] = int(np.sum(counts != n_beams))
         lines = lines[counts == n_beams]
@@ -239,8 +239,7 @@ def scan_recording(
 def seen_ranges(raw_m: Array, max_range_m: float) -> NDArray[np.float32]:
     """Ranges with +inf where nothing was seen: at the maximum or beyond, zero, or no number."""
     seen = (raw_m > 0.0) & (raw_m < max_range_m)
-    ranges: NDArray[np.float32] = np.where(seen, raw_m, np.inf).astype(np.float32)
-    return ranges
+    return np.where(seen, raw_m, np.inf).astype(np.float32)
 
 
 def _mount(poses: Array, laser_poses: Array) -> Array:
@@ -257,8 +256,7 @@ def _edges(words: Words, scan_lines: Rows) -> Array:
     if not len(vertices) or not len(edges) or len(scan_lines) < 2:
         return np.zeros((0, 3))
     above = np.searchsorted(vertices, scan_lines) - 1
-    if np.any(above < 0):
-        raise words.error(int(scan_lines[np.argmin(above)]), "a scan without its VERTEX2")
+    words.refuse(above < 0, scan_lines, "a scan without its VERTEX2")
     ids = words.finite(vertices, 1, 1, "VERTEX2")[:, 0]
     values = words.finite(edges, 1, 5, "EDGE2")
     motion: dict[tuple[float, float], Array] = {}
@@ -270,16 +268,10 @@ def _edges(words: Words, scan_lines: Rows) -> Array:
     return np.array([motion.get((float(a), float(b)), unknown) for a, b in pairs])
 
 
-def _rate(stamps: Array) -> float:
-    """Median rate, Hz; 1 where it cannot be told."""
-    step = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
-    return 1.0 / step if step > 1e-9 else 1.0
-
-
 def write_carmen(path: Path, recording: Recording) -> None:
     """Write a Recording's odometry and scans as ODOM and ROBOTLASER1 lines.
 
-    What the format cannot hold (landmarks, clouds, the truth) is left out. Unseen beams are
+    What the format cannot hold (landmarks, clouds, the truth) is dropped. Unseen beams are
     written as the maximum range.
 
     Raises
@@ -287,13 +279,9 @@ def write_carmen(path: Path, recording: Recording) -> None:
     InputError
         If the recording has no laser, or the file cannot be written.
     """
-    from sim.files import write_whole
-
     laser, log = recording.sensors.laser, recording.laser
     if laser is None or log is None:
         raise InputError(f"{path}: a CARMEN log is of a laser, and this recording has none")
-    from sim.robot import arc_increment
-
     steps = arc_increment(np.diff(recording.wheels.position_m, axis=0), recording.robot.track_m)
     poses = assemble.chained(steps)
     heading = np.unwrap(poses[:, 2])

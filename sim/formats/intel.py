@@ -91,12 +91,11 @@ def read_intel(
         order = assemble.in_order(times, "reference", {})
         truth = Truth(times[order], corrected[order])
     wheels = assemble.wheels_from_poses(stamps, poses, track_m, notes)
-    rate_hz = 1.0 / max(float(np.median(np.diff(stamps))), 1e-9)
     return scan_recording(
         wheels,
         stamps,
         seen_ranges(ranges, _NO_RETURN_M),
-        _scanner(rate_hz, n_beams, _NO_RETURN_M),
+        _scanner(assemble.rate_hz(stamps), n_beams, _NO_RETURN_M),
         truth,
         track_m,
         wheel_radius_m,
@@ -129,7 +128,7 @@ def read_thinned_intel(
     Recording
         With stamps of the matched scans; between them time is shared out by what the odometry
         says the robot did (0.5 m/s and 0.8 rad/s at full speed). Matches that would make it move
-        more than three times as fast are left out.
+        more than three times as fast are dropped.
     Array
         (N,) numbers of the scans whose stamps are known.
     """
@@ -137,7 +136,7 @@ def read_thinned_intel(
     ranges = read_words(scans).table(_N_THINNED_BEAMS, "scans")
     steps = read_words(odometry).table(3, "odometry")[: len(ranges) - 1]
     words = read_words(matches)
-    lines = np.arange(1, len(words.line_numbers))  # the first line names the columns
+    lines = words.lines[1:]  # the first line names the columns
     numbers = words.whole(lines, 0, "the number of a scan", 0, len(ranges) - 1)
     times = words.finite(lines, 3, 1, "the time of a match")[:, 0]
     assemble.require_readings(min(len(ranges), len(steps) + 1, len(times)), 2, where, "scans")

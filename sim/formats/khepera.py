@@ -30,7 +30,7 @@ NOMINAL_DIAMETER_M, NOMINAL_AXLE_M = 0.041, 0.0885
 
 @dataclass(frozen=True)
 class WheelLaserLog:
-    """Intervals in which both wheels and laser tell the motion.
+    """Intervals whose motion both the wheels and the laser measured.
 
     Attributes
     ----------

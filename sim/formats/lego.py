@@ -64,9 +64,7 @@ def parse_scans(words: Words) -> tuple[Array, NDArray[np.float32]]:
     lines = words.lines_of("S")
     assemble.require_readings(len(lines), 1, words.where, "S lines")
     counts = words.whole(lines, 2, "the number of beams", 1, _MOST_BEAMS)
-    other = np.flatnonzero(counts != counts[0])
-    if len(other):
-        raise words.error(int(lines[other[0]]), "a scan of another size than the first")
+    words.refuse(counts != counts[0], lines, "a scan of another size than the first")
     stamps = words.finite(lines, 1, 1, "an S line")[:, 0] / 1000.0
     ranges = words.numbers(lines, 3, int(counts[0]), "ranges") / 1000.0
     rows = assemble.in_order(stamps, "scans", {})

@@ -4,7 +4,7 @@ A data set is a folder or a tar archive of `RobotN_Odometry.dat` (t v omega),
 `RobotN_Measurement.dat` (t barcode range bearing), `RobotN_Groundtruth.dat` (t x y theta),
 `Landmark_Groundtruth.dat` (subject x y sigma_x sigma_y) and `Barcodes.dat` (subject barcode).
 Subjects that have no place in the landmark file are the other robots; they and unknown barcodes
-are left out.
+are dropped.
 
 A range r and a bearing b become the point (x, y, z) = (-r sin b, 0, r cos b) of the camera frame
 (z forward, x right, y down), with landmarks at the camera's height. The believed noise is that of
@@ -123,7 +123,7 @@ def parse_mrclam(
 def _landmark_rows(
     codes: Array, barcodes: Array, subjects: Array, notes: assemble.Notes
 ) -> NDArray[np.int64]:
-    """Row of the landmark of each barcode; -1 for other robots and codes nobody carries."""
+    """Row of the landmark of each barcode; -1 for other robots and unknown codes."""
     subject_of = {float(code): float(subject) for subject, code in barcodes}
     row_of = {float(subject): row for row, subject in enumerate(subjects)}
     rows = np.array([row_of.get(subject_of.get(float(c), math.nan), -1) for c in codes], np.int64)

@@ -51,7 +51,7 @@ def read_trajectory(path: Path) -> Trajectory:
 
 
 def parse_trajectory(words: Words) -> Trajectory:
-    """The trajectory in a file's words; stamps put in order, the last of equal ones kept."""
+    """The trajectory in a file's words; sorted by stamp, the last of equal stamps kept."""
     table = words.table((4, 13), "a Rawseeds trajectory")
     table = table[assemble.in_order(table[:, 0], "poses", {})]
     covariances = np.zeros((0, 3, 3))
@@ -71,13 +71,12 @@ def parse_sick(words: Words) -> tuple[Array, Array, float, float]:
 
     The offset counts quarter degrees from -90 on; steps are one degree.
     """
-    lines = np.arange(len(words.line_numbers))
+    lines = words.lines
     head = words.finite(lines, 0, 3, "stamp, count and offset")
     counts = words.whole(lines, 1, "the number of ranges", 1, _MOST_BEAMS)
     assemble.require_readings(len(lines), 1, words.where, "scans")
-    different = np.flatnonzero((counts != counts[0]) | (head[:, 2] != head[0, 2]))
-    if len(different):
-        raise words.error(int(different[0]), "a scan of another size or offset than the first")
+    different = (counts != counts[0]) | (head[:, 2] != head[0, 2])
+    words.refuse(different, lines, "a scan of another size or offset than the first")
     if not 0.0 <= head[0, 2] < 4.0:
         raise words.error(0, "the angular offset must be 0 to 3 quarter degrees")
     ranges = words.numbers(lines, 3, int(counts[0]), "ranges")

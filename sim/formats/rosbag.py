@@ -1,7 +1,7 @@
 """ROS 1 bags, ROS 2 bags and MCAP files: in and out, through the library `rosbags`.
 
-Only the message types named here are read, by definitions of our own and never by those that
-the file brings. Frames are REP-105's: `odom` -> `base_link`, the truth and the map in `map`.
+Only the message types named here are read, with our own definitions and never with those in the
+file. Frames are REP-105's: `odom` -> `base_link`, the truth and the map in `map`.
 
 | topic | type | holds |
 | --- | --- | --- |
@@ -19,7 +19,7 @@ the file brings. Frames are REP-105's: `odom` -> `base_link`, the truth and the 
 | /tf_static | tf2_msgs/TFMessage | where the sensors sit |
 | /estima/about | std_msgs/String | robot, sensors, configuration and Frame stamps as JSON |
 
-Stamps become nanoseconds; all else keeps its digits.
+Stamps become nanoseconds; everything else keeps its digits.
 """
 
 from __future__ import annotations
@@ -91,5 +91,4 @@ def nanoseconds(stamp: float) -> int:
 
 def seconds(counts: NDArray[np.int64]) -> Array:
     """Seconds of nanoseconds."""
-    found: Array = (counts // 10**9) + (counts % 10**9) / 1e9
-    return found
+    return (counts // 10**9) + (counts % 10**9) / 1e9

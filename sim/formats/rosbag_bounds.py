@@ -1,4 +1,4 @@
-"""What a hostile bag must not do: unpack to more than the memory holds, or bring code along."""
+"""What a hostile bag must not do: unpack to more than the memory holds, or run code."""
 
 from __future__ import annotations
 
@@ -95,10 +95,8 @@ def _bag_chunks(data: bytes) -> Iterator[tuple[str, bytes]]:
         (length,) = struct.unpack_from("<I", data, at)
         at += 4
         if b"op=\x05" in header:
-            name = header.split(b"compression=", maxsplit=1)[-1][:4]
-            kind = name.rstrip(b"\x00\x01\x02\x03\x04\x05\x06\x07\x08\x09\x0a\x0b\x0c\x0d")
-            names = {b"bz2": "bz2", b"lz4": "lz4"}
-            yield names.get(kind[:3], "none"), data[at : at + length]
+            name = header.split(b"compression=", maxsplit=1)[-1][:3]
+            yield {b"bz2": "bz2", b"lz4": "lz4"}.get(name, "none"), data[at : at + length]
         at += length
 
 

@@ -50,9 +50,20 @@ from sim.sensors import Encoder, Laser, Mount, SensorSuite, suite_from_config
 from sim.settings import build
 from sim.world import World
 
-NOMINAL_TRACK_M, NOMINAL_RADIUS_M = 0.3, 0.1  # of a robot that the bag says nothing of
+NOMINAL_TRACK_M, NOMINAL_RADIUS_M = 0.3, 0.1  # of a robot that the bag does not describe
 _BASES = ("base_link", "base_footprint", "base")
 _MOST_MESSAGES = 20_000_000
+# Topics with these names and another type are not ours
+_KINDS = {
+    ABOUT: STRING,
+    "/wheels": JOINTS,
+    "/ground_truth/wheels": JOINTS,
+    "/landmarks": CLOUD,
+    "/points": CLOUD,
+    "/places": CLOUD,
+    "/cmd_vel": TWIST,
+    "/map": MARKERS,
+}
 
 
 @dataclass
@@ -78,8 +89,8 @@ def read_bag(
 ) -> Recording:
     """A Recording of a ROS 1 bag, a folder of a ROS 2 bag, or an MCAP file.
 
-    Wheel travel is taken as it is where /wheels tells it, else rebuilt from odometry, else from
-    the transform odom -> base_link. The laser's mounting comes from the transforms.
+    Wheel travel comes from /wheels where there is such a topic, else from odometry, else from the
+    transform odom -> base_link. The laser's mounting comes from the transforms.
 
     Parameters
     ----------
@@ -87,7 +98,7 @@ def read_bag(
         Topics; None for `/odom`, `/scan` and `/ground_truth`, or else the topic of that type with
         most messages (for the truth: none).
     track_m, wheel_radius_m
-        The robot's, where the bag does not tell.
+        The robot's, where the bag does not give it.
 
     Raises
     ------
@@ -146,9 +157,7 @@ def _recording(
     wheels = _wheels(path, topics, wanted[0], track_m, notes)
     scans = _chosen(path, topics, wanted[1], "/scan", SCAN)
     mounts = _transforms(topics)
-    laser, laser_log = None, None
-    if scans is not None:
-        laser, laser_log = _laser(path, scans, mounts, notes)
+    laser, laser_log = _laser(path, scans, mounts, notes) if scans else (None, None)
     reference = _chosen(path, topics, wanted[2], "/ground_truth", ODOMETRY, only_named=True)
     landmarks, true_ids = _landmarks(path, topics)
     clouds, places = _clouds(path, topics), _places(path, topics)
@@ -186,21 +195,21 @@ def _recording(
 
 
 def _about(path: Path, topics: dict[str, _Topic]) -> dict[str, Any]:
-    """What a bag of ours says of itself; empty for another's."""
+    """What `write_bag` noted about the recording; empty for any other bag."""
     topic = topics.get(ABOUT)
-    if topic is None or topic.kind != STRING:
+    if topic is None:
         return {}
     try:
-        told = json.loads(topic.messages[0].data)
-        robot = build(RobotGeometry, told["robot"], "robot")
+        written = json.loads(topic.messages[0].data)
+        robot = build(RobotGeometry, written["robot"], "robot")
         return {
             "robot": robot,
             "track_m": robot.track_m,
-            "sensors": dict(told["sensors"]),
-            "config": dict(told["config"]),
-            "status": told["status"],
-            "frames": seconds(np.array(told["frame_stamps_ns"], np.int64)),
-            "world": told["world"],
+            "sensors": dict(written["sensors"]),
+            "config": dict(written["config"]),
+            "status": written["status"],
+            "frames": seconds(np.array(written["frame_stamps_ns"], np.int64)),
+            "world": written["world"],
         }
     except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         raise InputError(f"{path}: {ABOUT} is not as it was written ({error})") from error
@@ -233,16 +242,13 @@ def _wheels(
     track_m: float,
     notes: assemble.Notes,
 ) -> WheelLog:
-    if wanted is None and "/wheels" in topics and topics["/wheels"].kind == JOINTS:
+    if wanted is None and "/wheels" in topics:
         stamps, travel = _joints(topics["/wheels"])
         rows = assemble.in_order(stamps, "wheels", notes)
         assemble.require_readings(len(rows), 2, str(path), "wheel readings")
         return WheelLog(stamps[rows], travel[rows])
     topic = _chosen(path, topics, wanted, "/odom", ODOMETRY)
-    if topic is not None:
-        stamps, poses = _poses(topic)
-    else:
-        stamps, poses = _tf_odometry(topics)
+    stamps, poses = _poses(topic) if topic is not None else _tf_odometry(topics)
     rows = assemble.in_order(stamps, "odometry", notes)
     assemble.require_readings(len(rows), 2, str(path), "odometry messages or transforms")
     return assemble.wheels_from_poses(stamps[rows], poses[rows], track_m, notes)
@@ -275,9 +281,8 @@ def _laser(
     fov = max(step * (n_beams - 1), 1e-9)
     yaw = math.atan2(T_base_laser[1, 0], T_base_laser[0, 0]) + start + fov / 2.0
     x, y, z = (float(v) for v in T_base_laser[:3, 3])
-    rate = 1.0 / max(float(np.median(np.diff(stamps[rows]))), 1e-9) if len(rows) > 1 else 1.0
     laser = Laser(
-        rate_hz=rate,
+        rate_hz=assemble.rate_hz(stamps[rows]),
         n_beams=n_beams,
         fov_rad=min(fov, 2.0 * math.pi),
         min_range_m=max(lowest, 0.0),
@@ -292,7 +297,7 @@ def _landmarks(
 ) -> tuple[LandmarkLog | None, NDArray[np.int64]]:
     none = np.zeros(0, np.int64)
     topic = topics.get("/landmarks")
-    if topic is None or topic.kind != CLOUD:
+    if topic is None:
         return None, none
     images = [_cloud(path, message) for message in topic.messages]
     rows: NDArray[Any] = np.concatenate(images)
@@ -310,7 +315,7 @@ def _landmarks(
 
 def _clouds(path: Path, topics: dict[str, _Topic]) -> CloudLog | None:
     topic = topics.get("/points")
-    if topic is None or topic.kind != CLOUD or ABOUT not in topics:
+    if topic is None or ABOUT not in topics:
         return None
     turns = [
         _cloud(path, m)["range"].astype(np.float32).reshape(m.height, -1) for m in topic.messages
@@ -320,7 +325,7 @@ def _clouds(path: Path, topics: dict[str, _Topic]) -> CloudLog | None:
 
 def _places(path: Path, topics: dict[str, _Topic]) -> PlaceLog | None:
     topic = topics.get("/places")
-    if topic is None or topic.kind != CLOUD or ABOUT not in topics:
+    if topic is None or ABOUT not in topics:
         return None
     rows = [_cloud(path, message)["value"].astype(np.float32) for message in topic.messages]
     return PlaceLog(_stamps(topic), np.stack(rows))
@@ -328,14 +333,14 @@ def _places(path: Path, topics: dict[str, _Topic]) -> PlaceLog | None:
 
 def _commands(topics: dict[str, _Topic]) -> CommandLog | None:
     topic = topics.get("/cmd_vel")
-    if topic is None or topic.kind != TWIST:
+    if topic is None:
         return None
     velocity = [[m.twist.linear.x, m.twist.angular.z] for m in topic.messages]
     return CommandLog(_stamps(topic), np.array(velocity, float))
 
 
 def _world(topic: _Topic | None, name: str | None) -> World | None:
-    if topic is None or topic.kind != MARKERS:
+    if topic is None:
         return None
     points = {
         m.ns: np.array([[p.x, p.y, p.z] for p in m.points], float).reshape(-1, 3)
@@ -389,7 +394,7 @@ def _stamps(topic: _Topic) -> Array:
 def _poses(topic: _Topic) -> tuple[Array, Array]:
     """Stamps and planar poses (N, 3) of odometry messages; they must be finite."""
     rows = [
-        (p.position.x, p.position.y, _yaw(_quaternion(p.orientation)))
+        (p.position.x, p.position.y, _yaw(p.orientation))
         for p in (m.pose.pose for m in topic.messages)
     ]
     poses = np.array(rows, float).reshape(-1, 3)
@@ -398,18 +403,15 @@ def _poses(topic: _Topic) -> tuple[Array, Array]:
     return _stamps(topic), poses
 
 
-def _quaternion(q: Any) -> Array:
-    return np.array([q.x, q.y, q.z, q.w])
-
-
-def _yaw(q: Array) -> float:
-    x, y, z, w = q.tolist()  # plain numbers overflow without a warning
+def _yaw(q: Any) -> float:
+    x, y, z, w = float(q.x), float(q.y), float(q.z), float(q.w)  # overflow without a warning
     return math.atan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z)
 
 
 def _matrix(transform: Any) -> Array:
     """T (4, 4) of a transform message."""
-    x, y, z, w = q = _quaternion(transform.rotation)
+    r = transform.rotation
+    x, y, z, w = q = np.array([r.x, r.y, r.z, r.w])
     norm = float(q @ q)
     if not math.isfinite(norm) or norm < 1e-6:
         raise ValueError("a rotation that is none")
@@ -480,7 +482,9 @@ def _messages(path: Path) -> dict[str, _Topic]:
     try:
         check_bounds(path)
         with _reader(path) as (reader, deserialize):
-            wanted = [c for c in reader.connections if c.msgtype in READ]
+            wanted = [
+                c for c in reader.connections if c.msgtype == _KINDS.get(c.topic, c.msgtype) in READ
+            ]
             count = 0
             for connection, time, data in reader.messages(wanted) if wanted else ():
                 count += 1
@@ -495,7 +499,7 @@ def _messages(path: Path) -> dict[str, _Topic]:
                 topic.messages.append(deserialize(data, connection.msgtype))
     except InputError:
         raise
-    # the library tells of damaged files in exceptions of many kinds
+    # the library reports damaged files by exceptions of many kinds
     except Exception as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split())[:200]
         raise InputError(f"{path}: damaged or not a bag ({reason})") from error

@@ -241,7 +241,7 @@ def _write_recording(bag: _Bag, recording: Recording) -> None:
         "config": recording.config,
         "status": recording.status,
         "frame_stamps_ns": [nanoseconds(s) for s in recording.frame_stamps],
-        "world": recording.truth.world.name if recording.truth and recording.truth.world else None,
+        "world": recording.world.name if recording.world else None,
     }
     bag.write(ABOUT, STRING, first, data=json.dumps(about))
     _write_mounts(bag, recording, first)
@@ -273,8 +273,8 @@ def _write_recording(bag: _Bag, recording: Recording) -> None:
         for stamp, turn in zip(recording.clouds.stamps, recording.clouds.ranges_m, strict=True):
             ranges = np.where(np.isfinite(turn), turn, np.nan)
             unit = lidar.points_in_sensor(np.ones(turn.shape))
-            columns = _columns({c: unit[:, i] * ranges.ravel() for i, c in enumerate("xyz")})
-            columns = _joined(columns, _columns({"range": turn.ravel()}))
+            parts = {c: unit[:, i] * ranges.ravel() for i, c in enumerate("xyz")}
+            columns = _columns({**parts, "range": turn.ravel()})
             bag.cloud("/points", stamp, "lidar3d", columns, height=turn.shape[0])
     if recording.places is not None:
         for stamp, values in zip(
@@ -324,16 +324,14 @@ def _write_mounts(bag: _Bag, recording: Recording, stamp: float) -> None:
 
 
 def _write_landmarks(bag: _Bag, recording: Recording, log: LandmarkLog) -> None:
-    parts = {c: log.points_in_camera[:, i] for i, c in enumerate("xyz")}
-    columns = _columns(parts)
+    parts: dict[str, NDArray[Any]] = {c: log.points_in_camera[:, i] for i, c in enumerate("xyz")}
     if len(log.ids):
-        columns = _joined(columns, _columns({"id": log.ids.astype(np.int32)}))
+        parts["id"] = log.ids.astype(np.int32)
     true_ids = recording.truth.landmark_ids if recording.truth else np.zeros(0, np.int64)
-    if len(true_ids) == len(columns) > 0:
-        columns = _joined(columns, _columns({"true_id": true_ids.astype(np.int32)}))
-    if len(log.descriptors):
-        wide = {f"d{i}": log.descriptors[:, i] for i in range(log.descriptors.shape[1])}
-        columns = _joined(columns, _columns(wide))
+    if len(true_ids) == len(log.points_in_camera) > 0:
+        parts["true_id"] = true_ids.astype(np.int32)
+    parts |= {f"d{i}": column for i, column in enumerate(log.descriptors.T)}
+    columns = _columns(parts)
     for i, stamp in enumerate(log.stamps):
         bag.cloud("/landmarks", stamp, "camera", columns[log.splits[i] : log.splits[i + 1]])
 
@@ -392,15 +390,6 @@ def _columns(parts: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
     for name, values in parts.items():
         out[name] = values
     return out
-
-
-def _joined(first: NDArray[Any], second: NDArray[Any]) -> NDArray[Any]:
-    both = {**{n: first[n] for n in _names(first)}, **{n: second[n] for n in _names(second)}}
-    return _columns(both)
-
-
-def _names(columns: NDArray[Any]) -> tuple[str, ...]:
-    return columns.dtype.names or ()
 
 
 def _blank(store: Any, kind: str) -> Any:

@@ -19,7 +19,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from sim.errors import InputError
 
@@ -112,7 +112,7 @@ def _bare(name: str) -> str:
 
 @dataclass(frozen=True)
 class Words:
-    """The words of a text file, line by line; lines without words are left out.
+    """The words of a text file, line by line; blank lines are dropped.
 
     Attributes
     ----------
@@ -142,9 +142,20 @@ class Words:
         """(L,) words of each line."""
         return np.diff(self.first)
 
+    @property
+    def lines(self) -> Rows:
+        """(L,) numbers of all lines, from 0 on."""
+        return np.arange(len(self.line_numbers))
+
     def error(self, line: int, reason: str) -> InputError:
         """The error that names the file, the line and the reason."""
         return InputError(f"{self.where}:{self.line_numbers[line]}: {reason}")
+
+    def refuse(self, bad: ArrayLike, lines: Rows, reason: str) -> None:
+        """Raise the error of the first of the lines that is bad, if one is."""
+        rows = np.flatnonzero(bad)
+        if len(rows):
+            raise self.error(int(lines[rows[0]]), reason)
 
     def lines_of(self, keyword: str) -> Rows:
         """Lines whose first word is the keyword."""
@@ -159,32 +170,25 @@ class Words:
             Naming the first line that has too few words, or a word that is no number.
         """
         begin = self.first[lines] + column
-        short = np.flatnonzero(begin + n_columns > self.first[lines + 1])
-        if len(short):
-            raise self.error(int(lines[short[0]]), f"too few words for {what}")
+        short = begin + n_columns > self.first[lines + 1]
+        self.refuse(short, lines, f"too few words for {what}")
         wanted = begin[:, None] + np.arange(n_columns)
-        bad = np.flatnonzero(~self.is_number[wanted].all(axis=1))
-        if len(bad):
-            raise self.error(int(lines[bad[0]]), f"not a number in {what}")
+        self.refuse(~self.is_number[wanted].all(axis=1), lines, f"not a number in {what}")
         numbers: Array = self.values[wanted]
         return numbers
 
     def finite(self, lines: Rows, column: int | Rows, n_columns: int, what: str) -> Array:
         """As `numbers`, and they must be finite, and no larger than a log has reason to hold."""
         values = self.numbers(lines, column, n_columns, what)
-        bad = np.flatnonzero(~(np.abs(values) < LARGEST).all(axis=1))
-        if len(bad):
-            raise self.error(int(lines[bad[0]]), f"{what} must be finite numbers below {LARGEST:g}")
+        bad = ~(np.abs(values) < LARGEST).all(axis=1)
+        self.refuse(bad, lines, f"{what} must be finite numbers below {LARGEST:g}")
         return values
 
     def whole(self, lines: Rows, column: int, what: str, least: int, most: int) -> Rows:
         """Whole numbers (len(lines),) of one column, within bounds."""
         values = self.finite(lines, column, 1, what)[:, 0]
-        bad = np.flatnonzero((values != np.round(values)) | (values < least) | (values > most))
-        if len(bad):
-            raise self.error(
-                int(lines[bad[0]]), f"{what} must be a whole number from {least} to {most}"
-            )
+        bad = (values != np.round(values)) | (values < least) | (values > most)
+        self.refuse(bad, lines, f"{what} must be a whole number from {least} to {most}")
         return values.astype(np.int64)
 
     def table(self, n_columns: int | Sequence[int], what: str) -> Array:
@@ -197,13 +201,13 @@ class Words:
             raise self.error(
                 int(bad[0]), f"a line of {what} must be {width} numbers, this has {counts[bad[0]]}"
             )
-        return self.finite(np.arange(len(counts)), 0, width, what)
+        return self.finite(self.lines, 0, width, what)
 
 
 def split_words(data: bytes, where: str) -> Words:
     """Split text at white space, commas and semicolons; `#` begins a comment.
 
-    Numbers are read exactly, as Python's `float` reads them, but for underscores.
+    Numbers are read exactly, as Python's `float` reads them, except that underscores are refused.
 
     Raises
     ------

@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.errors import InputError
 from sim.files import write_whole
-from sim.formats.text import read_bytes
+from sim.formats.text import read_bytes, split_words
 
 Array = NDArray[np.float64]
 
@@ -38,30 +37,14 @@ def read_tum(path: Path) -> tuple[Array, Array]:
 
 def parse_tum(data: bytes, where: str) -> tuple[Array, Array]:
     """As `read_tum`, of a file's contents."""
-    stamps, poses = [], []
-    try:
-        text = data.decode("ascii")
-    except UnicodeDecodeError as error:
-        number = data.count(b"\n", 0, error.start) + 1
-        raise InputError(
-            f"{where}:{number}: cannot read this trajectory ({error.reason})"
-        ) from None
-    for number, line in enumerate(text.split("\n"), start=1):
-        words = line.split("#", maxsplit=1)[0].split()
-        if not words:
-            continue
-        try:
-            stamp, x, y, _, qx, qy, qz, qw = (float(word) for word in words)
-        except ValueError:
-            raise InputError(
-                f"{where}:{number}: a line must be timestamp tx ty tz qx qy qz qw"
-            ) from None
-        norm = qx * qx + qy * qy + qz * qz + qw * qw
-        if not math.isfinite(stamp + x + y) or not 0.5 < norm < 1.5:
-            raise InputError(
-                f"{where}:{number}: numbers must be finite, the quaternion of length 1"
-            )
-        yaw = math.atan2(2.0 * (qw * qz + qx * qy), norm - 2.0 * (qy * qy + qz * qz))
-        stamps.append(stamp)
-        poses.append((x, y, yaw))
-    return np.array(stamps), np.array(poses, float).reshape(-1, 3)
+    columns = "timestamp tx ty tz qx qy qz qw"
+    words = split_words(data, where)
+    words.refuse(words.counts != 8, words.lines, f"a line must be {columns}")
+    table = words.numbers(words.lines, 0, 8, columns)
+    x, y, (qx, qy, qz, qw) = table[:, 1], table[:, 2], table[:, 4:].T
+    with np.errstate(over="ignore"):
+        norm = np.sum(table[:, 4:] ** 2, axis=1)
+    sound = np.isfinite(table[:, :3]).all(axis=1) & (norm > 0.5) & (norm < 1.5)
+    words.refuse(~sound, words.lines, "numbers must be finite, the quaternion of length 1")
+    yaw = np.arctan2(2.0 * (qw * qz + qx * qy), norm - 2.0 * (qy * qy + qz * qz))
+    return table[:, 0].copy(), np.stack([x, y, yaw], axis=1)
