@@ -198,20 +198,19 @@ def write_arrays(out: Results) -> None:
         "truth": along,
         **{name: estimate.means for name, estimate in estimated.items()},
         "travelled_m": scores.travelled_m(along),
-        "revisited": scores.revisited(along[::4]),
         "landmarks": best.map["landmarks"],
         "landmark_covariances": best.map["landmark_covariances"],
         **placed,
         "image_pose": best.means[np.searchsorted(best.stamps, log.stamps[busiest])],
-        "in_image": np.isin(best.map["ids"], log.ids[slice(*log.splits[busiest : busiest + 2])]),
     }
-    out.write_arrays("path", **{name: _single(values) for name, values in pictured.items()})
+    out.write_arrays(
+        "path",
+        revisited=scores.revisited(along[::4]),
+        in_image=np.isin(best.map["ids"], log.ids[slice(*log.splits[busiest : busiest + 2])]),
+        **{name: values.astype(np.float32) for name, values in pictured.items()},
+    )
     line, particles = particles_along_a_motion(stream(path.seed, "figure"))
-    out.write_arrays("motion", line=_single(line), particles=_single(particles))
-
-
-def _single(values: NDArray[np.generic]) -> NDArray[np.generic]:
-    return values.astype(np.float32) if values.dtype == np.float64 else values
+    out.write_arrays("motion", line=line.astype(np.float32), particles=particles.astype(np.float32))
 
 
 def particles_along_a_motion(rng: np.random.Generator) -> tuple[Array, Array]:
