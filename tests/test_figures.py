@@ -100,7 +100,12 @@ def test_shares_end_at_one():
     starts = pd.DataFrame({"median_m": [0.1, 0.2], "rms_m": [0.2, 0.3], "spacing_m": 6.0})
     kinds = maximo2024.describers.KINDS
     clusters = pd.DataFrame(
-        {"geometry": "campus", "descriptor": kinds, "recall_at_1": 1.0, "recall_at_1_percent": 1.0}
+        {
+            "geometry": "campus",
+            "descriptor": list(kinds),
+            "recall_at_1": 1.0,
+            "recall_at_1_percent": 1.0,
+        }
     )
     right = maximo2024.campus_errors(starts, clusters).axes[1]
     assert np.array_equal(right.get_ylim(), (0.0, 1.0))

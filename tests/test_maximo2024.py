@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments.papers.maximo2024 import claims, settings, study, worlds
+from experiments.papers.maximo2024 import claims, examples, figures, settings, study, worlds
 from experiments.papers.results import Results
 from experiments.runs.paths import SOURCE
 from experiments.runs.seeds import stream
@@ -190,3 +190,21 @@ def test_the_filter_of_the_study_is_the_one_as_printed(case):
     noisy = worlds.case_of("umh", 5, "recording.noise_weight=1.6")
     np.testing.assert_array_equal(noisy.known_map.positions_m, case.known_map.positions_m)
     assert not np.array_equal(noisy.known_map.descriptors, case.known_map.descriptors)
+
+
+def test_the_tracked_tables_and_arrays_redraw_every_figure():
+    made = Results(SOURCE / "results", "maximo2024")
+    tracked = {path.stem for path in (SOURCE / "results" / "figures").glob("maximo2024_*.png")}
+    assert set(figures.draw(made)) == tracked
+    assert sum(path.stat().st_size for path in (made.folder / "arrays").glob("maximo2024_*")) < 5e5
+
+
+def test_examples_hold_what_the_figures_draw(case):
+    drawn = examples.route_arrays(case)
+    n = len(case.recording.frame_stamps)
+    assert [int(np.argmax(np.isfinite(e))) for e in drawn["start_errors_m"]] == [0, n // 4, n // 2]
+    assert np.isfinite(drawn["start_errors_m"][:, n // 2 :]).all()
+    assert len(drawn["clusters"]) == len(drawn["nodes_m"]) == len(case.known_map)
+    particles = drawn["particles_m"]
+    assert len(particles) == len(drawn["means_m"]) == len(settings.ITERATIONS)
+    np.testing.assert_allclose(particles.mean(axis=1), drawn["means_m"], rtol=1e-4)  # eq. (4)
