@@ -26,14 +26,14 @@ def small(_full, out):
     return [
         *((1.0, study._drive, [group]) for group in drives),
         (1.0, study._drive, [study._only(("icp", "fusion_clone"), fast[0])]),
-        *((1.0, study._wrong_beliefs, [group]) for group in beliefs),
+        *((1.0, study._scored, ["beliefs", study._BELIEF, group]) for group in beliefs),
         (1.0, study._drawn_office, [study._only(PAPERS_OWN, drives[0]), out]),
         (1.0, study._closeup, [*corridors[0], out]),
         (1.0, study._closeup, corridors[1]),
         *((1.0, study._scenes, [seed, place, 4]) for seed in seeds for place in PLACES),
         *((1.0, study._metrics, [seed, "room_small"]) for seed in seeds),
         *(
-            (1.0, study._ordering, [study._only(CHECKED, group)])
+            (1.0, study._scored, ["ordering", study._NOISE, study._only(CHECKED, group)])
             for group in study._planned("ordering", 2, *noise)
         ),
     ]
