@@ -49,6 +49,9 @@ def gradient_descent() -> pd.DataFrame:
     rows = []
     for name, (ideal, real, time_s) in DESCENTS.items():
         steps = math.ceil(30.0 / (0.08 * (ideal - real) ** 2 / time_s**2))
-        k = report_gradient_descent(ideal, real, time_s, n_iterations=min(steps, 10**6))
-        rows.append({"data": name, "k_after_100": k[100], "k_in_the_end": k[-1]})
+        after_100, in_the_end = (
+            report_gradient_descent(ideal, real, time_s, n_iterations=n)[-1]
+            for n in (100, min(steps, 10**6))
+        )
+        rows.append({"data": name, "k_after_100": after_100, "k_in_the_end": in_the_end})
     return pd.DataFrame(rows)
