@@ -110,15 +110,14 @@ def wean(fits: pd.DataFrame, drawn: Arrays) -> Figure:
     ):
         ax.imshow(
             np.ma.masked_invalid(drawn["occupancy"].T.astype(float)), origin="lower", cmap="Greys",
-            vmin=0.0, vmax=1.0, extent=drawn["cells_m"], interpolation="nearest",
+            vmin=0.0, vmax=1.0, extent=drawn["extent_m"], interpolation="nearest",
         )  # fmt: skip
         ax.set_facecolor("#dfe6ee")
         ax.plot(*drawn[f"ends_{row.log}"].T, ".", color=CYCLE[4], ms=1.2, label="beam ends")
         ax.plot(*drawn[f"path_{row.log}"].T, color=CYCLE[0], lw=1.2, label="path (ICP)")
         ax.plot(row.x_m, row.y_m, "o", color=CYCLE[0], ms=4)
-        x_m, y_m = drawn["window_m"]
         ax.set(
-            xlim=x_m, ylim=y_m, xlabel="x, m", ylabel="y, m", aspect="equal",
+            xlabel="x, m", ylabel="y, m", aspect="equal",
             title=f"Wean Hall, log {row.log}: fit {row.score:.2f}, "
             f"start {math.degrees(row.yaw_rad):.0f}°",
         )  # fmt: skip

@@ -360,13 +360,12 @@ def wean_fit(logs: str) -> tuple[pd.DataFrame, dict[str, NDArray[Any]]]:
 
 def _around(grid: wean.Grid, points: Array) -> dict[str, NDArray[Any]]:
     """The square part of a map that holds all points (N, 2): occupancy, and extent (4,) m."""
-    half = 1.05 * max(*np.ptp(points, axis=0), 10.0) / 2.0
-    low, high = points.mean(axis=0) - half, points.mean(axis=0) + half
-    first = np.maximum(np.floor(low / grid.cell_m), 0).astype(int)
-    last = np.minimum(np.ceil(high / grid.cell_m), grid.values.shape).astype(int)
-    cells = grid.occupancy[first[0] : last[0], first[1] : last[1]].astype(np.float16)
-    cells_m = np.stack([first, last], axis=1).ravel() * grid.cell_m
-    return {"occupancy": cells, "cells_m": cells_m, "window_m": np.stack([low, high], axis=1)}
+    half, middle = 1.05 * max(*np.ptp(points, axis=0), 10.0) / 2.0, points.mean(axis=0)
+    first = np.maximum((middle - half) / grid.cell_m, 0).astype(int)
+    last = np.minimum((middle + half) / grid.cell_m + 1, grid.values.shape).astype(int)
+    cells = grid.occupancy[first[0] : last[0], first[1] : last[1]]
+    extent_m = np.stack([first, last], axis=1).ravel() * grid.cell_m
+    return {"occupancy": cells.astype(np.float16), "extent_m": extent_m}
 
 
 def _halved(values: Array) -> Array:
