@@ -117,6 +117,7 @@ def wean(fits: pd.DataFrame, drawn: Arrays) -> Figure:
         ax.plot(*drawn[f"path_{row.log}"].T, color=CYCLE[0], lw=1.2, label="path (ICP)")
         ax.plot(row.x_m, row.y_m, "o", color=CYCLE[0], ms=4)
         ax.set(
+            xlim=drawn["extent_m"][:2], ylim=drawn["extent_m"][2:],
             xlabel="x, m", ylabel="y, m", aspect="equal",
             title=f"Wean Hall, log {row.log}: fit {row.score:.2f}, "
             f"start {math.degrees(row.yaw_rad):.0f}°",
