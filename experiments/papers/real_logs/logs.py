@@ -122,12 +122,10 @@ def calibrated_by_truth(recording: Recording, until_s: float = CALIBRATED_S) -> 
     along = np.cos(heading[:-1]) * np.diff(x) + np.sin(heading[:-1]) * np.diff(y)
     forward = np.concatenate([[0.0], np.cumsum(along)])
     every = round(lag_s / 0.02)
-    travel_step = travel[every::every] - travel[:-every:every]
-    turn = heading[every::every] - heading[:-every:every]
-    advance = forward[every::every] - forward[:-every:every]
+    rolled, turn, advance = (np.diff(v[::every], axis=0) for v in (travel, heading, forward))
     # turn = (a_r W_r - a_l W_l) / track, advance = (a_r W_r + a_l W_l) / 2
-    per_track = np.linalg.lstsq(travel_step * np.array([1.0, -1.0]), turn, rcond=None)[0]
-    mean = travel_step @ per_track / 2.0
+    per_track = np.linalg.lstsq(rolled * np.array([1.0, -1.0]), turn, rcond=None)[0]
+    mean = rolled @ per_track / 2.0
     track_m = float(mean @ advance / (mean @ mean))
     return dataclasses.replace(
         recording,

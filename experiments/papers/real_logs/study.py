@@ -56,7 +56,6 @@ from sim.formats import carmen, lego, rawseeds, wean
 from sim.formats.khepera import read_khepera
 from sim.formats.relations import Relations, read_relations
 from sim.formats.text import read_members, read_words, split_words
-from sim.recording import Recording
 
 Array = NDArray[np.float64]
 Paths = dict[str, NDArray[np.float32]]  # (T, 2) m, by name
@@ -137,10 +136,8 @@ def intel_relations() -> tuple[list[Row], Paths]:
     folder = DATA / "intel_lab"
     truth = read_relations(folder / "intel.relations.gz")
     runs = dict(zip(INTEL, planned(["+study=real_logs_intel"]), strict=True))
-    recordings: dict[str, Recording] = {}
-    for run in runs.values():
-        if run.recording_key not in recordings:
-            recordings[run.recording_key] = run.recording()
+    by_recording = {run.recording_key: run for run in runs.values()}
+    recordings = {key: run.recording() for key, run in by_recording.items()}
     sparse, logged = (recordings[runs[name].recording_key] for name in INTEL[:2])
     until_s = tuned_until_s(logged)
     rows: list[Row] = []
@@ -223,7 +220,11 @@ def landmark_slam(
 ) -> tuple[pd.DataFrame, Paths]:
     """Errors of dead reckoning, FastSLAM and EKF-SLAM against motion capture; and some paths."""
     robots = MRCLAM_ROBOTS[profile]
-    runs = {robot: _landmark_runs(robot) for robot in robots}
+    study = "+study=real_logs_mrclam"
+    runs = {
+        robot: dict(zip(MRCLAM, planned([study, f"recording.robot={robot}"]), strict=True))
+        for robot in robots
+    }
     ekf = int(profile is Profile.FULL)
     seeds = {"dead reckoning": 1, "FastSLAM": FASTSLAM_SEEDS[profile], "EKF-SLAM": ekf}
     jobs = [
@@ -247,12 +248,6 @@ def landmark_slam(
             paths[method] = path
         on_progress((i + 1) / len(jobs))
     return pd.DataFrame(rows), paths
-
-
-def _landmark_runs(robot: int) -> dict[str, Experiment]:
-    """The study's runs on one robot's log, by method."""
-    study = planned(["+study=real_logs_mrclam", f"recording.robot={robot}"])
-    return dict(zip(MRCLAM, study, strict=True))
 
 
 def _landmark_job(
@@ -295,27 +290,29 @@ def lego_errors() -> pd.DataFrame:
     folder = DATA / "lego_brenner"
     log = lego.parse_motors(read_words(folder / "robot4_motors.txt.gz"))
     stamps, positions = lego.parse_reference(read_words(folder / "robot4_reference.txt.gz"))
-    start = axle_at(positions[0], LEGO_START_RAD)
-    rows: list[Row] = []
-    for name, track_m in (
-        ("geometric width", lego.GEOMETRIC_TRACK_M),
-        ("lecture's effective width", lego.EFFECTIVE_TRACK_M),
-    ):
-        rms_m = dead_reckoning_rms_m(log, stamps, positions, lego.TICK_M, track_m, start)
-        rows.append({"case": name, "tick_m": lego.TICK_M, "track_m": track_m, "rms_m": rms_m})
+    start, half = axle_at(positions[0], LEGO_START_RAD), stamps < stamps.mean()
+
+    def rms_m(track_m: float) -> float:
+        return dead_reckoning_rms_m(log, stamps, positions, lego.TICK_M, track_m, start)
+
     found = calibrate_track(log, stamps, positions, LEGO_START_RAD)
-    half = stamps < stamps.mean()
     first = calibrate_track(log, stamps[half], positions[half], LEGO_START_RAD)
     tick_m, track_m = first.tick_m.value, first.track_m.value
     rest = dead_reckoning_rms_m(log, stamps[~half], positions[~half], tick_m, track_m, first.start)
-    fitted: Row = {"tick_m": found.tick_m.value, "track_m": found.track_m.value}
-    bounds: Row = {"track_low_m": found.track_m.low, "track_high_m": found.track_m.high}
-    second = "calibrated on the first half, judged on the second"
-    rows += [
-        {"case": "calibrated"} | fitted | {"rms_m": found.rms_m} | bounds,
-        {"case": second, "tick_m": tick_m, "track_m": track_m, "rms_m": rest},
+    whole = found.track_m
+    rows = [
+        ("geometric width", lego.TICK_M, lego.GEOMETRIC_TRACK_M, rms_m(lego.GEOMETRIC_TRACK_M)),
+        (
+            "lecture's effective width",
+            lego.TICK_M,
+            lego.EFFECTIVE_TRACK_M,
+            rms_m(lego.EFFECTIVE_TRACK_M),
+        ),
+        ("calibrated", found.tick_m.value, whole.value, found.rms_m, whole.low, whole.high),
+        ("calibrated on the first half, judged on the second", tick_m, track_m, rest),
     ]
-    return pd.DataFrame(rows)
+    columns = ["case", "tick_m", "track_m", "rms_m", "track_low_m", "track_high_m"]
+    return pd.DataFrame(rows, columns=columns)
 
 
 # --- Wean Hall -----------------------------------------------------------------------------------
