@@ -9,9 +9,14 @@ from experiments.calibration.calibrate import calibrate_recordings
 from experiments.calibration.end_pose_model import EndPoseModel, knots
 from experiments.calibration.end_poses import Manoeuvre, from_end_poses
 from experiments.calibration.wheel_truth import from_wheel_truth
-from experiments.papers.puzzlebot2024.descent import report_gradient_descent
 from experiments.papers.puzzlebot2024.settings import NOMINAL
-from experiments.papers.puzzlebot2024.study import Arm, arms, calibrate_once, ideal
+from experiments.papers.puzzlebot2024.study import (
+    Arm,
+    arms,
+    calibrate_once,
+    ideal,
+    report_gradient_descent,
+)
 from experiments.runs.seeds import stream
 from sim.errors import InputError
 from sim.kinematic import run_batch
@@ -79,9 +84,8 @@ def test_ignoring_a_gain_error_spoils_k():
     rng = np.random.default_rng(5)
     robot = slipping(1e-4, geometry=True)
     runs = [
-        Manoeuvre.of_route(
-            route,
-            NOMINAL,
+        Manoeuvre(
+            route.profile(NOMINAL),
             run_batch(robot, route, 20, rng, nominal_track_m=NOMINAL.track_m).end_poses,
         )
         for route in TABLE_1.values()

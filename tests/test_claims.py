@@ -11,7 +11,6 @@ from experiments.evaluation.verdict import Profile, Verdict, lower
 from experiments.papers.gil2008 import claims as gil2008
 from experiments.papers.maximo2024 import claims as maximo2024
 from experiments.papers.puzzlebot2024 import claims, study
-from experiments.papers.puzzlebot2024.descent import gradient_descent
 from experiments.papers.puzzlebot2024.settings import NOMINAL
 from experiments.papers.real_logs import claims as real_logs
 from experiments.report.claims import COLUMNS, read_claims, write_claims
@@ -71,7 +70,7 @@ def pb3(table):
     return {c.statistic.split(":")[0]: c for c in claims.pb3(table, DESCENT, ENGINE_K)}
 
 
-DESCENT = gradient_descent()
+DESCENT = study.gradient_descent()
 COVERAGE = "coverage of the 95 % intervals of kr and kl"
 BIAS = "relative bias, the worse of kr and kl"
 
@@ -227,7 +226,8 @@ def test_damaged_tables_are_refused_in_one_line(tmp_path, row, wrong):
 
 
 def test_a_table_without_verdicts_is_refused(tmp_path):
-    pd.DataFrame({"id": ["PB1"], "paper": ["p"]}).to_csv(tmp_path / "claims.csv", index=False)
+    table = pd.DataFrame({"id": ["PB1"], "paper": ["p"], "role": ["headline"]})
+    table.to_csv(tmp_path / "claims.csv", index=False)
     with pytest.raises(InputError, match="no column statistic"):
         read_claims(tmp_path / "claims.csv")
 

@@ -122,31 +122,21 @@ def _linearised_moments(travel: Array, k: Array, track_m: float) -> tuple[Array,
 
     puzzlebot2024, eq. (2), with the second form of eq. (6), its last row's sign settled.
     """
-    n_intervals = len(travel)
-    pose = np.zeros(3)
-    ends = np.empty((n_intervals, 2))
-    by_wheels = np.empty((n_intervals, 3, 2))
-    for s in range(n_intervals):
-        forward = (travel[s, 0] + travel[s, 1]) / 2.0
-        half = (travel[s, 0] - travel[s, 1]) / (2.0 * track_m)
-        cos, sin = np.cos(pose[2] + half), np.sin(pose[2] + half)
-        for w in range(2):
-            swing = (0.5 - w) * forward / track_m
-            by_wheels[s, 0, w] = cos / 2.0 - swing * sin
-            by_wheels[s, 1, w] = sin / 2.0 + swing * cos
-            by_wheels[s, 2, w] = (1.0 - 2.0 * w) / track_m
-        chord = forward * (1.0 - half**2 / 6.0 + half**4 / 120.0)
-        pose += np.array([chord * cos, chord * sin, 2.0 * half])
-        ends[s] = pose[:2]
+    forward = (travel[:, 0] + travel[:, 1]) / 2.0
+    half = (travel[:, 0] - travel[:, 1]) / (2.0 * track_m)
+    heading = np.cumsum(2.0 * half)
+    cos, sin = np.cos(heading - half), np.sin(heading - half)
+    chord = forward * (1.0 - half**2 / 6.0 + half**4 / 120.0)
+    x, y = np.cumsum(chord * cos), np.cumsum(chord * sin)
     covariance = np.zeros((3, 3))
-    for s in range(n_intervals):
-        for w in range(2):
-            column = by_wheels[s, :, w].copy()
-            # a turn swings all that follows about the interval's end
-            column[0] -= (pose[1] - ends[s, 1]) * by_wheels[s, 2, w]
-            column[1] += (pose[0] - ends[s, 0]) * by_wheels[s, 2, w]
-            covariance += k[w] * abs(travel[s, w]) * np.outer(column, column)
-    return pose, covariance
+    for w in range(2):
+        turn = np.full(len(travel), (1.0 - 2.0 * w) / track_m)
+        # a turn swings the interval itself, and all that follows about the interval's end
+        by_x = cos / 2.0 - (forward * sin / 2.0 + y[-1] - y) * turn
+        by_y = sin / 2.0 + (forward * cos / 2.0 + x[-1] - x) * turn
+        by_wheel = np.stack((by_x, by_y, turn))
+        covariance += (by_wheel * (k[w] * np.abs(travel[:, w]))) @ by_wheel.T
+    return np.array([x[-1], y[-1], heading[-1]]), covariance
 
 
 @njit()

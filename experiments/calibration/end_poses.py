@@ -11,14 +11,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from experiments.calibration.end_pose_model import EndPoseMethod, EndPoseModel
 from experiments.calibration.result import CalibrationResult
 from experiments.evaluation.statistics import Interval
 from sim.errors import InputError
 from sim.robot import DifferentialDrive
-from sim.route import TICK_S, OpenLoop
+from sim.route import TICK_S
 
 Array = NDArray[np.float64]
 Moments = tuple[Array, Array]
@@ -40,11 +40,6 @@ class Manoeuvre:
 
     profile: Array
     end_poses: Array
-
-    @classmethod
-    def of_route(cls, route: OpenLoop, robot: DifferentialDrive, end_poses: ArrayLike) -> Manoeuvre:
-        """The manoeuvre that a route commands to a robot."""
-        return cls(route.profile(robot), np.asarray(end_poses, dtype=np.float64))
 
 
 def from_end_poses(

@@ -8,6 +8,7 @@ effective track from ticks and an overhead camera that sees no heading.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass
 
@@ -60,15 +61,8 @@ class WheelCalibration:
     @property
     def values(self) -> Array:
         """The six parameters, (6,)."""
-        found = (
-            self.diameter_right_m,
-            self.diameter_left_m,
-            self.axle_m,
-            self.laser_x_m,
-            self.laser_y_m,
-            self.laser_yaw_rad,
-        )
-        return np.array([m.value for m in found])
+        parameters = dataclasses.fields(self)[:6]
+        return np.array([getattr(self, parameter.name).value for parameter in parameters])
 
 
 def calibrate_wheels(
@@ -146,11 +140,10 @@ def _residual(log: WheelLaserLog, parameters: Array) -> Array:
 
 @dataclass(frozen=True)
 class SlipOfTurns:
-    """kr and kl, m, as blocks of so many intervals show them."""
+    """kr and kl, m, and the number of blocks that show them."""
 
     kr: Interval
     kl: Interval
-    block: int
     n_blocks: int
 
 
@@ -195,7 +188,7 @@ def slip_of_turns(
     spread = np.array([_law(square[pick], path[pick]) for pick in picks])
     low, high = np.quantile(spread, [0.025, 0.975], axis=0)
     kr, kl = (Interval(float(k[i]), float(low[i]), float(high[i])) for i in (0, 1))
-    return SlipOfTurns(kr, kl, block, len(square))
+    return SlipOfTurns(kr, kl, len(square))
 
 
 def _law(square: Array, path: Array) -> Array:
@@ -229,6 +222,12 @@ class TrackCalibration:
     track_m: Interval
     start: Array
     rms_m: float
+
+
+def axle_at(scanner_m: Array, heading_rad: float) -> Array:
+    """Pose (3,) of the axle behind the scanner at a position (2,)."""
+    x, y = scanner_m - SCANNER_AHEAD_M * np.array([math.cos(heading_rad), math.sin(heading_rad)])
+    return np.array([x, y, heading_rad])
 
 
 def scanner_positions(log: TickLog, tick_m: float, track_m: float, start: Array) -> Array:
@@ -268,7 +267,7 @@ def calibrate_track(
 ) -> TrackCalibration:
     """Fit tick, track and start heading to reference positions (N, 2) at stamps (N,).
 
-    The camera tells no heading, so the start's is fitted; its position is the reference's first.
+    The camera sees no heading, so the start's is fitted; its position is the reference's first.
     Errors of dead reckoning build up: neighbours are alike, and the intervals count every
     twentieth reading only.
 
@@ -278,15 +277,11 @@ def calibrate_track(
         Rough heading at the start.
     """
 
-    def start(heading: float) -> Array:
-        ahead = SCANNER_AHEAD_M * np.array([math.cos(heading), math.sin(heading)])
-        return np.array([*(positions[0] - ahead), heading])
-
     def residual(unknowns: Array) -> Array:
         tick, track, heading = unknowns
-        off = _off_reference(log, stamps, positions, tick * tick_m, track * track_m, start(heading))
-        flat: Array = off.ravel()
-        return flat
+        start = axle_at(positions[0], heading)
+        off = _off_reference(log, stamps, positions, tick * tick_m, track * track_m, start)
+        return off.ravel()
 
     fit = optimize.least_squares(residual, np.array([1.0, 1.0, heading_rad]))
     covariance = np.linalg.inv(fit.jac.T @ fit.jac) * float(np.mean(fit.fun**2)) * 20.0
@@ -296,4 +291,4 @@ def calibrate_track(
         for v, h, u in zip(fit.x[:2], half, (tick_m, track_m), strict=True)
     )
     rms_m = float(np.sqrt(2.0 * np.mean(fit.fun**2)))
-    return TrackCalibration(tick, track, start(float(fit.x[2])), rms_m)
+    return TrackCalibration(tick, track, axle_at(positions[0], float(fit.x[2])), rms_m)

@@ -162,12 +162,10 @@ def pb4(coverage: pd.DataFrame, engine: pd.DataFrame) -> list[Claim]:
 
 def _engine_gap(engine: pd.DataFrame) -> pd.Series[float]:
     """RMS, per seed, of the end's gap in x, y and heading over that case's own spread."""
-    squares = pd.Series(0.0, index=engine.index)
-    for name in ("x_m", "y_m", "heading_rad"):
-        gap = engine[f"bullet_{name}"] - engine[f"kinematic_{name}"]
-        spread = engine.groupby("case")[f"kinematic_{name}"].transform("std")
-        squares += (gap / spread) ** 2 / 3.0
-    per_seed: pd.Series[float] = squares.groupby(engine["seed"]).mean() ** 0.5
+    kinematic = engine.filter(like="kinematic_")
+    spread = kinematic.groupby(engine["case"]).transform("std")
+    gap = (engine.filter(like="bullet_").to_numpy() - kinematic) / spread
+    per_seed: pd.Series[float] = (gap**2).mean(axis=1).groupby(engine["seed"]).mean() ** 0.5
     return per_seed
 
 

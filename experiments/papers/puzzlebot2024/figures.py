@@ -28,10 +28,11 @@ _PARAMETERS = {"kr": "$k_r$", "kl": "$k_l$"}
 
 def draw(made: Results) -> dict[str, Figure]:
     """Draw all figures of the paper, by file name."""
+    drawn = made.arrays("drawn")
     return {
-        "puzzlebot2024_ideal_and_real": ideal_and_real(made.arrays("square")),
+        "puzzlebot2024_ideal_and_real": ideal_and_real(drawn),
         "puzzlebot2024_ellipse_area": ellipse_area(
-            made.table("areas"), made.table("crossover"), made.arrays("straight")
+            made.table("areas"), made.table("crossover"), drawn
         ),
         "puzzlebot2024_calibration": calibration(made.table("calibration")),
         "puzzlebot2024_table_1": table_1(made.table("table_1")),
@@ -151,9 +152,9 @@ def table_1(table: pd.DataFrame) -> Figure:
             f"{row.omega_radps:g}",
             f"{row.duration_s:g}",
             f"{row.ideal_x_m:.2f}",
-            f"{_plain(row.real_x_mean_m)} ± {row.real_x_sd_m:.3f}",
+            f"{row.real_x_mean_m:z.3f} ± {row.real_x_sd_m:.3f}",
             f"{row.ideal_heading_rad:.2f}",
-            f"{_plain(row.real_heading_mean_rad)} ± {row.real_heading_sd_rad:.3f}",
+            f"{row.real_heading_mean_rad:z.3f} ± {row.real_heading_sd_rad:.3f}",
             f"{1e4 * row.kr_m:.2f} [{1e4 * row.kr_low_m:.2f}, {1e4 * row.kr_high_m:.2f}]",
             f"{1e4 * row.kl_m:.2f} [{1e4 * row.kl_low_m:.2f}, {1e4 * row.kl_high_m:.2f}]",
         ]
@@ -174,11 +175,6 @@ def table_1(table: pd.DataFrame) -> Figure:
         fontsize="medium",
     )
     return page
-
-
-def _plain(value: float) -> str:
-    """Three decimals, without the sign of a zero."""
-    return f"{round(value, 3) + 0.0:.3f}"
 
 
 def coverage(table: pd.DataFrame) -> Figure:

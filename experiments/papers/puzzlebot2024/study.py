@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import joblib
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
 from estimators.base import Estimate, Prior
@@ -26,12 +27,12 @@ from experiments.calibration.result import CalibrationResult
 from experiments.calibration.wheel_truth import from_wheel_truth
 from experiments.evaluation.metrics import ellipse_area_m2
 from experiments.evaluation.verdict import Profile
-from experiments.papers.puzzlebot2024.descent import gradient_descent
 from experiments.papers.puzzlebot2024.settings import (
     AREA_K_M,
     CALIBRATION_RUNS,
     CALIBRATIONS,
     COVERAGE_RUNS,
+    DESCENTS,
     ENGINE_OVERRIDES,
     LOOPS,
     NOMINAL,
@@ -51,6 +52,7 @@ from sim.sensors import SensorSuite
 
 Array = NDArray[np.float64]
 Routes = Mapping[str, OpenLoop]
+Driven = dict[tuple[str, str, int], Recording]  # by physics, case and seed
 
 
 def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) -> None:
@@ -65,8 +67,7 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
     """
     out.write_table("areas", areas())
     out.write_table("crossover", crossover())
-    out.write_arrays("square", **square())
-    out.write_arrays("straight", **straight())
+    out.write_arrays("drawn", **drawn())
     on_progress(0.05)
     calibrated = calibration(
         arms("calibration"), CALIBRATIONS[profile], lambda share: on_progress(0.05 + 0.65 * share)
@@ -173,30 +174,33 @@ def _crossing(distance: Array, ratio: Array) -> float:
     return float(np.interp(0.0, np.log(ratio[around]), distance[around]))
 
 
-def square() -> dict[str, NDArray[np.float32]]:
-    """Paths (2, n, T, 2) of real robots around the square, and the ideal one's ellipses."""
+def drawn() -> dict[str, NDArray[np.float32]]:
+    """Real robots around the square, the ideal one's ellipses; and its spread on the straight.
+
+    Returns
+    -------
+    dict
+        `real_m` (2, n, T, 2) and `covariances_m2` (2, T, 2, 2) for each `kr_kl_m` (2, 2), `ideal_m`
+        (T, 2); `distance_m` (T,) and `sigma_m` (T, 2) along and across the way of the crossover.
+    """
     robots = arms("square")
     route = robots[0].routes["open_loop"]
     real = [
         run_batch(a.robot, route, SQUARE_RUNS, stream(a.seed, "slip"), sample_s=0.1).poses
         for a in robots
     ]
-    promised = [ideal(route, a.robot.kr, a.robot.kl) for a in robots]
-    drawn = {
+    ellipses = [ideal(route, a.robot.kr, a.robot.kl) for a in robots]
+    straight = Experiment.compose(["study=puzzlebot2024_crossover"])
+    promised = ideal(straight.route(), straight.robot().kr, straight.robot().kl)
+    values = {
         "kr_kl_m": [a.robot.slip_variance_per_m for a in robots],
         "real_m": np.array(real)[..., :2],
-        "ideal_m": promised[0].means[:, :2],
-        "covariances_m2": [p.covariances[:, :2, :2] for p in promised],
+        "ideal_m": ellipses[0].means[:, :2],
+        "covariances_m2": [e.covariances[:, :2, :2] for e in ellipses],
+        "distance_m": promised.means[:, 0],
+        "sigma_m": np.sqrt(np.diagonal(promised.covariances, axis1=1, axis2=2)[:, :2]),
     }
-    return {name: np.asarray(values, np.float32) for name, values in drawn.items()}
-
-
-def straight() -> dict[str, Array]:
-    """Standard deviations (T, 2) along and across the way of the crossover, m."""
-    experiment = Experiment.compose(["study=puzzlebot2024_crossover"])
-    promised = ideal(experiment.route(), experiment.robot().kr, experiment.robot().kl)
-    variances = np.diagonal(promised.covariances, axis1=1, axis2=2)[:, :2]
-    return {"distance_m": promised.means[:, 0], "sigma_m": np.sqrt(variances)}
+    return {name: np.asarray(value, np.float32) for name, value in values.items()}
 
 
 def calibrate_once(arm: Arm) -> list[CalibrationResult]:
@@ -207,7 +211,7 @@ def calibrate_once(arm: Arm) -> list[CalibrationResult]:
         for name, route in arm.routes.items()
     }
     manoeuvres = [
-        Manoeuvre.of_route(route, NOMINAL, batches[name].end_poses)
+        Manoeuvre(route.profile(NOMINAL), batches[name].end_poses)
         for name, route in arm.routes.items()
     ]
     return [
@@ -314,48 +318,33 @@ def _inside(error: Array, covariance: Array) -> int:
     return int(np.sum(squares <= stats.chi2.ppf(0.95, error.shape[1])))
 
 
-@dataclass(frozen=True)
-class Drive:
-    """One manoeuvre driven by both robots with the same noise."""
-
-    case: str
-    seed: int
-    bullet: Recording
-    kinematic: Recording
-
-
-def engine_recordings(*overrides: str) -> list[Drive]:
-    """Drive some manoeuvres by PyBullet's robot and by the kinematic one."""
-    study = ["+study=puzzlebot2024_engine", *overrides]
-    bullet, kinematic = (
-        list(planned([*study, f"simulation.physics={physics}"]))
-        for physics in ("bullet", "kinematic")
-    )
-    cases = list(dict.fromkeys(run.choices["route"] for run in bullet))
-    driven = []
-    for pair in zip(bullet, kinematic, strict=True):
-        case, seed = pair[0].choices["route"], pair[0].seed
-        recordings = [
-            run.simulate(
-                streams={a: stream(seed, a, cases.index(case)) for a in ("slip", "sensors")}
-            )
-            for run in pair
-        ]
-        driven.append(Drive(case, seed, *recordings))
+def engine_recordings(*overrides: str) -> Driven:
+    """Drive some manoeuvres by PyBullet's robot and by the kinematic one, with the same noise."""
+    driven: Driven = {}
+    for physics in ("bullet", "kinematic"):
+        study = ["+study=puzzlebot2024_engine", f"simulation.physics={physics}", *overrides]
+        cases: dict[str, int] = {}
+        for run in planned(study):
+            case = run.choices["route"]
+            i = cases.setdefault(case, len(cases))
+            streams = {axis: stream(run.seed, axis, i) for axis in ("slip", "sensors")}
+            driven[physics, case, run.seed] = run.simulate(streams=streams)
     return driven
 
 
-def engine_ends(driven: list[Drive]) -> pd.DataFrame:
+def engine_ends(driven: Driven) -> pd.DataFrame:
     """End poses of PyBullet's robot beside the kinematic one's, per case and seed."""
-    names = ("x_m", "y_m", "heading_rad")
-    columns = [f"{physics}_{name}" for physics in ("bullet", "kinematic") for name in names]
-    rows = [(d.case, d.seed, *end_pose(d.bullet), *end_pose(d.kinematic)) for d in driven]
-    return pd.DataFrame(rows, columns=["case", "seed", *columns])
+    rows: dict[tuple[str, int], Row] = {}
+    for (physics, case, seed), recording in driven.items():
+        row = rows.setdefault((case, seed), {"case": case, "seed": seed})
+        for name, value in zip(("x_m", "y_m", "heading_rad"), end_pose(recording), strict=True):
+            row[f"{physics}_{name}"] = float(value)
+    return pd.DataFrame(list(rows.values()))
 
 
-def engine_k(driven: list[Drive]) -> pd.DataFrame:
+def engine_k(driven: Driven) -> pd.DataFrame:
     """Recover kr and kl from the wheels of PyBullet's robot."""
-    runs = [drive.bullet for drive in driven]
+    runs = [recording for (physics, *_), recording in driven.items() if physics == "bullet"]
     found = calibrate_recordings(runs, geometry=False, interval_s=0.02)
     robot = Experiment.compose(["study=puzzlebot2024_engine"]).robot()
     rows = [
@@ -363,4 +352,51 @@ def engine_k(driven: list[Drive]) -> pd.DataFrame:
         | dataclasses.asdict(interval)
         for name, interval in found.found.items()
     ]
+    return pd.DataFrame(rows)
+
+
+def report_gradient_descent(
+    final_ideal: float,
+    final_real: ArrayLike,
+    time_s: float,
+    *,
+    rate: float = 0.01,
+    n_iterations: int = 100,
+) -> Array:
+    """The report's own calibration, kept to show what it returns; not an estimator of kr or kl.
+
+    It fits k so that (k + k) v comes near v by gradient descent from k = 1; v is the deviation of
+    the end over the time. The data cancel: the minimum is 1/2 whatever they are, and they only set
+    how fast the descent gets there, (1 - 8 rate mean(v^2)) a step.
+
+    Parameters
+    ----------
+    final_ideal, final_real
+        Promised and real end positions (n,), m or rad.
+    time_s
+        Duration, s.
+
+    Returns
+    -------
+    Array
+        (n_iterations + 1,) values of k, the first one 1.
+    """
+    v = (np.atleast_1d(np.asarray(final_real, float)) - final_ideal) / time_s
+    slope = float(np.mean(v**2))
+    k = np.ones(n_iterations + 1)
+    for i in range(n_iterations):
+        k[i + 1] = k[i] - rate * 4.0 * (2.0 * k[i] - 1.0) * slope
+    return k
+
+
+def gradient_descent() -> pd.DataFrame:
+    """Run the report's own procedure on its example data and on others: it goes to 1/2."""
+    rows = []
+    for name, (ideal, real, time_s) in DESCENTS.items():
+        steps = math.ceil(30.0 / (0.08 * (ideal - real) ** 2 / time_s**2))
+        after_100, in_the_end = (
+            report_gradient_descent(ideal, real, time_s, n_iterations=n)[-1]
+            for n in (100, min(steps, 10**6))
+        )
+        rows.append({"data": name, "k_after_100": after_100, "k_in_the_end": in_the_end})
     return pd.DataFrame(rows)

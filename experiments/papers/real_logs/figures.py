@@ -3,27 +3,38 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
-from experiments.papers.real_logs.study import DATA
+from experiments.papers.real_logs.settings import GMAPPING, INTEL_DRAWN, MRCLAM_DRAWN
+from experiments.papers.results import Results
 from experiments.viewing.style import BLACK, CYCLE, figure
-from sim.formats.wean import read_grid
 
-_INTEL = ("odometry, calibrated", "ICP from the wheels", "EKF of wheels and ICP")
+Arrays = Mapping[str, NDArray[Any]]
 
 
-def intel(relations: pd.DataFrame, paths: pd.DataFrame) -> Figure:
-    """Paths through the Intel lab, and the relations metric beside the printed figures."""
+def draw(made: Results) -> dict[str, Figure]:
+    """Draw all figures of the study, by file name."""
+    return {
+        "real_logs_intel": intel(made.table("relations"), made.arrays("intel")),
+        "real_logs_mrclam": mrclam(made.table("mrclam"), made.arrays("mrclam")),
+        "real_logs_wheels": wheels(made.table("wheels")),
+        "real_logs_wean": wean(made.table("wean"), made.arrays("wean")),
+    }
+
+
+def intel(relations: pd.DataFrame, paths: Arrays) -> Figure:
+    """Paths through the Intel lab, and the relations metric beside the printed values."""
     page = figure(10.0, 5.2)
     left, right = page.subplots(1, 2, width_ratios=[1.1, 1.0])
-    for color, name in zip((*CYCLE[1:], BLACK), _INTEL, strict=False):
-        rows = paths[paths.method == name]
-        left.plot(rows.x_m, rows.y_m, color=color, lw=0.7, label=name)
-    rows = paths[paths.method == "GMapping, 910 poses"]
-    left.plot(rows.x_m, rows.y_m, color=BLACK, lw=0.7, label="GMapping (reference)")
+    for color, name in zip(CYCLE[1:], INTEL_DRAWN, strict=False):
+        left.plot(*paths[name].T, color=color, lw=0.7, label=name)
+    left.plot(*paths[GMAPPING].T, color=BLACK, lw=0.7, label="GMapping (reference)")
     left.set(xlabel="x, m", ylabel="y, m", aspect="equal", title="Intel Research Lab")
     page.legend(*left.get_legend_handles_labels(), loc="outside lower left", ncols=2, fontsize=7)
     rows = relations[relations.log == "intel"]
@@ -44,7 +55,7 @@ def intel(relations: pd.DataFrame, paths: pd.DataFrame) -> Figure:
     return page
 
 
-def mrclam(errors: pd.DataFrame, paths: pd.DataFrame) -> Figure:
+def mrclam(errors: pd.DataFrame, paths: Arrays) -> Figure:
     """Errors and NEES of each robot, and the paths of robot 4."""
     page = figure(11.0, 4.6)
     left, middle, right = page.subplots(1, 3, width_ratios=[1.0, 1.0, 1.1])
@@ -63,16 +74,12 @@ def mrclam(errors: pd.DataFrame, paths: pd.DataFrame) -> Figure:
     left.set(ylabel="ATE from the true start, m", ylim=(0.0, None), title="MRCLAM 6")
     middle.set(yscale="log", ylabel="mean NEES (3 is consistent)")
     middle.axhline(3.0, color=BLACK, lw=0.7, ls=":")
-    for name, color in (
-        ("motion capture", BLACK),
-        ("dead reckoning, calibrated", CYCLE[1]),
-        ("FastSLAM, known, wider noise", CYCLE[0]),
+    for name, color in zip(
+        ("motion capture", *MRCLAM_DRAWN), (BLACK, CYCLE[1], CYCLE[0]), strict=True
     ):
-        rows = paths[paths.method == name]
-        right.plot(rows.x_m, rows.y_m, color=color, lw=0.8, label=name)
+        right.plot(*paths[name].T, color=color, lw=0.8, label=name)
     right.set(xlabel="x, m", ylabel="y, m", aspect="equal", title="robot 4")
-    handles, labels = left.get_legend_handles_labels()
-    page.legend(handles, labels, loc="outside lower left", ncols=4, fontsize=7)
+    page.legend(*left.get_legend_handles_labels(), loc="outside lower left", ncols=4, fontsize=7)
     page.legend(*right.get_legend_handles_labels(), loc="outside lower right", fontsize=7)
     return page
 
@@ -81,11 +88,8 @@ def wheels(found: pd.DataFrame) -> Figure:
     """Khepera: kr and kl by the length of the blocks that residuals are summed over."""
     page = figure(5.5, 3.6)
     ax = page.subplots()
-    k = found[found.block > 0]
-    for color, (log, quantity) in zip(
-        CYCLE, [(a, b) for a in ("l90", "lmov") for b in ("kr", "kl")], strict=False
-    ):
-        rows = k[(k.log == log) & (k.quantity == quantity)]
+    slip = found[found.block > 0].groupby(["log", "quantity"], sort=False)
+    for color, ((log, quantity), rows) in zip(CYCLE, slip, strict=False):
         spread = np.abs(rows[["low", "high"]].to_numpy().T - rows.value.to_numpy())
         ax.errorbar(
             rows.block, rows.value, spread, color=color, marker="o", ms=3, capsize=2,
@@ -97,31 +101,26 @@ def wheels(found: pd.DataFrame) -> Figure:
     return page
 
 
-def wean(fits: pd.DataFrame, paths: pd.DataFrame) -> Figure:
+def wean(fits: pd.DataFrame, drawn: Arrays) -> Figure:
     """The map as the scans read it, with paths and beam ends."""
-    grid = read_grid(DATA / "wean_hall_mcl/wean.dat.gz")
-    names = [name for name in dict.fromkeys(paths.method) if name.startswith("log")]
-    page = figure(5.2 * len(names), 5.6)
-    side = grid.values.shape[0] * grid.cell_m
-    for ax, name in zip(np.atleast_1d(page.subplots(1, len(names))), names, strict=True):
+    right = fits[(fits.one_means == "free") & ~fits.mirrored]
+    page = figure(5.2 * len(right), 5.6)
+    for ax, row in zip(
+        page.subplots(1, len(right), squeeze=False)[0], right.itertuples(), strict=True
+    ):
         ax.imshow(
-            np.ma.masked_invalid(grid.occupancy.T), origin="lower", cmap="Greys", vmin=0.0,
-            vmax=1.0, extent=(0.0, side, 0.0, side), interpolation="nearest",
+            np.ma.masked_invalid(drawn["occupancy"].T.astype(float)), origin="lower", cmap="Greys",
+            vmin=0.0, vmax=1.0, extent=drawn["extent_m"], interpolation="nearest",
         )  # fmt: skip
         ax.set_facecolor("#dfe6ee")
-        number = name.split()[1]
-        ends, path = paths[paths.method == f"scans {number}"], paths[paths.method == name]
-        ax.plot(ends.x_m, ends.y_m, ".", color=CYCLE[4], ms=1.2, label="beam ends")
-        ax.plot(path.x_m, path.y_m, color=CYCLE[0], lw=1.2, label="path (ICP)")
-        row = fits[(fits.log == int(number)) & (fits.one_means == "free") & ~fits.mirrored].iloc[0]
+        ax.plot(*drawn[f"ends_{row.log}"].T, ".", color=CYCLE[4], ms=1.2, label="beam ends")
+        ax.plot(*drawn[f"path_{row.log}"].T, color=CYCLE[0], lw=1.2, label="path (ICP)")
         ax.plot(row.x_m, row.y_m, "o", color=CYCLE[0], ms=4)
-        x, y = paths.x_m[paths.method != ""], paths.y_m
-        middle = (float(x.mean()), float(y.mean()))
-        half = 1.05 * max(float(np.ptp(x)), float(np.ptp(y)), 10.0) / 2.0
         ax.set(
-            xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half),
+            xlim=drawn["extent_m"][:2], ylim=drawn["extent_m"][2:],
             xlabel="x, m", ylabel="y, m", aspect="equal",
-            title=f"Wean Hall, {name}: fit {row.score:.2f}, start {math.degrees(row.yaw_rad):.0f}°",
+            title=f"Wean Hall, log {row.log}: fit {row.score:.2f}, "
+            f"start {math.degrees(row.yaw_rad):.0f}°",
         )  # fmt: skip
     page.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=2, markerscale=6)
     return page

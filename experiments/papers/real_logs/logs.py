@@ -1,0 +1,134 @@
+"""Recordings of the real logs, as conf/study/real_logs_*.yaml name them."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimators.base import Estimate, Estimator, Prior
+from estimators.base import run as run_estimator
+from estimators.icp_odometry import IcpOdometry
+from experiments.calibration.logs import calibrate_wheels
+from experiments.papers.real_logs.settings import CALIBRATED_S, DATA, TUNED_SHARE
+from sim import se2
+from sim.formats import carmen, mrclam, wean
+from sim.formats import intel as intel_lab
+from sim.formats.khepera import WheelLaserLog
+from sim.recording import Recording, WheelLog
+from sim.robot import RobotGeometry
+from sim.sensors import Mount
+
+Array = NDArray[np.float64]
+
+
+def intel(version: Literal["sparse", "logged", "calibrated"]) -> Recording:
+    """The Intel Research Lab: 910 scans with a mapper's poses, or the log with all its scans."""
+    folder = DATA / "intel_lab"
+    if version == "sparse":
+        return intel_lab.read_intel(
+            folder / "intel_raw_910.json.gz", folder / "intel_gmapping_910.json.gz"
+        )
+    logged, _ = intel_lab.read_thinned_intel(
+        folder / "intel_mrpt_scans_converted.txt.gz",
+        folder / "intel_mrpt_ODO.txt.gz",
+        folder / "intel_mrpt_reference_matches.csv.gz",
+    )
+    return calibrated_by_scans(logged, tuned_until_s(logged)) if version == "calibrated" else logged
+
+
+def freiburg() -> Recording:
+    """Freiburg 079; its wheels are the edges of a graph that others optimised."""
+    return carmen.to_recording(carmen.read_carmen(DATA / "fr079_flirt" / "fr079.flirt.log.gz"))
+
+
+def landmarks(robot: int, calibrated: bool, identifies: bool) -> Recording:
+    """One robot of MRCLAM 6, with ranges and bearings to landmarks."""
+    archive = DATA / "mrclam6" / "MRCLAM_Dataset6.tar.xz"
+    logged = mrclam.read_mrclam(archive, robot, identifies)
+    return calibrated_by_truth(logged) if calibrated else logged
+
+
+def wean_hall(number: int) -> Recording:
+    """Log 1 or 2 of Wean Hall."""
+    return wean.read_wean(DATA / "wean_hall_mcl" / f"robotdata{number}.log.gz")
+
+
+def tracked(
+    estimator: Estimator, recording: Recording, seed: int = 0, start: Array | None = None
+) -> Estimate:
+    """Estimate from a start pose (3,) known to 1 mm and 1 mrad; the origin by default."""
+    mean = np.zeros(3) if start is None else start
+    prior = Prior(recording.robot, recording.sensors, mean, np.diag([1e-6, 1e-6, 1e-6]))
+    keep = ("registration_status",)
+    return run_estimator(estimator, recording, prior, np.random.default_rng(seed), keep=keep)
+
+
+def tuned_until_s(logged: Recording) -> float:
+    """End of the part of the Intel log that options were chosen on, s."""
+    assert logged.laser is not None
+    return float(np.quantile(logged.laser.stamps, TUNED_SHARE))
+
+
+def calibrated_by_scans(recording: Recording, until_s: float) -> Recording:
+    """The recording with wheels, track and laser as scan matching before `until_s` shows them.
+
+    The wheels of a log of poses are rebuilt with nominal sizes: what is found are corrections.
+    """
+    matcher = IcpOdometry(kr=3e-3, kl=3e-3, sigma_range_m=0.03, reference="previous")
+    estimate = tracked(matcher, recording)
+    assert recording.laser is not None
+    assert recording.sensors.laser is not None
+    stamps = recording.laser.stamps
+    rows = np.searchsorted(estimate.stamps, stamps)
+    poses = estimate.means[rows]
+    status = np.array([str(estimate.extras["registration_status"][i]) for i in rows])
+    trusted = (status[1:] == "ok") & (stamps[1:] < until_s)
+    wheels = recording.wheels
+    travel = np.stack(
+        [np.interp(stamps, wheels.stamps, wheels.position_m[:, i]) for i in (0, 1)], axis=1
+    )
+    log = WheelLaserLog(
+        np.diff(stamps)[trusted],
+        2.0 * np.diff(travel, axis=0)[trusted],
+        se2.between(poses[:-1], poses[1:])[trusted],
+    )
+    right, left, axle_m, x, y, yaw = calibrate_wheels(log, 1.0, recording.robot.track_m).values
+    laser = recording.sensors.laser
+    mount = Mount(x, y, laser.mount.z_m, laser.mount.yaw_rad + yaw)
+    return dataclasses.replace(
+        recording,
+        wheels=WheelLog(wheels.stamps.copy(), wheels.position_m * np.array([right, left])),
+        robot=RobotGeometry(recording.robot.wheel_radius_m, axle_m),
+        sensors=dataclasses.replace(
+            recording.sensors, laser=dataclasses.replace(laser, mount=mount)
+        ),
+    )
+
+
+def calibrated_by_truth(recording: Recording, until_s: float = CALIBRATED_S) -> Recording:
+    """The recording with wheel gains and track fitted to the truth of its first `until_s`."""
+    truth, wheels, lag_s = recording.truth, recording.wheels, 4.0
+    assert truth is not None
+    begin = max(truth.stamps[0], wheels.stamps[0])
+    times = np.arange(begin, min(begin + until_s, truth.stamps[-1]), 0.02)
+    travel = np.stack(
+        [np.interp(times, wheels.stamps, wheels.position_m[:, i]) for i in (0, 1)], axis=1
+    )
+    heading = np.interp(times, truth.stamps, np.unwrap(truth.poses[:, 2]))
+    x, y = (np.interp(times, truth.stamps, truth.poses[:, i]) for i in (0, 1))
+    along = np.cos(heading[:-1]) * np.diff(x) + np.sin(heading[:-1]) * np.diff(y)
+    forward = np.concatenate([[0.0], np.cumsum(along)])
+    every = round(lag_s / 0.02)
+    rolled, turn, advance = (np.diff(v[::every], axis=0) for v in (travel, heading, forward))
+    # turn = (a_r W_r - a_l W_l) / track, advance = (a_r W_r + a_l W_l) / 2
+    per_track = np.linalg.lstsq(rolled * np.array([1.0, -1.0]), turn, rcond=None)[0]
+    mean = rolled @ per_track / 2.0
+    track_m = float(mean @ advance / (mean @ mean))
+    return dataclasses.replace(
+        recording,
+        wheels=WheelLog(wheels.stamps.copy(), wheels.position_m * (per_track * track_m)),
+        robot=RobotGeometry(recording.robot.wheel_radius_m, track_m),
+    )

@@ -1,0 +1,62 @@
+"""Constants of the studies of real logs that are no configuration of a run."""
+
+from __future__ import annotations
+
+import math
+
+from experiments.evaluation.verdict import Profile
+from experiments.runs.paths import SOURCE
+
+DATA = SOURCE.parent / "shared" / "data"  # the logs are not part of the project
+
+RAWSEEDS = {  # printed with the logs: SE(2)-aligned ATE of 25a and 25b, m
+    "amcl_beam_model_default": ("0.149", "0.178"),
+    "amcl_likelihood_default": ("0.227", "0.174"),
+    "ndt_mcl_0.5": ("0.079", "0.077"),
+    "muse_default_params": ("0.142", "0.132"),
+    "GROUNDTRUTH-CARTOGRAPHER": ("0.059", "0.062"),
+    "GT-extended": ("0.031", "0.042"),
+    "GraphSLAM Laser": ("", "0.074"),
+}
+KUEMMERLE = {  # as quoted with the logs: mean and standard deviation of the translation, m
+    "intel": {"scan matching": (0.220, 0.296), "RBPF": (0.070, 0.083), "graph": (0.031, 0.026)},
+    "fr079": {"scan matching": (0.258, 0.427), "RBPF": (0.061, 0.044), "graph": (0.056, 0.042)},
+}
+KHEPERA = {  # published: right and left diameter, axle, m
+    "l90": (0.0414408, 0.0411796, 0.0880134),
+    "lmov": (0.0415888, 0.0414217, 0.0883953),
+}
+LEGO_START_RAD = math.radians(213.0)
+
+# What the runs of conf/study/real_logs_*.yaml are called, in their order
+FUSION = "EKF of wheels and ICP"
+GMAPPING = "GMapping, 910 poses"
+INTEL = (
+    "odometry, 910 scans",
+    "odometry, as logged",
+    "odometry, calibrated",
+    "ICP alone",
+    "ICP from the wheels",
+    FUSION,
+)
+INTEL_DRAWN = (INTEL[2], INTEL[4], FUSION)
+FREIBURG = ("graph's own edges", "ICP alone", "ICP from the edges")
+MRCLAM = (
+    "dead reckoning, as logged",
+    "dead reckoning, calibrated",
+    "FastSLAM, known",
+    "FastSLAM, known, wider noise",
+    "FastSLAM, unknown, wider noise",
+    "EKF-SLAM, known",
+    "EKF-SLAM, known, wider noise",
+    "EKF-SLAM, unknown, wider noise",
+)
+MRCLAM_DRAWN = (MRCLAM[1], MRCLAM[3])
+
+TUNED_SHARE = 0.4  # of the Intel log, on which options were chosen; the rest judges
+TUNED_ROBOTS = (1, 2)  # of MRCLAM; robots 3 to 5 judge
+CALIBRATED_S = 300.0  # from the start of a log of MRCLAM
+DRAWN_ROBOT = 4
+MRCLAM_ROBOTS = {Profile.QUICK: (1, 4), Profile.FULL: (1, 2, 3, 4, 5)}
+FASTSLAM_SEEDS = {Profile.QUICK: 1, Profile.FULL: 5}
+WEAN_LOGS = {Profile.QUICK: "1", Profile.FULL: "1,2"}
