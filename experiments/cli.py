@@ -464,7 +464,9 @@ def table(
 def plot(
     name: Annotated[str, typer.Argument(help="A sweep's name, or a folder or file of rows.")],
     x: Annotated[str, typer.Option(help="Swept setting, such as robot.kr.")],
-    y: Annotated[str, typer.Option(help="What was found.")] = "ate_rmse_m",
+    y: Annotated[str, typer.Option(help="Result, such as ate_rmse_m (estima options metrics).")] = (
+        "ate_rmse_m"
+    ),
     by: Annotated[str | None, typer.Option(help="One line a value of this.")] = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="Picture to write.")] = Path("plot.png"),
     only: Where = None,

@@ -149,7 +149,7 @@ def test_small_tables_whole_and_large_ones_begun(text):
     assert "1005" not in bodies["puzzlebot2024_large"]
 
 
-def test_origin_and_command_are_told(text):
+def test_origin_and_command_are_shown(text):
     sections = {e.get("aria-labelledby"): e["text"] for e in Outline(text).all("section")}
     assert "<i>quick profile, 12 s" in sections["puzzlebot2024"]
     assert "<i>fast" in sections["machine"]
@@ -178,8 +178,8 @@ def test_what_belongs_to_no_paper_comes_last_with_its_command(text):
 
 
 def test_claims_that_a_cut_table_lacks_are_named(results, capsys):
-    told = Outline(report.write_report(results).read_text()).all("header")[0]["text"]
-    assert "No verdict on PB2, PB3." in told  # of papers without any nothing is expected
+    header = Outline(report.write_report(results).read_text()).all("header")[0]["text"]
+    assert "No verdict on PB2, PB3." in header  # of papers without any nothing is expected
     (line,) = capsys.readouterr().err.splitlines()
     assert "claims.csv: no verdict on PB2, PB3" in line
 

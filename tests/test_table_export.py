@@ -55,7 +55,7 @@ def test_two_tables_never_become_one_file(tmp_path):
     export(paths, "markdown", None, 4)  # on paper both have their place
 
 
-def test_letters_that_the_output_lacks_are_told(tmp_path, monkeypatch):
+def test_letters_that_the_output_lacks_are_named(tmp_path, monkeypatch):
     path = tmp_path / "t.csv"
     path.write_text("name\n\u00e9\n", encoding="utf-8")
     monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(io.BytesIO(), encoding="ascii"))
@@ -66,7 +66,7 @@ def test_letters_that_the_output_lacks_are_told(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["README.md", "damaged.csv", "missing.csv"])
-def test_what_is_no_table_is_told_and_not_to_be_deleted(tmp_path, name):
+def test_what_is_no_table_is_refused_and_not_to_be_deleted(tmp_path, name):
     (tmp_path / "README.md").write_text("# Read me\n")
     (tmp_path / "damaged.csv").write_text('a,b\n1,2\n3,4,5,6\n"')
     with pytest.raises(InputError, match=f"{name}.*needs a CSV or Parquet table") as refusal:

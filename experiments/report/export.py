@@ -35,21 +35,23 @@ def read_table(path: Path) -> pd.DataFrame:
     """
     try:
         frame = read_rows(path)
-        cells = None
-        if path.suffix == ".csv" and path.is_file():
-            cells = pd.read_csv(path, dtype="str", keep_default_na=False)
+        written = frame
+        if path.suffix == ".csv":
+            written = pd.read_csv(path, dtype="str", keep_default_na=False)
     except (InputError, ValueError) as error:
         why = [*str(error.__cause__ or "no table there").splitlines(), "unreadable"][0].rstrip(".")
         raise InputError(f"{path}: {why}; export-table needs a CSV or Parquet table") from error
     for name, column in list(frame.items()):
-        gaps, filled = column.isna(), column.dropna()
-        if column.dtype.kind == "f":
-            whole = (filled % 1.0 == 0.0) & (filled.abs() < 2.0**53)
-            if gaps.any() and len(filled) and whole.all():
-                frame[name] = column.astype("Int64")
-        if cells is not None and (isinstance(column.dtype, pd.StringDtype) or filled.empty):
-            frame[name] = cells[name]  # "NA" is a gap among numbers, but a text among texts
+        filled = column.dropna()
+        if filled.empty or isinstance(column.dtype, pd.StringDtype):
+            frame[name] = written[name]  # "NA" is a gap among numbers, but a text among texts
+        elif column.dtype.kind == "f" and len(filled) < len(column) and _whole(filled):
+            frame[name] = column.astype("Int64")
     return frame
+
+
+def _whole(numbers: pd.Series[float]) -> bool:
+    return bool(((numbers % 1.0 == 0.0) & (numbers.abs() < 2.0**53)).all())
 
 
 def plain(value: Any, digits: int = 4) -> str:
@@ -99,11 +101,10 @@ def _latex(text: str) -> str:
     return f"${text}$" if re.fullmatch(r"-[\d.]+", text) else text.translate(_LATEX)
 
 
-FORMATS: dict[str, Callable[[pd.DataFrame, int], str]] = {
-    "markdown": to_markdown,
-    "latex": to_latex,
+FORMATS: dict[str, tuple[Callable[[pd.DataFrame, int], str], str]] = {
+    "markdown": (to_markdown, ".md"),
+    "latex": (to_latex, ".tex"),
 }
-SUFFIXES = {"markdown": ".md", "latex": ".tex"}
 
 
 def export(paths: Sequence[Path], form: str, out: Path | None, digits: int) -> None:
@@ -116,19 +117,20 @@ def export(paths: Sequence[Path], form: str, out: Path | None, digits: int) -> N
     """
     if form not in FORMATS:
         raise InputError(f"--format must be {' or '.join(FORMATS)}, got {form!r}")
+    as_form, suffix = FORMATS[form]
     if out is None:
         for path in paths:
-            _show(FORMATS[form](read_table(path), digits), path)
+            _show(as_form(read_table(path), digits), path)
         return
     sources: dict[Path, Path] = {}
     for path in paths:
-        target = out / f"{path.stem}{SUFFIXES[form]}"
+        target = out / f"{path.stem}{suffix}"
         if target in sources:
             raise InputError(f"{sources[target]} and {path} would both become {target}")
         sources[target] = path
     for target, path in sources.items():
         with write_whole(target) as part:
-            part.write_text(FORMATS[form](read_table(path), digits), encoding="utf-8")
+            part.write_text(as_form(read_table(path), digits), encoding="utf-8")
     print(f"{out}: {len(paths)} tables")
 
 

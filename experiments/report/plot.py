@@ -7,7 +7,6 @@ import textwrap
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from experiments.evaluation.statistics import mean_interval
 from experiments.runs.columns import COLUMNS, title
@@ -46,17 +45,13 @@ def sweep_figure(table: pd.DataFrame, x: str, y: str, by: str | None = None) -> 
     logarithmic = scale == "log" and _spans(table[y], _WIDE_Y)
     numeric = table[x].dtype.kind in "fi"
     names = sorted(table[x].dropna().unique())
-    place = {name: float(name) if numeric else float(i) for i, name in enumerate(names)}
     wide = numeric and _spans(table[x], _WIDE_X)
     groups = [("", table)] if by is None else list(table.groupby(by))
     for i, (label, rows) in enumerate(groups):
-        means = rows.groupby([x, "recording_checksum"])[y].mean().dropna()
-        points = {
-            place[name]: _interval(values.to_numpy(), logarithmic)
-            for name, values in means.groupby(level=0)
-        }
+        recordings = rows.groupby([x, "recording_checksum"])[y].mean().dropna().groupby(level=0)
+        points = {name: _interval(values, logarithmic) for name, values in recordings}
         value, low, high = np.array(list(points.values())).reshape(-1, 3).T
-        at = np.array(list(points))
+        at = np.array([name if numeric else names.index(name) for name in points], float)
         beside = i - (len(groups) - 1) / 2
         if wide:
             at *= (names[-1] / names[0]) ** (_BESIDE * beside)
@@ -89,7 +84,7 @@ def _spans(values: pd.Series[float], factor: float) -> bool:
     return bool(values.min() > 0.0 and values.max() > factor * values.min())
 
 
-def _interval(values: NDArray[np.float64], logarithmic: bool) -> tuple[float, float, float]:
+def _interval(values: pd.Series[float], logarithmic: bool) -> tuple[float, float, float]:
     """Mean and the bounds of its interval; those of the logarithms where they are drawn."""
     found = mean_interval(np.log(values) if logarithmic else values)
     bounds = np.array([found.value, found.low, found.high])

@@ -92,10 +92,8 @@ def where(table: pd.DataFrame, conditions: Sequence[str]) -> pd.DataFrame:
         column, equals, wanted = condition.partition("=")
         if not equals or column not in table:
             raise InputError(f"--where {condition}: COLUMN=VALUE, with a column of the sweep")
-        meets = table[column].astype(str) == wanted
-        number = pd.to_numeric(wanted, errors="coerce")
-        if table[column].dtype.kind in "fi" and not pd.isna(number):
-            meets = table[column] == number
+        numbers, number = (pd.to_numeric(v, errors="coerce") for v in (table[column], wanted))
+        meets = (table[column].astype(str) == wanted) | (numbers == number)
         if not meets.any():
             there = ", ".join(map(str, sorted(table[column].dropna().unique())[:8]))
             raise InputError(f"--where {condition}: no such row; there are {there or 'no values'}")
