@@ -50,7 +50,7 @@ from experiments.papers.real_logs.settings import (
 from experiments.papers.results import Results
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
-from experiments.sweeps.launch import planned
+from experiments.sweeps.plan import planned
 from sim import se2
 from sim.formats import carmen, lego, rawseeds, wean
 from sim.formats.khepera import read_khepera
