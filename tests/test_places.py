@@ -1,4 +1,4 @@
-"""The routes of maximo2024: their printed figures, their descriptors, and reordered recordings."""
+"""The routes of maximo2024: their printed sizes, their descriptors, and reordered recordings."""
 
 import gzip
 
@@ -21,7 +21,7 @@ def measured(world):
 
 
 @pytest.mark.parametrize("name", GEOMETRIES)
-def test_generated_routes_have_the_printed_figures(name):
+def test_generated_routes_have_the_printed_sizes(name):
     geometry = GEOMETRIES[name]
     parts = [measured(place_world(geometry, seed)) for seed in range(4)]
     spacing = np.concatenate([p[0] for p in parts])
@@ -87,7 +87,7 @@ def test_resequenced_recordings_move_as_the_wheels_did():
     np.testing.assert_allclose(np.diff(cut.frame_stamps), UMH.interval_s)
 
 
-def test_wheels_tell_the_way_that_was_gone():
+def test_wheels_record_the_distance_travelled():
     recording = place_world(UMH, 0).recording
     travel = np.diff(recording.wheels.position_m.mean(axis=1))
     steps = np.hypot(*np.diff(recording.truth.poses[:, :2], axis=0).T)

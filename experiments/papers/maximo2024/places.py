@@ -1,6 +1,6 @@
 """Routes of places for topological localization: geometry, synthetic descriptors, recordings.
 
-maximo2024 works on two routes whose clouds and network are not at hand. Their geometry is kept
+maximo2024 works on two routes whose clouds and network are not available. Their geometry is kept
 here, as printed or from positions that the reader has, and a synthetic field of descriptors
 stands for the network.
 """
