@@ -1,10 +1,11 @@
-"""`estima cache`, and the limit of the cache; test_recording.py has what goes first."""
+"""Where the command puts its results: `--results`, the cache, an empty folder; and `--version`."""
 
 import pytest
 
 from experiments.runs import cache
+from experiments.runs.version import code_version
 from sim.errors import InputError
-from tests.test_cli import estima, refused
+from tests.test_cli import QUICK, estima, refused
 
 
 @pytest.fixture
@@ -34,3 +35,24 @@ def test_the_command_shows_and_clears(folder, tmp_path):
     assert list(folder.glob("*.npz")) == []
     refused(estima("cache", "--results"), "--results must name a folder")
     refused(estima("cache", ESTIMA_CACHE_GIB="much"), "ESTIMA_CACHE_GIB", "'much'")
+
+
+@pytest.mark.parametrize("after", [False, True])
+def test_results_go_to_the_folder_of_the_option(tmp_path, after):
+    run = ["run", *QUICK, "route=linear_1", "name=moved", "picture=false"]
+    option = ["--results", "there"]
+    arguments = [*run, *option] if after else [*option, *run]
+    done = estima(*arguments, cwd=tmp_path, ESTIMA_RESULTS="elsewhere")
+    assert done.returncode == 0, done.stderr
+    assert len(list((tmp_path / "there" / "runs" / "moved").glob("*.parquet"))) == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["there"]
+
+
+def test_a_report_of_nothing_is_one_line(tmp_path):
+    refused(estima("report", cwd=tmp_path, ESTIMA_RESULTS=""), "results", "estima reproduce")
+
+
+def test_the_version_names_the_code():
+    said = estima("--version").stdout.split()
+    assert said[0] == "estima"
+    assert said[2:] == ["code", code_version()]
