@@ -98,7 +98,7 @@ def test_the_map_of_the_order_has_no_negative_zero_and_open_ends():
 
 def test_shares_end_at_one():
     starts = pd.DataFrame({"median_m": [0.1, 0.2], "rms_m": [0.2, 0.3], "spacing_m": 6.0})
-    kinds = maximo2024.describers.KINDS
+    kinds = list(maximo2024.describers.KINDS)
     clusters = pd.DataFrame(
         {
             "geometry": "campus",

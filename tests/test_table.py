@@ -3,11 +3,16 @@ import pytest
 from evo.tools import file_interface
 
 from estimators.base import Estimate
-from experiments.runs.row import check_row, read_rows, write_rows
+from experiments.runs.row import Outcome, Status, check_row, read_rows, write_rows
 from sim.errors import InputError
 from sim.formats.tum import read_tum, write_tum
 
-ROW = {"status": "ok", "code_version": "a", "recording_checksum": "b", "run_key": "c"}
+ROW = {
+    **Status().columns(),
+    "code_version": "a",
+    "recording_checksum": "b",
+    "run_key": "c",
+}
 
 
 def an_estimate(seed=0):
@@ -44,7 +49,8 @@ def test_wrong_rows_and_files_are_refused(tmp_path):
 def test_nan_needs_a_status():
     with pytest.raises(InputError, match="ate_rmse_m is nan though the status is ok"):
         check_row({**ROW, "ate_rmse_m": float("nan")})
-    check_row({**ROW, "ate_rmse_m": float("nan"), "status": "not finite at 1.00 s"})
+    failed = Status(Outcome.FAILED, "not_finite", "not finite at 1.00 s").columns()
+    check_row({**ROW, "ate_rmse_m": float("nan"), **failed})
     with pytest.raises(InputError, match="64 bits"):
         check_row({**ROW, "seed": 2**70})
 
