@@ -211,6 +211,12 @@ def test_sensor_on_a_wall_has_range_zero(share, fov_rad):
     np.testing.assert_array_equal(ranges, 0.0)
 
 
+def test_a_lone_beam_from_a_sensor_on_a_wall_has_range_zero():
+    caster = SegmentCaster(world_of([[-1.0, -1, 1, 1]]), Laser(n_beams=1, fov_rad=1.0))
+    for heading in (0.0, 2.0, -2.0):
+        assert caster.cast([0.25, 0.25, heading]).tolist() == [0.0]
+
+
 @pytest.mark.parametrize("gap", [1e-11, 1e-9, 1e-6, 1e-3])
 def test_sensor_close_to_a_wall_sees_it_on_one_side_only(gap):
     laser = Laser(n_beams=12, fov_rad=2 * math.pi)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 from sim.errors import InputError
 from sim.formats import assemble
 from sim.formats.carmen import NOMINAL_RADIUS_M, NOMINAL_TRACK_M, scan_recording, seen_ranges
-from sim.formats.text import LARGEST, read_bytes, read_words
+from sim.formats.text import json_number, read_bytes, read_words
 from sim.recording import Recording, Truth
 from sim.sensors import Laser, Mount
 
@@ -46,9 +45,9 @@ def parse_intel(data: bytes, where: str) -> tuple[Array, Array, Array]:
     stamps, poses, ranges = [], [], []
     for stamp, entry in entries:
         try:
-            stamps.append(_number(float(stamp)))
-            poses.append([_number(entry[key]) for key in ("x", "y", "theta")])
-            ranges.append([_number(r) for r in entry["range"]])
+            stamps.append(json_number(float(stamp)))
+            poses.append([json_number(entry[key]) for key in ("x", "y", "theta")])
+            ranges.append([json_number(r) for r in entry["range"]])
             if len(ranges[-1]) != len(ranges[0]):
                 raise ValueError(f"{len(ranges[-1])} beams, the first scan has {len(ranges[0])}")
         except (ValueError, KeyError, TypeError, IndexError, OverflowError) as error:
@@ -181,12 +180,3 @@ def _scanner(rate_hz: float, n_beams: int, max_range_m: float) -> Laser:
         max_range_m=max_range_m,
         mount=Mount(yaw_rad=-step / 2.0),
     )
-
-
-def _number(value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise TypeError(f"{str(value)[:40]!r} is no number")
-    number = float(value)
-    if not abs(number) < LARGEST:
-        raise ValueError(f"numbers must be finite, below {LARGEST:g}")
-    return number

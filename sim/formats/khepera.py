@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from sim import se2
 from sim.errors import InputError
 from sim.formats.assemble import chained
-from sim.formats.text import LARGEST, read_bytes, read_members
+from sim.formats.text import json_number, read_bytes, read_members
 from sim.recording import Recording, Truth, WheelLog
 from sim.robot import RobotGeometry
 from sim.sensors import SensorSuite
@@ -96,12 +96,7 @@ def parse_khepera(data: bytes, where: str) -> WheelLaserLog:
 def _row(entry: Any) -> tuple[float, ...]:
     x, y, turn = entry["sm"]
     row = (entry["T"], entry["phi_r"], entry["phi_l"], x, y, turn)
-    for value in row:
-        if isinstance(value, bool) or not isinstance(value, (int, float)):
-            raise TypeError(f"{value!r} is no number")
-    numbers = tuple(float(value) for value in row)
-    if not all(abs(value) < LARGEST for value in numbers):
-        raise ValueError(f"numbers must be finite, below {LARGEST:g}")
+    numbers = tuple(json_number(value) for value in row)
     if numbers[0] <= 0.0:
         raise ValueError("T must be positive")
     return numbers

@@ -255,3 +255,19 @@ def read_words(path: Path) -> Words:
 
 # Gaps are blanks; "1_0" is 10 to Python, but no number in a log, and no keyword has a "_".
 _PLAIN = bytes.maketrans(b",;_", b"  ?")
+
+
+def json_number(value: Any) -> float:
+    """A number of a JSON document.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If it is none, or not finite, or larger than a log has reason to hold.
+    """
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise TypeError(f"{str(value)[:40]!r} is no number")
+    number = float(value)
+    if not abs(number) < LARGEST:
+        raise ValueError(f"numbers must be finite, below {LARGEST:g}")
+    return number
