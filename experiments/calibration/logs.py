@@ -137,7 +137,7 @@ def _fit(
 def _residual(log: WheelLaserLog, parameters: Array) -> Array:
     """Laser displacement seen less foreseen, (N, 3)."""
     motion = arc_increment(log.rolled_rad * parameters[:2] / 2.0, float(parameters[2]))
-    laser = np.broadcast_to(parameters[3:], motion.shape)
+    laser = parameters[3:]
     foreseen = se2.compose(se2.inverse(laser), se2.compose(motion, laser))
     residual: Array = log.laser_motion - foreseen
     residual[:, 2] = se2.wrap(residual[:, 2])
