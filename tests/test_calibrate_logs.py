@@ -3,10 +3,18 @@ import math
 import numpy as np
 import pytest
 
+from estimators.ekf_icp import EkfIcp
+from estimators.ekf_slam import EkfSlam
+from estimators.fastslam import FastSLAM
+from estimators.icp_odometry import IcpOdometry
+from estimators.odometry import Odometry
 from experiments.calibration.logs import calibrate_track, dead_reckoning_rms_m, scanner_positions
+from experiments.papers.real_logs import settings
 from experiments.papers.real_logs.grid_match import beam_points, best_fit
+from experiments.sweeps.launch import planned
 from sim import se2
 from sim.formats.lego import TickLog, parse_motors, parse_reference
+from sim.formats.mrclam import CAMERA
 from sim.formats.text import read_words
 from tests.log_samples import DATA
 
@@ -75,3 +83,35 @@ def test_scans_find_their_place_and_the_maps_meaning():
     assert abs(se2.wrap(found.pose[2] - truth[2])) < 0.1
     inverted = best_fit(1.0 - occupancy, cell_m, points, n_headings=72)
     assert inverted.score < found.score - 0.2
+
+
+@pytest.mark.parametrize(
+    ("study", "names"),
+    [
+        ("intel", settings.INTEL),
+        ("fr079", settings.FREIBURG),
+        ("mrclam recording.robot=1", settings.MRCLAM),
+    ],
+)
+def test_every_run_of_a_study_has_its_name(study, names):
+    runs = dict(zip(names, planned(f"+study=real_logs_{study}".split()), strict=True))
+    methods = {
+        "ICP": IcpOdometry,
+        "EKF of": EkfIcp,
+        "EKF-SLAM": EkfSlam,
+        "FastSLAM": FastSLAM,
+        "odometry": Odometry,
+        "dead reckoning": Odometry,
+        "graph's": Odometry,
+    }
+    for name, run in runs.items():
+        (kind,) = [kind for start, kind in methods.items() if name.startswith(start)]
+        assert type(run.estimator()) is kind
+        unknown = run.config["estimator"].get("association") == "mahalanobis"
+        assert unknown == ("unknown" in name)
+        wider = run.config["estimator"].get("sigma_disparity_px") is not None
+        assert wider == ("wider noise" in name)
+    if study.startswith("mrclam"):
+        noise = runs["FastSLAM, known, wider noise"].config["estimator"]
+        assert noise["sigma_disparity_px"] == 4.0 * CAMERA.sigma_disparity_px
+        assert noise["sigma_column_px"] == 4.0 * CAMERA.sigma_column_px

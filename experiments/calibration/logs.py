@@ -104,17 +104,23 @@ def calibrate_wheels(
         spread = 1.4826 * np.median(np.abs(residual), axis=0) + 1e-9
         kept = np.sqrt(np.sum((residual / spread) ** 2, axis=1)) < _TRIM_SIGMAS
         fit = _fit(log, fit.x, 1.0 / spread, kept, scale)
-    values = fit.x.copy()
-    values[5] = se2.wrap(values[5])
-    unit = float(np.mean(fit.fun**2))
-    sigma = np.sqrt(unit * np.diag(np.linalg.inv(fit.jac.T @ fit.jac)))
-    half = float(stats.norm.ppf(0.975)) * sigma
-    right, left, axle, x, y, yaw = (
-        Interval(float(v), float(v - h), float(v + h)) for v, h in zip(values, half, strict=True)
-    )
-    residual = _residual(log, values)
-    travel = log.rolled_rad * values[:2] / 2.0
-    return WheelCalibration(right, left, axle, x, y, yaw, kept, travel, residual[:, 2])
+    values = np.append(fit.x[:5], se2.wrap(fit.x[5]))
+    right, left, axle, x, y, yaw = _intervals(values, fit)
+    travel, turns = log.rolled_rad * values[:2] / 2.0, _residual(log, values)[:, 2]
+    return WheelCalibration(right, left, axle, x, y, yaw, kept, travel, turns)
+
+
+def _intervals(
+    values: Array, fit: optimize.OptimizeResult, alike: float = 1.0, unit: Array | float = 1.0
+) -> list[Interval]:
+    """Parameters (P,) of a least-squares fit with 95 % intervals, times their units.
+
+    `alike` neighbouring residuals count as one.
+    """
+    covariance = np.linalg.inv(fit.jac.T @ fit.jac) * float(np.mean(fit.fun**2)) * alike
+    half = float(stats.norm.ppf(0.975)) * np.sqrt(np.diag(covariance))
+    bounds = np.stack([values, values - half, values + half]) * unit
+    return [Interval(*map(float, column)) for column in bounds.T]
 
 
 def _fit(
@@ -131,7 +137,7 @@ def _fit(
 def _residual(log: WheelLaserLog, parameters: Array) -> Array:
     """Laser displacement seen less foreseen, (N, 3)."""
     motion = arc_increment(log.rolled_rad * parameters[:2] / 2.0, float(parameters[2]))
-    laser = np.broadcast_to(parameters[3:], motion.shape)
+    laser = parameters[3:]
     foreseen = se2.compose(se2.inverse(laser), se2.compose(motion, laser))
     residual: Array = log.laser_motion - foreseen
     residual[:, 2] = se2.wrap(residual[:, 2])
@@ -166,8 +172,8 @@ def slip_of_turns(
     The estimate is the maximum of the likelihood of zero-mean Gaussian sums; its interval comes
     from resampling the blocks.
     """
-    axle = calibration.axle_m.value
-    travel, error = calibration.travel_m, calibration.turn_residual_rad * axle
+    travel = calibration.travel_m
+    error = calibration.turn_residual_rad * calibration.axle_m.value
     commands = np.sign(np.round(travel / (0.02 * np.abs(travel).max())))
     squares, paths = [], []
     for command in np.unique(commands, axis=0):
@@ -195,8 +201,7 @@ def _law(square: Array, path: Array) -> Array:
     """(kr, kl) >= 0 that make Gaussian sums of variance path @ k most likely."""
     k = np.full(2, float(square.sum() / path.sum()))
     for _ in range(10):  # iteratively reweighted: the score equations of the likelihood
-        weight = (path @ k) ** -2.0
-        weighted = path * weight[:, None]
+        weighted = path * ((path @ k) ** -2.0)[:, None]
         normal, right_hand = path.T @ weighted, weighted.T @ square
         k = np.linalg.solve(normal, right_hand)
         if k.min() <= 0.0:  # at the bound of one, the other stands alone
@@ -234,9 +239,7 @@ def scanner_positions(log: TickLog, tick_m: float, track_m: float, start: Array)
     """Positions (N, 2) of the scanner by dead reckoning of the axle from a start pose (3,)."""
     steps = arc_increment(np.diff(log.ticks, axis=0) * tick_m, track_m)
     axle = se2.compose(start, chained(steps))
-    ahead = SCANNER_AHEAD_M * np.stack([np.cos(axle[:, 2]), np.sin(axle[:, 2])], axis=1)
-    positions: Array = axle[:, :2] + ahead
-    return positions
+    return se2.compose(axle, np.array([SCANNER_AHEAD_M, 0.0, 0.0]))[:, :2]
 
 
 def dead_reckoning_rms_m(
@@ -284,11 +287,6 @@ def calibrate_track(
         return off.ravel()
 
     fit = optimize.least_squares(residual, np.array([1.0, 1.0, heading_rad]))
-    covariance = np.linalg.inv(fit.jac.T @ fit.jac) * float(np.mean(fit.fun**2)) * 20.0
-    half = float(stats.norm.ppf(0.975)) * np.sqrt(np.diag(covariance))[:2]
-    tick, track = (
-        Interval(float(v * u), float((v - h) * u), float((v + h) * u))
-        for v, h, u in zip(fit.x[:2], half, (tick_m, track_m), strict=True)
-    )
+    tick, track, _ = _intervals(fit.x, fit, 20.0, np.array([tick_m, track_m, 1.0]))
     rms_m = float(np.sqrt(2.0 * np.mean(fit.fun**2)))
     return TrackCalibration(tick, track, axle_at(positions[0], float(fit.x[2])), rms_m)

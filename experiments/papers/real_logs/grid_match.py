@@ -34,7 +34,7 @@ def beam_points(ranges_m: Array, bearings_rad: Array, T_base_laser: Array, poses
     Array
         (N, 2, 2): end and half way of each beam.
     """
-    lasers = se2.compose(poses, np.broadcast_to(T_base_laser, poses.shape))
+    lasers = se2.compose(poses, T_base_laser)
     angle = lasers[:, 2:] + bearings_rad
     direction = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     seen = np.isfinite(ranges_m)

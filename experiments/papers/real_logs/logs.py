@@ -60,10 +60,10 @@ def tracked(
     estimator: Estimator, recording: Recording, seed: int = 0, start: Array | None = None
 ) -> Estimate:
     """Estimate from a start pose (3,) known to 1 mm and 1 mrad; the origin by default."""
-    mean = np.zeros(3) if start is None else start
-    prior = Prior(recording.robot, recording.sensors, mean, np.diag([1e-6, 1e-6, 1e-6]))
-    keep = ("registration_status",)
-    return run_estimator(estimator, recording, prior, np.random.default_rng(seed), keep=keep)
+    mean, covariance = np.zeros(3) if start is None else start, np.diag([1e-6, 1e-6, 1e-6])
+    prior = Prior(recording.robot, recording.sensors, mean, covariance)
+    rng = np.random.default_rng(seed)
+    return run_estimator(estimator, recording, prior, rng, keep=("registration_status",))
 
 
 def tuned_until_s(logged: Recording) -> float:

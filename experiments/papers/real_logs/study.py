@@ -198,10 +198,8 @@ def _relation_rows(
 
 def _block_interval(errors: Array, stamps: Array, block_s: float = 60.0) -> tuple[float, float]:
     """95 % interval of a mean; relations that begin in the same minute are resampled together."""
-    blocks = np.floor((stamps - stamps.min()) / block_s).astype(int)
-    sums = np.bincount(blocks, errors)
-    counts = np.bincount(blocks)
-    sums, counts = sums[counts > 0], counts[counts > 0]
+    _, blocks = np.unique(np.floor((stamps - stamps.min()) / block_s), return_inverse=True)
+    sums, counts = np.bincount(blocks, errors), np.bincount(blocks)
     picks = np.random.default_rng(0).integers(len(sums), size=(2000, len(sums)))
     means = sums[picks].sum(axis=1) / counts[picks].sum(axis=1)
     low, high = np.quantile(means, [0.025, 0.975])
