@@ -1,29 +1,29 @@
 """The checks that every estimator must pass.
 
 An estimator may state `needs`, a set of names among `wheels`, `laser`, `landmarks`, `cloud`,
-`place` and `map`, and `global_or_grid = True` if it cannot be equivariant to the last digit (a
-grid, a global search): then it is compared in distribution.
+`place` and `map`. If it cannot be equivariant to the last digit (a grid, a global search), it
+states `global_or_grid = True` and is compared in distribution.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import importlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import yaml
 from numpy.typing import NDArray
+from omegaconf import OmegaConf
 
-from estimators.base import Belief, Estimator, Prior
+from estimators.base import Estimator, Prior
 from experiments.runs.experiment import Experiment
 from experiments.runs.seeds import stream
+from experiments.runs.targets import make
 from sim import se2
 from sim.errors import InputError
 from sim.recording import Recording
-from sim.robot import RobotGeometry
 from sim.sensors import SensorSuite
 from sim.world import World
 
@@ -31,11 +31,35 @@ Array = NDArray[np.float64]
 Make = Callable[[], Estimator]
 MOTION = np.array([3.0, -2.0, 0.7])  # the rigid motion of the world in the equivariance check
 N_SEEDS = 30  # runs of each arm when compared in distribution
-_SENSOR_OF = {"laser": "laser", "landmarks": "stereo", "cloud": "lidar3d"}
-_LOG_OF = {"laser": "laser", "landmarks": "landmarks", "cloud": "clouds"}
-# Wheels are in every recording; what a place descriptor comes from is no sensor of the suite.
+# What can be taken away: the sensor and the log that a need stands for
+_SENSOR_AND_LOG = {
+    "laser": ("laser", "laser"),
+    "landmarks": ("stereo", "landmarks"),
+    "cloud": ("lidar3d", "clouds"),
+}
+# Every recording has wheels, and a place descriptor comes from no sensor of the suite.
 _NEVER_MISSING = ("wheels", "place")
-_GRAIN = np.array([0.05, 0.05, 0.02])  # what a grid may differ by when it is turned: m, m, rad
+_GRAIN = np.array([0.05, 0.05, 0.02])  # how far a grid may be off once turned: m, m, rad
+# Recordings to check on, each with a tracking prior and its map
+_ROOM = (
+    "world=room",
+    "sensors=laser_stereo",
+    "sensors.stereo.rate_hz=5",
+    "sensors.stereo.max_observations=0",
+    "sensors.stereo.correlated=true",
+    "route.distance_m=4",
+    "simulation.physics=kinematic",
+    "prior.start=tracking",
+    "prior.sigma_position_m=0.02",
+    "prior.sigma_heading_rad=0.01",
+    "prior.map=world",
+)
+_PLACES = (
+    "study=maximo2024_umh",
+    "prior.start=tracking",
+    "prior.sigma_position_m=0.5",
+    "prior.sigma_heading_rad=0.1",
+)
 
 
 @dataclass(frozen=True)
@@ -48,32 +72,22 @@ class CheckResult:
 
 
 def check_estimator(
-    make: Make, recording: Recording, prior: Prior, *, n_frames: int = 60
+    make_estimator: Make, recording: Recording, prior: Prior, *, n_frames: int = 60
 ) -> list[CheckResult]:
     """Run all checks on the first Frames of a recording.
 
     Parameters
     ----------
-    make
-        Gives a new estimator, always the same one.
+    make_estimator
+        Makes a new estimator, equal each time.
     recording, prior
         A run with what the estimator needs, and a tracking prior with a proper covariance.
     """
     short = recording.cut(min(n_frames, len(recording.frame_stamps)))
-    checks: list[tuple[str, Callable[[], str]]] = [
-        ("finite", lambda: _finite(make, short, prior)),
-        ("covariance", lambda: _covariance(make, short, prior)),
-        ("same seed, same bits", lambda: _repeatable(make, short, prior)),
-        ("causal", lambda: _causal(make, short, prior)),
-        ("frames untouched", lambda: _untouched(make, short, prior)),
-        ("reset", lambda: _reset(make, short, prior)),
-        ("equivariant", lambda: _equivariant(make, short.cut(30), prior)),
-        ("missing sensor", lambda: _missing(make, short, prior)),
-    ]
     results = []
-    for name, check in checks:
+    for name, check in _CHECKS.items():
         try:
-            fault = check()
+            fault = check(make_estimator, short, prior)
         except Exception as error:  # a check that cannot run has failed, whatever the reason
             fault = f"{type(error).__name__}: {error}"
         results.append(CheckResult(name, not fault, fault or "ok"))
@@ -85,26 +99,21 @@ def walk(
 ) -> tuple[Array, Array]:
     """Means (T, 3) and covariances (T, 3, 3) over a recording."""
     estimator.reset(prior, stream(seed, "conform"))
-    return _collect([estimator.step(frame) for frame in recording.frames()])
+    beliefs = [estimator.step(frame) for frame in recording.frames()]
+    return np.array([b.mean for b in beliefs]), np.array([b.covariance for b in beliefs])
 
 
-def _collect(beliefs: Sequence[Belief]) -> tuple[Array, Array]:
-    means = np.array([belief.mean for belief in beliefs])
-    covariances = np.array([belief.covariance for belief in beliefs])
-    return means, covariances
-
-
-def _finite(make: Make, recording: Recording, prior: Prior) -> str:
-    means, covariances = walk(make(), recording, prior)
+def _finite(new: Make, recording: Recording, prior: Prior) -> str:
+    means, covariances = walk(new(), recording, prior)
     if means.shape[1:] != (3,) or covariances.shape[1:] != (3, 3):
         return f"mean and covariance have shapes {means.shape[1:]}, {covariances.shape[1:]}"
     bad = ~(np.isfinite(means).all(axis=1) & np.isfinite(covariances).all(axis=(1, 2)))
     return f"not finite from Frame {np.argmax(bad)} on" if bad.any() else ""
 
 
-def _covariance(make: Make, recording: Recording, prior: Prior) -> str:
+def _covariance(new: Make, recording: Recording, prior: Prior) -> str:
     """Symmetric and positive semi-definite, to 1e-9 of its largest entry, while it is finite."""
-    _, covariances = walk(make(), recording, prior)
+    _, covariances = walk(new(), recording, prior)
     covariances = covariances[np.isfinite(covariances).all(axis=(1, 2))]
     if len(covariances) == 0:
         return "never finite"
@@ -124,31 +133,31 @@ def _same(first: tuple[Array, Array], second: tuple[Array, Array]) -> bool:
     return all(np.array_equal(a, b) for a, b in zip(first, second, strict=True))
 
 
-def _repeatable(make: Make, recording: Recording, prior: Prior) -> str:
-    same = _same(walk(make(), recording, prior), walk(make(), recording, prior))
+def _repeatable(new: Make, recording: Recording, prior: Prior) -> str:
+    same = _same(walk(new(), recording, prior), walk(new(), recording, prior))
     return "" if same else "two new estimators with the same seed differ"
 
 
-def _causal(make: Make, recording: Recording, prior: Prior) -> str:
+def _causal(new: Make, recording: Recording, prior: Prior) -> str:
     """Compare beliefs with those on the recording cut short."""
-    whole = walk(make(), recording, prior)
+    whole = walk(new(), recording, prior)
     half = len(recording.frame_stamps) // 2
-    cut = walk(make(), recording.cut(half), prior)
+    cut = walk(new(), recording.cut(half), prior)
     if not _same((whole[0][:half], whole[1][:half]), cut):
         return f"the first {half} beliefs change when the recording ends there"
     return ""
 
 
-def _untouched(make: Make, recording: Recording, prior: Prior) -> str:
+def _untouched(new: Make, recording: Recording, prior: Prior) -> str:
     before = recording.checksum
-    estimator = make()
+    estimator = new()
     estimator.reset(prior, stream(0, "conform"))
     for i, frame in enumerate(recording.frames()):
-        writable = _writable_copy(frame)
-        kept = _writable_copy(frame)
+        writable, kept = (_writable_copy(frame) for _ in range(2))
         estimator.step(writable)
-        for name, mine, theirs in _pairs(kept, writable):
-            if not np.array_equal(mine, theirs, equal_nan=True):
+        after = _arrays(writable)
+        for name, before_step in _arrays(kept).items():
+            if not np.array_equal(before_step, after[name], equal_nan=True):
                 return f"step changed {name} of Frame {i}"
     return "" if recording.checksum == before else "the recording was changed"
 
@@ -158,47 +167,48 @@ def _writable_copy(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         return value.copy()
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        names = [f.name for f in dataclasses.fields(value)]
-        return type(value)(**{name: _writable_copy(getattr(value, name)) for name in names})
+        return type(value)(**{name: _writable_copy(part) for name, part in vars(value).items()})
     return value
 
 
-def _pairs(first: Any, second: Any, prefix: str = "") -> list[tuple[str, Any, Any]]:
-    if dataclasses.is_dataclass(first) and not isinstance(first, type):
-        return [
-            pair
-            for f in dataclasses.fields(first)
-            for pair in _pairs(getattr(first, f.name), getattr(second, f.name), f.name)
-        ]
-    return [(prefix, first, second)] if isinstance(first, np.ndarray) else []
+def _arrays(frame: Any) -> dict[str, Array]:
+    """Arrays of a Frame, and of what it holds, by the names of their fields."""
+    found: dict[str, Array] = {}
+    for name, value in vars(frame).items():
+        if dataclasses.is_dataclass(value):
+            found |= _arrays(value)
+        elif isinstance(value, np.ndarray):
+            found[name] = value
+    return found
 
 
-def _reset(make: Make, recording: Recording, prior: Prior) -> str:
-    estimator = make()
+def _reset(new: Make, recording: Recording, prior: Prior) -> str:
+    estimator = new()
     first = walk(estimator, recording, prior)
     return "" if _same(first, walk(estimator, recording, prior)) else "a second run differs"
 
 
-def _equivariant(make: Make, recording: Recording, prior: Prior) -> str:
+def _equivariant(new: Make, recording: Recording, prior: Prior) -> str:
     """Move the world; the beliefs must move with it."""
-    moved = _moved_prior(prior)
-    if not getattr(make(), "global_or_grid", False):
-        here, there = walk(make(), recording, prior), walk(make(), recording, moved)
+    recording, moved = recording.cut(30), _moved_prior(prior)
+    if not getattr(new(), "global_or_grid", False):
+        here, there = walk(new(), recording, prior), walk(new(), recording, moved)
         if not all(np.isfinite(part).all() for part in (*here, *there)):
             return "not finite"
-        tolerance = 1e-9 if _same(here, walk(make(), recording, prior, seed=1)) else 1e-6
+        tolerance = 1e-9 if _same(here, walk(new(), recording, prior, seed=1)) else 1e-6
         fault = _gap(here, there)
         return f"off by {fault:.2g} (allowed {tolerance:g})" if fault > tolerance else ""
     seeds = range(N_SEEDS)
-    ends = np.array([walk(make(), recording, prior, seed)[0][-1] for seed in seeds])
-    moved_ends = np.array([walk(make(), recording, moved, N_SEEDS + s)[0][-1] for s in seeds])
+    ends = np.array([walk(new(), recording, prior, seed)[0][-1] for seed in seeds])
+    moved_ends = np.array([walk(new(), recording, moved, N_SEEDS + s)[0][-1] for s in seeds])
     return _differ(ends, se2.compose(se2.inverse(MOTION), moved_ends))
 
 
 def _differ(first: Array, second: Array) -> str:
-    """Tell whether two samples of poses (N, 3) have different means or spreads.
+    """Say how two samples of poses (N, 3) differ in mean or spread; nothing if they do not.
 
-    Means may differ by 4 standard errors and a grain, standard deviations 3 times and a grain.
+    Means may differ by 4 standard errors and a grain, standard deviations by a factor of 3 and a
+    grain.
     """
     # Headings count from the common direction, so that none lies at the seam.
     headings = np.concatenate([first[:, 2], second[:, 2]])
@@ -215,8 +225,8 @@ def _differ(first: Array, second: Array) -> str:
 
 
 def _gap(here: tuple[Array, Array], there: tuple[Array, Array]) -> float:
-    expected = se2.compose(MOTION, here[0])
-    difference = there[0] - expected
+    """Largest difference of means and covariances once both are in the moved frame."""
+    difference = there[0] - se2.compose(MOTION, here[0])
     difference[:, 2] = se2.wrap(difference[:, 2])
     turn = _turn()
     size = max(1.0, float(np.abs(here[1]).max()))
@@ -266,31 +276,48 @@ def move_world(world: World, T_new_old: Array) -> World:
     )
 
 
-def _missing(make: Make, recording: Recording, prior: Prior) -> str:
-    """Take away what the estimator needs; it must say so in one InputError."""
-    for need in sorted(getattr(make(), "needs", ())):
+def _missing(new: Make, recording: Recording, prior: Prior) -> str:
+    """Take away what the estimator needs; it must then raise an InputError of one line."""
+    for need in sorted(getattr(new(), "needs", ())):
         blind, poorer = recording, prior
         if need == "map":
             poorer = dataclasses.replace(prior, map=None)
-        elif need in _SENSOR_OF:
-            absent: dict[str, Any] = {_SENSOR_OF[need]: None}
-            suite: SensorSuite = dataclasses.replace(prior.sensors, **absent)
+        elif need in _SENSOR_AND_LOG:
+            sensor, log = _SENSOR_AND_LOG[need]
+            suite: SensorSuite = _without(prior.sensors, sensor)
             poorer = dataclasses.replace(prior, sensors=suite)
-            no_log: dict[str, Any] = {_LOG_OF[need]: None}
-            blind = dataclasses.replace(recording, sensors=suite, **no_log)
+            blind = dataclasses.replace(_without(recording, log), sensors=suite)
         elif need in _NEVER_MISSING:
             continue
         else:
-            known = ", ".join([*_NEVER_MISSING, *_SENSOR_OF, "map"])
+            known = ", ".join([*_NEVER_MISSING, *_SENSOR_AND_LOG, "map"])
             return f"unknown need {need!r}; known: {known}"
         try:
-            walk(make(), blind, poorer)
+            walk(new(), blind, poorer)
         except InputError as error:
             if "\n" in str(error):
                 return f"without {need}: the message has several lines"
             continue
         return f"runs without {need}, which it says it needs"
     return ""
+
+
+def _without(holder: Any, name: str) -> Any:
+    """Return the recording, or the sensors, with None in place of one of its parts."""
+    nothing: dict[str, Any] = {name: None}
+    return dataclasses.replace(holder, **nothing)
+
+
+_CHECKS: Mapping[str, Callable[[Make, Recording, Prior], str]] = {
+    "finite": _finite,
+    "covariance": _covariance,
+    "same seed, same bits": _repeatable,
+    "causal": _causal,
+    "frames untouched": _untouched,
+    "reset": _reset,
+    "equivariant": _equivariant,
+    "missing sensor": _missing,
+}
 
 
 def conform_target(target: str, arguments: Sequence[str]) -> list[CheckResult]:
@@ -303,71 +330,38 @@ def conform_target(target: str, arguments: Sequence[str]) -> list[CheckResult]:
     arguments
         Hydra overrides of the option, or the constructor's arguments, key=value.
     """
-    by_class = ":" in target or "." in target
-    make = _of_class(target, arguments) if by_class else _of_option(target, arguments)
-    recording, prior = place_example() if "place" in getattr(make(), "needs", ()) else example()
-    return check_estimator(make, recording, prior)
-
-
-def _of_option(name: str, overrides: Sequence[str]) -> Make:
-    return Experiment.compose([f"estimator={name}", *overrides]).estimator
+    if ":" in target or "." in target:
+        new = _of_class(target, arguments)
+    else:
+        new = Experiment.compose([f"estimator={target}", *arguments]).estimator
+    recording, prior = example(places="place" in getattr(new(), "needs", ()))
+    return check_estimator(new, recording, prior)
 
 
 def _of_class(target: str, arguments: Sequence[str]) -> Make:
-    module_name, _, name = target.rpartition(":" if ":" in target else ".")
-    try:
-        cls = getattr(importlib.import_module(module_name), name)
-    except (ModuleNotFoundError, AttributeError) as error:
-        raise InputError(f"{target}: {error}; is its folder on PYTHONPATH?") from error
-    keywords: dict[str, Any] = {}
+    settings: Any = {"_target_": target.replace(":", ".")}
+    remedy = "give MODULE:CLASS of an estimator, and its arguments as key=value"
     for argument in arguments:
-        key, equals, value = argument.partition("=")
-        if not equals:
+        if "=" not in argument:
             raise InputError(f"{argument}: constructor arguments are key=value")
-        keywords[key] = _value(value)
     try:
-        cls(**keywords) if callable(cls) else None
-    except TypeError as error:
-        raise InputError(f"{target}: {error}; give its arguments as key=value") from error
-    if not callable(getattr(cls, "step", None)):
-        raise InputError(f"{target} has no method step; give MODULE:CLASS of an estimator")
-    return lambda: cls(**keywords)
+        settings |= OmegaConf.to_object(OmegaConf.from_dotlist(list(arguments)))
+        estimator = make(settings, "estimator")
+    except (InputError, yaml.YAMLError) as error:
+        raise InputError(f"{str(error).splitlines()[0]}; {remedy}") from error
+    if not callable(getattr(estimator, "step", None)):
+        raise InputError(f"{target} has no method step; {remedy}")
+    return lambda: make(settings, "estimator")
 
 
-def place_example() -> tuple[Recording, Prior]:
-    """Return a route of places, and a tracking prior with its map."""
-    start = ["prior.start=tracking", "prior.sigma_position_m=0.5", "prior.sigma_heading_rad=0.1"]
-    experiment = Experiment.compose(["study=maximo2024_umh", *start])
+def example(*, places: bool = False) -> tuple[Recording, Prior]:
+    """Return a short recording, and a tracking prior with its map.
+
+    Parameters
+    ----------
+    places
+        A route of place descriptors, instead of a room seen by all other sensors but the 3D lidar.
+    """
+    experiment = Experiment.compose(_PLACES if places else _ROOM)
     recording = experiment.recording()
     return recording, experiment.prior(recording)
-
-
-def _value(text: str) -> Any:
-    try:
-        return float(text) if any(c in text for c in ".eE") else yaml.safe_load(text)
-    except (ValueError, yaml.YAMLError):
-        return text
-
-
-def example() -> tuple[Recording, Prior]:
-    """Return a short recording with all sensors in a room, and a tracking prior with its map."""
-    experiment = Experiment.compose(
-        [
-            "world=room",
-            "sensors=lms291",
-            "sensors.laser.rate_hz=10",
-            "route.distance_m=4",
-            "simulation.physics=kinematic",
-        ]
-    )
-    sensors = experiment.config["sensors"]
-    stereo = Experiment.compose(["sensors=stereo_pixel"]).config["sensors"]["stereo"]
-    sensors = {**sensors, "stereo": {**stereo, "rate_hz": 5.0}}
-    experiment = experiment.replaced(sensors=sensors)
-    recording, robot = experiment.simulate(), experiment.robot()
-    truth = recording.truth
-    assert truth is not None
-    spread = np.diag(np.square([0.02, 0.02, 0.01]))
-    believed = RobotGeometry(robot.wheel_radius_m, robot.track_m)
-    start = truth.poses[0].copy()
-    return recording, Prior(believed, recording.sensors, start, spread, truth.world)

@@ -1,7 +1,7 @@
-"""Faults planted in the estimators' code, to learn what `estima check` finds.
+"""Faults planted in the estimators' code, to measure what `estima check` finds.
 
-Three kinds: a wrong entry of a derivative (or of the geometry it stands for), a lost observation,
-an inflated noise. Each has a size. No error is ever scaled.
+There are three kinds: a wrong entry of a derivative (or of the geometry behind it), lost
+observations, and noise that is added or overestimated. Each has a size. No error is ever scaled.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from typing import Any
 from unittest import mock
 
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimators import ekf_icp, ekf_icp_paper, odometry, wheels
-from estimators.base import Belief, Estimator, Prior
+from estimators.base import Estimator, Prior
 from estimators.gaussian import Gaussian
 from estimators.scan_matching import Match, ScanMatcher
 from estimators.stereo import StereoModel
@@ -29,243 +29,189 @@ Planted = Callable[[Estimator, np.random.Generator], AbstractContextManager[Esti
 Fault = Callable[[float], Planted]  # of a size
 
 
-def changed(change: Callable[[Frame, np.random.Generator], Frame]) -> Planted:
-    """Hand the estimator changed Frames."""
+def in_argument_of(
+    method: str,
+) -> Callable[[Callable[[Any, float, np.random.Generator], Any]], Fault]:
+    """Make a fault of a function that changes the first argument of an estimator's method.
 
-    @contextmanager
-    def plant(estimator: Estimator, rng: np.random.Generator) -> Iterator[Estimator]:
-        sound = estimator.step
+    It is called with the sound argument, the fault's size and a generator.
+    """
 
-        def step(frame: Frame) -> Belief:
-            return sound(change(frame, rng))
+    def decorate(change: Callable[[Any, float, np.random.Generator], Any]) -> Fault:
+        def fault(size: float) -> Planted:
+            @contextmanager
+            def plant(estimator: Estimator, rng: np.random.Generator) -> Iterator[Estimator]:
+                sound = getattr(estimator, method)
 
-        with mock.patch.object(estimator, "step", step):
-            yield estimator
+                def faulty(argument: Any, *others: Any) -> Any:
+                    return sound(change(argument, size, rng), *others)
 
-    return plant
+                with mock.patch.object(estimator, method, faulty):
+                    yield estimator
+
+            return plant
+
+        return fault
+
+    return decorate
 
 
-def patched(*patches: tuple[Any, str, Callable[[Any], Any]]) -> Planted:
-    """Put another function in place of an attribute: what `wrap(sound one)` gives."""
+def in_place_of(owner: Any, name: str) -> Callable[[Callable[..., Any]], Fault]:
+    """Make a fault of a function that takes the place of an attribute.
 
-    @contextmanager
-    def plant(estimator: Estimator, rng: np.random.Generator) -> Iterator[Estimator]:
-        with ExitStack() as stack:
-            for owner, name, wrap in patches:
-                stack.enter_context(mock.patch.object(owner, name, wrap(getattr(owner, name))))
-            yield estimator
+    It is called with the sound function, the fault's size and the sound function's arguments.
+    """
 
-    return plant
+    def decorate(wrong: Callable[..., Any]) -> Fault:
+        def fault(size: float) -> Planted:
+            @contextmanager
+            def plant(estimator: Estimator, rng: np.random.Generator) -> Iterator[Estimator]:
+                sound = getattr(owner, name)
+
+                def faulty(*arguments: Any, **keywords: Any) -> Any:
+                    return wrong(sound, size, *arguments, **keywords)
+
+                with mock.patch.object(owner, name, faulty):
+                    yield estimator
+
+            return plant
+
+        return fault
+
+    return decorate
 
 
 def lost(name: str) -> Fault:
-    """Each datum of a sensor goes missing with some chance."""
+    """Each reading of a sensor is dropped with some probability."""
 
-    def fault(share: float) -> Planted:
-        def change(frame: Frame, rng: np.random.Generator) -> Frame:
-            nothing: dict[str, Any] = {name: None}
-            return dataclasses.replace(frame, **nothing) if rng.random() < share else frame
-
-        return changed(change)
+    @in_argument_of("step")
+    def fault(frame: Frame, share: float, rng: np.random.Generator) -> Frame:
+        nothing: dict[str, Any] = {name: None}
+        return dataclasses.replace(frame, **nothing) if rng.random() < share else frame
 
     return fault
 
 
-def lost_landmarks(share: float) -> Planted:
-    """Each observation of a landmark goes missing with some chance."""
-
-    def change(frame: Frame, rng: np.random.Generator) -> Frame:
-        seen = frame.landmarks
-        if seen is None:
-            return frame
-        kept = rng.random(len(seen.points_in_camera)) >= share
-        parts = (seen.points_in_camera, seen.ids, seen.descriptors)
-        left = LandmarkSet(*(None if part is None else part[kept] for part in parts))  # type: ignore[arg-type]
-        return dataclasses.replace(frame, landmarks=left)
-
-    return changed(change)
+@in_argument_of("step")
+def lost_landmarks(frame: Frame, share: float, rng: np.random.Generator) -> Frame:
+    """Each observation of a landmark is dropped with some probability."""
+    seen = frame.landmarks
+    if seen is None:
+        return frame
+    kept = rng.random(len(seen.points_in_camera)) >= share
+    left: dict[str, Any] = {k: None if v is None else v[kept] for k, v in vars(seen).items()}
+    return dataclasses.replace(frame, landmarks=LandmarkSet(**left))
 
 
-def lost_increments(share: float) -> Planted:
-    """Each reading of the wheels goes missing with some chance, and its travel with it."""
-
-    def change(frame: Frame, rng: np.random.Generator) -> Frame:
-        gone = rng.random() < share
-        return dataclasses.replace(frame, wheel_increments_m=np.zeros(2)) if gone else frame
-
-    return changed(change)
+@in_argument_of("step")
+def lost_increments(frame: Frame, share: float, rng: np.random.Generator) -> Frame:
+    """Each reading of the wheels is dropped with some probability, and its travel with it."""
+    gone = rng.random() < share
+    return dataclasses.replace(frame, wheel_increments_m=np.zeros(2)) if gone else frame
 
 
-def noisy_increments(k: float) -> Planted:
-    """Wheel increments with noise of variance k |ds| added."""
-
-    def change(frame: Frame, rng: np.random.Generator) -> Frame:
-        travel = frame.wheel_increments_m
-        noisy = travel + wheel_errors(travel, k, rng)
-        return dataclasses.replace(frame, wheel_increments_m=noisy)
-
-    return changed(change)
+@in_argument_of("step")
+def noisy_increments(frame: Frame, k: float, rng: np.random.Generator) -> Frame:
+    """Noise of variance k |ds| is added to the wheel increments."""
+    travel = frame.wheel_increments_m
+    return dataclasses.replace(frame, wheel_increments_m=travel + wheel_errors(travel, k, rng))
 
 
-def noisy_ranges(sigma_m: float) -> Planted:
-    """Ranges with noise added."""
-
-    def change(frame: Frame, rng: np.random.Generator) -> Frame:
-        if frame.ranges_m is None:
-            return frame
-        noise = sigma_m * rng.standard_normal(frame.ranges_m.shape)
-        return dataclasses.replace(frame, ranges_m=(frame.ranges_m + noise).astype(np.float32))
-
-    return changed(change)
+@in_argument_of("step")
+def noisy_ranges(frame: Frame, sigma_m: float, rng: np.random.Generator) -> Frame:
+    """Noise is added to the ranges."""
+    if frame.ranges_m is None:
+        return frame
+    noise = sigma_m * rng.standard_normal(frame.ranges_m.shape)
+    return dataclasses.replace(frame, ranges_m=(frame.ranges_m + noise).astype(np.float32))
 
 
-def noisy_descriptors(sigma: float) -> Planted:
-    """Place descriptors with noise added, of this length on average."""
-
-    def change(frame: Frame, rng: np.random.Generator) -> Frame:
-        seen = frame.place_descriptor
-        if seen is None:
-            return frame
-        noise = sigma / math.sqrt(len(seen)) * rng.standard_normal(len(seen))
-        return dataclasses.replace(frame, place_descriptor=(seen + noise).astype(np.float32))
-
-    return changed(change)
+@in_argument_of("step")
+def noisy_descriptors(frame: Frame, sigma: float, rng: np.random.Generator) -> Frame:
+    """Noise of this mean length is added to the place descriptors."""
+    seen = frame.place_descriptor
+    if seen is None:
+        return frame
+    noise = sigma / math.sqrt(len(seen)) * rng.standard_normal(len(seen))
+    return dataclasses.replace(frame, place_descriptor=(seen + noise).astype(np.float32))
 
 
-def wrong_track(share: float) -> Planted:
-    """The track in the heading's row of the wheels' matrix is too long."""
-
-    def wrap(sound: Any) -> Any:
-        return lambda travel_m, track_m, form: sound(travel_m, (1.0 + share) * track_m, form)
-
-    return patched((odometry, "relative_motion", wrap))
-
-
-def wrong_mount(offset_m: float) -> Planted:
-    """The laser sits elsewhere on the robot than believed."""
-
-    @contextmanager
-    def plant(estimator: Estimator, rng: np.random.Generator) -> Iterator[Estimator]:
-        sound = estimator.reset
-
-        def reset(prior: Prior, rng: np.random.Generator) -> None:
-            laser = prior.sensors.laser
-            assert laser is not None
-            mount = dataclasses.replace(laser.mount, x_m=laser.mount.x_m + offset_m)
-            laser = dataclasses.replace(laser, mount=mount)
-            sensors = dataclasses.replace(prior.sensors, laser=laser)
-            sound(dataclasses.replace(prior, sensors=sensors), rng)
-
-        with mock.patch.object(estimator, "reset", reset):
-            yield estimator
-
-    return plant
-
-
-def wrong_between(share: float) -> Planted:
-    """The derivative of a relative heading by the robot's own is too large."""
-
-    def wrap(sound: Any) -> Any:
-        def between(first: Array, second: Array) -> tuple[Array, Array, Array]:
-            pose, by_first, by_second = sound(first, second)
-            by_second[2, 2] *= 1.0 + share
-            return pose, by_first, by_second
-
-        return between
-
-    return patched((ekf_icp, "between", wrap))
-
-
-def wrong_observation(share: float) -> Planted:
-    """The velocity's derivative by the heading is too large."""
-
-    def wrap(sound: Any) -> Any:
-        def observation(state: Array) -> tuple[Array, Array]:
-            velocity, H = sound(state)
-            H[:2, 2] *= 1.0 + share
-            return velocity, H
-
-        return observation
-
-    return patched((ekf_icp_paper, "observation", wrap))
-
-
-def wrong_prediction(share: float) -> Planted:
-    """The derivative of a landmark's predicted point by the heading is too large."""
-
-    def wrap(sound: Any) -> Any:
-        def predict(self: StereoModel, pose: Array, landmarks: Array) -> tuple[Array, Array, Array]:
-            points, by_pose, by_landmark = sound(self, pose, landmarks)
-            by_pose = by_pose * [1.0, 1.0, 1.0 + share]
-            return points, by_pose, by_landmark
-
-        return predict
-
-    return patched((StereoModel, "predict", wrap))
-
-
-def wrong_wheels(share: float) -> Planted:
-    """The heading's row of the motion's derivative by the wheels is too large."""
-    scale = np.array([1.0, 1.0, 1.0 + share])
-
-    def wrap(sound: Any) -> Any:
-        def wheel_motion(*arguments: Any) -> tuple[Gaussian, Array]:
-            motion, by_wheels = sound(*arguments)
-            covariance = scale[:, None] * motion.covariance * scale
-            return Gaussian(motion.mean, covariance), scale[:, None] * by_wheels
-
-        return wheel_motion
-
-    return patched((wheels, "wheel_motion", wrap))
-
-
-def wrong_travel(share: float) -> Planted:
+@in_argument_of("step")
+def wrong_travel(frame: Frame, share: float, _: np.random.Generator) -> Frame:
     """The wheels' travel is believed too long, as by a wrong radius."""
-
-    def change(frame: Frame, rng: np.random.Generator) -> Frame:
-        travel = (1.0 + share) * frame.wheel_increments_m
-        return dataclasses.replace(frame, wheel_increments_m=travel)
-
-    return changed(change)
+    travel = (1.0 + share) * frame.wheel_increments_m
+    return dataclasses.replace(frame, wheel_increments_m=travel)
 
 
-def inflated_wheels(share: float) -> Planted:
+@in_argument_of("reset")
+def wrong_mount(prior: Prior, offset_m: float, _: np.random.Generator) -> Prior:
+    """The laser is believed to be mounted further ahead than it is."""
+    laser = prior.sensors.known_laser
+    mount = dataclasses.replace(laser.mount, x_m=laser.mount.x_m + offset_m)
+    laser = dataclasses.replace(laser, mount=mount)
+    return dataclasses.replace(prior, sensors=dataclasses.replace(prior.sensors, laser=laser))
+
+
+@in_place_of(odometry, "relative_motion")
+def wrong_track(sound: Any, share: float, travel_m: Array, track_m: float, form: str) -> Any:
+    """The track in the heading's row of the wheels' matrix is too long."""
+    return sound(travel_m, (1.0 + share) * track_m, form)
+
+
+@in_place_of(ekf_icp, "between")
+def wrong_between(sound: Any, share: float, first: Array, second: Array) -> Any:
+    """The derivative of a relative heading with respect to the robot's own is too large."""
+    pose, by_first, by_second = sound(first, second)
+    by_second[2, 2] *= 1.0 + share
+    return pose, by_first, by_second
+
+
+@in_place_of(ekf_icp_paper, "observation")
+def wrong_observation(sound: Any, share: float, state: Array) -> Any:
+    """The velocity's derivative with respect to the heading is too large."""
+    velocity, H = sound(state)
+    H[:2, 2] *= 1.0 + share
+    return velocity, H
+
+
+@in_place_of(StereoModel, "predict")
+def wrong_prediction(sound: Any, share: float, *arguments: Any) -> Any:
+    """The derivative of a landmark's predicted point with respect to the heading is too large."""
+    points, by_pose, by_landmark = sound(*arguments)
+    return points, by_pose * [1.0, 1.0, 1.0 + share], by_landmark
+
+
+@in_place_of(wheels, "wheel_motion")
+def wrong_wheels(sound: Any, share: float, *arguments: Any) -> tuple[Gaussian, Array]:
+    """The heading's row of the motion's derivative with respect to the wheels is too large."""
+    scale = np.array([1.0, 1.0, 1.0 + share])
+    motion, by_wheels = sound(*arguments)
+    covariance = scale[:, None] * motion.covariance * scale
+    return Gaussian(motion.mean, covariance), scale[:, None] * by_wheels
+
+
+@in_place_of(wheels, "wheel_variances")
+def inflated_wheels(sound: Any, share: float, *arguments: Any) -> Any:
     """The slip of the wheels is believed too large."""
-
-    def wrap(sound: Any) -> Any:
-        return lambda *arguments: (1.0 + share) * sound(*arguments)
-
-    return patched((wheels, "wheel_variances", wrap))
+    return (1.0 + share) * sound(*arguments)
 
 
-def inflated_registration(share: float) -> Planted:
+@in_place_of(ScanMatcher, "match")
+def inflated_registration(sound: Any, share: float, *arguments: Any, **keywords: Any) -> Match:
     """The covariance of registrations is believed too large."""
-
-    def wrap(sound: Any) -> Any:
-        def match(self: ScanMatcher, *arguments: Any, **more: Any) -> Match:
-            found: Match = sound(self, *arguments, **more)
-            motion = Gaussian(found.motion.mean, (1.0 + share) * found.motion.covariance)
-            return dataclasses.replace(found, motion=motion)
-
-        return match
-
-    return patched((ScanMatcher, "match", wrap))
+    found: Match = sound(*arguments, **keywords)
+    motion = Gaussian(found.motion.mean, (1.0 + share) * found.motion.covariance)
+    return dataclasses.replace(found, motion=motion)
 
 
-def inflated_camera(share: float) -> Planted:
+@in_place_of(StereoModel, "of")
+def inflated_camera(sound: Any, share: float, *arguments: Any, **keywords: Any) -> StereoModel:
     """The camera's noise is believed too large."""
-
-    def wrap(sound: Any) -> Any:
-        def of(*arguments: Any, **more: Any) -> StereoModel:
-            model: StereoModel = sound(*arguments, **more)
-            return dataclasses.replace(model, variances_px2=(1.0 + share) * model.variances_px2)
-
-        return of
-
-    return patched((StereoModel, "of", wrap))
+    model: StereoModel = sound(*arguments, **keywords)
+    return dataclasses.replace(model, variances_px2=(1.0 + share) * model.variances_px2)
 
 
-# Each with a size to start the search from.
+# Each fault with the size from which the search for its grade starts.
 FAULTS: dict[str, dict[str, tuple[Fault, float]]] = {
     "odometry": {
         "derivative": (wrong_track, 0.02),
