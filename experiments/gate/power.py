@@ -45,7 +45,9 @@ from experiments.gate.compare import (
     judge,
 )
 from experiments.gate.faults import FAULTS, Fault, Planted
+from experiments.gate.report import LABELS
 from experiments.gate.suite import ERRORS, Suite, read_suite, run_suite, suite_path
+from experiments.report.export import to_markdown
 from experiments.runs.console import progress
 from experiments.runs.paths import SOURCE, results
 from experiments.runs.row import write_frame
@@ -389,32 +391,11 @@ def measured_text(
         "Whole checks of the same code under other conditions, against the tracked baselines "
         "(every estimator reseeded, recordings made anew where the processor's part changes):",
         "",
-        "| condition | tests | equal to rounding | largest change of those | least p of the others "
-        "| alarms |",
-        "| --- | --- | --- | --- | --- | --- |",
-    ]
-    for row in equal:
-        lines.append(
-            f"| {row['variant']} | {row['tests']} | {row['identical']} | "
-            f"{row['largest_change']:.1g} | {row['least_p']:.2g} | {row['alarms']} |"
-        )
-    lines += [
-        "",
+        to_markdown(pd.DataFrame([_condition(row) for row in equal])),
         "**Power** at faults graded to a rise of the position error by 10 %, in whole checks "
-        f"drawn anew ({power['checks'].iloc[0]} each):",
+        f"drawn from the pool ({power['checks'].iloc[0]} each):",
         "",
-        "| estimator | fault | size | position | aligned | heading | found | 95 % found from |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- |",
-    ]
-    for row in power.to_dict("records"):
-        rises = " | ".join(f"{100 * row[f'rise_{error}']:+.1f} %" for error in ERRORS)
-        lines.append(
-            f"| {row['estimator']} | {row['fault']} | {row['size']:.3g} | {rises} | "
-            f"{100 * row['found']:.1f} % ({100 * row['found_low']:.1f} to "
-            f"{100 * row['found_high']:.1f}) | {100 * row['smallest']:.1f} % |"
-        )
-    lines += [
-        "",
+        to_markdown(pd.DataFrame([_fault(row) for row in power.to_dict("records")])),
         "![The worsening that 95 % of checks find, of each estimator and fault](regression.png)",
     ]
     total, n_found = power["checks"].sum(), (power["found"] * power["checks"]).sum()
@@ -426,6 +407,29 @@ def measured_text(
         f"{100 * overall.high:.1f}); {len(power) - len(low)} of {len(power)} faults reach 95 %.",
     ]
     return "\n".join(lines)
+
+
+def _condition(row: dict[str, Any]) -> dict[str, str]:
+    return {
+        "condition": row["variant"],
+        "tests": str(row["tests"]),
+        "equal to rounding": str(row["identical"]),
+        "largest change of those": f"{row['largest_change']:.1g}",
+        "least p of the others": f"{row['least_p']:.2g}",
+        "alarms": str(row["alarms"]),
+    }
+
+
+def _fault(row: dict[str, Any]) -> dict[str, str]:
+    found, low, high = (100 * row[name] for name in ("found", "found_low", "found_high"))
+    return {
+        "estimator": row["estimator"],
+        "fault": row["fault"],
+        "size": f"{row['size']:.3g}",
+        **{LABELS[error]: f"{100 * row[f'rise_{error}']:+.1f} %" for error in ERRORS},
+        "found": f"{found:.1f} % ({low:.1f} to {high:.1f})",
+        "95 % found from": f"{100 * row['smallest']:.1f} %",
+    }
 
 
 def _write_measured(page: Path, text: str) -> None:
