@@ -94,7 +94,7 @@ def test_scans_find_their_place_and_the_maps_meaning():
     ],
 )
 def test_every_run_of_a_study_has_its_name(study, names):
-    runs = dict(zip(names, planned(f"+study=real_logs_{study}".split()), strict=True))
+    runs = dict(zip(names, planned(f"study=real_logs_{study}".split()), strict=True))
     methods = {
         "ICP": IcpOdometry,
         "EKF of": EkfIcp,

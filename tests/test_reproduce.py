@@ -1,13 +1,16 @@
-"""Reproducing: results are replaced as a whole, and what is replaced is told."""
+"""Reproducing: results are replaced as a whole, and what is replaced is said."""
 
 import json
 from types import SimpleNamespace
 
+import numpy as np
 import pandas as pd
 import pytest
 
+from experiments.evaluation.statistics import Interval
+from experiments.evaluation.verdict import Claim, Verdict
 from experiments.papers import reproduce as module
-from experiments.report.claims import Claim, read
+from experiments.report.claims import read_claims
 from experiments.runs.row import write_frame
 from experiments.viewing.style import figure
 from sim.errors import InputError
@@ -16,63 +19,72 @@ PAPER = "gil2008"
 
 
 def study(*, names=("runs", "noise"), fails=False):
-    """A study in small: a table and a figure a name, and one claim."""
+    """The parts of a paper's folder in small: a table and a figure a name, and one claim."""
 
     def run(profile, out, on_progress):
-        tables = {name: pd.DataFrame({"profile": [profile]}) for name in names}
-        for name, table in tables.items():
-            write_frame(table, out / f"{PAPER}_{name}.csv")
+        for name in names:
+            out.write_table(name, pd.DataFrame({"profile": [str(profile)]}))
+            out.write_arrays(name, path=np.zeros((2, 3)))
         on_progress(1.0)
-        return tables
 
-    def figures(tables):
+    def draw(made):
         if fails:
             raise KeyboardInterrupt
-        return {f"{PAPER}_{name}": figure(1.0, 1.0) for name in tables}
+        for name in names:
+            assert made.arrays(name)["path"].shape == (2, 3)
+        return {f"{PAPER}_{name}": figure(1.0, 1.0) for name in names}
 
-    def claims(tables, quick):
-        claim = Claim("GI1", PAPER, "a share", 0.5, 0.4, 0.6, "above 0", "reproduced")
-        return [claim.completed(study=PAPER, command="c", quick=quick)]
+    def judge(made):
+        assert len(made.table("runs")) == 1
+        found = Interval(0.5, 0.4, 0.6)
+        return [Claim("GI1", "a share", found, "above 0", Verdict.REPRODUCED)]
 
-    return SimpleNamespace(run=run, figures=figures, claims=claims)
+    return {
+        "study": SimpleNamespace(run=run),
+        "figures": SimpleNamespace(draw=draw),
+        "claims": SimpleNamespace(judge=judge),
+    }
 
 
 @pytest.fixture
 def results(tmp_path, monkeypatch):
     """A folder with the judged results of a study."""
-    monkeypatch.setattr(module, "RESULTS", tmp_path)
+    monkeypatch.setenv("ESTIMA_RESULTS", str(tmp_path))
     take(monkeypatch, study())
     module.reproduce(full=True, only=PAPER)
     write_frame(pd.DataFrame({"best": [1]}), tmp_path / "tables" / f"{PAPER}_tuning.csv")
     return tmp_path
 
 
-def take(monkeypatch, one):
-    monkeypatch.setattr(module, "_study", lambda paper: one)
+def take(monkeypatch, parts):
+    monkeypatch.setattr(module, "_part", lambda paper, name: parts[name])
 
 
 def state(results):
-    """Every table's and figure's name, the profile in the tables, the verdict, and the origin."""
-    files = {path.name for kind in ("tables", "figures") for path in (results / kind).iterdir()}
+    """Every file's name, the profile in the tables, the verdict and its profile, the origin."""
+    kinds = ("tables", "arrays", "figures")
+    files = {path.name for kind in kinds for path in (results / kind).iterdir()}
     profile = pd.read_csv(results / "tables" / f"{PAPER}_runs.csv")["profile"][0]
-    verdict = read(results / "claims.csv")["verdict"][0]
+    claim = read_claims(results / "claims.csv").iloc[0]
+    verdict = f"{claim['verdict']}, {claim['profile']}"
     made = json.loads((results / "provenance.json").read_text())[PAPER]["profile"]
     return files, profile, verdict, made
 
 
-FULL = {f"{PAPER}_{n}" for n in ("runs.csv", "noise.csv", "runs.png", "noise.png", "tuning.csv")}
+ENDINGS = (".csv", ".npz", ".png")
+FULL = {f"{PAPER}_{n}{e}" for n in ("runs", "noise") for e in ENDINGS} | {f"{PAPER}_tuning.csv"}
 
 
 def test_a_quick_run_replaces_everything_and_says_so(results, monkeypatch, capsys):
-    assert state(results) == (FULL, "full", "reproduced", "full")
+    assert state(results) == (FULL, "full", "reproduced, full", "full")
     capsys.readouterr()
     take(monkeypatch, study(names=("runs",)))
     module.reproduce(only=PAPER)
-    kept = {f"{PAPER}_{name}" for name in ("runs.csv", "runs.png", "tuning.csv")}
-    assert state(results) == (kept, "quick", "reproduced (quick)", "quick")
+    kept = {f"{PAPER}_{name}" for name in ("runs.csv", "runs.npz", "runs.png", "tuning.csv")}
+    assert state(results) == (kept, "quick", "reproduced, quick", "quick")
     assert not list((results / "cache").iterdir())
-    told = "replaces the judged results of gil2008; `git checkout results` brings them back"
-    assert told in capsys.readouterr().err
+    line = "replaces the judged results of gil2008; `git checkout results` brings them back"
+    assert line in capsys.readouterr().err
     module.reproduce(only=PAPER)
     assert "judged" not in capsys.readouterr().err
 
@@ -94,3 +106,18 @@ def test_what_cannot_be_replaced_or_added_to_is_named(results):
     (results / "claims.csv").write_text("id,paper")
     with pytest.raises(InputError, match=r"claims\.csv: the last row is cut off"):
         module.reproduce(only=PAPER)
+
+
+def test_figures_are_drawn_again_from_disk(results, capsys):
+    path = results / "figures" / f"{PAPER}_runs.png"
+    path.unlink()
+    module.redraw(only=PAPER)
+    assert path.exists()
+    (results / "arrays" / f"{PAPER}_runs.npz").write_bytes(b"PK")
+    with pytest.raises(InputError, match=r"gil2008_runs\.npz: damaged .*--paper gil2008"):
+        module.redraw(only=PAPER)
+    (results / "arrays" / f"{PAPER}_runs.npz").unlink()
+    with pytest.raises(InputError, match=r"gil2008_runs\.npz: missing"):
+        module.redraw(only=PAPER)
+    module.redraw(only="maximo2024")
+    assert "maximo2024: left out, no tables" in capsys.readouterr().err

@@ -112,7 +112,7 @@ class Arm:
 
 def arms(study: str) -> list[Arm]:
     """All robots of a study, each with all manoeuvres."""
-    runs = planned([f"+study=puzzlebot2024_{study}"])
+    runs = planned([f"study=puzzlebot2024_{study}"])
     return [
         Arm(seed, robot, {part.choices["route"]: part.route() for part in parts})
         for (seed, robot), parts in itertools.groupby(runs, lambda run: (run.seed, run.robot()))
@@ -153,7 +153,7 @@ def crossover(*overrides: str) -> pd.DataFrame:
     y by heading. The wheels' readings are noisy, so each run gives its own distance.
     """
     rows = []
-    for experiment in planned(["+study=puzzlebot2024_crossover", *overrides]):
+    for experiment in planned(["study=puzzlebot2024_crossover", *overrides]):
         robot = experiment.robot()
         batch = run_batch(robot, experiment.route(), 1, stream(experiment.seed, "slip"))
         believed = dead_reckoning(batch, robot.kr, robot.kl)
@@ -322,7 +322,7 @@ def engine_recordings(*overrides: str) -> Driven:
     """Drive some manoeuvres by PyBullet's robot and by the kinematic one, with the same noise."""
     driven: Driven = {}
     for physics in ("bullet", "kinematic"):
-        study = ["+study=puzzlebot2024_engine", f"simulation.physics={physics}", *overrides]
+        study = ["study=puzzlebot2024_engine", f"simulation.physics={physics}", *overrides]
         cases: dict[str, int] = {}
         for run in planned(study):
             case = run.choices["route"]

@@ -135,7 +135,7 @@ def intel_relations() -> tuple[list[Row], Paths]:
     """The relations metric of our estimates and of the references on the Intel log; and paths."""
     folder = DATA / "intel_lab"
     truth = read_relations(folder / "intel.relations.gz")
-    runs = dict(zip(INTEL, planned(["+study=real_logs_intel"]), strict=True))
+    runs = dict(zip(INTEL, planned(["study=real_logs_intel"]), strict=True))
     by_recording = {run.recording_key: run for run in runs.values()}
     recordings = {key: run.recording() for key, run in by_recording.items()}
     sparse, logged = (recordings[runs[name].recording_key] for name in INTEL[:2])
@@ -162,7 +162,7 @@ def freiburg_relations() -> list[Row]:
     folder = DATA / "fr079_flirt"
     truth = read_relations(folder / "fr079.relations.gz")
     rows: list[Row] = []
-    for name, run in zip(FREIBURG, planned(["+study=real_logs_fr079"]), strict=True):
+    for name, run in zip(FREIBURG, planned(["study=real_logs_fr079"]), strict=True):
         found = tracked(run.estimator(), run.recording())
         rows += _relation_rows("fr079", name, truth, found.stamps, found.means)
     log = carmen.read_carmen(folder / "fr079.flirt.log.gz")
@@ -218,7 +218,7 @@ def landmark_slam(
 ) -> tuple[pd.DataFrame, Paths]:
     """Errors of dead reckoning, FastSLAM and EKF-SLAM against motion capture; and some paths."""
     robots = MRCLAM_ROBOTS[profile]
-    study = "+study=real_logs_mrclam"
+    study = "study=real_logs_mrclam"
     runs = {
         robot: dict(zip(MRCLAM, planned([study, f"recording.robot={robot}"]), strict=True))
         for robot in robots
@@ -327,7 +327,7 @@ def wean_fit(logs: str) -> tuple[pd.DataFrame, dict[str, NDArray[Any]]]:
     grid = wean.read_grid(DATA / "wean_hall_mcl" / "wean.dat.gz")
     rows: list[Row] = []
     drawn: dict[str, NDArray[Any]] = {}
-    studies = planned(["+study=real_logs_wean", f"recording.number={logs}"])
+    studies = planned(["study=real_logs_wean", f"recording.number={logs}"])
     for number, run in zip(logs.split(","), studies, strict=True):
         recording = run.recording()
         laser = recording.sensors.laser
