@@ -170,6 +170,15 @@ def test_a_sweep_resumes_and_keeps_its_rows_apart(folder, capsys):
     assert (folder / "seeds.svg").exists()
 
 
+def test_a_sweep_follows_the_current_folder(folder, monkeypatch):
+    """Workers that joblib keeps from an earlier sweep do not write to its folder."""
+    for name in ("a", "b"):
+        (folder / name).mkdir()
+        monkeypatch.chdir(folder / name)
+        assert len(estima.sweep(*QUICK, "seed=0,1")) == 2
+        assert len(list((folder / name / "results" / "runs").iterdir())) == 1
+
+
 def test_a_failed_run_of_a_sweep_is_a_warning_and_a_row():
     wall = ("route=open_loop", "route.segments=[[0.5,0,20]]")
     with pytest.warns(UserWarning, match="1 of 1 runs"):

@@ -151,6 +151,7 @@ def _launch(runs: Sequence[Experiment], folder: Path, launching: Sequence[str]) 
     text = json.dumps(
         {
             "planner": [platform.node(), os.getpid()],
+            "places": [os.getcwd(), str(paths.results())],
             "jobs": [[[r.config, r.choices] for r in job] for job in jobs],
         }
     )
@@ -217,6 +218,9 @@ def job_application(cfg: DictConfig) -> None:
     """Run one job's share of the plan; a run that fails leaves its row, and the next follows."""
     plan = json.loads(Path(cfg.plan).read_text())
     _end_with(*plan["planner"])
+    if os.getpid() != plan["planner"][1]:  # joblib's workers stay, as they were, for later sweeps
+        folder, os.environ["ESTIMA_RESULTS"] = plan["places"]
+        os.chdir(folder)
     fetch = _LastRecording()
     for config, choices in plan["jobs"][cfg.job]:
         run_and_record(Experiment(config, choices), fetch)
