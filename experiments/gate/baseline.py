@@ -1,9 +1,9 @@
-"""Baselines of a suite: their files, a check against them, and their renewal."""
+"""Baselines of a suite: read, checked against, renewed and written."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -18,20 +18,20 @@ from experiments.runs.version import code_version
 from sim.errors import InputError
 from sim.files import write_whole
 
-_COUNT = re.compile(r"(\d+) rows")  # in a baseline's first line, so that one cut short is known
+_COUNT = re.compile(r"(\d+) rows")  # in a baseline's first line, to recognise one cut short
 _COLUMNS = (*WHICH, "checksum", "fingerprint", *ERRORS, "status")
 
 
 @dataclass(frozen=True)
 class Baseline:
-    """Rows of a baseline and the history written over them: when, which code, which, and why."""
+    """Rows of a baseline, and its history: when, which code, which estimators, and why."""
 
     rows: pd.DataFrame
     history: tuple[str, ...] = ()
 
 
 def baseline_folder() -> Path:
-    """Folder of the main suite's baselines: that of the results, else those that came along."""
+    """Folder of the main suite's baselines: in the results, else in the package."""
     own = results() / "baselines"
     return own if own.exists() else packaged("results/baselines")
 
@@ -42,7 +42,7 @@ def read_baseline(path: Path) -> Baseline:
     Raises
     ------
     InputError
-        If it is not there, or is no baseline.
+        If it is missing or damaged.
     """
     restore = f"restore it, e.g. git checkout -- {path}"
     try:
@@ -65,7 +65,7 @@ def read_baseline(path: Path) -> Baseline:
 
 
 def _damage(text: str, rows: pd.DataFrame) -> str:
-    """What no baseline that was written whole has; nothing if it is sound."""
+    """What is wrong with a baseline; empty if it is sound."""
     for name in _COLUMNS:
         if name not in rows:
             return f"no column {name}"
@@ -103,27 +103,25 @@ def write_baseline(baseline: Baseline, path: Path) -> None:
 def renewed(
     old: Baseline | None,
     rows: pd.DataFrame,
-    estimators: Iterable[str],
+    names: Sequence[str],
     reason: str,
-    known: Iterable[str],
+    known: Sequence[str],
 ) -> Baseline:
-    """Baseline with the rows of these estimators in place of its own, and why in its history.
+    """Replace the rows of these estimators, and add the reason to the history.
 
-    Estimators that the suite no longer knows are dropped.
+    Estimators that the suite no longer has are dropped.
     """
-    names = list(estimators)
     today = datetime.now(UTC).date().isoformat()
     line = f"{today} code {code_version()}: {', '.join(names)}: {' '.join(reason.split())}"
     fresh = rows[rows["estimator"].isin(names)]
     if old is None:
         return Baseline(fresh.reset_index(drop=True), (line,))
-    kept = old.rows[~old.rows["estimator"].isin(names)]
-    kept = kept[kept["estimator"].isin(list(known))]
+    kept = old.rows[old.rows["estimator"].isin(set(known) - set(names))]
     return Baseline(pd.concat([kept, fresh], ignore_index=True), (*old.history, line))
 
 
 def is_main(suite: str) -> bool:
-    """Whether this is the suite of the project's own gate, conf/suite/check.yaml."""
+    """Whether this is the main suite, conf/suite/check.yaml."""
     return suite_path(suite).resolve() == suite_path("check").resolve()
 
 
@@ -135,7 +133,7 @@ def baseline_paths(suite: str, *, own: bool = False) -> dict[str, Path]:
     Parameters
     ----------
     own
-        Where baselines are written; they are read from the package if there are none yet.
+        Where they are written; until then they are read from the package.
     """
     folder = suite_path(suite).with_suffix(".baselines")
     if is_main(suite):
@@ -157,9 +155,9 @@ def check(
     """
     suite = read_suite(suite_path(suite_name)).of(only)
     paths = baseline_paths(suite_name)
-    baselines = {"accepted": read_baseline(paths["accepted"]).rows}
-    if paths["release"].exists():
-        baselines["release"] = read_baseline(paths["release"]).rows
+    if not paths["release"].exists():
+        del paths["release"]
+    baselines = {key: read_baseline(path).rows for key, path in paths.items()}
     rows = run_suite(suite, repeats_of(suite, of_baseline=False), on_progress=on_progress)
     return compare(baselines, rows)
 
@@ -174,10 +172,10 @@ def accept(
 ) -> list[Path]:
     """Run a suite and make it the baseline, with the reason written into the file.
 
-    With `only` the baselines of the other estimators stay.
+    With `only`, the other estimators keep their baselines.
 
-    The release baseline stays pinned, but for estimators that are worse than it: they are what
-    the reason is given for. With `release` the whole of it is pinned again.
+    The release baseline stays pinned, except for estimators that are now worse: they are what the
+    reason is given for. With `release`, all of it is pinned again.
 
     Returns
     -------
@@ -191,11 +189,11 @@ def accept(
     names = [entry.name for entry in suite.estimators]
     known = [entry.name for entry in whole.estimators]
     paths = baseline_paths(suite_name)
-    old = {k: read_baseline(path) if path.exists() else None for k, path in paths.items()}
-    for key, baseline in old.items():
-        if baseline is None and len(names) < len(known):
+    old = {key: read_baseline(path) for key, path in paths.items() if path.exists()}
+    for key, path in paths.items():
+        if key not in old and len(names) < len(known):
             raise InputError(
-                f"{paths[key]}: no baseline yet, and one of {', '.join(names)} alone would not do; "
+                f"{path}: no baseline yet, and one of {', '.join(names)} alone would not do; "
                 "accept the whole suite, without --only"
             )
     rows = run_suite(suite, repeats_of(suite, of_baseline=True), on_progress=on_progress)
@@ -206,37 +204,30 @@ def accept(
             f"{first['estimator']} fails on recording {first['recording']} ({how(first)}); a "
             "baseline of failures guards nothing"
         )
-    changes = {"accepted": names}
-    pinned = old["release"]
-    if release or pinned is None:
-        changes["release"] = names
-    elif worse := _cannot_stay(pinned.rows, rows, names):
-        changes["release"] = worse
+    changes = {"accepted": names, "release": names}
+    if "release" in old and not release:
+        pinned = {"release": old["release"].rows}
+        changes["release"] = [
+            name for name in names if not _holds(pinned, rows[rows["estimator"] == name])
+        ]
     written = []
     for key, path in baseline_paths(suite_name, own=True).items():
-        before, changed = old[key], changes.get(key)
-        if changed is not None:
-            write_baseline(renewed(before, rows, changed, reason, known), path)
-        elif before is not None and path != paths[key]:  # the package's comes along
-            write_baseline(before, path)
+        if changes[key]:
+            write_baseline(renewed(old.get(key), rows, changes[key], reason, known), path)
+        elif path != paths[key]:  # the package's comes along
+            write_baseline(old[key], path)
         else:
             continue
         written.append(path)
     return written
 
 
-def _cannot_stay(pinned: pd.DataFrame, rows: pd.DataFrame, names: Sequence[str]) -> list[str]:
-    """Estimators that are worse than the release, or cannot be compared with it any more."""
-    out = []
-    for name in names:
-        try:
-            found = compare({"release": pinned}, rows[rows["estimator"] == name])
-        except InputError:
-            out.append(name)
-            continue
-        if any(finding.alarms for finding in found):
-            out.append(name)
-    return out
+def _holds(pinned: dict[str, pd.DataFrame], rows: pd.DataFrame) -> bool:
+    """Whether an estimator is comparable with the pinned baseline, and not worse than it."""
+    try:
+        return not any(finding.alarms for finding in compare(pinned, rows))
+    except InputError:
+        return False
 
 
 def repeats_of(suite: Suite, *, of_baseline: bool) -> dict[str, int]:

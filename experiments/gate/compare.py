@@ -1,18 +1,17 @@
 """The regression gate: errors of a suite against a baseline, by paired tests.
 
 A baseline and a check run the same recordings, so d = log(error now) - log(error then), one number
-a recording, holds neither the recordings' difficulty nor their noise. An estimator that draws at
-random has several runs a recording, and d is the difference of their means. Two questions follow:
+per recording, is free of the recordings' difficulty and noise. An estimator that draws at random
+has several runs per recording, and d is the difference of their means. Two questions follow:
 
-1. Is the difference real? Code that differs in its bits alone draws its errors from the same
-   distributions, so runs of then and now can be exchanged within each recording: a permutation
-   test, at 0.002 over all estimators, errors and baselines of a check together (Holm). Where
-   nothing is drawn at random equal code gives equal errors to rounding, and any difference
-   beyond 1e-6 is real.
-2. Is it one for the worse? A change may raise errors on some recordings and lower them on
-   others; so the mean of d must be above zero by a t test over the recordings, at 0.05.
+1. Is the difference real? Equivalent code draws its errors from the same distributions, so runs
+   of then and now can be exchanged within each recording: a permutation test, at 0.002 over all
+   estimators, errors and baselines of a check together (Holm). Where nothing is drawn at random,
+   equivalent code gives equal errors to rounding, and any difference beyond 1e-6 is real.
+2. Is it for the worse? A change may raise errors on some recordings and lower them on others; so
+   the mean of d must be above zero by a t test over the recordings, at 0.05.
 
-`worse` is what answers yes to both, and `better` likewise.
+`worse` means yes to both; `better` likewise, in the other direction.
 """
 
 from __future__ import annotations
@@ -44,7 +43,7 @@ N_DRAWS = 40_000
 _MOST_WAYS = 2**15 - 1  # to exchange a recording's runs; where there are more,
 _DRAWN_WAYS = 4096  # so many are drawn
 _PLAIN = 2.0  # standard deviations
-_LEAST_ERROR = 1e-12  # an error of nothing has no logarithm
+_LEAST_ERROR = 1e-12  # zero has no logarithm
 WHICH = ("estimator", "recording", "repeat")
 
 
@@ -56,26 +55,25 @@ class Finding:
     ----------
     estimator, error, baseline
         Whose, which of ERRORS, and `accepted` or `release`.
-    n_recordings
-        On which both ran to the end.
+    n_recordings, n_suite
+        Recordings on which both ran to the end, and all of the suite's.
     ratio, low, high
-        Geometric mean of now / then over the recordings, with its 90 % t interval: it leaves out
-        1 where a one-sided test at 0.05 tells a direction.
+        Geometric mean of now / then over the recordings, with its 90 % t interval: it excludes 1
+        where a one-sided test at 0.05 finds a direction.
     p_real, p_general
         (worse, better) of either question.
     verdict
-        `identical`: to rounding. `equal`: no difference is shown. `changed`: it is another
-        result, neither worse nor better on the whole. `failed`: runs end that used not to.
+        `identical`: to rounding. `equal`: no difference is shown. `changed`: another result,
+        neither worse nor better on the whole. `failed`: runs fail that did not before.
     message
         What failed.
-    n_suite
-        Recordings of the suite; `n_recordings` may be fewer.
     """
 
     estimator: str
     error: str
     baseline: str
     n_recordings: int
+    n_suite: int
     ratio: float
     low: float
     high: float
@@ -83,11 +81,10 @@ class Finding:
     p_general: tuple[float, float]
     verdict: Verdict
     message: str = ""
-    n_suite: int = 0
 
     @property
     def alarms(self) -> bool:
-        """Whether the check fails by it."""
+        """Whether it fails the check."""
         return self.verdict in ("worse", "failed")
 
 
@@ -105,7 +102,7 @@ def exchange_p(
     sums = _exchanged_sums(runs - runs.mean(axis=1, keepdims=True), n_now, rng)
     seen = float(sums[:, 0].sum())
     spread = math.sqrt(float(sums.var(axis=1).sum()))
-    if abs(seen) <= _PLAIN * spread:  # the normal law tells well enough that there is nothing
+    if abs(seen) <= _PLAIN * spread:  # nothing there: the normal distribution will do
         above = float(stats.norm.sf(seen / spread)) if spread > 0.0 else 1.0
         return above, 1.0 - above if spread > 0.0 else 1.0
     drawn = np.zeros(n_draws)
@@ -118,11 +115,9 @@ def exchange_p(
 
 def _exchanged_sums(runs: Array, n_now: int, rng: np.random.Generator) -> Array:
     """Sums of n_now of each recording's (n, B) runs, (n, ways); the first is of those seen."""
-    sums: Array
     if math.comb(runs.shape[1], n_now) <= _MOST_WAYS:
         picks = np.array(list(itertools.combinations(range(runs.shape[1]), n_now)))
-        sums = runs[:, picks].sum(axis=2)
-        return sums
+        return np.asarray(runs[:, picks].sum(axis=2))
     sums = np.empty((len(runs), _DRAWN_WAYS))
     for row, of_recording in zip(sums, runs, strict=True):
         ways = np.tile(of_recording, (_DRAWN_WAYS, 1))
@@ -142,50 +137,68 @@ def general_p(differences: Array) -> tuple[float, float]:
 
 
 def holm(p_values: Sequence[float], alpha: float) -> list[bool]:
-    """Which hypotheses fall, with the chance of any falling wrongly at most alpha (Holm 1979)."""
+    """Which null hypotheses to reject, with a family-wise error rate of alpha (Holm 1979)."""
     order = sorted(range(len(p_values)), key=lambda i: p_values[i])
-    falls = [False] * len(p_values)
+    rejected = [False] * len(p_values)
     for rank, i in enumerate(order):
         if p_values[i] > alpha / (len(p_values) - rank):
             break
-        falls[i] = True
-    return falls
+        rejected[i] = True
+    return rejected
 
 
-def examine(then: Array, now: Array, rng: np.random.Generator, n_draws: int = N_DRAWS) -> Finding:
-    """Look at one error, (n, B) then and (n, C) now; the verdict is still open.
+def examine(
+    which: tuple[str, str, str],
+    then: Array,
+    now: Array,
+    rng: np.random.Generator,
+    n_draws: int = N_DRAWS,
+    failure: str = "",
+) -> Finding:
+    """Compare one error on the recordings where all runs succeed; the verdict is still open.
 
     It is `identical`, or else `equal` where runs differ by chance, or `changed` where they do not.
+
+    Parameters
+    ----------
+    which
+        Estimator, error, baseline.
+    then, now
+        (n, B) and (n, C) errors, not finite where a run failed.
+    failure
+        How runs fail now that did not then; the verdict is then `failed`.
     """
-    logs_then, logs_now = (np.log(np.maximum(runs, _LEAST_ERROR)) for runs in (then, now))
+    sound = np.isfinite(then).all(axis=1) & np.isfinite(now).all(axis=1)
+    n, n_suite, ones = int(np.sum(sound)), len(then), (1.0, 1.0)
+    if failure or n < 2:
+        message, nan = failure or "no run succeeds", math.nan
+        return Finding(*which, n, n_suite, nan, nan, nan, ones, ones, "failed", message)
+    logs_then, logs_now = (np.log(np.maximum(runs[sound], _LEAST_ERROR)) for runs in (then, now))
     shared = min(then.shape[1], now.shape[1])
     same = np.abs(logs_now[:, :shared] - logs_then[:, :shared]).max() < ROUNDING
     if same:  # by the same draws, as far as both go
         logs_then, logs_now = logs_then[:, :shared], logs_now[:, :shared]
     differences = logs_now.mean(axis=1) - logs_then.mean(axis=1)
-    n, mean = len(differences), float(differences.mean())
+    mean = float(differences.mean())
     half = float(stats.t.ppf(1.0 - ALPHA_GENERAL, n - 1) * differences.std(ddof=1) / math.sqrt(n))
-    ratio, low, high = (math.exp(v) for v in (mean, mean - half, mean + half))
-    verdict: Verdict
-    p_real, p_general = (1.0, 1.0), (1.0, 1.0)
+    ratios = (math.exp(mean), math.exp(mean - half), math.exp(mean + half))
     if same:
-        verdict = "identical"
-    elif then.shape[1] == 1:  # nothing random in it
-        verdict, p_real, p_general = "changed", (0.0, 0.0), general_p(differences)
-    else:
-        verdict = "equal"
-        p_real, p_general = exchange_p(logs_then, logs_now, rng, n_draws), general_p(differences)
-    return Finding("", "", "", n, ratio, low, high, p_real, p_general, verdict)
+        return Finding(*which, n, n_suite, *ratios, ones, ones, "identical")
+    p_general = general_p(differences)
+    if then.shape[1] == 1:  # nothing random in it
+        return Finding(*which, n, n_suite, *ratios, (0.0, 0.0), p_general, "changed")
+    p_real = exchange_p(logs_then, logs_now, rng, n_draws)
+    return Finding(*which, n, n_suite, *ratios, p_real, p_general, "equal")
 
 
 def judge(findings: Sequence[Finding]) -> list[Finding]:
-    """Give the verdicts of a whole check."""
+    """Reach the verdicts of a whole check."""
     judged = list(findings)
-    open_ones = [i for i, f in enumerate(findings) if f.verdict in ("equal", "changed")]
+    undecided = [i for i, f in enumerate(findings) if f.verdict in ("equal", "changed")]
     verdicts: tuple[Verdict, Verdict] = ("worse", "better")
     for side, verdict in enumerate(verdicts):
-        real = holm([findings[i].p_real[side] for i in open_ones], ALPHA_REAL)
-        for i, is_real in zip(open_ones, real, strict=True):
+        real = holm([findings[i].p_real[side] for i in undecided], ALPHA_REAL)
+        for i, is_real in zip(undecided, real, strict=True):
             if is_real and findings[i].p_general[side] <= ALPHA_GENERAL:
                 judged[i] = dataclasses.replace(findings[i], verdict=verdict)
     return judged
@@ -208,51 +221,32 @@ def compare(
             _same_recordings(str(estimator), name, then, now)
             failure = _newly_failing(then, now)
             for error in ERRORS:
-                rng = stream(0, f"exchange/{estimator}/{error}")
-                found = _examined(then, now, error, failure, rng, n_draws)
-                findings.append(
-                    dataclasses.replace(
-                        found,
-                        estimator=str(estimator),
-                        error=error,
-                        baseline=name,
-                        n_suite=now["recording"].nunique(),
-                    )
+                rng, which = (
+                    stream(0, f"exchange/{estimator}/{error}"),
+                    (str(estimator), error, name),
                 )
+                errors = (by_repeat(then, error), by_repeat(now, error))
+                findings.append(examine(which, *errors, rng, n_draws, failure))
     return judge(findings)
 
 
-def _examined(
-    then: pd.DataFrame,
-    now: pd.DataFrame,
-    error: str,
-    failure: str,
-    rng: np.random.Generator,
-    n_draws: int,
-) -> Finding:
-    """One error on the recordings where all runs succeed, then and now."""
-    tables = [t.pivot(index="recording", columns="repeat", values=error) for t in (then, now)]
-    errors_then, errors_now = (table.to_numpy(np.float64) for table in tables)
-    sound = np.isfinite(errors_then).all(axis=1) & np.isfinite(errors_now).all(axis=1)
-    n = int(sound.sum())
-    if failure or n < 2:
-        nan, ones = math.nan, (1.0, 1.0)
-        told = failure or "no run succeeds"
-        return Finding("", "", "", n, nan, nan, nan, ones, ones, "failed", told)
-    return examine(errors_then[sound], errors_now[sound], rng, n_draws)
+def by_repeat(rows: pd.DataFrame, error: str) -> Array:
+    """Errors (n, repeats) of one estimator, in the order of the recordings."""
+    return np.asarray(rows.pivot(index="recording", columns="repeat", values=error), np.float64)
 
 
 def _same_recordings(estimator: str, name: str, then: pd.DataFrame, now: pd.DataFrame) -> None:
     remedy = "; check with --accept REASON to start a new baseline"
     if then.empty:
         raise InputError(f"the {name} baseline does not know {estimator}{remedy}")
-    before = then.drop_duplicates("recording").set_index("recording")
-    after = now.drop_duplicates("recording").set_index("recording")
+    before, after = (
+        rows.drop_duplicates("recording").set_index("recording") for rows in (then, now)
+    )
     if set(before.index) != set(after.index):
         raise InputError(f"the {name} baseline of {estimator} has other recordings{remedy}")
     after = after.loc[before.index]
     away = np.abs(after["fingerprint"] - before["fingerprint"])
-    near = away <= ROUNDING * np.abs(before["fingerprint"])  # NaN is near to nothing
+    near = away <= ROUNDING * np.abs(before["fingerprint"])  # false for NaN
     other = ~near & (after["checksum"] != before["checksum"])
     if other.any():
         raise InputError(
@@ -273,7 +267,7 @@ def how(run: pd.Series) -> str:
 
 
 def _newly_failing(then: pd.DataFrame, now: pd.DataFrame) -> str:
-    """What ends runs now on recordings where none of the baseline's failed; else nothing."""
+    """How runs fail on recordings where none of the baseline's did; empty if none does."""
     bad = now[failed(now)]
     new = bad[~bad["recording"].isin(then.loc[failed(then), "recording"])]
     if new.empty:

@@ -1,4 +1,4 @@
-"""What a check says: to people, to GitHub (annotations, a summary), and as JUnit XML."""
+"""Reports of a check: as text, to GitHub (annotations, a summary), and as JUnit XML."""
 
 from __future__ import annotations
 
@@ -7,21 +7,21 @@ import os
 import sys
 import tempfile
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import pandas as pd
 
 from experiments.gate.baseline import accept, baseline_folder, baseline_paths, check, is_main
-from experiments.gate.compare import Finding, Verdict
-from experiments.gate.suite import ERRORS, printable
+from experiments.gate.compare import Finding
+from experiments.gate.suite import printable
 from experiments.report.export import to_markdown
 from experiments.runs.console import progress
 from sim.errors import InputError
 from sim.files import write_whole
 
 LABELS = {"ate_rmse_m": "position", "ate_aligned_rmse_m": "aligned", "heading_rmse_rad": "heading"}
-_RANK: tuple[Verdict, ...] = ("failed", "worse", "better", "changed", "equal", "identical")
+_RANK = ("failed", "worse", "better", "changed", "equal", "identical")
 _MEANING = {
     "identical": "same errors to rounding",
     "equal": "no difference shown",
@@ -39,42 +39,43 @@ def run_check(
     summary: Path | None = None,
 ) -> bool:
     """Do what `estima check` does; return whether it found a worsening."""
-    if release and reason is None:
+    if reason is not None:
+        with progress("estimators over recordings, share", 1.0) as on_progress:
+            for path in accept(suite, reason, only, release=release, on_progress=on_progress):
+                print(path)
+        return False
+    if release:
         raise InputError("--release goes with --accept REASON")
     on_github = os.environ.get("GITHUB_ACTIONS") == "true"
     page = os.environ.get("GITHUB_STEP_SUMMARY") if on_github else None
-    for path in (junit, summary, Path(page) if page else None):
-        if path is not None and reason is None:
-            _writable(path)
-    found = smallest_found() if is_main(suite) and reason is None else {}
+    for report in (junit, summary, page):
+        if report:
+            _check_writable(Path(report))
+    detectable = smallest_found() if is_main(suite) else {}
     paths = baseline_paths(suite)
-    if reason is None and paths["accepted"].exists() and not paths["release"].exists():
+    if paths["accepted"].exists() and not paths["release"].exists():
         print(
             f"estima: {paths['release']}: no release baseline, so small steps can add "
             "up unseen; pin one with --accept REASON --release",
             file=sys.stderr,
         )
     with progress("estimators over recordings, share", 1.0) as on_progress:
-        if reason is not None:
-            for path in accept(suite, reason, only, release=release, on_progress=on_progress):
-                print(path)
-            return False
         findings = check(suite, only, on_progress)
-    _say(as_text(findings, found))
+    _say(as_text(findings, detectable))
     if junit is not None:
         write_text(as_junit(findings), junit)
     if summary is not None:
-        write_text(as_markdown(findings, found), summary)
+        write_text(as_markdown(findings, detectable), summary)
     if on_github:
         _say(as_annotations(findings))
-        if page:
-            with Path(page).open("a", encoding="utf-8") as file:
-                file.write(as_markdown(findings, found))
+    if page:
+        with Path(page).open("a", encoding="utf-8") as file:
+            file.write(as_markdown(findings, detectable))
     return any(finding.alarms for finding in findings)
 
 
-def _writable(path: Path) -> None:
-    """Tell before a run, and not after it, that a report has no place."""
+def _check_writable(path: Path) -> None:
+    """Refuse before the run, and not after it, a place where no report can be written."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("ab") if path.exists() else tempfile.TemporaryFile(dir=path.parent):
@@ -86,7 +87,7 @@ def _writable(path: Path) -> None:
 
 
 def _say(text: str) -> None:
-    """Print, with ? for letters that the terminal does not have."""
+    """Print, with ? for characters that the terminal cannot show."""
     encoding = sys.stdout.encoding or "utf-8"
     print(text.encode(encoding, "replace").decode(encoding))
 
@@ -113,68 +114,71 @@ def sentence(finding: Finding) -> str:
         return printable(f"{finding.estimator}: {finding.message}")
     if finding.verdict in _MEANING:
         return printable(f"{who}: {_MEANING[finding.verdict]}")
-    side, ends = (0, (finding.low, finding.high))
-    if finding.verdict == "better":
-        side, ends = (1, (finding.high, finding.low))
+    ends = sorted((finding.low, finding.high), key=lambda ratio: abs(ratio - 1.0))
     by, least, most = (abs(100.0 * (ratio - 1.0)) for ratio in (finding.ratio, *ends))
+    p = finding.p_general[("worse", "better").index(finding.verdict)]
     return printable(
         f"{who} {finding.verdict} by {by:.1f} % (90 % interval: {least:.1f} to {most:.1f} %; "
-        f"{finding.n_recordings} recordings, p {finding.p_general[side]:.1g}) than the "
+        f"{finding.n_recordings} recordings, p {p:.1g}) than the "
         f"{finding.baseline} baseline"
     )
 
 
-def as_text(findings: Sequence[Finding], found: Mapping[str, float] | None = None) -> str:
+def as_text(findings: Sequence[Finding], detectable: Mapping[str, float] | None = None) -> str:
     """Tables for a terminal, a line for each finding that counts, and a last line.
 
     Parameters
     ----------
-    found
+    detectable
         What `smallest_found` gives, if the suite is the one it was measured on.
     """
-    lines: list[str] = []
-    for baseline, rows in _tables(findings):
-        heads = " ".join(f"{LABELS[error]:>9}" for error in ERRORS)
-        finds = f"{'finds':>7}  " if found else ""
-        lines += [f"now / {baseline} baseline", f"  {'':<16} {heads}  {finds}verdict"]
-        for estimator, of_error, verdict in rows:
-            ratios = " ".join(f"{_ratio(of_error[error]):>9}" for error in ERRORS)
-            finds = f"{_finds(found, estimator):>7}  " if found else ""
-            lines.append(f"  {estimator:<16} {ratios}  {finds}{verdict}{_share(of_error)}")
-        lines.append("")
-    lines += [sentence(f) for f in _told(findings)]
-    if found:
+    lines = [f"{table.to_string(index=False)}\n" for table in _tables(findings, detectable)]
+    lines += [sentence(finding) for finding in _noteworthy(findings)]
+    if detectable:
         lines.append("finds: the smallest worsening that 95 % of checks find (docs/regression.md)")
     return "\n".join([*lines, last_line(findings)])
 
 
-def as_markdown(findings: Sequence[Finding], found: Mapping[str, float] | None = None) -> str:
+def as_markdown(findings: Sequence[Finding], detectable: Mapping[str, float] | None = None) -> str:
     """Give the same as Markdown, for a pull request's summary."""
     lines = ["## estima check", "", last_line(findings), ""]
-    lines += [*(f"- {sentence(f)}" for f in _told(findings)), ""]
-    for baseline, rows in _tables(findings):
-        table = []
-        for estimator, of_error, verdict in rows:
-            mark = f"**{verdict}**" if verdict in ("worse", "failed") else verdict
-            table.append(
-                {
-                    f"now / {baseline}": estimator,
-                    **{LABELS[error]: _ratio(of_error[error]) for error in ERRORS},
-                    **({"finds": _finds(found, estimator)} if found else {}),
-                    "verdict": mark + _share(of_error),
-                }
-            )
-        lines.append(to_markdown(pd.DataFrame(table)))
+    lines += [*(f"- {sentence(finding)}" for finding in _noteworthy(findings)), ""]
+    for table in _tables(findings, detectable):
+        bold = table["verdict"].str.replace("^(worse|failed)", r"**\1**", regex=True)
+        lines.append(to_markdown(table.assign(verdict=bold)))
     return "\n".join(lines)
+
+
+def _tables(
+    findings: Sequence[Finding], detectable: Mapping[str, float] | None
+) -> Iterator[pd.DataFrame]:
+    """Table of each baseline: the ratios of each estimator's errors, and its gravest verdict."""
+    for baseline in dict.fromkeys(f.baseline for f in findings):
+        rows = []
+        for estimator in dict.fromkeys(f.estimator for f in findings):
+            group = [f for f in findings if (f.baseline, f.estimator) == (baseline, estimator)]
+            row = {f"now / {baseline}": estimator}
+            row |= {LABELS[f.error]: _number(f.ratio, ".3f") for f in group}
+            if detectable:
+                row["finds"] = _number(100.0 * detectable.get(estimator, math.nan), ".1f", " %")
+            row["verdict"] = min((f.verdict for f in group), key=_RANK.index)
+            n, n_suite = min((f.n_recordings, f.n_suite) for f in group)
+            if n < n_suite:
+                row["verdict"] += f" ({n} of {n_suite} recordings)"
+            rows.append(row)
+        yield pd.DataFrame(rows)
+
+
+def _number(value: float, form: str, unit: str = "") -> str:
+    return "-" if math.isnan(value) else f"{value:{form}}{unit}"
 
 
 def as_annotations(findings: Sequence[Finding]) -> str:
     """Give GitHub's workflow commands: an error for each alarm, a notice for each improvement."""
     lines = []
-    for finding in _told(findings):
-        level = "error" if finding.alarms else "notice"
-        text = sentence(finding).replace("%", "%25")
-        lines.append(f"::{level} title=estima check::{text}")
+    for finding in _noteworthy(findings):
+        level, text = "error" if finding.alarms else "notice", sentence(finding)
+        lines.append(f"::{level} title=estima check::{text.replace('%', '%25')}")
     return "\n".join(lines)
 
 
@@ -215,50 +219,20 @@ def write_text(text: str, path: Path) -> None:
 
 def last_line(findings: Sequence[Finding]) -> str:
     """Say how the check ended."""
-    alarmed = list(dict.fromkeys(f.estimator for f in findings if f.alarms))
-    better = list(dict.fromkeys(f.estimator for f in findings if f.verdict == "better"))
-    parts = [f"worse: {', '.join(alarmed)}" if alarmed else "nothing is worse"]
+    alarmed = ", ".join(dict.fromkeys(f.estimator for f in findings if f.alarms))
+    better = ", ".join(dict.fromkeys(f.estimator for f in findings if f.verdict == "better"))
+    parts = [f"worse: {alarmed}" if alarmed else "nothing is worse"]
     if better:
-        parts.append(f"better: {', '.join(better)}")
+        parts.append(f"better: {better}")
     if alarmed:
-        parts.append('if it is meant: check with --accept "REASON"')
+        parts.append('if it is intended: check with --accept "REASON"')
     return "; ".join(parts)
 
 
-def _told(findings: Sequence[Finding]) -> list[Finding]:
-    """Findings worth a line: alarms and improvements; a failure is told once for all baselines."""
-    told, seen = [], set()
-    for finding in findings:
-        key = (finding.estimator, finding.message)
-        if finding.verdict in ("worse", "better") or (finding.alarms and key not in seen):
-            told.append(finding)
-            seen.add(key)
-    return told
-
-
-def _tables(
-    findings: Sequence[Finding],
-) -> list[tuple[str, list[tuple[str, dict[str, Finding], Verdict]]]]:
-    tables = []
-    for baseline in dict.fromkeys(f.baseline for f in findings):
-        rows = []
-        for estimator in dict.fromkeys(f.estimator for f in findings):
-            group = [f for f in findings if (f.baseline, f.estimator) == (baseline, estimator)]
-            verdict = min((f.verdict for f in group), key=_RANK.index)
-            rows.append((estimator, {f.error: f for f in group}, verdict))
-        tables.append((baseline, rows))
-    return tables
-
-
-def _ratio(finding: Finding) -> str:
-    return "-" if math.isnan(finding.ratio) else f"{finding.ratio:.3f}"
-
-
-def _share(of_error: Mapping[str, Finding]) -> str:
-    """How many recordings were compared, where it is not all of them."""
-    n, n_suite = min((f.n_recordings, f.n_suite) for f in of_error.values())
-    return f" ({n} of {n_suite} recordings)" if n < n_suite else ""
-
-
-def _finds(found: Mapping[str, float], estimator: str) -> str:
-    return f"{100.0 * found[estimator]:.1f} %" if estimator in found else "-"
+def _noteworthy(findings: Sequence[Finding]) -> list[Finding]:
+    """Findings worth a line: alarms and improvements; one failure counts once for all baselines."""
+    chosen: dict[tuple[object, ...], Finding] = {}
+    for f in findings:
+        if f.verdict in ("worse", "better", "failed"):
+            chosen.setdefault((f.estimator, f.message or (f.error, f.baseline)), f)
+    return list(chosen.values())

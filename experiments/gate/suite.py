@@ -9,9 +9,10 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -61,7 +62,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Suite:
-    """Groups of recordings and the estimators that read them.
+    """Groups of recordings, and the estimators that read them.
 
     Attributes
     ----------
@@ -70,7 +71,7 @@ class Suite:
     counts, overrides
         Of each group: how many recordings, and the Hydra overrides that make them.
     estimators
-        In the order in which they are told.
+        In the order of the file.
     """
 
     first_seed: int
@@ -78,9 +79,10 @@ class Suite:
     overrides: Mapping[str, tuple[str, ...]]
     estimators: tuple[Entry, ...] = field(default_factory=tuple)
 
-    def resized(self, counts: Mapping[str, int]) -> Suite:
-        """The same suite with other numbers of recordings."""
-        return dataclasses.replace(self, counts={**self.counts, **counts})
+    def cut(self, share: float) -> Suite:
+        """Return the same suite with this share of its recordings."""
+        counts = {group: round(share * n) for group, n in self.counts.items()}
+        return dataclasses.replace(self, counts=counts)
 
     def of(self, names: Sequence[str]) -> Suite:
         """Return the same suite with these estimators only; with all if none is named."""
@@ -104,17 +106,17 @@ def read_suite(path: Path) -> Suite:
         If the file cannot be read, or a key is missing, unknown or of the wrong kind.
     """
     try:
-        told = yaml.safe_load(path.read_text())
+        content = yaml.safe_load(path.read_text())
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         line = str(error).splitlines()[0]
         raise InputError(f"{path}: cannot read this suite ({line})") from error
     try:
-        groups = told["recordings"]
+        groups = content["recordings"]
         suite = Suite(
-            told["first_seed"],
+            content["first_seed"],
             {name: group["count"] for name, group in groups.items()},
             {name: _overrides(group["overrides"]) for name, group in groups.items()},
-            tuple(_entry(name, given) for name, given in told["estimators"].items()),
+            tuple(_entry(name, given) for name, given in content["estimators"].items()),
         )
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise InputError(
@@ -188,34 +190,32 @@ def run_suite(
     reseed
         Number of the seeding of the estimators' streams.
     planted
-        Faults planted in estimators, by name: a context that gives the faulty one.
+        Faults planted in estimators, by name: a context that yields the faulty one.
     on_progress
         Called with the share of the recordings done.
 
     Returns
     -------
     pandas.DataFrame
-        Besides: `checksum`, the first digits of the recording's, `fingerprint`, a number that
-        rounding hardly moves, and `status`, `ok` or the exception that ended the run.
+        Also: `checksum`, the first digits of the recording's; `fingerprint`, a number that
+        rounding hardly moves; and `status`, `ok` or the exception that ended the run.
     """
     from joblib import Parallel, delayed
 
     jobs = []
     for group, count in suite.counts.items():
-        entries = [e for e in suite.estimators if e.recordings == group and e.name in repeats]
-        if not entries:
-            continue
-        experiments = [_experiment(suite, entry, repeats) for entry in entries]
-        for seed in range(suite.first_seed, suite.first_seed + count):
-            runs = [
-                (entry, experiment, (planted or {}).get(entry.name))
-                for entry, experiment in zip(entries, experiments, strict=True)
-            ]
-            jobs.append((seed, runs, reseed))
-    done: Iterable[list[dict[str, Any]]] = Parallel(n_jobs=n_jobs, return_as="generator")(
+        runs = [
+            (entry, _experiment(suite, entry, repeats), (planted or {}).get(entry.name))
+            for entry in suite.estimators
+            if entry.recordings == group and entry.name in repeats
+        ]
+        if runs:
+            seeds = range(suite.first_seed, suite.first_seed + count)
+            jobs += [(seed, runs, reseed) for seed in seeds]
+    rows: list[dict[str, Any]] = []
+    done = Parallel(n_jobs=n_jobs, return_as="generator")(
         delayed(_run_recording)(*job) for job in jobs
     )
-    rows: list[dict[str, Any]] = []
     for i, part in enumerate(done, start=1):
         rows.extend(part)
         if on_progress is not None:
@@ -234,24 +234,21 @@ def _run_recording(
 ) -> list[dict[str, Any]]:
     """Rows of all runs over one recording."""
     rows = []
-    recording: Recording | None = None
+    recording = runs[0][1].replaced(seed=seed, world_seed=seed).recording()
+    origin = {"checksum": recording.checksum[:12], "fingerprint": fingerprint(recording)}
     for entry, experiment, planted in runs:
-        experiment = experiment.replaced(seed=seed, world_seed=seed)
-        if recording is None:
-            recording = experiment.recording()
-            origin = {"checksum": recording.checksum[:12], "fingerprint": fingerprint(recording)}
         for row in evaluate(
-            experiment,
+            experiment.replaced(seed=seed, world_seed=seed),
             recording,
-            streams=_streams(f"estimator/{entry.name}", seed, reseed),
+            streams=partial(_stream, f"estimator/{entry.name}", seed, reseed),
             planted=None if planted is None else _plant(planted, seed, reseed),
         ):
             prefix = "revised_" if entry.revised else ""
             if entry.revised and row["status"] == Outcome.OK and "revised_ate_rmse_m" not in row:
                 raise InputError(f"{entry.name} has no finish; drop `revised` from the suite")
             status = "ok"
-            collided = row["status_code"] == "recording"  # not the estimator's business
-            if row["status"] == Outcome.FAILED and not collided:
+            # a collision is no fault of the estimator
+            if row["status"] == Outcome.FAILED and row["status_code"] != "recording":
                 status = printable(f"{row['status_code']}: {row['status_detail']}")
             which = {"estimator": entry.name, "recording": seed, "repeat": row["repeat"]}
             errors = {name: row.get(prefix + name, math.nan) for name in ERRORS}
@@ -259,37 +256,35 @@ def _run_recording(
     return rows
 
 
-def _streams(axis: str, seed: int, reseed: int) -> Callable[[int], np.random.Generator]:
-    return lambda repeat: stream(seed, axis, repeat + _RESEEDED * reseed)
+def _stream(axis: str, seed: int, reseed: int, repeat: int) -> np.random.Generator:
+    return stream(seed, axis, repeat + _RESEEDED * reseed)
 
 
 def _plant(
     planted: Planted, seed: int, reseed: int
 ) -> Callable[[Estimator, int], AbstractContextManager[Estimator]]:
-    streams = _streams("fault", seed, reseed)
-    return lambda estimator, repeat: planted(estimator, streams(repeat))
+    return lambda estimator, repeat: planted(estimator, _stream("fault", seed, reseed, repeat))
 
 
 def printable(text: str) -> str:
-    """One line of text without what XML 1.0 forbids, and what would steer a terminal."""
+    """Replace by ? what XML 1.0 forbids and what would control a terminal."""
     return _UNPRINTABLE.sub("?", text)
 
 
 def fingerprint(recording: Recording) -> float:
-    """A weighted mean over all that was measured, and the true poses.
+    """Sum of weighted means over all that was measured, and over the true positions.
 
-    Machines whose last bits differ make recordings whose checksums differ; their fingerprints
-    agree to a millionth all the same, and those of other recordings do not.
+    Machines that differ in the last bits make recordings with different checksums, but with
+    fingerprints that agree to a millionth; those of different recordings do not.
     """
-    logs: list[Any] = [recording.wheels.position_m]
-    if recording.laser is not None:
-        logs.append(recording.laser.ranges_m)
-    if recording.landmarks is not None:
-        logs.append(recording.landmarks.points_in_camera)
-    if recording.places is not None:
-        logs.append(recording.places.descriptors)
-    if recording.clouds is not None:
-        logs.append(recording.clouds.ranges_m)
+    parts = (
+        (recording.wheels, "position_m"),
+        (recording.laser, "ranges_m"),
+        (recording.landmarks, "points_in_camera"),
+        (recording.places, "descriptors"),
+        (recording.clouds, "ranges_m"),
+    )
+    logs = [getattr(log, name) for log, name in parts if log is not None]
     if recording.truth is not None:
         logs.append(recording.truth.poses[:, :2])
     total = 0.0
