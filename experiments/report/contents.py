@@ -25,7 +25,7 @@ PAPERS = ("puzzlebot2024", "decristoforis2020", "gil2008", "maximo2024")
 OWN = {
     "leaderboard": ["estima run -m study=leaderboard"],
     "all_estimators": ["estima run -m study=all_estimators"],
-    "mcl_office": ["estima reproduce --paper mcl_office"],
+    "mcl_office": ["estima reproduce --paper mcl_office --full"],
 }
 SMALL_ROWS, SMALL_COLUMNS = 60, 20  # a table up to here is shown whole
 FIRST_ROWS = 5  # of a larger one
