@@ -123,16 +123,16 @@ def record(
     logs: _Logs = defaultdict(list)
     with contextlib.ExitStack() as stack:
         body: Body
-        caster: _ExactRays | _BulletRays
+        caster: ExactRays | BulletRays
         if physics == "bullet":
             from sim.bullet import BulletBody
 
             bullet = stack.enter_context(BulletBody(world, robot, pose))
             body, find_trouble = bullet, lambda: bullet.trouble
-            caster = _BulletRays(bullet) if rays == "bullet" else _ExactRays(world, sensors.laser)
+            caster = BulletRays(bullet) if rays == "bullet" else ExactRays(world, sensors.laser)
         else:
             body = KinematicBody(robot, pose)
-            caster = _ExactRays(world, sensors.laser)
+            caster = ExactRays(world, sensors.laser)
             find_trouble = lambda: "collision" if overlaps(world, robot, body.pose) else None  # noqa: E731
         probes = _probes(world, sensors, caster, streams["sensors"])
         status = _drive(
@@ -142,7 +142,7 @@ def record(
 
 
 def _probes(
-    world: World, sensors: SensorSuite, rays: _ExactRays | _BulletRays, rng: np.random.Generator
+    world: World, sensors: SensorSuite, rays: ExactRays | BulletRays, rng: np.random.Generator
 ) -> dict[str, Callable[[Array], Any]]:
     """What each sensor measures, as a function of the robot's pose."""
     laser, stereo, lidar = sensors.laser, sensors.stereo, sensors.lidar3d
@@ -150,7 +150,7 @@ def _probes(
     if laser:
         probes["laser"] = lambda pose: laser.measure(rays.scan(laser, pose), rng)
     if stereo:
-        probes["stereo"] = partial(_Landmarks(world, stereo, rng).observe, rays)
+        probes["stereo"] = partial(LandmarkEye(world, stereo, rng).observe, rays)
     if lidar:
         probes["lidar3d"] = lambda pose: lidar.measure(rays.cloud(lidar, pose), rng)
     return probes
@@ -227,7 +227,7 @@ def overlaps(world: World, robot: DifferentialDrive, pose: Array) -> bool:
     return bool(np.any(hit))
 
 
-class _ExactRays:
+class ExactRays:
     """The caster of `sim.casting`, imported only where it is used: it needs a compiler."""
 
     def __init__(self, world: World, laser: Laser | None) -> None:
@@ -238,26 +238,30 @@ class _ExactRays:
             self._caster = SegmentCaster(world, laser)
 
     def scan(self, laser: Laser, pose: Array) -> Array:
+        """Ranges (beams,) m of a laser on the robot at a pose (3,); inf without a return."""
         return self._caster.cast(sensor_pose(laser, pose))
 
     def cloud(self, lidar: Lidar3D, pose: Array) -> Array:
+        """Ranges (rings, azimuths) m of a lidar on the robot at a pose (3,)."""
         from sim.casting import cast_lidar
 
         return cast_lidar(self._world, lidar, sensor_pose(lidar, pose))
 
     def sees(self, origin: Array, points: Array) -> NDArray[np.bool_]:
+        """Whether nothing stands between a point (3,) and each of others (K, 3)."""
         from sim.casting import visible
 
         return visible(self._world, origin, points)
 
 
-class _BulletRays:
+class BulletRays:
     """The physics engine's rays."""
 
     def __init__(self, bullet: Any) -> None:
         self._bullet = bullet
 
     def scan(self, laser: Laser, pose: Array) -> Array:
+        """Ranges (beams,) m of a laser on the robot at a pose (3,); inf without a return."""
         planar = sensor_pose(laser, pose)
         angles = planar[2] + laser.bearings_rad
         starts = np.tile([planar[0], planar[1], laser.mount.z_m], (laser.n_beams, 1))
@@ -265,6 +269,7 @@ class _BulletRays:
         return self._ranges(starts, way, laser.max_range_m, ground=False)
 
     def cloud(self, lidar: Lidar3D, pose: Array) -> Array:
+        """Ranges (rings, azimuths) m of a lidar on the robot at a pose (3,)."""
         planar = sensor_pose(lidar, pose)
         elevation = np.repeat(lidar.elevations_rad, lidar.n_azimuths)
         azimuth = np.tile(planar[2] + lidar.azimuths_rad, lidar.n_rings)
@@ -275,6 +280,7 @@ class _BulletRays:
         return ranges.reshape(lidar.n_rings, lidar.n_azimuths)
 
     def sees(self, origin: Array, points: Array) -> NDArray[np.bool_]:
+        """Whether nothing stands between a point (3,) and each of others (K, 3)."""
         if len(points) == 0:
             return np.zeros(0, bool)
         distance = np.linalg.norm(points - origin, axis=1)
@@ -310,7 +316,7 @@ def points_in_camera(camera: StereoCamera, pose: Array, points_in_world: Array) 
     return np.stack([-left, -offset[:, 2], forward], axis=-1)
 
 
-class _Landmarks:
+class LandmarkEye:
     """The stereo camera's view of the world's landmarks."""
 
     def __init__(self, world: World, camera: StereoCamera, rng: np.random.Generator) -> None:
@@ -322,7 +328,7 @@ class _Landmarks:
         self._first_view_rad = np.full(len(world.landmarks), np.nan)
 
     def observe(
-        self, rays: _ExactRays | _BulletRays, pose: Array
+        self, rays: ExactRays | BulletRays, pose: Array
     ) -> tuple[Array, NDArray[np.int64], NDArray[np.float32]]:
         """Points in the camera frame (K, 3), true ids (K,), descriptors (K, D)."""
         camera, landmarks = self._camera, self._world.landmarks

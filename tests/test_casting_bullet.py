@@ -11,7 +11,7 @@ from experiments.runs.experiment import make
 from sim.bullet import BulletBody
 from sim.robot import DifferentialDrive
 from sim.sensors import Laser, Lidar3D, Mount
-from sim.simulate import _BulletRays, _ExactRays
+from sim.simulate import BulletRays, ExactRays
 
 pytestmark = pytest.mark.bullet
 
@@ -45,8 +45,8 @@ def both(request):
     world = make(config, "world", rng=np.random.default_rng(7))
     robot = DifferentialDrive(wheel_radius_m=0.05, track_m=0.3)
     with BulletBody(world, robot, world.start_pose) as body:
-        larger = _ExactRays(stretched(world), LASER)
-        yield world, _ExactRays(world, LASER), larger, _BulletRays(body)
+        larger = ExactRays(stretched(world), LASER)
+        yield world, ExactRays(world, LASER), larger, BulletRays(body)
 
 
 def poses_on_tour(world, count):

@@ -21,7 +21,7 @@ from sim.errors import InputError
 from sim.recording import LandmarkLog, Recording, WheelLog
 from sim.robot import wheel_errors
 from sim.sensors import StereoCamera, suite_from_config
-from sim.simulate import _ExactRays, _Landmarks
+from sim.simulate import ExactRays, LandmarkEye
 from sim.world import World
 
 Array = NDArray[np.float64]
@@ -82,8 +82,8 @@ def whole(config: Config) -> Recording:
     camera = dataclasses.replace(
         camera, max_distance_m=max(FARTHEST_M, camera.max_distance_m), max_observations=0
     )
-    eye = _Landmarks(world, camera, rng)
-    rays: Any = _ExactRays(world, None) if scene.occluded else _NoWalls()
+    eye = LandmarkEye(world, camera, rng)
+    rays: Any = ExactRays(world, None) if scene.occluded else _NoWalls()
     stamps = driven.known_landmarks.stamps
     images = [eye.observe(rays, pose) for pose in driven.truth_at(stamps)]
     points, ids, descriptors = (list(part) for part in zip(*images, strict=True))
