@@ -16,7 +16,7 @@ from sim.bullet import BulletBody
 from sim.robot import DifferentialDrive
 from sim.route import OpenLoop
 from sim.sensors import Encoder, Laser, SensorSuite
-from sim.simulate import _BulletRays, record
+from sim.simulate import BulletRays, record
 
 SIMULATED_S = 60.0
 ROBOT = DifferentialDrive(0.05, 0.19, kr=1e-5, kl=1e-5)
@@ -55,5 +55,5 @@ def _bullet_scan_s(n_boxes: int) -> float:
     laser = Laser(n_beams=721)
     start = np.asarray(poses[0], float)
     with BulletBody(world, ROBOT, start) as body:
-        rays = _BulletRays(body)
+        rays = BulletRays(body)
         return median_time_s(lambda pose: rays.scan(laser, pose), [(p,) for p in poses[:50]])
