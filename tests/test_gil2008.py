@@ -158,6 +158,7 @@ def test_revisited_ground_is_where_the_robot_was_long_before():
     assert scores.revisited_slope(poses, growing) == pytest.approx(0.01, rel=0.01)
 
 
+@pytest.mark.slow
 def test_plans_are_within_their_means(monkeypatch):
     composed = functools.cache(lambda *lines: list(planned(lines)))
     monkeypatch.setattr(study, "planned", lambda lines: composed(*lines))

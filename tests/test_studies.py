@@ -22,14 +22,23 @@ def shortened(experiment):
     return experiment.replaced(route=route, estimator=estimator, repeats=1)
 
 
+def runs_of(name, folder):
+    """One run of a study for each of its estimators."""
+    given = [f"data={own_places(folder)}"] if name == "maximo2024_own" else []
+    runs = list(planned([f"study={name}", *given]))
+    return list({run.estimator_name: run for run in reversed(runs)}.values())
+
+
+@pytest.mark.parametrize("name", STUDIES)
+def test_each_study_fits_together(name, tmp_path):
+    for experiment in runs_of(name, tmp_path):
+        experiment.check()
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("name", STUDIES)
 def test_each_study_runs(name, tmp_path):
-    given = []
-    if name == "maximo2024_own":
-        given = [f"data={own_places(tmp_path)}"]
-    runs = list(planned([f"study={name}", *given]))
-    by_estimator = {run.estimator_name: run for run in reversed(runs)}
-    for experiment in by_estimator.values():
+    for experiment in runs_of(name, tmp_path):
         rows = evaluate(shortened(experiment))
         assert [row["status_detail"] for row in rows if row["status"] == Outcome.FAILED] == []
 
