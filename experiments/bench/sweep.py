@@ -42,7 +42,7 @@ def run() -> list[Measurement]:
 def _overheads() -> list[Measurement]:
     experiment = Experiment.compose([*_SHORT, f"name={_NAME}", "picture=false"])
     recording = experiment.recording()
-    run_and_record(experiment, lambda _: recording)
+    run_and_record(experiment, {experiment.recording_key: recording})
     prior, estimator = experiment.prior(recording), experiment.estimator()
     own_s = median_time_s(lambda: run_estimator(estimator, recording, prior, stream(0, "bench")))
 

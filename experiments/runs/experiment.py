@@ -1,4 +1,4 @@
-"""One resolved configuration, and the objects it names. Nothing else reads configuration keys."""
+"""A resolved configuration and the objects it names. Nothing else reads configuration keys."""
 
 from __future__ import annotations
 
@@ -64,26 +64,10 @@ class Experiment:
     own_estimator: Estimator | None = None
 
     @classmethod
-    def compose(cls, overrides: Sequence[str] = (), config_dir: Path | None = None) -> Experiment:
-        """Compose an experiment from Hydra's overrides, such as `world=office seed=3`.
-
-        Parameters
-        ----------
-        overrides
-            `group=option` and `key=value`.
-        config_dir
-            A further folder of options.
-        """
-        lines = list(overrides)
-        if config_dir is not None:
-            folder = paths.quoted(f"file://{config_dir.resolve()}")
-            lines.append(f"hydra.searchpath=[{folder}]")
+    def compose(cls, overrides: Sequence[str] = ()) -> Experiment:
+        """Compose an experiment from Hydra's overrides, such as `world=office seed=3`."""
         with initialize_config_dir(str(paths.CONF), version_base="1.3"):
-            cfg = compose("config", overrides=lines, return_hydra_config=True)
-        chosen = cfg.hydra.runtime.choices
-        OmegaConf.set_struct(cfg, False)
-        del cfg["hydra"]
-        return cls.resolved(cfg, {group: str(chosen.get(group)) for group in GROUPS})
+            return cls.resolved(*composed(overrides))
 
     @classmethod
     def resolved(cls, cfg: DictConfig, choices: Mapping[str, str]) -> Experiment:
@@ -94,14 +78,14 @@ class Experiment:
         if isinstance(simulation, dict) and simulation.get("rays") is None:
             kinematic = simulation.get("physics") == "kinematic"  # it has no engine to cast rays
             simulation["rays"] = "exact" if kinematic else "bullet"
-        return cls(config, choices)
+        return cls(config, {group: str(choices.get(group)) for group in GROUPS})
 
     def replaced(self, **values: Any) -> Experiment:
         """Return the experiment with other values of top-level keys, such as `seed=3`."""
         return dataclasses.replace(self, config={**self.config, **values})
 
     def using(self, estimator: Estimator) -> Experiment:
-        """Return the experiment with an estimator that is no option of the configuration."""
+        """Return the experiment with an estimator that is not an option of the configuration."""
         kind = type(estimator)
         return dataclasses.replace(
             self.replaced(estimator={"class": f"{kind.__module__}.{kind.__qualname__}"}),
@@ -110,7 +94,7 @@ class Experiment:
         )
 
     def over(self, recording: Recording) -> Experiment:
-        """Return the experiment over a recording in memory, which is known by its checksum."""
+        """Return the experiment over a recording in memory, identified by its checksum."""
         self._compare_slip(recording)
         return self.replaced(recording={"checksum": recording.checksum})
 
@@ -176,13 +160,13 @@ class Experiment:
         return key_of(self._recording_settings())
 
     def labels(self, checksum: str) -> Row:
-        """What a row says of its origin: choices, every key, versions, the recording's checksum."""
-        kept = {k: v for k, v in self.config.items() if k not in ("keep", "picture")}
+        """Columns that state a row's origin: choices, all keys, versions, recording's checksum."""
+        settings = {k: v for k, v in self.config.items() if k not in ("keep", "picture")}
         brought = ("world", "sensors", "route") if self.config["recording"] is not None else ()
         choices = {f"choice.{g}": name for g, name in self.choices.items() if g not in brought}
         return {
             **choices,
-            **_flat(kept),
+            **_flat(settings),
             "repeat": 0,
             "run_key": self.key,
             "code_version": self._code_version(),
@@ -195,7 +179,7 @@ class Experiment:
     # What it names
 
     def check(self) -> None:
-        """Find what is wrong or does not fit together, before any time is spent.
+        """Find what is wrong or does not fit together, before any run.
 
         Raises
         ------
@@ -230,11 +214,12 @@ class Experiment:
             raise InputError("simulation.rays=bullet needs the engine; set simulation.rays=exact")
 
     def _check_needs(self) -> None:
-        """Check that the estimator gets the sensors and the map it cannot do without."""
-        settings, method = self.config["estimator"], self.own_estimator
-        needs = getattr(method or find(settings.get("_target_"), "estimator"), "needs", ())
+        """Check that the estimator gets the sensors and the map that it needs."""
+        settings = self.config["estimator"]
+        estimator = self.own_estimator or find(settings.get("_target_"), "estimator")
+        needs = getattr(estimator, "needs", ())
+        simulated = self.config["recording"] is None
         for need, (sensor, presets) in _SENSORS.items():
-            simulated = self.config["recording"] is None
             if need in needs and simulated and self.config["sensors"].get(sensor) is None:
                 raise InputError(
                     f"estimator={self.estimator_name} needs a {sensor} sensor, and "
@@ -323,7 +308,7 @@ class Experiment:
     def _compare_slip(self, recording: Recording) -> None:
         """Warn if kr or kl are not those that the recording was made with."""
         made_with, believed = recording.config.get("robot"), self.config["robot"]
-        if not isinstance(made_with, dict):
+        if not isinstance(made_with, dict):  # of a log of many robots, the number of one
             return
         for key in ("kr", "kl"):
             asked = key in made_with and key in self.config["estimator"]
@@ -349,18 +334,17 @@ class Experiment:
     def prior(self, recording: Recording) -> Prior:
         """Return what the estimator knows at the start."""
         settings = self.config["prior"]
-        believed = {key: settings[key] for key in ("wheel_radius_m", "track_m")}
-        given = {key: value for key, value in believed.items() if value is not None}
-        robot = build(RobotGeometry, dataclasses.asdict(recording.robot) | given, "prior")
+        geometry = dataclasses.asdict(recording.robot)
+        geometry |= {key: settings[key] for key in geometry if settings[key] is not None}
+        robot = build(RobotGeometry, geometry, "prior")
         known_map = self._map(recording)
         if settings["start"] == "global":
             return Prior(robot, recording.sensors, map=known_map)
         if settings["start"] != "tracking":
             raise InputError(f"prior.start must be tracking or global, got {settings['start']!r}")
         for key in ("sigma_position_m", "sigma_heading_rad"):
-            value = settings[key]
-            if not (isinstance(value, (int, float)) and 0.0 <= value < np.inf):
-                raise InputError(f"prior.{key} must be zero or positive, got {value}")
+            if not (isinstance(settings[key], (int, float)) and 0.0 <= settings[key] < np.inf):
+                raise InputError(f"prior.{key} must be zero or positive, got {settings[key]}")
         sigma = np.array([settings["sigma_position_m"]] * 2 + [settings["sigma_heading_rad"]])
         start = np.zeros(3)
         if recording.truth is not None:
@@ -379,10 +363,18 @@ class Experiment:
             raise InputError(
                 f"prior.map must be none, world or a mapping with _target_, got {wanted!r}"
             )
-        world = recording.truth.world if recording.truth else None
-        if world is None:
+        if recording.world is None:
             raise InputError("prior.map=world, but the recording has no map; set prior.map=none")
-        return world
+        return recording.world
+
+
+def composed(overrides: Sequence[str]) -> tuple[DictConfig, Mapping[str, str]]:
+    """Have Hydra, once initialized, compose a configuration; also give the options it chose."""
+    cfg = compose("config", overrides=list(overrides), return_hydra_config=True)
+    choices = cfg.hydra.runtime.choices
+    OmegaConf.set_struct(cfg, False)
+    del cfg["hydra"]
+    return cfg, choices
 
 
 def files_digest(tree: Any) -> dict[str, str]:

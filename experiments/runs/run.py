@@ -1,4 +1,4 @@
-"""The Hydra application: one configuration to its rows, in results/runs/NAME/KEY.parquet."""
+"""The Hydra application: a configuration's rows, in results/runs/NAME/KEY.parquet."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import sys
 import traceback
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from statistics import fmean
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
@@ -16,7 +17,7 @@ from experiments.runs import paths
 from experiments.runs.columns import COLUMNS
 from experiments.runs.console import RunFailedError, end, progress
 from experiments.runs.evaluate import evaluate
-from experiments.runs.experiment import GROUPS, Experiment
+from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome, Row, write_rows
 from sim.errors import InputError
 from sim.recording import Recording
@@ -56,8 +57,7 @@ def run_once(experiment: Experiment, draw: Draw) -> list[Row]:
             on_error=lambda error: traceback.print_exception(error),
         )
     write_rows(rows, path)
-    pictures = [folder / "run.png"] if (folder / "run.png").exists() else []
-    _print(rows, [path, *pictures])
+    _print(rows, [file for file in (path, folder / "run.png") if file.exists()])
     for row in rows:
         if row["status"] == Outcome.FAILED:
             raise RunFailedError(f"{row['status_code']}: {row['status_detail']}")
@@ -68,9 +68,8 @@ def application(arguments: Sequence[str], draw: Draw) -> None:
     """Run one configuration by a command line's arguments; sweeps are those of `sweeps.launch`."""
 
     def run(cfg: DictConfig) -> None:
-        chosen = HydraConfig.get().runtime.choices
         try:
-            run_once(Experiment.resolved(cfg, {g: str(chosen.get(g)) for g in GROUPS}), draw)
+            run_once(Experiment.resolved(cfg, HydraConfig.get().runtime.choices), draw)
         except (InputError, RunFailedError) as error:
             end(error)  # here, since Hydra would add a line of its own
 
@@ -95,7 +94,7 @@ def _print(rows: Sequence[Row], files: Sequence[Path]) -> None:
     for name in _SHOWN:
         values = [float(v) for row in rows if isinstance(v := row.get(name), (int, float))]
         if values:
-            mean = sum(values) / len(values)
-            print(f"  {COLUMNS[name].label:<30} {mean:10.4g} {COLUMNS[name].unit}")
+            column, mean = COLUMNS[name], fmean(values)
+            print(f"  {column.label:<30} {mean:10.4g} {column.unit}")
     for path in files:
         print(f"  {paths.short(path)}")

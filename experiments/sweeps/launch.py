@@ -1,7 +1,7 @@
-"""Many runs: leave out what is done, start the rest by Hydra's launcher.
+"""Many runs: skip what is done, and start the rest with Hydra's launcher.
 
-The runs are composed once, here, and packed into jobs; each job reads its share of the plan. So a
-run costs no composition of its own in the workers, and any of Hydra's launchers will do.
+The runs are composed once, here, and packed into jobs; each job reads its share of the plan. So
+workers compose nothing, and any of Hydra's launchers will do.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import hydra
@@ -54,7 +55,7 @@ def sweep_arguments(arguments: Sequence[str]) -> None:
 
 
 def sweep(arguments: Sequence[str], config_dir: str | None = None) -> None:
-    """Run all combinations of the swept values; those that are done already are left out.
+    """Run all combinations of the swept values, except those already done.
 
     Parameters
     ----------
@@ -81,25 +82,20 @@ def sweep(arguments: Sequence[str], config_dir: str | None = None) -> None:
         raise InputError("name is the folder of all the rows; a sweep has one, not several")
     folder = folders.pop()
     runs = list({run.key: run for run in every}.values())
-    missing = [run for run in runs if not is_done(folder, run.key)]
+    missing = [run for run in runs if _failure(folder, run.key) is not None]
     print(
         f"{len(runs)} runs, {len(runs) - len(missing)} of them done before: {paths.short(folder)}",
         file=sys.stderr,
     )
     if missing:
         _launch_all(missing, folder, launching)
-    bad = [status for run in runs if (status := _status(folder, run.key)) is not None]
+    bad = [failure for run in runs if (failure := _failure(folder, run.key)) is not None]
     if bad:
         raise RunFailedError(f"{len(bad)} of {len(runs)} runs; first: {bad[0]}")
 
 
-def is_done(folder: Path, key: str) -> bool:
-    """Whether the run has rows, and none of them tells of a failure."""
-    return (folder / f"{key}.parquet").exists() and _status(folder, key) is None
-
-
-def _status(folder: Path, key: str) -> str | None:
-    """Return how a run failed; None if it did not."""
+def _failure(folder: Path, key: str) -> str | None:
+    """Return how a run failed, or that it has no rows yet; None if it is done."""
     path = folder / f"{key}.parquet"
     if not path.exists():
         return "no row was written"
@@ -109,24 +105,24 @@ def _status(folder: Path, key: str) -> str | None:
         return str(error)
     if not {"status", "run_key"} <= set(rows) or (rows["run_key"] != key).any():
         return f"{path} holds other rows; delete it and run again"
-    failures = rows[rows["status"] == Outcome.FAILED]
-    for _, row in failures.iterrows():
-        return f"{row['status_code']}: {row['status_detail']}"
-    return None
+    failed = rows[rows["status"] == Outcome.FAILED]
+    if failed.empty:
+        return None
+    return f"{failed['status_code'].iloc[0]}: {failed['status_detail'].iloc[0]}"
 
 
 def _launch_all(runs: Sequence[Experiment], folder: Path, launching: Sequence[str]) -> None:
-    """Start the runs; those at which a worker died are told apart, and the rest goes on."""
+    """Start the runs; find those at which a worker died, and go on with the rest."""
     for run in runs:  # rows of an earlier failure, and files that are no rows
         path = folder / f"{run.key}.parquet"
         if path.is_dir():
             raise InputError(f"{path}: a folder in place of a table; remove it")
-        if path.exists() and not is_done(folder, run.key):
+        if _failure(folder, run.key) is not None:
             path.unlink(missing_ok=True)
         path.with_suffix(".failed").unlink(missing_ok=True)
         _begun(folder, run.key).unlink(missing_ok=True)
     _clear_plans(folder)
-    with _Watch(folder, [run.key for run in runs]):
+    with _watched(folder, {run.key for run in runs}):
         left = list(runs)
         while left:
             died = _launch(left, folder, launching)
@@ -148,15 +144,13 @@ def _launch(runs: Sequence[Experiment], folder: Path, launching: Sequence[str]) 
 
     jobs = packed(runs, _JOBS_PER_WORKER * (os.cpu_count() or 1))
     plan = folder / f"plan-{os.getpid()}-{secrets.token_hex(3)}.json"
-    text = json.dumps(
-        {
-            "planner": [platform.node(), os.getpid()],
-            "places": [os.getcwd(), str(paths.results())],
-            "jobs": [[[r.config, r.choices] for r in job] for job in jobs],
-        }
-    )
+    content = {
+        "planner": [platform.node(), os.getpid()],
+        "places": [os.getcwd(), str(paths.results())],
+        "jobs": [[[r.config, r.choices] for r in job] for job in jobs],
+    }
     with write_whole(plan) as part:
-        part.write_text(text)
+        part.write_text(json.dumps(content))
     arguments = sys.argv
     sys.argv = [
         "estima run",
@@ -172,27 +166,30 @@ def _launch(runs: Sequence[Experiment], folder: Path, launching: Sequence[str]) 
         return died
     finally:
         sys.argv = arguments
-        plan.unlink(missing_ok=True)
-        shutil.rmtree(f"{plan}.jobs", ignore_errors=True)
+        _remove(plan)
     return None
 
 
+def _remove(plan: Path) -> None:
+    plan.unlink(missing_ok=True)
+    shutil.rmtree(f"{plan}.jobs", ignore_errors=True)
+
+
 def _clear_plans(folder: Path) -> None:
-    """Remove what sweeps of this machine left that were killed."""
+    """Remove the plans of sweeps on this machine that were killed."""
     for plan in folder.glob("plan-*.json"):
         try:
             node, planner = json.loads(plan.read_text())["planner"]
             if node == platform.node():
                 os.kill(planner, 0)  # is it there?
         except ProcessLookupError:
-            plan.unlink(missing_ok=True)
-            shutil.rmtree(f"{plan}.jobs", ignore_errors=True)
+            _remove(plan)
         except (OSError, ValueError, KeyError, TypeError):
             continue
 
 
 def _begun(folder: Path, key: str) -> Path:
-    """Mark of a run that is being computed."""
+    """File that marks a run as being computed."""
     return folder / f"{key}.begun"
 
 
@@ -221,13 +218,13 @@ def job_application(cfg: DictConfig) -> None:
     if os.getpid() != plan["planner"][1]:  # joblib's workers stay, as they were, for later sweeps
         folder, os.environ["ESTIMA_RESULTS"] = plan["places"]
         os.chdir(folder)
-    fetch = _LastRecording()
+    held: dict[str, Recording] = {}
     for config, choices in plan["jobs"][cfg.job]:
-        run_and_record(Experiment(config, choices), fetch)
+        run_and_record(Experiment(config, choices), held)
 
 
 def _end_with(node: str, planner: int) -> None:
-    """End this process when the planner is killed, if it is the planner that started it."""
+    """End this process when the planner is killed, if the planner started it."""
     if platform.node() != node or os.getppid() != planner or os.getpid() == planner:
         return
 
@@ -240,8 +237,14 @@ def _end_with(node: str, planner: int) -> None:
         threading.Thread(target=watch, name="planner", daemon=True).start()
 
 
-def run_and_record(experiment: Experiment, fetch: Callable[[Experiment], Recording]) -> None:
-    """Run one experiment; what goes wrong becomes the status of its row."""
+def run_and_record(experiment: Experiment, held: dict[str, Recording]) -> None:
+    """Run one experiment; what goes wrong becomes the status of its row.
+
+    Parameters
+    ----------
+    held
+        The last recording by its key; most runs of a job share it.
+    """
     key = experiment.key
     path = experiment.rows_folder / f"{key}.parquet"
     mark = _begun(path.parent, key)
@@ -249,7 +252,10 @@ def run_and_record(experiment: Experiment, fetch: Callable[[Experiment], Recordi
         part.touch()
     try:
         experiment.check()
-        rows = evaluate(experiment, fetch(experiment))
+        if experiment.recording_key not in held:
+            held.clear()
+            held[experiment.recording_key] = experiment.recording()
+        rows = evaluate(experiment, held[experiment.recording_key])
         write_rows(rows, path)
         if any(row["status"] == Outcome.FAILED for row in rows):  # for those who watch
             path.with_suffix(".failed").touch()
@@ -270,41 +276,26 @@ def _record_failure(experiment: Experiment, status: Status) -> None:
     path.with_suffix(".failed").touch()
 
 
-class _LastRecording:
-    """Keeps the last recording: the runs of a job mostly share it."""
-
-    def __init__(self) -> None:
-        self._key = ""
-        self._recording: Recording | None = None
-
-    def __call__(self, experiment: Experiment) -> Recording:
-        key = experiment.recording_key
-        if self._recording is None or key != self._key:
-            self._recording, self._key = experiment.recording(), key
-        return self._recording
-
-
-class _Watch:
+@contextmanager
+def _watched(folder: Path, keys: set[str]) -> Iterator[None]:
     """Show how many runs are done and failed, at what rate, and the time that remains."""
+    ended = threading.Event()
 
-    def __init__(self, folder: Path, keys: Sequence[str]) -> None:
-        self._folder, self._keys, self._over = folder, set(keys), threading.Event()
-        self._thread = threading.Thread(target=self._watch, daemon=True)
+    def count(suffix: str) -> int:
+        return len({path.stem for path in folder.glob(f"*.{suffix}")} & keys)
 
-    def __enter__(self) -> None:
-        self._thread.start()
-
-    def __exit__(self, *_: object) -> None:
-        self._over.set()
-        self._thread.join()
-
-    def _watch(self) -> None:
-        with progress("", len(self._keys), "runs", summary=True) as on_progress:
+    def watch() -> None:
+        with progress("", len(keys), "runs", summary=True) as on_progress:
             over = False
             while not over:
-                over = self._over.wait(0.5)
-                if done := self._count("parquet"):
-                    on_progress(done, self._count("failed"))
+                over = ended.wait(0.5)
+                if done := count("parquet"):
+                    on_progress(done, count("failed"))
 
-    def _count(self, suffix: str) -> int:
-        return len({path.stem for path in self._folder.glob(f"*.{suffix}")} & self._keys)
+    thread = threading.Thread(target=watch, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()

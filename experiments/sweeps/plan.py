@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from hydra import compose, initialize_config_dir
@@ -13,7 +13,7 @@ from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from experiments.runs import paths
-from experiments.runs.experiment import GROUPS, Experiment
+from experiments.runs.experiment import Experiment, composed
 from sim.errors import InputError
 
 
@@ -58,7 +58,7 @@ class _Composer:
 
     def __init__(self, config_dir: str | None) -> None:
         self._is_group: dict[str, bool] = {}
-        self._bases: dict[tuple[str, ...], tuple[DictConfig, dict[str, str]]] = {}
+        self._bases: dict[tuple[str, ...], tuple[DictConfig, Mapping[str, str]]] = {}
         self.extra: list[str] = []
         if config_dir is not None:
             folder = paths.quoted(f"file://{Path(config_dir).resolve()}")
@@ -70,11 +70,7 @@ class _Composer:
         plain = [o for o in parsed if self._is_plain(o)]
         options = tuple(o.input_line or "" for o in parsed if not self._is_plain(o))
         if options not in self._bases:
-            cfg = compose("config", overrides=[*self.extra, *options], return_hydra_config=True)
-            choices = {g: str(cfg.hydra.runtime.choices.get(g)) for g in GROUPS}
-            OmegaConf.set_struct(cfg, False)
-            del cfg["hydra"]
-            self._bases[options] = (cfg, choices)
+            self._bases[options] = composed([*self.extra, *options])
         base, choices = self._bases[options]
         cfg = base.copy()
         OmegaConf.set_struct(cfg, True)
@@ -99,7 +95,7 @@ class _Composer:
 
 
 def _has(cfg: DictConfig, key: str) -> bool:
-    """Whether the configuration has the key, be its value missing yet."""
+    """Whether the configuration has the key, even if its value is still missing."""
     parent, _, leaf = key.rpartition(".")
     node = OmegaConf.select(cfg, parent) if parent else cfg
     if isinstance(node, ListConfig):
@@ -113,12 +109,10 @@ def packed(runs: Sequence[Experiment], n_jobs: int) -> list[list[Experiment]]:
     for run in runs:
         groups.setdefault(run.recording_key, []).append(run)
     size = max(1, -(-len(runs) // n_jobs))
-    jobs: list[list[Experiment]] = []
+    jobs: list[list[Experiment]] = [[]]
     for group in groups.values():
-        for low in range(0, len(group), size):
-            part = group[low : low + size]
-            if jobs and len(jobs[-1]) + len(part) <= size:
-                jobs[-1].extend(part)
-            else:
-                jobs.append(list(part))
+        for part in (group[low : low + size] for low in range(0, len(group), size)):
+            if jobs[-1] and len(jobs[-1]) + len(part) > size:
+                jobs.append([])
+            jobs[-1] += part
     return jobs

@@ -8,7 +8,7 @@ from sim.recording import Recording
 
 
 def describe(recording: Recording) -> str:
-    """Lines that tell what a recording holds."""
+    """Describe what a recording holds, in lines of text."""
     logs = {
         "wheels": recording.wheels,
         "laser": recording.laser,
@@ -32,8 +32,7 @@ def describe(recording: Recording) -> str:
             seen = 100 * np.isfinite(ranges_m).mean() if ranges_m.size else 0.0
             lines.append(f"            {ranges_m.shape[1]} beams, {seen:.1f} % of them in range")
         if log is recording.landmarks:
-            log = recording.landmarks
-            mean = len(log.points_in_camera) / max(len(log.stamps), 1)
+            mean = len(recording.landmarks.points_in_camera) / max(len(log.stamps), 1)
             lines.append(f"            {mean:.1f} landmarks an image")
     truth = recording.truth
     if truth is None:

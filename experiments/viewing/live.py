@@ -1,7 +1,7 @@
 """A run in PyBullet's window: the true robot among its walls, and the estimate beside it.
 
-The engine ends its process when it cannot open a window. So a display is asked for first, and the
-window belongs to a process of its own, whose end is told in a line.
+The engine ends its process when it cannot open a window. So a display is looked for first, and the
+window gets a process of its own; if that fails, one line says so.
 """
 
 from __future__ import annotations
@@ -23,9 +23,10 @@ Array = NDArray[np.float64]
 FPS = 20
 _REMEDY = "save the run instead: add -o run.html, run.gif or run.mp4"
 _HEIGHT_M = 0.1  # of the robots
-_CUT_M = 0.4  # height from which walls are not shown
-_TRAIL_EVERY = 5  # pictures a piece
-_SCAN_EVERY = 3
+_CUT_M = 0.4  # walls are shown up to this height
+_TRAIL_EVERY = 5  # pictures
+_SCAN_EVERY = 3  # pictures
+_UNKNOWN = np.full(3, np.nan)
 _BLACK, _BLUE, _RED = (0.1, 0.1, 0.1), (0.0, 0.45, 0.7), (0.84, 0.37, 0.0)
 
 
@@ -41,7 +42,7 @@ def watch(run: Run, seconds: float | None = None) -> None:
     Parameters
     ----------
     seconds
-        How long the whole run is to take; None: as long as it took.
+        How long the whole run is to take; None: real time.
 
     Raises
     ------
@@ -59,7 +60,7 @@ def watch(run: Run, seconds: float | None = None) -> None:
 def _window(run: Run, seconds: float | None) -> None:
     """Body of the window's process: play once, then wait for the window to be closed."""
     with open(os.devnull, "w") as sink:
-        os.dup2(sink.fileno(), 1)  # the engine tells of its threads and of OpenGL
+        os.dup2(sink.fileno(), 1)  # the engine prints about its threads and OpenGL
     from sim import bullet
 
     engine: Any = vars(bullet)["pybullet"]
@@ -72,10 +73,10 @@ def _window(run: Run, seconds: float | None) -> None:
             engine.stepSimulation()
             time.sleep(0.05)
     except KeyboardInterrupt:
-        sys.exit(0)  # told by the process that waits
+        sys.exit(0)  # the process that waits reports it
     except engine.error:
         if engine.isConnected(client):
-            raise  # else the window was closed, which is how one ends it
+            raise  # else the window was closed, as it should be
 
 
 def _play(engine: Any, run: Run, seconds: float | None) -> None:
@@ -83,19 +84,19 @@ def _play(engine: Any, run: Run, seconds: float | None) -> None:
     engine.configureDebugVisualizer(engine.COV_ENABLE_GUI, 0)
     recording = run.recording
     stamps = recording.frame_stamps[run.rows]
-    world = recording.truth.world if recording.truth else None
-    if world is not None and len(world.walls):
-        _build_walls(engine, world)
-    known = recording.truth is not None
-    truth = recording.truth_at(stamps) if known else np.full((len(stamps), 3), np.nan)
+    if recording.world is not None and len(recording.world.walls):
+        _build_walls(engine, recording.world)
+    truth = run.truth_at(stamps)
     _aim(engine, run, truth)
     radius = max(recording.robot.track_m / 2.0, 0.1)
-    bodies = {"truth": _body(engine, radius, _BLACK, 1.0)} if known else {}
+    bodies = {}
+    if recording.truth is not None:
+        bodies["truth"] = _body(engine, radius, _BLACK, 1.0)
     if run.estimate is not None:
         bodies["estimate"] = _body(engine, 1.1 * radius, _BLUE, 0.5)
     colours = {"truth": _BLACK, "estimate": _BLUE}
     trails: dict[str, Array] = {}
-    scan = -1
+    replaced: dict[str, int] = {}  # the scan drawn last, once there is one
     speed = 1.0 if seconds is None else max(stamps[-1] - stamps[0], 1e-9) / seconds
     begun = time.monotonic()
     for i, stamp in enumerate(stamps):
@@ -105,8 +106,8 @@ def _play(engine: Any, run: Run, seconds: float | None) -> None:
         if run.estimate is not None and belief >= 0:
             poses["estimate"] = run.estimate.means[belief]
         for name, body in bodies.items():
-            pose = poses.get(name)
-            if pose is None or not np.isfinite(pose).all():
+            pose = poses.get(name, _UNKNOWN)
+            if not np.isfinite(pose).all():
                 continue
             turned = engine.getQuaternionFromEuler([0, 0, float(pose[2])])
             engine.resetBasePositionAndOrientation(body, [*pose[:2], _HEIGHT_M / 2], turned)
@@ -117,28 +118,25 @@ def _play(engine: Any, run: Run, seconds: float | None) -> None:
         points = scan_points(run, float(stamp))[::3] if i % _SCAN_EVERY == 0 else np.zeros((0, 2))
         if len(points):
             raised = np.column_stack([points, np.full(len(points), 0.2)]).tolist()
-            replaced = {"replaceItemUniqueId": scan} if scan >= 0 else {}
             scan = engine.addUserDebugPoints(raised, [_RED] * len(points), 3, **replaced)
-        engine.stepSimulation()  # lets the window take part
+            replaced = {"replaceItemUniqueId": scan}
+        engine.stepSimulation()  # lets the window respond
 
 
 def _aim(engine: Any, run: Run, truth: Array) -> None:
-    """Look at the whole way from above."""
-    ways = [truth[:, :2]]
-    if run.estimate is not None:
-        ways.append(run.estimate.means[:, :2])
-    way = np.concatenate(ways)
+    """Look at the whole path from above."""
+    means = truth if run.estimate is None else run.estimate.means
+    way = np.concatenate([truth[:, :2], means[:, :2]])
     way = way[np.isfinite(way).all(axis=1)]
     if not len(way):
         raise InputError("this log has no truth to show; name an estimator with --estimate")
     low, high = way.min(axis=0), way.max(axis=0)
-    middle = [*((low + high) / 2.0), 0.0]
     reach = 1.2 * float(np.hypot(*(high - low))) + 2.0
-    engine.resetDebugVisualizerCamera(reach, 0, -65, middle)
+    engine.resetDebugVisualizerCamera(reach, 0, -65, [*((low + high) / 2.0), 0.0])
 
 
 def _build_walls(engine: Any, world: World) -> None:
-    """All walls as one mesh that is only seen, from both of its sides; cut low, to look over."""
+    """All walls as one mesh for show, visible from both sides; cut low, to see over them."""
     (x1, y1, x2, y2), (low, high) = world.walls.T, np.minimum(world.wall_z_m.T, _CUT_M)
     corners = [(x1, y1, low), (x2, y2, low), (x2, y2, high), (x1, y1, high)]
     vertices = np.stack([np.stack(corner, axis=-1) for corner in corners], axis=1)
@@ -154,7 +152,7 @@ def _build_walls(engine: Any, world: World) -> None:
 
 
 def _body(engine: Any, radius_m: float, colour: tuple[float, float, float], alpha: float) -> int:
-    """A disc with a nose that shows where it heads."""
+    """A disc with a nose that shows its heading."""
     disc = engine.createVisualShape(
         engine.GEOM_CYLINDER, radius=radius_m, length=_HEIGHT_M, rgbaColor=[*colour, alpha]
     )

@@ -5,19 +5,18 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 from numpy.typing import NDArray
 
 from estimators.base import Estimate
+from experiments.evaluation.metrics import CHI2_95_2DOF
 from experiments.viewing.style import ESTIMATE, TRUTH, figure
 from experiments.viewing.world import draw_world
 from sim import se2
 from sim.recording import Recording
 
 Array = NDArray[np.float64]
-CHI2_95_2DOF = 5.991464547107979
 
 
 def covariance_ellipse(mean: Array, covariance: Array, **style: object) -> Ellipse:
@@ -32,39 +31,32 @@ def run_figure(recording: Recording, estimate: Estimate, name: str) -> Figure:
     """Map with both trajectories and 95 % ellipses; errors against time."""
     page = figure(9.0, 4.6)
     halves: Any = page.subfigures(1, 2, width_ratios=(1.1, 1.0))
-    left, right = halves
-    map_axes = left.subplots()
-    world = recording.truth.world if recording.truth else None
-    if world is not None:
-        draw_world(map_axes, world, landmarks=recording.landmarks is not None)
-    known = recording.truth is not None
-    if known:
+    map_axes = halves[0].subplots()
+    if recording.world is not None:
+        draw_world(map_axes, recording.world, landmarks=recording.landmarks is not None)
+    if recording.truth is not None:
         truth = recording.truth_at(estimate.stamps)
-        map_axes.plot(truth[:, 0], truth[:, 1], color=TRUTH, lw=1.6, label="truth")
-    means = estimate.means
-    map_axes.plot(means[:, 0], means[:, 1], color=ESTIMATE, lw=1.2, ls="--", label=name)
+        map_axes.plot(*truth[:, :2].T, color=TRUTH, lw=1.6, label="truth")
+        _draw_errors(halves[1].subplots(3, 1, sharex=True), estimate, truth)
+    means, style = estimate.means, {"fill": False, "edgecolor": ESTIMATE, "lw": 0.8}
+    map_axes.plot(*means[:, :2].T, color=ESTIMATE, lw=1.2, ls="--", label=name)
     for i in np.linspace(0, len(means) - 1, 12).astype(int)[1:]:
-        ellipse = covariance_ellipse(means[i], estimate.covariances[i, :2, :2])
-        ellipse.set(facecolor="none", edgecolor=ESTIMATE, linewidth=0.8)
-        map_axes.add_patch(ellipse)
+        map_axes.add_patch(covariance_ellipse(means[i], estimate.covariances[i, :2, :2], **style))
     map_axes.set(xlabel="x, m", ylabel="y, m", aspect="equal")
     map_axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2)
-    if known:
-        _draw_errors(right.subplots(3, 1, sharex=True), estimate, truth)
     return page
 
 
 def _draw_errors(axes: Array, estimate: Estimate, truth: Array) -> None:
-    """Draw errors along x, y and heading, with the band in which 95 % of them should lie."""
+    """Draw the errors of x, y and heading, with the band that should hold 95 % of them."""
     error = estimate.means - truth
     error[:, 2] = se2.wrap(error[:, 2])
-    units = (("x error, m", 1.0), ("y error, m", 1.0), ("heading error, deg", np.degrees(1.0)))
-    for i, (label, unit) in enumerate(units):
-        ax: Axes = axes[i]
+    units = {"x error, m": 1.0, "y error, m": 1.0, "heading error, deg": np.degrees(1.0)}
+    for i, (ax, (label, unit)) in enumerate(zip(axes, units.items(), strict=True)):
         band = 1.96 * unit * np.sqrt(np.maximum(estimate.covariances[:, i, i], 0.0))
         ax.fill_between(estimate.stamps, -band, band, color=ESTIMATE, alpha=0.2, lw=0)
         ax.plot(estimate.stamps, unit * error[:, i], color=ESTIMATE, lw=1.0)
         ax.axhline(0.0, color=TRUTH, lw=0.6)
         ax.set_ylabel(label)
-    axes[0].set_title("error, and the band the belief gives 95 %", fontsize="medium")
+    axes[0].set_title("error, and the belief's 95 % band", fontsize="medium")
     axes[-1].set_xlabel("time, s")

@@ -1,4 +1,4 @@
-"""How all figures look: size, fonts, and colours that colour-blind people can tell apart."""
+"""The style of all figures: size, fonts, and colours that colour-blind people can distinguish."""
 
 from __future__ import annotations
 
@@ -30,16 +30,15 @@ _SETTINGS: dict[str, Any] = {
 
 
 def figure(width_in: float, height_in: float) -> Figure:
-    """Empty page with the house style and a layout that keeps its parts apart."""
-    for key, value in _SETTINGS.items():
-        mpl.rcParams[key] = value  # type: ignore[index]
+    """Empty page with the house style and a layout in which nothing overlaps."""
+    mpl.rcParams.update(_SETTINGS)  # type: ignore[arg-type]
     page = Figure(figsize=(width_in, height_in), layout="constrained")
     FigureCanvasAgg(page)
     return page
 
 
 def save_figure(page: Figure, path: Path) -> None:
-    """Write a figure whole, as the path's suffix says; the bytes do not depend on the date."""
+    """Write a figure whole, in the format of the path's suffix; its bytes carry no date."""
     if path.suffix not in _SUFFIXES:
         raise InputError(f"{path}: a picture is {', '.join(_SUFFIXES)}")
     metadata = {"Software": None} if path.suffix == ".png" else {"Date": None}

@@ -1,6 +1,6 @@
-"""A run as a moving picture: what is shown at each instant, and files of it.
+"""A run as an animation: what is shown at each instant, and files of it.
 
-The same `Run` is drawn to a file here (MP4, GIF, HTML) and in a window by `viewing.live`.
+The same `Run` is drawn to a file here (MP4, GIF, HTML), and in a window by `viewing.live`.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from estimators.base import Belief, Estimate, Estimator
 from estimators.base import run as run_estimator
+from experiments.evaluation.metrics import CHI2_95_2DOF
 from experiments.runs.experiment import Experiment
 from experiments.runs.seeds import stream
 from experiments.viewing.style import ESTIMATE, GREEN, ORANGE, RED, SKY, TRUTH, figure
@@ -39,22 +40,21 @@ SECONDS = 20.0
 _EXTRAS = ("particles", "landmarks", "landmark_covariances")
 _MOST_PARTICLES = 1000  # drawn, of any number
 _GROUND_M = 0.3  # cloud points below are left out
-_CHI2_95_2DOF = 5.991464547107979
 _DPI = 100
 
 
 @dataclass(frozen=True)
 class Run:
-    """What is watched.
+    """What is shown.
 
     Attributes
     ----------
     recording
         Sensors, and the truth if it is known.
     rows
-        (n,) Frames that are shown, increasing.
+        (n,) rows of the Frames that are shown, increasing.
     estimate
-        Beliefs, or None. Extras are kept where they are shown.
+        Beliefs, or None. They have extras at the shown Frames.
     name
         Of the estimate.
     """
@@ -66,23 +66,24 @@ class Run:
 
     def belief_row(self, stamp: float) -> int:
         """Row of the last belief up to a time; -1 before the first, or without an estimate."""
-        if self.estimate is None:
-            return -1
-        return int(np.searchsorted(self.estimate.stamps, stamp + 1e-9, side="right")) - 1
+        return -1 if self.estimate is None else _last(self.estimate.stamps, stamp)
 
-    def pose_at(self, stamp: float) -> Array | None:
-        """Where the robot is believed to be, else where it is; None if nobody knows."""
+    def pose_at(self, stamp: float) -> Array:
+        """Where the robot is believed to be, else where it is; NaN if neither is known."""
         row = self.belief_row(stamp)
         if row >= 0 and self.estimate is not None:
             return np.asarray(self.estimate.means[row])
-        if self.recording.truth is not None:
-            pose = self.recording.truth_at(np.array([stamp]))[0]
-            return pose if np.isfinite(pose).all() else None
-        return None
+        return np.asarray(self.truth_at(np.array([stamp]))[0])
+
+    def truth_at(self, stamps: Array) -> Array:
+        """True poses (N, 3) at stamps (N,); NaN where they are not known."""
+        if self.recording.truth is None:
+            return np.full((len(stamps), 3), np.nan)
+        return self.recording.truth_at(stamps)
 
 
 def shown_rows(recording: Recording, n_shown: int) -> NDArray[np.int64]:
-    """Rows of Frames nearest to `n_shown` instants, evenly apart in time."""
+    """Rows of the Frames nearest to `n_shown` instants, evenly spaced in time."""
     stamps = recording.frame_stamps
     instants = np.linspace(stamps[0], stamps[-1], max(n_shown, 2))
     return np.unique(np.clip(np.searchsorted(stamps, instants), 0, len(stamps) - 1))
@@ -100,10 +101,10 @@ def estimate_of(
     Parameters
     ----------
     source
-        A file `estimate.csv`, the folder of a run that has one, or the name of an estimator, which
-        is then run over the recording.
+        A file `estimate.csv`, the folder of a run that has one, or the name of an estimator to run
+        over the recording.
     overrides
-        Hydra's, for the estimator.
+        Hydra overrides for that estimator.
     rows
         Frames at which particles and landmarks are kept.
     on_step
@@ -139,11 +140,11 @@ def _estimated(
     shown: Collection[int],
     on_step: Callable[[int], None],
 ) -> Estimate:
-    """Run an estimator of the configuration, with the robot that the recording tells of."""
-    made_with = recording.config.get("robot")  # of a log of many robots, the number of one
-    slip = made_with if isinstance(made_with, dict) else {}
-    robot = {k: v for k, v in slip.items() if k in ("kr", "kl")}
-    robot |= dataclasses.asdict(recording.robot)
+    """Run an estimator of the configuration, with the recording's own robot."""
+    robot = dataclasses.asdict(recording.robot)
+    made_with = recording.config.get("robot")
+    if isinstance(made_with, dict):  # else, of a log of many robots, the number of one
+        robot |= {key: value for key, value in made_with.items() if key in ("kr", "kl")}
     given = [f"robot.{key}={value}" for key, value in robot.items()]
     experiment = Experiment.compose([f"estimator={name}", *given, *overrides])
     if "keep_map" in experiment.config["estimator"]:
@@ -155,7 +156,7 @@ def _estimated(
 
 
 class _Sparing:
-    """An estimator whose extras are kept at some Frames only: all of them would fill the memory."""
+    """An estimator whose extras are kept at the shown Frames only, to save memory."""
 
     def __init__(self, estimator: Estimator, shown: Collection[int]) -> None:
         self._estimator, self._shown, self._row = estimator, shown, -1
@@ -167,42 +168,36 @@ class _Sparing:
     def step(self, frame: Frame) -> Belief:
         belief = self._estimator.step(frame)
         self._row += 1
-        if self._row in self._shown:
-            copied = {k: np.array(v) for k, v in belief.extras.items() if k in _EXTRAS}
-            return Belief(belief.mean, belief.covariance, copied)
-        return Belief(belief.mean, belief.covariance)
+        kept = _EXTRAS if self._row in self._shown else ()
+        copied = {k: np.array(v) for k, v in belief.extras.items() if k in kept}
+        return Belief(belief.mean, belief.covariance, copied)
 
 
 def scan_points(run: Run, stamp: float) -> Array:
     """Points (N, 2) in map of the last scan, or cloud, up to a time."""
-    recording, sensors = run.recording, run.recording.sensors
-    if recording.laser is not None and sensors.laser is not None:
-        row = _last(recording.laser.stamps, stamp)
-        if row >= 0:
-            ranges = np.asarray(recording.laser.ranges_m[row], float)
-            seen = np.isfinite(ranges)
-            bearings = sensors.laser.bearings_rad[seen]
-            points = ranges[seen, None] * np.column_stack([np.cos(bearings), np.sin(bearings)])
-            return _in_map(run, recording.laser.stamps[row], sensors.laser.mount, points)
-    if recording.clouds is not None and sensors.lidar3d is not None:
-        row = _last(recording.clouds.stamps, stamp)
-        if row >= 0:
-            mount = sensors.lidar3d.mount
-            points = sensors.lidar3d.points_in_sensor(recording.clouds.ranges_m[row])
-            points = points[points[:, 2] + mount.z_m > _GROUND_M, :2]
-            return _in_map(run, recording.clouds.stamps[row], mount, points)
+    sensors, scans, clouds = run.recording.sensors, run.recording.laser, run.recording.clouds
+    if scans is not None and (row := _last(scans.stamps, stamp)) >= 0:
+        laser, ranges = sensors.known_laser, np.asarray(scans.ranges_m[row], float)
+        seen = np.isfinite(ranges)
+        bearings = laser.bearings_rad[seen]
+        points = ranges[seen, None] * np.column_stack([np.cos(bearings), np.sin(bearings)])
+        return _in_map(run, scans.stamps[row], laser.mount, points)
+    if clouds is not None and (row := _last(clouds.stamps, stamp)) >= 0:
+        lidar = sensors.known_lidar3d
+        points = lidar.points_in_sensor(clouds.ranges_m[row])
+        points = points[points[:, 2] + lidar.mount.z_m > _GROUND_M, :2]
+        return _in_map(run, clouds.stamps[row], lidar.mount, points)
     return np.zeros((0, 2))
 
 
 def seen_landmarks(run: Run, stamp: float) -> Array:
     """Points (N, 2) in map of the landmarks in the last image up to a time."""
-    log, camera = run.recording.landmarks, run.recording.sensors.stereo
-    row = _last(log.stamps, stamp) if log is not None else -1
-    if log is None or camera is None or row < 0:
+    log = run.recording.landmarks
+    if log is None or (row := _last(log.stamps, stamp)) < 0:
         return np.zeros((0, 2))
     points = log.points_in_camera[slice(*log.splits[row : row + 2])]
     flat = np.column_stack([points[:, 2], -points[:, 0]])  # z is forward, x to the right
-    return _in_map(run, log.stamps[row], camera.mount, flat)
+    return _in_map(run, log.stamps[row], run.recording.sensors.known_stereo.mount, flat)
 
 
 def _last(stamps: Array, stamp: float) -> int:
@@ -212,7 +207,7 @@ def _last(stamps: Array, stamp: float) -> int:
 
 def _in_map(run: Run, stamp: float, mount: Mount, points_in_sensor: Array) -> Array:
     pose = run.pose_at(float(stamp))
-    if pose is None or not np.isfinite(pose).all():
+    if not np.isfinite(pose).all():
         return np.zeros((0, 2))
     return se2.transform(se2.compose(pose, mount.pose), points_in_sensor)
 
@@ -220,7 +215,7 @@ def _in_map(run: Run, stamp: float, mount: Mount, points_in_sensor: Array) -> Ar
 def ellipse_outlines(means: Array, covariances: Array, n_corners: int = 24) -> Array:
     """95 % ellipses of means (N, 2), covariances (N, 2, 2) as one line, with gaps of NaN."""
     values, vectors = np.linalg.eigh(covariances)
-    axes = vectors * np.sqrt(_CHI2_95_2DOF * np.maximum(values, 0.0))[:, None, :]
+    axes = vectors * np.sqrt(CHI2_95_2DOF * np.maximum(values, 0.0))[:, None, :]
     angle = np.linspace(0.0, 2.0 * np.pi, n_corners + 1)
     circle = np.column_stack([np.cos(angle), np.sin(angle)])
     outlines = means[:, None, :] + circle @ axes.transpose(0, 2, 1)
@@ -234,16 +229,15 @@ def pictures(run: Run) -> Iterator[Picture]:
     What never moves is drawn once.
     """
     recording = run.recording
-    truth = recording.truth_at(recording.frame_stamps) if recording.truth is not None else None
+    truth = None if recording.truth is None else recording.truth_at(recording.frame_stamps)
     x1, y1, x2, y2 = _bounds(run, truth)
     height_in = float(np.clip(7.0 * (y2 - y1) / (x2 - x1), 2.0, 8.0)) + 1.2
     page = figure(8.0, height_in)
     page.set_dpi(_DPI)
     ax = page.subplots()
-    world = recording.truth.world if recording.truth else None
-    if world is not None:
-        draw_world(ax, world, landmarks=recording.landmarks is not None)
-    glyph = max(recording.robot.track_m / 2.0, 0.012 * (x2 - x1))  # seen, however large the map
+    if recording.world is not None:
+        draw_world(ax, recording.world, landmarks=recording.landmarks is not None)
+    glyph = max(recording.robot.track_m / 2.0, 0.012 * (x2 - x1))  # visible on any map
     moving = {
         key: ax.plot([], [], style, color=color, label=label, animated=True, **more)[0]
         for key, (style, color, label, more) in _layers(run, truth is not None).items()
@@ -252,7 +246,7 @@ def pictures(run: Run) -> Iterator[Picture]:
     ax.set(xlabel="x, m", ylabel="y, m", aspect="equal", xlim=(x1, x2), ylim=(y1, y2))
     handles, labels = ax.get_legend_handles_labels()
     page.legend(handles, labels, loc="outside lower center", ncols=4, fontsize="small")
-    ax.set_title(" ")  # room for the words
+    ax.set_title(" ")  # reserves the room
     canvas: Any = FigureCanvasAgg(page)
     canvas.draw()
     page.set_layout_engine("none")
@@ -271,35 +265,32 @@ def pictures(run: Run) -> Iterator[Picture]:
 
 def _layers(run: Run, known: bool) -> dict[str, tuple[str, str, str, dict[str, Any]]]:
     """Moving layers from the lowest up: style, colour, label, further settings."""
-    recording, estimate = run.recording, run.estimate
-    extras = estimate.extras if estimate is not None else {}
-    layers: dict[str, tuple[str, str, str, dict[str, Any]]] = {}
-    if _given(extras, "particles"):
-        layers["particles"] = (".", SKY, "particles", {"ms": 3, "alpha": 0.6})
-    if recording.laser is not None or recording.clouds is not None:
-        layers["scan"] = (".", RED, "scan", {"ms": 2})
-    if recording.landmarks is not None:
-        layers["seen"] = ("x", ORANGE, "landmarks seen", {"ms": 5})
-    if _given(extras, "landmarks"):
-        layers["landmarks"] = ("-", GREEN, "landmarks, 95 %", {"lw": 0.8})
-    if known:
-        layers["truth"] = ("-", TRUTH, "truth", {"lw": 1.6})
-        layers["truth robot"] = ("-", TRUTH, "", {"lw": 1.4})
-    if estimate is not None:
-        layers["estimate"] = ("--", ESTIMATE, run.name, {"lw": 1.3})
-        layers["estimate robot"] = ("-", ESTIMATE, "", {"lw": 1.4})
-        layers["ellipse"] = ("-", ESTIMATE, "its 95 % ellipse", {"lw": 0.9})
-    return layers
-
-
-def _given(extras: dict[str, list[Any]], name: str) -> bool:
-    return any(value is not None and len(value) for value in extras.get(name, []))
+    recording = run.recording
+    extras = {} if run.estimate is None else run.estimate.extras
+    particles, mapped = (
+        any(value is not None and len(value) for value in extras.get(name, []))
+        for name in ("particles", "landmarks")
+    )
+    scanned = recording.laser is not None or recording.clouds is not None
+    estimated = run.estimate is not None
+    layers: dict[str, tuple[bool, str, str, str, dict[str, Any]]] = {
+        "particles": (particles, ".", SKY, "particles", {"ms": 3, "alpha": 0.6}),
+        "scan": (scanned, ".", RED, "scan", {"ms": 2}),
+        "seen": (recording.landmarks is not None, "x", ORANGE, "landmarks seen", {"ms": 5}),
+        "landmarks": (mapped, "-", GREEN, "landmarks, 95 %", {"lw": 0.8}),
+        "truth": (known, "-", TRUTH, "truth", {"lw": 1.6}),
+        "truth robot": (known, "-", TRUTH, "", {"lw": 1.4}),
+        "estimate": (estimated, "--", ESTIMATE, run.name, {"lw": 1.3}),
+        "estimate robot": (estimated, "-", ESTIMATE, "", {"lw": 1.4}),
+        "ellipse": (estimated, "-", ESTIMATE, "its 95 % ellipse", {"lw": 0.9}),
+    }
+    return {name: layer[1:] for name, layer in layers.items() if layer[0]}
 
 
 def _instant(
     run: Run, frame: int, truth: Array | None, glyph_m: float
 ) -> tuple[dict[str, Array], str]:
-    """Points of every moving layer at a Frame, and a line of words."""
+    """Points of every moving layer at a Frame, and the title."""
     stamps = run.recording.frame_stamps
     stamp = float(stamps[frame])
     points = {"scan": scan_points(run, stamp), "seen": seen_landmarks(run, stamp)}
@@ -340,12 +331,11 @@ def _bounds(run: Run, truth: Array | None) -> tuple[float, float, float, float]:
 
     An estimate that runs away is followed to twice the size of all else.
     """
-    recording = run.recording
-    world = recording.truth.world if recording.truth else None
-    parts = [] if truth is None else [truth[:, :2]]
+    world = run.recording.world
+    parts = [np.zeros((0, 2))] if truth is None else [truth[:, :2]]
     if world is not None and len(world.walls):
         parts.append(world.walls.reshape(-1, 2))
-    sure = np.concatenate(parts) if parts else np.zeros((0, 2))
+    sure = np.concatenate(parts)
     sure = sure[np.isfinite(sure).all(axis=1)]
     means = np.zeros((0, 2)) if run.estimate is None else run.estimate.means[:, :2]
     means = means[np.isfinite(means).all(axis=1)]
@@ -357,9 +347,9 @@ def _bounds(run: Run, truth: Array | None) -> tuple[float, float, float, float]:
     if not len(corners):
         raise InputError("this log has no truth to show; name an estimator with --estimate")
     low, high = corners.min(axis=0), corners.max(axis=0)
-    margin = 0.05 * max((high - low).max(), 1.0) + recording.robot.track_m
-    low, high = low - margin, high + margin
-    return float(low[0]), float(low[1]), float(high[0]), float(high[1])
+    margin = 0.05 * max((high - low).max(), 1.0) + run.recording.robot.track_m
+    x1, y1, x2, y2 = (float(side) for side in (*(low - margin), *(high + margin)))
+    return x1, y1, x2, y2
 
 
 def check_output(path: Path) -> None:
@@ -413,7 +403,7 @@ def _write_mp4(images: Iterator[Picture], path: Path, fps: int) -> None:
 
 
 def _reduced(image: Picture) -> Any:
-    """The picture with a palette of its own: a third of the size, and no difference to see."""
+    """The picture with a palette of its own: a third of the size, with no visible difference."""
     from PIL import Image
 
     return Image.fromarray(image).quantize(96, method=Image.Quantize.FASTOCTREE)
@@ -426,16 +416,20 @@ def _write_gif(images: Iterator[Picture], path: Path, fps: int) -> None:
 
 
 def _write_html(images: Iterator[Picture], path: Path, fps: int) -> None:
-    frames = []
+    frames: list[str] = []
     for image in images:
         data = io.BytesIO()
         _reduced(image).save(data, format="PNG")
         frames.append("data:image/png;base64," + base64.b64encode(data.getvalue()).decode())
-    height, width = image.shape[:2]
+    values = {
+        "width": image.shape[1],
+        "height": image.shape[0],
+        "last": len(frames) - 1,
+        "fps": fps,
+        "first": frames[0],
+        "frames": ",\n".join(f'"{frame}"' for frame in frames),
+    }
     page = (Path(__file__).parent / "player.html").read_text(encoding="utf-8")
-    values = {"width": width, "height": height, "last": len(frames) - 1, "fps": fps}
     for name, value in values.items():
         page = page.replace(f"@{name}@", str(value))
-    listed = ",\n".join(f'"{frame}"' for frame in frames)
-    text = page.replace("@first@", frames[0]).replace("@frames@", listed)
-    path.write_text(text, encoding="utf-8")
+    path.write_text(page, encoding="utf-8")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
@@ -39,21 +41,19 @@ def draw_world(
     """Draw walls, and on request landmarks, named places and the tour, in metres."""
     if places:
         for name, rectangles in world.places.items():
+            style: Any = {"color": _PLACES.get(name, PURPLE), "alpha": 0.15, "lw": 0}
             for j, (x1, y1, x2, y2) in enumerate(rectangles):
-                color = _PLACES.get(name, PURPLE)
-                patch = Rectangle((x1, y1), x2 - x1, y2 - y1, color=color, alpha=0.15, lw=0)
-                patch.set_label(name.replace("_", ", ") if j == 0 else "")
-                ax.add_patch(patch)
+                label = name.replace("_", ", ") if j == 0 else ""
+                ax.add_patch(Rectangle((x1, y1), x2 - x1, y2 - y1, label=label, **style))
     high = world.wall_z_m[:, 0] > _LASER_HEIGHT_M
-    for rows, style in ((~high, {"color": WALL}), (high, {"color": GREEN, "alpha": 0.5})):
+    for rows, color, alpha in ((~high, WALL, None), (high, GREEN, 0.5)):
         lines = list(world.walls[rows].reshape(-1, 2, 2))
-        ax.add_collection(LineCollection(lines, lw=0.9, **style))
+        ax.add_collection(LineCollection(lines, lw=0.9, color=color, alpha=alpha))
     if landmarks and len(world.landmarks):
         twin = world.look_alike if len(world.look_alike) else np.zeros(len(world.landmarks), bool)
         for mask, color, label in ((~twin, PURPLE, "landmark"), (twin, ORANGE, "look-alike")):
             if mask.any():
-                x, y = world.landmarks[mask, :2].T
-                ax.plot(x, y, ".", color=color, ms=2.5, label=label)
+                ax.plot(*world.landmarks[mask, :2].T, ".", color=color, ms=2.5, label=label)
     if tour and len(world.waypoints):
         ax.plot(*world.waypoints.T, color=BLUE, lw=1.0, label="tour")
         ax.plot(*world.start_pose[:2], "o", color=BLUE, ms=4, label="start")
@@ -64,9 +64,8 @@ def draw_world(
 def world_figure(world: World) -> Figure:
     """One world with everything in it, and a legend above."""
     x1, y1, x2, y2 = world.bounds_m
-    width, height = x2 - x1, y2 - y1
-    # What the map needs beside the labels, with room above it for title and legend.
-    page = figure(9.0, float(np.clip(8.3 * height / max(width, 1.0), 2.0, 8.3)) + 1.5)
+    # The map's own height beside the labels, and room above it for title and legend
+    page = figure(9.0, float(np.clip(8.3 * (y2 - y1) / max(x2 - x1, 1.0), 2.0, 8.3)) + 1.5)
     ax = page.subplots()
     draw_world(ax, world, places=True, tour=True)
     ax.set_title(world.name, loc="left")
