@@ -2,15 +2,16 @@ import numpy as np
 import pytest
 
 from experiments.evaluation import statistics
-from experiments.evaluation.statistics import Interval, verdict
+from experiments.evaluation.statistics import Interval
+from experiments.evaluation.verdict import judged
 from sim.errors import InputError
 
 
 def test_verdicts():
-    assert verdict(Interval(1, 0.9, 1.1), 0.8, 1.25) == "reproduced"
-    assert verdict(Interval(1, 0.7, 1.1), 0.8, 1.25) == "undecided"
-    assert verdict(Interval(2, 1.5, 2.5), 0.8, 1.25) == "not reproduced"
-    assert verdict(Interval(2, np.nan, np.nan), 0.8) == "undecided"
+    assert judged(Interval(1, 0.9, 1.1), 0.8, 1.25) == "reproduced"
+    assert judged(Interval(1, 0.7, 1.1), 0.8, 1.25) == "undecided"
+    assert judged(Interval(2, 1.5, 2.5), 0.8, 1.25) == "not_reproduced"
+    assert judged(Interval(2, np.nan, np.nan), 0.8) == "undecided"
 
 
 @pytest.mark.parametrize("kind", ["mean", "bootstrap", "log_ratio"])
@@ -72,7 +73,7 @@ def test_too_few_data_decide_nothing():
         statistics.log_ratio_interval([1.0], [1.0]),
         statistics.equivalent([1.0], [1.0], 0.25)[0],
     ):
-        assert verdict(found, 0.5, 2.0) == "undecided"
+        assert judged(found, 0.5, 2.0) == "undecided"
 
 
 def test_the_bootstrap_draws_whole_recordings():
