@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib
 
+from experiments.bench.measure import as_json as json_text
+from experiments.bench.measure import as_table
 from sim.errors import InputError
 
 # name -> modules of this package, each with `run()`
@@ -19,20 +21,20 @@ SUITES = {
 
 
 def run_bench(name: str, *, as_json: bool) -> str:
-    """Run one suite, or `all`; the report as a table or as one JSON object.
+    """Run one suite, or `all`; return the results as a table or as one JSON object.
 
     Raises
     ------
     InputError
         For an unknown name.
     """
-    from experiments.bench.measure import as_json as json_text
-    from experiments.bench.measure import as_table
-
     if name not in (*SUITES, "all"):
         raise InputError(f"unknown benchmark {name}; known: {', '.join(SUITES)}, all")
-    results = []
-    for suite, modules in SUITES.items():
-        for module in modules if name in (suite, "all") else ():
-            results += importlib.import_module(f"experiments.bench.{module}").run()
+    results = [
+        result
+        for suite, modules in SUITES.items()
+        if name in (suite, "all")
+        for module in modules
+        for result in importlib.import_module(f"experiments.bench.{module}").run()
+    ]
     return json_text(results) if as_json else as_table(results)

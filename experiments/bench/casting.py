@@ -14,10 +14,9 @@ from sim.world import World
 
 Array = NDArray[np.float64]
 
-_HALF_HALL_M = 20.0
-_N_POSES = 500
 _GOAL_US = {30: 10.0, 300: 40.0}
 _LASER = Laser(n_beams=721, fov_rad=math.pi, max_range_m=80.0)
+_BATCH = 50  # small enough for its output to stay in the processor's cache
 
 
 def run() -> list[Measurement]:
@@ -28,34 +27,31 @@ def run() -> list[Measurement]:
 def _scans(n_boxes: int) -> list[Measurement]:
     world, poses = hall(n_boxes)
     caster = SegmentCaster(world, _LASER)
-    batch = 50  # small enough for its output to stay in the processor's cache
-    batches = [(poses[i : i + batch],) for i in range(0, len(poses), batch)]
+    batches = [(poses[i : i + _BATCH],) for i in range(0, len(poses), _BATCH)]
     each = median_time_s(caster.cast, [(pose,) for pose in poses])
-    many = median_time_s(caster.cast_many, batches) / batch
+    many = median_time_s(caster.cast_many, batches) / _BATCH
     name, faces = f"sim.scan_exact_{n_boxes}", f"721 beams, {len(world.walls)} faces"
     return [
         Measurement(f"{name}_us", each * 1e6, "us", _GOAL_US[n_boxes], note=f"{faces}, one call"),
-        Measurement(f"{name}_batch_us", many * 1e6, "us", note=f"{faces}, in batches of {batch}"),
+        Measurement(f"{name}_batch_us", many * 1e6, "us", note=f"{faces}, in batches of {_BATCH}"),
     ]
 
 
 def _other_rays() -> list[Measurement]:
-    world, poses = hall(75)
-    rng = np.random.default_rng(3)
-    points = rng.uniform([-19.0, -19.0, 0.2], [19.0, 19.0, 1.8], (800, 3))
-    lidar = Lidar3D()
-    cloud = median_time_s(lambda pose: cast_lidar(world, lidar, pose), [(p,) for p in poses[:50]])
-    origins = [(np.append(pose[:2], 0.5),) for pose in poses[:50]]
+    world, poses = hall(75, 50)
+    points = np.random.default_rng(3).uniform([-19.0, -19.0, 0.2], [19.0, 19.0, 1.8], (800, 3))
+    lidar, faces = Lidar3D(), f"{len(world.walls)} faces"
+    cloud = median_time_s(lambda pose: cast_lidar(world, lidar, pose), [(p,) for p in poses])
+    origins = [(np.append(pose[:2], 0.5),) for pose in poses]
     sight = median_time_s(lambda origin: visible(world, origin, points), origins)
-    faces = f"{len(world.walls)} faces"
     return [
         Measurement("sim.cloud_exact_us", cloud * 1e6, "us", note=f"16 x 720 rays, {faces}"),
         Measurement("sim.visible_exact_us", sight * 1e6, "us", note=f"800 points, {faces}"),
     ]
 
 
-def hall(n_boxes: int, n_poses: int = _N_POSES) -> tuple[World, Array]:
-    """A square hall of 40 m with boxes of 0.4 to 2 m, turned at random, and poses between them.
+def hall(n_boxes: int, n_poses: int = 500) -> tuple[World, Array]:
+    """A square hall of 40 m with randomly turned boxes of 0.4 to 2 m, and poses between them.
 
     Returns
     -------
@@ -68,12 +64,11 @@ def hall(n_boxes: int, n_poses: int = _N_POSES) -> tuple[World, Array]:
     centres = rng.uniform(-18.0, 18.0, (n_boxes, 2))
     halves = rng.uniform(0.2, 1.0, (n_boxes, 2))
     yaws = rng.uniform(-np.pi, np.pi, n_boxes)
-    axes = np.stack([[np.cos(yaws), np.sin(yaws)], [-np.sin(yaws), np.cos(yaws)]]).transpose(
-        2, 0, 1
-    )
+    cos, sin = np.cos(yaws), np.sin(yaws)
+    axes = np.stack([[cos, sin], [-sin, cos]]).transpose(2, 0, 1)
     square = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
-    corners = centres[:, None] + (square * halves[:, None]) @ axes
-    corners = np.concatenate([_HALF_HALL_M * square[None], corners])
+    boxes = centres[:, None] + (square * halves[:, None]) @ axes
+    corners = np.concatenate([20.0 * square[None], boxes])
     walls = np.concatenate([corners, np.roll(corners, -1, axis=1)], axis=2).reshape(-1, 4)
     world = World("hall", walls, np.tile([0.0, 2.0], (len(walls), 1)))
 

@@ -9,37 +9,30 @@ from experiments.bench.measure import Measurement
 from experiments.runs.experiment import Experiment
 from experiments.runs.seeds import stream
 
-_LENGTH_M = 20.0
-_GOAL = 20.0
+_OFFICE = (
+    "study=decristoforis2020_office",
+    "seed=1000",
+    "sensors.laser.rate_hz=75",
+    "simulation.physics=kinematic",
+    "route.distance_m=20",
+)
+_GOALS = {"ekf_icp": 20.0, "ekf_icp_paper": None, "icp_odometry": None}
 
 
 def run() -> list[Measurement]:
     """Real-time factors of the filters at 75 Hz and 721 beams, in an office."""
-    office = [
-        "study=decristoforis2020_office",
-        "seed=1000",
-        "sensors.laser.rate_hz=75",
-        "simulation.physics=kinematic",
-        f"route.distance_m={_LENGTH_M}",
-    ]
-    recording = Experiment.compose(office).simulate()
+    recording = Experiment.compose(_OFFICE).simulate()
+    note = f"721 beams, {len(recording.frame_stamps)} steps"
     results = []
-    for name in ("ekf_icp", "ekf_icp_paper", "icp_odometry"):
-        experiment = Experiment.compose([*office, f"estimator={name}"])
+    for name, goal in _GOALS.items():
+        experiment = Experiment.compose([*_OFFICE, f"estimator={name}"])
         prior = experiment.prior(recording)
-        factors = []
-        for repeat in range(3):
-            rng = stream(repeat, "bench")
-            estimate = run_estimator(experiment.estimator(), recording, prior, rng)
-            factors.append(recording.duration_s / estimate.step_seconds.sum())
+        estimates = (
+            run_estimator(experiment.estimator(), recording, prior, stream(repeat, "bench"))
+            for repeat in range(3)
+        )
+        factor = recording.duration_s / statistics.median(e.step_seconds.sum() for e in estimates)
         results.append(
-            Measurement(
-                f"{name}.realtime_factor_75hz",
-                statistics.median(factors),
-                "x",
-                _GOAL if name == "ekf_icp" else None,
-                "higher",
-                f"721 beams, {len(recording.frame_stamps)} steps",
-            )
+            Measurement(f"{name}.realtime_factor_75hz", factor, "x", goal, "higher", note)
         )
     return results

@@ -1,9 +1,8 @@
-"""Speed of FastSLAM: a whole step, the landmark update alone, and what either costs by size."""
+"""Speed of FastSLAM: a whole step, the landmark update alone, and how both grow with size."""
 
 from __future__ import annotations
 
 import itertools
-import time
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ from estimators.base import Prior
 from estimators.base import run as walk
 from estimators.fastslam import FastSLAM
 from estimators.stereo import StereoModel
-from experiments.bench.measure import Measurement, median_time_s
+from experiments.bench.measure import Measurement, median_time_s, timed_steps
 from experiments.evaluation.statistics import log_log_slope
 from sim.recording import LandmarkLog, Recording, WheelLog
 from sim.robot import RobotGeometry, wheel_errors
@@ -24,7 +23,6 @@ from sim.sensors import Encoder, SensorSuite, StereoCamera
 Array = NDArray[np.float64]
 
 PAPER = StereoCamera(sigma_column_px=10.0, sigma_row_px=10.0, correlated=False)
-PIXEL = StereoCamera()
 _TRACK_M, _STEP_M, _RADIUS_M, _K_M = 0.4, 0.4, 5.0, 5e-5
 _PAPER: dict[str, Any] = {"proposal": "motion", "resampling": "multinomial", "ess_share": 1.0}
 _SIZE: dict[str, Any] = {"n_landmarks": 200, "n_seen": 20}
@@ -40,26 +38,19 @@ def run_steps(
     camera: StereoCamera = PAPER,
     **options: Any,
 ) -> tuple[Array, float, float]:
-    """Seconds (T,) of each step of a run, share of steps that resample, bytes a particle.
-
-    Seconds are processor time, so that other programs count for little.
-    """
+    """Processor time (T,) of each step, s; share of steps that resample; bytes per particle."""
     recording = circling(n_landmarks, n_seen, n_steps, camera)
     prior = Prior(recording.robot, recording.sensors, np.zeros(3), np.zeros((3, 3)))
     estimator = FastSLAM(n_particles=n_particles, kr=_K_M, kl=_K_M, **options)
     walk(estimator, recording.cut(40), prior, np.random.default_rng(0))
     estimator.reset(prior, np.random.default_rng(0))
-    seconds, resampled = np.empty(n_steps), 0
-    for i, frame in enumerate(recording.frames()):
-        begun = time.process_time_ns()
-        belief = estimator.step(frame)
-        seconds[i] = 1e-9 * (time.process_time_ns() - begun)
-        resampled += belief.extras["resampled"]
-    return seconds, resampled / n_steps, estimator.bytes_per_particle
+    steps = timed_steps(estimator, recording.frames())
+    seconds, resampled = np.array([(s, belief.extras["resampled"]) for s, belief in steps]).T
+    return seconds, float(resampled.mean()), estimator.bytes_per_particle
 
 
 def circling(n_landmarks: int, n_seen: int, n_steps: int, camera: StereoCamera) -> Recording:
-    """Rounds inside a ring of N landmarks, of which every image shows B of those ahead.
+    """Laps inside a ring of N landmarks; every image shows B of those ahead.
 
     The ring grows with N, so that as many landmarks are in view whatever their number.
     """
@@ -69,22 +60,15 @@ def circling(n_landmarks: int, n_seen: int, n_steps: int, camera: StereoCamera) 
     poses = np.stack([radius_m * np.sin(turn), radius_m * (1 - np.cos(turn)), turn], axis=1)
     angle = rng.uniform(-np.pi, np.pi, n_landmarks)
     radius = radius_m + rng.uniform(1.0, 4.0, n_landmarks)
-    landmarks = np.stack(
-        [
-            radius * np.cos(angle),
-            radius_m + radius * np.sin(angle),
-            rng.uniform(0, 2, n_landmarks),
-        ],
-        axis=1,
-    )
+    x, y = radius * np.cos(angle), radius_m + radius * np.sin(angle)
+    landmarks = np.column_stack([x, y, rng.uniform(0, 2, n_landmarks)])
     model = StereoModel.of(camera)
-    points, ids = [], []
-    for pose in poses:
+    points, ids = np.empty((n_steps, n_seen, 3)), np.empty((n_steps, n_seen), np.int64)
+    for i, pose in enumerate(poses):
         seen = model.predict(pose, landmarks)[0]
         near = np.argsort(np.where(seen[:, 2] > 1.0, seen[:, 2], np.inf))[: 3 * n_seen]
-        chosen = rng.choice(near, n_seen, replace=False)
-        points.append(camera.measure(seen[chosen], rng))
-        ids.append(chosen)
+        ids[i] = rng.choice(near, n_seen, replace=False)
+        points[i] = camera.measure(seen[ids[i]], rng)
     wheels = np.full((n_steps, 2), _STEP_M) * (1.0 + np.array([0.5, -0.5]) * _TRACK_M / radius_m)
     wheels += wheel_errors(np.full(wheels.shape, _STEP_M), _K_M, rng)
     wheels[0] = 0.0
@@ -95,22 +79,19 @@ def circling(n_landmarks: int, n_seen: int, n_steps: int, camera: StereoCamera) 
         robot=RobotGeometry(0.1, _TRACK_M),
         sensors=SensorSuite(Encoder(None), stereo=camera),
         landmarks=LandmarkLog(
-            stamps, n_seen * np.arange(n_steps + 1), np.concatenate(points), np.concatenate(ids)
+            stamps, n_seen * np.arange(n_steps + 1), points.reshape(-1, 3), ids.ravel()
         ),
         config={"bench": "circling"},
     )
 
 
 def update_ns(n_particles: int, n_landmarks: int, n_seen: int = 20) -> float:
-    """Nanoseconds of one landmark update, a particle and an observation."""
+    """Time of one landmark update, ns per particle and observation."""
     rng = np.random.default_rng(0)
-    maps, camera = (
-        ekf.LandmarkMaps(n_particles, "contiguous", births=False),
-        StereoModel.of(StereoCamera()),
-    )
+    maps = ekf.LandmarkMaps(n_particles, "contiguous", births=False)
     points = rng.uniform([-3.0, -1.0, 2.0], [3.0, 1.0, 8.0], (n_landmarks, 3))
     maps.reserve(n_landmarks)
-    state, packed = ekf.new_state(maps.n_blocks), camera.packed
+    state, packed = ekf.new_state(maps.n_blocks), StereoModel.of(StereoCamera()).packed
     poses = np.tile([[0.0], [0.0], [0.0], [1.0], [0.0]], (1, maps.n_blocks * ekf.LANES))
     still, ahead = np.zeros((3, 3)), np.array([0.0, 0.0, 1.0, 0.0])
     ekf.move(poses, np.zeros(3), still, poses[:3], ahead, poses.copy(), state)
@@ -131,13 +112,13 @@ def _steps() -> list[Measurement]:
         "": ({}, 0.6, "FastSLAM 2.0, ESS < M/2"),
         "motion_": ({"proposal": "motion"}, 0.6, "FastSLAM 1.0, ESS < M/2"),
         "paper_": (_PAPER, None, "FastSLAM 1.0, multinomial at every image"),
-        "pixel_": ({"camera": PIXEL}, None, "FastSLAM 2.0, ESS < M/2, noise of 1 px"),
+        "pixel_": ({"camera": StereoCamera()}, None, "FastSLAM 2.0, ESS < M/2, noise of 1 px"),
     }
     results = []
     for arm, (options, goal, note) in arms.items():
         seconds, share, _ = run_steps(1000, **_SIZE, **options)
-        name = f"fastslam.{arm}step_m1000_n200_b20"
         mean, last = 1e3 * float(seconds.mean()), 1e3 * float(np.quantile(seconds, 0.99))
+        name = f"fastslam.{arm}step_m1000_n200_b20"
         results += [
             Measurement(f"{name}_ms", mean, "ms", goal, note=f"{note}; mean over all steps"),
             Measurement(f"{name}_p99_ms", last, "ms"),
@@ -149,12 +130,11 @@ def _steps() -> list[Measurement]:
 def cost_by_landmarks(n_repeats: int) -> pd.DataFrame:
     """Time of a step against N, with either kind of map, resampling at every image."""
     rows = []
-    for repeat in range(n_repeats):
-        for n, maps in itertools.product(_NS, ("shared", "contiguous")):
-            size: dict[str, Any] = {"n_landmarks": n, "n_seen": 20, "n_steps": n // 2 + 60}
-            seconds, _, _ = run_steps(1000, **size, maps=maps, **_PAPER)
-            ms = 1e3 * float(np.median(seconds[-50:]))  # in the second round
-            rows.append({"repeat": repeat, "maps": maps, "n_landmarks": n, "step_ms": ms})
+    for repeat, n, maps in itertools.product(range(n_repeats), _NS, ("shared", "contiguous")):
+        size: dict[str, Any] = {"n_landmarks": n, "n_seen": 20, "n_steps": n // 2 + 60}
+        seconds, _, _ = run_steps(1000, **size, maps=maps, **_PAPER)
+        ms = 1e3 * float(np.median(seconds[-50:]))  # in the second lap
+        rows.append({"repeat": repeat, "maps": maps, "n_landmarks": n, "step_ms": ms})
     return pd.DataFrame(rows)
 
 
@@ -168,18 +148,21 @@ def _by_size() -> list[Measurement]:
     ]
     for maps, part in cost_by_landmarks(1).groupby("maps"):
         exponent = log_log_slope(part["n_landmarks"], part["step_ms"])
+        kib = run_steps(1000, **_SIZE, n_steps=100, maps=maps)[2] / 1024
         note = f"N in {_NS}, resampling at every image"
-        results.append(Measurement(f"fastslam.slope_n_{maps}", exponent, "", note=note))
-        size = run_steps(1000, **_SIZE, n_steps=100, maps=maps)[2]
-        label = f"fastslam.memory_{maps}_n200_kib"
-        results.append(Measurement(label, size / 1024, "KiB", note="maps of one particle"))
+        results += [
+            Measurement(f"fastslam.slope_n_{maps}", exponent, "", note=note),
+            Measurement(
+                f"fastslam.memory_{maps}_n200_kib", kib, "KiB", note="maps of one particle"
+            ),
+        ]
     return results
 
 
 def run() -> list[Measurement]:
     """Steps, updates, slopes and memory."""
     small, large = update_ns(1000, 200), update_ns(1000, 2000)
-    note = "a particle and an observation, M = 1000"
+    note = "per particle and observation, M = 1000"
     return [
         *_steps(),
         Measurement("fastslam.update_ns", small, "ns", 10.0, note=f"{note}, N = 200"),

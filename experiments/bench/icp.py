@@ -1,22 +1,24 @@
 """Registration of pairs of scans without an initial guess, its covariances, and its peers.
 
-The pairs are of 721 beams over 180 degrees with range noise of 1 cm, in furnished rooms of 5 to
-10 m and in corridors of 30 to 50 m, whose only hold along themselves are niches of 8 to 20 cm
-and the end wall. `small` is a motion of 5 cm and 2 degrees, `large` of 20 cm and 8 degrees.
+Scans have 721 beams over 180 degrees and range noise of 1 cm. They are taken in furnished rooms of
+5 to 10 m and in corridors of 30 to 50 m, where only niches of 8 to 20 cm and the end wall fix the
+position along the corridor. `small` is a motion of 5 cm and 2 degrees, `large` of 20 cm and 8.
 
-`fisher_ratio` is sqrt(median(e' F^-1 e) / 2.366) of the errors e in (x, y, heading), with F the
-least covariance that the true pair allows (`evaluation.scan_bound`) and 2.366 the median of
-chi-squared with 3 degrees of freedom: an efficient estimator has 1. The bound noted beside
-`error_mm` is the root of the trace of its position. A failure is an error of
-more than 5 cm or 1 degree; failures are in all medians.
+`fisher_ratio` is sqrt(median(e' F^-1 e) / 2.366) of the errors e in (x, y, heading). F is the least
+covariance that the true pair allows (`evaluation.scan_bound`), 2.366 the median of chi-squared with
+3 degrees of freedom: an efficient estimator has 1. The bound noted beside `error_mm` is the root of
+the trace of F's position block. A failure is an error of more than 5 cm or 1 degree; failures count
+in all medians.
 """
 
 from __future__ import annotations
 
 import importlib.util
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,8 +28,10 @@ from estimators.icp import Metric, PreparedScan, Registration, prepare, register
 from experiments.bench.measure import Measurement, median_time_s
 from experiments.evaluation.scan_bound import cast, fisher_bound
 from sim import se2
+from sim.world import World
 
 Array = NDArray[np.float64]
+Matcher = Callable[[Array, Array], Array]  # ranges of the target and of the source -> pose
 
 SIGMA_RANGE_M = 0.01
 BEARINGS_RAD = np.linspace(-math.pi / 2.0, math.pi / 2.0, 721)
@@ -35,10 +39,8 @@ MOTIONS = {"small": (0.05, math.radians(2.0)), "large": (0.20, math.radians(8.0)
 FAILED_M, FAILED_RAD = 0.05, math.radians(1.0)
 
 _SEEDS = range(1000, 1300)  # those below 1000 were for tuning
-_PEER_PAIRS = 60
 _MEDIAN_CHI2_3 = 2.366
-_CLEARANCE_M = 0.3
-_GOAL_MS, _GOAL_RATIO, _GOAL_CENSI_US = 0.25, 1.2, 60.0
+_GOAL_MS, _GOAL_RATIO = 0.25, 1.2  # of point to line in rooms
 
 
 @dataclass(frozen=True)
@@ -52,21 +54,22 @@ class Pair:
 
 
 def run() -> list[Measurement]:
-    """Both metrics over all classes, the covariances, and what peers are installed."""
-    results: list[Measurement] = []
-    metrics: tuple[Metric, ...] = ("point_to_point", "point_to_line")
+    """Both metrics over all classes, the covariances, and the peers that are installed."""
     classes = {
         f"{place}_{size}": [pair(place, size, seed) for seed in _SEEDS]
         for place in ("room", "corridor")
         for size in MOTIONS
     }
-    for metric in metrics:
+    peers = {"scipy": _match_by_scipy, "small_gicp": _match_by_gicp, "open3d": _match_by_open3d}
+    matchers: dict[str, Matcher] = {
+        **{metric: partial(_match, metric) for metric in get_args(Metric)},
+        **{f"peer_{n}": match for n, match in peers.items() if importlib.util.find_spec(n)},
+    }
+    results = _covariances(classes["room_small"])
+    for name, match in matchers.items():
         for kind, pairs in classes.items():
-            results += _measured(metric, kind, _matcher(metric), pairs)
-    results += _covariances(classes["room_small"])
-    for name, matcher in _peers().items():
-        for kind, pairs in classes.items():
-            results += _measured(f"peer_{name}", kind, matcher, pairs[:_PEER_PAIRS])
+            chosen = pairs[:60] if name.startswith("peer") else pairs
+            results += _measured(f"icp.{name}.{kind}", match, chosen)
     return results
 
 
@@ -74,8 +77,10 @@ def pair(place: str, size: str, seed: int) -> Pair:
     """One pair of scans; the seed fixes the world, the poses and the noise."""
     rng = np.random.default_rng([seed, place == "room"])
     walls, (x_min, x_max, y_min, y_max) = _room(rng) if place == "room" else _corridor(rng)
+    world = World(place, walls, np.tile([0.0, 2.0], (len(walls), 1)))
     distance_m, turn_rad = MOTIONS[size]
-    while True:
+    clearance_m = 0.0
+    while clearance_m <= 0.3:
         heading = rng.uniform(-np.pi, np.pi)
         if place == "corridor":
             heading = rng.choice([0.0, np.pi]) + rng.normal(0.0, 0.1)
@@ -85,99 +90,77 @@ def pair(place: str, size: str, seed: int) -> Pair:
             [distance_m * np.cos(way), distance_m * np.sin(way), turn_rad * rng.choice([-1, 1])]
         )
         T_w_source = se2.compose(T_w_target, motion)
-        if min(_clearance_m(walls, p[:2]) for p in (T_w_target, T_w_source)) > _CLEARANCE_M:
-            break
-    scans = [
+        clearance_m = min(map(world.clearance_m, (T_w_target, T_w_source)))
+    target_m, source_m = (
         cast(walls, pose, BEARINGS_RAD)[0] + SIGMA_RANGE_M * rng.standard_normal(len(BEARINGS_RAD))
         for pose in (T_w_target, T_w_source)
-    ]
+    )
     bound = fisher_bound(walls, T_w_target, T_w_source, BEARINGS_RAD, SIGMA_RANGE_M)
-    return Pair(scans[0], scans[1], motion, bound)
+    return Pair(target_m, source_m, motion, bound)
 
 
-Matcher = Callable[[Array, Array], Array]  # ranges of the target and of the source -> pose
+def _match(metric: Metric, target_m: Array, source_m: Array) -> Array:
+    target, source = prepare(target_m, BEARINGS_RAD), prepare(source_m, BEARINGS_RAD)
+    return register(source, target, metric=metric).T_target_source
 
 
-def _matcher(metric: Metric) -> Matcher:
-    def match(target_m: Array, source_m: Array) -> Array:
-        target, source = prepare(target_m, BEARINGS_RAD), prepare(source_m, BEARINGS_RAD)
-        return register(source, target, metric=metric).T_target_source
-
-    return match
-
-
-def _measured(name: str, kind: str, match: Matcher, pairs: list[Pair]) -> Iterator[Measurement]:
+def _measured(row: str, match: Matcher, pairs: list[Pair]) -> list[Measurement]:
     """Time from ranges to pose, and the errors, of one way to register over one class."""
-    row, mine, room = f"icp.{name}.{kind}", name == "point_to_line", kind.startswith("room")
+    mine, in_room = "point_to_line" in row, "room" in row
     errors = np.array([match(p.target_m, p.source_m) - p.T_target_source for p in pairs])
     errors[:, 2] = se2.wrap(errors[:, 2])
     off_m, off_rad = np.hypot(errors[:, 0], errors[:, 1]), np.abs(errors[:, 2])
     failed = (off_m > FAILED_M) | (off_rad > FAILED_RAD)
-    bound_m = [math.sqrt(p.bound[0, 0] + p.bound[1, 1]) for p in pairs]
+    bound_m = np.median([math.sqrt(p.bound[0, 0] + p.bound[1, 1]) for p in pairs])
     squares = [e @ np.linalg.solve(p.bound, e) for e, p in zip(errors, pairs, strict=True)]
-    ratio = math.sqrt(float(np.median(squares)) / _MEDIAN_CHI2_3)
-    seconds = median_time_s(match, [(p.target_m, p.source_m) for p in pairs], repeats=1)
-    yield Measurement(
-        f"{row}.ms",
-        1e3 * seconds,
-        "ms",
-        _GOAL_MS if mine and room else None,
-        note="two raw scans to pose",
-    )
-    yield Measurement(
-        f"{row}.error_mm",
-        1e3 * float(np.median(off_m)),
-        "mm",
-        note=f"median; bound {1e3 * float(np.median(bound_m)):.2f}",
-    )
-    yield Measurement(f"{row}.error_deg", math.degrees(np.median(off_rad)), "deg", note="median")
-    yield Measurement(f"{row}.fisher_ratio", ratio, "1", _GOAL_RATIO if mine and room else None)
-    yield Measurement(
-        f"{row}.fail_share",
-        float(np.mean(failed)),
-        "1",
-        0.0 if mine else None,
-        note=f"of {len(pairs)} pairs",
-    )
+    ratio = math.sqrt(np.median(squares) / _MEDIAN_CHI2_3)
+    ms = 1e3 * median_time_s(match, [(p.target_m, p.source_m) for p in pairs], repeats=1)
+    goal_ms, goal_ratio = (_GOAL_MS, _GOAL_RATIO) if mine and in_room else (None, None)
+    return [
+        Measurement(f"{row}.ms", ms, "ms", goal_ms, note="two raw scans to pose"),
+        Measurement(
+            f"{row}.error_mm",
+            1e3 * float(np.median(off_m)),
+            "mm",
+            note=f"median; bound {1e3 * bound_m:.2f}",
+        ),
+        Measurement(f"{row}.error_deg", math.degrees(np.median(off_rad)), "deg", note="median"),
+        Measurement(f"{row}.fisher_ratio", ratio, "1", goal_ratio),
+        Measurement(
+            f"{row}.fail_share",
+            float(np.mean(failed)),
+            "1",
+            0.0 if mine else None,
+            note=f"of {len(pairs)} pairs",
+        ),
+    ]
 
 
-def _covariances(pairs: list[Pair]) -> Iterator[Measurement]:
+def _covariances(pairs: list[Pair]) -> list[Measurement]:
     """Time of each method for a point-to-line registration."""
-    prepared = []
-    for p in pairs[:20]:
-        source, target = prepare(p.source_m, BEARINGS_RAD), prepare(p.target_m, BEARINGS_RAD)
-        prepared.append((register(source, target), source, target))
+    scans = [
+        (prepare(p.source_m, BEARINGS_RAD), prepare(p.target_m, BEARINGS_RAD)) for p in pairs[:20]
+    ]
+    inputs = [(register(source, target), source, target) for source, target in scans]
     of_guess = np.diag([0.05**2, 0.05**2, 0.03**2])
-    rng = np.random.default_rng(0)
     methods: dict[str, Callable[[Registration, PreparedScan, PreparedScan], object]] = {
         "censi": icp_covariance.censi,
         "hessian": lambda found, source, target: icp_covariance.hessian(found),
-        "unscented": lambda found, source, target: icp_covariance.unscented(
-            found, source, target, of_guess
-        ),
-        "unscented_censi": lambda found, source, target: icp_covariance.unscented_censi(
-            found, source, target, of_guess
-        ),
-        "sampling": lambda found, source, target: icp_covariance.sampling(
-            found, source, target, rng
-        ),
+        "unscented": partial(icp_covariance.unscented, initial_covariance=of_guess),
+        "unscented_censi": partial(icp_covariance.unscented_censi, initial_covariance=of_guess),
+        "sampling": partial(icp_covariance.sampling, rng=np.random.default_rng(0)),
     }
-    for name, method in methods.items():
-        inputs = prepared[:3] if name == "sampling" else prepared
-        seconds = median_time_s(method, inputs, repeats=3 if name == "sampling" else 5)
-        goal = _GOAL_CENSI_US if name == "censi" else None
-        note = "100 samples" if name == "sampling" else ""
-        yield Measurement(f"icp.covariance.{name}_us", 1e6 * seconds, "us", goal, note=note)
-
-
-def _peers() -> dict[str, Matcher]:
-    """Other ways to register: SciPy's k-d tree, and what of small_gicp and Open3D is there."""
-    peers: dict[str, Matcher] = {"scipy": _match_by_scipy}
-    if importlib.util.find_spec("small_gicp") is not None:
-        peers["small_gicp"] = _match_by_small_gicp
-    if importlib.util.find_spec("open3d") is not None:
-        peers["open3d"] = _match_by_open3d
-    return peers
+    goals, notes = {"censi": 60.0}, {"sampling": "100 samples"}
+    return [
+        Measurement(
+            f"icp.covariance.{name}_us",
+            1e6 * median_time_s(method, inputs),
+            "us",
+            goals.get(name),
+            note=notes.get(name, ""),
+        )
+        for name, method in methods.items()
+    ]
 
 
 def _match_by_scipy(target_m: Array, source_m: Array) -> Array:
@@ -206,10 +189,10 @@ def _match_by_scipy(target_m: Array, source_m: Array) -> Array:
     return pose
 
 
-def _match_by_small_gicp(target_m: Array, source_m: Array) -> Array:
-    """small_gicp's plane-to-plane ICP, the best of its own here.
+def _match_by_gicp(target_m: Array, source_m: Array) -> Array:
+    """small_gicp's plane-to-plane ICP, the best of its methods here.
 
-    A second layer of points makes planes of the walls; 2 cm between the layers suits it best.
+    A second layer of points turns the walls into planes; 2 cm between the layers suits it best.
     """
     import small_gicp  # type: ignore[import-not-found]
 
@@ -227,18 +210,19 @@ def _match_by_small_gicp(target_m: Array, source_m: Array) -> Array:
 
 
 def _match_by_open3d(target_m: Array, source_m: Array) -> Array:
-    """Open3D's point-to-plane ICP, by the same two layers."""
+    """Open3D's point-to-plane ICP, with the same two layers."""
     import open3d  # type: ignore[import-not-found]
 
-    clouds = []
-    for ranges in (target_m, source_m):
-        cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(_two_layers(ranges)))
+    target, source = (
+        open3d.geometry.PointCloud(open3d.utility.Vector3dVector(_two_layers(ranges)))
+        for ranges in (target_m, source_m)
+    )
+    for cloud in (target, source):
         cloud.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(20))
-        clouds.append(cloud)
     ways = open3d.pipelines.registration
     found = ways.registration_icp(
-        clouds[1],
-        clouds[0],
+        source,
+        target,
         1.0,
         np.eye(4),
         ways.TransformationEstimationPointToPlane(),
@@ -249,9 +233,8 @@ def _match_by_open3d(target_m: Array, source_m: Array) -> Array:
 
 def _points(ranges_m: Array) -> Array:
     seen = np.isfinite(ranges_m)
-    bearings = BEARINGS_RAD[seen]
-    points: Array = ranges_m[seen, None] * np.stack([np.cos(bearings), np.sin(bearings)], axis=1)
-    return points
+    rays = np.stack([np.cos(BEARINGS_RAD[seen]), np.sin(BEARINGS_RAD[seen])], axis=1)
+    return np.asarray(ranges_m[seen, None] * rays)
 
 
 def _two_layers(ranges_m: Array) -> Array:
@@ -286,19 +269,15 @@ def _corridor(rng: np.random.Generator) -> tuple[Array, tuple[float, float, floa
             corners += [(x, y), (x, back), (x + 0.9, back), (x + 0.9, y)]
             x += rng.uniform(3.0, 7.0)
         sides.append([*corners, (length, y)])
-    loop = np.array(sides[0] + sides[1][::-1])
-    walls = np.hstack([loop, np.roll(loop, -1, axis=0)])
+    walls = _closed(np.array(sides[0] + sides[1][::-1]))
     return walls, (2.0, length - 2.0, -width / 2.0 + 0.4, width / 2.0 - 0.4)
 
 
 def _box(x: float, y: float, width: float, depth: float, turn_rad: float) -> Array:
     corners = np.array([[-width, -depth], [width, -depth], [width, depth], [-width, depth]]) / 2.0
-    corners = se2.transform(np.array([x, y, turn_rad]), corners)
+    return _closed(se2.transform(np.array([x, y, turn_rad]), corners))
+
+
+def _closed(corners: Array) -> Array:
+    """Walls (N, 4) along a closed line through corners (N, 2)."""
     return np.hstack([corners, np.roll(corners, -1, axis=0)])
-
-
-def _clearance_m(walls: Array, point: Array) -> float:
-    start, along = walls[:, :2], walls[:, 2:] - walls[:, :2]
-    share = np.sum((point - start) * along, axis=1) / np.sum(along**2, axis=1)
-    foot = start + np.clip(share, 0.0, 1.0)[:, None] * along
-    return float(np.min(np.hypot(*(point - foot).T)))

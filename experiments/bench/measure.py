@@ -7,11 +7,13 @@ import io
 import json
 import statistics
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from estimators.base import Belief, Estimator
 from experiments.runs.machine import machine
+from sim.recording import Frame
 
 
 @dataclass(frozen=True)
@@ -29,7 +31,7 @@ class Measurement:
     better
         Which direction is better.
     note
-        How it was taken, in a few words.
+        How it was measured, in a few words.
     """
 
     name: str
@@ -47,12 +49,24 @@ class Measurement:
         return self.value <= self.goal if self.better == "lower" else self.value >= self.goal
 
 
+def time_s(
+    function: Callable[..., object],
+    *arguments: Any,
+    clock: Callable[[], float] = time.perf_counter,
+) -> float:
+    """Duration of one call, s: wall time, or processor time with `time.process_time`."""
+    begun = clock()
+    function(*arguments)
+    return clock() - begun
+
+
 def median_time_s(
     function: Callable[..., object],
     inputs: Iterable[tuple[Any, ...]] = ((),),
     *,
     at_least_s: float = 0.3,
     repeats: int = 5,
+    clock: Callable[[], float] = time.perf_counter,
 ) -> float:
     """Median duration of one call, s.
 
@@ -62,24 +76,29 @@ def median_time_s(
         What to time, as a user calls it. The first round over the inputs is not counted, so
         that nothing is compiled or read while the clock runs.
     inputs
-        Argument tuples to go round; every call is timed on its own, so that a function is not
-        timed on one input that the processor has learnt.
+        Argument tuples to cycle through. Each call is timed on its own, so that the processor
+        cannot adapt to a single input.
     at_least_s, repeats
-        Go round until both this much time and this many rounds have passed.
+        Cycle until both this much time and this many rounds have passed.
+    clock
+        As for `time_s`.
     """
     arguments = list(inputs)
     for given in arguments:
         function(*given)
-    times_ns: list[int] = []
-    rounds = 0
+    times_s: list[float] = []
     until = time.perf_counter() + at_least_s
-    while rounds < repeats or time.perf_counter() < until:
-        for given in arguments:
-            begun = time.perf_counter_ns()
-            function(*given)
-            times_ns.append(time.perf_counter_ns() - begun)
-        rounds += 1
-    return statistics.median(times_ns) * 1e-9
+    while len(times_s) < repeats * len(arguments) or time.perf_counter() < until:
+        times_s += [time_s(function, *given, clock=clock) for given in arguments]
+    return statistics.median(times_s)
+
+
+def timed_steps(estimator: Estimator, frames: Iterable[Frame]) -> Iterator[tuple[float, Belief]]:
+    """Step through frames; yield each step's processor time, s, and its belief."""
+    for frame in frames:
+        begun = time.process_time()
+        belief = estimator.step(frame)
+        yield time.process_time() - begun, belief
 
 
 def as_json(results: list[Measurement]) -> str:
@@ -91,14 +110,15 @@ def as_json(results: list[Measurement]) -> str:
 def as_table(results: list[Measurement]) -> str:
     """The same for people: value, goal and whether it is reached."""
     from rich.console import Console
-    from rich.table import Table
+    from rich.table import Column, Table
 
-    table = Table(title=", ".join(f"{key} {value}" for key, value in machine().items()))
-    table.add_column("name", no_wrap=True)
-    for column in ("value", "goal"):
-        table.add_column(column, justify="right", no_wrap=True)
-    for column in ("unit", "", "note"):
-        table.add_column(column)
+    table = Table(
+        Column("name", no_wrap=True),
+        Column("value", justify="right", no_wrap=True),
+        Column("goal", justify="right", no_wrap=True),
+        *("unit", "", "note"),
+        title=", ".join(f"{key} {value}" for key, value in machine().items()),
+    )
     words = {None: "", True: "reached", False: "MISSED"}
     for r in results:
         sign = "<=" if r.better == "lower" else ">="

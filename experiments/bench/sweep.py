@@ -1,4 +1,4 @@
-"""What a sweep costs beside its runs, and what two workers gain."""
+"""Overhead of a sweep over its runs, and the gain of two workers."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ import statistics
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 
 from estimators.base import run as run_estimator
-from experiments.bench.measure import Measurement, median_time_s
+from experiments.bench.measure import Measurement, median_time_s, time_s
 from experiments.runs import paths
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
@@ -32,9 +33,16 @@ _FEW, _MANY = 10, 60
 
 
 def run() -> list[Measurement]:
-    """Overheads a run and a job, the gain of two workers, and the time of `estima --help`."""
+    """Overheads per run and per job, the gain of two workers, and the time of `estima --help`."""
     try:
-        return [*_overheads(), *_speedup(), _help()]
+        return [
+            *_overheads(),
+            _speedup(24, None),  # too short to make up for the workers' start-up
+            _speedup(200, 1.8),
+            Measurement(
+                "cli.help_s", statistics.median(_cli_s("--help") for _ in range(7)), "s", 0.4
+            ),
+        ]
     finally:
         shutil.rmtree(paths.results() / "runs" / _NAME, ignore_errors=True)
 
@@ -46,76 +54,53 @@ def _overheads() -> list[Measurement]:
     prior, estimator = experiment.prior(recording), experiment.estimator()
     own_s = median_time_s(lambda: run_estimator(estimator, recording, prior, stream(0, "bench")))
 
-    def packed(repeats: int) -> float:
+    def packed_s(repeats: int) -> float:
         many = experiment.replaced(repeats=repeats)
-        begun = time.process_time()
-        write_rows(evaluate(many, recording), many.rows_folder / f"{many.key}.parquet")
-        return time.process_time() - begun
+        path = many.rows_folder / f"{many.key}.parquet"
+        return time_s(lambda: write_rows(evaluate(many, recording), path), clock=time.process_time)
 
-    slopes = [(packed(_MANY) - packed(_FEW)) / (_MANY - _FEW) - own_s for _ in range(3)]
-    jobs = [(_swept_s(_MANY) - _swept_s(_FEW)) / (_MANY - _FEW) - own_s for _ in range(3)]
+    def swept_s(n_runs: int) -> float:
+        """Wall time of a sweep over values of a belief, the recording being cached."""
+        values = ",".join(f"{1e-6 * (i + 1):.7g}" for i in range(n_runs))
+        return _sweep_s(*_SHORT, f"estimator.kr={values}", "hydra/launcher=basic")
+
+    def overhead_ms(seconds: Callable[[int], float]) -> float:
+        """Slope of the time over the number of runs, less the estimator's own; median of three."""
+        slopes = [(seconds(_MANY) - seconds(_FEW)) / (_MANY - _FEW) - own_s for _ in range(3)]
+        return 1e3 * statistics.median(slopes)
+
+    packed = "processor time of a repeat beyond the estimator's own"
+    job = "wall time of a run of its own, from the command line, one after another"
     return [
-        Measurement(
-            "sweep.overhead_packed_ms",
-            1e3 * statistics.median(slopes),
-            "ms",
-            10.0,
-            note="processor time of a repeat beside the estimator's own",
-        ),
-        Measurement(
-            "sweep.overhead_job_ms",
-            1e3 * statistics.median(jobs),
-            "ms",
-            60.0,
-            note="wall time of a run of its own, from the command line, one after another",
-        ),
+        Measurement("sweep.overhead_packed_ms", overhead_ms(packed_s), "ms", 10.0, note=packed),
+        Measurement("sweep.overhead_job_ms", overhead_ms(swept_s), "ms", 60.0, note=job),
     ]
 
 
-def _swept_s(n_runs: int) -> float:
-    """Wall time of a sweep over values of a belief, recording at hand, without a cached row."""
+def _speedup(n_runs: int, goal: float | None) -> Measurement:
+    """Gain of two workers over one in a sweep of so many recordings."""
+    seconds = {}
+    for launcher in ("joblib", "joblib", "basic"):  # the first makes the recordings
+        workers = ["hydra.launcher.n_jobs=2"] if launcher == "joblib" else []
+        chosen = [f"seed=range(0,{n_runs})", f"hydra/launcher={launcher}", *workers]
+        seconds[launcher] = _sweep_s(*_LONG, *chosen)
+    return Measurement(
+        f"sweep.speedup_two_workers_{n_runs}",
+        seconds["basic"] / seconds["joblib"],
+        "x",
+        goal,
+        "higher",
+        f"{n_runs} runs of ekf_icp, {seconds['basic']:.0f} s on one; start-up included",
+    )
+
+
+def _sweep_s(*overrides: str) -> float:
+    """Wall time of a sweep that finds no rows of a former one."""
     shutil.rmtree(paths.results() / "runs" / _NAME, ignore_errors=True)
-    values = ",".join(f"{1e-6 * (i + 1):.7g}" for i in range(n_runs))
-    return _timed(
-        ["run", "-m", *_SHORT, f"name={_NAME}", f"estimator.kr={values}", "hydra/launcher=basic"]
-    )
+    return _cli_s("run", "-m", f"name={_NAME}", *overrides)
 
 
-def _speedup() -> list[Measurement]:
-    """Gain of two workers: for a short sweep their start-up weighs, for a usual one it does not."""
-    found = []
-    for n_runs, goal in ((24, None), (200, 1.8)):
-        seconds = {}
-        for launcher in ("joblib", "joblib", "basic"):  # the first makes the recordings
-            shutil.rmtree(paths.results() / "runs" / _NAME, ignore_errors=True)
-            chosen = [f"hydra/launcher={launcher}"]
-            if launcher == "joblib":
-                chosen.append("hydra.launcher.n_jobs=2")
-            seeds = f"seed=range(0,{n_runs})"
-            seconds[launcher] = _timed(["run", "-m", *_LONG, f"name={_NAME}", seeds, *chosen])
-        found.append(
-            Measurement(
-                f"sweep.speedup_two_workers_{n_runs}",
-                seconds["basic"] / seconds["joblib"],
-                "x",
-                goal,
-                "higher",
-                f"{n_runs} runs of ekf_icp, {seconds['basic']:.0f} s on one; start-up included",
-            )
-        )
-    return found
-
-
-def _help() -> Measurement:
-    seconds = [_timed(["--help"]) for _ in range(7)]
-    return Measurement("cli.help_s", statistics.median(seconds), "s", 0.4)
-
-
-def _timed(arguments: list[str]) -> float:
-    begun = time.perf_counter()
-    subprocess.run(
-        [sys.executable, "-m", "experiments.cli", *arguments],
-        check=True,
-        capture_output=True,
-    )
-    return time.perf_counter() - begun
+def _cli_s(*arguments: str) -> float:
+    """Wall time of a command."""
+    command = [sys.executable, "-m", "experiments.cli", *arguments]
+    return time_s(lambda: subprocess.run(command, check=True, capture_output=True))

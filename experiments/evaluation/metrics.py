@@ -23,8 +23,7 @@ RPE_DISTANCES_M = (1.0, 10.0)
 
 def position_errors_m(truth: Array, means: Array) -> Array:
     """Distances (T,) between true and estimated positions, m."""
-    distance: Array = np.hypot(*(means[:, :2] - truth[:, :2]).T)
-    return distance
+    return np.asarray(np.hypot(*(means[:, :2] - truth[:, :2]).T))
 
 
 def heading_errors_rad(truth: Array, means: Array) -> Array:
@@ -38,10 +37,10 @@ def rms(errors: Array) -> float:
 
 
 def alignment(truth: Array, means: Array) -> Array:
-    """Pose (3,) that takes the estimated positions closest to the true ones: SE(2), no scale.
+    """Pose (3,) that brings the estimated positions closest to the true ones: SE(2), no scale.
 
-    It minimises the sum of squared distances (Kabsch in the plane). Without any spread in the
-    positions the rotation is left at zero.
+    It minimises the sum of squared distances (Kabsch in the plane). The rotation is zero if the
+    positions have no spread.
     """
     centre_truth, centre_means = truth[:, :2].mean(axis=0), means[:, :2].mean(axis=0)
     a, b = means[:, :2] - centre_means, truth[:, :2] - centre_truth
@@ -59,7 +58,7 @@ def aligned(truth: Array, means: Array) -> Array:
 def pairs_by_distance(truth: Array, distance_m: float) -> NDArray[np.int64]:
     """Pairs (P, 2) of rows between which the truth travelled at least the distance.
 
-    Consecutive, without overlap, the first one from the start, as evo pairs.
+    Consecutive, without overlap, the first one from the start, as in evo.
     """
     steps = np.hypot(*np.diff(truth[:, :2], axis=0).T)
     rows, travelled = [0], 0.0
@@ -69,12 +68,6 @@ def pairs_by_distance(truth: Array, distance_m: float) -> NDArray[np.int64]:
             rows.append(i + 1)
             travelled = 0.0
     return np.array([rows[:-1], rows[1:]], dtype=np.int64).T.reshape(-1, 2)
-
-
-def pairs_by_frames(n_frames: int, delta: int) -> NDArray[np.int64]:
-    """Pairs (P, 2) of rows `delta` apart: consecutive, without overlap, as evo pairs."""
-    rows = np.arange(0, n_frames, delta, dtype=np.int64)
-    return np.stack([rows[:-1], rows[1:]], axis=1)
 
 
 def relative_errors(truth: Array, means: Array, pairs: NDArray[np.int64]) -> Array:
@@ -87,18 +80,15 @@ def relative_errors(truth: Array, means: Array, pairs: NDArray[np.int64]) -> Arr
 def nees(truth: Array, means: Array, covariances: Array) -> Array:
     """Normalised estimation error squared (T,); NaN where the covariance is singular.
 
-    Its mean is 3 for a consistent filter. Covariances such as the zero one of a known start say
-    nothing about errors, so those stamps are left out, as are those that are not finite.
+    Its mean is 3 for a consistent filter. A singular covariance, such as the zero one of a known
+    start, predicts no error, so its stamp is left out, as is one that is not finite.
     """
     error = means - truth
     error[:, 2] = se2.wrap(error[:, 2])
     sigma = np.sqrt(np.maximum(np.diagonal(covariances, axis1=1, axis2=2), 0.0))
-    usable = np.all(sigma > 0.0, axis=1) & np.isfinite(error).all(axis=1)
-    usable &= np.isfinite(covariances).all(axis=(1, 2))
-    values = np.full(len(error), np.nan)
-    if not usable.any():
-        return values
-    scale = sigma[usable]
+    finite = np.isfinite(error).all(axis=1) & np.isfinite(covariances).all(axis=(1, 2))
+    usable = finite & np.all(sigma > 0.0, axis=1)
+    values, scale = np.full(len(error), np.nan), sigma[usable]
     correlation = covariances[usable] / (scale[:, :, None] * scale[:, None, :])
     eigenvalues, vectors = np.linalg.eigh((correlation + correlation.transpose(0, 2, 1)) / 2)
     projected = np.einsum("tij,ti->tj", vectors, error[usable] / scale)
@@ -112,19 +102,18 @@ def ellipse_area_m2(covariances: Array) -> Array:
     """Areas (T,) of the 95 % position ellipses, m^2: pi chi2 sqrt(det)."""
     block = covariances[:, :2, :2]
     determinant = block[:, 0, 0] * block[:, 1, 1] - block[:, 0, 1] * block[:, 1, 0]
-    area: Array = math.pi * CHI2_95_2DOF * np.sqrt(np.maximum(determinant, 0.0))
-    return area
+    return np.asarray(math.pi * CHI2_95_2DOF * np.sqrt(np.maximum(determinant, 0.0)))
 
 
 def at_distances(truth: Array, distances_m: Array) -> NDArray[np.int64]:
-    """First row at which the truth has travelled each distance; -1 where it never has."""
+    """First row at which the truth has travelled each distance; -1 where it never does."""
     travelled = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(truth[:, :2], axis=0).T))])
     rows = np.searchsorted(travelled, distances_m)
     return np.where(rows < len(travelled), rows, -1)
 
 
 def nees_at_distances(truth: Array, means: Array, covariances: Array, distances_m: Array) -> Array:
-    """NEES (D,) where the truth has first travelled each distance; NaN where it never has."""
+    """NEES (D,) where the truth has first travelled each distance; NaN where it never does."""
     rows = at_distances(truth, distances_m)
     return np.where(rows >= 0, nees(truth, means, covariances)[rows], np.nan)
 
@@ -132,27 +121,25 @@ def nees_at_distances(truth: Array, means: Array, covariances: Array, distances_
 def score(recording: Recording, estimate: Estimate) -> dict[str, float]:
     """Score an estimate against its recording's truth; units are in the keys.
 
-    Stamps outside the truth's span are left out. What does not apply has no key: all but times
-    without a truth, the error over 10 m of a shorter run, the NEES without a usable covariance.
-    NaN means that the estimate itself is not finite.
+    Stamps outside the truth's span are left out. A score that does not apply has no key: all but
+    the times without a truth, the error over 10 m of a shorter run, the NEES without a usable
+    covariance. NaN means that the estimate itself is not finite.
 
     Raises
     ------
     InputError
         If no stamp of the estimate lies within the truth's span.
     """
-    steps = estimate.step_seconds
     row = {"duration_s": float(np.ptp(estimate.stamps)) if len(estimate.stamps) else 0.0}
-    if len(steps):
-        row["step_time_us"] = float(1e6 * np.median(steps))
+    if len(estimate.step_seconds):
+        row["step_time_us"] = float(1e6 * np.median(estimate.step_seconds))
     if recording.truth is None:
         return row
     truth = recording.truth_at(estimate.stamps)
     known = np.isfinite(truth).all(axis=1)
     if not known.any():
         raise InputError("no estimate lies within the truth's time span; are the clocks the same?")
-    truth, means = truth[known], estimate.means[known]
-    covariances = estimate.covariances[known]
+    truth, means, covariances = truth[known], estimate.means[known], estimate.covariances[known]
     fitted = aligned(truth, means)
     values = nees(truth, means, covariances)
     counted = np.isfinite(values)
@@ -171,9 +158,8 @@ def score(recording: Recording, estimate: Estimate) -> dict[str, float]:
         row["nees_mean"] = float(np.mean(values[counted]))
     for distance in RPE_DISTANCES_M:
         pairs = pairs_by_distance(truth, distance)
-        if len(pairs) == 0:
-            continue
-        errors = relative_errors(truth, means, pairs)
-        row[f"rpe_{distance:g}m_rmse_m"] = rms(np.hypot(errors[:, 0], errors[:, 1]))
-        row[f"rpe_{distance:g}m_heading_rmse_rad"] = rms(errors[:, 2])
+        if len(pairs):
+            errors = relative_errors(truth, means, pairs)
+            row[f"rpe_{distance:g}m_rmse_m"] = rms(np.hypot(errors[:, 0], errors[:, 1]))
+            row[f"rpe_{distance:g}m_heading_rmse_rad"] = rms(errors[:, 2])
     return row

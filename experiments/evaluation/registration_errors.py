@@ -1,8 +1,7 @@
-"""Errors of many noisy registrations of one pair of poses, beside every covariance of them."""
+"""Errors of many noisy registrations of one pair of poses, beside their predicted covariances."""
 
 from __future__ import annotations
 
-import itertools
 import math
 import time
 from collections.abc import Callable
@@ -23,8 +22,6 @@ Array = NDArray[np.float64]
 
 METRICS: tuple[Metric, ...] = ("point_to_line", "point_to_point")
 _GUESS_SIGMA = np.array([0.01, 0.01, math.radians(0.5)])
-_STEP_M, _MOST_TURN_RAD = 0.05, math.radians(3.0)
-_CLEARANCE_M = 0.35
 
 
 @dataclass(frozen=True)
@@ -42,10 +39,11 @@ def scenes(world: World, place: str, mount: Array, rng: np.random.Generator, n: 
     path = _resampled(world.waypoints, 0.1)
     inside = np.flatnonzero(world.place_of(path[:, :2]) == place)
     found: list[Scene] = []
+    turn_rad = math.radians(3.0)
     while len(found) < n:
         base = path[rng.choice(inside)] + np.append(rng.normal(0.0, 0.1, 2), rng.normal(0.0, 0.15))
-        moved = se2.compose(base, [_STEP_M, 0.0, rng.uniform(-_MOST_TURN_RAD, _MOST_TURN_RAD)])
-        if world.clearance_m(base) > _CLEARANCE_M:
+        moved = se2.compose(base, [0.05, 0.0, rng.uniform(-turn_rad, turn_rad)])
+        if world.clearance_m(base) > 0.35:
             target, source = se2.compose(base, mount), se2.compose(moved, mount)
             found.append(Scene(place, world.walls, target, source))
     return found
@@ -65,9 +63,8 @@ def measured(
     truth = se2.between(scene.T_w_target, scene.T_w_source)
     bound = fisher_bound(scene.walls, scene.T_w_target, scene.T_w_source, bearings, sigma)
     clean = [cast(scene.walls, pose, bearings)[0] for pose in (scene.T_w_target, scene.T_w_source)]
-    errors: dict[Metric, list[Array]] = {metric: [] for metric in METRICS}
-    taken_s: dict[Metric, list[float]] = {metric: [] for metric in METRICS}
-    tried: dict[tuple[Metric, str], list[tuple[float, float, float]]] = {}
+    matches: dict[Metric, list[tuple[float, ...]]] = {metric: [] for metric in METRICS}
+    tried: dict[tuple[Metric, str], list[tuple[float, ...]]] = {}
     for repeat in range(n_repeats):
         noisy = [ranges + sigma * rng.standard_normal(len(ranges)) for ranges in clean]
         target, source = (prepare(ranges, bearings, laser.max_range_m) for ranges in noisy)
@@ -75,10 +72,10 @@ def measured(
         for metric in METRICS:
             begun = time.perf_counter()
             found = register(source, target, guess, metric=metric, gate_m=0.6, gate_rad=0.06)
-            taken_s[metric].append(time.perf_counter() - begun)
+            took = time.perf_counter() - begun
             off = found.T_target_source - truth
             off[2] = math.remainder(off[2], 2.0 * math.pi)
-            errors[metric].append(off)
+            matches[metric].append((*off, took))
             if found.status in ("empty", "poor_overlap", "not_converged"):
                 continue
             for name, method in _methods(sigma, rng).items():
@@ -87,25 +84,25 @@ def measured(
                 begun = time.perf_counter()
                 covariance = method(found, source, target)
                 took = time.perf_counter() - begun
+                size = float(np.linalg.det(covariance)) ** (1.0 / 6.0)
                 value = _nees_share(off, covariance, found)
-                root = float(np.linalg.det(covariance)) ** (1.0 / 6.0)
-                tried.setdefault((metric, name), []).append((value, root, took))
+                tried.setdefault((metric, name), []).append((value, size, took))
     rows = []
     for (metric, name), values in tried.items():
-        nees, root, took = np.array(values).T
-        spread = np.array(errors[metric])
-        actual = float(np.linalg.det(np.cov(spread.T))) ** (1.0 / 6.0)
+        nees, sizes, took_s = np.array(values).T
+        off, registered_s = np.split(np.array(matches[metric]), [3], axis=1)
+        actual = float(np.linalg.det(np.cov(off.T))) ** (1.0 / 6.0)
         rows.append(
             {
                 "place": scene.place,
                 "metric": metric,
                 "method": name,
                 "nees_over_dof": float(np.mean(nees)),
-                "determinant_ratio": float(np.median(root)) / actual,
-                "time_us": 1e6 * float(np.median(took)),
-                "registration_us": 1e6 * float(np.median(taken_s[metric])),
-                "error_m": float(np.median(np.hypot(spread[:, 0], spread[:, 1]))),
-                "error_rad": float(np.median(np.abs(spread[:, 2]))),
+                "determinant_ratio": float(np.median(sizes)) / actual,
+                "time_us": 1e6 * float(np.median(took_s)),
+                "registration_us": 1e6 * float(np.median(registered_s)),
+                "error_m": float(np.median(np.hypot(off[:, 0], off[:, 1]))),
+                "error_rad": float(np.median(np.abs(off[:, 2]))),
                 "bound_m": math.sqrt(bound[0, 0] + bound[1, 1]),
                 "bound_rad": math.sqrt(bound[2, 2]),
                 "used_share": len(nees) / (n_sampled if name == "sampling" else n_repeats),
@@ -145,10 +142,9 @@ def _nees_share(error: Array, covariance: Array, found: Registration) -> float:
 
 def _resampled(waypoints: Array, spacing_m: float) -> Array:
     """Poses (N, 3) along a polyline, facing along it."""
-    poses = []
-    for start, end in itertools.pairwise(waypoints):
-        way = end - start
+    legs = []
+    for start, way in zip(waypoints, np.diff(waypoints, axis=0), strict=False):
         length, heading = float(np.hypot(*way)), math.atan2(way[1], way[0])
-        for share in np.arange(0.0, 1.0, spacing_m / max(length, spacing_m)):
-            poses.append([*(start + share * way), heading])
-    return np.array(poses)
+        share = np.arange(0.0, 1.0, spacing_m / max(length, spacing_m))[:, None]
+        legs.append(np.hstack([start + share * way, np.full(share.shape, heading)]))
+    return np.concatenate(legs)

@@ -1,7 +1,7 @@
 """The relations metric (Kuemmerle et al. 2009, "On measuring the accuracy of SLAM algorithms").
 
-An estimate is judged by the motion between pairs of its poses whose true relation is known, so
-no common frame is needed and an early error does not weigh on all that follows.
+An estimate is judged by the motion between pairs of its poses whose true relation is known. So no
+common frame is needed, and an early error does not count in all later poses.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class RelationErrors:
     translation_m, rotation_rad
         (N,) lengths of the errors of the relations that could be judged.
     rows
-        (N,) which relations those are.
+        (N,) indices of those relations.
     """
 
     translation_m: Array
@@ -40,13 +40,15 @@ class RelationErrors:
 
     def summary(self) -> dict[str, float]:
         """Means, standard deviations and maxima, with the unit in the key."""
-        found: dict[str, float] = {"n_relations": float(len(self.rows))}
+        found = {"n_relations": float(len(self.rows))}
         columns = {"translation": (self.translation_m, "m"), "rotation": (self.rotation_rad, "rad")}
         for name, (values, unit) in columns.items():
-            found[f"{name}_mean_{unit}"] = float(np.mean(values))
-            found[f"{name}_std_{unit}"] = float(np.std(values))
-            found[f"{name}_max_{unit}"] = float(np.max(values))
-            found[f"{name}_squared_mean_{unit}2"] = float(np.mean(values**2))
+            found |= {
+                f"{name}_mean_{unit}": float(np.mean(values)),
+                f"{name}_std_{unit}": float(np.std(values)),
+                f"{name}_max_{unit}": float(np.max(values)),
+                f"{name}_squared_mean_{unit}2": float(np.mean(values**2)),
+            }
         return found
 
 
@@ -63,9 +65,9 @@ def relation_errors(
     ----------
     association
         `near` takes the pose with the nearest stamp, if it is within the tolerance at both ends
-        (0 for exact stamps); `interpolated` works the poses out at the relations' stamps, where
-        the trajectory has them between. Where a robot turns fast between sparse poses the second
-        one adds errors of its own.
+        (0 for exact stamps). `interpolated` interpolates the poses at the relations' stamps within
+        the trajectory's span; it adds errors of its own where a robot turns fast between sparse
+        poses.
 
     Raises
     ------

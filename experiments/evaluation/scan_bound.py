@@ -1,4 +1,4 @@
-"""The least error any matcher of two laser scans can have, from the true walls.
+"""The smallest error that any matcher of two laser scans can reach, from the true walls.
 
 Censi, "On achievable accuracy for range-finder localization" (ICRA 2007) and "... for pose
 tracking" (ICRA 2009): ranges r(x) with white noise of variance sigma^2 hold the Fisher
@@ -15,7 +15,7 @@ from sim import se2
 
 Array = NDArray[np.float64]
 
-_NO_INFORMATION = 1e-6  # 1/m^2 or 1/rad^2: a direction nobody can see has a huge bound, not inf
+_NO_INFORMATION = 1e-6  # 1/m^2 or 1/rad^2: an unobservable direction has a huge bound, not inf
 
 
 def cast(walls: Array, T_w_sensor: Array, bearings_rad: Array) -> tuple[Array, Array]:
@@ -46,8 +46,7 @@ def cast(walls: Array, T_w_sensor: Array, bearings_rad: Array) -> tuple[Array, A
         share = _cross(start, ray) / across
     hit = (share >= 0.0) & (share <= 1.0) & (distance > 0.0)
     distance = np.where(hit, distance, np.inf)
-    nearest = np.argmin(distance, axis=1)
-    ranges = distance[np.arange(len(angle)), nearest]
+    nearest, ranges = distance.argmin(axis=1), distance.min(axis=1)
     normals = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.hypot(*along.T)[:, None]
     return ranges, np.where(np.isfinite(ranges)[:, None], normals[nearest], np.nan)
 
@@ -65,8 +64,7 @@ def fisher_information(
     dr/dheading = -r (n.v') / (n.v), v' being v turned left by a right angle.
     """
     ranges, normals = cast(walls, T_w_sensor, bearings_rad)
-    seen = ranges <= max_range_m
-    seen &= np.isfinite(ranges)
+    seen = np.isfinite(ranges) & (ranges <= max_range_m)
     angle = (T_w_sensor[2] + bearings_rad)[seen]
     ray = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     left = np.stack([-ray[:, 1], ray[:, 0]], axis=1)
@@ -74,8 +72,7 @@ def fisher_information(
     facing = np.sum(normal * ray, axis=1)
     turn = ranges[seen] * np.sum(normal * left, axis=1)
     slope = -np.column_stack([normal, turn]) / facing[:, None]
-    information: Array = slope.T @ slope / sigma_range_m**2
-    return information
+    return np.asarray(slope.T @ slope / sigma_range_m**2)
 
 
 def fisher_bound(
@@ -97,5 +94,4 @@ def fisher_bound(
 
 
 def _cross(a: Array, b: Array) -> Array:
-    product: Array = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
-    return product
+    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])

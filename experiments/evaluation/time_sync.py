@@ -1,4 +1,4 @@
-"""Bringing two trajectories together: which pose belongs to which instant, by stated rules."""
+"""Two trajectories with clocks of their own: which poses belong together."""
 
 from __future__ import annotations
 
@@ -21,8 +21,7 @@ def nearest(stamps: Array, wanted: Array) -> Rows:
         return np.zeros(np.shape(wanted), np.int64)
     after = np.clip(np.searchsorted(stamps, wanted), 1, len(stamps) - 1)
     before_is_nearer = wanted - stamps[after - 1] <= stamps[after] - wanted
-    rows: Rows = np.where(before_is_nearer, after - 1, after).astype(np.int64)
-    return rows
+    return np.where(before_is_nearer, after - 1, after).astype(np.int64)
 
 
 def interpolate(stamps: Array, poses: Array, wanted: Array, longest_gap_s: float = np.inf) -> Array:

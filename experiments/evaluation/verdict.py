@@ -12,8 +12,6 @@ from numpy.typing import ArrayLike
 
 from experiments.evaluation.statistics import Interval, log_ratio_interval, wilcoxon_p
 
-_MOST_P = 0.01
-
 
 class Verdict(StrEnum):
     """What an interval says of a criterion."""
@@ -30,7 +28,7 @@ class Verdict(StrEnum):
 
 
 class Role(StrEnum):
-    """Whether a statistic decides its claim's verdict, or stands beside it."""
+    """Whether a statistic decides its claim's verdict, or only stands beside it."""
 
     HEADLINE = "headline"
     BESIDE = "beside"
@@ -58,7 +56,7 @@ class Claim:
     criterion
         What the interval is held against.
     verdict, reason
-        The verdict, and why or where it holds, if there is more to say.
+        The verdict, and why or where it holds, if that needs saying.
     role
         A statistic without a criterion stands beside the claim.
     """
@@ -77,9 +75,9 @@ class Claim:
 
 
 def judged(interval: Interval, at_least: float = -math.inf, at_most: float = math.inf) -> Verdict:
-    """Judge an interval against [at_least, at_most]: inside, wholly outside, or spanning.
+    """Judge an interval against [at_least, at_most]: inside, wholly outside, or spanning an end.
 
-    An interval without bounds, for lack of data, decides nothing.
+    An interval without bounds, for lack of data, leaves the claim undecided.
     """
     if not (math.isfinite(interval.low) and math.isfinite(interval.high)):
         return Verdict.UNDECIDED
@@ -91,22 +89,22 @@ def judged(interval: Interval, at_least: float = -math.inf, at_most: float = mat
 
 
 def holds(condition: bool) -> Verdict:
-    """Judge a statistic that has no spread."""
+    """Judge a statistic without an interval."""
     return Verdict.REPRODUCED if condition else Verdict.NOT_REPRODUCED
 
 
 def lower(first: ArrayLike, second: ArrayLike) -> tuple[Interval, float, Verdict]:
     """Whether paired values are lower in the first arm: their ratio, Wilcoxon's p, the verdict.
 
-    Reproduced if the median is below one and p < 0.01; not reproduced if the ratio's interval holds
-    nothing below one; undecided if it spans one, or there are fewer than two pairs.
+    Reproduced if the median ratio is below one and p < 0.01; not reproduced if the ratio's interval
+    has nothing below one; undecided if it spans one, or there are fewer than two pairs.
     """
     above, below = np.asarray(first, float), np.asarray(second, float)
     ratio = log_ratio_interval(above, below)
     p = 1.0 if np.array_equal(above, below) else wilcoxon_p(above, below)
     if len(above) < 2:
         return ratio, p, Verdict.UNDECIDED
-    if p < _MOST_P and float(np.median(np.log(above) - np.log(below))) < 0.0:
+    if p < 0.01 and float(np.median(np.log(above) - np.log(below))) < 0.0:
         return ratio, p, Verdict.REPRODUCED
     return ratio, p, Verdict.NOT_REPRODUCED if ratio.low >= 1.0 else Verdict.UNDECIDED
 
