@@ -35,7 +35,7 @@ def run() -> list[Measurement]:
     hall_30, poses = hall(30, 50)
     laser = Laser(n_beams=721)
     with BulletBody(hall_30, _ROBOT, poses[0]) as body:
-        scan = _BulletRays(body).scan
+        scan = BulletRays(body).scan
         scan_s = median_time_s(lambda pose: scan(laser, pose), [(pose,) for pose in poses])
     factor, note = statistics.median(factors), "Bullet rays, 721 beams, 52 faces, 60 s"
     return [
@@ -43,15 +43,3 @@ def run() -> list[Measurement]:
         Measurement("sim.scan_bullet_30_us", 1e6 * scan_s, "us", note="the same scan by Bullet"),
         Measurement("sim.peak_memory_mib", memory_mib, "MiB", note="of the process so far"),
     ]
-<<<<<<< HEAD
-
-
-def _bullet_scan_s(n_boxes: int) -> float:
-    world, poses = hall(n_boxes)
-    laser = Laser(n_beams=721)
-    start = np.asarray(poses[0], float)
-    with BulletBody(world, ROBOT, start) as body:
-        rays = BulletRays(body)
-        return median_time_s(lambda pose: rays.scan(laser, pose), [(p,) for p in poses[:50]])
-=======
->>>>>>> w2b
