@@ -1,6 +1,6 @@
 """A cache of recordings, addressed by what decides their bits: a sweep simulates each of them once.
 
-It holds at most $ESTIMA_CACHE_GIB (8 unless set); the recordings used longest ago go first.
+It holds at most $ESTIMA_CACHE_GIB (8 unless set); the least recently used go first.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import json
 import os
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -35,10 +35,10 @@ def key_of(settings: dict[str, Any]) -> str:
 
 
 def cached(key: str, make: Callable[[], Recording]) -> Recording:
-    """Recording of the key, from the cache, or made now and kept.
+    """Recording of the key, from the cache, or made now and cached.
 
-    Safe under several processes: the second one waits for the first and reads its file. A file
-    that does not match its checksum is dropped and made again.
+    Safe with several processes: the second waits for the first and reads its file. A file that
+    does not match its checksum is dropped and made again.
     """
     path = folder() / f"{key}.npz"
     with _locked(path):
@@ -65,31 +65,25 @@ def limit_bytes() -> float:
         If ESTIMA_CACHE_GIB is not a number from 0 on.
     """
     text = os.environ.get("ESTIMA_CACHE_GIB") or str(_LIMIT_GIB)
-    try:
-        limit = float(text)
-    except ValueError:
-        limit = -1.0
-    if not limit >= 0.0:
-        raise InputError(f"ESTIMA_CACHE_GIB must be a number of GiB from 0 on, got {text!r}")
-    return limit * 2**30
+    with suppress(ValueError):
+        if float(text) >= 0.0:
+            return float(text) * 2**30
+    raise InputError(f"ESTIMA_CACHE_GIB must be a number of GiB, zero or more, got {text!r}")
 
 
 def files() -> list[tuple[Path, int]]:
-    """Cached recordings and their sizes in bytes, those used longest ago first."""
+    """Cached recordings and their sizes in bytes, the least recently used first."""
     found = []
     for path in folder().glob("*.npz"):
-        try:
-            about = path.stat()
-        except FileNotFoundError:  # another process dropped it
-            continue
-        found.append((about.st_mtime_ns, path, about.st_size))
+        with suppress(FileNotFoundError):  # another process dropped it
+            found.append((path.stat().st_mtime_ns, path, path.stat().st_size))
     return [(path, size) for _, path, size in sorted(found)]
 
 
 def trim(most_bytes: float) -> int:
-    """Drop the recordings used longest ago until the rest fit; return how many went.
+    """Drop the least recently used recordings until the rest fit; return how many were dropped.
 
-    One that a process is reading or writing at this moment stays.
+    One that a process is reading or writing right now stays.
     """
     kept, dropped = files(), 0
     excess = sum(size for _, size in kept) - most_bytes

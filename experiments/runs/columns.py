@@ -1,6 +1,6 @@
 """Columns of results: what a metric is called, its unit, and how tables and plots show it.
 
-The one schema of rows: a column is a setting, a metric, a status or an origin by its name.
+This is the one schema of rows: by its name, a column is a setting, a metric, a status or an origin.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ class Column:
     Attributes
     ----------
     label
-        In words, for the axes of plots.
+        For the axes of plots.
     symbol
-        In short, for the headings of wide tables.
+        Short, for the headings of wide tables.
     unit
-        Empty for a number without one.
+        Empty if there is none.
     scale
         Axis on which it is drawn when it spans decades.
     better

@@ -1,4 +1,4 @@
-"""What people see in the terminal: progress, and the one line that ends a failed command."""
+"""Terminal output: progress, and the one line that ends a failed command."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Any, NoReturn
 
 from sim.errors import InputError
 
-_QUIET_S = 2.0  # what ends sooner needs no progress
+_QUIET_S = 2.0  # what ends sooner shows no progress
 _LINE_EVERY_S = 10.0  # where the output is a file
 
 
@@ -25,7 +25,7 @@ class RunFailedError(Exception):
 def progress(
     label: str, total: float | None = None, unit: str = "", *, summary: bool = False
 ) -> Iterator[Callable[..., None]]:
-    """Give a function that takes the amount done, and how many of it failed (by default none).
+    """Yield a function that takes the amount done, and how much of it failed (by default none).
 
     It draws a bar on a terminal, and prints a line now and then elsewhere. Nothing is shown for
     the first two seconds.
@@ -33,11 +33,11 @@ def progress(
     Parameters
     ----------
     total
-        The amount when all is done; None if nobody knows.
+        The amount when all is done; None if unknown.
     unit
-        What is counted, such as runs; then their rate is shown too.
+        What is counted, such as runs; their rate is then shown too.
     summary
-        Leave the last state as a line, even if all took less than two seconds.
+        Print the last state, even if all took less than two seconds.
     """
     begun = time.monotonic()
     next_line, line, printed = begun + _QUIET_S, "", ""
@@ -79,12 +79,10 @@ def _state(
     label: str, done: float, total: float | None, unit: str, failed: int, spent_s: float
 ) -> str:
     amount = f"{done:.3g}" if isinstance(done, float) else str(done)
-    parts = [f"{amount} of {total:g}" if total else amount]
+    of_total = f"{amount} of {total:g}" if total else amount
+    parts = [f"{of_total} after {spent_s:.0f} s"]
     if unit:
-        parts[0] += f" {unit}"
-        parts.append(f"{done / max(spent_s, 1e-9):.2g} a second")
-    else:
-        parts[0] += f" after {spent_s:.0f} s"
+        parts = [f"{of_total} {unit}", f"{done / max(spent_s, 1e-9):.2g} a second"]
     if total and 0 < done < total:
         left_s = (total - done) * spent_s / done
         parts.append(f"{left_s / 60:.0f} min left" if left_s > 90 else f"{left_s:.0f} s left")
@@ -94,9 +92,9 @@ def _state(
 
 
 def end(error: BaseException) -> NoReturn:
-    """End the program with one line for what the user can mend: code 2 for input, 1 for failures.
+    """End the program with one line for what the user can fix: code 2 for input, 1 for failures.
 
-    An internal error ends with its trace and code 3.
+    An internal error ends with its traceback and code 3.
     """
     chain: list[BaseException] = [error]
     while (before := chain[-1].__cause__ or chain[-1].__context__) is not None:
@@ -117,7 +115,7 @@ def end(error: BaseException) -> NoReturn:
 
 
 def _configuration_errors() -> tuple[type[Exception], ...]:
-    """Errors of Hydra and OmegaConf, if they have been imported at all."""
+    """Errors of Hydra and OmegaConf, if they have been imported."""
     if "hydra" not in sys.modules:
         return ()
     hydra, omegaconf = (importlib.import_module(f"{n}.errors") for n in ("hydra", "omegaconf"))

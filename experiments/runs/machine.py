@@ -1,9 +1,10 @@
-"""The machine that made a result; nothing that names the computer or its user."""
+"""The machine that made a result, without the name of the computer or its user."""
 
 from __future__ import annotations
 
 import os
 import platform
+from contextlib import suppress
 from pathlib import Path
 
 
@@ -24,11 +25,9 @@ def machine() -> dict[str, str | int]:
 
 
 def _cpu_model() -> str:
-    """The processor's own name, from the kernel where it tells; else the platform's word."""
-    try:
+    """Name of the processor, from the kernel if it gives one, else from the platform."""
+    with suppress(OSError):
         for line in Path("/proc/cpuinfo").read_text().splitlines():
             if line.startswith("model name"):
                 return line.split(":", 1)[1].strip()
-    except OSError:
-        pass
     return platform.processor() or platform.machine()

@@ -9,29 +9,22 @@ from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from experiments.runs.columns import ORIGIN, STATUS
 from sim.errors import InputError
 from sim.files import write_whole
 
 if TYPE_CHECKING:
     import pandas as pd
 
-Scalar = str | int | float | bool | None
-Row = dict[str, Scalar]
-_TEXTS = (
-    "status",
-    "status_code",
-    "status_detail",
-    "code_version",
-    "recording_checksum",
-    "run_key",
-)
+Row = dict[str, str | int | float | bool | None]
+_TEXTS = (*STATUS, *ORIGIN)
 
 
 class Outcome(StrEnum):
     """How a run ended."""
 
     OK = "ok"
-    REMARK = "remark"  # it has something to report, such as a scan that was of no use
+    REMARK = "remark"  # with something to report, such as a scan that was not used
     FAILED = "failed"
 
 
@@ -44,8 +37,8 @@ class Status:
     outcome
         Column `status`.
     code
-        What a program tells apart: `recording`, `estimator`, `not_finite`, or the name of the
-        exception that ended the run. Column `status_code`.
+        For programs: `recording`, `estimator`, `not_finite`, or the name of the exception that
+        ended the run. Column `status_code`.
     detail
         One line for people. Column `status_detail`.
     """
@@ -61,11 +54,8 @@ class Status:
 
     def columns(self) -> Row:
         """Return the columns of a row."""
-        return {
-            "status": self.outcome.value,
-            "status_code": self.code,
-            "status_detail": self.detail,
-        }
+        values = (self.outcome.value, self.code, self.detail)
+        return dict(zip(STATUS, values, strict=True))
 
 
 def check_row(row: Row) -> None:
@@ -96,7 +86,7 @@ def check_row(row: Row) -> None:
 def to_frame(rows: Sequence[Row]) -> pd.DataFrame:
     """Tidy table of rows; a column that some rows lack is empty there.
 
-    A column that mixes numbers, text or truth values becomes text, since a file has one type a
+    A column that mixes numbers, text or booleans becomes text, since a file has one type per
     column.
     """
     import pandas as pd
@@ -146,12 +136,10 @@ def read_rows(path: Path) -> pd.DataFrame:
     frames = []
     for file in files:
         try:
-            if file.suffix == ".csv":  # a digest such as 12e4567 is no number
-                frames.append(
-                    pd.read_csv(file, dtype=dict.fromkeys(_TEXTS, "str"), index_col=False)
-                )
-            else:
-                # one thread: Arrow's own, started for a small file, can abort the program's end
+            if file.suffix == ".csv":  # a digest such as 12e4567 is not a number
+                texts = dict.fromkeys(_TEXTS, "str")
+                frames.append(pd.read_csv(file, dtype=texts, index_col=False))
+            else:  # one thread: Arrow's own, started for a small file, can crash at exit
                 read = pq.ParquetFile(file).read(use_threads=False)
                 frames.append(read.to_pandas(use_threads=False))
         except (OSError, ValueError) as error:
@@ -168,9 +156,9 @@ def read_rows(path: Path) -> pd.DataFrame:
 
 
 def _merged(orders: Sequence[Sequence[str]]) -> list[str]:
-    """Names of all orders; one that the earlier lack follows the name that precedes it in its own.
+    """Names of all orders; one that earlier orders lack follows its predecessor in its own.
 
-    So settings stay before what was found, also those that only some of the tables have.
+    So settings stay before results, even those that only some of the tables have.
     """
     merged: list[str] = []
     for order in dict.fromkeys(map(tuple, orders)):

@@ -20,7 +20,7 @@ def make(settings: Mapping[str, Any], where: str, **injected: Any) -> Any:
     where
         Its place in the configuration, for messages.
     injected
-        Further arguments, given by the program if the target asks for them.
+        Further arguments that the program passes if the target accepts them.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What code is this: digests of the project's own source, so that results never mix silently."""
+"""Digests of the source code, so that results of different versions never mix silently."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 
 from experiments.runs.paths import SOURCE
 
-# Files that read and write logs are left out: they decide no simulated recording and no estimate
+# Without the files that read and write logs: they affect no simulated recording and no estimate
 SIMULATION = ("sim",)
 RUNS = (
     "sim",
@@ -37,7 +37,7 @@ def code_version(parts: tuple[str, ...] = RUNS) -> str:
 
 
 def version_with(targets: Iterable[str]) -> str:
-    """Return the code's version, with a digest after a + of targets that are not the project's."""
+    """Return the code's version, followed by + and a digest of targets from elsewhere, if any."""
     found = {target: digest for target in sorted(targets) if (digest := source_digest(target))}
     if not found:
         return code_version()
@@ -46,10 +46,10 @@ def version_with(targets: Iterable[str]) -> str:
 
 @functools.cache
 def source_digest(target: str) -> str:
-    """Digest of the source behind a target such as `mine.Mine`, with what lies beside it.
+    """Digest of the source behind a target such as `mine.Mine`, and of the files beside it.
 
-    Of a package all its files count, of a single module those of its folder too, since it may
-    import them. Empty for what `code_version` covers, and for what is not found.
+    It covers all files of a package; of a single module, also those in its folder, which it may
+    import. Empty for what `code_version` covers, and for what is not found.
     """
     module, top = target.rpartition(".")[0], target.partition(".")[0]
     if top in ("sim", "estimators"):
@@ -59,13 +59,11 @@ def source_digest(target: str) -> str:
         files = [] if file in RUNS else [SOURCE / file]
     else:
         spec = importlib.util.find_spec(top)
-        if spec is None:
-            return ""
-        if spec.submodule_search_locations is not None:
+        if spec is not None and spec.submodule_search_locations is not None:
             places = map(Path, spec.submodule_search_locations)
             files = [path for place in places for path in sorted(place.rglob("*.py"))]
         else:
-            files = sorted(Path(spec.origin).parent.glob("*.py")) if spec.origin else []
+            files = sorted(Path(spec.origin).parent.glob("*.py")) if spec and spec.origin else []
     digest = hashlib.sha256()
     for path in filter(Path.is_file, files):
         digest.update(path.name.encode() + b"\0" + path.read_bytes())

@@ -1,4 +1,4 @@
-"""Rows of a sweep as one table: of one code version, in an order that is always the same."""
+"""Rows of a sweep as one table: of one code version, always in the same order."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from sim.errors import InputError
 if TYPE_CHECKING:
     import pandas as pd
 
-_TIMES = ("step_time_us",)  # they differ from run to run
-_DRAWN = ("seed", "world_seed")  # what `summary` averages over
+_TIMES = ["step_time_us"]  # they differ from run to run
+_DRAWN = ["seed", "world_seed"]  # what `summary` averages over
 _MAIN = (
     "ate_rmse_m",
     "ate_aligned_rmse_m",
@@ -39,10 +39,9 @@ def collect(name: str, *, all_versions: bool = False, times: bool = False) -> pd
     name
         A sweep's name, or a path.
     all_versions
-        Keep the rows that other versions of the code have made; by default they are dropped,
-        with a warning.
+        Keep the rows of other versions of the code; by default they are dropped with a warning.
     times
-        Keep the columns of computing times; without them the same sweep gives the same table.
+        Keep the columns of computing times; without them a repeated sweep gives the same table.
 
     Raises
     ------
@@ -73,9 +72,8 @@ def collect(name: str, *, all_versions: bool = False, times: bool = False) -> pd
             print(f"left out {(~mine).sum()} rows of other code versions", file=sys.stderr)
         table = table[mine]
     if not times:
-        table = table.drop(columns=list(_TIMES), errors="ignore")
-    order = [*swept(table), "run_key", REPEAT]
-    return table.sort_values(order, kind="stable", ignore_index=True)
+        table = table.drop(columns=_TIMES, errors="ignore")
+    return table.sort_values([*swept(table), "run_key", REPEAT], kind="stable", ignore_index=True)
 
 
 def where(table: pd.DataFrame, conditions: Sequence[str]) -> pd.DataFrame:
@@ -102,12 +100,12 @@ def where(table: pd.DataFrame, conditions: Sequence[str]) -> pd.DataFrame:
 
 
 def _of_this_code(table: pd.DataFrame) -> pd.Series[bool]:
-    """Which rows this version of the code has made, with that of estimators from elsewhere.
+    """Which rows are of this version of the code, and of estimators from elsewhere.
 
     Raises
     ------
     InputError
-        If there are rows of several versions of a file that is not to be found here.
+        If there are rows of several versions of a file that cannot be found here.
     """
     mine = table["code_version"].str.partition("+")[0] == code_version()
     targets = [column for column in table if str(column).endswith("_target_")]
@@ -149,17 +147,17 @@ def measured(table: pd.DataFrame) -> list[str]:
 
 
 def summary(table: pd.DataFrame, against: str | None = None) -> pd.DataFrame:
-    """Mean of the main errors for each combination of the swept settings but the seeds.
+    """Mean of the main errors for each combination of the swept settings except the seeds.
 
     Parameters
     ----------
     against
-        An estimator's name: errors (of the revised paths, where there are) are also given
-        relative to its, on the same recordings.
+        An estimator's name: errors (of the revised path, where there is one) are also given
+        relative to that estimator's, on the same recordings.
     """
     import numpy as np
 
-    by = telling(table.drop(columns=list(_DRAWN), errors="ignore"))
+    by = telling(table.drop(columns=_DRAWN, errors="ignore"))
     shown = [c for c in _MAIN if c in table and table[c].notna().any()]
     if against is not None:
         column = f"ate_rmse_over_{against}"
@@ -176,9 +174,9 @@ def summary(table: pd.DataFrame, against: str | None = None) -> pd.DataFrame:
 
 
 def _error_ratio(table: pd.DataFrame, against: str) -> pd.Series[float]:
-    """Position error over the mean one of an estimator on the same recording.
+    """Ratio of position error to an estimator's mean one on the same recording.
 
-    That of the revised path where there is one, else of the online one.
+    Errors are of the revised path where there is one, else of the online one.
     """
     one = table[table["choice.estimator"] == against]
     if one.empty:
