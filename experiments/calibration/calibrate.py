@@ -1,7 +1,7 @@
 """kr, kl, encoder gains and track from recorded runs, with 95 % intervals.
 
-By wheel truth each interval's encoder error is held against the travel (`wheel_truth`); by end
-poses, as in puzzlebot2024, candidates are simulated and their ends compared (`end_poses`).
+The wheel truth gives each interval's encoder error over the travel (`wheel_truth`). From end poses,
+as in puzzlebot2024, candidates are simulated and their ends compared (`end_poses`).
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ def calibrate_recordings(
     Parameters
     ----------
     recordings
-        For `wheel_truth`, any runs whose truth holds the wheels' travel. For `end_poses`,
-        repetitions of open-loop manoeuvres; those with the same commands belong together.
+        For `wheel_truth`, any runs whose truth includes the wheels' travel. For `end_poses`,
+        repetitions of open-loop manoeuvres, grouped by their commands.
     interval_s
         Shortest interval over which wheel travel is netted.
     rng
@@ -59,8 +59,8 @@ def calibrate_recordings(
         raise InputError(f"method must be wheel_truth or end_poses, got {method!r}")
     groups: dict[bytes, tuple[Array, list[Array]]] = {}
     for i, recording in enumerate(recordings):
-        profile, end = _command_profile(recording, i), end_pose(recording, i)
-        groups.setdefault(profile.tobytes(), (profile, []))[1].append(end)
+        profile = _command_profile(recording, i)
+        groups.setdefault(profile.tobytes(), (profile, []))[1].append(end_pose(recording, i))
     if min(len(ends) for _, ends in groups.values()) < 2:
         raise InputError(
             "end poses need open-loop runs with the same commands, at least 2 of each; "
@@ -69,8 +69,7 @@ def calibrate_recordings(
     manoeuvres = [Manoeuvre(profile, np.array(ends)) for profile, ends in groups.values()]
     believed = recordings[0].robot
     nominal = DifferentialDrive(believed.wheel_radius_m, believed.track_m)
-    rng = np.random.default_rng(0) if rng is None else rng
-    return from_end_poses(manoeuvres, nominal, rng, geometry=geometry)
+    return from_end_poses(manoeuvres, nominal, rng or np.random.default_rng(0), geometry=geometry)
 
 
 def _wheel_intervals(recording: Recording, i: int, interval_s: float) -> tuple[Array, Array, Array]:
@@ -81,30 +80,30 @@ def _wheel_intervals(recording: Recording, i: int, interval_s: float) -> tuple[A
             f"recording {i} has no true wheel travel; record it in simulation, or calibrate from "
             "end poses"
         )
-    begun, ended = wheels.stamps[0] - 1e-9, wheels.stamps[-1] + 1e-9
+    known = (truth.stamps >= wheels.stamps[0] - 1e-9) & (truth.stamps <= wheels.stamps[-1] + 1e-9)
     rows: list[int] = []
-    for row in np.flatnonzero((truth.stamps >= begun) & (truth.stamps <= ended)).tolist():
+    for row in np.flatnonzero(known).tolist():
         if not rows or truth.stamps[row] - truth.stamps[rows[-1]] >= interval_s - 1e-9:
             rows.append(row)
     if len(rows) < 2:
         raise InputError(f"recording {i} is shorter than one interval of {interval_s:g} s")
-    stamps = truth.stamps[rows]
-    encoder = [np.diff(np.interp(stamps, wheels.stamps, way)) for way in wheels.position_m.T]
+    encoder = [np.interp(truth.stamps[rows], wheels.stamps, way) for way in wheels.position_m.T]
     heading = np.unwrap(truth.poses[:, 2])[rows]
-    ground = np.diff(truth.wheel_travel_m[rows], axis=0)
-    return np.stack(encoder, axis=1), ground, np.diff(heading)
+    return np.diff(encoder).T, np.diff(truth.wheel_travel_m[rows], axis=0), np.diff(heading)
 
 
 def _command_profile(recording: Recording, i: int) -> Array:
     """Commanded body velocities (N, 2) at ticks."""
     log = recording.commands
     if log is None or len(log.stamps) == 0:
-        raise InputError(f"recording {i} has no commands; end poses say nothing without them")
-    n_ticks = round((recording.frame_stamps[-1] - recording.frame_stamps[0]) / TICK_S)
-    middles = recording.frame_stamps[0] + (np.arange(n_ticks) + 0.5) * TICK_S
+        raise InputError(
+            f"recording {i} has no commands; end poses are of no use without them: record it in "
+            "simulation, or use the wheel truth"
+        )
+    ticks = np.arange(round(recording.duration_s / TICK_S))
+    middles = recording.frame_stamps[0] + (ticks + 0.5) * TICK_S
     rows = np.searchsorted(log.stamps, middles, side="right") - 1
-    profile: Array = np.where(rows[:, None] >= 0, log.velocity[np.maximum(rows, 0)], 0.0)
-    return profile
+    return np.where(rows[:, None] >= 0, log.velocity[np.maximum(rows, 0)], 0.0)
 
 
 def end_pose(recording: Recording, i: int = 0) -> Array:
@@ -112,6 +111,5 @@ def end_pose(recording: Recording, i: int = 0) -> Array:
     if recording.truth is None or len(recording.truth.poses) < 2:
         raise InputError(f"recording {i} has no true poses to calibrate from")
     poses = recording.truth.poses
-    end: Array = se2.between(poses[0], poses[-1])
-    end[2] = np.unwrap(poses[:, 2])[-1] - poses[0, 2]
-    return end
+    x, y, _ = se2.between(poses[0], poses[-1])
+    return np.array([x, y, np.unwrap(poses[:, 2])[-1] - poses[0, 2]])

@@ -1,8 +1,8 @@
-"""Where open-loop runs end if kr, kl, encoder gains and track are so and so."""
+"""End poses of open-loop runs for given kr, kl, encoder gains and track."""
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,11 +21,11 @@ _LOG_CHART_UP_TO_RAD = 4.5  # beyond it the logarithm nears its pole at 2 pi
 
 
 class EndPoseModel:
-    """End poses of one manoeuvre as the candidates would have them.
+    """End poses of one manoeuvre for candidate parameters.
 
-    The wheels roll between two dozen knots: what the command and the biases make them roll, less
-    sqrt(k) times the slip's Brownian motion over the travel, delayed by the lag of the wheels'
-    speed loop as in `sim.robot.Slip`. Within an interval the path is an arc.
+    The run is cut at two dozen knots. Between two of them a wheel rolls as far as the command and
+    the bias make it, less sqrt(k) times the slip's Brownian motion over the travel, delayed by the
+    lag of the wheel's speed loop as in `sim.robot.Slip`; the path is an arc.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ class EndPoseModel:
         method: EndPoseMethod,
         n_samples: int,
     ) -> None:
-        if method not in ("sampled", "linearised"):
+        if method not in get_args(EndPoseMethod):
             raise InputError(f"method must be sampled or linearised, got {method!r}")
         self._commands_m = nominal.wheel_speeds(*profile.T) * TICK_S
         self._knots = knots(self._commands_m)
@@ -70,7 +70,7 @@ class EndPoseModel:
 def knots(commands_m: Array) -> Ticks:
     """Ticks (S + 1,) that cut the run: evenly, and where the robot comes to rest between moves."""
     speed = np.abs(commands_m).max(axis=1)
-    # a rounded plateau is no turning point: a minimum must lie below its surroundings clearly
+    # a rounded plateau is no turning point: a minimum must lie clearly below its surroundings
     change = np.diff(speed) / max(float(speed.max()), 1e-12)
     turning_points = np.flatnonzero((change[:-1] <= 0.0) & (change[1:] > 1e-6)) + 1
     even = np.linspace(0, len(commands_m), _KNOTS + 1).round().astype(np.int64)
@@ -80,24 +80,22 @@ def knots(commands_m: Array) -> Ticks:
 def _slip_paths(commands_m: Array, knots: Ticks, n_samples: int, rng: np.random.Generator) -> Array:
     """Slip (n, S, 2) of the ground travel between knots for k = 1, in m^(1/2).
 
-    The encoder error of a tick, of variance |ds|, reaches the ground through the lag: by tick n
-    the share 1 - (1 - a)^(n - m) of the error of tick m has. So the increments are normal with a
-    covariance known beforehand. The samples come in antithetic pairs and are whitened: their
-    first two moments are exact, and the sampling error is left to the arcs' curvature alone.
+    The encoder error of a tick, of variance |ds|, reaches the ground through the lag: by tick n,
+    the share 1 - (1 - a)^(n - m) of the error of tick m. So the increments are normal with a known
+    covariance. The samples come in antithetic pairs and are whitened: their first two moments are
+    exact, and only the curvature of the arcs leaves a sampling error.
     """
     n_intervals = len(knots) - 1
     half = max(n_samples // 2, 2 * n_intervals + 2)
     z = rng.standard_normal((half, 2 * n_intervals))
     z = np.linalg.solve(np.linalg.cholesky(z.T @ z / half), z.T).T
     z = np.concatenate([z, -z]).reshape(2 * half, n_intervals, 2)
-    ticks = np.arange(len(commands_m))
-    keep = 1.0 - TICK_S / SLIP_TIME_CONSTANT_S
-    settled = 1.0 - keep ** np.maximum(knots[:, None] - 1 - ticks[None, :], 0)
-    response = np.diff(settled, axis=0)  # (S, N): what tick m's error moves in each interval
+    age = np.maximum(knots[:, None] - 1 - np.arange(len(commands_m)), 0)  # (S + 1, N), ticks
+    settled = 1.0 - (1.0 - TICK_S / SLIP_TIME_CONSTANT_S) ** age
+    response = np.diff(settled, axis=0)  # (S, N): the share of each tick's error in each interval
     paths = np.empty_like(z)
     for i in (0, 1):
-        covariance = (response * np.abs(commands_m[:, i])) @ response.T
-        values, vectors = np.linalg.eigh(covariance)
+        values, vectors = np.linalg.eigh((response * np.abs(commands_m[:, i])) @ response.T)
         paths[:, :, i] = z[:, :, i] @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
     return paths
 
@@ -131,7 +129,7 @@ def _linearised_moments(travel: Array, k: Array, track_m: float) -> tuple[Array,
     covariance = np.zeros((3, 3))
     for w in range(2):
         turn = np.full(len(travel), (1.0 - 2.0 * w) / track_m)
-        # a turn swings the interval itself, and all that follows about the interval's end
+        # a turn swings the interval itself, and the rest of the path about the interval's end
         by_x = cos / 2.0 - (forward * sin / 2.0 + y[-1] - y) * turn
         by_y = sin / 2.0 + (forward * cos / 2.0 + x[-1] - x) * turn
         by_wheel = np.stack((by_x, by_y, turn))
@@ -143,9 +141,9 @@ def _linearised_moments(travel: Array, k: Array, track_m: float) -> tuple[Array,
 def _charted(poses: Array, log_chart: bool) -> Array:
     """Coordinates (n, 3) in which end poses (n, 3) are nearly normal.
 
-    The position is turned back by half the heading, so the crescent of a straight run becomes a
-    blob; the logarithm also divides by the chord's shortening, which makes it exact for a steady
-    slip but has a pole at 2 pi.
+    The position is turned back by half the heading, which makes a blob of the crescent of a
+    straight run. The logarithm also undoes the shortening of the chord, which makes it exact for
+    a steady slip but gives it a pole at 2 pi.
     """
     charted = np.empty_like(poses)
     for n, (x, y, heading) in enumerate(poses):
@@ -161,11 +159,10 @@ def _sampled_moments(
     travel: Array, noise: Array, scale: Array, track_m: float, log_chart: bool
 ) -> tuple[Array, Array]:
     """Mean (3,) and covariance (3, 3) of the coordinates of simulated end poses."""
-    n_samples, n_intervals = noise.shape[0], noise.shape[1]
-    ends = np.empty((n_samples, 3))
-    for n in range(n_samples):
+    ends = np.empty((len(noise), 3))
+    for n in range(len(noise)):
         x, y, heading = 0.0, 0.0, 0.0
-        for s in range(n_intervals):
+        for s in range(len(travel)):
             right = travel[s, 0] - scale[0] * noise[n, s, 0]
             left = travel[s, 1] - scale[1] * noise[n, s, 1]
             half = (right - left) / (2.0 * track_m)
@@ -175,6 +172,6 @@ def _sampled_moments(
             heading += 2.0 * half
         ends[n] = x, y, heading
     charted = _charted(ends, log_chart)
-    mean = charted.sum(axis=0) / n_samples
+    mean = charted.sum(axis=0) / len(noise)
     off = charted - mean
-    return mean, off.T @ off / n_samples
+    return mean, off.T @ off / len(noise)

@@ -23,8 +23,6 @@ from sim.route import TICK_S
 Array = NDArray[np.float64]
 Moments = tuple[Array, Array]
 
-_SAMPLES = 256
-
 
 @dataclass(frozen=True)
 class Manoeuvre:
@@ -49,15 +47,15 @@ def from_end_poses(
     *,
     method: EndPoseMethod = "sampled",
     geometry: bool = False,
-    n_samples: int = _SAMPLES,
+    n_samples: int = 256,
 ) -> CalibrationResult:
-    """Calibrate from commands and true end poses alone, the situation of puzzlebot2024.
+    """Calibrate from commands and true end poses alone, as in puzzlebot2024.
 
     `sampled`: a synthetic likelihood. For each candidate the manoeuvres' end poses are simulated
-    a few hundred times with common random numbers, mapped like the real ones to coordinates in
-    which they are nearly normal, and the real ones are judged by the samples' mean and
-    covariance. `linearised`: the mean is the command's and the covariance the analytic one of
-    eq. (2), in x, y and heading. It takes the bend of the end poses' cloud for slip and so
+    a few hundred times with common random numbers and mapped, like the real ones, to coordinates
+    in which they are nearly normal. The samples' mean and covariance give the likelihood of the
+    real ones. `linearised`: the mean is the command's and the covariance the analytic one of
+    eq. (2), in x, y and heading. It mistakes the bend of the cloud of end poses for slip and so
     overestimates k where headings scatter by more than a few degrees.
 
     The maximum is found by Fisher scoring over (log kr, log kl[, biases, log track]); the
@@ -68,11 +66,11 @@ def from_end_poses(
     manoeuvres
         At least one, each with its repetitions.
     nominal
-        The robot that the commands were meant for: its track turned them into wheel speeds.
+        The robot that the commands were meant for; its track turned them into wheel speeds.
     rng
         For the samples; unused by `linearised`.
     geometry
-        Estimate the two biases and the track jointly, else they are taken as zero and nominal.
+        Estimate the two biases and the track jointly; else they are zero and nominal.
 
     Raises
     ------
@@ -99,7 +97,8 @@ def from_end_poses(
         bias = unknowns[2:4] if geometry else np.zeros(2)
         track_m = nominal.track_m * (math.exp(unknowns[4]) if geometry else 1.0)
         parts = [model.moments(np.exp(unknowns[:2]), bias, track_m) for model in models]
-        return np.array([p[0] for p in parts]), np.array([p[1] for p in parts])
+        mean, covariance = map(np.array, zip(*parts, strict=True))
+        return mean, covariance
 
     start = np.zeros(wanted)
     start[:2] = math.log(_rough_k(manoeuvres, nominal))
@@ -150,16 +149,21 @@ def _fisher_scoring(
         trace = np.trace(np.linalg.solve(covariance, second(mean)), axis1=1, axis2=2)
         return -0.5 * float(np.sum(n_runs * (log_det + trace)))
 
-    steps = np.full(len(start), 1e-2)
-    steps[2:] = 1e-3  # biases and track move the mean, which is far sharper than the scatter
-    unknowns, information = start, np.eye(len(start))
+    # biases and track move the mean, which is far sharper than the scatter
+    steps = np.array([1e-2, 1e-2, 1e-3, 1e-3, 1e-3])[: len(start)]
+    unknowns = start
     mean, covariance = moments(unknowns)
     value = log_likelihood(mean, covariance)
     for _ in range(40):
-        slopes = []
-        for shift, step in zip(np.diag(steps), steps, strict=True):
-            ahead, behind = moments(unknowns + shift), moments(unknowns - shift)
-            slopes.append([(a - b) / (2.0 * step) for a, b in zip(ahead, behind, strict=True)])
+        slopes = [
+            [
+                (ahead - behind) / (2.0 * step)
+                for ahead, behind in zip(
+                    moments(unknowns + shift), moments(unknowns - shift), strict=True
+                )
+            ]
+            for shift, step in zip(np.diag(steps), steps, strict=True)
+        ]
         J, D = (np.array(part) for part in zip(*slopes, strict=True))  # (P, M, 3), (P, M, 3, 3)
         precision = np.linalg.inv(covariance)
         W = precision @ D

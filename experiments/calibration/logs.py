@@ -2,13 +2,12 @@
 
 `calibrate_wheels` finds diameters, axle and the laser's pose from wheel angles and scan matches
 (the problem of Censi et al., "Simultaneous calibration of odometry and sensor parameters"), and
-`slip_of_turns` what the wheels' noise is. `calibrate_track` finds the length of a tick and the
-effective track from ticks and an overhead camera that sees no heading.
+`slip_of_turns` finds kr and kl. `calibrate_track` finds the length of a tick and the effective
+track from ticks and an overhead camera that sees no heading.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from dataclasses import dataclass
 
@@ -27,14 +26,10 @@ from sim.robot import arc_increment
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_TRIM_SIGMAS = 6.0  # a scan match farther off than this has failed
-_ROUNDS = 5
-_LEAST_K = 1e-15
-
 
 @dataclass(frozen=True)
 class WheelCalibration:
-    """Diameters, axle and the laser's pose, with 95 % intervals, and what is left over.
+    """Diameters, axle and the laser's pose, with 95 % intervals, and the residuals.
 
     Attributes
     ----------
@@ -61,8 +56,7 @@ class WheelCalibration:
     @property
     def values(self) -> Array:
         """The six parameters, (6,)."""
-        parameters = dataclasses.fields(self)[:6]
-        return np.array([getattr(self, parameter.name).value for parameter in parameters])
+        return np.array([part.value for part in vars(self).values() if isinstance(part, Interval)])
 
 
 def calibrate_wheels(
@@ -70,9 +64,9 @@ def calibrate_wheels(
 ) -> WheelCalibration:
     """Fit the six parameters to the laser's displacements by trimmed least squares.
 
-    Residuals are weighted with their own spread (median absolute deviation), intervals beyond
-    six of it are left out, and the fit is repeated. The laser's yaw may be anything: eight
-    headings are tried as the start.
+    Residuals are weighted by their own spread (median absolute deviation), failed scan matches,
+    beyond six times that, are left out, and the fit is repeated. The laser's yaw may be anything:
+    eight yaws are tried to start from.
 
     Parameters
     ----------
@@ -87,22 +81,20 @@ def calibrate_wheels(
     if len(log.durations_s) < 12 or not np.any(log.laser_motion[:, 2]):
         raise InputError("at least 12 intervals with turns are needed to calibrate the wheels")
     weights = 1.0 / np.array([diameter_m / 20.0, diameter_m / 20.0, 0.05])
-    starts = [
-        np.array([diameter_m, diameter_m, axle_m, 0.0, 0.0, yaw])
-        for yaw in np.arange(8) * math.pi / 4.0 - math.pi
-    ]
-    scale = np.array([diameter_m, diameter_m, axle_m, 0.1, 0.1, 1.0])
+    sizes = diameter_m, diameter_m, axle_m
+    scale = np.array([*sizes, 0.1, 0.1, 1.0])
     some = np.zeros(len(log.durations_s), bool)
-    some[:: max(1, len(some) // 400)] = True  # enough to choose the start by
-    fits = [_fit(log, start, weights, some, scale) for start in starts]
+    some[:: max(1, len(some) // 400)] = True  # enough to choose the start
+    yaws = np.arange(8) * math.pi / 4.0 - math.pi
+    fits = [_fit(log, np.array([*sizes, 0.0, 0.0, yaw]), weights, some, scale) for yaw in yaws]
     fits = [fit for fit in fits if fit.x[:3].min() > 0.0]
     if not fits:
-        raise InputError("wheels and laser do not agree; are the wheels the right way round?")
+        raise InputError("wheels and laser do not agree; are right and left swapped?")
     fit = min(fits, key=lambda found: float(found.cost))
-    for _ in range(_ROUNDS):
+    for _ in range(5):
         residual = _residual(log, fit.x)
         spread = 1.4826 * np.median(np.abs(residual), axis=0) + 1e-9
-        kept = np.sqrt(np.sum((residual / spread) ** 2, axis=1)) < _TRIM_SIGMAS
+        kept = np.sqrt(np.sum((residual / spread) ** 2, axis=1)) < 6.0
         fit = _fit(log, fit.x, 1.0 / spread, kept, scale)
     values = np.append(fit.x[:5], se2.wrap(fit.x[5]))
     right, left, axle, x, y, yaw = _intervals(values, fit)
@@ -115,10 +107,10 @@ def _intervals(
 ) -> list[Interval]:
     """Parameters (P,) of a least-squares fit with 95 % intervals, times their units.
 
-    `alike` neighbouring residuals count as one.
+    So many neighbouring residuals as `alike` count as one.
     """
-    covariance = np.linalg.inv(fit.jac.T @ fit.jac) * float(np.mean(fit.fun**2)) * alike
-    half = float(stats.norm.ppf(0.975)) * np.sqrt(np.diag(covariance))
+    covariance = np.linalg.inv(fit.jac.T @ fit.jac) * np.mean(fit.fun**2) * alike
+    half = stats.norm.ppf(0.975) * np.sqrt(np.diag(covariance))
     bounds = np.stack([values, values - half, values + half]) * unit
     return [Interval(*map(float, column)) for column in bounds.T]
 
@@ -127,26 +119,26 @@ def _fit(
     log: WheelLaserLog, start: Array, weights: Array, kept: Mask, scale: Array
 ) -> optimize.OptimizeResult:
     chosen = WheelLaserLog(log.durations_s[kept], log.rolled_rad[kept], log.laser_motion[kept])
-
-    def weighted(parameters: Array) -> Array:
-        return (_residual(chosen, parameters) * weights).ravel()
-
-    return optimize.least_squares(weighted, start, x_scale=scale, loss="soft_l1")
+    return optimize.least_squares(
+        lambda unknowns: (_residual(chosen, unknowns) * weights).ravel(),
+        start,
+        x_scale=scale,
+        loss="soft_l1",
+    )
 
 
 def _residual(log: WheelLaserLog, parameters: Array) -> Array:
-    """Laser displacement seen less foreseen, (N, 3)."""
+    """Laser displacement measured less predicted, (N, 3)."""
     motion = arc_increment(log.rolled_rad * parameters[:2] / 2.0, float(parameters[2]))
     laser = parameters[3:]
-    foreseen = se2.compose(se2.inverse(laser), se2.compose(motion, laser))
-    residual: Array = log.laser_motion - foreseen
-    residual[:, 2] = se2.wrap(residual[:, 2])
-    return residual
+    predicted = se2.compose(se2.inverse(laser), se2.compose(motion, laser))
+    x, y, turn = (log.laser_motion - predicted).T
+    return np.column_stack([x, y, se2.wrap(turn)])
 
 
 @dataclass(frozen=True)
 class SlipOfTurns:
-    """kr and kl, m, and the number of blocks that show them."""
+    """kr and kl, m, and the number of blocks they come from."""
 
     kr: Interval
     kl: Interval
@@ -162,15 +154,15 @@ def slip_of_turns(
     """Fit the kr/kl law to the residual variance of the turns against |ds|.
 
     A wheel error e turns the robot by e / axle, so Var(axle * residual) = kr |ds_r| + kl |ds_l|.
-    The turn is used alone: scan matching sees it to 0.1 mm of wheel travel, but distances only
+    Only the turn is used: scan matching resolves it to 0.1 mm of wheel travel, but distances only
     to 0.6 mm, above any slip of 8 mm steps. Residuals are summed over blocks of consecutive
     intervals with the same commands. Errors of the stamps and of the scans, which two neighbours
-    share with opposite signs, cancel in long blocks and do not in short ones, so the figure of a
-    block of one is an upper reading and that of long blocks what builds up as the robot drives.
-    Each command's mean residual (a bias, not noise) is taken off.
+    share with opposite signs, cancel in long blocks but not in short ones. So a block of one gives
+    an upper bound, and long blocks give the noise that builds up as the robot drives. Each
+    command's mean residual (a bias, not noise) is subtracted.
 
-    The estimate is the maximum of the likelihood of zero-mean Gaussian sums; its interval comes
-    from resampling the blocks.
+    The estimate maximises the likelihood of zero-mean Gaussian sums; its interval comes from
+    resampling the blocks.
     """
     travel = calibration.travel_m
     error = calibration.turn_residual_rad * calibration.axle_m.value
@@ -185,16 +177,15 @@ def slip_of_turns(
             whole = run[: len(run) // block * block].reshape(-1, block)
             squares.append(off[whole].sum(axis=1) ** 2)
             paths.append(np.abs(travel[whole]).sum(axis=1))
-    square = np.concatenate(squares) if squares else np.zeros(0)
-    if len(square) < 10:
-        raise InputError(f"only {len(square)} blocks of {block} intervals; use shorter blocks")
-    path = np.concatenate(paths)
-    k = _law(square, path)
-    picks = rng.integers(len(square), size=(n_resamples, len(square)))
+    n = sum(map(len, squares))
+    if n < 10:
+        raise InputError(f"only {n} blocks of {block} intervals; use shorter blocks")
+    square, path = np.concatenate(squares), np.concatenate(paths)
+    picks = rng.integers(n, size=(n_resamples, n))
     spread = np.array([_law(square[pick], path[pick]) for pick in picks])
-    low, high = np.quantile(spread, [0.025, 0.975], axis=0)
-    kr, kl = (Interval(float(k[i]), float(low[i]), float(high[i])) for i in (0, 1))
-    return SlipOfTurns(kr, kl, len(square))
+    bounds = [_law(square, path), *np.quantile(spread, [0.025, 0.975], axis=0)]
+    kr, kl = (Interval(*map(float, column)) for column in np.transpose(bounds))
+    return SlipOfTurns(kr, kl, n)
 
 
 def _law(square: Array, path: Array) -> Array:
@@ -204,23 +195,23 @@ def _law(square: Array, path: Array) -> Array:
         weighted = path * ((path @ k) ** -2.0)[:, None]
         normal, right_hand = path.T @ weighted, weighted.T @ square
         k = np.linalg.solve(normal, right_hand)
-        if k.min() <= 0.0:  # at the bound of one, the other stands alone
-            k = np.where(k > 0.0, right_hand / np.diag(normal), _LEAST_K)
+        if k.min() <= 0.0:  # with one at its bound, only the other is fitted
+            k = np.where(k > 0.0, right_hand / np.diag(normal), 1e-15)
     return k
 
 
 @dataclass(frozen=True)
 class TrackCalibration:
-    """Length of a tick, effective track, start heading, with 95 % intervals, and the errors.
+    """Length of a tick and effective track, with 95 % intervals; start pose and error.
 
     Attributes
     ----------
     tick_m, track_m
-        Ground travel per tick of either track; distance that explains the turns.
+        Ground travel per tick of either track; distance of the tracks that explains the turns.
     start
         (3,) pose of the axle at the first reading.
     rms_m
-        RMS distance of the scanner's positions from the reference that was fitted.
+        RMS distance of the scanner's positions from the reference that they are fitted to.
     """
 
     tick_m: Interval
@@ -255,9 +246,8 @@ def _off_reference(
 ) -> Array:
     reached = scanner_positions(log, tick_m, track_m, start)
     inside = (stamps >= log.stamps[0]) & (stamps <= log.stamps[-1])
-    at = np.stack([np.interp(stamps[inside], log.stamps, reached[:, i]) for i in (0, 1)], axis=1)
-    off: Array = at - positions[inside]
-    return off
+    at = [np.interp(stamps[inside], log.stamps, way) for way in reached.T]
+    return np.asarray(np.stack(at, axis=1) - positions[inside])
 
 
 def calibrate_track(
@@ -270,9 +260,9 @@ def calibrate_track(
 ) -> TrackCalibration:
     """Fit tick, track and start heading to reference positions (N, 2) at stamps (N,).
 
-    The camera sees no heading, so the start's is fitted; its position is the reference's first.
-    Errors of dead reckoning build up: neighbours are alike, and the intervals count every
-    twentieth reading only.
+    The camera sees no heading, so the one at the start is fitted; the position there is the
+    reference's first. Errors of dead reckoning build up, so neighbours are alike, and the intervals
+    count only every twentieth reading.
 
     Parameters
     ----------
@@ -281,12 +271,11 @@ def calibrate_track(
     """
 
     def residual(unknowns: Array) -> Array:
-        tick, track, heading = unknowns
-        start = axle_at(positions[0], heading)
-        off = _off_reference(log, stamps, positions, tick * tick_m, track * track_m, start)
-        return off.ravel()
+        tick, track = unknowns[0] * tick_m, unknowns[1] * track_m
+        start = axle_at(positions[0], unknowns[2])
+        return _off_reference(log, stamps, positions, tick, track, start).ravel()
 
     fit = optimize.least_squares(residual, np.array([1.0, 1.0, heading_rad]))
     tick, track, _ = _intervals(fit.x, fit, 20.0, np.array([tick_m, track_m, 1.0]))
     rms_m = float(np.sqrt(2.0 * np.mean(fit.fun**2)))
-    return TrackCalibration(tick, track, axle_at(positions[0], float(fit.x[2])), rms_m)
+    return TrackCalibration(tick, track, axle_at(positions[0], fit.x[2]), rms_m)

@@ -22,11 +22,11 @@ class CalibrationResult:
     kr, kl
         Slip variance per metre, m.
     bias_right, bias_left
-        The encoder reads (1 + bias) times the ground travel; None if taken to be zero.
+        The encoder reads (1 + bias) times the ground travel; None if assumed to be zero.
     track_m
-        Effective distance of the wheels; None if taken to be the nominal one.
+        Effective distance of the wheels; None if assumed to be the nominal one.
     n_used
-        Intervals or runs that went into it.
+        Number of intervals or runs used.
     """
 
     method: str
@@ -52,6 +52,5 @@ class CalibrationResult:
         lines = [f"{self.method.replace('_', ' ')}, from {self.n_used} samples"]
         for name, found in self.found.items():
             interval = f"[{found.low:.4g}, {found.high:.4g}]"
-            line = f"  {name:<10} {found.value:12.5g} {interval:>26} {_UNITS[name]}"
-            lines.append(line.rstrip())
+            lines.append(f"  {name:<10} {found.value:12.5g} {interval:>26} {_UNITS[name]}".rstrip())
         return "\n".join(lines)

@@ -28,14 +28,14 @@ def from_wheel_truth(
     """Calibrate from the wheels' true travel.
 
     With e = encoder - ground, Var(e) = k |ds|, each wheel's estimate is
-    k = sum(e^2) / sum(|ds|): the likelihood's maximum for equal intervals. The mean of e^2 / |ds|
-    would be another one, but intervals that begin or end near rest, where |ds| is itself noise,
-    then carry as much weight as all others and bias it, six times at the tick's length. The
-    interval of k is that of a chi-square with the intervals' effective degrees of freedom, or
-    with those that the scatter of e^2 shows, if they are fewer.
+    k = sum(e^2) / sum(|ds|), the maximum likelihood for equal intervals. The mean of e^2 / |ds|
+    would be another estimate, but there the intervals near rest, where |ds| is itself noise, weigh
+    as much as all others and bias it, sixfold at the length of a tick. The interval of k is that of
+    a chi-square with the effective degrees of freedom of the intervals, or with those that the
+    scatter of e^2 shows, if fewer.
 
     With `geometry` the bias is regressed jointly, e = bias ds with weights 1 / |ds|, and its
-    degree of freedom is taken off; the track is regressed from the true turns.
+    degree of freedom is subtracted; the track is regressed from the true turns.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ def from_wheel_truth(
     Raises
     ------
     InputError
-        If intervals are too short, do not match, or hold too little travel.
+        If intervals are too short, do not match, or have too little travel.
     """
     encoder, ground = np.asarray(encoder_m, float), np.asarray(ground_m, float)
     if interval_s < SHORTEST_INTERVAL_S - 1e-9:
@@ -63,8 +63,8 @@ def from_wheel_truth(
             f"{ground.shape}"
         )
     (kr, right), (kl, left) = (_wheel(encoder[:, i], ground[:, i], geometry) for i in (0, 1))
-    regress_track = geometry and turns_rad is not None
-    track = _track(ground, np.asarray(turns_rad, float)) if regress_track else None
+    turns = turns_rad if geometry else None
+    track = None if turns is None else _track(ground, np.asarray(turns, float))
     return CalibrationResult("wheel_truth", kr, kl, right, left, track, len(encoder))
 
 
@@ -89,8 +89,8 @@ def _wheel(encoder_m: Array, ground_m: Array, geometry: bool) -> tuple[Interval,
     shown = min(left, 2.0 * (k * total_m) ** 2 / scatter) if scatter > 0.0 else left
     low, high = shown * k / stats.chi2.ppf([0.975, 0.025], shown)
     half = float(stats.t.ppf(0.975, left)) * math.sqrt(k / total_m)
-    found_bias = Interval(bias, bias - half, bias + half) if geometry else None
-    return Interval(k, float(low), float(high)), found_bias
+    of_bias = Interval(bias, bias - half, bias + half) if geometry else None
+    return Interval(k, float(low), float(high)), of_bias
 
 
 def _track(ground_m: Array, turns_rad: Array) -> Interval | None:
