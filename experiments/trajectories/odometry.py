@@ -18,7 +18,7 @@ from sim.files import write_whole
 
 Array = NDArray[np.float64]
 # Entries of x, y, heading in row-major 6x6 covariances in order x, y, z, rotX, rotY, rotZ.
-PLANAR = (slice(None), *np.ix_((0, 1, 5), (0, 1, 5)))
+PLANAR = (slice(None), [[0], [1], [5]], [0, 1, 5])
 
 
 _READ = [
