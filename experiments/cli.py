@@ -1,4 +1,4 @@
-"""The command `estima`. Heavy imports happen inside the commands, so that help is quick."""
+"""The command `estima`. Heavy libraries are imported inside the commands, so that help is quick."""
 
 from __future__ import annotations
 
@@ -8,6 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+from experiments.runs import columns, paths
+from experiments.runs.console import end, progress
+from experiments.runs.row import Outcome, write_frame
+from experiments.runs.version import code_version
+from sim.errors import InputError
 
 if TYPE_CHECKING:
     from estimators.base import Estimate
@@ -36,8 +42,6 @@ def _print_version(wanted: bool) -> None:
     if wanted:
         from importlib.metadata import version
 
-        from experiments.runs.version import code_version
-
         print(f"estima {version('estima')}, code {code_version()}")
         raise typer.Exit
 
@@ -60,7 +64,7 @@ def options_of_all(
         ),
     ] = False,
 ) -> None:
-    """Set what holds for all commands."""
+    """Options of all commands."""
     if results is not None:
         os.environ["ESTIMA_RESULTS"] = str(results.absolute())
 
@@ -99,7 +103,7 @@ def run(context: typer.Context) -> None:
 
 
 def _draw_run(recording: Recording, estimate: Estimate, name: str, folder: Path) -> None:
-    """Write what one looks at after a single run: a picture and the trajectory."""
+    """Write the picture and the trajectory of a single run."""
     from experiments.trajectories.odometry import write_odometry_csv
     from experiments.viewing.run_figure import run_figure
     from experiments.viewing.style import save_figure
@@ -117,9 +121,7 @@ def record(
 
     Example: estima record -o office.npz world=office sensors=lms291 seed=3
     """
-    from experiments.runs.console import progress
     from experiments.runs.experiment import Experiment
-    from sim.errors import InputError
     from sim.recording import save
 
     if out.suffix != ".npz":
@@ -138,9 +140,9 @@ def info(
     log: Annotated[list[Path], typer.Argument(help="A recording (.npz) or a log of any format.")],
     robot: Annotated[int, typer.Option(help="Which robot of an MRCLAM set.")] = 1,
 ) -> None:
-    """Check a recording or a log and tell what it holds.
+    """Check a recording or a log and say what it holds.
 
-    Formats that come in several files take them all; docs/formats.md tells their order.
+    Formats of several files take them all; docs/formats.md gives their order.
     """
     from experiments.viewing.describe import describe
     from sim.formats.detect import read_any
@@ -173,7 +175,6 @@ def convert(
       estima convert MRCLAM_Dataset6.tar.xz --robot 3 -o robot3.npz
     """
     from experiments.trajectories.convert import write_recording
-    from sim.errors import InputError
     from sim.formats.detect import read_any
 
     if not out.name:
@@ -197,18 +198,14 @@ def options(
 
       estima options metrics
     """
-    from experiments.runs.columns import as_text
-    from experiments.runs.paths import CONF
-    from sim.errors import InputError
-
     groups = ("world", "robot", "sensors", "route", "estimator", "study")
     if group == "metrics":
-        print(as_text())
+        print(columns.as_text())
         return
     if group not in (None, *groups):
         raise InputError(f"no group {group}; there are: {', '.join(groups)}, metrics")
     for name in groups if group is None else (group,):
-        names = sorted(path.stem for path in (CONF / name).glob("*.yaml"))
+        names = sorted(path.stem for path in (paths.CONF / name).glob("*.yaml"))
         print(f"{name:>10}: {', '.join(names)}")
 
 
@@ -234,13 +231,13 @@ def view(
     seconds: Annotated[
         float | None,
         typer.Option(
-            help="How long it takes at the most; few Frames take less [saved: 20, live: real time]."
+            help="Duration; shorter if there are few Frames [saved: 20, live: real time]."
         ),
     ] = None,
 ) -> None:
-    """Show a run as it moves, in a window or in a file; or draw a world.
+    """Show a run as an animation, in a window or in a file; or draw a world.
 
-    Robot, scan, particles or landmarks, truth and estimate. Without -o in PyBullet's window.
+    It shows robot, scan, particles or landmarks, truth and estimate. Without -o it opens a window.
 
     Examples
     --------
@@ -252,8 +249,6 @@ def view(
 
       estima view --world world=office seed=3 -o office.png
     """
-    from sim.errors import InputError
-
     if world:
         _draw_world(what or [], out or Path("world.png"))
         return
@@ -267,7 +262,6 @@ def view(
 
 
 def _draw_world(overrides: list[str], out: Path) -> None:
-    """Draw walls, landmarks, places and the tour of a world."""
     from experiments.runs.experiment import Experiment
     from experiments.viewing.style import save_figure
     from experiments.viewing.world import world_figure
@@ -280,8 +274,6 @@ def _draw_world(overrides: list[str], out: Path) -> None:
 def _show_run(
     log: Path, source: str | None, overrides: list[str], out: Path | None, seconds: float | None
 ) -> None:
-    """Save a run as an animation, or play it in a window."""
-    from experiments.runs.console import progress
     from experiments.viewing import live, view
     from sim.formats.detect import read_any
 
@@ -295,8 +287,8 @@ def _show_run(
     shown = view.Run(recording, rows)
     if source is not None:
         with progress(source, len(recording.frame_stamps)) as on_step:
-            found, name = view.estimate_of(recording, source, overrides, rows, on_step)
-        shown = view.Run(recording, rows, found, name)
+            found = view.estimate_of(recording, source, overrides, rows, on_step)
+        shown = view.Run(recording, rows, *found)
     if out is None:
         live.watch(shown, seconds)
         return
@@ -321,7 +313,6 @@ def calibrate(
     Example: estima calibrate run1.npz run2.npz --joint
     """
     from experiments.calibration.calibrate import calibrate_recordings
-    from sim.errors import InputError
     from sim.recording import load
 
     if method not in ("wheel-truth", "end-poses"):
@@ -445,15 +436,13 @@ def table(
 
     Example: estima table leaderboard --against smoother
     """
-    from experiments.runs.columns import title
-    from experiments.runs.row import write_frame
     from experiments.sweeps.collect import collect, summary, where
 
     rows = where(collect(name, all_versions=all_versions, times=times), only or [])
     if out is None or means:
         rows = summary(rows, against)
     if out is None:
-        shown = rows.rename(columns=lambda column: title(column, short=True))
+        shown = rows.rename(columns=lambda column: columns.title(column, short=True))
         print(shown.to_string(index=False, na_rep="-", float_format=lambda v: f"{v:.4g}"))
         return
     write_frame(rows, out)
@@ -476,7 +465,6 @@ def plot(
     Example: estima plot run --x robot.kr --y ate_rmse_m --by choice.estimator
     """
     from experiments.report.plot import sweep_figure
-    from experiments.runs.row import Outcome
     from experiments.sweeps.collect import collect, where
     from experiments.viewing.style import save_figure
 
@@ -516,23 +504,19 @@ def reproduce(
 
 @app.command()
 def report() -> None:
-    """Write results/report.html from what the studies left in results/.
+    """Write results/report.html from what the studies have written to results/.
 
     Example: estima report
     """
-    from experiments.runs.console import progress
-    from experiments.runs.paths import results, short
-    from sim.errors import InputError
-
-    if not any((results() / name).exists() for name in ("claims.csv", "figures", "tables")):
+    if not any((paths.results() / name).exists() for name in ("claims.csv", "figures", "tables")):
         raise InputError(
-            f"{short(results())}: no claims, figures or tables to report; `estima reproduce` makes "
-            "them, and `estima table NAME` shows a sweep"
+            f"{paths.short(paths.results())}: no claims, figures or tables to report; "
+            "`estima reproduce` makes them, and `estima table NAME` shows a sweep"
         )
     from experiments.report.page import write_report
 
     with progress("report", 1.0) as on_progress:
-        print(write_report(results(), on_progress))
+        print(write_report(paths.results(), on_progress))
 
 
 @app.command()
@@ -541,23 +525,22 @@ def cache(
 ) -> None:
     """Show the cache of simulated recordings, or clear it.
 
-    ESTIMA_CACHE_GIB sets its limit; the recordings used longest ago go first.
+    ESTIMA_CACHE_GIB sets its limit; the least recently used recordings are dropped first.
 
     Example: estima cache --clear
     """
     from experiments.runs.cache import files, folder, limit_bytes, trim
-    from experiments.runs.paths import short
 
     if clear:
         print(f"{trim(0.0)} recordings deleted")
     kept = files()
     size, limit = sum(size for _, size in kept) / 2**30, limit_bytes() / 2**30
-    print(f"{short(folder())}: {len(kept)} recordings, {size:.2f} of {limit:g} GiB")
+    print(f"{paths.short(folder())}: {len(kept)} recordings, {size:.2f} of {limit:g} GiB")
 
 
 @app.command("export-table")
 def export_table(
-    paths: Annotated[list[Path], typer.Argument(help="Tables, .csv or .parquet.")],
+    tables: Annotated[list[Path], typer.Argument(help="Tables, .csv or .parquet.")],
     form: Annotated[str, typer.Option("--format", help="markdown, or latex (booktabs).")] = (
         "markdown"
     ),
@@ -572,13 +555,11 @@ def export_table(
     """
     from experiments.report.export import export
 
-    export(paths, form, out, digits)
+    export(tables, form, out, digits)
 
 
 def main() -> None:
     """Run the command line; wrong input ends in one line and code 2, a failed run in code 1."""
-    from experiments.runs.console import end
-
     try:
         app(_results_first(sys.argv[1:]))
     except (Exception, KeyboardInterrupt) as error:
@@ -590,9 +571,7 @@ def main() -> None:
 
 
 def _results_first(arguments: list[str]) -> list[str]:
-    """Arguments with `--results DIR` before the command's name, since it may stand anywhere."""
-    from sim.errors import InputError
-
+    """Move `--results DIR`, which may be anywhere, before the command's name."""
     for i, argument in enumerate(arguments):
         if argument.partition("=")[0] == "--results":
             n_words = 1 if "=" in argument else 2

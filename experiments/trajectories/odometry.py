@@ -1,4 +1,4 @@
-"""Estimates in the shape of nav_msgs/Odometry, as CSV and JSON (puzzlebot2024, eqs. (10)-(11))."""
+"""Estimates in the form of nav_msgs/Odometry, as CSV and JSON (puzzlebot2024, eqs. (10)-(11))."""
 
 from __future__ import annotations
 
@@ -17,21 +17,29 @@ from sim.errors import InputError
 from sim.files import write_whole
 
 Array = NDArray[np.float64]
-# Places of x, y, heading in the row-major 6x6 covariance in order x, y, z, rotX, rotY, rotZ.
-PLANAR = np.ix_((0, 1, 5), (0, 1, 5))
+# Entries of x, y, heading in row-major 6x6 covariances in order x, y, z, rotX, rotY, rotZ.
+PLANAR = (slice(None), [[0], [1], [5]], [0, 1, 5])
+
+
+_READ = [
+    "header.stamp",
+    *(f"pose.position.{axis}" for axis in "xy"),
+    *(f"pose.orientation.{axis}" for axis in "zw"),
+    *(f"pose.covariance.{i}" for i in range(36)),
+]
 
 
 def covariance_6x6(covariances: Array) -> Array:
     """Covariances (T, 6, 6) with the planar ones (T, 3, 3) in their places, zero elsewhere."""
     full = np.zeros((len(covariances), 6, 6))
-    full[:, [[0], [1], [5]], [0, 1, 5]] = covariances
+    full[PLANAR] = covariances
     return full
 
 
 def odometry_records(estimate: Estimate, frame_id: str = "odom") -> list[dict[str, Any]]:
-    """One nav_msgs/Odometry-shaped record a stamp.
+    """One record like nav_msgs/Odometry per stamp.
 
-    The twist is the mean velocity in base_link since the record before, by differences of the
+    The twist is the mean velocity in base_link since the previous record, from differences of the
     poses; its covariance is unknown, which the message's convention writes as zeros.
     """
     stamps, poses = estimate.stamps, estimate.means
@@ -72,7 +80,7 @@ def write_odometry_json(estimate: Estimate, path: Path) -> None:
     Raises
     ------
     InputError
-        If the estimate is not finite: JSON has no word for that.
+        If the estimate is not finite, which JSON cannot express.
     """
     try:
         text = json.dumps(odometry_records(estimate), allow_nan=False)
@@ -83,7 +91,7 @@ def write_odometry_json(estimate: Estimate, path: Path) -> None:
 
 
 def write_odometry_csv(estimate: Estimate, path: Path) -> None:
-    """Write one line a record; the 36 covariances are pose.covariance.0 to .35."""
+    """Write one line per record; the 36 covariances are pose.covariance.0 to .35."""
     records = odometry_records(estimate)
     if not records:
         raise InputError(f"{path}: the estimate holds no belief; nothing to write")
@@ -101,26 +109,22 @@ def read_odometry_csv(path: Path) -> Estimate:
     InputError
         Naming the file and the line that cannot be read.
     """
-    stamps, means, covariances = [], [], []
+    rows = []
     try:
         with path.open(newline="") as file:
             for number, row in enumerate(csv.DictReader(file), start=2):
                 try:
-                    z, w = (float(row[f"pose.orientation.{k}"]) for k in "zw")
-                    x, y = (float(row[f"pose.position.{k}"]) for k in "xy")
-                    full = [float(row[f"pose.covariance.{k}"]) for k in range(36)]
-                    stamps.append(float(row["header.stamp"]))
+                    rows.append([float(row[name]) for name in _READ])
                 except (KeyError, TypeError, ValueError) as error:
                     raise InputError(f"{path}:{number}: not an odometry record ({error})") from None
-                means.append([x, y, 2.0 * math.atan2(z, w)])
-                covariances.append(np.array(full).reshape(6, 6)[PLANAR])
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path}: cannot read ({error})") from error
-    poses = np.array(means, float).reshape(-1, 3)
-    if not len(poses):
+    if not rows:
         raise InputError(f"{path}: holds no record; write it with `estima run`")
-    poses[:, 2] = se2.wrap(poses[:, 2])
-    return Estimate(np.array(stamps), poses, np.array(covariances).reshape(-1, 3, 3))
+    stamps, x, y, z, w, *covariances = np.array(rows).T
+    heading = se2.wrap(2.0 * np.arctan2(z, w))
+    full = np.stack(covariances, axis=1).reshape(-1, 6, 6)
+    return Estimate(stamps, np.column_stack([x, y, heading]), full[PLANAR])
 
 
 def _flat_keys(tree: Any, prefix: str = "") -> list[str]:

@@ -34,17 +34,16 @@ def describe(recording: Recording) -> str:
         if log is recording.landmarks:
             mean = len(recording.landmarks.points_in_camera) / max(len(log.stamps), 1)
             lines.append(f"            {mean:.1f} landmarks an image")
-    truth = recording.truth
-    if truth is None:
+    if recording.truth is None:
         lines.append("truth       none")
     else:
-        distance = float(np.sum(np.hypot(*np.diff(truth.poses[:, :2], axis=0).T)))
-        where = f" in world {truth.world.name}" if truth.world else ""
-        lines.append(f"truth       {distance:.2f} m travelled{where}")
+        steps = np.diff(recording.truth.poses[:, :2], axis=0)
+        where = f" in world {recording.world.name}" if recording.world else ""
+        lines.append(f"truth       {np.hypot(*steps.T).sum():.2f} m travelled{where}")
     if "source" in recording.config:
         lines.append(f"source      {recording.config['source']}")
-        for name, value in recording.config.get("notes", {}).items():
-            lines.append(f"            {name.replace('_', ' ')}: {value}")
+        notes = recording.config.get("notes", {})
+        lines += [f"            {key.replace('_', ' ')}: {note}" for key, note in notes.items()]
     if "seed" in recording.config:
         lines.append(f"seed        {recording.config['seed']}")
     lines.append(f"checksum    {recording.checksum}")
