@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from typing import Any
 from unittest import mock
 
@@ -21,11 +21,11 @@ from estimators.base import Estimator, Prior
 from estimators.gaussian import Gaussian
 from estimators.scan_matching import Match, ScanMatcher
 from estimators.stereo import StereoModel
-from experiments.gate.suite import Planted
 from sim.recording import Frame, LandmarkSet
 from sim.robot import wheel_errors
 
 Array = NDArray[np.float64]
+Planted = Callable[[Estimator, np.random.Generator], AbstractContextManager[Estimator]]
 Fault = Callable[[float], Planted]  # of a size
 
 

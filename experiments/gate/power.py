@@ -51,8 +51,8 @@ from experiments.gate.compare import (
     examine,
     judge,
 )
-from experiments.gate.faults import FAULTS, Fault
-from experiments.gate.suite import ERRORS, Planted, Suite, read_suite, run_suite, suite_path
+from experiments.gate.faults import FAULTS, Fault, Planted
+from experiments.gate.suite import ERRORS, Suite, read_suite, run_suite, suite_path
 from experiments.runs.console import progress
 from experiments.runs.paths import SOURCE, results
 from experiments.runs.row import write_frame
