@@ -157,7 +157,7 @@ def test_a_clear_error_for_each_missing_need_passes(case):
 
 
 class Scattered(Base):
-    """A global search: its end is drawn anew with each seed, true in distribution only."""
+    """A global search: its end is drawn with each seed, true in distribution only."""
 
     global_or_grid = True
     sigma = np.array([0.2, 0.2, 0.1])
@@ -201,7 +201,7 @@ def test_headings_at_the_seam_do_not_look_scattered():
     assert "heading" in _differ(draws[:30], draws[30:] + np.array([0, 0, 0.2]))
 
 
-def test_a_map_that_cannot_be_moved_is_told(case):
+def test_a_map_that_cannot_be_moved_is_refused(case):
     import dataclasses
 
     recording, prior = case

@@ -129,8 +129,8 @@ def test_the_commands(tmp_path, capsys):
     )
     assert done.exit_code == 0, done.output
     assert len(load(folder / "c.npz").laser.stamps) == 3
-    told = runner.invoke(app, ["info", str(folder / "carmen.log")])
-    assert "source      carmen" in told.output
-    assert "scans longest gap s: 1.0" in told.output
+    shown = runner.invoke(app, ["info", str(folder / "carmen.log")])
+    assert "source      carmen" in shown.output
+    assert "scans longest gap s: 1.0" in shown.output
     wrong = runner.invoke(app, ["convert", str(folder / "carmen.log"), "-o", str(folder / "c.xyz")])
     assert isinstance(wrong.exception, InputError)

@@ -51,7 +51,7 @@ def test_quaternions_are_unit_and_turn_about_z():
         assert turned == pytest.approx([np.cos(mean[2]), np.sin(mean[2])])
 
 
-def test_estimates_that_cannot_be_written_are_told(tmp_path):
+def test_estimates_that_cannot_be_written_are_refused(tmp_path):
     empty = Estimate(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3, 3)))
     assert odometry_records(empty) == []
     with pytest.raises(InputError, match="no belief"):

@@ -116,7 +116,7 @@ def test_holm_keeps_the_family():
     assert holm([], 0.05) == []
 
 
-def test_failed_runs_alarm_and_are_told_once():
+def test_failed_runs_alarm_and_are_reported_once():
     then = table("e", np.ones((5, 1)))
     now = then.copy()
     now.loc[2, [*ERRORS, "status"]] = [math.nan] * 3 + ["ValueError: no"]
@@ -132,9 +132,9 @@ def test_errors_that_became_infinite_alarm():
     now.loc[4, ERRORS[0]] = math.inf
     found = regress.compare({"accepted": then, "release": then}, now)
     assert {f.verdict for f in found} == {"failed"}
-    told = "e: 1 of 10 runs fail; recording 2: errors that are not finite"
+    message = "e: 1 of 10 runs fail; recording 2: errors that are not finite"
     for report in (regress_report.as_text(found), regress_report.as_annotations(found)):
-        assert report.count(told) == 1  # of both baselines once
+        assert report.count(message) == 1  # of both baselines once
     # where the baseline failed already nothing is new, and the tables say that less was compared
     known = regress.compare({"accepted": now}, now)
     assert {f.verdict for f in known} == {"identical"}
@@ -144,7 +144,7 @@ def test_errors_that_became_infinite_alarm():
 
 
 def test_many_runs_are_exchanged_by_drawing():
-    """20 runs can be parted in 125 970 ways, 32 in 600 million."""
+    """20 runs can be split in 125 970 ways, 32 in 600 million."""
     rng = np.random.default_rng(6)
     for n_then, n_now in ((12, 8), (16, 16)):
         then, now = (0.2 * rng.standard_normal((6, n)) for n in (n_then, n_now))
@@ -207,7 +207,7 @@ def test_suites_of_ones_own_keep_their_baselines_apart(tmp_path):
     assert baseline.baseline_paths(names[0])["release"] == tmp_path / "check.baselines/release.csv"
 
 
-def test_damage_is_told_from_otherness(tmp_path):
+def test_a_damaged_baseline_is_called_damaged(tmp_path):
     path, sound = tmp_path / "b.csv", table("e", np.full((4, 2), 0.25))
     baseline.write_baseline(baseline.Baseline(sound, ("why",)), path)
     text = path.read_text()
@@ -265,9 +265,9 @@ def test_one_estimator_alone_makes_no_baseline(small, monkeypatch, capsys):
     # and a check says that the release is missing
     monkeypatch.setattr(baseline, "run_suite", lambda *_, **__: rows)
     assert not regress_report.run_check(str(small), None)
-    told = capsys.readouterr().err
-    assert "release.csv: no release baseline" in told
-    assert "--accept REASON --release" in told
+    warning = capsys.readouterr().err
+    assert "release.csv: no release baseline" in warning
+    assert "--accept REASON --release" in warning
 
 
 def test_failures_are_not_accepted(small, monkeypatch):
@@ -376,7 +376,7 @@ def test_recordings_of_the_check_turn():
         ),
     ],
 )
-def test_wrong_suites_are_told_in_a_line(tmp_path, text, words):
+def test_wrong_suites_are_refused_in_one_line(tmp_path, text, words):
     path = tmp_path / "s.yaml"
     path.write_text(text)
     with pytest.raises(InputError, match=words) as refusal:
@@ -384,7 +384,7 @@ def test_wrong_suites_are_told_in_a_line(tmp_path, text, words):
     assert "\n" not in str(refusal.value)
 
 
-def test_fingerprints_tell_recordings_apart_and_forgive_rounding(small):
+def test_fingerprints_distinguish_recordings_and_ignore_rounding(small):
     from tests.fakes import circle
 
     recording = circle()
@@ -448,7 +448,7 @@ def test_reports_agree(monkeypatch, tmp_path, capsys):
         regress_report.run_check("check", None, release=True)
 
 
-def test_what_was_measured_on_the_main_suite_is_not_said_of_others(small, monkeypatch, capsys):
+def test_the_power_of_the_main_suite_is_not_stated_of_others(small, monkeypatch, capsys):
     monkeypatch.setattr(regress_report, "check", lambda *_: findings())
     regress_report.run_check("check", None)
     assert "finds" in capsys.readouterr().out
@@ -497,7 +497,7 @@ def test_messages_are_made_printable(small):
 
 
 @pytest.mark.parametrize("where", ["junit", "summary", "step"])
-def test_reports_without_a_place_are_told_before_the_run(where, tmp_path, monkeypatch):
+def test_reports_that_cannot_be_written_are_refused_before_the_run(where, tmp_path, monkeypatch):
     monkeypatch.setattr(regress_report, "check", no_run)
     (tmp_path / "file").touch()
     for path in (tmp_path / "file" / "report", tmp_path):

@@ -78,7 +78,7 @@ def test_the_quick_composer_resolves_as_hydra_does():
     assert len({run.key for run in runs}) == 8
 
 
-def test_a_study_sweeps_its_own_values_unless_told_otherwise():
+def test_a_study_sweeps_its_own_values_unless_others_are_given():
     runs = list(plan.planned(["study=decristoforis2020_office"]))
     assert len(runs) == 20 * 4
     assert {run.config["seed"] for run in runs} == set(range(1000, 1020))
@@ -94,7 +94,7 @@ def test_unknown_keys_and_options_are_refused():
     refused(estima("run", "-m", "--frob", "seed=1,2"), "--frob")
 
 
-def test_keys_tell_what_decides_the_rows(tmp_path, monkeypatch):
+def test_keys_depend_on_what_decides_the_rows(tmp_path, monkeypatch):
     experiment = Experiment.compose([])
     assert experiment.replaced(name="other").key == experiment.key
     assert experiment.replaced(seed=5).key != experiment.key
@@ -198,14 +198,14 @@ def own_estimator(folder, body):
 
 
 @pytest.mark.parametrize(
-    ("body", "told"),
+    ("body", "words"),
     [("self.how == 'bad' and sys.exit(0)", "SystemExit"),
      ("self.how == 'bad' and os._exit(3)", "process died")],
     ids=["exits", "dies"],
 )  # fmt: skip
-def test_an_estimator_that_ends_its_process_costs_its_own_runs(name, tmp_path, body, told):
-    words = own_estimator(tmp_path, body)
-    done = estima(*words, "estimator.how=sound,bad", "seed=0,1", f"name={name}",
+def test_an_estimator_that_ends_its_process_costs_its_own_runs(name, tmp_path, body, words):
+    arguments = own_estimator(tmp_path, body)
+    done = estima(*arguments, "estimator.how=sound,bad", "seed=0,1", f"name={name}",
                   PYTHONPATH=f"{ROOT}:{tmp_path}")  # fmt: skip
     assert done.returncode == 1, done.stderr
     assert "Traceback" not in done.stderr
@@ -214,7 +214,7 @@ def test_an_estimator_that_ends_its_process_costs_its_own_runs(name, tmp_path, b
     assert (rows.loc[rows["estimator.how"] == "sound", "status"] == "ok").all()
     bad = rows[rows["estimator.how"] == "bad"]
     assert (bad["status"] == "failed").all()
-    assert (bad["status_code"] + ": " + bad["status_detail"]).str.contains(told).all()
+    assert (bad["status_code"] + ": " + bad["status_detail"]).str.contains(words).all()
     assert len(rows) == 4
     assert {path.suffix for path in folder(name).iterdir()} <= {".parquet", ".failed"}
 
@@ -245,8 +245,8 @@ def test_two_sweeps_of_one_name_at_once(name):
         for low in (0, 100)
     ]  # fmt: skip
     for process in both:
-        _, told = process.communicate(timeout=120)
-        assert process.returncode == 0, told
+        _, errors = process.communicate(timeout=120)
+        assert process.returncode == 0, errors
     assert sorted(table_of(name)["seed"]) == [*range(15), *range(100, 115)]
     assert {path.suffix for path in folder(name).iterdir()} == {".parquet"}
 
@@ -278,14 +278,14 @@ def test_a_terminated_sweep_says_so_and_leaves_no_plan(name):
         assert process.poll() is None
         time.sleep(0.1)
     process.terminate()
-    _, told = process.communicate(timeout=30)
+    _, errors = process.communicate(timeout=30)
     assert process.returncode == 130
-    assert told.splitlines()[-1] == "estima: interrupted; what was finished is kept"
+    assert errors.splitlines()[-1] == "estima: interrupted; what was finished is kept"
     assert not list(folder(name).glob("plan-*"))
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("arguments", "words"),
     [
         (["name=a,b", "seed=0"], "one, not several"),
         (["name=2026", "seed=0,1"], "one word"),
@@ -295,9 +295,9 @@ def test_a_terminated_sweep_says_so_and_leaves_no_plan(name):
         (["study=maximo2024_own", "seed=0,1"], "data"),
     ],
 )
-def test_wrong_sweeps_end_in_a_line(words, told):
-    done = estima("run", "-m", *SHORT[:2], *words)
-    refused(done, told)
+def test_wrong_sweeps_end_in_one_line(arguments, words):
+    done = estima("run", "-m", *SHORT[:2], *arguments)
+    refused(done, words)
     for never in ("runs/b", "runs/2026", "runs/None", "../evil"):
         assert not (results() / never).exists()
 
@@ -341,7 +341,7 @@ def test_files_that_are_not_the_runs_rows(name):
     assert again.returncode == 0, again.stderr
     pd.testing.assert_frame_equal(table_of(name), expected, check_exact=True)
     expected.to_parquet(folder(name) / "all.parquet")
-    assert len(table_of(name)) == 3  # told once each
+    assert len(table_of(name)) == 3  # each row once
 
 
 @pytest.mark.parametrize("launcher", ["basic", "submitit_local", "ray"])
@@ -412,10 +412,10 @@ def test_a_full_disk_ends_in_a_line_and_a_correct_re_run(name, full, tmp_path):
     first, second = (int(line.split()[1]) for line in done.stdout.splitlines())
     assert first in (1, 2), done.stderr
     assert second == 0, done.stderr
-    told = [line for line in done.stderr.splitlines() if line.startswith("estima: ")]
-    assert len(told) == 1
-    assert "No space left on device" in told[0]
-    assert "free some space" in told[0]
+    lines = [line for line in done.stderr.splitlines() if line.startswith("estima: ")]
+    assert len(lines) == 1
+    assert "No space left on device" in lines[0]
+    assert "free some space" in lines[0]
     assert "Traceback" not in done.stderr
     clear(name)
     assert estima("run", "-m", *SHORT, "seed=range(0,12)", f"name={name}").returncode == 0

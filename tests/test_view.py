@@ -138,17 +138,17 @@ def test_estimates_of_something_else_are_refused(recording, tmp_path):
     wild = ",".join("inf" if i == x else cell for i, cell in enumerate(first.split(",")))
     write_odometry_csv(dataclasses.replace(sound, stamps=sound.stamps + 1e6), path)
     later = path.read_text()
-    for text, told in (
+    for text, words in (
         (later, "no stamp of it"),
         ("\n".join([head, first, wild, *rest]), r"csv:3: .* not finite"),
         (head, "holds no record"),
     ):
         path.write_text(text)
-        with pytest.raises(InputError, match=told):
+        with pytest.raises(InputError, match=words):
             view.estimate_of(recording, str(path), [], np.arange(3), silent)
 
 
-def test_a_robot_that_is_told_by_its_number(recording):
+def test_a_robot_given_by_its_number(recording):
     """As the logs of several robots do."""
     numbered = dataclasses.replace(recording, config={"robot": 3})
     assert view.estimate_of(numbered, "odometry", [], np.arange(3), silent)[1] == "odometry"
@@ -167,11 +167,11 @@ def test_gif(run, tmp_path):
 def test_mp4(run, tmp_path):
     path = tmp_path / "run.mp4"
     view.save(run, path, silent)
-    told = subprocess.run(
+    played = subprocess.run(
         ["ffmpeg", "-i", str(path), "-f", "null", "-"], capture_output=True, text=True
     )
-    assert told.returncode == 0
-    assert f"frame={len(run.rows):5d}" in told.stderr
+    assert played.returncode == 0
+    assert f"frame={len(run.rows):5d}" in played.stderr
 
 
 def test_without_ffmpeg_the_remedy_is_named(monkeypatch):
@@ -251,8 +251,8 @@ def test_the_window_shows_the_robots(tmp_path):
     )
     os.close(write)
     try:
-        with os.fdopen(read) as told:
-            display = f":{told.readline().strip()}"
+        with os.fdopen(read) as numbers:
+            display = f":{numbers.readline().strip()}"
         command = ["view", str(tmp_path / "run.npz"), "-e", "odometry", "--seconds", "1"]
         window = subprocess.Popen(
             [sys.executable, "-m", "experiments.cli", *command],

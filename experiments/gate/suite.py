@@ -123,26 +123,36 @@ def read_suite(path: Path) -> Suite:
             f"{path}: a suite holds first_seed, recordings (count, overrides) and estimators "
             f"(recordings, repeats, overrides), as conf/suite/check.yaml does ({error!r})"
         ) from error
-    if not _is_whole(suite.first_seed, 0):
-        raise InputError(
-            f"{path}: first_seed must be a whole number from 0 on, got {suite.first_seed!r}"
-        )
-    if not suite.estimators:
-        raise InputError(f"{path}: estimators is empty; name at least one of conf/estimator")
-    for name, count in suite.counts.items():
-        if not _is_whole(count, 2):
-            raise InputError(f"{path}: recordings.{name}.count must be 2 or more, got {count!r}")
-    for entry in suite.estimators:
-        if entry.recordings not in suite.counts:
-            raise InputError(
-                f"{path}: estimators.{entry.name}.recordings={entry.recordings!r}; known: "
-                f"{', '.join(map(str, suite.counts))}"
+    checks = [
+        (
+            _is_whole(suite.first_seed, 0),
+            f"first_seed must be a whole number, zero or more, got {suite.first_seed!r}",
+        ),
+        (suite.estimators, "estimators is empty; name at least one of conf/estimator"),
+        *(
+            (_is_whole(n, 2), f"recordings.{group}.count must be 2 or more, got {n!r}")
+            for group, n in suite.counts.items()
+        ),
+        *(
+            (
+                entry.recordings in suite.counts,
+                f"estimators.{entry.name}.recordings={entry.recordings!r}; known: "
+                f"{', '.join(map(str, suite.counts))}",
             )
-        if not all(_is_whole(count, 1, _RESEEDED) for count in entry.repeats):
-            raise InputError(
-                f"{path}: estimators.{entry.name}.repeats must lie in 1..{_RESEEDED}, got "
-                f"{list(entry.repeats)}"
+            for entry in suite.estimators
+        ),
+        *(
+            (
+                all(_is_whole(n, 1, _RESEEDED) for n in entry.repeats),
+                f"estimators.{entry.name}.repeats must lie in 1..{_RESEEDED}, got "
+                f"{list(entry.repeats)}",
             )
+            for entry in suite.estimators
+        ),
+    ]
+    for sound, complaint in checks:
+        if not sound:
+            raise InputError(f"{path}: {complaint}")
     return suite
 
 

@@ -93,13 +93,13 @@ def to_frame(rows: Sequence[Row]) -> pd.DataFrame:
 
     for row in rows:
         check_row(row)
-    names = list(dict.fromkeys(name for row in rows for name in row))
     columns = {}
-    for name in names:
+    for name in dict.fromkeys(name for row in rows for name in row):
         values = [row.get(name) for row in rows]
         kinds = {(isinstance(v, str), isinstance(v, bool)) for v in values if v is not None}
-        mixed = len(kinds) > 1
-        columns[name] = [None if v is None else str(v) for v in values] if mixed else values
+        if len(kinds) > 1:
+            values = [None if v is None else str(v) for v in values]
+        columns[name] = values
     return pd.DataFrame(columns)
 
 

@@ -130,29 +130,18 @@ def estimate_of(
         if not sound.all():
             raise InputError(f"{path}:{2 + int(np.argmin(sound))}: a pose that is not finite")
         return estimate, "estimate"
-    return _estimated(recording, source, overrides, set(rows.tolist()), on_step), source
-
-
-def _estimated(
-    recording: Recording,
-    name: str,
-    overrides: Sequence[str],
-    shown: Collection[int],
-    on_step: Callable[[int], None],
-) -> Estimate:
-    """Run an estimator of the configuration, with the recording's own robot."""
-    robot = dataclasses.asdict(recording.robot)
+    robot = dataclasses.asdict(recording.robot)  # the recording's own, with its slip if it is known
     made_with = recording.config.get("robot")
     if isinstance(made_with, dict):  # else, of a log of many robots, the number of one
         robot |= {key: value for key, value in made_with.items() if key in ("kr", "kl")}
     given = [f"robot.{key}={value}" for key, value in robot.items()]
-    experiment = Experiment.compose([f"estimator={name}", *given, *overrides])
+    experiment = Experiment.compose([f"estimator={source}", *given, *overrides])
     if "keep_map" in experiment.config["estimator"]:
         settings = {**experiment.config["estimator"], "keep_map": True}
         experiment = experiment.replaced(estimator=settings)
-    sparing = _Sparing(experiment.estimator(), shown)
-    rng = stream(experiment.seed, f"estimator/{name}", 0)
-    return run_estimator(sparing, recording, experiment.prior(recording), rng, _EXTRAS, on_step)
+    sparing = _Sparing(experiment.estimator(), set(rows.tolist()))
+    rng, prior = stream(experiment.seed, f"estimator/{source}", 0), experiment.prior(recording)
+    return run_estimator(sparing, recording, prior, rng, _EXTRAS, on_step), source
 
 
 class _Sparing:
@@ -327,23 +316,21 @@ def robot_outline(pose: Array, radius_m: float) -> Array:
 
 
 def _bounds(run: Run, truth: Array | None) -> tuple[float, float, float, float]:
-    """What the map shows: the world and the way, with a margin.
+    """What the map shows: the world and the path, with a margin.
 
-    An estimate that runs away is followed to twice the size of all else.
+    A diverging estimate is followed to twice the size of all else.
     """
     world = run.recording.world
-    parts = [np.zeros((0, 2))] if truth is None else [truth[:, :2]]
-    if world is not None and len(world.walls):
-        parts.append(world.walls.reshape(-1, 2))
-    sure = np.concatenate(parts)
-    sure = sure[np.isfinite(sure).all(axis=1)]
+    known = np.zeros((0, 2)) if truth is None else truth[:, :2]
+    if world is not None:
+        known = np.concatenate([known, world.walls.reshape(-1, 2)])
     means = np.zeros((0, 2)) if run.estimate is None else run.estimate.means[:, :2]
-    means = means[np.isfinite(means).all(axis=1)]
-    if len(sure) and len(means):
-        low, high = sure.min(axis=0), sure.max(axis=0)
+    known, means = (points[np.isfinite(points).all(axis=1)] for points in (known, means))
+    if len(known) and len(means):
+        low, high = known.min(axis=0), known.max(axis=0)
         reach = (high - low).max() / 2.0
         means = np.clip(means, low - reach, high + reach)
-    corners = np.concatenate([sure, means])
+    corners = np.concatenate([known, means])
     if not len(corners):
         raise InputError("this log has no truth to show; name an estimator with --estimate")
     low, high = corners.min(axis=0), corners.max(axis=0)
