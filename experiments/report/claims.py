@@ -97,7 +97,7 @@ def read_claims(path: Path) -> pd.DataFrame:
 
 
 def note_provenance(results: Path, paper: str, profile: str, seconds: float) -> None:
-    """Record how a paper's results were made, beside them."""
+    """Record how a paper's results were made, in provenance.json."""
     made = read_provenance(results)
     made[paper] = {"profile": profile, "seconds": round(seconds), **this_code()}
     with write_whole(results / "provenance.json") as part:

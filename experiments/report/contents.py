@@ -76,14 +76,12 @@ def contents(results: Path, on_progress: Callable[[float], None]) -> dict[str, A
 
 def findings(name: str) -> dict[str, Any]:
     """A paper's findings in our words: `title`, `about`, `claims` by id, `figures` by file name."""
-    empty = {"title": name, "about": "", "claims": {}, "figures": {}}
     path = _FOLDER / name / "findings.yaml"
-    if not path.exists():
-        return empty
     try:
-        return {**empty, **yaml.safe_load(path.read_text(encoding="utf-8"))}
+        found = yaml.safe_load(path.read_text(encoding="utf-8")) if path.exists() else {}
     except yaml.YAMLError as error:
         raise InputError(f"{path}: not YAML ({str(error).splitlines()[0]})") from error
+    return {"title": name, "about": "", "claims": {}, "figures": {}, **found}
 
 
 def judged_claims(table: pd.DataFrame, about: Mapping[str, Entry]) -> Mapping[str, Entry]:

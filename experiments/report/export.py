@@ -26,7 +26,7 @@ _MARKDOWN = str.maketrans({"\\": r"\\", "|": r"\|"})
 
 
 def read_table(path: Path) -> pd.DataFrame:
-    """Read any table; texts stay as they are written, integers beside gaps stay integers.
+    """Read any table; texts stay as they are written, integers among gaps stay integers.
 
     Raises
     ------

@@ -16,7 +16,7 @@ from experiments.viewing.style import CYCLE, figure
 from sim.errors import InputError
 
 _WIDE_X, _WIDE_Y = 20.0, 30.0  # an axis that spans more than this factor is logarithmic
-# Bars of several lines are set apart, so that none hides another
+# How far the bars of several lines are moved, so that none hides another
 _BESIDE = 0.006  # share of the axis
 _BESIDE_WORD = 0.08  # among words, which are 1 apart
 
