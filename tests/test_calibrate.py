@@ -80,7 +80,7 @@ def test_gain_and_track_errors_are_found_jointly():
 
 
 def test_ignoring_a_gain_error_spoils_k():
-    """What the joint arm is for: the same runs, calibrated with the nominal geometry."""
+    """Why the joint arm is needed: the same runs, calibrated with the nominal geometry."""
     rng = np.random.default_rng(5)
     robot = slipping(1e-4, geometry=True)
     runs = [

@@ -1,4 +1,4 @@
-"""Rows of sweeps as tables, means and plots; the schema that they share."""
+"""Rows of sweeps as tables, means and plots; the schema they share."""
 
 import numpy as np
 import pandas as pd

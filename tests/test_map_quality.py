@@ -1,4 +1,4 @@
-"""Maps of laser points: true poses give true maps, and what is wrong with poses shows."""
+"""Maps of laser points: true poses give true maps, and wrong poses show."""
 
 import dataclasses
 

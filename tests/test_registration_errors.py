@@ -1,4 +1,4 @@
-"""Scenes and the covariances held against repeated registrations."""
+"""Scenes, and predicted covariances against the scatter of repeated registrations."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ def test_scenes_lie_in_their_place(world):
             assert np.hypot(moved[0], moved[1]) == pytest.approx(0.05, abs=0.01)
 
 
-def test_nees_tells_a_fitting_covariance_from_one_that_does_not(world, monkeypatch):
+def test_nees_distinguishes_a_fitting_covariance_from_a_wrong_one(world, monkeypatch):
     def table():
         rng = np.random.default_rng(4)
         (scene,) = scenes(world, "corridor_objects", LASER.mount.pose, rng, 1)

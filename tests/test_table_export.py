@@ -1,4 +1,4 @@
-"""Exported tables hold what their files hold, and wrong ones end in one line."""
+"""Exported tables match their files, and wrong input ends in one line."""
 
 import io
 import sys
@@ -66,7 +66,7 @@ def test_letters_that_the_output_lacks_are_named(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["README.md", "damaged.csv", "missing.csv"])
-def test_what_is_no_table_is_refused_and_not_to_be_deleted(tmp_path, name):
+def test_a_file_that_is_no_table_is_refused_without_advice_to_delete_it(tmp_path, name):
     (tmp_path / "README.md").write_text("# Read me\n")
     (tmp_path / "damaged.csv").write_text('a,b\n1,2\n3,4,5,6\n"')
     with pytest.raises(InputError, match=f"{name}.*needs a CSV or Parquet table") as refusal:

@@ -1,4 +1,4 @@
-"""Speeds and accuracies on one core, beside their goals."""
+"""Speeds and accuracies on one core, with their goals."""
 
 from __future__ import annotations
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import io
 import json
 import statistics
@@ -103,8 +102,7 @@ def timed_steps(estimator: Estimator, frames: Iterable[Frame]) -> Iterator[tuple
 
 def as_json(results: list[Measurement]) -> str:
     """One object: the machine, and the results in order."""
-    rows = [dataclasses.asdict(result) for result in results]
-    return json.dumps({"machine": machine(), "results": rows}, indent=2)
+    return json.dumps({"machine": machine(), "results": [vars(r) for r in results]}, indent=2)
 
 
 def as_table(results: list[Measurement]) -> str:

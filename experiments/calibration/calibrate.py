@@ -67,8 +67,7 @@ def calibrate_recordings(
             "give repetitions, or use the wheel truth"
         )
     manoeuvres = [Manoeuvre(profile, np.array(ends)) for profile, ends in groups.values()]
-    believed = recordings[0].robot
-    nominal = DifferentialDrive(believed.wheel_radius_m, believed.track_m)
+    nominal = DifferentialDrive(**vars(recordings[0].robot))
     return from_end_poses(manoeuvres, nominal, rng or np.random.default_rng(0), geometry=geometry)
 
 

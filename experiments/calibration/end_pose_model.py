@@ -43,7 +43,7 @@ class EndPoseModel:
         nominal: DifferentialDrive,
         rng: np.random.Generator,
         method: EndPoseMethod,
-        n_samples: int,
+        n_samples: int = 256,
     ) -> None:
         if method not in get_args(EndPoseMethod):
             raise InputError(f"method must be sampled or linearised, got {method!r}")

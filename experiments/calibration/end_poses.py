@@ -47,7 +47,6 @@ def from_end_poses(
     *,
     method: EndPoseMethod = "sampled",
     geometry: bool = False,
-    n_samples: int = 256,
 ) -> CalibrationResult:
     """Calibrate from commands and true end poses alone, as in puzzlebot2024.
 
@@ -86,7 +85,7 @@ def from_end_poses(
     for i, manoeuvre in enumerate(manoeuvres):
         if not np.all(np.isfinite(manoeuvre.end_poses)):
             raise InputError(f"manoeuvre {i} has an end pose that is not finite; leave it out")
-    models = [EndPoseModel(m.profile, nominal, rng, method, n_samples) for m in manoeuvres]
+    models = [EndPoseModel(m.profile, nominal, rng, method) for m in manoeuvres]
     seen = [model.coordinates(m.end_poses) for model, m in zip(models, manoeuvres, strict=True)]
     means = np.array([y.mean(axis=0) for y in seen])
     scatters = np.array(

@@ -63,8 +63,9 @@ def from_wheel_truth(
             f"{ground.shape}"
         )
     (kr, right), (kl, left) = (_wheel(encoder[:, i], ground[:, i], geometry) for i in (0, 1))
-    turns = turns_rad if geometry else None
-    track = None if turns is None else _track(ground, np.asarray(turns, float))
+    track = None
+    if geometry and turns_rad is not None:
+        track = _track(ground, np.asarray(turns_rad, float))
     return CalibrationResult("wheel_truth", kr, kl, right, left, track, len(encoder))
 
 

@@ -1,4 +1,4 @@
-"""Errors of many noisy registrations of one pair of poses, beside their predicted covariances."""
+"""Errors of many noisy registrations of one pair of poses, against their predicted covariances."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ def _methods(sigma: float, rng: np.random.Generator) -> dict[str, Method]:
 
 
 def _nees_share(error: Array, covariance: Array, found: Registration) -> float:
-    """NEES over its degrees of freedom, in the directions that the scans hold."""
+    """NEES over its degrees of freedom, in the directions that the scans constrain."""
     if found.status != "degenerate":
         return float(error @ np.linalg.solve(covariance, error)) / 3.0
     held, loose = icp_covariance.split_directions(found)

@@ -1,7 +1,7 @@
 """The smallest error that any matcher of two laser scans can reach, from the true walls.
 
 Censi, "On achievable accuracy for range-finder localization" (ICRA 2007) and "... for pose
-tracking" (ICRA 2009): ranges r(x) with white noise of variance sigma^2 hold the Fisher
+tracking" (ICRA 2009): ranges r(x) with white noise of variance sigma^2 carry the Fisher
 information sum dr^T dr / sigma^2 about the pose x. Both scans of a pair are noisy, so the
 covariance of their relative pose is at least the sum of the two poses' bounds.
 """

@@ -12,8 +12,6 @@ from sim.errors import InputError
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
-LONGEST_GAP_S = 3.0
-
 
 def nearest(stamps: Array, wanted: Array) -> Rows:
     """Row of the stamp nearest to each wanted one (the earlier of two); stamps increasing."""
@@ -42,16 +40,11 @@ def interpolate(stamps: Array, poses: Array, wanted: Array, longest_gap_s: float
 
 
 def aligned_ate_m(
-    truth_stamps: Array,
-    truth: Array,
-    stamps: Array,
-    poses: Array,
-    longest_gap_s: float = LONGEST_GAP_S,
+    truth_stamps: Array, truth: Array, stamps: Array, poses: Array, longest_gap_s: float = 3.0
 ) -> float:
     """RMS position error, m, after SE(2) alignment of an estimate with clocks of its own.
 
-    The estimate is interpolated at the truth's stamps; those that fall into its gaps are left
-    out.
+    The estimate is interpolated at the truth's stamps; those in its gaps are left out.
 
     Raises
     ------

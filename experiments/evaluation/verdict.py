@@ -14,7 +14,7 @@ from experiments.evaluation.statistics import Interval, log_ratio_interval, wilc
 
 
 class Verdict(StrEnum):
-    """What an interval says of a criterion."""
+    """Whether an interval meets a criterion."""
 
     REPRODUCED = "reproduced"
     NOT_REPRODUCED = "not_reproduced"
@@ -28,7 +28,7 @@ class Verdict(StrEnum):
 
 
 class Role(StrEnum):
-    """Whether a statistic decides its claim's verdict, or only stands beside it."""
+    """Whether a statistic decides its claim's verdict, or only accompanies it."""
 
     HEADLINE = "headline"
     BESIDE = "beside"
@@ -54,11 +54,11 @@ class Claim:
     found
         Its value and 95 % interval, unless the statistic names another level.
     criterion
-        What the interval is held against.
+        What the interval is judged by.
     verdict, reason
-        The verdict, and why or where it holds, if that needs saying.
+        The verdict; why, or where it holds, if that is not obvious.
     role
-        A statistic without a criterion stands beside the claim.
+        A statistic without a criterion only accompanies the claim.
     """
 
     id: str
@@ -110,7 +110,7 @@ def lower(first: ArrayLike, second: ArrayLike) -> tuple[Interval, float, Verdict
 
 
 def overall(parts: Sequence[Verdict]) -> Verdict:
-    """Return the verdict on a whole whose parts must all hold."""
+    """Return the verdict on a claim whose parts must all hold."""
     if set(parts) == {Verdict.REPRODUCED}:
         return Verdict.REPRODUCED
     return Verdict.NOT_REPRODUCED if Verdict.NOT_REPRODUCED in parts else Verdict.UNDECIDED

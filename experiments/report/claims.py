@@ -1,4 +1,4 @@
-"""What studies leave for the report beside tables and figures: judged claims, and their origin.
+"""What studies leave for the report besides tables and figures: judged claims, and their origin.
 
 The claims are the rows of results/claims.csv; results/provenance.json says how they were made.
 """
@@ -35,7 +35,7 @@ COLUMNS = (
     "study",
     "command",
 )
-# What the texts must match, and what that is in words
+# The pattern of each text, and what it describes
 _TEXTS = {
     "id": (r"\w+", "a word"),
     "paper": (r"[a-z][a-z0-9_]*", "a paper's short name"),
@@ -49,7 +49,7 @@ _REMEDY = "restore it by `git checkout`, or delete it and run `estima reproduce`
 def write_claims(
     claims: Sequence[Claim], path: Path, *, paper: str, profile: Profile, command: str
 ) -> None:
-    """Write a paper's claims to the table in place of its old ones; others keep their rows.
+    """Replace a paper's claims in the table; other papers keep their rows.
 
     The statistics of a claim stay in the order given: the paper's headline first.
     """
@@ -78,28 +78,26 @@ def read_claims(path: Path) -> pd.DataFrame:
         table = read_rows(path)
     except InputError as error:
         raise InputError(f"{path}: cannot read the claims; {_REMEDY}") from error
-    for name in COLUMNS:
-        if name not in table:
-            raise InputError(f"{path}: no column {name}; {_REMEDY}")
+    for name in [name for name in COLUMNS if name not in table]:
+        raise InputError(f"{path}: no column {name}; {_REMEDY}")
     table["reason"] = table["reason"].fillna("")
     for name in (*_TEXTS, *_NUMBERS):
         pattern, wanted = _TEXTS.get(name, ("", "a number"))
+        cells = table[name]
         if pattern:
-            good = table[name].astype("str").str.fullmatch(pattern, na=False)
+            good = cells.astype("str").str.fullmatch(pattern, na=False)
         else:
-            good = pd.to_numeric(table[name], errors="coerce").notna() | table[name].isna()
-        if not good.all():
-            row = int(np.argmin(good))
-            cell = f"{name} is {table[name].tolist()[row]!r}, not {wanted}"
+            good = cells.isna() | pd.to_numeric(cells, errors="coerce").notna()
+        for row in np.flatnonzero(~good):
+            cell = f"{name} is {cells.tolist()[row]!r}, not {wanted}"
             raise InputError(f"{path}, row {row + 2}: {cell}; {_REMEDY}")
-    duplicates = np.flatnonzero(table.duplicated(["paper", "id", "statistic"]))
-    if len(duplicates):
-        raise InputError(f"{path}, row {duplicates[0] + 2}: a duplicate; {_REMEDY}")
+    for row in np.flatnonzero(table.duplicated(["paper", "id", "statistic"])):
+        raise InputError(f"{path}, row {row + 2}: a duplicate; {_REMEDY}")
     return table.astype(dict.fromkeys(_NUMBERS, float))
 
 
 def note_provenance(results: Path, paper: str, profile: str, seconds: float) -> None:
-    """Keep how a paper's results were made, beside them."""
+    """Record how a paper's results were made, in provenance.json."""
     made = read_provenance(results)
     made[paper] = {"profile": profile, "seconds": round(seconds), **this_code()}
     with write_whole(results / "provenance.json") as part:

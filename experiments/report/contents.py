@@ -21,7 +21,7 @@ from sim.errors import InputError
 
 Entry = Mapping[str, Any]
 PAPERS = ("puzzlebot2024", "decristoforis2020", "gil2008", "maximo2024")
-# What belongs to no paper, by the start of its files' names, and the commands that make it.
+# What belongs to no paper, by the prefix of its files' names, and the commands that make it.
 OWN = {
     "leaderboard": ["estima run -m study=leaderboard"],
     "all_estimators": ["estima run -m study=all_estimators"],
@@ -35,7 +35,7 @@ _REMEDY = "restore it by `git checkout`, or delete it and run `estima reproduce`
 
 
 def contents(results: Path, on_progress: Callable[[float], None]) -> dict[str, Any]:
-    """Read all that the report shows, by its names in the templates."""
+    """Read all that the report shows, under its names in the templates."""
     table = read_claims(results / "claims.csv")
     made = read_provenance(results)
     papers = [*PAPERS, *sorted(set(table["paper"]) - set(PAPERS))]
@@ -57,7 +57,7 @@ def contents(results: Path, on_progress: Callable[[float], None]) -> dict[str, A
         "n_judged": table["id"].nunique(),
         "tally": [f"{counts[verdict]} {verdict.label}" for verdict in Verdict if counts[verdict]],
         "n_quick": int((table["profile"] == Profile.QUICK).sum()),
-        # what a cut table would lack: claims without a verdict of papers that have some
+        # a table that was cut off lacks these: claims without a verdict in papers that have some
         "missing": [
             key
             for paper in dict.fromkeys(table["paper"])
@@ -75,22 +75,20 @@ def contents(results: Path, on_progress: Callable[[float], None]) -> dict[str, A
 
 
 def findings(name: str) -> dict[str, Any]:
-    """What a paper says, in our words: `title`, `about`, `claims` by id, `figures` by file name."""
-    empty = {"title": name, "about": "", "claims": {}, "figures": {}}
+    """A paper's findings in our words: `title`, `about`, `claims` by id, `figures` by file name."""
     path = _FOLDER / name / "findings.yaml"
-    if not path.exists():
-        return empty
     try:
-        return {**empty, **yaml.safe_load(path.read_text(encoding="utf-8"))}
+        found = yaml.safe_load(path.read_text(encoding="utf-8")) if path.exists() else {}
     except yaml.YAMLError as error:
         raise InputError(f"{path}: not YAML ({str(error).splitlines()[0]})") from error
+    return {"title": name, "about": "", "claims": {}, "figures": {}, **found}
 
 
 def judged_claims(table: pd.DataFrame, about: Mapping[str, Entry]) -> Mapping[str, Entry]:
     """Every claim by its id: those with a sentence in their order, then the others.
 
-    Each has its `statistics`, the rows of the table; the `worst` of them, which speaks for it; the
-    first of each verdict as `examples`; its `verdict` in words, and its `style` on the page.
+    Each has its `statistics`, the rows of the table; the first of the `worst` verdict, which stands
+    for it; the first of each verdict as `examples`; its `verdict` in words, and its `style`.
     """
     sentences = {key: text for page in about.values() for key, text in page["claims"].items()}
     rows: dict[str, list[Entry]] = {key: [] for key in sentences}
@@ -147,7 +145,7 @@ def study(results: Path, name: str, about: Entry, claims: Mapping[str, Entry]) -
 
 
 def picture(path: Path, about: Entry, claims: Mapping[str, Entry]) -> Entry:
-    """Read a figure; one without findings is named after its file.
+    """Read a figure; without findings, its title is the file's name.
 
     Raises
     ------

@@ -26,7 +26,7 @@ _MARKDOWN = str.maketrans({"\\": r"\\", "|": r"\|"})
 
 
 def read_table(path: Path) -> pd.DataFrame:
-    """Read any table; texts stay as they are written, whole numbers beside gaps stay whole.
+    """Read any table; texts stay as they are written, integers among gaps stay integers.
 
     Raises
     ------
@@ -35,9 +35,8 @@ def read_table(path: Path) -> pd.DataFrame:
     """
     try:
         frame = read_rows(path)
-        written = frame
-        if path.suffix == ".csv":
-            written = pd.read_csv(path, dtype="str", keep_default_na=False)
+        as_csv = path.suffix == ".csv"
+        written = pd.read_csv(path, dtype="str", keep_default_na=False) if as_csv else frame
     except (InputError, ValueError) as error:
         why = [*str(error.__cause__ or "no table there").splitlines(), "unreadable"][0].rstrip(".")
         raise InputError(f"{path}: {why}; export-table needs a CSV or Parquet table") from error
@@ -45,17 +44,17 @@ def read_table(path: Path) -> pd.DataFrame:
         filled = column.dropna()
         if filled.empty or isinstance(column.dtype, pd.StringDtype):
             frame[name] = written[name]  # "NA" is a gap among numbers, but a text among texts
-        elif column.dtype.kind == "f" and len(filled) < len(column) and _whole(filled):
+        elif (
+            column.dtype.kind == "f"
+            and column.hasnans
+            and ((filled % 1.0 == 0.0) & (filled.abs() < 2.0**53)).all()
+        ):
             frame[name] = column.astype("Int64")
     return frame
 
 
-def _whole(numbers: pd.Series[float]) -> bool:
-    return bool(((numbers % 1.0 == 0.0) & (numbers.abs() < 2.0**53)).all())
-
-
 def plain(value: Any, digits: int = 4) -> str:
-    """A cell in words: numbers with so many significant digits, nothing where there is none."""
+    """A cell as text: floats with so many significant digits, nothing where it is empty."""
     if pd.isna(value):
         return ""
     if isinstance(value, bool):
@@ -64,7 +63,7 @@ def plain(value: Any, digits: int = 4) -> str:
 
 
 def as_text(frame: pd.DataFrame, digits: int = 4) -> pd.DataFrame:
-    """Every cell as `plain` says it, under headings with units."""
+    """Every cell as `plain` writes it, under headings with units."""
     cells = frame.set_axis([title(str(name)) for name in frame], axis=1).astype(object)
     return cells.map(lambda value: " ".join(plain(value, digits).split()))
 
@@ -75,7 +74,7 @@ def numeric(frame: pd.DataFrame) -> list[bool]:
 
 
 def to_markdown(frame: pd.DataFrame, digits: int = 4) -> str:
-    """Pipe table; columns of numbers are set to the right."""
+    """Pipe table; columns of numbers are aligned to the right."""
     cells = as_text(frame, digits).map(lambda text: text.translate(_MARKDOWN))
     table: str = cells.rename(columns=lambda name: name.translate(_MARKDOWN)).to_markdown(
         index=False,
@@ -91,7 +90,7 @@ def to_latex(frame: pd.DataFrame, digits: int = 4) -> str:
     cells = as_text(frame, digits).map(_latex).rename(columns=_latex)
     columns = "".join("r" if number else "l" for number in numeric(frame))
     table: str = cells.style.hide(axis="index").to_latex(column_format=columns, hrules=True)
-    return re.sub(r"(?m)^(?=[*\[])", "{}", table)  # \\ would take it as its argument
+    return re.sub(r"(?m)^(?=[*\[])", "{}", table)  # else \\ takes it as its argument
 
 
 def _latex(text: str) -> str:
@@ -108,7 +107,7 @@ FORMATS: dict[str, tuple[Callable[[pd.DataFrame, int], str], str]] = {
 
 
 def export(paths: Sequence[Path], form: str, out: Path | None, digits: int) -> None:
-    """Do what `estima export-table` does: print tables, or write them to the folder `out`.
+    """Run `estima export-table`: print tables, or write them to the folder `out`.
 
     Raises
     ------
@@ -120,7 +119,14 @@ def export(paths: Sequence[Path], form: str, out: Path | None, digits: int) -> N
     as_form, suffix = FORMATS[form]
     if out is None:
         for path in paths:
-            _show(as_form(read_table(path), digits), path)
+            text = as_form(read_table(path), digits)
+            try:
+                print(text)
+            except UnicodeEncodeError as error:
+                raise InputError(
+                    f"{path}: the output's encoding, {error.encoding}, lacks "
+                    f"{text[error.start]!a}; write files with -o, or set PYTHONIOENCODING=utf-8"
+                ) from error
         return
     sources: dict[Path, Path] = {}
     for path in paths:
@@ -132,13 +138,3 @@ def export(paths: Sequence[Path], form: str, out: Path | None, digits: int) -> N
         with write_whole(target) as part:
             part.write_text(as_form(read_table(path), digits), encoding="utf-8")
     print(f"{out}: {len(paths)} tables")
-
-
-def _show(text: str, path: Path) -> None:
-    try:
-        print(text)
-    except UnicodeEncodeError as error:
-        raise InputError(
-            f"{path}: the output's encoding, {error.encoding}, lacks {text[error.start]!a}; write "
-            "files with -o, or set PYTHONIOENCODING=utf-8"
-        ) from error

@@ -1,6 +1,6 @@
 """One page of all results, results/report.html: claims, figures, tables, and how to redo them.
 
-It is made only of what the studies left in results/, and needs nothing beside itself to be read.
+It is made only from what the studies left in results/, and is a single file.
 """
 
 from __future__ import annotations
@@ -24,8 +24,7 @@ def write_report(results: Path, on_progress: Callable[[float], None] = lambda _:
     Parameters
     ----------
     results
-        Holds claims.csv, provenance.json, figures/ and tables/; whatever is missing is named as
-        missing in the page.
+        Folder of claims.csv, provenance.json, figures/ and tables/; the page names what is missing.
     on_progress
         Called with the share done.
     """

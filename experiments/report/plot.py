@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import textwrap
 
 import numpy as np
@@ -15,12 +16,13 @@ from experiments.viewing.style import CYCLE, figure
 from sim.errors import InputError
 
 _WIDE_X, _WIDE_Y = 20.0, 30.0  # an axis that spans more than this factor is logarithmic
-_BESIDE = 0.006  # between the bars of two lines, which would hide each other: share of the axis
-_BESIDE_WORD = 0.08  # the same among words, which stand 1 apart
+# How far the bars of several lines are moved, so that none hides another
+_BESIDE = 0.006  # share of the axis
+_BESIDE_WORD = 0.08  # among words, which are 1 apart
 
 
 def sweep_figure(table: pd.DataFrame, x: str, y: str, by: str | None = None) -> Figure:
-    """Mean of `y` over the recordings, with 95 % intervals, against `x`, one line a value of `by`.
+    """Mean of `y` over the recordings, with 95 % intervals, against `x`; one line per `by`.
 
     Repeats over one recording are averaged first: the recording is the unit of inference. On a
     logarithmic axis means and intervals are those of the logarithm.
@@ -28,7 +30,7 @@ def sweep_figure(table: pd.DataFrame, x: str, y: str, by: str | None = None) -> 
     Raises
     ------
     InputError
-        If a column is not in the table, y holds no numbers, or x has no values.
+        If a column is not in the table, y has no numbers, or no run has both x and y.
     """
     for column in filter(None, (x, y, by)):
         if column not in table:
@@ -63,17 +65,18 @@ def sweep_figure(table: pd.DataFrame, x: str, y: str, by: str | None = None) -> 
             ls="-" if numeric else "none", color=CYCLE[i % len(CYCLE)],
             label=f"{label:g}" if isinstance(label, float) else str(label),
         )  # fmt: skip
-    if wide:
-        ax.set_xscale("log")
+    ax.set(
+        xlabel=title(x),
+        ylabel=title(y),
+        xscale="log" if wide else "linear",
+        yscale="log" if logarithmic else "linear",
+    )
     if not numeric:
         ax.set_xticks(range(len(names)), [str(n) for n in names], rotation=20, ha="right")
-    if logarithmic:
-        ax.set_yscale("log")
     pooled = [c for c in telling(table) if c not in (x, by, "seed", "world_seed")]
     over = ", ".join(["recordings", *(c.removeprefix("choice.") for c in pooled)])
     kind = "geometric mean" if logarithmic else "mean"
     ax.set_title(textwrap.fill(f"{kind} over {over}; 95 % intervals", 62), fontsize="small")
-    ax.set(xlabel=title(x), ylabel=title(y))
     if by is not None:
         page.legend(title=title(by), loc="outside right upper")
     return page
@@ -84,8 +87,7 @@ def _spans(values: pd.Series[float], factor: float) -> bool:
     return bool(values.min() > 0.0 and values.max() > factor * values.min())
 
 
-def _interval(values: pd.Series[float], logarithmic: bool) -> tuple[float, float, float]:
-    """Mean and the bounds of its interval; those of the logarithms where they are drawn."""
-    found = mean_interval(np.log(values) if logarithmic else values)
-    bounds = np.array([found.value, found.low, found.high])
-    return tuple(np.exp(bounds) if logarithmic else bounds)
+def _interval(values: pd.Series[float], logarithmic: bool) -> tuple[float, ...]:
+    """Mean and the bounds of its interval; those of the logarithm on a logarithmic axis."""
+    found = vars(mean_interval(np.log(values) if logarithmic else values))
+    return tuple(math.exp(v) if logarithmic else v for v in found.values())
