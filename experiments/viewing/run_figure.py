@@ -2,51 +2,36 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Ellipse
 from numpy.typing import NDArray
 
 from estimators.base import Estimate
+from experiments.viewing.plotting import draw_ellipses
 from experiments.viewing.style import ESTIMATE, TRUTH, figure
 from experiments.viewing.world import draw_world
 from sim import se2
 from sim.recording import Recording
 
 Array = NDArray[np.float64]
-CHI2_95_2DOF = 5.991464547107979
-
-
-def covariance_ellipse(mean: Array, covariance: Array, **style: object) -> Ellipse:
-    """95 % ellipse of a position, from its (2, 2) covariance, m^2."""
-    values, vectors = np.linalg.eigh(covariance)
-    width, height = 2.0 * np.sqrt(CHI2_95_2DOF * np.maximum(values[::-1], 0.0))
-    angle = np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1]))
-    return Ellipse((mean[0], mean[1]), width, height, angle=angle, **style)
 
 
 def run_figure(recording: Recording, estimate: Estimate, name: str) -> Figure:
     """Map with both trajectories and 95 % ellipses; errors against time."""
     page = figure(9.0, 4.6)
-    halves: Any = page.subfigures(1, 2, width_ratios=(1.1, 1.0))
-    left, right = halves
+    left, right = page.subfigures(1, 2, width_ratios=(1.1, 1.0))  # type: ignore[misc]
     map_axes = left.subplots()
-    world = recording.truth.world if recording.truth else None
-    if world is not None:
-        draw_world(map_axes, world, landmarks=recording.landmarks is not None)
+    if recording.world is not None:
+        draw_world(map_axes, recording.world, landmarks=recording.landmarks is not None)
     known = recording.truth is not None
     if known:
         truth = recording.truth_at(estimate.stamps)
         map_axes.plot(truth[:, 0], truth[:, 1], color=TRUTH, lw=1.6, label="truth")
     means = estimate.means
     map_axes.plot(means[:, 0], means[:, 1], color=ESTIMATE, lw=1.2, ls="--", label=name)
-    for i in np.linspace(0, len(means) - 1, 12).astype(int)[1:]:
-        ellipse = covariance_ellipse(means[i], estimate.covariances[i, :2, :2])
-        ellipse.set(facecolor="none", edgecolor=ESTIMATE, linewidth=0.8)
-        map_axes.add_patch(ellipse)
+    some = np.linspace(0, len(means) - 1, 12).astype(int)[1:]
+    draw_ellipses(map_axes, means[some], estimate.covariances[some], ec=ESTIMATE, fc="none", lw=0.8)
     map_axes.set(xlabel="x, m", ylabel="y, m", aspect="equal")
     map_axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2)
     if known:

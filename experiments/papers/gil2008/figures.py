@@ -182,16 +182,15 @@ def components(run: Arrays) -> Figure:
     axes = page.subplots(3, 2, sharex=True)
     for i, name in enumerate(("x, m", "y, m", "heading, rad")):
         left, right = axes[i]
-        straighten = np.unwrap if i == 2 else np.asarray
+        straighten, wrap = (np.unwrap, se2.wrap) if i == 2 else (np.asarray, np.asarray)
         for key, colour, label in (
             ("odometry", ODOMETRY, "odometry"),
             ("fastslam", ESTIMATE, "FastSLAM, M = 200"),
             ("smoother", _BATCH, "batch"),
         ):
-            error = run[key][:, i] - truth[:, i]
-            error = se2.wrap(error) if i == 2 else error
             if key != "smoother":
                 left.plot(along, straighten(run[key][:, i]), color=colour, lw=1.0)
+            error = wrap(run[key][:, i] - truth[:, i])
             right.plot(along, error, color=colour, lw=1.0, label=label)
         left.plot(along, straighten(truth[:, i]), color=TRUTH, lw=1.0, label="truth")
         low, high = right.get_ylim()

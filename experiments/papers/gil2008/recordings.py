@@ -19,6 +19,7 @@ from experiments.runs.experiment import Config, Experiment
 from experiments.runs.seeds import stream
 from sim.errors import InputError
 from sim.recording import LandmarkLog, Recording, WheelLog
+from sim.robot import wheel_errors
 from sim.sensors import StereoCamera, suite_from_config
 from sim.simulate import _ExactRays, _Landmarks
 from sim.world import World
@@ -75,17 +76,15 @@ def whole(config: Config) -> Recording:
     """Recording of a configuration's scene: all landmarks within 20 m in every image, with ids."""
     scene, camera = Scene.of(config), _camera(config)
     driven = _drive(config).recording()
-    assert driven.truth is not None
-    assert driven.truth.world is not None
-    assert driven.landmarks is not None
     # the noise of descriptors alone leaves the images as they are
     rng = stream(scene.seed, f"gil2008/images/{dataclasses.replace(scene, sigma_descriptor=0.0)}")
-    world = _alike(driven.truth.world, scene.alike_share, rng)
-    farthest_m = max(FARTHEST_M, camera.max_distance_m)
-    camera = dataclasses.replace(camera, max_distance_m=farthest_m, max_observations=0)
+    world = _alike(driven.known_world, scene.alike_share, rng)
+    camera = dataclasses.replace(
+        camera, max_distance_m=max(FARTHEST_M, camera.max_distance_m), max_observations=0
+    )
     eye = _Landmarks(world, camera, rng)
     rays: Any = _ExactRays(world, None) if scene.occluded else _NoWalls()
-    stamps = driven.landmarks.stamps
+    stamps = driven.known_landmarks.stamps
     images = [eye.observe(rays, pose) for pose in driven.truth_at(stamps)]
     points, ids, descriptors = (list(part) for part in zip(*images, strict=True))
     true_ids = np.concatenate(ids)
@@ -97,7 +96,7 @@ def whole(config: Config) -> Recording:
         ),
         wheels=driven.wheels if scene.draw == 0 else _wheels(driven, scene, config),
         sensors=dataclasses.replace(driven.sensors, stereo=camera),
-        truth=dataclasses.replace(driven.truth, landmark_ids=true_ids, world=world),
+        truth=dataclasses.replace(driven.known_truth, landmark_ids=true_ids, world=world),
     )
 
 
@@ -107,10 +106,8 @@ def thinned(recording: Recording, config: Config) -> Recording:
     Landmarks are kept by their true distance. One random order decides for every B, so fewer
     observations are a subset of more.
     """
-    log, truth = recording.landmarks, recording.truth
+    log, truth = recording.known_landmarks, recording.known_truth
     camera, scene = _camera(config), Scene.of(config)
-    assert log is not None
-    assert truth is not None
     rng = stream(scene.seed, "gil2008/choice", scene.draw)
     image = np.repeat(np.arange(len(log.stamps)), np.diff(log.splits))
     distance = landmark_distances_m(recording)
@@ -137,31 +134,25 @@ def thinned(recording: Recording, config: Config) -> Recording:
 
 def landmark_distances_m(recording: Recording) -> Array:
     """True distance (K,) from the camera to the landmark of each observation, m."""
-    log, truth, camera = recording.landmarks, recording.truth, recording.sensors.stereo
-    assert log is not None
-    assert camera is not None
-    assert truth is not None
-    assert truth.world is not None
+    log, camera = recording.known_landmarks, recording.sensors.known_stereo
     where = np.repeat(recording.truth_at(log.stamps), np.diff(log.splits), axis=0)
     where[:, 2] = camera.mount.z_m
-    distance: Array = np.linalg.norm(truth.world.landmarks[truth.landmark_ids] - where, axis=1)
+    true = recording.known_world.landmarks[recording.known_truth.landmark_ids]
+    distance: Array = np.linalg.norm(true - where, axis=1)
     return distance
 
 
 def _drive(config: Config) -> Experiment:
     """Drive of a configuration's robot; whatever its camera, it is the same one."""
-    camera = StereoCamera(rate_hz=_camera(config).rate_hz)
-    sensors = {**config["sensors"], "stereo": dataclasses.asdict(camera)}
+    camera = dataclasses.asdict(StereoCamera(rate_hz=_camera(config).rate_hz))
+    sensors = {**config["sensors"], "stereo": camera}
     return Experiment({**config, "recording": None, "sensors": sensors})
 
 
 def _camera(config: Config) -> StereoCamera:
-    camera = suite_from_config(config["sensors"]).stereo
-    if camera is None or camera.selection == "spread":
-        raise InputError(
-            "gil2008 needs a stereo camera whose selection is random or nearest; try "
-            "sensors=stereo_paper"
-        )
+    camera = suite_from_config(config["sensors"]).known_stereo
+    if camera.selection == "spread":
+        raise InputError("gil2008 needs sensors.stereo.selection=random or nearest, got spread")
     return camera
 
 
@@ -174,12 +165,11 @@ class _NoWalls:
 
 def _wheels(driven: Recording, scene: Scene, config: Config) -> WheelLog:
     """Encoders with other errors over the same true travel, by the law of k |ds|."""
-    assert driven.truth is not None
-    robot = Experiment(config).robot()
+    robot, truth = Experiment(config).robot(), driven.known_truth
     rng = stream(scene.seed, "gil2008/wheels", scene.draw)
-    ground = np.diff(driven.truth.wheel_travel_m, axis=0, prepend=0.0)
-    error = np.sqrt([robot.kr, robot.kl] * np.abs(ground)) * rng.standard_normal(ground.shape)
-    return WheelLog(driven.truth.stamps, np.cumsum(ground + error, axis=0))
+    ground = np.diff(truth.wheel_travel_m, axis=0, prepend=0.0)
+    error = wheel_errors(ground, [robot.kr, robot.kl], rng)
+    return WheelLog(truth.stamps, np.cumsum(ground + error, axis=0))
 
 
 def _alike(world: World, share: float, rng: np.random.Generator) -> World:

@@ -23,9 +23,7 @@ def map_scores(recording: Recording, found: Any) -> Row:
     """RMS distances of the map's landmarks from the true ones, raw and aligned in the plane."""
     if not isinstance(found, dict) or len(found.get("ids", ())) < 2:
         return {}
-    assert recording.truth is not None
-    assert recording.truth.world is not None
-    true, made = recording.truth.world.landmarks[found["ids"]], found["landmarks"]
+    true, made = recording.known_world.landmarks[found["ids"]], found["landmarks"]
     fitted = np.column_stack([se2.transform(alignment(true, made), made[:, :2]), made[:, 2]])
     return {
         "n_landmarks": len(true),
@@ -52,8 +50,7 @@ def right_share(recording: Recording, associations: Sequence[NDArray[np.int64]])
 
     An observation that starts a landmark is right if that one had not been seen before.
     """
-    assert recording.truth is not None
-    true = recording.truth.landmark_ids
+    true = recording.known_truth.landmark_ids
     given = np.concatenate(associations)
     first = np.zeros(len(true), bool)
     first[np.unique(true, return_index=True)[1]] = True
@@ -63,9 +60,7 @@ def right_share(recording: Recording, associations: Sequence[NDArray[np.int64]])
 
 def matching_precision(recording: Recording) -> float:
     """Share of observations whose descriptor is nearest to that of their landmark's first one."""
-    log, truth = recording.landmarks, recording.truth
-    assert log is not None
-    assert truth is not None
+    log, truth = recording.known_landmarks, recording.known_truth
     ids, first = np.unique(truth.landmark_ids, return_index=True)
     again = np.delete(np.arange(len(truth.landmark_ids)), first)
     nearest = np.argmax(log.descriptors[again] @ log.descriptors[first].T, axis=1)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterable, Sequence
+from itertools import accumulate
 
 import numpy as np
 import pandas as pd
@@ -30,7 +31,7 @@ from experiments.runs.seeds import stream
 from experiments.sweeps.plan import planned
 from sim import se2
 from sim.recording import Recording
-from sim.robot import arc_increment
+from sim.robot import arc_increment, wheel_errors
 
 Array = NDArray[np.float64]
 Run = tuple[str, Experiment]  # the table its rows go to; its configuration
@@ -138,9 +139,7 @@ def labels_of(table: str, experiment: Experiment) -> Row:
 
 def _shown(recording: Recording) -> Row:
     """What a recording's images show."""
-    camera, log = recording.sensors.stereo, recording.landmarks
-    assert camera is not None
-    assert log is not None
+    camera, log = recording.sensors.known_stereo, recording.known_landmarks
     far = landmark_distances_m(recording) > 10.0
     return {
         "max_distance_m": camera.max_distance_m,
@@ -173,28 +172,24 @@ def write_arrays(out: Results) -> None:
     """Write what the figures draw of one recording, and particles along a motion."""
     path = Experiment.compose(["study=gil2008"])
     recording = path.recording()
-    log, camera, truth = recording.landmarks, recording.sensors.stereo, recording.truth
-    assert log is not None
-    assert camera is not None
-    assert truth is not None
-    assert truth.world is not None
-    prior = path.prior(recording)
+    log, world = recording.known_landmarks, recording.known_world
     estimated = {}
     for name in ("odometry", "fastslam", "smoother"):
-        estimator = Experiment.compose(["study=gil2008", f"estimator={name}"]).estimator()
-        online, revised = estimates(estimator, recording, prior, stream(path.seed, "example"))
+        one = Experiment.compose(["study=gil2008", f"estimator={name}"])
+        rng = stream(one.seed, "example")
+        online, revised = estimates(one.estimator(), recording, one.prior(recording), rng)
         estimated[name] = revised or online
     best, along = estimated["fastslam"], recording.truth_at(recording.frame_stamps)
     rows = np.repeat(np.searchsorted(best.stamps, log.stamps), np.diff(log.splits))
-    model = StereoModel.of(camera)
+    model = StereoModel.of(recording.sensors.known_stereo)
     placed = {
         f"placed_by_{name}": model.place(estimated[name].means[rows], log.points_in_camera)[:, :2]
         for name in ("odometry", "fastslam")
     }
     busiest = int(np.argmax(np.diff(log.splits)))
     pictured = {
-        "walls": truth.world.walls,
-        "wall_z_m": truth.world.wall_z_m,
+        "walls": world.walls,
+        "wall_z_m": world.wall_z_m,
         "truth": along,
         **{name: estimate.means for name, estimate in estimated.items()},
         "travelled_m": scores.travelled_m(along),
@@ -218,13 +213,9 @@ def particles_along_a_motion(rng: np.random.Generator) -> tuple[Array, Array]:
 
     The noise is ten times the study's.
     """
-    k, track_m = 5e-4, 0.4
     steps = np.array([[0.4, 0.4]] * 10 + [[0.48, 0.32]] * 8 + [[0.4, 0.4]] * 10)
-    poses, line, seventh = np.zeros((300, 3)), [np.zeros(3)], []
-    for i, step in enumerate(steps):
-        noisy = step + np.sqrt(k * step) * rng.standard_normal((len(poses), 2))
-        poses = se2.compose(poses, arc_increment(noisy, track_m))
-        line.append(se2.compose(line[-1], arc_increment(step, track_m)))
-        if i % 7 == 6:
-            seventh.append(poses)
-    return np.array(line), np.array(seventh)
+    each = np.tile(steps[:, None], (1, 300, 1))
+    drawn = arc_increment(each + wheel_errors(each, 5e-4, rng), track_m=0.4)
+    line = accumulate(arc_increment(steps, track_m=0.4), se2.compose, initial=np.zeros(3))
+    paths = accumulate(drawn, se2.compose, initial=np.zeros((300, 3)))
+    return np.array(list(line)), np.array(list(paths))[7::7]
