@@ -51,8 +51,9 @@ def ideal_and_real(square: Arrays) -> Figure:
         ax.plot(*real[0].T, color=ORANGE, lw=1.2, label=f"real robot ({len(real)} runs)")
         ax.plot(*real[:, -1].T, ".", color=ORANGE, ms=3)
         ax.plot(*means.T, color=BLUE, lw=1.4, label="ideal robot")
-        style = {"label": "95 % ellipse", "fill": False, "color": BLUE, "lw": 0.9}
-        draw_ellipses(ax, means[some], covariances[some], **style)
+        draw_ellipses(
+            ax, means[some], covariances[some], "95 % ellipse", fill=False, color=BLUE, lw=0.9
+        )
         title = f"$k_r$ = {kr:.2g} m, $k_l$ = {kl:.2g} m"
         ax.set(xlabel="x, m", ylabel="y, m", aspect="equal", title=title)
     return with_legend(page, ncols=3)
