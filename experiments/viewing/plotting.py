@@ -47,5 +47,6 @@ def plain_log(axis: Axis, multiples: Sequence[float] = (1.0, 2.0, 5.0)) -> None:
 
 def with_legend(page: Figure, ncols: int, loc: str = "outside lower center") -> Figure:
     """Page with one legend for all its axes: of what the first of them shows."""
-    page.legend(*page.axes[0].get_legend_handles_labels(), loc=loc, ncols=ncols)
+    handles, labels = page.axes[0].get_legend_handles_labels()
+    page.legend(handles, labels, loc=loc, ncols=ncols)  # type: ignore[call-overload]
     return page

@@ -64,7 +64,7 @@ def pb2(areas: pd.DataFrame, crossover: pd.DataFrame, track_m: float) -> list[Cl
         steps = np.concatenate([np.diff(part["area_m2"]) for _, part in table.groupby("k_m")])
         shrinking = float(np.mean(steps < -1e-9 * table["area_m2"].max()))
         statistic = f"share of steps in which the 95 % ellipse shrinks, {name}"
-        judgement = ("0", holds(shrinking <= 0.0))
+        judgement = ("0", holds(shrinking <= 0.0), "")
         if name == "out and back":
             judgement = ("shown, not judged", Verdict.SHOWN, "it shrinks on the way back")
         claims.append(Claim("PB2", statistic, Interval.exact(shrinking), *judgement))
