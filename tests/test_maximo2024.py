@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments.papers.maximo2024 import claims, examples, figures, settings, study, worlds
+from experiments.papers.maximo2024 import claims, figures, settings, study, worlds
 from experiments.papers.results import Results
 from experiments.runs.paths import SOURCE
 from experiments.runs.seeds import stream
@@ -200,7 +200,7 @@ def test_the_tracked_tables_and_arrays_redraw_every_figure():
 
 
 def test_examples_hold_what_the_figures_draw(case):
-    drawn = examples.route_arrays(case)
+    drawn = study.route_arrays(case)
     n = len(case.recording.frame_stamps)
     assert [int(np.argmax(np.isfinite(e))) for e in drawn["start_errors_m"]] == [0, n // 4, n // 2]
     assert np.isfinite(drawn["start_errors_m"][:, n // 2 :]).all()

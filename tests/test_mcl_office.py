@@ -75,7 +75,7 @@ def test_it_runs_only_when_named():
 
 def test_the_figure_comes_from_disk_and_nothing_is_judged(tmp_path):
     made = Results(tmp_path, "mcl_office")
-    made.write_table("starts", table())
+    made.write_tables(starts=table())
     assert list(draw(made)) == ["mcl_office_found"]
     assert claims.judge(made) == []
 

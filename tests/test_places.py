@@ -48,8 +48,8 @@ def test_the_real_oxford_positions():
 
 
 def test_a_wrong_positions_file_is_an_input_error(tmp_path):
-    assert places.oxford_positions(None) is None
-    assert places.oxford_positions(tmp_path / "none.gz") is None
+    with pytest.raises(InputError, match="no such file"):
+        places.oxford_positions(tmp_path / "none.gz")
     path = tmp_path / "positions.csv.gz"
     path.write_bytes(gzip.compress(b"a,b\n1,2\n"))
     with pytest.raises(InputError, match="not the Oxford positions"):

@@ -23,7 +23,7 @@ def study(*, names=("runs", "noise"), fails=False):
 
     def run(profile, out, on_progress):
         for name in names:
-            out.write_table(name, pd.DataFrame({"profile": [str(profile)]}))
+            out.write_tables(**{name: pd.DataFrame({"profile": [str(profile)]})})
             out.write_arrays(name, path=np.zeros((2, 3)))
         on_progress(1.0)
 

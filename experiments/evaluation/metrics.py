@@ -105,11 +105,15 @@ def ellipse_area_m2(covariances: Array) -> Array:
     return np.asarray(math.pi * CHI2_95_2DOF * np.sqrt(np.maximum(determinant, 0.0)))
 
 
+def travelled_m(path: Array) -> Array:
+    """Distance (T,) travelled along a path (T, 2) or poses (T, 3) to each of its rows, m."""
+    return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path[:, :2], axis=0).T))])
+
+
 def at_distances(truth: Array, distances_m: Array) -> NDArray[np.int64]:
-    """First row at which the truth has travelled each distance; -1 where it never does."""
-    travelled = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(truth[:, :2], axis=0).T))])
-    rows = np.searchsorted(travelled, distances_m)
-    return np.where(rows < len(travelled), rows, -1)
+    """First row at which the truth has travelled each distance; -1 where it never has."""
+    rows = np.searchsorted(travelled_m(truth), distances_m)
+    return np.where(rows < len(truth), rows, -1)
 
 
 def nees_at_distances(truth: Array, means: Array, covariances: Array, distances_m: Array) -> Array:

@@ -88,6 +88,29 @@ def judged(interval: Interval, at_least: float = -math.inf, at_most: float = mat
     return Verdict.UNDECIDED
 
 
+def banded(
+    claim: str,
+    statistic: str,
+    found: Interval,
+    at_least: float = -math.inf,
+    at_most: float = math.inf,
+    criterion: str = "",
+) -> Claim:
+    """Judge that an interval lies in [at_least, at_most]; the criterion is these bounds in words.
+
+    Parameters
+    ----------
+    claim
+        Its id.
+    criterion
+        Other words for the bounds.
+    """
+    words = f"at least {at_least:g}" if at_least > -math.inf else f"at most {at_most:g}"
+    if -math.inf < at_least and at_most < math.inf:
+        words = f"within {at_least:g} and {at_most:g}"
+    return Claim(claim, statistic, found, criterion or words, judged(found, at_least, at_most))
+
+
 def holds(condition: bool) -> Verdict:
     """Judge a statistic without an interval."""
     return Verdict.REPRODUCED if condition else Verdict.NOT_REPRODUCED

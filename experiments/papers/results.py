@@ -25,9 +25,10 @@ class Results:
     folder: Path
     paper: str
 
-    def write_table(self, name: str, frame: pd.DataFrame) -> None:
-        """Write a table."""
-        write_frame(frame, self.folder / "tables" / f"{self.paper}_{name}.csv", digits=12)
+    def write_tables(self, **frames: pd.DataFrame) -> None:
+        """Write tables by name."""
+        for name, frame in frames.items():
+            write_frame(frame, self._path("tables", f"{name}.csv"), digits=12)
 
     def table(self, name: str) -> pd.DataFrame:
         """Read a table.
@@ -37,15 +38,11 @@ class Results:
         InputError
             If it is missing or damaged.
         """
-        path = self.folder / "tables" / f"{self.paper}_{name}.csv"
-        if not path.exists():
-            raise InputError(f"{path}: missing; run `estima reproduce --paper {self.paper}`")
-        return read_rows(path)
+        return read_rows(self._path("tables", f"{name}.csv", to_read=True))
 
     def write_arrays(self, name: str, **arrays: NDArray[np.generic]) -> None:
-        """Write named arrays, compressed."""
-        path = self.folder / "arrays" / f"{self.paper}_{name}.npz"
-        with write_whole(path) as part, part.open("wb") as file:
+        """Write named arrays to one file, compressed."""
+        with write_whole(self._path("arrays", f"{name}.npz")) as part, part.open("wb") as file:
             np.savez_compressed(file, allow_pickle=False, **arrays)
 
     def arrays(self, name: str) -> dict[str, NDArray[np.generic]]:
@@ -56,12 +53,19 @@ class Results:
         InputError
             If they are missing or damaged.
         """
-        path = self.folder / "arrays" / f"{self.paper}_{name}.npz"
-        remedy = f"run `estima reproduce --paper {self.paper}`"
+        path = self._path("arrays", f"{name}.npz", to_read=True)
         try:
             with np.load(path, allow_pickle=False) as file:
                 return dict(file)
-        except FileNotFoundError:
-            raise InputError(f"{path}: missing; {remedy}") from None
         except (OSError, ValueError, zipfile.BadZipFile) as error:
-            raise InputError(f"{path}: damaged ({error}); {remedy}") from error
+            raise InputError(f"{path}: damaged ({error}); {self._remedy}") from error
+
+    def _path(self, kind: str, name: str, *, to_read: bool = False) -> Path:
+        path = self.folder / kind / f"{self.paper}_{name}"
+        if to_read and not path.exists():
+            raise InputError(f"{path}: missing; {self._remedy}")
+        return path
+
+    @property
+    def _remedy(self) -> str:
+        return f"run `estima reproduce --paper {self.paper}`"

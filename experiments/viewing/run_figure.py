@@ -6,25 +6,16 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.patches import Ellipse
 from numpy.typing import NDArray
 
 from estimators.base import Estimate
-from experiments.evaluation.metrics import CHI2_95_2DOF
+from experiments.viewing.plotting import draw_ellipses
 from experiments.viewing.style import ESTIMATE, TRUTH, figure
 from experiments.viewing.world import draw_world
 from sim import se2
 from sim.recording import Recording
 
 Array = NDArray[np.float64]
-
-
-def covariance_ellipse(mean: Array, covariance: Array, **style: object) -> Ellipse:
-    """95 % ellipse of a position, from its (2, 2) covariance, m^2."""
-    values, vectors = np.linalg.eigh(covariance)
-    width, height = 2.0 * np.sqrt(CHI2_95_2DOF * np.maximum(values[::-1], 0.0))
-    angle = np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1]))
-    return Ellipse((mean[0], mean[1]), width, height, angle=angle, **style)
 
 
 def run_figure(recording: Recording, estimate: Estimate, name: str) -> Figure:
@@ -38,10 +29,10 @@ def run_figure(recording: Recording, estimate: Estimate, name: str) -> Figure:
         truth = recording.truth_at(estimate.stamps)
         map_axes.plot(*truth[:, :2].T, color=TRUTH, lw=1.6, label="truth")
         _draw_errors(halves[1].subplots(3, 1, sharex=True), estimate, truth)
-    means, style = estimate.means, {"fill": False, "edgecolor": ESTIMATE, "lw": 0.8}
+    means = estimate.means
     map_axes.plot(*means[:, :2].T, color=ESTIMATE, lw=1.2, ls="--", label=name)
-    for i in np.linspace(0, len(means) - 1, 12).astype(int)[1:]:
-        map_axes.add_patch(covariance_ellipse(means[i], estimate.covariances[i, :2, :2], **style))
+    some = np.linspace(0, len(means) - 1, 12).astype(int)[1:]
+    draw_ellipses(map_axes, means[some], estimate.covariances[some], ec=ESTIMATE, fc="none", lw=0.8)
     map_axes.set(xlabel="x, m", ylabel="y, m", aspect="equal")
     map_axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2)
     return page

@@ -37,6 +37,14 @@ def figure(width_in: float, height_in: float) -> Figure:
     return page
 
 
+def subplots(
+    width_in: float, height_in: float, n_rows: int = 1, n_cols: int = 1, **options: Any
+) -> tuple[Figure, Any]:
+    """Page in the house style and its axes, as `matplotlib.pyplot.subplots` gives them."""
+    page = figure(width_in, height_in)
+    return page, page.subplots(n_rows, n_cols, **options)
+
+
 def save_figure(page: Figure, path: Path) -> None:
     """Write a figure whole, in the format of the path's suffix; its bytes carry no date."""
     if path.suffix not in _SUFFIXES:

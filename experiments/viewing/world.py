@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
+from numpy.typing import NDArray
 
 from experiments.viewing.style import (
     BLACK,
@@ -23,6 +24,8 @@ from experiments.viewing.style import (
     figure,
 )
 from sim.world import World
+
+Array = NDArray[np.float64]
 
 _PLACES = {
     "room": SKY,
@@ -45,10 +48,7 @@ def draw_world(
             for j, (x1, y1, x2, y2) in enumerate(rectangles):
                 label = name.replace("_", ", ") if j == 0 else ""
                 ax.add_patch(Rectangle((x1, y1), x2 - x1, y2 - y1, label=label, **style))
-    high = world.wall_z_m[:, 0] > _LASER_HEIGHT_M
-    for rows, color, alpha in ((~high, WALL, None), (high, GREEN, 0.5)):
-        lines = list(world.walls[rows].reshape(-1, 2, 2))
-        ax.add_collection(LineCollection(lines, lw=0.9, color=color, alpha=alpha))
+    draw_walls(ax, world.walls, world.wall_z_m)
     if landmarks and len(world.landmarks):
         twin = world.look_alike if len(world.look_alike) else np.zeros(len(world.landmarks), bool)
         for mask, color, label in ((~twin, PURPLE, "landmark"), (twin, ORANGE, "look-alike")):
@@ -57,6 +57,14 @@ def draw_world(
     if tour and len(world.waypoints):
         ax.plot(*world.waypoints.T, color=BLUE, lw=1.0, label="tour")
         ax.plot(*world.start_pose[:2], "o", color=BLUE, ms=4, label="start")
+
+
+def draw_walls(ax: Axes, walls: Array, wall_z_m: Array, **style: Any) -> None:
+    """Draw walls (W, 4) whose faces stand between two heights (W, 2), and axes in metres."""
+    high = wall_z_m[:, 0] > _LASER_HEIGHT_M
+    for rows, usual in ((~high, {"color": WALL}), (high, {"color": GREEN, "alpha": 0.5})):
+        lines = list(walls[rows].reshape(-1, 2, 2))
+        ax.add_collection(LineCollection(lines, **{"lw": 0.9, **usual, **style}))
     ax.set(xlabel="x, m", ylabel="y, m", aspect="equal")
     ax.autoscale_view()
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from experiments.evaluation.registration_errors import METRICS
 from experiments.evaluation.statistics import Interval, log_ratio_interval, mean_interval
-from experiments.evaluation.verdict import Claim, Verdict, judged, lower
+from experiments.evaluation.verdict import Claim, Verdict, banded, judged, lower
 from experiments.papers.decristoforis2020.settings import CONSISTENT, PLACES
 from experiments.papers.results import Results
 
@@ -60,9 +60,9 @@ def dc2(ellipses: pd.DataFrame) -> list[Claim]:
     tilt = mean_interval(ellipses["tilt_bare_deg"])
     shrinks = log_ratio_interval(ellipses["long_objects_m"], ellipses["long_bare_m"])
     return [
-        _at_least("DC2", "long over short axis on the bare stretch", ratio, 3.0),
-        _at_most("DC2", "angle of the long axis to the corridor, deg", tilt, 10.0),
-        _at_most("DC2", "long axis near objects over bare", shrinks, 0.5),
+        banded("DC2", "long over short axis on the bare stretch", ratio, at_least=3.0),
+        banded("DC2", "angle of the long axis to the corridor, deg", tilt, at_most=10.0),
+        banded("DC2", "long axis near objects over bare", shrinks, at_most=0.5),
     ]
 
 
@@ -77,10 +77,10 @@ def dc3(ellipses: pd.DataFrame) -> list[Claim]:
         )
         turned = mean_interval(ellipses[f"turned_in_{bend}_deg"])
         claims += [
-            _at_least("DC3", f"largest long axis in the {bend} over before", grown, 1.5),
-            _at_least("DC3", f"median long axis in the {bend} over before", typical, 1.5),
-            _at_most("DC3", f"long axis after the {bend} over before", after, 1.2),
-            _at_least("DC3", f"turn of the long axis in the {bend}, deg", turned, 10.0),
+            banded("DC3", f"largest long axis in the {bend} over before", grown, at_least=1.5),
+            banded("DC3", f"median long axis in the {bend} over before", typical, at_least=1.5),
+            banded("DC3", f"long axis after the {bend} over before", after, at_most=1.2),
+            banded("DC3", f"turn of the long axis in the {bend}, deg", turned, at_least=10.0),
         ]
     return claims
 
@@ -106,8 +106,10 @@ def dc4(covariances: pd.DataFrame) -> list[Claim]:
         slower = log_ratio_interval(times["sampling"], times["censi"])
         faster = log_ratio_interval(times["hessian"], times["sampling"])
         claims += [
-            _at_least("DC4", f"time of sampling over Censi's closed form, {metric}", slower, 10.0),
-            _at_most("DC4", f"time of Hessian over sampling, {metric}", faster, 0.1),
+            banded(
+                "DC4", f"time of sampling over Censi's closed form, {metric}", slower, at_least=10.0
+            ),
+            banded("DC4", f"time of Hessian over sampling, {metric}", faster, at_most=0.1),
         ]
     return claims
 
@@ -125,14 +127,14 @@ def dc5(metrics: pd.DataFrame) -> list[Claim]:
     wide = metrics.pivot(index=["class", "seed"], columns="metric")
     measures = (("position error", "error_m"), ("heading error", "error_rad"), ("time", "time_us"))
     return [
-        _at_most(
+        banded(
             "DC5",
             f"{what}, point to line over point to point, {kind}",
             log_ratio_interval(
                 wide.loc[kind, (column, "point_to_line")],
                 wide.loc[kind, (column, "point_to_point")],
             ),
-            1.0,
+            at_most=1.0,
         )
         for kind in wide.index.unique("class")
         for what, column in measures
@@ -182,11 +184,3 @@ def _lower(claim: str, statistic: str, first: Array, second: Array) -> Claim:
     """Judge that the first arm is below the second."""
     ratio, p, verdict = lower(first, second)
     return Claim(claim, statistic, ratio, f"below 1, Wilcoxon p < 0.01 (p = {p:.2g})", verdict)
-
-
-def _at_least(claim: str, statistic: str, found: Interval, bound: float) -> Claim:
-    return Claim(claim, statistic, found, f"at least {bound:g}", judged(found, at_least=bound))
-
-
-def _at_most(claim: str, statistic: str, found: Interval, bound: float) -> Claim:
-    return Claim(claim, statistic, found, f"at most {bound:g}", judged(found, at_most=bound))

@@ -17,7 +17,7 @@ from experiments.evaluation.statistics import log_ratio_interval
 from experiments.papers.decristoforis2020.claims import judged_runs, nees_intervals
 from experiments.papers.decristoforis2020.settings import CONSISTENT, PAPERS_OWN, PLACES
 from experiments.papers.results import Results
-from experiments.viewing.run_figure import covariance_ellipse
+from experiments.viewing.plotting import draw_ellipses, plain_ticks, with_legend
 from experiments.viewing.style import (
     BLUE,
     GREEN,
@@ -28,9 +28,9 @@ from experiments.viewing.style import (
     SKY,
     TRUTH,
     figure,
+    subplots,
 )
-from experiments.viewing.world import draw_world
-from sim.world import World
+from experiments.viewing.world import draw_walls
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -72,15 +72,10 @@ def draw(made: Results) -> dict[str, Figure]:
     return {f"{made.paper}_{name}": page for name, page in pages.items()}
 
 
-def _draw_walls(ax: Axes, arrays: Arrays) -> None:
-    draw_world(ax, World("", arrays["walls"], arrays["wall_z_m"]))
-
-
 def route(office: Arrays) -> Figure:
     """Figure 1: the route, with areas like the paper's A (a curve) and B (corridor, objects)."""
-    page = figure(9.0, 6.4)
-    ax = page.subplots()
-    _draw_walls(ax, office)
+    page, ax = subplots(9.0, 6.4)
+    draw_walls(ax, office["walls"], office["wall_z_m"])
     ax.plot(*office["truth"].T, color=BLUE, lw=1.2, label="route")
     ax.plot(*office["truth"][0], "o", color=BLUE, ms=5, label="start")
     for name, area, color in (("A", "corner", RED), ("B", "corridor", GREEN)):
@@ -91,8 +86,7 @@ def route(office: Arrays) -> Figure:
             textcoords="offset points", ha="center", va="center", color=color, size=13,
             weight="bold",
         )  # fmt: skip
-    page.legend(*ax.get_legend_handles_labels(), loc="outside upper center", ncols=2)
-    return page
+    return with_legend(page, ncols=2, loc="outside upper center")
 
 
 def ellipses(corridor: Arrays, path: pd.DataFrame) -> Figure:
@@ -102,12 +96,10 @@ def ellipses(corridor: Arrays, path: pd.DataFrame) -> Figure:
     left, right = top.subplots(1, 2, width_ratios=(1.0, 1.25))
     scale = 0.6 / (2.45 * path["long_m"].quantile(0.9))
     title = f"A: a curve (ellipses {scale:.0f} times their size)"
-    _draw_ellipses(left, corridor, path, "curve", scale, 0.75, title)
-    for column, color, label in (
-        ("long_m", BLUE, "long axis"),
-        ("short_m", ORANGE, "short axis"),
-    ):
-        right.semilogy(path["distance_m"], 1e3 * path[column], color=color, lw=1.0, label=label)
+    _enlarged_ellipses(left, corridor, path, "curve", scale, 0.75, title)
+    for name, color in (("long", BLUE), ("short", ORANGE)):
+        sigma_mm = 1e3 * path[f"{name}_m"]
+        right.semilogy(path["distance_m"], sigma_mm, color=color, lw=1.0, label=f"{name} axis")
     low, high = right.get_ylim()
     for place, color, name, raised in (
         ("corridor_bare", ORANGE, "bare", 2.2),
@@ -116,19 +108,19 @@ def ellipses(corridor: Arrays, path: pd.DataFrame) -> Figure:
         ("curve", SKY, "curve", 2.2),
     ):
         inside = path.loc[path["place"] == place, "distance_m"]
-        right.axvspan(inside.min(), inside.max(), color=color, alpha=0.12, lw=0)
-        middle = (inside.min() + inside.max()) / 2
-        right.text(middle, raised * high, name, ha="center", va="top", size=8)
+        ends = inside.min(), inside.max()
+        right.axvspan(*ends, color=color, alpha=0.12, lw=0)
+        right.text(sum(ends) / 2, raised * high, name, ha="center", va="top", size=8)
     right.set(
         xlabel="distance, m", ylabel="standard deviation of a step, mm", ylim=(low, 2.5 * high)
     )
     right.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
     title = f"B: a corridor, bare and with objects ({scale:.0f} times)"
-    _draw_ellipses(bottom.subplots(), corridor, path, "corridor", scale, 1.0, title)
+    _enlarged_ellipses(bottom.subplots(), corridor, path, "corridor", scale, 1.0, title)
     return page
 
 
-def _draw_ellipses(
+def _enlarged_ellipses(
     ax: Axes,
     corridor: Arrays,
     path: pd.DataFrame,
@@ -139,14 +131,12 @@ def _draw_ellipses(
 ) -> None:
     """Draw the enlarged ellipses of the places whose names begin so, one every `spacing_m`."""
     rows = path[path["place"].str.startswith(place, na=False)]
-    _draw_walls(ax, corridor)
+    draw_walls(ax, corridor["walls"], corridor["wall_z_m"])
     ax.plot(path["x_m"], path["y_m"], color=TRUTH, lw=0.6)
     along = rows["distance_m"].to_numpy()
     drawn = rows.iloc[np.searchsorted(along, np.arange(along[0], along[-1], spacing_m))]
     squares_m2 = drawn[["xx_m2", "xy_m2", "xy_m2", "yy_m2"]].to_numpy().reshape(-1, 2, 2)
-    style = {"facecolor": "none", "edgecolor": BLUE, "linewidth": 0.9}
-    for mean, covariance in zip(drawn[["x_m", "y_m"]].to_numpy(), squares_m2, strict=True):
-        ax.add_patch(covariance_ellipse(mean, scale**2 * covariance, **style))
+    draw_ellipses(ax, drawn[["x_m", "y_m"]], scale**2 * squares_m2, fill=False, color=BLUE, lw=0.9)
     ax.set(
         xlim=(rows["x_m"].min() - 2.0, rows["x_m"].max() + 2.0),
         ylim=(rows["y_m"].min() - 2.0, rows["y_m"].max() + 2.0),
@@ -159,11 +149,11 @@ def trajectories(office: Arrays, table: pd.DataFrame) -> Figure:
     page = figure(9.0, 8.4)
     top, bottom = page.subfigures(2, 1, height_ratios=(2.2, 1.0))  # type: ignore[misc]
     ax, below = top.subplots(), bottom.subplots()
-    _draw_walls(ax, office)
-    for method in ("truth", *PAPERS_OWN):
-        style = "-" if method in ("truth", "odometry") else "--"
-        ax.plot(*office[method].T, style, color=COLORS[method], lw=1.2, label=NAMES[method])
+    draw_walls(ax, office["walls"], office["wall_z_m"])
+    ax.plot(*office["truth"].T, "-", color=COLORS["truth"], lw=1.2, label=NAMES["truth"])
     for method in PAPERS_OWN:
+        style = "-" if method == "odometry" else "--"
+        ax.plot(*office[method].T, style, color=COLORS[method], lw=1.2, label=NAMES[method])
         off = np.hypot(*(office[method] - office["truth"]).T)
         below.semilogy(office["stamp_s"], np.maximum(off, 1e-4), color=COLORS[method], lw=1.0)
     ax.set_title(_of_all(table, "ate_rmse_m", "position RMSE, m"), size=9)
@@ -185,8 +175,7 @@ def _of_all(table: pd.DataFrame, column: str, words: str) -> str:
 
 def boxes(table: pd.DataFrame) -> Figure:
     """Figure 4: absolute errors of position and heading over all recordings."""
-    page = figure(8.0, 3.8)
-    axes: Any = page.subplots(1, 2)
+    page, axes = subplots(8.0, 3.8, 1, 2)
     panels = (("position_m", "position error, m", 1.0), ("heading_rad", "heading error, deg", _DEG))
     for ax, (name, label, unit) in zip(axes, panels, strict=True):
         rows = table[table["error"] == name].set_index("method")
@@ -203,12 +192,9 @@ def boxes(table: pd.DataFrame) -> Figure:
 
 def maps(office: Arrays, table: pd.DataFrame) -> Figure:
     """Figure 5: laser points placed by each method, over the true walls."""
-    page = figure(10.0, 3.1)
-    axes: Any = page.subplots(1, 3, sharex=True, sharey=True)
+    page, axes = subplots(10.0, 3.1, 1, 3, sharex=True, sharey=True)
     for ax, method in zip(axes, PAPERS_OWN, strict=True):
-        _draw_walls(ax, office)
-        for line in ax.collections:
-            line.set(color=RED, linewidth=0.5)
+        draw_walls(ax, office["walls"], office["wall_z_m"], color=RED, lw=0.5)
         ax.plot(*office[f"{method}_points"].T, ",", color=TRUTH, alpha=0.8)
         ax.set_title(f"by {NAMES[method]}", fontsize="medium")
         ax.label_outer()
@@ -219,14 +205,13 @@ def maps(office: Arrays, table: pd.DataFrame) -> Figure:
 
 def runs(table: pd.DataFrame) -> Figure:
     """Errors and consistency of every method, one dot a recording."""
-    page = figure(9.5, 3.8)
-    axes: Any = page.subplots(1, 3)
+    page, axes = subplots(9.5, 3.8, 1, 3)
     rows = judged_runs(table)
     methods = [name for name in NAMES if name in set(rows["method"])]
     panels = (
         ("ate_rmse_m", "believed_rmse_m", "position RMSE, m", 1.0),
         ("heading_rmse_rad", "believed_heading_rmse_rad", "heading RMSE, deg", _DEG),
-        ("nees_mean", None, "NEES / 3", 1.0 / 3.0),
+        ("nees_mean", "", "NEES / 3", 1.0 / 3.0),
     )
     for ax, (column, believed, label, unit) in zip(axes, panels, strict=True):
         for i, method in enumerate(methods):
@@ -234,9 +219,10 @@ def runs(table: pd.DataFrame) -> Figure:
             spread = np.linspace(-0.2, 0.2, len(own))
             ax.plot(i + spread, unit * own[column], ".", color=COLORS[method], ms=4)
             ax.plot([i - 0.3, i + 0.3], [unit * own[column].median()] * 2, color=TRUTH, lw=1.2)
-            if believed is not None:
-                middle = unit * own[believed].median()
-                ax.plot(i + 0.35, middle, "D", color=TRUTH, mfc="white", ms=4)
+            if believed:
+                ax.plot(
+                    i + 0.35, unit * own[believed].median(), "D", color=TRUTH, mfc="white", ms=4
+                )
         ax.set(yscale="log", ylabel=label)
         ax.set_xticks(range(len(methods)), [NAMES[m] for m in methods], rotation=35, ha="right")
     axes[-1].axhspan(*CONSISTENT, color=GREEN, alpha=0.2, lw=0)
@@ -250,18 +236,17 @@ def runs(table: pd.DataFrame) -> Figure:
 
 def covariances(table: pd.DataFrame) -> Figure:
     """NEES of every covariance by metric and place, and its time."""
-    page = figure(9.5, 4.6)
-    *axes, times_axes = page.subplots(1, 3, width_ratios=(1.2, 1.2, 0.8))
+    page, (*axes, times_axes) = subplots(9.5, 4.6, 1, 3, width_ratios=(1.2, 1.2, 0.8))
     nees = nees_intervals(table)
     for ax, metric in zip(axes, METRICS, strict=True):
         ax.axvspan(*CONSISTENT, color=GREEN, alpha=0.2, lw=0)
         for j, (place, color) in enumerate(zip(PLACES, (BLUE, RED, ORANGE, GREEN), strict=True)):
             found = pd.DataFrame([nees[metric, place, method] for method in _METHODS])
-            reach = [found["value"] - found["low"], found["high"] - found["value"]]
             heights = np.arange(len(_METHODS)) + 0.16 * (j - 1.5)
             ax.errorbar(
-                found["value"], heights, xerr=reach, fmt="o", ms=4, color=color, label=place
-            )
+                found["value"], heights, fmt="o", ms=4, color=color, label=place,
+                xerr=[found["value"] - found["low"], found["high"] - found["value"]],
+            )  # fmt: skip
         ax.set(xscale="log", xlabel="NEES / dof", title=metric.replace("_", " "))
     times = table.groupby(["metric", "method"])["time_us"].median().unstack("metric")
     for metric, marker, fill in zip(METRICS, "os", (TRUTH, "none"), strict=True):
@@ -274,25 +259,17 @@ def covariances(table: pd.DataFrame) -> Figure:
     for ax in (*axes, times_axes):
         ax.set_yticks(range(len(_METHODS)), [])
         ax.invert_yaxis()
-    axes[0].set(
-        xlim=(0.4, 5.0),
-        xticks=[0.5, 1.0, 2.0, 4.0],
-        xticklabels=["0.5", "1", "2", "4"],
-        yticklabels=[m.replace("_", " ") for m in _METHODS],
-    )
-    axes[0].minorticks_off()
-    page.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=4)
-    return page
+    axes[0].set(xlim=(0.4, 5.0), yticklabels=[m.replace("_", " ") for m in _METHODS])
+    plain_ticks(axes[0], [0.5, 1.0, 2.0, 4.0])
+    return with_legend(page, ncols=4, loc="outside upper center")
 
 
 def beliefs(table: pd.DataFrame) -> Figure:
     """What wrong beliefs do to the clone filter's error and to its consistency."""
-    page = figure(8.5, 3.6)
-    axes: Any = page.subplots(1, 2, sharey=True)
-    names = list(dict.fromkeys(table["belief"]))
-    right = table[table["belief"] == "right"].set_index("seed")
-    for i, name in enumerate(names):
-        rows = table[table["belief"] == name].set_index("seed")
+    page, axes = subplots(8.5, 3.6, 1, 2, sharey=True)
+    by_belief = table.set_index("seed").groupby("belief", sort=False)
+    right = by_belief.get_group("right")
+    for i, (_, rows) in enumerate(by_belief):
         ratio = rows["ate_rmse_m"] / right["ate_rmse_m"]
         for ax, values in zip(axes, (ratio, rows["nees_mean"] / 3.0), strict=True):
             ax.plot(values, i + np.linspace(-0.15, 0.15, len(values)), ".", color=SKY, ms=4)
@@ -304,8 +281,8 @@ def beliefs(table: pd.DataFrame) -> Figure:
     axes[0].set(
         xscale="log",
         xlabel="position RMSE over that of right beliefs",
-        yticks=range(len(names)),
-        yticklabels=names,
+        yticks=range(len(by_belief)),
+        yticklabels=list(by_belief.groups),
     )
     axes[0].invert_yaxis()
     axes[1].set(xscale="log", xlabel="NEES / 3")
@@ -315,8 +292,7 @@ def beliefs(table: pd.DataFrame) -> Figure:
 
 def ordering(table: pd.DataFrame) -> Figure:
     """Where fusion beats ICP, and ICP odometry: log ratios over slip and range noise."""
-    page = figure(9.0, 5.6)
-    axes: Any = page.subplots(2, 3, sharex=True, sharey=True)
+    page, axes = subplots(9.0, 5.6, 2, 3, sharex=True, sharey=True)
     pairs = (("fusion", "icp"), ("icp", "odometry"), ("fusion_clone", "icp"))
     errors = (("ate_rmse_m", "position"), ("heading_rmse_rad", "heading"))
     cells = ["k_m", "sigma_range_m"]
@@ -347,8 +323,7 @@ def _grid(ax: Axes, values: pd.DataFrame) -> Any:
 
 def steps(table: pd.DataFrame) -> Figure:
     """Registrations from scan to scan: correlation, accumulation, and the least possible error."""
-    page = figure(9.5, 3.4)
-    axes: Any = page.subplots(1, 3)
+    page, axes = subplots(9.5, 3.4, 1, 3)
     rows = table[table["rays"] == "exact"].assign(
         position=lambda row: row["step_error_m"] / row["step_bound_m"],
         heading=lambda row: row["step_error_rad"] / row["step_bound_rad"],
@@ -359,9 +334,8 @@ def steps(table: pd.DataFrame) -> Figure:
         (["position", "heading"], 0.0),
     )
     for rate, color, shift in ((10.0, BLUE, -0.06), (75.0, ORANGE, 0.06)):
-        part = rows[rows["rate_hz"] == rate]
         for ax, (columns, first) in zip(axes, panels, strict=True):
-            values = part[columns]
+            values = rows.loc[rows["rate_hz"] == rate, columns]
             at, middle = first + shift + np.arange(len(columns)), values.median()
             ends = [middle - values.min(), values.max() - middle]
             ax.errorbar(at, middle, yerr=ends, fmt="o", color=color, ms=4, label=f"{rate:g} Hz")
@@ -382,5 +356,4 @@ def steps(table: pd.DataFrame) -> Figure:
         xticks=[0, 1],
         xticklabels=["x, y", "heading"],
     )
-    page.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=2)
-    return page
+    return with_legend(page, ncols=2, loc="outside upper center")

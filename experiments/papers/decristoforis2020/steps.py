@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from estimators.base import Estimate
 from estimators.gaussian import STILL, Gaussian
+from experiments.evaluation.metrics import travelled_m
 from experiments.evaluation.scan_bound import fisher_bound
 from experiments.papers.decristoforis2020.settings import HELD_M, WINDOWS_S
 from experiments.runs.row import Row
@@ -33,9 +34,7 @@ def step_errors(recording: Recording, world: World, estimate: Estimate) -> Row:
         `correlation_lag_1` to `_5`; `nees_over_3` of one step, and of all in 1 s and 10 s as
         `accumulated_over_predicted_`; RMS `step_error_` and `step_bound_`, m and rad.
     """
-    truth = recording.truth_at(recording.frame_stamps)
-    laser = recording.sensors.laser
-    assert laser is not None
+    truth, laser = recording.truth_at(recording.frame_stamps), recording.sensors.known_laser
     motions, true_motions = (se2.between(p[:-1], p[1:]) for p in (estimate.means, truth))
     off = motions - true_motions
     off[:, 2] = se2.wrap(off[:, 2])
@@ -94,7 +93,6 @@ def ellipse_path(recording: Recording, world: World, estimate: Estimate) -> pd.D
         `direction_rad` of the long one.
     """
     truth = recording.truth_at(recording.frame_stamps)
-    rolled = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(truth[:, :2], axis=0).T))])
     found = estimate.extras["registration_covariance"]
     use = np.array([i for i, C in enumerate(found) if C is not None])
     cos, sin = np.cos(truth[use - 1, 2]), np.sin(truth[use - 1, 2])
@@ -103,7 +101,7 @@ def ellipse_path(recording: Recording, world: World, estimate: Estimate) -> pd.D
     values, vectors = np.linalg.eigh(in_map)
     return pd.DataFrame(
         {
-            "distance_m": rolled[use],
+            "distance_m": travelled_m(truth)[use],
             "place": world.place_of(truth[use, :2]),
             "x_m": truth[use, 0],
             "y_m": truth[use, 1],

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
+import operator
 import timeit
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
-import joblib
 import numpy as np
 import pandas as pd
 from matplotlib.cbook import boxplot_stats
@@ -24,6 +24,7 @@ from experiments.evaluation.metrics import (
 )
 from experiments.evaluation.registration_errors import METRICS, measured, scenes
 from experiments.evaluation.verdict import Profile
+from experiments.papers.decristoforis2020.claims import judged_runs
 from experiments.papers.decristoforis2020.settings import (
     CHECKED,
     JUDGED_SEED,
@@ -33,6 +34,7 @@ from experiments.papers.decristoforis2020.settings import (
     PLACES,
 )
 from experiments.papers.decristoforis2020.steps import ellipse_path, ellipse_summary, step_errors
+from experiments.papers.jobs import in_parallel
 from experiments.papers.results import Results
 from experiments.runs.console import RunFailedError
 from experiments.runs.evaluate import evaluate
@@ -70,21 +72,17 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
     on_progress
         Called with the share done.
     """
-    jobs = _jobs(profile is Profile.FULL, out)
-    done = np.cumsum([cost for cost, _, _ in jobs])
+    costs, functions, arguments = zip(*_jobs(profile is Profile.FULL, out), strict=True)
+    calls = [(function, *given) for function, given in zip(functions, arguments, strict=True)]
     parts: dict[str, list[pd.DataFrame]] = {}
-    calls = (joblib.delayed(function)(*arguments) for _, function, arguments in jobs)
-    found = joblib.Parallel(n_jobs=-1, return_as="generator")(calls)
-    for share, tables in zip(done / done[-1], found, strict=True):
+    for tables in in_parallel(operator.call, calls, on_progress, costs):
         for name, frame in tables.items():
             parts.setdefault(name, []).append(frame)
-        on_progress(share)
     whole = {name: pd.concat(frames, ignore_index=True) for name, frames in parts.items()}
     whole["boxes"] = _boxes(whole.pop("errors"))
     whole["covariances"] = whole["covariances"].sort_values(["metric", "method", "place", "seed"])
     whole["ordering"] = whole["ordering"][[*_NOISE, "ate_rmse_m", "heading_rmse_rad"]]
-    for name, frame in whole.items():
-        out.write_table(name, frame)
+    out.write_tables(**whole)
 
 
 def _jobs(full: bool, out: Results) -> list[Job]:
@@ -214,7 +212,7 @@ def _drawn_office(group: Sequence[Experiment], out: Results) -> Tables:
     for experiment in group:
         row, estimate = _run(experiment, recording, _RUN)
         points = map_points(recording, estimate)
-        arrays[f"{row['method']}"] = estimate.means[keep, :2]
+        arrays[str(row["method"])] = estimate.means[keep, :2]
         arrays[f"{row['method']}_points"] = points[:: max(1, len(points) // 5000)]
     out.write_arrays("office", **{name: a.astype(np.float32) for name, a in arrays.items()})
     return {}
@@ -239,8 +237,7 @@ def _scenes(seed: int, place: str, n_repeats: int) -> Tables:
     """Many registrations of one pair of poses in a place, and all covariances of them."""
     study, part = PLACES[place]
     experiment = Experiment.compose([f"study=decristoforis2020_{study}", f"seed={seed}"])
-    laser = experiment.sensors().laser
-    assert laser is not None
+    laser = experiment.sensors().known_laser
     rng = stream(seed, f"scenes/{place}")
     (scene,) = scenes(experiment.world(), part, laser.mount.pose, rng, 1)
     found = measured(scene, laser, rng, n_repeats, max(2, n_repeats // 4))
@@ -272,12 +269,11 @@ def _metrics(seed: int, kind: str) -> Tables:
 
 def _boxes(errors: pd.DataFrame) -> pd.DataFrame:
     """Quartiles and whiskers (1.5 times the quartiles' distance) of the pooled errors."""
-    of = errors.query("rate_hz == 10.0 and rays == 'exact'").groupby("method")
-    samples = [
-        (method, name, of.get_group(method)[name].to_numpy())
+    by_method = judged_runs(errors).groupby("method")
+    rows = [
+        {"method": method, "error": name, "n": len(values), **boxplot_stats(values)[0]}
         for method in PAPERS_OWN
-        for name in ("position_m", "heading_rad")
+        for name, values in by_method.get_group(method)[["position_m", "heading_rad"]].items()
     ]
-    rows = [{"method": m, "error": e, "n": len(v), **boxplot_stats(v)[0]} for m, e, v in samples]
     kept = ["method", "error", "n", "whislo", "q1", "med", "q3", "whishi", "mean"]
     return pd.DataFrame(rows)[kept]

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator
 from numpy.typing import NDArray
 
 from experiments.evaluation.metrics import rms
 from experiments.papers.gil2008.claims import pooled
 from experiments.papers.results import Results
-from experiments.viewing.run_figure import covariance_ellipse
+from experiments.viewing.plotting import draw_ellipses, plain_log, plain_ticks, with_legend
 from experiments.viewing.style import (
     BLACK,
     BLUE,
@@ -29,10 +27,10 @@ from experiments.viewing.style import (
     TRUTH,
     WALL,
     figure,
+    subplots,
 )
-from experiments.viewing.world import draw_world
+from experiments.viewing.world import draw_walls
 from sim import se2
-from sim.world import World
 
 Array = NDArray[np.float64]
 Arrays = dict[str, Any]
@@ -72,12 +70,10 @@ def draw(made: Results) -> dict[str, Figure]:
 
 def maps(run: Arrays) -> Figure:
     """Figure 1: the rooms, and the landmarks as the best particle maps them."""
-    page = figure(10.0, 4.9)
-    left, right = page.subplots(1, 2, sharex=True, sharey=True)
-    draw_world(left, _world(run))
+    page, (left, right) = subplots(10.0, 4.9, 1, 2, sharex=True, sharey=True)
+    draw_walls(left, run["walls"], run["wall_z_m"])
     left.set_title("walls and objects", loc="left")
-    for mean, covariance in zip(run["landmarks"], run["landmark_covariances"], strict=True):
-        right.add_patch(covariance_ellipse(mean, covariance[:2, :2], color=SKY, alpha=0.4, lw=0))
+    draw_ellipses(right, run["landmarks"], run["landmark_covariances"], color=SKY, alpha=0.4, lw=0)
     right.plot(*run["landmarks"][:, :2].T, ".", color=BLUE, ms=3)
     right.set(xlabel="x, m", ylabel="y, m", aspect="equal")
     right.set_title("map of landmarks, with 95 % ellipses", loc="left")
@@ -86,26 +82,26 @@ def maps(run: Arrays) -> Figure:
 
 def corrected(run: Arrays) -> Figure:
     """Figure 2: landmarks placed by odometry, against the map of SLAM."""
-    page = figure(10.0, 4.9)
-    world = _world(run)
+    page, axes = subplots(10.0, 4.9, 1, 2, sharex=True, sharey=True)
+    corners = run["walls"].reshape(-1, 2)
+    xlim, ylim = zip(corners.min(axis=0) - 4, corners.max(axis=0) + 4, strict=True)
     for ax, name, colour, title in zip(
-        page.subplots(1, 2, sharex=True, sharey=True),
+        axes,
         ("odometry", "fastslam"),
         (ODOMETRY, BLUE),
         ("placed by odometry", "placed from the path of FastSLAM"),
         strict=True,
     ):
-        draw_world(ax, world)
+        draw_walls(ax, run["walls"], run["wall_z_m"])
         ax.plot(*run[f"placed_by_{name}"].T, ".", color=colour, ms=1.5)
         ax.set_title(title, loc="left")
-        ax.set(xlim=world.bounds_m[[0, 2]] + [-4, 4], ylim=world.bounds_m[[1, 3]] + [-4, 4])
+        ax.set(xlim=xlim, ylim=ylim)
     return page
 
 
 def particles_along_a_motion(motion: Arrays) -> Figure:
     """Figure 3: particles drawn along a motion; the noise is ten times the study's."""
-    page = figure(6.0, 4.0)
-    ax = page.subplots()
+    page, ax = subplots(6.0, 4.0)
     ax.plot(*motion["particles"][..., :2].T, ".", color=BLUE, ms=1.5)
     ax.plot(*motion["line"][:, :2].T, color=BLACK, label="odometry")
     ax.plot([], [], ".", color=BLUE, label="particles")
@@ -116,16 +112,15 @@ def particles_along_a_motion(motion: Arrays) -> Figure:
 
 def association_ellipses() -> Figure:
     """Figure 4: a measurement between two landmarks, and what either distance says."""
-    page = figure(5.5, 4.0)
-    ax = page.subplots()
+    page, ax = subplots(5.5, 4.0)
     means = np.array([[0.0, 0.0], [1.1, 0.5]])
     spreads = np.array([[[0.05, 0.02], [0.02, 0.09]], [[0.06, -0.03], [-0.03, 0.05]]])
     z, R = np.array([0.62, 0.12]), np.array([[0.16, 0.03], [0.03, 0.03]])
     for name, mean, spread, colour in zip("AB", means, spreads, (BLUE, GREEN), strict=True):
-        ax.add_patch(covariance_ellipse(mean, spread, fill=False, color=colour, lw=1.5))
+        draw_ellipses(ax, [mean], [spread], fill=False, color=colour, lw=1.5)
         d = (z - mean) @ np.linalg.solve(spread + R, z - mean)
         ax.plot(*mean, "o", color=colour, label=f"landmark {name}, distance {d:.1f}")
-    ax.add_patch(covariance_ellipse(z, R, fill=False, color=RED, lw=1.5, ls="--"))
+    draw_ellipses(ax, [z], [R], fill=False, color=RED, lw=1.5, ls="--")
     ax.plot(*z, "x", color=RED, label="measurement")
     ax.set(xlabel="x, m", ylabel="y, m", aspect="equal", xlim=(-0.9, 1.9), ylim=(-1.0, 1.9))
     ax.legend(loc="upper left")
@@ -164,24 +159,21 @@ def world_3d(run: Arrays) -> Figure:
 
 def path(run: Arrays) -> Figure:
     """Figure 6: true path, odometry and the best particle's path."""
-    page = figure(6.6, 6.4)
-    ax = page.subplots()
-    draw_world(ax, _world(run))
+    page, ax = subplots(6.6, 6.4)
+    draw_walls(ax, run["walls"], run["wall_z_m"])
     ax.plot(*run["truth"][:, :2].T, color=TRUTH, lw=1.2, label="truth")
     ax.plot(*run["odometry"][:, :2].T, "--", color=ODOMETRY, lw=1.2, label="odometry")
     best = run["fastslam"][::12]
     ax.plot(*best[:, :2].T, "s", color=ESTIMATE, ms=2.5, mfc="none", label="FastSLAM, M = 200")
-    page.legend(loc="outside upper center", ncols=3)
-    return page
+    return with_legend(page, ncols=3, loc="outside upper center")
 
 
 def components(run: Arrays) -> Figure:
     """Figure 7: the pose's components by distance, and their errors."""
-    page = figure(10.0, 6.5)
+    page, axes = subplots(10.0, 6.5, 3, 2, sharex=True)
     truth, along = run["truth"], run["travelled_m"]
-    axes = page.subplots(3, 2, sharex=True)
-    for i, name in enumerate(("x, m", "y, m", "heading, rad")):
-        left, right = axes[i]
+    names = ("x, m", "y, m", "heading, rad")
+    for i, (name, (left, right)) in enumerate(zip(names, axes, strict=True)):
         straighten, wrap = (np.unwrap, se2.wrap) if i == 2 else (np.asarray, np.asarray)
         for key, colour, label in (
             ("odometry", ODOMETRY, "odometry"),
@@ -198,9 +190,8 @@ def components(run: Arrays) -> Figure:
             along[::4], low, high, where=run["revisited"], color=SKY, alpha=0.2, lw=0,
             label="revisited ground",
         )  # fmt: skip
-        right.set_ylim(low, high)
-        left.set_ylabel(name)
-        right.set_ylabel(f"error of {name}")
+        left.set(ylabel=name)
+        right.set(ylabel=f"error of {name}", ylim=(low, high))
     for ax in axes[-1]:
         ax.set_xlabel("path travelled, m")
     handles = [handle for ax in axes[0] for handle in ax.get_legend_handles_labels()[0]]
@@ -210,25 +201,24 @@ def components(run: Arrays) -> Figure:
 
 def by_particles(repeats: pd.DataFrame, bound: pd.DataFrame) -> Figure:
     """Figure 8, the paper's design: one recording, the filter repeated; bars of 2 sigma."""
-    page = figure(9.0, 4.0)
+    page, axes = subplots(9.0, 4.0, 1, 2)
     best = bound[(bound["seed"] == repeats["seed"][0]) & (bound["noise"] == "paper")]
-    for ax, (column, label) in zip(page.subplots(1, 2), _BOTH, strict=True):
+    for ax, (column, label) in zip(axes, _BOTH, strict=True):
         for j, (name, part) in enumerate(repeats.groupby("filter", sort=False)):
             colour, marker, words = _FILTERS[str(name)]
-            groups = part.groupby("n_particles")[column]
+            found = part.groupby("n_particles")[column].agg(["mean", "std"])
             ax.errorbar(
-                groups.mean().index * (1.0 + 0.06 * j), groups.mean(), 2.0 * groups.std(),
+                found.index * (1.0 + 0.06 * j), found["mean"], 2.0 * found["std"],
                 marker=marker, color=colour, label=words, capsize=2.5, lw=1.0, ms=4,
             )  # fmt: skip
         ax.axhline(float(best[column].iloc[0]), color=_BATCH, ls=":", label="batch bound")
         ax.set(xscale="log", xlabel="particles M", ylabel=label, ylim=(0.0, None))
-        _plain_ticks(ax, repeats["n_particles"])
+        plain_ticks(ax, repeats["n_particles"], fontsize=8)
     page.suptitle(
         f"one recording, {repeats['repeat'].max() + 1} runs each; odometry errs by "
         f"{repeats['odometry_rmse_m'][0]:.1f} m"
     )
-    page.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=4)
-    return page
+    return with_legend(page, ncols=4)
 
 
 def by_particles_over_worlds(particles: pd.DataFrame, bound: pd.DataFrame) -> Figure:
@@ -236,16 +226,15 @@ def by_particles_over_worlds(particles: pd.DataFrame, bound: pd.DataFrame) -> Fi
 
     Every number of particles has the same recordings: one of each world.
     """
-    particles = particles[particles["draw"] == 0]
-    by_noise = list(particles.groupby("noise", sort=False))
-    page = figure(11.0, 3.2 * len(by_noise) + 0.6)
+    by_noise = particles[particles["draw"] == 0].groupby("noise", sort=False)
     columns = {
         _PATH: "path",
         "revised_ate_aligned_rmse_m": "path, aligned",
         _MAP: "map",
         "map_aligned_rmse_m": "map, aligned",
     }
-    grid = page.subplots(len(by_noise), 4, squeeze=False, sharex=True)
+    size = (11.0, 3.2 * len(by_noise) + 0.6, len(by_noise), 4)
+    page, grid = subplots(*size, squeeze=False, sharex=True)
     for (noise, table), row in zip(by_noise, grid, strict=True):
         best = np.log(bound[bound["noise"] == noise][list(columns)]).mean()
         for ax, (column, label) in zip(row, columns.items(), strict=True):
@@ -253,8 +242,8 @@ def by_particles_over_worlds(particles: pd.DataFrame, bound: pd.DataFrame) -> Fi
             ax.axhline(np.exp(best[column]), color=_BATCH, ls=":", label="batch bound")
             ax.set(xscale="log", yscale="log")
             ax.set_title(f"{label}, {_NOISE[noise]}", loc="left")
-            _plain_ticks(ax, [10, 50, 200, 1000])
-            _plain_log(ax.yaxis)
+            plain_ticks(ax, [10, 50, 200, 1000], fontsize=8)
+            plain_log(ax.yaxis)
         row[0].set_ylabel("RMS error, m")
     for ax in grid[-1]:
         ax.set_xlabel("particles M")
@@ -266,7 +255,7 @@ def by_particles_over_worlds(particles: pd.DataFrame, bound: pd.DataFrame) -> Fi
 
 def by_distance(distance: pd.DataFrame) -> Figure:
     """Figure 9: dmax, by filter, choice of observations, walls and noise."""
-    page = figure(10.5, 4.4)
+    page, axes = subplots(10.5, 4.4, 1, 2, sharex=True)
     kinds = {
         ("fastslam2", True, "paper", 0, "random"): (BLUE, "-", "all visible"),
         ("paper", True, "paper", 0, "random"): (ORANGE, "-", "all visible, as printed"),
@@ -277,7 +266,6 @@ def by_distance(distance: pd.DataFrame) -> Figure:
         ("fastslam2", True, "pixel", 0, "random"): (PURPLE, "-", "all visible, 1 px"),
     }
     parts = dict(list(distance.groupby(["filter", "occluded", "noise", "n_seen", "rule"])))
-    axes = page.subplots(1, 2, sharex=True)
     for ax, (column, label) in zip(axes, _BOTH, strict=True):
         for kind, (colour, line, words) in kinds.items():
             if kind in parts:
@@ -287,21 +275,19 @@ def by_distance(distance: pd.DataFrame) -> Figure:
                 ax.fill_between(middle.index, *band, color=colour, alpha=0.08, lw=0)
         ax.axvline(10.0, color=BLACK, lw=0.6, ls=":")
         ax.set(xlabel="dmax, m", ylabel=label, yscale="log")
-        _plain_log(ax.yaxis)
-    page.legend(*axes[0].get_legend_handles_labels(), loc="outside right center")
-    return page
+        plain_log(ax.yaxis)
+    return with_legend(page, ncols=1, loc="outside right center")
 
 
 def by_observations(observations: pd.DataFrame) -> Figure:
     """Error against the most observations of an image."""
-    page = figure(9.0, 3.8)
-    for ax, (column, label) in zip(page.subplots(1, 2), _BOTH, strict=True):
+    page, axes = subplots(9.0, 3.8, 1, 2)
+    for ax, (column, label) in zip(axes, _BOTH, strict=True):
         _by_filter(ax, observations, "n_seen", column)
         ax.set(xscale="log", yscale="log", xlabel="most observations B", ylabel=label)
-        _plain_ticks(ax, observations["n_seen"])
-        _plain_log(ax.yaxis)
-    page.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=2)
-    return page
+        plain_ticks(ax, observations["n_seen"], fontsize=8)
+        plain_log(ax.yaxis)
+    return with_legend(page, ncols=2)
 
 
 _WAYS = {
@@ -321,8 +307,8 @@ def by_association(association: pd.DataFrame) -> Figure:
         for noise, table in association.groupby("noise", sort=False)
     ]
     counts = [len(ways) for _, ways in by_noise]
-    page = figure(10.0, 0.36 * sum(counts) + 1.2)
-    grid = page.subplots(len(counts), 2, squeeze=False, sharey="row", height_ratios=counts)
+    size = (10.0, 0.36 * sum(counts) + 1.2, len(counts), 2)
+    page, grid = subplots(*size, squeeze=False, sharey="row", height_ratios=counts)
     for (noise, ways), (left, right) in zip(by_noise, grid, strict=True):
         labels = []
         for i, ((name, sigma, p0), part) in enumerate(ways):
@@ -334,12 +320,16 @@ def by_association(association: pd.DataFrame) -> Figure:
             left.plot(rms(ratio.to_numpy()), i, "D", color=colour, ms=5)
             right.barh(i, part["right_share"].mean(), color=colour, height=0.6)
         left.axvline(0.5, color=BLACK, lw=0.6, ls=":")
-        left.set(yticks=range(len(labels)), yticklabels=labels, xscale="log")
-        left.set_ylim(len(labels) - 0.4, -0.6)  # from above; both sides share the heights
+        left.set(
+            yticks=range(len(labels)),
+            yticklabels=labels,
+            ylim=(len(labels) - 0.4, -0.6),  # from above; both sides share the heights
+            xscale="log",
+        )
+        left.set_title(f"noise of {_NOISE[noise]}", loc="left")
+        plain_log(left.xaxis)
         right.set(xlim=(0.0, 1.0))
         right.tick_params(axis="y", left=False, labelleft=False)
-        left.set_title(f"noise of {_NOISE[noise]}", loc="left")
-        _plain_log(left.xaxis)
     grid[-1, 0].set_xlabel("path error over odometry's (each world; diamonds: RMS)")
     grid[-1, 1].set_xlabel("share of right associations")
     return page
@@ -347,8 +337,7 @@ def by_association(association: pd.DataFrame) -> Figure:
 
 def by_settings(resampling: pd.DataFrame, noise: pd.DataFrame) -> Figure:
     """Resampling schemes, and where R is taken, by noise."""
-    page = figure(10.0, 3.8)
-    left, right = page.subplots(1, 2)
+    page, (left, right) = subplots(10.0, 3.8, 1, 2)
     for j, (share, words) in enumerate(((1.0, "at every image"), (0.5, "ESS < M/2"))):
         part = resampling[resampling["ess_share"] == share]
         middle, bars = _intervals(part, "resampling", "revised_ate_aligned_rmse_m")
@@ -356,27 +345,36 @@ def by_settings(resampling: pd.DataFrame, noise: pd.DataFrame) -> Figure:
             np.arange(len(middle)) + 0.2 * j - 0.1, middle, bars, marker="os"[j],
             color=(ORANGE, BLUE)[j], ls="none", capsize=3, label=words,
         )  # fmt: skip
-    left.set(xticks=range(len(middle)), xticklabels=middle.index, ylim=(0.0, None))
-    left.set_ylabel("RMS of the path, aligned, m")
+    left.set(
+        xticks=range(len(middle)),
+        xticklabels=middle.index,
+        ylabel="RMS of the path, aligned, m",
+        ylim=(0.0, None),
+    )
     left.set_title("FastSLAM 1.0, M = 200", loc="left")
     left.legend()
     for at, colour in (("predicted", BLUE), ("measured", RED)):
         middle, bars = _intervals(noise[noise["noise_at"] == at], "sigma_px", _PATH)
-        style: dict[str, Any] = {"marker": "o", "color": colour, "capsize": 3}
-        right.errorbar(middle.index, middle, bars, label=f"R at the {at} point", **style)
-    right.set(xscale="log", yscale="log", xlabel="noise of column and row, px")
-    right.set_ylabel("RMS of the path, m")
+        right.errorbar(
+            middle.index, middle, bars, marker="o", color=colour, capsize=3,
+            label=f"R at the {at} point",
+        )  # fmt: skip
+    right.set(
+        xscale="log",
+        yscale="log",
+        xlabel="noise of column and row, px",
+        ylabel="RMS of the path, m",
+    )
     right.set_title("FastSLAM 2.0, M = 200", loc="left")
-    _plain_ticks(right, noise["sigma_px"])
-    _plain_log(right.yaxis)
+    plain_ticks(right, noise["sigma_px"], fontsize=8)
+    plain_log(right.yaxis)
     right.legend()
     return page
 
 
 def cost(table: pd.DataFrame) -> Figure:
     """Time of a step against the number of landmarks in the map."""
-    page = figure(5.5, 3.8)
-    ax = page.subplots()
+    page, ax = subplots(5.5, 3.8)
     for maps_kind, part in table.groupby("maps", sort=False):
         colour = BLUE if maps_kind == "shared" else ORANGE
         wide = part.groupby("n_landmarks")["step_ms"]
@@ -384,8 +382,8 @@ def cost(table: pd.DataFrame) -> Figure:
         ax.fill_between(list(wide.groups), wide.min(), wide.max(), color=colour, alpha=0.2, lw=0)
     ax.set(xscale="log", yscale="log", xlabel="landmarks N", ylabel="time of a step, ms")
     ax.set_title("M = 1000, B = 20, resampling at every image", loc="left")
-    _plain_ticks(ax, table["n_landmarks"])
-    _plain_log(ax.yaxis)
+    plain_ticks(ax, table["n_landmarks"], fontsize=8)
+    plain_log(ax.yaxis)
     ax.legend()
     return page
 
@@ -395,8 +393,9 @@ def _by_filter(ax: Axes, table: pd.DataFrame, by: str, column: str) -> None:
     for name, part in table.groupby("filter", sort=False):
         colour, marker, words = _FILTERS[str(name)]
         middle, bars = _intervals(part, by, column)
-        style: dict[str, Any] = {"marker": marker, "color": colour, "capsize": 2.5, "ms": 4}
-        ax.errorbar(middle.index, middle, bars, label=words, **style)
+        ax.errorbar(
+            middle.index, middle, bars, marker=marker, color=colour, capsize=2.5, ms=4, label=words
+        )
 
 
 def _intervals(part: pd.DataFrame, by: str, column: str) -> tuple[pd.Series[float], Array]:
@@ -406,20 +405,6 @@ def _intervals(part: pd.DataFrame, by: str, column: str) -> tuple[pd.Series[floa
     return middle, np.array([-middle * np.expm1(-half), middle * np.expm1(half)])
 
 
-def _plain_ticks(ax: Axes, values: Iterable[float]) -> None:
-    """Ticks of a logarithmic axis at the values themselves."""
-    ticks = sorted(set(values))
-    ax.set_xticks(ticks, [f"{tick:g}" for tick in ticks], fontsize=8)
-    ax.minorticks_off()
-
-
-def _plain_log(axis: Any) -> None:
-    """Numbers without powers of ten on a logarithmic axis, at 1, 2 and 5."""
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axis.set_major_formatter("{x:g}")
-    axis.set_minor_formatter("")
-
-
 def _ellipsoid(mean: Array, covariance: Array) -> Array:
     """Wire (3, K) of the surface that holds 95 % of a Gaussian."""
     turn, lift = np.meshgrid(np.linspace(0, 2 * np.pi, 17), np.linspace(-np.pi / 2, np.pi / 2, 9))
@@ -427,9 +412,4 @@ def _ellipsoid(mean: Array, covariance: Array) -> Array:
     values, vectors = np.linalg.eigh(covariance)
     axes = _CHI_95_3D * vectors * np.sqrt(np.maximum(values, 0.0))
     surface = np.pad(np.tensordot(axes, ball, 1), [(0, 0), (0, 0), (0, 1)], constant_values=np.nan)
-    wire: Array = mean[:, None] + surface.reshape(3, -1)
-    return wire
-
-
-def _world(run: Arrays) -> World:
-    return World("gil2008", run["walls"], run["wall_z_m"])
+    return np.asarray(mean[:, None] + surface.reshape(3, -1))

@@ -138,8 +138,7 @@ def landmark_distances_m(recording: Recording) -> Array:
     where = np.repeat(recording.truth_at(log.stamps), np.diff(log.splits), axis=0)
     where[:, 2] = camera.mount.z_m
     true = recording.known_world.landmarks[recording.known_truth.landmark_ids]
-    distance: Array = np.linalg.norm(true - where, axis=1)
-    return distance
+    return np.asarray(np.linalg.norm(true - where, axis=1))
 
 
 def _drive(config: Config) -> Experiment:

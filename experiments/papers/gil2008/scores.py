@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimators.base import Estimate
-from experiments.evaluation.metrics import alignment, position_errors_m, rms
+from experiments.evaluation.metrics import alignment, position_errors_m, rms, travelled_m
 from experiments.papers.gil2008.settings import LAG_M, WITHIN_M
 from experiments.runs.row import Row
 from sim import se2
@@ -67,18 +67,11 @@ def matching_precision(recording: Recording) -> float:
     return float(np.mean(ids[nearest] == truth.landmark_ids[again]))
 
 
-def travelled_m(truth: Array) -> Array:
-    """Path (T,) behind the robot, m."""
-    steps = np.hypot(*np.diff(truth[:, :2], axis=0).T)
-    return np.concatenate([[0.0], np.cumsum(steps)])
-
-
 def revisited(truth: Array) -> NDArray[np.bool_]:
     """Rows (T,) where the robot is within a metre of where it was at least 20 m of path ago."""
     travelled = travelled_m(truth)
     near = np.hypot(*(truth[:, None, :2] - truth[None, :, :2]).transpose(2, 0, 1)) < WITHIN_M
-    answer: NDArray[np.bool_] = np.any(near & (travelled[:, None] - travelled > LAG_M), axis=1)
-    return answer
+    return np.asarray(np.any(near & (travelled[:, None] - travelled > LAG_M), axis=1))
 
 
 def revisited_slope(truth: Array, means: Array) -> float:

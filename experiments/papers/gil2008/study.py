@@ -12,17 +12,17 @@ from itertools import accumulate
 
 import numpy as np
 import pandas as pd
-from joblib import Parallel, delayed
 from numpy.typing import NDArray
 
 from estimators.base import run as walk
 from estimators.odometry import Odometry
 from estimators.stereo import StereoModel
 from experiments.bench.fastslam import cost_by_landmarks
-from experiments.evaluation.metrics import position_errors_m, rms
+from experiments.evaluation.metrics import position_errors_m, rms, travelled_m
 from experiments.evaluation.verdict import Profile
 from experiments.papers.gil2008 import scores, settings
 from experiments.papers.gil2008.recordings import Scene, landmark_distances_m, thinned, whole
+from experiments.papers.jobs import in_parallel
 from experiments.papers.results import Results
 from experiments.runs.evaluate import estimates, scored, status_of
 from experiments.runs.experiment import Experiment
@@ -59,21 +59,17 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
     on_progress
         Called with the share done.
     """
-    runs = plan(profile)
     jobs = [
-        part[low : low + _RUNS_PER_JOB]
-        for part in by_scene(runs)
+        [part[low : low + _RUNS_PER_JOB]]
+        for part in by_scene(plan(profile))
         for low in range(0, len(part), _RUNS_PER_JOB)
     ]
     rows: dict[str, list[Row]] = {table: [] for table in settings.LABELS}
-    done = Parallel(n_jobs=-1, return_as="generator")(delayed(rows_of)(job) for job in jobs)
-    for number, job in enumerate(done, start=1):
+    for job in in_parallel(rows_of, jobs, lambda share: on_progress(0.95 * share)):
         for table, row in job:
             rows[table].append(row)
-        on_progress(0.95 * number / len(jobs))
-    for table, part in rows.items():
-        out.write_table(table, pd.DataFrame(part))
-    out.write_table("cost", cost_by_landmarks(settings.SIZES[profile].n_timings))
+    cost = cost_by_landmarks(settings.SIZES[profile].n_timings)
+    out.write_tables(**{table: pd.DataFrame(part) for table, part in rows.items()}, cost=cost)
     write_arrays(out)
     on_progress(1.0)
 
@@ -192,7 +188,7 @@ def write_arrays(out: Results) -> None:
         "wall_z_m": world.wall_z_m,
         "truth": along,
         **{name: estimate.means for name, estimate in estimated.items()},
-        "travelled_m": scores.travelled_m(along),
+        "travelled_m": travelled_m(along),
         "landmarks": best.map["landmarks"],
         "landmark_covariances": best.map["landmark_covariances"],
         **placed,

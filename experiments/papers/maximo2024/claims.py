@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -15,15 +16,11 @@ from experiments.evaluation.statistics import (
     mean_interval,
     share_interval,
 )
-from experiments.evaluation.verdict import Claim, Verdict, holds, judged, lower, overall
+from experiments.evaluation.verdict import Claim, Verdict, banded, holds, judged, lower, overall
 from experiments.papers.maximo2024.settings import NAMES, RECOVERED_WITHIN, WITHIN
 from experiments.papers.results import Results
 
 _LEAST_M = 1e-3  # added to what may be zero, before a logarithm
-_MX8 = {
-    False: ("without", "at most 0.5", {"at_most": 0.5}),
-    True: ("with", "at least 0.95", {"at_least": 0.95}),
-}
 
 
 def judge(made: Results) -> list[Claim]:
@@ -65,7 +62,6 @@ def mx1(weighting: pd.DataFrame, quality: pd.DataFrame) -> list[Claim]:
                 "MX1",
                 f"share of worlds with M3 worse than 5 times M2, {NAMES[name]}",
                 errors["M3"] > 5.0 * errors["M2"],
-                "at least 0.8",
                 at_least=0.8,
             )
             claims.append(replace(share, reason=_where_m3_fails(quality, "oxford")))
@@ -86,42 +82,37 @@ def mx1(weighting: pd.DataFrame, quality: pd.DataFrame) -> list[Claim]:
 
 def mx3(dispersion: pd.DataFrame, quality: pd.DataFrame) -> list[Claim]:
     """MX3: M2 concentrates faster than M1: its dispersion at step 10."""
-    at_10 = dispersion[dispersion["step"] == 10]
-    # all on one node is zero
-    at_10 = at_10.assign(dispersion_m=at_10["dispersion_m"] + _LEAST_M)
+    at_10 = dispersion.query("step == 10").assign(
+        dispersion_m=lambda rows: rows["dispersion_m"] + _LEAST_M  # all on one node is zero
+    )
     return _m2_below_m1("MX3", "dispersion", at_10, quality, " at step 10")
 
 
 def _m2_below_m1(
-    id_: str, what: str, table: pd.DataFrame, quality: pd.DataFrame, at: str = ""
+    claim: str, what: str, table: pd.DataFrame, quality: pd.DataFrame, at: str = ""
 ) -> list[Claim]:
     """Judge on each geometry whether M2 is below M1; the reason: where with shared parameters."""
     claims = []
     for name in geometries(table):
         worlds = _by_world(table[table["geometry"] == name], f"{what}_m")
         ratio, p, verdict = lower(worlds["M2"], worlds["M1"])
-        claims.append(
-            Claim(
-                id_,
-                f"{what} of M2 over M1{at}, {NAMES[name]}",
-                ratio,
-                f"below 1 by Wilcoxon, p < 0.01 (p = {p:.2g})",
-                verdict,
-                _where_less(quality[quality["geometry"] == name], f"{what}_m"),
-            )
-        )
+        statistic = f"{what} of M2 over M1{at}, {NAMES[name]}"
+        criterion = f"below 1 by Wilcoxon, p < 0.01 (p = {p:.2g})"
+        reason = _where_less(quality[quality["geometry"] == name], f"{what}_m")
+        claims.append(Claim(claim, statistic, ratio, criterion, verdict, reason))
     return claims
 
 
 def _where_less(quality: pd.DataFrame, column: str) -> str:
     """Name the B at which M2 is below M1 when both have the same parameters, at a noise of 0.8."""
     part = quality[quality["noise_weight"] == 0.8]
-    found = []
-    for n_nearest, rows in part.groupby("n_nearest"):
-        worlds = _by_world(rows, column) + _LEAST_M
-        if lower(worlds["M2"], worlds["M1"])[2] is Verdict.REPRODUCED:
-            found.append(str(n_nearest))
-    where = f"B = {', '.join(found)}" if found else "no B tried"
+    by_b = {b: _by_world(rows, column) + _LEAST_M for b, rows in part.groupby("n_nearest")}
+    less = [
+        str(b)
+        for b, worlds in by_b.items()
+        if lower(worlds["M2"], worlds["M1"])[2] is Verdict.REPRODUCED
+    ]
+    where = f"B = {', '.join(less)}" if less else "no B tried"
     return "" if part.empty else f"with shared parameters at {where}"
 
 
@@ -180,9 +171,8 @@ def mx2(particles: pd.DataFrame, times: pd.DataFrame) -> list[Claim]:
     return claims
 
 
-def _share(id_: str, statistic: str, hits: pd.Series, criterion: str, **bounds: float) -> Claim:
-    share = share_interval(int(hits.sum()), len(hits))
-    return Claim(id_, statistic, share, criterion, judged(share, **bounds))
+def _share(claim: str, statistic: str, hits: pd.Series[bool], **judging: Any) -> Claim:
+    return banded(claim, statistic, share_interval(int(hits.sum()), len(hits)), **judging)
 
 
 def mx4(starts: pd.DataFrame) -> list[Claim]:
@@ -192,8 +182,8 @@ def mx4(starts: pd.DataFrame) -> list[Claim]:
             "MX4",
             f"share of starts that M2 localises within {WITHIN} steps, {NAMES[name]}",
             part["settled_at"] <= WITHIN,
-            "lower bound above 0.95",
             at_least=0.95,
+            criterion="lower bound above 0.95",
         )
         for name, part in starts.groupby("geometry", sort=False)
     ]
@@ -208,13 +198,13 @@ def mx5(clusters: pd.DataFrame) -> list[Claim]:
     asked = clusters[clusters["descriptor"] != "scan_context"]
     shares = asked.groupby(["geometry", "descriptor"], sort=False)["contiguous"]
     return [
-        Claim(
+        banded(
             "MX5",
             f"share of nodes with a route neighbour in their cluster, {NAMES[name]}"
             + (f", {descriptor}" if descriptor != "synthetic" else ""),
             mean_interval(part),
-            "above 0.8",
-            judged(mean_interval(part), at_least=0.8),
+            at_least=0.8,
+            criterion="above 0.8",
         )
         for (name, descriptor), part in shares
     ]
@@ -226,7 +216,6 @@ def mx6(starts: pd.DataFrame) -> Claim:
         "MX6",
         "share of starts localised on campus clouds (our own)",
         starts["settled_at"] <= WITHIN,
-        "at least 0.95",
         at_least=0.95,
     )
 
@@ -236,19 +225,21 @@ def mx7(starts: pd.DataFrame) -> Claim:
     worlds = starts.dropna(subset="rms_m").groupby("seed")[["spacing_m", "rms_m"]].mean()
     ratio = log_ratio_interval(worlds["spacing_m"], worlds["rms_m"])
     statistic = "node spacing over RMS error with refinement, campus clouds (our own)"
-    return Claim("MX7", statistic, ratio, "at least 5", judged(ratio, at_least=5.0))
+    return banded("MX7", statistic, ratio, at_least=5.0)
 
 
 def mx8(kidnapping: pd.DataFrame) -> list[Claim]:
     """Our own: a kidnapped robot is found again with injection, and not without."""
     known = kidnapping[kidnapping["known_before"]]
     back = known["settled_at"] <= RECOVERED_WITHIN
-    claims = []
-    for (name, injects), trials in back.groupby(
-        [known["geometry"], known["injection"] > 0.0], sort=False
-    ):
-        how, criterion, bounds = _MX8[injects]
-        statistic = f"share recovered within {RECOVERED_WITHIN} nodes {how} injection, "
-        statistic += f"{NAMES[name]} (our own)"
-        claims.append(_share("MX8", statistic, trials, criterion, **bounds))
-    return claims
+    trials = back.groupby([known["geometry"], known["injection"] > 0.0], sort=False)
+    return [
+        _share(
+            "MX8",
+            f"share recovered within {RECOVERED_WITHIN} nodes {'with' if injects else 'without'} "
+            f"injection, {NAMES[name]} (our own)",
+            recovered,
+            **({"at_least": 0.95} if injects else {"at_most": 0.5}),
+        )
+        for (name, injects), recovered in trials
+    ]

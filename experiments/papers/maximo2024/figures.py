@@ -9,7 +9,6 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, NullFormatter
 from numpy.typing import NDArray
 
 from estimators import descriptors as describers
@@ -22,7 +21,8 @@ from experiments.papers.maximo2024.settings import (
     RECOVERED_WITHIN,
 )
 from experiments.papers.results import Results
-from experiments.viewing.style import BLACK, BLUE, CYCLE, GREEN, ORANGE, RED, SKY, WALL, figure
+from experiments.viewing.plotting import plain_log, with_legend
+from experiments.viewing.style import BLACK, BLUE, CYCLE, GREEN, ORANGE, RED, SKY, WALL, subplots
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -56,8 +56,7 @@ def draw(made: Results) -> dict[str, Figure]:
 
 def data(campus: Arrays) -> Figure:
     """Figure 1: clouds at the nodes of the map and along the robot's way, seen from above."""
-    page = figure(6.0, 5.4)
-    ax = page.subplots()
+    page, ax = subplots(6.0, 5.4)
     here, there = campus["map_spots_m"], campus["query_spots_m"]
     ax.plot(*campus["map_clouds_m"].T, ".", color=BLUE, ms=2.6, mew=0)
     ax.plot(*campus["query_clouds_m"].T, ".", color=RED, ms=0.9, mew=0)
@@ -66,15 +65,15 @@ def data(campus: Arrays) -> Figure:
     # what lies within 40 m of the nodes
     shown = np.concatenate([line.get_xydata() for line in ax.get_lines()])
     near = shown[np.hypot(*(shown - here.mean(axis=0)).T) < 40.0]
-    (x_min, y_min), (x_max, y_max) = near.min(axis=0) - 4.0, near.max(axis=0) + 4.0
-    _plan(ax, xlim=(x_min, x_max), ylim=(y_min, y_max))
-    return _with_legend(page, 2)
+    xlim, ylim = zip(near.min(axis=0) - 4.0, near.max(axis=0) + 4.0, strict=True)
+    _plan(ax, xlim=xlim, ylim=ylim)
+    return with_legend(page, ncols=2)
 
 
 def clusters(drawn: dict[str, Arrays]) -> Figure:
     """Figure 2: 40 clusters of the nodes' descriptors by k-means."""
-    page = figure(10.0, 3.8)
-    for ax, (name, place) in zip(page.subplots(1, 3), drawn.items(), strict=True):
+    page, axes = subplots(10.0, 3.8, 1, 3)
+    for ax, (name, place) in zip(axes, drawn.items(), strict=True):
         # neighbours along the route get colours that differ
         order = np.unique(place["clusters"], return_index=True)[1]
         rank = np.argsort(np.argsort(order))[place["clusters"]]
@@ -88,14 +87,14 @@ def clusters(drawn: dict[str, Arrays]) -> Figure:
 
 def map_and_route(drawn: dict[str, Arrays]) -> Figure:
     """Figure 3: the nodes of the map and the positions of the queries."""
-    page = figure(10.0, 4.5)
-    for ax, (name, place) in zip(page.subplots(1, 3), drawn.items(), strict=True):
+    page, axes = subplots(10.0, 4.5, 1, 3)
+    for ax, (name, place) in zip(axes, drawn.items(), strict=True):
         walls = list(place.get("walls_m", ()))
         ax.add_collection(LineCollection(walls, colors=WALL, linewidths=0.5))
         ax.plot(*place["queries_m"].T, ".", color=RED, ms=2, label="queries")
         ax.plot(*place["nodes_m"].T, ".", color=BLUE, ms=2, label="nodes of the map")
         _plan(ax, title=NAMES[name])
-    return _with_legend(page, 2)
+    return with_legend(page, ncols=2)
 
 
 def dispersion(table: pd.DataFrame) -> Figure:
@@ -114,17 +113,17 @@ def dispersion(table: pd.DataFrame) -> Figure:
         axes[1].set(xlabel="step")
     columns[0][0][0].set(ylabel="dispersion, m")
     columns[0][0][1].set(ylabel="error, m")
-    return _with_legend(page, 3)
+    return with_legend(page, ncols=3)
 
 
 def starts(routes: dict[str, Arrays]) -> Figure:
     """Figure 5: error of M2 along the route from three starts."""
-    page = figure(9.0, 3.8)
-    for ax, (name, route) in zip(page.subplots(1, 2), routes.items(), strict=True):
+    page, axes = subplots(9.0, 3.8, 1, 2)
+    for ax, (name, route) in zip(axes, routes.items(), strict=True):
         for errors, colour in zip(route["start_errors_m"], CYCLE[:3], strict=True):
             start = int(np.argmax(np.isfinite(errors)))
-            mean = f"start {start}: mean {np.nanmean(errors):.2f} m"
-            ax.plot(errors, color=colour, lw=0.9, label=mean)
+            label = f"start {start}: mean {np.nanmean(errors):.2f} m"
+            ax.plot(errors, color=colour, lw=0.9, label=label)
             ax.plot(start, errors[start], "o", color=colour, ms=4)
         spacing = float(np.median(np.hypot(*np.diff(route["nodes_m"], axis=0).T)))
         ax.set_yscale("symlog", linthresh=spacing)
@@ -136,19 +135,19 @@ def starts(routes: dict[str, Arrays]) -> Figure:
 
 def particles(route: Arrays) -> Figure:
     """Figure 6: particles on the nodes at iterations 0, 5, 10 and 21."""
-    page = figure(9.0, 7.4)
+    page, axes = subplots(9.0, 7.4, 2, 2)
     robots = route["queries_m"][list(ITERATIONS)]
-    drawn = zip(ITERATIONS, robots, route["means_m"], route["particles_m"], strict=True)
-    for ax, (step, robot, mean, cloud) in zip(page.subplots(2, 2).flat, drawn, strict=True):
+    drawn = (axes.flat, ITERATIONS, robots, route["means_m"], route["particles_m"])
+    for ax, step, robot, mean, cloud in zip(*drawn, strict=True):
         places, counts = np.unique(cloud, axis=0, return_counts=True)
-        size = 12.0 + 160.0 * counts / counts.sum()
+        sizes = 12.0 + 160.0 * counts / counts.sum()
         ax.plot(*route["nodes_m"].T, ".", color="#BBBBBB", ms=2, label="nodes")
-        ax.scatter(*places.T, s=size, color=BLUE, alpha=0.7, lw=0, label="particles")
+        ax.scatter(*places.T, s=sizes, color=BLUE, alpha=0.7, lw=0, label="particles")
         ax.plot(*robot, "+", color=RED, ms=14, mew=1.5, label="robot")
         ax.plot(*mean, "x", color=BLACK, ms=8, label="estimate")
         error = np.hypot(*(mean - robot))
         _plan(ax, title=f"iteration {step}: on {len(places)} nodes, error {error:.1f} m")
-    return _with_legend(page, 4)
+    return with_legend(page, ncols=4)
 
 
 def table_1(table: pd.DataFrame, weighting: pd.DataFrame) -> Figure:
@@ -167,22 +166,20 @@ def table_1(table: pd.DataFrame, weighting: pd.DataFrame) -> Figure:
                 ax.errorbar(i + 0.3, row["paper_m"], yerr=row["paper_sd_m"], **bar)
         nearest = float(part["nearest_node_m"].iloc[0])
         ax.axhline(nearest, color=WALL, ls=":", lw=1, label="nearest node")
-        ax.set_xticks(range(3), METHODS)
-        ax.set(title=NAMES[name], xlim=(-0.5, 2.6))
+        ax.set(title=NAMES[name], xticks=range(3), xticklabels=METHODS, xlim=(-0.5, 2.6))
         _log_scale(ax)
         low, high = ax.get_ylim()
         ax.set_ylim(min(low, 0.5 * nearest), max(high, 5.0 * nearest))
     page.axes[0].set(ylabel="mean error over the route, m")
-    return _with_legend(page, 4)
+    return with_legend(page, ncols=4)
 
 
 def table_2(table: pd.DataFrame) -> Figure:
     """Table 2: error and time per node by the number of particles, beside the paper's."""
-    page = figure(9.0, 5.4)
+    page, axes = subplots(9.0, 5.4, 2, 2)
     here, paper = {"fmt": "o-", "color": BLUE}, {"fmt": "D--", "color": RED}
-    for (upper, lower), (name, part) in zip(
-        page.subplots(2, 2).T, table.groupby("geometry", sort=False), strict=True
-    ):
+    parts = table.groupby("geometry", sort=False)
+    for (upper, lower), (name, part) in zip(axes.T, parts, strict=True):
         n = part["particles"]
         upper.errorbar(n, part["error_m"], part["sd_repeats_m"], label="here", capsize=3, **here)
         upper.errorbar(n, part["paper_m"], part["paper_sd_m"], label="paper", capsize=3, **paper)
@@ -191,7 +188,7 @@ def table_2(table: pd.DataFrame) -> Figure:
         lower.errorbar(n, 1e3 * part["time_s"], **here)
         lower.errorbar(n, 1e3 * part["paper_time_s"], **paper)
         lower.set(xlabel="particles", ylabel="time a node, ms", yscale="log")
-    return _with_legend(page, 2)
+    return with_legend(page, ncols=2)
 
 
 def quality(table: pd.DataFrame) -> Figure:
@@ -224,13 +221,12 @@ def kidnapping(table: pd.DataFrame) -> Figure:
         ax.axvline(RECOVERED_WITHIN, color=WALL, ls=":", lw=1)
         ax.set(xlabel="nodes since the kidnapping", title=NAMES[name], ylim=(-0.03, 1.03))
     page.axes[0].set(ylabel="share recovered")
-    return _with_legend(page, 2)
+    return with_legend(page, ncols=2)
 
 
 def campus_errors(starts_table: pd.DataFrame, clusters_table: pd.DataFrame) -> Figure:
     """Refined errors on simulated clouds, and the retrieval of each descriptor there."""
-    page = figure(9.0, 3.6)
-    left, right = page.subplots(1, 2)
+    page, (left, right) = subplots(9.0, 3.6, 1, 2)
     left.ecdf(starts_table["median_m"].dropna(), color=BLUE, label="median of a start")
     left.ecdf(starts_table["rms_m"].dropna(), color=ORANGE, label="RMS of a start")
     spacing = float(starts_table["spacing_m"].mean())
@@ -258,10 +254,10 @@ def _columns(
 ) -> tuple[Figure, list[tuple[Any, str, pd.DataFrame]]]:
     """Page with a column for each geometry; the column's axes, the geometry and its rows."""
     names = geometries(table)
-    page = figure(width_in * len(names) + margin_in, height_in)
-    axes = page.subplots(n_rows, len(names), sharex=n_rows > 1, sharey=sharey, squeeze=False).T
+    size = (width_in * len(names) + margin_in, height_in, n_rows, len(names))
+    page, axes = subplots(*size, sharex=n_rows > 1, sharey=sharey, squeeze=False)
     parts = [table[table["geometry"] == name] for name in names]
-    return page, list(zip(axes, names, parts, strict=True))
+    return page, list(zip(axes.T, names, parts, strict=True))
 
 
 def _plan(ax: Axes, **settings: Any) -> None:
@@ -271,14 +267,5 @@ def _plan(ax: Axes, **settings: Any) -> None:
 
 def _log_scale(ax: Axes, bottom: float | None = None) -> None:
     """Errors on a log scale, decades as plain numbers and nothing between."""
-    ax.set_yscale("log")
-    ax.set_ylim(bottom=bottom)
-    ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    ax.yaxis.set_minor_formatter(NullFormatter())
-
-
-def _with_legend(page: Figure, ncols: int) -> Figure:
-    """Add one legend below all parts, of what the first of them shows."""
-    handles = page.axes[0].get_legend_handles_labels()
-    page.legend(*handles, loc="outside lower center", ncols=ncols)
-    return page
+    ax.set(yscale="log", ylim=(bottom, None))
+    plain_log(ax.yaxis, multiples=(1.0,))

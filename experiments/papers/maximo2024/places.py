@@ -21,12 +21,13 @@ from scipy.signal import lfilter
 
 from estimators import descriptors as describers
 from estimators.topological_map import TopologicalMap, from_arrays, from_recording, read_array
+from experiments.evaluation.metrics import travelled_m
 from experiments.runs.experiment import Experiment
 from experiments.runs.seeds import stream
 from sim import se2
 from sim.errors import InputError
 from sim.recording import CloudLog, PlaceLog, Recording, Truth, WheelLog
-from sim.robot import RobotGeometry
+from sim.robot import RobotGeometry, wheel_errors
 from sim.sensors import SensorSuite
 
 Array = NDArray[np.float64]
@@ -89,25 +90,24 @@ class PlaceWorld:
 
 def gaps_m(points_m: Array, nodes_m: Array) -> Array:
     """Distances (K, N) m of points (K, 2) to nodes (N, 2)."""
-    gaps: Array = np.hypot(*(points_m[:, None] - nodes_m[None]).transpose(2, 0, 1))
-    return gaps
+    return np.asarray(np.hypot(*(points_m[:, None] - nodes_m[None]).transpose(2, 0, 1)))
 
 
-def oxford_positions(path: Path | None) -> Array | None:
+def oxford_positions(path: Path) -> Array:
     """Positions (397, 2) m, east and north, of the paper's Oxford run, less their mean.
 
     Parameters
     ----------
     path
-        The positions' `.csv.gz` with columns run_name, set, northing_m and easting_m, or None.
+        The positions' `.csv.gz` with columns run_name, set, northing_m and easting_m.
 
     Raises
     ------
     InputError
-        If the file is there but holds something else.
+        If the file is missing or holds something else.
     """
-    if path is None or not path.is_file():
-        return None
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; set positions to null for a made route")
     try:
         table = pd.read_csv(path, compression="gzip", float_precision="round_trip")
         chosen = table[(table["run_name"] == OXFORD_RUN) & (table["set"] == "database")]
@@ -116,8 +116,7 @@ def oxford_positions(path: Path | None) -> Array | None:
         raise InputError(f"{path}: not the Oxford positions ({error}); leave it out") from error
     if len(positions) < 2:
         raise InputError(f"{path}: no database positions of run {OXFORD_RUN}")
-    positions -= positions.mean(axis=0)
-    return positions
+    return np.asarray(positions - positions.mean(axis=0))
 
 
 def route(geometry: Geometry, rng: np.random.Generator) -> Array:
@@ -160,8 +159,7 @@ def queries(nodes_m: Array, geometry: Geometry, rng: np.random.Generator) -> Arr
         angle = rng.uniform(-math.pi, math.pi) + turning
         length = geometry.offset_m + geometry.offset_sd_m * rng.standard_normal(n)
         offset = length[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    placed: Array = nodes_m + offset[:, :1] * forward + offset[:, 1:] * left
-    return placed
+    return np.asarray(nodes_m + offset[:, :1] * forward + offset[:, 1:] * left)
 
 
 def field(geometry: Geometry, nodes_m: Array, rng: np.random.Generator) -> Describe:
@@ -170,15 +168,14 @@ def field(geometry: Geometry, nodes_m: Array, rng: np.random.Generator) -> Descr
     The stretches, 40 along the route, crossfade into each other. The place's own part is a
     random Fourier feature map of the position, so that it changes smoothly and never repeats.
     """
-    g = geometry
-    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(nodes_m, axis=0).T))])
+    along = travelled_m(nodes_m)
     along /= max(along[-1], 1e-9)
     lengths = rng.uniform(0.5, 1.5, N_STRETCHES)
     middles = (np.cumsum(lengths) - lengths / 2.0) / lengths.sum()
     edges, width = (middles[1:] + middles[:-1]) / 2.0, 0.15 / N_STRETCHES
     stretches = rng.standard_normal((N_STRETCHES, SIZE))
     stretches /= np.linalg.norm(stretches, axis=1, keepdims=True)
-    waves = rng.standard_normal((2, SIZE)) / g.place_scale_m
+    waves = rng.standard_normal((2, SIZE)) / geometry.place_scale_m
     phases = rng.uniform(0.0, 2.0 * math.pi, SIZE)
 
     def describe(points_m: Array, rng: np.random.Generator) -> NDArray[np.float32]:
@@ -187,8 +184,8 @@ def field(geometry: Geometry, nodes_m: Array, rng: np.random.Generator) -> Descr
         shares = -np.diff(above, axis=1, prepend=1.0, append=0.0)
         place = math.sqrt(2.0 / SIZE) * np.cos(points_m @ waves + phases)
         noise = rng.standard_normal((len(points_m), SIZE)) / math.sqrt(SIZE)
-        whole = g.stretch_weight * (shares @ stretches) + g.place_weight * place
-        whole += g.noise_weight * noise
+        whole = geometry.stretch_weight * (shares @ stretches) + geometry.place_weight * place
+        whole += geometry.noise_weight * noise
         return np.asarray(whole / np.linalg.norm(whole, axis=1, keepdims=True), np.float32)
 
     return describe
@@ -202,8 +199,7 @@ def place_world(geometry: Geometry, seed: int, nodes_m: Array | None = None) -> 
     queries_m = queries(nodes_m, geometry, rng)
     describe = field(geometry, nodes_m, rng)
     known_map = from_arrays(nodes_m, describe(nodes_m, rng))
-    seen = describe(queries_m, rng)
-    slip = stream(seed, "slip")
+    seen, slip = describe(queries_m, rng), stream(seed, "slip")
     return PlaceWorld(known_map, query_recording(queries_m, seen, geometry.interval_s, slip))
 
 
@@ -226,12 +222,11 @@ def query_recording(
     heading = np.append(heading, heading[-1])
     travel = np.hypot(*moves.T)[:, None] * np.ones(2)
     travel += np.diff(heading)[:, None] * _CAR.track_m / 2.0 * np.array([1.0, -1.0])
-    wheels = travel + np.sqrt(k * np.abs(travel)) * rng.standard_normal(travel.shape)
-    stamps: Array = interval_s * np.arange(n, dtype=np.float64)
-    rolled = np.concatenate([np.zeros((1, 2)), np.cumsum(wheels, axis=0)])
+    stamps = interval_s * np.arange(n, dtype=np.float64)
+    rolled = np.cumsum(travel + wheel_errors(travel, k, rng), axis=0)
     return Recording(
         stamps,
-        WheelLog(stamps, rolled),
+        WheelLog(stamps, np.concatenate([np.zeros((1, 2)), rolled])),
         _CAR,
         SensorSuite(),
         truth=Truth(stamps, np.column_stack([positions_m, se2.wrap(heading)])),
@@ -246,9 +241,8 @@ def resequenced(recording: Recording, rows: NDArray[np.int64]) -> Recording:
     Rows 100, 101, ... start elsewhere on the route; a jump in the rows is a kidnapping that the
     wheels know nothing of. Rows count the place descriptors or, without them, the clouds.
     """
-    log = recording.places or recording.clouds
-    assert log is not None
-    stamps = log.stamps
+    places, clouds = recording.places, recording.clouds
+    stamps = (places or recording.known_clouds).stamps
     rolled = np.stack(
         [np.interp(stamps, recording.wheels.stamps, p) for p in recording.wheels.position_m.T],
         axis=1,
@@ -256,7 +250,6 @@ def resequenced(recording: Recording, rows: NDArray[np.int64]) -> Recording:
     lapses = np.diff(stamps, prepend=2.0 * stamps[0] - stamps[1])
     steps = np.diff(rolled, axis=0, prepend=2.0 * rolled[:1] - rolled[1:2])
     new_stamps = np.cumsum(lapses[rows])
-    places, clouds = recording.places, recording.clouds
     return dataclasses.replace(
         recording,
         frame_stamps=new_stamps,
@@ -272,9 +265,7 @@ def resequenced(recording: Recording, rows: NDArray[np.int64]) -> Recording:
 
 def described(recording: Recording, descriptor: str) -> Recording:
     """The recording with a place descriptor for each of its clouds."""
-    lidar, clouds = recording.sensors.lidar3d, recording.clouds
-    if lidar is None or clouds is None:
-        raise InputError("the recording has no 3D clouds to describe; choose sensors=lidar3d")
+    lidar, clouds = recording.sensors.known_lidar3d, recording.known_clouds
     kind = describers.kind(descriptor)
     rows = np.array([kind.describe(lidar, turn) for turn in clouds.ranges_m])
     return dataclasses.replace(recording, places=PlaceLog(clouds.stamps.copy(), rows))
@@ -321,9 +312,7 @@ def _route(
     geometry = GEOMETRIES[name]
     if noise_weight is not None:
         geometry = dataclasses.replace(geometry, noise_weight=noise_weight)
-    nodes = oxford_positions(Path(positions)) if positions is not None else None
-    if positions is not None and nodes is None:
-        raise InputError(f"{positions}: no such file; set positions to null for a made route")
+    nodes = None if positions is None else oxford_positions(Path(positions))
     return place_world(geometry, config["world_seed"], nodes)
 
 

@@ -11,17 +11,22 @@ import itertools
 import math
 from collections.abc import Callable
 
+import numpy as np
 import pandas as pd
-from joblib import Parallel, delayed
+from numpy.typing import NDArray
 
+from estimators.topological_map import from_recording
+from experiments.bench import topological
 from experiments.evaluation.verdict import Profile
-from experiments.papers.maximo2024.examples import write_examples
-from experiments.papers.maximo2024.places import GEOMETRIES
+from experiments.papers.jobs import in_parallel
+from experiments.papers.maximo2024.places import GEOMETRIES, resequenced
 from experiments.papers.maximo2024.settings import (
+    DRAWN_DESCRIPTOR,
     GRID_B,
     GRID_SIGMA_L,
     GRID_SIGMA_M,
     HELD,
+    ITERATIONS,
     JUDGED_SEED,
     METHODS,
     N_CAMPUSES,
@@ -36,9 +41,12 @@ from experiments.papers.maximo2024.settings import (
     TOLERANCE,
 )
 from experiments.papers.maximo2024.worlds import (
+    Case,
     Rows,
     campus_rows,
+    campus_runs,
     case_of,
+    cluster_labels,
     cluster_row,
     kidnapping_rows,
     localize,
@@ -50,6 +58,14 @@ from experiments.papers.maximo2024.worlds import (
 )
 from experiments.papers.results import Results
 from experiments.runs.seeds import stream
+from sim import se2
+from sim.recording import Recording
+
+Array = NDArray[np.float64]
+Arrays = dict[str, NDArray[np.generic]]
+
+_REACH_M = 65.0  # of the clouds kept, from the middle of the nodes drawn
+_CLOUD_GRID_M = 0.05
 
 
 def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) -> None:
@@ -67,23 +83,20 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
     campus = "campus" if profile is Profile.FULL else "campus_quick"
     oxford = "oxford_real" if POSITIONS.is_file() else "oxford"
     routes = dict.fromkeys(["oxford", "umh", oxford])  # each once
-    jobs = [(campus, JUDGED_SEED + i) for i in range(N_CAMPUSES[profile])]
-    jobs += [(name, JUDGED_SEED + i) for name in routes for i in range(N_WORLDS[profile])]
-    parts = Parallel(n_jobs=-1, return_as="generator")(
-        delayed(_rows)(name, seed, profile) for name, seed in jobs
-    )
+    jobs = [(campus, JUDGED_SEED + i, profile) for i in range(N_CAMPUSES[profile])]
+    jobs += [(name, JUDGED_SEED + i, profile) for name in routes for i in range(N_WORLDS[profile])]
     rows: dict[str, Rows] = {}
-    for done, ((name, seed), part) in enumerate(zip(jobs, parts, strict=True), start=1):
+    for (name, seed, _), part in zip(jobs, in_parallel(_rows, jobs, on_progress), strict=True):
         for table, found in part.items():
             labelled = ({"geometry": name, "seed": seed, **row} for row in found)
             rows.setdefault(table, []).extend(labelled)
-        on_progress(done / len(jobs))
     tables = {name: pd.DataFrame(found) for name, found in rows.items()} | {"times": times()}
     tables["table_1"] = table_1(tables["weighting"])
     tables["table_2"] = table_2(tables["particles"], tables["times"])
-    for name, table in tables.items():
-        out.write_table(name, table)
-    write_examples(out, [oxford, "umh"], campus)
+    out.write_tables(**tables)
+    for name in (oxford, "umh"):
+        out.write_arrays(name, **route_arrays(case_of(name, JUDGED_SEED)))
+    out.write_arrays(campus, **campus_arrays(campus))
 
 
 def _rows(name: str, seed: int, profile: Profile) -> dict[str, Rows]:
@@ -111,13 +124,10 @@ def _rows(name: str, seed: int, profile: Profile) -> dict[str, Rows]:
 
 def times() -> pd.DataFrame:
     """Table 2: time per node on one core, after the other jobs have ended."""
-    from experiments.bench.topological import PAPER_S
-    from experiments.bench.topological import run as measure
-
-    measured = {m.name: m.value for m in measure()}
+    measured = {measurement.name: measurement.value for measurement in topological.run()}
     rows = [
         (name, count, 1e-3 * measured[f"topological.node_{count}_ms"], paper_s)
-        for name, counts in PAPER_S.items()
+        for name, counts in topological.PAPER_S.items()
         for count, paper_s in counts.items()
     ]
     return pd.DataFrame(rows, columns=["geometry", "particles", "time_s", "paper_s"])
@@ -155,16 +165,98 @@ def _over_worlds(table: pd.DataFrame, by: str) -> pd.DataFrame:
     )
 
 
+# What the figures draw
+
+
+def route_arrays(case: Case) -> Arrays:
+    """Nodes, their clusters and queries; errors of M2 from three starts, particles of a fourth run.
+
+    Returns
+    -------
+    dict
+        `nodes_m` (N, 2), `clusters` (N,), `queries_m` (K, 2); `start_errors_m` (3, K), NaN before
+        the start; at `ITERATIONS` `means_m` (4, 2) and `particles_m` (4, M, 2).
+    """
+    n = len(case.recording.frame_stamps)
+    errors = np.full((3, n), np.nan)
+    for i, start in enumerate((0, n // 4, n // 2)):
+        part = resequenced(case.recording, np.arange(start, n))
+        rng = stream(case.seed, "estimator/figure", start)
+        errors[i, start:] = localize(case, options(case), rng, part).errors_m
+    rng, part = stream(case.seed, "estimator/figure", 6), case.recording.cut(ITERATIONS[-1] + 1)
+    found = localize(case, options(case), rng, part).estimate
+    steps = list(ITERATIONS)
+    return {
+        "nodes_m": case.known_map.positions_m,
+        "clusters": cluster_labels(case.known_map, case.seed),
+        "queries_m": case.recording.truth_at(case.recording.frame_stamps)[:, :2],
+        "start_errors_m": errors.astype(np.float32),
+        "means_m": found.means[steps, :2],
+        "particles_m": np.array(found.extras["particles"])[steps, :, :2].astype(np.float32),
+    }
+
+
+def campus_arrays(name: str) -> Arrays:
+    """Nodes, their clusters, queries and walls; clouds of four nodes and of four queries.
+
+    Returns
+    -------
+    dict
+        `nodes_m` (N, 2), `clusters` (N,), `queries_m` (K, 2), `walls_m` (W, 2, 2); where the
+        clouds were taken, `map_spots_m` and `query_spots_m` (4, 2), and what they show above
+        ground, `map_clouds_m` and `query_clouds_m` (P, 2).
+    """
+    experiments = campus_runs(name, JUDGED_SEED)
+    mapping, taking = (experiment.recording() for experiment in experiments)
+    spacing_m = experiments[0].config["prior"]["map"]["spacing_m"]
+    known = from_recording(mapping, DRAWN_DESCRIPTOR, spacing_m)
+    # where there is most to see within 40 m
+    seen = np.convolve(np.sum(known.slices_m < 40.0, axis=1), np.ones(4), "valid")
+    nodes = known.positions_m[np.argmax(seen) + np.arange(4)]
+    between = nodes + 0.4 * np.diff(nodes, axis=0, append=nodes[-1:])
+    map_spots, map_clouds = _clouds(mapping, nodes)
+    query_spots, query_clouds = _clouds(taking, between)
+    return {
+        "nodes_m": known.positions_m,
+        "clusters": cluster_labels(known, JUDGED_SEED),
+        "queries_m": taking.truth_at(taking.frame_stamps)[:, :2],
+        "walls_m": taking.known_world.walls.reshape(-1, 2, 2),
+        "map_spots_m": map_spots,
+        "map_clouds_m": map_clouds,
+        "query_spots_m": query_spots,
+        "query_clouds_m": query_clouds,
+    }
+
+
+def _clouds(recording: Recording, points_m: Array) -> tuple[Array, NDArray[np.float32]]:
+    """Where the clouds nearest to points (4, 2) were taken, and what they show above ground."""
+    lidar, clouds = recording.sensors.known_lidar3d, recording.known_clouds
+    poses = recording.truth_at(clouds.stamps)
+    rows = [int(np.argmin(np.hypot(*(poses[:, :2] - point).T))) for point in points_m]
+    shown = []
+    for row in rows:
+        points = lidar.points_in_sensor(clouds.ranges_m[row])
+        points = points[points[:, 2] + lidar.mount.z_m > 0.3]
+        shown.append(se2.transform(poses[row], points[:, :2]))
+    drawn = np.concatenate(shown)
+    drawn = drawn[np.hypot(*(drawn - points_m.mean(axis=0)).T) < _REACH_M]
+    cells = np.unique(np.round(drawn / _CLOUD_GRID_M), axis=0)  # a picture shows no more
+    return poses[rows, :2], (_CLOUD_GRID_M * cells).astype(np.float32)
+
+
+# Choosing the parameters
+
+
 def tune(out: Results, n_worlds: int = 12) -> None:
     """Mean error of every setting of the grid on seeds 0, 1, ...; the least is in `TUNED`.
 
     Takes some ten minutes on two cores. All methods see the same worlds and draws.
     """
     jobs = [(name, seed) for seed in range(n_worlds) for name in GEOMETRIES]
-    parts = Parallel(n_jobs=-1)(delayed(_tuning_rows)(*job) for job in jobs)
+    parts = in_parallel(_tuning_rows, jobs, lambda _share: None)
     columns = ["geometry", "method", "sigma_l", "sigma_m", "n_nearest", "error_m"]
-    table = pd.DataFrame([row for part in parts for row in part], columns=columns)
-    out.write_table("tuning", table.groupby(columns[:-1], as_index=False)["error_m"].mean())
+    table = pd.DataFrame(list(itertools.chain.from_iterable(parts)), columns=columns)
+    out.write_tables(tuning=table.groupby(columns[:-1], as_index=False)["error_m"].mean())
 
 
 def _tuning_rows(name: str, seed: int) -> list[tuple[str, str, float, float, int, float]]:

@@ -17,6 +17,7 @@ from scipy.cluster.vq import kmeans2
 from estimators import descriptors as describers
 from estimators.base import Estimate, Prior, run
 from estimators.topological_map import TopologicalMap, from_recording
+from experiments.evaluation.metrics import rms, travelled_m
 from experiments.papers.maximo2024.places import N_STRETCHES, UMH, described, gaps_m, resequenced
 from experiments.papers.maximo2024.settings import (
     CAMPUS_SHIFT_M,
@@ -150,24 +151,24 @@ def weighting_rows(case: Case, n_repeats: int) -> dict[str, Rows]:
 
     `M2_mode` is M2 with the mode's mean as its estimate in place of eq. (4).
     """
-    errors: Rows = []
-    steps: Rows = []
+    tables: dict[str, Rows] = {"weighting": [], "dispersion": []}
     taken = case.recording.truth_at(case.recording.frame_stamps)[:, :2]
     # what a topological estimate cannot beat
-    nearest = float(gaps_m(taken, case.known_map.positions_m).min(axis=1).mean())
+    nearest_m = float(gaps_m(taken, case.known_map.positions_m).min(axis=1).mean())
     for method in (*METHODS, "M2_mode"):
         settings = options(case, method[:2])
         settings |= {"estimate": "mode"} if method == "M2_mode" else {}
         walks = _repeated(case, settings, "estimator/topological_mcl", n_repeats)
-        label = {"method": method}
-        errors += [label | row | {"nearest_node_m": nearest} for row in _errors(walks)]
-        dispersion = np.mean([walk.dispersions_m[: WITHIN + 1] for walk in walks], axis=0)
-        error = np.mean([walk.errors_m[: WITHIN + 1] for walk in walks], axis=0)
-        steps += [
-            label | {"step": i, "dispersion_m": float(dispersion[i]), "error_m": float(error[i])}
-            for i in range(WITHIN + 1)
+        tables["weighting"] += [
+            {"method": method, **row, "nearest_node_m": nearest_m} for row in _errors(walks)
         ]
-    return {"weighting": errors, "dispersion": steps}
+        spread = np.mean([walk.dispersions_m[: WITHIN + 1] for walk in walks], axis=0)
+        error = np.mean([walk.errors_m[: WITHIN + 1] for walk in walks], axis=0)
+        tables["dispersion"] += [
+            {"method": method, "step": i, "dispersion_m": float(spread[i]), "error_m": float(e)}
+            for i, e in enumerate(error)
+        ]
+    return tables
 
 
 def particle_rows(case: Case, n_repeats: int) -> Rows:
@@ -201,8 +202,7 @@ def starts(
     case: Case, n_starts: int, settings: dict[str, Any], tolerance_m: float
 ) -> list[tuple[int, float, Walk]]:
     """Figure 5: starts all along the route, the step at which each is localized, and its run."""
-    runs = []
-    length = WITHIN + HELD
+    runs, length = [], WITHIN + HELD
     last = len(case.recording.frame_stamps) - length - 1
     for start in map(int, np.linspace(0, last, n_starts)):
         part = resequenced(case.recording, np.arange(start, start + length))
@@ -274,12 +274,10 @@ def quality_rows(name: str, seed: int) -> Rows:
 
 def _retrieval(known_map: TopologicalMap, recording: Recording) -> dict[str, float]:
     """Retrieval quality; right is a node within 25 m in Oxford, else within 1.5 spacings."""
-    assert recording.places is not None
-    kind = describers.KINDS.get(known_map.descriptor)
+    places, kind = recording.known_places, describers.KINDS.get(known_map.descriptor)
     compare = kind.distances if kind else describers.euclidean
-    rows = recording.places.descriptors
-    distances = np.array([compare(row, known_map.descriptors) for row in rows])
-    here = recording.truth_at(recording.places.stamps)[:, :2]
+    distances = np.array([compare(row, known_map.descriptors) for row in places.descriptors])
+    here = recording.truth_at(places.stamps)[:, :2]
     within_m = 25.0 if known_map.spacing_m > 15.0 else 1.5 * known_map.spacing_m
     return describers.retrieval(distances, gaps_m(here, known_map.positions_m), within_m)
 
@@ -291,8 +289,7 @@ def cluster_labels(known_map: TopologicalMap, seed: int) -> NDArray[np.int64]:
     streams = [stream(seed, "clusters", start) for start in range(5)]
     found = [kmeans2(features, n_clusters, minit="++", seed=rng) for rng in streams]
     costs = [np.sum((features - centres[labels]) ** 2) for centres, labels in found]
-    labels: NDArray[np.int64] = found[int(np.argmin(costs))][1].astype(np.int64)
-    return labels
+    return np.asarray(found[int(np.argmin(costs))][1], np.int64)
 
 
 def cluster_row(known_map: TopologicalMap, recording: Recording, descriptor: str, seed: int) -> Row:
@@ -354,8 +351,7 @@ def campus_rows(name: str, seed: int, n_repeats: int) -> dict[str, Rows]:
 
 def _one_query_a_node(case: Case) -> Case:
     """As the paper has it: one query a node, the filter as printed, nothing tuned for it."""
-    poses = case.recording.truth_at(case.recording.frame_stamps)
-    gone = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T))])
+    gone = travelled_m(case.recording.truth_at(case.recording.frame_stamps))
     rows = np.unique(np.searchsorted(gone, np.arange(0.0, gone[-1], case.known_map.spacing_m)))
     printed = Experiment.compose(["estimator=topological_mcl_paper"]).config["estimator"]
     experiment = case.experiment.replaced(estimator=printed)
@@ -368,15 +364,15 @@ def _campus_starts(case: Case) -> Rows:
     spacing_m = case.known_map.spacing_m
     for start, settled, walk in starts(case, 60, {}, spacing_m):
         after = walk.errors_m[int(settled) :] if math.isfinite(settled) else np.array([math.nan])
-        refined = [state == "ok" for state in walk.estimate.extras["refinement"]]
+        refinement = walk.estimate.extras["refinement"]
         rows.append(
             {
                 "start": start,
                 "spacing_m": spacing_m,
                 "settled_at": settled,
-                "rms_m": float(np.sqrt(np.mean(after**2))),
+                "rms_m": rms(after),
                 "median_m": float(np.median(after)),
-                "refined": float(np.mean(refined)),
+                "refined": float(np.mean([state == "ok" for state in refinement])),
             }
         )
     return rows

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from experiments.papers.mcl_office.settings import WITHIN_M
 from experiments.papers.results import Results
-from experiments.viewing.style import BLUE, RED, WALL, figure
+from experiments.viewing.style import BLUE, RED, WALL, subplots
 
 
 def draw(made: Results) -> dict[str, Figure]:
@@ -18,8 +18,7 @@ def draw(made: Results) -> dict[str, Figure]:
 
 def found_by(starts: pd.DataFrame) -> Figure:
     """Draw the share of starts localised against travel, and the starts by office."""
-    page = figure(9.0, 3.6)
-    left, right = page.subplots(1, 2)
+    page, (left, right) = subplots(9.0, 3.6, 1, 2)
     found_m = np.sort(starts["found_m"][np.isfinite(starts["found_m"])])
     share = np.arange(len(found_m) + 1) / len(starts)
     left.step([0.0, *found_m, WITHIN_M], [*share, share[-1]], where="post", color=BLUE)
@@ -33,7 +32,11 @@ def found_by(starts: pd.DataFrame) -> Figure:
         missed = np.full(len(office) - len(found), WITHIN_M + 1.0)
         right.plot(found, np.full(len(found), i), "|", color=BLUE, ms=9)
         right.plot(missed, np.full(len(missed), i), "x", color=RED, ms=5)
-    right.set(xlabel="travel until localised, m (x: not within 30 m)", xlim=(-0.5, 32))
-    right.set_yticks(range(len(offices)), [str(seed) for seed in offices.groups])
-    right.set_ylabel("office, by seed")
+    right.set(
+        xlabel="travel until localised, m (x: not within 30 m)",
+        ylabel="office, by seed",
+        xlim=(-0.5, 32),
+        yticks=range(len(offices)),
+        yticklabels=list(offices.groups),
+    )
     return page

@@ -7,17 +7,18 @@ filter begins without a pose and is judged over the next 40 m.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Callable
 
-import joblib
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from experiments.evaluation.metrics import heading_errors_rad, position_errors_m
+from experiments.evaluation.metrics import heading_errors_rad, position_errors_m, travelled_m
 from experiments.evaluation.statistics import bootstrap_interval, share_interval
 from experiments.evaluation.verdict import Profile
+from experiments.papers.jobs import in_parallel
 from experiments.papers.mcl_office.settings import FOR_M, NEAR_M, NEAR_RAD, WITHIN_M
 from experiments.papers.results import Results
 from experiments.runs.console import RunFailedError
@@ -41,15 +42,10 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
         Called with the share done.
     """
     n_starts, fewer = (20, []) if profile is Profile.FULL else (3, ["seed=range(1000,1004)"])
-    offices = list(planned(["study=mcl_office", *fewer]))
-    jobs = (joblib.delayed(starts)(office, n_starts) for office in offices)
-    rows: list[Row] = []
-    for i, found in enumerate(joblib.Parallel(n_jobs=-1, return_as="generator")(jobs)):
-        rows += found
-        on_progress((i + 1) / len(offices))
-    table = pd.DataFrame(rows)
-    out.write_table("starts", table)
-    out.write_table("share", localised_share(table))
+    jobs = [(office, n_starts) for office in planned(["study=mcl_office", *fewer])]
+    rows = itertools.chain.from_iterable(in_parallel(starts, jobs, on_progress))
+    table = pd.DataFrame(list(rows))
+    out.write_tables(starts=table, share=localised_share(table))
 
 
 def localised_share(table: pd.DataFrame) -> pd.DataFrame:
@@ -100,7 +96,7 @@ def starts(experiment: Experiment, n_starts: int) -> list[Row]:
     if recording.status != "ok":
         raise RunFailedError(f"seed {experiment.seed}: the drive ended early: {recording.status}")
     truth = recording.truth_at(recording.frame_stamps)
-    travel_m = np.insert(np.cumsum(np.hypot(*np.diff(truth[:, :2], axis=0).T)), 0, 0.0)
+    travel_m = travelled_m(truth)
     last_m = travel_m[-1] - WITHIN_M - FOR_M - 1.0
     first_rows = np.searchsorted(travel_m, (np.arange(n_starts) + 0.5) / n_starts * last_m)
     return [

@@ -10,14 +10,17 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from experiments.evaluation.statistics import Interval, mean_interval, share_interval
-from experiments.evaluation.verdict import Claim, Verdict, holds, judged, overall
+from experiments.evaluation.verdict import Claim, Verdict, banded, holds, judged, overall
 from experiments.papers.puzzlebot2024.settings import NOMINAL
 from experiments.papers.results import Results
 
 Array = NDArray[np.float64]
 
-PRINTED_1 = ((0.5, 0.01, 0.01), (0.01, 0.5, 0.01), (0.01, 0.01, 0.2))
-PRINTED_2 = ((0.9998, 0.0207, 0.0180), (0.0207, 1.0040, 0.0399), (0.0180, 0.0399, 0.4000))
+# Sigma_1 and Sigma_2 as printed, each with half a unit of its last digit
+PRINTED = (
+    (((0.5, 0.01, 0.01), (0.01, 0.5, 0.01), (0.01, 0.01, 0.2)), 0.005),
+    (((0.9998, 0.0207, 0.0180), (0.0207, 1.0040, 0.0399), (0.0180, 0.0399, 0.4000)), 0.00005),
+)
 
 
 def judge(made: Results) -> list[Claim]:
@@ -46,10 +49,9 @@ def worked_matrices() -> tuple[Array, Array]:
 
 def pb1() -> list[Claim]:
     """PB1: the worked matrices come out to the printed digit (0.998 read as 0.9998)."""
-    first, second = worked_matrices()
     worst = max(
-        float(np.abs(first - PRINTED_1).max()) / 0.005,
-        float(np.abs(second - PRINTED_2).max()) / 0.00005,
+        float(np.abs(worked - printed).max()) / half_unit
+        for worked, (printed, half_unit) in zip(worked_matrices(), PRINTED, strict=True)
     )
     statistic = "largest deviation of Sigma_1 and Sigma_2, in half units of the last printed digit"
     return [Claim("PB1", statistic, Interval.exact(worst), "at most 1", holds(worst <= 1.0))]
@@ -62,15 +64,13 @@ def pb2(areas: pd.DataFrame, crossover: pd.DataFrame, track_m: float) -> list[Cl
         steps = np.concatenate([np.diff(part["area_m2"]) for _, part in table.groupby("k_m")])
         shrinking = float(np.mean(steps < -1e-9 * table["area_m2"].max()))
         statistic = f"share of steps in which the 95 % ellipse shrinks, {name}"
-        found, verdict = Interval.exact(shrinking), holds(shrinking <= 0.0)
+        judgement = ("0", holds(shrinking <= 0.0), "")
         if name == "out and back":
-            shown = ("shown, not judged", Verdict.SHOWN, "it shrinks on the way back")
-            claims.append(Claim("PB2", statistic, found, *shown))
-        else:
-            claims.append(Claim("PB2", statistic, found, "0", verdict))
+            judgement = ("shown, not judged", Verdict.SHOWN, "it shrinks on the way back")
+        claims.append(Claim("PB2", statistic, Interval.exact(shrinking), *judgement))
     ratio = mean_interval(crossover["crossover_m"] / (track_m * math.sqrt(3.0) / 2.0))
     statistic = "distance at which heading-borne spread overtakes, over track sqrt(3) / 2"
-    return [*claims, _within("PB2", statistic, ratio, 0.98, 1.02)]
+    return [*claims, banded("PB2", statistic, ratio, 0.98, 1.02)]
 
 
 def pb3(calibration: pd.DataFrame, descent: pd.DataFrame, engine_k: pd.DataFrame) -> list[Claim]:
@@ -88,23 +88,27 @@ def pb3(calibration: pd.DataFrame, descent: pd.DataFrame, engine_k: pd.DataFrame
         for names, part in parts.items():
             share = _clustered_share(part["truth"].between(part["low"], part["high"]), part["seed"])
             label = f"coverage of the 95 % intervals of {names}: {where}"
-            claims.append(_within("PB3", label, share, 0.90, 0.99))
+            claims.append(banded("PB3", label, share, 0.90, 0.99))
         relative = slips["value"] / slips["truth"] - 1.0
         biases = [mean_interval(part) for _, part in relative.groupby(slips["parameter"])]
         worse = max(biases, key=lambda bias: abs(bias.value))
-        claim = _within(
-            "PB3", f"relative bias, the worse of kr and kl: {where}", worse, -0.05, 0.05
-        )
+        label = f"relative bias, the worse of kr and kl: {where}"
         verdict = overall([judged(bias, -0.05, 0.05) for bias in biases])
+        claim = banded("PB3", label, worse, -0.05, 0.05)
         claims.append(dataclasses.replace(claim, verdict=verdict))
-    for row in engine_k.itertuples():
-        ratio = Interval(*(value / row.truth for value in (row.value, row.low, row.high)))
-        label = (
-            f"{row.parameter} of PyBullet's robot by wheel truth, over the truth, k = {row.k_m:g} m"
-        )
-        claims.append(_within("PB3", label, ratio, 0.95, 1.05))
     return [
         *claims,
+        *(
+            banded(
+                "PB3",
+                f"{row.parameter} of PyBullet's robot by wheel truth, over the truth, "
+                f"k = {row.k_m:g} m",
+                Interval(row.value / row.truth, row.low / row.truth, row.high / row.truth),
+                0.95,
+                1.05,
+            )
+            for row in engine_k.itertuples()
+        ),
         Claim(
             "PB3",
             "the report's gradient descent: largest distance of its limit from 1/2, any data",
@@ -135,14 +139,13 @@ def pb4(coverage: pd.DataFrame, engine: pd.DataFrame) -> list[Claim]:
                 f"{parts.count(Verdict.REPRODUCED)} of {len(parts)} manoeuvres within",
             )
         )
-    gap = mean_interval(_engine_gap(engine))
     claims.append(
-        Claim(
+        banded(
             "PB4",
             "distance of PyBullet's end from the kinematic robot's, same noise, over the spread",
-            gap,
-            "below 0.05: the kinematic robot stands for PyBullet's",
-            judged(gap, at_most=0.05),
+            mean_interval(_engine_gap(engine)),
+            at_most=0.05,
+            criterion="below 0.05: the kinematic robot stands for PyBullet's",
         )
     )
     left = [k for k, verdict in verdicts.items() if verdict is Verdict.NOT_REPRODUCED]
@@ -165,8 +168,7 @@ def _engine_gap(engine: pd.DataFrame) -> pd.Series[float]:
     kinematic = engine.filter(like="kinematic_")
     spread = kinematic.groupby(engine["case"]).transform("std")
     gap = (engine.filter(like="bullet_").to_numpy() - kinematic) / spread
-    per_seed: pd.Series[float] = (gap**2).mean(axis=1).groupby(engine["seed"]).mean() ** 0.5
-    return per_seed
+    return (gap**2).mean(axis=1).groupby(engine["seed"]).mean() ** 0.5
 
 
 def _clustered_share(hits: pd.Series[bool], seeds: pd.Series[int]) -> Interval:
@@ -180,8 +182,3 @@ def _clustered_share(hits: pd.Series[bool], seeds: pd.Series[int]) -> Interval:
     together = max(1.0, float(by_seed.var()) / alone) if alone > 0.0 else 1.0
     trials = round(len(hits) / together)
     return dataclasses.replace(share_interval(round(share * trials), trials), value=share)
-
-
-def _within(claim: str, statistic: str, found: Interval, low: float, high: float) -> Claim:
-    """Judge a statistic by a band."""
-    return Claim(claim, statistic, found, f"within {low:g} and {high:g}", judged(found, low, high))

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from experiments.papers.puzzlebot2024.settings import CALIBRATION_RUNS, NOMINAL, TABLE_1_K_M
 from experiments.papers.results import Results
-from experiments.viewing.run_figure import covariance_ellipse
-from experiments.viewing.style import BLACK, BLUE, CYCLE, ORANGE, figure
+from experiments.viewing.plotting import draw_ellipses, plain_ticks, with_legend
+from experiments.viewing.style import BLACK, BLUE, CYCLE, ORANGE, subplots
 
 Arrays = Mapping[str, NDArray[Any]]
 
@@ -42,38 +42,36 @@ def draw(made: Results) -> dict[str, Figure]:
 
 def ideal_and_real(square: Arrays) -> Figure:
     """Draw the report's RViz view: the ideal robot with its ellipses, and real robots."""
-    page, means = figure(9.0, 4.4), square["ideal_m"]
+    page, axes = subplots(9.0, 4.4, 1, 2)
+    means = square["ideal_m"]
+    some = np.linspace(0, len(means) - 1, 15).astype(int)[1:]
     parts = (square[name] for name in ("kr_kl_m", "real_m", "covariances_m2"))
-    for ax, (kr, kl), real, covariances in zip(page.subplots(1, 2), *parts, strict=True):
+    for ax, (kr, kl), real, covariances in zip(axes, *parts, strict=True):
         ax.plot(*real[1:].T, color=ORANGE, lw=0.4, alpha=0.35)
         ax.plot(*real[0].T, color=ORANGE, lw=1.2, label=f"real robot ({len(real)} runs)")
         ax.plot(*real[:, -1].T, ".", color=ORANGE, ms=3)
         ax.plot(*means.T, color=BLUE, lw=1.4, label="ideal robot")
-        for i in np.linspace(0, len(means) - 1, 15).astype(int)[1:]:
-            ellipse = covariance_ellipse(means[i], covariances[i])
-            ellipse.set(facecolor="none", edgecolor=BLUE, linewidth=0.9)
-            ellipse.set_label("95 % ellipse" if i == len(means) - 1 else "")
-            ax.add_patch(ellipse)
-        ax.set(xlabel="x, m", ylabel="y, m", aspect="equal")
-        ax.set_title(f"$k_r$ = {kr:.2g} m, $k_l$ = {kl:.2g} m")
-    page.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=3)
-    return page
+        draw_ellipses(
+            ax, means[some], covariances[some], "95 % ellipse", fill=False, color=BLUE, lw=0.9
+        )
+        title = f"$k_r$ = {kr:.2g} m, $k_l$ = {kl:.2g} m"
+        ax.set(xlabel="x, m", ylabel="y, m", aspect="equal", title=title)
+    return with_legend(page, ncols=3)
 
 
 def ellipse_area(areas: pd.DataFrame, crossover: pd.DataFrame, straight: Arrays) -> Figure:
     """Draw the 95 % ellipse's area against distance, and where heading takes over."""
-    page = figure(9.0, 3.8)
-    left, right = page.subplots(1, 2)
+    page, (left, right) = subplots(9.0, 3.8, 1, 2)
     for i, (name, table) in enumerate(areas.groupby("manoeuvre", sort=False)):
         for k, part in table.groupby("k_m"):
-            style = "-" if k < 5e-5 else "--"
-            label = f"{name}, k = {k:g} m"
-            left.plot(part["distance_m"], part["area_m2"], style, color=CYCLE[i], label=label)
+            left.plot(
+                part["distance_m"], part["area_m2"], "-" if k < 5e-5 else "--", color=CYCLE[i],
+                label=f"{name}, k = {k:g} m",
+            )  # fmt: skip
     left.set(xlabel="distance rolled, m", ylabel="area of the 95 % ellipse, m²", yscale="log")
     left.set_ylim(bottom=1e-6)
-    page.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=3)
     _crossover(right, crossover, straight)
-    return page
+    return with_legend(page, ncols=3)
 
 
 def _crossover(ax: Axes, crossover: pd.DataFrame, straight: Arrays) -> None:
@@ -97,8 +95,7 @@ def _crossover(ax: Axes, crossover: pd.DataFrame, straight: Arrays) -> None:
 def calibration(table: pd.DataFrame) -> Figure:
     """Draw the estimates over the truth by method and wheel, their mean interval and coverage."""
     ks = sorted(table["k_m"].unique())
-    page = figure(9.0, 6.4)
-    axes = page.subplots(2, len(ks), sharex=True, sharey=True)
+    page, axes = subplots(9.0, 6.4, 2, len(ks), sharex=True, sharey=True)
     rows = [(method, name) for method in _METHODS for name in _PARAMETERS]
     for joint, line in zip((False, True), axes, strict=True):
         for ax, k in zip(line, ks, strict=True):
@@ -110,10 +107,9 @@ def calibration(table: pd.DataFrame) -> Figure:
             arm = "gain and track joint" if joint else "nominal geometry"
             ax.set_title(f"k = {k:g} m, {arm}", fontsize="small")
     labels = [f"{_METHODS[method]}, {_PARAMETERS[name]}" for method, name in rows]
-    axes[0, 0].set(xscale="log", xlim=(0.55, 6.5), yticks=range(len(rows)))
-    axes[0, 0].set_yticklabels(labels[::-1])
-    axes[0, 0].set_xticks([0.7, 1.0, 1.5, 2.0, 3.0, 4.0], ["0.7", "1", "1.5", "2", "3", "4"])
-    axes[0, 0].minorticks_off()
+    ticks = {"yticks": range(len(rows)), "yticklabels": labels[::-1]}
+    axes[0, 0].set(xscale="log", xlim=(0.55, 6.5), **ticks)
+    plain_ticks(axes[0, 0], [0.7, 1.0, 1.5, 2.0, 3.0, 4.0])
     page.supxlabel(
         "estimate over the truth: histogram, its mean (dot), mean 95 % interval (bar); "
         "at the right, the share of intervals that cover",
@@ -138,8 +134,7 @@ def _estimates(ax: Axes, part: pd.DataFrame, level: int, color: str) -> None:
 
 def table_1(table: pd.DataFrame) -> Figure:
     """Print table 1 of the report, with our robots' ends and kr, kl from each case alone."""
-    page = figure(9.0, 3.4)
-    ax = page.subplots()
+    page, ax = subplots(9.0, 3.4)
     ax.axis("off")
     header = (
         "case", "v, m/s", "ω, rad/s", "T, s", "ideal x, m", "real x, m", "ideal θ, rad",
@@ -167,8 +162,7 @@ def table_1(table: pd.DataFrame) -> Figure:
     drawn.scale(1.0, 1.35)
     for (row_number, _), cell in drawn.get_celld().items():
         cell.set_edgecolor("#cccccc")
-        if row_number == 0:
-            cell.set_text_props(weight="bold")
+        cell.set_text_props(weight="normal" if row_number else "bold")
     ax.set_title(
         f"table 1, {CALIBRATION_RUNS} runs a case; true $k_r$ = {1.5e4 * TABLE_1_K_M:g}e-4 m, "
         f"$k_l$ = {0.5e4 * TABLE_1_K_M:g}e-4 m",
@@ -179,13 +173,13 @@ def table_1(table: pd.DataFrame) -> Figure:
 
 def coverage(table: pd.DataFrame) -> Figure:
     """Draw the share of true ends in the ideal robot's ellipse and ellipsoid against k."""
-    page = figure(9.0, 4.0)
-    axes = page.subplots(1, 2, sharey=True)
-    titles = {
-        "in_ellipse": "position in the 95 % ellipse",
-        "in_ellipsoid": "pose in the 95 % ellipsoid",
-    }
-    for ax, (column, title) in zip(axes, titles.items(), strict=True):
+    page, axes = subplots(9.0, 4.0, 1, 2, sharey=True)
+    for ax, column, title in zip(
+        axes,
+        ("in_ellipse", "in_ellipsoid"),
+        ("position in the 95 % ellipse", "pose in the 95 % ellipsoid"),
+        strict=True,
+    ):
         ax.axhspan(0.93, 0.97, color=BLACK, alpha=0.1, lw=0, label="0.93 to 0.97")
         for i, (name, part) in enumerate(table.groupby("case", sort=False)):
             share = part[column] / part["runs"]
@@ -204,5 +198,4 @@ def coverage(table: pd.DataFrame) -> Figure:
         ax.set(xlabel="k, m ($k_r$ = 1.5 k, $k_l$ = 0.5 k)", xscale="log", title=title)
         ax.set_xlim(table["k_m"].min() * 0.7, table["k_m"].max() * 1.4)
     axes[0].set_ylabel("share of runs")
-    page.legend(*axes[0].get_legend_handles_labels(), loc="outside right center")
-    return page
+    return with_legend(page, ncols=1, loc="outside right center")

@@ -12,7 +12,6 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-import joblib
 import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
@@ -25,8 +24,9 @@ from experiments.calibration.calibrate import calibrate_recordings, end_pose
 from experiments.calibration.end_poses import Manoeuvre, from_end_poses
 from experiments.calibration.result import CalibrationResult
 from experiments.calibration.wheel_truth import from_wheel_truth
-from experiments.evaluation.metrics import ellipse_area_m2
+from experiments.evaluation.metrics import ellipse_area_m2, travelled_m
 from experiments.evaluation.verdict import Profile
+from experiments.papers.jobs import in_parallel
 from experiments.papers.puzzlebot2024.settings import (
     AREA_K_M,
     CALIBRATION_RUNS,
@@ -65,23 +65,18 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
     on_progress
         Called with the share done.
     """
-    out.write_table("areas", areas())
-    out.write_table("crossover", crossover())
+    out.write_tables(areas=areas(), crossover=crossover(), gradient_descent=gradient_descent())
     out.write_arrays("drawn", **drawn())
-    on_progress(0.05)
     calibrated = calibration(
         arms("calibration"), CALIBRATIONS[profile], lambda share: on_progress(0.05 + 0.65 * share)
     )
-    out.write_table("calibration", calibrated)
     covered = arms("coverage")
-    out.write_table("table_1", table_1(next(a for a in covered if a.k_m == TABLE_1_K_M)))
-    on_progress(0.75)
-    out.write_table("coverage", coverage(covered, COVERAGE_RUNS[profile]))
+    once = table_1(next(arm for arm in covered if arm.k_m == TABLE_1_K_M))
+    out.write_tables(calibration=calibrated, table_1=once)
+    out.write_tables(coverage=coverage(covered, COVERAGE_RUNS[profile]))
     on_progress(0.85)
     driven = engine_recordings(*ENGINE_OVERRIDES[profile])
-    out.write_table("engine", engine_ends(driven))
-    out.write_table("engine_k", engine_k(driven))
-    out.write_table("gradient_descent", gradient_descent())
+    out.write_tables(engine=engine_ends(driven), engine_k=engine_k(driven))
     on_progress(1.0)
 
 
@@ -138,11 +133,14 @@ def areas() -> pd.DataFrame:
     parts = []
     for k, (name, route) in itertools.product(AREA_K_M, LOOPS.items()):
         promised = ideal(route, k, k)
-        steps = np.hypot(*np.diff(promised.means[:, :2], axis=0).T)
-        rolled = np.concatenate([[0.0], np.cumsum(steps)])
-        columns = {"distance_m": rolled, "area_m2": ellipse_area_m2(promised.covariances)}
-        labels = {"manoeuvre": name, "k_m": k, "stamp_s": promised.stamps}
-        parts.append(pd.DataFrame(labels | columns))
+        columns = {
+            "manoeuvre": name,
+            "k_m": k,
+            "stamp_s": promised.stamps,
+            "distance_m": travelled_m(promised.means),
+            "area_m2": ellipse_area_m2(promised.covariances),
+        }
+        parts.append(pd.DataFrame(columns))
     return pd.concat(parts, ignore_index=True)
 
 
@@ -186,17 +184,17 @@ def drawn() -> dict[str, NDArray[np.float32]]:
     robots = arms("square")
     route = robots[0].routes["open_loop"]
     real = [
-        run_batch(a.robot, route, SQUARE_RUNS, stream(a.seed, "slip"), sample_s=0.1).poses
-        for a in robots
+        run_batch(arm.robot, route, SQUARE_RUNS, stream(arm.seed, "slip"), sample_s=0.1).poses
+        for arm in robots
     ]
-    ellipses = [ideal(route, a.robot.kr, a.robot.kl) for a in robots]
+    ellipses = [ideal(route, arm.robot.kr, arm.robot.kl) for arm in robots]
     straight = Experiment.compose(["study=puzzlebot2024_crossover"])
     promised = ideal(straight.route(), straight.robot().kr, straight.robot().kl)
     values = {
-        "kr_kl_m": [a.robot.slip_variance_per_m for a in robots],
+        "kr_kl_m": [arm.robot.slip_variance_per_m for arm in robots],
         "real_m": np.array(real)[..., :2],
         "ideal_m": ellipses[0].means[:, :2],
-        "covariances_m2": [e.covariances[:, :2, :2] for e in ellipses],
+        "covariances_m2": [each.covariances[:, :2, :2] for each in ellipses],
         "distance_m": promised.means[:, 0],
         "sigma_m": np.sqrt(np.diagonal(promised.covariances, axis1=1, axis2=2)[:, :2]),
     }
@@ -206,16 +204,16 @@ def drawn() -> dict[str, NDArray[np.float32]]:
 def calibrate_once(arm: Arm) -> list[CalibrationResult]:
     """Calibrate by all methods on one set of runs: each manoeuvre 20 times."""
     rng, draws = stream(arm.seed, "slip"), stream(arm.seed, "samples")
-    batches = {
-        name: run_batch(arm.robot, route, CALIBRATION_RUNS, rng, nominal_track_m=NOMINAL.track_m)
-        for name, route in arm.routes.items()
-    }
+    batches = [
+        run_batch(arm.robot, route, CALIBRATION_RUNS, rng, nominal_track_m=NOMINAL.track_m)
+        for route in arm.routes.values()
+    ]
     manoeuvres = [
-        Manoeuvre(route.profile(NOMINAL), batches[name].end_poses)
-        for name, route in arm.routes.items()
+        Manoeuvre(route.profile(NOMINAL), batch.end_poses)
+        for route, batch in zip(arm.routes.values(), batches, strict=True)
     ]
     return [
-        from_batches(list(batches.values()), geometry=arm.joint),
+        from_batches(batches, geometry=arm.joint),
         from_end_poses(manoeuvres, NOMINAL, draws, method="sampled", geometry=arm.joint),
         from_end_poses(manoeuvres, NOMINAL, draws, method="linearised", geometry=arm.joint),
     ]
@@ -234,24 +232,25 @@ def calibration(
 ) -> pd.DataFrame:
     """Repeat the calibration of each robot, on all cores."""
     repeated = [
-        dataclasses.replace(arm, seed=arm.seed + repetition)
+        [dataclasses.replace(arm, seed=arm.seed + repetition)]
         for repetition in range(n_repetitions)
         for arm in robots
     ]
-    calls = (joblib.delayed(_calibration_rows)(arm) for arm in repeated)
-    rows: list[Row] = []
-    for done, part in enumerate(joblib.Parallel(n_jobs=-1, return_as="generator")(calls), start=1):
-        rows += part
-        on_progress(done / len(repeated))
-    return pd.DataFrame(rows)
+    parts = in_parallel(_calibration_rows, repeated, on_progress)
+    return pd.DataFrame(list(itertools.chain.from_iterable(parts)))
 
 
 def _calibration_rows(arm: Arm) -> list[Row]:
-    labels: Row = {"k_m": arm.k_m, "joint": arm.joint, "seed": arm.seed}
     return [
-        labels
-        | {"method": result.method, "parameter": name, "truth": getattr(arm.robot, name)}
-        | dataclasses.asdict(interval)
+        {
+            "k_m": arm.k_m,
+            "joint": arm.joint,
+            "seed": arm.seed,
+            "method": result.method,
+            "parameter": name,
+            "truth": getattr(arm.robot, name),
+            **dataclasses.asdict(interval),
+        }
         for result in calibrate_once(arm)
         for name, interval in result.found.items()
     ]
@@ -265,8 +264,8 @@ def table_1(arm: Arm) -> pd.DataFrame:
         batch = run_batch(arm.robot, route, CALIBRATION_RUNS, rng)
         found = from_batches([batch], geometry=False)
         v, omega, duration = route.segments[0]
-        promised, mean = route.ideal_end(), batch.end_poses.mean(axis=0)
-        spread = batch.end_poses.std(axis=0, ddof=1)
+        promised, ends = route.ideal_end(), batch.end_poses
+        mean, spread = ends.mean(axis=0), ends.std(axis=0, ddof=1)
         rows.append(
             {
                 "case": name,
@@ -334,12 +333,10 @@ def engine_recordings(*overrides: str) -> Driven:
 
 def engine_ends(driven: Driven) -> pd.DataFrame:
     """End poses of PyBullet's robot beside the kinematic one's, per case and seed."""
-    rows: dict[tuple[str, int], Row] = {}
-    for (physics, case, seed), recording in driven.items():
-        row = rows.setdefault((case, seed), {"case": case, "seed": seed})
-        for name, value in zip(("x_m", "y_m", "heading_rad"), end_pose(recording), strict=True):
-            row[f"{physics}_{name}"] = float(value)
-    return pd.DataFrame(list(rows.values()))
+    names = ["x_m", "y_m", "heading_rad"]
+    ends = pd.DataFrame([end_pose(run) for run in driven.values()], list(driven), names)
+    sides = [ends.loc[physics].add_prefix(f"{physics}_") for physics in ("bullet", "kinematic")]
+    return pd.concat(sides, axis=1).rename_axis(["case", "seed"]).reset_index()
 
 
 def engine_k(driven: Driven) -> pd.DataFrame:
@@ -394,9 +391,7 @@ def gradient_descent() -> pd.DataFrame:
     rows = []
     for name, (ideal, real, time_s) in DESCENTS.items():
         steps = math.ceil(30.0 / (0.08 * (ideal - real) ** 2 / time_s**2))
-        after_100, in_the_end = (
-            report_gradient_descent(ideal, real, time_s, n_iterations=n)[-1]
-            for n in (100, min(steps, 10**6))
-        )
-        rows.append({"data": name, "k_after_100": after_100, "k_in_the_end": in_the_end})
+        last = min(steps, 10**6)
+        k = report_gradient_descent(ideal, real, time_s, n_iterations=max(100, last))
+        rows.append({"data": name, "k_after_100": k[100], "k_in_the_end": k[last]})
     return pd.DataFrame(rows)

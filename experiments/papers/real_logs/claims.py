@@ -25,9 +25,11 @@ def judge(made: Results) -> list[Claim]:
 def rl1(ate: pd.DataFrame) -> list[Claim]:
     """RL1: ATE of stored trajectories equals the printed values to the last digit."""
     same = ate.ate_m.map("{:.3f}".format) == ate.printed_m.astype(float).map("{:.3f}".format)
-    statistic = f"share of {len(same)} trajectories of Rawseeds 25a, 25b whose ATE has the "
-    share = Interval.exact(float(same.mean()))
-    return [Claim("RL1", f"{statistic}printed digits", share, "1", holds(bool(same.all())))]
+    statistic = (
+        f"share of {len(same)} trajectories of Rawseeds 25a, 25b whose ATE has the printed digits"
+    )
+    found = Interval.exact(float(same.mean()))
+    return [Claim("RL1", statistic, found, "1", holds(bool(same.all())))]
 
 
 def rl2(relations: pd.DataFrame) -> list[Claim]:
@@ -43,20 +45,17 @@ def rl2(relations: pd.DataFrame) -> list[Claim]:
         found = Interval(*(float(fused[f"translation_{end}_m"]) for end in ("mean", "low", "high")))
         for other in (name for name in INTEL[1:] if name != FUSION):
             rival = rows.loc[other]
-            reason = f"fusion is {'ahead' if found.value < rival.translation_mean_m else 'behind'}"
-            criterion, verdict = "intervals apart, fusion below", Verdict.UNDECIDED
-            if part == "all":
-                criterion = "shown, not judged: the tuned part is in it"
-                verdict = Verdict.SHOWN
-            elif found.high < rival.translation_low_m:
-                verdict, reason = Verdict.REPRODUCED, ""
-            elif found.low > rival.translation_high_m:
-                verdict, reason = Verdict.NOT_REPRODUCED, ""
             statistic = (
                 f"mean translational error of {FUSION}, m, beside {other} "
                 f"({rival.translation_mean_m:.3f} m), Intel, {where}"
             )
-            claims.append(Claim("RL2", statistic, found, criterion, verdict, reason))
+            ahead = f"fusion is {'ahead' if found.value < rival.translation_mean_m else 'behind'}"
+            judgement = ("intervals apart, fusion below", Verdict.UNDECIDED, ahead)
+            if part == "all":
+                judgement = ("shown, not judged: the tuned part is in it", Verdict.SHOWN, ahead)
+            elif found.high < rival.translation_low_m or found.low > rival.translation_high_m:
+                judgement = (judgement[0], holds(found.high < rival.translation_low_m), "")
+            claims.append(Claim("RL2", statistic, found, *judgement))
     return claims
 
 
@@ -112,5 +111,4 @@ def rl5(wean: pd.DataFrame) -> list[Claim]:
     best = wean.groupby("one_means").score.max()
     gap = float(best["free"] - best["occupied"])
     statistic = "fit of the scans with 1 = free, less that with 1 = occupied, Wean Hall"
-    found, criterion = Interval.exact(gap), "above 0.1: 1 is free"
-    return [Claim("RL5", statistic, found, criterion, holds(gap > 0.1))]
+    return [Claim("RL5", statistic, Interval.exact(gap), "above 0.1: 1 is free", holds(gap > 0.1))]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from experiments.papers.real_logs.settings import GMAPPING, INTEL_DRAWN, MRCLAM_DRAWN
 from experiments.papers.results import Results
-from experiments.viewing.style import BLACK, CYCLE, figure
+from experiments.viewing.style import BLACK, CYCLE, subplots
 
 Arrays = Mapping[str, NDArray[Any]]
 
@@ -30,8 +30,7 @@ def draw(made: Results) -> dict[str, Figure]:
 
 def intel(relations: pd.DataFrame, paths: Arrays) -> Figure:
     """Paths through the Intel lab, and the relations metric beside the printed values."""
-    page = figure(10.0, 5.2)
-    left, right = page.subplots(1, 2, width_ratios=[1.1, 1.0])
+    page, (left, right) = subplots(10.0, 5.2, 1, 2, width_ratios=[1.1, 1.0])
     for color, name in zip(CYCLE[1:], INTEL_DRAWN, strict=False):
         left.plot(*paths[name].T, color=color, lw=0.7, label=name)
     left.plot(*paths[GMAPPING].T, color=BLACK, lw=0.7, label="GMapping (reference)")
@@ -57,16 +56,12 @@ def intel(relations: pd.DataFrame, paths: Arrays) -> Figure:
 
 def mrclam(errors: pd.DataFrame, paths: Arrays) -> Figure:
     """Errors and NEES of each robot, and the paths of robot 4."""
-    page = figure(11.0, 4.6)
-    left, middle, right = page.subplots(1, 3, width_ratios=[1.0, 1.0, 1.1])
-    methods = list(dict.fromkeys(errors.method))
-    robots = sorted(errors.robot.unique())
-    for i, (method, color) in enumerate(
-        zip(methods, (BLACK, *CYCLE[:-1], "#999999"), strict=False)
-    ):
-        rows = errors[errors.method == method].groupby("robot")
-        shift = (i - len(methods) / 2.0) * 0.09
-        at = np.searchsorted(robots, list(rows.groups)) + shift
+    page, (left, middle, right) = subplots(11.0, 4.6, 1, 3, width_ratios=[1.0, 1.0, 1.1])
+    robots, by_method = sorted(errors.robot.unique()), errors.groupby("method", sort=False)
+    colors = (BLACK, *CYCLE[:-1], "#999999")
+    for i, ((method, part), color) in enumerate(zip(by_method, colors, strict=False)):
+        rows = part.groupby("robot")
+        at = np.searchsorted(robots, list(rows.groups)) + (i - len(by_method) / 2.0) * 0.09
         left.plot(at, rows.ate_rmse_m.mean(), "o", ms=4, color=color, label=method)
         middle.plot(at, rows.nees_mean.median(), "o", ms=4, color=color)
     for ax in (left, middle):
@@ -74,9 +69,8 @@ def mrclam(errors: pd.DataFrame, paths: Arrays) -> Figure:
     left.set(ylabel="ATE from the true start, m", ylim=(0.0, None), title="MRCLAM 6")
     middle.set(yscale="log", ylabel="mean NEES (3 is consistent)")
     middle.axhline(3.0, color=BLACK, lw=0.7, ls=":")
-    for name, color in zip(
-        ("motion capture", *MRCLAM_DRAWN), (BLACK, CYCLE[1], CYCLE[0]), strict=True
-    ):
+    drawn = ("motion capture", *MRCLAM_DRAWN)
+    for name, color in zip(drawn, (BLACK, CYCLE[1], CYCLE[0]), strict=True):
         right.plot(*paths[name].T, color=color, lw=0.8, label=name)
     right.set(xlabel="x, m", ylabel="y, m", aspect="equal", title="robot 4")
     page.legend(*left.get_legend_handles_labels(), loc="outside lower left", ncols=4, fontsize=7)
@@ -86,8 +80,7 @@ def mrclam(errors: pd.DataFrame, paths: Arrays) -> Figure:
 
 def wheels(found: pd.DataFrame) -> Figure:
     """Khepera: kr and kl by the length of the blocks that residuals are summed over."""
-    page = figure(5.5, 3.6)
-    ax = page.subplots()
+    page, ax = subplots(5.5, 3.6)
     slip = found[found.block > 0].groupby(["log", "quantity"], sort=False)
     for color, ((log, quantity), rows) in zip(CYCLE, slip, strict=False):
         spread = np.abs(rows[["low", "high"]].to_numpy().T - rows.value.to_numpy())
@@ -104,10 +97,8 @@ def wheels(found: pd.DataFrame) -> Figure:
 def wean(fits: pd.DataFrame, drawn: Arrays) -> Figure:
     """The map as the scans read it, with paths and beam ends."""
     right = fits[(fits.one_means == "free") & ~fits.mirrored]
-    page = figure(5.2 * len(right), 5.6)
-    for ax, row in zip(
-        page.subplots(1, len(right), squeeze=False)[0], right.itertuples(), strict=True
-    ):
+    page, axes = subplots(5.2 * len(right), 5.6, 1, len(right), squeeze=False)
+    for ax, row in zip(axes[0], right.itertuples(), strict=True):
         ax.imshow(
             np.ma.masked_invalid(drawn["occupancy"].T.astype(float)), origin="lower", cmap="Greys",
             vmin=0.0, vmax=1.0, extent=drawn["extent_m"], interpolation="nearest",

@@ -68,8 +68,7 @@ def tracked(
 
 def tuned_until_s(logged: Recording) -> float:
     """End of the part of the Intel log that options were chosen on, s."""
-    assert logged.laser is not None
-    return float(np.quantile(logged.laser.stamps, TUNED_SHARE))
+    return float(np.quantile(logged.known_laser.stamps, TUNED_SHARE))
 
 
 def calibrated_by_scans(recording: Recording, until_s: float) -> Recording:
@@ -79,24 +78,18 @@ def calibrated_by_scans(recording: Recording, until_s: float) -> Recording:
     """
     matcher = IcpOdometry(kr=3e-3, kl=3e-3, sigma_range_m=0.03, reference="previous")
     estimate = tracked(matcher, recording)
-    assert recording.laser is not None
-    assert recording.sensors.laser is not None
-    stamps = recording.laser.stamps
+    stamps, wheels = recording.known_laser.stamps, recording.wheels
     rows = np.searchsorted(estimate.stamps, stamps)
-    poses = estimate.means[rows]
+    poses, travel = estimate.means[rows], _wheels_at(wheels, stamps)
     status = np.array([str(estimate.extras["registration_status"][i]) for i in rows])
     trusted = (status[1:] == "ok") & (stamps[1:] < until_s)
-    wheels = recording.wheels
-    travel = np.stack(
-        [np.interp(stamps, wheels.stamps, wheels.position_m[:, i]) for i in (0, 1)], axis=1
-    )
     log = WheelLaserLog(
         np.diff(stamps)[trusted],
         2.0 * np.diff(travel, axis=0)[trusted],
         se2.between(poses[:-1], poses[1:])[trusted],
     )
     right, left, axle_m, x, y, yaw = calibrate_wheels(log, 1.0, recording.robot.track_m).values
-    laser = recording.sensors.laser
+    laser = recording.sensors.known_laser
     mount = Mount(x, y, laser.mount.z_m, laser.mount.yaw_rad + yaw)
     return dataclasses.replace(
         recording,
@@ -110,18 +103,14 @@ def calibrated_by_scans(recording: Recording, until_s: float) -> Recording:
 
 def calibrated_by_truth(recording: Recording, until_s: float = CALIBRATED_S) -> Recording:
     """The recording with wheel gains and track fitted to the truth of its first `until_s`."""
-    truth, wheels, lag_s = recording.truth, recording.wheels, 4.0
-    assert truth is not None
+    truth, wheels = recording.known_truth, recording.wheels
     begin = max(truth.stamps[0], wheels.stamps[0])
     times = np.arange(begin, min(begin + until_s, truth.stamps[-1]), 0.02)
-    travel = np.stack(
-        [np.interp(times, wheels.stamps, wheels.position_m[:, i]) for i in (0, 1)], axis=1
-    )
     heading = np.interp(times, truth.stamps, np.unwrap(truth.poses[:, 2]))
     x, y = (np.interp(times, truth.stamps, truth.poses[:, i]) for i in (0, 1))
     along = np.cos(heading[:-1]) * np.diff(x) + np.sin(heading[:-1]) * np.diff(y)
     forward = np.concatenate([[0.0], np.cumsum(along)])
-    every = round(lag_s / 0.02)
+    travel, every = _wheels_at(wheels, times), 200  # 4 s
     rolled, turn, advance = (np.diff(v[::every], axis=0) for v in (travel, heading, forward))
     # turn = (a_r W_r - a_l W_l) / track, advance = (a_r W_r + a_l W_l) / 2
     per_track = np.linalg.lstsq(rolled * np.array([1.0, -1.0]), turn, rcond=None)[0]
@@ -132,3 +121,8 @@ def calibrated_by_truth(recording: Recording, until_s: float = CALIBRATED_S) -> 
         wheels=WheelLog(wheels.stamps.copy(), wheels.position_m * (per_track * track_m)),
         robot=RobotGeometry(recording.robot.wheel_radius_m, track_m),
     )
+
+
+def _wheels_at(wheels: WheelLog, stamps: Array) -> Array:
+    """Wheel positions (N, 2) interpolated at stamps (N,), m."""
+    return np.stack([np.interp(stamps, wheels.stamps, p) for p in wheels.position_m.T], axis=1)

@@ -9,14 +9,24 @@ from experiments.runs.paths import SOURCE
 
 DATA = SOURCE.parent / "shared" / "data"  # the logs are not part of the project
 
-RAWSEEDS = {  # printed with the logs: SE(2)-aligned ATE of 25a and 25b, m
-    "amcl_beam_model_default": ("0.149", "0.178"),
-    "amcl_likelihood_default": ("0.227", "0.174"),
-    "ndt_mcl_0.5": ("0.079", "0.077"),
-    "muse_default_params": ("0.142", "0.132"),
-    "GROUNDTRUTH-CARTOGRAPHER": ("0.059", "0.062"),
-    "GT-extended": ("0.031", "0.042"),
-    "GraphSLAM Laser": ("", "0.074"),
+RAWSEEDS = {  # printed with the logs: SE(2)-aligned ATE by session, m
+    "25a": {
+        "amcl_beam_model_default": "0.149",
+        "amcl_likelihood_default": "0.227",
+        "ndt_mcl_0.5": "0.079",
+        "muse_default_params": "0.142",
+        "GROUNDTRUTH-CARTOGRAPHER": "0.059",
+        "GT-extended": "0.031",
+    },
+    "25b": {
+        "amcl_beam_model_default": "0.178",
+        "amcl_likelihood_default": "0.174",
+        "ndt_mcl_0.5": "0.077",
+        "muse_default_params": "0.132",
+        "GROUNDTRUTH-CARTOGRAPHER": "0.062",
+        "GT-extended": "0.042",
+        "GraphSLAM Laser": "0.074",
+    },
 }
 KUEMMERLE = {  # as quoted with the logs: mean and standard deviation of the translation, m
     "intel": {"scan matching": (0.220, 0.296), "RBPF": (0.070, 0.083), "graph": (0.031, 0.026)},

@@ -11,7 +11,6 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-import joblib
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
@@ -23,10 +22,11 @@ from experiments.calibration.logs import (
     dead_reckoning_rms_m,
     slip_of_turns,
 )
-from experiments.evaluation.metrics import score
+from experiments.evaluation.metrics import score, travelled_m
 from experiments.evaluation.relations import relation_errors
 from experiments.evaluation.time_sync import aligned_ate_m
 from experiments.evaluation.verdict import Profile
+from experiments.papers.jobs import in_parallel
 from experiments.papers.real_logs.grid_match import beam_points, best_fit
 from experiments.papers.real_logs.logs import tracked, tuned_until_s
 from experiments.papers.real_logs.settings import (
@@ -78,9 +78,7 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
     on_progress
         Called with the share done.
     """
-    out.write_table("ate", rawseeds_ate())
-    out.write_table("wheels", wheels())
-    out.write_table("lego", lego_errors())
+    out.write_tables(ate=rawseeds_ate(), wheels=wheels(), lego=lego_errors())
     on_progress(0.1)
     errors, paths = intel_relations()
     printed = [
@@ -89,15 +87,14 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
         for log, figures in KUEMMERLE.items()
         for name, (mean, spread) in figures.items()
     ]
-    out.write_table("relations", pd.DataFrame([*errors, *freiburg_relations(), *printed]))
+    out.write_tables(relations=pd.DataFrame([*errors, *freiburg_relations(), *printed]))
     out.write_arrays("intel", **paths)
     on_progress(0.3)
     slam, paths = landmark_slam(profile, lambda share: on_progress(0.3 + 0.5 * share))
-    out.write_table("mrclam", slam)
     out.write_arrays("mrclam", **paths)
     fits, drawn = wean_fit(WEAN_LOGS[profile])
-    out.write_table("wean", fits)
     out.write_arrays("wean", **drawn)
+    out.write_tables(mrclam=slam, wean=fits)
     on_progress(1.0)
 
 
@@ -107,25 +104,21 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
 def rawseeds_ate() -> pd.DataFrame:
     """ATE of the stored trajectories beside the printed figures."""
     members = read_members(DATA / "rawseeds_bicocca_reference/rawseeds_bicocca_25a_25b.tar.xz")
-    rows = []
-    for i, session in enumerate(("25a", "25b")):
+
+    def trajectory(session: str, name: str) -> tuple[Array, Array]:
         folder = f"Bicocca_2009-02-{session}"
+        names = (f"{folder}/{name}.csv", f"{folder}/{folder}-{name}.csv")
+        member = next(n for n in names if n in members)
+        found = rawseeds.parse_trajectory(split_words(members[member], member))
+        return found.stamps, found.poses
 
-        def trajectory(name: str, folder: str = folder) -> rawseeds.Trajectory:
-            names = (f"{folder}/{name}.csv", f"{folder}/{folder}-{name}.csv")
-            member = next(n for n in names if n in members)
-            return rawseeds.parse_trajectory(split_words(members[member], member))
-
-        truth = trajectory("GROUNDTRUTH")
-        for name, printed in RAWSEEDS.items():
-            if not printed[i]:
-                continue
-            found = trajectory(name)
-            ate_m = aligned_ate_m(truth.stamps, truth.poses, found.stamps, found.poses)
-            rows.append(
-                {"session": session, "trajectory": name, "ate_m": ate_m, "printed_m": printed[i]}
-            )
-    return pd.DataFrame(rows)
+    rows = [
+        (session, name, aligned_ate_m(*truth, *trajectory(session, name)), ate_m)
+        for session, printed_m in RAWSEEDS.items()
+        for truth in [trajectory(session, "GROUNDTRUTH")]
+        for name, ate_m in printed_m.items()
+    ]
+    return pd.DataFrame(rows, columns=["session", "trajectory", "ate_m", "printed_m"])
 
 
 # --- Intel and Freiburg 079 ----------------------------------------------------------------------
@@ -140,21 +133,21 @@ def intel_relations() -> tuple[list[Row], Paths]:
     recordings = {key: run.recording() for key, run in by_recording.items()}
     sparse, logged = (recordings[runs[name].recording_key] for name in INTEL[:2])
     until_s = tuned_until_s(logged)
-    rows: list[Row] = []
-    paths = {}
+    found: dict[str, tuple[Array, Array]] = {}
     for name, run in runs.items():
-        found = tracked(run.estimator(), recordings[run.recording_key])
-        rows += _relation_rows("intel", name, truth, found.stamps, found.means, until_s=until_s)
-        if name in INTEL_DRAWN:
-            paths[name] = _path(found.means)
-    assert sparse.truth is not None
-    mapper = sparse.truth
-    rows += _relation_rows("intel", GMAPPING, truth, mapper.stamps, mapper.poses, until_s=until_s)
+        estimate = tracked(run.estimator(), recordings[run.recording_key])
+        found[name] = estimate.stamps, estimate.means
+    found[GMAPPING] = sparse.known_truth.stamps, sparse.known_truth.poses
     graph = carmen.read_carmen(folder / "intel-lab.flirt.log.gz")
+    rows = [
+        row
+        for name, path in found.items()
+        for row in _relation_rows("intel", name, truth, *path, until_s=until_s)
+    ]
     rows += _relation_rows(
         "intel", "graph (FLIRT)", truth, graph.scan_stamps, graph.scan_poses, near=True
     )
-    return rows, paths | {GMAPPING: _path(mapper.poses)}
+    return rows, {name: _path(found[name][1]) for name in (*INTEL_DRAWN, GMAPPING)}
 
 
 def freiburg_relations() -> list[Row]:
@@ -189,21 +182,19 @@ def _relation_rows(
     rows: list[Row] = []
     for part, chosen in parts.items():
         found = relation_errors(chosen, stamps, poses, "near" if near else "interpolated")
-        low, high = _block_interval(found.translation_m, chosen.stamps[found.rows, 0])
-        labels: Row = {"log": log, "method": method, "part": part}
-        bounds = {"translation_low_m": low, "translation_high_m": high}
-        rows.append({**labels, **found.summary(), **bounds})
+        bounds = _block_interval(found.translation_m, chosen.stamps[found.rows, 0])
+        rows.append({"log": log, "method": method, "part": part, **found.summary(), **bounds})
     return rows
 
 
-def _block_interval(errors: Array, stamps: Array, block_s: float = 60.0) -> tuple[float, float]:
+def _block_interval(errors: Array, stamps: Array, block_s: float = 60.0) -> dict[str, float]:
     """95 % interval of a mean; relations that begin in the same minute are resampled together."""
     _, blocks = np.unique(np.floor((stamps - stamps.min()) / block_s), return_inverse=True)
     sums, counts = np.bincount(blocks, errors), np.bincount(blocks)
     picks = np.random.default_rng(0).integers(len(sums), size=(2000, len(sums)))
     means = sums[picks].sum(axis=1) / counts[picks].sum(axis=1)
     low, high = np.quantile(means, [0.025, 0.975])
-    return float(low), float(high)
+    return {"translation_low_m": float(low), "translation_high_m": float(high)}
 
 
 def _path(poses: Array) -> NDArray[np.float32]:
@@ -217,34 +208,27 @@ def landmark_slam(
     profile: Profile, on_progress: Callable[[float], None]
 ) -> tuple[pd.DataFrame, Paths]:
     """Errors of dead reckoning, FastSLAM and EKF-SLAM against motion capture; and some paths."""
-    robots = MRCLAM_ROBOTS[profile]
     study = "study=real_logs_mrclam"
     runs = {
         robot: dict(zip(MRCLAM, planned([study, f"recording.robot={robot}"]), strict=True))
-        for robot in robots
+        for robot in MRCLAM_ROBOTS[profile]
     }
     ekf = int(profile is Profile.FULL)
     seeds = {"dead reckoning": 1, "FastSLAM": FASTSLAM_SEEDS[profile], "EKF-SLAM": ekf}
     jobs = [
         (run, method, robot, seed)
         for kind, n_seeds in seeds.items()
-        for robot in robots
-        for method, run in runs[robot].items()
+        for robot, by_method in runs.items()
+        for method, run in by_method.items()
         if method.startswith(kind)
         for seed in range(n_seeds)
     ]
-    done = joblib.Parallel(n_jobs=-1, return_as="generator")(
-        joblib.delayed(_landmark_job)(*job) for job in jobs
-    )
-    truth = runs[DRAWN_ROBOT][MRCLAM[1]].recording().truth
-    assert truth is not None
-    paths = {"motion capture": _path(truth.poses[::20])}
-    rows = []
-    for i, ((_, method, robot, seed), (row, path)) in enumerate(zip(jobs, done, strict=True)):
+    truth = runs[DRAWN_ROBOT][MRCLAM[1]].recording().known_truth
+    paths, rows = {"motion capture": _path(truth.poses[::20])}, []
+    for row, path in in_parallel(_landmark_job, jobs, on_progress):
         rows.append(row)
-        if robot == DRAWN_ROBOT and seed == 0 and method in MRCLAM_DRAWN:
-            paths[method] = path
-        on_progress((i + 1) / len(jobs))
+        if (row["robot"], row["seed"]) == (DRAWN_ROBOT, 0) and row["method"] in MRCLAM_DRAWN:
+            paths[str(row["method"])] = path
     return pd.DataFrame(rows), paths
 
 
@@ -254,10 +238,9 @@ def _landmark_job(
     log = run.recording()
     estimate = tracked(run.estimator(), log, seed, log.truth_at(log.frame_stamps[:1])[0])
     found = score(log, estimate)
-    labels: Row = {"robot": robot, "method": method, "seed": seed}
-    judged: Row = {"judged": robot not in TUNED_ROBOTS}
-    scores = {key: found.get(key, math.nan) for key in _SCORES}
-    return labels | judged | scores, _path(estimate.means[::5])
+    row: Row = {"robot": robot, "method": method, "seed": seed, "judged": robot not in TUNED_ROBOTS}
+    row |= {key: found.get(key, math.nan) for key in _SCORES}
+    return row, _path(estimate.means[::5])
 
 
 # --- wheels --------------------------------------------------------------------------------------
@@ -272,14 +255,14 @@ def wheels() -> pd.DataFrame:
         for quantity, printed in zip(
             ("diameter_right_m", "diameter_left_m", "axle_m"), published, strict=True
         ):
-            measured = dataclasses.asdict(getattr(found, quantity))
             labels = {"log": name, "quantity": quantity}
-            rows.append(labels | measured | {"published": printed, "block": 0})
+            measured = dataclasses.asdict(getattr(found, quantity))
+            rows.append({**labels, **measured, "published": printed, "block": 0})
         for block in (1, 2, 4, 8, 16):
             slip = slip_of_turns(found, block, np.random.default_rng(0))
             for quantity, interval in (("kr", slip.kr), ("kl", slip.kl)):
                 labels = {"log": name, "quantity": quantity}
-                rows.append(labels | dataclasses.asdict(interval) | {"block": block})
+                rows.append({**labels, **dataclasses.asdict(interval), "block": block})
     return pd.DataFrame(rows)
 
 
@@ -325,28 +308,25 @@ def wean_fit(logs: str) -> tuple[pd.DataFrame, dict[str, NDArray[Any]]]:
         Their numbers, as in `1,2`.
     """
     grid = wean.read_grid(DATA / "wean_hall_mcl" / "wean.dat.gz")
-    rows: list[Row] = []
+    rows = []
     drawn: dict[str, NDArray[Any]] = {}
     studies = planned(["study=real_logs_wean", f"recording.number={logs}"])
     for number, run in zip(logs.split(","), studies, strict=True):
         recording = run.recording()
-        laser = recording.sensors.laser
-        assert recording.laser is not None
-        assert laser is not None
+        laser, scans = recording.sensors.known_laser, recording.known_laser
         estimate = tracked(run.estimator(), recording)
-        poses = estimate.means[np.searchsorted(estimate.stamps, recording.laser.stamps)]
-        travelled = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T))])
+        poses = estimate.means[np.searchsorted(estimate.stamps, scans.stamps)]
+        travelled = travelled_m(poses)
         chosen = np.searchsorted(travelled, np.arange(0.0, min(travelled[-1], 15.0), 0.5))
-        ranges = recording.laser.ranges_m[chosen][:, ::3].astype(np.float64)
+        ranges = scans.ranges_m[chosen][:, ::3].astype(np.float64)
         points = beam_points(ranges, laser.bearings_rad[::3], laser.mount.pose, poses[chosen])
         for one_means, mirrored in itertools.product(("free", "occupied"), (False, True)):
             read = dataclasses.replace(grid, free_is_one=one_means == "free")
             coarse = _halved(read.occupancy.T if mirrored else read.occupancy)
             fit = best_fit(coarse, 2.0 * grid.cell_m, points)
-            x_m, y_m, yaw_rad = map(float, fit.pose)
-            pose: Row = {"x_m": x_m, "y_m": y_m, "yaw_rad": yaw_rad}
-            labels: Row = {"log": int(number), "one_means": one_means, "mirrored": mirrored}
-            rows.append(labels | {"score": fit.score} | pose)
+            labels = {"log": int(number), "one_means": one_means, "mirrored": mirrored}
+            pose = dict(zip(("x_m", "y_m", "yaw_rad"), fit.pose, strict=True))
+            rows.append({**labels, "score": fit.score, **pose})
             if one_means == "free" and not mirrored:
                 drawn[f"path_{number}"] = _path(se2.compose(fit.pose, poses))
                 drawn[f"ends_{number}"] = _path(se2.transform(fit.pose, points[:, 0]))
@@ -368,5 +348,4 @@ def _halved(values: Array) -> Array:
     n_x, n_y = values.shape[0] // 2, values.shape[1] // 2
     cells = values[: 2 * n_x, : 2 * n_y].reshape(n_x, 2, n_y, 2)
     with np.errstate(invalid="ignore"):
-        halved: Array = np.nansum(cells, axis=(1, 3)) / np.isfinite(cells).sum(axis=(1, 3))
-    return halved
+        return np.asarray(np.nansum(cells, axis=(1, 3)) / np.isfinite(cells).sum(axis=(1, 3)))

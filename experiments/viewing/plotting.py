@@ -1,0 +1,52 @@
+"""What several figures draw: 95 % ellipses, plain numbers on logarithmic axes, one legend."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse
+from matplotlib.ticker import LogLocator
+from numpy.typing import ArrayLike
+
+from experiments.evaluation.metrics import CHI2_95_2DOF
+
+
+def draw_ellipses(
+    ax: Axes, means: ArrayLike, covariances: ArrayLike, label: str = "", **style: Any
+) -> None:
+    """Draw the 95 % ellipses of positions (N, 2) or more columns, m, and their covariances, m^2.
+
+    The label names them all once.
+    """
+    planes = np.asarray(covariances)[:, :2, :2]
+    for mean, values, vectors in zip(np.asarray(means), *np.linalg.eigh(planes), strict=True):
+        width, height = 2.0 * np.sqrt(CHI2_95_2DOF * np.maximum(values[::-1], 0.0))
+        angle = np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1]))
+        ax.add_patch(Ellipse(mean[:2], width, height, angle=angle, label=label, **style))
+        label = ""
+
+
+def plain_ticks(ax: Axes, values: Iterable[float], **text: Any) -> None:
+    """Ticks of a logarithmic x axis at the values themselves; none between, on both axes."""
+    ticks = sorted(set(values))
+    ax.set_xticks(ticks, [f"{tick:g}" for tick in ticks], **text)
+    ax.minorticks_off()
+
+
+def plain_log(axis: Axis, multiples: Sequence[float] = (1.0, 2.0, 5.0)) -> None:
+    """Numbers without powers of ten on a logarithmic axis, at multiples of each decade."""
+    axis.set_major_locator(LogLocator(subs=multiples))
+    axis.set_major_formatter("{x:g}")
+    axis.set_minor_formatter("")
+
+
+def with_legend(page: Figure, ncols: int, loc: str = "outside lower center") -> Figure:
+    """Page with one legend for all its axes: of what the first of them shows."""
+    handles, labels = page.axes[0].get_legend_handles_labels()
+    page.legend(handles, labels, loc=loc, ncols=ncols)  # type: ignore[call-overload]
+    return page
