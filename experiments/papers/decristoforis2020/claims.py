@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
@@ -66,9 +68,8 @@ def dc2(ellipses: pd.DataFrame) -> list[Claim]:
     ]
 
 
-def dc3(ellipses: pd.DataFrame) -> list[Claim]:
+def dc3(ellipses: pd.DataFrame) -> Iterator[Claim]:
     """DC3: in a curve the ellipse turns and grows, then shrinks again; the same in a sharp bend."""
-    claims = []
     for bend in ("curve", "corner"):
         before = ellipses[f"long_before_{bend}_m"]
         grown, typical, after = (
@@ -76,22 +77,21 @@ def dc3(ellipses: pd.DataFrame) -> list[Claim]:
             for part in ("in", "median_in", "after")
         )
         turned = mean_interval(ellipses[f"turned_in_{bend}_deg"])
-        claims += [
+        yield from (
             banded("DC3", f"largest long axis in the {bend} over before", grown, at_least=1.5),
             banded("DC3", f"median long axis in the {bend} over before", typical, at_least=1.5),
             banded("DC3", f"long axis after the {bend} over before", after, at_most=1.2),
             banded("DC3", f"turn of the long axis in the {bend}, deg", turned, at_least=10.0),
-        ]
-    return claims
+        )
 
 
-def dc4(covariances: pd.DataFrame) -> list[Claim]:
+def dc4(covariances: pd.DataFrame) -> Iterator[Claim]:
     """DC4: Hessian fast but wrong, sampling right but slow, Censi right and fast.
 
     One verdict a metric and place, and one of the times.
     """
     low, high = CONSISTENT
-    nees, claims = nees_intervals(covariances), []
+    nees = nees_intervals(covariances)
     for metric in METRICS:
         for place in PLACES:
             for method in ("hessian", "sampling", "censi"):
@@ -100,18 +100,14 @@ def dc4(covariances: pd.DataFrame) -> list[Claim]:
                 if method == "hessian":
                     verdict, side = _OPPOSITE[verdict], "outside"
                 what = f"NEES over dof of {method}, {metric}, {place} (geometric mean of scenes)"
-                claims.append(Claim("DC4", what, found, f"{side} {low:g} and {high:g}", verdict))
+                yield Claim("DC4", what, found, f"{side} {low:g} and {high:g}", verdict)
         table = covariances[covariances["metric"] == metric]
         times = table.groupby(["method", "seed"])["time_us"].median().unstack("method").dropna()
         slower = log_ratio_interval(times["sampling"], times["censi"])
+        label = f"time of sampling over Censi's closed form, {metric}"
+        yield banded("DC4", label, slower, at_least=10.0)
         faster = log_ratio_interval(times["hessian"], times["sampling"])
-        claims += [
-            banded(
-                "DC4", f"time of sampling over Censi's closed form, {metric}", slower, at_least=10.0
-            ),
-            banded("DC4", f"time of Hessian over sampling, {metric}", faster, at_most=0.1),
-        ]
-    return claims
+        yield banded("DC4", f"time of Hessian over sampling, {metric}", faster, at_most=0.1)
 
 
 def nees_intervals(covariances: pd.DataFrame) -> dict[tuple[str, str, str], Interval]:

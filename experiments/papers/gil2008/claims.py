@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -24,7 +24,7 @@ from experiments.evaluation.statistics import (
     mean_interval,
     page_trend_p,
 )
-from experiments.evaluation.verdict import Claim, Verdict, judged
+from experiments.evaluation.verdict import Claim, Verdict, banded, judged
 from experiments.papers.gil2008.settings import P0
 from experiments.papers.results import Results
 
@@ -78,10 +78,10 @@ def gi1(particles: pd.DataFrame) -> Iterator[Claim]:
         m, worst = max(ratios.items(), key=lambda item: item[1].high)
         where = f"{NAMES[name]}, {NOISE[noise]}"
         label = f"error of SLAM over odometry's, the worst of M >= 50 (M = {m}): {where}"
-        yield Claim("GI1", label, worst, "below 0.5", judged(worst, at_most=0.5))
+        yield banded("GI1", label, worst, at_most=0.5, criterion="below 0.5")
         growth = mean_interval(1e3 * table.groupby("seed")["slope"].mean().dropna())
         label = f"growth of the error over revisited ground, mm per m of path: {where}"
-        yield Claim("GI1", label, growth, "not above 0", judged(growth, at_most=0.0))
+        yield banded("GI1", label, growth, at_most=0.0, criterion="not above 0")
     own = mean_interval(particles.groupby("seed")["odometry_rmse_m"].mean())
     yield Claim(
         "GI1", "RMS position error of odometry, m (the paper: 3)", own, SHOWN, Verdict.SHOWN
@@ -121,7 +121,7 @@ def gi4(distance: pd.DataFrame) -> Iterator[Claim]:
         errors = pooled(part, POSITION, "max_distance_m")
         found = log_ratio_interval(errors[3], errors[10])
         label = f"position error, dmax = 3 m over 10 m: {kind.words}"
-        claim = Claim("GI4", label, found, "above 1.5", judged(found, at_least=1.5))
+        claim = banded("GI4", label, found, at_least=1.5, criterion="above 1.5")
         yield _shown_if_nearest(claim, kind)
 
 
@@ -171,7 +171,7 @@ def gi7(association: pd.DataFrame) -> Iterator[Claim]:
             f"{ekf.mean():.2f} less FastSLAM's {fastslam.mean():.2f}, both by Mahalanobis "
             f"distance: {NOISE[noise]}"
         )
-        claim = Claim("GI7", label, found, "above 0", judged(found, at_least=1e-9))
+        claim = banded("GI7", label, found, at_least=1e-9, criterion="above 0")
         if np.array_equal(ekf, fastslam):
             claim = _undecided(claim, "both diverge in the same worlds")
         yield claim
@@ -179,14 +179,15 @@ def gi7(association: pd.DataFrame) -> Iterator[Claim]:
 
 def gi8(cost: pd.DataFrame) -> Iterator[Claim]:
     """GI8: time of a step against N, with shared and with contiguous maps."""
-    bands = {"shared": (-np.inf, 0.3), "contiguous": (0.8, 1.2)}
+    bands: dict[str, dict[str, Any]] = {
+        "shared": {"at_most": 0.3, "criterion": "below 0.3"},
+        "contiguous": {"at_least": 0.8, "at_most": 1.2},
+    }
     for maps, table in cost.groupby("maps", sort=False):
         repeats = table.groupby("repeat")
         found = mean_interval([log_log_slope(p["n_landmarks"], p["step_ms"]) for _, p in repeats])
-        low, high = bands[maps]
         label = f"exponent of N in the time of a step, {maps} maps, resampling at every image"
-        criterion = f"below {high:g}" if low < 0 else f"within {low:g} and {high:g}"
-        yield Claim("GI8", label, found, criterion, judged(found, low, high))
+        yield banded("GI8", label, found, **bands[maps])
     wide = cost.groupby(["n_landmarks", "maps"])["step_ms"].median().unstack("maps")
     least = Interval.exact(float((wide["contiguous"] / wide["shared"]).iloc[0]))
     label = "time of a step, contiguous over shared, at the least N: shared is faster from there on"
@@ -238,8 +239,7 @@ def _trends(
     """Judge by Page's test that errors fall; few worlds or p up to 5 % are undecided."""
     for column, what in ERRORS.items():
         errors = pooled(table, column, by)
-        first, last = errors.columns[0], errors.columns[-1]
-        p = page_trend_p(errors)
+        (first, *_, last), p = errors.columns, page_trend_p(errors)
         verdict = Verdict.NOT_REPRODUCED
         if p < limit:
             verdict = Verdict.REPRODUCED

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -48,39 +49,32 @@ def _by_world(table: pd.DataFrame, column: str, by: str = "method") -> pd.DataFr
     return table.pivot_table(index="seed", columns=by, values=column, aggfunc="mean")
 
 
-def mx1(weighting: pd.DataFrame, quality: pd.DataFrame) -> list[Claim]:
+def mx1(weighting: pd.DataFrame, quality: pd.DataFrame) -> Iterator[Claim]:
     """MX1: M2 is the best weighting; M3 fails on Oxford and holds on UMH.
 
     Each method has the parameters that suit it best. The reason says where M3 fails with
     parameters that the methods share.
     """
-    claims = []
     for name in geometries(weighting):
         errors = _by_world(weighting[weighting["geometry"] == name], "error_m")
         if name.startswith("oxford"):
-            share = _share(
-                "MX1",
-                f"share of worlds with M3 worse than 5 times M2, {NAMES[name]}",
-                errors["M3"] > 5.0 * errors["M2"],
-                at_least=0.8,
-            )
-            claims.append(replace(share, reason=_where_m3_fails(quality, "oxford")))
+            statistic = f"share of worlds with M3 worse than 5 times M2, {NAMES[name]}"
+            share = _share("MX1", statistic, errors["M3"] > 5.0 * errors["M2"], at_least=0.8)
+            yield replace(share, reason=_where_m3_fails(quality, "oxford"))
         if name == "umh":
             ratio, p = equivalent(errors["M3"], errors["M2"], 0.25)
-            claims.append(
-                Claim(
-                    "MX1",
-                    "error of M3 over M2, UMH (90 % interval)",
-                    ratio,
-                    "within 25 % by two one-sided tests",
-                    _equal(ratio, p, 0.25),
-                    _where_m3_fails(quality, "umh"),
-                )
+            yield Claim(
+                "MX1",
+                "error of M3 over M2, UMH (90 % interval)",
+                ratio,
+                "within 25 % by two one-sided tests",
+                _equal(ratio, p, 0.25),
+                _where_m3_fails(quality, "umh"),
             )
-    return claims + _m2_below_m1("MX1", "error", weighting, quality)
+    yield from _m2_below_m1("MX1", "error", weighting, quality)
 
 
-def mx3(dispersion: pd.DataFrame, quality: pd.DataFrame) -> list[Claim]:
+def mx3(dispersion: pd.DataFrame, quality: pd.DataFrame) -> Iterator[Claim]:
     """MX3: M2 concentrates faster than M1: its dispersion at step 10."""
     at_10 = dispersion.query("step == 10").assign(
         dispersion_m=lambda rows: rows["dispersion_m"] + _LEAST_M  # all on one node is zero
@@ -90,17 +84,15 @@ def mx3(dispersion: pd.DataFrame, quality: pd.DataFrame) -> list[Claim]:
 
 def _m2_below_m1(
     claim: str, what: str, table: pd.DataFrame, quality: pd.DataFrame, at: str = ""
-) -> list[Claim]:
+) -> Iterator[Claim]:
     """Judge on each geometry whether M2 is below M1; the reason: where with shared parameters."""
-    claims = []
     for name in geometries(table):
         worlds = _by_world(table[table["geometry"] == name], f"{what}_m")
         ratio, p, verdict = lower(worlds["M2"], worlds["M1"])
         statistic = f"{what} of M2 over M1{at}, {NAMES[name]}"
         criterion = f"below 1 by Wilcoxon, p < 0.01 (p = {p:.2g})"
         reason = _where_less(quality[quality["geometry"] == name], f"{what}_m")
-        claims.append(Claim(claim, statistic, ratio, criterion, verdict, reason))
-    return claims
+        yield Claim(claim, statistic, ratio, criterion, verdict, reason)
 
 
 def _where_less(quality: pd.DataFrame, column: str) -> str:
@@ -139,36 +131,30 @@ def _where_m3_fails(quality: pd.DataFrame, name: str) -> str:
     return f"with shared parameters M3 fails {where}"
 
 
-def mx2(particles: pd.DataFrame, times: pd.DataFrame) -> list[Claim]:
+def mx2(particles: pd.DataFrame, times: pd.DataFrame) -> Iterator[Claim]:
     """MX2: the error does not depend on the number of particles, the time grows with it."""
-    claims = []
     for name, part in particles.groupby("geometry", sort=False):
         errors = _by_world(part, "error_m", "per_node")
         ratios = {n: equivalent(errors[n], errors[4], 0.05) for n in errors.columns if n != 4}
         worst = max(ratios, key=lambda n: abs(math.log(ratios[n][0].value)))
-        claims.append(
-            Claim(
-                "MX2",
-                f"error with {worst} particles a node over that with 4, the worst, {NAMES[name]} "
-                "(90 % interval)",
-                ratios[worst][0],
-                "within 5 % by two one-sided tests, for 2, 6 and 8",
-                overall([_equal(ratio, p, 0.05) for ratio, p in ratios.values()]),
-            )
+        yield Claim(
+            "MX2",
+            f"error with {worst} particles a node over that with 4, the worst, {NAMES[name]} "
+            "(90 % interval)",
+            ratios[worst][0],
+            "within 5 % by two one-sided tests, for 2, 6 and 8",
+            overall([_equal(ratio, p, 0.05) for ratio, p in ratios.values()]),
         )
     for name, part in times.groupby("geometry", sort=False):
         rising = bool(np.all(np.diff(part.sort_values("particles")["time_s"]) > 0.0))
         slowest = float((part["time_s"] / part["paper_s"]).max())
-        claims.append(
-            Claim(
-                "MX2",
-                f"time a node over the paper's, the largest, {NAMES[name]}",
-                Interval.exact(slowest),
-                "below 0.1, and rising with the particles",
-                holds(rising and slowest < 0.1),
-            )
+        yield Claim(
+            "MX2",
+            f"time a node over the paper's, the largest, {NAMES[name]}",
+            Interval.exact(slowest),
+            "below 0.1, and rising with the particles",
+            holds(rising and slowest < 0.1),
         )
-    return claims
 
 
 def _share(claim: str, statistic: str, hits: pd.Series[bool], **judging: Any) -> Claim:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Iterator
 
 import numpy as np
 import pandas as pd
@@ -57,9 +58,8 @@ def pb1() -> list[Claim]:
     return [Claim("PB1", statistic, Interval.exact(worst), "at most 1", holds(worst <= 1.0))]
 
 
-def pb2(areas: pd.DataFrame, crossover: pd.DataFrame, track_m: float) -> list[Claim]:
+def pb2(areas: pd.DataFrame, crossover: pd.DataFrame, track_m: float) -> Iterator[Claim]:
     """PB2: the ellipse grows on straights and arcs; heading takes over at track sqrt(3) / 2."""
-    claims = []
     for name, table in areas.groupby("manoeuvre", sort=False):
         steps = np.concatenate([np.diff(part["area_m2"]) for _, part in table.groupby("k_m")])
         shrinking = float(np.mean(steps < -1e-9 * table["area_m2"].max()))
@@ -67,18 +67,19 @@ def pb2(areas: pd.DataFrame, crossover: pd.DataFrame, track_m: float) -> list[Cl
         judgement = ("0", holds(shrinking <= 0.0), "")
         if name == "out and back":
             judgement = ("shown, not judged", Verdict.SHOWN, "it shrinks on the way back")
-        claims.append(Claim("PB2", statistic, Interval.exact(shrinking), *judgement))
+        yield Claim("PB2", statistic, Interval.exact(shrinking), *judgement)
     ratio = mean_interval(crossover["crossover_m"] / (track_m * math.sqrt(3.0) / 2.0))
     statistic = "distance at which heading-borne spread overtakes, over track sqrt(3) / 2"
-    return [*claims, banded("PB2", statistic, ratio, 0.98, 1.02)]
+    yield banded("PB2", statistic, ratio, 0.98, 1.02)
 
 
-def pb3(calibration: pd.DataFrame, descent: pd.DataFrame, engine_k: pd.DataFrame) -> list[Claim]:
+def pb3(
+    calibration: pd.DataFrame, descent: pd.DataFrame, engine_k: pd.DataFrame
+) -> Iterator[Claim]:
     """PB3: kr, kl from open-loop runs, per method, k and arm: coverage and relative bias.
 
     The biases of kr and kl are judged apart, since opposite ones would cancel; the worse is shown.
     """
-    claims = []
     for (method, joint, k), table in calibration.groupby(["method", "joint", "k_m"], sort=False):
         where = f"{method}, k = {k:g} m, {'gain and track joint' if joint else 'nominal geometry'}"
         is_slip = table["parameter"].isin(["kr", "kl"])
@@ -88,79 +89,63 @@ def pb3(calibration: pd.DataFrame, descent: pd.DataFrame, engine_k: pd.DataFrame
         for names, part in parts.items():
             share = _clustered_share(part["truth"].between(part["low"], part["high"]), part["seed"])
             label = f"coverage of the 95 % intervals of {names}: {where}"
-            claims.append(banded("PB3", label, share, 0.90, 0.99))
+            yield banded("PB3", label, share, 0.90, 0.99)
         relative = slips["value"] / slips["truth"] - 1.0
         biases = [mean_interval(part) for _, part in relative.groupby(slips["parameter"])]
         worse = max(biases, key=lambda bias: abs(bias.value))
         label = f"relative bias, the worse of kr and kl: {where}"
         verdict = overall([judged(bias, -0.05, 0.05) for bias in biases])
-        claim = banded("PB3", label, worse, -0.05, 0.05)
-        claims.append(dataclasses.replace(claim, verdict=verdict))
-    return [
-        *claims,
-        *(
-            banded(
-                "PB3",
-                f"{row.parameter} of PyBullet's robot by wheel truth, over the truth, "
-                f"k = {row.k_m:g} m",
-                Interval(row.value / row.truth, row.low / row.truth, row.high / row.truth),
-                0.95,
-                1.05,
-            )
-            for row in engine_k.itertuples()
-        ),
-        Claim(
-            "PB3",
-            "the report's gradient descent: largest distance of its limit from 1/2, any data",
-            Interval.exact(float(np.abs(descent["k_in_the_end"] - 0.5).max())),
-            "an estimator of kr, kl would depend on the data",
-            Verdict.NOT_REPRODUCED,
-            "it returns 1/2 whatever the data",
-        ),
-    ]
+        yield dataclasses.replace(banded("PB3", label, worse, -0.05, 0.05), verdict=verdict)
+    for row in engine_k.itertuples():
+        label = (
+            f"{row.parameter} of PyBullet's robot by wheel truth, over the truth, k = {row.k_m:g} m"
+        )
+        ratio = Interval(row.value / row.truth, row.low / row.truth, row.high / row.truth)
+        yield banded("PB3", label, ratio, 0.95, 1.05)
+    yield Claim(
+        "PB3",
+        "the report's gradient descent: largest distance of its limit from 1/2, any data",
+        Interval.exact(float(np.abs(descent["k_in_the_end"] - 0.5).max())),
+        "an estimator of kr, kl would depend on the data",
+        Verdict.NOT_REPRODUCED,
+        "it returns 1/2 whatever the data",
+    )
 
 
-def pb4(coverage: pd.DataFrame, engine: pd.DataFrame) -> list[Claim]:
+def pb4(coverage: pd.DataFrame, engine: pd.DataFrame) -> Iterator[Claim]:
     """PB4: the true end lies in the ideal robot's 95 % ellipse, per k; and where that ends."""
-    claims, verdicts = [], {}
+    verdicts = {}
     for k, table in coverage.groupby("k_m"):
         shares = [share_interval(int(row.in_ellipse), int(row.runs)) for row in table.itertuples()]
         worst = int(np.argmin([share.value for share in shares]))
         parts = [judged(share, 0.93, 0.97) for share in shares]
         verdicts[k] = overall(parts)
-        claims.append(
-            Claim(
-                "PB4",
-                "least share of ends in the 95 % ellipse over nine manoeuvres "
-                f"({table.iloc[worst]['case']}), k = {k:g}",
-                shares[worst],
-                "every manoeuvre's interval within 0.93 and 0.97",
-                verdicts[k],
-                f"{parts.count(Verdict.REPRODUCED)} of {len(parts)} manoeuvres within",
-            )
-        )
-    claims.append(
-        banded(
+        yield Claim(
             "PB4",
-            "distance of PyBullet's end from the kinematic robot's, same noise, over the spread",
-            mean_interval(_engine_gap(engine)),
-            at_most=0.05,
-            criterion="below 0.05: the kinematic robot stands for PyBullet's",
+            "least share of ends in the 95 % ellipse over nine manoeuvres "
+            f"({table.iloc[worst]['case']}), k = {k:g}",
+            shares[worst],
+            "every manoeuvre's interval within 0.93 and 0.97",
+            verdicts[k],
+            f"{parts.count(Verdict.REPRODUCED)} of {len(parts)} manoeuvres within",
         )
+    yield banded(
+        "PB4",
+        "distance of PyBullet's end from the kinematic robot's, same noise, over the spread",
+        mean_interval(_engine_gap(engine)),
+        at_most=0.05,
+        criterion="below 0.05: the kinematic robot stands for PyBullet's",
     )
     left = [k for k, verdict in verdicts.items() if verdict is Verdict.NOT_REPRODUCED]
     if left:
         within = [k for k, v in verdicts.items() if v is Verdict.REPRODUCED and k < left[0]]
-        claims.append(
-            Claim(
-                "PB4",
-                "least k at which a manoeuvre leaves the band, m (low: the last with all in it)",
-                Interval(left[0], max(within, default=0.0), left[0]),
-                "above 1e-4",
-                holds(left[0] > 1e-4 * (1 + 1e-9)),
-            )
+        yield Claim(
+            "PB4",
+            "least k at which a manoeuvre leaves the band, m (low: the last with all in it)",
+            Interval(left[0], max(within, default=0.0), left[0]),
+            "above 1e-4",
+            holds(left[0] > 1e-4 * (1 + 1e-9)),
         )
-    return claims
 
 
 def _engine_gap(engine: pd.DataFrame) -> pd.Series[float]:

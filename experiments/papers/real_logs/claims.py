@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import pandas as pd
 
@@ -32,13 +34,12 @@ def rl1(ate: pd.DataFrame) -> list[Claim]:
     return [Claim("RL1", statistic, found, "1", holds(bool(same.all())))]
 
 
-def rl2(relations: pd.DataFrame) -> list[Claim]:
+def rl2(relations: pd.DataFrame) -> Iterator[Claim]:
     """RL2: on the Intel log, fusion beats odometry and ICP in the relations metric.
 
     Judged after the part that the filter's noise was tuned on; the whole log is shown beside.
     """
     intel = relations[relations.log == "intel"]
-    claims = []
     for part, where in (("judged", "after the tuned part"), ("all", "the whole log")):
         rows = intel[intel.part == part].set_index("method")
         fused = rows.loc[FUSION]
@@ -55,30 +56,25 @@ def rl2(relations: pd.DataFrame) -> list[Claim]:
                 judgement = ("shown, not judged: the tuned part is in it", Verdict.SHOWN, ahead)
             elif found.high < rival.translation_low_m or found.low > rival.translation_high_m:
                 judgement = (judgement[0], holds(found.high < rival.translation_low_m), "")
-            claims.append(Claim("RL2", statistic, found, *judgement))
-    return claims
+            yield Claim("RL2", statistic, found, *judgement)
 
 
-def rl3(mrclam: pd.DataFrame) -> list[Claim]:
+def rl3(mrclam: pd.DataFrame) -> Iterator[Claim]:
     """RL3: SLAM with known association beats calibrated dead reckoning on every robot."""
-    claims = []
     plain = mrclam[mrclam.method == "dead reckoning, calibrated"].set_index("robot").ate_rmse_m
     for method, rows in mrclam[~mrclam.method.str.contains("reckoning")].groupby("method"):
         ratio = (rows.groupby("robot").ate_rmse_m.mean() / plain).dropna()
         worse = [str(robot) for robot in ratio.index[ratio >= 1.0]]
         several = "s" if len(worse) > 1 else ""
-        claims.append(
-            Claim(
-                "RL3",
-                f"ATE of {method} over that of calibrated dead reckoning, MRCLAM 6: mean over the "
-                "robots (in brackets the least and the greatest of a robot)",
-                Interval(float(ratio.mean()), float(ratio.min()), float(ratio.max())),
-                "below 1 on every robot",
-                holds(not worse),
-                f"not on robot{several} {', '.join(worse)}" if worse else "",
-            )
+        yield Claim(
+            "RL3",
+            f"ATE of {method} over that of calibrated dead reckoning, MRCLAM 6: mean over the "
+            "robots (in brackets the least and the greatest of a robot)",
+            Interval(float(ratio.mean()), float(ratio.min()), float(ratio.max())),
+            "below 1 on every robot",
+            holds(not worse),
+            f"not on robot{several} {', '.join(worse)}" if worse else "",
         )
-    return claims
 
 
 def rl4(wheels: pd.DataFrame, lego: pd.DataFrame) -> list[Claim]:
