@@ -104,7 +104,9 @@ def main() -> None:
     env["VIRTUAL_ENV"] = str(VENV)
     lock = str(ROOT / "requirements.lock")
     run([uv, "pip", "sync", "--quiet", "--compile-bytecode", "--require-hashes", lock], env)
-    local = ["--no-deps", "--no-build-isolation", "--editable", str(ROOT)]
+    # by plain path, so that a clone named estima does not hide the package from its parent folder
+    plain = ["--config-setting", "editable_mode=compat"]
+    local = ["--no-deps", "--no-build-isolation", *plain, "--editable", str(ROOT)]
     run([uv, "pip", "install", "--quiet", *local], env)
     STAMP.write_text(state)
     print("set-up: done", flush=True)

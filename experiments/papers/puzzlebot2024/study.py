@@ -334,7 +334,8 @@ def engine_recordings(*overrides: str) -> Driven:
 def engine_ends(driven: Driven) -> pd.DataFrame:
     """End poses of PyBullet's robot beside the kinematic one's, per case and seed."""
     names = ["x_m", "y_m", "heading_rad"]
-    ends = pd.DataFrame([end_pose(run) for run in driven.values()], list(driven), names)
+    cases = pd.MultiIndex.from_tuples(driven)
+    ends = pd.DataFrame([end_pose(run) for run in driven.values()], cases, names)
     sides = [ends.loc[physics].add_prefix(f"{physics}_") for physics in ("bullet", "kinematic")]
     return pd.concat(sides, axis=1).rename_axis(["case", "seed"]).reset_index()
 
