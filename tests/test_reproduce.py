@@ -108,7 +108,7 @@ def test_what_cannot_be_replaced_or_added_to_is_named(results):
         module.reproduce(only=PAPER)
 
 
-def test_figures_are_drawn_again_from_disk(results, capsys):
+def test_figures_are_drawn_again_from_disk(results, monkeypatch, capsys):
     path = results / "figures" / f"{PAPER}_runs.png"
     path.unlink()
     module.redraw(only=PAPER)
@@ -119,5 +119,47 @@ def test_figures_are_drawn_again_from_disk(results, capsys):
     (results / "arrays" / f"{PAPER}_runs.npz").unlink()
     with pytest.raises(InputError, match=r"gil2008_runs\.npz: missing"):
         module.redraw(only=PAPER)
-    module.redraw(only="maximo2024")
+    take(monkeypatch, study(names=()))
+    module.redraw()
     assert "maximo2024: left out, no tables" in capsys.readouterr().err
+    for only, line in (("maximo2024", "of maximo2024"), (None, "of any paper")):
+        monkeypatch.setenv("ESTIMA_RESULTS", str(results / "bare"))
+        with pytest.raises(InputError, match=rf"tables: no tables {line}; run `estima reproduce"):
+            module.redraw(only=only)
+
+
+REMEDY = r"; run `estima reproduce --paper gil2008`$"
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "line"),
+    [
+        ("arrays/gil2008_runs.npz", b"", r"gil2008_runs\.npz: damaged \(.+\)"),
+        ("arrays/gil2008_runs.npz", {"other": [1]}, r"gil2008_runs\.npz: .*\('path' missing\)"),
+        ("tables/gil2008_runs.csv", b"", r"gil2008_runs\.csv: cannot read this table \(.+\)"),
+        ("tables/gil2008_runs.csv", b"profile\n", r"gil2008_runs\.csv: damaged \(no rows\)"),
+        ("tables/gil2008_runs.csv", b"other\n1\n", r"of gil2008 are .*\('profile' missing\)"),
+        ("tables/gil2008_runs.csv", b"profile\n1\n", r"of gil2008 are damaged or of another .*"),
+    ],
+)
+def test_files_without_their_content_end_in_one_line(results, monkeypatch, name, content, line):
+    def draw(made):
+        return {made.table("runs")["profile"].str.upper()[0]: made.arrays("runs")["path"]}
+
+    take(monkeypatch, {**study(), "figures": SimpleNamespace(draw=draw)})
+    if isinstance(content, dict):
+        np.savez(results / name, **content)
+    else:
+        (results / name).write_bytes(content)
+    with pytest.raises(InputError, match=line + REMEDY) as caught:
+        module.redraw(only=PAPER)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_programming_error_in_a_fresh_study_keeps_its_trace(results, monkeypatch):
+    def run(profile, out, on_progress):
+        raise KeyError("a slip of ours")
+
+    take(monkeypatch, {**study(), "study": SimpleNamespace(run=run)})
+    with pytest.raises(KeyError, match="a slip of ours"):
+        module.reproduce(only=PAPER)

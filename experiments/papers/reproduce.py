@@ -63,14 +63,28 @@ def reproduce(*, full: bool = False, only: str | None = None) -> None:
 
 
 def redraw(only: str | None = None) -> None:
-    """Draw the figures again, from the tables and arrays that the studies left."""
+    """Draw the figures again, from the tables and arrays that the studies left.
+
+    Raises
+    ------
+    InputError
+        If there are none, or they are damaged.
+    """
     place = results()
+    present = [p for p in _chosen(only) if any((place / "tables").glob(f"{p}_*.csv"))]
+    if not present:
+        command = f"estima reproduce --paper {only}" if only else "estima reproduce"
+        raise InputError(
+            f"{short(place / 'tables')}: no tables of {only or 'any paper'}; run `{command}`"
+        )
     for paper in _chosen(only):
         begun = time.monotonic()
-        if not list((place / "tables").glob(f"{paper}_*.csv")):
+        if paper not in present:
             print(f"{paper}: left out, no tables in {short(place)}", file=sys.stderr)
             continue
-        _draw(Results(place, paper))
+        made = Results(place, paper)
+        with made.as_found():
+            _draw(made)
         print(f"{paper}: {time.monotonic() - begun:.0f} s", file=sys.stderr)
 
 

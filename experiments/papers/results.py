@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import zipfile
+import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,6 +13,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from experiments.runs.paths import short
 from experiments.runs.row import read_rows, write_frame
 from sim.errors import InputError
 from sim.files import write_whole
@@ -36,9 +40,13 @@ class Results:
         Raises
         ------
         InputError
-            If it is missing or damaged.
+            If it is missing or damaged, or has no rows.
         """
-        return read_rows(self._path("tables", f"{name}.csv", to_read=True))
+        path = self._path("tables", f"{name}.csv", to_read=True)
+        table = read_rows(path, self._remedy)
+        if table.empty:
+            raise InputError(f"{short(path)}: damaged (no rows); {self._remedy}")
+        return table
 
     def write_arrays(self, name: str, **arrays: NDArray[np.generic]) -> None:
         """Write named arrays to one file, compressed."""
@@ -51,21 +59,54 @@ class Results:
         Raises
         ------
         InputError
-            If they are missing or damaged.
+            If they are missing or damaged, or one is asked for that is not among them.
         """
         path = self._path("arrays", f"{name}.npz", to_read=True)
         try:
             with np.load(path, allow_pickle=False) as file:
-                return dict(file)
-        except (OSError, ValueError, zipfile.BadZipFile) as error:
-            raise InputError(f"{path}: damaged ({error}); {self._remedy}") from error
+                return _Arrays(file, short(path), self._remedy)
+        except (OSError, ValueError, TypeError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+            raise InputError(f"{short(path)}: damaged ({error}); {self._remedy}") from error
+
+    @contextmanager
+    def as_found(self) -> Iterator[None]:
+        """Blame the files on disk for errors in what is made from them.
+
+        Raises
+        ------
+        InputError
+            If their content is not what the claims or figures expect.
+        """
+        try:
+            yield
+        except (LookupError, ValueError, TypeError, AttributeError, EOFError) as error:
+            why = (str(error).splitlines() or [type(error).__name__])[0]
+            if isinstance(error, KeyError):
+                why = f"{why} missing"
+            raise InputError(
+                f"{short(self.folder)}: the tables or arrays of {self.paper} are damaged or of "
+                f"another version ({why}); {self._remedy}"
+            ) from error
 
     def _path(self, kind: str, name: str, *, to_read: bool = False) -> Path:
         path = self.folder / kind / f"{self.paper}_{name}"
         if to_read and not path.exists():
-            raise InputError(f"{path}: missing; {self._remedy}")
+            raise InputError(f"{short(path)}: missing; {self._remedy}")
         return path
 
     @property
     def _remedy(self) -> str:
         return f"run `estima reproduce --paper {self.paper}`"
+
+
+class _Arrays(dict[str, NDArray[np.generic]]):
+    """Arrays of a file, which is named if one is asked for that it lacks."""
+
+    def __init__(self, arrays: Mapping[str, NDArray[np.generic]], file: str, remedy: str) -> None:
+        super().__init__(arrays)
+        self._file, self._remedy = file, remedy
+
+    def __missing__(self, name: str) -> NDArray[np.generic]:
+        raise InputError(
+            f"{self._file}: damaged or of another version ({name!r} missing); {self._remedy}"
+        )

@@ -119,8 +119,13 @@ def write_frame(frame: pd.DataFrame, path: Path, digits: int = 10) -> None:
             frame.to_parquet(part, index=False)
 
 
-def read_rows(path: Path) -> pd.DataFrame:
+def read_rows(path: Path, remedy: str = "") -> pd.DataFrame:
     """Read a table, or all tables of a folder as one.
+
+    Parameters
+    ----------
+    remedy
+        What to do about a file that cannot be read, if the caller knows.
 
     Raises
     ------
@@ -144,9 +149,10 @@ def read_rows(path: Path) -> pd.DataFrame:
                 frames.append(read.to_pandas(use_threads=False))
         except (OSError, ValueError) as error:
             ours = file.suffix == ".parquet" and file.parent.parent.name == "runs"
-            remedy = "delete it and run again" if ours else "a table is a .parquet or .csv file"
+            usual = "delete it and run again" if ours else "a table is a .parquet or .csv file"
+            why = (str(error).splitlines() or [""])[0]
             raise InputError(
-                f"{file}: cannot read this table ({(str(error).splitlines() or [''])[0]}); {remedy}"
+                f"{file}: cannot read this table ({why}); {remedy or usual}"
             ) from error
     table = pd.concat(frames, ignore_index=True)[_merged([list(f.columns) for f in frames])]
     for column in filter(lambda name: pd.api.types.is_object_dtype(table[name]), table):
