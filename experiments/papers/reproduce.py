@@ -83,6 +83,9 @@ def redraw(only: str | None = None) -> None:
             print(f"{paper}: left out, no tables in {short(place)}", file=sys.stderr)
             continue
         made = Results(place, paper)
+        if paper in LOGS and only is None and not any((place / "arrays").glob(f"{paper}_*.npz")):
+            print(f"{paper}: left out, what it draws of the logs is not here", file=sys.stderr)
+            continue
         with made.as_found():
             _draw(made)
         print(f"{paper}: {time.monotonic() - begun:.0f} s", file=sys.stderr)

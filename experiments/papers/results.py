@@ -68,6 +68,10 @@ class Results:
         except (OSError, ValueError, TypeError, EOFError, zipfile.BadZipFile, zlib.error) as error:
             raise InputError(f"{short(path)}: damaged ({error}); {self._remedy}") from error
 
+    def has_arrays(self, name: str) -> bool:
+        """Whether the study left these arrays, or they came with the project."""
+        return self._path("arrays", f"{name}.npz").exists()
+
     @contextmanager
     def as_found(self) -> Iterator[None]:
         """Blame the files on disk for errors in what is made from them.

@@ -32,9 +32,8 @@ _RECALL = {"recall_at_1": "recall@1", "recall_at_1_percent": "recall@1 %"}
 
 
 def draw(made: Results) -> dict[str, Figure]:
-    """All figures, by file name; the Oxford route is the real one if it was judged."""
-    starts_table = made.table("starts")
-    oxford = "oxford_real" if "oxford_real" in set(starts_table["geometry"]) else "oxford"
+    """All figures, by file name; the Oxford route is the real one where its positions are."""
+    oxford = "oxford_real" if made.has_arrays("oxford_real") else "oxford"
     campus_starts = made.table("campus_starts")
     campus = str(campus_starts["geometry"].iloc[0])
     drawn: dict[str, Arrays] = {name: made.arrays(name) for name in (oxford, "umh", campus)}

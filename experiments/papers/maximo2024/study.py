@@ -94,7 +94,7 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
     tables["table_1"] = table_1(tables["weighting"])
     tables["table_2"] = table_2(tables["particles"], tables["times"])
     out.write_tables(**tables)
-    for name in (oxford, "umh"):
+    for name in routes:
         out.write_arrays(name, **route_arrays(case_of(name, JUDGED_SEED)))
     out.write_arrays(campus, **campus_arrays(campus))
 
