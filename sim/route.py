@@ -138,6 +138,8 @@ class Tour:
         )
         if self.distance_m is not None and not 0.0 < self.distance_m < math.inf:
             raise InputError(f"route.distance_m must be positive, got {self.distance_m}")
+        if self.waypoints is not None:
+            _check_waypoints(self.waypoints)
 
     def start(self, world: World, robot: DifferentialDrive) -> tuple[Array, Pursuit]:
         """Start pose (3,) on the first way-point, facing the second, and the driver."""
@@ -228,6 +230,16 @@ class Pursuit:
     def _point_at(self, along_m: float) -> Array:
         columns = [np.interp(along_m, self._along_m, self._path[:, i]) for i in (0, 1)]
         return np.array(columns)
+
+
+def _check_waypoints(waypoints: ArrayLike) -> None:
+    wanted = "route.waypoints must be null or at least two points [x, y], m"
+    try:
+        points = np.array(waypoints, float)
+    except (TypeError, ValueError):
+        raise InputError(f"{wanted}, got {waypoints!r}") from None
+    if points.ndim != 2 or points.shape[1] != 2 or len(points) < 2 or not np.isfinite(points).all():
+        raise InputError(f"{wanted}, got {waypoints!r}")
 
 
 def _lengthened(path: Array, distance_m: float | None) -> Array:

@@ -346,8 +346,8 @@ def suite_from_config(config: dict[str, Any]) -> SensorSuite:
             raise InputError(f"unknown sensor sensors.{name}; known: {', '.join(kinds)}")
         if settings is None:
             continue
-        fields = dict(settings)
-        if "mount" in fields:
-            fields["mount"] = build(Mount, fields["mount"], f"sensors.{name}.mount")
-        sensors[name] = build(kinds[name], fields, f"sensors.{name}")
+        if isinstance(settings, dict) and "mount" in settings:
+            mount = build(Mount, settings["mount"], f"sensors.{name}.mount")
+            settings = {**settings, "mount": mount}
+        sensors[name] = build(kinds[name], settings, f"sensors.{name}")
     return SensorSuite(**sensors)

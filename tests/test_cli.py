@@ -9,7 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from experiments.runs.experiment import Experiment
 from experiments.runs.row import read_rows
+from sim.errors import InputError
 
 ROOT = Path(__file__).resolve().parent.parent
 QUICK = ["simulation.physics=kinematic", "simulation.rays=exact"]
@@ -84,11 +86,46 @@ def test_a_run_prints_its_errors_and_leaves_a_row(tmp_path):
         (["name=../../x"], ["name", "one word"]),
         (["world.n_objects=-3"], ["objects", "zero or more"]),
         (["route.speed_mps="], ["route", "must be real number"]),
+        (["robot=null"], ["robot=null", "estima options robot"]),
+        (["~world"], ["world is missing"]),
+        (["~robot.kr"], ["robot.kr", "estimator.kr"]),
+        (["sensors.laser=foo"], ["sensors.laser", "mapping"]),
+        (["recording={_target_:os.getcwd}"], ["os.getcwd must return a Recording", "str"]),
     ],
 )
 def test_bad_input_is_one_line_and_code_2(arguments, words):
     given = [a for a in QUICK if a.split("=")[0] not in {b.split("=")[0] for b in arguments}]
     refused(estima("run", *given, *arguments), *words)
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("=3", "=3: no key"),
+        ("world=3", "world=3.*estima options world"),
+        ("estimator=3", "estimator=3.*estima options estimator"),
+        ("route=null", "route=null.*estima options route"),
+        ("estimator=null", "estimator=null.*estima options estimator"),
+        ("sensors=[]", "sensors is missing"),
+        ("~seed", "world_seed.*seed"),
+        ("~prior.map", "prior.map is missing"),
+        ("sensors.laser=3", "sensors.laser must be a mapping"),
+        ("sensors.encoder=foo", "sensors.encoder must be a mapping"),
+        ("route.waypoints=foo", "route.waypoints.*foo"),
+        ("route.waypoints=[[0,0],[1]]", r"route.waypoints.*\[1\]"),
+        ("route.waypoints=[[0,0],[a,b]]", "route.waypoints.*'a'"),
+        ("recording=3", "recording must be a path.*3"),
+    ],
+)
+def test_a_bad_configuration_names_its_key(override, words):
+    with pytest.raises(InputError, match=words):
+        Experiment.compose(["simulation.physics=kinematic", override]).check()
+
+
+def test_a_malformed_option_names_its_file(tmp_path):
+    (tmp_path / "estimator").mkdir()
+    (tmp_path / "estimator" / "c.yaml").write_text("kr: [1\n  a: : b\n")
+    refused(estima("run", "--config-dir", str(tmp_path), "estimator=c", *QUICK), "c.yaml", "line 1")
 
 
 def test_damaged_recordings_are_refused(tmp_path):

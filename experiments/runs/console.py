@@ -115,11 +115,12 @@ def end(error: BaseException) -> NoReturn:
 
 
 def _configuration_errors() -> tuple[type[Exception], ...]:
-    """Errors of Hydra and OmegaConf, if they have been imported."""
+    """Errors of Hydra, OmegaConf and YAML, if they have been imported."""
     if "hydra" not in sys.modules:
         return ()
     hydra, omegaconf = (importlib.import_module(f"{n}.errors") for n in ("hydra", "omegaconf"))
-    return (hydra.HydraException, omegaconf.OmegaConfBaseException)
+    malformed = importlib.import_module("yaml").YAMLError
+    return (hydra.HydraException, omegaconf.OmegaConfBaseException, malformed)
 
 
 def _say(message: str, code: int) -> NoReturn:

@@ -14,7 +14,9 @@ from typing import Any
 
 import numpy as np
 from hydra import compose, initialize_config_dir
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import InterpolationKeyError
 
 from estimators.base import Estimator, Prior
 from experiments.runs import paths
@@ -34,6 +36,13 @@ Config = dict[str, Any]
 GROUPS = ("world", "robot", "sensors", "route", "estimator")
 _MAPPINGS = (*GROUPS, "simulation", "prior")
 _SIMULATED_KEYS = ("world", "robot", "sensors", "route", "simulation", "seed", "world_seed")
+_KEYS = (
+    *_MAPPINGS,
+    *("seed", "world_seed", "repeats", "recording", "name", "picture", "keep"),
+    *("simulation.physics", "simulation.rays"),
+    *("prior.start", "prior.sigma_position_m", "prior.sigma_heading_rad"),
+    *("prior.wheel_radius_m", "prior.track_m", "prior.map"),
+)
 _NOT_IN_KEY = ("name", "picture", "recording")
 _PHYSICS = ("bullet", "kinematic")
 _RAYS = ("bullet", "exact")
@@ -71,12 +80,25 @@ class Experiment:
 
     @classmethod
     def resolved(cls, cfg: DictConfig, choices: Mapping[str, str]) -> Experiment:
-        """Resolve a composed configuration."""
-        config: Config = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
+        """Resolve a composed configuration.
+
+        Raises
+        ------
+        InputError
+            If a key is missing, or is no mapping where it must be one.
+        """
+        try:
+            config: Config = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
+        except InterpolationKeyError as error:
+            raise InputError(
+                f"{error.full_key} follows a key that is missing: {str(error).splitlines()[0]}; "
+                f"keep that key, or set {error.full_key} too"
+            ) from error
         config.pop("sweeps", None)
+        _check_shape(config)
         simulation = config["simulation"]
-        if isinstance(simulation, dict) and simulation.get("rays") is None:
-            kinematic = simulation.get("physics") == "kinematic"  # it has no engine to cast rays
+        if simulation["rays"] is None:
+            kinematic = simulation["physics"] == "kinematic"  # it has no engine to cast rays
             simulation["rays"] = "exact" if kinematic else "bullet"
         return cls(config, {group: str(choices.get(group)) for group in GROUPS})
 
@@ -187,9 +209,7 @@ class Experiment:
             Naming the key, and the remedy.
         """
         config = self.config
-        for group in _MAPPINGS:
-            if not isinstance(config[group], dict):
-                raise InputError(f"{group} must hold keys, got {config[group]!r}")
+        _check_shape(config)
         repeats, keep = config["repeats"], config["keep"]
         if isinstance(repeats, bool) or not isinstance(repeats, int) or repeats < 1:
             raise InputError(f"repeats must be a whole number from 1 on, got {repeats!r}")
@@ -297,7 +317,12 @@ class Experiment:
         """
         wanted = self.config["recording"]
         if isinstance(wanted, dict):
-            made: Recording = make(wanted, "recording", config=self.config)
+            made = make(wanted, "recording", config=self.config)
+            if not isinstance(made, Recording):
+                raise InputError(
+                    f"recording: {wanted['_target_']} must return a Recording, "
+                    f"got {type(made).__name__}"
+                )
             return made
         if wanted is not None:
             recording = load(Path(wanted))
@@ -368,8 +393,44 @@ class Experiment:
         return recording.world
 
 
+def _check_shape(config: Config) -> None:
+    """Check that every key is there, and holds keys or a path where it must."""
+    for key in _KEYS:
+        parent, _, leaf = key.rpartition(".")
+        if leaf not in (config[parent] if parent else config):
+            remedy = f"choose one of `estima options {key}`" if key in GROUPS else "set it"
+            raise InputError(f"{key} is missing; {remedy}")
+        if key in _MAPPINGS and not isinstance(config[key], dict):
+            raise InputError(f"{key} must hold keys, got {config[key]!r}")
+    wanted = config["recording"]
+    if not (wanted is None or isinstance(wanted, dict) or (isinstance(wanted, str) and wanted)):
+        got = "nothing" if wanted == "" else repr(wanted)
+        raise InputError(f"recording must be a path, null, or a mapping with _target_, got {got}")
+
+
+def check_overrides(overrides: Sequence[str]) -> None:
+    """Check what Hydra itself does not: that each override has a key, and groups have names.
+
+    Raises
+    ------
+    InputError
+        Naming the override.
+    """
+    for override in OverridesParser.create().parse_overrides(list(overrides)):
+        key, value = override.key_or_group, override.value()
+        if not key:
+            raise InputError(f"{override.input_line}: no key before the =")
+        named = override.is_sweep_override() or isinstance(value, (str, list))
+        if key in (*GROUPS, "study") and not (named or override.is_delete()):
+            raise InputError(
+                f"{override.input_line}: {key} must be one of `estima options {key}`; "
+                f"single keys are set by {key}.KEY=VALUE"
+            )
+
+
 def composed(overrides: Sequence[str]) -> tuple[DictConfig, Mapping[str, str]]:
     """Have Hydra, once initialized, compose a configuration; also give the options it chose."""
+    check_overrides(overrides)
     cfg = compose("config", overrides=list(overrides), return_hydra_config=True)
     choices = cfg.hydra.runtime.choices
     OmegaConf.set_struct(cfg, False)

@@ -17,9 +17,8 @@ from experiments.runs import paths
 from experiments.runs.columns import COLUMNS
 from experiments.runs.console import RunFailedError, end, progress
 from experiments.runs.evaluate import evaluate
-from experiments.runs.experiment import Experiment
+from experiments.runs.experiment import Experiment, check_overrides
 from experiments.runs.row import Outcome, Row, write_rows
-from sim.errors import InputError
 from sim.recording import Recording
 
 Draw = Callable[[Recording, Estimate, str, Path], None]
@@ -70,9 +69,11 @@ def application(arguments: Sequence[str], draw: Draw) -> None:
     def run(cfg: DictConfig) -> None:
         try:
             run_once(Experiment.resolved(cfg, HydraConfig.get().runtime.choices), draw)
-        except (InputError, RunFailedError) as error:
+        except Exception as error:
             end(error)  # here, since Hydra would add a line of its own
 
+    pairs = zip(["", *arguments], arguments, strict=False)
+    check_overrides([a for option, a in pairs if "=" in a and "-" not in (a[0], option[:1])])
     sys.argv = ["estima run", *arguments]
     hydra.main(version_base="1.3", config_path=str(paths.CONF), config_name="config")(run)()
 

@@ -13,7 +13,7 @@ from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from experiments.runs import paths
-from experiments.runs.experiment import Experiment, composed
+from experiments.runs.experiment import Experiment, check_overrides, composed
 from sim.errors import InputError
 
 
@@ -25,6 +25,7 @@ def planned(arguments: Sequence[str], config_dir: str | None = None) -> Iterator
         arguments = [a for a in arguments if a not in composer.extra]
         given = OverridesParser.create().parse_overrides(list(arguments))
         fixed = [o.input_line or "" for o in given if not o.is_sweep_override()]
+        check_overrides(fixed)
         study = compose("config", overrides=composer.extra + fixed, return_hydra_config=True)
         params: dict[str, str] = dict(study.hydra.sweeper.get("params") or {})
         for part in study.get("sweeps") or [{}]:
