@@ -127,7 +127,7 @@ def record(
     if out.suffix != ".npz":
         raise InputError(f"-o {out}: a recording is an .npz file")
     experiment = Experiment.compose(overrides or [])
-    with progress("simulating, s") as on_progress:
+    with progress("simulated seconds") as on_progress:
         recording = experiment.simulate(on_progress)
     checksum = save(recording, out)
     print(f"{out}: {recording.status}, {recording.duration_s:.1f} s, checksum {checksum}")

@@ -459,9 +459,9 @@ def main() -> None:
     folder: Path = given.folder / f"{Path(given.suite).stem}_{given.share:g}"
     folder.mkdir(parents=True, exist_ok=True)
     n_null, n_power = 4000, 400 if given.share == 1.0 else 200
-    with progress("faults graded, share", 1.0) as on_progress:
+    with progress("grading the faults", 1.0) as on_progress:
         pool = fill_pool(suite, given.share, folder, on_progress)
-    with progress("faults looked for, share", 1.0) as on_progress:
+    with progress("looking for the faults", 1.0) as on_progress:
         power = power_table(pool, n_power, on_progress)
     hits, _ = alarms(pool, n_null, 0)
     print(f"{hits} false alarms in {n_null} checks")
@@ -470,7 +470,7 @@ def main() -> None:
     save_figure(detectable(power, TARGET), SOURCE / "docs" / "regression.png")
     page = SOURCE / "docs" / "regression.md"
     _write_measured(page, measured_text(pool, (hits, n_null), power, []))
-    with progress("conditions, share", 1.0) as on_progress:
+    with progress("other conditions", 1.0) as on_progress:
         equal = variants(given.suite, given.share, folder, on_progress)
     _write_measured(page, measured_text(pool, (hits, n_null), power, equal))
     print(page)

@@ -40,7 +40,7 @@ def run_check(
 ) -> bool:
     """Do what `estima check` does; return whether it found a worsening."""
     if reason is not None:
-        with progress("estimators over recordings, share", 1.0) as on_progress:
+        with progress("checking the estimators", 1.0) as on_progress:
             for path in accept(suite, reason, only, release=release, on_progress=on_progress):
                 print(path)
         return False
@@ -59,7 +59,7 @@ def run_check(
             "up unseen; pin one with --accept REASON --release",
             file=sys.stderr,
         )
-    with progress("estimators over recordings, share", 1.0) as on_progress:
+    with progress("checking the estimators", 1.0) as on_progress:
         findings = check(suite, only, on_progress)
     _say(as_text(findings, detectable))
     if junit is not None:

@@ -33,7 +33,7 @@ def progress(
     Parameters
     ----------
     total
-        The amount when all is done; None if unknown.
+        The amount when all is done; None if unknown, 1.0 if the amount is a share.
     unit
         What is counted, such as runs; their rate is then shown too.
     summary
@@ -80,6 +80,8 @@ def _state(
 ) -> str:
     amount = f"{done:.3g}" if isinstance(done, float) else str(done)
     of_total = f"{amount} of {total:g}" if total else amount
+    if total == 1.0 and not unit:
+        of_total = f"{100 * done:.0f} %"
     parts = [f"{of_total} after {spent_s:.0f} s"]
     if unit:
         parts = [f"{of_total} {unit}", f"{done / max(spent_s, 1e-9):.2g} a second"]
@@ -105,7 +107,7 @@ def end(error: BaseException) -> NoReturn:
         if isinstance(link, RunFailedError):
             _say(f"the run failed: {link}", 1)
         if isinstance(link, KeyboardInterrupt):
-            _say("interrupted; what was finished is kept", 1)
+            _say("interrupted; what was finished is kept", 130)
         if isinstance(link, _configuration_errors()):
             lines = [line.strip() for line in str(link).splitlines() if line.strip()]
             text = textwrap.shorten(" ".join(lines), 600, placeholder=" ...")

@@ -40,7 +40,7 @@ def run_once(experiment: Experiment, draw: Draw) -> list[Row]:
     experiment.check()
     folder, name = experiment.rows_folder / experiment.key, experiment.estimator_name
     path = folder.with_suffix(".parquet")
-    with progress("simulating, s") as on_progress:
+    with progress("simulated seconds") as on_progress:
         recording = experiment.recording(on_progress)
 
     def keep(repeat: int, online: Estimate, _: Estimate | None) -> None:
