@@ -86,6 +86,9 @@ def test_a_run_prints_its_errors_and_leaves_a_row(tmp_path):
         (["name=../../x"], ["name", "one word"]),
         (["world.n_objects=-3"], ["objects", "zero or more"]),
         (["route.speed_mps="], ["route", "must be real number"]),
+        (["study=leaderboard"], ["-m study=leaderboard"]),
+        (["robot.kq=1"], ["unknown key robot.kq", "robot.kr", "robot.track_m"]),
+        (["estimator=nosuch"], ["no estimator named nosuch", "fastslam, ", "topological_mcl"]),
         (["robot=null"], ["robot=null", "estima options robot"]),
         (["~world"], ["world is missing"]),
         (["~robot.kr"], ["robot.kr", "estimator.kr"]),
@@ -115,11 +118,21 @@ def test_bad_input_is_one_line_and_code_2(arguments, words):
         ("route.waypoints=[[0,0],[1]]", r"route.waypoints.*\[1\]"),
         ("route.waypoints=[[0,0],[a,b]]", "route.waypoints.*'a'"),
         ("recording=3", "recording must be a path.*3"),
+        ("recording=", "recording must be a path.*got nothing"),
+        ("prior.start=foo", "prior.start must be"),
+        ("prior.map=nosuch", "prior.map must be"),
+        ("prior.sigma_heading_rad=-1", "prior.sigma_heading_rad"),
+        ("world_seed=abc", "^world_seed must be"),
     ],
 )
 def test_a_bad_configuration_names_its_key(override, words):
     with pytest.raises(InputError, match=words):
         Experiment.compose(["simulation.physics=kinematic", override]).check()
+
+
+@pytest.mark.parametrize("argument", ["robot.kq=1,2", "robot.kq=1"])
+def test_an_unknown_key_of_a_sweep_names_the_known_ones(argument):
+    refused(estima("run", "-m", *QUICK, argument), "unknown key robot.kq", "robot.kr")
 
 
 def test_a_malformed_option_names_its_file(tmp_path):

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import importlib
+import re
 import sys
 import textwrap
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, NoReturn
 
@@ -109,11 +110,37 @@ def end(error: BaseException) -> NoReturn:
         if isinstance(link, KeyboardInterrupt):
             _say("interrupted; what was finished is kept", 130)
         if isinstance(link, _configuration_errors()):
+            if refusal := _refusal(link):
+                _say(refusal, 2)
             lines = [line.strip() for line in str(link).splitlines() if line.strip()]
             text = textwrap.shorten(" ".join(lines), 600, placeholder=" ...")
             _say(f"configuration: {text}; see estima run --cfg job", 2)
     traceback.print_exception(error)
     sys.exit(3)
+
+
+def unknown_key(key: str, config: Mapping[str, Any]) -> str:
+    """Say that a key is unknown, and which ones are known beside it."""
+    place = ""
+    for part in key.split(".")[:-1]:
+        if not isinstance(config.get(part), Mapping):
+            break
+        place, config = f"{place}{part}.", config[part]
+    known = (f"{place}{name}" for name in config if name != "hydra")
+    return f"unknown key {key}; known: {', '.join(known)}"
+
+
+def _refusal(error: BaseException) -> str | None:
+    """Say what Hydra could not find, and what there is; None if the error is another."""
+    missing, options = (getattr(error, name, None) for name in ("missing_cfg_file", "options"))
+    if missing and options:
+        group, _, name = missing.rpartition("/")
+        return f"no {group} named {name}; there are: {', '.join(options)}"
+    found = re.match(r"Could not override '(.+?)'", str(error))
+    root = getattr(error.__cause__, "parent_node", None)
+    if found is None or root is None:
+        return None
+    return unknown_key(found[1], root._get_root())
 
 
 def _configuration_errors() -> tuple[type[Exception], ...]:

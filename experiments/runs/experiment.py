@@ -219,8 +219,9 @@ class Experiment:
         self.sensors()
         make(config["route"], "route")
         stream(config["seed"], "slip")
-        stream(config["world_seed"], "world")
+        stream(config["world_seed"], "world", key="world_seed")
         self._check_simulation()
+        self._check_prior()
         self._check_needs()
 
     def _check_simulation(self) -> None:
@@ -232,6 +233,19 @@ class Experiment:
                 )
         if simulation["physics"] == "kinematic" and simulation["rays"] == "bullet":
             raise InputError("simulation.rays=bullet needs the engine; set simulation.rays=exact")
+
+    def _check_prior(self) -> None:
+        settings = self.config["prior"]
+        start, known_map = settings["start"], settings["map"]
+        if start not in ("tracking", "global"):
+            raise InputError(f"prior.start must be tracking or global, got {start!r}")
+        for key in ("sigma_position_m", "sigma_heading_rad") if start == "tracking" else ():
+            if not (isinstance(settings[key], (int, float)) and 0.0 <= settings[key] < np.inf):
+                raise InputError(f"prior.{key} must be zero or positive, got {settings[key]}")
+        if not isinstance(known_map, dict) and known_map not in ("none", "world"):
+            raise InputError(
+                f"prior.map must be none, world or a mapping with _target_, got {known_map!r}"
+            )
 
     def _check_needs(self) -> None:
         """Check that the estimator gets the sensors and the map that it needs."""
@@ -254,7 +268,7 @@ class Experiment:
 
     def world(self) -> World:
         """Make the world, from its own stream."""
-        rng = stream(self.config["world_seed"], "world")
+        rng = stream(self.config["world_seed"], "world", key="world_seed")
         world: World = make(self.config["world"], "world", rng=rng)
         return world
 
@@ -358,6 +372,7 @@ class Experiment:
 
     def prior(self, recording: Recording) -> Prior:
         """Return what the estimator knows at the start."""
+        self._check_prior()
         settings = self.config["prior"]
         geometry = dataclasses.asdict(recording.robot)
         geometry |= {key: settings[key] for key in geometry if settings[key] is not None}
@@ -365,11 +380,6 @@ class Experiment:
         known_map = self._map(recording)
         if settings["start"] == "global":
             return Prior(robot, recording.sensors, map=known_map)
-        if settings["start"] != "tracking":
-            raise InputError(f"prior.start must be tracking or global, got {settings['start']!r}")
-        for key in ("sigma_position_m", "sigma_heading_rad"):
-            if not (isinstance(settings[key], (int, float)) and 0.0 <= settings[key] < np.inf):
-                raise InputError(f"prior.{key} must be zero or positive, got {settings[key]}")
         sigma = np.array([settings["sigma_position_m"]] * 2 + [settings["sigma_heading_rad"]])
         start = np.zeros(3)
         if recording.truth is not None:
@@ -384,10 +394,6 @@ class Experiment:
             return make(wanted, "prior.map", config=self.config, recording=recording)
         if wanted == "none":
             return None
-        if wanted != "world":
-            raise InputError(
-                f"prior.map must be none, world or a mapping with _target_, got {wanted!r}"
-            )
         if recording.world is None:
             raise InputError("prior.map=world, but the recording has no map; set prior.map=none")
         return recording.world

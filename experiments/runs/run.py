@@ -19,6 +19,7 @@ from experiments.runs.console import RunFailedError, end, progress
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment, check_overrides
 from experiments.runs.row import Outcome, Row, write_rows
+from sim.errors import InputError
 from sim.recording import Recording
 
 Draw = Callable[[Recording, Estimate, str, Path], None]
@@ -68,7 +69,14 @@ def application(arguments: Sequence[str], draw: Draw) -> None:
 
     def run(cfg: DictConfig) -> None:
         try:
-            run_once(Experiment.resolved(cfg, HydraConfig.get().runtime.choices), draw)
+            hydra_settings = HydraConfig.get()
+            choices = hydra_settings.runtime.choices
+            if cfg.get("sweeps") or hydra_settings.sweeper.get("params"):
+                study = choices.get("study")
+                raise InputError(
+                    f"study={study} sweeps values; add -m: estima run -m study={study}"
+                )
+            run_once(Experiment.resolved(cfg, choices), draw)
         except Exception as error:
             end(error)  # here, since Hydra would add a line of its own
 

@@ -9,7 +9,7 @@ import numpy as np
 from sim.errors import InputError
 
 
-def stream(seed: int, axis: str, index: int = 0) -> np.random.Generator:
+def stream(seed: int, axis: str, index: int = 0, *, key: str = "seed") -> np.random.Generator:
     """Generator of one axis of randomness.
 
     Streams of different axes, names or indices are independent, and none depends on the order
@@ -23,8 +23,15 @@ def stream(seed: int, axis: str, index: int = 0) -> np.random.Generator:
         `world`, `route`, `slip`, `sensors`, or `estimator/NAME`.
     index
         Repetition.
+    key
+        The seed's place in the configuration, for messages.
+
+    Raises
+    ------
+    InputError
+        If the seed is no such number.
     """
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
-        raise InputError(f"seed must be a whole number from 0 on, got {seed!r}")
-    key = (zlib.crc32(axis.encode()), index)
-    return np.random.default_rng(np.random.SeedSequence(entropy=seed, spawn_key=key))
+        raise InputError(f"{key} must be a whole number from 0 on, got {seed!r}")
+    spawn_key = (zlib.crc32(axis.encode()), index)
+    return np.random.default_rng(np.random.SeedSequence(entropy=seed, spawn_key=spawn_key))

@@ -13,6 +13,7 @@ from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from experiments.runs import paths
+from experiments.runs.console import unknown_key
 from experiments.runs.experiment import Experiment, check_overrides, composed
 from sim.errors import InputError
 
@@ -78,9 +79,7 @@ class _Composer:
         for override in plain:
             key = override.key_or_group
             if not _has(cfg, key):
-                raise InputError(
-                    f"unknown key {key}; see estima run --cfg job, or +{key}=... to add it"
-                )
+                raise InputError(unknown_key(key, cfg))
             OmegaConf.update(cfg, key, override.value(), merge=True)
         return Experiment.resolved(cfg, choices).replaced(picture=False)
 
