@@ -284,11 +284,11 @@ def _show_run(
     recording = read_any([log])
     length_s = seconds or (recording.duration_s if out is None else view.SECONDS)
     rows = view.shown_rows(recording, int(length_s * (live.FPS if out is None else view.FPS)))
-    shown = view.Run(recording, rows)
+    shown = view.Playback(recording, rows)
     if source is not None:
         with progress(source, len(recording.frame_stamps)) as on_step:
             found = view.estimate_of(recording, source, overrides, rows, on_step)
-        shown = view.Run(recording, rows, *found)
+        shown = view.Playback(recording, rows, *found)
     if out is None:
         live.watch(shown, seconds)
         return

@@ -40,7 +40,7 @@ def test_what_ends_soon_leaves_at_most_a_summary(clock, capsys):
         with console.progress("drawing", 1.0, summary=summary) as on_progress:
             clock[0] += 1.0
             on_progress(1.0)
-        assert capsys.readouterr().err == "drawing: 1 of 1 after 1 s\n" * summary
+        assert capsys.readouterr().err == "drawing: 100 % after 1 s\n" * summary
 
 
 def test_a_terminal_gets_a_bar_and_then_the_summary(clock, monkeypatch):

@@ -41,7 +41,7 @@ def run(recording):
     rows = view.shown_rows(recording, 6)
     overrides = ["estimator.n_particles=20"]
     found, name = view.estimate_of(recording, "fastslam", overrides, rows, silent)
-    return view.Run(recording, rows, found, name)
+    return view.Playback(recording, rows, found, name)
 
 
 def believed(recording, poses):
@@ -58,7 +58,7 @@ def test_shown_frames_are_evenly_apart_and_hold_both_ends(recording):
 
 
 def test_the_scan_lies_on_the_walls_of_the_truth(recording):
-    run = view.Run(recording, np.array([0]))
+    run = view.Playback(recording, np.array([0]))
     for stamp in recording.frame_stamps[[0, 17]]:
         points = view.scan_points(run, stamp)
         assert len(points) == 61
@@ -68,18 +68,18 @@ def test_the_scan_lies_on_the_walls_of_the_truth(recording):
 def test_with_an_estimate_the_scan_goes_where_it_is_believed_to_be(recording):
     shift = np.array([0.3, -0.2, 0.5])
     moved = se2.compose(shift, recording.truth_at(recording.frame_stamps))
-    run = view.Run(recording, np.array([0]), believed(recording, moved))
-    plain = view.scan_points(view.Run(recording, np.array([0])), 1.0)
+    run = view.Playback(recording, np.array([0]), believed(recording, moved))
+    plain = view.scan_points(view.Playback(recording, np.array([0])), 1.0)
     assert np.allclose(view.scan_points(run, 1.0), se2.transform(shift, plain), atol=1e-9)
 
 
 def test_landmarks_seen_are_the_true_ones(recording):
-    seen = view.seen_landmarks(view.Run(recording, np.array([0])), recording.frame_stamps[4])
+    seen = view.seen_landmarks(view.Playback(recording, np.array([0])), recording.frame_stamps[4])
     true = recording.truth.world.landmarks[:, :2]
     nearest = np.hypot(*(seen[:, None] - true).transpose(2, 0, 1)).min(axis=1)
     assert len(seen) > 3
     assert np.median(nearest) < 0.4  # a stereo camera errs by some decimetres
-    assert len(view.seen_landmarks(view.Run(recording, np.array([0])), -1.0)) == 0
+    assert len(view.seen_landmarks(view.Playback(recording, np.array([0])), -1.0)) == 0
 
 
 def test_outlines_lie_on_the_ellipse():
@@ -107,7 +107,7 @@ def test_pictures_show_what_moves(run):
     assert all(side % 2 == 0 for side in images[0].shape[:2])  # which video needs
     changed = [(first != second).any() for first, second in pairwise(images)]
     assert all(changed)
-    bare = next(iter(view.pictures(view.Run(run.recording, run.rows[-1:]))))
+    bare = next(iter(view.pictures(view.Playback(run.recording, run.rows[-1:]))))
     assert (bare == [0, 114, 178]).all(axis=2).sum() == 0  # no blue without an estimate
     assert (images[-1] == [0, 114, 178]).all(axis=2).sum() > 20
 
@@ -115,9 +115,9 @@ def test_pictures_show_what_moves(run):
 def test_a_log_without_truth_needs_an_estimate(recording):
     blind = dataclasses.replace(recording, truth=None)
     with pytest.raises(InputError, match="--estimate"):
-        next(view.pictures(view.Run(blind, np.array([0, 5]))))
+        next(view.pictures(view.Playback(blind, np.array([0, 5]))))
     poses = recording.truth_at(recording.frame_stamps)
-    run = view.Run(blind, np.array([0, 5]), believed(blind, poses))
+    run = view.Playback(blind, np.array([0, 5]), believed(blind, poses))
     assert len(list(view.pictures(run))) == 2
 
 
@@ -125,7 +125,7 @@ def test_an_estimate_that_runs_away_or_is_not_finite_is_still_drawn(recording):
     poses = recording.truth_at(recording.frame_stamps)
     poses[10:, 0] = 1e6
     poses[20:] = np.nan
-    run = view.Run(recording, np.array([0, 15, 25]), believed(recording, poses))
+    run = view.Playback(recording, np.array([0, 15, 25]), believed(recording, poses))
     assert len(list(view.pictures(run))) == 3
 
 

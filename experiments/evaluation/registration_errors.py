@@ -25,7 +25,7 @@ _GUESS_SIGMA = np.array([0.01, 0.01, math.radians(0.5)])
 
 
 @dataclass(frozen=True)
-class Scene:
+class ScanScene:
     """Two laser poses (3,) in a world's walls, and the place they are in."""
 
     place: str
@@ -34,23 +34,25 @@ class Scene:
     T_w_source: Array
 
 
-def scenes(world: World, place: str, mount: Array, rng: np.random.Generator, n: int) -> list[Scene]:
+def scenes(
+    world: World, place: str, mount: Array, rng: np.random.Generator, n: int
+) -> list[ScanScene]:
     """Poses of the laser along the world's tour inside a place, 5 cm and up to 3 degrees apart."""
     path = _resampled(world.waypoints, 0.1)
     inside = np.flatnonzero(world.place_of(path[:, :2]) == place)
-    found: list[Scene] = []
+    found: list[ScanScene] = []
     turn_rad = math.radians(3.0)
     while len(found) < n:
         base = path[rng.choice(inside)] + np.append(rng.normal(0.0, 0.1, 2), rng.normal(0.0, 0.15))
         moved = se2.compose(base, [0.05, 0.0, rng.uniform(-turn_rad, turn_rad)])
         if world.clearance_m(base) > 0.35:
             target, source = se2.compose(base, mount), se2.compose(moved, mount)
-            found.append(Scene(place, world.walls, target, source))
+            found.append(ScanScene(place, world.walls, target, source))
     return found
 
 
 def measured(
-    scene: Scene, laser: Laser, rng: np.random.Generator, n_repeats: int, n_sampled: int
+    scene: ScanScene, laser: Laser, rng: np.random.Generator, n_repeats: int, n_sampled: int
 ) -> pd.DataFrame:
     """Rows (metric x method): NEES over dof, determinants, errors, times.
 

@@ -21,7 +21,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from enum import StrEnum
 
 import numpy as np
 import pandas as pd
@@ -33,9 +33,6 @@ from experiments.runs.seeds import stream
 from sim.errors import InputError
 
 Array = NDArray[np.float64]
-Verdict = Literal["identical", "equal", "changed", "better", "worse", "failed"]
-
-
 ALPHA_REAL = 0.002  # of a whole check
 ALPHA_GENERAL = 0.05  # of one error of one estimator
 ROUNDING = 1e-6  # of an error, as a share; machines differ by less than 1e-9
@@ -45,6 +42,17 @@ _DRAWN_WAYS = 4096  # so many are drawn
 _PLAIN = 2.0  # standard deviations
 _LEAST_ERROR = 1e-12  # zero has no logarithm
 WHICH = ("estimator", "recording", "repeat")
+
+
+class Change(StrEnum):
+    """How an error compares with its baseline's, the gravest first."""
+
+    FAILED = "failed"  # runs fail that did not before
+    WORSE = "worse"
+    BETTER = "better"
+    CHANGED = "changed"  # another result, neither worse nor better on the whole
+    EQUAL = "equal"  # no difference is shown
+    IDENTICAL = "identical"  # to rounding
 
 
 @dataclass(frozen=True)
@@ -63,8 +71,7 @@ class Finding:
     p_real, p_general
         (worse, better) of either question.
     verdict
-        `identical`: to rounding. `equal`: no difference is shown. `changed`: another result,
-        neither worse nor better on the whole. `failed`: runs fail that did not before.
+        How it compares.
     message
         What failed.
     """
@@ -79,13 +86,13 @@ class Finding:
     high: float
     p_real: tuple[float, float]
     p_general: tuple[float, float]
-    verdict: Verdict
+    verdict: Change
     message: str = ""
 
     @property
     def alarms(self) -> bool:
         """Whether it fails the check."""
-        return self.verdict in ("worse", "failed")
+        return self.verdict in (Change.WORSE, Change.FAILED)
 
 
 def exchange_p(
@@ -172,7 +179,7 @@ def examine(
     n, n_suite, ones = int(np.sum(sound)), len(then), (1.0, 1.0)
     if failure or n < 2:
         message, nan = failure or "no run succeeds", math.nan
-        return Finding(*which, n, n_suite, nan, nan, nan, ones, ones, "failed", message)
+        return Finding(*which, n, n_suite, nan, nan, nan, ones, ones, Change.FAILED, message)
     logs_then, logs_now = (np.log(np.maximum(runs[sound], _LEAST_ERROR)) for runs in (then, now))
     shared = min(then.shape[1], now.shape[1])
     same = np.abs(logs_now[:, :shared] - logs_then[:, :shared]).max() < ROUNDING
@@ -183,20 +190,19 @@ def examine(
     half = float(stats.t.ppf(1.0 - ALPHA_GENERAL, n - 1) * differences.std(ddof=1) / math.sqrt(n))
     ratios = (math.exp(mean), math.exp(mean - half), math.exp(mean + half))
     if same:
-        return Finding(*which, n, n_suite, *ratios, ones, ones, "identical")
+        return Finding(*which, n, n_suite, *ratios, ones, ones, Change.IDENTICAL)
     p_general = general_p(differences)
     if then.shape[1] == 1:  # nothing random in it
-        return Finding(*which, n, n_suite, *ratios, (0.0, 0.0), p_general, "changed")
+        return Finding(*which, n, n_suite, *ratios, (0.0, 0.0), p_general, Change.CHANGED)
     p_real = exchange_p(logs_then, logs_now, rng, n_draws)
-    return Finding(*which, n, n_suite, *ratios, p_real, p_general, "equal")
+    return Finding(*which, n, n_suite, *ratios, p_real, p_general, Change.EQUAL)
 
 
 def judge(findings: Sequence[Finding]) -> list[Finding]:
     """Reach the verdicts of a whole check."""
     judged = list(findings)
-    undecided = [i for i, f in enumerate(findings) if f.verdict in ("equal", "changed")]
-    verdicts: tuple[Verdict, Verdict] = ("worse", "better")
-    for side, verdict in enumerate(verdicts):
+    undecided = [i for i, f in enumerate(findings) if f.verdict in (Change.EQUAL, Change.CHANGED)]
+    for side, verdict in enumerate((Change.WORSE, Change.BETTER)):
         real = holm([findings[i].p_real[side] for i in undecided], ALPHA_REAL)
         for i, is_real in zip(undecided, real, strict=True):
             if is_real and findings[i].p_general[side] <= ALPHA_GENERAL:

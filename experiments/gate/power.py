@@ -45,6 +45,7 @@ from experiments.gate.baseline import (
 from experiments.gate.compare import (
     ALPHA_GENERAL,
     ALPHA_REAL,
+    Change,
     Finding,
     by_repeat,
     compare,
@@ -332,7 +333,7 @@ def variants(
             for key, rows_then in then.items()
         }
         found = compare(of_pool, rows_now)
-        fixed = [f for f in found if f.verdict == "identical"]
+        fixed = [f for f in found if f.verdict is Change.IDENTICAL]
         rows.append(
             {
                 "variant": name,

@@ -13,7 +13,7 @@ from pathlib import Path
 import pandas as pd
 
 from experiments.gate.baseline import accept, baseline_folder, baseline_paths, check, is_main
-from experiments.gate.compare import Finding
+from experiments.gate.compare import Change, Finding
 from experiments.gate.suite import printable
 from experiments.report.export import to_markdown
 from experiments.runs.console import progress
@@ -21,11 +21,10 @@ from sim.errors import InputError
 from sim.files import write_whole
 
 LABELS = {"ate_rmse_m": "position", "ate_aligned_rmse_m": "aligned", "heading_rmse_rad": "heading"}
-_RANK = ("failed", "worse", "better", "changed", "equal", "identical")
 _MEANING = {
-    "identical": "same errors to rounding",
-    "equal": "no difference shown",
-    "changed": "other errors, neither worse nor better on the whole",
+    Change.IDENTICAL: "same errors to rounding",
+    Change.EQUAL: "no difference shown",
+    Change.CHANGED: "other errors, neither worse nor better on the whole",
 }
 
 
@@ -110,13 +109,13 @@ def smallest_found() -> dict[str, float]:
 def sentence(finding: Finding) -> str:
     """One finding in one line of printable characters."""
     who = f"{finding.estimator}, {LABELS[finding.error]} error"
-    if finding.verdict == "failed":
+    if finding.verdict is Change.FAILED:
         return printable(f"{finding.estimator}: {finding.message}")
     if finding.verdict in _MEANING:
         return printable(f"{who}: {_MEANING[finding.verdict]}")
     ends = sorted((finding.low, finding.high), key=lambda ratio: abs(ratio - 1.0))
     by, least, most = (abs(100.0 * (ratio - 1.0)) for ratio in (finding.ratio, *ends))
-    p = finding.p_general[("worse", "better").index(finding.verdict)]
+    p = finding.p_general[(Change.WORSE, Change.BETTER).index(finding.verdict)]
     return printable(
         f"{who} {finding.verdict} by {by:.1f} % (90 % interval: {least:.1f} to {most:.1f} %; "
         f"{finding.n_recordings} recordings, p {p:.1g}) than the "
@@ -161,7 +160,7 @@ def _tables(
             row |= {LABELS[f.error]: _number(f.ratio, ".3f") for f in group}
             if detectable:
                 row["finds"] = _number(100.0 * detectable.get(estimator, math.nan), ".1f", " %")
-            row["verdict"] = min((f.verdict for f in group), key=_RANK.index)
+            row["verdict"] = min((f.verdict for f in group), key=list(Change).index).value
             n, n_suite = min((f.n_recordings, f.n_suite) for f in group)
             if n < n_suite:
                 row["verdict"] += f" ({n} of {n_suite} recordings)"
@@ -220,7 +219,7 @@ def write_text(text: str, path: Path) -> None:
 def last_line(findings: Sequence[Finding]) -> str:
     """Say how the check ended."""
     alarmed = ", ".join(dict.fromkeys(f.estimator for f in findings if f.alarms))
-    better = ", ".join(dict.fromkeys(f.estimator for f in findings if f.verdict == "better"))
+    better = ", ".join(dict.fromkeys(f.estimator for f in findings if f.verdict is Change.BETTER))
     parts = [f"worse: {alarmed}" if alarmed else "nothing is worse"]
     if better:
         parts.append(f"better: {better}")
@@ -233,6 +232,6 @@ def _noteworthy(findings: Sequence[Finding]) -> list[Finding]:
     """Findings worth a line: alarms and improvements; one failure counts once for all baselines."""
     chosen: dict[tuple[object, ...], Finding] = {}
     for f in findings:
-        if f.verdict in ("worse", "better", "failed"):
+        if f.verdict in (Change.WORSE, Change.BETTER, Change.FAILED):
             chosen.setdefault((f.estimator, f.message or (f.error, f.baseline)), f)
     return list(chosen.values())

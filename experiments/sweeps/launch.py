@@ -84,7 +84,8 @@ def sweep(arguments: Sequence[str], config_dir: str | None = None) -> None:
     runs = list({run.key: run for run in every}.values())
     missing = [run for run in runs if _failure(folder, run.key) is not None]
     print(
-        f"{len(runs)} runs, {len(runs) - len(missing)} of them done before: {paths.short(folder)}",
+        f"{len(runs)} run{'s' if len(runs) > 1 else ''}, {len(runs) - len(missing)} of them done "
+        f"before: {paths.short(folder)}",
         file=sys.stderr,
     )
     if missing:

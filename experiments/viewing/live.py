@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from experiments.viewing.view import Run, scan_points
+from experiments.viewing.view import Playback, scan_points
 from sim.errors import InputError
 from sim.world import World
 
@@ -36,7 +36,7 @@ def check_display() -> None:
         raise InputError(f"there is no display for a window (DISPLAY is not set); {_REMEDY}")
 
 
-def watch(run: Run, seconds: float | None = None) -> None:
+def watch(run: Playback, seconds: float | None = None) -> None:
     """Show the run in a window until it has ended and the window is closed.
 
     Parameters
@@ -57,7 +57,7 @@ def watch(run: Run, seconds: float | None = None) -> None:
         raise InputError(f"the window could not be opened or was lost; {_REMEDY}")
 
 
-def _window(run: Run, seconds: float | None) -> None:
+def _window(run: Playback, seconds: float | None) -> None:
     """Body of the window's process: play once, then wait for the window to be closed."""
     with open(os.devnull, "w") as sink:
         os.dup2(sink.fileno(), 1)  # the engine prints about its threads and OpenGL
@@ -79,7 +79,7 @@ def _window(run: Run, seconds: float | None) -> None:
             raise  # else the window was closed, as it should be
 
 
-def _play(engine: Any, run: Run, seconds: float | None) -> None:
+def _play(engine: Any, run: Playback, seconds: float | None) -> None:
     """Move the robots by the clock, from the first shown Frame to the last."""
     engine.configureDebugVisualizer(engine.COV_ENABLE_GUI, 0)
     recording = run.recording
@@ -123,7 +123,7 @@ def _play(engine: Any, run: Run, seconds: float | None) -> None:
         engine.stepSimulation()  # lets the window respond
 
 
-def _aim(engine: Any, run: Run, truth: Array) -> None:
+def _aim(engine: Any, run: Playback, truth: Array) -> None:
     """Look at the whole path from above."""
     means = truth if run.estimate is None else run.estimate.means
     way = np.concatenate([truth[:, :2], means[:, :2]])

@@ -1,6 +1,6 @@
 """A run as an animation: what is shown at each instant, and files of it.
 
-The same `Run` is drawn to a file here (MP4, GIF, HTML), and in a window by `viewing.live`.
+The same `Playback` is drawn to a file here (MP4, GIF, HTML), and in a window by `viewing.live`.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _DPI = 100
 
 
 @dataclass(frozen=True)
-class Run:
+class Playback:
     """What is shown.
 
     Attributes
@@ -162,7 +162,7 @@ class _Sparing:
         return Belief(belief.mean, belief.covariance, copied)
 
 
-def scan_points(run: Run, stamp: float) -> Array:
+def scan_points(run: Playback, stamp: float) -> Array:
     """Points (N, 2) in map of the last scan, or cloud, up to a time."""
     sensors, scans, clouds = run.recording.sensors, run.recording.laser, run.recording.clouds
     if scans is not None and (row := _last(scans.stamps, stamp)) >= 0:
@@ -179,7 +179,7 @@ def scan_points(run: Run, stamp: float) -> Array:
     return np.zeros((0, 2))
 
 
-def seen_landmarks(run: Run, stamp: float) -> Array:
+def seen_landmarks(run: Playback, stamp: float) -> Array:
     """Points (N, 2) in map of the landmarks in the last image up to a time."""
     log = run.recording.landmarks
     if log is None or (row := _last(log.stamps, stamp)) < 0:
@@ -194,7 +194,7 @@ def _last(stamps: Array, stamp: float) -> int:
     return int(np.searchsorted(stamps, stamp + 1e-9, side="right")) - 1
 
 
-def _in_map(run: Run, stamp: float, mount: Mount, points_in_sensor: Array) -> Array:
+def _in_map(run: Playback, stamp: float, mount: Mount, points_in_sensor: Array) -> Array:
     pose = run.pose_at(float(stamp))
     if not np.isfinite(pose).all():
         return np.zeros((0, 2))
@@ -212,7 +212,7 @@ def ellipse_outlines(means: Array, covariances: Array, n_corners: int = 24) -> A
     return np.concatenate([outlines, gaps], axis=1).reshape(-1, 2)
 
 
-def pictures(run: Run) -> Iterator[Picture]:
+def pictures(run: Playback) -> Iterator[Picture]:
     """The run as pictures (H, W, 3) with even sides, one for each row shown.
 
     What never moves is drawn once.
@@ -252,7 +252,7 @@ def pictures(run: Run) -> Iterator[Picture]:
         yield image[: image.shape[0] // 2 * 2, : image.shape[1] // 2 * 2].copy()
 
 
-def _layers(run: Run, known: bool) -> dict[str, tuple[str, str, str, dict[str, Any]]]:
+def _layers(run: Playback, known: bool) -> dict[str, tuple[str, str, str, dict[str, Any]]]:
     """Moving layers from the lowest up: style, colour, label, further settings."""
     recording = run.recording
     extras = {} if run.estimate is None else run.estimate.extras
@@ -277,7 +277,7 @@ def _layers(run: Run, known: bool) -> dict[str, tuple[str, str, str, dict[str, A
 
 
 def _instant(
-    run: Run, frame: int, truth: Array | None, glyph_m: float
+    run: Playback, frame: int, truth: Array | None, glyph_m: float
 ) -> tuple[dict[str, Array], str]:
     """Points of every moving layer at a Frame, and the title."""
     stamps = run.recording.frame_stamps
@@ -315,7 +315,7 @@ def robot_outline(pose: Array, radius_m: float) -> Array:
     return np.concatenate([circle, front[None]])
 
 
-def _bounds(run: Run, truth: Array | None) -> tuple[float, float, float, float]:
+def _bounds(run: Playback, truth: Array | None) -> tuple[float, float, float, float]:
     """What the map shows: the world and the path, with a margin.
 
     A diverging estimate is followed to twice the size of all else.
@@ -347,7 +347,7 @@ def check_output(path: Path) -> None:
         raise InputError(f"{path}: MP4 needs ffmpeg, which is not installed; take .gif or .html")
 
 
-def save(run: Run, path: Path, on_progress: Callable[[float], None], fps: int = FPS) -> None:
+def save(run: Playback, path: Path, on_progress: Callable[[float], None], fps: int = FPS) -> None:
     """Write the run as `.mp4` (needs ffmpeg), `.gif` or `.html`, whole or not at all.
 
     Parameters

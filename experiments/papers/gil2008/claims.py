@@ -117,27 +117,33 @@ def gi3(particles: pd.DataFrame) -> Iterator[Claim]:
 
 def gi4(distance: pd.DataFrame) -> Iterator[Claim]:
     """GI4: the error falls with dmax."""
-    for kind, part in _kinds(distance[distance["occluded"]]):
+    for variant, part in _variants(distance[distance["occluded"]]):
         errors = pooled(part, POSITION, "max_distance_m")
         found = log_ratio_interval(errors[3], errors[10])
+<<<<<<< HEAD
         label = f"position error, dmax = 3 m over 10 m: {kind.words}"
         claim = banded("GI4", label, found, at_least=1.5, criterion="above 1.5")
         yield _shown_if_nearest(claim, kind)
+=======
+        label = f"position error, dmax = 3 m over 10 m: {variant.words}"
+        claim = Claim("GI4", label, found, "above 1.5", judged(found, at_least=1.5))
+        yield _shown_if_nearest(claim, variant)
+>>>>>>> fx2
 
 
 def gi5(distance: pd.DataFrame) -> Iterator[Claim]:
     """GI5: nothing significant is gained past 10 m, because of the noise of far landmarks."""
-    for kind, part in _kinds(distance):
+    for variant, part in _variants(distance):
         far = float(part[part["max_distance_m"] == 20]["share_beyond_10_m"].mean())
         errors = pooled(part, POSITION, "max_distance_m")
         label = (
             f"position error, dmax = 10 m over 20 m, {100 * far:.0f} % of observations beyond "
-            f"10 m (90 % interval): {kind.words}"
+            f"10 m (90 % interval): {variant.words}"
         )
         claim = _equivalence("GI5", label, errors[10], errors[20], 0.30)
         if far < 0.1:
             claim = _undecided(claim, "too few far observations")
-        yield _shown_if_nearest(claim, kind)
+        yield _shown_if_nearest(claim, variant)
 
 
 def gi6(observations: pd.DataFrame) -> Iterator[Claim]:
@@ -200,7 +206,7 @@ def median_interval(values: Array) -> Interval:
     return Interval(float(np.median(values)), float(found.low), float(found.high))
 
 
-class Kind(NamedTuple):
+class Variant(NamedTuple):
     """Runs that differ in dmax alone."""
 
     filter: str
@@ -217,18 +223,18 @@ class Kind(NamedTuple):
         return f"{NAMES[self.filter]}, {seen}, {walls}, {NOISE[self.noise]}"
 
 
-def _kinds(distance: pd.DataFrame) -> Iterator[tuple[Kind, pd.DataFrame]]:
-    for key, part in distance.groupby(list(Kind._fields), sort=False):
-        yield Kind(*key), part
+def _variants(distance: pd.DataFrame) -> Iterator[tuple[Variant, pd.DataFrame]]:
+    for key, part in distance.groupby(list(Variant._fields), sort=False):
+        yield Variant(*key), part
 
 
 def _undecided(claim: Claim, reason: str) -> Claim:
     return dataclasses.replace(claim, verdict=Verdict.UNDECIDED, reason=reason)
 
 
-def _shown_if_nearest(claim: Claim, kind: Kind) -> Claim:
+def _shown_if_nearest(claim: Claim, variant: Variant) -> Claim:
     """The nearest landmarks are our addition, which no claim is about."""
-    if kind.rule != "nearest":
+    if variant.rule != "nearest":
         return claim
     return dataclasses.replace(claim, criterion=SHOWN, verdict=Verdict.SHOWN, reason="")
 
