@@ -120,15 +120,9 @@ def gi4(distance: pd.DataFrame) -> Iterator[Claim]:
     for variant, part in _variants(distance[distance["occluded"]]):
         errors = pooled(part, POSITION, "max_distance_m")
         found = log_ratio_interval(errors[3], errors[10])
-<<<<<<< HEAD
-        label = f"position error, dmax = 3 m over 10 m: {kind.words}"
-        claim = banded("GI4", label, found, at_least=1.5, criterion="above 1.5")
-        yield _shown_if_nearest(claim, kind)
-=======
         label = f"position error, dmax = 3 m over 10 m: {variant.words}"
-        claim = Claim("GI4", label, found, "above 1.5", judged(found, at_least=1.5))
+        claim = banded("GI4", label, found, at_least=1.5, criterion="above 1.5")
         yield _shown_if_nearest(claim, variant)
->>>>>>> fx2
 
 
 def gi5(distance: pd.DataFrame) -> Iterator[Claim]:
