@@ -10,6 +10,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 
 from sim.arrays import Array
+from sim.errors import InputError
 from sim.recording import Frame, Recording
 from sim.robot import RobotGeometry
 from sim.sensors import SensorSuite
@@ -120,6 +121,11 @@ def run(
     -------
     Estimate
         The online estimate at the Frame stamps.
+
+    Raises
+    ------
+    InputError
+        If the first step returns no Belief, or one of other shapes.
     """
     n_frames = len(recording.frame_stamps)
     means, covariances = np.empty((n_frames, 3)), np.empty((n_frames, 3, 3))
@@ -131,6 +137,8 @@ def run(
         begun = time.perf_counter()
         belief = estimator.step(frame)
         seconds[i] = time.perf_counter() - begun
+        if i == 0:
+            _check_belief(belief, estimator)
         means[i], covariances[i] = belief.mean, belief.covariance
         for name in keep:
             extras[name].append(belief.extras.get(name))
@@ -147,3 +155,18 @@ def run(
         extras=extras,
         status=status,
     )
+
+
+def _check_belief(belief: object, estimator: Estimator) -> None:
+    wanted = (
+        f"{type(estimator).__name__}.step must return a Belief with a mean of shape (3,) "
+        "and a covariance of shape (3, 3)"
+    )
+    if not isinstance(belief, Belief):
+        raise InputError(f"{wanted}, got {type(belief).__name__}")
+    try:
+        shapes = np.shape(belief.mean), np.shape(belief.covariance)
+    except ValueError as error:  # ragged lists
+        raise InputError(f"{wanted}: {error}") from error
+    if shapes != ((3,), (3, 3)):
+        raise InputError(f"{wanted}, got shapes {shapes[0]} and {shapes[1]}")

@@ -575,7 +575,8 @@ def _results_first(arguments: list[str]) -> list[str]:
     for i, argument in enumerate(arguments):
         if argument.partition("=")[0] == "--results":
             n_words = 1 if "=" in argument else 2
-            if i + n_words > len(arguments):
+            given = [*argument.split("=", 1)[1:], *arguments[i + 1 :]]
+            if not given or not given[0]:
                 raise InputError("--results must name a folder")
             return [*arguments[i : i + n_words], *arguments[:i], *arguments[i + n_words :]]
     return arguments

@@ -89,7 +89,9 @@ def where(table: pd.DataFrame, conditions: Sequence[str]) -> pd.DataFrame:
     for condition in conditions:
         column, equals, wanted = condition.partition("=")
         if not equals or column not in table:
-            raise InputError(f"--where {condition}: COLUMN=VALUE, with a column of the sweep")
+            raise InputError(
+                f"--where {condition}: give COLUMN=VALUE; columns: {', '.join(map(str, table))}"
+            )
         numbers, number = (pd.to_numeric(v, errors="coerce") for v in (table[column], wanted))
         meets = (table[column].astype(str) == wanted) | (numbers == number)
         if not meets.any():
