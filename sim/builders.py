@@ -13,14 +13,12 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sim.arrays import Array
 from sim.errors import InputError
 from sim.plan import Plan, box_corners, rectangle_corners
 from sim.world import World
 from sim.world_file import read_world
-
-Array = NDArray[np.float64]
 
 
 def empty(*, rng: np.random.Generator, tour_m: float) -> World:

@@ -14,8 +14,8 @@ from collections.abc import Iterator
 from types import TracebackType
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sim.arrays import Array
 from sim.errors import InputError
 from sim.robot import DifferentialDrive
 from sim.world import World
@@ -41,7 +41,6 @@ def _quiet() -> Iterator[None]:
 with _quiet():
     import pybullet
 
-Array = NDArray[np.float64]
 
 DT_S = 1.0 / 300.0
 MAX_RAYS = 16_000  # a batch of 16384 rays loses its last one

@@ -17,11 +17,10 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sim.arrays import Array
 from sim.compiled import njit
 from sim.sensors import Laser, Lidar3D
 from sim.world import World
-
-Array = NDArray[np.float64]
 
 IGNORED_NEAR_POINT_M = 0.005
 

@@ -6,14 +6,13 @@ import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from sim.arrays import Array
 from sim.compiled import njit
 from sim.errors import InputError
 from sim.robot import SLIP_TIME_CONSTANT_S, DifferentialDrive, arc_increment
 from sim.route import TICK_S, OpenLoop
-
-Array = NDArray[np.float64]
 
 _BLOCK_NORMALS = 2_000_000  # drawn at once, 16 MB; the bits do not depend on it
 

@@ -9,10 +9,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sim.arrays import Array
 from sim.errors import InputError
 from sim.world import World, facing_second
 
-Array = NDArray[np.float64]
 WALL_HEIGHT_M = 2.5
 DESCRIPTOR_SIZE = 128
 _APART_M = 0.12  # between furniture and walls, and among furniture

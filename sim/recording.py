@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sim.arrays import Array
 from sim.errors import InputError, required
 from sim.files import write_whole
 from sim.robot import RobotGeometry
@@ -26,7 +27,6 @@ from sim.sensors import SensorSuite, suite_from_config
 from sim.settings import build
 from sim.world import World
 
-Array = NDArray[np.float64]
 FORMAT_VERSION = 1
 
 

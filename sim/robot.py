@@ -12,12 +12,11 @@ from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from sim.arrays import Array
 from sim.errors import InputError
 from sim.settings import check_numbers
-
-Array = NDArray[np.float64]
 
 SLIP_TIME_CONSTANT_S = 0.1
 _SMALL_ANGLE_RAD = 1e-4

@@ -10,15 +10,15 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from sim.arrays import Array
 from sim.errors import InputError
 from sim.robot import DifferentialDrive, arc_increment
 from sim.se2 import chain
 from sim.settings import check_numbers
 from sim.world import World, facing_second
 
-Array = NDArray[np.float64]
 Segment = tuple[float, float, float]
 
 TICK_S = 1.0 / 300.0

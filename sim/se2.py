@@ -7,9 +7,9 @@ All functions broadcast over leading axes.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from sim.arrays import Array
 
 _SMALL_ANGLE_RAD = 1e-4  # below it the series are exact to the last bit
 

@@ -13,10 +13,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sim.arrays import Array
 from sim.errors import InputError, required
 from sim.settings import build, check_numbers
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

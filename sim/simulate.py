@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim import se2
+from sim.arrays import Array
 from sim.errors import InputError
 from sim.kinematic import KinematicBody
 from sim.recording import (
@@ -32,7 +33,6 @@ from sim.robot import DifferentialDrive, RobotGeometry, Slip
 from sim.sensors import Laser, Lidar3D, SensorSuite, StereoCamera
 from sim.world import World
 
-Array = NDArray[np.float64]
 Physics = Literal["bullet", "kinematic"]
 Rays = Literal["bullet", "exact"]
 _Logs = defaultdict[str, list[tuple[int, Any]]]  # of each sensor: tick and reading

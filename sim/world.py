@@ -8,9 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from sim.arrays import Array
 from sim.errors import InputError
-
-Array = NDArray[np.float64]
 
 
 def facing_second(waypoints: Array) -> Array:

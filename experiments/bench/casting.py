@@ -5,14 +5,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from experiments.bench.measure import Measurement, median_time_s
+from sim.arrays import Array
 from sim.casting import SegmentCaster, cast_lidar, visible
 from sim.sensors import Laser, Lidar3D
 from sim.world import World
-
-Array = NDArray[np.float64]
 
 _GOAL_US = {30: 10.0, 300: 40.0}
 _LASER = Laser(n_beams=721, fov_rad=math.pi, max_range_m=80.0)

@@ -16,11 +16,10 @@ from estimators.fastslam import FastSLAM
 from estimators.stereo import StereoModel
 from experiments.bench.measure import Measurement, median_time_s, timed_steps
 from experiments.evaluation.statistics import log_log_slope
+from sim.arrays import Array
 from sim.recording import LandmarkLog, Recording, WheelLog
 from sim.robot import RobotGeometry, wheel_errors
 from sim.sensors import Encoder, SensorSuite, StereoCamera
-
-Array = NDArray[np.float64]
 
 PAPER = StereoCamera(sigma_column_px=10.0, sigma_row_px=10.0, correlated=False)
 _TRACK_M, _STEP_M, _RADIUS_M, _K_M = 0.4, 0.4, 5.0, 5e-5

@@ -21,16 +21,15 @@ from functools import partial
 from typing import get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimators import icp_covariance
 from estimators.icp import Metric, PreparedScan, Registration, prepare, register
 from experiments.bench.measure import Measurement, median_time_s
 from experiments.evaluation.scan_bound import cast, fisher_bound
 from sim import se2
+from sim.arrays import Array
 from sim.world import World
 
-Array = NDArray[np.float64]
 Matcher = Callable[[Array, Array], Array]  # ranges of the target and of the source -> pose
 
 SIGMA_RANGE_M = 0.01

@@ -18,14 +18,13 @@ from estimators.mcl import Mcl
 from experiments.bench.measure import Measurement, median_time_s, timed_steps
 from experiments.runs.seeds import stream
 from sim import se2
+from sim.arrays import Array
 from sim.builders import office
 from sim.casting import SegmentCaster
 from sim.recording import Frame
 from sim.robot import RobotGeometry, arc_increment
 from sim.sensors import Laser, SensorSuite
 from sim.world import World
-
-Array = NDArray[np.float64]
 
 _LASER = Laser(n_beams=721, max_range_m=80.0, sigma_range_m=0.01)
 _N_PARTICLES = 10_000

@@ -10,18 +10,16 @@ from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from experiments.calibration.end_poses import Manoeuvre, from_end_poses
 from experiments.calibration.result import CalibrationResult
 from experiments.calibration.wheel_truth import from_wheel_truth
 from sim import se2
+from sim.arrays import Array
 from sim.errors import InputError
 from sim.recording import Recording
 from sim.robot import DifferentialDrive
 from sim.route import TICK_S
-
-Array = NDArray[np.float64]
 
 
 def calibrate_recordings(

@@ -7,12 +7,12 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from sim.arrays import Array
 from sim.compiled import njit
 from sim.errors import InputError
 from sim.robot import SLIP_TIME_CONSTANT_S, DifferentialDrive
 from sim.route import TICK_S
 
-Array = NDArray[np.float64]
 Ticks = NDArray[np.int64]
 EndPoseMethod = Literal["sampled", "linearised"]
 

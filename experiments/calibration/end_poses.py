@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from experiments.calibration.end_pose_model import EndPoseMethod, EndPoseModel
 from experiments.calibration.result import CalibrationResult
 from experiments.evaluation.statistics import Interval
+from sim.arrays import Array
 from sim.errors import InputError
 from sim.robot import DifferentialDrive
 from sim.route import TICK_S
 
-Array = NDArray[np.float64]
 Moments = tuple[Array, Array]
 
 

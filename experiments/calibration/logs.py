@@ -17,13 +17,13 @@ from scipy import optimize, stats
 
 from experiments.evaluation.statistics import Interval
 from sim import se2
+from sim.arrays import Array
 from sim.errors import InputError
 from sim.formats.assemble import chained
 from sim.formats.khepera import WheelLaserLog
 from sim.formats.lego import GEOMETRIC_TRACK_M, SCANNER_AHEAD_M, TICK_M, TickLog
 from sim.robot import arc_increment
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 

@@ -5,14 +5,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import stats
 
 from experiments.calibration.result import CalibrationResult
 from experiments.evaluation.statistics import Interval
+from sim.arrays import Array
 from sim.errors import InputError
-
-Array = NDArray[np.float64]
 
 SHORTEST_INTERVAL_S = 0.02
 

@@ -5,14 +5,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimators.base import Estimate
 from sim import se2
+from sim.arrays import Array
 from sim.recording import Recording
 from sim.world import World
-
-Array = NDArray[np.float64]
 
 _CHUNK = 2000
 _LEAST_SIGMA_M = 1e-3  # points on one line have no spread across it

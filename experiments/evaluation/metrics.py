@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from estimators.base import Estimate
 from sim import se2
+from sim.arrays import Array
 from sim.errors import InputError
 from sim.recording import Recording
 
-Array = NDArray[np.float64]
 CHI2_95_2DOF = 5.991464547107979  # 95 % quantile of chi-square with two degrees of freedom
 _SINGULAR = 1e-10  # least eigenvalue of a correlation matrix that can be trusted
 RPE_DISTANCES_M = (1.0, 10.0)

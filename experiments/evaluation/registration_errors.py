@@ -9,16 +9,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from estimators import icp_covariance
 from estimators.icp import Metric, PreparedScan, Registration, prepare, register
 from experiments.evaluation.scan_bound import cast, fisher_bound
 from sim import se2
+from sim.arrays import Array
 from sim.sensors import Laser
 from sim.world import World
-
-Array = NDArray[np.float64]
 
 METRICS: tuple[Metric, ...] = ("point_to_line", "point_to_point")
 _GUESS_SIGMA = np.array([0.01, 0.01, math.radians(0.5)])

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from experiments.evaluation.time_sync import interpolate, nearest
 from sim import se2
+from sim.arrays import Array
 from sim.errors import InputError
 from sim.formats.relations import Relations
 
-Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 Association = Literal["near", "interpolated"]
 

@@ -9,11 +9,9 @@ covariance of their relative pose is at least the sum of the two poses' bounds.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sim import se2
-
-Array = NDArray[np.float64]
+from sim.arrays import Array
 
 _NO_INFORMATION = 1e-6  # 1/m^2 or 1/rad^2: an unobservable direction has a huge bound, not inf
 

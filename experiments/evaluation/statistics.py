@@ -7,12 +7,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import stats
 
+from sim.arrays import Array
 from sim.errors import InputError
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 from experiments.evaluation.metrics import aligned, position_errors_m, rms
 from sim import se2
+from sim.arrays import Array
 from sim.errors import InputError
 
-Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
 

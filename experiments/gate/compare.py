@@ -25,14 +25,13 @@ from enum import StrEnum
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 from scipy import stats
 
 from experiments.gate.suite import ERRORS
 from experiments.runs.seeds import stream
+from sim.arrays import Array
 from sim.errors import InputError
 
-Array = NDArray[np.float64]
 ALPHA_REAL = 0.002  # of a whole check
 ALPHA_GENERAL = 0.05  # of one error of one estimator
 ROUNDING = 1e-6  # of an error, as a share; machines differ by less than 1e-9

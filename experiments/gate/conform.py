@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 from omegaconf import OmegaConf
 
 from estimators.base import Estimator, Prior
@@ -22,12 +21,12 @@ from experiments.runs.experiment import Experiment
 from experiments.runs.seeds import stream
 from experiments.runs.targets import make
 from sim import se2
+from sim.arrays import Array
 from sim.errors import InputError
 from sim.recording import Recording
 from sim.sensors import SensorSuite
 from sim.world import World
 
-Array = NDArray[np.float64]
 Make = Callable[[], Estimator]
 MOTION = np.array([3.0, -2.0, 0.7])  # the rigid motion of the world in the equivariance check
 N_SEEDS = 30  # runs of each arm when compared in distribution

@@ -14,17 +14,16 @@ from typing import Any
 from unittest import mock
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimators import ekf_icp, ekf_icp_paper, odometry, wheels
 from estimators.base import Estimator, Prior
 from estimators.gaussian import Gaussian
 from estimators.scan_matching import Match, ScanMatcher
 from estimators.stereo import StereoModel
+from sim.arrays import Array
 from sim.recording import Frame, LandmarkSet
 from sim.robot import wheel_errors
 
-Array = NDArray[np.float64]
 Planted = Callable[[Estimator, np.random.Generator], AbstractContextManager[Estimator]]
 Fault = Callable[[float], Planted]  # of a size
 

@@ -31,7 +31,6 @@ from unittest import mock
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from scipy import stats
 
 from estimators.base import Estimator, Prior
@@ -61,9 +60,8 @@ from experiments.runs.paths import SOURCE, results
 from experiments.runs.row import write_frame
 from experiments.runs.seeds import stream
 from experiments.viewing.style import BLUE, GREEN, ORANGE, WALL, figure, save_figure
+from sim.arrays import Array
 from sim.files import write_whole
-
-Array = NDArray[np.float64]
 
 TARGET = 0.10  # worsening that faults are graded to
 _NEAR = 0.01  # of it

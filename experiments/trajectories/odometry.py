@@ -9,14 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimators.base import Estimate
 from sim import se2
+from sim.arrays import Array
 from sim.errors import InputError
 from sim.files import write_whole
 
-Array = NDArray[np.float64]
 # Entries of x, y, heading in row-major 6x6 covariances in order x, y, z, rotX, rotY, rotZ.
 PLANAR = (slice(None), [[0], [1], [5]], [0, 1, 5])
 

@@ -13,13 +13,12 @@ import time
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from experiments.viewing.view import Playback, scan_points
+from sim.arrays import Array
 from sim.errors import InputError
 from sim.world import World
 
-Array = NDArray[np.float64]
 FPS = 20
 _REMEDY = "save the run instead: add -o run.html, run.gif or run.mp4"
 _HEIGHT_M = 0.1  # of the robots

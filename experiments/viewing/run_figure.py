@@ -6,16 +6,14 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from estimators.base import Estimate
 from experiments.viewing.plotting import draw_ellipses
 from experiments.viewing.style import ESTIMATE, TRUTH, figure
 from experiments.viewing.world import draw_world
 from sim import se2
+from sim.arrays import Array
 from sim.recording import Recording
-
-Array = NDArray[np.float64]
 
 
 def run_figure(recording: Recording, estimate: Estimate, name: str) -> Figure:

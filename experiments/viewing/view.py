@@ -27,12 +27,12 @@ from experiments.runs.seeds import stream
 from experiments.viewing.style import ESTIMATE, GREEN, ORANGE, RED, SKY, TRUTH, figure
 from experiments.viewing.world import draw_world
 from sim import se2
+from sim.arrays import Array
 from sim.errors import InputError
 from sim.files import write_whole
 from sim.recording import Frame, Recording
 from sim.sensors import Mount
 
-Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 SUFFIXES = (".mp4", ".gif", ".html")
 FPS = 10

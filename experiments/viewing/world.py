@@ -9,7 +9,6 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
-from numpy.typing import NDArray
 
 from experiments.viewing.style import (
     BLACK,
@@ -23,9 +22,8 @@ from experiments.viewing.style import (
     YELLOW,
     figure,
 )
+from sim.arrays import Array
 from sim.world import World
-
-Array = NDArray[np.float64]
 
 _PLACES = {
     "room": SKY,

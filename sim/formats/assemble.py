@@ -21,10 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim import se2
+from sim.arrays import Array
 from sim.errors import InputError
 from sim.recording import WheelLog
 
-Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 Notes = dict[str, Any]
 

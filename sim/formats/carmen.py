@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim import se2
+from sim.arrays import Array
 from sim.errors import InputError
 from sim.files import write_whole
 from sim.formats import assemble
@@ -31,7 +32,6 @@ from sim.recording import LaserLog, Recording, Truth, WheelLog
 from sim.robot import RobotGeometry, arc_increment
 from sim.sensors import Encoder, Laser, Mount, SensorSuite
 
-Array = NDArray[np.float64]
 Poses = Literal["odometry", "reference"]
 
 _ODOM, _FLASER, _ROBOTLASER = "ODOM", "FLASER", "ROBOTLASER1"

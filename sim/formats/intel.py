@@ -11,16 +11,14 @@ import math
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sim.arrays import Array
 from sim.errors import InputError
 from sim.formats import assemble
 from sim.formats.carmen import NOMINAL_RADIUS_M, NOMINAL_TRACK_M, scan_recording, seen_ranges
 from sim.formats.text import json_number, read_bytes, read_words
 from sim.recording import Recording, Truth
 from sim.sensors import Laser, Mount
-
-Array = NDArray[np.float64]
 
 _NO_RETURN_M = 81.83  # what the log writes where nothing was seen
 _N_THINNED_BEAMS, _THINNED_MAX_RANGE_M = 180, 50.0

@@ -12,17 +12,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sim import se2
+from sim.arrays import Array
 from sim.errors import InputError
 from sim.formats.assemble import chained
 from sim.formats.text import json_number, read_bytes, read_members
 from sim.recording import Recording, Truth, WheelLog
 from sim.robot import RobotGeometry
 from sim.sensors import SensorSuite
-
-Array = NDArray[np.float64]
 
 # What a rolled radian is taken to be until it is calibrated (the robot's data sheet)
 NOMINAL_DIAMETER_M, NOMINAL_AXLE_M = 0.041, 0.0885

@@ -15,14 +15,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from sim.arrays import Array
 from sim.formats import assemble
 from sim.formats.carmen import scan_recording
 from sim.formats.text import Words, read_words
 from sim.recording import Recording, Truth, WheelLog
 from sim.sensors import Laser, Mount
 from sim.world import World
-
-Array = NDArray[np.float64]
 
 # The lecture's constants: geometric width of the tracks, effective one, length of a tick, the
 # scanner ahead of the axle, and the angles of its beams

@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from sim.arrays import Array
 from sim.errors import InputError
 from sim.formats import assemble
 from sim.formats.text import Words, read_members, split_words
@@ -28,8 +29,6 @@ from sim.recording import LandmarkLog, Recording, Truth
 from sim.robot import RobotGeometry
 from sim.sensors import Encoder, Mount, SensorSuite, StereoCamera
 from sim.world import World
-
-Array = NDArray[np.float64]
 
 # An iRobot Create
 TRACK_M, WHEEL_RADIUS_M = 0.258, 0.033

@@ -13,15 +13,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sim.arrays import Array
 from sim.formats import assemble
 from sim.formats.carmen import scan_recording, seen_ranges
 from sim.formats.text import Words, read_words
 from sim.recording import Recording, Truth
 from sim.sensors import Laser, Mount
-
-Array = NDArray[np.float64]
 
 TRACK_M, WHEEL_RADIUS_M = 0.48, 0.095  # of the Robocom the sets were recorded with, nominal
 FRONT_SICK = Mount(0.08, 0.0, 0.45)

@@ -10,12 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sim.arrays import Array
 from sim.files import write_whole
 from sim.formats.text import Words, read_words
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -31,9 +31,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sim.arrays import Array
 from sim.errors import InputError
-
-Array = NDArray[np.float64]
 
 ABOUT = "/estima/about"
 ODOMETRY = "nav_msgs/msg/Odometry"

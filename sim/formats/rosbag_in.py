@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sim.arrays import Array
 from sim.errors import InputError
 from sim.formats import assemble
 from sim.formats.rosbag import (
@@ -28,7 +29,6 @@ from sim.formats.rosbag import (
     STRING,
     TF,
     TWIST,
-    Array,
     Track,
     library,
     seconds,

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim import se2
+from sim.arrays import Array
 from sim.errors import InputError
 from sim.formats.assemble import chained
 from sim.formats.rosbag import (
@@ -29,7 +30,6 @@ from sim.formats.rosbag import (
     STRING,
     TF,
     TWIST,
-    Array,
     Track,
     library,
     nanoseconds,

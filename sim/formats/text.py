@@ -21,9 +21,9 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sim.arrays import Array
 from sim.errors import InputError
 
-Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
 MOST_BYTES = 1 << 30  # unpacked; a small archive may promise far more

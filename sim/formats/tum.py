@@ -6,12 +6,10 @@ import math
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sim.arrays import Array
 from sim.files import write_whole
 from sim.formats.text import read_bytes, split_words
-
-Array = NDArray[np.float64]
 
 
 def write_tum(path: Path, stamps: Array, poses: Array) -> None:

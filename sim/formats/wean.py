@@ -14,17 +14,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sim import se2
+from sim.arrays import Array
 from sim.errors import InputError
 from sim.formats import assemble
 from sim.formats.carmen import scan_recording, seen_ranges
 from sim.formats.text import Words, read_bytes, read_words, split_words
 from sim.recording import Recording
 from sim.sensors import Laser, Mount
-
-Array = NDArray[np.float64]
 
 _N_BEAMS = 180
 _NO_RETURN_M = 81.83  # and beyond, up to 81.91

@@ -6,15 +6,13 @@ from collections.abc import Iterator
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from experiments.evaluation.registration_errors import METRICS
 from experiments.evaluation.statistics import Interval, log_ratio_interval, mean_interval
 from experiments.evaluation.verdict import Claim, Verdict, banded, judged, lower
 from experiments.papers.decristoforis2020.settings import CONSISTENT, PLACES
 from experiments.papers.results import Results
-
-Array = NDArray[np.float64]
+from sim.arrays import Array
 
 _ERRORS = {"position": "ate_rmse_m", "heading": "heading_rmse_rad"}
 _ORDER = (("fusion", "icp"), ("icp", "odometry"))

@@ -7,7 +7,6 @@ import math
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from estimators.base import Estimate
 from estimators.gaussian import STILL, Gaussian
@@ -16,10 +15,9 @@ from experiments.evaluation.scan_bound import fisher_bound
 from experiments.papers.decristoforis2020.settings import HELD_M, WINDOWS_S
 from experiments.runs.row import Row
 from sim import se2
+from sim.arrays import Array
 from sim.recording import Recording
 from sim.world import World
-
-Array = NDArray[np.float64]
 
 
 def step_errors(recording: Recording, world: World, estimate: Estimate) -> Row:

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import stats
 
 from experiments.evaluation.statistics import (
@@ -27,8 +27,7 @@ from experiments.evaluation.statistics import (
 from experiments.evaluation.verdict import Claim, Verdict, banded, judged
 from experiments.papers.gil2008.settings import P0
 from experiments.papers.results import Results
-
-Array = NDArray[np.float64]
+from sim.arrays import Array
 
 POSITION = "revised_ate_rmse_m"
 ERRORS = {

@@ -8,7 +8,6 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from experiments.evaluation.metrics import rms
 from experiments.papers.gil2008.claims import pooled
@@ -31,8 +30,8 @@ from experiments.viewing.style import (
 )
 from experiments.viewing.world import draw_walls
 from sim import se2
+from sim.arrays import Array
 
-Array = NDArray[np.float64]
 Arrays = dict[str, Any]
 
 _FILTERS = {

@@ -17,14 +17,13 @@ from numpy.typing import NDArray
 from experiments.papers.gil2008.settings import FARTHEST_M
 from experiments.runs.experiment import Config, Experiment
 from experiments.runs.seeds import stream
+from sim.arrays import Array
 from sim.errors import InputError
 from sim.recording import LandmarkLog, Recording, WheelLog
 from sim.robot import wheel_errors
 from sim.sensors import StereoCamera, suite_from_config
 from sim.simulate import ExactRays, LandmarkEye
 from sim.world import World
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

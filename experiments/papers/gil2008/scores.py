@@ -13,9 +13,9 @@ from experiments.evaluation.metrics import alignment, position_errors_m, rms, tr
 from experiments.papers.gil2008.settings import LAG_M, WITHIN_M
 from experiments.runs.row import Row
 from sim import se2
+from sim.arrays import Array
 from sim.recording import Recording
 
-Array = NDArray[np.float64]
 KEEP = ("associations", "resampled")  # Belief extras that `filter_scores` reads
 
 

@@ -12,7 +12,6 @@ from itertools import accumulate
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from estimators.base import run as walk
 from estimators.odometry import Odometry
@@ -30,10 +29,10 @@ from experiments.runs.row import Row
 from experiments.runs.seeds import stream
 from experiments.sweeps.plan import planned
 from sim import se2
+from sim.arrays import Array
 from sim.recording import Recording
 from sim.robot import arc_increment, wheel_errors
 
-Array = NDArray[np.float64]
 Run = tuple[str, Experiment]  # the table its rows go to; its configuration
 
 _SCORES = (

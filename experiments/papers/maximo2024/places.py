@@ -25,12 +25,12 @@ from experiments.evaluation.metrics import travelled_m
 from experiments.runs.experiment import Experiment
 from experiments.runs.seeds import stream
 from sim import se2
+from sim.arrays import Array
 from sim.errors import InputError
 from sim.recording import CloudLog, PlaceLog, Recording, Truth, WheelLog
 from sim.robot import RobotGeometry, wheel_errors
 from sim.sensors import SensorSuite
 
-Array = NDArray[np.float64]
 # Noisy unit descriptors (K, 512) at points (K, 2) m
 Describe = Callable[[Array, np.random.Generator], NDArray[np.float32]]
 

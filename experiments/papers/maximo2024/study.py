@@ -59,9 +59,9 @@ from experiments.papers.maximo2024.worlds import (
 from experiments.papers.results import Results
 from experiments.runs.seeds import stream
 from sim import se2
+from sim.arrays import Array
 from sim.recording import Recording
 
-Array = NDArray[np.float64]
 Arrays = dict[str, NDArray[np.generic]]
 
 _REACH_M = 65.0  # of the clouds kept, from the middle of the nodes drawn

@@ -38,9 +38,9 @@ from experiments.papers.maximo2024.settings import (
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
 from experiments.runs.seeds import stream
+from sim.arrays import Array
 from sim.recording import Recording
 
-Array = NDArray[np.float64]
 Rows = list[Row]
 
 

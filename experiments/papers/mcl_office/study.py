@@ -26,9 +26,8 @@ from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
 from experiments.runs.seeds import stream
 from experiments.sweeps.plan import planned
+from sim.arrays import Array
 from sim.recording import Recording
-
-Array = NDArray[np.float64]
 
 
 def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) -> None:

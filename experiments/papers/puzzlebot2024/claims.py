@@ -8,14 +8,12 @@ from collections.abc import Iterator
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from experiments.evaluation.statistics import Interval, mean_interval, share_interval
 from experiments.evaluation.verdict import Claim, Verdict, banded, holds, judged, overall
 from experiments.papers.puzzlebot2024.settings import NOMINAL
 from experiments.papers.results import Results
-
-Array = NDArray[np.float64]
+from sim.arrays import Array
 
 # Sigma_1 and Sigma_2 as printed, each with half a unit of its last digit
 PRINTED = (

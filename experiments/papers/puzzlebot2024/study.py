@@ -44,13 +44,13 @@ from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
 from experiments.runs.seeds import stream
 from experiments.sweeps.plan import planned
+from sim.arrays import Array
 from sim.kinematic import BatchRuns, run_batch
 from sim.recording import Recording, WheelLog
 from sim.robot import DifferentialDrive, RobotGeometry
 from sim.route import OpenLoop
 from sim.sensors import SensorSuite
 
-Array = NDArray[np.float64]
 Routes = Mapping[str, OpenLoop]
 Driven = dict[tuple[str, str, int], Recording]  # by physics, case and seed
 

@@ -6,12 +6,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft
 
 from sim import se2
-
-Array = NDArray[np.float64]
+from sim.arrays import Array
 
 
 @dataclass(frozen=True)

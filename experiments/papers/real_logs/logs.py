@@ -6,7 +6,6 @@ import dataclasses
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimators.base import Estimate, Estimator, Prior
 from estimators.base import run as run_estimator
@@ -14,14 +13,13 @@ from estimators.icp_odometry import IcpOdometry
 from experiments.calibration.logs import calibrate_wheels
 from experiments.papers.real_logs.settings import CALIBRATED_S, DATA, TUNED_SHARE
 from sim import se2
+from sim.arrays import Array
 from sim.formats import carmen, mrclam, wean
 from sim.formats import intel as intel_lab
 from sim.formats.khepera import WheelLaserLog
 from sim.recording import Recording, WheelLog
 from sim.robot import RobotGeometry
 from sim.sensors import Mount
-
-Array = NDArray[np.float64]
 
 
 def intel(version: Literal["sparse", "logged", "calibrated"]) -> Recording:

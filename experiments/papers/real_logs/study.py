@@ -52,12 +52,12 @@ from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
 from experiments.sweeps.plan import planned
 from sim import se2
+from sim.arrays import Array
 from sim.formats import carmen, lego, rawseeds, wean
 from sim.formats.khepera import read_khepera
 from sim.formats.relations import Relations, read_relations
 from sim.formats.text import read_members, read_words, split_words
 
-Array = NDArray[np.float64]
 Paths = dict[str, NDArray[np.float32]]  # (T, 2) m, by name
 
 _SCORES = ("ate_rmse_m", "ate_aligned_rmse_m", "heading_rmse_rad", "nees_mean", "step_time_us")
