@@ -7,11 +7,16 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
+from estimators.base import Belief
+from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import read_rows
+from experiments.sweeps.collect import where
 from sim.errors import InputError
+from tests.fakes import circle
 
 ROOT = Path(__file__).resolve().parent.parent
 QUICK = ["simulation.physics=kinematic", "simulation.rays=exact"]
@@ -133,6 +138,41 @@ def test_a_bad_configuration_names_its_key(override, words):
 @pytest.mark.parametrize("argument", ["robot.kq=1,2", "robot.kq=1"])
 def test_an_unknown_key_of_a_sweep_names_the_known_ones(argument):
     refused(estima("run", "-m", *QUICK, argument), "unknown key robot.kq", "robot.kr")
+
+
+@pytest.mark.parametrize(
+    ("belief", "words"),
+    [
+        (None, "got NoneType"),
+        (Belief(np.zeros(2), np.eye(3)), r"got shapes \(2,\) and \(3, 3\)"),
+        (Belief(np.zeros(3), 0.0), r"got shapes \(3,\) and \(\)"),
+        (Belief([0.0, [1.0]], np.eye(3)), "inhomogeneous"),
+    ],
+)
+def test_a_step_that_returns_no_belief_names_step_and_the_shapes(belief, words):
+    class Mine:
+        def reset(self, prior, rng):
+            pass
+
+        def step(self, frame):
+            return belief
+
+    experiment = Experiment.compose(["simulation.physics=kinematic"]).using(Mine())
+    with pytest.raises(InputError, match=rf"Mine.step .*\(3,\).*\(3, 3\).*{words}"):
+        evaluate(experiment, circle(n_frames=3))
+
+
+def test_where_lists_the_columns():
+    table = pd.DataFrame({"seed": [0, 1], "robot.kr": [1e-5, 1e-4]})
+    with pytest.raises(InputError, match="--where foo: .*columns: seed, robot.kr"):
+        where(table, ["foo"])
+
+
+@pytest.mark.parametrize(
+    "arguments", [["--results", "", "cache"], ["cache", "--results="], ["cache", "--results", ""]]
+)
+def test_results_need_a_folder(arguments):
+    refused(estima(*arguments), "--results must name a folder")
 
 
 def test_a_malformed_option_names_its_file(tmp_path):
