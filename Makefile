@@ -38,6 +38,7 @@ format: setup
 
 docs: setup
 	@NO_MKDOCS_2_WARNING=1 .venv/bin/mkdocs build --strict --quiet
+	@echo "site/index.html"
 
 # Rewrites the lock after a change of pyproject.toml; hashes only, no addresses.
 lock: setup

@@ -179,6 +179,8 @@ def convert(
 
     if not out.name:
         raise InputError(f"-o {out}: name the file to write, such as run.mcap")
+    if out.exists() and any(path.exists() and out.samefile(path) for path in log):
+        raise InputError(f"-o {out}: that is the log itself; give another name")
     recording = read_any(log, robot)
     write_recording(out, recording)
     print(f"{out}: {recording.duration_s:.1f} s, {len(recording.frame_stamps)} frames")

@@ -199,6 +199,9 @@ def test_damaged_recordings_are_refused(tmp_path):
     refused(estima("run", f"recording={log}"), "a.log", "estima convert")
     refused(estima("record", "-o", "."), ".npz")
     refused(estima("convert", str(path), "-o", "."), "name the file")
+    before = path.read_bytes()
+    refused(estima("convert", str(path), "-o", str(path)), "the log itself", "another name")
+    assert path.read_bytes() == before
 
 
 def test_calibration_from_recordings(tmp_path):
