@@ -57,7 +57,11 @@ _TYPES = {
 
 
 def __getattr__(name: str) -> Any:
-    """Import a type when it is first asked for: `import estima` alone loads no library."""
+    """Find a type or the version when first asked for: `import estima` alone loads no library."""
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("estima")
     if name not in _TYPES:
         raise AttributeError(f"module 'estima' has no attribute {name!r}")
     return getattr(importlib.import_module(_TYPES[name]), name)
@@ -229,7 +233,7 @@ def score(recording: Recording, estimate: Estimate) -> dict[str, float]:
     Raises
     ------
     InputError
-        If the estimate and the truth share no time.
+        If it is no Estimate, or shares no time with the truth.
 
     Examples
     --------
@@ -239,8 +243,14 @@ def score(recording: Recording, estimate: Estimate) -> dict[str, float]:
     >>> sorted(scores)[:2], scores["distance_m"] > 0.5
     (['ate_aligned_rmse_m', 'ate_rmse_m'], True)
     """
+    from estimators.base import Estimate
     from experiments.evaluation.metrics import score
+    from sim.errors import InputError
 
+    if not isinstance(estimate, Estimate):
+        raise InputError(
+            f"estima.score takes an Estimate, such as run.online, got {type(estimate).__name__}"
+        )
     return score(recording, estimate)
 
 
@@ -311,7 +321,7 @@ def plot(
     Raises
     ------
     InputError
-        If there is no such column, or it holds no numbers to average.
+        If there is no such column, it holds no numbers to average, or the table is not a sweep's.
 
     Examples
     --------
@@ -323,7 +333,13 @@ def plot(
     """
     from experiments.report.plot import sweep_figure
     from experiments.runs.row import Outcome
+    from sim.errors import InputError
 
+    for column in ("status", "recording_checksum"):
+        if column not in table:
+            raise InputError(
+                f"the table has no column {column}; estima.plot takes what estima.sweep returned"
+            )
     return _saved(sweep_figure(table[table["status"] != Outcome.FAILED], x, y, by), path)
 
 

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import estima
@@ -72,6 +73,20 @@ def test_it_imports_nothing_heavy():
 def test_every_name_is_there_and_documented():
     for name in estima.__all__:
         assert getattr(estima, name).__doc__
+
+
+def test_its_version_is_that_of_the_command_line():
+    assert command("--version").stdout.startswith(f"estima {estima.__version__}, code ")
+
+
+def test_what_is_no_estimate_or_no_sweep_is_said():
+    with pytest.raises(estima.InputError, match=r"takes an Estimate, .*, got NoneType"):
+        estima.score(estima.simulate(*QUICK), None)
+    table = pd.DataFrame({"seed": [1, 2], "ate_rmse_m": [0.1, 0.2]})
+    for column in ("status", "recording_checksum"):
+        with pytest.raises(estima.InputError, match=f"no column {column}; .* estima.sweep"):
+            estima.plot(table, x="seed")
+        table[column] = "ok"
 
 
 def test_a_simulated_recording_is_that_of_the_command_line(folder):

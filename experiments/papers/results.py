@@ -18,6 +18,9 @@ from experiments.runs.row import read_rows, write_frame
 from sim.errors import InputError
 from sim.files import write_whole
 
+# Errors of a table or array without its content; a query for a missing column is a NameError
+_MISFITS = (LookupError, ValueError, TypeError, AttributeError, NameError, EOFError)
+
 
 @dataclass(frozen=True)
 class Results:
@@ -83,7 +86,7 @@ class Results:
         """
         try:
             yield
-        except (LookupError, ValueError, TypeError, AttributeError, EOFError) as error:
+        except _MISFITS as error:
             why = (str(error).splitlines() or [type(error).__name__])[0]
             if isinstance(error, KeyError):
                 why = f"{why} missing"
