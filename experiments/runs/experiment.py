@@ -429,8 +429,7 @@ def check_overrides(overrides: Sequence[str]) -> None:
         named = override.is_sweep_override() or isinstance(value, (str, list))
         if key in (*GROUPS, "study") and not (named or override.is_delete()):
             raise InputError(
-                f"{override.input_line}: {key} must be one of `estima options {key}`; "
-                f"single keys are set by {key}.KEY=VALUE"
+                f"{override.input_line}: {key} must name one of `estima options {key}`"
             )
 
 

@@ -80,8 +80,14 @@ def application(arguments: Sequence[str], draw: Draw) -> None:
         except Exception as error:
             end(error)  # here, since Hydra would add a line of its own
 
-    pairs = zip(["", *arguments], arguments, strict=False)
-    check_overrides([a for option, a in pairs if "=" in a and "-" not in (a[0], option[:1])])
+    before = ["", *arguments]  # neither an option nor its value, which may hold a = too
+    check_overrides(
+        [
+            argument
+            for option, argument in zip(before, arguments, strict=False)
+            if "=" in argument and not argument.startswith("-") and not option.startswith("-")
+        ]
+    )
     sys.argv = ["estima run", *arguments]
     hydra.main(version_base="1.3", config_path=str(paths.CONF), config_name="config")(run)()
 
