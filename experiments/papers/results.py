@@ -19,7 +19,14 @@ from sim.errors import InputError
 from sim.files import write_whole
 
 # Errors of a table or array without its content; a query for a missing column is a NameError
-_MISFITS = (LookupError, ValueError, TypeError, AttributeError, NameError, EOFError)
+_MISFITS = (
+    LookupError,
+    ValueError,
+    TypeError,
+    AttributeError,
+    pd.errors.UndefinedVariableError,
+    EOFError,
+)
 
 
 @dataclass(frozen=True)
