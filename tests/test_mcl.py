@@ -164,7 +164,7 @@ def test_scans_without_returns_and_none():
 
 def test_beliefs_stay_as_they_were_told():
     _, frames = drive(ROOM, 30)
-    estimator = Mcl(n_least=500, n_most=500, ess_share=0.01, least_ess=0.0)  # never drawn anew
+    estimator = Mcl(n_least=500, n_most=500, ess_share=0.01, least_ess=0.0)  # never resampled
     estimator.reset(prior(), np.random.default_rng(0))
     first = estimator.step(frames[0])
     kept = first.extras["particles"].copy()

@@ -259,7 +259,7 @@ def test_the_wheels_carry_a_registered_pose_over_a_gap():
     run_ = ring_run()
     truth = run_.truth.poses
     known = from_recording(run_, "ring_key", 1.0)
-    known = dataclasses.replace(  # places that are told apart, in a room that looks alike
+    known = dataclasses.replace(  # distinct places in a room that looks alike
         known, descriptor="", descriptors=known.positions_m.astype(np.float32)
     )
     suite = SensorSuite(lidar3d=LIDAR)
