@@ -181,10 +181,12 @@ def boxes(table: pd.DataFrame) -> Figure:
         rows = table[table["error"] == name].set_index("method")
         stats = unit * rows[["whislo", "q1", "med", "q3", "whishi"]]
         stats["label"] = rows.index.map(NAMES)
-        drawn = ax.bxp(stats.to_dict("records"), showfliers=False, patch_artist=True, widths=0.6)
-        for patch, line, method in zip(drawn["boxes"], drawn["medians"], rows.index, strict=True):
+        drawn = ax.bxp(
+            stats.to_dict("records"), showfliers=False, patch_artist=True, widths=0.6,
+            medianprops={"color": TRUTH},
+        )  # fmt: skip
+        for patch, method in zip(drawn["boxes"], rows.index, strict=True):
             patch.set(facecolor=COLORS[method], alpha=0.6)
-            line.set_color(TRUTH)
         ax.set(yscale="log", ylabel=label, ylim=(stats["q1"].min() / 10, None))
     page.suptitle("all recordings; box: quartiles, whiskers: 1.5 times their distance", size=9)
     return page
@@ -339,18 +341,18 @@ def steps(table: pd.DataFrame) -> Figure:
             at, middle = first + shift + np.arange(len(columns)), values.median()
             ends = [middle - values.min(), values.max() - middle]
             ax.errorbar(at, middle, yerr=ends, fmt="o", color=color, ms=4, label=f"{rate:g} Hz")
-    axes[0].axhline(0.0, color=TRUTH, lw=0.6)
-    for ax in axes[1:]:
-        ax.axhline(1.0, color=TRUTH, lw=0.6)
-        ax.set_ylim(bottom=0.0)
+    for ax, level in zip(axes, (0.0, 1.0, 1.0), strict=True):
+        ax.axhline(level, color=TRUTH, lw=0.6)
     axes[0].set(xlabel="lag, registrations", ylabel="correlation of errors")
     axes[1].set(
+        ylim=(0.0, None),
         xlabel="composed over",
         ylabel="squared error over\nits covariance, / 3",
         xticks=range(3),
         xticklabels=["one step", "1 s", "10 s"],
     )
     axes[2].set(
+        ylim=(0.0, None),
         ylabel="RMS error of a step\nover the Fisher bound",
         xlim=(-0.5, 1.5),
         xticks=[0, 1],

@@ -155,15 +155,14 @@ def _run(
     squares = nees_at_distances(truth, estimate.means, estimate.covariances, np.array(NEES_AT_M))
     variances = np.mean(np.diagonal(estimate.covariances, axis1=1, axis2=2), axis=0)
     labels = experiment.labels(checksum="")
-    row: Row = {
+    return {
         **{name: found[key] for name, key in origin.items()},
         **{key: value for key, value in found.items() if key not in labels},
         **{f"nees_{d:g}m": float(v) for d, v in zip(NEES_AT_M, squares, strict=True)},
         "believed_rmse_m": float(np.sqrt(variances[0] + variances[1])),
         "believed_heading_rmse_rad": float(np.sqrt(variances[2])),
         "realtime_factor": float(np.ptp(estimate.stamps) / estimate.step_seconds.sum()),
-    }
-    return row, estimate
+    }, estimate
 
 
 def _drive(group: Sequence[Experiment]) -> Tables:

@@ -182,8 +182,7 @@ def components(run: Arrays) -> Figure:
         ):
             if key != "smoother":
                 left.plot(along, straighten(run[key][:, i]), color=colour, lw=1.0)
-            error = wrap(run[key][:, i] - truth[:, i])
-            right.plot(along, error, color=colour, lw=1.0, label=label)
+            right.plot(along, wrap(run[key][:, i] - truth[:, i]), color=colour, lw=1.0, label=label)
         left.plot(along, straighten(truth[:, i]), color=TRUTH, lw=1.0, label="truth")
         low, high = right.get_ylim()
         right.fill_between(

@@ -79,5 +79,4 @@ def revisited_slope(truth: Array, means: Array) -> float:
     rows = np.flatnonzero(revisited(truth[::4])) * 4
     if len(rows) < 10:
         return float("nan")
-    errors = position_errors_m(truth, means)
-    return float(np.polyfit(travelled_m(truth)[rows], errors[rows], 1)[0])
+    return float(np.polyfit(travelled_m(truth)[rows], position_errors_m(truth, means)[rows], 1)[0])

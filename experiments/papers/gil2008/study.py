@@ -68,7 +68,7 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
     for job in in_parallel(rows_of, jobs, lambda share: on_progress(0.95 * share)):
         for table, row in job:
             rows[table].append(row)
-    cost = cost_by_landmarks(settings.SIZES[profile].n_timings)
+    cost = cost_by_landmarks(settings.N_TIMINGS[profile])
     out.write_tables(**{table: pd.DataFrame(part) for table, part in rows.items()}, cost=cost)
     write_arrays(out)
     on_progress(1.0)
@@ -79,12 +79,12 @@ def plan(profile: Profile) -> list[Run]:
 
     They are composed for one world: the others differ in their seed alone.
     """
-    size, runs = settings.SIZES[profile], []
+    runs = []
     for table in settings.LABELS:
-        n_worlds = 1 if table == "repeats" else size.n_worlds
+        n_worlds = 1 if table == "repeats" else settings.N_WORLDS[profile]
         for one in planned([f"study=gil2008_{table}", f"seed={settings.SEED}"]):
-            if one.config["recording"]["draw"] < size.n_draws:
-                repeats = min(one.repeats, size.n_repeats)
+            if one.config["recording"]["draw"] < settings.N_DRAWS[profile]:
+                repeats = min(one.repeats, settings.N_REPEATS[profile])
                 runs += [
                     (table, one.replaced(seed=seed, world_seed=seed, repeats=repeats))
                     for seed in range(settings.SEED, settings.SEED + n_worlds)
@@ -113,7 +113,7 @@ def rows_of(runs: Sequence[Run]) -> list[tuple[str, Row]]:
         "odometry_slope": scores.revisited_slope(truth, odometry.means),
         "matching_precision": scores.matching_precision(recording),
     }
-    rows: list[tuple[str, Row]] = []
+    rows = []
     for table, experiment in runs:
         seen = thinned(recording, experiment.config)
         labels = labels_of(table, experiment)
@@ -153,11 +153,10 @@ def one_run(experiment: Experiment, recording: Recording, rng: np.random.Generat
     )
     revised = revised or online
     found = scored(recording, online, revised)
-    truth = recording.truth_at(revised.stamps)
     return {
         **status_of(recording, online).columns(),
         **{key: found[key] for key in _SCORES},
-        "slope": scores.revisited_slope(truth, revised.means),
+        "slope": scores.revisited_slope(recording.truth_at(revised.stamps), revised.means),
         "step_mean_us": 1e6 * float(online.step_seconds.mean()),
         **scores.map_scores(recording, revised.map),
         **scores.filter_scores(recording, online),

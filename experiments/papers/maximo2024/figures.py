@@ -33,18 +33,16 @@ _RECALL = {"recall_at_1": "recall@1", "recall_at_1_percent": "recall@1 %"}
 
 def draw(made: Results) -> dict[str, Figure]:
     """All figures, by file name; the Oxford route is the real one if it was judged."""
-    starts_table = made.table("starts")
-    oxford = "oxford_real" if "oxford_real" in set(starts_table["geometry"]) else "oxford"
+    oxford = "oxford_real" if "oxford_real" in set(made.table("starts")["geometry"]) else "oxford"
     campus_starts = made.table("campus_starts")
     campus = str(campus_starts["geometry"].iloc[0])
     drawn: dict[str, Arrays] = {name: made.arrays(name) for name in (oxford, "umh", campus)}
-    routes = {name: drawn[name] for name in (oxford, "umh")}
     return {
         "maximo2024_data": data(drawn[campus]),
         "maximo2024_clusters": clusters(drawn),
         "maximo2024_map_and_route": map_and_route(drawn),
         "maximo2024_dispersion": dispersion(made.table("dispersion")),
-        "maximo2024_starts": starts(routes),
+        "maximo2024_starts": starts({name: drawn[name] for name in (oxford, "umh")}),
         "maximo2024_particles": particles(drawn[oxford]),
         "maximo2024_table_1": table_1(made.table("table_1"), made.table("weighting")),
         "maximo2024_table_2": table_2(made.table("table_2")),

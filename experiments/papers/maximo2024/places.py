@@ -247,9 +247,8 @@ def resequenced(recording: Recording, rows: NDArray[np.int64]) -> Recording:
         [np.interp(stamps, recording.wheels.stamps, p) for p in recording.wheels.position_m.T],
         axis=1,
     )
-    lapses = np.diff(stamps, prepend=2.0 * stamps[0] - stamps[1])
     steps = np.diff(rolled, axis=0, prepend=2.0 * rolled[:1] - rolled[1:2])
-    new_stamps = np.cumsum(lapses[rows])
+    new_stamps = np.cumsum(np.diff(stamps, prepend=2.0 * stamps[0] - stamps[1])[rows])
     return dataclasses.replace(
         recording,
         frame_stamps=new_stamps,

@@ -266,6 +266,5 @@ def _tuning_rows(name: str, seed: int) -> list[tuple[str, str, float, float, int
         if method == "M2" or sigma_m == 0.1:  # M1 and M3 do not depend on it
             settings = options(case, method, (sigma_l, sigma_m, n_nearest))
             walk = localize(case, settings, stream(seed, "estimator/tuning"))
-            error = float(walk.errors_m.mean())
-            rows.append((name, method, sigma_l, sigma_m, n_nearest, error))
+            rows.append((name, method, sigma_l, sigma_m, n_nearest, float(walk.errors_m.mean())))
     return rows

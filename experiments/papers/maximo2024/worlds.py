@@ -132,8 +132,7 @@ def localize(
     spread, extras = np.empty(len(errors)), estimate.extras
     for i, (cloud, logs) in enumerate(zip(extras["particles"], extras["log_weights"], strict=True)):
         weights = np.exp(logs)
-        away = np.hypot(*(cloud[:, :2] - estimate.means[i, :2]).T)
-        spread[i] = weights @ away / weights.sum()
+        spread[i] = weights @ np.hypot(*(cloud[:, :2] - estimate.means[i, :2]).T) / weights.sum()
     return Walk(errors, spread, estimate)
 
 
@@ -165,8 +164,8 @@ def weighting_rows(case: Case, n_repeats: int) -> dict[str, Rows]:
         spread = np.mean([walk.dispersions_m[: WITHIN + 1] for walk in walks], axis=0)
         error = np.mean([walk.errors_m[: WITHIN + 1] for walk in walks], axis=0)
         tables["dispersion"] += [
-            {"method": method, "step": i, "dispersion_m": float(spread[i]), "error_m": float(e)}
-            for i, e in enumerate(error)
+            {"method": method, "step": i, "dispersion_m": float(away), "error_m": float(off)}
+            for i, (away, off) in enumerate(zip(spread, error, strict=True))
         ]
     return tables
 
@@ -203,8 +202,7 @@ def starts(
 ) -> list[tuple[int, float, Walk]]:
     """Figure 5: starts all along the route, the step at which each is localized, and its run."""
     runs, length = [], WITHIN + HELD
-    last = len(case.recording.frame_stamps) - length - 1
-    for start in map(int, np.linspace(0, last, n_starts)):
+    for start in map(int, np.linspace(0, len(case.recording.frame_stamps) - length - 1, n_starts)):
         part = resequenced(case.recording, np.arange(start, start + length))
         walk = localize(case, settings, stream(case.seed, "estimator/starts", start), part)
         runs.append((start, settled_at(walk.errors_m, tolerance_m), walk))
@@ -295,11 +293,10 @@ def cluster_labels(known_map: TopologicalMap, seed: int) -> NDArray[np.int64]:
 def cluster_row(known_map: TopologicalMap, recording: Recording, descriptor: str, seed: int) -> Row:
     """Figure 2: share of nodes with a route neighbour in their cluster; retrieval beside."""
     same = np.diff(cluster_labels(known_map, seed)) == 0
-    beside = np.append(same, False) | np.append(False, same)
     return {
         "descriptor": descriptor,
         "nodes": len(known_map),
-        "contiguous": float(beside.mean()),
+        "contiguous": float((np.append(same, False) | np.append(False, same)).mean()),
         **_retrieval(known_map, recording),
     }
 
@@ -320,8 +317,7 @@ def campus_runs(name: str, seed: int) -> tuple[Experiment, Experiment]:
     along = np.gradient(way, axis=0)
     along[[0, -1]] = way[1] - way[-2]  # the tour is closed
     left = along[:, ::-1] * [-1.0, 1.0] / np.hypot(*along.T)[:, None]
-    lane = (way + CAMPUS_SHIFT_M * left).tolist()
-    route = {**mapping.config["route"], "waypoints": lane}
+    route = {**mapping.config["route"], "waypoints": (way + CAMPUS_SHIFT_M * left).tolist()}
     return mapping, mapping.replaced(seed=seed + 500, route=route)  # the same world_seed
 
 

@@ -95,8 +95,7 @@ def starts(experiment: Experiment, n_starts: int) -> list[Row]:
     recording = experiment.recording()
     if recording.status != "ok":
         raise RunFailedError(f"seed {experiment.seed}: the drive ended early: {recording.status}")
-    truth = recording.truth_at(recording.frame_stamps)
-    travel_m = travelled_m(truth)
+    travel_m = travelled_m(recording.truth_at(recording.frame_stamps))
     last_m = travel_m[-1] - WITHIN_M - FOR_M - 1.0
     first_rows = np.searchsorted(travel_m, (np.arange(n_starts) + 0.5) / n_starts * last_m)
     return [

@@ -160,16 +160,12 @@ def crossover(*overrides: str) -> pd.DataFrame:
         left = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
         sigma = believed.covariances[1:, :2, :2]
         along, across = (np.einsum("ti,tij,tj->t", u, sigma, u) for u in (ahead, left))
-        distance = batch.encoder_m[0, 1:].mean(axis=1)
-        rows.append({"seed": experiment.seed, "crossover_m": _crossing(distance, across / along)})
+        distance, ratio = batch.encoder_m[0, 1:].mean(axis=1), across / along
+        crossed = int(np.argmax(ratio > 1.0))
+        around = slice(crossed - 1, crossed + 1)  # interpolated in the ratio's logarithm
+        crossover_m = float(np.interp(0.0, np.log(ratio[around]), distance[around]))
+        rows.append({"seed": experiment.seed, "crossover_m": crossover_m})
     return pd.DataFrame(rows)
-
-
-def _crossing(distance: Array, ratio: Array) -> float:
-    """Distance at which a ratio first passes one, interpolated in its logarithm."""
-    crossed = int(np.argmax(ratio > 1.0))
-    around = slice(crossed - 1, crossed + 1)
-    return float(np.interp(0.0, np.log(ratio[around]), distance[around]))
 
 
 def drawn() -> dict[str, NDArray[np.float32]]:
@@ -390,8 +386,7 @@ def gradient_descent() -> pd.DataFrame:
     """Run the report's own procedure on its example data and on others: it goes to 1/2."""
     rows = []
     for name, (ideal, real, time_s) in DESCENTS.items():
-        steps = math.ceil(30.0 / (0.08 * (ideal - real) ** 2 / time_s**2))
-        last = min(steps, 10**6)
+        last = min(math.ceil(30.0 / (0.08 * (ideal - real) ** 2 / time_s**2)), 10**6)
         k = report_gradient_descent(ideal, real, time_s, n_iterations=max(100, last))
         rows.append({"data": name, "k_after_100": k[100], "k_in_the_end": k[last]})
     return pd.DataFrame(rows)

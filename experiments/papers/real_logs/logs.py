@@ -46,8 +46,7 @@ def freiburg() -> Recording:
 
 def landmarks(robot: int, calibrated: bool, identifies: bool) -> Recording:
     """One robot of MRCLAM 6, with ranges and bearings to landmarks."""
-    archive = DATA / "mrclam6" / "MRCLAM_Dataset6.tar.xz"
-    logged = mrclam.read_mrclam(archive, robot, identifies)
+    logged = mrclam.read_mrclam(DATA / "mrclam6" / "MRCLAM_Dataset6.tar.xz", robot, identifies)
     return calibrated_by_truth(logged) if calibrated else logged
 
 

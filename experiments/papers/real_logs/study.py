@@ -192,8 +192,7 @@ def _block_interval(errors: Array, stamps: Array, block_s: float = 60.0) -> dict
     _, blocks = np.unique(np.floor((stamps - stamps.min()) / block_s), return_inverse=True)
     sums, counts = np.bincount(blocks, errors), np.bincount(blocks)
     picks = np.random.default_rng(0).integers(len(sums), size=(2000, len(sums)))
-    means = sums[picks].sum(axis=1) / counts[picks].sum(axis=1)
-    low, high = np.quantile(means, [0.025, 0.975])
+    low, high = np.quantile(sums[picks].sum(axis=1) / counts[picks].sum(axis=1), [0.025, 0.975])
     return {"translation_low_m": float(low), "translation_high_m": float(high)}
 
 
@@ -250,19 +249,20 @@ def wheels() -> pd.DataFrame:
     """Khepera: geometry beside the published one; kr and kl by the length of the blocks."""
     archive = DATA / "censi_khepera_calib/khepera_l90_lmov.tar.xz"
     rows: list[dict[str, Any]] = []
-    for name, published in KHEPERA.items():
-        found = calibrate_wheels(read_khepera(archive, f"{name}.tuple"))
-        for quantity, printed in zip(
-            ("diameter_right_m", "diameter_left_m", "axle_m"), published, strict=True
-        ):
-            labels = {"log": name, "quantity": quantity}
-            measured = dataclasses.asdict(getattr(found, quantity))
-            rows.append({**labels, **measured, "published": printed, "block": 0})
+    for log, published in KHEPERA.items():
+        found = calibrate_wheels(read_khepera(archive, f"{log}.tuple"))
+        names = ("diameter_right_m", "diameter_left_m", "axle_m")
+        parts: list[tuple[Any, str, Row]] = [
+            (found, name, {"published": value, "block": 0})
+            for name, value in zip(names, published, strict=True)
+        ]
         for block in (1, 2, 4, 8, 16):
             slip = slip_of_turns(found, block, np.random.default_rng(0))
-            for quantity, interval in (("kr", slip.kr), ("kl", slip.kl)):
-                labels = {"log": name, "quantity": quantity}
-                rows.append({**labels, **dataclasses.asdict(interval), "block": block})
+            parts += [(slip, name, {"block": block}) for name in ("kr", "kl")]
+        rows += [
+            {"log": log, "quantity": name, **dataclasses.asdict(getattr(part, name)), **more}
+            for part, name, more in parts
+        ]
     return pd.DataFrame(rows)
 
 
