@@ -1,8 +1,8 @@
-"""The jobs of a study, on all cores."""
+"""The jobs of a study: which runs go together, and all of them on all cores."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
@@ -32,3 +32,11 @@ def in_parallel(
     for share, result in zip(done / done[-1], results, strict=True):
         yield result
         on_progress(float(share))
+
+
+def grouped(runs: Iterable[T], key: Callable[[T], Hashable]) -> list[list[T]]:
+    """Runs with the same key together, in the order of their first."""
+    groups: dict[Hashable, list[T]] = {}
+    for run in runs:
+        groups.setdefault(key(run), []).append(run)
+    return list(groups.values())

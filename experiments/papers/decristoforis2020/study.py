@@ -34,7 +34,7 @@ from experiments.papers.decristoforis2020.settings import (
     PLACES,
 )
 from experiments.papers.decristoforis2020.steps import ellipse_path, ellipse_summary, step_errors
-from experiments.papers.jobs import in_parallel
+from experiments.papers.jobs import grouped, in_parallel
 from experiments.papers.results import Results
 from experiments.runs.console import RunFailedError
 from experiments.runs.evaluate import evaluate
@@ -121,10 +121,8 @@ def _jobs(full: bool, out: Results) -> list[Job]:
 def _planned(study: str, n_seeds: int, *overrides: str) -> list[list[Experiment]]:
     """Experiments of conf/study/decristoforis2020_*.yaml, grouped by recording."""
     seeds = f"seed=range({JUDGED_SEED},{JUDGED_SEED + n_seeds})"
-    groups: dict[str, list[Experiment]] = {}
-    for experiment in planned([f"study=decristoforis2020_{study}", seeds, *overrides]):
-        groups.setdefault(experiment.recording_key, []).append(experiment)
-    return list(groups.values())
+    runs = planned([f"study=decristoforis2020_{study}", seeds, *overrides])
+    return grouped(runs, lambda run: run.recording_key)
 
 
 def _only(methods: Sequence[str], group: Sequence[Experiment]) -> list[Experiment]:

@@ -7,7 +7,7 @@ is drawn once.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import accumulate
 
 import numpy as np
@@ -22,7 +22,7 @@ from experiments.evaluation.metrics import position_errors_m, rms, travelled_m
 from experiments.evaluation.verdict import Profile
 from experiments.papers.gil2008 import scores, settings
 from experiments.papers.gil2008.recordings import Scene, landmark_distances_m, thinned, whole
-from experiments.papers.jobs import in_parallel
+from experiments.papers.jobs import grouped, in_parallel
 from experiments.papers.results import Results
 from experiments.runs.evaluate import estimates, scored, status_of
 from experiments.runs.experiment import Experiment
@@ -61,7 +61,7 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
     """
     jobs = [
         [part[low : low + _RUNS_PER_JOB]]
-        for part in by_scene(plan(profile))
+        for part in grouped(plan(profile), lambda run: Scene.of(run[1].config))
         for low in range(0, len(part), _RUNS_PER_JOB)
     ]
     rows: dict[str, list[Row]] = {table: [] for table in settings.LABELS}
@@ -74,30 +74,18 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
     on_progress(1.0)
 
 
-def plan(profile: Profile) -> list[Run]:
+def plan(profile: Profile) -> Iterator[Run]:
     """All runs; quick, the same ones over fewer worlds, with fewer repeats.
 
     They are composed for one world: the others differ in their seed alone.
     """
-    runs = []
     for table in settings.LABELS:
         n_worlds = 1 if table == "repeats" else settings.N_WORLDS[profile]
         for one in planned([f"study=gil2008_{table}", f"seed={settings.SEED}"]):
             if one.config["recording"]["draw"] < settings.N_DRAWS[profile]:
                 repeats = min(one.repeats, settings.N_REPEATS[profile])
-                runs += [
-                    (table, one.replaced(seed=seed, world_seed=seed, repeats=repeats))
-                    for seed in range(settings.SEED, settings.SEED + n_worlds)
-                ]
-    return runs
-
-
-def by_scene(runs: Iterable[Run]) -> list[list[Run]]:
-    """Runs of each scene."""
-    scenes: dict[Scene, list[Run]] = {}
-    for table, experiment in runs:
-        scenes.setdefault(Scene.of(experiment.config), []).append((table, experiment))
-    return list(scenes.values())
+                for seed in range(settings.SEED, settings.SEED + n_worlds):
+                    yield table, one.replaced(seed=seed, world_seed=seed, repeats=repeats)
 
 
 def rows_of(runs: Sequence[Run]) -> list[tuple[str, Row]]:

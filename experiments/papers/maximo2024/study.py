@@ -112,13 +112,13 @@ def _rows(name: str, seed: int, profile: Profile) -> dict[str, Rows]:
             {"start": start, "settled_at": settled}
             for start, settled, _ in starts(case, N_STARTS[profile], settings, tolerance_m)
         ],
-        "kidnapping": kidnapping_rows(case, by_mode, 0.05, 5, RECOVERED_WITHIN + HELD),
+        "kidnapping": list(kidnapping_rows(case, by_mode, 0.05, 5, RECOVERED_WITHIN + HELD)),
         "clusters": [cluster_row(case.known_map, case.recording, "synthetic", seed)],
     }
     if name in GEOMETRIES:  # not again on the real positions
-        tables["particles"] = particle_rows(case, N_REPEATS[profile])
+        tables["particles"] = list(particle_rows(case, N_REPEATS[profile]))
         if seed < JUDGED_SEED + N_QUALITY_WORLDS[profile]:
-            tables["quality"] = quality_rows(name, seed)
+            tables["quality"] = list(quality_rows(name, seed))
     return tables
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -170,15 +171,13 @@ def weighting_rows(case: Case, n_repeats: int) -> dict[str, Rows]:
     return tables
 
 
-def particle_rows(case: Case, n_repeats: int) -> Rows:
+def particle_rows(case: Case, n_repeats: int) -> Iterator[Row]:
     """Table 2: errors of M2 by the number of particles a node."""
-    rows: Rows = []
     for per_node in PER_NODE:
         settings = options(case) | {"particles_per_node": per_node}
         walks = _repeated(case, settings, f"estimator/{per_node}", n_repeats)
         label = {"per_node": per_node, "particles": per_node * len(case.known_map)}
-        rows += [label | row for row in _errors(walks)]
-    return rows
+        yield from (label | row for row in _errors(walks))
 
 
 def _repeated(case: Case, settings: dict[str, Any], axis: str, n_repeats: int) -> list[Walk]:
@@ -216,7 +215,7 @@ def kidnapping_rows(
     n_trials: int,
     n_after: int,
     queries_per_node: float = 1.0,
-) -> Rows:
+) -> Iterator[Row]:
     """Carry the robot off and see whether the filter finds it, without and with injection.
 
     Parameters
@@ -224,7 +223,6 @@ def kidnapping_rows(
     n_after
         Queries after the kidnapping.
     """
-    rows: Rows = []
     n, tolerance_m = len(case.recording.frame_stamps), TOLERANCE * case.known_map.spacing_m
     draws = stream(case.seed, "kidnapping")
     for trial in range(n_trials):
@@ -234,21 +232,16 @@ def kidnapping_rows(
         for share in (0.0, injection):
             rng = stream(case.seed, "estimator/kidnapping", trial)
             errors = localize(case, settings | {"injection": share}, rng, part).errors_m
-            rows.append(
-                {
-                    "trial": trial,
-                    "injection": share,
-                    "known_before": bool(errors[KIDNAPPED_AFTER - 1] <= tolerance_m),
-                    "settled_at": settled_at(errors[KIDNAPPED_AFTER:], tolerance_m)
-                    / queries_per_node,
-                }
-            )
-    return rows
+            yield {
+                "trial": trial,
+                "injection": share,
+                "known_before": bool(errors[KIDNAPPED_AFTER - 1] <= tolerance_m),
+                "settled_at": settled_at(errors[KIDNAPPED_AFTER:], tolerance_m) / queries_per_node,
+            }
 
 
-def quality_rows(name: str, seed: int) -> Rows:
+def quality_rows(name: str, seed: int) -> Iterator[Row]:
     """Map of M1-M3 over the descriptors' noise and B, with the same sigmas for all methods."""
-    rows: Rows = []
     for noise in QUALITIES:
         case = case_of(name, seed, f"recording.noise_weight={noise}")
         recall = _retrieval(case.known_map, case.recording)["recall_at_1"]
@@ -257,17 +250,14 @@ def quality_rows(name: str, seed: int) -> Rows:
             settings = options(case, method, (*SHARED_SIGMA, n_nearest))
             rng = stream(seed, "estimator/quality")
             walk = localize(case, settings | {"particles_per_node": 2}, rng, part)
-            rows.append(
-                {
-                    "noise_weight": noise,
-                    "recall_at_1": recall,
-                    "n_nearest": n_nearest,
-                    "method": method,
-                    "error_m": float(walk.errors_m.mean()),
-                    "dispersion_m": float(walk.dispersions_m[10]),
-                }
-            )
-    return rows
+            yield {
+                "noise_weight": noise,
+                "recall_at_1": recall,
+                "n_nearest": n_nearest,
+                "method": method,
+                "error_m": float(walk.errors_m.mean()),
+                "dispersion_m": float(walk.dispersions_m[10]),
+            }
 
 
 def _retrieval(known_map: TopologicalMap, recording: Recording) -> dict[str, float]:
@@ -340,8 +330,8 @@ def campus_rows(name: str, seed: int, n_repeats: int) -> dict[str, Rows]:
     return {
         **weighting_rows(_one_query_a_node(bare), n_repeats),
         "clusters": clusters,
-        "campus_starts": _campus_starts(case),
-        "kidnapping": kidnapping_rows(bare, {}, 0.02, 25, 4 * RECOVERED_WITHIN, per_node),
+        "campus_starts": list(_campus_starts(case)),
+        "kidnapping": list(kidnapping_rows(bare, {}, 0.02, 25, 4 * RECOVERED_WITHIN, per_node)),
     }
 
 
@@ -354,21 +344,17 @@ def _one_query_a_node(case: Case) -> Case:
     return replace(case, experiment=experiment, recording=resequenced(case.recording, rows))
 
 
-def _campus_starts(case: Case) -> Rows:
+def _campus_starts(case: Case) -> Iterator[Row]:
     """Default filter from 60 starts: when it is localized, and how well where it refines."""
-    rows: Rows = []
     spacing_m = case.known_map.spacing_m
     for start, settled, walk in starts(case, 60, {}, spacing_m):
         after = walk.errors_m[int(settled) :] if math.isfinite(settled) else np.array([math.nan])
         refinement = walk.estimate.extras["refinement"]
-        rows.append(
-            {
-                "start": start,
-                "spacing_m": spacing_m,
-                "settled_at": settled,
-                "rms_m": rms(after),
-                "median_m": float(np.median(after)),
-                "refined": float(np.mean([state == "ok" for state in refinement])),
-            }
-        )
-    return rows
+        yield {
+            "start": start,
+            "spacing_m": spacing_m,
+            "settled_at": settled,
+            "rms_m": rms(after),
+            "median_m": float(np.median(after)),
+            "refined": float(np.mean([state == "ok" for state in refinement])),
+        }

@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -150,18 +150,17 @@ def intel_relations() -> tuple[list[Row], Paths]:
     return rows, {name: _path(found[name][1]) for name in (*INTEL_DRAWN, GMAPPING)}
 
 
-def freiburg_relations() -> list[Row]:
+def freiburg_relations() -> Iterator[Row]:
     """The relations metric of our estimates and of the graph on the log of Freiburg 079."""
     folder = DATA / "fr079_flirt"
     truth = read_relations(folder / "fr079.relations.gz")
-    rows: list[Row] = []
     for name, run in zip(FREIBURG, planned(["study=real_logs_fr079"]), strict=True):
         found = tracked(run.estimator(), run.recording())
-        rows += _relation_rows("fr079", name, truth, found.stamps, found.means)
+        yield from _relation_rows("fr079", name, truth, found.stamps, found.means)
     log = carmen.read_carmen(folder / "fr079.flirt.log.gz")
     for name, near in (("graph (FLIRT)", False), ("graph (FLIRT), exact stamps", True)):
-        rows += _relation_rows("fr079", name, truth, log.scan_stamps, log.scan_poses, near=near)
-    return rows
+        stamps, poses = log.scan_stamps, log.scan_poses
+        yield from _relation_rows("fr079", name, truth, stamps, poses, near=near)
 
 
 def _relation_rows(
@@ -173,18 +172,16 @@ def _relation_rows(
     *,
     near: bool = False,
     until_s: float | None = None,
-) -> list[Row]:
+) -> Iterator[Row]:
     """Rows of all relations and, for a tuned method, of those after the tuned part."""
     parts = {"all": relations}
     if until_s is not None:
         late = np.all(relations.stamps > until_s, axis=1)
         parts["judged"] = Relations(relations.stamps[late], relations.motion[late])
-    rows: list[Row] = []
     for part, chosen in parts.items():
         found = relation_errors(chosen, stamps, poses, "near" if near else "interpolated")
         bounds = _block_interval(found.translation_m, chosen.stamps[found.rows, 0])
-        rows.append({"log": log, "method": method, "part": part, **found.summary(), **bounds})
-    return rows
+        yield {"log": log, "method": method, "part": part, **found.summary(), **bounds}
 
 
 def _block_interval(errors: Array, stamps: Array, block_s: float = 60.0) -> dict[str, float]:
