@@ -1,4 +1,4 @@
-"""All papers' tables, figures and claims into results/: what `make reproduce` runs."""
+"""Make all papers' tables, figures and claims in results/, as `make reproduce` does."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def reproduce(*, full: bool = False, only: str | None = None) -> None:
     Parameters
     ----------
     full
-        The judged profile; else the quick one, whose verdicts are marked quick.
+        Run the full profile, not the quick one, whose verdicts are marked quick.
     only
         A paper's short name, or None for all papers.
     """

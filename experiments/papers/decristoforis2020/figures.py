@@ -1,4 +1,4 @@
-"""The figures of decristoforis2020, and what the studies add to them."""
+"""The figures of decristoforis2020, and those that our studies add."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ _METHODS = ("censi", "censi_sliding", "censi_last", "hessian", "unscented_censi"
 
 
 def draw(made: Results) -> dict[str, Figure]:
-    """Draw all figures of the paper, and those beside them, by file name."""
+    """Draw all figures, by file name."""
     office, table = made.arrays("office"), made.table("runs")
     pages = {
         "1_route": route(office),
@@ -129,7 +129,7 @@ def _enlarged_ellipses(
     spacing_m: float,
     title: str,
 ) -> None:
-    """Draw the enlarged ellipses of the places whose names begin so, one every `spacing_m`."""
+    """Draw enlarged ellipses, one every `spacing_m`, where the place's name begins with `place`."""
     rows = path[path["place"].str.startswith(place, na=False)]
     draw_walls(ax, corridor["walls"], corridor["wall_z_m"])
     ax.plot(path["x_m"], path["y_m"], color=TRUTH, lw=0.6)
@@ -163,9 +163,9 @@ def trajectories(office: Arrays, table: pd.DataFrame) -> Figure:
 
 
 def _of_all(table: pd.DataFrame, column: str, words: str) -> str:
-    """What the recording drawn has by method, beside the median of all recordings."""
+    """Each method's value for the recording drawn, and the median of all recordings."""
     wide = judged_runs(table).pivot(index="seed", columns="method", values=column)
-    drawn = wide.index.min()  # the one whose paths and points are kept
+    drawn = wide.index.min()  # the only one whose paths and points are stored
     parts = ", ".join(
         f"{NAMES[method]} {wide.loc[drawn, method]:.2f} ({wide[method].median():.2f})"
         for method in PAPERS_OWN
@@ -206,7 +206,7 @@ def maps(office: Arrays, table: pd.DataFrame) -> Figure:
 
 
 def runs(table: pd.DataFrame) -> Figure:
-    """Errors and consistency of every method, one dot a recording."""
+    """Errors and consistency of every method, one dot per recording."""
     page, axes = subplots(9.5, 3.8, 1, 3)
     rows = judged_runs(table)
     methods = [name for name in NAMES if name in set(rows["method"])]

@@ -68,9 +68,9 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
     Parameters
     ----------
     profile
-        `quick`: few and short recordings; `full`: what the claims are judged by.
+        `quick`: few and short recordings; `full`: those that the claims are judged on.
     on_progress
-        Called with the share done.
+        Called with the share of the work done.
     """
     costs, functions, arguments = zip(*_jobs(profile is Profile.FULL, out), strict=True)
     calls = [(function, *given) for function, given in zip(functions, arguments, strict=True)]
@@ -242,7 +242,7 @@ def _scenes(seed: int, place: str, n_repeats: int) -> Tables:
 
 
 def _metrics(seed: int, kind: str) -> Tables:
-    """Both metrics over one of the benchmark's pairs: error and time, without a guess."""
+    """Both metrics on one of the benchmark's pairs: error and time, without an initial guess."""
     place, size = kind.split("_")
     p = pair(place, size, seed)
     target, source = (prepare(r, BEARINGS_RAD) for r in (p.target_m, p.source_m))
@@ -265,7 +265,7 @@ def _metrics(seed: int, kind: str) -> Tables:
 
 
 def _boxes(errors: pd.DataFrame) -> pd.DataFrame:
-    """Quartiles and whiskers (1.5 times the quartiles' distance) of the pooled errors."""
+    """Quartiles and whiskers (1.5 times the interquartile range) of the pooled errors."""
     by_method = judged_runs(errors).groupby("method")
     rows = [
         {"method": method, "error": name, "n": len(values), **boxplot_stats(values)[0]}

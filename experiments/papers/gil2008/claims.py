@@ -62,7 +62,7 @@ def judge(made: Results) -> list[Claim]:
 
 
 def pooled(table: pd.DataFrame, column: str, by: str) -> pd.DataFrame:
-    """Root of the mean square of a column, one row a world and one column a value of `by`."""
+    """Root mean square of a column, one row per world and one column per value of `by`."""
     squares = (table[column] ** 2).groupby([table["seed"], table[by]]).mean()
     return squares.unstack(by).dropna() ** 0.5
 

@@ -1,4 +1,4 @@
-"""Constants of the gil2008 studies; what is configuration stands in conf/study/gil2008*.yaml."""
+"""Constants of the gil2008 studies; the configuration is in conf/study/gil2008*.yaml."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ N_REPEATS = {Profile.FULL: 20, Profile.QUICK: 3}  # of a run
 N_DRAWS = {Profile.FULL: 5, Profile.QUICK: 2}  # of the wheel errors
 N_TIMINGS = {Profile.FULL: 5, Profile.QUICK: 2}
 SEED = 1000  # of the first world
-P0 = 1e-3  # names the row of an estimator that has none
-FARTHEST_M = 20.0  # images are drawn with all landmarks within
+P0 = 1e-3  # in the rows of estimators without a p0
+FARTHEST_M = 20.0  # images are drawn with all landmarks within this distance
 LAG_M = 20.0  # ground is revisited when the robot was there at least this much path ago
 WITHIN_M = 1.0  # and this near

@@ -1,7 +1,7 @@
 """The studies of gil2008: particles, distance, observations, association, noise, cost.
 
-Each table is a study of conf/study: its swept values are the runs. Runs over one scene share what
-is drawn once.
+Each table is a study of conf/study, whose swept values are its runs. Runs over one scene share its
+recording.
 """
 
 from __future__ import annotations
@@ -55,9 +55,9 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
     profile
         `quick`: the same runs over fewer worlds, with fewer repeats.
     out
-        Where they go.
+        Where tables and arrays go.
     on_progress
-        Called with the share done.
+        Called with the share of the work done.
     """
     jobs = [
         [part[low : low + _RUNS_PER_JOB]]
@@ -75,9 +75,9 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
 
 
 def plan(profile: Profile) -> Iterator[Run]:
-    """All runs; quick, the same ones over fewer worlds, with fewer repeats.
+    """All runs; the quick profile has the same ones over fewer worlds, with fewer repeats.
 
-    They are composed for one world: the others differ in their seed alone.
+    They are composed for one world; the others differ only in their seed.
     """
     for table in settings.LABELS:
         n_worlds = 1 if table == "repeats" else settings.N_WORLDS[profile]
@@ -122,7 +122,7 @@ def labels_of(table: str, experiment: Experiment) -> Row:
 
 
 def _shown(recording: Recording) -> Row:
-    """What a recording's images show."""
+    """What the images of a recording show."""
     camera, log = recording.sensors.known_stereo, recording.known_landmarks
     far = landmark_distances_m(recording) > 10.0
     return {

@@ -65,7 +65,7 @@ class Case:
 
 
 def case_of(name: str, seed: int, *overrides: str) -> Case:
-    """World of a route; `oxford_real` stands on the real positions."""
+    """World of a route; `oxford_real` has the real positions."""
     lines = [f"study=maximo2024_{name.removesuffix('_real')}", f"seed={seed}", *overrides]
     if name == "oxford_real":
         lines.append(f"positions='{POSITIONS}'")
@@ -79,7 +79,7 @@ def options(
 ) -> dict[str, Any]:
     """Keys of the estimator: a method with the parameters chosen for its geometry, or others.
 
-    The campus takes those of UMH, untuned, in its own spacings.
+    The campus takes those of UMH, untuned, in units of its own spacing.
 
     Parameters
     ----------
@@ -153,7 +153,7 @@ def weighting_rows(case: Case, n_repeats: int) -> dict[str, Rows]:
     """
     tables: dict[str, Rows] = {"weighting": [], "dispersion": []}
     taken = case.recording.truth_at(case.recording.frame_stamps)[:, :2]
-    # what a topological estimate cannot beat
+    # the least error of a topological estimate
     nearest_m = float(gaps_m(taken, case.known_map.positions_m).min(axis=1).mean())
     for method in (*METHODS, "M2_mode"):
         settings = options(case, method[:2])
@@ -172,7 +172,7 @@ def weighting_rows(case: Case, n_repeats: int) -> dict[str, Rows]:
 
 
 def particle_rows(case: Case, n_repeats: int) -> Iterator[Row]:
-    """Table 2: errors of M2 by the number of particles a node."""
+    """Table 2: errors of M2 by the number of particles per node."""
     for per_node in PER_NODE:
         settings = options(case) | {"particles_per_node": per_node}
         walks = _repeated(case, settings, f"estimator/{per_node}", n_repeats)
@@ -216,7 +216,7 @@ def kidnapping_rows(
     n_after: int,
     queries_per_node: float = 1.0,
 ) -> Iterator[Row]:
-    """Carry the robot off and see whether the filter finds it, without and with injection.
+    """Kidnap the robot and see whether the filter finds it again, without and with injection.
 
     Parameters
     ----------
@@ -336,7 +336,7 @@ def campus_rows(name: str, seed: int, n_repeats: int) -> dict[str, Rows]:
 
 
 def _one_query_a_node(case: Case) -> Case:
-    """As the paper has it: one query a node, the filter as printed, nothing tuned for it."""
+    """As in the paper: one query per node, the filter as printed, nothing tuned for it."""
     gone = travelled_m(case.recording.truth_at(case.recording.frame_stamps))
     rows = np.unique(np.searchsorted(gone, np.arange(0.0, gone[-1], case.known_map.spacing_m)))
     printed = Experiment.compose(["estimator=topological_mcl_paper"]).config["estimator"]
@@ -345,7 +345,7 @@ def _one_query_a_node(case: Case) -> Case:
 
 
 def _campus_starts(case: Case) -> Iterator[Row]:
-    """Default filter from 60 starts: when it is localized, and how well where it refines."""
+    """Default filter from 60 starts: when it is localized, and how accurately once refined."""
     spacing_m = case.known_map.spacing_m
     for start, settled, walk in starts(case, 60, {}, spacing_m):
         after = walk.errors_m[int(settled) :] if math.isfinite(settled) else np.array([math.nan])

@@ -1,4 +1,4 @@
-"""Recordings of the real logs, as conf/study/real_logs_*.yaml name them."""
+"""Recordings of the real logs that conf/study/real_logs_*.yaml name."""
 
 from __future__ import annotations
 
@@ -71,9 +71,9 @@ def tuned_until_s(logged: Recording) -> float:
 
 
 def calibrated_by_scans(recording: Recording, until_s: float) -> Recording:
-    """The recording with wheels, track and laser as scan matching before `until_s` shows them.
+    """The recording with wheels, track and laser calibrated by scan matching before `until_s`.
 
-    The wheels of a log of poses are rebuilt with nominal sizes: what is found are corrections.
+    The wheels of a log of poses are rebuilt with nominal sizes, so the calibration corrects those.
     """
     matcher = IcpOdometry(kr=3e-3, kl=3e-3, sigma_range_m=0.03, reference="previous")
     estimate = tracked(matcher, recording)

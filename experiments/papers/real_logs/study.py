@@ -1,6 +1,6 @@
-"""The estimators on logs that others recorded, beside the errors that were printed with them.
+"""The estimators on logs that others recorded, beside the errors published with them.
 
-The logs are not part of the project; they are looked for in ../shared/data.
+The logs are not part of the project; they are expected in ../shared/data.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ _SCORES = ("ate_rmse_m", "ate_aligned_rmse_m", "heading_rmse_rad", "nees_mean", 
 
 
 def missing() -> str:
-    """Why the study cannot run, or nothing."""
+    """Why the study cannot run; empty if it can."""
     return "" if DATA.is_dir() else f"the real logs are not in {DATA.parent.name}/{DATA.name}"
 
 
@@ -76,7 +76,7 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
     profile
         `quick`: fewer robots, seeds and hypotheses.
     on_progress
-        Called with the share done.
+        Called with the share of the work done.
     """
     out.write_tables(ate=rawseeds_ate(), wheels=wheels(), lego=lego_errors())
     on_progress(0.1)
@@ -185,7 +185,7 @@ def _relation_rows(
 
 
 def _block_interval(errors: Array, stamps: Array, block_s: float = 60.0) -> dict[str, float]:
-    """95 % interval of a mean; relations that begin in the same minute are resampled together."""
+    """95 % bootstrap interval of a mean; relations that begin in the same minute stay together."""
     _, blocks = np.unique(np.floor((stamps - stamps.min()) / block_s), return_inverse=True)
     sums, counts = np.bincount(blocks, errors), np.bincount(blocks)
     picks = np.random.default_rng(0).integers(len(sums), size=(2000, len(sums)))
@@ -297,7 +297,7 @@ def lego_errors() -> pd.DataFrame:
 
 
 def wean_fit(logs: str) -> tuple[pd.DataFrame, dict[str, NDArray[Any]]]:
-    """How well the scans fit the map under each reading of it; and what is drawn of both.
+    """How well the scans fit the map under each reading of it, and what the figure draws.
 
     Parameters
     ----------
@@ -341,7 +341,7 @@ def _around(grid: wean.Grid, points: Array) -> dict[str, NDArray[Any]]:
 
 
 def _halved(values: Array) -> Array:
-    """A grid of cells twice as large: means of what is known in them."""
+    """A grid of cells twice as large: means of their known cells."""
     n_x, n_y = values.shape[0] // 2, values.shape[1] // 2
     cells = values[: 2 * n_x, : 2 * n_y].reshape(n_x, 2, n_y, 2)
     with np.errstate(invalid="ignore"):
