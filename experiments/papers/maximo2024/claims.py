@@ -77,9 +77,7 @@ def mx1(weighting: pd.DataFrame, quality: pd.DataFrame) -> Iterator[Claim]:
 def mx3(dispersion: pd.DataFrame, quality: pd.DataFrame) -> Iterator[Claim]:
     """MX3: M2 concentrates faster than M1: its dispersion at step 10."""
     at_10 = dispersion.query("step == 10").assign(
-        dispersion_m=lambda rows: (
-            rows["dispersion_m"] + _LEAST_M
-        )  # zero if all particles are on one node
+        dispersion_m=lambda rows: rows["dispersion_m"] + _LEAST_M  # may be zero
     )
     return _m2_below_m1("MX3", "dispersion", at_10, quality, " at step 10")
 

@@ -210,7 +210,7 @@ def campus_arrays(name: str) -> Arrays:
     mapping, taking = (experiment.recording() for experiment in experiments)
     spacing_m = experiments[0].config["prior"]["map"]["spacing_m"]
     known = from_recording(mapping, DRAWN_DESCRIPTOR, spacing_m)
-    # where the most walls are within 40 m
+    # where most is seen within 40 m
     seen = np.convolve(np.sum(known.slices_m < 40.0, axis=1), np.ones(4), "valid")
     nodes = known.positions_m[np.argmax(seen) + np.arange(4)]
     between = nodes + 0.4 * np.diff(nodes, axis=0, append=nodes[-1:])
