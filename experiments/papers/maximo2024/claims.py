@@ -76,9 +76,7 @@ def mx1(weighting: pd.DataFrame, quality: pd.DataFrame) -> Iterator[Claim]:
 
 def mx3(dispersion: pd.DataFrame, quality: pd.DataFrame) -> Iterator[Claim]:
     """MX3: M2 concentrates faster than M1: its dispersion at step 10."""
-    at_10 = dispersion.query("step == 10").assign(
-        dispersion_m=lambda rows: rows["dispersion_m"] + _LEAST_M  # may be zero
-    )
+    at_10 = dispersion.query("step == 10").eval("dispersion_m = dispersion_m + @_LEAST_M")
     return _m2_below_m1("MX3", "dispersion", at_10, quality, " at step 10")
 
 
