@@ -1,1 +1,1 @@
-"""One folder a paper: settings, study, claims, figures, findings."""
+"""One folder per paper: settings, study, claims, figures, findings."""

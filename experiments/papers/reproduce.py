@@ -1,4 +1,4 @@
-"""All papers' tables, figures and claims into results/: what `make reproduce` runs."""
+"""Make all papers' tables, figures and claims in results/, as `make reproduce` does."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from sim.errors import InputError
 
 PAPERS = ("puzzlebot2024", "decristoforis2020", "maximo2024", "gil2008")
 LOGS = ("real_logs",)  # run only where the logs are
-OWN = ("mcl_office",)  # our studies, which judge no claim: run only when named
-_APART = "_tuning"  # a table made on other seeds, that parameters were chosen by
+OWN = ("mcl_office",)  # our own study, which judges no claim: run only when named
+_APART = "_tuning"  # the table on other seeds from which parameters were chosen
 
 
 def reproduce(*, full: bool = False, only: str | None = None) -> None:
@@ -36,12 +36,12 @@ def reproduce(*, full: bool = False, only: str | None = None) -> None:
     Parameters
     ----------
     full
-        The judged profile; else the quick one, whose verdicts are marked quick.
+        Run the full profile, not the quick one, whose verdicts are marked quick.
     only
         A paper's short name, or None for all papers.
     """
     place = results()
-    read_claims(place / "claims.csv")  # what cannot be added to is said before hours are spent
+    read_claims(place / "claims.csv")  # a damaged table ends the command before hours are spent
     profile, made = Profile.FULL if full else Profile.QUICK, read_provenance(place)
     for paper in _chosen(only):
         begun = time.monotonic()
@@ -57,9 +57,8 @@ def reproduce(*, full: bool = False, only: str | None = None) -> None:
         _print(reproduce_paper(paper, profile))
         print(f"{paper}: {time.monotonic() - begun:.0f} s", file=sys.stderr)
     write_report(place)
-    named = {"report": "report.html", "claims": "claims.csv"}
-    named |= {kind: kind for kind in ("figures", "tables")}
-    print(", ".join(f"{what}: {short(place / name)}" for what, name in named.items()))
+    names = ("report.html", "claims.csv", "figures", "tables")
+    print(", ".join(f"{name.split('.')[0]}: {short(place / name)}" for name in names))
 
 
 def redraw(only: str | None = None) -> None:
@@ -94,7 +93,7 @@ def redraw(only: str | None = None) -> None:
 def reproduce_paper(paper: str, profile: Profile) -> list[Claim]:
     """Run one paper's study, and put its files, claims and origin in place.
 
-    All are made apart first, so an end in between leaves the results as they were.
+    The files are written elsewhere first, so an interrupted run leaves the results as they were.
     """
     begun, place = time.monotonic(), results()
     aside = place / "cache"  # which is not committed
@@ -107,10 +106,8 @@ def reproduce_paper(paper: str, profile: Profile) -> list[Claim]:
         claims: list[Claim] = _part(paper, "claims").judge(made)
         for kind in ("tables", "arrays", "figures"):
             _put_in_place(made.folder / kind, place / kind, paper)
-        command = f"estima reproduce --paper {paper}"
-        command += " --full" if profile is Profile.FULL else ""
-        path = place / "claims.csv"
-        write_claims(claims, path, paper=paper, profile=profile, command=command)
+        command = f"estima reproduce --paper {paper}{' --full' * (profile is Profile.FULL)}"
+        write_claims(claims, place / "claims.csv", paper=paper, profile=profile, command=command)
         note_provenance(place, paper, profile, time.monotonic() - begun)
     return claims
 
@@ -121,7 +118,7 @@ def _draw(made: Results) -> None:
 
 
 def _put_in_place(new: Path, old: Path, paper: str) -> None:
-    """Move a paper's new files over its old ones; old ones that were not made again go."""
+    """Move a paper's new files over its old ones, and delete the old ones without a new one."""
     made = {path.name for path in new.glob(f"{paper}_*")}
     try:
         old.mkdir(parents=True, exist_ok=True)
@@ -138,12 +135,10 @@ def _put_in_place(new: Path, old: Path, paper: str) -> None:
 
 
 def _chosen(only: str | None) -> tuple[str, ...]:
-    if only is None:
-        return (*PAPERS, *LOGS)
     known = (*PAPERS, *LOGS, *OWN)
-    if only not in known:
+    if only is not None and only not in known:
         raise InputError(f"--paper must be one of {', '.join(known)}, got {only!r}")
-    return (only,)
+    return (*PAPERS, *LOGS) if only is None else (only,)
 
 
 def _part(paper: str, name: str) -> ModuleType:

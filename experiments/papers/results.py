@@ -1,4 +1,4 @@
-"""What a study leaves on disk for its claims and figures: tables, and arrays."""
+"""What a study writes for its claims and figures: tables and arrays."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ _MISFITS = (
 
 @dataclass(frozen=True)
 class Results:
-    """A study's files: `tables/PAPER_NAME.csv` and `arrays/PAPER_NAME.npz` of a folder.
+    """A study's files in a folder: `tables/PAPER_NAME.csv` and `arrays/PAPER_NAME.npz`.
 
-    Claims and figures are made from these alone, so what is judged and drawn is what is on disk.
+    Claims and figures are made from these alone, so what is on disk is what is judged and drawn.
     """
 
     folder: Path

@@ -1,4 +1,4 @@
-"""What several figures draw: 95 % ellipses, plain numbers on logarithmic axes, one legend."""
+"""Parts of many figures: 95 % ellipses, plain numbers on logarithmic axes, one legend."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from experiments.evaluation.metrics import CHI2_95_2DOF
 def draw_ellipses(
     ax: Axes, means: ArrayLike, covariances: ArrayLike, label: str = "", **style: Any
 ) -> None:
-    """Draw the 95 % ellipses of positions (N, 2) or more columns, m, and their covariances, m^2.
+    """Draw 95 % ellipses at means (N, 2 or more), m, from covariances of x and y, m^2.
 
-    The label names them all once.
+    They share one label in the legend.
     """
     planes = np.asarray(covariances)[:, :2, :2]
     for mean, values, vectors in zip(np.asarray(means), *np.linalg.eigh(planes), strict=True):
@@ -32,21 +32,21 @@ def draw_ellipses(
 
 
 def plain_ticks(ax: Axes, values: Iterable[float], **text: Any) -> None:
-    """Ticks of a logarithmic x axis at the values themselves; none between, on both axes."""
+    """Put the ticks of a logarithmic x axis at the values; both axes lose their minor ticks."""
     ticks = sorted(set(values))
     ax.set_xticks(ticks, [f"{tick:g}" for tick in ticks], **text)
     ax.minorticks_off()
 
 
 def plain_log(axis: Axis, multiples: Sequence[float] = (1.0, 2.0, 5.0)) -> None:
-    """Numbers without powers of ten on a logarithmic axis, at multiples of each decade."""
+    """Label a logarithmic axis with plain numbers, at these multiples of each decade."""
     axis.set_major_locator(LogLocator(subs=multiples))
     axis.set_major_formatter("{x:g}")
     axis.set_minor_formatter("")
 
 
 def with_legend(page: Figure, ncols: int, loc: str = "outside lower center") -> Figure:
-    """Page with one legend for all its axes: of what the first of them shows."""
+    """Add one legend for all axes, of what the first of them shows; return the page."""
     handles, labels = page.axes[0].get_legend_handles_labels()
     page.legend(handles, labels, loc=loc, ncols=ncols)  # type: ignore[call-overload]
     return page

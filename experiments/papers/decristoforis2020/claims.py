@@ -86,7 +86,7 @@ def dc3(ellipses: pd.DataFrame) -> Iterator[Claim]:
 def dc4(covariances: pd.DataFrame) -> Iterator[Claim]:
     """DC4: Hessian fast but wrong, sampling right but slow, Censi right and fast.
 
-    One verdict a metric and place, and one of the times.
+    One verdict per metric and place, and two on the times of each metric.
     """
     low, high = CONSISTENT
     nees = nees_intervals(covariances)
@@ -160,7 +160,7 @@ def _paired(table: pd.DataFrame, column: str, first: str, second: str) -> tuple[
 
 
 def _region(ordering: pd.DataFrame) -> tuple[str, float]:
-    """Where the median paired log ratios of the order are all below 0; and at what share."""
+    """Cells in which the median log ratios of the order are all below 0, and their share."""
     cells = ordering.groupby(["k_m", "sigma_range_m"])
     good = [
         f"k {k:g} sigma {sigma:g}"

@@ -1,4 +1,4 @@
-"""The figures of decristoforis2020, and what the studies add to them."""
+"""The figures of decristoforis2020, and those that our studies add."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ _METHODS = ("censi", "censi_sliding", "censi_last", "hessian", "unscented_censi"
 
 
 def draw(made: Results) -> dict[str, Figure]:
-    """Draw all figures of the paper, and those beside them, by file name."""
+    """Draw all figures, by file name."""
     office, table = made.arrays("office"), made.table("runs")
     pages = {
         "1_route": route(office),
@@ -129,7 +129,7 @@ def _enlarged_ellipses(
     spacing_m: float,
     title: str,
 ) -> None:
-    """Draw the enlarged ellipses of the places whose names begin so, one every `spacing_m`."""
+    """Draw enlarged ellipses, one every `spacing_m`, where the place's name begins with `place`."""
     rows = path[path["place"].str.startswith(place, na=False)]
     draw_walls(ax, corridor["walls"], corridor["wall_z_m"])
     ax.plot(path["x_m"], path["y_m"], color=TRUTH, lw=0.6)
@@ -163,9 +163,9 @@ def trajectories(office: Arrays, table: pd.DataFrame) -> Figure:
 
 
 def _of_all(table: pd.DataFrame, column: str, words: str) -> str:
-    """What the recording drawn has by method, beside the median of all recordings."""
+    """Each method's value for the recording drawn, and the median of all recordings."""
     wide = judged_runs(table).pivot(index="seed", columns="method", values=column)
-    drawn = wide.index.min()  # the one whose paths and points are kept
+    drawn = wide.index.min()  # the only one whose paths and points are stored
     parts = ", ".join(
         f"{NAMES[method]} {wide.loc[drawn, method]:.2f} ({wide[method].median():.2f})"
         for method in PAPERS_OWN
@@ -181,10 +181,12 @@ def boxes(table: pd.DataFrame) -> Figure:
         rows = table[table["error"] == name].set_index("method")
         stats = unit * rows[["whislo", "q1", "med", "q3", "whishi"]]
         stats["label"] = rows.index.map(NAMES)
-        drawn = ax.bxp(stats.to_dict("records"), showfliers=False, patch_artist=True, widths=0.6)
-        for patch, line, method in zip(drawn["boxes"], drawn["medians"], rows.index, strict=True):
+        drawn = ax.bxp(
+            stats.to_dict("records"), showfliers=False, patch_artist=True, widths=0.6,
+            medianprops={"color": TRUTH},
+        )  # fmt: skip
+        for patch, method in zip(drawn["boxes"], rows.index, strict=True):
             patch.set(facecolor=COLORS[method], alpha=0.6)
-            line.set_color(TRUTH)
         ax.set(yscale="log", ylabel=label, ylim=(stats["q1"].min() / 10, None))
     page.suptitle("all recordings; box: quartiles, whiskers: 1.5 times their distance", size=9)
     return page
@@ -204,7 +206,7 @@ def maps(office: Arrays, table: pd.DataFrame) -> Figure:
 
 
 def runs(table: pd.DataFrame) -> Figure:
-    """Errors and consistency of every method, one dot a recording."""
+    """Errors and consistency of every method, one dot per recording."""
     page, axes = subplots(9.5, 3.8, 1, 3)
     rows = judged_runs(table)
     methods = [name for name in NAMES if name in set(rows["method"])]
@@ -339,18 +341,18 @@ def steps(table: pd.DataFrame) -> Figure:
             at, middle = first + shift + np.arange(len(columns)), values.median()
             ends = [middle - values.min(), values.max() - middle]
             ax.errorbar(at, middle, yerr=ends, fmt="o", color=color, ms=4, label=f"{rate:g} Hz")
-    axes[0].axhline(0.0, color=TRUTH, lw=0.6)
-    for ax in axes[1:]:
-        ax.axhline(1.0, color=TRUTH, lw=0.6)
-        ax.set_ylim(bottom=0.0)
+    for ax, level in zip(axes, (0.0, 1.0, 1.0), strict=True):
+        ax.axhline(level, color=TRUTH, lw=0.6)
     axes[0].set(xlabel="lag, registrations", ylabel="correlation of errors")
     axes[1].set(
+        ylim=(0.0, None),
         xlabel="composed over",
         ylabel="squared error over\nits covariance, / 3",
         xticks=range(3),
         xticklabels=["one step", "1 s", "10 s"],
     )
     axes[2].set(
+        ylim=(0.0, None),
         ylabel="RMS error of a step\nover the Fisher bound",
         xlim=(-0.5, 1.5),
         xticks=[0, 1],

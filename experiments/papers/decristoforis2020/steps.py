@@ -1,4 +1,4 @@
-"""Registration from scan to scan: what its steps err by, and the shape of its ellipses."""
+"""Registration from scan to scan: the errors of its steps, and the shape of its ellipses."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def step_errors(recording: Recording, world: World, estimate: Estimate) -> Row:
     """Correlation of successive errors, their accumulation, and their size beside its bound.
 
     Errors are in the axes of the reference, and whitened by the registration's own covariance.
-    Steps whose match is wrong, or that the walls do not hold in some direction, are left out.
+    Steps whose match is wrong, or that the walls do not constrain in some direction, are left out.
 
     Returns
     -------
@@ -40,8 +40,8 @@ def step_errors(recording: Recording, world: World, estimate: Estimate) -> Row:
     use = np.array([i for i, C in enumerate(found) if C is not None])
     R = np.array([found[i] for i in use])
     white = np.linalg.solve(np.linalg.cholesky(R), off[use][:, :, None])[:, :, 0]
-    sound = np.sum(white**2, axis=1) < 30.0  # a wrong match says nothing of correlations
-    sound &= R[:, 0, 0] + R[:, 1, 1] < HELD_M**2  # nor does a guess where nothing is held
+    sound = np.sum(white**2, axis=1) < 30.0  # a wrong match would dominate the correlations
+    sound &= R[:, 0, 0] + R[:, 1, 1] < HELD_M**2  # and so would a guess in a free direction
     row: Row = {}
     for lag in range(1, 6):
         both = sound[lag:] & sound[:-lag] & (use[lag:] - use[:-lag] == lag)
@@ -86,7 +86,7 @@ def ellipse_path(recording: Recording, world: World, estimate: Estimate) -> pd.D
     Returns
     -------
     DataFrame
-        One row a registration: `distance_m` driven, `place`, true pose; covariance `xx_m2`,
+        One row per registration: `distance_m` driven, `place`, true pose; covariance `xx_m2`,
         `xy_m2`, `yy_m2`; standard deviations along the axes `long_m`, `short_m`, and the
         `direction_rad` of the long one.
     """

@@ -34,7 +34,7 @@ from experiments.papers.decristoforis2020.settings import (
     PLACES,
 )
 from experiments.papers.decristoforis2020.steps import ellipse_path, ellipse_summary, step_errors
-from experiments.papers.jobs import in_parallel
+from experiments.papers.jobs import grouped, in_parallel
 from experiments.papers.results import Results
 from experiments.runs.console import RunFailedError
 from experiments.runs.evaluate import evaluate
@@ -68,9 +68,9 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
     Parameters
     ----------
     profile
-        `quick`: few and short recordings; `full`: what the claims are judged by.
+        `quick`: few and short recordings; `full`: those that the claims are judged on.
     on_progress
-        Called with the share done.
+        Called with the share of the work done.
     """
     costs, functions, arguments = zip(*_jobs(profile is Profile.FULL, out), strict=True)
     calls = [(function, *given) for function, given in zip(functions, arguments, strict=True)]
@@ -121,10 +121,8 @@ def _jobs(full: bool, out: Results) -> list[Job]:
 def _planned(study: str, n_seeds: int, *overrides: str) -> list[list[Experiment]]:
     """Experiments of conf/study/decristoforis2020_*.yaml, grouped by recording."""
     seeds = f"seed=range({JUDGED_SEED},{JUDGED_SEED + n_seeds})"
-    groups: dict[str, list[Experiment]] = {}
-    for experiment in planned([f"study=decristoforis2020_{study}", seeds, *overrides]):
-        groups.setdefault(experiment.recording_key, []).append(experiment)
-    return list(groups.values())
+    runs = planned([f"study=decristoforis2020_{study}", seeds, *overrides])
+    return grouped(runs, lambda run: run.recording_key)
 
 
 def _only(methods: Sequence[str], group: Sequence[Experiment]) -> list[Experiment]:
@@ -155,15 +153,14 @@ def _run(
     squares = nees_at_distances(truth, estimate.means, estimate.covariances, np.array(NEES_AT_M))
     variances = np.mean(np.diagonal(estimate.covariances, axis1=1, axis2=2), axis=0)
     labels = experiment.labels(checksum="")
-    row: Row = {
+    return {
         **{name: found[key] for name, key in origin.items()},
         **{key: value for key, value in found.items() if key not in labels},
         **{f"nees_{d:g}m": float(v) for d, v in zip(NEES_AT_M, squares, strict=True)},
         "believed_rmse_m": float(np.sqrt(variances[0] + variances[1])),
         "believed_heading_rmse_rad": float(np.sqrt(variances[2])),
         "realtime_factor": float(np.ptp(estimate.stamps) / estimate.step_seconds.sum()),
-    }
-    return row, estimate
+    }, estimate
 
 
 def _drive(group: Sequence[Experiment]) -> Tables:
@@ -245,7 +242,7 @@ def _scenes(seed: int, place: str, n_repeats: int) -> Tables:
 
 
 def _metrics(seed: int, kind: str) -> Tables:
-    """Both metrics over one of the benchmark's pairs: error and time, without a guess."""
+    """Both metrics on one of the benchmark's pairs: error and time, without an initial guess."""
     place, size = kind.split("_")
     p = pair(place, size, seed)
     target, source = (prepare(r, BEARINGS_RAD) for r in (p.target_m, p.source_m))
@@ -268,7 +265,7 @@ def _metrics(seed: int, kind: str) -> Tables:
 
 
 def _boxes(errors: pd.DataFrame) -> pd.DataFrame:
-    """Quartiles and whiskers (1.5 times the quartiles' distance) of the pooled errors."""
+    """Quartiles and whiskers (1.5 times the interquartile range) of the pooled errors."""
     by_method = judged_runs(errors).groupby("method")
     rows = [
         {"method": method, "error": name, "n": len(values), **boxplot_stats(values)[0]}

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -61,7 +61,7 @@ def judge(made: Results) -> list[Claim]:
 
 
 def pooled(table: pd.DataFrame, column: str, by: str) -> pd.DataFrame:
-    """Root of the mean square of a column, one row a world and one column a value of `by`."""
+    """Root mean square of a column, one row per world and one column per value of `by`."""
     squares = (table[column] ** 2).groupby([table["seed"], table[by]]).mean()
     return squares.unstack(by).dropna() ** 0.5
 
@@ -116,27 +116,27 @@ def gi3(particles: pd.DataFrame) -> Iterator[Claim]:
 
 def gi4(distance: pd.DataFrame) -> Iterator[Claim]:
     """GI4: the error falls with dmax."""
-    for variant, part in _variants(distance[distance["occluded"]]):
+    for words, is_ours, part in _kinds(distance[distance["occluded"]]):
         errors = pooled(part, POSITION, "max_distance_m")
         found = log_ratio_interval(errors[3], errors[10])
-        label = f"position error, dmax = 3 m over 10 m: {variant.words}"
+        label = f"position error, dmax = 3 m over 10 m: {words}"
         claim = banded("GI4", label, found, at_least=1.5, criterion="above 1.5")
-        yield _shown_if_nearest(claim, variant)
+        yield _shown(claim) if is_ours else claim
 
 
 def gi5(distance: pd.DataFrame) -> Iterator[Claim]:
     """GI5: nothing significant is gained past 10 m, because of the noise of far landmarks."""
-    for variant, part in _variants(distance):
+    for words, is_ours, part in _kinds(distance):
         far = float(part[part["max_distance_m"] == 20]["share_beyond_10_m"].mean())
         errors = pooled(part, POSITION, "max_distance_m")
         label = (
             f"position error, dmax = 10 m over 20 m, {100 * far:.0f} % of observations beyond "
-            f"10 m (90 % interval): {variant.words}"
+            f"10 m (90 % interval): {words}"
         )
         claim = _equivalence("GI5", label, errors[10], errors[20], 0.30)
         if far < 0.1:
             claim = _undecided(claim, "too few far observations")
-        yield _shown_if_nearest(claim, variant)
+        yield _shown(claim) if is_ours else claim
 
 
 def gi6(observations: pd.DataFrame) -> Iterator[Claim]:
@@ -150,8 +150,7 @@ def gi7(association: pd.DataFrame) -> Iterator[Claim]:
     for noise, table in association.groupby("noise", sort=False):
         ours = table[(table["filter"] == "fastslam2") & np.isclose(table["p0"], P0)]
         known = ours[ours["association"] == "known"].set_index("seed")[POSITION]
-        described = ours[ours["association"] == "descriptor"]
-        for _, part in described.groupby("sigma_descriptor"):
+        for _, part in ours[ours["association"] == "descriptor"].groupby("sigma_descriptor"):
             right, alone = part["right_share"].mean(), part["matching_precision"].mean()
             label = (
                 f"position error by distance and descriptor over known association (90 % "
@@ -199,36 +198,23 @@ def median_interval(values: Array) -> Interval:
     return Interval(float(np.median(values)), float(found.low), float(found.high))
 
 
-class Variant(NamedTuple):
-    """Runs that differ in dmax alone."""
+def _kinds(distance: pd.DataFrame) -> Iterator[tuple[str, bool, pd.DataFrame]]:
+    """Runs that differ in dmax alone: their name, whether no claim is about them, their rows.
 
-    filter: str
-    occluded: bool
-    noise: str
-    n_seen: int
-    rule: str
-
-    @property
-    def words(self) -> str:
-        """What a statistic calls them."""
-        seen = f"{self.n_seen} {self.rule}" if self.n_seen else "all visible"
-        walls = "behind walls" if self.occluded else "no walls"
-        return f"{NAMES[self.filter]}, {seen}, {walls}, {NOISE[self.noise]}"
-
-
-def _variants(distance: pd.DataFrame) -> Iterator[tuple[Variant, pd.DataFrame]]:
-    for key, part in distance.groupby(list(Variant._fields), sort=False):
-        yield Variant(*key), part
+    The nearest landmarks are our addition.
+    """
+    keys = ["filter", "occluded", "noise", "n_seen", "rule"]
+    for (name, occluded, noise, n_seen, rule), part in distance.groupby(keys, sort=False):
+        seen = f"{n_seen} {rule}" if n_seen else "all visible"
+        walls = "behind walls" if occluded else "no walls"
+        yield f"{NAMES[name]}, {seen}, {walls}, {NOISE[noise]}", rule == "nearest", part
 
 
 def _undecided(claim: Claim, reason: str) -> Claim:
     return dataclasses.replace(claim, verdict=Verdict.UNDECIDED, reason=reason)
 
 
-def _shown_if_nearest(claim: Claim, variant: Variant) -> Claim:
-    """The nearest landmarks are our addition, which no claim is about."""
-    if variant.rule != "nearest":
-        return claim
+def _shown(claim: Claim) -> Claim:
     return dataclasses.replace(claim, criterion=SHOWN, verdict=Verdict.SHOWN, reason="")
 
 

@@ -110,7 +110,7 @@ def particles_along_a_motion(motion: Arrays) -> Figure:
 
 
 def association_ellipses() -> Figure:
-    """Figure 4: a measurement between two landmarks, and what either distance says."""
+    """Figure 4: a measurement between two landmarks, and its distance to either."""
     page, ax = subplots(5.5, 4.0)
     means = np.array([[0.0, 0.0], [1.1, 0.5]])
     spreads = np.array([[[0.05, 0.02], [0.02, 0.09]], [[0.06, -0.03], [-0.03, 0.05]]])
@@ -181,8 +181,7 @@ def components(run: Arrays) -> Figure:
         ):
             if key != "smoother":
                 left.plot(along, straighten(run[key][:, i]), color=colour, lw=1.0)
-            error = wrap(run[key][:, i] - truth[:, i])
-            right.plot(along, error, color=colour, lw=1.0, label=label)
+            right.plot(along, wrap(run[key][:, i] - truth[:, i]), color=colour, lw=1.0, label=label)
         left.plot(along, straighten(truth[:, i]), color=TRUTH, lw=1.0, label="truth")
         low, high = right.get_ylim()
         right.fill_between(
@@ -279,7 +278,7 @@ def by_distance(distance: pd.DataFrame) -> Figure:
 
 
 def by_observations(observations: pd.DataFrame) -> Figure:
-    """Error against the most observations of an image."""
+    """Error against the maximum number of observations per image."""
     page, axes = subplots(9.0, 3.8, 1, 2)
     for ax, (column, label) in zip(axes, _BOTH, strict=True):
         _by_filter(ax, observations, "n_seen", column)
@@ -298,7 +297,7 @@ _WAYS = {
 
 
 def by_association(association: pd.DataFrame) -> Figure:
-    """Error and right associations of every way to associate."""
+    """Error and share of right associations for every way to associate."""
     way = association["association"].where(association["filter"] != "ekf_slam", "ekf_slam")
     association = association.assign(way=pd.Categorical(way, list(_WAYS)))
     by_noise = [
@@ -322,7 +321,7 @@ def by_association(association: pd.DataFrame) -> Figure:
         left.set(
             yticks=range(len(labels)),
             yticklabels=labels,
-            ylim=(len(labels) - 0.4, -0.6),  # from above; both sides share the heights
+            ylim=(len(labels) - 0.4, -0.6),  # the first on top; both sides share the heights
             xscale="log",
         )
         left.set_title(f"noise of {_NOISE[noise]}", loc="left")
@@ -388,7 +387,7 @@ def cost(table: pd.DataFrame) -> Figure:
 
 
 def _by_filter(ax: Axes, table: pd.DataFrame, by: str, column: str) -> None:
-    """Draw a column over worlds against `by`, one line a filter."""
+    """Draw a column over worlds against `by`, one line per filter."""
     for name, part in table.groupby("filter", sort=False):
         colour, marker, words = _FILTERS[str(name)]
         middle, bars = _intervals(part, by, column)

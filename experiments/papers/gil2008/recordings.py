@@ -1,8 +1,8 @@
 """The recordings of gil2008: one drive through each world, with images drawn over it.
 
-A world is driven through once. What else a run needs is drawn over the true path: further wheel
-errors by the law of k |ds|, and images by the simulator's own camera. Images hold every landmark
-within 20 m; a run keeps those within its dmax, and B of them, so runs share their noise.
+Each world is driven through once. Whatever else a run needs is drawn over the true path: other
+wheel errors by the law of k |ds|, and images by the simulator's own camera. Images hold every
+landmark within 20 m; a run keeps those within its dmax, and B of them, so runs share their noise.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from sim.world import World
 
 @dataclass(frozen=True)
 class Scene:
-    """What a recording's images and wheel errors are drawn by. Its text names their stream.
+    """What a recording's images and wheel errors depend on. Its text names their stream.
 
     Attributes
     ----------
@@ -37,13 +37,13 @@ class Scene:
     draw
         0: the drive's own wheel errors; others are drawn over the same path.
     noise
-        `paper`: X, Y and Z drawn apart. `pixel`: drawn in the image.
+        `paper`: X, Y and Z have independent noise. `pixel`: the noise is drawn in the image.
     occluded
         Whether walls hide landmarks.
     sigma_px
         Standard deviation, px, of images with noise of their own; None for those that all share.
     sigma_descriptor, alike_share
-        Noise of the descriptors; share of landmarks that have another one's.
+        Noise of the descriptors; share of landmarks that have the descriptor of another.
     """
 
     seed: int
@@ -75,7 +75,7 @@ def whole(config: Config) -> Recording:
     """Recording of a configuration's scene: all landmarks within 20 m in every image, with ids."""
     scene, camera = Scene.of(config), _camera(config)
     driven = _drive(config).recording()
-    # the noise of descriptors alone leaves the images as they are
+    # the images do not depend on the noise of the descriptors
     rng = stream(scene.seed, f"gil2008/images/{dataclasses.replace(scene, sigma_descriptor=0.0)}")
     world = _alike(driven.known_world, scene.alike_share, rng)
     camera = dataclasses.replace(
@@ -100,10 +100,10 @@ def whole(config: Config) -> Recording:
 
 
 def thinned(recording: Recording, config: Config) -> Recording:
-    """Recording as a configuration's camera gives it.
+    """Recording as a configuration's camera would take it.
 
-    Landmarks are kept by their true distance. One random order decides for every B, so fewer
-    observations are a subset of more.
+    Landmarks are kept by their true distance. The same random order is used for every B, so the
+    observations of a smaller B are a subset of those of a larger one.
     """
     log, truth = recording.known_landmarks, recording.known_truth
     camera, scene = _camera(config), Scene.of(config)
@@ -141,7 +141,7 @@ def landmark_distances_m(recording: Recording) -> Array:
 
 
 def _drive(config: Config) -> Experiment:
-    """Drive of a configuration's robot; whatever its camera, it is the same one."""
+    """Drive of a configuration's robot; it does not depend on the camera."""
     camera = dataclasses.asdict(StereoCamera(rate_hz=_camera(config).rate_hz))
     sensors = {**config["sensors"], "stereo": camera}
     return Experiment({**config, "recording": None, "sensors": sensors})
@@ -155,7 +155,7 @@ def _camera(config: Config) -> StereoCamera:
 
 
 class _NoWalls:
-    """Rays that nothing stops."""
+    """Rays without walls."""
 
     def sees(self, origin: Array, points: Array) -> NDArray[np.bool_]:
         return np.ones(len(points), np.bool_)
@@ -171,7 +171,7 @@ def _wheels(driven: Recording, scene: Scene, config: Config) -> WheelLog:
 
 
 def _alike(world: World, share: float, rng: np.random.Generator) -> World:
-    """World in which a share of the landmarks has the descriptor of another one of them."""
+    """World in which a share of the landmarks has the descriptor of another landmark."""
     n = 2 * round(share * len(world.landmarks) / 2)
     first, second = rng.permutation(len(world.landmarks))[:n].reshape(2, -1)
     descriptors, twins = world.descriptors.copy(), np.zeros(len(world.landmarks), bool)

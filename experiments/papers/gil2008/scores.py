@@ -1,4 +1,4 @@
-"""What gil2008 measures of a run beside its path: map, associations, error over known ground."""
+"""What gil2008 measures of a run besides its path: map, associations, error on revisited ground."""
 
 from __future__ import annotations
 
@@ -46,9 +46,9 @@ def filter_scores(recording: Recording, online: Estimate) -> Row:
 
 
 def right_share(recording: Recording, associations: Sequence[NDArray[np.int64]]) -> float:
-    """Share of observations given to the landmark they are of.
+    """Share of observations associated with the right landmark.
 
-    An observation that starts a landmark is right if that one had not been seen before.
+    One that starts a landmark is right if that landmark had not been seen before.
     """
     true = recording.known_truth.landmark_ids
     given = np.concatenate(associations)
@@ -79,5 +79,4 @@ def revisited_slope(truth: Array, means: Array) -> float:
     rows = np.flatnonzero(revisited(truth[::4])) * 4
     if len(rows) < 10:
         return float("nan")
-    errors = position_errors_m(truth, means)
-    return float(np.polyfit(travelled_m(truth)[rows], errors[rows], 1)[0])
+    return float(np.polyfit(travelled_m(truth)[rows], position_errors_m(truth, means)[rows], 1)[0])

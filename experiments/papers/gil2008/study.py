@@ -1,13 +1,13 @@
 """The studies of gil2008: particles, distance, observations, association, noise, cost.
 
-Each table is a study of conf/study: its swept values are the runs. Runs over one scene share what
-is drawn once.
+Each table is a study of conf/study, whose swept values are its runs. Runs over one scene share its
+recording.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import accumulate
 
 import numpy as np
@@ -21,7 +21,7 @@ from experiments.evaluation.metrics import position_errors_m, rms, travelled_m
 from experiments.evaluation.verdict import Profile
 from experiments.papers.gil2008 import scores, settings
 from experiments.papers.gil2008.recordings import Scene, landmark_distances_m, thinned, whole
-from experiments.papers.jobs import in_parallel
+from experiments.papers.jobs import grouped, in_parallel
 from experiments.papers.results import Results
 from experiments.runs.evaluate import estimates, scored, status_of
 from experiments.runs.experiment import Experiment
@@ -54,49 +54,37 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
     profile
         `quick`: the same runs over fewer worlds, with fewer repeats.
     out
-        Where they go.
+        Where tables and arrays go.
     on_progress
-        Called with the share done.
+        Called with the share of the work done.
     """
     jobs = [
         [part[low : low + _RUNS_PER_JOB]]
-        for part in by_scene(plan(profile))
+        for part in grouped(plan(profile), lambda run: Scene.of(run[1].config))
         for low in range(0, len(part), _RUNS_PER_JOB)
     ]
     rows: dict[str, list[Row]] = {table: [] for table in settings.LABELS}
     for job in in_parallel(rows_of, jobs, lambda share: on_progress(0.95 * share)):
         for table, row in job:
             rows[table].append(row)
-    cost = cost_by_landmarks(settings.SIZES[profile].n_timings)
+    cost = cost_by_landmarks(settings.N_TIMINGS[profile])
     out.write_tables(**{table: pd.DataFrame(part) for table, part in rows.items()}, cost=cost)
     write_arrays(out)
     on_progress(1.0)
 
 
-def plan(profile: Profile) -> list[Run]:
-    """All runs; quick, the same ones over fewer worlds, with fewer repeats.
+def plan(profile: Profile) -> Iterator[Run]:
+    """All runs; the quick profile has the same ones over fewer worlds, with fewer repeats.
 
-    They are composed for one world: the others differ in their seed alone.
+    They are composed for one world; the others differ only in their seed.
     """
-    size, runs = settings.SIZES[profile], []
     for table in settings.LABELS:
-        n_worlds = 1 if table == "repeats" else size.n_worlds
+        n_worlds = 1 if table == "repeats" else settings.N_WORLDS[profile]
         for one in planned([f"study=gil2008_{table}", f"seed={settings.SEED}"]):
-            if one.config["recording"]["draw"] < size.n_draws:
-                repeats = min(one.repeats, size.n_repeats)
-                runs += [
-                    (table, one.replaced(seed=seed, world_seed=seed, repeats=repeats))
-                    for seed in range(settings.SEED, settings.SEED + n_worlds)
-                ]
-    return runs
-
-
-def by_scene(runs: Iterable[Run]) -> list[list[Run]]:
-    """Runs of each scene."""
-    scenes: dict[Scene, list[Run]] = {}
-    for table, experiment in runs:
-        scenes.setdefault(Scene.of(experiment.config), []).append((table, experiment))
-    return list(scenes.values())
+            if one.config["recording"]["draw"] < settings.N_DRAWS[profile]:
+                repeats = min(one.repeats, settings.N_REPEATS[profile])
+                for seed in range(settings.SEED, settings.SEED + n_worlds):
+                    yield table, one.replaced(seed=seed, world_seed=seed, repeats=repeats)
 
 
 def rows_of(runs: Sequence[Run]) -> list[tuple[str, Row]]:
@@ -112,7 +100,7 @@ def rows_of(runs: Sequence[Run]) -> list[tuple[str, Row]]:
         "odometry_slope": scores.revisited_slope(truth, odometry.means),
         "matching_precision": scores.matching_precision(recording),
     }
-    rows: list[tuple[str, Row]] = []
+    rows = []
     for table, experiment in runs:
         seen = thinned(recording, experiment.config)
         labels = labels_of(table, experiment)
@@ -133,7 +121,7 @@ def labels_of(table: str, experiment: Experiment) -> Row:
 
 
 def _shown(recording: Recording) -> Row:
-    """What a recording's images show."""
+    """What the images of a recording show."""
     camera, log = recording.sensors.known_stereo, recording.known_landmarks
     far = landmark_distances_m(recording) > 10.0
     return {
@@ -152,11 +140,10 @@ def one_run(experiment: Experiment, recording: Recording, rng: np.random.Generat
     )
     revised = revised or online
     found = scored(recording, online, revised)
-    truth = recording.truth_at(revised.stamps)
     return {
         **status_of(recording, online).columns(),
         **{key: found[key] for key in _SCORES},
-        "slope": scores.revisited_slope(truth, revised.means),
+        "slope": scores.revisited_slope(recording.truth_at(revised.stamps), revised.means),
         "step_mean_us": 1e6 * float(online.step_seconds.mean()),
         **scores.map_scores(recording, revised.map),
         **scores.filter_scores(recording, online),

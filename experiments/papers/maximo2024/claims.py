@@ -21,11 +21,11 @@ from experiments.evaluation.verdict import Claim, Verdict, banded, holds, judged
 from experiments.papers.maximo2024.settings import NAMES, RECOVERED_WITHIN, WITHIN
 from experiments.papers.results import Results
 
-_LEAST_M = 1e-3  # added to what may be zero, before a logarithm
+_LEAST_M = 1e-3  # added to dispersions that may be zero, before a logarithm
 
 
 def judge(made: Results) -> list[Claim]:
-    """All claims of a finished study."""
+    """Judge MX1-MX8 by the tables."""
     quality = made.table("quality")
     return [
         *mx1(made.table("weighting"), quality),
@@ -45,7 +45,7 @@ def geometries(table: pd.DataFrame) -> list[str]:
 
 
 def _by_world(table: pd.DataFrame, column: str, by: str = "method") -> pd.DataFrame:
-    """Mean over repeats: a row a world, a column a value of `by`."""
+    """Mean over repeats: one row per world, one column per value of `by`."""
     return table.pivot_table(index="seed", columns=by, values=column, aggfunc="mean")
 
 
@@ -76,9 +76,7 @@ def mx1(weighting: pd.DataFrame, quality: pd.DataFrame) -> Iterator[Claim]:
 
 def mx3(dispersion: pd.DataFrame, quality: pd.DataFrame) -> Iterator[Claim]:
     """MX3: M2 concentrates faster than M1: its dispersion at step 10."""
-    at_10 = dispersion.query("step == 10").assign(
-        dispersion_m=lambda rows: rows["dispersion_m"] + _LEAST_M  # all on one node is zero
-    )
+    at_10 = dispersion.query("step == 10").eval("dispersion_m = dispersion_m + @_LEAST_M")
     return _m2_below_m1("MX3", "dispersion", at_10, quality, " at step 10")
 
 
@@ -109,7 +107,7 @@ def _where_less(quality: pd.DataFrame, column: str) -> str:
 
 
 def _equal(ratio: Interval, p: float, margin: float) -> Verdict:
-    """Equivalent, surely different, or undecided."""
+    """Judge two one-sided tests: equivalent, clearly different, or undecided."""
     if p < 0.05:
         return Verdict.REPRODUCED
     return judged(ratio, at_least=1.0 / (1.0 + margin), at_most=1.0 + margin)
@@ -178,8 +176,8 @@ def mx4(starts: pd.DataFrame) -> list[Claim]:
 def mx5(clusters: pd.DataFrame) -> list[Claim]:
     """MX5: clusters of descriptors are stretches of the route.
 
-    On the synthetic field this only says that the field was made so. Scan Context is left out:
-    it turns with the robot, and k-means does not know.
+    On the synthetic field this holds by construction. Scan Context is left out, since it turns
+    with the robot, which k-means does not allow for.
     """
     asked = clusters[clusters["descriptor"] != "scan_context"]
     shares = asked.groupby(["geometry", "descriptor"], sort=False)["contiguous"]

@@ -37,13 +37,12 @@ def draw(made: Results) -> dict[str, Figure]:
     campus_starts = made.table("campus_starts")
     campus = str(campus_starts["geometry"].iloc[0])
     drawn: dict[str, Arrays] = {name: made.arrays(name) for name in (oxford, "umh", campus)}
-    routes = {name: drawn[name] for name in (oxford, "umh")}
     return {
         "maximo2024_data": data(drawn[campus]),
         "maximo2024_clusters": clusters(drawn),
         "maximo2024_map_and_route": map_and_route(drawn),
         "maximo2024_dispersion": dispersion(made.table("dispersion")),
-        "maximo2024_starts": starts(routes),
+        "maximo2024_starts": starts({name: drawn[name] for name in (oxford, "umh")}),
         "maximo2024_particles": particles(drawn[oxford]),
         "maximo2024_table_1": table_1(made.table("table_1"), made.table("weighting")),
         "maximo2024_table_2": table_2(made.table("table_2")),
@@ -73,7 +72,7 @@ def clusters(drawn: dict[str, Arrays]) -> Figure:
     """Figure 2: 40 clusters of the nodes' descriptors by k-means."""
     page, axes = subplots(10.0, 3.8, 1, 3)
     for ax, (name, place) in zip(axes, drawn.items(), strict=True):
-        # neighbours along the route get colours that differ
+        # neighbours along the route get different colours
         order = np.unique(place["clusters"], return_index=True)[1]
         rank = np.argsort(np.argsort(order))[place["clusters"]]
         nodes, colours = place["nodes_m"].T, (rank * 7) % len(order)
@@ -251,7 +250,7 @@ def _columns(
     n_rows: int = 1,
     sharey: bool = False,
 ) -> tuple[Figure, list[tuple[Any, str, pd.DataFrame]]]:
-    """Page with a column for each geometry; the column's axes, the geometry and its rows."""
+    """Page with one column per geometry: its axes, name and rows."""
     names = geometries(table)
     size = (width_in * len(names) + margin_in, height_in, n_rows, len(names))
     page, axes = subplots(*size, sharex=n_rows > 1, sharey=sharey, squeeze=False)
@@ -260,11 +259,11 @@ def _columns(
 
 
 def _plan(ax: Axes, **settings: Any) -> None:
-    """Axes of a plan in map, metres."""
+    """Label the axes of a plan in the map frame, metres."""
     ax.set(xlabel="x, m", ylabel="y, m", aspect="equal", **settings)
 
 
 def _log_scale(ax: Axes, bottom: float | None = None) -> None:
-    """Errors on a log scale, decades as plain numbers and nothing between."""
+    """Show errors on a log scale, with plain numbers at the decades only."""
     ax.set(yscale="log", ylim=(bottom, None))
     plain_log(ax.yaxis, multiples=(1.0,))

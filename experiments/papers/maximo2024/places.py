@@ -1,8 +1,7 @@
 """Routes of places for topological localization: geometry, synthetic descriptors, recordings.
 
-maximo2024 works on two routes whose clouds and network are not available. Their geometry is kept
-here, as printed or from positions that the reader has, and a synthetic field of descriptors
-stands for the network.
+maximo2024 works on two routes whose clouds and network are not available. Their geometry is as
+printed, or from positions that the user has; a synthetic field of descriptors replaces the network.
 """
 
 from __future__ import annotations
@@ -42,7 +41,7 @@ _CAR = RobotGeometry(wheel_radius_m=0.3, track_m=1.5)
 
 @dataclass(frozen=True)
 class Geometry:
-    """A route as maximo2024, sec. 3 describes it, and the field of descriptors over it.
+    """A route as in maximo2024, sec. 3, and the field of descriptors over it.
 
     Attributes
     ----------
@@ -137,7 +136,7 @@ def route(geometry: Geometry, rng: np.random.Generator) -> Array:
 
 
 def queries(nodes_m: Array, geometry: Geometry, rng: np.random.Generator) -> Array:
-    """Positions (N, 2) m of the queries, one a node, with the geometry's offsets.
+    """Positions (N, 2) m of the queries, one per node, with the geometry's offsets.
 
     In Oxford the offset is a plane Gaussian that changes slowly (the printed mean and deviation
     of the distance, 10.09 and 5.25 m, are those of a Rayleigh law); in UMH it has a constant
@@ -210,7 +209,7 @@ def query_recording(
     rng: np.random.Generator,
     k: float = 1e-4,
 ) -> Recording:
-    """Recording of descriptors taken at positions (K, 2), with wheels that slip by k a metre."""
+    """Recording of descriptors taken at positions (K, 2), with wheels that slip by k, m."""
     n = len(positions_m)
     if descriptors.ndim != 2 or len(descriptors) != n or n < 2:
         raise InputError(
@@ -239,7 +238,7 @@ def resequenced(recording: Recording, rows: NDArray[np.int64]) -> Recording:
     """The recording's observations in another order, each with the travel before it.
 
     Rows 100, 101, ... start elsewhere on the route; a jump in the rows is a kidnapping that the
-    wheels know nothing of. Rows count the place descriptors or, without them, the clouds.
+    wheels do not show. Rows count the place descriptors or, without them, the clouds.
     """
     places, clouds = recording.places, recording.clouds
     stamps = (places or recording.known_clouds).stamps
@@ -247,9 +246,8 @@ def resequenced(recording: Recording, rows: NDArray[np.int64]) -> Recording:
         [np.interp(stamps, recording.wheels.stamps, p) for p in recording.wheels.position_m.T],
         axis=1,
     )
-    lapses = np.diff(stamps, prepend=2.0 * stamps[0] - stamps[1])
     steps = np.diff(rolled, axis=0, prepend=2.0 * rolled[:1] - rolled[1:2])
-    new_stamps = np.cumsum(lapses[rows])
+    new_stamps = np.cumsum(np.diff(stamps, prepend=2.0 * stamps[0] - stamps[1])[rows])
     return dataclasses.replace(
         recording,
         frame_stamps=new_stamps,
@@ -319,7 +317,7 @@ def _route(
 def recording_from_files(
     config: dict[str, Any], positions: str, descriptors: str, interval_s: float = 1.0
 ) -> Recording:
-    """Queries of one's own: positions (K, 2) and descriptors (K, D) as `.npy` or `.csv`.
+    """The user's own queries: positions (K, 2) and descriptors (K, D) as `.npy` or `.csv`.
 
     The wheels go straight from each position to the next, without slip.
     """

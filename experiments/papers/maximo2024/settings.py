@@ -5,7 +5,7 @@ from __future__ import annotations
 from experiments.evaluation.verdict import Profile
 from experiments.runs.paths import SOURCE
 
-# The Oxford positions of the paper, if they are at hand
+# The Oxford positions of the paper, if available
 POSITIONS = SOURCE.parent / "shared" / "data" / "oxford_positions" / "positions.csv.gz"
 # Geometries of the tables, the paper's first; the quick profile's campus is kinematic
 NAMES = {
@@ -42,8 +42,8 @@ QUALITIES = (0.4, 0.8, 1.2, 1.6)
 SHARED_SIGMA = (2.0, 0.1)
 QUALITY_STEPS = 136
 
-TOLERANCE = 1.5  # spacings: an estimate this near is right
-HELD = 10  # steps that it has to stay so
+TOLERANCE = 1.5  # spacings: an estimate within is right
+HELD = 10  # steps that it has to stay right
 WITHIN = 40  # steps to localize in
 RECOVERED_WITHIN = 20  # nodes
 KIDNAPPED_AFTER = 30  # steps

@@ -74,11 +74,11 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
     Parameters
     ----------
     profile
-        `quick`: few worlds and repeats; `full`: what the claims are judged by.
+        `quick`: few worlds and repeats; `full`: those that the claims are judged on.
     out
         Where tables and arrays go.
     on_progress
-        Called with the share done.
+        Called with the share of the work done.
     """
     campus = "campus" if profile is Profile.FULL else "campus_quick"
     oxford = "oxford_real" if POSITIONS.is_file() else "oxford"
@@ -112,13 +112,13 @@ def _rows(name: str, seed: int, profile: Profile) -> dict[str, Rows]:
             {"start": start, "settled_at": settled}
             for start, settled, _ in starts(case, N_STARTS[profile], settings, tolerance_m)
         ],
-        "kidnapping": kidnapping_rows(case, by_mode, 0.05, 5, RECOVERED_WITHIN + HELD),
+        "kidnapping": list(kidnapping_rows(case, by_mode, 0.05, 5, RECOVERED_WITHIN + HELD)),
         "clusters": [cluster_row(case.known_map, case.recording, "synthetic", seed)],
     }
     if name in GEOMETRIES:  # not again on the real positions
-        tables["particles"] = particle_rows(case, N_REPEATS[profile])
+        tables["particles"] = list(particle_rows(case, N_REPEATS[profile]))
         if seed < JUDGED_SEED + N_QUALITY_WORLDS[profile]:
-            tables["quality"] = quality_rows(name, seed)
+            tables["quality"] = list(quality_rows(name, seed))
     return tables
 
 
@@ -134,9 +134,9 @@ def times() -> pd.DataFrame:
 
 
 def table_1(weighting: pd.DataFrame) -> pd.DataFrame:
-    """Errors of the methods: mean over worlds, deviation over repeats as in the paper and worlds.
+    """Errors of the methods beside the paper's.
 
-    Beside them the paper's.
+    Means over worlds; deviations over repeats, as in the paper, and over worlds.
     """
     table = _over_worlds(weighting, "method")
     table[["paper_m", "paper_sd_m"]] = [
@@ -210,7 +210,7 @@ def campus_arrays(name: str) -> Arrays:
     mapping, taking = (experiment.recording() for experiment in experiments)
     spacing_m = experiments[0].config["prior"]["map"]["spacing_m"]
     known = from_recording(mapping, DRAWN_DESCRIPTOR, spacing_m)
-    # where there is most to see within 40 m
+    # where most is seen within 40 m
     seen = np.convolve(np.sum(known.slices_m < 40.0, axis=1), np.ones(4), "valid")
     nodes = known.positions_m[np.argmax(seen) + np.arange(4)]
     between = nodes + 0.4 * np.diff(nodes, axis=0, append=nodes[-1:])
@@ -240,7 +240,7 @@ def _clouds(recording: Recording, points_m: Array) -> tuple[Array, NDArray[np.fl
         shown.append(se2.transform(poses[row], points[:, :2]))
     drawn = np.concatenate(shown)
     drawn = drawn[np.hypot(*(drawn - points_m.mean(axis=0)).T) < _REACH_M]
-    cells = np.unique(np.round(drawn / _CLOUD_GRID_M), axis=0)  # a picture shows no more
+    cells = np.unique(np.round(drawn / _CLOUD_GRID_M), axis=0)  # finer than a picture shows
     return poses[rows, :2], (_CLOUD_GRID_M * cells).astype(np.float32)
 
 
@@ -250,7 +250,7 @@ def _clouds(recording: Recording, points_m: Array) -> tuple[Array, NDArray[np.fl
 def tune(out: Results, n_worlds: int = 12) -> None:
     """Mean error of every setting of the grid on seeds 0, 1, ...; the least is in `TUNED`.
 
-    Takes some ten minutes on two cores. All methods see the same worlds and draws.
+    Takes about ten minutes on two cores. All methods see the same worlds and draws.
     """
     jobs = [(name, seed) for seed in range(n_worlds) for name in GEOMETRIES]
     parts = in_parallel(_tuning_rows, jobs, lambda _share: None)
@@ -266,6 +266,5 @@ def _tuning_rows(name: str, seed: int) -> list[tuple[str, str, float, float, int
         if method == "M2" or sigma_m == 0.1:  # M1 and M3 do not depend on it
             settings = options(case, method, (sigma_l, sigma_m, n_nearest))
             walk = localize(case, settings, stream(seed, "estimator/tuning"))
-            error = float(walk.errors_m.mean())
-            rows.append((name, method, sigma_l, sigma_m, n_nearest, error))
+            rows.append((name, method, sigma_l, sigma_m, n_nearest, float(walk.errors_m.mean())))
     return rows

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -64,7 +65,7 @@ class Case:
 
 
 def case_of(name: str, seed: int, *overrides: str) -> Case:
-    """World of a route; `oxford_real` stands on the real positions."""
+    """World of a route; `oxford_real` has the real positions."""
     lines = [f"study=maximo2024_{name.removesuffix('_real')}", f"seed={seed}", *overrides]
     if name == "oxford_real":
         lines.append(f"positions='{POSITIONS}'")
@@ -78,7 +79,7 @@ def options(
 ) -> dict[str, Any]:
     """Keys of the estimator: a method with the parameters chosen for its geometry, or others.
 
-    The campus takes those of UMH, untuned, in its own spacings.
+    The campus takes those of UMH, untuned, in units of its own spacing.
 
     Parameters
     ----------
@@ -132,8 +133,7 @@ def localize(
     spread, extras = np.empty(len(errors)), estimate.extras
     for i, (cloud, logs) in enumerate(zip(extras["particles"], extras["log_weights"], strict=True)):
         weights = np.exp(logs)
-        away = np.hypot(*(cloud[:, :2] - estimate.means[i, :2]).T)
-        spread[i] = weights @ away / weights.sum()
+        spread[i] = weights @ np.hypot(*(cloud[:, :2] - estimate.means[i, :2]).T) / weights.sum()
     return Walk(errors, spread, estimate)
 
 
@@ -153,7 +153,7 @@ def weighting_rows(case: Case, n_repeats: int) -> dict[str, Rows]:
     """
     tables: dict[str, Rows] = {"weighting": [], "dispersion": []}
     taken = case.recording.truth_at(case.recording.frame_stamps)[:, :2]
-    # what a topological estimate cannot beat
+    # the least error of a topological estimate
     nearest_m = float(gaps_m(taken, case.known_map.positions_m).min(axis=1).mean())
     for method in (*METHODS, "M2_mode"):
         settings = options(case, method[:2])
@@ -165,21 +165,19 @@ def weighting_rows(case: Case, n_repeats: int) -> dict[str, Rows]:
         spread = np.mean([walk.dispersions_m[: WITHIN + 1] for walk in walks], axis=0)
         error = np.mean([walk.errors_m[: WITHIN + 1] for walk in walks], axis=0)
         tables["dispersion"] += [
-            {"method": method, "step": i, "dispersion_m": float(spread[i]), "error_m": float(e)}
-            for i, e in enumerate(error)
+            {"method": method, "step": i, "dispersion_m": float(away), "error_m": float(off)}
+            for i, (away, off) in enumerate(zip(spread, error, strict=True))
         ]
     return tables
 
 
-def particle_rows(case: Case, n_repeats: int) -> Rows:
-    """Table 2: errors of M2 by the number of particles a node."""
-    rows: Rows = []
+def particle_rows(case: Case, n_repeats: int) -> Iterator[Row]:
+    """Table 2: errors of M2 by the number of particles per node."""
     for per_node in PER_NODE:
         settings = options(case) | {"particles_per_node": per_node}
         walks = _repeated(case, settings, f"estimator/{per_node}", n_repeats)
         label = {"per_node": per_node, "particles": per_node * len(case.known_map)}
-        rows += [label | row for row in _errors(walks)]
-    return rows
+        yield from (label | row for row in _errors(walks))
 
 
 def _repeated(case: Case, settings: dict[str, Any], axis: str, n_repeats: int) -> list[Walk]:
@@ -203,8 +201,7 @@ def starts(
 ) -> list[tuple[int, float, Walk]]:
     """Figure 5: starts all along the route, the step at which each is localized, and its run."""
     runs, length = [], WITHIN + HELD
-    last = len(case.recording.frame_stamps) - length - 1
-    for start in map(int, np.linspace(0, last, n_starts)):
+    for start in map(int, np.linspace(0, len(case.recording.frame_stamps) - length - 1, n_starts)):
         part = resequenced(case.recording, np.arange(start, start + length))
         walk = localize(case, settings, stream(case.seed, "estimator/starts", start), part)
         runs.append((start, settled_at(walk.errors_m, tolerance_m), walk))
@@ -218,15 +215,14 @@ def kidnapping_rows(
     n_trials: int,
     n_after: int,
     queries_per_node: float = 1.0,
-) -> Rows:
-    """Carry the robot off and see whether the filter finds it, without and with injection.
+) -> Iterator[Row]:
+    """Kidnap the robot and see whether the filter finds it again, without and with injection.
 
     Parameters
     ----------
     n_after
         Queries after the kidnapping.
     """
-    rows: Rows = []
     n, tolerance_m = len(case.recording.frame_stamps), TOLERANCE * case.known_map.spacing_m
     draws = stream(case.seed, "kidnapping")
     for trial in range(n_trials):
@@ -236,21 +232,16 @@ def kidnapping_rows(
         for share in (0.0, injection):
             rng = stream(case.seed, "estimator/kidnapping", trial)
             errors = localize(case, settings | {"injection": share}, rng, part).errors_m
-            rows.append(
-                {
-                    "trial": trial,
-                    "injection": share,
-                    "known_before": bool(errors[KIDNAPPED_AFTER - 1] <= tolerance_m),
-                    "settled_at": settled_at(errors[KIDNAPPED_AFTER:], tolerance_m)
-                    / queries_per_node,
-                }
-            )
-    return rows
+            yield {
+                "trial": trial,
+                "injection": share,
+                "known_before": bool(errors[KIDNAPPED_AFTER - 1] <= tolerance_m),
+                "settled_at": settled_at(errors[KIDNAPPED_AFTER:], tolerance_m) / queries_per_node,
+            }
 
 
-def quality_rows(name: str, seed: int) -> Rows:
+def quality_rows(name: str, seed: int) -> Iterator[Row]:
     """Map of M1-M3 over the descriptors' noise and B, with the same sigmas for all methods."""
-    rows: Rows = []
     for noise in QUALITIES:
         case = case_of(name, seed, f"recording.noise_weight={noise}")
         recall = _retrieval(case.known_map, case.recording)["recall_at_1"]
@@ -259,17 +250,14 @@ def quality_rows(name: str, seed: int) -> Rows:
             settings = options(case, method, (*SHARED_SIGMA, n_nearest))
             rng = stream(seed, "estimator/quality")
             walk = localize(case, settings | {"particles_per_node": 2}, rng, part)
-            rows.append(
-                {
-                    "noise_weight": noise,
-                    "recall_at_1": recall,
-                    "n_nearest": n_nearest,
-                    "method": method,
-                    "error_m": float(walk.errors_m.mean()),
-                    "dispersion_m": float(walk.dispersions_m[10]),
-                }
-            )
-    return rows
+            yield {
+                "noise_weight": noise,
+                "recall_at_1": recall,
+                "n_nearest": n_nearest,
+                "method": method,
+                "error_m": float(walk.errors_m.mean()),
+                "dispersion_m": float(walk.dispersions_m[10]),
+            }
 
 
 def _retrieval(known_map: TopologicalMap, recording: Recording) -> dict[str, float]:
@@ -295,11 +283,10 @@ def cluster_labels(known_map: TopologicalMap, seed: int) -> NDArray[np.int64]:
 def cluster_row(known_map: TopologicalMap, recording: Recording, descriptor: str, seed: int) -> Row:
     """Figure 2: share of nodes with a route neighbour in their cluster; retrieval beside."""
     same = np.diff(cluster_labels(known_map, seed)) == 0
-    beside = np.append(same, False) | np.append(False, same)
     return {
         "descriptor": descriptor,
         "nodes": len(known_map),
-        "contiguous": float(beside.mean()),
+        "contiguous": float((np.append(same, False) | np.append(False, same)).mean()),
         **_retrieval(known_map, recording),
     }
 
@@ -320,8 +307,7 @@ def campus_runs(name: str, seed: int) -> tuple[Experiment, Experiment]:
     along = np.gradient(way, axis=0)
     along[[0, -1]] = way[1] - way[-2]  # the tour is closed
     left = along[:, ::-1] * [-1.0, 1.0] / np.hypot(*along.T)[:, None]
-    lane = (way + CAMPUS_SHIFT_M * left).tolist()
-    route = {**mapping.config["route"], "waypoints": lane}
+    route = {**mapping.config["route"], "waypoints": (way + CAMPUS_SHIFT_M * left).tolist()}
     return mapping, mapping.replaced(seed=seed + 500, route=route)  # the same world_seed
 
 
@@ -344,13 +330,13 @@ def campus_rows(name: str, seed: int, n_repeats: int) -> dict[str, Rows]:
     return {
         **weighting_rows(_one_query_a_node(bare), n_repeats),
         "clusters": clusters,
-        "campus_starts": _campus_starts(case),
-        "kidnapping": kidnapping_rows(bare, {}, 0.02, 25, 4 * RECOVERED_WITHIN, per_node),
+        "campus_starts": list(_campus_starts(case)),
+        "kidnapping": list(kidnapping_rows(bare, {}, 0.02, 25, 4 * RECOVERED_WITHIN, per_node)),
     }
 
 
 def _one_query_a_node(case: Case) -> Case:
-    """As the paper has it: one query a node, the filter as printed, nothing tuned for it."""
+    """As in the paper: one query per node, the filter as printed, nothing tuned for it."""
     gone = travelled_m(case.recording.truth_at(case.recording.frame_stamps))
     rows = np.unique(np.searchsorted(gone, np.arange(0.0, gone[-1], case.known_map.spacing_m)))
     printed = Experiment.compose(["estimator=topological_mcl_paper"]).config["estimator"]
@@ -358,21 +344,17 @@ def _one_query_a_node(case: Case) -> Case:
     return replace(case, experiment=experiment, recording=resequenced(case.recording, rows))
 
 
-def _campus_starts(case: Case) -> Rows:
-    """Default filter from 60 starts: when it is localized, and how well where it refines."""
-    rows: Rows = []
+def _campus_starts(case: Case) -> Iterator[Row]:
+    """Default filter from 60 starts: when it is localized, and how accurately once refined."""
     spacing_m = case.known_map.spacing_m
     for start, settled, walk in starts(case, 60, {}, spacing_m):
         after = walk.errors_m[int(settled) :] if math.isfinite(settled) else np.array([math.nan])
         refinement = walk.estimate.extras["refinement"]
-        rows.append(
-            {
-                "start": start,
-                "spacing_m": spacing_m,
-                "settled_at": settled,
-                "rms_m": rms(after),
-                "median_m": float(np.median(after)),
-                "refined": float(np.mean([state == "ok" for state in refinement])),
-            }
-        )
-    return rows
+        yield {
+            "start": start,
+            "spacing_m": spacing_m,
+            "settled_at": settled,
+            "rms_m": rms(after),
+            "median_m": float(np.median(after)),
+            "refined": float(np.mean([state == "ok" for state in refinement])),
+        }

@@ -7,5 +7,5 @@ from experiments.papers.results import Results
 
 
 def judge(_made: Results) -> list[Claim]:
-    """Return no claims: the study is our own."""
+    """Return no claims, since the study is our own."""
     return []

@@ -1,4 +1,4 @@
-"""Global localization in offices: how often, and how soon, Monte Carlo localization finds itself.
+"""Global localization in offices: how often, and how soon, Monte Carlo localization succeeds.
 
 A robot drives the whole tour of each office once; starts are spread evenly along it. From each the
 filter begins without a pose and is judged over the next 40 m.
@@ -38,7 +38,7 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
     profile
         `quick`: 3 starts in each of 4 offices; `full`: 20 in each of 10.
     on_progress
-        Called with the share done.
+        Called with the share of the work done.
     """
     n_starts, fewer = (20, []) if profile is Profile.FULL else (3, ["seed=range(1000,1004)"])
     jobs = [(office, n_starts) for office in planned(["study=mcl_office", *fewer])]
@@ -62,7 +62,7 @@ def localised_share(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def found_after_m(travel_m: Array, near: NDArray[np.bool_]) -> float:
-    """Travel after which the belief is near and stays near, m; infinite if not in time.
+    """Travel after which the belief is and stays near the truth, m; infinite if not in time.
 
     Parameters
     ----------
@@ -82,8 +82,8 @@ def starts(experiment: Experiment, n_starts: int) -> list[Row]:
     Returns
     -------
     list of Row
-        One a start: `seed`, `start`; `x_m`, `y_m`, where; `localised`; `found_m`, the travel after
-        which the belief is near and stays near for 10 m (infinite: never within 30 m); `error_m`,
+        One per start: `seed`, `start`; where, `x_m`, `y_m`; `localised`; the travel after which the
+        belief is near and stays near for 10 m, `found_m` (infinite: never within 30 m); `error_m`,
         `error_deg` at the end; `near_share` of the Frames after it was found; `particles_mean`.
 
     Raises
@@ -94,8 +94,7 @@ def starts(experiment: Experiment, n_starts: int) -> list[Row]:
     recording = experiment.recording()
     if recording.status != "ok":
         raise RunFailedError(f"seed {experiment.seed}: the drive ended early: {recording.status}")
-    truth = recording.truth_at(recording.frame_stamps)
-    travel_m = travelled_m(truth)
+    travel_m = travelled_m(recording.truth_at(recording.frame_stamps))
     last_m = travel_m[-1] - WITHIN_M - FOR_M - 1.0
     first_rows = np.searchsorted(travel_m, (np.arange(n_starts) + 0.5) / n_starts * last_m)
     return [
@@ -107,7 +106,7 @@ def starts(experiment: Experiment, n_starts: int) -> list[Row]:
 def _start(
     experiment: Experiment, recording: Recording, travel_m: Array, row: int, start: int
 ) -> Row:
-    """One start, at a Frame's row."""
+    """One start, at a row of the Frames."""
     end = int(np.searchsorted(travel_m, travel_m[row] + WITHIN_M + FOR_M + 0.5))
     first, *rest = list(recording.frames())[row:end]
     estimator = experiment.estimator()

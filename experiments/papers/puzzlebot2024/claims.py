@@ -157,8 +157,8 @@ def _engine_gap(engine: pd.DataFrame) -> pd.Series[float]:
 def _clustered_share(hits: pd.Series[bool], seeds: pd.Series[int]) -> Interval:
     """Share of hits with its Clopper-Pearson interval.
 
-    One repetition gives several hits or misses; where they go together, they count for fewer
-    trials, by the ratio of the repetitions' scatter to that of independent trials.
+    One repetition gives several hits or misses. As far as these are correlated, they count as fewer
+    trials, by the ratio of the repetitions' variance to that of independent trials.
     """
     share, by_seed = float(hits.mean()), hits.groupby(seeds).mean()
     alone = share * (1.0 - share) * len(by_seed) / len(hits)

@@ -183,12 +183,11 @@ def coverage(table: pd.DataFrame) -> Figure:
         ax.axhspan(0.93, 0.97, color=BLACK, alpha=0.1, lw=0, label="0.93 to 0.97")
         for i, (name, part) in enumerate(table.groupby("case", sort=False)):
             share = part[column] / part["runs"]
-            error = 1.96 * np.sqrt(share * (1 - share) / part["runs"])
             linear = str(name).startswith("linear")
             ax.errorbar(
                 part["k_m"],
                 share,
-                error,
+                1.96 * np.sqrt(share * (1 - share) / part["runs"]),
                 fmt="-o" if linear else "--s",
                 ms=3,
                 lw=1.0,

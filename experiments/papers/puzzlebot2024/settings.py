@@ -1,4 +1,4 @@
-"""Constants of the studies of puzzlebot2024 that are no configuration of a run."""
+"""Constants of the studies of puzzlebot2024; the runs' configuration is in conf/study."""
 
 from __future__ import annotations
 

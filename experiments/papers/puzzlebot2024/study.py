@@ -1,7 +1,7 @@
 """The studies of puzzlebot2024: covariance, calibration of kr and kl, coverage of the ellipse.
 
-Thousands of runs come from the kinematic robot, which obeys the same slip law as PyBullet's; a
-subset is driven by PyBullet too, and both are compared.
+Thousands of runs come from the kinematic robot, which obeys the same slip law as PyBullet's; some
+are driven by PyBullet too, and both are compared.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ from sim.route import OpenLoop
 from sim.sensors import SensorSuite
 
 Routes = Mapping[str, OpenLoop]
-Driven = dict[tuple[str, str, int], Recording]  # by physics, case and seed
+Driven = dict[tuple[str, str, int], Recording]  # keyed by physics, case and seed
 
 
 def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) -> None:
@@ -61,9 +61,9 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
     Parameters
     ----------
     profile
-        `quick`: few repetitions; `full`: what the claims are judged by.
+        `quick`: few repetitions; `full`: those that the claims are judged on.
     on_progress
-        Called with the share done.
+        Called with the share of the work done.
     """
     out.write_tables(areas=areas(), crossover=crossover(), gradient_descent=gradient_descent())
     out.write_arrays("drawn", **drawn())
@@ -101,7 +101,7 @@ class Arm:
 
     @property
     def joint(self) -> bool:
-        """Whether the robot's gains and track err too, and are to be estimated."""
+        """Whether the robot's gains and track are off too, and are estimated."""
         return bool(self.robot.slip_bias.any())
 
 
@@ -115,7 +115,7 @@ def arms(study: str) -> list[Arm]:
 
 
 def ideal(route: OpenLoop, kr: float, kl: float) -> Estimate:
-    """What the commands alone promise: dead reckoning of a robot that does not slip."""
+    """Dead reckoning by the commands alone, of a robot that does not slip."""
     return dead_reckoning(run_batch(NOMINAL, route, 1, np.random.default_rng(0)), kr, kl)
 
 
@@ -147,8 +147,8 @@ def areas() -> pd.DataFrame:
 def crossover(*overrides: str) -> pd.DataFrame:
     """Distance at which the heading-borne spread overtakes the translation-borne one.
 
-    On a straight along x the filter's variance along x is borne by translation and the one along
-    y by heading. The wheels' readings are noisy, so each run gives its own distance.
+    On a straight along x the variance along x comes from translation, and the one along y from
+    the heading. The encoders are noisy, so each run gives its own distance.
     """
     rows = []
     for experiment in planned(["study=puzzlebot2024_crossover", *overrides]):
@@ -160,16 +160,12 @@ def crossover(*overrides: str) -> pd.DataFrame:
         left = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
         sigma = believed.covariances[1:, :2, :2]
         along, across = (np.einsum("ti,tij,tj->t", u, sigma, u) for u in (ahead, left))
-        distance = batch.encoder_m[0, 1:].mean(axis=1)
-        rows.append({"seed": experiment.seed, "crossover_m": _crossing(distance, across / along)})
+        distance, ratio = batch.encoder_m[0, 1:].mean(axis=1), across / along
+        crossed = int(np.argmax(ratio > 1.0))
+        around = slice(crossed - 1, crossed + 1)  # interpolated in the ratio's logarithm
+        crossover_m = float(np.interp(0.0, np.log(ratio[around]), distance[around]))
+        rows.append({"seed": experiment.seed, "crossover_m": crossover_m})
     return pd.DataFrame(rows)
-
-
-def _crossing(distance: Array, ratio: Array) -> float:
-    """Distance at which a ratio first passes one, interpolated in its logarithm."""
-    crossed = int(np.argmax(ratio > 1.0))
-    around = slice(crossed - 1, crossed + 1)
-    return float(np.interp(0.0, np.log(ratio[around]), distance[around]))
 
 
 def drawn() -> dict[str, NDArray[np.float32]]:
@@ -202,7 +198,7 @@ def drawn() -> dict[str, NDArray[np.float32]]:
 
 
 def calibrate_once(arm: Arm) -> list[CalibrationResult]:
-    """Calibrate by all methods on one set of runs: each manoeuvre 20 times."""
+    """Calibrate by all methods on the same runs: each manoeuvre 20 times."""
     rng, draws = stream(arm.seed, "slip"), stream(arm.seed, "samples")
     batches = [
         run_batch(arm.robot, route, CALIBRATION_RUNS, rng, nominal_track_m=NOMINAL.track_m)
@@ -257,7 +253,7 @@ def _calibration_rows(arm: Arm) -> list[Row]:
 
 
 def table_1(arm: Arm) -> pd.DataFrame:
-    """Table 1: what each case promises, where the robot ends, and kr, kl from that case alone."""
+    """Table 1: each case's ideal and real ends, and kr and kl from that case alone."""
     rng = stream(arm.seed, "slip")
     rows = []
     for name, route in arm.routes.items():
@@ -361,7 +357,7 @@ def report_gradient_descent(
     rate: float = 0.01,
     n_iterations: int = 100,
 ) -> Array:
-    """The report's own calibration, kept to show what it returns; not an estimator of kr or kl.
+    """The report's own calibration, kept to show what it returns; it does not estimate kr or kl.
 
     It fits k so that (k + k) v comes near v by gradient descent from k = 1; v is the deviation of
     the end over the time. The data cancel: the minimum is 1/2 whatever they are, and they only set
@@ -388,11 +384,10 @@ def report_gradient_descent(
 
 
 def gradient_descent() -> pd.DataFrame:
-    """Run the report's own procedure on its example data and on others: it goes to 1/2."""
+    """Run the report's own procedure on its example data and on others: it converges to 1/2."""
     rows = []
     for name, (ideal, real, time_s) in DESCENTS.items():
-        steps = math.ceil(30.0 / (0.08 * (ideal - real) ** 2 / time_s**2))
-        last = min(steps, 10**6)
+        last = min(math.ceil(30.0 / (0.08 * (ideal - real) ** 2 / time_s**2)), 10**6)
         k = report_gradient_descent(ideal, real, time_s, n_iterations=max(100, last))
         rows.append({"data": name, "k_after_100": k[100], "k_in_the_end": k[last]})
     return pd.DataFrame(rows)

@@ -95,7 +95,7 @@ def wheels(found: pd.DataFrame) -> Figure:
 
 
 def wean(fits: pd.DataFrame, drawn: Arrays) -> Figure:
-    """The map as the scans read it, with paths and beam ends."""
+    """The map in the reading that fits the scans, with paths and beam ends."""
     right = fits[(fits.one_means == "free") & ~fits.mirrored]
     page, axes = subplots(5.2 * len(right), 5.6, 1, len(right), squeeze=False)
     for ax, row in zip(axes[0], right.itertuples(), strict=True):

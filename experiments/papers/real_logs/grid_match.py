@@ -16,8 +16,8 @@ from sim.arrays import Array
 class GridFit:
     """The best pose (3,) in the grid's frame, and its score.
 
-    The score is the share of beams that end where the map is occupied, less the share of points
-    half way that are: 1 for a perfect map, about 0 for one whose meaning is inverted.
+    The score is the share of beams that end in occupied cells, less the share whose midpoints do:
+    1 for a perfect map, about 0 for an inverted one.
     """
 
     pose: Array
@@ -25,12 +25,12 @@ class GridFit:
 
 
 def beam_points(ranges_m: Array, bearings_rad: Array, T_base_laser: Array, poses: Array) -> Array:
-    """Ends (N, 2) of all seen beams of scans (S, beams) taken at poses (S, 3), and half ways.
+    """Ends and midpoints of all beams with a return, of scans (S, beams) taken at poses (S, 3).
 
     Returns
     -------
     Array
-        (N, 2, 2): end and half way of each beam.
+        (N, 2, 2): end and midpoint of each beam.
     """
     lasers = se2.compose(poses, T_base_laser)
     angle = lasers[:, 2:] + bearings_rad
@@ -47,7 +47,7 @@ def best_fit(occupancy: Array, cell_m: float, points: Array, n_headings: int = 9
     Parameters
     ----------
     occupancy
-        (X, Y) probability, NaN where nothing is known: such cells count as neither.
+        (X, Y) probability, NaN where unknown: such cells count as neither.
     cell_m
         Side of a cell.
     """
@@ -61,7 +61,7 @@ def best_fit(occupancy: Array, cell_m: float, points: Array, n_headings: int = 9
         turned = se2.transform(np.array([0.0, 0.0, heading]), points.reshape(-1, 2))
         cells = np.round(turned / cell_m).astype(np.int64).reshape(points.shape)
         for i, weight in ((0, 1.0), (1, -1.0)):
-            # what would wrap around lies outside the map for every position that is looked at
+            # cells that wrap around lie outside the map for every position considered
             np.add.at(kernel, (cells[:, i, 0] % size[0], cells[:, i, 1] % size[1]), weight)
         scores = fft.irfft2(spectrum * np.conj(fft.rfft2(kernel)), size)
         scores = scores[: known.shape[0], : known.shape[1]] / len(points)

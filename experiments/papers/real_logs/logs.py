@@ -1,4 +1,4 @@
-"""Recordings of the real logs, as conf/study/real_logs_*.yaml name them."""
+"""Recordings of the real logs that conf/study/real_logs_*.yaml name."""
 
 from __future__ import annotations
 
@@ -44,8 +44,7 @@ def freiburg() -> Recording:
 
 def landmarks(robot: int, calibrated: bool, identifies: bool) -> Recording:
     """One robot of MRCLAM 6, with ranges and bearings to landmarks."""
-    archive = DATA / "mrclam6" / "MRCLAM_Dataset6.tar.xz"
-    logged = mrclam.read_mrclam(archive, robot, identifies)
+    logged = mrclam.read_mrclam(DATA / "mrclam6" / "MRCLAM_Dataset6.tar.xz", robot, identifies)
     return calibrated_by_truth(logged) if calibrated else logged
 
 
@@ -70,9 +69,9 @@ def tuned_until_s(logged: Recording) -> float:
 
 
 def calibrated_by_scans(recording: Recording, until_s: float) -> Recording:
-    """The recording with wheels, track and laser as scan matching before `until_s` shows them.
+    """The recording with wheels, track and laser calibrated by scan matching before `until_s`.
 
-    The wheels of a log of poses are rebuilt with nominal sizes: what is found are corrections.
+    The wheels of a log of poses are rebuilt with nominal sizes, so the calibration corrects those.
     """
     matcher = IcpOdometry(kr=3e-3, kl=3e-3, sigma_range_m=0.03, reference="previous")
     estimate = tracked(matcher, recording)

@@ -1,4 +1,4 @@
-"""Constants of the studies of real logs that are no configuration of a run."""
+"""Constants of the studies of real logs; the runs' configuration is in conf/study."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ KHEPERA = {  # published: right and left diameter, axle, m
 }
 LEGO_START_RAD = math.radians(213.0)
 
-# What the runs of conf/study/real_logs_*.yaml are called, in their order
+# Names of the runs of conf/study/real_logs_*.yaml, in their order
 FUSION = "EKF of wheels and ICP"
 GMAPPING = "GMapping, 910 poses"
 INTEL = (

@@ -1,6 +1,6 @@
-"""The estimators on logs that others recorded, beside the errors that were printed with them.
+"""The estimators on logs that others recorded, beside the errors published with them.
 
-The logs are not part of the project; they are looked for in ../shared/data.
+The logs are not part of the project; they are expected in ../shared/data.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -64,7 +64,7 @@ _SCORES = ("ate_rmse_m", "ate_aligned_rmse_m", "heading_rmse_rad", "nees_mean", 
 
 
 def missing() -> str:
-    """Why the study cannot run, or nothing."""
+    """Why the study cannot run; empty if it can."""
     return "" if DATA.is_dir() else f"the real logs are not in {DATA.parent.name}/{DATA.name}"
 
 
@@ -76,7 +76,7 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
     profile
         `quick`: fewer robots, seeds and hypotheses.
     on_progress
-        Called with the share done.
+        Called with the share of the work done.
     """
     out.write_tables(ate=rawseeds_ate(), wheels=wheels(), lego=lego_errors())
     on_progress(0.1)
@@ -150,18 +150,17 @@ def intel_relations() -> tuple[list[Row], Paths]:
     return rows, {name: _path(found[name][1]) for name in (*INTEL_DRAWN, GMAPPING)}
 
 
-def freiburg_relations() -> list[Row]:
+def freiburg_relations() -> Iterator[Row]:
     """The relations metric of our estimates and of the graph on the log of Freiburg 079."""
     folder = DATA / "fr079_flirt"
     truth = read_relations(folder / "fr079.relations.gz")
-    rows: list[Row] = []
     for name, run in zip(FREIBURG, planned(["study=real_logs_fr079"]), strict=True):
         found = tracked(run.estimator(), run.recording())
-        rows += _relation_rows("fr079", name, truth, found.stamps, found.means)
+        yield from _relation_rows("fr079", name, truth, found.stamps, found.means)
     log = carmen.read_carmen(folder / "fr079.flirt.log.gz")
     for name, near in (("graph (FLIRT)", False), ("graph (FLIRT), exact stamps", True)):
-        rows += _relation_rows("fr079", name, truth, log.scan_stamps, log.scan_poses, near=near)
-    return rows
+        stamps, poses = log.scan_stamps, log.scan_poses
+        yield from _relation_rows("fr079", name, truth, stamps, poses, near=near)
 
 
 def _relation_rows(
@@ -173,27 +172,24 @@ def _relation_rows(
     *,
     near: bool = False,
     until_s: float | None = None,
-) -> list[Row]:
+) -> Iterator[Row]:
     """Rows of all relations and, for a tuned method, of those after the tuned part."""
     parts = {"all": relations}
     if until_s is not None:
         late = np.all(relations.stamps > until_s, axis=1)
         parts["judged"] = Relations(relations.stamps[late], relations.motion[late])
-    rows: list[Row] = []
     for part, chosen in parts.items():
         found = relation_errors(chosen, stamps, poses, "near" if near else "interpolated")
         bounds = _block_interval(found.translation_m, chosen.stamps[found.rows, 0])
-        rows.append({"log": log, "method": method, "part": part, **found.summary(), **bounds})
-    return rows
+        yield {"log": log, "method": method, "part": part, **found.summary(), **bounds}
 
 
 def _block_interval(errors: Array, stamps: Array, block_s: float = 60.0) -> dict[str, float]:
-    """95 % interval of a mean; relations that begin in the same minute are resampled together."""
+    """95 % bootstrap interval of a mean; relations that begin in the same minute stay together."""
     _, blocks = np.unique(np.floor((stamps - stamps.min()) / block_s), return_inverse=True)
     sums, counts = np.bincount(blocks, errors), np.bincount(blocks)
     picks = np.random.default_rng(0).integers(len(sums), size=(2000, len(sums)))
-    means = sums[picks].sum(axis=1) / counts[picks].sum(axis=1)
-    low, high = np.quantile(means, [0.025, 0.975])
+    low, high = np.quantile(sums[picks].sum(axis=1) / counts[picks].sum(axis=1), [0.025, 0.975])
     return {"translation_low_m": float(low), "translation_high_m": float(high)}
 
 
@@ -250,19 +246,20 @@ def wheels() -> pd.DataFrame:
     """Khepera: geometry beside the published one; kr and kl by the length of the blocks."""
     archive = DATA / "censi_khepera_calib/khepera_l90_lmov.tar.xz"
     rows: list[dict[str, Any]] = []
-    for name, published in KHEPERA.items():
-        found = calibrate_wheels(read_khepera(archive, f"{name}.tuple"))
-        for quantity, printed in zip(
-            ("diameter_right_m", "diameter_left_m", "axle_m"), published, strict=True
-        ):
-            labels = {"log": name, "quantity": quantity}
-            measured = dataclasses.asdict(getattr(found, quantity))
-            rows.append({**labels, **measured, "published": printed, "block": 0})
+    for log, published in KHEPERA.items():
+        found = calibrate_wheels(read_khepera(archive, f"{log}.tuple"))
+        names = ("diameter_right_m", "diameter_left_m", "axle_m")
+        parts: list[tuple[Any, str, Row]] = [
+            (found, name, {"published": value, "block": 0})
+            for name, value in zip(names, published, strict=True)
+        ]
         for block in (1, 2, 4, 8, 16):
             slip = slip_of_turns(found, block, np.random.default_rng(0))
-            for quantity, interval in (("kr", slip.kr), ("kl", slip.kl)):
-                labels = {"log": name, "quantity": quantity}
-                rows.append({**labels, **dataclasses.asdict(interval), "block": block})
+            parts += [(slip, name, {"block": block}) for name in ("kr", "kl")]
+        rows += [
+            {"log": log, "quantity": name, **dataclasses.asdict(getattr(part, name)), **more}
+            for part, name, more in parts
+        ]
     return pd.DataFrame(rows)
 
 
@@ -300,7 +297,7 @@ def lego_errors() -> pd.DataFrame:
 
 
 def wean_fit(logs: str) -> tuple[pd.DataFrame, dict[str, NDArray[Any]]]:
-    """How well the scans fit the map under each reading of it; and what is drawn of both.
+    """How well the scans fit the map under each reading of it, and what the figure draws.
 
     Parameters
     ----------
@@ -344,7 +341,7 @@ def _around(grid: wean.Grid, points: Array) -> dict[str, NDArray[Any]]:
 
 
 def _halved(values: Array) -> Array:
-    """A grid of cells twice as large: means of what is known in them."""
+    """A grid of cells twice as large: means of their known cells."""
     n_x, n_y = values.shape[0] // 2, values.shape[1] // 2
     cells = values[: 2 * n_x, : 2 * n_y].reshape(n_x, 2, n_y, 2)
     with np.errstate(invalid="ignore"):
