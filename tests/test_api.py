@@ -43,6 +43,7 @@ def test_its_examples():
     assert tried > 12
 
 
+@pytest.mark.slow
 def test_the_five_lines_of_the_readme(folder):
     (lines,) = re.findall(r"```py\n(.*?)```", (ROOT / "README.md").read_text(), re.S)
     short = 'simulation.physics=kinematic", "route.distance_m=2'

@@ -80,6 +80,7 @@ def test_real_log(example):
     assert names["recording"].truth is None
 
 
+@pytest.mark.slow
 def test_gate(example):
     said, written, _ = example("gate")
     assert written == WRITES["gate"]

@@ -234,6 +234,7 @@ def test_rows_of_an_edited_estimator_do_not_mix(name, tmp_path, monkeypatch, cap
     assert len(collect(name, all_versions=True)) == 4
 
 
+@pytest.mark.slow
 def test_two_sweeps_of_one_name_at_once(name):
     command = [sys.executable, "-m", "experiments.cli", "run", "-m", *SHORT, f"name={name}",
                "hydra/launcher=basic"]  # fmt: skip
@@ -251,6 +252,7 @@ def test_two_sweeps_of_one_name_at_once(name):
     assert {path.suffix for path in folder(name).iterdir()} == {".parquet"}
 
 
+@pytest.mark.slow
 def test_workers_end_with_a_killed_sweep(name):
     process = subprocess.Popen(
         [sys.executable, "-m", "experiments.cli", "run", "-m", *SHORT, f"name={name}",
@@ -268,6 +270,7 @@ def test_workers_end_with_a_killed_sweep(name):
     assert not list(folder(name).glob("plan-*"))
 
 
+@pytest.mark.slow
 def test_a_terminated_sweep_says_so_and_leaves_no_plan(name):
     process = subprocess.Popen(
         [sys.executable, "-m", "experiments.cli", "run", "-m", *SHORT, f"name={name}",
@@ -391,6 +394,7 @@ def test_a_killed_sweep_resumes_to_the_same_table(name):
         clear(whole)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("full", ["cache", "runs/{name}"], ids=["recordings", "rows"])
 def test_a_full_disk_ends_in_a_line_and_a_correct_re_run(name, full, tmp_path):
     place = results() / full.format(name=name)
