@@ -22,6 +22,12 @@ def an_estimate(seed=0):
     return Estimate(np.sort(rng.random(7)) * 1e9, means, roots @ roots.transpose(0, 2, 1))
 
 
+def test_what_a_killed_process_was_writing_is_not_read(tmp_path):
+    write_rows([ROW], tmp_path / "a.parquet")
+    (tmp_path / ".b.1.ff.part.parquet").write_bytes(b"PAR1")
+    assert len(read_rows(tmp_path)) == 1
+
+
 @pytest.mark.parametrize("suffix", [".parquet", ".csv"])
 def test_rows_survive_the_round_trip(tmp_path, suffix):
     rows = [

@@ -135,7 +135,9 @@ def read_rows(path: Path, remedy: str = "") -> pd.DataFrame:
     import pandas as pd
     import pyarrow.parquet as pq
 
-    files = sorted(path.glob("*.parquet")) if path.is_dir() else [path]
+    files = [path]
+    if path.is_dir():  # a killed process may have left a hidden file that it was writing
+        files = sorted(file for file in path.glob("*.parquet") if file.name[0] != ".")
     if not files or not path.exists():
         raise InputError(f"{path}: no results here; run the study first")
     frames = []
