@@ -5,6 +5,7 @@ import json
 import os
 import shutil
 import subprocess
+import time
 import tempfile
 from contextlib import contextmanager
 from pathlib import Path
@@ -88,6 +89,13 @@ class Page:
                 windowsVirtualKeyCode={"Tab": 9, "Enter": 13, " ": 32}[key],
                 text=text if kind == "keyDown" else "",
             )
+
+    def becomes(self, expression):
+        """Whether an expression is true, at once or within two seconds of a key press."""
+        until = time.monotonic() + 2.0
+        while not (found := self.js(expression)) and time.monotonic() < until:
+            time.sleep(0.02)
+        return found
 
     def shape(self, width, height, *, dark=False):
         """Size of the window in CSS pixels, and the colour scheme that the reader prefers."""

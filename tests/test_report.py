@@ -254,12 +254,12 @@ def test_the_keyboard_skips_to_the_claims_and_opens_details(tab):
     assert tab.js("document.activeElement.textContent") == "Skip to the claims"
     assert tab.js("document.activeElement.getBoundingClientRect().left") >= 0  # it is shown
     tab.press("Enter", text="\r")
-    assert tab.js("location.hash") == "#claims"
+    assert tab.becomes("location.hash == '#claims'")
     tab.press("Tab")
     assert tab.js("document.activeElement.textContent") == "PB4: all 3 statistics"
     assert tab.js("getComputedStyle(document.activeElement).outlineStyle") == "solid"
     tab.press("Enter", text="\r")
-    assert tab.js("document.querySelector('#claim-PB4 details').open")
+    assert tab.becomes("document.querySelector('#claim-PB4 details').open")
 
 
 def test_what_scrolls_sideways_can_be_reached_by_keyboard(tab):
