@@ -5,8 +5,8 @@ import json
 import os
 import shutil
 import subprocess
-import time
 import tempfile
+import time
 from contextlib import contextmanager
 from pathlib import Path
 
