@@ -98,7 +98,9 @@ class EkfIcp:
         gate_probability: float | None = 1e-9,
         shared_noise: float = 0.75,
         window_s: float = 0.05,
+        laser: str = "laser",
     ) -> None:
+        self.laser = laser
         self._matcher = ScanMatcher(metric, search, covariance, sigma_range_m)
         self.wheels = WheelPrediction(
             kr, kl, window_s, lateral_slip_m=lateral_slip_m, encoder_tick_m=encoder_tick_m
@@ -117,7 +119,7 @@ class EkfIcp:
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Start from the prior's pose; the first scan becomes the key frame."""
-        self._laser, self._rng = require_laser(prior, "ekf_icp"), rng
+        self._laser, self._rng = require_laser(prior, self.laser, "ekf_icp"), rng
         start = start_pose(prior, "ekf_icp")
         self.wheels.reset(prior.robot.track_m)
         self._key: PreparedScan | None = None
@@ -137,8 +139,9 @@ class EkfIcp:
         """Predict by the wheels; correct by the Frame's scan, if it has one."""
         self._predict(frame)
         extras: dict[str, Any] = {}
-        if frame.ranges_m is not None:
-            self._correct(self._matcher.prepare(frame.ranges_m, self._laser), extras)
+        scan = frame.readings.get(self.laser)
+        if scan is not None:
+            self._correct(self._matcher.prepare(scan["ranges_m"], self._laser), extras)
         by_twist = _from_twist(self._mean[_POSE])
         covariance = by_twist @ self._covariance[_POSE, _POSE] @ by_twist.T
         return Belief(self._mean[_POSE].copy(), (covariance + covariance.T) / 2.0, extras)

@@ -7,10 +7,11 @@ sensor fires at its own multiple of the tick.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import math
+import zlib
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
-from functools import partial
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -20,28 +21,22 @@ from sim import se2
 from sim.arrays import Array
 from sim.errors import InputError
 from sim.kinematic import KinematicBody
-from sim.recording import (
-    CloudLog,
-    CommandLog,
-    LandmarkLog,
-    LaserLog,
-    Recording,
-    Truth,
-    WheelLog,
-)
+from sim.rays import BulletRays, ExactRays
+from sim.recording import CommandLog, Log, Recording, Truth, WheelLog, joined
 from sim.robot import DifferentialDrive, RobotGeometry, Slip
-from sim.sensors import Laser, Lidar3D, SensorSuite, StereoCamera
+from sim.sensors.base import Probe, Rays, Reading, Sensor, Sensors, View, parted
 from sim.world import World
 
 Physics = Literal["bullet", "kinematic"]
-Rays = Literal["bullet", "exact"]
-_Logs = defaultdict[str, list[tuple[int, Any]]]  # of each sensor: tick and reading
+RayKind = Literal["bullet", "exact"]
+_Logs = defaultdict[str, list[tuple[int, Any]]]  # by sensor: tick and reading
 
 TICKS_PER_S = 300
 DT_S = 1.0 / TICKS_PER_S
 _CHECK_EVERY = 6  # ticks between looks for collisions
 _SLIP_EVENT_TICKS = 30
-_SURFACE_M = 0.005  # a landmark this near the face that a ray hits is seen
+# These draw their noise from one generator, in this order; every other sensor has its own
+_SHARE_NOISE = ("laser", "stereo", "lidar3d")
 
 
 class Body(Protocol):
@@ -76,12 +71,12 @@ class Route(Protocol):
 def record(
     world: World,
     robot: DifferentialDrive,
-    sensors: SensorSuite,
+    sensors: Sensors,
     route: Route,
     streams: Mapping[str, np.random.Generator],
     *,
     physics: Physics = "bullet",
-    rays: Rays = "bullet",
+    rays: RayKind = "bullet",
     config: dict[str, Any] | None = None,
     on_progress: Callable[[float], None] | None = None,
 ) -> Recording:
@@ -123,18 +118,18 @@ def record(
     logs: _Logs = defaultdict(list)
     with contextlib.ExitStack() as stack:
         body: Body
-        caster: ExactRays | BulletRays
+        caster: Rays
         if physics == "bullet":
             from sim.bullet import BulletBody
 
             bullet = stack.enter_context(BulletBody(world, robot, pose))
             body, find_trouble = bullet, lambda: bullet.trouble
-            caster = BulletRays(bullet) if rays == "bullet" else ExactRays(world, sensors.laser)
+            caster = BulletRays(bullet) if rays == "bullet" else ExactRays(world)
         else:
             body = KinematicBody(robot, pose)
-            caster = ExactRays(world, sensors.laser)
+            caster = ExactRays(world)
             find_trouble = lambda: "collision" if overlaps(world, robot, body.pose) else None  # noqa: E731
-        probes = _probes(world, sensors, caster, streams["sensors"])
+        probes = _probes(world, sensors, caster, streams["sensors"], pose)
         status = _drive(
             robot, periods, body, driver, find_trouble, probes, streams["slip"], logs, on_progress
         )
@@ -142,18 +137,38 @@ def record(
 
 
 def _probes(
-    world: World, sensors: SensorSuite, rays: ExactRays | BulletRays, rng: np.random.Generator
-) -> dict[str, Callable[[Array], Any]]:
-    """What each sensor measures, as a function of the robot's pose."""
-    laser, stereo, lidar = sensors.laser, sensors.stereo, sensors.lidar3d
-    probes: dict[str, Callable[[Array], Any]] = {}
-    if laser:
-        probes["laser"] = lambda pose: laser.measure(rays.scan(laser, pose), rng)
-    if stereo:
-        probes["stereo"] = partial(LandmarkEye(world, stereo, rng).observe, rays)
-    if lidar:
-        probes["lidar3d"] = lambda pose: lidar.measure(rays.cloud(lidar, pose), rng)
+    world: World, sensors: Sensors, rays: Rays, rng: np.random.Generator, start: Array
+) -> dict[str, _Firing]:
+    """Every sensor at work, those that share their noise first."""
+    order = [*(name for name in _SHARE_NOISE if name in sensors)]
+    order += [name for name in sensors if name not in order]
+    probes = {}
+    for name in order:
+        own = rng if name in _SHARE_NOISE else _stream_of(rng, name)
+        probes[name] = _Firing(sensors[name].start(own), View(0.0, start, world, rays, 0.0, start))
     return probes
+
+
+def _stream_of(rng: np.random.Generator, name: str) -> np.random.Generator:
+    """Generator of a sensor's own: what other sensors there are does not change its noise."""
+    seed: Any = rng.bit_generator.seed_seq
+    key = (*seed.spawn_key, zlib.crc32(name.encode()))
+    return np.random.default_rng(np.random.SeedSequence(seed.entropy, spawn_key=key))
+
+
+class _Firing:
+    """A probe, and what it saw last."""
+
+    def __init__(self, probe: Probe, first: View) -> None:
+        self._probe, self._last = probe, first
+        if hasattr(probe, "begin"):
+            probe.begin(first)
+
+    def __call__(self, stamp: float, pose: Array) -> Reading | None:
+        last = self._last
+        view = View(stamp, pose, last.world, last.rays, last.stamp, last.pose)
+        self._last = view
+        return self._probe(view)
 
 
 def _drive(
@@ -162,7 +177,7 @@ def _drive(
     body: Body,
     driver: Driver,
     find_trouble: Callable[[], str | None],
-    probes: dict[str, Callable[[Array], Any]],
+    probes: dict[str, _Firing],
     rng: np.random.Generator,
     logs: _Logs,
     on_progress: Callable[[float], None] | None,
@@ -179,10 +194,11 @@ def _drive(
         wanted = driver.command(tick, pose)
         if due or wanted is None:
             counts = _quantise(encoder, robot.encoder_tick_m)
-            logs["frames"].append((tick, (counts, travel.copy(), pose)))
+            logs["/frames"].append((tick, (counts, travel.copy(), pose)))
         for name in due:
-            if name in probes:
-                logs[name].append((tick, probes[name](pose)))
+            reading = probes[name](tick / TICKS_PER_S, pose)
+            if reading is not None:
+                logs[name].append((tick, reading))
         if wanted is None or tick % _CHECK_EVERY == 0:
             trouble = (find_trouble() if wanted is not None else None) or driver.trouble
             if trouble is not None:
@@ -191,7 +207,7 @@ def _drive(
             return "ok"
         if not np.array_equal(wanted, velocity) or tick == 0:
             velocity = wanted
-            logs["commands"].append((tick, velocity))
+            logs["/commands"].append((tick, velocity))
         if on_progress is not None and tick % TICKS_PER_S == 0:
             on_progress(tick * DT_S)
         speeds = robot.wheel_speeds(velocity[0], velocity[1]) - slip.correction_mps
@@ -227,173 +243,6 @@ def overlaps(world: World, robot: DifferentialDrive, pose: Array) -> bool:
     return bool(np.any(hit))
 
 
-class ExactRays:
-    """The caster of `sim.casting`, imported only where it is used: it needs a compiler."""
-
-    def __init__(self, world: World, laser: Laser | None) -> None:
-        self._world = world
-        if laser is not None:
-            from sim.casting import SegmentCaster
-
-            self._caster = SegmentCaster(world, laser)
-
-    def scan(self, laser: Laser, pose: Array) -> Array:
-        """Ranges (beams,) m of a laser on the robot at a pose (3,); inf without a return."""
-        return self._caster.cast(sensor_pose(laser, pose))
-
-    def cloud(self, lidar: Lidar3D, pose: Array) -> Array:
-        """Ranges (rings, azimuths) m of a lidar on the robot at a pose (3,)."""
-        from sim.casting import cast_lidar
-
-        return cast_lidar(self._world, lidar, sensor_pose(lidar, pose))
-
-    def sees(self, origin: Array, points: Array) -> NDArray[np.bool_]:
-        """Whether nothing stands between a point (3,) and each of others (K, 3)."""
-        from sim.casting import visible
-
-        return visible(self._world, origin, points)
-
-
-class BulletRays:
-    """The physics engine's rays."""
-
-    def __init__(self, bullet: Any) -> None:
-        self._bullet = bullet
-
-    def scan(self, laser: Laser, pose: Array) -> Array:
-        """Ranges (beams,) m of a laser on the robot at a pose (3,); inf without a return."""
-        planar = sensor_pose(laser, pose)
-        angles = planar[2] + laser.bearings_rad
-        starts = np.tile([planar[0], planar[1], laser.mount.z_m], (laser.n_beams, 1))
-        way = np.stack([np.cos(angles), np.sin(angles), np.zeros_like(angles)], axis=-1)
-        return self._ranges(starts, way, laser.max_range_m, ground=False)
-
-    def cloud(self, lidar: Lidar3D, pose: Array) -> Array:
-        """Ranges (rings, azimuths) m of a lidar on the robot at a pose (3,)."""
-        planar = sensor_pose(lidar, pose)
-        elevation = np.repeat(lidar.elevations_rad, lidar.n_azimuths)
-        azimuth = np.tile(planar[2] + lidar.azimuths_rad, lidar.n_rings)
-        flat = np.cos(elevation)
-        way = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=-1)
-        starts = np.tile([planar[0], planar[1], lidar.mount.z_m], (len(way), 1))
-        ranges = self._ranges(starts, way, lidar.max_range_m, ground=True)
-        return ranges.reshape(lidar.n_rings, lidar.n_azimuths)
-
-    def sees(self, origin: Array, points: Array) -> NDArray[np.bool_]:
-        """Whether nothing stands between a point (3,) and each of others (K, 3)."""
-        if len(points) == 0:
-            return np.zeros(0, bool)
-        distance = np.linalg.norm(points - origin, axis=1)
-        share = self._bullet.cast(np.broadcast_to(origin, points.shape), points)
-        seen: NDArray[np.bool_] = share * distance >= distance - _SURFACE_M
-        return seen
-
-    def _ranges(self, starts: Array, way: Array, reach_m: float, *, ground: bool) -> Array:
-        share = self._bullet.cast(starts, starts + reach_m * way, ground=ground)
-        return np.where(share < 1.0, share * reach_m, np.inf)
-
-
-def sensor_pose(sensor: Laser | Lidar3D | StereoCamera, pose: Array) -> Array:
-    """Pose (3,) of a mounted sensor in map for the robot's pose (3,)."""
-    mount = sensor.mount
-    cos, sin = math.cos(pose[2]), math.sin(pose[2])
-    return np.array(
-        [
-            pose[0] + cos * mount.x_m - sin * mount.y_m,
-            pose[1] + sin * mount.x_m + cos * mount.y_m,
-            pose[2] + mount.yaw_rad,
-        ]
-    )
-
-
-def points_in_camera(camera: StereoCamera, pose: Array, points_in_world: Array) -> Array:
-    """Points (N, 3) of map in the camera frame (z forward, x right, y down), m."""
-    planar = sensor_pose(camera, pose)
-    offset = points_in_world - np.array([planar[0], planar[1], camera.mount.z_m])
-    cos, sin = math.cos(planar[2]), math.sin(planar[2])
-    forward = cos * offset[:, 0] + sin * offset[:, 1]
-    left = -sin * offset[:, 0] + cos * offset[:, 1]
-    return np.stack([-left, -offset[:, 2], forward], axis=-1)
-
-
-class LandmarkEye:
-    """The stereo camera's view of the world's landmarks."""
-
-    def __init__(self, world: World, camera: StereoCamera, rng: np.random.Generator) -> None:
-        self._world, self._camera, self._rng = world, camera, rng
-        size = world.descriptors.shape[1] if world.descriptors.ndim == 2 else 0
-        self._view_axes = rng.standard_normal((len(world.landmarks), size)).astype(np.float32)
-        if size:
-            self._view_axes /= np.linalg.norm(self._view_axes, axis=1, keepdims=True)
-        self._first_view_rad = np.full(len(world.landmarks), np.nan)
-
-    def observe(
-        self, rays: ExactRays | BulletRays, pose: Array
-    ) -> tuple[Array, NDArray[np.int64], NDArray[np.float32]]:
-        """Points in the camera frame (K, 3), true ids (K,), descriptors (K, D)."""
-        camera, landmarks = self._camera, self._world.landmarks
-        inside = points_in_camera(camera, pose, landmarks)
-        x, y, z = inside.T
-        field_of_view = (
-            (z > 0.05)
-            & (np.abs(x) <= z * math.tan(camera.fov_horizontal_rad / 2))
-            & (np.abs(y) <= z * math.tan(camera.fov_vertical_rad / 2))
-            & (np.linalg.norm(inside, axis=1) <= camera.max_distance_m)
-        )
-        ids = np.flatnonzero(field_of_view)
-        planar = sensor_pose(camera, pose)
-        origin = np.array([planar[0], planar[1], camera.mount.z_m])
-        ids = ids[rays.sees(origin, landmarks[ids])]
-        ids = self._choose(ids, inside)
-        observed = camera.measure(inside[ids], self._rng)
-        descriptors = self._describe(ids, origin)
-        whole = np.isfinite(observed).all(axis=1)
-        return observed[whole], ids[whole].astype(np.int64), descriptors[whole]
-
-    def _choose(self, ids: NDArray[np.int64], inside: Array) -> NDArray[np.int64]:
-        """At most B of the visible landmarks, by the camera's rule."""
-        camera = self._camera
-        most = camera.max_observations
-        if most == 0 or len(ids) <= most:
-            return ids
-        if camera.selection == "nearest":
-            order = np.argsort(np.linalg.norm(inside[ids], axis=1), kind="stable")
-            return ids[order[:most]]
-        if camera.selection == "random":
-            return self._rng.choice(ids, most, replace=False)
-        # Farthest-point choice over the image: each next landmark is the one farthest, in
-        # pixels, from those already taken.
-        pixels = inside[ids, :2] / inside[ids, 2:]
-        taken = [int(np.argmin(np.linalg.norm(pixels, axis=1)))]
-        gap = np.linalg.norm(pixels - pixels[taken[0]], axis=1)
-        while len(taken) < most:
-            taken.append(int(np.argmax(gap)))
-            gap = np.minimum(gap, np.linalg.norm(pixels - pixels[taken[-1]], axis=1))
-        return ids[taken]
-
-    def _describe(self, ids: NDArray[np.int64], origin: Array) -> NDArray[np.float32]:
-        """Noisy descriptors: white noise, and a drift with the change of the viewing angle."""
-        camera, world = self._camera, self._world
-        if world.descriptors.size == 0:
-            return np.zeros((len(ids), 0), np.float32)
-        offset = world.landmarks[ids, :2] - origin[:2]
-        view = np.arctan2(offset[:, 1], offset[:, 0])
-        fresh = np.isnan(self._first_view_rad[ids])
-        self._first_view_rad[ids[fresh]] = view[fresh]
-        change = np.abs((view - self._first_view_rad[ids] + np.pi) % (2 * np.pi) - np.pi)
-        size = world.descriptors.shape[1]
-        white = self._rng.standard_normal((len(ids), size)) / math.sqrt(size)
-        noisy = (
-            world.descriptors[ids]
-            + camera.sigma_descriptor * white
-            + camera.sigma_view_descriptor * change[:, None] * self._view_axes[ids]
-        )
-        unit: NDArray[np.float32] = (noisy / np.linalg.norm(noisy, axis=1, keepdims=True)).astype(
-            np.float32
-        )
-        return unit
-
-
 class _SlipEvents:
     """Slip that kr and kl do not describe: a wheel's encoder runs on by some centimetres."""
 
@@ -425,11 +274,12 @@ def _quantise(position_m: Array, tick_m: float) -> Array:
     return np.floor(position_m / tick_m) * tick_m if tick_m > 0.0 else position_m.copy()
 
 
-def _periods(sensors: SensorSuite) -> dict[str, int]:
+def _periods(sensors: Sensors) -> dict[str, int]:
     """Ticks between firings of each sensor."""
     periods = {}
-    for name in ("encoder", "laser", "stereo", "lidar3d"):
-        rate = getattr(getattr(sensors, name), "rate_hz", None)
+    order = [name for name in _SHARE_NOISE if name in sensors]
+    for name in (*order, *(name for name in sensors if name not in order)):
+        rate = sensors[name].rate_hz
         if rate is None:
             continue
         ticks = TICKS_PER_S / rate
@@ -447,7 +297,7 @@ def _periods(sensors: SensorSuite) -> dict[str, int]:
 def _assemble(
     world: World,
     robot: DifferentialDrive,
-    sensors: SensorSuite,
+    sensors: Sensors,
     logs: _Logs,
     status: str,
     config: dict[str, Any],
@@ -456,39 +306,40 @@ def _assemble(
         ticks = np.array([tick for tick, _ in logs[name]], dtype=np.int64)
         return ticks / TICKS_PER_S, [reading for _, reading in logs[name]]
 
-    stamps, frames = read("frames")
+    stamps, frames = read("/frames")
     encoder, travel, poses = (np.array(part) for part in zip(*frames, strict=True))
     poses[:, 2] = se2.wrap(poses[:, 2])
-    command_stamps, commands = read("commands")
-    laser = landmarks = clouds = None
-    landmark_ids = np.zeros(0, np.int64)
-    if sensors.laser:
-        scan_stamps, scans = read("laser")
-        laser = LaserLog(scan_stamps, np.array(scans))
-    if sensors.lidar3d:
-        turn_stamps, turns = read("lidar3d")
-        clouds = CloudLog(turn_stamps, np.array(turns))
-    if sensors.stereo:
-        image_stamps, images = read("stereo")
-        points, ids, descriptors = zip(*images, strict=True)
-        landmark_ids = np.concatenate(ids)
-        landmarks = LandmarkLog(
-            stamps=image_stamps,
-            splits=np.cumsum([0, *(len(p) for p in points)]),
-            points_in_camera=np.concatenate(points),
-            ids=landmark_ids if sensors.stereo.identifies else np.zeros(0, np.int64),
-            descriptors=np.concatenate(descriptors),
-        )
+    command_stamps, commands = read("/commands")
+    made, hidden = {}, {}
+    for name, sensor in sensors.items():
+        if sensor.schema:
+            made[name], hidden[name] = _log(name, sensor, *read(name))
     return Recording(
         frame_stamps=stamps,
         wheels=WheelLog(stamps, encoder),
         robot=RobotGeometry(robot.wheel_radius_m, robot.track_m),
         sensors=sensors,
-        truth=Truth(stamps, poses, travel, landmark_ids, world),
-        laser=laser,
-        landmarks=landmarks,
-        clouds=clouds,
+        logs=made,
+        truth=Truth(stamps, poses, travel, {k: v for k, v in hidden.items() if v}, world),
         commands=CommandLog(command_stamps, np.array(commands, float).reshape(-1, 2)),
         config=config,
         status=status,
+    )
+
+
+def _log(
+    name: str, sensor: Sensor, stamps: Array, readings: list[Reading]
+) -> tuple[Log, dict[str, NDArray[Any]]]:
+    """Log of a sensor, and what its schema marks as truth."""
+    schema = sensor.schema
+    for reading in readings:
+        if set(reading) != set(schema):
+            raise InputError(
+                f"sensors.{name}: a reading has the fields {[*reading]}, its schema {[*schema]}"
+            )
+    log = joined(schema, stamps, readings, f"sensors.{name}")
+    seen, hidden = parted(schema)
+    return (
+        dataclasses.replace(log, schema=seen, values={key: log[key] for key in seen}),
+        {key: log[key] for key in hidden},
     )

@@ -17,9 +17,9 @@ from estimators.stereo import StereoModel
 from experiments.bench.measure import Measurement, median_time_s, timed_steps
 from experiments.evaluation.statistics import log_log_slope
 from sim.arrays import Array
-from sim.recording import LandmarkLog, Recording, WheelLog
+from sim.recording import Log, Recording, WheelLog
 from sim.robot import RobotGeometry, wheel_errors
-from sim.sensors import Encoder, SensorSuite, StereoCamera
+from sim.sensors import StereoCamera
 
 PAPER = StereoCamera(sigma_column_px=10.0, sigma_row_px=10.0, correlated=False)
 _TRACK_M, _STEP_M, _RADIUS_M, _K_M = 0.4, 0.4, 5.0, 5e-5
@@ -76,10 +76,17 @@ def circling(n_landmarks: int, n_seen: int, n_steps: int, camera: StereoCamera) 
         frame_stamps=stamps,
         wheels=WheelLog(stamps, np.cumsum(wheels, axis=0)),
         robot=RobotGeometry(0.1, _TRACK_M),
-        sensors=SensorSuite(Encoder(None), stereo=camera),
-        landmarks=LandmarkLog(
-            stamps, n_seen * np.arange(n_steps + 1), points.reshape(-1, 3), ids.ravel()
-        ),
+        sensors={"stereo": camera},
+        logs={
+            "stereo": Log.of(
+                camera,
+                stamps,
+                n_seen * np.arange(n_steps + 1),
+                points_in_camera=points.reshape(-1, 3),
+                ids=ids.ravel(),
+                descriptors=np.zeros((ids.size, 0)),
+            )
+        },
         config={"bench": "circling"},
     )
 

@@ -23,7 +23,7 @@ from sim.builders import office
 from sim.casting import SegmentCaster
 from sim.recording import Frame
 from sim.robot import RobotGeometry, arc_increment
-from sim.sensors import Laser, SensorSuite
+from sim.sensors import Laser
 from sim.world import World
 
 _LASER = Laser(n_beams=721, max_range_m=80.0, sigma_range_m=0.01)
@@ -44,7 +44,7 @@ def run() -> list[Measurement]:
     )
     poses, travels, scans = _drive(world, 240)
     frames = [
-        Frame(0.5 * i, 0.5 if i else 0.0, travel, scan)
+        Frame(0.5 * i, 0.5 if i else 0.0, travel, {"laser": {"ranges_m": scan}})
         for i, (travel, scan) in enumerate(zip(travels, scans, strict=True))
     ]
     per_update = _N_PARTICLES * _LASER.n_beams
@@ -100,7 +100,7 @@ def _updates(world: World, poses: Array, frames: list[Frame]) -> tuple[float, fl
     )
     prior = Prior(
         RobotGeometry(0.1, _TRACK_M),
-        SensorSuite(laser=_LASER),
+        {"laser": _LASER},
         poses[0].copy(),
         np.diag(np.square([0.1, 0.1, 0.03])),
         world,

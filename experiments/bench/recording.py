@@ -11,10 +11,11 @@ from experiments.bench.measure import Measurement, median_time_s
 from experiments.runs.experiment import Experiment
 from experiments.runs.seeds import stream
 from sim.bullet import BulletBody
+from sim.rays import BulletRays
 from sim.robot import DifferentialDrive
 from sim.route import OpenLoop
-from sim.sensors import Encoder, Laser, SensorSuite
-from sim.simulate import BulletRays, record
+from sim.sensors import Laser
+from sim.simulate import record
 
 _ROBOT = DifferentialDrive(0.05, 0.19, kr=1e-5, kl=1e-5)
 _CIRCLE = OpenLoop(((0.1, 0.2, 59.6),))  # for a minute; a metre across, clear of walls
@@ -23,7 +24,7 @@ _CIRCLE = OpenLoop(((0.1, 0.2, 59.6),))  # for a minute; a metre across, clear o
 def run() -> list[Measurement]:
     """Real-time factor of a minute at 10 Hz and 721 beams among 52 faces; one Bullet scan."""
     world = Experiment.compose(["world=boxes", "world.n_boxes=12"]).world()
-    sensors = SensorSuite(Encoder(None), Laser(rate_hz=10.0))
+    sensors = {"laser": Laser(rate_hz=10.0)}
     factors = []
     for repeat in range(3):
         streams = {axis: stream(repeat, axis) for axis in ("slip", "sensors")}

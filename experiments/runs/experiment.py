@@ -23,13 +23,13 @@ from experiments.runs import paths
 from experiments.runs.cache import cached, key_of
 from experiments.runs.row import Row
 from experiments.runs.seeds import stream
-from experiments.runs.targets import find, make, targets
+from experiments.runs.targets import make, targets
 from experiments.runs.version import version_with
 from sim.errors import InputError
 from sim.recording import Recording, load
 from sim.robot import DifferentialDrive, RobotGeometry
-from sim.sensors import SensorSuite, suite_from_config
-from sim.settings import build
+from sim.sensors import Sensor, sensors_from_config
+from sim.settings import build, find
 from sim.world import World
 
 Config = dict[str, Any]
@@ -46,12 +46,6 @@ _KEYS = (
 _NOT_IN_KEY = ("name", "picture", "recording")
 _PHYSICS = ("bullet", "kinematic")
 _RAYS = ("bullet", "exact")
-# What an estimator may need of the sensors: the key that must be set, and presets that set it
-_SENSORS = {
-    "laser": ("laser", "lms291, hokuyo or laser_stereo"),
-    "landmarks": ("stereo", "stereo_pixel, stereo_paper or laser_stereo"),
-    "place": ("lidar3d", "lidar3d"),
-}
 
 
 @dataclass(frozen=True)
@@ -251,12 +245,15 @@ class Experiment:
         """Check that the estimator gets the sensors and the map that it needs."""
         settings = self.config["estimator"]
         estimator = self.own_estimator or find(settings.get("_target_"), "estimator")
-        needs = getattr(estimator, "needs", ())
-        simulated = self.config["recording"] is None
-        for need, (sensor, presets) in _SENSORS.items():
-            if need in needs and simulated and self.config["sensors"].get(sensor) is None:
+        needs = frozenset(getattr(estimator, "needs", ()))
+        has = {name for name, sensor in self.config["sensors"].items() if sensor is not None}
+        for need in needs - {"map"} if self.config["recording"] is None else ():
+            # an option of the estimator says how the sensor is called
+            names = [settings.get(option, option) for option in need.split("|")]
+            if not has.intersection(names):
+                presets = ", ".join(_presets_with(names)) or "one that has it"
                 raise InputError(
-                    f"estimator={self.estimator_name} needs a {sensor} sensor, and "
+                    f"estimator={self.estimator_name} needs a sensor {' or '.join(names)}, and "
                     f"sensors={self.choices.get('sensors')} has none; try sensors={presets}"
                 )
         mapped = self.config["prior"]["map"] != "none" or settings.get("map_path")
@@ -276,9 +273,9 @@ class Experiment:
         """Make the true robot."""
         return build(DifferentialDrive, self.config["robot"], "robot")
 
-    def sensors(self) -> SensorSuite:
+    def sensors(self) -> dict[str, Sensor]:
         """Make the sensors."""
-        return suite_from_config(self.config["sensors"])
+        return sensors_from_config(self.config["sensors"])
 
     def estimator(self) -> Estimator:
         """Make the estimator: anything with `reset` and `step`."""
@@ -342,7 +339,9 @@ class Experiment:
             recording = load(Path(wanted))
             self._compare_slip(recording)
             return recording
-        return cached(self.recording_key, lambda: self.simulate(on_progress))
+        recording = cached(self.recording_key, lambda: self.simulate(on_progress))
+        # a file does not choose what code runs, but the configuration does
+        return dataclasses.replace(recording, sensors=self.sensors())
 
     def _compare_slip(self, recording: Recording) -> None:
         """Warn if kr or kl are not those that the recording was made with."""
@@ -412,6 +411,12 @@ def _check_shape(config: Config) -> None:
     if not (wanted is None or isinstance(wanted, dict) or (isinstance(wanted, str) and wanted)):
         got = "nothing" if wanted == "" else repr(wanted)
         raise InputError(f"recording must be a path, null, or a mapping with _target_, got {got}")
+
+
+def _presets_with(names: Sequence[str]) -> list[str]:
+    """Options of conf/sensors that have one of these sensors."""
+    found = {path.stem: OmegaConf.load(path) for path in (paths.CONF / "sensors").glob("*.yaml")}
+    return sorted(preset for preset, sensors in found.items() if any(n in sensors for n in names))
 
 
 def check_overrides(overrides: Sequence[str]) -> None:

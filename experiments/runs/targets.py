@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import importlib
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 from sim.errors import InputError
+from sim.settings import find
 
 
 def make(settings: Mapping[str, Any], where: str, **injected: Any) -> Any:
@@ -45,29 +45,6 @@ def make(settings: Mapping[str, Any], where: str, **injected: Any) -> Any:
         return function(**arguments, **{k: v for k, v in injected.items() if k in known})
     except (TypeError, ValueError) as error:
         raise InputError(f"{where} ({target}) does not accept its values: {error}") from error
-
-
-def find(target: Any, where: str) -> Callable[..., Any]:
-    """Import the class or function that a `_target_` names.
-
-    Raises
-    ------
-    InputError
-        If there is none.
-    """
-    if not isinstance(target, str) or "." not in target:
-        raise InputError(f"{where}._target_ must name a class or function, such as mine.Mine")
-    module_name, _, name = target.rpartition(".")
-    try:
-        module = importlib.import_module(module_name)
-    except ModuleNotFoundError as error:
-        raise InputError(
-            f"{where}._target_={target}: no module {error.name}; is its folder on PYTHONPATH?"
-        ) from error
-    found = getattr(module, name, None)
-    if not callable(found):
-        raise InputError(f"{where}._target_={target}: {module_name} has no class {name}")
-    return found  # type: ignore[no-any-return]
 
 
 def targets(tree: Any) -> set[str]:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments.viewing.view import Playback, scan_points
+from experiments.viewing.view import Playback, seen
 from sim.arrays import Array
 from sim.errors import InputError
 from sim.world import World
@@ -114,7 +114,7 @@ def _play(engine: Any, run: Playback, seconds: float | None) -> None:
             if i % _TRAIL_EVERY == 0:
                 engine.addUserDebugLine([*before[:2], 0.02], [*pose[:2], 0.02], colours[name], 2)
                 trails[name] = pose
-        points = scan_points(run, float(stamp))[::3] if i % _SCAN_EVERY == 0 else np.zeros((0, 2))
+        points = seen(run, float(stamp))[::3] if i % _SCAN_EVERY == 0 else np.zeros((0, 2))
         if len(points):
             raised = np.column_stack([points, np.full(len(points), 0.2)]).tolist()
             scan = engine.addUserDebugPoints(raised, [_RED] * len(points), 3, **replaced)

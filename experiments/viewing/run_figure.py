@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from estimators.base import Estimate
 from experiments.viewing.plotting import draw_ellipses
 from experiments.viewing.style import ESTIMATE, TRUTH, figure
-from experiments.viewing.world import draw_world
+from experiments.viewing.world import draw_world, sees_landmarks
 from sim import se2
 from sim.arrays import Array
 from sim.recording import Recording
@@ -22,7 +22,7 @@ def run_figure(recording: Recording, estimate: Estimate, name: str) -> Figure:
     halves: Any = page.subfigures(1, 2, width_ratios=(1.1, 1.0))
     map_axes = halves[0].subplots()
     if recording.world is not None:
-        draw_world(map_axes, recording.world, landmarks=recording.landmarks is not None)
+        draw_world(map_axes, recording.world, landmarks=sees_landmarks(recording))
     if recording.truth is not None:
         truth = recording.truth_at(estimate.stamps)
         map_axes.plot(*truth[:, :2].T, color=TRUTH, lw=1.6, label="truth")

@@ -8,6 +8,7 @@ from __future__ import annotations
 import base64
 import dataclasses
 import io
+import itertools
 import shutil
 import subprocess
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -24,22 +25,32 @@ from estimators.base import run as run_estimator
 from experiments.evaluation.metrics import CHI2_95_2DOF
 from experiments.runs.experiment import Experiment
 from experiments.runs.seeds import stream
-from experiments.viewing.style import ESTIMATE, GREEN, ORANGE, RED, SKY, TRUTH, figure
-from experiments.viewing.world import draw_world
+from experiments.viewing.style import (
+    BLUE,
+    ESTIMATE,
+    GREEN,
+    ORANGE,
+    PURPLE,
+    RED,
+    SKY,
+    TRUTH,
+    YELLOW,
+    figure,
+)
+from experiments.viewing.world import draw_world, sees_landmarks
 from sim import se2
 from sim.arrays import Array
 from sim.errors import InputError
 from sim.files import write_whole
 from sim.recording import Frame, Recording
-from sim.sensors import Mount
 
 Picture = NDArray[np.uint8]
+_Layer = tuple[bool, str, str, str, dict[str, Any]]  # whether drawn, marker, colour, label, style
 SUFFIXES = (".mp4", ".gif", ".html")
 FPS = 10
 SECONDS = 20.0
 _EXTRAS = ("particles", "landmarks", "landmark_covariances")
 _MOST_PARTICLES = 1000  # drawn, of any number
-_GROUND_M = 0.3  # cloud points below are left out
 _DPI = 100
 
 
@@ -162,43 +173,26 @@ class _Sparing:
         return Belief(belief.mean, belief.covariance, copied)
 
 
-def scan_points(run: Playback, stamp: float) -> Array:
-    """Points (N, 2) in map of the last scan, or cloud, up to a time."""
-    sensors, scans, clouds = run.recording.sensors, run.recording.laser, run.recording.clouds
-    if scans is not None and (row := _last(scans.stamps, stamp)) >= 0:
-        laser, ranges = sensors.known_laser, np.asarray(scans.ranges_m[row], float)
-        seen = np.isfinite(ranges)
-        bearings = laser.bearings_rad[seen]
-        points = ranges[seen, None] * np.column_stack([np.cos(bearings), np.sin(bearings)])
-        return _in_map(run, scans.stamps[row], laser.mount, points)
-    if clouds is not None and (row := _last(clouds.stamps, stamp)) >= 0:
-        lidar = sensors.known_lidar3d
-        points = lidar.points_in_sensor(clouds.ranges_m[row])
-        points = points[points[:, 2] + lidar.mount.z_m > _GROUND_M, :2]
-        return _in_map(run, clouds.stamps[row], lidar.mount, points)
-    return np.zeros((0, 2))
-
-
-def seen_landmarks(run: Playback, stamp: float) -> Array:
-    """Points (N, 2) in map of the landmarks in the last image up to a time."""
-    log = run.recording.landmarks
-    if log is None or (row := _last(log.stamps, stamp)) < 0:
+def seen_points(run: Playback, name: str, stamp: float) -> Array:
+    """Points (N, 2) in map of a sensor's last reading up to a time."""
+    log, sensor = run.recording.logs[name], run.recording.sensors[name]
+    row = _last(log.stamps, stamp)
+    pose = run.pose_at(float(log.stamps[row])) if row >= 0 else np.full(3, np.nan)
+    if not np.isfinite(pose).all():
         return np.zeros((0, 2))
-    points = log.points_in_camera[slice(*log.splits[row : row + 2])]
-    flat = np.column_stack([points[:, 2], -points[:, 0]])  # z is forward, x to the right
-    return _in_map(run, log.stamps[row], run.recording.sensors.known_stereo.mount, flat)
+    drawn: Any = getattr(sensor, "points_in_base")(log.reading(row))  # noqa: B009
+    return se2.transform(pose, drawn[:, :2])
+
+
+def seen(run: Playback, stamp: float) -> Array:
+    """Points (N, 2) in map of all sensors' last readings up to a time."""
+    names = _sensor_layers(run.recording)
+    return np.concatenate([np.zeros((0, 2)), *(seen_points(run, name, stamp) for name in names)])
 
 
 def _last(stamps: Array, stamp: float) -> int:
     """Row of the last of the stamps up to a time, or -1."""
     return int(np.searchsorted(stamps, stamp + 1e-9, side="right")) - 1
-
-
-def _in_map(run: Playback, stamp: float, mount: Mount, points_in_sensor: Array) -> Array:
-    pose = run.pose_at(float(stamp))
-    if not np.isfinite(pose).all():
-        return np.zeros((0, 2))
-    return se2.transform(se2.compose(pose, mount.pose), points_in_sensor)
 
 
 def ellipse_outlines(means: Array, covariances: Array, n_corners: int = 24) -> Array:
@@ -225,7 +219,7 @@ def pictures(run: Playback) -> Iterator[Picture]:
     page.set_dpi(_DPI)
     ax = page.subplots()
     if recording.world is not None:
-        draw_world(ax, recording.world, landmarks=recording.landmarks is not None)
+        draw_world(ax, recording.world, landmarks=sees_landmarks(recording))
     glyph = max(recording.robot.track_m / 2.0, 0.012 * (x2 - x1))  # visible on any map
     moving = {
         key: ax.plot([], [], style, color=color, label=label, animated=True, **more)[0]
@@ -260,12 +254,10 @@ def _layers(run: Playback, known: bool) -> dict[str, tuple[str, str, str, dict[s
         any(value is not None and len(value) for value in extras.get(name, []))
         for name in ("particles", "landmarks")
     )
-    scanned = recording.laser is not None or recording.clouds is not None
     estimated = run.estimate is not None
-    layers: dict[str, tuple[bool, str, str, str, dict[str, Any]]] = {
+    layers: dict[str, _Layer] = {
         "particles": (particles, ".", SKY, "particles", {"ms": 3, "alpha": 0.6}),
-        "scan": (scanned, ".", RED, "scan", {"ms": 2}),
-        "seen": (recording.landmarks is not None, "x", ORANGE, "landmarks seen", {"ms": 5}),
+        **_sensor_layers(recording),
         "landmarks": (mapped, "-", GREEN, "landmarks, 95 %", {"lw": 0.8}),
         "truth": (known, "-", TRUTH, "truth", {"lw": 1.6}),
         "truth robot": (known, "-", TRUTH, "", {"lw": 1.4}),
@@ -276,13 +268,23 @@ def _layers(run: Playback, known: bool) -> dict[str, tuple[str, str, str, dict[s
     return {name: layer[1:] for name, layer in layers.items() if layer[0]}
 
 
+def _sensor_layers(recording: Recording) -> dict[str, _Layer]:
+    """Layers of the sensors whose readings can be drawn: dots of scans, crosses of landmarks."""
+    layers: dict[str, _Layer] = {}
+    shown = [n for n in recording.logs if hasattr(recording.sensors[n], "points_in_base")]
+    for name, color in zip(shown, itertools.cycle((RED, ORANGE, PURPLE, BLUE, YELLOW))):
+        few = recording.logs[name].splits is not None
+        layers[name] = (True, "x" if few else ".", color, name, {"ms": 5 if few else 2})
+    return layers
+
+
 def _instant(
     run: Playback, frame: int, truth: Array | None, glyph_m: float
 ) -> tuple[dict[str, Array], str]:
     """Points of every moving layer at a Frame, and the title."""
     stamps = run.recording.frame_stamps
     stamp = float(stamps[frame])
-    points = {"scan": scan_points(run, stamp), "seen": seen_landmarks(run, stamp)}
+    points = {name: seen_points(run, name, stamp) for name in _sensor_layers(run.recording)}
     words = f"t = {stamp - stamps[0]:.1f} s"
     if truth is not None:
         points["truth"] = truth[: frame + 1, :2]

@@ -23,6 +23,7 @@ from experiments.viewing.style import (
     figure,
 )
 from sim.arrays import Array
+from sim.recording import Recording
 from sim.world import World
 
 _PLACES = {
@@ -34,6 +35,11 @@ _PLACES = {
     "door": BLACK,
 }
 _LASER_HEIGHT_M = 0.25  # faces that begin above it are drawn faintly
+
+
+def sees_landmarks(recording: Recording) -> bool:
+    """Whether a sensor observes any number of things at once, as a camera does landmarks."""
+    return any(log.splits is not None for log in recording.logs.values())
 
 
 def draw_world(

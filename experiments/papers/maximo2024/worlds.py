@@ -262,9 +262,9 @@ def quality_rows(name: str, seed: int) -> Iterator[Row]:
 
 def _retrieval(known_map: TopologicalMap, recording: Recording) -> dict[str, float]:
     """Retrieval quality; right is a node within 25 m in Oxford, else within 1.5 spacings."""
-    places, kind = recording.known_places, describers.KINDS.get(known_map.descriptor)
+    places, kind = recording.log("place"), describers.KINDS.get(known_map.descriptor)
     compare = kind.distances if kind else describers.euclidean
-    distances = np.array([compare(row, known_map.descriptors) for row in places.descriptors])
+    distances = np.array([compare(row, known_map.descriptors) for row in places["descriptor"]])
     here = recording.truth_at(places.stamps)[:, :2]
     within_m = 25.0 if known_map.spacing_m > 15.0 else 1.5 * known_map.spacing_m
     return describers.retrieval(distances, gaps_m(here, known_map.positions_m), within_m)
@@ -326,7 +326,8 @@ def campus_rows(name: str, seed: int, n_repeats: int) -> dict[str, Rows]:
     case = cases[settings["descriptor"]]
     travel_m = np.median(np.abs(np.diff(taken.wheels.position_m[:, 0])))
     per_node = float(case.known_map.spacing_m / travel_m)
-    bare = replace(case, recording=replace(case.recording, clouds=None))
+    places = {"place": case.recording.log("place")}  # without the clouds
+    bare = replace(case, recording=replace(case.recording, logs=places))
     return {
         **weighting_rows(_one_query_a_node(bare), n_repeats),
         "clusters": clusters,

@@ -49,7 +49,6 @@ from sim.kinematic import BatchRuns, run_batch
 from sim.recording import Recording, WheelLog
 from sim.robot import DifferentialDrive, RobotGeometry
 from sim.route import OpenLoop
-from sim.sensors import SensorSuite
 
 Routes = Mapping[str, OpenLoop]
 Driven = dict[tuple[str, str, int], Recording]  # keyed by physics, case and seed
@@ -123,8 +122,8 @@ def dead_reckoning(batch: BatchRuns, kr: float, kl: float) -> Estimate:
     """Odometry from the origin over the first run, with the nominal geometry."""
     geometry = RobotGeometry(NOMINAL.wheel_radius_m, NOMINAL.track_m)
     wheels = WheelLog(batch.stamps, batch.encoder_m[0])
-    recording = Recording(batch.stamps, wheels, geometry, SensorSuite())
-    prior = Prior(geometry, SensorSuite(), np.zeros(3), np.zeros((3, 3)))
+    recording = Recording(batch.stamps, wheels, geometry)
+    prior = Prior(geometry, mean=np.zeros(3), covariance=np.zeros((3, 3)))
     return run_estimator(Odometry(kr, kl), recording, prior, np.random.default_rng(0))
 
 
