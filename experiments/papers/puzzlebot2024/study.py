@@ -200,10 +200,7 @@ def drawn() -> dict[str, NDArray[np.float32]]:
 def calibrate_once(arm: Arm) -> list[CalibrationResult]:
     """Calibrate by all methods on the same runs: each manoeuvre 20 times."""
     rng, draws = stream(arm.seed, "slip"), stream(arm.seed, "samples")
-    batches = [
-        run_batch(arm.robot, route, CALIBRATION_RUNS, rng, nominal_track_m=NOMINAL.track_m)
-        for route in arm.routes.values()
-    ]
+    batches = [run_batch(arm.robot, route, CALIBRATION_RUNS, rng) for route in arm.routes.values()]
     manoeuvres = [
         Manoeuvre(route.profile(NOMINAL), batch.end_poses)
         for route, batch in zip(arm.routes.values(), batches, strict=True)
