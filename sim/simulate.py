@@ -7,6 +7,7 @@ sensor fires at its own multiple of the tick.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import math
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 from sim import se2
 from sim.arrays import Array
 from sim.errors import InputError
+from sim.feedback import Feedback, feedback_of
 from sim.kinematic import KinematicBody
 from sim.recording import (
     CloudLog,
@@ -59,7 +61,10 @@ class Driver(Protocol):
     """What commands a run, tick by tick."""
 
     def command(self, tick: int, pose: Array) -> Array | None:
-        """Body velocity (2,) m/s, rad/s for the tick, or None when the route is done."""
+        """Body velocity (2,) m/s, rad/s for the tick, or None when the route is done.
+
+        The pose (3,) is the one that the route's feedback gives, the true one or a believed one.
+        """
 
     @property
     def trouble(self) -> str | None:
@@ -67,7 +72,10 @@ class Driver(Protocol):
 
 
 class Route(Protocol):
-    """A plan that gives a Driver for a robot in a world."""
+    """A plan that gives a Driver for a robot in a world.
+
+    It may have an attribute `feedback`, see `sim.feedback`; without one its driver gets the truth.
+    """
 
     def start(self, world: World, robot: DifferentialDrive) -> tuple[Array, Driver]:
         """Start pose (3,) and the driver."""
@@ -120,6 +128,7 @@ def record(
             f"the robot overlaps a wall of world {world.name} at its start "
             f"({pose[0]:.2f}, {pose[1]:.2f}); move the start pose or the wall"
         )
+    feedback = feedback_of(route, robot, pose)
     logs: _Logs = defaultdict(list)
     with contextlib.ExitStack() as stack:
         body: Body
@@ -136,9 +145,19 @@ def record(
             find_trouble = lambda: "collision" if overlaps(world, robot, body.pose) else None  # noqa: E731
         probes = _probes(world, sensors, caster, streams["sensors"])
         status = _drive(
-            robot, periods, body, driver, find_trouble, probes, streams["slip"], logs, on_progress
+            robot,
+            periods,
+            body,
+            driver,
+            feedback,
+            find_trouble,
+            probes,
+            streams["slip"],
+            logs,
+            on_progress,
         )
-    return _assemble(world, robot, sensors, logs, status, config or {})
+    recording = _assemble(world, robot, sensors, logs, status, config or {})
+    return dataclasses.replace(recording, robot=robot.nominal)
 
 
 def _probes(
@@ -161,6 +180,7 @@ def _drive(
     periods: dict[str, int],
     body: Body,
     driver: Driver,
+    feedback: Feedback,
     find_trouble: Callable[[], str | None],
     probes: dict[str, Callable[[Array], Any]],
     rng: np.random.Generator,
@@ -176,9 +196,9 @@ def _drive(
     while True:
         pose = body.pose
         due = [name for name, period in periods.items() if tick % period == 0]
-        wanted = driver.command(tick, pose)
+        wanted = driver.command(tick, feedback.pose(tick, pose, encoder))
         if due or wanted is None:
-            counts = _quantise(encoder, robot.encoder_tick_m)
+            counts = robot.encoder_reading(encoder)
             logs["frames"].append((tick, (counts, travel.copy(), pose)))
         for name in due:
             if name in probes:
@@ -418,11 +438,6 @@ def _normals(rng: np.random.Generator, block: int = 3000) -> Iterator[Array]:
     """Pairs of standard normals, drawn in blocks for speed; the bits do not depend on the block."""
     while True:
         yield from rng.standard_normal((block, 2))
-
-
-def _quantise(position_m: Array, tick_m: float) -> Array:
-    """Counts are quantised, never increments, so the error does not accumulate."""
-    return np.floor(position_m / tick_m) * tick_m if tick_m > 0.0 else position_m.copy()
 
 
 def _periods(sensors: SensorSuite) -> dict[str, int]:
