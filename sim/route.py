@@ -288,20 +288,20 @@ class GoToPoints:
 
     def start(self, world: World, robot: DifferentialDrive) -> tuple[Array, GoToPoint]:
         """Start pose (3,) of the world, and the driver."""
-        points = transform(world.start_pose, np.array(self.points, float))
-        return world.start_pose, GoToPoint(self, robot, points)
+        path = np.array([(0.0, 0.0), *self.points])
+        return world.start_pose, GoToPoint(self, robot, transform(world.start_pose, path))
 
 
 class GoToPoint:
     """Driver of GoToPoints, 50 times a second, with limited acceleration."""
 
-    def __init__(self, route: GoToPoints, robot: DifferentialDrive, points: Array) -> None:
-        self._route, self._points = route, points
+    def __init__(self, route: GoToPoints, robot: DifferentialDrive, path: Array) -> None:
+        self._route, self._points = route, path[1:]
         self._most = _accelerations(robot)
         self._velocity, self._reached = np.zeros(2), 0
         self._rest_ticks: int | None = None
-        ways = np.diff(points, axis=0, prepend=points[:1])
-        slowest_s = 4.0 * np.hypot(*ways.T).sum() / route.speed_mps + 60.0 * len(points)
+        turns_s = math.pi * len(self._points) / route.turn_rate_radps
+        slowest_s = 4.0 * (_along_m(path)[-1] / route.speed_mps + turns_s) + 60.0
         self._last_tick, self._late = round(slowest_s / TICK_S), False
 
     def command(self, tick: int, pose: Array) -> Array | None:

@@ -134,3 +134,12 @@ def test_points_are_of_the_frame_of_the_start_pose():
     assert omega == pytest.approx(0.0)
     v, omega = driver.command(6, np.array([1.0, 1.0, np.pi]))  # at the first; the next is left
     assert omega > 0.0
+
+
+def test_a_point_never_reached_leaves_the_route_incomplete():
+    world = World("open", np.zeros((0, 4)), np.zeros((0, 2)))
+    start, driver = GoToPoints(**SQUARE).start(world, ROBOT)
+    driver.command(0, start)
+    assert driver.trouble is None
+    driver.command(6 * 300 * 60, start)
+    assert driver.trouble == "incomplete"

@@ -218,15 +218,15 @@ def square_feedback(*overrides: str) -> tuple[pd.DataFrame, dict[str, NDArray[np
     rows: list[Row] = []
     paths: dict[str, list[Array]] = {"true_m": [], "believed_m": []}
     for experiment in planned(["study=puzzlebot2024_square_feedback", *overrides]):
-        recording = experiment.simulate()
+        route, recording = experiment.route(), experiment.simulate()
         prior, rng = experiment.prior(recording), np.random.default_rng(0)
         believed = run_estimator(experiment.estimator(), recording, prior, rng).means[:, :2]
         stamps = recording.frame_stamps
         true = recording.truth_at(stamps)[:, :2]
-        corner = np.array(experiment.config["route"]["points"][-1])
+        corner = np.array(route.points[-1])
         row = {
             "robot": experiment.choices["robot"],
-            "feedback": experiment.config["route"]["feedback"],
+            "feedback": route.feedback,
             "seed": experiment.seed,
             "status": recording.status,
             "true_end_m": np.hypot(*(true[-1] - corner)),
@@ -237,8 +237,7 @@ def square_feedback(*overrides: str) -> tuple[pd.DataFrame, dict[str, NDArray[np
         sampled_s = np.linspace(stamps[0], stamps[-1], SQUARE_SAMPLES)
         for name, path in (("true_m", true), ("believed_m", believed)):
             paths[name].append(np.stack([np.interp(sampled_s, stamps, c) for c in path.T], axis=1))
-    wanted = [[0.0, 0.0], *experiment.config["route"]["points"]]
-    arrays = {"wanted_m": wanted, **paths}
+    arrays = {"wanted_m": [(0.0, 0.0), *route.points], **paths}
     return pd.DataFrame(rows), {k: np.asarray(v, np.float32) for k, v in arrays.items()}
 
 
