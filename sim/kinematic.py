@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -82,7 +81,6 @@ def run_batch(
     rng: np.random.Generator,
     *,
     start: ArrayLike = (0.0, 0.0, 0.0),
-    nominal_track_m: float | None = None,
     sample_s: float = 0.05,
 ) -> BatchRuns:
     """Drive a route many times with independent slip, at 300 ticks a second.
@@ -93,8 +91,6 @@ def run_batch(
         The true robot. Its unmodelled slip must be off.
     start
         (3,) common start pose.
-    nominal_track_m
-        Track by which the commands become wheel speeds; the robot's own if None.
     sample_s
         Time between samples, a multiple of the tick; the end is sampled in any case.
 
@@ -107,7 +103,7 @@ def run_batch(
         raise InputError("batches know the kr/kl law only; set robot.unmodelled_slip=0")
     if n_runs < 1:
         raise InputError(f"n_runs must be at least 1, got {n_runs}")
-    commands_m = wheel_commands(robot, route, nominal_track_m)
+    commands_m = wheel_commands(robot, route)
     n_ticks = len(commands_m)
     every = max(1, round(sample_s / TICK_S))
     sampled = np.append(np.arange(0, n_ticks, every), n_ticks)
@@ -129,17 +125,12 @@ def run_batch(
             encoder_m[rows],
             ground_m[rows],
         )
-    if robot.encoder_tick_m > 0.0:
-        encoder_m = np.floor(encoder_m / robot.encoder_tick_m) * robot.encoder_tick_m
-    return BatchRuns(sampled * TICK_S, poses, encoder_m, ground_m)
+    return BatchRuns(sampled * TICK_S, poses, robot.encoder_reading(encoder_m), ground_m)
 
 
-def wheel_commands(
-    robot: DifferentialDrive, route: OpenLoop, nominal_track_m: float | None = None
-) -> Array:
+def wheel_commands(robot: DifferentialDrive, route: OpenLoop) -> Array:
     """Commanded ground travel (N, 2) of the wheels, right and left, tick by tick, m."""
-    nominal = dataclasses.replace(robot, track_m=nominal_track_m or robot.track_m)
-    return nominal.wheel_speeds(*route.profile(robot).T) * TICK_S
+    return robot.wheel_speeds(*route.profile(robot).T) * TICK_S
 
 
 @njit()

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,11 +21,15 @@ from sim.settings import check_numbers
 
 SLIP_TIME_CONSTANT_S = 0.1
 _SMALL_ANGLE_RAD = 1e-4
+_LEAST_BIAS, _MOST_BIAS = -0.67, 2.0  # the encoder reads between a third and three times the travel
 
 
 @dataclass(frozen=True)
 class DifferentialDrive:
-    """What the simulated robot is and how its wheels slip: the truth, never a belief.
+    """What the simulated robot is and how its wheels slip: the truth, never an estimator's belief.
+
+    The nominal geometry is part of that truth: it is what the robot's own controller uses, right
+    or wrong.
 
     Parameters
     ----------
@@ -33,9 +38,18 @@ class DifferentialDrive:
     kr, kl
         Slip variance per metre of the right and left wheel, m.
     bias_right, bias_left
-        Systematic part of the slip: the encoder reads (1 + bias) times the ground travel.
+        Systematic part of the slip: the encoder reads (1 + bias) times the ground travel. A factor
+        of three either way is the most. The wheel's loop settles within 0.1 s / (1 + bias).
+    nominal_wheel_radius_m, nominal_track_m
+        Geometry by which the robot's controller turns body velocities into wheel speeds and wheel
+        angles into metres; None for the true one. A robot whose nominal track is 0.44 of the true
+        one turns by 0.44 of what it is commanded.
     encoder_tick_m
-        Quantum of the encoder counts along the ground, m; 0 for no quantisation.
+        Quantum of the encoder counts, in metres that the encoder reports; 0 for no quantisation.
+    encoder_pulses_per_turn
+        Pulses per turn of the encoder's shaft, in place of `encoder_tick_m`; 0 for none.
+    gear_ratio
+        Turns of the encoder's shaft for one turn of the wheel.
     unmodelled_slip
         Stress: probability per second of an event that stops a wheel from gripping (its
         encoder runs on by `unmodelled_slip_m` while the ground travel stands). It is not
@@ -54,7 +68,11 @@ class DifferentialDrive:
     kl: float = 0.0
     bias_right: float = 0.0
     bias_left: float = 0.0
+    nominal_wheel_radius_m: float | None = None
+    nominal_track_m: float | None = None
     encoder_tick_m: float = 0.0
+    encoder_pulses_per_turn: int = 0
+    gear_ratio: float = 1.0
     unmodelled_slip: float = 0.0
     unmodelled_slip_m: float = 0.02
     body_length_m: float = 0.18
@@ -75,13 +93,37 @@ class DifferentialDrive:
                 "body_height_m",
                 "mass_kg",
                 "max_acceleration_mps2",
+                "gear_ratio",
             ),
-            ("kr", "kl", "encoder_tick_m", "unmodelled_slip", "unmodelled_slip_m"),
+            (
+                "kr",
+                "kl",
+                "encoder_tick_m",
+                "encoder_pulses_per_turn",
+                "unmodelled_slip",
+                "unmodelled_slip_m",
+            ),
         )
+        for name in ("nominal_wheel_radius_m", "nominal_track_m"):
+            if getattr(self, name) is not None:
+                check_numbers("robot", self, (name,))
         for name in ("bias_right", "bias_left"):
             value = getattr(self, name)
-            if not math.isfinite(value) or value <= -0.5 or value >= 0.5:
-                raise InputError(f"robot.{name} must lie in (-0.5, 0.5), got {value}")
+            if not _LEAST_BIAS <= value <= _MOST_BIAS:
+                raise InputError(
+                    f"robot.{name} must lie in [{_LEAST_BIAS:g}, {_MOST_BIAS:g}], a factor of "
+                    f"three either way, got {value}"
+                )
+        if self.encoder_pulses_per_turn and self.encoder_tick_m:
+            raise InputError(
+                "robot.encoder_pulses_per_turn and robot.encoder_tick_m both set the encoder's "
+                "quantum; set one of them to 0"
+            )
+        if self.gear_ratio != 1.0 and not self.encoder_pulses_per_turn:
+            raise InputError(
+                "robot.gear_ratio has no effect without pulses; set robot.encoder_pulses_per_turn, "
+                "or robot.gear_ratio=1"
+            )
 
     @property
     def slip_variance_per_m(self) -> Array:
@@ -93,15 +135,51 @@ class DifferentialDrive:
         """(bias_right, bias_left)."""
         return np.array([self.bias_right, self.bias_left])
 
+    @cached_property
+    def nominal(self) -> RobotGeometry:
+        """The geometry that the robot's controller uses, and that its recordings state."""
+        return RobotGeometry(
+            self.nominal_wheel_radius_m or self.wheel_radius_m, self.nominal_track_m or self.track_m
+        )
+
+    @property
+    def encoder_quantum_m(self) -> float:
+        """Travel of one encoder count in metres that the encoder reports; 0 for none.
+
+        2 pi r / (pulses per turn * gear ratio), with the nominal radius r (decristoforis2020, the
+        distances rolled in eq. (1); their formula is lost in the text that we have, its symbols
+        are explained).
+        """
+        if not self.encoder_pulses_per_turn:
+            return self.encoder_tick_m
+        pulses = self.encoder_pulses_per_turn * self.gear_ratio
+        return 2.0 * math.pi * self.nominal.wheel_radius_m / pulses
+
     def wheel_speeds(self, v_mps: ArrayLike, omega_radps: ArrayLike) -> Array:
-        """Ground speeds (..., 2) of the wheels for a body velocity, m/s."""
-        v, turn = np.asarray(v_mps, float), np.asarray(omega_radps, float) * self.track_m / 2.0
-        return np.stack([v + turn, v - turn], axis=-1)
+        """Ground speeds (..., 2) of wheels that do not slip at a commanded body velocity, m/s.
+
+        The controller sets the wheels' rates by its nominal geometry; the wheels roll by the true
+        radius.
+        """
+        nominal = self.nominal
+        v, turn = np.asarray(v_mps, float), np.asarray(omega_radps, float) * nominal.track_m / 2.0
+        speeds: Array = np.stack([v + turn, v - turn], axis=-1)
+        return speeds * (self.wheel_radius_m / nominal.wheel_radius_m)
+
+    def encoder_reading(self, position_m: Array) -> Array:
+        """What the encoders report (..., 2), m, at positions (..., 2) along the ground, m.
+
+        The wheel's angle, in whole counts, times the nominal radius. Positions are quantised,
+        never increments, so the error does not accumulate.
+        """
+        reading = position_m * (self.nominal.wheel_radius_m / self.wheel_radius_m)
+        quantum_m = self.encoder_quantum_m
+        return np.floor(reading / quantum_m) * quantum_m if quantum_m > 0.0 else reading
 
 
 @dataclass(frozen=True)
 class RobotGeometry:
-    """What an estimator believes of the robot: the wheel radius and the track, m."""
+    """What is believed of the robot: the wheel radius and the track, m."""
 
     wheel_radius_m: float
     track_m: float

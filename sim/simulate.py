@@ -20,10 +20,11 @@ from numpy.typing import NDArray
 from sim import se2
 from sim.arrays import Array
 from sim.errors import InputError
+from sim.feedback import Feedback, Onboard, feedback_of
 from sim.kinematic import KinematicBody
 from sim.rays import BulletRays, ExactRays
 from sim.recording import CommandLog, Log, Recording, Truth, WheelLog, joined
-from sim.robot import DifferentialDrive, RobotGeometry, Slip
+from sim.robot import DifferentialDrive, Slip
 from sim.sensors.base import Probe, Rays, Reading, Sensor, Sensors, View, parted
 from sim.world import World
 
@@ -54,7 +55,10 @@ class Driver(Protocol):
     """What commands a run, tick by tick."""
 
     def command(self, tick: int, pose: Array) -> Array | None:
-        """Body velocity (2,) m/s, rad/s for the tick, or None when the route is done."""
+        """Body velocity (2,) m/s, rad/s for the tick, or None when the route is done.
+
+        The pose (3,) is the one that the route's feedback gives, the true one or a believed one.
+        """
 
     @property
     def trouble(self) -> str | None:
@@ -62,7 +66,10 @@ class Driver(Protocol):
 
 
 class Route(Protocol):
-    """A plan that gives a Driver for a robot in a world."""
+    """A plan that gives a Driver for a robot in a world.
+
+    It may have an attribute `feedback`, see `sim.feedback`; without one its driver gets the truth.
+    """
 
     def start(self, world: World, robot: DifferentialDrive) -> tuple[Array, Driver]:
         """Start pose (3,) and the driver."""
@@ -79,6 +86,7 @@ def record(
     rays: RayKind = "bullet",
     config: dict[str, Any] | None = None,
     on_progress: Callable[[float], None] | None = None,
+    onboard: Onboard | None = None,
 ) -> Recording:
     """Drive the route and record what the sensors measure.
 
@@ -94,6 +102,8 @@ def record(
         Kept in the recording: where it came from.
     on_progress
         Called about every simulated second with the simulated time, s.
+    onboard
+        Starts the estimator that a route's feedback names.
 
     Returns
     -------
@@ -115,6 +125,7 @@ def record(
             f"the robot overlaps a wall of world {world.name} at its start "
             f"({pose[0]:.2f}, {pose[1]:.2f}); move the start pose or the wall"
         )
+    feedback = feedback_of(route, robot, pose, sensors, world, onboard)
     logs: _Logs = defaultdict(list)
     with contextlib.ExitStack() as stack:
         body: Body
@@ -131,7 +142,16 @@ def record(
             find_trouble = lambda: "collision" if overlaps(world, robot, body.pose) else None  # noqa: E731
         probes = _probes(world, sensors, caster, streams["sensors"], pose)
         status = _drive(
-            robot, periods, body, driver, find_trouble, probes, streams["slip"], logs, on_progress
+            robot,
+            periods,
+            body,
+            driver,
+            feedback,
+            find_trouble,
+            probes,
+            streams["slip"],
+            logs,
+            on_progress,
         )
     return _assemble(world, robot, sensors, logs, status, config or {})
 
@@ -176,6 +196,7 @@ def _drive(
     periods: dict[str, int],
     body: Body,
     driver: Driver,
+    feedback: Feedback,
     find_trouble: Callable[[], str | None],
     probes: dict[str, _Firing],
     rng: np.random.Generator,
@@ -191,14 +212,16 @@ def _drive(
     while True:
         pose = body.pose
         due = [name for name, period in periods.items() if tick % period == 0]
-        wanted = driver.command(tick, pose)
+        wanted = driver.command(tick, feedback.pose(tick, pose, encoder))
         if due or wanted is None:
-            counts = _quantise(encoder, robot.encoder_tick_m)
+            counts = robot.encoder_reading(encoder)
             logs["/frames"].append((tick, (counts, travel.copy(), pose)))
-        for name in due:
-            reading = probes[name](tick / TICKS_PER_S, pose)
-            if reading is not None:
-                logs[name].append((tick, reading))
+        readings = {name: probes[name](tick / TICKS_PER_S, pose) for name in due}
+        shown = {name: reading for name, reading in readings.items() if reading is not None}
+        for name, reading in shown.items():
+            logs[name].append((tick, reading))
+        if due:
+            feedback.see(tick / TICKS_PER_S, encoder, shown)
         if wanted is None or tick % _CHECK_EVERY == 0:
             trouble = (find_trouble() if wanted is not None else None) or driver.trouble
             if trouble is not None:
@@ -269,11 +292,6 @@ def _normals(rng: np.random.Generator, block: int = 3000) -> Iterator[Array]:
         yield from rng.standard_normal((block, 2))
 
 
-def _quantise(position_m: Array, tick_m: float) -> Array:
-    """Counts are quantised, never increments, so the error does not accumulate."""
-    return np.floor(position_m / tick_m) * tick_m if tick_m > 0.0 else position_m.copy()
-
-
 def _periods(sensors: Sensors) -> dict[str, int]:
     """Ticks between firings of each sensor."""
     periods = {}
@@ -317,7 +335,7 @@ def _assemble(
     return Recording(
         frame_stamps=stamps,
         wheels=WheelLog(stamps, encoder),
-        robot=RobotGeometry(robot.wheel_radius_m, robot.track_m),
+        robot=robot.nominal,
         sensors=sensors,
         logs=made,
         truth=Truth(stamps, poses, travel, {k: v for k, v in hidden.items() if v}, world),

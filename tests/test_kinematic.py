@@ -83,10 +83,11 @@ def test_encoder_follows_the_command_and_the_ground_wanders():
 
 
 def test_commands_use_the_nominal_track():
-    nominal = wheel_commands(IDEAL, ROUTE, nominal_track_m=0.36)
-    turn = ROUTE.profile(IDEAL)[:, 1]
+    robot = dataclasses.replace(IDEAL, nominal_track_m=0.36)
+    nominal = wheel_commands(robot, ROUTE)
+    turn = ROUTE.profile(robot)[:, 1]
     np.testing.assert_allclose(nominal[:, 0] - nominal[:, 1], turn * 0.36 * TICK_S, atol=1e-15)
-    runs = run_batch(IDEAL, TABLE_1["angular_1"], 1, np.random.default_rng(0), nominal_track_m=0.36)
+    runs = run_batch(robot, TABLE_1["angular_1"], 1, np.random.default_rng(0))
     assert runs.end_poses[0, 2] == pytest.approx(3.0)  # twice the 1.5 rad asked for
 
 
@@ -101,6 +102,13 @@ def test_encoder_counts_are_quantised():
     robot = dataclasses.replace(NOISY, encoder_tick_m=1e-3)
     counts = run_batch(robot, ROUTE, 1, np.random.default_rng(1)).encoder_m / 1e-3
     np.testing.assert_allclose(counts, np.round(counts), atol=1e-9)
+
+
+def test_batch_reads_the_encoders_by_the_nominal_radius():
+    robot = dataclasses.replace(IDEAL, nominal_wheel_radius_m=0.04)
+    runs = run_batch(robot, TABLE_1["linear_1"], 1, np.random.default_rng(0))
+    assert runs.encoder_m[0, -1] == pytest.approx([1.0, 1.0])  # as commanded
+    assert runs.ground_m[0, -1] == pytest.approx([1.25, 1.25])  # by the true radius
 
 
 def test_unmodelled_slip_is_refused():

@@ -105,6 +105,49 @@ def test_bias_makes_the_encoder_read_more():
     assert encoder[0] == pytest.approx(5.0, rel=2e-3)  # closed on the encoder, but for the lag
 
 
+@pytest.mark.parametrize("factor", [0.34, 3.0])
+def test_bias_up_to_a_factor_of_three_settles(factor):
+    """The wheel's loop, closed on the encoder, brings the encoder to the command."""
+    robot = DifferentialDrive(0.05, 0.19, bias_right=factor - 1.0)
+    slip = Slip.start(robot, DT_S)
+    for _ in range(1500):
+        rolling = (0.5 - slip.correction_mps) * DT_S
+        read = slip.advance(rolling, np.zeros(2))
+    assert (read / DT_S).tolist() == pytest.approx([0.5, 0.5])
+    assert (rolling / DT_S).tolist() == pytest.approx([0.5 / factor, 0.5])
+
+
+def test_nominal_geometry_turns_commands_into_wheel_speeds():
+    robot = DifferentialDrive(0.05, 0.2, nominal_wheel_radius_m=0.04, nominal_track_m=0.1)
+    assert robot.nominal == RobotGeometry(0.04, 0.1)
+    rates = robot.wheel_speeds(0.4, 2.0) / 0.05
+    assert (rates * 0.04).tolist() == pytest.approx([0.4 + 0.1, 0.4 - 0.1])
+    right = DifferentialDrive(0.05, 0.2)
+    assert right.nominal == RobotGeometry(0.05, 0.2)
+    assert right.wheel_speeds(0.4, 2.0).tolist() == [0.4 + 0.2, 0.4 - 0.2]
+
+
+def test_pulses_are_counted_by_the_formula():
+    """Travel per pulse is 2 pi r / (pulses * gear), decristoforis2020, eq. (1)."""
+    robot = DifferentialDrive(0.05, 0.19, encoder_pulses_per_turn=13, gear_ratio=34.0)
+    quantum = 2 * math.pi * 0.05 / (13 * 34)
+    assert robot.encoder_quantum_m == pytest.approx(quantum)
+    read = robot.encoder_reading(np.array([[100.5, -0.5], [0.25, 441.0001]]) * quantum)
+    np.testing.assert_allclose(read / quantum, [[100, -1], [0, 441]], atol=1e-9)
+    turn = robot.encoder_reading(np.array([2 * math.pi * 0.05 + 1e-9] * 2))
+    assert turn / quantum == pytest.approx([442, 442])
+
+
+def test_counts_become_metres_by_the_nominal_radius():
+    """The wheel's angle is true, and the radius that makes it metres is the controller's."""
+    robot = DifferentialDrive(
+        0.05, 0.19, nominal_wheel_radius_m=0.06, encoder_pulses_per_turn=100, gear_ratio=2.0
+    )
+    turns = np.array([1.503, 0.2511])
+    read = robot.encoder_reading(turns * 2 * math.pi * 0.05)
+    assert (read / (2 * math.pi * 0.06) * 200).tolist() == pytest.approx([300, 50])
+
+
 def test_travel_window_does_not_inflate_travel_by_encoder_noise():
     """At k <= 1e-4 m and 75 Hz the sum of |ds| stays within 2 % of the distance, crawling."""
     rng = np.random.default_rng(3)
@@ -133,7 +176,21 @@ def test_wheel_variances_are_k_times_travel():
 
 @pytest.mark.parametrize(
     "change",
-    [{"kr": -1.0}, {"kl": math.nan}, {"track_m": 0.0}, {"bias_left": 2.0}, {"kr": math.inf}],
+    [
+        {"kr": -1.0},
+        {"kl": math.nan},
+        {"track_m": 0.0},
+        {"bias_left": 2.1},
+        {"bias_right": -0.7},
+        {"bias_right": math.nan},
+        {"kr": math.inf},
+        {"nominal_track_m": 0.0},
+        {"nominal_wheel_radius_m": math.nan},
+        {"encoder_pulses_per_turn": -1},
+        {"gear_ratio": 0.0},
+        {"gear_ratio": 34.0},  # without pulses
+        {"encoder_pulses_per_turn": 13, "encoder_tick_m": 1e-3},
+    ],
 )
 def test_impossible_robots_are_refused(change):
     with pytest.raises(InputError, match=f"robot.{next(iter(change))}"):

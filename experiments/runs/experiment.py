@@ -25,10 +25,11 @@ from experiments.runs.row import Row
 from experiments.runs.seeds import stream
 from experiments.runs.targets import make, targets
 from experiments.runs.version import version_with
+from sim.arrays import Array
 from sim.errors import InputError
-from sim.recording import Recording, load
+from sim.recording import Frame, Recording, load
 from sim.robot import DifferentialDrive, RobotGeometry
-from sim.sensors import Sensor, sensors_from_config
+from sim.sensors import Sensor, Sensors, sensors_from_config
 from sim.settings import build, find
 from sim.world import World
 
@@ -173,7 +174,10 @@ class Experiment:
     @property
     def recording_key(self) -> str:
         """Digest of what decides the recording's bits: its settings, or a file's; and the code."""
-        return key_of(self._recording_settings())
+        settings = self._recording_settings()
+        others = {target for target in targets(settings) if not target.startswith("sim.")}
+        # sensors, routes and estimators on board whose code is not the simulator's
+        return key_of(settings | ({"code": version_with(others)} if others else {}))
 
     def labels(self, checksum: str) -> Row:
         """Columns that state a row's origin: choices, all keys, versions, recording's checksum."""
@@ -319,7 +323,17 @@ class Experiment:
             rays=self.config["simulation"]["rays"],
             config={key: self.config[key] for key in _SIMULATED_KEYS},
             on_progress=on_progress,
+            onboard=self._onboard,
         )
+
+    def _onboard(
+        self, world: World, robot: RobotGeometry, sensors: Sensors, start: Array
+    ) -> Callable[[Frame], Array]:
+        """Start the estimator that the route's feedback names; it knows the start and the map."""
+        estimator: Estimator = make(self.config["route"]["feedback"], "route.feedback")
+        prior = Prior(robot, sensors, start.copy(), np.zeros((3, 3)), world)
+        estimator.reset(prior, stream(self.config["seed"], "onboard"))
+        return lambda frame: estimator.step(frame).mean
 
     def recording(self, on_progress: Callable[[float], None] | None = None) -> Recording:
         """Read the recording, find it in the cache, or simulate it.

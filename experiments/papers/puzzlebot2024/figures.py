@@ -23,6 +23,11 @@ _METHODS = {
     "sampled": "end poses, sampled",
     "linearised": "end poses, linearised",
 }
+_ROBOTS = {
+    "puzzlebot": "nominal geometry right",
+    "puzzlebot_short_turns": "turns 0.44 of the command",
+}
+_FEEDBACKS = {"truth": "steered by the true pose", "odometry": "steered by odometry"}
 _PARAMETERS = {"kr": "$k_r$", "kl": "$k_l$"}
 
 
@@ -31,6 +36,9 @@ def draw(made: Results) -> dict[str, Figure]:
     drawn = made.arrays("drawn")
     return {
         "puzzlebot2024_ideal_and_real": ideal_and_real(drawn),
+        "puzzlebot2024_square_feedback": square_feedback(
+            made.table("square_feedback"), made.arrays("square_feedback")
+        ),
         "puzzlebot2024_ellipse_area": ellipse_area(
             made.table("areas"), made.table("crossover"), drawn
         ),
@@ -56,6 +64,29 @@ def ideal_and_real(square: Arrays) -> Figure:
         )
         title = f"$k_r$ = {kr:.2g} m, $k_l$ = {kl:.2g} m"
         ax.set(xlabel="x, m", ylabel="y, m", aspect="equal", title=title)
+    return with_legend(page, ncols=3)
+
+
+def square_feedback(table: pd.DataFrame, paths: Arrays) -> Figure:
+    """Draw the square as driven and as believed, by feedback and robot."""
+    page, axes = subplots(9.0, 8.6, 2, 2, sharex="row", sharey="row")
+    for line, (robot, its) in zip(axes, _ROBOTS.items(), strict=True):
+        for ax, (feedback, steered) in zip(line, _FEEDBACKS.items(), strict=True):
+            chosen = table["robot"].eq(robot) & table["feedback"].eq(feedback)
+            rows = np.flatnonzero(chosen)
+            ax.plot(*paths["wanted_m"].T, color=BLACK, lw=3.0, alpha=0.25, label="wanted square")
+            for name, color, label in (
+                ("true_m", ORANGE, "true path"),
+                ("believed_m", BLUE, "path by odometry"),
+            ):
+                ways = paths[name][rows]
+                ax.plot(*ways[1:].T, color=color, lw=0.4, alpha=0.5)
+                ax.plot(*ways[0].T, color=color, lw=1.2, label=label)
+                ax.plot(*ways[:, -1].T, ".", color=color, ms=5)
+            end_m = table.loc[chosen, "true_end_m"].median()
+            title = f"{its}, {steered}\nmedian end {end_m:.2f} m from the corner wanted"
+            ax.set_title(title, fontsize="medium")
+            ax.set(xlabel="x, m", ylabel="y, m", aspect="equal")
     return with_legend(page, ncols=3)
 
 
