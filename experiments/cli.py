@@ -36,6 +36,9 @@ _PASS_ON = {
 Overrides = Annotated[
     list[str] | None, typer.Argument(help="Hydra overrides, such as world=office seed=3.")
 ]
+ConfigDir = Annotated[
+    Path | None, typer.Option("--config-dir", "-cd", help="Folder with options of your own.")
+]
 
 
 def _print_version(wanted: bool) -> None:
@@ -116,17 +119,18 @@ def _draw_run(recording: Recording, estimate: Estimate, name: str, folder: Path)
 def record(
     out: Annotated[Path, typer.Option("--out", "-o", help="File to write, .npz.")],
     overrides: Overrides = None,
+    config_dir: ConfigDir = None,
 ) -> None:
     """Simulate a recording and save it.
 
     Example: estima record -o office.npz world=office sensors=lms291 seed=3
     """
-    from experiments.runs.experiment import Experiment
+    from experiments.runs.experiment import Experiment, searched
     from sim.recording import save
 
     if out.suffix != ".npz":
         raise InputError(f"-o {out}: a recording is an .npz file")
-    experiment = Experiment.compose(overrides or [])
+    experiment = Experiment.compose([*searched(config_dir), *(overrides or [])])
     with progress("simulated seconds") as on_progress:
         recording = experiment.simulate(on_progress)
     checksum = save(recording, out)
@@ -236,6 +240,7 @@ def view(
             help="Duration; shorter if there are few Frames [saved: 20, live: real time]."
         ),
     ] = None,
+    config_dir: ConfigDir = None,
 ) -> None:
     """Show a run as an animation, in a window or in a file; or draw a world.
 
@@ -251,8 +256,10 @@ def view(
 
       estima view --world world=office seed=3 -o office.png
     """
+    from experiments.runs.experiment import searched
+
     if world:
-        _draw_world(what or [], out or Path("world.png"))
+        _draw_world([*searched(config_dir), *(what or [])], out or Path("world.png"))
         return
     if not what or "=" in what[0]:
         raise InputError("name a recording to view, such as run.npz, or say --world")
@@ -260,7 +267,7 @@ def view(
         raise InputError(f"--seconds must lie between 0 and 3600, got {seconds:g}")
     if estimate is None and len(what) > 1:
         raise InputError(f"{what[1]}: overrides need an estimator; add --estimate NAME")
-    _show_run(Path(what[0]), estimate, what[1:], out, seconds)
+    _show_run(Path(what[0]), estimate, [*searched(config_dir), *what[1:]], out, seconds)
 
 
 def _draw_world(overrides: list[str], out: Path) -> None:
@@ -341,6 +348,7 @@ def conform(
         list[str] | None,
         typer.Argument(help="Overrides of the option, or the constructor's arguments, key=value."),
     ] = None,
+    config_dir: ConfigDir = None,
 ) -> None:
     """Run the checks that every estimator must pass.
 
@@ -351,8 +359,9 @@ def conform(
       estima conform estimators.odometry:Odometry kr=1e-5 kl=1e-5
     """
     from experiments.gate.conform import conform_target
+    from experiments.runs.experiment import searched
 
-    results = conform_target(target, arguments or [])
+    results = conform_target(target, arguments or [], searched(config_dir))
     for result in results:
         print(f"{'pass' if result.passed else 'FAIL':<5}{result.name}: {result.message}")
     if not all(result.passed for result in results):

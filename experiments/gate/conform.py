@@ -180,8 +180,9 @@ def _reset(new: Make, recording: Recording, prior: Prior) -> str:
 def _equivariant(new: Make, recording: Recording, prior: Prior) -> str:
     """Move the world; the beliefs must move with it."""
     recording, moved = recording.cut(30), _moved_prior(prior)
+    elsewhere = _moved_readings(recording)
     if not getattr(new(), "global_or_grid", False):
-        here, there = walk(new(), recording, prior), walk(new(), recording, moved)
+        here, there = walk(new(), recording, prior), walk(new(), elsewhere, moved)
         if not all(np.isfinite(part).all() for part in (*here, *there)):
             return "not finite"
         tolerance = 1e-9 if _same(here, walk(new(), recording, prior, seed=1)) else 1e-6
@@ -189,8 +190,20 @@ def _equivariant(new: Make, recording: Recording, prior: Prior) -> str:
         return f"off by {fault:.2g} (allowed {tolerance:g})" if fault > tolerance else ""
     seeds = range(N_SEEDS)
     ends = np.array([walk(new(), recording, prior, seed)[0][-1] for seed in seeds])
-    moved_ends = np.array([walk(new(), recording, moved, N_SEEDS + s)[0][-1] for s in seeds])
+    moved_ends = np.array([walk(new(), elsewhere, moved, N_SEEDS + s)[0][-1] for s in seeds])
     return _differ(ends, se2.compose(se2.inverse(MOTION), moved_ends))
+
+
+def _moved_readings(recording: Recording) -> Recording:
+    """Return the recording with readings of places in map, as a beacon's, in the moved map."""
+    for name, log in recording.logs.items():
+        values = dict(log.values)
+        for key in (key for key, field in log.schema.items() if field.in_map):
+            values[key] = values[key].copy()
+            flat = values[key][..., :2].reshape(-1, 2).astype(np.float64)
+            values[key][..., :2] = se2.transform(MOTION, flat).reshape(values[key][..., :2].shape)
+        recording = recording.with_log(name, dataclasses.replace(log, values=values))
+    return recording
 
 
 def _differ(first: Array, second: Array) -> str:
@@ -297,7 +310,9 @@ _CHECKS: Mapping[str, Callable[[Make, Recording, Prior], str]] = {
 }
 
 
-def conform_target(target: str, arguments: Sequence[str]) -> list[CheckResult]:
+def conform_target(
+    target: str, arguments: Sequence[str], searched: Sequence[str] = ()
+) -> list[CheckResult]:
     """Check an estimator on a small recording.
 
     Parameters
@@ -307,14 +322,16 @@ def conform_target(target: str, arguments: Sequence[str]) -> list[CheckResult]:
     arguments
         Hydra overrides of the option, or the constructor's arguments, key=value; overrides of
         `sensors` say what the recording is made with.
+    searched
+        Override that names where else options are.
     """
     sensors = [a for a in arguments if a.lstrip("+~").startswith("sensors")]
     if ":" in target or "." in target:
         new = _of_class(target, [a for a in arguments if a not in sensors])
     else:
-        new = Experiment.compose([f"estimator={target}", *arguments]).estimator
+        new = Experiment.compose([*searched, f"estimator={target}", *arguments]).estimator
     places = "place|lidar3d" in getattr(new(), "needs", ())
-    return check_estimator(new, *example(sensors, places=places))
+    return check_estimator(new, *example([*searched, *sensors], places=places))
 
 
 def _of_class(target: str, arguments: Sequence[str]) -> Make:

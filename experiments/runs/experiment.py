@@ -433,6 +433,22 @@ def _presets_with(names: Sequence[str]) -> list[str]:
     return sorted(preset for preset, sensors in found.items() if any(n in sensors for n in names))
 
 
+def searched(config_dir: str | Path | None) -> list[str]:
+    """Override that makes Hydra look for options in another folder too; none for None.
+
+    Raises
+    ------
+    InputError
+        If there is no such folder.
+    """
+    if config_dir is None:
+        return []
+    folder = Path(config_dir).resolve()
+    if not folder.is_dir():
+        raise InputError(f"--config-dir must name a folder, got {config_dir}")
+    return [f"hydra.searchpath=[{paths.quoted(f'file://{folder}')}]"]
+
+
 def check_overrides(overrides: Sequence[str]) -> None:
     """Check what Hydra itself does not: that each override has a key, and groups have names.
 

@@ -48,8 +48,8 @@ def _line(name: str, stamps: Array) -> str:
 def _field(log: Log, name: str) -> str:
     """What a field holds, in words."""
     kind, values = log.schema[name], log[name]
-    shape = " x ".join(map(str, values.shape[1:])) or "a number"
-    words = f"{name}: {shape}{f' in {kind.unit}' if kind.unit else ''}"
+    shape = " x ".join(map(str, values.shape[1:]))
+    words = ", ".join(filter(None, (name, shape, kind.unit)))
     if kind.ragged:
         words += f", {len(values) / max(len(log.stamps), 1):.1f} rows a reading"
     elif kind.dtype in ("f4", "f8") and values.size:

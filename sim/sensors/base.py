@@ -55,6 +55,8 @@ class Field:
         Whether a reading has any number of rows of this shape.
     truth
         Whether it is kept with the truth, out of every Frame.
+    in_map
+        Whether it holds points of the frame map, (..., 2) or (..., 3).
     """
 
     unit: str = ""
@@ -62,6 +64,7 @@ class Field:
     shape: tuple[int | None, ...] = ()
     ragged: bool = False
     truth: bool = False
+    in_map: bool = False
 
     def __post_init__(self) -> None:
         if self.dtype not in _DTYPES:
@@ -261,7 +264,7 @@ class RecordedSensor:
         raise InputError(f"a recorded {self.target} cannot be simulated; name its class in sensors")
 
 
-def sensor_of(sensors: Sensors, name: str, kind: type[S]) -> S:
+def sensor_of(sensors: Sensors, name: str, kind: type[S] = object) -> S:  # type: ignore[assignment]
     """Return the sensor of a name.
 
     Raises
