@@ -53,14 +53,13 @@ def upgraded(
             arrays["logs.stereo.descriptors"] = np.zeros((n_points, 0), np.float32)
         if len(true_ids) == n_points:
             arrays["truth.readings.stereo.true_ids"] = true_ids
-    logged = {name.split(".")[1] for name in arrays if name.startswith("logs.")}
     schemas = {
         name: {
             key: dataclasses.asdict(field)
             for key, field in sensor.schema.items()
-            if not field.truth
+            if f"{'truth.readings' if field.truth else 'logs'}.{name}.{key}" in arrays
         }
         for name, sensor in sensors_from_meta(sensors, {}).items()
-        if name in logged
+        if f"logs.{name}.stamps" in arrays
     }
     return arrays, {**meta, "sensors": sensors, "schemas": schemas}
