@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +11,7 @@ from numpy.typing import ArrayLike
 from sim.arrays import Array
 from sim.compiled import njit
 from sim.errors import InputError
-from sim.robot import SLIP_TIME_CONSTANT_S, DifferentialDrive, arc_increment
+from sim.robot import SLIP_TIME_CONSTANT_S, SMALL_ANGLE_RAD, DifferentialDrive
 from sim.route import TICK_S, OpenLoop
 
 _BLOCK_NORMALS = 2_000_000  # drawn at once, 16 MB; the bits do not depend on it
@@ -31,20 +32,32 @@ class KinematicBody:
 
     def __init__(self, robot: DifferentialDrive, pose: ArrayLike, dt_s: float = TICK_S) -> None:
         self._track_m, self._dt_s = robot.track_m, dt_s
-        self._pose = np.array(pose, dtype=np.float64)
+        self._x, self._y, self._heading = np.array(pose, dtype=np.float64).tolist()
 
-    def step(self, wheel_speeds_mps: Array) -> Array:
-        """Advance one tick at ground speeds (2,), right and left; return the rolling (2,) m."""
-        rolling: Array = np.asarray(wheel_speeds_mps, dtype=np.float64) * self._dt_s
-        x, y, turn = arc_increment(rolling, self._track_m)
-        cos, sin = np.cos(self._pose[2]), np.sin(self._pose[2])
-        self._pose += (cos * x - sin * y, sin * x + cos * y, turn)
-        return rolling
+    def step(self, right_mps: float, left_mps: float) -> tuple[float, float]:
+        """Advance one tick at ground speeds of the wheels; return their rolling, m."""
+        right, left = right_mps * self._dt_s, left_mps * self._dt_s
+        x, y, turn = _arc(right, left, self._track_m)
+        cos, sin = math.cos(self._heading), math.sin(self._heading)
+        self._x += cos * x - sin * y
+        self._y += sin * x + cos * y
+        self._heading += turn
+        return right, left
 
     @property
     def pose(self) -> Array:
         """(3,) m, m, rad: base_link in map; the heading is not wrapped."""
-        return self._pose.copy()
+        return np.array([self._x, self._y, self._heading])
+
+
+def _arc(right_m: float, left_m: float, track_m: float) -> tuple[float, float, float]:
+    """`robot.arc_increment` in floats: one robot's tick is too small for NumPy's calls."""
+    turn = (right_m - left_m) / track_m
+    half = turn / 2.0
+    small = abs(half) < SMALL_ANGLE_RAD
+    chord = (right_m + left_m) / 2.0
+    chord *= 1.0 - half**2 / 6.0 if small else math.sin(half) / half
+    return chord * math.cos(half), chord * math.sin(half), turn
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ import math
 from collections import deque
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,7 +21,7 @@ from sim.errors import InputError
 from sim.settings import check_numbers
 
 SLIP_TIME_CONSTANT_S = 0.1
-_SMALL_ANGLE_RAD = 1e-4
+SMALL_ANGLE_RAD = 1e-4
 _LEAST_BIAS, _MOST_BIAS = -0.67, 2.0  # the encoder reads between a third and three times the travel
 
 
@@ -166,6 +167,10 @@ class DifferentialDrive:
         speeds: Array = np.stack([v + turn, v - turn], axis=-1)
         return speeds * (self.wheel_radius_m / nominal.wheel_radius_m)
 
+    def slips(self, dt_s: float) -> tuple[Slip, Slip]:
+        """Slip of the right and the left wheel of the robot at rest."""
+        return Slip(self.kr, self.bias_right, dt_s), Slip(self.kl, self.bias_left, dt_s)
+
     def encoder_reading(self, position_m: Array) -> Array:
         """What the encoders report (..., 2), m, at positions (..., 2) along the ground, m.
 
@@ -212,17 +217,20 @@ def wheel_errors(travel_m: ArrayLike, variance_per_m: ArrayLike, rng: np.random.
         Errors of the shape of `travel_m`.
     """
     travel = np.asarray(travel_m, float)
-    return _scaled_errors(travel, variance_per_m, rng.standard_normal(travel.shape))
+    errors: Array = scaled_error(travel, variance_per_m, rng.standard_normal(travel.shape))
+    return errors
 
 
-def _scaled_errors(travel_m: Array, variance_per_m: ArrayLike, standard_normal: Array) -> Array:
-    """Encoder errors, m, of variance k |ds| from normals drawn beforehand."""
+def scaled_error(travel_m: Any, variance_per_m: Any, standard_normal: Any) -> Any:
+    """Encoder error, m, of variance k |ds| from a normal drawn beforehand."""
+    if isinstance(travel_m, float):  # NumPy's call would cost ten times more
+        return math.sqrt(variance_per_m * abs(travel_m)) * standard_normal
     return np.sqrt(variance_per_m * np.abs(travel_m)) * standard_normal
 
 
 @dataclass
 class Slip:
-    """The slip of the wheels, tick by tick, for one robot or a batch of them.
+    """The slip of one wheel, tick by tick; in floats for one robot, in arrays for a batch.
 
     At each tick the wheel is driven at `command - correction_mps`; it rolls `rolling_m` on the
     ground and its encoder reads that plus an error of variance k |rolling|, white over ticks.
@@ -232,34 +240,31 @@ class Slip:
 
     Attributes
     ----------
+    variance_per_m, bias
+        k, m, and the share by which the encoder reads more than the wheel rolls.
+    dt_s
+        Length of a tick.
     lag_m
-        State of the lag, (..., 2) m.
+        State of the lag.
     """
 
-    variance_per_m: Array
-    bias: Array
+    variance_per_m: float
+    bias: float
     dt_s: float
-    lag_m: Array
-
-    @classmethod
-    def start(cls, robot: DifferentialDrive, dt_s: float, batch: tuple[int, ...] = ()) -> Slip:
-        """Slip of a robot at rest."""
-        return cls(robot.slip_variance_per_m, robot.slip_bias, dt_s, np.zeros((*batch, 2)))
+    lag_m: Any = 0.0
 
     @property
-    def correction_mps(self) -> Array:
-        """Speed (..., 2) to take off the wheel command at the next tick, m/s."""
+    def correction_mps(self) -> Any:
+        """Speed to take off the wheel's command at the next tick, m/s."""
         return self.lag_m / self.dt_s
 
-    def advance(
-        self, rolling_m: Array, standard_normal: Array, extra_m: Array | float = 0.0
-    ) -> Array:
-        """Encoder increment (..., 2), m, of a tick in which the wheels rolled `rolling_m`.
+    def advance(self, rolling_m: Any, standard_normal: Any, extra_m: Any = 0.0) -> Any:
+        """Encoder increment, m, of a tick in which the wheel rolled `rolling_m`.
 
         `extra_m` is an encoder error from outside the law.
         """
         error = self.bias * rolling_m + extra_m
-        error += _scaled_errors(rolling_m, self.variance_per_m, standard_normal)
+        error += scaled_error(rolling_m, self.variance_per_m, standard_normal)
         self.lag_m += (self.dt_s / SLIP_TIME_CONSTANT_S) * (error - self.lag_m)
         return rolling_m + error
 
@@ -273,7 +278,7 @@ def arc_increment(travel_m: ArrayLike, track_m: float) -> Array:
     forward = (travel[..., 0] + travel[..., 1]) / 2.0
     turn = (travel[..., 0] - travel[..., 1]) / track_m
     half = turn / 2.0
-    small = np.abs(half) < _SMALL_ANGLE_RAD
+    small = np.abs(half) < SMALL_ANGLE_RAD
     chord = forward * np.where(small, 1.0 - half**2 / 6.0, np.sin(half) / np.where(small, 1, half))
     return np.stack([chord * np.cos(half), chord * np.sin(half), turn], axis=-1)
 
@@ -287,7 +292,7 @@ def arc_increment_jacobian(travel_m: ArrayLike, track_m: float) -> Array:
     travel = np.asarray(travel_m, float)
     forward = (travel[..., 0] + travel[..., 1]) / 2.0
     half = (travel[..., 0] - travel[..., 1]) / track_m / 2.0
-    small = np.abs(half) < _SMALL_ANGLE_RAD
+    small = np.abs(half) < SMALL_ANGLE_RAD
     safe = np.where(small, 1.0, half)
     sinc = np.where(small, 1.0 - half**2 / 6.0, np.sin(safe) / safe)
     sinc_slope = np.where(small, -half / 3.0, (np.cos(safe) - np.sin(safe) / safe) / safe)

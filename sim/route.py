@@ -206,12 +206,13 @@ class Pursuit:
         for i in range(low, min(max(high, low + 2), len(self._path)) - 1):
             start, way = self._path[i], self._path[i + 1] - self._path[i]
             length = self._along_m[i + 1] - self._along_m[i]
-            share = float(np.clip((pose[:2] - start) @ way / length**2, 0.0, 1.0))
+            share = min(max(float((pose[:2] - start) @ way / length**2), 0.0), 1.0)
             at_m = self._along_m[i] + share * length
             if not self._done_m - 1e-9 <= at_m <= ahead_m:
                 at_m = min(max(at_m, self._done_m), ahead_m)
                 share = (at_m - self._along_m[i]) / length
-            gap = float(np.hypot(*(pose[:2] - start - share * way)))
+            x, y = (pose[:2] - start - share * way).tolist()
+            gap = float(np.hypot(x, y))
             if gap < best - 1e-9:
                 best, done_m = gap, at_m
         self._done_m, self._off_m = done_m, best

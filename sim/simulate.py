@@ -24,7 +24,7 @@ from sim.feedback import Feedback, Onboard, feedback_of
 from sim.kinematic import KinematicBody
 from sim.rays import BulletRays, ExactRays
 from sim.recording import CommandLog, Log, Recording, Truth, WheelLog, joined
-from sim.robot import DifferentialDrive, Slip
+from sim.robot import DifferentialDrive
 from sim.sensors.base import Probe, Rays, Reading, Sensor, Sensors, View, parted
 from sim.world import World
 
@@ -43,8 +43,8 @@ _SHARE_NOISE = ("laser", "stereo", "lidar3d")
 class Body(Protocol):
     """What moves: PyBullet's robot or the kinematic one."""
 
-    def step(self, wheel_speeds_mps: Array) -> Array:
-        """Advance one tick; return the wheels' rolling (2,) m."""
+    def step(self, right_mps: float, left_mps: float) -> tuple[float, float]:
+        """Advance one tick at these wheel speeds; return the wheels' rolling, m."""
 
     @property
     def pose(self) -> Array:
@@ -139,7 +139,7 @@ def record(
         else:
             body = KinematicBody(robot, pose)
             caster = ExactRays(world)
-            find_trouble = lambda: "collision" if overlaps(world, robot, body.pose) else None  # noqa: E731
+            find_trouble = _Collisions(world, robot, body)
         probes = _probes(world, sensors, caster, streams["sensors"], pose)
         status = _drive(
             robot,
@@ -204,11 +204,11 @@ def _drive(
     on_progress: Callable[[float], None] | None,
 ) -> str:
     """Run tick by tick until the route ends or something goes wrong; return the status."""
-    slip = Slip.start(robot, DT_S)
+    right, left = robot.slips(DT_S)
     noise = _normals(rng)
     events = _SlipEvents(robot, rng)
     encoder, travel = np.zeros(2), np.zeros(2)
-    tick, velocity = 0, np.zeros(2)
+    tick, velocity, speeds = 0, (0.0, 0.0), (0.0, 0.0)
     while True:
         pose = body.pose
         due = [name for name, period in periods.items() if tick % period == 0]
@@ -216,11 +216,11 @@ def _drive(
         if due or wanted is None:
             counts = robot.encoder_reading(encoder)
             logs["/frames"].append((tick, (counts, travel.copy(), pose)))
-        readings = {name: probes[name](tick / TICKS_PER_S, pose) for name in due}
-        shown = {name: reading for name, reading in readings.items() if reading is not None}
-        for name, reading in shown.items():
-            logs[name].append((tick, reading))
         if due:
+            readings = {name: probes[name](tick / TICKS_PER_S, pose) for name in due}
+            shown = {name: reading for name, reading in readings.items() if reading is not None}
+            for name, reading in shown.items():
+                logs[name].append((tick, reading))
             feedback.see(tick / TICKS_PER_S, encoder, shown)
         if wanted is None or tick % _CHECK_EVERY == 0:
             trouble = (find_trouble() if wanted is not None else None) or driver.trouble
@@ -228,15 +228,18 @@ def _drive(
                 return f"{trouble} at {tick * DT_S:.2f} s near ({pose[0]:.2f}, {pose[1]:.2f})"
         if wanted is None:
             return "ok"
-        if not np.array_equal(wanted, velocity) or tick == 0:
-            velocity = wanted
+        if (*wanted,) != velocity or tick == 0:
+            velocity = (*wanted,)
+            speeds = (*robot.wheel_speeds(*velocity).tolist(),)
             logs["/commands"].append((tick, velocity))
         if on_progress is not None and tick % TICKS_PER_S == 0:
             on_progress(tick * DT_S)
-        speeds = robot.wheel_speeds(velocity[0], velocity[1]) - slip.correction_mps
-        rolling = body.step(speeds)
-        encoder = encoder + slip.advance(rolling, next(noise), events.error(rolling))
-        travel = travel + rolling
+        rolled = body.step(speeds[0] - right.correction_mps, speeds[1] - left.correction_mps)
+        z_right, z_left = next(noise)
+        extra_right, extra_left = events.error(rolled)
+        encoder[0] += right.advance(rolled[0], z_right, extra_right)
+        encoder[1] += left.advance(rolled[1], z_left, extra_left)
+        travel += rolled
         tick += 1
 
 
@@ -249,12 +252,7 @@ def overlaps(world: World, robot: DifferentialDrive, pose: Array) -> bool:
     to_base = np.array([[cos, sin], [-sin, cos]])
     start = (world.walls[low, :2] - pose[:2]) @ to_base.T
     along = (world.walls[low, 2:] - pose[:2]) @ to_base.T - start
-    half = np.array(
-        [
-            max(robot.body_length_m / 2, robot.wheel_radius_m),
-            max(robot.body_width_m, robot.track_m) / 2,
-        ]
-    )
+    half = _half_footprint_m(robot)
     # Clip each wall against the footprint's two slabs; what is left of it lies inside.
     with np.errstate(divide="ignore", invalid="ignore"):
         near, far = (-half - start) / along, (half - start) / along
@@ -266,6 +264,41 @@ def overlaps(world: World, robot: DifferentialDrive, pose: Array) -> bool:
     return bool(np.any(hit))
 
 
+class _Collisions:
+    """Looks for collisions of a body without an engine, and only where a wall is within reach."""
+
+    def __init__(self, world: World, robot: DifferentialDrive, body: Body) -> None:
+        self._world, self._robot, self._body = world, robot, body
+        self._reach_m = math.hypot(*_half_footprint_m(robot))
+        self._at, self._free_m = np.zeros(2), -1.0  # no wall is nearer to that point
+
+    def __call__(self) -> str | None:
+        """`collision` if the robot overlaps a wall now, else None."""
+        pose = self._body.pose
+        if math.hypot(*(pose[:2] - self._at)) + self._reach_m < self._free_m:
+            return None
+        self._at, self._free_m = pose[:2], _wall_distance_m(self._world, pose[:2])
+        return "collision" if overlaps(self._world, self._robot, pose) else None
+
+
+def _wall_distance_m(world: World, point: Array) -> float:
+    """Distance of a point (2,) to the nearest wall, m; inf without walls."""
+    start, along = world.walls[:, :2] - point, world.walls[:, 2:] - world.walls[:, :2]
+    share = np.clip(-np.sum(start * along, axis=1) / np.sum(along**2, axis=1), 0.0, 1.0)
+    gaps = start + share[:, None] * along
+    return float(np.hypot(*gaps.T).min(initial=np.inf))
+
+
+def _half_footprint_m(robot: DifferentialDrive) -> Array:
+    """Half the length and width (2,) of body and wheels, m."""
+    return np.array(
+        [
+            max(robot.body_length_m / 2, robot.wheel_radius_m),
+            max(robot.body_width_m, robot.track_m) / 2,
+        ]
+    )
+
+
 class _SlipEvents:
     """Slip that kr and kl do not describe: a wheel's encoder runs on by some centimetres."""
 
@@ -275,21 +308,22 @@ class _SlipEvents:
         self._rng = rng.spawn(1)[0]
         self._left = np.zeros(2, dtype=np.int64)
 
-    def error(self, rolling_m: Array) -> Array | float:
-        """Encoder error (2,) m of this tick."""
+    def error(self, rolling_m: tuple[float, float]) -> tuple[float, float]:
+        """Encoder errors of the right and left wheel, m, of this tick."""
         if self._chance == 0.0:
-            return 0.0
+            return 0.0, 0.0
         begins = self._rng.random(2) < self._chance
         self._left[begins] = _SLIP_EVENT_TICKS
         active = self._left > 0
         self._left[active] -= 1
-        return np.where(active, self._step_m * np.sign(rolling_m), 0.0)
+        right, left = np.where(active, self._step_m * np.sign(rolling_m), 0.0).tolist()
+        return right, left
 
 
-def _normals(rng: np.random.Generator, block: int = 3000) -> Iterator[Array]:
+def _normals(rng: np.random.Generator, block: int = 3000) -> Iterator[tuple[float, float]]:
     """Pairs of standard normals, drawn in blocks for speed; the bits do not depend on the block."""
     while True:
-        yield from rng.standard_normal((block, 2))
+        yield from rng.standard_normal((block, 2)).tolist()
 
 
 def _periods(sensors: Sensors) -> dict[str, int]:

@@ -1,6 +1,7 @@
 """Routes steered by the true pose, or by the robot's odometry with its nominal geometry."""
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from sim.errors import InputError
 from sim.feedback import CONTROL_TICKS, OdometryFeedback
 from sim.robot import DifferentialDrive, arc_increment
 from sim.route import OpenLoop, Tour
-from sim.sensors import Encoder, SensorSuite
+from sim.sensors import Encoder
 from sim.simulate import record
 from sim.world import World
 
@@ -29,7 +30,7 @@ CORNER = np.array(SQUARE.points[-1])
 
 def drive(robot, route=SQUARE, physics="kinematic", seed=0):
     streams = {axis: stream(seed, axis) for axis in ("slip", "sensors")}
-    sensors = SensorSuite(Encoder(50.0))
+    sensors = {"encoder": Encoder(50.0)}
     return record(EMPTY, robot, sensors, route, streams, physics=physics, rays="exact")
 
 
@@ -136,9 +137,50 @@ def test_a_square_from_the_configuration_on_the_robot_with_short_turns():
     assert experiment.route().feedback == "odometry"
 
 
+ONBOARD = "route.feedback={_target_: estimators.ekf_icp.EkfIcp, kr: 1e-4, kl: 1e-4}"
+
+
+def test_an_estimator_on_board_steers_by_what_it_makes_of_the_recording():
+    """It sees the Frames of the recording: run over it again, it has the same beliefs."""
+    experiment = Experiment.compose(
+        [
+            *("world=room", "sensors=hokuyo", "route.distance_m=3", "robot.kr=1e-4"),
+            *("robot.kl=1e-4", "simulation.physics=kinematic", ONBOARD),
+        ]
+    )
+    experiment.check()
+    believed = []
+
+    def spied(*arguments):
+        step = experiment._onboard(*arguments)
+        return lambda frame: believed.append(step(frame)) or believed[-1]
+
+    recording = record(
+        experiment.world(),
+        experiment.robot(),
+        experiment.sensors(),
+        experiment.route(),
+        {axis: np.random.default_rng(i) for i, axis in enumerate(("slip", "sensors"))},
+        physics="kinematic",
+        rays="exact",
+        onboard=spied,
+    )
+    assert recording.status == "ok"
+    truth = recording.truth
+    step = experiment._onboard(truth.world, recording.robot, recording.sensors, truth.poses[0])
+    again = [step(frame) for frame in recording.frames()]
+    np.testing.assert_array_equal(again[: len(believed)], believed)
+    assert np.hypot(*(again - truth.poses)[:, :2].T).max() < 0.02
+    by_truth = experiment.replaced(route={**experiment.config["route"], "feedback": "truth"})
+    assert by_truth.recording_key != experiment.recording_key
+
+
 def test_what_cannot_steer_is_refused_before_anything_is_simulated():
-    asked = Experiment.compose(["+route.feedback._target_=estimators.odometry.Odometry"])
-    with pytest.raises(InputError, match=r"route\.feedback names an onboard estimator"):
-        asked.check()
-    with pytest.raises(InputError, match=r"unknown key route\.feedback"):
-        Experiment.compose(["route=linear_1", "+route.feedback=odometry"]).check()
+    for overrides, message in (
+        ([ONBOARD], "route.feedback needs a sensor laser, and sensors=encoder has none"),
+        (["route.feedback={_target_: nowhere.Mine}"], "no module nowhere"),
+        (["route.feedback={kr: 1}"], "must be truth, odometry or a mapping"),
+        (["route=linear_1", "+route.feedback=odometry"], "unknown key route.feedback"),
+    ):
+        with pytest.raises(InputError, match=re.escape(message)):
+            Experiment.compose(overrides).check()

@@ -7,7 +7,7 @@ import pytest
 
 from sim.errors import InputError
 from sim.kinematic import KinematicBody, run_batch, wheel_commands
-from sim.robot import DifferentialDrive, Slip
+from sim.robot import DifferentialDrive
 from sim.route import TABLE_1, TICK_S, OpenLoop
 
 IDEAL = DifferentialDrive(wheel_radius_m=0.05, track_m=0.18)
@@ -17,7 +17,7 @@ ROUTE = OpenLoop(((0.5, 0.0, 1.0), (0.2, 0.9, 1.5), (0.0, -0.6, 1.0)))
 
 def test_body_rolls_along_exact_arcs():
     body = KinematicBody(IDEAL, [1.0, 2.0, 0.3], dt_s=1.0)
-    rolling = body.step(np.array([0.4, 0.1]))
+    rolling = body.step(0.4, 0.1)
     np.testing.assert_array_equal(rolling, [0.4, 0.1])
     turn, radius = 0.3 / 0.18, 0.25 / (0.3 / 0.18)
     expected = [
@@ -31,7 +31,7 @@ def test_body_rolls_along_exact_arcs():
 def test_heading_is_not_wrapped():
     body = KinematicBody(IDEAL, np.zeros(3), dt_s=1.0)
     for _ in range(4):
-        body.step(np.array([0.18, -0.18]))
+        body.step(0.18, -0.18)
     assert body.pose[2] == pytest.approx(8.0)
 
 
@@ -50,13 +50,14 @@ def test_batch_is_the_slip_law_tick_by_tick():
     profile = ROUTE.profile(NOISY)
     normals = rng.standard_normal((2, len(profile), 2))
     for run in range(2):
-        body, slip = KinematicBody(NOISY, np.zeros(3)), Slip.start(NOISY, TICK_S)
+        body, (right, left) = KinematicBody(NOISY, np.zeros(3)), NOISY.slips(TICK_S)
         encoder, ground = np.zeros(2), np.zeros(2)
         encoders = [encoder.copy()]
         for tick, velocity in enumerate(profile):
-            rolling = body.step(NOISY.wheel_speeds(*velocity) - slip.correction_mps)
-            encoder += slip.advance(rolling, normals[run, tick])
-            ground += rolling
+            speeds = NOISY.wheel_speeds(*velocity) - [right.correction_mps, left.correction_mps]
+            rolled, (z_right, z_left) = body.step(*speeds.tolist()), normals[run, tick].tolist()
+            encoder += right.advance(rolled[0], z_right), left.advance(rolled[1], z_left)
+            ground += rolled
             if (tick + 1) % 30 == 0:
                 encoders.append(encoder.copy())
         np.testing.assert_allclose(runs.end_poses[run], body.pose, atol=1e-9)

@@ -9,7 +9,6 @@ from sim.errors import InputError
 from sim.robot import (
     DifferentialDrive,
     RobotGeometry,
-    Slip,
     TravelWindow,
     arc_increment,
     arc_increment_jacobian,
@@ -41,6 +40,21 @@ def test_arc_jacobian_matches_finite_differences(wheels):
         assert np.allclose(numeric, exact[:, i], atol=1e-7)
 
 
+class Wheels:
+    """Both wheels' slip, of one robot or a batch, in arrays (..., 2)."""
+
+    def __init__(self, robot, dt_s):
+        self.slips = robot.slips(dt_s)
+
+    @property
+    def correction_mps(self):
+        return np.stack([slip.correction_mps for slip in self.slips], axis=-1)
+
+    def advance(self, rolling, normals):
+        parts = [s.advance(rolling[..., i], normals[..., i]) for i, s in enumerate(self.slips)]
+        return np.stack(parts, axis=-1)
+
+
 def test_right_wheel_turns_counter_clockwise():
     assert arc_increment([0.1, 0.0], 0.2)[2] > 0
     assert arc_increment_jacobian([0.1, 0.1], 0.2)[2].tolist() == pytest.approx([5.0, -5.0])
@@ -51,11 +65,11 @@ def test_slip_law_over_a_batch():
     robot = DifferentialDrive(0.05, 0.19, kr=1e-4, kl=3e-4)
     rng = np.random.default_rng(1)
     n_runs, n_ticks = 400, 600
-    slip = Slip.start(robot, DT_S, (n_runs,))
+    slip = Wheels(robot, DT_S)
     ground, encoder = np.zeros((n_runs, 2)), np.zeros((n_runs, 2))
     grounds, encoders = [], []
     for _ in range(n_ticks):
-        rolling = (0.5 - slip.correction_mps) * DT_S
+        rolling = np.broadcast_to(0.5 - slip.correction_mps, (n_runs, 2)) * DT_S
         encoder = encoder + slip.advance(rolling, rng.standard_normal((n_runs, 2)))
         ground = ground + rolling
         grounds.append(ground)
@@ -89,14 +103,14 @@ def test_slip_and_wheel_errors_are_one_law():
     robot = DifferentialDrive(0.05, 0.19, kr=1e-4, kl=3e-4)
     rolling = np.array([0.002, -0.001])
     normals = np.random.default_rng(4).standard_normal(2)
-    read = Slip.start(robot, DT_S).advance(rolling, normals)
+    read = Wheels(robot, DT_S).advance(rolling, normals)
     errors = wheel_errors(rolling, robot.slip_variance_per_m, np.random.default_rng(4))
     assert read.tolist() == (rolling + errors).tolist()
 
 
 def test_bias_makes_the_encoder_read_more():
     robot = DifferentialDrive(0.05, 0.19, bias_right=0.05)
-    slip = Slip.start(robot, DT_S)
+    slip = Wheels(robot, DT_S)
     encoder = ground = np.zeros(2)
     for _ in range(3000):
         rolling = (0.5 - slip.correction_mps) * DT_S
@@ -109,7 +123,7 @@ def test_bias_makes_the_encoder_read_more():
 def test_bias_up_to_a_factor_of_three_settles(factor):
     """The wheel's loop, closed on the encoder, brings the encoder to the command."""
     robot = DifferentialDrive(0.05, 0.19, bias_right=factor - 1.0)
-    slip = Slip.start(robot, DT_S)
+    slip = Wheels(robot, DT_S)
     for _ in range(1500):
         rolling = (0.5 - slip.correction_mps) * DT_S
         read = slip.advance(rolling, np.zeros(2))

@@ -7,7 +7,7 @@ import hashlib
 import json
 import re
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -250,22 +250,32 @@ class Experiment:
         settings = self.config["estimator"]
         estimator = self.own_estimator or find(settings.get("_target_"), "estimator")
         needs = frozenset(getattr(estimator, "needs", ()))
-        has = {name for name, sensor in self.config["sensors"].items() if sensor is not None}
-        for need in needs - {"map"} if self.config["recording"] is None else ():
-            # an option of the estimator says how the sensor is called
-            names = [settings.get(option, option) for option in need.split("|")]
-            if not has.intersection(names):
-                presets = ", ".join(_presets_with(names)) or "one that has it"
-                raise InputError(
-                    f"estimator={self.estimator_name} needs a sensor {' or '.join(names)}, and "
-                    f"sensors={self.choices.get('sensors')} has none; try sensors={presets}"
-                )
+        if self.config["recording"] is None:
+            self._check_sensors(f"estimator={self.estimator_name}", needs - {"map"}, settings)
+            onboard = self.config["route"].get("feedback")
+            if isinstance(onboard, dict):
+                make(onboard, "route.feedback")
+                steering = getattr(find(onboard["_target_"], "route.feedback"), "needs", ())
+                self._check_sensors("route.feedback", frozenset(steering) - {"map"}, onboard)
         mapped = self.config["prior"]["map"] != "none" or settings.get("map_path")
         if "map" in needs and not mapped:
             raise InputError(
                 f"estimator={self.estimator_name} needs a map; set prior.map=world, or a mapping "
                 "with _target_"
             )
+
+    def _check_sensors(self, who: str, needs: Iterable[str], settings: Config) -> None:
+        """Check that the robot has the sensors that an estimator needs."""
+        has = {name for name, sensor in self.config["sensors"].items() if sensor is not None}
+        for need in needs:
+            # an option of the estimator says how the sensor is called
+            names = [settings.get(option, option) for option in need.split("|")]
+            if not has.intersection(names):
+                presets = ", ".join(_presets_with(names)) or "one that has it"
+                raise InputError(
+                    f"{who} needs a sensor {' or '.join(names)}, and "
+                    f"sensors={self.choices.get('sensors')} has none; try sensors={presets}"
+                )
 
     def world(self) -> World:
         """Make the world, from its own stream."""
