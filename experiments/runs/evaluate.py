@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import functools
+import os
 from collections.abc import Callable, Collection
 from contextlib import AbstractContextManager, nullcontext
 
 import numpy as np
+from threadpoolctl import ThreadpoolController
 
 from estimators.base import Estimate, Estimator, Prior, run
 from experiments.evaluation.metrics import score
@@ -94,10 +97,27 @@ def estimates(
     keep: Collection[str] = (),
     on_step: Callable[[int], None] | None = None,
 ) -> tuple[Estimate, Estimate | None]:
-    """Online estimate of a run, and the revised one of an estimator that has `finish`."""
-    online = run(estimator, recording, prior, rng, keep, on_step)
-    finish = getattr(estimator, "finish", None)
-    return online, None if finish is None else finish()
+    """Online estimate of a run, and the revised one of an estimator that has `finish`.
+
+    BLAS uses one thread, unless the environment sets OMP_NUM_THREADS or OPENBLAS_NUM_THREADS: its
+    threads spin while they wait, and the matrices of filters are small.
+    """
+    with _one_blas_thread():
+        online = run(estimator, recording, prior, rng, keep, on_step)
+        finish = getattr(estimator, "finish", None)
+        return online, None if finish is None else finish()
+
+
+def _one_blas_thread() -> AbstractContextManager[object]:
+    asked = {"OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"} & set(os.environ)
+    return nullcontext() if asked else _blas().limit(limits=1, user_api="blas")
+
+
+@functools.cache
+def _blas() -> ThreadpoolController:
+    import scipy.linalg  # noqa: F401 its BLAS is found once it is loaded
+
+    return ThreadpoolController()
 
 
 def scored(recording: Recording, online: Estimate, revised: Estimate | None) -> Row:
