@@ -11,7 +11,7 @@ from experiments.runs.experiment import make
 from sim.bullet import BulletBody
 from sim.robot import DifferentialDrive
 from sim.sensors import Laser, Lidar3D, Mount
-from sim.simulate import BulletRays, ExactRays
+from sim.rays import BulletRays, ExactRays
 
 pytestmark = pytest.mark.bullet
 

@@ -66,8 +66,9 @@ class OwnRandomness(Base):
 class Meddler(Base):
     def step(self, frame):
         belief = super().step(frame)
-        if frame.ranges_m is not None and frame.ranges_m.flags.writeable:
-            frame.ranges_m[0] = 0.0
+        scan = frame.readings.get("laser")
+        if scan is not None and scan["ranges_m"].flags.writeable:
+            scan["ranges_m"][0] = 0.0
         return belief
 
 
@@ -121,13 +122,13 @@ def test_each_fault_fails_its_check(cls, checks, case):
 class Careful(Base):
     """Needs everything that can be taken away, and says so when it is."""
 
-    needs = frozenset({"wheels", "laser", "landmarks", "map"})
+    needs = frozenset({"laser", "stereo", "map"})
 
     def reset(self, prior, rng):
         super().reset(prior, rng)
         for name, there in (
-            ("laser", prior.sensors.laser),
-            ("stereo", prior.sensors.stereo),
+            ("laser", prior.sensors.get("laser")),
+            ("stereo", prior.sensors.get("stereo")),
             ("map", prior.map),
         ):
             if there is None:
@@ -145,7 +146,7 @@ class Waiting(Base):
 
     def step(self, frame):
         self._frames += 1
-        self._scans += frame.ranges_m is not None
+        self._scans += "laser" in frame.readings
         if self._frames > 20 and self._scans == 0:
             raise InputError("20 Frames without a scan; is the laser on?")
         return super().step(frame)

@@ -27,7 +27,7 @@ def full_recording(n_frames=12):
     stamps = recording.frame_stamps[:3].copy()
     turns = rng.uniform(1.0, 9.0, (3, 4, 6)).astype(np.float32)
     turns[0, 0, 0] = np.inf
-    n_observed = len(recording.landmarks.points_in_camera)
+    n_observed = len(recording.log("stereo")["points_in_camera"])
     return dataclasses.replace(
         recording,
         sensors=dataclasses.replace(recording.sensors, lidar3d=lidar),
@@ -111,9 +111,9 @@ def test_an_independent_reader_sees_the_same(tmp_path):
             messages.setdefault(channel.topic, []).append(message)
     scans = messages["/scan"]
     np.testing.assert_array_equal(
-        np.array([m.ranges for m in scans], np.float32), recording.laser.ranges_m
+        np.array([m.ranges for m in scans], np.float32), recording.log("laser")["ranges_m"]
     )
-    assert scans[0].angle_min == pytest.approx(recording.sensors.laser.bearings_rad[0])
+    assert scans[0].angle_min == pytest.approx(recording.sensors["laser"].bearings_rad[0])
     covariance = np.array(messages["/estimate"][3].pose.covariance).reshape(6, 6)
     np.testing.assert_array_equal(covariance, covariance_6x6(estimate.covariances[3]))
     assert covariance[0, 5] == covariance.ravel()[5] == estimate.covariances[3][0, 2]
@@ -216,9 +216,9 @@ def test_a_foreign_bag(tmp_path, with_odometry):
     recording = read_bag(foreign(tmp_path, with_odometry=with_odometry))
     step = 0.2 if with_odometry else 0.1
     np.testing.assert_allclose(np.diff(recording.wheels.position_m, axis=0), step, atol=1e-12)
-    assert recording.sensors.laser.mount.x_m == pytest.approx(0.15)
-    np.testing.assert_array_equal(recording.laser.ranges_m[0], [1.0, 2.0, np.inf, np.inf])
-    bearings = recording.sensors.laser.bearings_rad + recording.sensors.laser.mount.yaw_rad
+    assert recording.sensors["laser"].mount.x_m == pytest.approx(0.15)
+    np.testing.assert_array_equal(recording.log("laser")["ranges_m"][0], [1.0, 2.0, np.inf, np.inf])
+    bearings = recording.sensors["laser"].bearings_rad + recording.sensors["laser"].mount.yaw_rad
     np.testing.assert_allclose(bearings, [-0.3, -0.1, 0.1, 0.3], atol=1e-6)
     assert recording.truth is None
     with pytest.raises(InputError, match="no nav_msgs/msg/Odometry on /nothing; there is"):
@@ -228,8 +228,8 @@ def test_a_foreign_bag(tmp_path, with_odometry):
 def test_a_scanner_mounted_upside_down(tmp_path):
     recording = read_bag(foreign(tmp_path, flipped=True))
     # its first beam, at -0.3 rad of its own, looks to the left of the robot
-    np.testing.assert_array_equal(recording.laser.ranges_m[0], [np.inf, np.inf, 2.0, 1.0])
-    bearings = recording.sensors.laser.bearings_rad + recording.sensors.laser.mount.yaw_rad
+    np.testing.assert_array_equal(recording.log("laser")["ranges_m"][0], [np.inf, np.inf, 2.0, 1.0])
+    bearings = recording.sensors["laser"].bearings_rad + recording.sensors["laser"].mount.yaw_rad
     np.testing.assert_allclose(bearings, [-0.3, -0.1, 0.1, 0.3], atol=1e-6)
 
 

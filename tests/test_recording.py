@@ -91,8 +91,8 @@ def test_frames_show_each_sensor_when_it_fires():
     frames = list(small_recording().frames())
     assert [f.ranges_m is not None for f in frames] == [True, False] * 3
     assert [f.landmarks is not None for f in frames] == [False, True, False, False, True, False]
-    assert len(frames[1].landmarks.points_in_camera) == 2
-    assert frames[4].landmarks.ids.tolist() == [1]
+    assert len(frames[1].log("stereo")["points_in_camera"]) == 2
+    assert frames[4].log("stereo")["ids"].tolist() == [1]
     assert frames[0].duration_s == 0.0
     assert frames[0].wheel_increments_m.tolist() == [0.0, 0.0]
     total = sum(f.wheel_increments_m for f in frames)
@@ -109,7 +109,7 @@ def test_wheels_are_interpolated_between_their_stamps():
         frame_stamps=np.array([0.0, 0.25, 1.0]),
         wheels=WheelLog(stamps, np.array([[0.0, 0.0], [4.0, 2.0]])),
         robot=RobotGeometry(0.05, 0.19),
-        sensors=SensorSuite(),
+        sensors={},
     )
     increments = [f.wheel_increments_m.tolist() for f in recording.frames()]
     assert increments == [[0, 0], [1, 0.5], [3, 1.5]]
