@@ -153,7 +153,15 @@ def joined(schema: Schema, stamps: Array, readings: Sequence[Reading], where: st
     ragged = [name for name, field in schema.items() if field.ragged]
     splits = None
     if ragged:
-        sizes = [len(reading[ragged[0]]) for reading in readings]
+        first, *others = ragged
+        sizes = [len(reading[first]) for reading in readings]
+        for name in others:
+            for size, reading in zip(sizes, readings, strict=True):
+                if len(reading[name]) != size:
+                    raise InputError(
+                        f"{where}.{name} has {len(reading[name])} rows in a reading, "
+                        f"{where}.{first} {size}; they must be as many"
+                    )
         splits = np.cumsum([0, *sizes]).astype(np.int64)
     values = {
         name: field.joined([reading[name] for reading in readings], f"{where}.{name}")
@@ -291,10 +299,14 @@ class Recording:
         return dataclasses.replace(self, sensors=sensors, logs={**self.logs, name: log})
 
     def without(self, name: str) -> Recording:
-        """Return the recording without a sensor and its log."""
+        """Return the recording without a sensor, its log, and the truth of its readings."""
         sensors = {key: sensor for key, sensor in self.sensors.items() if key != name}
         logs = {key: log for key, log in self.logs.items() if key != name}
-        return dataclasses.replace(self, sensors=sensors, logs=logs)
+        truth = self.truth
+        if truth is not None:
+            hidden = {key: values for key, values in truth.readings.items() if key != name}
+            truth = dataclasses.replace(truth, readings=hidden)
+        return dataclasses.replace(self, sensors=sensors, logs=logs, truth=truth)
 
     def frames(self) -> Iterator[Frame]:
         """Walk through the Frames in order.
@@ -491,6 +503,8 @@ def _assemble(stored: dict[str, NDArray[Any]], meta: dict[str, Any]) -> Recordin
 
     logs, hidden = {}, {}
     schemas = {name: schema_from_meta(fields) for name, fields in meta["schemas"].items()}
+    if unknown := set(schemas) - set(meta["sensors"]):
+        raise InputError(f"readings of sensors that it does not describe: {sorted(unknown)}")
     for name, schema in schemas.items():
         seen, hidden_fields = parted(schema)
         values = part(f"logs.{name}")

@@ -135,7 +135,9 @@ def test_lego(tmp_path):
     paths = [write(tmp_path / name, data) for name, data in files.items()]
     recording = lego.read_lego(*paths, tick_m=0.001)
     np.testing.assert_allclose(recording.wheels.position_m[-1], [0.012, 0.010])  # right, left
-    np.testing.assert_allclose(recording.log("laser")["ranges_m"], [[0.5, 0.6, 0.7], [0.51, np.inf, np.inf]])
+    np.testing.assert_allclose(
+        recording.log("laser")["ranges_m"], [[0.5, 0.6, 0.7], [0.51, np.inf, np.inf]]
+    )
     # driving along x, the axle is 3 cm behind the scanner
     np.testing.assert_allclose(recording.truth.poses[0], [0.97, 1.0, 0.0], atol=1e-9)
     with pytest.raises(InputError, match="log:2: a scan of another size"):

@@ -95,7 +95,9 @@ def test_further_wheel_errors_keep_their_law(small):
 
 def test_noise_of_descriptors_alone_leaves_the_images(small):
     first, second = (everything(f"sensors.stereo.sigma_descriptor={s}") for s in (0.1, 0.9))
-    assert np.array_equal(first.log("stereo")["points_in_camera"], second.log("stereo")["points_in_camera"])
+    assert np.array_equal(
+        first.log("stereo")["points_in_camera"], second.log("stereo")["points_in_camera"]
+    )
 
 
 def test_recordings_with_other_cameras_have_other_keys():

@@ -53,7 +53,9 @@ def test_a_prior_without_what_an_estimator_needs_names_the_estimator():
     with pytest.raises(InputError, match=r"^mcl needs a start pose; "):
         start_pose(bare, "mcl")
     for require in (require_laser, require_stereo):
-        with pytest.raises(InputError, match=r"^mcl: no sensor named front .there is none.; choose"):
+        with pytest.raises(
+            InputError, match=r"^mcl: no sensor named front .there is none.; choose"
+        ):
             require(bare, "front", "mcl")
 
 
@@ -63,7 +65,7 @@ def test_a_sensor_is_found_by_its_name_and_must_be_of_its_kind():
     assert require_laser(prior, "rear", "mcl") is sensors["rear"]
     with pytest.raises(InputError, match=r"laser \(there is encoder, front, rear\); choose"):
         require_laser(prior, "laser", "mcl")
-    with pytest.raises(InputError, match="^fastslam: sensor front is no StereoCamera but a Laser"):
+    with pytest.raises(InputError, match=r"^fastslam: sensor front is no StereoCamera but a Laser"):
         require_stereo(prior, "front", "fastslam")
 
 

@@ -191,7 +191,9 @@ def test_selection_keeps_b_of_them(selection):
 def test_the_robot_is_not_in_its_own_scan():
     world = Experiment.compose(["world=room", "seed=0"]).world()
     laser = Laser(n_beams=90, fov_rad=2 * np.pi, sigma_range_m=0.0, mount=Mount(z_m=0.05))
-    recording = drive(PUZZLEBOT, (0.1, 0, 1.0), sensors={"encoder": Encoder(), "laser": laser}, world=world)
+    recording = drive(
+        PUZZLEBOT, (0.1, 0, 1.0), sensors={"encoder": Encoder(), "laser": laser}, world=world
+    )
     assert recording.log("laser")["ranges_m"].min() > 0.3
 
 

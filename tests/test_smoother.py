@@ -17,7 +17,7 @@ from sim import se2
 from sim.errors import InputError
 from sim.sensors import Mount, StereoCamera
 from sim.sensors.stereo import points_in_camera
-from tests.fakes import circle, tracking_prior
+from tests.fakes import circle, tracking_prior, with_field
 
 CAMERA = StereoCamera(mount=Mount(x_m=0.2, y_m=-0.1, z_m=0.5, yaw_rad=0.3))
 PIXELS = np.array([CAMERA.sigma_column_px, CAMERA.sigma_row_px, CAMERA.sigma_disparity_px])

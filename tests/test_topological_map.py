@@ -137,7 +137,8 @@ def test_a_map_from_a_mapping_run():
     rows = [int(np.argmin(np.hypot(*(run.truth.poses[:, :2] - p).T))) for p in known.positions_m]
     np.testing.assert_allclose(known.headings_rad, run.truth.poses[rows, 2])
     np.testing.assert_array_equal(
-        known.descriptors[3], descriptors.scan_context(LIDAR, run.log("lidar3d")["ranges_m"][rows[3]])
+        known.descriptors[3],
+        descriptors.scan_context(LIDAR, run.log("lidar3d")["ranges_m"][rows[3]]),
     )
     # the slice is the planar scan of the walls, 4 m away at most by sqrt 2
     bearings = LIDAR.azimuths_rad

@@ -16,6 +16,7 @@ from sim import se2
 from sim.errors import InputError
 from sim.recording import Frame
 from sim.robot import RobotGeometry
+from sim.sensors import PlaceDescriptor
 from tests.fakes import blind, place_route, with_reading
 from tests.test_topological_map import LIDAR, ring_run
 
@@ -27,6 +28,7 @@ PAPER = {
     "estimate": "mean",
 }
 ROBOT = RobotGeometry(0.1, 0.4)
+PLACES = {"place": PlaceDescriptor()}
 
 
 def line_map(n=10, step_m=2.0, join=True):
@@ -45,7 +47,7 @@ def frame(i, travel_m=2.0, descriptor=None, cloud_ranges_m=None):
 
 def started(known, seed=0, sensors=None, **options):
     estimator = TopologicalMcl(**options)
-    prior = Prior(ROBOT, sensors or {}, map=known)
+    prior = Prior(ROBOT, sensors or PLACES, map=known)
     estimator.reset(prior, np.random.default_rng(seed))
     return estimator
 
@@ -124,9 +126,7 @@ def test_paper_motion_hops_one_node_an_observation_and_not_before_the_first():
 def test_odometry_motion_follows_steps_of_any_length():
     """Known start and direction: after any number of steps the node is the one reached."""
     known = line_map(60)
-    prior = Prior(
-        ROBOT, {}, np.array([10.0, 0.0, 0.0]), np.diag([1e-4, 1e-4, 1e-4]), known
-    )
+    prior = Prior(ROBOT, PLACES, np.array([10.0, 0.0, 0.0]), np.diag([1e-4, 1e-4, 1e-4]), known)
     for travel in (0.37, 2.0, 5.3):
         estimator = TopologicalMcl(
             p_stay=0.0, p_skip=0.0, p_turn=0.0, sigma_l_m=0.3, injection=0.0, particles_per_node=50
@@ -146,9 +146,7 @@ def test_odometry_motion_follows_steps_of_any_length():
 
 def test_stay_and_skip_spread_the_particles_without_bias():
     known = line_map(200)
-    prior = Prior(
-        ROBOT, {}, np.array([40.0, 0.0, 0.0]), np.diag([1e-4, 1e-4, 1e-4]), known
-    )
+    prior = Prior(ROBOT, PLACES, np.array([40.0, 0.0, 0.0]), np.diag([1e-4, 1e-4, 1e-4]), known)
     estimator = TopologicalMcl(
         p_stay=0.2, p_skip=0.2, p_turn=0.0, sigma_l_m=0.3, particles_per_node=100, estimate="mean"
     )
@@ -305,7 +303,9 @@ def test_refinement_finds_the_pose_from_a_node_nearby():
     for row in (2, 9, 23):
         truth = run_.truth.poses[row]
         node = int(np.argmin(np.hypot(*(known.positions_m - truth[:2]).T)))
-        noisy = run_.log("lidar3d")["ranges_m"][row] + noise.normal(0, 0.01, (16, 360)).astype(np.float32)
+        noisy = run_.log("lidar3d")["ranges_m"][row] + noise.normal(0, 0.01, (16, 360)).astype(
+            np.float32
+        )
         found = refiner.refine(noisy, node, [])
         off = np.array(found.pose) - truth
         # a square room looks the same after a quarter turn: the heading of the node's is tried

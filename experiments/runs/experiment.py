@@ -24,7 +24,7 @@ from experiments.runs.cache import cached, key_of
 from experiments.runs.row import Row
 from experiments.runs.seeds import stream
 from experiments.runs.targets import make, targets
-from experiments.runs.version import version_with
+from experiments.runs.version import source_digest, version_with
 from sim.errors import InputError
 from sim.recording import Recording, load
 from sim.robot import DifferentialDrive, RobotGeometry
@@ -367,6 +367,9 @@ class Experiment:
         world_file = self.config["world"].get("path")
         if world_file is not None and Path(world_file).is_file():  # an edited file: another world
             settings["world_file"] = _digest(Path(world_file))
+        elsewhere = {target: source_digest(target) for target in sorted(targets(settings))}
+        if any(elsewhere.values()):  # a sensor, route or world of one's own, edited: another one
+            settings["sources"] = elsewhere
         return settings
 
     def prior(self, recording: Recording) -> Prior:
