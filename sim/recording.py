@@ -421,9 +421,9 @@ def load(path: Path) -> Recording:
         )
     if _digest(stored, meta) != checksum:
         raise InputError(f"{path}: the data do not match their checksum; {remedy}")
-    if meta["format"] == 1:
-        stored, meta = upgraded(stored, meta)
     try:
+        if meta["format"] == 1:
+            stored, meta = upgraded(stored, meta)
         return _assemble(stored, meta)
     except (InputError, *_UNREADABLE) as error:
         raise InputError(f"{path}: {error}; {remedy}") from error

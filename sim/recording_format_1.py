@@ -58,7 +58,7 @@ def upgraded(
         name: {
             key: dataclasses.asdict(field)
             for key, field in sensor.schema.items()
-            if not field.truth
+            if not field.truth or f"truth.readings.{name}.{key}" in arrays
         }
         for name, sensor in sensors_from_meta(sensors, {}).items()
         if name in logged
