@@ -1,5 +1,6 @@
 """Recordings and bags of version 0.1, built by hand as it wrote them."""
 
+import itertools
 import json
 
 import numpy as np
@@ -217,7 +218,7 @@ def old_bag(path, *, identified=True, with_truth=True, **sensors):
     parts |= {f"d{i}": column for i, column in enumerate(DESCRIPTORS.T)}
     images = [
         point_cloud.fields({name: column[a:b] for name, column in parts.items()})
-        for a, b in zip(SPLITS[:-1], SPLITS[1:], strict=True)
+        for a, b in itertools.pairwise(SPLITS)
     ]
     ros1 = path.suffix == ".bag"
     target = path if ros1 else path.with_suffix("")
