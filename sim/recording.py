@@ -78,6 +78,7 @@ class Log:
         sensor: Sensor,
         stamps: Array,
         splits: NDArray[np.int64] | None = None,
+        /,
         **values: NDArray[Any],
     ) -> Log:
         """Log of a sensor's readings, with the types of its schema.

@@ -16,17 +16,26 @@ from experiments.trajectories.convert import write_recording
 from sim.errors import InputError
 from sim.formats.detect import read_any
 from sim.formats.rosbag_in import read_bag
-from sim.recording import load, save
+from sim.recording import Log, load, save
 from sim.robot import DifferentialDrive
 from sim.route import OpenLoop
-from sim.sensors import Encoder, Gyroscope, Laser, Mount, StereoCamera, sensors_from_config
-from sim.sensors.base import RecordedSensor
+from sim.sensors import (
+    Encoder,
+    Field,
+    Gyroscope,
+    Laser,
+    Mount,
+    StereoCamera,
+    sensors_from_config,
+)
+from sim.sensors.base import RecordedSensor, schema_from_meta
 from sim.simulate import record
 from tests.beacons import Beacons, Compass, Forgetful
 from tests.fakes import square_room
 
 FRONT, REAR = Laser(n_beams=31), Laser(5.0, 17, mount=Mount(x_m=-0.1, yaw_rad=np.pi))
 SENSORS = {"encoder": Encoder(), "beacons": Beacons(), "laser": FRONT}
+COUNTS, ANY_COUNTS = Field("", "i4", (3,)), Field("", "i4", (None,))
 ENDINGS = [".mcap", ".bag", ".db3", ""]
 QUICK = ["simulation.physics=kinematic", "simulation.rays=exact", "world=room", "route=linear_1"]
 
@@ -249,6 +258,49 @@ def test_an_edited_sensor_is_another_recording(tmp_path, monkeypatch):
 def test_a_reading_without_a_field_of_the_schema_is_named():
     with pytest.raises(InputError, match=r"sensors\.f: a reading has the fields \['battery_v'\]"):
         drive({"encoder": Encoder(), "f": Forgetful()}, seconds=0.3)
+
+
+def recorded_as(recording, name, schema):
+    """The recording with two readings of a sensor of this schema."""
+    sensor = RecordedSensor("elsewhere.Sensor", {}, schema)
+    sizes = {key: (2, *(size or 4 for size in field.shape)) for key, field in schema.items()}
+    values = {key: np.arange(np.prod(size)).reshape(size) for key, size in sizes.items()}
+    return recording.with_log(name, Log.of(sensor, np.array([0.0, 0.1]), **values), sensor)
+
+
+@pytest.mark.parametrize("ending", [".mcap", ".bag"])
+def test_fields_of_any_name(tmp_path, ending):
+    """Names that functions of the writer have too."""
+    pytest.importorskip("rosbags")
+    names = ("self", "kind", "topic", "stamp", "sensor", "cls", "string", "float64", "A", "a__b_")
+    odd = recorded_as(drive({"encoder": Encoder()}, 0.3), "x", dict.fromkeys(names, COUNTS))
+    assert save(odd, tmp_path / "a.npz") == load(tmp_path / "a.npz").checksum
+    write_recording(tmp_path / f"a{ending}", odd)
+    same_log(odd.log("x"), read_bag(tmp_path / f"a{ending}").log("x"))
+
+
+def test_names_that_cannot_be():
+    for name in ("class", "from", "None", "header", "splits", "a b", "a.b", "_a", "1", ""):
+        with pytest.raises(InputError, match="cannot be the name of a field"):
+            schema_from_meta({name: {"unit": "", "dtype": "f8", "shape": []}})
+
+
+@pytest.mark.parametrize(
+    "schemas",
+    [
+        {"aB": {"a": COUNTS}, "ab": {"b": COUNTS}},
+        {"x": {"a": ANY_COUNTS, "a_shape": COUNTS}},  # an open size is written beside the values
+    ],
+)
+def test_messages_that_would_be_called_the_same(tmp_path, schemas):
+    pytest.importorskip("rosbags")
+    odd = drive({"encoder": Encoder()}, 0.3)
+    for name, schema in schemas.items():
+        odd = recorded_as(odd, name, schema)
+    with pytest.raises(InputError, match="rename a sensor or a field") as caught:
+        write_recording(tmp_path / "a.mcap", odd)
+    assert "\n" not in str(caught.value)
+    assert list(tmp_path.iterdir()) == []
 
 
 # Several sensors

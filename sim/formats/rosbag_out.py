@@ -112,7 +112,7 @@ class _Bag:
     def __exit__(self, *_: object) -> None:
         self._writer.close()
 
-    def make(self, kind: str, **fields: Any) -> Any:
+    def make(self, kind: str, /, **fields: Any) -> Any:
         """A message or part of one; what is not given is zero or empty.
 
         A mapping in place of a part, or a list of them, is made into it.
@@ -136,7 +136,7 @@ class _Bag:
         time = self.make("builtin_interfaces/msg/Time", sec=whole, nanosec=rest)
         return self.make("std_msgs/msg/Header", stamp=time, frame_id=frame)
 
-    def write(self, topic: str, kind: str, stamp: float, **fields: Any) -> None:
+    def write(self, topic: str, kind: str, stamp: float, /, **fields: Any) -> None:
         """Write a message."""
         if topic not in self._connections:
             self._connections[topic] = self._writer.add_connection(

@@ -18,6 +18,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from keyword import iskeyword
 from typing import Any, ClassVar, Protocol, TypeVar
 
 import numpy as np
@@ -366,7 +367,7 @@ def _place_of(name: Any) -> str:
 
 def _check_fields(schema: Schema, where: str) -> None:
     for name in schema:
-        if not _NAME.fullmatch(name) or name in ("stamps", "splits", "header"):
+        if not _NAME.fullmatch(name) or iskeyword(name) or name in ("stamps", "splits", "header"):
             raise InputError(f"{where}: {name!r} cannot be the name of a field")
     seen, hidden = parted(schema)
     ragged = [any(field.ragged for field in part.values()) for part in (seen, hidden)]
