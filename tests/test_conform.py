@@ -5,6 +5,7 @@ import pytest
 from hydra.errors import MissingConfigException
 
 from estimators.base import Belief
+from estimators.icp_odometry import IcpOdometry
 from estimators.odometry import Odometry
 from experiments.gate.conform import check_estimator, conform_target, example
 from experiments.runs.paths import CONF
@@ -246,6 +247,19 @@ def test_targets_by_name():
         conform_target("nowhere.to:Be", [])
     with pytest.raises(InputError, match="key=value"):
         conform_target("estimators.odometry:Odometry", [])
+
+
+def test_the_sensors_can_be_chosen():
+    """And an estimator reads, and misses, the one that its option names."""
+    rear = "{_target_: sim.sensors.laser.Laser, n_beams: 91, rate_hz: 10, mount: {yaw_rad: 3.1}}"
+    given = ["sensors=hokuyo", f"+sensors.rear={rear}", "estimator.laser=rear"]
+    results = conform_target("icp_odometry", given)
+    assert [f"{r.name}: {r.message}" for r in results if not r.passed] == []
+    recording, prior = example(given[:2])
+    assert {"laser", "rear"} <= recording.logs.keys()
+    assert prior.sensors == recording.sensors
+    with pytest.raises(InputError, match="no sensor named side"):
+        IcpOdometry(laser="side").reset(prior, np.random.default_rng(0))
 
 
 OPTIONS = sorted(path.stem for path in (CONF / "estimator").glob("*.yaml"))
