@@ -13,7 +13,7 @@ here are read, with our own definitions and never with those in the file. Frames
 | /points | sensor_msgs/PointCloud2 | 3D lidar turns, rings by azimuths: x, y, z, range |
 | /places | sensor_msgs/PointCloud2 | place descriptors, one point a component |
 | /imu | sensor_msgs/Imu | yaw rates of a gyroscope |
-| /sensors/NAME | estima_msgs/NAME | readings of any other sensor, by its schema |
+| /sensors/NAME | estima_msgs/NAME | readings of any other sensor, or class, by its schema |
 | /ground_truth/sensors/NAME | estima_msgs/NAMETruth | what the schema marks as truth |
 | /cmd_vel | geometry_msgs/TwistStamped | commands |
 | /ground_truth | nav_msgs/Odometry | true poses |
