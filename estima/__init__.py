@@ -194,7 +194,7 @@ def run(*given: Any, estimator: str | Estimator | None = None) -> Run:
     (0.0001, True)
     >>> estima.run(*quick, estimator="ekf_icp")
     Traceback (most recent call last):
-    sim.errors.InputError: estimator=ekf_icp needs a laser sensor, and sensors=encoder has none; try sensors=lms291, hokuyo or laser_stereo
+    sim.errors.InputError: estimator=ekf_icp needs a sensor laser, and sensors=encoder has none; try sensors=hokuyo, laser_stereo, lms291
     """  # noqa: E501 the message is one line
     from experiments.runs.evaluate import evaluate
     from sim.errors import InputError

@@ -78,6 +78,7 @@ class Log:
         sensor: Sensor,
         stamps: Array,
         splits: NDArray[np.int64] | None = None,
+        /,
         **values: NDArray[Any],
     ) -> Log:
         """Log of a sensor's readings, with the types of its schema.
@@ -153,7 +154,15 @@ def joined(schema: Schema, stamps: Array, readings: Sequence[Reading], where: st
     ragged = [name for name, field in schema.items() if field.ragged]
     splits = None
     if ragged:
-        sizes = [len(reading[ragged[0]]) for reading in readings]
+        first, *others = ragged
+        sizes = [len(reading[first]) for reading in readings]
+        for name in others:
+            for size, reading in zip(sizes, readings, strict=True):
+                if len(reading[name]) != size:
+                    raise InputError(
+                        f"{where}.{name} has {len(reading[name])} rows in a reading, "
+                        f"{where}.{first} {size}; they must be as many"
+                    )
         splits = np.cumsum([0, *sizes]).astype(np.int64)
     values = {
         name: field.joined([reading[name] for reading in readings], f"{where}.{name}")
@@ -291,10 +300,14 @@ class Recording:
         return dataclasses.replace(self, sensors=sensors, logs={**self.logs, name: log})
 
     def without(self, name: str) -> Recording:
-        """Return the recording without a sensor and its log."""
+        """Return the recording without a sensor, its log, and the truth of its readings."""
         sensors = {key: sensor for key, sensor in self.sensors.items() if key != name}
         logs = {key: log for key, log in self.logs.items() if key != name}
-        return dataclasses.replace(self, sensors=sensors, logs=logs)
+        truth = self.truth
+        if truth is not None:
+            hidden = {key: values for key, values in truth.readings.items() if key != name}
+            truth = dataclasses.replace(truth, readings=hidden)
+        return dataclasses.replace(self, sensors=sensors, logs=logs, truth=truth)
 
     def frames(self) -> Iterator[Frame]:
         """Walk through the Frames in order.
@@ -409,9 +422,9 @@ def load(path: Path) -> Recording:
         )
     if _digest(stored, meta) != checksum:
         raise InputError(f"{path}: the data do not match their checksum; {remedy}")
-    if meta["format"] == 1:
-        stored, meta = upgraded(stored, meta)
     try:
+        if meta["format"] == 1:
+            stored, meta = upgraded(stored, meta)
         return _assemble(stored, meta)
     except (InputError, *_UNREADABLE) as error:
         raise InputError(f"{path}: {error}; {remedy}") from error
@@ -491,6 +504,8 @@ def _assemble(stored: dict[str, NDArray[Any]], meta: dict[str, Any]) -> Recordin
 
     logs, hidden = {}, {}
     schemas = {name: schema_from_meta(fields) for name, fields in meta["schemas"].items()}
+    if unknown := set(schemas) - set(meta["sensors"]):
+        raise InputError(f"readings of sensors that it does not describe: {sorted(unknown)}")
     for name, schema in schemas.items():
         seen, hidden_fields = parted(schema)
         values = part(f"logs.{name}")

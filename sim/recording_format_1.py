@@ -57,7 +57,7 @@ def upgraded(
         name: {
             key: dataclasses.asdict(field)
             for key, field in sensor.schema.items()
-            if f"{'truth.readings' if field.truth else 'logs'}.{name}.{key}" in arrays
+            if not field.truth or f"truth.readings.{name}.{key}" in arrays
         }
         for name, sensor in sensors_from_meta(sensors, {}).items()
         if f"logs.{name}.stamps" in arrays

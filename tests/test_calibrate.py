@@ -21,7 +21,7 @@ from experiments.runs.seeds import stream
 from sim.errors import InputError
 from sim.kinematic import run_batch
 from sim.route import TABLE_1, OpenLoop
-from sim.sensors import Encoder, SensorSuite
+from sim.sensors import Encoder
 from sim.simulate import record
 from sim.world import World
 
@@ -45,7 +45,7 @@ def recordings(robot, n, route, physics="kinematic", rate_hz=20.0, first_seed=0)
         record(
             OPEN,
             robot,
-            SensorSuite(Encoder(rate_hz)),
+            {"encoder": Encoder(rate_hz)},
             route,
             {axis: stream(seed, axis) for axis in ("slip", "sensors")},
             physics=physics,

@@ -97,7 +97,7 @@ def test_a_run_prints_its_errors_and_leaves_a_row(tmp_path):
         (["robot=null"], ["robot=null", "estima options robot"]),
         (["~world"], ["world is missing"]),
         (["~robot.kr"], ["robot.kr", "estimator.kr"]),
-        (["sensors.laser=foo"], ["sensors.laser", "mapping"]),
+        (["sensors=lms291", "sensors.laser=foo"], ["sensors.laser", "mapping"]),
         (["recording={_target_:os.getcwd}"], ["os.getcwd must return a Recording", "str"]),
     ],
 )
@@ -117,7 +117,7 @@ def test_bad_input_is_one_line_and_code_2(arguments, words):
         ("sensors=[]", "sensors is missing"),
         ("~seed", "world_seed.*seed"),
         ("~prior.map", "prior.map is missing"),
-        ("sensors.laser=3", "sensors.laser must be a mapping"),
+        ("+sensors.laser=3", "sensors.laser must be a mapping"),
         ("sensors.encoder=foo", "sensors.encoder must be a mapping"),
         ("route.waypoints=foo", "route.waypoints.*foo"),
         ("route.waypoints=[[0,0],[1]]", r"route.waypoints.*\[1\]"),

@@ -24,7 +24,7 @@ from experiments.runs.cache import cached, key_of
 from experiments.runs.row import Row
 from experiments.runs.seeds import stream
 from experiments.runs.targets import make, targets
-from experiments.runs.version import version_with
+from experiments.runs.version import code_version, source_digest, version_with
 from sim.arrays import Array
 from sim.errors import InputError
 from sim.recording import Frame, Recording, load
@@ -174,10 +174,7 @@ class Experiment:
     @property
     def recording_key(self) -> str:
         """Digest of what decides the recording's bits: its settings, or a file's; and the code."""
-        settings = self._recording_settings()
-        others = {target for target in targets(settings) if not target.startswith("sim.")}
-        # sensors, routes and estimators on board whose code is not the simulator's
-        return key_of(settings | ({"code": version_with(others)} if others else {}))
+        return key_of(self._recording_settings())
 
     def labels(self, checksum: str) -> Row:
         """Columns that state a row's origin: choices, all keys, versions, recording's checksum."""
@@ -391,6 +388,11 @@ class Experiment:
         world_file = self.config["world"].get("path")
         if world_file is not None and Path(world_file).is_file():  # an edited file: another world
             settings["world_file"] = _digest(Path(world_file))
+        elsewhere = {target: source_digest(target) for target in sorted(targets(settings))}
+        if any(elsewhere.values()):  # a sensor, route or world of one's own, edited: another one
+            settings["sources"] = elsewhere
+        if any(target.startswith("estimators.") for target in elsewhere):  # one on board
+            settings["code"] = code_version()
         return settings
 
     def prior(self, recording: Recording) -> Prior:

@@ -13,7 +13,7 @@ here are read, with our own definitions and never with those in the file. Frames
 | /points | sensor_msgs/PointCloud2 | 3D lidar turns, rings by azimuths: x, y, z, range |
 | /places | sensor_msgs/PointCloud2 | place descriptors, one point a component |
 | /imu | sensor_msgs/Imu | yaw rates of a gyroscope |
-| /sensors/NAME | estima_msgs/NAME | readings of any other sensor, by its schema |
+| /sensors/NAME | estima_msgs/NAME | readings of any other sensor, or class, by its schema |
 | /ground_truth/sensors/NAME | estima_msgs/NAMETruth | what the schema marks as truth |
 | /cmd_vel | geometry_msgs/TwistStamped | commands |
 | /ground_truth | nav_msgs/Odometry | true poses |
@@ -109,8 +109,13 @@ def register(store: Any, kind: str, schema: Schema) -> None:
 
     An array is written row by row; one of a size that the schema leaves open has its shape beside
     it.
+
+    Raises
+    ------
+    InputError
+        If another sensor's message is called the same.
     """
-    from rosbags.typesys import get_types_from_msg
+    from rosbags.typesys import TypesysError, get_types_from_msg
 
     lines = ["std_msgs/Header header"]
     for name, field in schema.items():
@@ -118,7 +123,13 @@ def register(store: Any, kind: str, schema: Schema) -> None:
         lines.append(f"{_NUMBERS[field.dtype]}{array} {name}")
         if array and _open(field):
             lines.append(f"int32[] {name}_shape")
-    store.register(get_types_from_msg("\n".join(lines), kind))
+    try:
+        store.register(get_types_from_msg("\n".join(lines), kind))
+    except TypesysError as error:
+        raise InputError(
+            f"{kind} would be two messages, or its fields two of a name; rename a sensor or a "
+            f"field ({error})"
+        ) from error
 
 
 def own_fields(schema: Schema, reading: Reading) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import tempfile
@@ -42,7 +43,15 @@ from sim.formats.rosbag_bounds import check_bounds
 from sim.recording import CommandLog, Log, Recording, Truth, WheelLog, joined
 from sim.recording_format_1 import upgraded_sensors
 from sim.robot import RobotGeometry
-from sim.sensors import Encoder, Laser, Mount, PlaceDescriptor, Sensor, point_cloud
+from sim.sensors import (
+    Encoder,
+    Laser,
+    Mount,
+    PlaceDescriptor,
+    Sensor,
+    StereoCamera,
+    point_cloud,
+)
 from sim.sensors.base import parted, schema_from_meta, sensors_from_meta
 from sim.settings import build
 from sim.world import World
@@ -153,6 +162,10 @@ def _recording(
     hidden: dict[str, dict[str, NDArray[Any]]] = {}
     for name in about.get("topics", {}):
         logs[name], hidden[name] = _sensor_log(topics, about, name)
+        camera = sensors[name]
+        if isinstance(camera, StereoCamera) and "ids" not in logs[name].values:
+            # in version 0.1 the settings did not always say that a camera does not identify
+            sensors = {**sensors, name: dataclasses.replace(camera, identifies=False)}
     scans = None if about else _chosen(path, topics, wanted[1], "/scan", SCAN)
     if scans is not None:
         laser, logs["laser"] = _laser(path, scans, _transforms(topics), notes)

@@ -40,6 +40,7 @@ from sim.formats.rosbag import (
 from sim.recording import Log, Recording, Truth, described
 from sim.robot import arc_increment
 from sim.sensors import Mount, point_cloud
+from sim.sensors.base import is_ours
 
 _MARKER_POINTS, _MARKER_LINES = 8, 5
 _OPTICAL = np.array([-0.5, 0.5, -0.5, 0.5])  # quaternion of the optical frame on the camera
@@ -111,7 +112,7 @@ class _Bag:
     def __exit__(self, *_: object) -> None:
         self._writer.close()
 
-    def make(self, kind: str, **fields: Any) -> Any:
+    def make(self, kind: str, /, **fields: Any) -> Any:
         """A message or part of one; what is not given is zero or empty.
 
         A mapping in place of a part, or a list of them, is made into it.
@@ -135,7 +136,7 @@ class _Bag:
         time = self.make("builtin_interfaces/msg/Time", sec=whole, nanosec=rest)
         return self.make("std_msgs/msg/Header", stamp=time, frame_id=frame)
 
-    def write(self, topic: str, kind: str, stamp: float, **fields: Any) -> None:
+    def write(self, topic: str, kind: str, stamp: float, /, **fields: Any) -> None:
         """Write a message."""
         if topic not in self._connections:
             self._connections[topic] = self._writer.add_connection(
@@ -235,7 +236,10 @@ class _Bag:
 def _write_recording(bag: _Bag, recording: Recording) -> None:
     wheels, first = recording.wheels, float(recording.frame_stamps[0])
     logged = {name: recording.sensors[name] for name in recording.logs}
-    topics = topics_of(logged)
+    usual = topics_of(logged)
+    # a class from elsewhere is not imported to read its messages, so its readings are also there
+    # by their schema
+    topics = {n: t if is_ours(logged[n]) else f"/sensors/{n}" for n, t in usual.items()}
     about = {
         **described(recording),
         "topics": topics,
@@ -248,7 +252,7 @@ def _write_recording(bag: _Bag, recording: Recording) -> None:
     bag.odometry("/odom", "odom", wheels.stamps, poses, np.zeros((len(poses), 3, 3)))
     bag.joints("/wheels", wheels.stamps, wheels.position_m)
     for name, topic in topics.items():
-        _write_sensor(bag, recording, name, topic)
+        _write_sensor(bag, recording, name, topic, usual[name])
     if recording.commands is not None:
         log = recording.commands
         for stamp, (v, omega) in zip(log.stamps, log.velocity, strict=True):
@@ -277,14 +281,14 @@ def _write_mounts(bag: _Bag, recording: Recording, stamp: float) -> None:
         bag.write("/tf_static", TF[0], stamp, transforms=transforms)
 
 
-def _write_sensor(bag: _Bag, recording: Recording, name: str, topic: str) -> None:
+def _write_sensor(bag: _Bag, recording: Recording, name: str, topic: str, usual: str) -> None:
     sensor: Any = recording.sensors[name]
     log = recording.logs[name]
     frame = name if isinstance(getattr(sensor, "mount", None), Mount) else "base_link"
     if hasattr(sensor, "ros_message"):
         contents = (sensor.to_ros(log.reading(row)) for row in range(len(log.stamps)))
-        bag.readings(topic, sensor.ros_message, frame, log.stamps, contents)
-    else:
+        bag.readings(usual, sensor.ros_message, frame, log.stamps, contents)
+    if topic != usual or not hasattr(sensor, "ros_message"):
         bag.own_readings(topic, own_kind(name), frame, log)
     hidden = recording.truth.readings.get(name) if recording.truth is not None else None
     if hidden:

@@ -18,6 +18,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from keyword import iskeyword
 from typing import Any, ClassVar, Protocol, TypeVar
 
 import numpy as np
@@ -292,9 +293,7 @@ def sensors_from_config(config: Mapping[str, Any]) -> dict[str, Sensor]:
     """
     sensors = {}
     for name, settings in config.items():
-        where = f"sensors.{name}"
-        if not isinstance(name, str) or not _NAME.fullmatch(name):
-            raise InputError(f"{where}: a sensor's name must be one word of letters and digits")
+        where = _place_of(name)
         if settings is None:
             continue
         if not isinstance(settings, Mapping) or "_target_" not in settings:
@@ -303,6 +302,11 @@ def sensors_from_config(config: Mapping[str, Any]) -> dict[str, Sensor]:
             )
         sensors[name] = _made(find(settings["_target_"], where), settings, where)
     return sensors
+
+
+def is_ours(sensor: Sensor) -> bool:
+    """Whether the sensor's class is this package's, so that a file may name it."""
+    return type(sensor).__module__.startswith(_OWN)
 
 
 def sensor_settings(sensor: Sensor) -> dict[str, Any]:
@@ -321,7 +325,9 @@ def sensor_settings(sensor: Sensor) -> dict[str, Any]:
 
 def schema_from_meta(fields: Mapping[str, Any]) -> Schema:
     """Schema of a file's description."""
-    return {name: Field(**{**f, "shape": tuple(f["shape"])}) for name, f in fields.items()}
+    schema = {name: Field(**{**f, "shape": tuple(f["shape"])}) for name, f in fields.items()}
+    _check_fields(schema, "schemas")
+    return schema
 
 
 def sensors_from_meta(
@@ -330,7 +336,7 @@ def sensors_from_meta(
     """Sensors of a file's description: this package's, or `RecordedSensor`s."""
     sensors: dict[str, Sensor] = {}
     for name, values in settings.items():
-        target, where = str(values["_target_"]), f"sensors.{name}"
+        target, where = str(values["_target_"]), _place_of(name)
         if target.startswith(_OWN):
             sensors[name] = _made(find(target, where), values, where)
         else:
@@ -348,8 +354,25 @@ def _made(kind: Any, settings: Mapping[str, Any], where: str) -> Sensor:
     for name in ("rate_hz", "schema", "start"):
         if not hasattr(made, name):
             raise InputError(f"{where}: {settings['_target_']} has no {name}; see sim.sensors.base")
-    for field in made.schema:
-        if not _NAME.fullmatch(field) or field in ("stamps", "splits", "header"):
-            raise InputError(f"{where}: {field!r} cannot be the name of a field")
+    _check_fields(made.schema, where)
     sensor: Sensor = made
     return sensor
+
+
+def _place_of(name: Any) -> str:
+    """Place of a sensor in the configuration; its name must be a word."""
+    if not isinstance(name, str) or not _NAME.fullmatch(name):
+        raise InputError(
+            f"sensors: a sensor's name must be one word of letters and digits, got {name!r}"
+        )
+    return f"sensors.{name}"
+
+
+def _check_fields(schema: Schema, where: str) -> None:
+    for name in schema:
+        if not _NAME.fullmatch(name) or iskeyword(name) or name in ("stamps", "splits", "header"):
+            raise InputError(f"{where}: {name!r} cannot be the name of a field")
+    seen, hidden = parted(schema)
+    ragged = [any(field.ragged for field in part.values()) for part in (seen, hidden)]
+    if ragged == [False, True]:
+        raise InputError(f"{where}: a ragged field of the truth needs one beside it that is seen")

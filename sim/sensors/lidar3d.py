@@ -9,9 +9,9 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+import sim.sensors.point_cloud as point_cloud
 from sim.arrays import Array
 from sim.errors import InputError
-from sim.sensors import point_cloud
 from sim.sensors.base import Field, Mount, Probe, Reading, Schema
 from sim.sensors.laser import noisy_ranges
 from sim.settings import check_numbers

@@ -7,8 +7,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+import sim.sensors.point_cloud as point_cloud
 from sim.errors import InputError
-from sim.sensors import point_cloud
 from sim.sensors.base import Field, Probe, Reading, Schema
 
 

@@ -9,9 +9,9 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+import sim.sensors.point_cloud as point_cloud
 from sim.arrays import Array
 from sim.errors import InputError
-from sim.sensors import point_cloud
 from sim.sensors.base import Field, Mount, Reading, Schema, View
 from sim.settings import check_numbers
 from sim.world import World
