@@ -55,13 +55,6 @@ def test_equivalence_and_trend():
     assert statistics.wilcoxon_p(a, 1.2 * a * rng.lognormal(0, 0.1, 100)) < 1e-6
 
 
-def test_anees_band():
-    rng = np.random.default_rng(3)
-    low, high = statistics.anees_band(20)
-    means = rng.chisquare(3, (4000, 20)).mean(axis=1) / 3
-    assert np.mean((means > low) & (means < high)) == pytest.approx(0.95, abs=0.012)
-
-
 def test_too_few_data_decide_nothing():
     rng = np.random.default_rng(4)
     for found in (

@@ -109,12 +109,6 @@ def log_log_slope(x: ArrayLike, y: ArrayLike) -> float:
     return float(np.polyfit(np.log(x), np.log(y), 1)[0])
 
 
-def anees_band(n_recordings: int, dof: int = 3) -> tuple[float, float]:
-    """95 % band of the mean NEES of independent recordings, over its degrees of freedom."""
-    low, high = (stats.chi2.ppf([0.025, 0.975], dof * n_recordings) / (dof * n_recordings)).tolist()
-    return low, high
-
-
 def _log_ratios(first: ArrayLike, second: ArrayLike) -> Array:
     """Logs (N,) of paired ratios.
 

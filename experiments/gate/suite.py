@@ -249,7 +249,7 @@ def _run_recording(
     for entry, experiment, planted in runs:
         for row in evaluate(
             experiment.replaced(seed=seed, world_seed=seed),
-            recording,
+            lambda: recording,
             streams=partial(_stream, f"estimator/{entry.name}", seed, reseed),
             planted=None if planted is None else _plant(planted, seed, reseed),
         ):

@@ -103,7 +103,7 @@ def reproduce_paper(paper: str, profile: Profile) -> list[Claim]:
         with progress(paper, 1.0) as on_progress:
             _part(paper, "study").run(profile, made, on_progress)
         _draw(made)
-        claims: list[Claim] = _part(paper, "claims").judge(made)
+        claims: list[Claim] = [] if paper in OWN else _part(paper, "claims").judge(made)
         for kind in ("tables", "arrays", "figures"):
             _put_in_place(made.folder / kind, place / kind, paper)
         command = f"estima reproduce --paper {paper}{' --full' * (profile is Profile.FULL)}"

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import textwrap
+from collections.abc import Sequence
+from difflib import SequenceMatcher
 
 import numpy as np
 import pandas as pd
@@ -34,9 +36,10 @@ def sweep_figure(table: pd.DataFrame, x: str, y: str, by: str | None = None) -> 
     """
     for column in filter(None, (x, y, by)):
         if column not in table:
-            near = [c for c in table.columns if column.split(".")[-1] in c]
-            hint = f"; did you mean {', '.join(near[:4])}?" if near else ""
-            raise InputError(f"the sweep has no column {column}{hint}")
+            raise InputError(
+                f"the sweep has no column {column}; there are "
+                f"{', '.join(_closest_first(column, list(table)))}"
+            )
     if table[y].dtype.kind not in "fi":
         raise InputError(f"column {y} holds no numbers; there are {', '.join(measured(table))}")
     if table[[x, y]].dropna().empty:
@@ -80,6 +83,16 @@ def sweep_figure(table: pd.DataFrame, x: str, y: str, by: str | None = None) -> 
     if by is not None:
         page.legend(title=title(by), loc="outside right upper")
     return page
+
+
+def _closest_first(wanted: str, names: Sequence[str]) -> list[str]:
+    """Sort names by how much they are like one that is not among them."""
+
+    def unlikeness(name: str) -> float:
+        parts = (name, name.rpartition(".")[2])  # with its group, or without
+        return -max(SequenceMatcher(None, wanted, part).ratio() for part in parts)
+
+    return sorted(names, key=unlikeness)
 
 
 def _spans(values: pd.Series[float], factor: float) -> bool:

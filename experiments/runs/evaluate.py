@@ -17,32 +17,34 @@ from sim.recording import Recording
 
 Streams = Callable[[int], np.random.Generator]
 Planted = Callable[[Estimator, int], AbstractContextManager[Estimator]]
+Shown = Callable[[Recording], AbstractContextManager[Callable[[int], None]]]
 
 
 def evaluate(
     experiment: Experiment,
-    recording: Recording | None = None,
+    fetch: Callable[[], Recording] | None = None,
     *,
     streams: Streams | None = None,
     planted: Planted | None = None,
-    on_step: Callable[[int], None] | None = None,
-    on_estimate: Callable[[int, Estimate, Estimate | None], None] | None = None,
+    shown: Shown | None = None,
+    on_estimate: Callable[[Recording, int, Estimate, Estimate | None], None] | None = None,
     on_error: Callable[[Exception | SystemExit], None] | None = None,
 ) -> list[Row]:
     """Run an experiment's estimator `repeats` times over its recording, and score each run.
 
     Parameters
     ----------
-    recording
-        In place of the experiment's own.
+    fetch
+        Gives the recording, once the configuration is known to fit together; by default the
+        experiment's own.
     streams
         The estimator's generator of each repeat; by default that of the axis `estimator/NAME`.
     planted
         Gives the estimator with a fault in it, as a context, for each repeat.
-    on_step
-        Called with the number of Frames done.
+    shown
+        Takes the number of Frames done, as a context around each repeat.
     on_estimate
-        Called with the repeat, its online estimate and the revised one (or None).
+        Called with the recording, the repeat, its online estimate and the revised one (or None).
     on_error
         Called with the exception that ended a run, which becomes its row's status.
 
@@ -58,8 +60,7 @@ def evaluate(
         If the configuration or the recording does not fit together.
     """
     experiment.check()
-    if recording is None:
-        recording = experiment.recording()
+    recording = fetch() if fetch else experiment.recording()
     prior = experiment.prior(recording)
     labels = experiment.labels(recording.checksum)
     axis = f"estimator/{experiment.estimator_name}"
@@ -69,7 +70,10 @@ def evaluate(
         rng = streams(repeat) if streams else stream(experiment.seed, axis, repeat)
         scores: Row = {}
         try:
-            with planted(estimator, repeat) if planted else nullcontext(estimator) as ready:
+            with (
+                planted(estimator, repeat) if planted else nullcontext(estimator) as ready,
+                shown(recording) if shown else nullcontext() as on_step,
+            ):
                 online, revised = estimates(ready, recording, prior, rng, experiment.keep, on_step)
             status = status_of(recording, online)
             scores = scored(recording, online, revised)
@@ -81,7 +85,7 @@ def evaluate(
                 on_error(error)
         else:
             if on_estimate is not None:
-                on_estimate(repeat, online, revised)
+                on_estimate(recording, repeat, online, revised)
         rows.append({**labels, "repeat": repeat, **status.columns(), **scores})
     return rows
 

@@ -137,8 +137,7 @@ def estimate_of(
     given = [f"robot.{key}={value}" for key, value in robot.items()]
     experiment = Experiment.compose([f"estimator={source}", *given, *overrides])
     if "keep_map" in experiment.config["estimator"]:
-        settings = {**experiment.config["estimator"], "keep_map": True}
-        experiment = experiment.replaced(estimator=settings)
+        experiment = experiment.with_estimator(keep_map=True)
     sparing = _Sparing(experiment.estimator(), set(rows.tolist()))
     rng, prior = stream(experiment.seed, f"estimator/{source}", 0), experiment.prior(recording)
     return run_estimator(sparing, recording, prior, rng, _EXTRAS, on_step), source

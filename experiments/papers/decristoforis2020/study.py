@@ -144,7 +144,7 @@ def _run(
     """
     seen: list[Estimate] = []
     (found,) = evaluate(
-        experiment, recording, on_estimate=lambda _, online, __: seen.append(online)
+        experiment, lambda: recording, on_estimate=lambda _, __, online, ___: seen.append(online)
     )
     if not seen:
         raise RunFailedError(f"{experiment.name}: {found['status_code']}: {found['status_detail']}")

@@ -121,9 +121,8 @@ def localize(
         In place of the case's own.
     """
     taken = case.recording if recording is None else recording
-    estimator = {**case.experiment.config["estimator"], **settings}
     estimate = run(
-        case.experiment.replaced(estimator=estimator).estimator(),
+        case.experiment.with_estimator(**settings).estimator(),
         taken,
         Prior(taken.robot, taken.sensors, map=case.known_map),
         rng,
