@@ -1,7 +1,5 @@
 """The whole fusion of wheels and laser at the laser's full rate."""
 
-from __future__ import annotations
-
 import statistics
 
 from estimators.base import run as run_estimator

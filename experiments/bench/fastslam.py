@@ -1,7 +1,5 @@
 """Speed of FastSLAM: a whole step, the landmark update alone, and how both grow with size."""
 
-from __future__ import annotations
-
 import itertools
 from typing import Any
 

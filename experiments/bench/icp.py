@@ -11,8 +11,6 @@ the trace of F's position block. A failure is an error of more than 5 cm or 1 de
 in all medians.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import math
 from collections.abc import Callable

@@ -5,8 +5,6 @@ uses them all. Times are processor times of all threads, so that other programs 
 for little. MRPT claims 30 to 36 million.
 """
 
-from __future__ import annotations
-
 import time
 
 import numpy as np

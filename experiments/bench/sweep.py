@@ -1,7 +1,5 @@
 """Overhead of a sweep over its runs, and the gain of two workers."""
 
-from __future__ import annotations
-
 import shutil
 import statistics
 import subprocess

@@ -4,8 +4,6 @@ One node is one observation of a 512-d descriptor: the B most similar of all nod
 resampling, the hop, the mean. The note of each figure gives the paper's time, on its machine.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from estimators.base import Estimator, Prior

@@ -4,8 +4,6 @@ An estimate is judged by the motion between pairs of its poses whose true relati
 common frame is needed, and an early error does not count in all later poses.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

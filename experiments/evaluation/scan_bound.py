@@ -6,8 +6,6 @@ information sum dr^T dr / sigma^2 about the pose x. Both scans of a pair are noi
 covariance of their relative pose is at least the sum of the two poses' bounds.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from sim import se2

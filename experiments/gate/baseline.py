@@ -1,7 +1,5 @@
 """Baselines of a suite: read, checked against, renewed and written."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

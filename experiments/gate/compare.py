@@ -14,8 +14,6 @@ has several runs per recording, and d is the difference of their means. Two ques
 `worse` means yes to both; `better` likewise, in the other direction.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math

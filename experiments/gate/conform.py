@@ -5,8 +5,6 @@ An estimator may state `needs`, a set of names among `wheels`, `laser`, `landmar
 states `global_or_grid = True` and is compared in distribution.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ There are three kinds: a wrong entry of a derivative (or of the geometry behind 
 observations, and noise that is added or overestimated. Each has a size. No error is ever scaled.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable, Iterator

@@ -13,8 +13,6 @@ one estimator from its faulty runs.
     python -m experiments.gate.power --share 0.1    # a few minutes; rough
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import math

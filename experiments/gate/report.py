@@ -1,7 +1,5 @@
 """Reports of a check: as text, to GitHub (annotations, a summary), and as JUnit XML."""
 
-from __future__ import annotations
-
 import math
 import os
 import sys

@@ -1,7 +1,5 @@
 """Make all papers' tables, figures and claims in results/, as `make reproduce` does."""
 
-from __future__ import annotations
-
 import importlib
 import os
 import sys

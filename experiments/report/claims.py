@@ -3,8 +3,6 @@
 The claims are the rows of results/claims.csv; results/provenance.json says how they were made.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from pathlib import Path

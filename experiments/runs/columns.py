@@ -3,8 +3,6 @@
 This is the one schema of rows: by its name, a column is a setting, a metric, a status or an origin.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import dataclass
 from typing import Literal

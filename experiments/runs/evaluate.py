@@ -1,7 +1,5 @@
 """The one runner: an experiment's rows."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection
 from contextlib import AbstractContextManager, nullcontext
 

@@ -1,7 +1,5 @@
 """The Hydra application: a configuration's rows, in results/runs/NAME/KEY.parquet."""
 
-from __future__ import annotations
-
 import sys
 import traceback
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """Objects that a configuration names by `_target_`."""
 
-from __future__ import annotations
-
 import importlib
 import inspect
 from collections.abc import Callable, Collection, Mapping

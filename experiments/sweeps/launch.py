@@ -4,8 +4,6 @@ The runs are composed once, here, and packed into jobs; each job reads its share
 workers compose nothing, and any of Hydra's launchers will do.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import os

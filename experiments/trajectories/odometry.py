@@ -1,7 +1,5 @@
 """Estimates in the form of nav_msgs/Odometry, as CSV and JSON (puzzlebot2024, eqs. (10)-(11))."""
 
-from __future__ import annotations
-
 import csv
 import json
 import math

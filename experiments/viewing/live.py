@@ -4,8 +4,6 @@ The engine ends its process when it cannot open a window. So a display is looked
 window gets a process of its own; if that fails, one line says so.
 """
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import sys

@@ -1,7 +1,5 @@
 """Parts of many figures: 95 % ellipses, plain numbers on logarithmic axes, one legend."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """One run at a glance: truth and estimate in the world, and the errors with their 2-sigma bands."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -3,8 +3,6 @@
 The same `Playback` is drawn to a file here (MP4, GIF, HTML), and in a window by `viewing.live`.
 """
 
-from __future__ import annotations
-
 import base64
 import dataclasses
 import io

@@ -1,7 +1,5 @@
 """The studies of decristoforis2020: registration, its covariance, and fusion with odometry."""
 
-from __future__ import annotations
-
 import math
 import operator
 import timeit

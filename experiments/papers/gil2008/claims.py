@@ -5,8 +5,6 @@ anything is compared. Errors of position and map are those of the revised path a
 best particle, as the paper has them, raw and rigidly aligned.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterator
 from typing import Any

@@ -4,8 +4,6 @@ Each table is a study of conf/study, whose swept values are its runs. Runs over 
 recording.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from itertools import accumulate

@@ -1,7 +1,5 @@
 """The figures of maximo2024, from its tables and arrays."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

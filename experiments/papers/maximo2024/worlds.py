@@ -3,8 +3,6 @@
 A world is a route with a synthetic field of descriptors, or a campus with simulated clouds.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Iterator

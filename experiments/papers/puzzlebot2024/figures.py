@@ -1,7 +1,5 @@
 """The figures of puzzlebot2024."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Figures of the real logs."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Any

@@ -1,7 +1,5 @@
 """Recordings of the real logs that conf/study/real_logs_*.yaml name."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Literal
 

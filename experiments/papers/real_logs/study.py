@@ -3,8 +3,6 @@
 The logs are not part of the project; they are expected in ../shared/data.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math
