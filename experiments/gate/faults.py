@@ -6,8 +6,8 @@ observations, and noise that is added or overestimated. Each has a size. No erro
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from typing import Any
 from unittest import mock
 
@@ -22,7 +22,7 @@ from sim.arrays import Array
 from sim.recording import Frame, LandmarkSet
 from sim.robot import wheel_errors
 
-Planted = Callable[[Estimator, np.random.Generator], AbstractContextManager[Estimator]]
+Planted = Callable[[Estimator, np.random.Generator], AbstractContextManager[object]]
 Fault = Callable[[float], Planted]  # of a size
 
 
@@ -36,15 +36,15 @@ def in_argument_of(
 
     def decorate(change: Callable[[Any, float, np.random.Generator], Any]) -> Fault:
         def fault(size: float) -> Planted:
-            @contextmanager
-            def plant(estimator: Estimator, rng: np.random.Generator) -> Iterator[Estimator]:
+            def plant(
+                estimator: Estimator, rng: np.random.Generator
+            ) -> AbstractContextManager[object]:
                 sound = getattr(estimator, method)
 
                 def faulty(argument: Any, *others: Any) -> Any:
                     return sound(change(argument, size, rng), *others)
 
-                with mock.patch.object(estimator, method, faulty):
-                    yield estimator
+                return mock.patch.object(estimator, method, faulty)
 
             return plant
 
@@ -61,15 +61,15 @@ def in_place_of(owner: Any, name: str) -> Callable[[Callable[..., Any]], Fault]:
 
     def decorate(wrong: Callable[..., Any]) -> Fault:
         def fault(size: float) -> Planted:
-            @contextmanager
-            def plant(estimator: Estimator, rng: np.random.Generator) -> Iterator[Estimator]:
+            def plant(
+                estimator: Estimator, rng: np.random.Generator
+            ) -> AbstractContextManager[object]:
                 sound = getattr(owner, name)
 
                 def faulty(*arguments: Any, **keywords: Any) -> Any:
                     return wrong(sound, size, *arguments, **keywords)
 
-                with mock.patch.object(owner, name, faulty):
-                    yield estimator
+                return mock.patch.object(owner, name, faulty)
 
             return plant
 

@@ -172,11 +172,11 @@ def _number(value: float, form: str, unit: str = "") -> str:
 
 def as_annotations(findings: Sequence[Finding]) -> str:
     """Give GitHub's workflow commands: an error for each alarm, a notice for each improvement."""
-    lines = []
-    for finding in _noteworthy(findings):
-        level, text = "error" if finding.alarms else "notice", sentence(finding)
-        lines.append(f"::{level} title=estima check::{text.replace('%', '%25')}")
-    return "\n".join(lines)
+    return "\n".join(
+        f"::{'error' if finding.alarms else 'notice'} title=estima check::"
+        + sentence(finding).replace("%", "%25")
+        for finding in _noteworthy(findings)
+    )
 
 
 def as_junit(findings: Sequence[Finding]) -> str:

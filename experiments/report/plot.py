@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from experiments.evaluation.statistics import mean_interval
 from experiments.runs.columns import COLUMNS, title
 from experiments.sweeps.collect import measured, telling
-from experiments.viewing.style import CYCLE, figure
+from experiments.viewing.style import CYCLE, subplots
 from sim.errors import InputError
 
 _WIDE_X, _WIDE_Y = 20.0, 30.0  # an axis that spans more than this factor is logarithmic
@@ -44,8 +44,7 @@ def sweep_figure(table: pd.DataFrame, x: str, y: str, by: str | None = None) -> 
         raise InputError(f"column {y} holds no numbers; there are {', '.join(measured(table))}")
     if table[[x, y]].dropna().empty:
         raise InputError(f"no run has both {x} and {y}")
-    page = figure(6.5, 4.0)
-    ax = page.subplots()
+    page, ax = subplots(6.5, 4.0)
     scale = COLUMNS[y].scale if y in COLUMNS else "log"
     logarithmic = scale == "log" and _spans(table[y], _WIDE_Y)
     numeric = table[x].dtype.kind in "fi"

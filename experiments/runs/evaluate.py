@@ -14,7 +14,7 @@ from sim.errors import InputError
 from sim.recording import Recording
 
 Streams = Callable[[int], np.random.Generator]
-Planted = Callable[[Estimator, int], AbstractContextManager[Estimator]]
+Planted = Callable[[Estimator, int], AbstractContextManager[object]]
 Shown = Callable[[Recording], AbstractContextManager[Callable[[int], None]]]
 
 
@@ -25,8 +25,8 @@ def evaluate(
     streams: Streams | None = None,
     planted: Planted | None = None,
     shown: Shown | None = None,
-    on_estimate: Callable[[Recording, int, Estimate, Estimate | None], None] | None = None,
-    on_error: Callable[[Exception | SystemExit], None] | None = None,
+    on_estimate: Callable[[Recording, int, Estimate, Estimate | None], None] = lambda *_: None,
+    on_error: Callable[[Exception | SystemExit], None] = lambda _: None,
 ) -> list[Row]:
     """Run an experiment's estimator `repeats` times over its recording, and score each run.
 
@@ -38,7 +38,7 @@ def evaluate(
     streams
         The estimator's generator of each repeat; by default that of the axis `estimator/NAME`.
     planted
-        Gives the estimator with a fault in it, as a context, for each repeat.
+        Gives a context in which the estimator is faulty, for each repeat.
     shown
         Takes the number of Frames done, as a context around each repeat.
     on_estimate
@@ -69,21 +69,21 @@ def evaluate(
         scores: Row = {}
         try:
             with (
-                planted(estimator, repeat) if planted else nullcontext(estimator) as ready,
+                planted(estimator, repeat) if planted else nullcontext(),
                 shown(recording) if shown else nullcontext() as on_step,
             ):
-                online, revised = estimates(ready, recording, prior, rng, experiment.keep, on_step)
+                online, revised = estimates(
+                    estimator, recording, prior, rng, experiment.keep, on_step
+                )
             status = status_of(recording, online)
             scores = scored(recording, online, revised)
         except InputError:
             raise
         except (Exception, SystemExit) as error:
             status = Status.of_error(error)
-            if on_error is not None:
-                on_error(error)
+            on_error(error)
         else:
-            if on_estimate is not None:
-                on_estimate(recording, repeat, online, revised)
+            on_estimate(recording, repeat, online, revised)
         rows.append({**labels, "repeat": repeat, **status.columns(), **scores})
     return rows
 

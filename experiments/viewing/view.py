@@ -22,7 +22,7 @@ from estimators.base import run as run_estimator
 from experiments.evaluation.metrics import CHI2_95_2DOF
 from experiments.runs.experiment import Experiment
 from experiments.runs.seeds import stream
-from experiments.viewing.style import ESTIMATE, GREEN, ORANGE, RED, SKY, TRUTH, figure
+from experiments.viewing.style import ESTIMATE, GREEN, ORANGE, RED, SKY, TRUTH, subplots
 from experiments.viewing.world import draw_world
 from sim import se2
 from sim.arrays import Array
@@ -216,11 +216,10 @@ def pictures(run: Playback) -> Iterator[Picture]:
     """
     recording = run.recording
     truth = None if recording.truth is None else recording.truth_at(recording.frame_stamps)
-    x1, y1, x2, y2 = _bounds(run, truth)
+    x1, y1, x2, y2 = bounds(run, truth)
     height_in = float(np.clip(7.0 * (y2 - y1) / (x2 - x1), 2.0, 8.0)) + 1.2
-    page = figure(8.0, height_in)
+    page, ax = subplots(8.0, height_in)
     page.set_dpi(_DPI)
-    ax = page.subplots()
     if recording.world is not None:
         draw_world(ax, recording.world, landmarks=recording.landmarks is not None)
     glyph = max(recording.robot.track_m / 2.0, 0.012 * (x2 - x1))  # visible on any map
@@ -312,7 +311,7 @@ def robot_outline(pose: Array, radius_m: float) -> Array:
     return np.concatenate([circle, front[None]])
 
 
-def _bounds(run: Playback, truth: Array | None) -> tuple[float, float, float, float]:
+def bounds(run: Playback, truth: Array | None) -> tuple[float, float, float, float]:
     """What the map shows: the world and the path, with a margin.
 
     A diverging estimate is followed to twice the size of all else.

@@ -18,7 +18,7 @@ from experiments.viewing.style import (
     SKY,
     WALL,
     YELLOW,
-    figure,
+    subplots,
 )
 from sim.arrays import Array
 from sim.world import World
@@ -69,8 +69,7 @@ def world_figure(world: World) -> Figure:
     """One world with everything in it, and a legend above."""
     x1, y1, x2, y2 = world.bounds_m
     # The map's own height beside the labels, and room above it for title and legend
-    page = figure(9.0, float(np.clip(8.3 * (y2 - y1) / max(x2 - x1, 1.0), 2.0, 8.3)) + 1.5)
-    ax = page.subplots()
+    page, ax = subplots(9.0, float(np.clip(8.3 * (y2 - y1) / max(x2 - x1, 1.0), 2.0, 8.3)) + 1.5)
     draw_world(ax, world, places=True, tour=True)
     ax.set_title(world.name, loc="left")
     if ax.get_legend_handles_labels()[1]:
