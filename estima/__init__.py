@@ -100,8 +100,7 @@ class Run:
         from experiments.viewing.run_figure import run_figure
 
         estimate = self.online if self.revised is None else self.revised
-        name = str(self.row["choice.estimator"])
-        return _saved(run_figure(self.recording, estimate, name), path)
+        return _saved(run_figure(self.recording, estimate, str(self.row["choice.estimator"])), path)
 
 
 def simulate(*overrides: str) -> Recording:

@@ -30,8 +30,7 @@ def run() -> Iterator[Measurement]:
         prior = experiment.prior(recording)
         for n_particles, paper_s in times_s.items():
             per_node = n_particles // len(prior.map)
-            printed = experiment.with_estimator(particles_per_node=per_node)
-            filters = {"": printed.estimator()}
+            filters = {"": experiment.with_estimator(particles_per_node=per_node).estimator()}
             if n_particles == max(times_s):
                 filters["_odometry"] = TopologicalMcl(particles_per_node=per_node)
             for suffix, estimator in filters.items():

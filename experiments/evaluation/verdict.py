@@ -55,8 +55,6 @@ class Claim:
         What the interval is judged by.
     verdict, reason
         The verdict; why, or where it holds, if that is not obvious.
-    role
-        A statistic without a criterion only accompanies the claim.
     """
 
     id: str
@@ -65,11 +63,11 @@ class Claim:
     criterion: str
     verdict: Verdict
     reason: str = ""
-    role: Role = Role.HEADLINE
 
-    def __post_init__(self) -> None:
-        if self.verdict is Verdict.SHOWN:
-            object.__setattr__(self, "role", Role.BESIDE)
+    @property
+    def role(self) -> Role:
+        """A statistic without a criterion only accompanies the claim."""
+        return Role.BESIDE if self.verdict is Verdict.SHOWN else Role.HEADLINE
 
 
 def judged(interval: Interval, at_least: float = -math.inf, at_most: float = math.inf) -> Verdict:

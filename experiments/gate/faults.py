@@ -136,8 +136,7 @@ def noisy_descriptors(frame: Frame, sigma: float, rng: np.random.Generator) -> F
 @in_argument_of("step")
 def wrong_travel(frame: Frame, share: float, _: np.random.Generator) -> Frame:
     """The wheels' travel is believed too long, as by a wrong radius."""
-    travel = (1.0 + share) * frame.wheel_increments_m
-    return dataclasses.replace(frame, wheel_increments_m=travel)
+    return dataclasses.replace(frame, wheel_increments_m=(1.0 + share) * frame.wheel_increments_m)
 
 
 @in_argument_of("reset")

@@ -101,5 +101,5 @@ def _spans(values: pd.Series[float], factor: float) -> bool:
 
 def _interval(values: pd.Series[float], logarithmic: bool) -> tuple[float, ...]:
     """Mean and the bounds of its interval; those of the logarithm on a logarithmic axis."""
-    found = vars(mean_interval(np.log(values) if logarithmic else values))
-    return tuple(math.exp(v) if logarithmic else v for v in found.values())
+    found = vars(mean_interval(np.log(values) if logarithmic else values)).values()
+    return tuple(map(math.exp, found)) if logarithmic else tuple(found)

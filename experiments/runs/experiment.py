@@ -198,9 +198,8 @@ class Experiment:
             left_out |= set(_SIMULATED_KEYS) - {"seed"}
         settings = {k: v for k, v in self.config.items() if k not in left_out}
         brought = left_out if wanted is None else {*left_out, "world", "sensors", "route"}
-        choices = {f"choice.{g}": name for g, name in self.choices.items() if g not in brought}
         return {
-            **choices,
+            **{f"choice.{g}": name for g, name in self.choices.items() if g not in brought},
             **_flat(settings),
             "repeat": 0,
             "run_key": self.key,

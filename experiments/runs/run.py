@@ -52,7 +52,7 @@ def run_once(experiment: Experiment, draw: Draw) -> list[Row]:
         fetch,
         shown=lambda recording: progress(name, len(recording.frame_stamps)),
         on_estimate=keep,
-        on_error=lambda error: traceback.print_exception(error),
+        on_error=traceback.print_exception,
     )
     write_rows(rows, path)
     _print(rows, [file for file in (path, folder / "run.png") if file.exists()])

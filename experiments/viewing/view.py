@@ -205,8 +205,7 @@ def ellipse_outlines(means: Array, covariances: Array, n_corners: int = 24) -> A
     angle = np.linspace(0.0, 2.0 * np.pi, n_corners + 1)
     circle = np.column_stack([np.cos(angle), np.sin(angle)])
     outlines = means[:, None, :] + circle @ axes.transpose(0, 2, 1)
-    gaps = np.full((len(means), 1, 2), np.nan)
-    return np.concatenate([outlines, gaps], axis=1).reshape(-1, 2)
+    return np.concatenate([outlines, np.full((len(means), 1, 2), np.nan)], axis=1).reshape(-1, 2)
 
 
 def pictures(run: Playback) -> Iterator[Picture]:
@@ -217,8 +216,7 @@ def pictures(run: Playback) -> Iterator[Picture]:
     recording = run.recording
     truth = None if recording.truth is None else recording.truth_at(recording.frame_stamps)
     x1, y1, x2, y2 = bounds(run, truth)
-    height_in = float(np.clip(7.0 * (y2 - y1) / (x2 - x1), 2.0, 8.0)) + 1.2
-    page, ax = subplots(8.0, height_in)
+    page, ax = subplots(8.0, float(np.clip(7.0 * (y2 - y1) / (x2 - x1), 2.0, 8.0)) + 1.2)
     page.set_dpi(_DPI)
     if recording.world is not None:
         draw_world(ax, recording.world, landmarks=recording.landmarks is not None)
