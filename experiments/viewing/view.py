@@ -22,6 +22,7 @@ from estimators.base import run as run_estimator
 from experiments.evaluation.metrics import CHI2_95_2DOF
 from experiments.runs.experiment import Experiment
 from experiments.runs.seeds import stream
+from experiments.viewing.plotting import plan_axes
 from experiments.viewing.style import ESTIMATE, GREEN, ORANGE, RED, SKY, TRUTH, subplots
 from experiments.viewing.world import draw_world
 from sim import se2
@@ -226,7 +227,7 @@ def pictures(run: Playback) -> Iterator[Picture]:
         for key, (style, color, label, more) in _layers(run, truth is not None).items()
     }
     title = ax.text(0.0, 1.01, "", transform=ax.transAxes, animated=True)
-    ax.set(xlabel="x, m", ylabel="y, m", aspect="equal", xlim=(x1, x2), ylim=(y1, y2))
+    plan_axes(ax, xlim=(x1, x2), ylim=(y1, y2))
     handles, labels = ax.get_legend_handles_labels()
     page.legend(handles, labels, loc="outside lower center", ncols=4, fontsize="small")
     ax.set_title(" ")  # reserves the room

@@ -8,6 +8,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from experiments.viewing.plotting import plan_axes
 from experiments.viewing.style import (
     BLACK,
     BLUE,
@@ -61,7 +62,7 @@ def draw_walls(ax: Axes, walls: Array, wall_z_m: Array, **style: Any) -> None:
     for rows, usual in ((~high, {"color": WALL}), (high, {"color": GREEN, "alpha": 0.5})):
         lines = list(walls[rows].reshape(-1, 2, 2))
         ax.add_collection(LineCollection(lines, **{"lw": 0.9, **usual, **style}))
-    ax.set(xlabel="x, m", ylabel="y, m", aspect="equal")
+    plan_axes(ax)
     ax.autoscale_view()
 
 
