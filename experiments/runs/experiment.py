@@ -189,26 +189,34 @@ class Experiment:
     def labels(self, checksum: str) -> Row:
         """Columns that state a row's origin: choices, keys, versions, the recording's checksum.
 
-        A recording from a file or from memory was made by other settings than these, which have
-        no column.
+        Settings that did not make the recording have no column.
         """
-        wanted = self.config["recording"]
-        left_out = {"keep", "picture"}
-        if wanted is not None and "_target_" not in wanted:
-            left_out |= set(_SIMULATED_KEYS) - {"seed"}
-        settings = {k: v for k, v in self.config.items() if k not in left_out}
-        brought = left_out if wanted is None else {*left_out, "world", "sensors", "route"}
+        applied = self._applied()
+        brought = ("world", "sensors", "route") if self.config["recording"] is not None else ()
+        choices = {g: name for g, name in self.choices.items() if g in applied and g not in brought}
         return {
-            **{f"choice.{g}": name for g, name in self.choices.items() if g not in brought},
-            **_flat(settings),
+            **{f"choice.{group}": name for group, name in choices.items()},
+            **_flat({k: v for k, v in applied.items() if k not in ("keep", "picture")}),
             "repeat": 0,
             "run_key": self.key,
             "code_version": self._code_version(),
             "recording_checksum": checksum,
         }
 
+    def _applied(self) -> Config:
+        """Settings without those of a simulation that a recording from a file takes the place of.
+
+        A function that makes the recording or the map may read all of them.
+        """
+        places = (self.config["recording"], self.config["prior"].get("map"))
+        made = any(isinstance(place, dict) and "_target_" in place for place in places)
+        if self.config["recording"] is None or made:
+            return self.config
+        unused = set(_SIMULATED_KEYS) - {"seed"}
+        return {key: value for key, value in self.config.items() if key not in unused}
+
     def _code_version(self) -> str:
-        return version_with(targets(self.config))
+        return version_with(targets(self._applied()))
 
     # What it names
 
