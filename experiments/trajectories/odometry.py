@@ -33,7 +33,7 @@ def covariance_6x6(covariances: Array) -> Array:
     return full
 
 
-def odometry_records(estimate: Estimate, frame_id: str = "odom") -> list[dict[str, Any]]:
+def odometry_records(estimate: Estimate) -> list[dict[str, Any]]:
     """One record like nav_msgs/Odometry per stamp.
 
     The twist is the mean velocity in base_link since the previous record, from differences of the
@@ -49,7 +49,7 @@ def odometry_records(estimate: Estimate, frame_id: str = "odom") -> list[dict[st
         vx, vy, turn = (float(v) for v in twists[i])
         records.append(
             {
-                "header": {"stamp": float(stamps[i]), "frame_id": frame_id},
+                "header": {"stamp": float(stamps[i]), "frame_id": "odom"},
                 "child_frame_id": "base_link",
                 "pose": {
                     "position": {"x": x, "y": y, "z": 0.0},

@@ -199,11 +199,11 @@ def _in_map(run: Playback, stamp: float, mount: Mount, points_in_sensor: Array) 
     return se2.transform(se2.compose(pose, mount.pose), points_in_sensor)
 
 
-def ellipse_outlines(means: Array, covariances: Array, n_corners: int = 24) -> Array:
+def ellipse_outlines(means: Array, covariances: Array) -> Array:
     """95 % ellipses of means (N, 2), covariances (N, 2, 2) as one line, with gaps of NaN."""
     values, vectors = np.linalg.eigh(covariances)
     axes = vectors * np.sqrt(CHI2_95_2DOF * np.maximum(values, 0.0))[:, None, :]
-    angle = np.linspace(0.0, 2.0 * np.pi, n_corners + 1)
+    angle = np.linspace(0.0, 2.0 * np.pi, 25)
     circle = np.column_stack([np.cos(angle), np.sin(angle)])
     outlines = means[:, None, :] + circle @ axes.transpose(0, 2, 1)
     return np.concatenate([outlines, np.full((len(means), 1, 2), np.nan)], axis=1).reshape(-1, 2)
@@ -342,15 +342,13 @@ def check_output(path: Path) -> None:
         raise InputError(f"{path}: MP4 needs ffmpeg, which is not installed; take .gif or .html")
 
 
-def save(run: Playback, path: Path, on_progress: Callable[[float], None], fps: int = FPS) -> None:
+def save(run: Playback, path: Path, on_progress: Callable[[float], None]) -> None:
     """Write the run as `.mp4` (needs ffmpeg), `.gif` or `.html`, whole or not at all.
 
     Parameters
     ----------
     on_progress
         Called with the share done.
-    fps
-        Pictures per second.
     """
     check_output(path)
 
@@ -361,13 +359,13 @@ def save(run: Playback, path: Path, on_progress: Callable[[float], None], fps: i
 
     write = {".mp4": _write_mp4, ".gif": _write_gif, ".html": _write_html}[path.suffix]
     with write_whole(path) as part:
-        write(counted(), part, fps)
+        write(counted(), part)
 
 
-def _write_mp4(images: Iterator[Picture], path: Path, fps: int) -> None:
+def _write_mp4(images: Iterator[Picture], path: Path) -> None:
     first = next(images)
     size = f"{first.shape[1]}x{first.shape[0]}"
-    raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", str(fps), "-i", "-"]
+    raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", str(FPS), "-i", "-"]
     command = ["ffmpeg", "-y", "-loglevel", "error", *raw, "-pix_fmt", "yuv420p", str(path)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         assert process.stdin is not None
@@ -391,13 +389,12 @@ def _reduced(image: Picture) -> Any:
     return Image.fromarray(image).quantize(96, method=Image.Quantize.FASTOCTREE)
 
 
-def _write_gif(images: Iterator[Picture], path: Path, fps: int) -> None:
+def _write_gif(images: Iterator[Picture], path: Path) -> None:
     first, *rest = (_reduced(image) for image in images)
-    duration_ms = round(1000 / fps)
-    first.save(path, format="GIF", save_all=True, append_images=rest, duration=duration_ms, loop=0)
+    first.save(path, "GIF", save_all=True, append_images=rest, duration=1000 // FPS, loop=0)
 
 
-def _write_html(images: Iterator[Picture], path: Path, fps: int) -> None:
+def _write_html(images: Iterator[Picture], path: Path) -> None:
     frames: list[str] = []
     for image in images:
         data = io.BytesIO()
@@ -407,7 +404,7 @@ def _write_html(images: Iterator[Picture], path: Path, fps: int) -> None:
         "width": image.shape[1],
         "height": image.shape[0],
         "last": len(frames) - 1,
-        "fps": fps,
+        "fps": FPS,
         "first": frames[0],
         "frames": ",\n".join(f'"{frame}"' for frame in frames),
     }
