@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Sequence
-from difflib import SequenceMatcher
+from difflib import get_close_matches
 
 import numpy as np
 import pandas as pd
@@ -37,8 +36,7 @@ def sweep_figure(table: pd.DataFrame, x: str, y: str, by: str | None = None) -> 
     for column in filter(None, (x, y, by)):
         if column not in table:
             raise InputError(
-                f"the sweep has no column {column}; there are "
-                f"{', '.join(_closest_first(column, list(table)))}"
+                f"the sweep has no column {column}; there are {', '.join(_columns(table, column))}"
             )
     if table[y].dtype.kind not in "fi":
         raise InputError(f"column {y} holds no numbers; there are {', '.join(measured(table))}")
@@ -84,14 +82,11 @@ def sweep_figure(table: pd.DataFrame, x: str, y: str, by: str | None = None) -> 
     return page
 
 
-def _closest_first(wanted: str, names: Sequence[str]) -> list[str]:
-    """Sort names by how much they are like one that is not among them."""
-
-    def unlikeness(name: str) -> float:
-        parts = (name, name.rpartition(".")[2])  # with its group, or without
-        return -max(SequenceMatcher(None, wanted, part).ratio() for part in parts)
-
-    return sorted(names, key=unlikeness)
+def _columns(table: pd.DataFrame, wanted: str) -> list[str]:
+    """Columns of a table: those most like a wanted one, swept settings, results, and all others."""
+    near = get_close_matches(wanted, map(str, table), n=len(table.columns))
+    near += [name for name in table if wanted.rpartition(".")[2] in name]
+    return list(dict.fromkeys([*near, *telling(table), *measured(table), *table]))
 
 
 def _spans(values: pd.Series[float], factor: float) -> bool:

@@ -33,7 +33,7 @@ class Column:
     better: Literal["lower", "higher"] | None = "lower"
 
 
-_OF_THE_RUN = {
+OF_THE_RUN = {
     "duration_s": Column("duration", "t", "s", "linear", None),
     "distance_m": Column("distance travelled", "d", "m", "linear", None),
 }
@@ -58,7 +58,7 @@ _OF_THE_PATH = {
     "rpe_10m_heading_rmse_rad": Column("heading RMSE over 10 m", "RPE heading 10 m", "rad"),
 }
 COLUMNS = {
-    **_OF_THE_RUN,
+    **OF_THE_RUN,
     **_OF_THE_PATH,
     **{
         f"revised_{name}": dataclasses.replace(

@@ -7,6 +7,7 @@ import numpy as np
 
 from estimators.base import Estimate, Estimator, Prior, run
 from experiments.evaluation.metrics import score
+from experiments.runs.columns import OF_THE_RUN
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome, Row, Status
 from experiments.runs.seeds import stream
@@ -40,7 +41,8 @@ def evaluate(
     planted
         Gives a context in which the estimator is faulty, for each repeat.
     shown
-        Takes the number of Frames done, as a context around each repeat.
+        Shows the progress over a recording: gives a function of the number of Frames done, as a
+        context around each repeat.
     on_estimate
         Called with the recording, the repeat, its online estimate and the revised one (or None).
     on_error
@@ -107,11 +109,8 @@ def scored(recording: Recording, online: Estimate, revised: Estimate | None) -> 
     scores: Row = {**score(recording, online)}
     if revised is not None:
         found = score(recording, revised)
-        scores |= {f"revised_{k}": found[k] for k in found if k not in _OF_THE_RUN}
+        scores |= {f"revised_{k}": found[k] for k in found if k not in OF_THE_RUN}
     return scores
-
-
-_OF_THE_RUN = ("duration_s", "distance_m")
 
 
 def status_of(recording: Recording, online: Estimate) -> Status:
