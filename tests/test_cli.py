@@ -80,7 +80,7 @@ def test_a_run_prints_its_errors_and_leaves_a_row(tmp_path):
         (["simulation.rays=psychic"], ["simulation.rays"]),
         (["simulation.rays=bullet"], ["rays=exact"]),
         (["prior.start=nowhere"], ["prior.start", "tracking"]),
-        (["prior.start=global"], ["start pose"]),
+        (["prior.start=global", "route=linear_1"], ["start pose"]),
         (["estimator=icp_odometry"], ["laser"]),
         (["route.waypoints=[[0.05,0.05],[2,2]]"], ["overlaps a wall"]),
         (["recording=missing.npz"], ["missing.npz"]),
