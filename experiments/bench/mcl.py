@@ -5,9 +5,8 @@ uses them all. Times are processor times of all threads, so that other programs 
 for little. MRPT claims 30 to 36 million.
 """
 
-from __future__ import annotations
-
 import time
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +31,7 @@ _TRACK_M = 0.44
 _STEP_M = 0.25  # a scan is used every 0.2 m
 
 
-def run() -> list[Measurement]:
+def run() -> Iterator[Measurement]:
     """Whole updates while tracking, and look-ups near the robot and over all the floor."""
     world = office(
         rng=stream(0, "world"),
@@ -52,10 +51,10 @@ def run() -> list[Measurement]:
     size = f"{_LASER.n_beams} beams x {_N_PARTICLES} particles"
     whole = f"{size}; motion, weights, belief, resampling ({resampled:.0%} of updates)"
     rate = per_update / update_s
-    results = [
+    yield from (
         Measurement("mcl.particle_beams_per_s", rate, "1/s", 400e6, "higher", whole),
         Measurement("mcl.update_ms", update_s * 1e3, "ms", note=whole),
-    ]
+    )
     field, rng = likelihood_field(world, _LASER), np.random.default_rng(0)
     ends = [beam_ends(scan, _LASER, _LASER.n_beams) for scan in scans[::24]]
     spread = [0.1, 0.1, 0.03]
@@ -65,8 +64,7 @@ def run() -> list[Measurement]:
         inputs = zip(particles, ends, strict=True)
         rate = per_update / median_time_s(field.log_likelihood, inputs, clock=time.process_time)
         note = f"{size}; the look-up alone, particles {name}"
-        results.append(Measurement(f"mcl.lookups_{name}_per_s", rate, "1/s", None, "higher", note))
-    return results
+        yield Measurement(f"mcl.lookups_{name}_per_s", rate, "1/s", None, "higher", note)
 
 
 def _drive(world: World, n_frames: int) -> tuple[Array, Array, NDArray[np.float32]]:

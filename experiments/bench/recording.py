@@ -1,7 +1,5 @@
 """Speed of recording with the physics engine and its rays, from the first tick to the last."""
 
-from __future__ import annotations
-
 import resource
 import statistics
 import time

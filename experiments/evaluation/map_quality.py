@@ -1,7 +1,5 @@
 """Quality of a map of laser points: distance to the true walls, and entropy."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -5,8 +5,6 @@ the last digit (a grid, a global search), it states `global_or_grid = True` and 
 distribution.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

@@ -4,12 +4,10 @@ There are three kinds: a wrong entry of a derivative (or of the geometry behind 
 observations, and noise that is added or overestimated. Each has a size. No error is ever scaled.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from typing import Any
 from unittest import mock
 
@@ -25,7 +23,7 @@ from sim.recording import Frame
 from sim.robot import wheel_errors
 from sim.sensors import Laser, Reading, sensor_of
 
-Planted = Callable[[Estimator, np.random.Generator], AbstractContextManager[Estimator]]
+Planted = Callable[[Estimator, np.random.Generator], AbstractContextManager[object]]
 Fault = Callable[[float], Planted]  # of a size
 
 
@@ -39,15 +37,15 @@ def in_argument_of(
 
     def decorate(change: Callable[[Any, float, np.random.Generator], Any]) -> Fault:
         def fault(size: float) -> Planted:
-            @contextmanager
-            def plant(estimator: Estimator, rng: np.random.Generator) -> Iterator[Estimator]:
+            def plant(
+                estimator: Estimator, rng: np.random.Generator
+            ) -> AbstractContextManager[object]:
                 sound = getattr(estimator, method)
 
                 def faulty(argument: Any, *others: Any) -> Any:
                     return sound(change(argument, size, rng), *others)
 
-                with mock.patch.object(estimator, method, faulty):
-                    yield estimator
+                return mock.patch.object(estimator, method, faulty)
 
             return plant
 
@@ -64,15 +62,15 @@ def in_place_of(owner: Any, name: str) -> Callable[[Callable[..., Any]], Fault]:
 
     def decorate(wrong: Callable[..., Any]) -> Fault:
         def fault(size: float) -> Planted:
-            @contextmanager
-            def plant(estimator: Estimator, rng: np.random.Generator) -> Iterator[Estimator]:
+            def plant(
+                estimator: Estimator, rng: np.random.Generator
+            ) -> AbstractContextManager[object]:
                 sound = getattr(owner, name)
 
                 def faulty(*arguments: Any, **keywords: Any) -> Any:
                     return wrong(sound, size, *arguments, **keywords)
 
-                with mock.patch.object(owner, name, faulty):
-                    yield estimator
+                return mock.patch.object(owner, name, faulty)
 
             return plant
 
@@ -148,8 +146,7 @@ def _reading(frame: Frame, name: str, reading: Reading | None) -> Frame:
 @in_argument_of("step")
 def wrong_travel(frame: Frame, share: float, _: np.random.Generator) -> Frame:
     """The wheels' travel is believed too long, as by a wrong radius."""
-    travel = (1.0 + share) * frame.wheel_increments_m
-    return dataclasses.replace(frame, wheel_increments_m=travel)
+    return dataclasses.replace(frame, wheel_increments_m=(1.0 + share) * frame.wheel_increments_m)
 
 
 @in_argument_of("reset")

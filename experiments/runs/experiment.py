@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import math
 import re
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -23,14 +24,14 @@ from experiments.runs import paths
 from experiments.runs.cache import cached, key_of
 from experiments.runs.row import Row
 from experiments.runs.seeds import stream
-from experiments.runs.targets import make, targets
+from experiments.runs.targets import checked, make, targets
 from experiments.runs.version import code_version, source_digest, version_with
 from sim.arrays import Array
 from sim.errors import InputError
 from sim.recording import Frame, Recording, load
 from sim.robot import DifferentialDrive, RobotGeometry
 from sim.sensors import Sensor, Sensors, sensors_from_config
-from sim.settings import build, find
+from sim.settings import build
 from sim.world import World
 
 Config = dict[str, Any]
@@ -110,6 +111,10 @@ class Experiment:
             own_estimator=estimator,
         )
 
+    def with_estimator(self, **settings: Any) -> Experiment:
+        """Return the experiment with other values of keys of its estimator."""
+        return self.replaced(estimator={**self.config["estimator"], **settings})
+
     def over(self, recording: Recording) -> Experiment:
         """Return the experiment over a recording in memory, identified by its checksum."""
         self._compare_slip(recording)
@@ -177,21 +182,36 @@ class Experiment:
         return key_of(self._recording_settings())
 
     def labels(self, checksum: str) -> Row:
-        """Columns that state a row's origin: choices, all keys, versions, recording's checksum."""
-        settings = {k: v for k, v in self.config.items() if k not in ("keep", "picture")}
+        """Columns that state a row's origin: choices, keys, versions, the recording's checksum.
+
+        Settings that did not make the recording have no column.
+        """
+        applied = self._applied()
         brought = ("world", "sensors", "route") if self.config["recording"] is not None else ()
-        choices = {f"choice.{g}": name for g, name in self.choices.items() if g not in brought}
+        choices = {g: name for g, name in self.choices.items() if g in applied and g not in brought}
         return {
-            **choices,
-            **_flat(settings),
+            **{f"choice.{group}": name for group, name in choices.items()},
+            **_flat({k: v for k, v in applied.items() if k not in ("keep", "picture")}),
             "repeat": 0,
             "run_key": self.key,
             "code_version": self._code_version(),
             "recording_checksum": checksum,
         }
 
+    def _applied(self) -> Config:
+        """Settings without those of a simulation that a recording from a file takes the place of.
+
+        A function that makes the recording or the map may read all of them.
+        """
+        places = (self.config["recording"], self.config["prior"].get("map"))
+        made = any(isinstance(place, dict) and "_target_" in place for place in places)
+        if self.config["recording"] is None or made:
+            return self.config
+        unused = set(_SIMULATED_KEYS) - {"seed"}
+        return {key: value for key, value in self.config.items() if key not in unused}
+
     def _code_version(self) -> str:
-        return version_with(targets(self.config))
+        return version_with(targets(self._applied()))
 
     # What it names
 
@@ -212,7 +232,8 @@ class Experiment:
             raise InputError(f"keep must be a list of names, such as [ess], got {keep!r}")
         self.robot()
         self.sensors()
-        make(config["route"], "route")
+        self.route()
+        checked(config["world"], "world", ("rng",))
         stream(config["seed"], "slip")
         stream(config["world_seed"], "world", key="world_seed")
         self._check_simulation()
@@ -234,10 +255,16 @@ class Experiment:
         start, known_map = settings["start"], settings["map"]
         if start not in ("tracking", "global"):
             raise InputError(f"prior.start must be tracking or global, got {start!r}")
-        for key in ("sigma_position_m", "sigma_heading_rad") if start == "tracking" else ():
-            if not (isinstance(settings[key], (int, float)) and 0.0 <= settings[key] < np.inf):
-                raise InputError(f"prior.{key} must be zero or positive, got {settings[key]}")
-        if not isinstance(known_map, dict) and known_map not in ("none", "world"):
+        for key in ("sigma_position_m", "sigma_heading_rad"):
+            sigma = settings[key]
+            number = isinstance(sigma, (int, float)) and not isinstance(sigma, bool)
+            if not (number and 0.0 <= sigma < math.inf):
+                raise InputError(f"prior.{key} must be zero or a positive number, got {sigma!r}")
+        believed = {key: settings[key] for key in ("wheel_radius_m", "track_m")}
+        build(RobotGeometry, {k: 1.0 if v is None else v for k, v in believed.items()}, "prior")
+        if isinstance(known_map, dict):
+            checked(known_map, "prior.map", ("config", "recording"))
+        elif known_map not in ("none", "world"):
             raise InputError(
                 f"prior.map must be none, world or a mapping with _target_, got {known_map!r}"
             )
@@ -245,14 +272,15 @@ class Experiment:
     def _check_needs(self) -> None:
         """Check that the estimator gets the sensors and the map that it needs."""
         settings = self.config["estimator"]
-        estimator = self.own_estimator or find(settings.get("_target_"), "estimator")
+        estimator = self.own_estimator or checked(settings, "estimator")
+        if str(settings.get("_target_")).startswith("estimators."):
+            self.estimator()  # its values too; one from elsewhere may take long to make
         needs = frozenset(getattr(estimator, "needs", ()))
         if self.config["recording"] is None:
             self._check_sensors(f"estimator={self.estimator_name}", needs - {"map"}, settings)
             onboard = self.config["route"].get("feedback")
             if isinstance(onboard, dict):
-                make(onboard, "route.feedback")
-                steering = getattr(find(onboard["_target_"], "route.feedback"), "needs", ())
+                steering = getattr(make(onboard, "route.feedback"), "needs", ())
                 self._check_sensors("route.feedback", frozenset(steering) - {"map"}, onboard)
         mapped = self.config["prior"]["map"] != "none" or settings.get("map_path")
         if "map" in needs and not mapped:
@@ -433,6 +461,9 @@ def _check_shape(config: Config) -> None:
             raise InputError(f"{key} is missing; {remedy}")
         if key in _MAPPINGS and not isinstance(config[key], dict):
             raise InputError(f"{key} must hold keys, got {config[key]!r}")
+    for place in ("simulation", "prior"):
+        for name in config[place]:
+            _check_known(f"{place}.{name}")
     wanted = config["recording"]
     if not (wanted is None or isinstance(wanted, dict) or (isinstance(wanted, str) and wanted)):
         got = "nothing" if wanted == "" else repr(wanted)
@@ -461,6 +492,36 @@ def searched(config_dir: str | Path | None) -> list[str]:
     return [f"hydra.searchpath=[{paths.quoted(f'file://{folder}')}]"]
 
 
+def _check_known(key: str) -> None:
+    """Check that a key is one of the configuration's own."""
+    if key not in _KEYS:
+        place = key.rpartition(".")[0]
+        known = [other for other in _KEYS if other.rpartition(".")[0] == place]
+        raise InputError(f"unknown key {key}; known: {', '.join(known)}")
+
+
+def check_added(hydra: Any) -> None:
+    """Check that no override adds a key that nothing reads.
+
+    A study's YAML may have keys of its own; the command line sets those without a +.
+
+    Parameters
+    ----------
+    hydra
+        Hydra's own settings of a composed configuration.
+
+    Raises
+    ------
+    InputError
+        Naming the key, and the known ones.
+    """
+    groups = {choice.partition("@")[0] for choice in hydra.runtime.choices}
+    for override in OverridesParser.create().parse_overrides(list(hydra.overrides.task)):
+        added = override.is_add() or override.is_force_add()
+        if added and override.key_or_group not in groups:
+            _check_known(override.key_or_group.partition(".")[0])
+
+
 def check_overrides(overrides: Sequence[str]) -> None:
     """Check what Hydra itself does not: that each override has a key, and groups have names.
 
@@ -484,6 +545,7 @@ def composed(overrides: Sequence[str]) -> tuple[DictConfig, Mapping[str, str]]:
     """Have Hydra, once initialized, compose a configuration; also give the options it chose."""
     check_overrides(overrides)
     cfg = compose("config", overrides=list(overrides), return_hydra_config=True)
+    check_added(cfg.hydra)
     choices = cfg.hydra.runtime.choices
     OmegaConf.set_struct(cfg, False)
     del cfg["hydra"]

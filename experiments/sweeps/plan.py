@@ -1,7 +1,5 @@
 """The runs of a sweep: expand the swept values, compose each combination, pack them into jobs."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 

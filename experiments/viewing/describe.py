@@ -1,7 +1,5 @@
 """A recording in words."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sim.arrays import Array

@@ -3,8 +3,6 @@
 The same `Playback` is drawn to a file here (MP4, GIF, HTML), and in a window by `viewing.live`.
 """
 
-from __future__ import annotations
-
 import base64
 import dataclasses
 import io
@@ -25,6 +23,7 @@ from estimators.base import run as run_estimator
 from experiments.evaluation.metrics import CHI2_95_2DOF
 from experiments.runs.experiment import Experiment
 from experiments.runs.seeds import stream
+from experiments.viewing.plotting import plan_axes
 from experiments.viewing.style import (
     BLUE,
     ESTIMATE,
@@ -35,7 +34,7 @@ from experiments.viewing.style import (
     SKY,
     TRUTH,
     YELLOW,
-    figure,
+    subplots,
 )
 from experiments.viewing.world import draw_world, sees_landmarks
 from sim import se2
@@ -148,8 +147,7 @@ def estimate_of(
     given = [f"robot.{key}={value}" for key, value in robot.items()]
     experiment = Experiment.compose([f"estimator={source}", *given, *overrides])
     if "keep_map" in experiment.config["estimator"]:
-        settings = {**experiment.config["estimator"], "keep_map": True}
-        experiment = experiment.replaced(estimator=settings)
+        experiment = experiment.with_estimator(keep_map=True)
     sparing = _Sparing(experiment.estimator(), set(rows.tolist()))
     rng, prior = stream(experiment.seed, f"estimator/{source}", 0), experiment.prior(recording)
     return run_estimator(sparing, recording, prior, rng, _EXTRAS, on_step), source
@@ -195,15 +193,14 @@ def _last(stamps: Array, stamp: float) -> int:
     return int(np.searchsorted(stamps, stamp + 1e-9, side="right")) - 1
 
 
-def ellipse_outlines(means: Array, covariances: Array, n_corners: int = 24) -> Array:
+def ellipse_outlines(means: Array, covariances: Array) -> Array:
     """95 % ellipses of means (N, 2), covariances (N, 2, 2) as one line, with gaps of NaN."""
     values, vectors = np.linalg.eigh(covariances)
     axes = vectors * np.sqrt(CHI2_95_2DOF * np.maximum(values, 0.0))[:, None, :]
-    angle = np.linspace(0.0, 2.0 * np.pi, n_corners + 1)
+    angle = np.linspace(0.0, 2.0 * np.pi, 25)
     circle = np.column_stack([np.cos(angle), np.sin(angle)])
     outlines = means[:, None, :] + circle @ axes.transpose(0, 2, 1)
-    gaps = np.full((len(means), 1, 2), np.nan)
-    return np.concatenate([outlines, gaps], axis=1).reshape(-1, 2)
+    return np.concatenate([outlines, np.full((len(means), 1, 2), np.nan)], axis=1).reshape(-1, 2)
 
 
 def pictures(run: Playback) -> Iterator[Picture]:
@@ -213,11 +210,9 @@ def pictures(run: Playback) -> Iterator[Picture]:
     """
     recording = run.recording
     truth = None if recording.truth is None else recording.truth_at(recording.frame_stamps)
-    x1, y1, x2, y2 = _bounds(run, truth)
-    height_in = float(np.clip(7.0 * (y2 - y1) / (x2 - x1), 2.0, 8.0)) + 1.2
-    page = figure(8.0, height_in)
+    x1, y1, x2, y2 = bounds(run, truth)
+    page, ax = subplots(8.0, float(np.clip(7.0 * (y2 - y1) / (x2 - x1), 2.0, 8.0)) + 1.2)
     page.set_dpi(_DPI)
-    ax = page.subplots()
     if recording.world is not None:
         draw_world(ax, recording.world, landmarks=sees_landmarks(recording))
     glyph = max(recording.robot.track_m / 2.0, 0.012 * (x2 - x1))  # visible on any map
@@ -226,7 +221,7 @@ def pictures(run: Playback) -> Iterator[Picture]:
         for key, (style, color, label, more) in _layers(run, truth is not None).items()
     }
     title = ax.text(0.0, 1.01, "", transform=ax.transAxes, animated=True)
-    ax.set(xlabel="x, m", ylabel="y, m", aspect="equal", xlim=(x1, x2), ylim=(y1, y2))
+    plan_axes(ax, xlim=(x1, x2), ylim=(y1, y2))
     handles, labels = ax.get_legend_handles_labels()
     page.legend(handles, labels, loc="outside lower center", ncols=4, fontsize="small")
     ax.set_title(" ")  # reserves the room
@@ -317,7 +312,7 @@ def robot_outline(pose: Array, radius_m: float) -> Array:
     return np.concatenate([circle, front[None]])
 
 
-def _bounds(run: Playback, truth: Array | None) -> tuple[float, float, float, float]:
+def bounds(run: Playback, truth: Array | None) -> tuple[float, float, float, float]:
     """What the map shows: the world and the path, with a margin.
 
     A diverging estimate is followed to twice the size of all else.
@@ -349,15 +344,13 @@ def check_output(path: Path) -> None:
         raise InputError(f"{path}: MP4 needs ffmpeg, which is not installed; take .gif or .html")
 
 
-def save(run: Playback, path: Path, on_progress: Callable[[float], None], fps: int = FPS) -> None:
+def save(run: Playback, path: Path, on_progress: Callable[[float], None]) -> None:
     """Write the run as `.mp4` (needs ffmpeg), `.gif` or `.html`, whole or not at all.
 
     Parameters
     ----------
     on_progress
         Called with the share done.
-    fps
-        Pictures per second.
     """
     check_output(path)
 
@@ -368,13 +361,13 @@ def save(run: Playback, path: Path, on_progress: Callable[[float], None], fps: i
 
     write = {".mp4": _write_mp4, ".gif": _write_gif, ".html": _write_html}[path.suffix]
     with write_whole(path) as part:
-        write(counted(), part, fps)
+        write(counted(), part)
 
 
-def _write_mp4(images: Iterator[Picture], path: Path, fps: int) -> None:
+def _write_mp4(images: Iterator[Picture], path: Path) -> None:
     first = next(images)
     size = f"{first.shape[1]}x{first.shape[0]}"
-    raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", str(fps), "-i", "-"]
+    raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", str(FPS), "-i", "-"]
     command = ["ffmpeg", "-y", "-loglevel", "error", *raw, "-pix_fmt", "yuv420p", str(path)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         assert process.stdin is not None
@@ -398,13 +391,12 @@ def _reduced(image: Picture) -> Any:
     return Image.fromarray(image).quantize(96, method=Image.Quantize.FASTOCTREE)
 
 
-def _write_gif(images: Iterator[Picture], path: Path, fps: int) -> None:
+def _write_gif(images: Iterator[Picture], path: Path) -> None:
     first, *rest = (_reduced(image) for image in images)
-    duration_ms = round(1000 / fps)
-    first.save(path, format="GIF", save_all=True, append_images=rest, duration=duration_ms, loop=0)
+    first.save(path, "GIF", save_all=True, append_images=rest, duration=1000 // FPS, loop=0)
 
 
-def _write_html(images: Iterator[Picture], path: Path, fps: int) -> None:
+def _write_html(images: Iterator[Picture], path: Path) -> None:
     frames: list[str] = []
     for image in images:
         data = io.BytesIO()
@@ -414,7 +406,7 @@ def _write_html(images: Iterator[Picture], path: Path, fps: int) -> None:
         "width": image.shape[1],
         "height": image.shape[0],
         "last": len(frames) - 1,
-        "fps": fps,
+        "fps": FPS,
         "first": frames[0],
         "frames": ",\n".join(f'"{frame}"' for frame in frames),
     }

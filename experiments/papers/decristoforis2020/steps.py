@@ -1,7 +1,5 @@
 """Registration from scan to scan: the errors of its steps, and the shape of its ellipses."""
 
-from __future__ import annotations
-
 import functools
 import math
 

@@ -1,7 +1,5 @@
 """The studies of decristoforis2020: registration, its covariance, and fusion with odometry."""
 
-from __future__ import annotations
-
 import math
 import operator
 import timeit
@@ -145,7 +143,7 @@ def _run(
     """
     seen: list[Estimate] = []
     (found,) = evaluate(
-        experiment, recording, on_estimate=lambda _, online, __: seen.append(online)
+        experiment, lambda: recording, on_estimate=lambda _, __, online, ___: seen.append(online)
     )
     if not seen:
         raise RunFailedError(f"{experiment.name}: {found['status_code']}: {found['status_detail']}")

@@ -1,7 +1,5 @@
 """What gil2008 measures of a run besides its path: map, associations, error on revisited ground."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -4,8 +4,6 @@ Each table is a study of conf/study, whose swept values are its runs. Runs over 
 recording.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from itertools import accumulate
@@ -34,7 +32,7 @@ from sim.recording import Recording
 from sim.robot import arc_increment, wheel_errors
 from sim.sensors import StereoCamera
 
-Run = tuple[str, Experiment]  # the table its rows go to; its configuration
+TableRun = tuple[str, Experiment]  # the table its rows go to; its configuration
 
 _SCORES = (
     "ate_rmse_m",
@@ -74,7 +72,7 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
     on_progress(1.0)
 
 
-def plan(profile: Profile) -> Iterator[Run]:
+def plan(profile: Profile) -> Iterator[TableRun]:
     """All runs; the quick profile has the same ones over fewer worlds, with fewer repeats.
 
     They are composed for one world; the others differ only in their seed.
@@ -88,7 +86,7 @@ def plan(profile: Profile) -> Iterator[Run]:
                     yield table, one.replaced(seed=seed, world_seed=seed, repeats=repeats)
 
 
-def rows_of(runs: Sequence[Run]) -> list[tuple[str, Row]]:
+def rows_of(runs: Sequence[TableRun]) -> list[tuple[str, Row]]:
     """Table and row of every run over one scene."""
     first = runs[0][1]
     scene, recording = Scene.of(first.config), whole(first.config)

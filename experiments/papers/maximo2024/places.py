@@ -4,8 +4,6 @@ maximo2024 works on two routes whose clouds and network are not available. Their
 printed, or from positions that the user has; a synthetic field of descriptors replaces the network.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable

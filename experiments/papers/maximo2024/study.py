@@ -5,8 +5,6 @@ queries and descriptors of its own. Parameters are chosen on seeds below 100 by 
 on seeds from 1000 on.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Callable

@@ -3,8 +3,6 @@
 A world is a route with a synthetic field of descriptors, or a campus with simulated clouds.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Iterator
@@ -121,9 +119,8 @@ def localize(
         In place of the case's own.
     """
     taken = case.recording if recording is None else recording
-    estimator = {**case.experiment.config["estimator"], **settings}
     estimate = run(
-        case.experiment.replaced(estimator=estimator).estimator(),
+        case.experiment.with_estimator(**settings).estimator(),
         taken,
         Prior(taken.robot, taken.sensors, map=case.known_map),
         rng,
@@ -198,14 +195,13 @@ def _errors(walks: list[Walk]) -> Rows:
 
 def starts(
     case: Case, n_starts: int, settings: dict[str, Any], tolerance_m: float
-) -> list[tuple[int, float, Walk]]:
+) -> Iterator[tuple[int, float, Walk]]:
     """Figure 5: starts all along the route, the step at which each is localized, and its run."""
-    runs, length = [], WITHIN + HELD
+    length = WITHIN + HELD
     for start in map(int, np.linspace(0, len(case.recording.frame_stamps) - length - 1, n_starts)):
         part = resequenced(case.recording, np.arange(start, start + length))
         walk = localize(case, settings, stream(case.seed, "estimator/starts", start), part)
-        runs.append((start, settled_at(walk.errors_m, tolerance_m), walk))
-    return runs
+        yield start, settled_at(walk.errors_m, tolerance_m), walk
 
 
 def kidnapping_rows(

@@ -1,7 +1,5 @@
 """The figures of puzzlebot2024."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 
@@ -13,7 +11,7 @@ from numpy.typing import NDArray
 
 from experiments.papers.puzzlebot2024.settings import CALIBRATION_RUNS, NOMINAL, TABLE_1_K_M
 from experiments.papers.results import Results
-from experiments.viewing.plotting import draw_ellipses, plain_ticks, with_legend
+from experiments.viewing.plotting import draw_ellipses, plain_ticks, plan_axes, with_legend
 from experiments.viewing.style import BLACK, BLUE, CYCLE, ORANGE, subplots
 
 Arrays = Mapping[str, NDArray[Any]]
@@ -62,8 +60,7 @@ def ideal_and_real(square: Arrays) -> Figure:
         draw_ellipses(
             ax, means[some], covariances[some], "95 % ellipse", fill=False, color=BLUE, lw=0.9
         )
-        title = f"$k_r$ = {kr:.2g} m, $k_l$ = {kl:.2g} m"
-        ax.set(xlabel="x, m", ylabel="y, m", aspect="equal", title=title)
+        plan_axes(ax, title=f"$k_r$ = {kr:.2g} m, $k_l$ = {kl:.2g} m")
     return with_legend(page, ncols=3)
 
 
@@ -99,8 +96,12 @@ def ellipse_area(areas: pd.DataFrame, crossover: pd.DataFrame, straight: Arrays)
                 part["distance_m"], part["area_m2"], "-" if k < 5e-5 else "--", color=CYCLE[i],
                 label=f"{name}, k = {k:g} m",
             )  # fmt: skip
-    left.set(xlabel="distance rolled, m", ylabel="area of the 95 % ellipse, m²", yscale="log")
-    left.set_ylim(bottom=1e-6)
+    left.set(
+        xlabel="distance rolled, m",
+        ylabel="area of the 95 % ellipse, m²",
+        yscale="log",
+        ylim=(1e-6, None),
+    )
     _crossover(right, crossover, straight)
     return with_legend(page, ncols=3)
 
@@ -225,7 +226,11 @@ def coverage(table: pd.DataFrame) -> Figure:
                 color=CYCLE[i % 4 if linear else (i - 4) % 5],
                 label=str(name).replace("_", " "),
             )
-        ax.set(xlabel="k, m ($k_r$ = 1.5 k, $k_l$ = 0.5 k)", xscale="log", title=title)
-        ax.set_xlim(table["k_m"].min() * 0.7, table["k_m"].max() * 1.4)
+        ax.set(
+            xlabel="k, m ($k_r$ = 1.5 k, $k_l$ = 0.5 k)",
+            xscale="log",
+            xlim=(table["k_m"].min() * 0.7, table["k_m"].max() * 1.4),
+            title=title,
+        )
     axes[0].set_ylabel("share of runs")
     return with_legend(page, ncols=1, loc="outside right center")

@@ -4,8 +4,6 @@ Thousands of runs come from the kinematic robot, which obeys the same slip law a
 are driven by PyBullet too, and both are compared.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math

@@ -1,7 +1,5 @@
 """Recordings of the real logs that conf/study/real_logs_*.yaml name."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Literal
 
@@ -96,11 +94,11 @@ def calibrated_by_scans(recording: Recording, until_s: float) -> Recording:
     )
 
 
-def calibrated_by_truth(recording: Recording, until_s: float = CALIBRATED_S) -> Recording:
-    """The recording with wheel gains and track fitted to the truth of its first `until_s`."""
+def calibrated_by_truth(recording: Recording) -> Recording:
+    """The recording with wheel gains and track fitted to the truth of its first `CALIBRATED_S`."""
     truth, wheels = recording.known_truth, recording.wheels
     begin = max(truth.stamps[0], wheels.stamps[0])
-    times = np.arange(begin, min(begin + until_s, truth.stamps[-1]), 0.02)
+    times = np.arange(begin, min(begin + CALIBRATED_S, truth.stamps[-1]), 0.02)
     heading = np.interp(times, truth.stamps, np.unwrap(truth.poses[:, 2]))
     x, y = (np.interp(times, truth.stamps, truth.poses[:, i]) for i in (0, 1))
     along = np.cos(heading[:-1]) * np.diff(x) + np.sin(heading[:-1]) * np.diff(y)

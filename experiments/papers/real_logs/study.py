@@ -3,8 +3,6 @@
 The logs are not part of the project; they are expected in ../shared/data.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math
@@ -185,9 +183,9 @@ def _relation_rows(
         yield {"log": log, "method": method, "part": part, **found.summary(), **bounds}
 
 
-def _block_interval(errors: Array, stamps: Array, block_s: float = 60.0) -> dict[str, float]:
+def _block_interval(errors: Array, stamps: Array) -> dict[str, float]:
     """95 % bootstrap interval of a mean; relations that begin in the same minute stay together."""
-    _, blocks = np.unique(np.floor((stamps - stamps.min()) / block_s), return_inverse=True)
+    _, blocks = np.unique(np.floor((stamps - stamps.min()) / 60.0), return_inverse=True)
     sums, counts = np.bincount(blocks, errors), np.bincount(blocks)
     picks = np.random.default_rng(0).integers(len(sums), size=(2000, len(sums)))
     low, high = np.quantile(sums[picks].sum(axis=1) / counts[picks].sum(axis=1), [0.025, 0.975])
