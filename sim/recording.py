@@ -151,6 +151,10 @@ def joined(schema: Schema, stamps: Array, readings: Sequence[Reading], where: st
     InputError
         If they do not fit the schema.
     """
+    values = {
+        name: field.joined([reading[name] for reading in readings], f"{where}.{name}")
+        for name, field in schema.items()
+    }
     ragged = [name for name, field in schema.items() if field.ragged]
     splits = None
     if ragged:
@@ -164,10 +168,6 @@ def joined(schema: Schema, stamps: Array, readings: Sequence[Reading], where: st
                         f"{where}.{first} {size}; they must be as many"
                     )
         splits = np.cumsum([0, *sizes]).astype(np.int64)
-    values = {
-        name: field.joined([reading[name] for reading in readings], f"{where}.{name}")
-        for name, field in schema.items()
-    }
     log = Log(schema, stamps, values, splits)
     log.check(where)
     return log

@@ -312,6 +312,8 @@ def test_ragged_fields_of_a_reading_have_as_many_rows():
     ]
     with pytest.raises(InputError, match=r"s\.ids has 1 rows? in a reading, s\.points 2"):
         joined(schema, np.zeros(2), odd, "s")
+    with pytest.raises(InputError, match=r"s\.ids: readings that do not go together"):
+        joined(schema, np.zeros(1), [{"points": np.ones((1, 2)), "ids": 3}], "s")
 
 
 @pytest.mark.parametrize("damage", ["cut", "flip", "empty", "text", "other_zip"])
