@@ -193,7 +193,7 @@ def _off_line(surface: Segments, k: int, x: float, y: float) -> float:
     return off
 
 
-@njit(error_model="numpy", fastmath={"contract"})
+@njit(forceinline=True, error_model="numpy", fastmath={"contract"})
 def _nearest(
     surface: Segments, full_circle: bool, start: int, x: float, y: float
 ) -> tuple[int, float]:
@@ -520,13 +520,13 @@ def _judge(pair: _Pair, pose: Array, fit: _Fit) -> tuple[Array, Array, Array]:
 
 
 @njit(forceinline=True, error_model="numpy", fastmath={"contract"})
-def _beams_beside(scan: PreparedScan, j: int, x: float, y: float) -> tuple[int, bool]:
+def _beams_beside(rays: Array, full_circle: bool, j: int, x: float, y: float) -> tuple[int, bool]:
     """The beam before a point, by a walk from a guess, and whether there is one on both sides."""
-    rays, n = scan.rays, len(scan.rays)
+    n = len(rays)
     for _ in range(n):
         after = j + 1 if j + 1 < n else 0
         back = rays[j, 0] * y - rays[j, 1] * x < 0.0
-        at_end = (j if back else after) == 0 and not scan.full_circle
+        at_end = (j if back else after) == 0 and not full_circle
         if not back and rays[after, 0] * y - rays[after, 1] * x < 0.0:
             return j, not at_end
         if at_end:
@@ -548,7 +548,7 @@ def _confront(
     """
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
     c, s = math.cos(turn), math.sin(turn)
-    n, j = len(other.rays), 0
+    normals, surface, rays, j = scan.segments.normals, other.segments, other.rays, 0
     for i in range(len(scan.points)):
         line = scan.line_of_point[i]
         if line < 0:
@@ -556,18 +556,17 @@ def _confront(
         px, py = scan.points[i, 0], scan.points[i, 1]
         x, y = _turned(cos, sin, px, py)
         x, y = x + pose[0], y + pose[1]
-        j, between = _beams_beside(other, j, x, y)
+        j, between = _beams_beside(rays, other.full_circle, j, x, y)
         if not between:
-            j = min(j, n - 2)
+            j = min(j, len(rays) - 2)
             continue
-        if other.rays[j, 0] * x + other.rays[j, 1] * y <= 0.0:
+        if rays[j, 0] * x + rays[j, 1] * y <= 0.0:
             continue
         near, seen_m = False, math.inf
-        for k in (j, j + 1 if j + 1 < n else 0):
+        for k in (j, j + 1 if j + 1 < len(rays) else 0):
             on, seen_m = other.line_of_point[k], min(seen_m, other.ranges_m[k])
-            near |= on >= 0 and abs(_off_line(other.segments, on, x, y)) < tolerance
+            near |= on >= 0 and abs(_off_line(surface, on, x, y)) < tolerance
         if near or math.hypot(x, y) <= seen_m - 2.0 * tolerance:
-            normals = scan.segments.normals
             n1, n2 = _turned(c, s, normals[line, 0], normals[line, 1])
             qx, qy = _turned(c, s, px - lever[0], py - lever[1])
             _add_line(agreed if near else denied, 1.0, n1, n2, qx, qy)
