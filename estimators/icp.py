@@ -1,8 +1,8 @@
 """Registration of two laser scans in the plane: point-to-point and point-to-line ICP.
 
-The lines are those of `estimators.scan_lines`. Nothing is trimmed unless asked for: gates narrow
-only after the increment has settled, so the few points that hold the robot along a corridor still
-count.
+The lines are those of `estimators.scan_lines`. No share of the matches is trimmed, and gates
+narrow only after the increment has settled, so the few points that hold the robot along a corridor
+still count.
 
 Poses `T_target_source` take points of the source scan into the frame of the target scan.
 """
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from estimators.options import require_choices
-from estimators.scan_lines import PreparedScan, Segments, prepare, ranked
+from estimators.scan_lines import PreparedScan, Segments, prepare
 from sim.arrays import Array, Ints
 from sim.compiled import njit
 from sim.errors import InputError
@@ -25,7 +25,6 @@ from sim.errors import InputError
 __all__ = ["PreparedScan", "Registration", "prepare", "register"]
 
 Metric = Literal["point_to_line", "point_to_point"]
-Kernel = Literal["tukey", "huber", "none"]
 
 _COARSE_POINTS = 6  # points that stand for a line of the source until the poses are close
 # Errors of the heading, rad, that the second and the third stage may find: they bound how far
@@ -34,8 +33,7 @@ _TURN_THEN, _TURN_LAST = 0.01, 0.002
 _SEARCHED_RAD, _GUESSED_RAD = 0.08, 0.2  # after a search of the heading, and without
 _NO_GAIN = 1e-4  # fall of the cost, in squared standard deviations, that is worth no iteration
 _GRAZING = 0.001  # squared sine below which a beam along a wall is not trusted further
-# Whether weights fall to zero, and the tuning constant in standard deviations
-_KERNELS = {"none": (False, math.inf), "huber": (False, 1.345), "tukey": (True, 6.0)}
+_TUKEY = 6.0  # tuning constant, in standard deviations
 _LEAST_MEMBERS = 3  # points on a line before it holds a direction
 _AGREEMENT = 6.0  # range standard deviations from a line of the other scan
 LEAST_POINTS = 3  # of a scan that can be registered
@@ -121,16 +119,12 @@ class _Settings(NamedTuple):
 
     Attributes
     ----------
-    redescending
-        Whether the last stages weigh as Tukey does, or as Huber does.
-    trim, max_iterations, increment_m, increment_rad
+    max_iterations, increment_m, increment_rad
         See `register`.
     sigma_m, sigma_rad
         Standard deviations of the guess.
     """
 
-    redescending: bool
-    trim: float
     max_iterations: int
     increment_m: float
     increment_rad: float
@@ -145,7 +139,8 @@ class _Stage(NamedTuple):
     ----------
     coarse
         Weigh by the distance itself, as Geman and McClure do, and hold the pose to the guess;
-        or else by standard deviations of the range noise as it shows at the beam's incidence.
+        or else, as Tukey does, by standard deviations of the range noise as it shows at the
+        beam's incidence.
     gate_m
         Widest distance of a match.
     width
@@ -398,22 +393,19 @@ def _variance(n1: float, n2: float, vx: float, vy: float, noise_m: float) -> flo
 
 
 @njit(forceinline=True, error_model="numpy", fastmath={"contract"})
-def _weight(stage: _Stage, redescending: bool, squared: float, variance: float) -> float:
-    """How much a squared residual counts, by Geman and McClure, Tukey, or Huber."""
+def _weight(stage: _Stage, squared: float, variance: float) -> float:
+    """How much a squared residual counts, by Geman and McClure or by Tukey."""
     ratio = squared / (variance * stage.width * stage.width)
     if stage.coarse:
         return 1.0 / (1.0 + ratio) ** 2
-    if redescending:
-        return (1.0 - ratio) ** 2 if ratio < 1.0 else 0.0
-    return 1.0 / math.sqrt(ratio) if ratio > 1.0 else 1.0
+    return (1.0 - ratio) ** 2 if ratio < 1.0 else 0.0
 
 
 @njit(forceinline=True, error_model="numpy", fastmath={"contract"})
 def _linearise(
-    pair: _Pair, stage: _Stage, redescending: bool, sample: _Sample, pose: Array, fit: _Fit,
-    misses: Array, limit: float,
-) -> tuple[Array, Array]:  # fmt: skip
-    """Normal equations of the points whose squared miss is within a limit."""
+    pair: _Pair, stage: _Stage, sample: _Sample, pose: Array, fit: _Fit, misses: Array
+) -> tuple[Array, Array]:
+    """Normal equations of the points that are within the gate."""
     source, surface, counts = pair.source, pair.surface, sample.counts
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
     normal, gradient = np.zeros((3, 3)), np.zeros(3)
@@ -421,7 +413,7 @@ def _linearise(
         i = sample.points[k]
         j = fit.matches[i]
         fit.weights[i], fit.residuals[i] = 0.0, math.nan
-        if misses[k] > limit:
+        if misses[k] > stage.gate_m * stage.gate_m:
             continue
         qx, qy = _turned(cos, sin, source.points[i, 0], source.points[i, 1])
         if pair.to_lines:
@@ -429,7 +421,7 @@ def _linearise(
             vx, vy = _turned(cos, sin, source.rays[i, 0], source.rays[i, 1])
             miss = _off_line(surface, j, qx + pose[0], qy + pose[1])
             variance = 1.0 if stage.coarse else _variance(n1, n2, vx, vy, pair.noise_m)
-            weight = _weight(stage, redescending, miss * miss, variance) * (counts[k] / variance)
+            weight = _weight(stage, miss * miss, variance) * (counts[k] / variance)
             lever = _add_line(normal, weight, n1, n2, qx, qy)
             gradient[0] += weight * miss * n1
             gradient[1] += weight * miss * n2
@@ -439,7 +431,7 @@ def _linearise(
             ey = qy + pose[1] - pair.target.points[j, 1]
             miss = math.sqrt(ex * ex + ey * ey)
             variance = 1.0 if stage.coarse else 2.0 * pair.noise_m * pair.noise_m
-            weight = _weight(stage, redescending, miss * miss, variance) * (counts[k] / variance)
+            weight = _weight(stage, miss * miss, variance) * (counts[k] / variance)
             _add_point(normal, weight, qx, qy)
             gradient[0] += weight * ex
             gradient[1] += weight * ey
@@ -457,12 +449,7 @@ def _align(
     misses = np.empty(len(sample.points))
     for iteration in range(settings.max_iterations):
         _match(pair, stage.reach_m, sample, pose, iteration == 0, fit, misses)
-        limit = stage.gate_m * stage.gate_m
-        if settings.trim > 0.0:
-            limit = min(limit, ranked(misses, int((1.0 - settings.trim) * (len(misses) - 1))))
-        normal, gradient = _linearise(
-            pair, stage, settings.redescending, sample, pose, fit, misses, limit
-        )
+        normal, gradient = _linearise(pair, stage, sample, pose, fit, misses)
         if not normal[0, 0] + normal[1, 1] > 0.0:
             return iteration, False
         no_gain = _NO_GAIN
@@ -610,8 +597,6 @@ def register(
     initial: ArrayLike | None = None,
     *,
     metric: Metric = "point_to_line",
-    kernel: Kernel = "tukey",
-    trim: float = 0.0,
     gate_m: float = 2.0,
     gate_rad: float | None = None,
     heading_window_rad: float | None = None,
@@ -630,11 +615,6 @@ def register(
     ----------
     initial
         (3,) first guess of T_target_source; none is needed up to some decimetres and degrees.
-    kernel
-        Weight of residuals in the last stage: `tukey`, `huber`, or `none`.
-    trim
-        Share of the worst matches to leave out at every iteration. It takes the few points
-        that hold a robot along a corridor first; 0 is the sound choice.
     gate_m, gate_rad
         Errors that the guess may have, as four standard deviations. The first is also the widest
         distance of a match to begin with; both say how far the first stage may look, and hold
@@ -653,9 +633,7 @@ def register(
         raise InputError(
             f"an initial guess is three finite numbers (x, y, heading), got {initial!r}"
         )
-    require_choices("", metric=(metric, Metric), kernel=(kernel, Kernel))
-    if not 0.0 <= trim < 1.0:
-        raise InputError(f"trim must lie in [0, 1), got {trim}")
+    require_choices("", metric=(metric, Metric))
     to_lines = metric == "point_to_line"
     too_few = min(len(source.points), len(target.points)) < LEAST_POINTS
     if too_few or (to_lines and len(target.lines) == 0):
@@ -669,23 +647,20 @@ def register(
         window = math.pi / 6.0 if initial is None else 0.0
     if gate_rad is None:
         gate_rad = _SEARCHED_RAD if window > 0.0 else _GUESSED_RAD
-    redescending, width = _KERNELS[kernel]
-    settings = _Settings(
-        redescending, trim, max_iterations, increment_m, increment_rad, gate_m / 4.0, gate_rad / 4.0
-    )
+    settings = _Settings(max_iterations, increment_m, increment_rad, gate_m / 4.0, gate_rad / 4.0)
     reach_m, middle_m = 4.0 * gate_m / gate_rad, 0.5 / _TURN_THEN
     if to_lines:
         stages: tuple[_Stage, ...] = (
             _Stage(True, gate_m, 0.3, reach_m, 200.0),
             _Stage(True, min(gate_m, 0.5), 0.1, middle_m, 200.0),
-            _Stage(False, min(gate_m, 0.3), 3.0 * width, 0.3 / _TURN_LAST, 200.0),
-            _Stage(False, min(gate_m, 0.3), width, math.inf, 1.0),
+            _Stage(False, min(gate_m, 0.3), 3.0 * _TUKEY, 0.3 / _TURN_LAST, 200.0),
+            _Stage(False, min(gate_m, 0.3), _TUKEY, math.inf, 1.0),
         )
     else:
         stages = (
             _Stage(True, gate_m, 0.5, reach_m, 10.0),
             _Stage(True, min(gate_m, 0.5), 0.2, middle_m, 10.0),
-            _Stage(False, min(gate_m, 0.2), width, math.inf, 1.0),
+            _Stage(False, min(gate_m, 0.2), _TUKEY, math.inf, 1.0),
         )
     fit, iterations, converged, normal, information, spurious, agreed, denied = _register(
         source, target, pose, to_lines, window, settings, stages
