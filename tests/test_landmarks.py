@@ -42,11 +42,9 @@ class Batch:
         self.write()
 
     def rolled(self, normals, root):
-        moved = np.empty_like(self.lanes)
         x, y, yaw = self.model.mount
         mount = np.array([x, y, math.cos(yaw), math.sin(yaw)])
-        ekf.move(self.lanes, np.zeros(3), root, normals, mount, moved, self.state)
-        return moved
+        return ekf.move(self.lanes, np.zeros(3), root, normals, mount, self.state)
 
     def write(self):
         numbers = self.maps.data.reshape(len(self.maps.data), -1, 9, LANES)
