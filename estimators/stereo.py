@@ -137,16 +137,18 @@ class StereoModel:
     def packed(self) -> PackedCamera:
         """For the compiled loops."""
         by_focal, by_disparity = 1.0 / self.focal_px, 1.0 / (self.focal_px * self.baseline_m)
-        unit = float(np.prod(self.variances_px2)) * by_focal**4 * by_disparity**2
+        column, row, disparity = self.variances_px2.tolist()
         return PackedCamera(
             by_focal,
             by_disparity,
-            *self.variances_px2.tolist(),
+            column,
+            row,
+            disparity,
             self.height_m,
             self.correlated,
             self.in_image,
             self.at_measured,
-            unit,
+            column * row * disparity * by_focal**4 * by_disparity**2,
         )
 
     def usable(self, points_in_camera: ArrayLike) -> NDArray[np.bool_]:
