@@ -371,7 +371,8 @@ def _describe(
         angle = abs(math.atan2(a[0] * b[1] - a[1] * b[0], a[0] * b[0] + a[1] * b[1]))
         adjacent = beams[ends[k, 0]] - beams[ends[k - 1, 1]] <= _ADJACENT_BEAMS
         if adjacent and angle < _SMOOTH_JOINT_RAD:
-            variances[k - 1 : k + 1] += angle * angle / 12.0
+            variances[k - 1] += angle * angle / 12.0
+            variances[k] += angle * angle / 12.0
     return Segments(normals, distances, spans, end_rays, variances)
 
 
