@@ -362,7 +362,7 @@ def _add_point(matrix: Array, weight: float, qx: float, qy: float) -> None:
     matrix[2, 2] += weight * (qx * qx + qy * qy)
 
 
-@njit(forceinline=True, error_model="numpy", fastmath={"contract"})
+@njit(error_model="numpy", fastmath={"contract"})
 def _match(
     pair: _Pair, reach_m: float, sample: _Sample, pose: Array, first: bool, fit: _Fit, misses: Array
 ) -> None:
@@ -401,7 +401,7 @@ def _weight(stage: _Stage, squared: float, variance: float) -> float:
     return (1.0 - ratio) ** 2 if ratio < 1.0 else 0.0
 
 
-@njit(forceinline=True, error_model="numpy", fastmath={"contract"})
+@njit(error_model="numpy", fastmath={"contract"})
 def _linearise(
     pair: _Pair, stage: _Stage, sample: _Sample, pose: Array, fit: _Fit, misses: Array
 ) -> tuple[Array, Array]:
