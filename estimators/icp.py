@@ -223,17 +223,11 @@ def _nearest(
     return best, best_d2
 
 
-@njit(error_model="numpy", fastmath={"contract"})
 def _as_segments(scan: PreparedScan) -> Segments:
     """The points of a scan as segments without length."""
-    n = len(scan.points)
-    normals, spans, end_rays = np.zeros((n, 2)), np.empty((n, 2)), np.empty((n, 2, 2))
-    for k in range(n):
-        normals[k, 0] = 1.0
-        for end in range(2):
-            spans[k, end] = scan.points[k, 1]
-            end_rays[k, end, 0], end_rays[k, end, 1] = scan.rays[k, 0], scan.rays[k, 1]
-    return Segments(normals, scan.points[:, 0].copy(), spans, end_rays, np.zeros(n))
+    n, (x, y) = len(scan.points), scan.points.T.copy()
+    spans, end_rays = np.stack([y, y], axis=1), np.stack([scan.rays, scan.rays], axis=1)
+    return Segments(np.tile([1.0, 0.0], (n, 1)), x, spans, end_rays, np.zeros(n))
 
 
 @njit(error_model="numpy", fastmath={"contract"})
@@ -561,14 +555,10 @@ def _confront(
 
 @njit(error_model="numpy", fastmath={"contract"})
 def _register(
-    source: PreparedScan, target: PreparedScan, pose: Array, to_lines: bool, window: float,
-    settings: _Settings, stages: tuple[_Stage, ...],
-) -> tuple[_Fit, int, bool, Array, Array, Array, Array, Array]:  # fmt: skip
+    pair: _Pair, pose: Array, window: float, settings: _Settings, stages: tuple[_Stage, ...]
+) -> tuple[_Fit, int, bool, Array, Array, Array, Array, Array]:
     """All of a registration, from `pose`, in place."""
-    n = len(source.points)
-    noise = max(source.noise_m, target.noise_m)
-    surface = target.segments if to_lines else _as_segments(target)
-    pair = _Pair(source, target, to_lines, surface, noise)
+    source, target, n = pair.source, pair.target, len(pair.source.points)
     fit = _Fit(np.zeros(n, np.int64), np.zeros(n), np.zeros(n))
     if window > 0.0:
         pose[2] = _heading_by_lines(source, target, pose[2], window)
@@ -576,14 +566,14 @@ def _register(
     few, every = _representatives(source), _Sample(np.arange(n), np.ones(n))
     iterations, converged = 0, False
     for stage in stages:
-        sample = few if to_lines and stage.coarse else every
+        sample = few if pair.to_lines and stage.coarse else every
         done, converged = _align(pair, settings, stage, sample, guess, pose, fit)
         iterations += done
     normal, information, spurious = _judge(pair, pose, fit)
     for matrix in (normal, information, spurious):
         matrix[0, 1], matrix[0, 2], matrix[1, 2] = matrix[1, 0], matrix[2, 0], matrix[2, 1]
     agreed, denied = np.zeros((3, 3)), np.zeros((3, 3))
-    tolerance = _AGREEMENT * noise
+    tolerance = _AGREEMENT * pair.noise_m
     _confront(source, target, pose, pose[2], (0.0, 0.0), tolerance, agreed, denied)
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
     back = np.array([-cos * pose[0] - sin * pose[1], sin * pose[0] - cos * pose[1], -pose[2]])
@@ -662,8 +652,10 @@ def register(
             _Stage(True, min(gate_m, 0.5), 0.2, middle_m, 10.0),
             _Stage(False, min(gate_m, 0.2), _TUKEY, math.inf, 1.0),
         )
+    surface = target.segments if to_lines else _as_segments(target)
+    pair = _Pair(source, target, to_lines, surface, max(source.noise_m, target.noise_m))
     fit, iterations, converged, normal, information, spurious, agreed, denied = _register(
-        source, target, pose, to_lines, window, settings, stages
+        pair, pose, window, settings, stages
     )
     pose[2] = math.remainder(pose[2], 2.0 * math.pi)
     status = "ok"

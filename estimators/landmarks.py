@@ -612,7 +612,6 @@ def _gather(
     n_particles = ancestry.shape[1]
     ancestors = np.arange(n_particles)
     offsets = np.zeros(maps.shape[1] // _NUMBERS, np.int64)
-    older = np.empty(births.shape[1], np.int64)
     generation = len(ancestry)
     for slot in slots:
         if generation > epoch[slot]:
@@ -630,10 +629,9 @@ def _gather(
                 for j in range(LANES):
                     T[k * LANES + j] = source[lanes[j] + k * LANES]
         place[slot], spare = spare, place[slot]
-        if len(older):
-            older[:] = births[slot]
-            for m in range(n_particles):
-                births[slot, m] = older[ancestors[m]]
+        older = births[slot].copy()
+        for m in range(len(older)):
+            births[slot, m] = older[ancestors[m]]
     return spare
 
 
