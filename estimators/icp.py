@@ -439,7 +439,10 @@ def _align(
     pair: _Pair, settings: _Settings, stage: _Stage, sample: _Sample, guess: Array, pose: Array,
     fit: _Fit,
 ) -> tuple[int, bool]:  # fmt: skip
-    """Iterate from `pose`, in place, to rest in one stage; iterations, converged."""
+    """Iterate from `pose`, in place, to rest in one stage: iterations, converged.
+
+    A coarse stage holds the pose to the guess where the scans show nothing.
+    """
     misses = np.empty(len(sample.points))
     for iteration in range(settings.max_iterations):
         _match(pair, stage.reach_m, sample, pose, iteration == 0, fit, misses)
@@ -639,6 +642,7 @@ def register(
         gate_rad = _SEARCHED_RAD if window > 0.0 else _GUESSED_RAD
     settings = _Settings(max_iterations, increment_m, increment_rad, gate_m / 4.0, gate_rad / 4.0)
     reach_m, middle_m = 4.0 * gate_m / gate_rad, 0.5 / _TURN_THEN
+    # each is coarse or not, with its gate, width, reach and slack
     if to_lines:
         stages: tuple[_Stage, ...] = (
             _Stage(True, gate_m, 0.3, reach_m, 200.0),
