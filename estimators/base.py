@@ -1,7 +1,5 @@
 """What every estimator takes and gives: Prior, Belief, Estimate, and the protocol itself."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field

@@ -4,8 +4,6 @@ Each kind has `describe(lidar, ranges)`, one float32 row (D,) a cloud, and
 `distances(query, database)`, (N,) from a row to each of (N, D).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -8,8 +8,6 @@ Errors are twists in map (an invariant filter; Barrau and Bonnabel 2017): with e
 coordinates, registrations would spuriously inform the absolute heading once it is uncertain.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from typing import Any
@@ -19,7 +17,7 @@ from scipy.special import chdtri
 
 from estimators.base import Belief, Prior
 from estimators.gaussian import STILL, Gaussian, between, compose, rotated, update, wrap
-from estimators.icp import Metric, PreparedScan, Search
+from estimators.icp import Metric, PreparedScan
 from estimators.options import require_laser, require_non_negative, require_shares, start_pose
 from estimators.scan_matching import (
     Covariance,
@@ -50,7 +48,7 @@ class EkfIcp:
 
     Parameters
     ----------
-    metric, search, covariance, sigma_range_m
+    metric, covariance, sigma_range_m
         As in `estimators.scan_matching.ScanMatcher`; each scan contributes half of the covariance.
     keyframe_distance_m, keyframe_turn_rad
         How far the robot goes before it takes a new key frame.
@@ -89,7 +87,6 @@ class EkfIcp:
     def __init__(
         self,
         metric: Metric = "point_to_line",
-        search: Search = "angular",
         covariance: Covariance = "censi",
         sigma_range_m: float | None = None,
         keyframe_distance_m: float = 0.5,
@@ -106,7 +103,7 @@ class EkfIcp:
         laser: str = "laser",
     ) -> None:
         self.laser = laser
-        self._matcher = ScanMatcher(metric, search, covariance, sigma_range_m)
+        self._matcher = ScanMatcher(metric, covariance, sigma_range_m)
         self.wheels = WheelPrediction(
             kr, kl, window_s, lateral_slip_m=lateral_slip_m, encoder_tick_m=encoder_tick_m
         )

@@ -4,8 +4,6 @@
 paper. Its covariance is reported as it comes out.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 
@@ -13,7 +11,7 @@ import numpy as np
 
 from estimators.base import Belief, Prior
 from estimators.gaussian import STILL, Gaussian, update, wrap
-from estimators.icp import Metric, PreparedScan, Search
+from estimators.icp import Metric, PreparedScan
 from estimators.options import require_laser, require_non_negative, start_pose
 from estimators.scan_matching import (
     Covariance,
@@ -37,7 +35,7 @@ class EkfIcpPaper:
 
     Parameters
     ----------
-    metric, search, covariance, sigma_range_m
+    metric, covariance, sigma_range_m
         As in `estimators.scan_matching.ScanMatcher`.
     kr, kl
         Believed slip variance per metre of the wheels, m.
@@ -65,7 +63,6 @@ class EkfIcpPaper:
     def __init__(
         self,
         metric: Metric = "point_to_line",
-        search: Search = "angular",
         covariance: Covariance = "censi",
         sigma_range_m: float | None = None,
         kr: float = 1e-4,
@@ -77,7 +74,7 @@ class EkfIcpPaper:
         laser: str = "laser",
     ) -> None:
         self.laser = laser
-        self._matcher = ScanMatcher(metric, search, covariance, sigma_range_m)
+        self._matcher = ScanMatcher(metric, covariance, sigma_range_m)
         self.wheels = WheelPrediction(kr, kl, window_s, lateral_slip_m=lateral_slip_m)
         require_non_negative(acceleration_noise=acceleration_noise, turn_noise=turn_noise)
         self.acceleration_noise, self.turn_noise = acceleration_noise, turn_noise

@@ -4,8 +4,6 @@ One Gaussian over the robot's pose and all landmarks, with all their correlation
 association for the whole filter, and a wrong one is never taken back.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

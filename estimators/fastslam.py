@@ -1,7 +1,5 @@
 """FastSLAM: a particle filter over the robot's path, with an EKF for each landmark (gil2008)."""
 
-from __future__ import annotations
-
 import math
 from typing import Any, Literal
 
@@ -294,10 +292,8 @@ class FastSLAM:
 
     def _move(self, normals: Array) -> Array:
         """Poses (5, lanes) after the motion, and the state that belongs to them."""
-        moved = np.empty_like(self._poses)
         mean, mount = self._rolled.mean, self._mount
-        ekf.move(self._poses, mean, self._root, normals, mount, moved, self._state)
-        return moved
+        return ekf.move(self._poses, mean, self._root, normals, mount, self._state)
 
     def _take_stock(self) -> None:
         """Moments of the particles as they are drawn and weighted."""

@@ -13,8 +13,6 @@ direction (a bare corridor, a round room) every method gives it the large varian
   ICP covariance estimation", RA-L 2020), and its sum with `censi`.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any, Literal
 

@@ -4,8 +4,6 @@ Each scan is registered against the previous one, eq. (5), or against a key fram
 covariance is composed along.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -14,7 +12,7 @@ import numpy as np
 
 from estimators.base import Belief, Prior
 from estimators.gaussian import STILL, Gaussian
-from estimators.icp import Metric, PreparedScan, Search
+from estimators.icp import Metric, PreparedScan
 from estimators.options import require_choices, require_laser, require_non_negative, start_pose
 from estimators.scan_matching import (
     FAILED,
@@ -46,7 +44,7 @@ class IcpOdometry:
 
     Parameters
     ----------
-    metric, search, covariance, sigma_range_m
+    metric, covariance, sigma_range_m
         As in `estimators.scan_matching.ScanMatcher`.
     reference
         What a scan is registered against: the `previous` scan (decristoforis2020, eq. (5)), or a
@@ -84,14 +82,13 @@ class IcpOdometry:
         use_odometry_guess: bool = True,
         covariance: Covariance = "censi",
         sigma_range_m: float | None = None,
-        search: Search = "angular",
         kr: float = 1e-4,
         kl: float = 1e-4,
         window_s: float = 0.05,
         laser: str = "laser",
     ) -> None:
         self.laser = laser
-        self._matcher = ScanMatcher(metric, search, covariance, sigma_range_m)
+        self._matcher = ScanMatcher(metric, covariance, sigma_range_m)
         self.wheels = WheelPrediction(kr, kl, window_s)
         require_choices(reference=(reference, Reference))
         require_non_negative(

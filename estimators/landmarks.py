@@ -2,20 +2,16 @@
 
 Each particle has a map of its own; slot n of a map holds one landmark, a mean (3,) and a covariance
 of 6 unique entries in map axes. In memory come slots, then blocks of `LANES` particles, then the
-nine numbers: an observation of the slot that all particles share runs through memory once, and a
-vector unit works on as many particles as it is wide.
+nine numbers, a row of `LANES` each: an observation of the slot that all particles share runs
+through memory once, and a vector unit works on as many particles as it is wide.
 
 The update, gil2008, eqs. (3)-(8), is computed in map axes, where G = 1 (see
 `estimators.stereo`): S = P + C^T R C, K = P S^-1, and P - K P for the covariance, of which only the
 upper half is computed, so that it stays symmetric. Weights are those of eq. (13).
 
-State of a particle for one image, a row of `LANES` each: camera position x, y, cosine and sine of
-its heading, base_link x, y, then what the image adds up: sum of Mahalanobis distances, product of
-determinants and of the factors of depth that go with them, information (6) and information vector
-(3) on the pose.
+The state of the particles for one image has blocks too: the geometry of each particle, and what
+the image adds up. `_X + j` is where the number x of lane j lies in its block.
 """
-
-from __future__ import annotations
 
 import math
 from typing import Literal
@@ -23,19 +19,32 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from estimators.stereo import PackedCamera
+from sim import se2
 from sim.arrays import Array, Ints
 from sim.compiled import njit
 
 Maps = Literal["shared", "contiguous"]
 
 LANES = 16  # the least trip count that LLVM vectorises behind a check for overlap
+# A landmark's mean and covariance
 _NUMBERS = 9
+_X, _Y, _Z, _XX, _XY, _XZ, _YY, _YZ, _ZZ = (k * LANES for k in range(_NUMBERS))
+# State: position of the camera, cosine and sine of its heading, position of base_link; sum of
+# Mahalanobis distances, products of determinants and of the factors of depth that go with them;
+# information (6) and information vector (3) on the pose
 _FIELDS = 18
-_DISTANCE, _DETERMINANT, _DEPTH, _INFORMATION = 6, 7, 8, 9
+_GEOMETRY = 6
+_CAMERA_X, _CAMERA_Y, _COS, _SIN, _BASE_X, _BASE_Y = (k * LANES for k in range(_GEOMETRY))
+_DISTANCE, _DETERMINANT, _DEPTH = (k * LANES for k in range(_GEOMETRY, 9))
+_IXX, _IXY, _IXT, _IYY, _IYT, _ITT, _IX, _IY, _IT = (k * LANES for k in range(9, _FIELDS))
 _GENERATIONS = 256
 GROUP = 24  # observations whose determinants are multiplied before their log is taken
 LOG_2PI_1_5 = 1.5 * math.log(2.0 * math.pi)
 _LEAST_DEPTH_M = 0.1  # as in estimators.stereo
+
+_Vector = tuple[float, float, float]
+_Symmetric = tuple[float, float, float, float, float, float]  # xx, xy, xz, yy, yz, zz
 
 # No option that takes NaN or infinity for impossible: they must come out as they are.
 _FLOATS = {"error_model": "numpy", "fastmath": {"contract", "arcp", "reassoc", "nsz"}}
@@ -174,9 +183,9 @@ def new_state(n_blocks: int) -> Array:
 
 def summed(state: Array, n_particles: int) -> Array:
     """Log weights (M,) that a group of observations gave, eq. (13), but for `log_scale`."""
-    fields = state.reshape(len(state), _FIELDS, LANES)
     distances, determinants, depths = (
-        fields[:, field].reshape(-1)[:n_particles] for field in (_DISTANCE, _DETERMINANT, _DEPTH)
+        state[:, field : field + LANES].reshape(-1)[:n_particles]
+        for field in (_DISTANCE, _DETERMINANT, _DEPTH)
     )
     with np.errstate(divide="ignore", invalid="ignore"):
         logs: Array = -0.5 * (distances + np.log(determinants / depths))
@@ -185,290 +194,255 @@ def summed(state: Array, n_particles: int) -> Array:
     return logs
 
 
-def log_scale(points: Array, camera: Array) -> float:
+def log_scale(points: Array, camera: PackedCamera) -> float:
     """Add to the weights for points (K, 3): 2 pi, and determinants of R at the measured points."""
-    at_measured = len(points) * math.log(camera[9]) + 8.0 * float(np.log(points[:, 2]).sum())
+    at_measured = len(points) * math.log(camera.unit_determinant) + 8.0 * float(
+        np.log(points[:, 2]).sum()
+    )
     return -len(points) * LOG_2PI_1_5 - 0.5 * at_measured
 
 
 @njit(forceinline=True, **_FLOATS)
-def _innovation(
-    px: float,
-    py: float,
-    pz: float,
-    cos: float,
-    sin: float,
-    mx: float,
-    my: float,
-    mz: float,
-    camera: Array,
-) -> tuple[float, float, float, float, float, float, float, float, float, float]:
-    """Innovation (3) and R (6) in map axes, and depth factor, of a landmark at p off the camera."""
-    qx, qy, qz = cos * mz + sin * mx, sin * mz - cos * mx, -my
-    vx, vy, vz = qx - px, qy - py, qz - pz
-    if camera[8] > 0.5:  # R at the measured point
-        px, py, pz = qx, qy, qz
-    x, z = sin * px - cos * py, max(cos * px + sin * py, _LEAST_DEPTH_M)
-    factor = 1.0
-    if camera[7] > 0.5:  # innovations of the image
-        factor = z * (1.0 / mz)
-        vx, vy, vz = vx * factor, vy * factor, vz * factor
-    by_focal, by_disparity = z * camera[0], z * camera[1]
-    scale, apart = by_focal * by_focal, by_disparity * by_disparity * camera[4]
-    together = camera[6] * apart  # share of the disparity's variance that correlates
-    apart -= together
-    across = scale * camera[2] + apart * x * x
-    along = apart * z * z
-    xx = across * sin * sin + along * cos * cos + together * px * px
-    xy = (along - across) * sin * cos + together * px * py
-    yy = across * cos * cos + along * sin * sin + together * py * py
-    zz = scale * camera[3] + (apart + together) * pz * pz
-    return vx, vy, vz, xx, xy, together * px * pz, yy, together * py * pz, zz, factor
+def _dot(a: _Vector, b: _Vector) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @njit(forceinline=True, **_FLOATS)
-def _inverse(
-    xx: float, xy: float, xz: float, yy: float, yz: float, zz: float
-) -> tuple[float, float, float, float, float, float, float]:
-    """Inverse (6) and determinant of a symmetric matrix."""
+def _times(m: _Symmetric, v: _Vector) -> _Vector:
+    """Product of a symmetric matrix and a vector."""
+    xx, xy, xz, yy, yz, zz = m
+    return _dot((xx, xy, xz), v), _dot((xy, yy, yz), v), _dot((xz, yz, zz), v)
+
+
+@njit(forceinline=True, **_FLOATS)
+def _plus(a: _Symmetric, b: _Symmetric) -> _Symmetric:
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2], a[3] + b[3], a[4] + b[4], a[5] + b[5]
+
+
+@njit(forceinline=True, **_FLOATS)
+def _inverse(m: _Symmetric) -> tuple[_Symmetric, float]:
+    """Inverse and determinant of a symmetric matrix."""
+    xx, xy, xz, yy, yz, zz = m
     a, b, c = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
     determinant = xx * a + xy * b + xz * c
     s = 1.0 / determinant
     d, e, f = xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy
-    return a * s, b * s, c * s, d * s, e * s, f * s, determinant
+    return (a * s, b * s, c * s, d * s, e * s, f * s), determinant
+
+
+@njit(forceinline=True, **_FLOATS)
+def _covariance(L: Array, j: int) -> _Symmetric:
+    """Covariance of lane j of a landmark block."""
+    return L[_XX + j], L[_XY + j], L[_XZ + j], L[_YY + j], L[_YZ + j], L[_ZZ + j]
+
+
+@njit(forceinline=True, **_FLOATS)
+def _in_map(S: Array, j: int, seen: _Vector) -> _Vector:
+    """A point seen in the camera frame of lane j, from the camera, in map axes."""
+    cos, sin = S[_COS + j], S[_SIN + j]
+    return cos * seen[2] + sin * seen[0], sin * seen[2] - cos * seen[0], -seen[1]
+
+
+@njit(forceinline=True, **_FLOATS)
+def _noise(S: Array, j: int, at: _Vector, camera: PackedCamera) -> tuple[_Symmetric, float]:
+    """R in map axes at a point off the camera of lane j, and the point's depth."""
+    px, py, pz = at
+    cos, sin = S[_COS + j], S[_SIN + j]
+    x, z = sin * px - cos * py, max(cos * px + sin * py, _LEAST_DEPTH_M)
+    by_focal, by_disparity = z * camera.per_focal, z * camera.per_disparity
+    scale, apart = by_focal * by_focal, by_disparity * by_disparity * camera.disparity_variance
+    together = camera.correlated * apart  # share of the disparity's variance that correlates
+    apart -= together
+    across = scale * camera.column_variance + apart * x * x
+    along = apart * z * z
+    xx = across * sin * sin + along * cos * cos + together * px * px
+    xy = (along - across) * sin * cos + together * px * py
+    yy = across * cos * cos + along * sin * sin + together * py * py
+    zz = scale * camera.row_variance + (apart + together) * pz * pz
+    return (xx, xy, together * px * pz, yy, together * py * pz, zz), z
+
+
+@njit(forceinline=True, **_FLOATS)
+def _innovation(
+    L: Array, S: Array, j: int, seen: _Vector, camera: PackedCamera
+) -> tuple[_Vector, _Symmetric, float]:
+    """Innovation and R in map axes, and depth factor, of lane j of a landmark block."""
+    p = L[_X + j] - S[_CAMERA_X + j], L[_Y + j] - S[_CAMERA_Y + j], L[_Z + j] - camera.height_m
+    q = _in_map(S, j, seen)
+    R, z = _noise(S, j, q if camera.at_measured else p, camera)
+    factor = z * (1.0 / seen[2]) if camera.in_image else 1.0
+    return ((q[0] - p[0]) * factor, (q[1] - p[1]) * factor, (q[2] - p[2]) * factor), R, factor
 
 
 @njit(forceinline=True, **_FLOATS)
 def _corrected(
-    L: Array, S: Array, j: int, mx: float, my: float, mz: float, camera: Array, scale: float
+    L: Array, S: Array, j: int, seen: _Vector, camera: PackedCamera, scale: float
 ) -> None:
     """Update lane j of a landmark block with one observation, and add to the lane's weight.
 
     The determinant of S is scaled, so that a product of many is not far from 1.
     """
-    cos, sin = S[2 * LANES + j], S[3 * LANES + j]
-    vx, vy, vz, rxx, rxy, rxz, ryy, ryz, rzz, factor = _innovation(
-        L[j] - S[j],
-        L[LANES + j] - S[LANES + j],
-        L[2 * LANES + j] - camera[5],
-        cos,
-        sin,
-        mx,
-        my,
-        mz,
-        camera,
-    )
-    pxx, pxy, pxz = L[3 * LANES + j], L[4 * LANES + j], L[5 * LANES + j]
-    pyy, pyz, pzz = L[6 * LANES + j], L[7 * LANES + j], L[8 * LANES + j]
-    wxx, wxy, wxz, wyy, wyz, wzz, determinant = _inverse(
-        pxx + rxx, pxy + rxy, pxz + rxz, pyy + ryy, pyz + ryz, pzz + rzz
-    )
-    ux = wxx * vx + wxy * vy + wxz * vz
-    uy = wxy * vx + wyy * vy + wyz * vz
-    uz = wxz * vx + wyz * vy + wzz * vz
-    S[_DISTANCE * LANES + j] += vx * ux + vy * uy + vz * uz
-    eighth = factor * factor
-    eighth *= eighth
-    eighth *= eighth
-    S[_DETERMINANT * LANES + j] *= determinant * scale
-    S[_DEPTH * LANES + j] *= eighth
-    L[j] += pxx * ux + pxy * uy + pxz * uz
-    L[LANES + j] += pxy * ux + pyy * uy + pyz * uz
-    L[2 * LANES + j] += pxz * ux + pyz * uy + pzz * uz
-    k00 = pxx * wxx + pxy * wxy + pxz * wxz
-    k01 = pxx * wxy + pxy * wyy + pxz * wyz
-    k02 = pxx * wxz + pxy * wyz + pxz * wzz
-    k10 = pxy * wxx + pyy * wxy + pyz * wxz
-    k11 = pxy * wxy + pyy * wyy + pyz * wyz
-    k12 = pxy * wxz + pyy * wyz + pyz * wzz
-    k20 = pxz * wxx + pyz * wxy + pzz * wxz
-    k21 = pxz * wxy + pyz * wyy + pzz * wyz
-    k22 = pxz * wxz + pyz * wyz + pzz * wzz
-    L[3 * LANES + j] = pxx - (k00 * pxx + k01 * pxy + k02 * pxz)
-    L[4 * LANES + j] = pxy - (k00 * pxy + k01 * pyy + k02 * pyz)
-    L[5 * LANES + j] = pxz - (k00 * pxz + k01 * pyz + k02 * pzz)
-    L[6 * LANES + j] = pyy - (k10 * pxy + k11 * pyy + k12 * pyz)
-    L[7 * LANES + j] = pyz - (k10 * pxz + k11 * pyz + k12 * pzz)
-    L[8 * LANES + j] = pzz - (k20 * pxz + k21 * pyz + k22 * pzz)
+    v, R, factor = _innovation(L, S, j, seen, camera)
+    P = _covariance(L, j)
+    W, determinant = _inverse(_plus(P, R))
+    u = _times(W, v)
+    S[_DISTANCE + j] += _dot(v, u)
+    S[_DETERMINANT + j] *= determinant * scale
+    fourth = (factor * factor) * (factor * factor)
+    S[_DEPTH + j] *= fourth * fourth
+    x, y, z = (P[0], P[1], P[2]), (P[1], P[3], P[4]), (P[2], P[4], P[5])
+    L[_X + j] += _dot(x, u)
+    L[_Y + j] += _dot(y, u)
+    L[_Z + j] += _dot(z, u)
+    Wx, Wy, Wz = _times(W, x), _times(W, y), _times(W, z)
+    L[_XX + j], L[_XY + j], L[_XZ + j] = P[0] - _dot(x, Wx), P[1] - _dot(x, Wy), P[2] - _dot(x, Wz)
+    L[_YY + j], L[_YZ + j], L[_ZZ + j] = P[3] - _dot(y, Wy), P[4] - _dot(y, Wz), P[5] - _dot(z, Wz)
 
 
 @njit(forceinline=True, **_FLOATS)
-def _informed(L: Array, S: Array, j: int, mx: float, my: float, mz: float, camera: Array) -> None:
+def _informed(L: Array, S: Array, j: int, seen: _Vector, camera: PackedCamera) -> None:
     """Add one observation's information on the pose of lane j: H^T S^-1 H and H^T S^-1 v.
 
     In map axes H = [[-1, 0, dy], [0, -1, -dx], [0, 0, 0]], with d from base_link to the landmark.
     """
-    cos, sin = S[2 * LANES + j], S[3 * LANES + j]
-    vx, vy, vz, rxx, rxy, rxz, ryy, ryz, rzz, _ = _innovation(
-        L[j] - S[j],
-        L[LANES + j] - S[LANES + j],
-        L[2 * LANES + j] - camera[5],
-        cos,
-        sin,
-        mx,
-        my,
-        mz,
-        camera,
-    )
-    wxx, wxy, wxz, wyy, wyz, _, _ = _inverse(
-        L[3 * LANES + j] + rxx,
-        L[4 * LANES + j] + rxy,
-        L[5 * LANES + j] + rxz,
-        L[6 * LANES + j] + ryy,
-        L[7 * LANES + j] + ryz,
-        L[8 * LANES + j] + rzz,
-    )
-    dx, dy = L[j] - S[4 * LANES + j], L[LANES + j] - S[5 * LANES + j]
-    tx, ty = wxx * dy - wxy * dx, wxy * dy - wyy * dx
-    ux, uy = wxx * vx + wxy * vy + wxz * vz, wxy * vx + wyy * vy + wyz * vz
-    at = _INFORMATION * LANES + j
-    S[at] += wxx
-    S[at + LANES] += wxy
-    S[at + 2 * LANES] -= tx
-    S[at + 3 * LANES] += wyy
-    S[at + 4 * LANES] -= ty
-    S[at + 5 * LANES] += tx * dy - ty * dx
-    S[at + 6 * LANES] -= ux
-    S[at + 7 * LANES] -= uy
-    S[at + 8 * LANES] += ux * dy - uy * dx
+    v, R, _ = _innovation(L, S, j, seen, camera)
+    W, _ = _inverse(_plus(_covariance(L, j), R))
+    dx, dy = L[_X + j] - S[_BASE_X + j], L[_Y + j] - S[_BASE_Y + j]
+    (tx, ty, _), (ux, uy, _) = _times(W, (dy, -dx, 0.0)), _times(W, v)
+    S[_IXX + j] += W[0]
+    S[_IXY + j] += W[1]
+    S[_IXT + j] -= tx
+    S[_IYY + j] += W[3]
+    S[_IYT + j] -= ty
+    S[_ITT + j] += tx * dy - ty * dx
+    S[_IX + j] -= ux
+    S[_IY + j] -= uy
+    S[_IT + j] += ux * dy - uy * dx
 
 
 @njit(**_FLOATS)
-def update(maps: Array, rows: Ints, points: Array, state: Array, camera: Array) -> None:
+def _reset_weights(state: Array) -> None:
+    state[:, _DISTANCE:_DETERMINANT] = 0.0
+    state[:, _DETERMINANT:_IXX] = 1.0
+
+
+@njit(**_FLOATS)
+def update(maps: Array, rows: Ints, points: Array, state: Array, camera: PackedCamera) -> None:
     """Update rows (K,), the same in all particles, by points (K, 3) in the camera frame.
 
     Resets the state's sums first. K is at most `GROUP`, so that the product of determinants, each
     over that of R at the measured point, stays within a double.
     """
-    state[:, _DISTANCE * LANES : (_DISTANCE + 1) * LANES] = 0.0
-    state[:, _DETERMINANT * LANES : (_DEPTH + 1) * LANES] = 1.0
+    _reset_weights(state)
     for i in range(len(rows)):
-        mx, my, mz = points[i, 0], points[i, 1], points[i, 2]
-        scale = 1.0 / (camera[9] * mz**8)
+        seen = points[i, 0], points[i, 1], points[i, 2]
+        scale = 1.0 / (camera.unit_determinant * seen[2] ** 8)
         for block in range(len(state)):
             L, S = maps[rows[i], block], state[block]
             for j in range(LANES):
-                _corrected(L, S, j, mx, my, mz, camera, scale)
+                _corrected(L, S, j, seen, camera, scale)
 
 
 @njit(**_FLOATS)
-def inform(maps: Array, rows: Ints, points: Array, state: Array, camera: Array) -> None:
+def inform(maps: Array, rows: Ints, points: Array, state: Array, camera: PackedCamera) -> None:
     """Sum the information of points (K, 3) of rows (K,) on every particle's pose."""
-    state[:, _INFORMATION * LANES :] = 0.0
+    state[:, _IXX:] = 0.0
     for i in range(len(rows)):
-        mx, my, mz = points[i, 0], points[i, 1], points[i, 2]
+        seen = points[i, 0], points[i, 1], points[i, 2]
         for block in range(len(state)):
             L, S = maps[rows[i], block], state[block]
             for j in range(LANES):
-                _informed(L, S, j, mx, my, mz, camera)
+                _informed(L, S, j, seen, camera)
 
 
 @njit(**_FLOATS)
-def update_each(maps: Array, rows: Ints, points: Array, state: Array, camera: Array) -> None:
+def update_each(maps: Array, rows: Ints, points: Array, state: Array, camera: PackedCamera) -> None:
     """`update` with rows (K, M) of each particle; negative ones are left out."""
-    state[:, _DISTANCE * LANES : (_DISTANCE + 1) * LANES] = 0.0
-    state[:, _DETERMINANT * LANES : (_DEPTH + 1) * LANES] = 1.0
+    _reset_weights(state)
     for i in range(rows.shape[0]):
-        mx, my, mz = points[i, 0], points[i, 1], points[i, 2]
-        scale = 1.0 / (camera[9] * mz**8)
+        seen = points[i, 0], points[i, 1], points[i, 2]
+        scale = 1.0 / (camera.unit_determinant * seen[2] ** 8)
         for m in range(rows.shape[1]):
             if rows[i, m] >= 0:
-                block = m // LANES
-                L = maps[rows[i, m], block]
-                _corrected(L, state[block], m % LANES, mx, my, mz, camera, scale)
+                block, j = m // LANES, m % LANES
+                _corrected(maps[rows[i, m], block], state[block], j, seen, camera, scale)
 
 
 @njit(**_FLOATS)
-def inform_each(maps: Array, rows: Ints, points: Array, state: Array, camera: Array) -> None:
+def inform_each(maps: Array, rows: Ints, points: Array, state: Array, camera: PackedCamera) -> None:
     """`inform` with rows (K, M) of each particle; negative ones are left out."""
-    state[:, _INFORMATION * LANES :] = 0.0
+    state[:, _IXX:] = 0.0
     for i in range(rows.shape[0]):
-        mx, my, mz = points[i, 0], points[i, 1], points[i, 2]
+        seen = points[i, 0], points[i, 1], points[i, 2]
         for m in range(rows.shape[1]):
             if rows[i, m] >= 0:
-                block = m // LANES
-                _informed(maps[rows[i, m], block], state[block], m % LANES, mx, my, mz, camera)
+                block, j = m // LANES, m % LANES
+                _informed(maps[rows[i, m], block], state[block], j, seen, camera)
 
 
 @njit(**_FLOATS)
-def create(maps: Array, rows: Ints, points: Array, state: Array, camera: Array) -> None:
+def create(maps: Array, rows: Ints, points: Array, state: Array, camera: PackedCamera) -> None:
     """Start landmarks in rows (K, M) by points (K, 3); negative rows are left out.
 
     gil2008, eqs. (16)-(18), with the covariance (G^T R^-1 G)^-1 = C^T R C in place of its inverse.
     """
     for i in range(rows.shape[0]):
-        mx, my, mz = points[i, 0], points[i, 1], points[i, 2]
         for m in range(rows.shape[1]):
             if rows[i, m] < 0:
                 continue
             block, j = m // LANES, m % LANES
             L, S = maps[rows[i, m], block], state[block]
-            cos, sin = S[2 * LANES + j], S[3 * LANES + j]
-            qx, qy, qz = cos * mz + sin * mx, sin * mz - cos * mx, -my
-            R = _innovation(qx, qy, qz, cos, sin, mx, my, mz, camera)
-            L[j], L[LANES + j], L[2 * LANES + j] = S[j] + qx, S[LANES + j] + qy, camera[5] + qz
-            for k in range(6):
-                L[(3 + k) * LANES + j] = R[3 + k]
+            x, y, z = _in_map(S, j, (points[i, 0], points[i, 1], points[i, 2]))
+            R, _ = _noise(S, j, (x, y, z), camera)
+            L[_X + j], L[_Y + j] = S[_CAMERA_X + j] + x, S[_CAMERA_Y + j] + y
+            L[_Z + j] = camera.height_m + z
+            L[_XX + j], L[_XY + j], L[_XZ + j], L[_YY + j], L[_YZ + j], L[_ZZ + j] = R
 
 
-@njit(**_FLOATS)
 def move(
-    poses: Array,
-    increment: Array,
-    root: Array,
-    normals: Array,
-    mount: Array,
-    moved: Array,
-    state: Array,
-) -> None:
+    poses: Array, increment: Array, root: Array, normals: Array, mount: Array, state: Array
+) -> Array:
     """Compose poses (5, lanes) with the increment (3,) + root (3, 3) normals (3, lanes).
 
-    A pose is x, y, heading, and the heading's cosine and sine. Writes `moved` (5, lanes) and the
-    geometry of the state. `mount` (4,) is x, y of the camera, and cosine and sine of its yaw.
+    A pose is x, y, heading, and the heading's cosine and sine. Writes the geometry of the state.
+    `mount` (4,) is x, y of the camera, and cosine and sine of its yaw.
     """
-    for lane in range(poses.shape[1]):
-        cos, sin = poses[3, lane], poses[4, lane]
-        a, b, c = normals[0, lane], normals[1, lane], normals[2, lane]
-        dx = increment[0] + root[0, 0] * a + root[0, 1] * b + root[0, 2] * c
-        dy = increment[1] + root[1, 0] * a + root[1, 1] * b + root[1, 2] * c
-        heading = poses[2, lane] + increment[2] + root[2, 0] * a + root[2, 1] * b + root[2, 2] * c
-        heading -= 2.0 * math.pi * math.ceil((heading - math.pi) / (2.0 * math.pi))
-        x, y = poses[0, lane] + cos * dx - sin * dy, poses[1, lane] + sin * dx + cos * dy
-        cos, sin = math.cos(heading), math.sin(heading)
-        moved[0, lane], moved[1, lane], moved[2, lane] = x, y, heading
-        moved[3, lane], moved[4, lane] = cos, sin
-        S, j = state[lane // LANES], lane % LANES
-        S[j] = x + cos * mount[0] - sin * mount[1]
-        S[LANES + j] = y + sin * mount[0] + cos * mount[1]
-        S[2 * LANES + j] = cos * mount[2] - sin * mount[3]
-        S[3 * LANES + j] = sin * mount[2] + cos * mount[3]
-        S[4 * LANES + j], S[5 * LANES + j] = x, y
+    x, y, heading, cos, sin = poses
+    dx, dy, turn = increment[:, None] + root @ normals
+    heading = se2.wrap(heading + turn)
+    x, y = x + cos * dx - sin * dy, y + sin * dx + cos * dy
+    cos, sin = np.cos(heading), np.sin(heading)
+    at_x, at_y, cos_yaw, sin_yaw = mount
+    geometry = np.stack(
+        [
+            x + cos * at_x - sin * at_y,
+            y + sin * at_x + cos * at_y,
+            cos * cos_yaw - sin * sin_yaw,
+            sin * cos_yaw + cos * sin_yaw,
+            x,
+            y,
+        ]
+    )
+    by_block = geometry.reshape(_GEOMETRY, -1, LANES).swapaxes(0, 1)
+    state[:, : _GEOMETRY * LANES] = by_block.reshape(len(state), -1)
+    return np.stack([x, y, heading, cos, sin])
 
 
-@njit(**_FLOATS)
 def moments(poses: Array, weights: Array) -> tuple[Array, Array]:
     """Mean (3,) and covariance (3, 3) of weighted poses (M, 3); the mean heading is circular."""
-    mean, covariance = np.zeros(3), np.zeros((3, 3))
-    cos = sin = 0.0
-    for m in range(len(poses)):
-        mean[0] += weights[m] * poses[m, 0]
-        mean[1] += weights[m] * poses[m, 1]
-        cos += weights[m] * math.cos(poses[m, 2])
-        sin += weights[m] * math.sin(poses[m, 2])
-    mean[2] = math.atan2(sin, cos)
-    for m in range(len(poses)):
-        x, y, turn = poses[m, 0] - mean[0], poses[m, 1] - mean[1], poses[m, 2] - mean[2]
-        turn -= 2.0 * math.pi * math.ceil((turn - math.pi) / (2.0 * math.pi))
-        covariance[0, 0] += weights[m] * x * x
-        covariance[0, 1] += weights[m] * x * y
-        covariance[0, 2] += weights[m] * x * turn
-        covariance[1, 1] += weights[m] * y * y
-        covariance[1, 2] += weights[m] * y * turn
-        covariance[2, 2] += weights[m] * turn * turn
-    for i in range(3):
-        for k in range(i):
-            covariance[i, k] = covariance[k, i]
-    return mean, covariance
+    mean = weights @ poses
+    heading = poses[:, 2]
+    mean[2] = math.atan2(float(weights @ np.sin(heading)), float(weights @ np.cos(heading)))
+    off = poses - mean
+    off[:, 2] = se2.wrap(off[:, 2])
+    return mean, off.T @ (off * weights[:, None])
+
+
+@njit(forceinline=True, **_FLOATS)
+def _column(root: Array, k: int, cos: float, sin: float) -> _Vector:
+    """Column k of B, in `propose`."""
+    x, y = root[0, k], root[1, k]
+    return cos * x - sin * y, sin * x + cos * y, root[2, k]
 
 
 @njit(**_FLOATS)
@@ -487,44 +461,25 @@ def propose(
         for j in range(LANES):
             lane = first + j
             cos, sin = poses[3, lane], poses[4, lane]
-            # B, of which the heading's row is the root's
-            b00, b10 = cos * root[0, 0] - sin * root[1, 0], sin * root[0, 0] + cos * root[1, 0]
-            b01, b11 = cos * root[0, 1] - sin * root[1, 1], sin * root[0, 1] + cos * root[1, 1]
-            b02, b12 = cos * root[0, 2] - sin * root[1, 2], sin * root[0, 2] + cos * root[1, 2]
-            b20, b21, b22 = root[2, 0], root[2, 1], root[2, 2]
-            at = _INFORMATION * LANES + j
-            xx, xy, xt = S[at], S[at + LANES], S[at + 2 * LANES]
-            yy, yt, tt = S[at + 3 * LANES], S[at + 4 * LANES], S[at + 5 * LANES]
-            ix, iy, it = S[at + 6 * LANES], S[at + 7 * LANES], S[at + 8 * LANES]
-            x0, y0, t0 = (
-                xx * b00 + xy * b10 + xt * b20,
-                xy * b00 + yy * b10 + yt * b20,
-                xt * b00 + yt * b10 + tt * b20,
-            )
-            x1, y1, t1 = (
-                xx * b01 + xy * b11 + xt * b21,
-                xy * b01 + yy * b11 + yt * b21,
-                xt * b01 + yt * b11 + tt * b21,
-            )
-            x2, y2, t2 = (
-                xx * b02 + xy * b12 + xt * b22,
-                xy * b02 + yy * b12 + yt * b22,
-                xt * b02 + yt * b12 + tt * b22,
-            )
+            b0, b1 = _column(root, 0, cos, sin), _column(root, 1, cos, sin)
+            b2 = _column(root, 2, cos, sin)
+            info = S[_IXX + j], S[_IXY + j], S[_IXT + j], S[_IYY + j], S[_IYT + j], S[_ITT + j]
+            i0, i1, i2 = _times(info, b0), _times(info, b1), _times(info, b2)
             f, g, h = start[0, lane], start[1, lane], start[2, lane]
-            ix += x0 * f + x1 * g + x2 * h
-            iy += y0 * f + y1 * g + y2 * h
-            it += t0 * f + t1 * g + t2 * h
+            at_start = (
+                S[_IX + j] + i0[0] * f + i1[0] * g + i2[0] * h,
+                S[_IY + j] + i0[1] * f + i1[1] * g + i2[1] * h,
+                S[_IT + j] + i0[2] * f + i1[2] * g + i2[2] * h,
+            )
             # P^-1 = U^T U with U upper; x = U^-1 (U^-T B^T i + normal)
-            u00 = math.sqrt(1.0 + b00 * x0 + b10 * y0 + b20 * t0)
-            u01 = (b00 * x1 + b10 * y1 + b20 * t1) / u00
-            u02 = (b00 * x2 + b10 * y2 + b20 * t2) / u00
-            u11 = math.sqrt(1.0 + b01 * x1 + b11 * y1 + b21 * t1 - u01 * u01)
-            u12 = (b01 * x2 + b11 * y2 + b21 * t2 - u01 * u02) / u11
-            u22 = math.sqrt(1.0 + b02 * x2 + b12 * y2 + b22 * t2 - u02 * u02 - u12 * u12)
-            r0 = (b00 * ix + b10 * iy + b20 * it) / u00
-            r1 = (b01 * ix + b11 * iy + b21 * it - u01 * r0) / u11
-            r2 = (b02 * ix + b12 * iy + b22 * it - u02 * r0 - u12 * r1) / u22
+            u00 = math.sqrt(1.0 + _dot(b0, i0))
+            u01, u02 = _dot(b0, i1) / u00, _dot(b0, i2) / u00
+            u11 = math.sqrt(1.0 + _dot(b1, i1) - u01 * u01)
+            u12 = (_dot(b1, i2) - u01 * u02) / u11
+            u22 = math.sqrt(1.0 + _dot(b2, i2) - u02 * u02 - u12 * u12)
+            r0 = _dot(b0, at_start) / u00
+            r1 = (_dot(b1, at_start) - u01 * r0) / u11
+            r2 = (_dot(b2, at_start) - u02 * r0 - u12 * r1) / u22
             a, b, c = normals[0, lane], normals[1, lane], normals[2, lane]
             z = (r2 + c) / u22
             y = (r1 + b - u12 * z) / u11
@@ -546,7 +501,7 @@ def associate(
     spread: Array,
     threshold: float,
     state: Array,
-    camera: Array,
+    camera: PackedCamera,
     slots: Ints,
 ) -> None:
     """Associate points (K, 3) with landmarks, in each particle apart (gil2008, eq. (15)).
@@ -566,52 +521,47 @@ def associate(
     spread
         (3, 3) covariance of the pose yet to be drawn, in axes of the camera.
     """
-    n_points, described = len(points), unlikeness.shape[1] > 0
+    described = unlikeness.shape[1] > 0
     taken = np.zeros(len(candidates), np.bool_)
     for m in range(len(counts)):
         block, j = m // LANES, m % LANES
         S = state[block]
-        cos, sin = S[2 * LANES + j], S[3 * LANES + j]
+        cos, sin = S[_COS + j], S[_SIN + j]
+        # the spread in map axes
         sxx = cos * cos * spread[0, 0] - 2 * cos * sin * spread[0, 1] + sin * sin * spread[1, 1]
         syy = sin * sin * spread[0, 0] + 2 * cos * sin * spread[0, 1] + cos * cos * spread[1, 1]
         sxy = cos * sin * (spread[0, 0] - spread[1, 1]) + (cos**2 - sin**2) * spread[0, 1]
-        sxt, syt = (
-            cos * spread[0, 2] - sin * spread[1, 2],
-            sin * spread[0, 2] + cos * spread[1, 2],
-        )
+        sxt = cos * spread[0, 2] - sin * spread[1, 2]
+        syt = sin * spread[0, 2] + cos * spread[1, 2]
         stt = spread[2, 2]
         taken[:] = False
-        for i in range(n_points):
-            mx, my, mz = points[i, 0], points[i, 1], points[i, 2]
+        for i in range(len(points)):
+            seen = points[i, 0], points[i, 1], points[i, 2]
             best, chosen = math.inf, -1
             for c in range(len(candidates)):
                 slot = candidates[c]
                 if taken[c] or slot >= counts[m]:
                     continue
                 L = maps[place[slot], block]
-                px, py, pz = L[j] - S[j], L[LANES + j] - S[LANES + j], L[2 * LANES + j] - camera[5]
-                if cos * px + sin * py < _LEAST_DEPTH_M:
-                    continue
+                px, py = L[_X + j] - S[_CAMERA_X + j], L[_Y + j] - S[_CAMERA_Y + j]
                 unlike = unlikeness[i, births[slot, m]] if described else 0.0
-                if unlike > 0.0:
+                if cos * px + sin * py < _LEAST_DEPTH_M or unlike > 0.0:
                     continue
-                v = _innovation(px, py, pz, cos, sin, mx, my, mz, camera)
-                dx, dy = L[j] - S[4 * LANES + j], L[LANES + j] - S[5 * LANES + j]
-                xx = L[3 * LANES + j] + v[3] + sxx - 2 * dy * sxt + dy * dy * stt
-                xy = L[4 * LANES + j] + v[4] + sxy + dx * sxt - dy * syt - dx * dy * stt
-                yy = L[6 * LANES + j] + v[6] + syy + 2 * dx * syt + dx * dx * stt
-                xz, yz = L[5 * LANES + j] + v[5], L[7 * LANES + j] + v[7]
-                zz = L[8 * LANES + j] + v[8]
-                # v^T S^-1 v is at least |v|^2 / trace S
-                square = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
-                if square > threshold * (xx + yy + zz):
-                    continue
-                w = _inverse(xx, xy, xz, yy, yz, zz)
-                distance = (
-                    v[0] * (w[0] * v[0] + 2.0 * (w[1] * v[1] + w[2] * v[2]))
-                    + v[1] * (w[3] * v[1] + 2.0 * w[4] * v[2])
-                    + w[5] * v[2] * v[2]
+                v, R, _ = _innovation(L, S, j, seen, camera)
+                dx, dy = L[_X + j] - S[_BASE_X + j], L[_Y + j] - S[_BASE_Y + j]
+                of_pose = (
+                    sxx - 2 * dy * sxt + dy * dy * stt,
+                    sxy + dx * sxt - dy * syt - dx * dy * stt,
+                    0.0,
+                    syy + 2 * dx * syt + dx * dx * stt,
+                    0.0,
+                    0.0,
                 )
+                total = _plus(_plus(_covariance(L, j), R), of_pose)
+                # v^T S^-1 v is at least |v|^2 / trace S
+                if _dot(v, v) > threshold * (total[0] + total[3] + total[5]):
+                    continue
+                distance = _dot(v, _times(_inverse(total)[0], v))
                 if distance < threshold and distance + unlike < best:
                     best, chosen = distance + unlike, c
             slots[i, m] = -1
@@ -634,8 +584,8 @@ def _mark_near(
             if slot >= counts[m]:
                 continue
             L, S, j = maps[place[slot], m // LANES], state[m // LANES], m % LANES
-            px, py = L[j] - S[j], L[LANES + j] - S[LANES + j]
-            ahead = px * S[2 * LANES + j] + py * S[3 * LANES + j]
+            px, py = L[_X + j] - S[_CAMERA_X + j], L[_Y + j] - S[_CAMERA_Y + j]
+            ahead = px * S[_COS + j] + py * S[_SIN + j]
             if ahead > 0.0 and px * px + py * py < reach_m * reach_m:
                 near[slot] = True
                 break
@@ -660,7 +610,6 @@ def _gather(
     n_particles = ancestry.shape[1]
     ancestors = np.arange(n_particles)
     offsets = np.zeros(maps.shape[1] // _NUMBERS, np.int64)
-    older = np.empty(births.shape[1], np.int64)
     generation = len(ancestry)
     for slot in slots:
         if generation > epoch[slot]:
@@ -678,10 +627,9 @@ def _gather(
                 for j in range(LANES):
                     T[k * LANES + j] = source[lanes[j] + k * LANES]
         place[slot], spare = spare, place[slot]
-        if len(older):
-            older[:] = births[slot]
-            for m in range(n_particles):
-                births[slot, m] = older[ancestors[m]]
+        older = births[slot].copy()
+        for m in range(len(older)):
+            births[slot, m] = older[ancestors[m]]
     return spare
 
 

@@ -8,8 +8,6 @@ looked up in a table over the floor. The table holds (log p(0) - log p(d)) / ste
 of 16 bits, so that it stays in the processor's cache and a scan is a sum of integers.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -5,8 +5,6 @@ follows the spread of the belief (KLD sampling). When scans fit worse than their
 particles are injected over all the floor (augmented MCL), drawn by the scan (sensor resetting).
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

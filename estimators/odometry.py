@@ -1,7 +1,5 @@
 """Dead reckoning with its kr/kl covariance (puzzlebot2024, eqs. (1)-(6))."""
 
-from __future__ import annotations
-
 import math
 from typing import Literal
 

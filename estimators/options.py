@@ -1,7 +1,5 @@
 """Checks of an estimator's options and of its Prior; an error names the key and the remedy."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any, TypeVar, get_args

@@ -4,8 +4,6 @@ Weights are kept as logs and need no normalisation by the caller; a weight of -i
 that the observations rule out. Weights that have all underflowed count as equal.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Literal
 

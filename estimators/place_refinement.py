@@ -3,8 +3,6 @@
 maximo2024, sec. 5, leaves this to future work.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -8,8 +8,6 @@ A line is stored as m with {x : m.x = 1} in the sensor frame. Along a beam of di
 at range 1 / (m.v), so 1 / range is linear in m, and every line that a sensor can see has one.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 
@@ -22,10 +20,44 @@ from sim.errors import InputError
 
 _NOISE_FLOOR_M = 0.002  # quantised ranges can look free of noise
 _MIN_LINE_POINTS = 3
+_ADJACENT_BEAMS = 3  # lines whose ends are no farther apart may be one wall, or meet in a corner
+_SMOOTH_JOINT_RAD = 0.45  # neighbours that meet at less may be chords of one curve
+# Growing a line
 _FIT_GATE = 3.5  # standard deviations by which the next point may miss its line
 _DRIFT_GATE = 3.0  # the same for the mean of the last points: where a wall bends slowly
+_DRIFT_POINTS = 8
+_MOST_SKIPPED = 1  # points in a row that miss the line before it ends
+# Cutting neighbours again: how many points each may give to the other
+_GIVEN_ON, _GIVEN_BACK = 12, 6
+_RECUT_GATE = 4.0  # standard deviations by which a point may miss the line that it is given to
 _MERGE_GATE = 13.8  # chi-squared, 2 degrees of freedom, 99.9 %
-_SMOOTH_JOINT_RAD = 0.45  # neighbours that meet at less may be chords of one curve
+
+# Weighted sums of a line's fit to inverse ranges: information (1, 1), (1, 2), (2, 2), vector (2)
+_Sums = tuple[float, float, float, float, float]
+
+
+class Segments(NamedTuple):
+    """Straight pieces with ends; what can be matched with.
+
+    Attributes
+    ----------
+    normals
+        (L, 2) unit vectors, away from the sensor.
+    distances_m
+        (L,) of the line from the sensor.
+    spans_m
+        (L, 2) start and end along the line, counter-clockwise from the foot of the normal.
+    end_rays
+        (L, 2, 2) unit vectors to start and end.
+    direction_variances
+        (L,) rad^2.
+    """
+
+    normals: Array
+    distances_m: Array
+    spans_m: Array
+    end_rays: Array
+    direction_variances: Array
 
 
 class PreparedScan(NamedTuple):
@@ -48,9 +80,7 @@ class PreparedScan(NamedTuple):
     line_ends
         (L, 2) first and last point of each line.
     segments
-        (L, 10) normal (2), distance m, start and end along the line m, rays to both ends (2, 2),
-        and the variance of the line's direction, rad^2. A line ends at the beam next to its last
-        point, for so far it may go on.
+        The lines with their ends: at the beam next to the last point, for so far a wall may go on.
     noise_m
         Standard deviation of the ranges about straight walls, measured in the scan itself.
     full_circle
@@ -66,7 +96,7 @@ class PreparedScan(NamedTuple):
     lines: Array
     line_information: Array
     line_ends: Ints
-    segments: Array
+    segments: Segments
     noise_m: float
     full_circle: bool
 
@@ -100,30 +130,22 @@ def prepare(
     return _prepare(ranges, bearings, float(max_range_m), full)
 
 
-@njit(error_model="numpy", fastmath={"contract"})
-def select(keys: Array, order: Ints, low: int, high: int, rank: int) -> float:
-    """Reorder order[low:high] so that keys[order] is at its place at `rank`, smaller before."""
-    high -= 1
-    while low < high:
-        pivot = keys[order[(low + high) // 2]]
-        i, j = low, high
-        while i <= j:
-            while keys[order[i]] < pivot:
-                i += 1
-            while keys[order[j]] > pivot:
-                j -= 1
-            if i <= j:
-                order[i], order[j] = order[j], order[i]
-                i += 1
-                j -= 1
-        if rank <= j:
-            high = j
-        elif rank >= i:
-            low = i
+@njit()
+def _ranked(values: Array, rank: int) -> float:
+    """The value at a place of the sorted values, without sorting them.
+
+    `numpy.partition` does the same, but takes eleven seconds to compile.
+    """
+    while True:
+        pivot: float = values[len(values) // 2]
+        below, above = values[values < pivot], values[values > pivot]
+        if rank < len(below):
+            values = below
+        elif rank < len(values) - len(above):
+            return pivot
         else:
-            break
-    value: float = keys[order[rank]]
-    return value
+            rank -= len(values) - len(above)
+            values = above
 
 
 @njit(error_model="numpy", fastmath={"contract"})
@@ -144,192 +166,212 @@ def _noise(ranges: Array, rays: Array, beams: Ints) -> float:
         n += 1
     if n < 10:
         return _NOISE_FLOOR_M
-    median = select(found, np.arange(n), 0, n, n // 2)
-    return max(median / 0.6745, _NOISE_FLOOR_M)
-
-
-@njit(error_model="numpy", fastmath={"contract"})
-def _fit(ranges: Array, rays: Array, own: Ints, m: Array) -> tuple[float, float, float]:
-    """One Gauss-Newton step of a line's fit to the ranges of its own points, from m, in place.
-
-    Returns the entries (1, 1), (1, 2), (2, 2) of its information.
-    """
-    s11, s12, s22, b1, b2 = 0.0, 0.0, 0.0, 0.0, 0.0
-    for i in own:
-        u, v = rays[i, 0], rays[i, 1]
-        inverse = m[0] * u + m[1] * v
-        # beams nearly along the line would be given a range without end
-        expected = 1.0 / inverse if inverse * ranges[i] > 0.5 else ranges[i]
-        weight = expected**4
-        miss = -(expected**2) * (ranges[i] - expected)
-        s11 += weight * u * u
-        s12 += weight * u * v
-        s22 += weight * v * v
-        b1 += miss * u
-        b2 += miss * v
-    det = s11 * s22 - s12 * s12
-    if det > 0.0:
-        m[0] += (s22 * b1 - s12 * b2) / det
-        m[1] += (s11 * b2 - s12 * b1) / det
-    return s11, s12, s22
+    return max(_ranked(found[:n], n // 2) / 0.6745, _NOISE_FLOOR_M)
 
 
 @njit(forceinline=True, error_model="numpy", fastmath={"contract"})
-def _miss(lines: Array, k: int, u: float, v: float, r: float) -> float:
-    """Distance by which a range r along a ray (u, v) misses line k, to first order."""
-    miss: float = r * r * (1.0 / r - lines[k, 0] * u - lines[k, 1] * v)
-    return miss
+def _added(sums: _Sums, weight: float, moment: float, u: float, v: float) -> _Sums:
+    """The sums of a fit with one more ray (u, v): its weight, and that times its inverse range."""
+    s11, s12, s22, b1, b2 = sums
+    s11 += weight * u * u
+    s12 += weight * u * v
+    s22 += weight * v * v
+    return s11, s12, s22, b1 + moment * u, b2 + moment * v
+
+
+@njit(forceinline=True, error_model="numpy", fastmath={"contract"})
+def _solved(sums: _Sums) -> tuple[float, float, float]:
+    """The line m of a fit's sums, and the determinant of its information."""
+    s11, s12, s22, b1, b2 = sums
+    determinant = s11 * s22 - s12 * s12
+    return (s22 * b1 - s12 * b2) / determinant, (s11 * b2 - s12 * b1) / determinant, determinant
+
+
+@njit(forceinline=True, error_model="numpy", fastmath={"contract"})
+def _form(s11: float, s12: float, s22: float, u: float, v: float) -> float:
+    """(u, v) S (u, v) of a symmetric S."""
+    return s11 * u * u + 2.0 * s12 * u * v + s22 * v * v
+
+
+@njit(forceinline=True, error_model="numpy", fastmath={"contract"})
+def _miss(m1: float, m2: float, u: float, v: float, r: float) -> float:
+    """Distance by which a range r along a ray (u, v) misses a line, to first order."""
+    return r * r * (1.0 / r - m1 * u - m2 * v)
 
 
 @njit(error_model="numpy", fastmath={"contract"})
-def _segment(
-    ranges: Array, rays: Array, beams: Ints, noise: float
-) -> tuple[Ints, Array, Array, Ints]:
-    """Cut a scan into straight pieces: line of each point, lines, information, ends."""
-    n = len(ranges)
-    line_of_point = np.zeros(n, np.int64) - 1
-    lines = np.zeros((n // _MIN_LINE_POINTS + 1, 2))
-    information = np.zeros((len(lines), 3))
+def _grown(
+    ranges: Array, rays: Array, noise: float, first: int, number: int, line_of_point: Ints
+) -> tuple[int, int, float, float, float]:
+    """Number the points of the line that begins at a point.
+
+    By recursive least squares of 1 / range = m.v with weights range^4 / noise^2.
+
+    Returns
+    -------
+    tuple
+        The last point, the number of points, m, and the determinant of its information.
+    """
+    sums = (0.0, 0.0, 0.0, 0.0, 0.0)
+    recent, drift = np.zeros(_DRIFT_POINTS), 0.0  # the last misses, and their sum
+    last, count = first, 0
+    for i in range(first, len(ranges)):
+        if i - last > _MOST_SKIPPED + 1:
+            break
+        u, v, r = rays[i, 0], rays[i, 1], ranges[i]
+        weight = r**4
+        if count >= 2:
+            m1, m2, determinant = _solved(sums)
+            leverage = weight * _form(sums[2], -sums[1], sums[0], u, v) / determinant
+            miss = _miss(m1, m2, u, v, r) / (noise * math.sqrt(1.0 + leverage))
+            moved = drift + miss - recent[count % _DRIFT_POINTS]
+            if abs(miss) > _FIT_GATE or abs(moved) > _DRIFT_GATE * math.sqrt(_DRIFT_POINTS):
+                continue
+            drift = moved
+            recent[count % _DRIFT_POINTS] = miss
+        line_of_point[i] = number
+        sums = _added(sums, weight, r**3, u, v)
+        last, count = i, count + 1
+    m1, m2, determinant = _solved(sums)
+    return last, count, m1, m2, determinant
+
+
+@njit(error_model="numpy", fastmath={"contract"})
+def _grow(ranges: Array, rays: Array, noise: float) -> tuple[Ints, Array, Ints]:
+    """Lines from left to right, each as long as it goes: line of each point, lines, ends."""
+    line_of_point = np.full(len(ranges), -1)
+    lines = np.zeros((len(ranges) // _MIN_LINE_POINTS + 1, 2))
     ends = np.zeros((len(lines), 2), np.int64)
     n_lines = first = 0
-    while first < n:
-        # grow by recursive least squares of 1/range = m.v with weights range^4 / noise^2
-        s11, s12, s22, b1, b2 = 0.0, 0.0, 0.0, 0.0, 0.0
-        recent, drift, count = np.zeros(8), 0.0, 0
-        last = i = first
-        skipped = 0
-        while i < n and skipped < 2:
-            u, v, r = rays[i, 0], rays[i, 1], ranges[i]
-            weight = r**4
-            if count >= 2:
-                det = s11 * s22 - s12 * s12
-                m1, m2 = (s22 * b1 - s12 * b2) / det, (s11 * b2 - s12 * b1) / det
-                leverage = weight * (s22 * u * u - 2.0 * s12 * u * v + s11 * v * v) / det
-                miss = r * r * (1.0 / r - m1 * u - m2 * v) / (noise * math.sqrt(1.0 + leverage))
-                slot = count % 8
-                moved = drift + miss - recent[slot]
-                if abs(miss) > _FIT_GATE or abs(moved) > _DRIFT_GATE * math.sqrt(8.0):
-                    skipped += 1
-                    i += 1
-                    continue
-                drift = moved
-                recent[slot] = miss
-            line_of_point[i] = n_lines
-            s11 += weight * u * u
-            s12 += weight * u * v
-            s22 += weight * v * v
-            b1 += r**3 * u
-            b2 += r**3 * v
-            count += 1
-            skipped = 0
-            last = i
-            i += 1
-        det = s11 * s22 - s12 * s12
-        if count < _MIN_LINE_POINTS or det <= 0.0:
+    while first < len(ranges):
+        last, count, m1, m2, determinant = _grown(
+            ranges, rays, noise, first, n_lines, line_of_point
+        )
+        if count < _MIN_LINE_POINTS or determinant <= 0.0:
             line_of_point[first : last + 1] = -1
             first += 1
             continue
-        lines[n_lines] = (s22 * b1 - s12 * b2) / det, (s11 * b2 - s12 * b1) / det
-        ends[n_lines] = first, last
+        lines[n_lines, 0], lines[n_lines, 1] = m1, m2
+        ends[n_lines, 0], ends[n_lines, 1] = first, last
         n_lines += 1
         first = last + 1
-    # a piece grown from the left runs on around a corner: give its last points to the next one
-    for k in range(n_lines - 1):
+    return line_of_point, lines[:n_lines], ends[:n_lines]
+
+
+@njit(error_model="numpy", fastmath={"contract"})
+def _recut(
+    ranges: Array, rays: Array, noise: float, line_of_point: Ints, lines: Array, ends: Ints
+) -> None:
+    """Cut between neighbours where both fit best: a grown line runs on around a corner."""
+    bound = _RECUT_GATE**2 * noise * noise
+    for k in range(len(lines) - 1):
         low, high = ends[k, 1], ends[k + 1, 0]
-        if high - low > 3:
+        start = max(low - _GIVEN_ON, ends[k, 0] + 1)
+        stop = min(high + _GIVEN_BACK, ends[k + 1, 1] - 1)
+        if high - low > _ADJACENT_BEAMS or start >= stop:
             continue
-        start = max(low - 12, ends[k, 0] + 1)
-        stop = min(high + 6, ends[k + 1, 1] - 1)
-        best, best_cost, cost = low, 1e300, 0.0
-        # cost of cutting after point i, up to a constant
+        cut, least, cost = start, math.inf, 0.0  # of cutting after a point, beside before all
         for i in range(start, stop):
-            u, v, r = rays[i, 0], rays[i, 1], ranges[i]
-            one, two = _miss(lines, k, u, v, r), _miss(lines, k + 1, u, v, r)
-            cost += min(one * one, 16.0 * noise * noise) - min(two * two, 16.0 * noise * noise)
-            if cost < best_cost:
-                best, best_cost = i, cost
-        if stop > start:
-            if best_cost > 0.0:
-                best = start - 1
-            for i in range(start, stop):
-                on = k if i <= best else k + 1
-                miss = _miss(lines, on, rays[i, 0], rays[i, 1], ranges[i])
-                line_of_point[i] = on if abs(miss) <= 4.0 * noise else -1
-            ends[k, 1], ends[k + 1, 0] = best, best + 1
-    # fit, and join neighbours that are one wall
+            before = _miss(lines[k, 0], lines[k, 1], rays[i, 0], rays[i, 1], ranges[i])
+            after = _miss(lines[k + 1, 0], lines[k + 1, 1], rays[i, 0], rays[i, 1], ranges[i])
+            cost += min(before * before, bound) - min(after * after, bound)
+            if cost < least:
+                cut, least = i, cost
+        if least > 0.0:
+            cut = start - 1
+        for i in range(start, stop):
+            on = k if i <= cut else k + 1
+            miss = _miss(lines[on, 0], lines[on, 1], rays[i, 0], rays[i, 1], ranges[i])
+            line_of_point[i] = on if abs(miss) <= _RECUT_GATE * noise else -1
+        ends[k, 1], ends[k + 1, 0] = cut, cut + 1
+
+
+@njit(error_model="numpy", fastmath={"contract"})
+def _fit(ranges: Array, rays: Array, own: Ints, line: Array) -> tuple[float, ...]:
+    """The line by one Gauss-Newton step of its fit to its own points' ranges; its information."""
+    sums = (0.0, 0.0, 0.0, 0.0, 0.0)
+    for i in own:
+        u, v = rays[i, 0], rays[i, 1]
+        inverse = line[0] * u + line[1] * v
+        # beams nearly along the line would be given a range without end
+        expected = 1.0 / inverse if inverse * ranges[i] > 0.5 else ranges[i]
+        sums = _added(sums, expected**4, -(expected**2) * (ranges[i] - expected), u, v)
+    by_1, by_2, determinant = _solved(sums)
+    if not determinant > 0.0:
+        by_1 = by_2 = 0.0
+    return line[0] + by_1, line[1] + by_2, sums[0], sums[1], sums[2]
+
+
+@njit(error_model="numpy", fastmath={"contract"})
+def _merge(
+    ranges: Array, rays: Array, beams: Ints, noise: float, line_of_point: Ints, lines: Array,
+    ends: Ints,
+) -> tuple[Array, Array, Ints]:  # fmt: skip
+    """Fit the lines, and join neighbours that are one wall: lines, information, ends."""
+    information = np.zeros((len(lines), 3))
     kept = 0
-    for k in range(n_lines):
+    for k in range(len(lines)):
         own = ends[k, 0] + np.flatnonzero(line_of_point[ends[k, 0] : ends[k, 1] + 1] == k)
         if len(own) < _MIN_LINE_POINTS:
             line_of_point[own] = -1
             continue
-        m = lines[k].copy()
-        a11, a12, a22 = _fit(ranges, rays, own, m)
-        joined = False
-        if kept > 0 and beams[own[0]] - beams[ends[kept - 1, 1]] <= 3:
-            j = kept - 1
+        m1, m2, a11, a12, a22 = _fit(ranges, rays, own, lines[k])
+        first, last, j = own[0], own[-1], kept - 1
+        if kept > 0 and beams[first] - beams[ends[j, 1]] <= _ADJACENT_BEAMS:
+            n1, n2 = lines[j, 0], lines[j, 1]
             c11, c12, c22 = information[j, 0], information[j, 1], information[j, 2]
             t11, t12, t22 = a11 + c11, a12 + c12, a22 + c22
-            det = t11 * t22 - t12 * t12
-            y1 = a11 * m[0] + a12 * m[1] + c11 * lines[j, 0] + c12 * lines[j, 1]
-            y2 = a12 * m[0] + a22 * m[1] + c12 * lines[j, 0] + c22 * lines[j, 1]
-            w1, w2 = (t22 * y1 - t12 * y2) / det, (t11 * y2 - t12 * y1) / det
-            p1, p2 = m[0] - w1, m[1] - w2
-            q1, q2 = lines[j, 0] - w1, lines[j, 1] - w2
-            misfit = a11 * p1 * p1 + 2.0 * a12 * p1 * p2 + a22 * p2 * p2
-            misfit += c11 * q1 * q1 + 2.0 * c12 * q1 * q2 + c22 * q2 * q2
+            y1 = a11 * m1 + a12 * m2 + c11 * n1 + c12 * n2
+            y2 = a12 * m1 + a22 * m2 + c12 * n1 + c22 * n2
+            w1, w2, _ = _solved((t11, t12, t22, y1, y2))
+            misfit = _form(a11, a12, a22, m1 - w1, m2 - w2)
+            misfit += _form(c11, c12, c22, n1 - w1, n2 - w2)
             if misfit < _MERGE_GATE * noise * noise:
-                lines[j], information[j] = (w1, w2), (t11, t12, t22)
-                ends[j, 1] = own[-1]
-                joined = True
-        if not joined:
-            lines[kept], information[kept] = m, (a11, a12, a22)
-            ends[kept] = own[0], own[-1]
-            kept += 1
-        line_of_point[own] = kept - 1
-    return line_of_point, lines[:kept].copy(), information[:kept].copy(), ends[:kept].copy()
+                m1, m2, a11, a12, a22 = w1, w2, t11, t12, t22
+                first, kept = ends[j, 0], j
+        lines[kept, 0], lines[kept, 1] = m1, m2
+        information[kept, 0], information[kept, 1], information[kept, 2] = a11, a12, a22
+        ends[kept, 0], ends[kept, 1] = first, last
+        line_of_point[own] = kept
+        kept += 1
+    return lines[:kept].copy(), information[:kept].copy(), ends[:kept].copy()
 
 
 @njit(error_model="numpy", fastmath={"contract"})
 def _describe(
-    lines: Array,
-    information: Array,
-    ends: Ints,
-    rays: Array,
-    beams: Ints,
-    spacing: float,
+    lines: Array, information: Array, ends: Ints, rays: Array, beams: Ints, spacing: float,
     noise: float,
-) -> Array:
-    """Segments (L, 10) of the lines: see `PreparedScan.segments`."""
-    segments = np.empty((len(lines), 10))
+) -> Segments:  # fmt: skip
+    """The lines as segments."""
+    n = len(lines)
+    normals, distances, spans = np.empty((n, 2)), np.empty(n), np.empty((n, 2))
+    end_rays, variances = np.empty((n, 2, 2)), np.empty(n)
     cos, sin = math.cos(spacing), math.sin(spacing)
-    for k in range(len(lines)):
+    for k in range(n):
         m1, m2 = lines[k, 0], lines[k, 1]
         size = math.hypot(m1, m2)
         n1, n2 = m1 / size, m2 / size
-        segments[k, 0], segments[k, 1], segments[k, 2] = n1, n2, 1.0 / size
+        normals[k, 0], normals[k, 1], distances[k] = n1, n2, 1.0 / size
         for side in range(2):
             # a wall may go on as far as the next beam
             a, b = rays[ends[k, side], 0], rays[ends[k, side], 1]
             turn = sin if side == 1 else -sin
             u, v = cos * a - turn * b, turn * a + cos * b
-            inverse = max(m1 * u + m2 * v, 0.3 * (m1 * a + m2 * b))
-            segments[k, 3 + side] = (v * n1 - u * n2) / inverse
-            segments[k, 5 + 2 * side], segments[k, 6 + 2 * side] = u, v
+            spans[k, side] = (v * n1 - u * n2) / max(m1 * u + m2 * v, 0.3 * (m1 * a + m2 * b))
+            end_rays[k, side, 0], end_rays[k, side, 1] = u, v
         s11, s12, s22 = information[k, 0], information[k, 1], information[k, 2]
         # variance of m across itself, as an angle: covariance of m is noise^2 S^-1
-        across = (s11 * n1 * n1 + 2.0 * s12 * n1 * n2 + s22 * n2 * n2) / (s11 * s22 - s12 * s12)
-        segments[k, 9] = noise * noise * across / (size * size)
+        across = _form(s11, s12, s22, n1, n2) / (s11 * s22 - s12 * s12)
+        variances[k] = noise * noise * across / (size * size)
     # a piece that meets its neighbour at a small angle may be a chord of a curve
-    for k in range(1, len(lines)):
-        if beams[ends[k, 0]] - beams[ends[k - 1, 1]] > 3:
-            continue
-        a, b = segments[k - 1], segments[k]
+    for k in range(1, n):
+        a, b = normals[k - 1], normals[k]
         angle = abs(math.atan2(a[0] * b[1] - a[1] * b[0], a[0] * b[0] + a[1] * b[1]))
-        if angle < _SMOOTH_JOINT_RAD:
-            a[9] += angle * angle / 12.0
-            b[9] += angle * angle / 12.0
-    return segments
+        adjacent = beams[ends[k, 0]] - beams[ends[k - 1, 1]] <= _ADJACENT_BEAMS
+        if adjacent and angle < _SMOOTH_JOINT_RAD:
+            variances[k - 1] += angle * angle / 12.0
+            variances[k] += angle * angle / 12.0
+    return Segments(normals, distances, spans, end_rays, variances)
 
 
 @njit(error_model="numpy", fastmath={"contract"})
@@ -343,7 +385,9 @@ def _prepare(ranges: Array, bearings: Array, max_range: float, full_circle: bool
         points[k, 0], points[k, 1] = ranges[i] * rays[k, 0], ranges[i] * rays[k, 1]
     seen_m = ranges[beams]
     noise = _noise(seen_m, rays, beams)
-    line_of_point, lines, information, ends = _segment(seen_m, rays, beams, noise)
+    line_of_point, lines, ends = _grow(seen_m, rays, noise)
+    _recut(seen_m, rays, noise, line_of_point, lines, ends)
+    lines, information, ends = _merge(seen_m, rays, beams, noise, line_of_point, lines, ends)
     spacing = bearings[1] - bearings[0] if len(bearings) > 1 else 0.0
     segments = _describe(lines, information, ends, rays, beams, spacing, noise)
     return PreparedScan(

@@ -4,8 +4,6 @@ The guess sets how far to look, the chosen method the covariance; directions tha
 not constrain are reported.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from dataclasses import dataclass
@@ -21,7 +19,6 @@ from estimators.icp import (
     Metric,
     PreparedScan,
     Registration,
-    Search,
     prepare,
     register,
 )
@@ -99,7 +96,7 @@ class ScanMatcher:
 
     Parameters
     ----------
-    metric, search
+    metric
         As in `estimators.icp.register`.
     covariance
         Method of `estimators.icp_covariance`; `censi_last` counts the noise of the last scan
@@ -109,14 +106,12 @@ class ScanMatcher:
     """
 
     metric: Metric
-    search: Search
     covariance: Covariance
     sigma_range_m: float | None
 
     def __post_init__(self) -> None:
         require_choices(
             metric=(self.metric, Metric),
-            search=(self.search, Search),
             covariance=(self.covariance, Covariance),
         )
         if self.sigma_range_m is not None:
@@ -157,7 +152,6 @@ class ScanMatcher:
             reference,
             in_laser.mean,
             metric=self.metric,
-            search=self.search,
             gate_m=min(_LEAST_GATE_M + 4.0 * math.sqrt(xx + yy), _MOST_GATE_M),
             gate_rad=min(_LEAST_GATE_RAD + 4.0 * math.sqrt(turn), _MOST_GATE_RAD),
             heading_window_rad=heading_window_rad,
@@ -202,10 +196,10 @@ class ScanMatcher:
         if self.covariance == "hessian":
             return icp_covariance.hessian(found)
         if self.covariance == "sampling":
-            return icp_covariance.sampling(found, source, target, rng, sigma_m, search=self.search)
+            return icp_covariance.sampling(found, source, target, rng, sigma_m)
         if self.covariance == "unscented_censi":
             return icp_covariance.unscented_censi(
-                found, source, target, of_guess, sigma_m, matches="sliding", search=self.search
+                found, source, target, of_guess, sigma_m, matches="sliding"
             )
         scans: icp_covariance.Scans = "last" if self.covariance == "censi_last" else "both"
         return icp_covariance.censi(found, source, target, sigma_m, scans=scans, matches="sliding")

@@ -4,8 +4,6 @@ Shared by `estimators.ekf_slam` and `estimators.fastslam`, whose filters choose 
 distance themselves.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import dataclass
 from typing import Literal

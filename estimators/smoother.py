@@ -7,6 +7,7 @@ complement), so that only the poses are left to factorise.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import itertools
 import math
@@ -15,6 +16,7 @@ from typing import Literal
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, lapack
+from scipy.sparse import bsr_array
 
 from estimators.base import Belief, Estimate, Prior
 from estimators.gaussian import Gaussian, compose, wrap
@@ -29,7 +31,6 @@ from estimators.stereo import LEAST_DEPTH_M, StereoModel
 from estimators.wheels import WheelPrediction
 from sim import se2
 from sim.arrays import Array, Ints
-from sim.compiled import njit
 from sim.errors import InputError
 from sim.recording import Frame
 
@@ -268,25 +269,31 @@ def solve(
     """
     n_landmarks = int(problem.landmark_rows.max(initial=-1)) + 1
     order = np.argsort(problem.landmark_rows, kind="stable")
-    pose_rows, landmark_rows = problem.pose_rows[order], problem.landmark_rows[order]
-    points = problem.points_in_camera[order]
-    splits = np.searchsorted(landmark_rows, np.arange(n_landmarks + 1))
-    residuals = _Residuals(problem, pose_rows, landmark_rows, points, robust, robust_sigma)
+    problem = dataclasses.replace(
+        problem,
+        pose_rows=problem.pose_rows[order],
+        landmark_rows=problem.landmark_rows[order],
+        points_in_camera=problem.points_in_camera[order],
+    )
+    splits = np.searchsorted(problem.landmark_rows, np.arange(n_landmarks + 1))
+    residuals = _Residuals(problem, splits, robust, robust_sigma)
 
-    by_depth = np.lexsort((points[:, 2], landmark_rows))
+    by_depth = np.lexsort((problem.points_in_camera[:, 2], problem.landmark_rows))
     nearest = by_depth[splits[:-1]]
-    landmarks = problem.camera.place(poses[pose_rows[nearest]], points[nearest])
+    landmarks = problem.camera.place(
+        poses[problem.pose_rows[nearest]], problem.points_in_camera[nearest]
+    )
     iterations, converged = 0, True
     stages = [(True, 1e-9)] if n_landmarks == 0 else [(False, 1e-4), (True, 1e-9)]
     for in_image, tolerance in stages:
         poses, landmarks, taken = _descend(
-            residuals, poses, landmarks, splits, in_image, tolerance, max_iterations
+            residuals, poses, landmarks, in_image, tolerance, max_iterations
         )
         iterations, converged = iterations + taken, taken < max_iterations
     poses = np.column_stack([poses[:, :2], se2.wrap(poses[:, 2])])
     whitening = residuals.whitening(poses, landmarks, True)
     system = residuals.linearised(poses, landmarks, whitening, True)
-    covariance, of_landmarks = system.covariances(splits)
+    covariance, of_landmarks = system.covariances()
     return Solution(poses, covariance, landmarks, of_landmarks, system.cost, iterations, converged)
 
 
@@ -294,7 +301,6 @@ def _descend(
     residuals: _Residuals,
     poses: Array,
     landmarks: Array,
-    splits: Ints,
     in_image: bool,
     tolerance: float,
     max_iterations: int,
@@ -313,7 +319,7 @@ def _descend(
         whitening = residuals.whitening(poses, landmarks, in_image)
         system = residuals.linearised(poses, landmarks, whitening, in_image)
         while True:
-            step = system.step(damping, splits)
+            step = system.step(damping)
             if step is not None:
                 trial = poses + step[0], landmarks + step[1]
                 gain = system.cost - residuals.cost(*trial, whitening, in_image)
@@ -336,11 +342,12 @@ class _Linearised:
     Attributes
     ----------
     H, g
-        (3 T, 3 T), (3 T,) of the poses.
+        (3 T, 3 T), (T, 3) of the poses.
     V, h
         (N, 3, 3), (N, 3) of each landmark.
     W
-        (K, 3, 3) of each observation, pose by landmark.
+        (K, 3, 3) of each observation, pose by landmark; `splits` (N + 1,) are the first of each
+        landmark.
     """
 
     H: Array
@@ -348,45 +355,56 @@ class _Linearised:
     V: Array
     h: Array
     W: Array
-    pose_rows: Ints
-    landmark_rows: Ints
+    problem: Problem
+    splits: Ints
     cost: float
 
-    def _reduced(self, damping: float, splits: Ints) -> tuple[Array, Array, Array]:
+    def _reduced(self, damping: float) -> tuple[Array, Array, Array]:
         """Damped information of the poses without the landmarks, V^-1 and W V^-1."""
         V, S = self.V.copy(), self.H.copy()
         V[:, range(3), range(3)] *= 1.0 + damping
         S[np.diag_indices_from(S)] *= 1.0 + damping
         V_inverse = _inverse(V)
-        WV = self.W @ V_inverse[self.landmark_rows]
-        _eliminate(S, self.W, WV, self.pose_rows, splits)
+        WV = self.W @ V_inverse[self.problem.landmark_rows]
+        if len(V):
+            S -= (self._by_landmark(WV).T @ self._by_landmark(self.W)).toarray()
         return S, V_inverse, WV
 
-    def step(self, damping: float, splits: Ints) -> tuple[Array, Array] | None:
+    def _by_landmark(self, blocks: Array) -> bsr_array:
+        """Blocks (K, 3, 3) of the observations as a sparse matrix (3 N, 3 T), transposed."""
+        shape = 3 * len(self.V), len(self.H)
+        return bsr_array((_transposed(blocks), self.problem.pose_rows, self.splits), shape=shape)
+
+    def step(self, damping: float) -> tuple[Array, Array] | None:
         """Changes of the poses (T, 3) and landmarks (N, 3); None if it cannot be solved."""
         try:
-            S, V_inverse, WV = self._reduced(damping, splits)
-            rhs = self.g.reshape(-1, 3).copy()
-            np.subtract.at(rhs, self.pose_rows, _times(WV, self.h[self.landmark_rows]))
-            of_poses = -cho_solve(cho_factor(S, lower=True, check_finite=False), rhs.ravel())
+            S, V_inverse, WV = self._reduced(damping)
+            rhs = self.g.copy()
+            np.subtract.at(
+                rhs, self.problem.pose_rows, _times(WV, self.h[self.problem.landmark_rows])
+            )
+            solved = cho_solve(cho_factor(S, lower=True, check_finite=False), rhs.ravel())
         except np.linalg.LinAlgError:
             return None
-        if not np.isfinite(of_poses).all():
+        if not np.isfinite(solved).all():
             return None
-        of_poses = of_poses.reshape(-1, 3)
+        of_poses = -solved.reshape(-1, 3)
         rest = self.h.copy()
-        turned = _times(self.W.transpose(0, 2, 1), of_poses[self.pose_rows])
-        np.add.at(rest, self.landmark_rows, turned)
-        of_landmarks = -_times(V_inverse, rest)
-        return of_poses, of_landmarks
+        turned = _times(_transposed(self.W), of_poses[self.problem.pose_rows])
+        np.add.at(rest, self.problem.landmark_rows, turned)
+        return of_poses, -_times(V_inverse, rest)
 
-    def covariances(self, splits: Ints) -> tuple[Array, Array]:
+    def covariances(self) -> tuple[Array, Array]:
         """Joint covariance (3 T, 3 T) of the poses, and (N, 3, 3) of each landmark."""
-        S, V_inverse, WV = self._reduced(0.0, splits)
+        S, of_landmarks, WV = self._reduced(0.0)
         factor = cho_factor(S, lower=True, check_finite=False)[0]
         lower = np.tril(lapack.dpotri(factor, lower=1)[0])
         covariance = lower + np.tril(lower, -1).T
-        return covariance, V_inverse + _spread_of_poses(covariance, WV, self.pose_rows, splits)
+        rows = 3 * self.problem.pose_rows[:, None] + np.arange(3)
+        for n, (start, stop) in enumerate(itertools.pairwise(self.splits)):
+            seen_from, gain = rows[start:stop].ravel(), WV[start:stop].reshape(-1, 3)
+            of_landmarks[n] += gain.T @ covariance[np.ix_(seen_from, seen_from)] @ gain
+        return covariance, of_landmarks
 
 
 @dataclass(frozen=True)
@@ -394,9 +412,7 @@ class _Residuals:
     """Whitened residuals of a problem, its observations sorted by landmark."""
 
     problem: Problem
-    pose_rows: Ints
-    landmark_rows: Ints
-    points: Array
+    splits: Ints
     robust: Robust
     robust_sigma: float
 
@@ -404,11 +420,13 @@ class _Residuals:
         """(K, 3, 3) that makes the residuals of the observations unit white noise."""
         camera = self.problem.camera
         if not in_image:
-            return _whitening(camera.covariance(self.points))
+            return _whitening(camera.covariance(self.problem.points_in_camera))
         if camera.in_image:
             inverse = np.diag(1.0 / np.sqrt(camera.variances_px2))
-            return np.broadcast_to(inverse, (len(self.points), 3, 3))
-        predicted = camera.predict(poses[self.pose_rows], landmarks[self.landmark_rows])[0]
+            return np.broadcast_to(inverse, (len(self.problem.points_in_camera), 3, 3))
+        predicted = camera.predict(
+            poses[self.problem.pose_rows], landmarks[self.problem.landmark_rows]
+        )[0]
         return _whitening(camera.covariance(predicted))
 
     def cost(self, poses: Array, landmarks: Array, whitening: Array, in_image: bool) -> float:
@@ -422,18 +440,19 @@ class _Residuals:
         self, poses: Array, landmarks: Array, whitening: Array, in_image: bool
     ) -> _Linearised:
         """Normal equations about these poses and landmarks."""
-        p, n = self.problem, 3 * len(poses)
-        H, g = np.zeros((n, n)), np.zeros((len(poses), 3))
+        p, n, n_landmarks = self.problem, len(poses), len(landmarks)
+        H, g = np.zeros((n, n, 3, 3)), np.zeros((n, 3))
         start, motion = self._of_motions(poses)
         by_start = _whitening(p.prior_covariance)
-        H[:3, :3] += by_start.T @ by_start
+        H[0, 0] += by_start.T @ by_start
         g[0] += by_start.T @ start
         whiten = _whitening(p.motion_covariances)
-        by_first, by_second = se2.between_jacobians(poses[p.first], poses[p.second])
-        by_first, by_second = whiten @ by_first, whiten @ by_second
-        _add_blocks(H, by_first, by_second, p.first, p.second)
-        np.add.at(g, p.first, _times(by_first.transpose(0, 2, 1), motion))
-        np.add.at(g, p.second, _times(by_second.transpose(0, 2, 1), motion))
+        sides = [whiten @ side for side in se2.between_jacobians(poses[p.first], poses[p.second])]
+        ends = list(zip((p.first, p.second), sides, strict=True))
+        for rows, by_pose in ends:
+            np.add.at(g, rows, _times(_transposed(by_pose), motion))
+            for columns, by_other in ends:
+                np.add.at(H, (rows, columns), _transposed(by_pose) @ by_other)
 
         seen, by_pose, by_landmark = self._of_image(poses, landmarks, in_image)
         seen = _times(whitening, seen)
@@ -441,19 +460,23 @@ class _Residuals:
         weighted = whitening * np.sqrt(weight)[:, None, None]
         seen = seen * np.sqrt(weight)[:, None]
         by_pose, by_landmark = weighted @ by_pose, weighted @ by_landmark
-        of_pose, of_landmark = by_pose.transpose(0, 2, 1), by_landmark.transpose(0, 2, 1)
-        blocks = np.zeros((len(poses), 3, 3))
-        np.add.at(blocks, self.pose_rows, of_pose @ by_pose)
-        each = range(len(poses))
-        H.reshape(len(poses), 3, -1, 3)[each, :, each] += blocks
-        np.add.at(g, self.pose_rows, _times(of_pose, seen))
-        V = np.tile(_LEAST_INFORMATION * np.eye(3), (len(landmarks), 1, 1))
-        h = np.zeros((len(landmarks), 3))
-        np.add.at(V, self.landmark_rows, of_landmark @ by_landmark)
-        np.add.at(h, self.landmark_rows, _times(of_landmark, seen))
-        cost = float(np.sum(start**2) + np.sum(motion**2) + np.sum(loss))
-        W = of_pose @ by_landmark
-        return _Linearised(H, g.ravel(), V, h, W, self.pose_rows, self.landmark_rows, cost)
+        of_pose, of_landmark = _transposed(by_pose), _transposed(by_landmark)
+        np.add.at(H, (p.pose_rows, p.pose_rows), of_pose @ by_pose)
+        np.add.at(g, p.pose_rows, _times(of_pose, seen))
+        V = np.tile(_LEAST_INFORMATION * np.eye(3), (n_landmarks, 1, 1))
+        h = np.zeros((n_landmarks, 3))
+        np.add.at(V, p.landmark_rows, of_landmark @ by_landmark)
+        np.add.at(h, p.landmark_rows, _times(of_landmark, seen))
+        return _Linearised(
+            H.swapaxes(1, 2).reshape(3 * n, 3 * n),
+            g,
+            V,
+            h,
+            of_pose @ by_landmark,
+            p,
+            self.splits,
+            float(np.sum(start**2) + np.sum(motion**2) + np.sum(loss)),
+        )
 
     def _of_motions(self, poses: Array) -> tuple[Array, Array]:
         """Whitened residuals of the first pose (3,) and of the relative poses (F, 3)."""
@@ -475,17 +498,21 @@ class _Residuals:
         """
         camera = self.problem.camera
         predicted, by_pose, by_landmark = camera.predict(
-            poses[self.pose_rows], landmarks[self.landmark_rows]
+            poses[self.problem.pose_rows], landmarks[self.problem.landmark_rows]
         )
         if not (in_image and camera.in_image):
-            return predicted - self.points, by_pose, by_landmark
+            return predicted - self.problem.points_in_camera, by_pose, by_landmark
         # What is guessed to lie behind the camera is pulled before it
         predicted[:, 2] = np.maximum(predicted[:, 2], LEAST_DEPTH_M)
         image = camera.to_image(predicted)
         by_point = -image[:, :, None] * np.array([0.0, 0.0, 1.0])
         by_point[:, 0, 0] = by_point[:, 1, 1] = camera.focal_px
         by_point /= predicted[:, 2, None, None]
-        return image - camera.to_image(self.points), by_point @ by_pose, by_point @ by_landmark
+        return (
+            image - camera.to_image(self.problem.points_in_camera),
+            by_point @ by_pose,
+            by_point @ by_landmark,
+        )
 
     def _loss(self, squares: Array) -> tuple[Array, Array]:
         """Loss (K,) of squared Mahalanobis distances, and its derivative by them."""
@@ -548,6 +575,10 @@ def _times(matrices: Array, vectors: Array) -> Array:
     return (matrices @ vectors[:, :, None])[:, :, 0]
 
 
+def _transposed(matrices: Array) -> Array:
+    return matrices.transpose(0, 2, 1)
+
+
 def _inverse(matrices: Array) -> Array:
     return np.asarray(np.linalg.inv(matrices), dtype=np.float64)
 
@@ -555,60 +586,3 @@ def _inverse(matrices: Array) -> Array:
 def _whitening(covariances: Array) -> Array:
     """Matrices (..., 3, 3) that make residuals of these covariances unit white noise."""
     return _inverse(np.asarray(np.linalg.cholesky(covariances), dtype=np.float64))
-
-
-@njit()
-def _add_blocks(H: Array, by_first: Array, by_second: Array, first: Ints, second: Ints) -> None:
-    """Add the four blocks of each relative pose to the poses' information."""
-    for k in range(len(first)):
-        a, b = 3 * first[k], 3 * second[k]
-        for i in range(3):
-            for j in range(3):
-                aa = bb = ab = 0.0
-                for m in range(3):
-                    aa += by_first[k, m, i] * by_first[k, m, j]
-                    bb += by_second[k, m, i] * by_second[k, m, j]
-                    ab += by_first[k, m, i] * by_second[k, m, j]
-                H[a + i, a + j] += aa
-                H[b + i, b + j] += bb
-                H[a + i, b + j] += ab
-                H[b + j, a + i] += ab
-
-
-@njit()
-def _eliminate(S: Array, W: Array, WV: Array, pose_rows: Ints, splits: Ints) -> None:
-    """Take W V^-1 W^T of every landmark off the poses' information, lower triangle only."""
-    for n in range(len(splits) - 1):
-        for a in range(splits[n], splits[n + 1]):
-            for b in range(splits[n], splits[n + 1]):
-                row, column = 3 * pose_rows[a], 3 * pose_rows[b]
-                if column > row:
-                    continue
-                for i in range(3):
-                    for j in range(3):
-                        S[row + i, column + j] -= (
-                            WV[a, i, 0] * W[b, j, 0]
-                            + WV[a, i, 1] * W[b, j, 1]
-                            + WV[a, i, 2] * W[b, j, 2]
-                        )
-
-
-@njit()
-def _spread_of_poses(covariance: Array, WV: Array, pose_rows: Ints, splits: Ints) -> Array:
-    """Covariance (N, 3, 3) that landmarks have from the poses they were seen from."""
-    spread = np.zeros((len(splits) - 1, 3, 3))
-    half = np.empty((3, 3))
-    for n in range(len(splits) - 1):
-        for a in range(splits[n], splits[n + 1]):
-            half[:] = 0.0
-            for b in range(splits[n], splits[n + 1]):
-                row, column = 3 * pose_rows[a], 3 * pose_rows[b]
-                for i in range(3):
-                    for j in range(3):
-                        for m in range(3):
-                            half[i, j] += covariance[row + i, column + m] * WV[b, m, j]
-            for i in range(3):
-                for j in range(3):
-                    for m in range(3):
-                        spread[n, i, j] += WV[a, m, i] * half[m, j]
-    return spread

@@ -27,7 +27,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -40,6 +40,35 @@ NoiseModel = Literal["camera", "diagonal", "correlated", "image"]
 NoiseAt = Literal["predicted", "measured"]
 
 LEAST_DEPTH_M = 0.1  # nearer than this no camera sees, and noise laws end
+
+
+class PackedCamera(NamedTuple):
+    """A `StereoModel` as plain numbers.
+
+    Attributes
+    ----------
+    per_focal, per_disparity
+        1 / f and 1 / (f B), 1/px and 1/(px m).
+    column_variance, row_variance, disparity_variance
+        px^2.
+    height_m
+        Of the camera.
+    correlated, in_image, at_measured
+        As in `StereoModel`.
+    unit_determinant
+        Of the correlated R at a depth of 1 m; it grows as depth^8.
+    """
+
+    per_focal: float
+    per_disparity: float
+    column_variance: float
+    row_variance: float
+    disparity_variance: float
+    height_m: float
+    correlated: bool
+    in_image: bool
+    at_measured: bool
+    unit_determinant: float
 
 
 @dataclass(frozen=True)
@@ -105,17 +134,22 @@ class StereoModel:
         )
 
     @property
-    def packed(self) -> Array:
-        """(10,) numbers for the compiled loops, in the order of `estimators.landmarks`.
-
-        1 / f and 1 / (f B), the variances, the height, three flags, and the determinant of the
-        correlated R at a depth of 1 m, which grows as depth^8.
-        """
-        flags = (self.correlated, self.in_image, self.at_measured)
-        inverse = np.array([1.0, 1.0 / self.baseline_m]) / self.focal_px
-        unit = np.prod(self.variances_px2) * inverse[0] ** 4 * inverse[1] ** 2
-        values = [*inverse, *self.variances_px2, self.height_m, *flags, unit]
-        return np.array(values, dtype=np.float64)
+    def packed(self) -> PackedCamera:
+        """For the compiled loops."""
+        by_focal, by_disparity = 1.0 / self.focal_px, 1.0 / (self.focal_px * self.baseline_m)
+        column, row, disparity = self.variances_px2.tolist()
+        return PackedCamera(
+            by_focal,
+            by_disparity,
+            column,
+            row,
+            disparity,
+            self.height_m,
+            self.correlated,
+            self.in_image,
+            self.at_measured,
+            column * row * disparity * by_focal**4 * by_disparity**2,
+        )
 
     def usable(self, points_in_camera: ArrayLike) -> NDArray[np.bool_]:
         """Which measurements (K, 3) can be used.

@@ -4,8 +4,6 @@ Particles sit on nodes and face a neighbour; they hop from node to node and are 
 places whose descriptors are most like the one observed.
 """
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any, Literal

@@ -1,7 +1,5 @@
 """The motion of a Frame as its wheel encoders predict it."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from estimators.gaussian import Gaussian, wheel_motion

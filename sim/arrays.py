@@ -1,7 +1,5 @@
 """Names of the array types that functions take and give."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

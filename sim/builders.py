@@ -4,8 +4,6 @@ Each builder is a function `name(*, rng, ...) -> World`; its parameters' default
 conf/world/<name>.yaml and nowhere else.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from itertools import pairwise

@@ -10,8 +10,6 @@ range 0 on all beams. In the kernels bearings are counted in beams from the firs
 [0, turn), where `turn` is the full circle and `phase` the first beam's angle in map, in rad.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -134,7 +132,9 @@ def visible(
 
 
 def _chains(walls: Array) -> Array:
-    """Faces (W, 4) strung into chains of corners, so that neighbours share the work on a corner.
+    """Faces (W, 4) as chains of corners, so that neighbours share the work on a corner.
+
+    A chain goes on as long as each face starts where the one before ends.
 
     Returns
     -------
@@ -145,22 +145,9 @@ def _chains(walls: Array) -> Array:
         chains, which are turned clockwise. It is infinite for other faces, and -1 where the
         chain ends and no face follows.
     """
-    starting: dict[tuple[float, float], list[int]] = {}
-    for i in range(len(walls) - 1, -1, -1):
-        starting.setdefault((walls[i, 0], walls[i, 1]), []).append(i)
-    unused = np.ones(len(walls), bool)
-    columns = []
-    for first in range(len(walls)):
-        if not unused[first]:
-            continue
-        corners = [walls[first, :2]]
-        following: int | None = first
-        while following is not None:
-            unused[following] = False
-            corners.append(walls[following, 2:])
-            candidates = starting.get((walls[following, 2], walls[following, 3]), [])
-            following = next((i for i in candidates if unused[i]), None)
-        columns.append(_chain(np.array(corners)))
+    breaks = 1 + np.flatnonzero(np.any(walls[1:, :2] != walls[:-1, 2:], axis=1))
+    chains = [part for part in np.split(walls, breaks) if len(part)]
+    columns = [_chain(np.vstack([part[:, :2], part[-1:, 2:]])) for part in chains]
     return np.concatenate([np.zeros((5, 0)), *columns], axis=1)
 
 

@@ -1,7 +1,5 @@
 """Numba's decorator for the hot loops: compiled once, cached on disk, announced when it happens."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable
 from typing import Any, TypeVar

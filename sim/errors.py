@@ -1,7 +1,5 @@
 """The one exception for input that a user can mend."""
 
-from __future__ import annotations
-
 from typing import TypeVar
 
 T = TypeVar("T")

@@ -4,8 +4,6 @@ The simulator asks at every tick and passes on what it alone knows, the true pos
 positions; a feedback answers with what reaches the controller.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import Protocol
 

@@ -1,7 +1,5 @@
 """Writing files so that nothing half-written is ever read back."""
 
-from __future__ import annotations
-
 import os
 import secrets
 from collections.abc import Iterator

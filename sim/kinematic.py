@@ -1,7 +1,5 @@
 """The robot with ideal rolling: the same slip law as the Bullet robot, without the engine."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

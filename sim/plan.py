@@ -1,7 +1,5 @@
 """A plan on which builders draw: walls, boxes, doors, objects clear of the tour, landmarks."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field

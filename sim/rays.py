@@ -1,7 +1,5 @@
 """Rays in a world: by the exact caster, or by the physics engine; the geometry is the same."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

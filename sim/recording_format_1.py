@@ -1,7 +1,5 @@
 """Recordings of version 0.1, which had four sensors, each with a log of another name."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

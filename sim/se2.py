@@ -4,8 +4,6 @@ Frames: `T_a_b` is the pose of frame b in frame a, so `compose(T_a_b, T_b_c)` is
 All functions broadcast over leading axes.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

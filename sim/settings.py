@@ -1,7 +1,5 @@
 """From plain mappings to the frozen dataclasses of this package, with errors that name the key."""
 
-from __future__ import annotations
-
 import dataclasses
 import importlib
 import math

@@ -1,7 +1,5 @@
 """World: upright walls, point landmarks and named places, in the frame `map` (metres)."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 

@@ -14,8 +14,6 @@ start_pose: [1, 1, 0]       # x m, y m, heading deg; without it, the first way-p
 ```
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from pathlib import Path

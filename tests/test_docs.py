@@ -53,7 +53,9 @@ def test_its_examples_are_the_scripts(site):
     page = (ROOT / "docs" / "examples" / "index.md").read_text()
     shown = re.findall(r'--8<-- "(.*?)"', page)
     assert sorted(shown) == sorted(
-        str(path.relative_to(ROOT)) for path in (ROOT / "docs" / "examples").glob("*.[py]*")
+        str(path.relative_to(ROOT))
+        for path in (ROOT / "docs" / "examples").rglob("*")
+        if path.suffix in (".py", ".yaml")
     )
     assert "Dead reckoning whose covariance" in (site[0] / "examples" / "index.html").read_text()
 

@@ -11,6 +11,7 @@ from estimators import landmarks as ekf
 from estimators.landmarks import LANES, LandmarkMaps
 from estimators.particles import in_place
 from estimators.stereo import StereoModel
+from sim import se2
 from sim.sensors import Mount, StereoCamera
 
 CAMERA = StereoCamera(mount=Mount(x_m=0.2, y_m=-0.1, z_m=0.6, yaw_rad=0.3))
@@ -42,11 +43,9 @@ class Batch:
         self.write()
 
     def rolled(self, normals, root):
-        moved = np.empty_like(self.lanes)
         x, y, yaw = self.model.mount
         mount = np.array([x, y, math.cos(yaw), math.sin(yaw)])
-        ekf.move(self.lanes, np.zeros(3), root, normals, mount, moved, self.state)
-        return moved
+        return ekf.move(self.lanes, np.zeros(3), root, normals, mount, self.state)
 
     def write(self):
         numbers = self.maps.data.reshape(len(self.maps.data), -1, 9, LANES)
@@ -283,6 +282,37 @@ def test_association_is_the_least_distance_of_each_particle(described):
         assert slots[:, m].tolist() == expected
     assert len(np.unique(slots)) > 3
     assert np.any(slots < 0)
+
+
+def test_nearby_are_those_before_some_camera_within_reach():
+    batch = Batch(n_slots=8)
+    batch.means[:, :3] -= [8.0, 0.0, 0.0]  # behind all cameras
+    batch.means[3, 1] += [8.0, 0.0, 0.0]  # but for one
+    batch.means[:, 4] += [30.0, 0.0, 0.0]
+    batch.maps.counts[:] = 7
+    batch.write()
+    expected = np.zeros(8, bool)
+    for m in range(N_PARTICLES):
+        position, C = batch.model.axes(batch.poses[m])
+        off = batch.means[m] - position
+        within = (off @ C[2] > 0.0) & (np.hypot(off[:, 0], off[:, 1]) < 10.0)
+        expected |= within & (np.arange(8) < 7)
+    found = batch.maps.nearby(batch.state, 10.0)
+    assert np.array_equal(found, np.flatnonzero(expected))
+    assert found.tolist() == [1, 3, 5, 6]
+
+
+def test_poses_move_by_the_increment_and_its_noise():
+    batch, rng = Batch(), np.random.default_rng(6)
+    root, increment = rng.normal(0.0, 0.1, (3, 3)), np.array([0.4, 0.1, 3.0])
+    normals = rng.standard_normal((3, batch.lanes.shape[1]))
+    mount = np.array([*batch.model.mount[:2], 1.0, 0.0])
+    moved = ekf.move(batch.lanes, increment, root, normals, mount, batch.state)
+    steps = increment + (root @ normals).T
+    for pose, found, step in zip(batch.lanes[:3].T, moved.T, steps, strict=True):
+        expected = se2.compose(pose, step)
+        heading = expected[2]
+        assert np.allclose(found, [*expected, np.cos(heading), np.sin(heading)], atol=1e-12)
 
 
 def test_moments_are_those_of_numpy():

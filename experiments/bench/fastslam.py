@@ -99,7 +99,7 @@ def update_ns(n_particles: int, n_landmarks: int, n_seen: int = 20) -> float:
     state, packed = ekf.new_state(maps.n_blocks), StereoModel.of(StereoCamera()).packed
     poses = np.tile([[0.0], [0.0], [0.0], [1.0], [0.0]], (1, maps.n_blocks * ekf.LANES))
     ahead = np.array([0.0, 0.0, 1.0, 0.0])
-    ekf.move(poses, np.zeros(3), np.zeros((3, 3)), poses[:3], ahead, poses.copy(), state)
+    ekf.move(poses, np.zeros(3), np.zeros((3, 3)), poses[:3], ahead, state)
     slots = np.tile(np.arange(n_landmarks)[:, None], (1, n_particles))
     ekf.create(maps.data, maps.rows(slots), points, state, packed)
 

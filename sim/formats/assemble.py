@@ -12,8 +12,6 @@ The rules for all readers:
   not drawn into one arc.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -11,8 +11,6 @@ Other lines are skipped. Ranges at or beyond the maximum, and those that are not
 and to be 180 / n degrees apart (180 / (n - 1) for an odd n), as the program that writes them does.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from itertools import pairwise

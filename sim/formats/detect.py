@@ -1,7 +1,5 @@
 """Which format a file is in, and a Recording of it, whatever it is."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 

@@ -4,8 +4,6 @@
 are wheel odometry, the corrected one's, at the same stamps, are those of a mapper.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

@@ -4,8 +4,6 @@ Each tuple is a JSON object `{"T": s, "phi_l": rad/s, "phi_r": rad/s, "sm": [x, 
 follow one another with white space between, several on a line or one over several lines.
 """
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from pathlib import Path

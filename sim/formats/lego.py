@@ -6,8 +6,6 @@ P stamp_ms x y                                                     mm, of the sc
 L C x y diameter                                                   mm
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from pathlib import Path

@@ -12,8 +12,6 @@ a stereo camera whose disparity error gives the growth of the range error and wh
 gives that of the bearing.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Mapping

@@ -6,8 +6,6 @@ GROUNDTRUTH    stamp, x, y, theta, and the 3 x 3 covariance row by row
 trajectories   stamp, x, y, theta
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from pathlib import Path

@@ -4,8 +4,6 @@ Lines of `stamp1 stamp2 x y z roll pitch yaw`, with blanks or commas: the pose a
 frame of the pose at stamp1.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -26,8 +26,6 @@ here are read, with our own definitions and never with those in the file. Frames
 Stamps become nanoseconds; everything else keeps its digits.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from dataclasses import dataclass

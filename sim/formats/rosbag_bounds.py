@@ -1,7 +1,5 @@
 """What a hostile bag must not do: unpack to more than the memory holds, or run code."""
 
-from __future__ import annotations
-
 import bz2
 import sqlite3
 import struct

@@ -1,7 +1,5 @@
 """Recordings and trajectories from bags and MCAP files; see `sim.formats.rosbag`."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math

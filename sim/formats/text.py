@@ -4,8 +4,6 @@ Whatever the file holds, the memory is bounded by its size: nothing is ever allo
 header promises it.
 """
 
-from __future__ import annotations
-
 import io
 import lzma
 import math
@@ -89,7 +87,7 @@ def read_members(path: Path) -> dict[str, bytes]:
     """
     if path.is_dir():
         files = {p: read_bytes(p) for p in sorted(path.iterdir()) if p.is_file()}
-        return {_bare(p.name): data for p, data in files.items()}
+        return {p.name.removesuffix(".gz").removesuffix(".xz"): data for p, data in files.items()}
     data = read_bytes(path)
     members: dict[str, bytes] = {}
     try:
@@ -104,10 +102,6 @@ def read_members(path: Path) -> dict[str, bytes]:
     if len(folders) == 1 and all("/" in name for name in members):
         members = {name.split("/", maxsplit=1)[1]: text for name, text in members.items()}
     return members
-
-
-def _bare(name: str) -> str:
-    return name.removesuffix(".gz").removesuffix(".xz")
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,5 @@
 """TUM trajectories: lines of `timestamp tx ty tz qx qy qz qw`."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

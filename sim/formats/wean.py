@@ -7,8 +7,6 @@ The map has seven lines of header and 800 x 800 cells of 10 cm: -1 where nothing
 probability. What the probability is of, the file does not say: see `Grid.free_is_one`.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from pathlib import Path

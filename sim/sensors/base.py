@@ -11,8 +11,6 @@ state, such as a bias that walks. These are optional:
   to a standard ROS message. A sensor without them gets a message of its own from its schema.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import re

@@ -1,7 +1,5 @@
 """The wheel encoders."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

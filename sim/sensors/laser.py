@@ -1,7 +1,5 @@
 """A planar laser scanner. Ranges that see nothing are +inf, as REP-117 asks."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from typing import Any, ClassVar

@@ -1,7 +1,5 @@
 """A spinning 3D lidar."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from typing import Any, ClassVar

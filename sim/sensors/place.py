@@ -1,7 +1,5 @@
 """Global descriptors of places, from a network or from whole clouds."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, ClassVar
 

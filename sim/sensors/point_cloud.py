@@ -1,7 +1,5 @@
 """Columns of numbers as sensor_msgs/PointCloud2, and back."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 
