@@ -201,6 +201,7 @@ class TopologicalMcl:
     """
 
     needs = frozenset({"place", "map"})
+    maps = (TopologicalMap,)
     global_or_grid = True
 
     def __init__(
