@@ -3,12 +3,13 @@
 Each scan adds to a cell's log odds once (Moravec and Elfes 1985; Thrun, Burgard, Fox 2005,
 Probabilistic Robotics, ch. 9):
 
-    l <- min(max(l + log(p / (1 - p)), l_least), l_most),
+    l <- l + log(p / (1 - p)),
 
-with p = `p_hit` where one of its beams ends, else `p_miss` where one passes. So a beam that grazes
-a wall does not erase what its neighbours hit. The bounds let a cell change its mind; the values
-are OctoMap's (Hornung and others 2013). A cell that no beam has touched is unknown, and so is all
-that a beam without a return may have crossed.
+with p = `p_hit` where one of its beams ends, else `p_miss` where one passes. The line between the
+ends of neighbouring beams is not cleared: along a wall it is the wall, and beams that graze it
+would erase it between the few cells that the scan hits. Nothing bounds the sum, as the world does
+not change: a wall that was seen well outlasts a few scans from a pose in error. A cell that no beam
+has touched is unknown, and so is all that a beam without a return may have crossed.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim import se2
-from sim.arrays import Array, Floats
+from sim.arrays import Array, Floats, Ints
 from sim.compiled import njit
 from sim.errors import InputError
 from sim.grid import OccupancyGrid, check_size
@@ -36,10 +37,8 @@ def map_scans(
     *,
     resolution_m: float,
     max_range_m: float | None = None,
-    p_hit: float = 0.7,
+    p_hit: float = 0.8,
     p_miss: float = 0.4,
-    p_least: float = 0.12,
-    p_most: float = 0.97,
     on_progress: Callable[[int], None] | None = None,
 ) -> OccupancyGrid:
     """Build a grid from scans.
@@ -55,9 +54,8 @@ def map_scans(
     max_range_m
         Longer beams clear the cells up to here, and hit nothing; None for the laser's range.
     p_hit, p_miss
-        Probability that a cell is occupied if a beam ends in it, or passes through it.
-    p_least, p_most
-        Bounds of a cell's probability.
+        Probability that a cell is occupied if a beam ends in it, or passes through it. With these a
+        cell ends up occupied if a quarter of the scans hit it, GMapping's share.
     on_progress
         Called with the number of scans done.
 
@@ -85,17 +83,17 @@ def map_scans(
     )
     log_odds = np.zeros((int(rows), int(columns)), np.float32)
     last_scan = np.zeros(log_odds.shape, np.int32)
-    hit, miss, least, most = (math.log(p / (1.0 - p)) for p in (p_hit, p_miss, p_least, p_most))
+    hit, miss = math.log(p_hit / (1.0 - p_hit)), math.log(p_miss / (1.0 - p_miss))
     eyes = np.column_stack([lasers[:, :2] / resolution_m - corner, lasers[:, 2]])
     for begin in range(0, len(eyes), _AT_ONCE):
         part = slice(begin, begin + _AT_ONCE)
         _add_scans(
             log_odds, last_scan, eyes[part], ranges[part], bearings, resolution_m, most_m,
-            (hit, miss, least, most), begin,
+            hit, miss, begin,
         )  # fmt: skip
         if on_progress is not None:
             on_progress(min(begin + _AT_ONCE, len(eyes)))
-    probability = np.where(last_scan > 0, 1.0 / (1.0 + np.exp(-log_odds)), np.float32(np.nan))
+    probability = np.where(log_odds != 0.0, 1.0 / (1.0 + np.exp(-log_odds)), np.float32(np.nan))
     origin = np.array([*(corner * resolution_m), 0.0])
     return OccupancyGrid(probability.astype(np.float32), resolution_m, origin)
 
@@ -118,6 +116,33 @@ def _bounds(lasers: Array, ranges: Floats, bearings: Array, most_m: float) -> tu
 
 
 @njit()
+def _between(start: Array, end: Array, cells: Ints) -> int:
+    """Put the cells (row, column) from one point (x, y, in cells) to another into `cells`.
+
+    From border to border (Amanatides and Woo 1987); returns their number.
+    """
+    x, y = start[0], start[1]
+    dx, dy = end[0] - x, end[1] - y
+    row, column = int(y), int(x)
+    n = 1 + abs(int(end[1]) - row) + abs(int(end[0]) - column)
+    right, up = (1 if dx > 0.0 else -1), (1 if dy > 0.0 else -1)
+    # Share of the way to the next border, and from border to border
+    per_x = abs(1.0 / dx) if dx != 0.0 else np.inf
+    per_y = abs(1.0 / dy) if dy != 0.0 else np.inf
+    t_x = per_x * (column + 1 - x if right > 0 else x - column) if dx != 0.0 else np.inf
+    t_y = per_y * (row + 1 - y if up > 0 else y - row) if dy != 0.0 else np.inf
+    for k in range(n):
+        cells[k, 0], cells[k, 1] = row, column
+        if t_x < t_y:
+            t_x += per_x
+            column += right
+        else:
+            t_y += per_y
+            row += up
+    return n
+
+
+@njit()
 def _add_scans(
     log_odds: Floats,
     last_scan: NDArray[np.int32],
@@ -126,7 +151,8 @@ def _add_scans(
     bearings: Array,
     cell_m: float,
     most_m: float,
-    steps: tuple[float, float, float, float],
+    hit: float,
+    miss: float,
     begun: int,
 ) -> None:
     """Add scans to the grid (rows, columns), in place.
@@ -134,49 +160,38 @@ def _add_scans(
     Parameters
     ----------
     last_scan
-        Number of the last scan that touched each cell, from 1; 0 for none.
+        Number of the last scan that was done with each cell, from 1; 0 for none.
     eyes
         (N, 3): where the lasers are, in cells from the grid's corner, and their headings.
     ranges
         (N, beams) m; 0 for a beam that says nothing.
-    steps
-        Log odds of a hit and of a miss, and their least and greatest sum.
+    hit, miss
+        Log odds that they add.
     begun
         Number of scans already there.
     """
-    hit, miss, least, most = steps
     ends = np.empty((len(bearings), 2))
+    cells = np.empty((log_odds.shape[0] + log_odds.shape[1] + 2, 2), np.int64)
     for s in range(len(eyes)):
         number = begun + s + 1
-        x0, y0 = eyes[s, 0], eyes[s, 1]
         for b in range(len(bearings)):
             r = min(ranges[s, b], most_m) / cell_m
             angle = eyes[s, 2] + bearings[b]
-            ends[b, 0], ends[b, 1] = x0 + r * math.cos(angle), y0 + r * math.sin(angle)
+            ends[b, 0] = eyes[s, 0] + r * math.cos(angle)
+            ends[b, 1] = eyes[s, 1] + r * math.sin(angle)
             if 0.0 < ranges[s, b] <= most_m:
                 row, column = int(ends[b, 1]), int(ends[b, 0])
                 if last_scan[row, column] != number:
                     last_scan[row, column] = number
-                    log_odds[row, column] = min(log_odds[row, column] + hit, most)
+                    log_odds[row, column] += hit
+        for b in range(1, len(bearings)):
+            if 0.0 < ranges[s, b - 1] <= most_m and 0.0 < ranges[s, b] <= most_m:
+                for k in range(_between(ends[b - 1], ends[b], cells)):
+                    last_scan[cells[k, 0], cells[k, 1]] = number
         for b in range(len(bearings)):
-            if ranges[s, b] == 0.0:
-                continue
-            # From border to border (Amanatides and Woo 1987); t is the share of the beam
-            dx, dy = ends[b, 0] - x0, ends[b, 1] - y0
-            row, column = int(y0), int(x0)
-            n_borders = abs(int(ends[b, 1]) - row) + abs(int(ends[b, 0]) - column)
-            right, up = (1 if dx > 0.0 else -1), (1 if dy > 0.0 else -1)
-            per_x = abs(1.0 / dx) if dx != 0.0 else np.inf
-            per_y = abs(1.0 / dy) if dy != 0.0 else np.inf
-            t_x = per_x * (column + 1 - x0 if right > 0 else x0 - column) if dx != 0.0 else np.inf
-            t_y = per_y * (row + 1 - y0 if up > 0 else y0 - row) if dy != 0.0 else np.inf
-            for _ in range(n_borders + 1):
-                if last_scan[row, column] != number:
-                    last_scan[row, column] = number
-                    log_odds[row, column] = max(log_odds[row, column] + miss, least)
-                if t_x < t_y:
-                    t_x += per_x
-                    column += right
-                else:
-                    t_y += per_y
-                    row += up
+            if ranges[s, b] > 0.0:
+                for k in range(_between(eyes[s], ends[b], cells)):
+                    row, column = cells[k, 0], cells[k, 1]
+                    if last_scan[row, column] != number:
+                        last_scan[row, column] = number
+                        log_odds[row, column] += miss

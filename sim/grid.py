@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
 MOST_CELLS = 50_000_000  # 200 MB
 FREE_BELOW, OCCUPIED_ABOVE = 0.196, 0.65  # the thresholds that ROS's map server writes
-_TOUCHING_M = 1e-6  # a wall on the border of two cells touches both
 
 
 @dataclass(frozen=True)
@@ -121,8 +120,10 @@ def of_world(recording: Recording, resolution_m: float, z_m: float) -> Occupancy
 def rasterized(world: World, resolution_m: float, z_m: float) -> OccupancyGrid:
     """Grid of a world's walls at a height z_m, with a margin of two cells.
 
-    Occupied is every cell that a wall touches. Free is what can be reached from the start pose and
-    the way-points; the rest, such as what lies outside or inside furniture, is unknown.
+    Occupied is every cell within a quarter of a cell of a wall, so that a wall near a border takes
+    the cells on both sides, and is where their middle is to a quarter of a cell. Free is what can be
+    reached from the start pose and the way-points; the rest, such as what lies outside or inside
+    furniture, is unknown.
 
     Raises
     ------
@@ -143,8 +144,8 @@ def rasterized(world: World, resolution_m: float, z_m: float) -> OccupancyGrid:
     for x1, y1, x2, y2 in walls:
         steps = math.ceil(8.0 * math.hypot(x2 - x1, y2 - y1) / resolution_m)
         on_wall = np.linspace((x1, y1), (x2, y2), steps + 1) - corner
-        for beside in _TOUCHING_M * np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]]):
-            column, row = ((on_wall + beside) / resolution_m).astype(np.int64).T
+        for beside in np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]]) / 4.0:
+            column, row = (on_wall / resolution_m + beside).astype(np.int64).T
             occupied[row, column] = True
     floors, _ = ndimage.label(~occupied)
     starts = np.concatenate([world.start_pose[None, :2], world.waypoints])

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from experiments.viewing.style import figure
 from sim.grid import OccupancyGrid
 
-_OCCUPIED, _FREE, _UNKNOWN = 60, 255, 222  # greys
+_OCCUPIED, _FREE, _UNKNOWN = 0, 255, 222  # greys
 
 
 def draw_grid(ax: Axes, grid: OccupancyGrid, **style: Any) -> None:
