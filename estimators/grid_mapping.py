@@ -19,6 +19,7 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import expit
 
 from sim import se2
 from sim.arrays import Array, Floats, Ints
@@ -93,7 +94,7 @@ def map_scans(
         )  # fmt: skip
         if on_progress is not None:
             on_progress(min(begin + _AT_ONCE, len(eyes)))
-    probability = np.where(log_odds != 0.0, 1.0 / (1.0 + np.exp(-log_odds)), np.float32(np.nan))
+    probability = np.where(log_odds != 0.0, expit(log_odds), np.float32(np.nan))
     origin = np.array([*(corner * resolution_m), 0.0])
     return OccupancyGrid(probability.astype(np.float32), resolution_m, origin)
 

@@ -120,10 +120,10 @@ def of_world(recording: Recording, resolution_m: float, z_m: float) -> Occupancy
 def rasterized(world: World, resolution_m: float, z_m: float) -> OccupancyGrid:
     """Grid of a world's walls at a height z_m, with a margin of two cells.
 
-    Occupied is every cell within a quarter of a cell of a wall, so that a wall near a border takes
-    the cells on both sides, and is where their middle is to a quarter of a cell. Free is what can be
-    reached from the start pose and the way-points; the rest, such as what lies outside or inside
-    furniture, is unknown.
+    Occupied is every cell within a quarter of a cell of a wall: a wall near a border takes the
+    cells on both sides, so that their middle is off by a quarter of a cell at most. Free is what
+    can be reached from the start pose and the way-points; the rest, such as what lies outside or
+    inside furniture, is unknown.
 
     Raises
     ------
