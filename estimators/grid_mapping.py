@@ -5,11 +5,10 @@ Probabilistic Robotics, ch. 9):
 
     l <- l + log(p / (1 - p)),
 
-with p = `p_hit` where one of its beams ends, else `p_miss` where one passes. The line between the
-ends of neighbouring beams is not cleared: along a wall it is the wall, and beams that graze it
-would erase it between the few cells that the scan hits. Nothing bounds the sum, as the world does
-not change: a wall that was seen well outlasts a few scans from a pose in error. A cell that no beam
-has touched is unknown, and so is all that a beam without a return may have crossed.
+with p = `p_hit` where one of its beams ends, else `p_miss` where one passes. So beams that graze a
+wall do not clear the cells that their neighbours hit. Nothing bounds the sum, as the world does not
+change: a wall that was seen well outlasts a few scans from a pose in error. A cell that no beam has
+touched is unknown, and so is all that a beam without a return may have crossed.
 """
 
 from __future__ import annotations
@@ -94,7 +93,7 @@ def map_scans(
         )  # fmt: skip
         if on_progress is not None:
             on_progress(min(begin + _AT_ONCE, len(eyes)))
-    probability = np.where(log_odds != 0.0, expit(log_odds), np.float32(np.nan))
+    probability = np.where(last_scan > 0, expit(log_odds), np.float32(np.nan))
     origin = np.array([*(corner * resolution_m), 0.0])
     return OccupancyGrid(probability.astype(np.float32), resolution_m, origin)
 
@@ -161,7 +160,7 @@ def _add_scans(
     Parameters
     ----------
     last_scan
-        Number of the last scan that was done with each cell, from 1; 0 for none.
+        Number of the last scan that touched each cell, from 1; 0 for none.
     eyes
         (N, 3): where the lasers are, in cells from the grid's corner, and their headings.
     ranges
@@ -185,10 +184,6 @@ def _add_scans(
                 if last_scan[row, column] != number:
                     last_scan[row, column] = number
                     log_odds[row, column] += hit
-        for b in range(1, len(bearings)):
-            if 0.0 < ranges[s, b - 1] <= most_m and 0.0 < ranges[s, b] <= most_m:
-                for k in range(_between(ends[b - 1], ends[b], cells)):
-                    last_scan[cells[k, 0], cells[k, 1]] = number
         for b in range(len(bearings)):
             if ranges[s, b] > 0.0:
                 for k in range(_between(eyes[s], ends[b], cells)):

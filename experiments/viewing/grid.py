@@ -42,7 +42,8 @@ def grid_figure(grid: OccupancyGrid, title: str) -> Figure:
     page = figure(9.0, float(np.clip(8.3 * height_m / width_m, 2.0, 8.3)) + 0.9)
     ax = page.subplots()
     draw_grid(ax, grid)
-    ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+    grey = 3 * (_UNKNOWN / 255,)  # off the grid, too
+    ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), facecolor=grey)
     ax.set_title(f"{title}: {described(grid)}", loc="left", fontsize="medium")
     return page
 
