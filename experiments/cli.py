@@ -379,10 +379,10 @@ def build_map(
     if "=" in what[0]:
         raise InputError(f"{what[0]}: name a recording first, such as run.npz")
     recording = read_any([Path(what[0])])
-    log, _ = laser_scans(recording)
+    n_all = len(laser_scans(recording)[0])
     with progress(estimate, len(recording.frame_stamps)) as on_step:
         stamps, poses = path_of(recording, estimate, what[1:], on_step)
-    with progress("mapping", len(log.stamps), "scans") as on_progress:
+    with progress("mapping", n_all, "scans") as on_progress:
         grid, n_scans = grid_along(
             recording,
             stamps,
@@ -392,7 +392,7 @@ def build_map(
             on_progress=on_progress,
         )
     write_grid(grid, out, "raw" if raw else "trinary")
-    print(f"{out}: {described(grid)}, from {n_scans} of {len(log.stamps)} scans")
+    print(f"{out}: {described(grid)}, from {n_scans} of {n_all} scans")
 
 
 @app.command()

@@ -13,18 +13,19 @@ from experiments.evaluation.time_sync import interpolate
 from experiments.runs.evaluate import estimates
 from experiments.runs.seeds import stream
 from experiments.viewing.view import experiment_over, read_estimate
-from sim.arrays import Array
+from sim.arrays import Array, Floats
 from sim.errors import InputError
 from sim.grid import OccupancyGrid
-from sim.recording import LaserLog, Recording
+from sim.recording import Recording
 from sim.sensors import Laser
 
 _LONGEST_GAP_S = 3.0  # between poses; scans in longer ones are left out
 
 
-def laser_scans(recording: Recording) -> tuple[LaserLog, Laser]:
-    """The scans that are mapped, and their laser; InputError if there are none."""
-    return recording.known_laser, recording.sensors.known_laser
+def laser_scans(recording: Recording) -> tuple[Array, Floats, Laser]:
+    """Stamps (N,) s and ranges (N, beams) m of the scans, and their laser; InputError if none."""
+    log = recording.known_laser
+    return log.stamps, log.ranges_m, recording.sensors.known_laser
 
 
 def path_of(
@@ -85,16 +86,16 @@ def grid_along(
     Poses (T, 3) are interpolated at the scans' stamps; scans before the first, after the last or
     in gaps of more than 3 s are left out.
     """
-    log, laser = laser_scans(recording)
+    scan_stamps, ranges_m, laser = laser_scans(recording)
     if len(stamps) < 2:
         raise InputError("a map needs a path of two poses or more")
-    at_scans = interpolate(stamps, poses, log.stamps, _LONGEST_GAP_S)
+    at_scans = interpolate(stamps, poses, scan_stamps, _LONGEST_GAP_S)
     placed = np.isfinite(at_scans).all(axis=1)
     if not placed.any():
         raise InputError("no scan lies within the time span of the path")
     grid = map_scans(
         at_scans[placed],
-        log.ranges_m[placed],
+        ranges_m[placed],
         laser,
         resolution_m=resolution_m,
         max_range_m=max_range_m,
