@@ -100,8 +100,7 @@ class Run:
         from experiments.viewing.run_figure import run_figure
 
         estimate = self.online if self.revised is None else self.revised
-        name = str(self.row["choice.estimator"])
-        return _saved(run_figure(self.recording, estimate, name), path)
+        return _saved(run_figure(self.recording, estimate, str(self.row["choice.estimator"])), path)
 
 
 def simulate(*overrides: str) -> Recording:
@@ -194,7 +193,7 @@ def run(*given: Any, estimator: str | Estimator | None = None) -> Run:
     (0.0001, True)
     >>> estima.run(*quick, estimator="ekf_icp")
     Traceback (most recent call last):
-    sim.errors.InputError: estimator=ekf_icp needs a laser sensor, and sensors=encoder has none; try sensors=lms291, hokuyo or laser_stereo
+    sim.errors.InputError: estimator=ekf_icp needs a sensor laser, and sensors=encoder has none; try sensors=hokuyo, laser_stereo, lms291
     """  # noqa: E501 the message is one line
     from experiments.runs.evaluate import evaluate
     from sim.errors import InputError
@@ -209,19 +208,16 @@ def run(*given: Any, estimator: str | Estimator | None = None) -> Run:
         )
     if not (estimator is None or isinstance(estimator, str)):
         experiment = experiment.using(estimator)
-    if recording is None:
-        experiment.check()
-        recording = experiment.recording()
-    else:
+    if recording is not None:
         experiment = experiment.over(recording)
-    estimates: list[tuple[Estimate, Estimate | None]] = []
+    found: list[tuple[Recording, Estimate, Estimate | None]] = []
     rows = evaluate(
         experiment,
-        recording,
-        on_estimate=lambda _, online, revised: estimates.append((online, revised)),
+        None if recording is None else lambda: recording,
+        on_estimate=lambda read, _, online, revised: found.append((read, online, revised)),
         on_error=_raise,
     )
-    return Run(recording, *estimates[0], rows[0])
+    return Run(*found[0], rows[0])
 
 
 def score(recording: Recording, estimate: Estimate) -> dict[str, float]:

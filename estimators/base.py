@@ -13,7 +13,7 @@ from sim.arrays import Array
 from sim.errors import InputError
 from sim.recording import Frame, Recording
 from sim.robot import RobotGeometry
-from sim.sensors import SensorSuite
+from sim.sensors import Sensors
 
 
 @dataclass(frozen=True)
@@ -22,8 +22,10 @@ class Prior:
 
     Attributes
     ----------
-    robot, sensors
-        Believed geometry, mounting and noise.
+    robot
+        Believed geometry.
+    sensors
+        By name, believed mounting and noise.
     mean, covariance
         First belief, (3,) and (3, 3), m, m, rad in map; None for global localization.
     map
@@ -31,7 +33,7 @@ class Prior:
     """
 
     robot: RobotGeometry
-    sensors: SensorSuite
+    sensors: Sensors = field(default_factory=dict)
     mean: Array | None = None
     covariance: Array | None = None
     map: Any = None
@@ -89,7 +91,11 @@ class Estimate:
 
 
 class Estimator(Protocol):
-    """A localization method. It may also have `finish() -> Estimate`, the revised trajectory."""
+    """A localization method. It may also have `finish() -> Estimate`, the revised trajectory.
+
+    `needs`, if it has that, is the set of its options that name a sensor it cannot do without
+    (`laser`, whose value is the sensor's name), and `map`.
+    """
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Forget everything and start from the prior."""

@@ -54,6 +54,9 @@ class EkfIcp:
         As in `estimators.scan_matching.ScanMatcher`; each scan contributes half of the covariance.
     keyframe_distance_m, keyframe_turn_rad
         How far the robot goes before it takes a new key frame.
+    register_distance_m, register_turn_rad
+        How far the robot is believed to go before another scan is registered: it must exceed one
+        of them. 0 and 0: every scan is.
     kr, kl
         Believed slip variance per metre of the wheels, m.
     lateral_slip_m
@@ -91,6 +94,8 @@ class EkfIcp:
         sigma_range_m: float | None = None,
         keyframe_distance_m: float = 0.5,
         keyframe_turn_rad: float = 0.35,
+        register_distance_m: float = 0.0,
+        register_turn_rad: float = 0.0,
         kr: float = 1e-4,
         kl: float = 1e-4,
         lateral_slip_m: float = 1e-7,
@@ -98,13 +103,18 @@ class EkfIcp:
         gate_probability: float | None = 1e-9,
         shared_noise: float = 0.75,
         window_s: float = 0.05,
+        laser: str = "laser",
     ) -> None:
+        self.laser = laser
         self._matcher = ScanMatcher(metric, search, covariance, sigma_range_m)
         self.wheels = WheelPrediction(
             kr, kl, window_s, lateral_slip_m=lateral_slip_m, encoder_tick_m=encoder_tick_m
         )
         require_non_negative(
-            keyframe_distance_m=keyframe_distance_m, keyframe_turn_rad=keyframe_turn_rad
+            keyframe_distance_m=keyframe_distance_m,
+            keyframe_turn_rad=keyframe_turn_rad,
+            register_distance_m=register_distance_m,
+            register_turn_rad=register_turn_rad,
         )
         require_shares(shared_noise=shared_noise)
         if gate_probability is not None and not 0.0 < gate_probability < 1.0:
@@ -113,11 +123,13 @@ class EkfIcp:
                 f"got {gate_probability}"
             )
         self.keyframe_distance_m, self.keyframe_turn_rad = keyframe_distance_m, keyframe_turn_rad
+        self.register_distance_m = register_distance_m
+        self.register_turn_rad = register_turn_rad
         self.gate_probability, self.shared_noise = gate_probability, shared_noise
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Start from the prior's pose; the first scan becomes the key frame."""
-        self._laser, self._rng = require_laser(prior, "ekf_icp"), rng
+        self._laser, self._rng = require_laser(prior, self.laser, "ekf_icp"), rng
         start = start_pose(prior, "ekf_icp")
         self.wheels.reset(prior.robot.track_m)
         self._key: PreparedScan | None = None
@@ -137,8 +149,9 @@ class EkfIcp:
         """Predict by the wheels; correct by the Frame's scan, if it has one."""
         self._predict(frame)
         extras: dict[str, Any] = {}
-        if frame.ranges_m is not None:
-            self._correct(self._matcher.prepare(frame.ranges_m, self._laser), extras)
+        scan = frame.readings.get(self.laser)
+        if scan is not None and self._is_due():
+            self._correct(self._matcher.prepare(scan["ranges_m"], self._laser), extras)
         by_twist = _from_twist(self._mean[_POSE])
         covariance = by_twist @ self._covariance[_POSE, _POSE] @ by_twist.T
         return Belief(self._mean[_POSE].copy(), (covariance + covariance.T) / 2.0, extras)
@@ -149,6 +162,13 @@ class EkfIcp:
         self._mean[_POSE], _, by_motion = compose(self._mean[_POSE], motion.mean)
         by_motion = _from_twist(-self._mean[_POSE]) @ by_motion
         self._covariance[_POSE, _POSE] += by_motion @ motion.covariance @ by_motion.T
+
+    def _is_due(self) -> bool:
+        """Whether a scan is to be registered, by the motion since the last one that was."""
+        if self._last is None or not (self.register_distance_m or self.register_turn_rad):
+            return True
+        moved, _, _ = between(self._mean[_LAST], self._mean[_POSE])
+        return moved_beyond(moved, self.register_distance_m, self.register_turn_rad)
 
     def _correct(self, scan: PreparedScan | None, extras: dict[str, Any]) -> None:
         """Register the scan against the key frame, or else the last scan, and take it in."""

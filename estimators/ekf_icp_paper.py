@@ -74,7 +74,9 @@ class EkfIcpPaper:
         acceleration_noise: float = 1.0,
         turn_noise: float = 2.0,
         window_s: float = 0.05,
+        laser: str = "laser",
     ) -> None:
+        self.laser = laser
         self._matcher = ScanMatcher(metric, search, covariance, sigma_range_m)
         self.wheels = WheelPrediction(kr, kl, window_s, lateral_slip_m=lateral_slip_m)
         require_non_negative(acceleration_noise=acceleration_noise, turn_noise=turn_noise)
@@ -82,7 +84,7 @@ class EkfIcpPaper:
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Start from the prior's pose, with velocities unknown."""
-        self._laser, self._rng = require_laser(prior, "ekf_icp_paper"), rng
+        self._laser, self._rng = require_laser(prior, self.laser, "ekf_icp_paper"), rng
         start = start_pose(prior, "ekf_icp_paper")
         self.wheels.reset(prior.robot.track_m)
         self._mean = np.concatenate([start.mean, np.zeros(3)])
@@ -101,9 +103,9 @@ class EkfIcpPaper:
             motion = self.wheels.predict(frame)
             self._rolled, self._since_s = self._rolled.then(motion), self._since_s + dt
             self._measure(motion, dt, np.eye(3))
-        if frame.ranges_m is not None:
-            scan = self._matcher.prepare(frame.ranges_m, self._laser)
-            self._correct(scan, extras)
+        scan = frame.readings.get(self.laser)
+        if scan is not None:
+            self._correct(self._matcher.prepare(scan["ranges_m"], self._laser), extras)
         return Belief(self._mean[:3].copy(), self._covariance[:3, :3].copy(), extras)
 
     def _predict(self, dt: float) -> None:

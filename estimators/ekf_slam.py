@@ -18,7 +18,8 @@ from estimators.slam_frontend import Association, SlamFrontEnd
 from estimators.stereo import LEAST_DEPTH_M, NoiseAt, NoiseModel
 from estimators.wheels import WheelPrediction
 from sim.arrays import Array, Ints
-from sim.recording import Frame, LandmarkSet
+from sim.recording import Frame
+from sim.sensors import Reading
 
 
 class EkfSlam:
@@ -56,7 +57,7 @@ class EkfSlam:
     A step costs O(K N^2): the whole covariance is touched.
     """
 
-    needs = frozenset({"landmarks"})
+    needs = frozenset({"stereo"})
 
     def __init__(
         self,
@@ -72,10 +73,13 @@ class EkfSlam:
         kl: float = 5e-5,
         window_s: float = 0.05,
         keep_map: bool = False,
+        stereo: str = "stereo",
     ) -> None:
+        self.stereo = stereo
         self.wheels = WheelPrediction(kr, kl, window_s)
         self.front_end = SlamFrontEnd(
             "ekf_slam",
+            stereo,
             association,
             d0,
             noise_model,
@@ -99,9 +103,10 @@ class EkfSlam:
         """Roll by the wheels; at an image, associate, update, and add new landmarks."""
         self._motion = self._motion.then(self.wheels.predict(frame))
         extras: dict[str, Any] = {}
-        if frame.landmarks is not None:
+        seen = frame.readings.get(self.stereo)
+        if seen is not None:
             self._move()
-            extras = self._see(frame.landmarks)
+            extras = self._see(seen)
         pose = Gaussian(self._mean[:3], self._covariance[:3, :3]).then(self._motion)
         if self.keep_map:
             extras |= {k: v for k, v in self.map.items() if k.startswith("landmark")}
@@ -141,7 +146,7 @@ class EkfSlam:
         self._mean[:3] = mean
         self._motion = STILL
 
-    def _see(self, seen: LandmarkSet) -> dict[str, Any]:
+    def _see(self, seen: Reading) -> dict[str, Any]:
         """Take in one image; the extras that it gives."""
         image = self.front_end.read(seen)
         extras: dict[str, Any] = {"status": image.status} if image.status else {}

@@ -30,7 +30,8 @@ from estimators.stereo import NoiseAt, NoiseModel
 from estimators.wheels import WheelPrediction
 from sim import se2
 from sim.arrays import Array, Ints
-from sim.recording import Frame, LandmarkSet
+from sim.recording import Frame
+from sim.sensors import Reading
 
 Proposal = Literal["motion", "optimal"]
 
@@ -94,7 +95,7 @@ class FastSLAM:
     `finish` gives the path of the best particle's lineage; `map` is its map.
     """
 
-    needs = frozenset({"landmarks"})
+    needs = frozenset({"stereo"})
 
     def __init__(
         self,
@@ -116,7 +117,9 @@ class FastSLAM:
         kl: float = 5e-5,
         window_s: float = 0.05,
         keep_map: bool = False,
+        stereo: str = "stereo",
     ) -> None:
+        self.stereo = stereo
         require_counts(n_particles=n_particles)
         require_choices(
             proposal=(proposal, Proposal), resampling=(resampling, Scheme), maps=(maps, Maps)
@@ -126,6 +129,7 @@ class FastSLAM:
         self.wheels = WheelPrediction(kr, kl, window_s)
         self.front_end = SlamFrontEnd(
             "fastslam",
+            stereo,
             association,
             d0,
             noise_model,
@@ -170,8 +174,9 @@ class FastSLAM:
         """Roll by the wheels; at an image, draw, associate, weight, update and resample."""
         self._roll(frame)
         extras: dict[str, Any] = {"resampled": False}
-        if frame.landmarks is not None:
-            self._see(frame.landmarks, extras)
+        seen = frame.readings.get(self.stereo)
+        if seen is not None:
+            self._see(seen, extras)
         elif self._rolled.covariance[2, 2] > _MOST_DRIFT_RAD**2:
             self._poses = self._move(self._normals())
             self._take_stock()
@@ -194,7 +199,7 @@ class FastSLAM:
             extras["resampled"] = True
         return Belief(belief.mean, belief.covariance, extras)
 
-    def _see(self, seen: LandmarkSet, extras: dict[str, Any]) -> None:
+    def _see(self, seen: Reading, extras: dict[str, Any]) -> None:
         """Take in one image."""
         image = self.front_end.read(seen)
         if image.status:

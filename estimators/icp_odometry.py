@@ -88,7 +88,9 @@ class IcpOdometry:
         kr: float = 1e-4,
         kl: float = 1e-4,
         window_s: float = 0.05,
+        laser: str = "laser",
     ) -> None:
+        self.laser = laser
         self._matcher = ScanMatcher(metric, search, covariance, sigma_range_m)
         self.wheels = WheelPrediction(kr, kl, window_s)
         require_choices(reference=(reference, Reference))
@@ -100,7 +102,7 @@ class IcpOdometry:
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Start from the prior's pose; the first scan becomes the reference."""
-        self._laser, self._rng = require_laser(prior, "icp_odometry"), rng
+        self._laser, self._rng = require_laser(prior, self.laser, "icp_odometry"), rng
         self._key = self._last = _Anchor(start_pose(prior, "icp_odometry"), None)
         self._key_to_last = STILL
         self._lost = False
@@ -113,9 +115,10 @@ class IcpOdometry:
         self._since_s += frame.duration_s
         if self.use_odometry_guess:
             self._rolled = self._rolled.then(self.wheels.predict(frame))
-        if frame.ranges_m is None:
+        reading = frame.readings.get(self.laser)
+        if reading is None:
             return _belief(self._last.belief.then(self._rolled), {})
-        scan = self._matcher.prepare(frame.ranges_m, self._laser)
+        scan = self._matcher.prepare(reading["ranges_m"], self._laser)
         guess = self._guess()
         belief = self._last.belief.then(guess)
         if scan is None:

@@ -130,7 +130,9 @@ class Mcl:
         kr: float = 1e-4,
         kl: float = 1e-4,
         window_s: float = 0.05,
+        laser: str = "laser",
     ) -> None:
+        self.laser = laser
         self.wheels = WheelPrediction(kr, kl, window_s)
         require_counts(n_least=n_least, n_most=n_most, n_beams=n_beams, tries=tries)
         require_choices(resampling=(resampling, Scheme))
@@ -173,7 +175,7 @@ class Mcl:
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Draw particles from the prior's pose, or from all the floor if there is none."""
-        self._laser, self._rng = require_laser(prior, "mcl"), rng
+        self._laser, self._rng = require_laser(prior, self.laser, "mcl"), rng
         if not isinstance(prior.map, self.maps):
             raise InputError("mcl needs a map of walls; set prior.map=world, or to a grid's .yaml")
         self.wheels.reset(prior.robot.track_m)
@@ -205,8 +207,9 @@ class Mcl:
         """Roll by the wheels; with a scan from a new place, weight and resample."""
         self._motion = self._motion.then(self.wheels.predict(frame))
         extras: dict[str, Any] = {}
-        if frame.ranges_m is not None and self._is_due():
-            ends = beam_ends(frame.ranges_m, self._laser, self.n_beams)
+        scan = frame.readings.get(self.laser)
+        if scan is not None and self._is_due():
+            ends = beam_ends(scan["ranges_m"], self._laser, self.n_beams)
             self._move()
             self._seen = True
             if ends.shape[1] == 0:

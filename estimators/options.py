@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, get_args
+from typing import Any, TypeVar, get_args
 
 from estimators.base import Prior
 from estimators.gaussian import Gaussian
 from sim.errors import InputError
-from sim.sensors import Laser, StereoCamera
+from sim.sensors import Laser, StereoCamera, sensor_of
+
+S = TypeVar("S")
 
 
 def require_choices(owner: str = "estimator.", /, **choices: tuple[str, Any]) -> None:
@@ -55,15 +57,18 @@ def start_pose(prior: Prior, estimator: str) -> Gaussian:
     return Gaussian(prior.mean.copy(), prior.covariance.copy())
 
 
-def require_laser(prior: Prior, estimator: str) -> Laser:
-    """Return the prior's laser, without which this estimator cannot start."""
-    if prior.sensors.laser is None:
-        raise InputError(f"{estimator} needs a laser; choose sensors that have one")
-    return prior.sensors.laser
+def require_laser(prior: Prior, name: str, estimator: str) -> Laser:
+    """Return the laser of a name, without which this estimator cannot start."""
+    return _required(prior, name, Laser, estimator)
 
 
-def require_stereo(prior: Prior, estimator: str) -> StereoCamera:
-    """Return the prior's stereo camera, without which this estimator cannot start."""
-    if prior.sensors.stereo is None:
-        raise InputError(f"{estimator} needs a stereo camera; choose sensors that have one")
-    return prior.sensors.stereo
+def require_stereo(prior: Prior, name: str, estimator: str) -> StereoCamera:
+    """Return the stereo camera of a name, without which this estimator cannot start."""
+    return _required(prior, name, StereoCamera, estimator)
+
+
+def _required(prior: Prior, name: str, kind: type[S], estimator: str) -> S:
+    try:
+        return sensor_of(prior.sensors, name, kind)
+    except InputError as error:
+        raise InputError(f"{estimator}: {error}") from None

@@ -25,7 +25,7 @@ from estimators.options import (
 from estimators.stereo import NoiseAt, NoiseModel, StereoModel
 from sim.arrays import Array, Floats, Ints
 from sim.errors import InputError
-from sim.recording import LandmarkSet
+from sim.sensors import Reading
 
 Association = Literal["known", "mahalanobis", "descriptor"]
 
@@ -42,8 +42,10 @@ class Image:
         (K, 3) m in the camera frame.
     numbers
         (K,) their numbers among all observations of the run, counted from 0.
-    ids, descriptors
-        (K,) and (K, D); None where the sensor gives none.
+    ids
+        (K,); None where the sensor gives none.
+    descriptors
+        (K, D), D = 0 where it gives none.
     used
         (A,) which of all the image's observations these are.
     status
@@ -53,7 +55,7 @@ class Image:
     points: Array
     numbers: Ints
     ids: Ints | None
-    descriptors: Floats | None
+    descriptors: Floats
     used: NDArray[np.bool_]
     status: str
 
@@ -94,6 +96,7 @@ class SlamFrontEnd:
     def __init__(
         self,
         estimator: str,
+        stereo: str,
         association: Association,
         d0: float,
         noise_model: NoiseModel,
@@ -109,7 +112,8 @@ class SlamFrontEnd:
         require_non_negative(**self._sigmas)
         require_positive(d0=d0)
         self.association, self.d0 = association, d0
-        self._estimator, self._noise_model, self._noise_at = estimator, noise_model, noise_at
+        self._stereo, self._estimator = stereo, estimator
+        self._noise_model, self._noise_at = noise_model, noise_at
 
     def reset(self, prior: Prior) -> Gaussian:
         """Forget all landmarks; return the prior's pose in map.
@@ -119,7 +123,7 @@ class SlamFrontEnd:
         InputError
             If there is no camera, no start pose, or no ids where association needs them.
         """
-        camera = require_stereo(prior, self._estimator)
+        camera = require_stereo(prior, self._stereo, self._estimator)
         start = start_pose(prior, self._estimator)
         if self.association == "known" and not camera.identifies:
             raise InputError(
@@ -137,18 +141,19 @@ class SlamFrontEnd:
         self._n_observations, self._n_blind = 0, 0
         return start
 
-    def read(self, seen: LandmarkSet) -> Image:
+    def read(self, seen: Reading) -> Image:
         """Return the observations of an image that can be used; of duplicate ids the first."""
-        used = self.camera.usable(seen.points_in_camera)
+        all_points, all_ids = seen["points_in_camera"], seen.get("ids")
+        used = self.camera.usable(all_points)
         status = "" if used.all() else "observation without depth rejected"
         if self.association == "known" and used.any():
-            if seen.ids is None:
+            if all_ids is None:
                 raise InputError(
                     f"{self._estimator}: observations without ids; set "
                     "estimator.association=mahalanobis or descriptor"
                 )
             rows = np.flatnonzero(used)
-            first = np.unique(seen.ids[rows], return_index=True)[1]
+            first = np.unique(all_ids[rows], return_index=True)[1]
             if len(first) < len(rows):
                 used, status = np.isin(np.arange(len(used)), rows[first]), "duplicate id rejected"
         self._n_blind = 0 if used.any() else self._n_blind + 1
@@ -156,10 +161,9 @@ class SlamFrontEnd:
             status = f"no landmark in {self._n_blind} images"
         numbers = self._n_observations + np.flatnonzero(used)
         self._n_observations += len(used)
-        ids = None if seen.ids is None else seen.ids[used]
-        descriptors = None if seen.descriptors is None else seen.descriptors[used]
-        points = np.ascontiguousarray(seen.points_in_camera[used])
-        return Image(points, numbers, ids, descriptors, used, status)
+        ids = None if all_ids is None else all_ids[used]
+        points = np.ascontiguousarray(all_points[used])
+        return Image(points, numbers, ids, seen["descriptors"][used], used, status)
 
     def known(self, image: Image) -> Ints:
         """Landmark (K,) of each id, -1 for new ones."""
@@ -173,7 +177,7 @@ class SlamFrontEnd:
         """
         if self.association != "descriptor":
             return np.zeros((len(image.points), 0))
-        if image.descriptors is None:
+        if image.descriptors.shape[1] == 0 < len(image.points):
             raise InputError(
                 f"{self._estimator}: observations without descriptors; set "
                 "estimator.association=mahalanobis"
@@ -190,7 +194,7 @@ class SlamFrontEnd:
         self.origins = np.concatenate([self.origins, image.numbers[rows]])
         if self.association == "known" and image.ids is not None:
             self._landmark_of_id |= {i: n + k for k, i in enumerate(image.ids[rows].tolist())}
-        if self.association == "descriptor" and image.descriptors is not None:
+        if self.association == "descriptor":
             fresh = image.descriptors[rows]
             self._descriptors = np.concatenate([self._descriptors, fresh]) if n else fresh
 

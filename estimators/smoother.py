@@ -129,7 +129,7 @@ class Smoother:
     be read at 10 Hz or more: an arc over 0.4 m misses more of a bend than slip adds.
     """
 
-    needs = frozenset({"wheels", "landmarks"})
+    needs = frozenset({"stereo"})
 
     def __init__(
         self,
@@ -139,7 +139,9 @@ class Smoother:
         robust_sigma: float = 3.0,
         max_iterations: int = 100,
         window_s: float = 0.05,
+        stereo: str = "stereo",
     ) -> None:
+        self.stereo = stereo
         self.wheels = WheelPrediction(kr, kl, window_s)
         require_choices(robust=(robust, Robust))
         require_positive(robust_sigma=robust_sigma)
@@ -148,7 +150,7 @@ class Smoother:
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Start from the prior's pose, with nothing seen."""
-        self._camera = StereoModel.of(require_stereo(prior, "smoother"))
+        self._camera = StereoModel.of(require_stereo(prior, self.stereo, "smoother"))
         self._belief = start_pose(prior, "smoother")
         self._start_covariance = self._belief.covariance + _FLOOR
         self.wheels.reset(prior.robot.track_m)
@@ -161,17 +163,18 @@ class Smoother:
         """Keep what the Frame shows; the belief is dead reckoning alone."""
         motion = self.wheels.predict(frame)
         self._belief = self._belief.then(motion)
-        if frame.landmarks is not None and len(frame.landmarks.points_in_camera):
-            if frame.landmarks.ids is None:
+        seen = frame.readings.get(self.stereo)
+        if seen is not None and len(seen["points_in_camera"]):
+            if "ids" not in seen:
                 raise InputError(
                     "smoother needs to know which landmark is which; set "
-                    "sensors.stereo.identifies=true"
+                    f"sensors.{self.stereo}.identifies=true"
                 )
-            points = frame.landmarks.points_in_camera
+            points = seen["points_in_camera"]
             usable = self._camera.usable(points)
             if usable.any():
                 row = len(self._stamps)
-                self._images.append((row, points[usable], frame.landmarks.ids[usable]))
+                self._images.append((row, points[usable], seen["ids"][usable]))
         self._stamps.append(frame.stamp)
         self._dead_reckoned.append(self._belief.mean)
         loose = motion.covariance + _sideways(motion) + _FLOOR

@@ -211,7 +211,7 @@ def from_recording(
     """
     if not spacing_m > 0.0:
         raise InputError(f"spacing_m of a topological map must be positive, got {spacing_m}")
-    log = recording.places or recording.clouds
+    log = recording.logs.get("place") or recording.logs.get("lidar3d")
     if log is None:
         raise InputError("a topological map needs a recording with 3D clouds or place descriptors")
     poses = recording.truth_at(log.stamps)
@@ -222,15 +222,13 @@ def from_recording(
     if not rows:
         raise InputError("none of the clouds of the recording has a true pose; no map can be built")
     slices = None
-    if recording.places is not None:
-        features, descriptor = recording.places.descriptors[rows], ""
+    if "place" in recording.logs:
+        features, descriptor = log["descriptor"][rows], ""
     else:
-        lidar, clouds = recording.sensors.lidar3d, recording.clouds
-        assert lidar is not None
-        assert clouds is not None
-        kind = describers.kind(descriptor)
-        features = np.array([kind.describe(lidar, clouds.ranges_m[row]) for row in rows])
-        slices = [level_slice(lidar, clouds.ranges_m[row]) for row in rows]
+        lidar, kind = recording.sensor("lidar3d", Lidar3D), describers.kind(descriptor)
+        turns = log["ranges_m"][rows]
+        features = np.array([kind.describe(lidar, turn) for turn in turns])
+        slices = [level_slice(lidar, turn) for turn in turns]
     return from_arrays(
         poses[rows, :2],
         features,

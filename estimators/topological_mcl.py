@@ -28,6 +28,7 @@ from sim.arrays import Array, Floats, Ints
 from sim.errors import InputError
 from sim.recording import Frame
 from sim.robot import arc_increment
+from sim.sensors import Lidar3D, sensor_of
 
 Weighting = Literal["M1", "M2", "M3"]
 Motion = Literal["odometry", "paper"]
@@ -200,7 +201,7 @@ class TopologicalMcl:
     observation that holds NaN, or a cloud that saw nothing, is passed over with a `status`.
     """
 
-    needs = frozenset({"place", "map"})
+    needs = frozenset({"place|lidar3d", "map"})  # one of the two sensors
     maps = (TopologicalMap,)
     global_or_grid = True
 
@@ -221,7 +222,10 @@ class TopologicalMcl:
         estimate: Summary = "mode",
         refine: bool = True,
         map_path: str | None = None,
+        place: str = "place",
+        lidar3d: str = "lidar3d",
     ) -> None:
+        self.place, self.lidar3d = place, lidar3d
         require_choices(
             weighting=(weighting, Weighting),
             motion=(motion, Motion),
@@ -252,7 +256,14 @@ class TopologicalMcl:
                 "to the function that makes one"
             )
         self._rng, self._map, self._graph = rng, known, Graph(known)
-        self._lidar, self._track_m = prior.sensors.lidar3d, prior.robot.track_m
+        if not {self.place, self.lidar3d} & set(prior.sensors):
+            raise InputError(
+                "topological_mcl needs place descriptors or a 3D lidar; choose sensors=lidar3d"
+            )
+        self._lidar = None
+        if self.lidar3d in prior.sensors:
+            self._lidar = sensor_of(prior.sensors, self.lidar3d, Lidar3D)
+        self._track_m = prior.robot.track_m
         self._kind = describers.KINDS.get(known.descriptor)
         self._node_of_state = np.concatenate([self._graph.tail, self._graph.head])
         headings = np.tile(self._graph.heading_rad, 2)
@@ -294,25 +305,28 @@ class TopologicalMcl:
         if self.resampling == "always" or ess < 0.5 * len(self._edge):
             self._resample()
         belief = self._summary({"ess": ess})
-        if self._refiner is not None and frame.cloud_ranges_m is not None:
-            belief = self._refined(frame.cloud_ranges_m, belief)
+        turn = frame.readings.get(self.lidar3d)
+        if self._refiner is not None and turn is not None:
+            belief = self._refined(turn["ranges_m"], belief)
         self._belief = belief
         return Belief(belief.mean.copy(), belief.covariance.copy(), belief.extras)
 
     def _descriptor(self, frame: Frame) -> tuple[Floats | None, str]:
         """Descriptor of the Frame's place, or None and why if something is wrong with it."""
-        observed = frame.place_descriptor
-        if observed is None:
-            if frame.cloud_ranges_m is None:
-                return None, ""
+        place, turn = frame.readings.get(self.place), frame.readings.get(self.lidar3d)
+        if place is not None:
+            observed = place["descriptor"]
+        elif turn is None:
+            return None, ""
+        else:
             if self._kind is None or self._lidar is None:
                 raise InputError(
                     "the map's descriptors come from elsewhere, but the recording has clouds "
                     "only; give it place descriptors, or build the map from clouds"
                 )
-            if not np.isfinite(frame.cloud_ranges_m).any():
+            if not np.isfinite(turn["ranges_m"]).any():
                 return None, "empty cloud"
-            observed = self._kind.describe(self._lidar, frame.cloud_ranges_m)
+            observed = self._kind.describe(self._lidar, turn["ranges_m"])
         size = self._map.descriptors.shape[1]
         if observed.shape != (size,):
             raise InputError(

@@ -36,6 +36,9 @@ _PASS_ON = {
 Overrides = Annotated[
     list[str] | None, typer.Argument(help="Hydra overrides, such as world=office seed=3.")
 ]
+ConfigDir = Annotated[
+    Path | None, typer.Option("--config-dir", "-cd", help="Folder with options of your own.")
+]
 
 
 def _print_version(wanted: bool) -> None:
@@ -116,17 +119,18 @@ def _draw_run(recording: Recording, estimate: Estimate, name: str, folder: Path)
 def record(
     out: Annotated[Path, typer.Option("--out", "-o", help="File to write, .npz.")],
     overrides: Overrides = None,
+    config_dir: ConfigDir = None,
 ) -> None:
     """Simulate a recording and save it.
 
     Example: estima record -o office.npz world=office sensors=lms291 seed=3
     """
-    from experiments.runs.experiment import Experiment
+    from experiments.runs.experiment import Experiment, searched
     from sim.recording import save
 
     if out.suffix != ".npz":
         raise InputError(f"-o {out}: a recording is an .npz file")
-    experiment = Experiment.compose(overrides or [])
+    experiment = Experiment.compose([*searched(config_dir), *(overrides or [])])
     with progress("simulated seconds") as on_progress:
         recording = experiment.simulate(on_progress)
     checksum = save(recording, out)
@@ -240,6 +244,7 @@ def view(
             help="Duration; shorter if there are few Frames [saved: 20, live: real time]."
         ),
     ] = None,
+    config_dir: ConfigDir = None,
 ) -> None:
     """Show a run as an animation, in a window or in a file; or draw a world or a map.
 
@@ -259,13 +264,15 @@ def view(
 
       estima view --map map.yaml -o map.png
     """
+    from experiments.runs.experiment import searched
+
     if world and grid is not None:
         raise InputError("--world and --map: draw one at a time")
     if grid is not None and not what:
         _draw_map(grid, out or Path("map.png"))
         return
     if world:
-        _draw_world(what or [], out or Path("world.png"))
+        _draw_world([*searched(config_dir), *(what or [])], out or Path("world.png"))
         return
     if not what or "=" in what[0]:
         raise InputError("name a recording to view, such as run.npz, or say --world")
@@ -273,7 +280,8 @@ def view(
         raise InputError(f"--seconds must lie between 0 and 3600, got {seconds:g}")
     if estimate is None and len(what) > 1:
         raise InputError(f"{what[1]}: overrides need an estimator; add --estimate NAME")
-    _show_run(Path(what[0]), estimate, what[1:], out, seconds, grid)
+    overrides = [*searched(config_dir), *what[1:]]
+    _show_run(Path(what[0]), estimate, overrides, out, seconds, grid)
 
 
 def _draw_world(overrides: list[str], out: Path) -> None:
@@ -357,6 +365,8 @@ def build_map(
         bool,
         typer.Option("--raw", help="Keep probabilities in percent (mode raw), not three states."),
     ] = False,
+    laser: Annotated[str, typer.Option(help="Name of the laser in the recording.")] = "laser",
+    config_dir: ConfigDir = None,
 ) -> None:
     """Build an occupancy grid from a recording's laser scans and any estimate of its path.
 
@@ -370,6 +380,7 @@ def build_map(
 
       estima run world=office seed=3 sensors=lms291 estimator=mcl prior.map=map.yaml
     """
+    from experiments.runs.experiment import searched
     from experiments.viewing.grid import described
     from experiments.viewing.map import grid_along, laser_scans, path_of
     from sim.formats.detect import read_any
@@ -379,9 +390,10 @@ def build_map(
     if "=" in what[0]:
         raise InputError(f"{what[0]}: name a recording first, such as run.npz")
     recording = read_any([Path(what[0])])
-    n_all = len(laser_scans(recording)[0])
+    n_all = len(laser_scans(recording, laser)[0])
     with progress(estimate, len(recording.frame_stamps)) as on_step:
-        stamps, poses = path_of(recording, estimate, what[1:], on_step)
+        overrides = [*searched(config_dir), *what[1:]]
+        stamps, poses = path_of(recording, estimate, overrides, on_step)
     with progress("mapping", n_all, "scans") as on_progress:
         grid, n_scans = grid_along(
             recording,
@@ -389,6 +401,7 @@ def build_map(
             poses,
             resolution_m=resolution_m,
             max_range_m=max_range_m,
+            laser=laser,
             on_progress=on_progress,
         )
     write_grid(grid, out, "raw" if raw else "trinary")
@@ -437,6 +450,7 @@ def conform(
         list[str] | None,
         typer.Argument(help="Overrides of the option, or the constructor's arguments, key=value."),
     ] = None,
+    config_dir: ConfigDir = None,
 ) -> None:
     """Run the checks that every estimator must pass.
 
@@ -447,8 +461,9 @@ def conform(
       estima conform estimators.odometry:Odometry kr=1e-5 kl=1e-5
     """
     from experiments.gate.conform import conform_target
+    from experiments.runs.experiment import searched
 
-    results = conform_target(target, arguments or [])
+    results = conform_target(target, arguments or [], searched(config_dir))
     for result in results:
         print(f"{'pass' if result.passed else 'FAIL':<5}{result.name}: {result.message}")
     if not all(result.passed for result in results):

@@ -8,6 +8,7 @@ the nominal one within 0.01 %.
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import sys
 from collections.abc import Iterator
@@ -83,9 +84,9 @@ class BulletBody:
         self._walls = self._build_walls(world)
         self._robot = self._build_robot(robot, pose)
         self._heading = float(pose[2])
-        self._angles = np.zeros(2)
+        self._angles = 0.0, 0.0
         for _ in range(_SETTLE_TICKS):
-            self.step(np.zeros(2))
+            self.step(0.0, 0.0)
 
     def __enter__(self) -> BulletBody:
         return self
@@ -104,20 +105,21 @@ class BulletBody:
             pybullet.disconnect(self._client)
             self._client = -1
 
-    def step(self, wheel_speeds_mps: Array) -> Array:
-        """Advance one tick with commanded ground speeds (2,); return the wheels' rolling (2,) m."""
+    def step(self, right_mps: float, left_mps: float) -> tuple[float, float]:
+        """Advance one tick with commanded ground speeds; return the wheels' rolling, m."""
         pybullet.setJointMotorControlArray(
             self._robot,
             (0, 1),
             pybullet.VELOCITY_CONTROL,
-            targetVelocities=(wheel_speeds_mps / self._radius_m).tolist(),
+            targetVelocities=(right_mps / self._radius_m, left_mps / self._radius_m),
             forces=(_MOTOR_TORQUE_NM, _MOTOR_TORQUE_NM),
             physicsClientId=self._client,
         )
         pybullet.stepSimulation(physicsClientId=self._client)
-        angles = self._wheel_angles()
-        before, self._angles = self._angles, angles
-        return (angles - before) * self._radius_m
+        states = pybullet.getJointStates(self._robot, (0, 1), physicsClientId=self._client)
+        (right, *_), (left, *_) = states
+        (right_before, left_before), self._angles = self._angles, (right, left)
+        return (right - right_before) * self._radius_m, (left - left_before) * self._radius_m
 
     @property
     def pose(self) -> Array:
@@ -127,7 +129,7 @@ class BulletBody:
         )
         x, y, z, w = quaternion
         yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-        self._heading += float((yaw - self._heading + np.pi) % (2.0 * np.pi) - np.pi)
+        self._heading += (yaw - self._heading + math.pi) % (2.0 * math.pi) - math.pi
         return np.array([position[0], position[1], self._heading])
 
     @property
@@ -163,10 +165,6 @@ class BulletBody:
             )
             shares[rows] = [hit[2] for hit in hits]
         return shares
-
-    def _wheel_angles(self) -> Array:
-        right, left = pybullet.getJointStates(self._robot, (0, 1), physicsClientId=self._client)
-        return np.array([right[0], left[0]])
 
     def _surface(self, body: int, link: int, friction: float, group: int, mask: int) -> None:
         """Friction of a link, and what it collides with."""

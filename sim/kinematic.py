@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from sim.arrays import Array
 from sim.compiled import njit
 from sim.errors import InputError
-from sim.robot import SLIP_TIME_CONSTANT_S, DifferentialDrive, arc_increment
+from sim.robot import SLIP_TIME_CONSTANT_S, SMALL_ANGLE_RAD, DifferentialDrive
 from sim.route import TICK_S, OpenLoop
 
 _BLOCK_NORMALS = 2_000_000  # drawn at once, 16 MB; the bits do not depend on it
@@ -32,20 +32,32 @@ class KinematicBody:
 
     def __init__(self, robot: DifferentialDrive, pose: ArrayLike, dt_s: float = TICK_S) -> None:
         self._track_m, self._dt_s = robot.track_m, dt_s
-        self._pose = np.array(pose, dtype=np.float64)
+        self._x, self._y, self._heading = np.array(pose, dtype=np.float64).tolist()
 
-    def step(self, wheel_speeds_mps: Array) -> Array:
-        """Advance one tick at ground speeds (2,), right and left; return the rolling (2,) m."""
-        rolling: Array = np.asarray(wheel_speeds_mps, dtype=np.float64) * self._dt_s
-        x, y, turn = arc_increment(rolling, self._track_m)
-        cos, sin = np.cos(self._pose[2]), np.sin(self._pose[2])
-        self._pose += (cos * x - sin * y, sin * x + cos * y, turn)
-        return rolling
+    def step(self, right_mps: float, left_mps: float) -> tuple[float, float]:
+        """Advance one tick at ground speeds of the wheels; return their rolling, m."""
+        right, left = right_mps * self._dt_s, left_mps * self._dt_s
+        x, y, turn = _arc(right, left, self._track_m)
+        cos, sin = math.cos(self._heading), math.sin(self._heading)
+        self._x += cos * x - sin * y
+        self._y += sin * x + cos * y
+        self._heading += turn
+        return right, left
 
     @property
     def pose(self) -> Array:
         """(3,) m, m, rad: base_link in map; the heading is not wrapped."""
-        return self._pose.copy()
+        return np.array([self._x, self._y, self._heading])
+
+
+def _arc(right_m: float, left_m: float, track_m: float) -> tuple[float, float, float]:
+    """`robot.arc_increment` in floats: one robot's tick is too small for NumPy's calls."""
+    turn = (right_m - left_m) / track_m
+    half = turn / 2.0
+    small = abs(half) < SMALL_ANGLE_RAD
+    chord = (right_m + left_m) / 2.0
+    chord *= 1.0 - half**2 / 6.0 if small else math.sin(half) / half
+    return chord * math.cos(half), chord * math.sin(half), turn
 
 
 @dataclass(frozen=True)
@@ -82,7 +94,6 @@ def run_batch(
     rng: np.random.Generator,
     *,
     start: ArrayLike = (0.0, 0.0, 0.0),
-    nominal_track_m: float | None = None,
     sample_s: float = 0.05,
 ) -> BatchRuns:
     """Drive a route many times with independent slip, at 300 ticks a second.
@@ -93,8 +104,6 @@ def run_batch(
         The true robot. Its unmodelled slip must be off.
     start
         (3,) common start pose.
-    nominal_track_m
-        Track by which the commands become wheel speeds; the robot's own if None.
     sample_s
         Time between samples, a multiple of the tick; the end is sampled in any case.
 
@@ -107,7 +116,7 @@ def run_batch(
         raise InputError("batches know the kr/kl law only; set robot.unmodelled_slip=0")
     if n_runs < 1:
         raise InputError(f"n_runs must be at least 1, got {n_runs}")
-    commands_m = wheel_commands(robot, route, nominal_track_m)
+    commands_m = wheel_commands(robot, route)
     n_ticks = len(commands_m)
     every = max(1, round(sample_s / TICK_S))
     sampled = np.append(np.arange(0, n_ticks, every), n_ticks)
@@ -129,17 +138,12 @@ def run_batch(
             encoder_m[rows],
             ground_m[rows],
         )
-    if robot.encoder_tick_m > 0.0:
-        encoder_m = np.floor(encoder_m / robot.encoder_tick_m) * robot.encoder_tick_m
-    return BatchRuns(sampled * TICK_S, poses, encoder_m, ground_m)
+    return BatchRuns(sampled * TICK_S, poses, robot.encoder_reading(encoder_m), ground_m)
 
 
-def wheel_commands(
-    robot: DifferentialDrive, route: OpenLoop, nominal_track_m: float | None = None
-) -> Array:
+def wheel_commands(robot: DifferentialDrive, route: OpenLoop) -> Array:
     """Commanded ground travel (N, 2) of the wheels, right and left, tick by tick, m."""
-    nominal = dataclasses.replace(robot, track_m=nominal_track_m or robot.track_m)
-    return nominal.wheel_speeds(*route.profile(robot).T) * TICK_S
+    return robot.wheel_speeds(*route.profile(robot).T) * TICK_S
 
 
 @njit()

@@ -11,10 +11,10 @@ import hashlib
 import json
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,12 +22,24 @@ from numpy.typing import NDArray
 from sim.arrays import Array
 from sim.errors import InputError, required
 from sim.files import write_whole
+from sim.recording_format_1 import upgraded
 from sim.robot import RobotGeometry
-from sim.sensors import SensorSuite, suite_from_config
+from sim.sensors.base import (
+    Reading,
+    Schema,
+    Sensor,
+    Sensors,
+    parted,
+    schema_from_meta,
+    sensor_of,
+    sensor_settings,
+    sensors_from_meta,
+)
 from sim.settings import build
 from sim.world import World
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
+S = TypeVar("S")
 
 
 @dataclass(frozen=True)
@@ -39,52 +51,126 @@ class WheelLog:
 
 
 @dataclass(frozen=True)
-class LaserLog:
-    """Scans: stamps (N,) s; ranges (N, beams) m, float32, +inf where nothing was seen."""
-
-    stamps: Array
-    ranges_m: NDArray[np.float32]
-
-
-@dataclass(frozen=True)
-class LandmarkLog:
-    """Landmark observations of N images, K in all, image i at rows splits[i]:splits[i + 1].
+class Log:
+    """The readings of one sensor.
 
     Attributes
     ----------
+    schema
+        What the fields are.
     stamps
         (N,) s.
+    values
+        Each field: (N, *shape), or all rows (K, *shape) of a ragged one.
     splits
-        (N + 1,) row numbers.
-    points_in_camera
-        (K, 3) m: z forward, x right, y down.
-    ids
-        (K,) landmark ids if the sensor identifies landmarks, else (0,).
-    descriptors
-        (K, D) float32, or (0, 0).
+        (N + 1,): reading i has the rows splits[i]:splits[i + 1] of each ragged field. None if no
+        field is ragged.
     """
 
+    schema: Schema
     stamps: Array
-    splits: NDArray[np.int64]
-    points_in_camera: Array
-    ids: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
-    descriptors: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 0), np.float32))
+    values: Mapping[str, NDArray[Any]]
+    splits: NDArray[np.int64] | None = None
+
+    @classmethod
+    def of(
+        cls,
+        sensor: Sensor,
+        stamps: Array,
+        splits: NDArray[np.int64] | None = None,
+        /,
+        **values: NDArray[Any],
+    ) -> Log:
+        """Log of a sensor's readings, with the types of its schema.
+
+        Raises
+        ------
+        InputError
+            If they do not fit the schema.
+        """
+        schema, _ = parted(sensor.schema)
+        if set(values) != set(schema):
+            kind = type(sensor).__name__
+            raise InputError(f"a {kind} has the fields {[*schema]}, got {[*values]}")
+        typed = {name: np.asarray(values[name], field.dtype) for name, field in schema.items()}
+        log = cls(schema, stamps, typed, splits)
+        log.check(type(sensor).__name__)
+        return log
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        """All values of a field."""
+        return self.values[name]
+
+    @property
+    def known_splits(self) -> NDArray[np.int64]:
+        """The splits; InputError if no field is ragged."""
+        return required(self.splits, "a log without ragged fields has no splits")
+
+    def taken(self, rows: NDArray[np.int64], stamps: Array) -> Log:
+        """Log of these readings, at other stamps; none of its fields may be ragged."""
+        values = {name: array[rows] for name, array in self.values.items()}
+        return dataclasses.replace(self, stamps=stamps, values=values)
+
+    def reading(self, row: int) -> Reading:
+        """One reading."""
+        rows = slice(*self.splits[row : row + 2]) if self.splits is not None else row
+        return {
+            name: values[rows if self.schema[name].ragged else row]
+            for name, values in self.values.items()
+        }
+
+    def check(self, where: str) -> None:
+        """Check presence, type and shape of all arrays.
+
+        Raises
+        ------
+        InputError
+            Naming the field that does not fit the schema.
+        """
+        n, splits = len(self.stamps), self.splits
+        if self.stamps.shape != (n,) or self.stamps.dtype != np.float64:
+            raise InputError(f"{where}.stamps must be float64 of shape (N,)")
+        if any(field.ragged for field in self.schema.values()) != (splits is not None):
+            raise InputError(f"{where}.splits must be there if a field is ragged, and only then")
+        n_rows = 0
+        if splits is not None:
+            if splits.shape != (n + 1,) or splits.dtype != np.int64:
+                raise InputError(f"{where}.splits must be int64 of shape ({n + 1},)")
+            if splits[0] != 0 or (np.diff(splits) < 0).any():
+                raise InputError(f"{where}.splits must begin at 0 and not decrease")
+            n_rows = int(splits[-1])
+        for name, kind in self.schema.items():
+            kind.check(self.values[name], n_rows if kind.ragged else n, f"{where}.{name}")
 
 
-@dataclass(frozen=True)
-class CloudLog:
-    """3D lidar turns: stamps (N,) s; ranges (N, rings, azimuths) m, float32, +inf unseen."""
+def joined(schema: Schema, stamps: Array, readings: Sequence[Reading], where: str) -> Log:
+    """Log of single readings.
 
-    stamps: Array
-    ranges_m: NDArray[np.float32]
-
-
-@dataclass(frozen=True)
-class PlaceLog:
-    """Global descriptors of places: stamps (N,) s; descriptors (N, D) float32."""
-
-    stamps: Array
-    descriptors: NDArray[np.float32]
+    Raises
+    ------
+    InputError
+        If they do not fit the schema.
+    """
+    values = {
+        name: field.joined([reading[name] for reading in readings], f"{where}.{name}")
+        for name, field in schema.items()
+    }
+    ragged = [name for name, field in schema.items() if field.ragged]
+    splits = None
+    if ragged:
+        first, *others = ragged
+        sizes = [len(reading[first]) for reading in readings]
+        for name in others:
+            for size, reading in zip(sizes, readings, strict=True):
+                if len(reading[name]) != size:
+                    raise InputError(
+                        f"{where}.{name} has {len(reading[name])} rows in a reading, "
+                        f"{where}.{first} {size}; they must be as many"
+                    )
+        splits = np.cumsum([0, *sizes]).astype(np.int64)
+    log = Log(schema, stamps, values, splits)
+    log.check(where)
+    return log
 
 
 @dataclass(frozen=True)
@@ -105,8 +191,8 @@ class Truth:
         (T,) s and (T, 3) m, m, rad: base_link in map.
     wheel_travel_m
         (T, 2) accumulated rolling of the right and left wheel on the ground, or (0, 2).
-    landmark_ids
-        (K,) true id of each row of the landmark observations.
+    readings
+        By sensor, what its schema marks as truth, row by row as in its log.
     world
         The map, or None.
     """
@@ -114,17 +200,8 @@ class Truth:
     stamps: Array
     poses: Array
     wheel_travel_m: Array = field(default_factory=lambda: np.zeros((0, 2)))
-    landmark_ids: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    readings: Mapping[str, Mapping[str, NDArray[Any]]] = field(default_factory=dict)
     world: World | None = None
-
-
-@dataclass(frozen=True)
-class LandmarkSet:
-    """The landmark observations of one Frame, as in `LandmarkLog`; ids None if not identified."""
-
-    points_in_camera: Array
-    ids: NDArray[np.int64] | None
-    descriptors: NDArray[np.float32] | None
 
 
 @dataclass(frozen=True)
@@ -139,23 +216,14 @@ class Frame:
         Time since the previous Frame, s; 0 at the first.
     wheel_increments_m
         (2,) encoder travel of the right and left wheel since the previous Frame, m.
-    ranges_m
-        (beams,) laser scan, m, or None.
-    landmarks
-        Landmark observations, or None.
-    cloud_ranges_m
-        (rings, azimuths) 3D lidar turn, m, or None.
-    place_descriptor
-        (D,) global descriptor, or None.
+    readings
+        By sensor, the reading that it took at this instant: arrays by field.
     """
 
     stamp: float
     duration_s: float
     wheel_increments_m: Array
-    ranges_m: NDArray[np.float32] | None = None
-    landmarks: LandmarkSet | None = None
-    cloud_ranges_m: NDArray[np.float32] | None = None
-    place_descriptor: NDArray[np.float32] | None = None
+    readings: Mapping[str, Reading] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -166,12 +234,14 @@ class Recording:
     ----------
     frame_stamps
         (F,) s, increasing: the instants that estimators see.
-    wheels, laser, landmarks, clouds, places, commands
-        The sensors' logs, None where there is none.
+    wheels, commands
+        The wheels' log, and the commands' if they are known.
+    robot
+        Nominal wheel radius and track.
+    sensors, logs
+        By name, each sensor's geometry and nominal noise, and its readings.
     truth
         What Frames never show; None for a log without reference.
-    robot, sensors
-        Nominal wheel radius and track, and the sensors' geometry and nominal noise.
     config
         The resolved configuration (plain JSON) the recording came from.
     status
@@ -181,12 +251,9 @@ class Recording:
     frame_stamps: Array
     wheels: WheelLog
     robot: RobotGeometry
-    sensors: SensorSuite
+    sensors: Sensors = field(default_factory=dict)
+    logs: Mapping[str, Log] = field(default_factory=dict)
     truth: Truth | None = None
-    laser: LaserLog | None = None
-    landmarks: LandmarkLog | None = None
-    clouds: CloudLog | None = None
-    places: PlaceLog | None = None
     commands: CommandLog | None = None
     config: dict[str, Any] = field(default_factory=dict)
     status: str = "ok"
@@ -217,31 +284,30 @@ class Recording:
         """The map; InputError if there is none."""
         return required(self.world, "this recording has no map; use a simulated one")
 
-    @property
-    def known_laser(self) -> LaserLog:
-        """The laser scans; InputError if there are none."""
-        return required(
-            self.laser, "this recording has no laser scans; choose sensors such as sensors=hokuyo"
-        )
+    def log(self, name: str) -> Log:
+        """Log of a sensor; InputError if there is none."""
+        known = ", ".join(self.logs) or "none"
+        complaint = f"this recording has no readings of a sensor {name} (there is {known})"
+        return required(self.logs.get(name), complaint)
 
-    @property
-    def known_landmarks(self) -> LandmarkLog:
-        """The landmark observations; InputError if there are none."""
-        return required(
-            self.landmarks,
-            "this recording has no landmark observations; choose sensors such as "
-            "sensors=stereo_pixel",
-        )
+    def sensor(self, name: str, kind: type[S]) -> S:
+        """Sensor of a name and class; InputError if there is none."""
+        return sensor_of(self.sensors, name, kind)
 
-    @property
-    def known_clouds(self) -> CloudLog:
-        """The 3D lidar turns; InputError if there are none."""
-        return required(self.clouds, "this recording has no 3D lidar turns; choose sensors=lidar3d")
+    def with_log(self, name: str, log: Log, sensor: Sensor | None = None) -> Recording:
+        """Return the recording with another log of a sensor, or with one more sensor."""
+        sensors = self.sensors if sensor is None else {**self.sensors, name: sensor}
+        return dataclasses.replace(self, sensors=sensors, logs={**self.logs, name: log})
 
-    @property
-    def known_places(self) -> PlaceLog:
-        """The place descriptors; InputError if there are none."""
-        return required(self.places, "this recording has no place descriptors")
+    def without(self, name: str) -> Recording:
+        """Return the recording without a sensor, its log, and the truth of its readings."""
+        sensors = {key: sensor for key, sensor in self.sensors.items() if key != name}
+        logs = {key: log for key, log in self.logs.items() if key != name}
+        truth = self.truth
+        if truth is not None:
+            hidden = {key: values for key, values in truth.readings.items() if key != name}
+            truth = dataclasses.replace(truth, readings=hidden)
+        return dataclasses.replace(self, sensors=sensors, logs=logs, truth=truth)
 
     def frames(self) -> Iterator[Frame]:
         """Walk through the Frames in order.
@@ -257,27 +323,18 @@ class Recording:
         increments = np.diff(position, axis=0, prepend=position[:1])
         durations = np.diff(stamps, prepend=stamps[:1])
         increments.setflags(write=False)
-        logs = (self.laser, self.landmarks, self.clouds, self.places)
-        rows_of_frames = np.stack([_rows_at(stamps, log) for log in logs], axis=1).tolist()
-        for i, (scan, image, turn, place) in enumerate(rows_of_frames):
+        shown = {name: _rows_at(stamps, log).tolist() for name, log in self.logs.items()}
+        for i, stamp in enumerate(stamps.tolist()):
             yield Frame(
-                stamp=float(stamps[i]),
+                stamp=stamp,
                 duration_s=float(durations[i]),
                 wheel_increments_m=increments[i],
-                ranges_m=self.known_laser.ranges_m[scan] if scan >= 0 else None,
-                landmarks=self._image(image) if image >= 0 else None,
-                cloud_ranges_m=self.known_clouds.ranges_m[turn] if turn >= 0 else None,
-                place_descriptor=self.known_places.descriptors[place] if place >= 0 else None,
+                readings={
+                    name: self.logs[name].reading(rows[i])
+                    for name, rows in shown.items()
+                    if rows[i] >= 0
+                },
             )
-
-    def _image(self, row: int) -> LandmarkSet:
-        log = self.known_landmarks
-        rows = slice(*log.splits[row : row + 2])
-        return LandmarkSet(
-            points_in_camera=log.points_in_camera[rows],
-            ids=log.ids[rows] if len(log.ids) else None,
-            descriptors=log.descriptors[rows] if len(log.descriptors) else None,
-        )
 
     def truth_at(self, stamps: Array) -> Array:
         """True poses (N, 3) at stamps (N,), interpolated; NaN outside the truth's time span.
@@ -296,22 +353,11 @@ class Recording:
     @property
     def checksum(self) -> str:
         """SHA-256 over all the recording holds, as hex."""
-        return _digest(_arrays(self), _meta(self))
+        return _digest(_arrays(self), described(self))
 
     def cut(self, n_frames: int) -> Recording:
         """The same recording, ended after `n_frames` Frames (the logs keep their tails)."""
         return dataclasses.replace(self, frame_stamps=self.frame_stamps[:n_frames].copy())
-
-
-_LOGS: dict[str, Any] = {
-    "wheels": WheelLog,
-    "laser": LaserLog,
-    "landmarks": LandmarkLog,
-    "clouds": CloudLog,
-    "places": PlaceLog,
-    "commands": CommandLog,
-    "truth": Truth,
-}
 
 
 # What NumPy, zipfile and json raise for files that are not what they should be
@@ -339,7 +385,7 @@ def save(recording: Recording, path: Path) -> str:
     InputError
         If it cannot be written (full disk, no permission).
     """
-    arrays, meta = _arrays(recording), _meta(recording)
+    arrays, meta = _arrays(recording), described(recording)
     checksum = _digest(arrays, meta)
     meta_bytes = np.frombuffer(json.dumps({**meta, "checksum": checksum}).encode(), np.uint8)
     with write_whole(path) as part, part.open("wb") as file:
@@ -369,21 +415,24 @@ def load(path: Path) -> Recording:
         checksum = meta.pop("checksum")
     except _UNREADABLE as error:
         raise InputError(f"{path}: truncated or not a recording ({error}); {remedy}") from error
-    if meta.get("format") != FORMAT_VERSION:
+    if meta.get("format") not in (1, FORMAT_VERSION):
         raise InputError(
-            f"{path}: recording format {meta.get('format')}, this version reads {FORMAT_VERSION}; "
-            f"{remedy}"
+            f"{path}: recording format {meta.get('format')}, this version reads up to "
+            f"{FORMAT_VERSION}; {remedy}"
         )
     if _digest(stored, meta) != checksum:
         raise InputError(f"{path}: the data do not match their checksum; {remedy}")
-    return _assemble(stored, meta)
+    try:
+        if meta["format"] == 1:
+            stored, meta = upgraded(stored, meta)
+        return _assemble(stored, meta)
+    except (InputError, *_UNREADABLE) as error:
+        raise InputError(f"{path}: {error}; {remedy}") from error
 
 
-def _rows_at(
-    frame_stamps: Array, log: LaserLog | LandmarkLog | CloudLog | PlaceLog | None
-) -> NDArray[np.int64]:
+def _rows_at(frame_stamps: Array, log: Log) -> NDArray[np.int64]:
     """Row of a sensor's log that each Frame shows, -1 for none; the last of equal stamps wins."""
-    if log is None or len(log.stamps) == 0:
+    if len(log.stamps) == 0:
         return np.full(len(frame_stamps), -1)
     found = np.searchsorted(log.stamps, frame_stamps, side="right") - 1
     return np.where((found >= 0) & (log.stamps[found] == frame_stamps), found, -1)
@@ -392,25 +441,45 @@ def _rows_at(
 def _arrays(recording: Recording) -> dict[str, NDArray[Any]]:
     """Every array of a recording under the name it is saved by."""
     arrays = {"frame_stamps": recording.frame_stamps}
-    parts = {name: getattr(recording, name) for name in _LOGS} | {"world": recording.world}
+    parts = {
+        "wheels": recording.wheels,
+        "commands": recording.commands,
+        "truth": recording.truth,
+        "world": recording.world,
+        **{f"logs.{name}": log for name, log in recording.logs.items()},
+    }
     for name, part in parts.items():
-        for field_name, value in vars(part).items() if part else ():
+        for field_name, value in vars(part).items() if part is not None else ():
             if isinstance(value, np.ndarray):
                 arrays[f"{name}.{field_name}"] = value
-    if recording.world:
+    for name, log in recording.logs.items():
+        arrays |= {f"logs.{name}.{key}": values for key, values in log.values.items()}
+    if recording.truth is not None:
+        for name, hidden in recording.truth.readings.items():
+            arrays |= {f"truth.readings.{name}.{key}": values for key, values in hidden.items()}
+    if recording.world is not None:
         arrays |= {f"world.places.{k}": v for k, v in recording.world.places.items()}
     return arrays
 
 
-def _meta(recording: Recording) -> dict[str, Any]:
-    # Rebuilt from plain values, so that 100 and 100.0 Hz are the same recording.
-    sensors = suite_from_config(dataclasses.asdict(recording.sensors))
+def described(recording: Recording) -> dict[str, Any]:
+    """What a recording holds besides arrays, as plain values."""
     robot = build(RobotGeometry, dataclasses.asdict(recording.robot), "robot")
+    truth = recording.truth.readings if recording.truth else {}
+    schemas = {
+        name: {k: f for k, f in recording.sensors[name].schema.items() if k in truth.get(name, {})}
+        | dict(log.schema)
+        for name, log in recording.logs.items()
+    }
     return {
         "format": FORMAT_VERSION,
         "status": recording.status,
         "robot": dataclasses.asdict(robot),
-        "sensors": dataclasses.asdict(sensors),
+        "sensors": {name: sensor_settings(s) for name, s in recording.sensors.items()},
+        "schemas": {
+            name: {key: dataclasses.asdict(field) for key, field in schema.items()}
+            for name, schema in schemas.items()
+        },
         "config": recording.config,
         "world": recording.world.name if recording.world else None,
     }
@@ -426,20 +495,39 @@ def _digest(arrays: dict[str, NDArray[Any]], meta: dict[str, Any]) -> str:
 
 
 def _assemble(stored: dict[str, NDArray[Any]], meta: dict[str, Any]) -> Recording:
-    def part(name: str) -> dict[str, NDArray[Any]]:
-        prefix = f"{name}."
-        return {k.removeprefix(prefix): v for k, v in stored.items() if k.startswith(prefix)}
+    def part(prefix: str) -> dict[str, NDArray[Any]]:
+        """Arrays directly under a name."""
+        below = {
+            k.removeprefix(f"{prefix}."): v for k, v in stored.items() if k.startswith(f"{prefix}.")
+        }
+        return {name: values for name, values in below.items() if "." not in name}
 
-    logs: dict[str, Any] = {name: cls(**part(name)) for name, cls in _LOGS.items() if part(name)}
+    logs, hidden = {}, {}
+    schemas = {name: schema_from_meta(fields) for name, fields in meta["schemas"].items()}
+    if unknown := set(schemas) - set(meta["sensors"]):
+        raise InputError(f"readings of sensors that it does not describe: {sorted(unknown)}")
+    for name, schema in schemas.items():
+        seen, hidden_fields = parted(schema)
+        values = part(f"logs.{name}")
+        logs[name] = Log(
+            seen, values["stamps"], {key: values[key] for key in seen}, values.get("splits")
+        )
+        logs[name].check(name)
+        if hidden_fields:
+            hidden[name] = part(f"truth.readings.{name}")
+    world = truth = None
     if meta["world"] is not None:
-        fields = {k: v for k, v in part("world").items() if not k.startswith("places.")}
-        world = World(name=meta["world"], places=part("world.places"), **fields)
-        logs["truth"] = dataclasses.replace(logs["truth"], world=world)
+        world = World(name=meta["world"], places=part("world.places"), **part("world"))
+    if part("truth"):
+        truth = Truth(**part("truth"), readings=hidden, world=world)
     return Recording(
         frame_stamps=stored["frame_stamps"],
+        wheels=WheelLog(**part("wheels")),
         robot=RobotGeometry(**meta["robot"]),
-        sensors=suite_from_config(meta["sensors"]),
+        sensors=sensors_from_meta(meta["sensors"], schemas),
+        logs=logs,
+        truth=truth,
+        commands=CommandLog(**part("commands")) if part("commands") else None,
         config=meta["config"],
         status=meta["status"],
-        **logs,
     )

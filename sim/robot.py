@@ -10,6 +10,8 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,12 +21,16 @@ from sim.errors import InputError
 from sim.settings import check_numbers
 
 SLIP_TIME_CONSTANT_S = 0.1
-_SMALL_ANGLE_RAD = 1e-4
+SMALL_ANGLE_RAD = 1e-4
+_LEAST_BIAS, _MOST_BIAS = -0.67, 2.0  # the encoder reads between a third and three times the travel
 
 
 @dataclass(frozen=True)
 class DifferentialDrive:
-    """What the simulated robot is and how its wheels slip: the truth, never a belief.
+    """What the simulated robot is and how its wheels slip: the truth, never an estimator's belief.
+
+    The nominal geometry is part of that truth: it is what the robot's own controller uses, right
+    or wrong.
 
     Parameters
     ----------
@@ -33,9 +39,18 @@ class DifferentialDrive:
     kr, kl
         Slip variance per metre of the right and left wheel, m.
     bias_right, bias_left
-        Systematic part of the slip: the encoder reads (1 + bias) times the ground travel.
+        Systematic part of the slip: the encoder reads (1 + bias) times the ground travel. A factor
+        of three either way is the most. The wheel's loop settles within 0.1 s / (1 + bias).
+    nominal_wheel_radius_m, nominal_track_m
+        Geometry by which the robot's controller turns body velocities into wheel speeds and wheel
+        angles into metres; None for the true one. A robot whose nominal track is 0.44 of the true
+        one turns by 0.44 of what it is commanded.
     encoder_tick_m
-        Quantum of the encoder counts along the ground, m; 0 for no quantisation.
+        Quantum of the encoder counts, in metres that the encoder reports; 0 for no quantisation.
+    encoder_pulses_per_turn
+        Pulses per turn of the encoder's shaft, in place of `encoder_tick_m`; 0 for none.
+    gear_ratio
+        Turns of the encoder's shaft for one turn of the wheel.
     unmodelled_slip
         Stress: probability per second of an event that stops a wheel from gripping (its
         encoder runs on by `unmodelled_slip_m` while the ground travel stands). It is not
@@ -54,7 +69,11 @@ class DifferentialDrive:
     kl: float = 0.0
     bias_right: float = 0.0
     bias_left: float = 0.0
+    nominal_wheel_radius_m: float | None = None
+    nominal_track_m: float | None = None
     encoder_tick_m: float = 0.0
+    encoder_pulses_per_turn: int = 0
+    gear_ratio: float = 1.0
     unmodelled_slip: float = 0.0
     unmodelled_slip_m: float = 0.02
     body_length_m: float = 0.18
@@ -75,13 +94,37 @@ class DifferentialDrive:
                 "body_height_m",
                 "mass_kg",
                 "max_acceleration_mps2",
+                "gear_ratio",
             ),
-            ("kr", "kl", "encoder_tick_m", "unmodelled_slip", "unmodelled_slip_m"),
+            (
+                "kr",
+                "kl",
+                "encoder_tick_m",
+                "encoder_pulses_per_turn",
+                "unmodelled_slip",
+                "unmodelled_slip_m",
+            ),
         )
+        for name in ("nominal_wheel_radius_m", "nominal_track_m"):
+            if getattr(self, name) is not None:
+                check_numbers("robot", self, (name,))
         for name in ("bias_right", "bias_left"):
             value = getattr(self, name)
-            if not math.isfinite(value) or value <= -0.5 or value >= 0.5:
-                raise InputError(f"robot.{name} must lie in (-0.5, 0.5), got {value}")
+            if not _LEAST_BIAS <= value <= _MOST_BIAS:
+                raise InputError(
+                    f"robot.{name} must lie in [{_LEAST_BIAS:g}, {_MOST_BIAS:g}], a factor of "
+                    f"three either way, got {value}"
+                )
+        if self.encoder_pulses_per_turn and self.encoder_tick_m:
+            raise InputError(
+                "robot.encoder_pulses_per_turn and robot.encoder_tick_m both set the encoder's "
+                "quantum; set one of them to 0"
+            )
+        if self.gear_ratio != 1.0 and not self.encoder_pulses_per_turn:
+            raise InputError(
+                "robot.gear_ratio has no effect without pulses; set robot.encoder_pulses_per_turn, "
+                "or robot.gear_ratio=1"
+            )
 
     @property
     def slip_variance_per_m(self) -> Array:
@@ -93,15 +136,55 @@ class DifferentialDrive:
         """(bias_right, bias_left)."""
         return np.array([self.bias_right, self.bias_left])
 
+    @cached_property
+    def nominal(self) -> RobotGeometry:
+        """The geometry that the robot's controller uses, and that its recordings state."""
+        return RobotGeometry(
+            self.nominal_wheel_radius_m or self.wheel_radius_m, self.nominal_track_m or self.track_m
+        )
+
+    @property
+    def encoder_quantum_m(self) -> float:
+        """Travel of one encoder count in metres that the encoder reports; 0 for none.
+
+        2 pi r / (pulses per turn * gear ratio), with the nominal radius r (decristoforis2020, the
+        distances rolled in eq. (1); their formula is lost in the text that we have, its symbols
+        are explained).
+        """
+        if not self.encoder_pulses_per_turn:
+            return self.encoder_tick_m
+        pulses = self.encoder_pulses_per_turn * self.gear_ratio
+        return 2.0 * math.pi * self.nominal.wheel_radius_m / pulses
+
     def wheel_speeds(self, v_mps: ArrayLike, omega_radps: ArrayLike) -> Array:
-        """Ground speeds (..., 2) of the wheels for a body velocity, m/s."""
-        v, turn = np.asarray(v_mps, float), np.asarray(omega_radps, float) * self.track_m / 2.0
-        return np.stack([v + turn, v - turn], axis=-1)
+        """Ground speeds (..., 2) of wheels that do not slip at a commanded body velocity, m/s.
+
+        The controller sets the wheels' rates by its nominal geometry; the wheels roll by the true
+        radius.
+        """
+        nominal = self.nominal
+        v, turn = np.asarray(v_mps, float), np.asarray(omega_radps, float) * nominal.track_m / 2.0
+        speeds: Array = np.stack([v + turn, v - turn], axis=-1)
+        return speeds * (self.wheel_radius_m / nominal.wheel_radius_m)
+
+    def slips(self, dt_s: float) -> tuple[Slip, Slip]:
+        """Slip of the right and the left wheel of the robot at rest."""
+        return Slip(self.kr, self.bias_right, dt_s), Slip(self.kl, self.bias_left, dt_s)
+
+    def encoder_reading(self, position_m: Array) -> Array:
+        """What the encoders report (..., 2), m, at positions (..., 2) along the ground, m.
+
+        The wheel's angle, in whole counts, times the nominal radius. Positions are quantised,
+        never increments, so the error does not accumulate.
+        """
+        reading = position_m * (self.nominal.wheel_radius_m / self.wheel_radius_m)
+        quantum_m = self.encoder_quantum_m
+        return np.floor(reading / quantum_m) * quantum_m if quantum_m > 0.0 else reading
 
 
 @dataclass(frozen=True)
 class RobotGeometry:
-    """What an estimator believes of the robot: the wheel radius and the track, m."""
+    """What is believed of the robot: the wheel radius and the track, m."""
 
     wheel_radius_m: float
     track_m: float
@@ -134,17 +217,20 @@ def wheel_errors(travel_m: ArrayLike, variance_per_m: ArrayLike, rng: np.random.
         Errors of the shape of `travel_m`.
     """
     travel = np.asarray(travel_m, float)
-    return _scaled_errors(travel, variance_per_m, rng.standard_normal(travel.shape))
+    errors: Array = scaled_error(travel, variance_per_m, rng.standard_normal(travel.shape))
+    return errors
 
 
-def _scaled_errors(travel_m: Array, variance_per_m: ArrayLike, standard_normal: Array) -> Array:
-    """Encoder errors, m, of variance k |ds| from normals drawn beforehand."""
+def scaled_error(travel_m: Any, variance_per_m: Any, standard_normal: Any) -> Any:
+    """Encoder error, m, of variance k |ds| from a normal drawn beforehand."""
+    if isinstance(travel_m, float):  # NumPy's call would cost ten times more
+        return math.sqrt(variance_per_m * abs(travel_m)) * standard_normal
     return np.sqrt(variance_per_m * np.abs(travel_m)) * standard_normal
 
 
 @dataclass
 class Slip:
-    """The slip of the wheels, tick by tick, for one robot or a batch of them.
+    """The slip of one wheel, tick by tick; in floats for one robot, in arrays for a batch.
 
     At each tick the wheel is driven at `command - correction_mps`; it rolls `rolling_m` on the
     ground and its encoder reads that plus an error of variance k |rolling|, white over ticks.
@@ -154,34 +240,31 @@ class Slip:
 
     Attributes
     ----------
+    variance_per_m, bias
+        k, m, and the share by which the encoder reads more than the wheel rolls.
+    dt_s
+        Length of a tick.
     lag_m
-        State of the lag, (..., 2) m.
+        State of the lag.
     """
 
-    variance_per_m: Array
-    bias: Array
+    variance_per_m: float
+    bias: float
     dt_s: float
-    lag_m: Array
-
-    @classmethod
-    def start(cls, robot: DifferentialDrive, dt_s: float, batch: tuple[int, ...] = ()) -> Slip:
-        """Slip of a robot at rest."""
-        return cls(robot.slip_variance_per_m, robot.slip_bias, dt_s, np.zeros((*batch, 2)))
+    lag_m: Any = 0.0
 
     @property
-    def correction_mps(self) -> Array:
-        """Speed (..., 2) to take off the wheel command at the next tick, m/s."""
+    def correction_mps(self) -> Any:
+        """Speed to take off the wheel's command at the next tick, m/s."""
         return self.lag_m / self.dt_s
 
-    def advance(
-        self, rolling_m: Array, standard_normal: Array, extra_m: Array | float = 0.0
-    ) -> Array:
-        """Encoder increment (..., 2), m, of a tick in which the wheels rolled `rolling_m`.
+    def advance(self, rolling_m: Any, standard_normal: Any, extra_m: Any = 0.0) -> Any:
+        """Encoder increment, m, of a tick in which the wheel rolled `rolling_m`.
 
         `extra_m` is an encoder error from outside the law.
         """
         error = self.bias * rolling_m + extra_m
-        error += _scaled_errors(rolling_m, self.variance_per_m, standard_normal)
+        error += scaled_error(rolling_m, self.variance_per_m, standard_normal)
         self.lag_m += (self.dt_s / SLIP_TIME_CONSTANT_S) * (error - self.lag_m)
         return rolling_m + error
 
@@ -195,7 +278,7 @@ def arc_increment(travel_m: ArrayLike, track_m: float) -> Array:
     forward = (travel[..., 0] + travel[..., 1]) / 2.0
     turn = (travel[..., 0] - travel[..., 1]) / track_m
     half = turn / 2.0
-    small = np.abs(half) < _SMALL_ANGLE_RAD
+    small = np.abs(half) < SMALL_ANGLE_RAD
     chord = forward * np.where(small, 1.0 - half**2 / 6.0, np.sin(half) / np.where(small, 1, half))
     return np.stack([chord * np.cos(half), chord * np.sin(half), turn], axis=-1)
 
@@ -209,7 +292,7 @@ def arc_increment_jacobian(travel_m: ArrayLike, track_m: float) -> Array:
     travel = np.asarray(travel_m, float)
     forward = (travel[..., 0] + travel[..., 1]) / 2.0
     half = (travel[..., 0] - travel[..., 1]) / track_m / 2.0
-    small = np.abs(half) < _SMALL_ANGLE_RAD
+    small = np.abs(half) < SMALL_ANGLE_RAD
     safe = np.where(small, 1.0, half)
     sinc = np.where(small, 1.0 - half**2 / 6.0, np.sin(safe) / safe)
     sinc_slope = np.where(small, -half / 3.0, (np.cos(safe) - np.sin(safe) / safe) / safe)

@@ -6,16 +6,18 @@ A velocity command is (v, omega): m/s forward and rad/s counter-clockwise.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from sim.arrays import Array
 from sim.errors import InputError
+from sim.feedback import CONTROL_TICKS, check_feedback
 from sim.robot import DifferentialDrive, arc_increment
-from sim.se2 import chain
+from sim.se2 import chain, transform
 from sim.settings import check_numbers
 from sim.world import World, facing_second
 
@@ -103,10 +105,10 @@ class Replay:
 
 @dataclass(frozen=True)
 class Tour:
-    """Way-point following by pure pursuit of the true pose.
+    """Way-point following by pure pursuit.
 
-    The robot is guided by its true pose, as if someone drove it, so that slip makes the odometry
-    err but never the route.
+    Guided by its true pose, as if someone drove it, the robot keeps its route, and slip makes only
+    the odometry err. Guided by its odometry, it leaves the route without noticing.
 
     Attributes
     ----------
@@ -123,6 +125,9 @@ class Tour:
         Distance from the tour at which the robot counts as off its route.
     turn_rate_radps
         Limit of the turn rate.
+    feedback
+        The pose that is followed: `truth`, `odometry`, or a mapping with the `_target_` of an
+        estimator; see `sim.feedback`.
     """
 
     speed_mps: float = 0.5
@@ -131,15 +136,18 @@ class Tour:
     look_ahead_m: float = 0.35
     tolerance_m: float = 0.5
     turn_rate_radps: float = 1.0
+    feedback: str | Mapping[str, Any] = "truth"
 
     def __post_init__(self) -> None:
+        check_feedback(self.feedback)
         check_numbers(
             "route", self, ("speed_mps", "look_ahead_m", "tolerance_m", "turn_rate_radps")
         )
         if self.distance_m is not None and not 0.0 < self.distance_m < math.inf:
             raise InputError(f"route.distance_m must be positive, got {self.distance_m}")
         if self.waypoints is not None:
-            _check_waypoints(self.waypoints)
+            wanted = "route.waypoints must be null or at least two points [x, y], m"
+            _check_points(self.waypoints, wanted, at_least=2)
 
     def start(self, world: World, robot: DifferentialDrive) -> tuple[Array, Pursuit]:
         """Start pose (3,) on the first way-point, facing the second, and the driver."""
@@ -159,8 +167,7 @@ class Pursuit:
     def __init__(self, tour: Tour, robot: DifferentialDrive, path: Array) -> None:
         self._tour, self._path = tour, path
         self._along_m = _along_m(path)
-        self._acceleration = 0.5 * robot.max_acceleration_mps2  # the other half is for turning
-        self._turn_acceleration = robot.max_acceleration_mps2 / robot.track_m
+        self._most = _accelerations(robot)
         self._done_m, self._velocity = 0.0, np.zeros(2)
         self._off_m = 0.0
         self._rest_ticks: int | None = None
@@ -172,7 +179,7 @@ class Pursuit:
         if self._rest_ticks is not None:
             self._rest_ticks -= 1
             return None if self._rest_ticks < 0 else np.zeros(2)
-        if tick % 6:
+        if tick % CONTROL_TICKS:
             return self._velocity
         self._late = tick >= self._last_tick
         self._project(pose)
@@ -180,7 +187,7 @@ class Pursuit:
         if left_m < 0.02 and self._velocity[0] < 0.05:
             self._rest_ticks = 60
             return np.zeros(2)
-        self._velocity = self._limited(self._wanted(pose, left_m), 6 * TICK_S)
+        self._velocity = _limited(self._wanted(pose, left_m), self._velocity, self._most)
         return self._velocity
 
     @property
@@ -199,12 +206,13 @@ class Pursuit:
         for i in range(low, min(max(high, low + 2), len(self._path)) - 1):
             start, way = self._path[i], self._path[i + 1] - self._path[i]
             length = self._along_m[i + 1] - self._along_m[i]
-            share = float(np.clip((pose[:2] - start) @ way / length**2, 0.0, 1.0))
+            share = min(max(float((pose[:2] - start) @ way / length**2), 0.0), 1.0)
             at_m = self._along_m[i] + share * length
             if not self._done_m - 1e-9 <= at_m <= ahead_m:
                 at_m = min(max(at_m, self._done_m), ahead_m)
                 share = (at_m - self._along_m[i]) / length
-            gap = float(np.hypot(*(pose[:2] - start - share * way)))
+            x, y = (pose[:2] - start - share * way).tolist()
+            gap = float(np.hypot(x, y))
             if gap < best - 1e-9:
                 best, done_m = gap, at_m
         self._done_m, self._off_m = done_m, best
@@ -215,7 +223,7 @@ class Pursuit:
         bearing = math.atan2(goal[1] - pose[1], goal[0] - pose[0]) - pose[2]
         bearing = math.atan2(math.sin(bearing), math.cos(bearing))
         distance = max(float(np.hypot(*(goal - pose[:2]))), 1e-3)
-        brake = math.sqrt(2.0 * 0.8 * self._acceleration * max(left_m, 0.0))
+        brake = math.sqrt(2.0 * 0.8 * self._most[0] * max(left_m, 0.0))
         if abs(bearing) > 0.6:  # too sharp for an arc: slow down and turn on the spot
             return np.array([0.0, math.copysign(tour.turn_rate_radps, bearing)])
         v = min(tour.speed_mps * math.cos(bearing) ** 4, brake)
@@ -223,23 +231,136 @@ class Pursuit:
         limit = tour.turn_rate_radps
         return np.array([max(v, 0.01), min(max(omega, -limit), limit)])
 
-    def _limited(self, wanted: Array, dt_s: float) -> Array:
-        most = dt_s * np.array([self._acceleration, self._turn_acceleration])
-        return self._velocity + np.clip(wanted - self._velocity, -most, most)
-
     def _point_at(self, along_m: float) -> Array:
         columns = [np.interp(along_m, self._along_m, self._path[:, i]) for i in (0, 1)]
         return np.array(columns)
 
 
-def _check_waypoints(waypoints: ArrayLike) -> None:
-    wanted = "route.waypoints must be null or at least two points [x, y], m"
+@dataclass(frozen=True)
+class GoToPoints:
+    """One point after another: turn on the spot towards it, then drive to it.
+
+    The closed loop of puzzlebot2024: a ControlNode that steers by the pose on `/odom` (section
+    "Obtención kr y kl", image 1). The report prints neither its control law nor its gains,
+    tolerance, speeds or points; it says only that by its odometry the robot reaches the points
+    (section "Problemas encontrados"). The law here is the proportional one that is usual for such
+    nodes: with the point at distance rho and bearing alpha from the believed pose, omega =
+    gain_bearing alpha, and v = gain_distance rho, or 0 while abs(alpha) is above `turn_above_rad`.
+    Both are limited, as are their accelerations. The numbers in `conf/route/square.yaml` are ours.
+
+    Attributes
+    ----------
+    points
+        (P, 2) m, in the frame of the start pose.
+    speed_mps, turn_rate_radps
+        Limits of v and omega.
+    gain_distance, gain_bearing
+        Gains, 1/s.
+    turn_above_rad
+        Bearing above which the robot turns on the spot.
+    tolerance_m
+        Believed distance at which a point counts as reached.
+    feedback
+        The pose that is steered by: `truth`, `odometry`, or a mapping with the `_target_` of an
+        estimator; see `sim.feedback`.
+    """
+
+    points: tuple[tuple[float, float], ...]
+    speed_mps: float
+    turn_rate_radps: float
+    gain_distance: float
+    gain_bearing: float
+    turn_above_rad: float
+    tolerance_m: float
+    feedback: str | Mapping[str, Any] = "truth"
+
+    def __post_init__(self) -> None:
+        check_feedback(self.feedback)
+        check_numbers(
+            "route",
+            self,
+            (
+                "speed_mps",
+                "turn_rate_radps",
+                "gain_distance",
+                "gain_bearing",
+                "turn_above_rad",
+                "tolerance_m",
+            ),
+        )
+        _check_points(self.points, "route.points must be at least one point [x, y], m", at_least=1)
+
+    def start(self, world: World, robot: DifferentialDrive) -> tuple[Array, GoToPoint]:
+        """Start pose (3,) of the world, and the driver."""
+        path = np.array([(0.0, 0.0), *self.points])
+        return world.start_pose, GoToPoint(self, robot, transform(world.start_pose, path))
+
+
+class GoToPoint:
+    """Driver of GoToPoints, 50 times a second, with limited acceleration."""
+
+    def __init__(self, route: GoToPoints, robot: DifferentialDrive, path: Array) -> None:
+        self._route, self._points = route, path[1:]
+        self._most = _accelerations(robot)
+        self._velocity, self._reached = np.zeros(2), 0
+        self._rest_ticks: int | None = None
+        turns_s = math.pi * len(self._points) / route.turn_rate_radps
+        slowest_s = 4.0 * (_along_m(path)[-1] / route.speed_mps + turns_s) + 60.0
+        self._last_tick, self._late = round(slowest_s / TICK_S), False
+
+    def command(self, tick: int, pose: Array) -> Array | None:
+        """Velocity (2,) of the tick; None when the robot rests at the last point."""
+        if self._rest_ticks is not None:
+            self._rest_ticks -= 1
+            return None if self._rest_ticks < 0 else np.zeros(2)
+        if tick % CONTROL_TICKS:
+            return self._velocity
+        self._late = tick >= self._last_tick
+        route, offset = self._route, self._points[self._reached] - pose[:2]
+        if np.hypot(*offset) <= route.tolerance_m:
+            self._reached += 1
+            if self._reached == len(self._points):
+                self._rest_ticks = 60
+                return np.zeros(2)
+            offset = self._points[self._reached] - pose[:2]
+        bearing = math.atan2(offset[1], offset[0]) - pose[2]
+        bearing = math.atan2(math.sin(bearing), math.cos(bearing))
+        most = route.turn_rate_radps
+        omega = min(max(route.gain_bearing * bearing, -most), most)
+        v = 0.0
+        if abs(bearing) <= route.turn_above_rad:
+            v = min(route.gain_distance * float(np.hypot(*offset)), route.speed_mps)
+        self._velocity = _limited(np.array([v, omega]), self._velocity, self._most)
+        return self._velocity
+
+    @property
+    def trouble(self) -> str | None:
+        """`incomplete` (far too slow), else None."""
+        return "incomplete" if self._late else None
+
+
+def _accelerations(robot: DifferentialDrive) -> Array:
+    """Limits (2,) of v and omega, m/s^2 and rad/s^2: half of a wheel's acceleration for each."""
+    linear = robot.max_acceleration_mps2
+    return np.array([0.5 * linear, linear / robot.nominal.track_m])
+
+
+def _limited(wanted: Array, velocity: Array, most: Array) -> Array:
+    """Velocity (2,) a control period later, on the way to the wanted one."""
+    step = CONTROL_TICKS * TICK_S * most
+    limited: Array = velocity + np.clip(wanted - velocity, -step, step)
+    return limited
+
+
+def _check_points(given: ArrayLike, wanted: str, at_least: int) -> None:
+    """Refuse what is not (P, 2) finite numbers, with a line that says what is wanted."""
     try:
-        points = np.array(waypoints, float)
+        points = np.array(given, float)
     except (TypeError, ValueError):
-        raise InputError(f"{wanted}, got {waypoints!r}") from None
-    if points.ndim != 2 or points.shape[1] != 2 or len(points) < 2 or not np.isfinite(points).all():
-        raise InputError(f"{wanted}, got {waypoints!r}")
+        raise InputError(f"{wanted}, got {given!r}") from None
+    shaped = points.ndim == 2 and points.shape[1] == 2 and len(points) >= at_least
+    if not (shaped and np.isfinite(points).all()):
+        raise InputError(f"{wanted}, got {given!r}")
 
 
 def _lengthened(path: Array, distance_m: float | None) -> Array:
@@ -285,7 +406,8 @@ def _merged(segments: Iterable[Iterable[float]]) -> list[Segment]:
 def _trapezoid(segment: Segment, robot: DifferentialDrive) -> tuple[float, float, float]:
     """Plateau and ramp times, s, and the share of the velocity that the plateau reaches."""
     v, omega, duration_s = segment
-    fastest_mps = abs(v) + abs(omega) * robot.track_m / 2.0
+    track_m = max(robot.track_m, robot.nominal.track_m)  # neither body nor wheels are hurried
+    fastest_mps = abs(v) + abs(omega) * track_m / 2.0
     ramp_s = fastest_mps / robot.max_acceleration_mps2
     if ramp_s <= duration_s:
         return duration_s - ramp_s, ramp_s, 1.0

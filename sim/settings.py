@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import math
-from collections.abc import Mapping
-from typing import Any, TypeVar
+from collections.abc import Callable, Mapping
+from types import NoneType, UnionType
+from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from sim.errors import InputError
 
@@ -18,7 +20,7 @@ def build(cls: type[T], settings: Mapping[str, Any], where: str) -> T:
     Parameters
     ----------
     cls
-        A dataclass whose fields are the allowed keys.
+        A dataclass whose fields are the allowed keys; a field may be a dataclass too.
     settings
         The mapping; numbers are checked to be numbers.
     where
@@ -33,10 +35,11 @@ def build(cls: type[T], settings: Mapping[str, Any], where: str) -> T:
         raise InputError(f"{where} must be a mapping of keys to values, got {settings!r}")
     fields = {f.name: f for f in dataclasses.fields(cls)}  # type: ignore[arg-type]
     values: dict[str, Any] = {}
+    kinds = get_type_hints(cls)
     for key, value in settings.items():
         if key not in fields:
             raise InputError(f"unknown key {where}.{key}; known: {', '.join(fields)}")
-        values[key] = _checked(value, str(fields[key].type), f"{where}.{key}")
+        values[key] = _checked(value, kinds[key], f"{where}.{key}")
     for name, f in fields.items():
         bare = f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING
         if bare and name not in values:
@@ -61,19 +64,43 @@ def check_numbers(
             raise InputError(f"{where}.{name} must be {wanted}, got {value}")
 
 
-def _checked(value: Any, annotation: str, where: str) -> Any:
-    kind = annotation.split(" ", maxsplit=1)[0]
-    if value is None and "None" in annotation:
+def find(target: Any, where: str) -> Callable[..., Any]:
+    """Import the class or function that a `_target_` names.
+
+    Raises
+    ------
+    InputError
+        If there is none.
+    """
+    if not isinstance(target, str) or "." not in target:
+        raise InputError(f"{where}._target_ must name a class or function, such as mine.Mine")
+    module_name, _, name = target.rpartition(".")
+    try:
+        module = importlib.import_module(module_name)
+    except ModuleNotFoundError as error:
+        raise InputError(
+            f"{where}._target_={target}: no module {error.name}; is its folder on PYTHONPATH?"
+        ) from error
+    found = getattr(module, name, None)
+    if not callable(found):
+        raise InputError(f"{where}._target_={target}: {module_name} has no class {name}")
+    return found  # type: ignore[no-any-return]
+
+
+def _checked(value: Any, kind: Any, where: str) -> Any:
+    kinds = get_args(kind) if get_origin(kind) in (Union, UnionType) else (kind,)
+    if value is None and NoneType in kinds:
         return value
     number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    if kind == "float":
+    if float in kinds:
         if not number:
             raise InputError(f"{where} must be a number, got {value!r}")
         return float(value)
-    if kind == "int":
+    if int in kinds:
         if not (number and float(value).is_integer()):
             raise InputError(f"{where} must be a whole number, got {value!r}")
         return int(value)
-    if kind == "bool" and not isinstance(value, bool):
+    if bool in kinds and not isinstance(value, bool):
         raise InputError(f"{where} must be true or false, got {value!r}")
-    return value
+    part = next((k for k in kinds if isinstance(k, type) and dataclasses.is_dataclass(k)), None)
+    return value if part is None or isinstance(value, part) else build(part, value, where)

@@ -7,10 +7,11 @@ sensor fires at its own multiple of the tick.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import math
+import zlib
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
-from functools import partial
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -19,36 +20,31 @@ from numpy.typing import NDArray
 from sim import se2
 from sim.arrays import Array
 from sim.errors import InputError
+from sim.feedback import Feedback, Onboard, feedback_of
 from sim.kinematic import KinematicBody
-from sim.recording import (
-    CloudLog,
-    CommandLog,
-    LandmarkLog,
-    LaserLog,
-    Recording,
-    Truth,
-    WheelLog,
-)
-from sim.robot import DifferentialDrive, RobotGeometry, Slip
-from sim.sensors import Laser, Lidar3D, SensorSuite, StereoCamera
+from sim.rays import BulletRays, ExactRays
+from sim.recording import CommandLog, Log, Recording, Truth, WheelLog, joined
+from sim.robot import DifferentialDrive
+from sim.sensors.base import Probe, Rays, Reading, Sensor, Sensors, View, parted
 from sim.world import World
 
 Physics = Literal["bullet", "kinematic"]
-Rays = Literal["bullet", "exact"]
-_Logs = defaultdict[str, list[tuple[int, Any]]]  # of each sensor: tick and reading
+RayKind = Literal["bullet", "exact"]
+_Logs = defaultdict[str, list[tuple[int, Any]]]  # by sensor: tick and reading
 
 TICKS_PER_S = 300
 DT_S = 1.0 / TICKS_PER_S
 _CHECK_EVERY = 6  # ticks between looks for collisions
 _SLIP_EVENT_TICKS = 30
-_SURFACE_M = 0.005  # a landmark this near the face that a ray hits is seen
+# These draw their noise from one generator, in this order; every other sensor has its own
+_SHARE_NOISE = ("laser", "stereo", "lidar3d")
 
 
 class Body(Protocol):
     """What moves: PyBullet's robot or the kinematic one."""
 
-    def step(self, wheel_speeds_mps: Array) -> Array:
-        """Advance one tick; return the wheels' rolling (2,) m."""
+    def step(self, right_mps: float, left_mps: float) -> tuple[float, float]:
+        """Advance one tick at these wheel speeds; return the wheels' rolling, m."""
 
     @property
     def pose(self) -> Array:
@@ -59,7 +55,10 @@ class Driver(Protocol):
     """What commands a run, tick by tick."""
 
     def command(self, tick: int, pose: Array) -> Array | None:
-        """Body velocity (2,) m/s, rad/s for the tick, or None when the route is done."""
+        """Body velocity (2,) m/s, rad/s for the tick, or None when the route is done.
+
+        The pose (3,) is the one that the route's feedback gives, the true one or a believed one.
+        """
 
     @property
     def trouble(self) -> str | None:
@@ -67,7 +66,10 @@ class Driver(Protocol):
 
 
 class Route(Protocol):
-    """A plan that gives a Driver for a robot in a world."""
+    """A plan that gives a Driver for a robot in a world.
+
+    It may have an attribute `feedback`, see `sim.feedback`; without one its driver gets the truth.
+    """
 
     def start(self, world: World, robot: DifferentialDrive) -> tuple[Array, Driver]:
         """Start pose (3,) and the driver."""
@@ -76,14 +78,15 @@ class Route(Protocol):
 def record(
     world: World,
     robot: DifferentialDrive,
-    sensors: SensorSuite,
+    sensors: Sensors,
     route: Route,
     streams: Mapping[str, np.random.Generator],
     *,
     physics: Physics = "bullet",
-    rays: Rays = "bullet",
+    rays: RayKind = "bullet",
     config: dict[str, Any] | None = None,
     on_progress: Callable[[float], None] | None = None,
+    onboard: Onboard | None = None,
 ) -> Recording:
     """Drive the route and record what the sensors measure.
 
@@ -99,6 +102,8 @@ def record(
         Kept in the recording: where it came from.
     on_progress
         Called about every simulated second with the simulated time, s.
+    onboard
+        Starts the estimator that a route's feedback names.
 
     Returns
     -------
@@ -120,40 +125,70 @@ def record(
             f"the robot overlaps a wall of world {world.name} at its start "
             f"({pose[0]:.2f}, {pose[1]:.2f}); move the start pose or the wall"
         )
+    feedback = feedback_of(route, robot, pose, sensors, world, onboard)
     logs: _Logs = defaultdict(list)
     with contextlib.ExitStack() as stack:
         body: Body
-        caster: ExactRays | BulletRays
+        caster: Rays
         if physics == "bullet":
             from sim.bullet import BulletBody
 
             bullet = stack.enter_context(BulletBody(world, robot, pose))
             body, find_trouble = bullet, lambda: bullet.trouble
-            caster = BulletRays(bullet) if rays == "bullet" else ExactRays(world, sensors.laser)
+            caster = BulletRays(bullet) if rays == "bullet" else ExactRays(world)
         else:
             body = KinematicBody(robot, pose)
-            caster = ExactRays(world, sensors.laser)
-            find_trouble = lambda: "collision" if overlaps(world, robot, body.pose) else None  # noqa: E731
-        probes = _probes(world, sensors, caster, streams["sensors"])
+            caster = ExactRays(world)
+            find_trouble = _Collisions(world, robot, body)
+        probes = _probes(world, sensors, caster, streams["sensors"], pose)
         status = _drive(
-            robot, periods, body, driver, find_trouble, probes, streams["slip"], logs, on_progress
+            robot,
+            periods,
+            body,
+            driver,
+            feedback,
+            find_trouble,
+            probes,
+            streams["slip"],
+            logs,
+            on_progress,
         )
     return _assemble(world, robot, sensors, logs, status, config or {})
 
 
 def _probes(
-    world: World, sensors: SensorSuite, rays: ExactRays | BulletRays, rng: np.random.Generator
-) -> dict[str, Callable[[Array], Any]]:
-    """What each sensor measures, as a function of the robot's pose."""
-    laser, stereo, lidar = sensors.laser, sensors.stereo, sensors.lidar3d
-    probes: dict[str, Callable[[Array], Any]] = {}
-    if laser:
-        probes["laser"] = lambda pose: laser.measure(rays.scan(laser, pose), rng)
-    if stereo:
-        probes["stereo"] = partial(LandmarkEye(world, stereo, rng).observe, rays)
-    if lidar:
-        probes["lidar3d"] = lambda pose: lidar.measure(rays.cloud(lidar, pose), rng)
+    world: World, sensors: Sensors, rays: Rays, rng: np.random.Generator, start: Array
+) -> dict[str, _Firing]:
+    """Every sensor at work, those that share their noise first."""
+    order = [*(name for name in _SHARE_NOISE if name in sensors)]
+    order += [name for name in sensors if name not in order]
+    probes = {}
+    for name in order:
+        own = rng if name in _SHARE_NOISE else _stream_of(rng, name)
+        probes[name] = _Firing(sensors[name].start(own), View(0.0, start, world, rays, 0.0, start))
     return probes
+
+
+def _stream_of(rng: np.random.Generator, name: str) -> np.random.Generator:
+    """Generator of a sensor's own: what other sensors there are does not change its noise."""
+    seed: Any = rng.bit_generator.seed_seq
+    key = (*seed.spawn_key, zlib.crc32(name.encode()))
+    return np.random.default_rng(np.random.SeedSequence(seed.entropy, spawn_key=key))
+
+
+class _Firing:
+    """A probe, and what it saw last."""
+
+    def __init__(self, probe: Probe, first: View) -> None:
+        self._probe, self._last = probe, first
+        if hasattr(probe, "begin"):
+            probe.begin(first)
+
+    def __call__(self, stamp: float, pose: Array) -> Reading | None:
+        last = self._last
+        view = View(stamp, pose, last.world, last.rays, last.stamp, last.pose)
+        self._last = view
+        return self._probe(view)
 
 
 def _drive(
@@ -161,43 +196,50 @@ def _drive(
     periods: dict[str, int],
     body: Body,
     driver: Driver,
+    feedback: Feedback,
     find_trouble: Callable[[], str | None],
-    probes: dict[str, Callable[[Array], Any]],
+    probes: dict[str, _Firing],
     rng: np.random.Generator,
     logs: _Logs,
     on_progress: Callable[[float], None] | None,
 ) -> str:
     """Run tick by tick until the route ends or something goes wrong; return the status."""
-    slip = Slip.start(robot, DT_S)
+    right, left = robot.slips(DT_S)
     noise = _normals(rng)
     events = _SlipEvents(robot, rng)
     encoder, travel = np.zeros(2), np.zeros(2)
-    tick, velocity = 0, np.zeros(2)
+    tick, velocity, speeds = 0, (0.0, 0.0), (0.0, 0.0)
     while True:
         pose = body.pose
         due = [name for name, period in periods.items() if tick % period == 0]
-        wanted = driver.command(tick, pose)
+        wanted = driver.command(tick, feedback.pose(tick, pose, encoder))
         if due or wanted is None:
-            counts = _quantise(encoder, robot.encoder_tick_m)
-            logs["frames"].append((tick, (counts, travel.copy(), pose)))
-        for name in due:
-            if name in probes:
-                logs[name].append((tick, probes[name](pose)))
+            counts = robot.encoder_reading(encoder)
+            logs["/frames"].append((tick, (counts, travel.copy(), pose)))
+        if due:
+            readings = {name: probes[name](tick / TICKS_PER_S, pose) for name in due}
+            shown = {name: reading for name, reading in readings.items() if reading is not None}
+            for name, reading in shown.items():
+                logs[name].append((tick, reading))
+            feedback.see(tick / TICKS_PER_S, encoder, shown)
         if wanted is None or tick % _CHECK_EVERY == 0:
             trouble = (find_trouble() if wanted is not None else None) or driver.trouble
             if trouble is not None:
                 return f"{trouble} at {tick * DT_S:.2f} s near ({pose[0]:.2f}, {pose[1]:.2f})"
         if wanted is None:
             return "ok"
-        if not np.array_equal(wanted, velocity) or tick == 0:
-            velocity = wanted
-            logs["commands"].append((tick, velocity))
+        if (*wanted,) != velocity or tick == 0:
+            velocity = (*wanted,)
+            speeds = (*robot.wheel_speeds(*velocity).tolist(),)
+            logs["/commands"].append((tick, velocity))
         if on_progress is not None and tick % TICKS_PER_S == 0:
             on_progress(tick * DT_S)
-        speeds = robot.wheel_speeds(velocity[0], velocity[1]) - slip.correction_mps
-        rolling = body.step(speeds)
-        encoder = encoder + slip.advance(rolling, next(noise), events.error(rolling))
-        travel = travel + rolling
+        rolled = body.step(speeds[0] - right.correction_mps, speeds[1] - left.correction_mps)
+        z_right, z_left = next(noise)
+        extra_right, extra_left = events.error(rolled)
+        encoder[0] += right.advance(rolled[0], z_right, extra_right)
+        encoder[1] += left.advance(rolled[1], z_left, extra_left)
+        travel += rolled
         tick += 1
 
 
@@ -210,12 +252,7 @@ def overlaps(world: World, robot: DifferentialDrive, pose: Array) -> bool:
     to_base = np.array([[cos, sin], [-sin, cos]])
     start = (world.walls[low, :2] - pose[:2]) @ to_base.T
     along = (world.walls[low, 2:] - pose[:2]) @ to_base.T - start
-    half = np.array(
-        [
-            max(robot.body_length_m / 2, robot.wheel_radius_m),
-            max(robot.body_width_m, robot.track_m) / 2,
-        ]
-    )
+    half = _half_footprint_m(robot)
     # Clip each wall against the footprint's two slabs; what is left of it lies inside.
     with np.errstate(divide="ignore", invalid="ignore"):
         near, far = (-half - start) / along, (half - start) / along
@@ -227,171 +264,39 @@ def overlaps(world: World, robot: DifferentialDrive, pose: Array) -> bool:
     return bool(np.any(hit))
 
 
-class ExactRays:
-    """The caster of `sim.casting`, imported only where it is used: it needs a compiler."""
+class _Collisions:
+    """Looks for collisions of a body without an engine, and only where a wall is within reach."""
 
-    def __init__(self, world: World, laser: Laser | None) -> None:
-        self._world = world
-        if laser is not None:
-            from sim.casting import SegmentCaster
+    def __init__(self, world: World, robot: DifferentialDrive, body: Body) -> None:
+        self._world, self._robot, self._body = world, robot, body
+        self._reach_m = math.hypot(*_half_footprint_m(robot))
+        self._at, self._free_m = np.zeros(2), -1.0  # no wall is nearer to that point
 
-            self._caster = SegmentCaster(world, laser)
-
-    def scan(self, laser: Laser, pose: Array) -> Array:
-        """Ranges (beams,) m of a laser on the robot at a pose (3,); inf without a return."""
-        return self._caster.cast(sensor_pose(laser, pose))
-
-    def cloud(self, lidar: Lidar3D, pose: Array) -> Array:
-        """Ranges (rings, azimuths) m of a lidar on the robot at a pose (3,)."""
-        from sim.casting import cast_lidar
-
-        return cast_lidar(self._world, lidar, sensor_pose(lidar, pose))
-
-    def sees(self, origin: Array, points: Array) -> NDArray[np.bool_]:
-        """Whether nothing stands between a point (3,) and each of others (K, 3)."""
-        from sim.casting import visible
-
-        return visible(self._world, origin, points)
+    def __call__(self) -> str | None:
+        """`collision` if the robot overlaps a wall now, else None."""
+        pose = self._body.pose
+        if math.hypot(*(pose[:2] - self._at)) + self._reach_m < self._free_m:
+            return None
+        self._at, self._free_m = pose[:2], _wall_distance_m(self._world, pose[:2])
+        return "collision" if overlaps(self._world, self._robot, pose) else None
 
 
-class BulletRays:
-    """The physics engine's rays."""
-
-    def __init__(self, bullet: Any) -> None:
-        self._bullet = bullet
-
-    def scan(self, laser: Laser, pose: Array) -> Array:
-        """Ranges (beams,) m of a laser on the robot at a pose (3,); inf without a return."""
-        planar = sensor_pose(laser, pose)
-        angles = planar[2] + laser.bearings_rad
-        starts = np.tile([planar[0], planar[1], laser.mount.z_m], (laser.n_beams, 1))
-        way = np.stack([np.cos(angles), np.sin(angles), np.zeros_like(angles)], axis=-1)
-        return self._ranges(starts, way, laser.max_range_m, ground=False)
-
-    def cloud(self, lidar: Lidar3D, pose: Array) -> Array:
-        """Ranges (rings, azimuths) m of a lidar on the robot at a pose (3,)."""
-        planar = sensor_pose(lidar, pose)
-        elevation = np.repeat(lidar.elevations_rad, lidar.n_azimuths)
-        azimuth = np.tile(planar[2] + lidar.azimuths_rad, lidar.n_rings)
-        flat = np.cos(elevation)
-        way = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=-1)
-        starts = np.tile([planar[0], planar[1], lidar.mount.z_m], (len(way), 1))
-        ranges = self._ranges(starts, way, lidar.max_range_m, ground=True)
-        return ranges.reshape(lidar.n_rings, lidar.n_azimuths)
-
-    def sees(self, origin: Array, points: Array) -> NDArray[np.bool_]:
-        """Whether nothing stands between a point (3,) and each of others (K, 3)."""
-        if len(points) == 0:
-            return np.zeros(0, bool)
-        distance = np.linalg.norm(points - origin, axis=1)
-        share = self._bullet.cast(np.broadcast_to(origin, points.shape), points)
-        seen: NDArray[np.bool_] = share * distance >= distance - _SURFACE_M
-        return seen
-
-    def _ranges(self, starts: Array, way: Array, reach_m: float, *, ground: bool) -> Array:
-        share = self._bullet.cast(starts, starts + reach_m * way, ground=ground)
-        return np.where(share < 1.0, share * reach_m, np.inf)
+def _wall_distance_m(world: World, point: Array) -> float:
+    """Distance of a point (2,) to the nearest wall, m; inf without walls."""
+    start, along = world.walls[:, :2] - point, world.walls[:, 2:] - world.walls[:, :2]
+    share = np.clip(-np.sum(start * along, axis=1) / np.sum(along**2, axis=1), 0.0, 1.0)
+    gaps = start + share[:, None] * along
+    return float(np.hypot(*gaps.T).min(initial=np.inf))
 
 
-def sensor_pose(sensor: Laser | Lidar3D | StereoCamera, pose: Array) -> Array:
-    """Pose (3,) of a mounted sensor in map for the robot's pose (3,)."""
-    mount = sensor.mount
-    cos, sin = math.cos(pose[2]), math.sin(pose[2])
+def _half_footprint_m(robot: DifferentialDrive) -> Array:
+    """Half the length and width (2,) of body and wheels, m."""
     return np.array(
         [
-            pose[0] + cos * mount.x_m - sin * mount.y_m,
-            pose[1] + sin * mount.x_m + cos * mount.y_m,
-            pose[2] + mount.yaw_rad,
+            max(robot.body_length_m / 2, robot.wheel_radius_m),
+            max(robot.body_width_m, robot.track_m) / 2,
         ]
     )
-
-
-def points_in_camera(camera: StereoCamera, pose: Array, points_in_world: Array) -> Array:
-    """Points (N, 3) of map in the camera frame (z forward, x right, y down), m."""
-    planar = sensor_pose(camera, pose)
-    offset = points_in_world - np.array([planar[0], planar[1], camera.mount.z_m])
-    cos, sin = math.cos(planar[2]), math.sin(planar[2])
-    forward = cos * offset[:, 0] + sin * offset[:, 1]
-    left = -sin * offset[:, 0] + cos * offset[:, 1]
-    return np.stack([-left, -offset[:, 2], forward], axis=-1)
-
-
-class LandmarkEye:
-    """The stereo camera's view of the world's landmarks."""
-
-    def __init__(self, world: World, camera: StereoCamera, rng: np.random.Generator) -> None:
-        self._world, self._camera, self._rng = world, camera, rng
-        size = world.descriptors.shape[1] if world.descriptors.ndim == 2 else 0
-        self._view_axes = rng.standard_normal((len(world.landmarks), size)).astype(np.float32)
-        if size:
-            self._view_axes /= np.linalg.norm(self._view_axes, axis=1, keepdims=True)
-        self._first_view_rad = np.full(len(world.landmarks), np.nan)
-
-    def observe(
-        self, rays: ExactRays | BulletRays, pose: Array
-    ) -> tuple[Array, NDArray[np.int64], NDArray[np.float32]]:
-        """Points in the camera frame (K, 3), true ids (K,), descriptors (K, D)."""
-        camera, landmarks = self._camera, self._world.landmarks
-        inside = points_in_camera(camera, pose, landmarks)
-        x, y, z = inside.T
-        field_of_view = (
-            (z > 0.05)
-            & (np.abs(x) <= z * math.tan(camera.fov_horizontal_rad / 2))
-            & (np.abs(y) <= z * math.tan(camera.fov_vertical_rad / 2))
-            & (np.linalg.norm(inside, axis=1) <= camera.max_distance_m)
-        )
-        ids = np.flatnonzero(field_of_view)
-        planar = sensor_pose(camera, pose)
-        origin = np.array([planar[0], planar[1], camera.mount.z_m])
-        ids = ids[rays.sees(origin, landmarks[ids])]
-        ids = self._choose(ids, inside)
-        observed = camera.measure(inside[ids], self._rng)
-        descriptors = self._describe(ids, origin)
-        whole = np.isfinite(observed).all(axis=1)
-        return observed[whole], ids[whole].astype(np.int64), descriptors[whole]
-
-    def _choose(self, ids: NDArray[np.int64], inside: Array) -> NDArray[np.int64]:
-        """At most B of the visible landmarks, by the camera's rule."""
-        camera = self._camera
-        most = camera.max_observations
-        if most == 0 or len(ids) <= most:
-            return ids
-        if camera.selection == "nearest":
-            order = np.argsort(np.linalg.norm(inside[ids], axis=1), kind="stable")
-            return ids[order[:most]]
-        if camera.selection == "random":
-            return self._rng.choice(ids, most, replace=False)
-        # Farthest-point choice over the image: each next landmark is the one farthest, in
-        # pixels, from those already taken.
-        pixels = inside[ids, :2] / inside[ids, 2:]
-        taken = [int(np.argmin(np.linalg.norm(pixels, axis=1)))]
-        gap = np.linalg.norm(pixels - pixels[taken[0]], axis=1)
-        while len(taken) < most:
-            taken.append(int(np.argmax(gap)))
-            gap = np.minimum(gap, np.linalg.norm(pixels - pixels[taken[-1]], axis=1))
-        return ids[taken]
-
-    def _describe(self, ids: NDArray[np.int64], origin: Array) -> NDArray[np.float32]:
-        """Noisy descriptors: white noise, and a drift with the change of the viewing angle."""
-        camera, world = self._camera, self._world
-        if world.descriptors.size == 0:
-            return np.zeros((len(ids), 0), np.float32)
-        offset = world.landmarks[ids, :2] - origin[:2]
-        view = np.arctan2(offset[:, 1], offset[:, 0])
-        fresh = np.isnan(self._first_view_rad[ids])
-        self._first_view_rad[ids[fresh]] = view[fresh]
-        change = np.abs((view - self._first_view_rad[ids] + np.pi) % (2 * np.pi) - np.pi)
-        size = world.descriptors.shape[1]
-        white = self._rng.standard_normal((len(ids), size)) / math.sqrt(size)
-        noisy = (
-            world.descriptors[ids]
-            + camera.sigma_descriptor * white
-            + camera.sigma_view_descriptor * change[:, None] * self._view_axes[ids]
-        )
-        unit: NDArray[np.float32] = (noisy / np.linalg.norm(noisy, axis=1, keepdims=True)).astype(
-            np.float32
-        )
-        return unit
 
 
 class _SlipEvents:
@@ -403,33 +308,30 @@ class _SlipEvents:
         self._rng = rng.spawn(1)[0]
         self._left = np.zeros(2, dtype=np.int64)
 
-    def error(self, rolling_m: Array) -> Array | float:
-        """Encoder error (2,) m of this tick."""
+    def error(self, rolling_m: tuple[float, float]) -> tuple[float, float]:
+        """Encoder errors of the right and left wheel, m, of this tick."""
         if self._chance == 0.0:
-            return 0.0
+            return 0.0, 0.0
         begins = self._rng.random(2) < self._chance
         self._left[begins] = _SLIP_EVENT_TICKS
         active = self._left > 0
         self._left[active] -= 1
-        return np.where(active, self._step_m * np.sign(rolling_m), 0.0)
+        right, left = np.where(active, self._step_m * np.sign(rolling_m), 0.0).tolist()
+        return right, left
 
 
-def _normals(rng: np.random.Generator, block: int = 3000) -> Iterator[Array]:
+def _normals(rng: np.random.Generator, block: int = 3000) -> Iterator[tuple[float, float]]:
     """Pairs of standard normals, drawn in blocks for speed; the bits do not depend on the block."""
     while True:
-        yield from rng.standard_normal((block, 2))
+        yield from rng.standard_normal((block, 2)).tolist()
 
 
-def _quantise(position_m: Array, tick_m: float) -> Array:
-    """Counts are quantised, never increments, so the error does not accumulate."""
-    return np.floor(position_m / tick_m) * tick_m if tick_m > 0.0 else position_m.copy()
-
-
-def _periods(sensors: SensorSuite) -> dict[str, int]:
+def _periods(sensors: Sensors) -> dict[str, int]:
     """Ticks between firings of each sensor."""
     periods = {}
-    for name in ("encoder", "laser", "stereo", "lidar3d"):
-        rate = getattr(getattr(sensors, name), "rate_hz", None)
+    order = [name for name in _SHARE_NOISE if name in sensors]
+    for name in (*order, *(name for name in sensors if name not in order)):
+        rate = sensors[name].rate_hz
         if rate is None:
             continue
         ticks = TICKS_PER_S / rate
@@ -447,7 +349,7 @@ def _periods(sensors: SensorSuite) -> dict[str, int]:
 def _assemble(
     world: World,
     robot: DifferentialDrive,
-    sensors: SensorSuite,
+    sensors: Sensors,
     logs: _Logs,
     status: str,
     config: dict[str, Any],
@@ -456,39 +358,40 @@ def _assemble(
         ticks = np.array([tick for tick, _ in logs[name]], dtype=np.int64)
         return ticks / TICKS_PER_S, [reading for _, reading in logs[name]]
 
-    stamps, frames = read("frames")
+    stamps, frames = read("/frames")
     encoder, travel, poses = (np.array(part) for part in zip(*frames, strict=True))
     poses[:, 2] = se2.wrap(poses[:, 2])
-    command_stamps, commands = read("commands")
-    laser = landmarks = clouds = None
-    landmark_ids = np.zeros(0, np.int64)
-    if sensors.laser:
-        scan_stamps, scans = read("laser")
-        laser = LaserLog(scan_stamps, np.array(scans))
-    if sensors.lidar3d:
-        turn_stamps, turns = read("lidar3d")
-        clouds = CloudLog(turn_stamps, np.array(turns))
-    if sensors.stereo:
-        image_stamps, images = read("stereo")
-        points, ids, descriptors = zip(*images, strict=True)
-        landmark_ids = np.concatenate(ids)
-        landmarks = LandmarkLog(
-            stamps=image_stamps,
-            splits=np.cumsum([0, *(len(p) for p in points)]),
-            points_in_camera=np.concatenate(points),
-            ids=landmark_ids if sensors.stereo.identifies else np.zeros(0, np.int64),
-            descriptors=np.concatenate(descriptors),
-        )
+    command_stamps, commands = read("/commands")
+    made, hidden = {}, {}
+    for name, sensor in sensors.items():
+        if sensor.schema:
+            made[name], hidden[name] = _log(name, sensor, *read(name))
     return Recording(
         frame_stamps=stamps,
         wheels=WheelLog(stamps, encoder),
-        robot=RobotGeometry(robot.wheel_radius_m, robot.track_m),
+        robot=robot.nominal,
         sensors=sensors,
-        truth=Truth(stamps, poses, travel, landmark_ids, world),
-        laser=laser,
-        landmarks=landmarks,
-        clouds=clouds,
+        logs=made,
+        truth=Truth(stamps, poses, travel, {k: v for k, v in hidden.items() if v}, world),
         commands=CommandLog(command_stamps, np.array(commands, float).reshape(-1, 2)),
         config=config,
         status=status,
+    )
+
+
+def _log(
+    name: str, sensor: Sensor, stamps: Array, readings: list[Reading]
+) -> tuple[Log, dict[str, NDArray[Any]]]:
+    """Log of a sensor, and what its schema marks as truth."""
+    schema = sensor.schema
+    for reading in readings:
+        if set(reading) != set(schema):
+            raise InputError(
+                f"sensors.{name}: a reading has the fields {[*reading]}, its schema {[*schema]}"
+            )
+    log = joined(schema, stamps, readings, f"sensors.{name}")
+    seen, hidden = parted(schema)
+    return (
+        dataclasses.replace(log, schema=seen, values={key: log[key] for key in seen}),
+        {key: log[key] for key in hidden},
     )

@@ -11,9 +11,9 @@ import numpy as np
 from estimators.base import Estimate, Prior
 from experiments.papers.maximo2024.places import UMH, place_world
 from sim import se2
-from sim.recording import LandmarkLog, LaserLog, Recording, Truth, WheelLog
+from sim.recording import Frame, Log, Recording, Truth, WheelLog
 from sim.robot import RobotGeometry
-from sim.sensors import Encoder, Laser, Mount, SensorSuite, StereoCamera
+from sim.sensors import Encoder, Laser, Mount, StereoCamera
 from sim.world import World
 
 ROBOT = RobotGeometry(wheel_radius_m=0.05, track_m=0.19)
@@ -69,15 +69,21 @@ def circle(
         frame_stamps=stamps,
         wheels=WheelLog(stamps, np.cumsum(steps + errors, axis=0)),
         robot=ROBOT,
-        sensors=SensorSuite(Encoder(rate_hz), laser=laser, stereo=camera),
-        laser=LaserLog(stamps, laser.measure(room_ranges_m(laser, poses), rng)),
-        landmarks=LandmarkLog(
-            stamps[::2],
-            np.cumsum([0, *(len(i) for _, i in images)]),
-            points,
-            ids if identifies else np.zeros(0, np.int64),
-        ),
-        truth=Truth(stamps, poses, travel, ids, world),
+        sensors={"encoder": Encoder(rate_hz), "laser": laser, "stereo": camera},
+        logs={
+            "laser": Log.of(
+                laser, stamps, ranges_m=laser.measure(room_ranges_m(laser, poses), rng)
+            ),
+            "stereo": Log.of(
+                camera,
+                stamps[::2],
+                np.cumsum([0, *(len(i) for _, i in images)]),
+                points_in_camera=points,
+                descriptors=np.zeros((len(points), 0)),
+                **({"ids": ids} if identifies else {}),
+            ),
+        },
+        truth=Truth(stamps, poses, travel, {"stereo": {"true_ids": ids}}, world),
         config={"fake": "circle", "seed": seed},
     )
 
@@ -101,6 +107,46 @@ def _image(camera, pose, landmarks, rng):
     inside &= np.abs(points[:, 0]) < z * np.tan(camera.fov_horizontal_rad / 2)
     inside &= np.abs(points[:, 1]) < z * np.tan(camera.fov_vertical_rad / 2)
     return camera.measure(points[inside], rng), np.flatnonzero(inside)
+
+
+def scan_frame(stamp, duration_s, wheel_increments_m, ranges_m):
+    """A Frame with a laser scan."""
+    reading = {"laser": {"ranges_m": np.asarray(ranges_m, np.float32)}}
+    return Frame(stamp, duration_s, wheel_increments_m, reading)
+
+
+def with_reading(frame, name, **fields):
+    """The Frame with another reading of a sensor."""
+    return dataclasses.replace(frame, readings={**frame.readings, name: fields})
+
+
+def with_scan(frame, ranges_m):
+    """The Frame with another laser scan."""
+    return with_reading(frame, "laser", ranges_m=np.asarray(ranges_m, np.float32))
+
+
+def blind(frame):
+    """The Frame without readings: the wheels alone."""
+    return dataclasses.replace(frame, readings={})
+
+
+def with_field(recording, name, splits=None, **values):
+    """The recording with other values of a sensor's fields, and other splits if they are given."""
+    log = recording.log(name)
+    splits = log.splits if splits is None else splits
+    other = dataclasses.replace(log, splits=splits, values={**log.values, **values})
+    other.check(name)
+    return recording.with_log(name, other)
+
+
+def with_descriptors(recording, descriptors):
+    """The recording with descriptors (K, D) of all its landmark observations."""
+    return with_field(recording, "stereo", descriptors=np.asarray(descriptors, np.float32))
+
+
+def true_ids(recording):
+    """True landmark (K,) of each observation."""
+    return recording.truth.readings["stereo"]["true_ids"]
 
 
 def tracking_prior(recording, sigma=(0.02, 0.02, 0.01), with_map=True):

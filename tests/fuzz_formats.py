@@ -22,8 +22,11 @@ from sim.formats import carmen, intel, khepera, lego, mrclam, rawseeds, relation
 from sim.formats.rosbag_in import read_bag, read_tracks
 from sim.formats.rosbag_out import write_bag
 from sim.formats.text import read_bytes, read_members, split_words
+from sim.recording import joined
+from sim.sensors.base import parted
 from tests import fakes
 from tests import log_samples as samples
+from tests.beacons import Beacons
 
 LONGEST_S = 5.0
 MOST_MEMORY_MIB = 600  # growth of the process over the whole run
@@ -146,6 +149,17 @@ def text_targets():
     }  # fmt: skip
 
 
+def own_log(sensor, stamps):
+    """Readings of a sensor that the package does not know, each with two rows."""
+    seen, _ = parted(sensor.schema)
+    shapes = {k: (2,) * (f.ragged + f.shape.count(None)) for k, f in seen.items()}
+    readings = [
+        {k: np.ones((*shapes[k], *filter(None, f.shape)), f.dtype) for k, f in seen.items()}
+        for _ in stamps
+    ]
+    return joined(seen, stamps, readings, "beacons")
+
+
 def file_targets(folder):
     """Name to reader and samples of what is no text: packed files, archives, bags."""
     archive = io.BytesIO()
@@ -155,6 +169,8 @@ def file_targets(folder):
             member.size = len(text)
             tar.addfile(member, io.BytesIO(text))
     recording = fakes.circle(n_frames=3, n_beams=5)
+    own = Beacons()  # a message by the schema that is in the file
+    recording = recording.with_log("beacons", own_log(own, recording.frame_stamps), own)
     bags = {}
     for name in ("run.mcap", "run.bag", "run.db3"):
         write_bag(folder / name, recording)

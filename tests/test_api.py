@@ -108,7 +108,15 @@ def test_a_run_has_the_numbers_of_the_command_line(folder):
         assert estima.score(found.recording, found.online)["ate_rmse_m"] == row["ate_rmse_m"]
     assert run.row["run_key"] == row["run_key"]
     assert again.row["run_key"] != row["run_key"], "it is known by the recording's checksum"
-    assert "choice.world" not in again.row, "the recording says what it was made in"
+    made_in = {"choice.world", "world.n_objects", "world_seed", "robot.kr", "simulation.rays"}
+    assert made_in <= run.row.keys()
+    assert not made_in & again.row.keys(), "the recording says what it was made in"
+    mapped = "prior.map={_target_:tests.test_api.no_map}"  # it may read all settings
+    assert "robot.kr" in estima.run(again.recording, mapped).row
+
+
+def no_map(config):
+    return None
 
 
 def test_a_revised_estimate_and_its_picture(folder):
@@ -142,7 +150,7 @@ def test_what_it_needs_is_said_before_anything_is_simulated(folder):
         needs = ("laser",)
 
     for estimator in ("icp_odometry", Scans()):
-        with pytest.raises(estima.InputError, match=r"needs a laser sensor.*sensors=lms291"):
+        with pytest.raises(estima.InputError, match=r"needs a sensor laser.*sensors=.*lms291"):
             estima.run(*QUICK, estimator=estimator)
     assert not (folder / "results").exists()
     with pytest.raises(estima.InputError, match=r"use estima\.sweep for repeats=3"):

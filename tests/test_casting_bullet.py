@@ -9,9 +9,9 @@ import yaml
 
 from experiments.runs.experiment import make
 from sim.bullet import BulletBody
+from sim.rays import BulletRays, ExactRays
 from sim.robot import DifferentialDrive
 from sim.sensors import Laser, Lidar3D, Mount
-from sim.simulate import BulletRays, ExactRays
 
 pytestmark = pytest.mark.bullet
 
@@ -45,8 +45,8 @@ def both(request):
     world = make(config, "world", rng=np.random.default_rng(7))
     robot = DifferentialDrive(wheel_radius_m=0.05, track_m=0.3)
     with BulletBody(world, robot, world.start_pose) as body:
-        larger = ExactRays(stretched(world), LASER)
-        yield world, ExactRays(world, LASER), larger, BulletRays(body)
+        larger = ExactRays(stretched(world))
+        yield world, ExactRays(world), larger, BulletRays(body)
 
 
 def poses_on_tour(world, count):

@@ -74,10 +74,13 @@ def test_a_run_prints_its_errors_and_leaves_a_row(tmp_path):
         (["sensors=lms291", "sensors.laser.n_beams=0"], ["n_beams", "at least 1"]),
         (["sensors=lms291", "sensors.laser.rate_hz=7"], ["rate_hz", "divide"]),
         (["+estimator.gain=2"], ["estimator.gain", "known: kr, kl"]),
+        (["+foo=1"], ["unknown key foo", "known: world, robot"]),
+        (["++foo.bar=1"], ["unknown key foo", "known: world, robot"]),
+        (["prior.track_m=wide"], ["prior.track_m", "'wide'"]),
         (["simulation.rays=psychic"], ["simulation.rays"]),
         (["simulation.rays=bullet"], ["rays=exact"]),
         (["prior.start=nowhere"], ["prior.start", "tracking"]),
-        (["prior.start=global"], ["start pose"]),
+        (["prior.start=global", "route=linear_1"], ["start pose"]),
         (["estimator=icp_odometry"], ["laser"]),
         (["route.waypoints=[[0.05,0.05],[2,2]]"], ["overlaps a wall"]),
         (["recording=missing.npz"], ["missing.npz"]),
@@ -97,7 +100,7 @@ def test_a_run_prints_its_errors_and_leaves_a_row(tmp_path):
         (["robot=null"], ["robot=null", "estima options robot"]),
         (["~world"], ["world is missing"]),
         (["~robot.kr"], ["robot.kr", "estimator.kr"]),
-        (["sensors.laser=foo"], ["sensors.laser", "mapping"]),
+        (["sensors=lms291", "sensors.laser=foo"], ["sensors.laser", "mapping"]),
         (["recording={_target_:os.getcwd}"], ["os.getcwd must return a Recording", "str"]),
     ],
 )
@@ -117,7 +120,7 @@ def test_bad_input_is_one_line_and_code_2(arguments, words):
         ("sensors=[]", "sensors is missing"),
         ("~seed", "world_seed.*seed"),
         ("~prior.map", "prior.map is missing"),
-        ("sensors.laser=3", "sensors.laser must be a mapping"),
+        ("+sensors.laser=3", "sensors.laser must be a mapping"),
         ("sensors.encoder=foo", "sensors.encoder must be a mapping"),
         ("route.waypoints=foo", "route.waypoints.*foo"),
         ("route.waypoints=[[0,0],[1]]", r"route.waypoints.*\[1\]"),
@@ -126,7 +129,16 @@ def test_bad_input_is_one_line_and_code_2(arguments, words):
         ("recording=", "recording must be a path.*got nothing"),
         ("prior.start=foo", "prior.start must be"),
         ("prior.map=nosuch", "prior.map must be"),
+        ("+prior.foo=1", "unknown key prior.foo; known: prior.start, .*prior.map"),
+        ("+simulation.foo=1", "unknown key simulation.foo; known: simulation.physics"),
         ("prior.sigma_heading_rad=-1", "prior.sigma_heading_rad"),
+        ("prior.sigma_position_m=true", "prior.sigma_position_m must be .*True"),
+        ("prior.track_m=wide", "prior.track_m must be a number, got 'wide'"),
+        ("prior.wheel_radius_m=0", "prior.wheel_radius_m must be a positive number"),
+        ("prior.map={_target_:nosuch.x}", "prior.map._target_=nosuch.x"),
+        ("prior.map={_target_:os.getcwd,x:1}", "unknown key prior.map.x"),
+        ("estimator.kr=-1", "estimator.kr must be"),
+        ("+world.rooms=3", "unknown key world.rooms"),
         ("world_seed=abc", "^world_seed must be"),
     ],
 )
@@ -138,6 +150,12 @@ def test_a_bad_configuration_names_its_key(override, words):
 @pytest.mark.parametrize("argument", ["robot.kq=1,2", "robot.kq=1"])
 def test_an_unknown_key_of_a_sweep_names_the_known_ones(argument):
     refused(estima("run", "-m", *QUICK, argument), "unknown key robot.kq", "robot.kr")
+
+
+def test_a_sweep_with_a_bad_value_runs_nothing(tmp_path):
+    done = estima("run", "-m", *QUICK, "estimator.kr=1e-5,-1", ESTIMA_RESULTS=str(tmp_path))
+    refused(done, "estimator.kr", "-1")
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(
@@ -159,7 +177,7 @@ def test_a_step_that_returns_no_belief_names_step_and_the_shapes(belief, words):
 
     experiment = Experiment.compose(["simulation.physics=kinematic"]).using(Mine())
     with pytest.raises(InputError, match=rf"Mine.step .*\(3,\).*\(3, 3\).*{words}"):
-        evaluate(experiment, circle(n_frames=3))
+        evaluate(experiment, lambda: circle(n_frames=3))
 
 
 def test_where_lists_the_columns():

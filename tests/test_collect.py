@@ -120,8 +120,12 @@ def test_plots_name_a_missing_column_and_average_recordings():
     assert page.axes[0].get_yscale() == "log"
     with pytest.raises(InputError, match="no run has both"):
         sweep_figure(table.assign(**{"robot.kr": None}), "robot.kr", "ate_rmse_m")
-    with pytest.raises(InputError, match=r"robot\.krr"):
+    with pytest.raises(
+        InputError, match=r"no column robot\.krr; there are robot\.kr, .*ate_rmse_m"
+    ):
         sweep_figure(rows(), "robot.krr", "ate_rmse_m")
+    with pytest.raises(InputError, match=r"no column nosuch; there are .*robot\.kr"):
+        sweep_figure(rows(), "nosuch", "ate_rmse_m")
     with pytest.raises(InputError, match="no numbers"):
         sweep_figure(rows(), "robot.kr", "status")
 
@@ -130,7 +134,7 @@ def test_every_column_of_a_row_is_in_the_schema():
     overrides = ["world=rooms", "robot=robocom", "sensors=stereo_pixel", "estimator=smoother"]
     overrides += ["simulation.physics=kinematic", "route.distance_m=12"]
     experiment = Experiment.compose(overrides)
-    (row,) = evaluate(experiment, experiment.simulate())
+    (row,) = evaluate(experiment, experiment.simulate)
     others = {name for name in row if not is_setting(name)} - {REPEAT, *STATUS, *ORIGIN}
     assert others <= set(COLUMNS)
     assert {"ate_rmse_m", "rpe_10m_rmse_m", "revised_nees_mean", "step_time_us"} <= others

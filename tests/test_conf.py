@@ -12,7 +12,7 @@ from experiments.runs.experiment import Experiment
 from experiments.runs.targets import make
 from sim.errors import InputError
 from sim.robot import DifferentialDrive, RobotGeometry
-from sim.sensors import suite_from_config
+from sim.sensors import sensors_from_config
 from tests.fakes import circle
 
 CONF = Path(__file__).resolve().parent.parent / "conf"
@@ -40,12 +40,11 @@ def test_robots_state_every_key(name):
 @pytest.mark.parametrize("name", options("sensors"))
 def test_sensors_build_and_state_every_key(name):
     config = Experiment.compose([f"sensors={name}"]).config
-    suite = suite_from_config(config["sensors"])
-    assert set(config["sensors"]) == set(inspect.signature(type(suite)).parameters)
+    sensors = sensors_from_config(config["sensors"])
+    assert set(sensors) == set(config["sensors"])
     for kind, settings in config["sensors"].items():
-        if settings is not None:
-            known = inspect.signature(type(getattr(suite, kind))).parameters
-            assert set(settings) == set(known), kind
+        known = inspect.signature(type(sensors[kind])).parameters
+        assert set(settings) == {"_target_", *known}, kind
 
 
 @pytest.mark.parametrize("name", options("route"))

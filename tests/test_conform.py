@@ -5,6 +5,7 @@ import pytest
 from hydra.errors import MissingConfigException
 
 from estimators.base import Belief
+from estimators.icp_odometry import IcpOdometry
 from estimators.odometry import Odometry
 from experiments.gate.conform import check_estimator, conform_target, example
 from experiments.runs.paths import CONF
@@ -66,8 +67,9 @@ class OwnRandomness(Base):
 class Meddler(Base):
     def step(self, frame):
         belief = super().step(frame)
-        if frame.ranges_m is not None and frame.ranges_m.flags.writeable:
-            frame.ranges_m[0] = 0.0
+        scan = frame.readings.get("laser")
+        if scan is not None and scan["ranges_m"].flags.writeable:
+            scan["ranges_m"][0] = 0.0
         return belief
 
 
@@ -121,13 +123,13 @@ def test_each_fault_fails_its_check(cls, checks, case):
 class Careful(Base):
     """Needs everything that can be taken away, and says so when it is."""
 
-    needs = frozenset({"wheels", "laser", "landmarks", "map"})
+    needs = frozenset({"laser", "stereo", "map"})
 
     def reset(self, prior, rng):
         super().reset(prior, rng)
         for name, there in (
-            ("laser", prior.sensors.laser),
-            ("stereo", prior.sensors.stereo),
+            ("laser", prior.sensors.get("laser")),
+            ("stereo", prior.sensors.get("stereo")),
             ("map", prior.map),
         ):
             if there is None:
@@ -145,7 +147,7 @@ class Waiting(Base):
 
     def step(self, frame):
         self._frames += 1
-        self._scans += frame.ranges_m is not None
+        self._scans += "laser" in frame.readings
         if self._frames > 20 and self._scans == 0:
             raise InputError("20 Frames without a scan; is the laser on?")
         return super().step(frame)
@@ -245,6 +247,19 @@ def test_targets_by_name():
         conform_target("nowhere.to:Be", [])
     with pytest.raises(InputError, match="key=value"):
         conform_target("estimators.odometry:Odometry", [])
+
+
+def test_the_sensors_can_be_chosen():
+    """And an estimator reads, and misses, the one that its option names."""
+    rear = "{_target_: sim.sensors.laser.Laser, n_beams: 91, rate_hz: 10, mount: {yaw_rad: 3.1}}"
+    given = ["sensors=hokuyo", f"+sensors.rear={rear}", "estimator.laser=rear"]
+    results = conform_target("icp_odometry", given)
+    assert [f"{r.name}: {r.message}" for r in results if not r.passed] == []
+    recording, prior = example(given[:2])
+    assert {"laser", "rear"} <= recording.logs.keys()
+    assert prior.sensors == recording.sensors
+    with pytest.raises(InputError, match="no sensor named side"):
+        IcpOdometry(laser="side").reset(prior, np.random.default_rng(0))
 
 
 OPTIONS = sorted(path.stem for path in (CONF / "estimator").glob("*.yaml"))

@@ -13,9 +13,9 @@ from estimators.scan_matching import Match
 from experiments.evaluation.scan_bound import cast
 from sim import se2
 from sim.errors import InputError
-from sim.recording import Frame
 from sim.robot import arc_increment
 from sim.sensors import Laser
+from tests.fakes import blind, scan_frame, with_scan
 from tests.test_icp import BARE, ROOM, circle
 from tests.test_icp_odometry import LASER, P0, START, TRACK_M, drive, errors, follow, prior
 
@@ -78,7 +78,7 @@ def test_consistent_where_its_model_holds(share):
         fake.poses = np.array(poses)
         estimator.reset(prior(), rng)
         for i in range(40):
-            frame = Frame(0.1 * i, 0.1 if i else 0.0, travel * (i > 0), np.ones(9, np.float32))
+            frame = scan_frame(0.1 * i, 0.1 if i else 0.0, travel * (i > 0), np.ones(9))
             belief = estimator.step(frame)
         off = belief.mean - poses[-1]
         off[2] = se2.wrap(off[2])
@@ -96,7 +96,7 @@ def test_a_robot_at_rest_does_not_learn(share):
     estimator._matcher = fake
     estimator.reset(prior(), np.random.default_rng(0))
     for i in range(50):
-        belief = estimator.step(Frame(0.1 * i, 0.1, np.zeros(2), np.ones(9, np.float32)))
+        belief = estimator.step(scan_frame(0.1 * i, 0.1, np.zeros(2), np.ones(9)))
     np.testing.assert_allclose(np.diag(belief.covariance), np.diag(P0), rtol=1e-3)
 
 
@@ -118,7 +118,7 @@ def test_wheels_that_know_nothing_leave_the_last_registration(share):
     estimator.reset(still, np.random.default_rng(0))
     for i in range(n):
         travel = np.full(2, 0.05 if i else 0.0)
-        belief = estimator.step(Frame(0.1 * i, 0.1, travel, np.ones(9, np.float32)))
+        belief = estimator.step(scan_frame(0.1 * i, 0.1, travel, np.ones(9)))
     np.testing.assert_allclose(np.diag(belief.covariance), np.diag(R), rtol=0.05)
 
 
@@ -184,7 +184,7 @@ def test_lost_scans_are_told_and_survived(bad):
     for i in (10, 11, 12):
         seen = cast(ROOM, np.array([4.0, 3.2, START[2] + np.pi + i]), LASER.bearings_rad)[0]
         ranges = {"inf": np.full(721, np.inf), "nan": np.full(721, np.nan)}.get(bad, seen)
-        frames[i] = dataclasses.replace(frames[i], ranges_m=ranges.astype(np.float32))
+        frames[i] = with_scan(frames[i], ranges)
     beliefs = follow(EkfIcp(), frames)
     told = {i for i, b in enumerate(beliefs) if "status" in b.extras}
     assert told >= {10}
@@ -233,7 +233,7 @@ def test_gate_leaves_out_what_cannot_be():
     # the room is moved under the robot: the wheels know better
     shifted = ROOM + np.array([0.1, 0.0, 0.1, 0.0])
     seen = cast(shifted, se2.compose(poses[6], LASER.mount.pose), LASER.bearings_rad)[0]
-    frames[6] = dataclasses.replace(frames[6], ranges_m=seen.astype(np.float32))
+    frames[6] = with_scan(frames[6], seen)
     gated = follow(EkfIcp(kr=1e-5, kl=1e-5, gate_probability=1e-3), frames)
     free = follow(EkfIcp(kr=1e-5, kl=1e-5, gate_probability=None), frames)
     assert gated[6].extras["status"] == "gated"
@@ -247,10 +247,10 @@ def test_gate_leaves_out_what_cannot_be():
 
 def test_ticks_and_sideways_slip_widen():
     _, frames = drive(ROOM, 6)
-    blind = [dataclasses.replace(f, ranges_m=None) for f in frames]
-    plain = follow(EkfIcp(), blind)[-1].covariance
-    sideways = follow(EkfIcp(lateral_slip_m=1e-3), blind)[-1].covariance
-    ticks = follow(EkfIcp(encoder_tick_m=0.01), blind)[-1].covariance
+    scanless = [blind(f) for f in frames]
+    plain = follow(EkfIcp(), scanless)[-1].covariance
+    sideways = follow(EkfIcp(lateral_slip_m=1e-3), scanless)[-1].covariance
+    ticks = follow(EkfIcp(encoder_tick_m=0.01), scanless)[-1].covariance
     assert np.trace(sideways - plain) > 2e-4
     assert ticks[2, 2] - plain[2, 2] == pytest.approx(5 * 2 * 0.01**2 / 6 / TRACK_M**2, rel=0.01)
 

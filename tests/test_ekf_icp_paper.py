@@ -9,6 +9,7 @@ from estimators.ekf_icp_paper import EkfIcpPaper, mean_velocity, observation
 from estimators.odometry import Odometry
 from sim import se2
 from sim.errors import InputError
+from tests.fakes import blind, with_scan
 from tests.test_gaussian import numeric
 from tests.test_icp import ROOM
 from tests.test_icp_odometry import TRACK_M, drive, errors, follow, prior
@@ -37,9 +38,9 @@ def test_observation_is_the_motion_of_a_constant_velocity():
 def test_wheels_alone_are_dead_reckoning():
     """Without scans and with free velocities the filter integrates the wheels, and their noise."""
     _, frames = drive(ROOM, 40, wheel_noise_m=0.002)
-    blind = [dataclasses.replace(f, ranges_m=None) for f in frames]
-    found = follow(EkfIcpPaper(acceleration_noise=30.0, turn_noise=30.0), blind)[-1]
-    wheels = follow(Odometry(1e-4, 1e-4), blind)[-1]
+    scanless = [blind(f) for f in frames]
+    found = follow(EkfIcpPaper(acceleration_noise=30.0, turn_noise=30.0), scanless)[-1]
+    wheels = follow(Odometry(1e-4, 1e-4), scanless)[-1]
     np.testing.assert_allclose(found.mean, wheels.mean, atol=2e-3)
     np.testing.assert_allclose(np.diag(found.covariance), np.diag(wheels.covariance), rtol=0.1)
 
@@ -59,7 +60,7 @@ def test_fusion_follows_a_curve():
 def test_lost_scans_are_told_and_survived(ranges):
     poses, frames = drive(ROOM, 24)
     for i in (10, 11):
-        frames[i] = dataclasses.replace(frames[i], ranges_m=np.full(721, ranges, np.float32))
+        frames[i] = with_scan(frames[i], np.full(721, ranges))
     beliefs = follow(EkfIcpPaper(), frames)
     assert [i for i, b in enumerate(beliefs) if "status" in b.extras] == [10, 11]
     assert np.abs(errors(beliefs, poses)).max() < 0.03

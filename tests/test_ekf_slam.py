@@ -14,8 +14,8 @@ from sim import se2
 from sim.errors import InputError
 from sim.robot import TravelWindow, arc_increment
 from sim.sensors import Mount
-from sim.simulate import points_in_camera
-from tests.fakes import circle, tracking_prior
+from sim.sensors.stereo import points_in_camera
+from tests.fakes import circle, tracking_prior, true_ids, with_descriptors, with_field
 
 K_M = 1e-4  # kr and kl
 WHEELS = {"kr": K_M, "kl": K_M}
@@ -54,8 +54,9 @@ def plain(recording, prior, camera):
         F = slope(lambda x: moved(x, travel), mean)  # noqa: B023
         G = slope(lambda t: moved(mean, t), travel)  # noqa: B023
         mean, P = moved(mean, travel), F @ P @ F.T + G @ np.diag(variances) @ G.T
-        if frame.landmarks is not None:
-            seen = list(zip(frame.landmarks.ids, frame.landmarks.points_in_camera, strict=True))
+        if "stereo" in frame.readings:
+            image = frame.readings["stereo"]
+            seen = list(zip(image["ids"], image["points_in_camera"], strict=True))
             known = [(row_of[i], z) for i, z in seen if i in row_of]
 
             def predicted(x):
@@ -97,9 +98,9 @@ def plain(recording, prior, camera):
 def test_is_the_filter_written_plainly():
     recording = circle(0, n_frames=24, kr=K_M, kl=K_M)
     mount = Mount(x_m=0.15, y_m=-0.05, z_m=0.4, yaw_rad=0.2)
-    camera = dataclasses.replace(recording.sensors.stereo, mount=mount)
-    suite = dataclasses.replace(recording.sensors, stereo=camera)
-    prior = dataclasses.replace(tracking_prior(recording), sensors=suite)
+    camera = dataclasses.replace(recording.sensors["stereo"], mount=mount)
+    sensors = {**recording.sensors, "stereo": camera}
+    prior = dataclasses.replace(tracking_prior(recording), sensors=sensors)
     filtered = EkfSlam(**WHEELS)
     online = follow(filtered, recording, prior)
     beliefs, mean, P = plain(recording, prior, camera)
@@ -138,7 +139,7 @@ def test_errors_are_within_their_covariances():
         off = filtered.map["landmarks"] - recording.truth.world.landmarks[filtered.map["ids"]]
         P = filtered.map["landmark_covariances"]
         of_landmarks.append(np.mean(np.sum(off * np.linalg.solve(P, off[..., None])[..., 0], 1)))
-        ids = recording.truth.landmark_ids
+        ids = true_ids(recording)
         assert np.array_equal(ids[joined(online)], ids)
     assert 0.7 < np.mean(squares) / 3.0 < 1.35
     # Depth by disparity is skew: a few runs have their landmarks far off, the median has not
@@ -150,11 +151,10 @@ def described(recording, seed=0, sigma=0.05):
     rng = np.random.default_rng(seed)
     of_landmark = rng.standard_normal((len(recording.truth.world.landmarks), 64))
     of_landmark /= np.linalg.norm(of_landmark, axis=1, keepdims=True)
-    noise = sigma / 8.0 * rng.standard_normal((len(recording.truth.landmark_ids), 64))
-    seen = of_landmark[recording.truth.landmark_ids] + noise
+    noise = sigma / 8.0 * rng.standard_normal((len(true_ids(recording)), 64))
+    seen = of_landmark[true_ids(recording)] + noise
     seen /= np.linalg.norm(seen, axis=1, keepdims=True)
-    log = dataclasses.replace(recording.landmarks, descriptors=seen.astype(np.float32))
-    return dataclasses.replace(recording, landmarks=log)
+    return with_descriptors(recording, seen)
 
 
 def test_associations():
@@ -166,12 +166,12 @@ def test_associations():
         for association, shares in rights.items():
             filtered = EkfSlam(kr=1e-3, kl=1e-3, association=association)
             online = follow(filtered, recording)
-            ids, first = recording.truth.landmark_ids, joined(online)
+            ids, first = true_ids(recording), joined(online)
             assert len(first) == len(ids)
             shares.append(np.mean(ids[first] == ids))
             for rows, image in zip(
-                np.split(first, recording.landmarks.splits[1:-1]),
-                np.split(ids, recording.landmarks.splits[1:-1]),
+                np.split(first, recording.log("stereo").splits[1:-1]),
+                np.split(ids, recording.log("stereo").splits[1:-1]),
                 strict=True,
             ):
                 assert len(np.unique(rows)) == len(image)  # each landmark once an image
@@ -187,21 +187,21 @@ def test_threshold_decides_what_is_new():
         filtered = EkfSlam(**WHEELS, association="mahalanobis", d0=d0)
         follow(filtered, recording)
         sizes.append(len(filtered.map["landmarks"]))
-    n_seen = len(np.unique(recording.truth.landmark_ids))
+    n_seen = len(np.unique(true_ids(recording)))
     assert sizes[0] > 2 * n_seen  # chi-square with 3 degrees of freedom: 92 % are beyond 0.5
     assert sizes[1] <= n_seen + 1
 
 
 def test_odd_observations_are_told_and_survived():
     recording = circle(2, n_frames=30)
-    log = recording.landmarks
-    points, ids = log.points_in_camera.copy(), log.ids.copy()
+    log = recording.log("stereo")
+    points, ids = log["points_in_camera"].copy(), log["ids"].copy()
     first, second = log.splits[np.flatnonzero(np.diff(log.splits) >= 4)[:2]]
     points[first + 1 : first + 4] = [[np.nan] * 3, [0.1, 0.0, 0.0], [0.1, 0.0, -2.0]]
     ids[second + 1] = ids[second]
-    odd = dataclasses.replace(log, points_in_camera=points, ids=ids)
+    odd = with_field(recording, "stereo", points_in_camera=points, ids=ids)
     prior = dataclasses.replace(tracking_prior(recording), covariance=np.zeros((3, 3)))
-    online = follow(EkfSlam(**WHEELS), dataclasses.replace(recording, landmarks=odd), prior)
+    online = follow(EkfSlam(**WHEELS), odd, prior)
     images = [s for s in online.extras["status"] if s is not None]
     assert images == ["observation without depth rejected", "duplicate id rejected"]
     births = joined(online)
@@ -223,11 +223,9 @@ def test_a_broken_covariance_is_told():
 
 def test_without_landmarks_it_is_dead_reckoning():
     recording = circle(3, n_frames=210, n_beams=1)
-    log = recording.landmarks
-    nothing = dataclasses.replace(
-        log, splits=np.zeros_like(log.splits), points_in_camera=np.zeros((0, 3)), ids=log.ids[:0]
-    )
-    blind = dataclasses.replace(recording, landmarks=nothing)
+    log = recording.log("stereo")
+    nothing = {name: values[:0] for name, values in log.values.items()}
+    blind = with_field(recording, "stereo", np.zeros_like(log.splits), **nothing)
     online, alone = (follow(e(**WHEELS), blind) for e in (EkfSlam, Smoother))
     np.testing.assert_allclose(online.means, alone.means, atol=1e-9)
     np.testing.assert_allclose(online.covariances, alone.covariances, rtol=1e-6, atol=1e-12)

@@ -12,8 +12,15 @@ from estimators.odometry import Odometry
 from experiments.evaluation.metrics import position_errors_m, rms
 from experiments.gate.conform import check_estimator
 from sim.errors import InputError
-from sim.recording import Frame, LandmarkSet
-from tests.fakes import circle, tracking_prior
+from sim.recording import Frame
+from tests.fakes import (
+    circle,
+    tracking_prior,
+    true_ids,
+    with_descriptors,
+    with_field,
+    with_reading,
+)
 
 K = {"kr": 1e-3, "kl": 1e-3}  # wheels so poor that the camera has something to mend
 
@@ -65,13 +72,11 @@ def test_the_optimal_proposal_wastes_fewer_particles(recording):
 def test_both_proposals_have_the_same_posterior():
     """Without resampling, few particles of 2.0 agree with 1e5 of 1.0: weights are right."""
     recording = circle(seed=3, n_frames=7, rate_hz=2.0, kr=5e-5, kl=5e-5)
-    log = recording.landmarks
-    kept = np.isin(log.ids, np.unique(log.ids)[:6])
+    log = recording.log("stereo")
+    kept = np.isin(log["ids"], np.unique(log["ids"])[:6])
     splits = np.concatenate([[0], np.cumsum(kept)])[log.splits]
-    log = dataclasses.replace(
-        log, splits=splits, ids=log.ids[kept], points_in_camera=log.points_in_camera[kept]
-    )
-    recording = dataclasses.replace(recording, landmarks=log)
+    left = {name: values[kept] for name, values in log.values.items()}
+    recording = with_field(recording, "stereo", splits, **left)
     believed = {"kr": 5e-5, "kl": 5e-5, "ess_share": 0.0}
     believed |= {"sigma_column_px": 12.0, "sigma_row_px": 12.0, "sigma_disparity_px": 3.0}
     many, _ = walked(recording, n_particles=100_000, proposal="motion", keep=("ess",), **believed)
@@ -103,7 +108,7 @@ def test_associates_without_ids(proposal):
     options = {"association": "mahalanobis", "proposal": proposal, "keep": ("associations",)}
     done, estimator = walked(recording, **options, **believed)
     told, guessed = (
-        recording.truth.landmark_ids,
+        true_ids(recording),
         np.concatenate([a for a in done.extras["associations"] if a is not None]),
     )
     assert np.mean(told[guessed] == told) > 0.9
@@ -115,7 +120,7 @@ def test_associates_without_ids(proposal):
 
 def test_known_association_tells_where_each_landmark_began(recording):
     done, estimator = walked(recording, keep=("associations",))
-    ids = recording.landmarks.ids
+    ids = recording.log("stereo")["ids"]
     _, first = np.unique(ids, return_index=True)
     began = {ids[i]: i for i in first}
     told = np.concatenate([a for a in done.extras["associations"] if a is not None])
@@ -128,14 +133,13 @@ def described(recording, words_of_observations, sigma=0.3):
     rng = np.random.default_rng(0)
     seen = words_of_observations + sigma * rng.standard_normal(words_of_observations.shape)
     seen /= np.linalg.norm(seen, axis=1, keepdims=True)
-    log = dataclasses.replace(recording.landmarks, descriptors=seen.astype(np.float32))
-    return dataclasses.replace(recording, landmarks=log)
+    return with_descriptors(recording, seen)
 
 
 def test_descriptors_decide_with_the_distance():
     believed = {"kr": 1e-4, "kl": 1e-4}
     recording = circle(seed=2, n_frames=100, identifies=False, **believed)
-    told, rng = recording.truth.landmark_ids, np.random.default_rng(0)
+    told, rng = true_ids(recording), np.random.default_rng(0)
     words = rng.standard_normal((len(recording.truth.world.landmarks), 64))
     arms = {
         "each its own": words[told],
@@ -214,14 +218,16 @@ def test_conforms(recording, options):
 
 def seen(points, ids=None):
     points = np.array(points, float).reshape(-1, 3)
-    return LandmarkSet(points, None if ids is None else np.array(ids, np.int64), None)
+    known = {} if ids is None else {"ids": np.array(ids, np.int64)}
+    descriptors = np.zeros((len(points), 0), np.float32)
+    return {"points_in_camera": points, "descriptors": descriptors, **known}
 
 
 def stepped(recording, images, **options):
     estimator = FastSLAM(**{**K, "n_particles": 20, **options})
     estimator.reset(tracking_prior(recording), np.random.default_rng(0))
     return estimator, [
-        estimator.step(Frame(0.5 * i, 0.5, np.array([0.05, 0.04]), landmarks=image))
+        estimator.step(Frame(0.5 * i, 0.5, np.array([0.05, 0.04]), {"stereo": image}))
         for i, image in enumerate(images)
     ]
 
@@ -285,10 +291,10 @@ def test_frames_without_an_image_roll_on(recording):
     for i in range(4):
         depth = 3.0 - 0.2 * i
         image = seen([[0.0, 0.0, depth], [0.5, 0.1, depth + 1.0]], [5, 6])
-        last = whole.step(Frame(float(i), 1.0, np.array([0.2, 0.2]), landmarks=image))
+        last = whole.step(Frame(float(i), 1.0, np.array([0.2, 0.2]), {"stereo": image}))
         for k in range(4):
             frame = Frame(i + k / 4.0, 0.25, np.array([0.05, 0.05]))
-            between = parts.step(frame if k < 3 else dataclasses.replace(frame, landmarks=image))
+            between = parts.step(frame if k < 3 else with_reading(frame, "stereo", **image))
     sigma = np.sqrt(np.diagonal(last.covariance))
     assert np.all(np.abs(last.mean - between.mean) < 0.3 * sigma)
     assert np.allclose(np.sqrt(np.diagonal(between.covariance)), sigma, rtol=0.2)
@@ -329,12 +335,11 @@ def test_best_particle_carries_its_weight_along_the_ancestry(recording):
 def test_images_that_never_show_a_landmark(proposal):
     """Without a single observation a recording holds no ids; the wheels carry on."""
     recording = circle(n_frames=20)
-    empty = LandmarkSet(np.zeros((0, 3)), None, None)
     estimator = FastSLAM(n_particles=20, proposal=proposal, association="known", kr=1e-5, kl=1e-5)
     estimator.reset(tracking_prior(recording), np.random.default_rng(0))
     for frame in recording.frames():
-        if frame.landmarks is not None:
-            frame = dataclasses.replace(frame, landmarks=empty)
+        if "stereo" in frame.readings:
+            frame = with_reading(frame, "stereo", **seen([]))
         belief = estimator.step(frame)
     assert np.isfinite(belief.mean).all()
     assert np.isfinite(belief.covariance).all()

@@ -11,6 +11,7 @@ from sim.errors import InputError
 from sim.formats import intel, lego, mrclam, rawseeds, relations, wean
 from sim.formats.text import split_words
 from tests import log_samples as samples
+from tests.fakes import true_ids
 from tests.log_samples import ARC, DATA, RANGES
 
 needs_data = pytest.mark.skipif(not DATA.exists(), reason="no real logs here")
@@ -29,9 +30,9 @@ def test_intel(tmp_path):
     raw = write(tmp_path / "raw.json", samples.intel_json())
     recording = intel.read_intel(raw, raw)
     np.testing.assert_allclose(recording.truth.poses, ARC[:3])
-    assert recording.laser.ranges_m.shape == (3, 4)
-    assert np.isinf(recording.laser.ranges_m[0, 3])
-    laser = recording.sensors.laser
+    assert recording.log("laser")["ranges_m"].shape == (3, 4)
+    assert np.isinf(recording.log("laser")["ranges_m"][0, 3])
+    laser = recording.sensors["laser"]
     np.testing.assert_allclose(
         laser.bearings_rad + laser.mount.yaw_rad, np.radians([-90, -45, 0, 45]), atol=1e-9
     )
@@ -78,11 +79,11 @@ def mrclam_folder(tmp_path, **changes):
 def test_mrclam(tmp_path):
     folder = mrclam_folder(tmp_path)
     recording = mrclam.read_mrclam(folder, 1)
-    log = recording.landmarks
+    log = recording.log("stereo")
     np.testing.assert_allclose(log.stamps, [0.2, 0.6])
     np.testing.assert_array_equal(log.splits, [0, 1, 2])
-    np.testing.assert_array_equal(log.ids, [0, 1])
-    x, y, z = log.points_in_camera[0]  # range 2, bearing 0.1 to the left
+    np.testing.assert_array_equal(log["ids"], [0, 1])
+    x, y, z = log["points_in_camera"][0]  # range 2, bearing 0.1 to the left
     assert math.hypot(x, z) == pytest.approx(2.0)
     assert math.atan2(-x, z) == pytest.approx(0.1)
     assert y == 0.0
@@ -93,8 +94,10 @@ def test_mrclam(tmp_path):
     np.testing.assert_allclose(turned.sum() / mrclam.TRACK_M, 0.2 * 0.5)
     np.testing.assert_allclose(recording.truth.world.landmarks[:, :2], [[2, 0.2], [3, -0.6]])
     hidden = mrclam.read_mrclam(folder, 1, identifies=False)
-    assert all(f.landmarks is None or f.landmarks.ids is None for f in hidden.frames())
-    np.testing.assert_array_equal(hidden.truth.landmark_ids, [0, 1])
+    images = [f.readings["stereo"] for f in hidden.frames() if "stereo" in f.readings]
+    assert images
+    assert all("ids" not in image for image in images)
+    np.testing.assert_array_equal(true_ids(hidden), [0, 1])
 
 
 def test_mrclam_refused(tmp_path):
@@ -109,9 +112,9 @@ def test_rawseeds(tmp_path):
     sick = write(tmp_path / "sick.csv", samples.rawseeds_sick())
     truth = write(tmp_path / "truth.csv", samples.rawseeds_truth())
     recording = rawseeds.read_rawseeds(odometry, sick, truth)
-    assert recording.laser.ranges_m.shape == (3, 4)
+    assert recording.log("laser")["ranges_m"].shape == (3, 4)
     np.testing.assert_allclose(recording.truth.poses, ARC)
-    laser = recording.sensors.laser
+    laser = recording.sensors["laser"]
     np.testing.assert_allclose(
         laser.bearings_rad + laser.mount.yaw_rad, np.radians([-90, -89, -88, -87]), atol=1e-9
     )
@@ -132,7 +135,9 @@ def test_lego(tmp_path):
     paths = [write(tmp_path / name, data) for name, data in files.items()]
     recording = lego.read_lego(*paths, tick_m=0.001)
     np.testing.assert_allclose(recording.wheels.position_m[-1], [0.012, 0.010])  # right, left
-    np.testing.assert_allclose(recording.laser.ranges_m, [[0.5, 0.6, 0.7], [0.51, np.inf, np.inf]])
+    np.testing.assert_allclose(
+        recording.log("laser")["ranges_m"], [[0.5, 0.6, 0.7], [0.51, np.inf, np.inf]]
+    )
     # driving along x, the axle is 3 cm behind the scanner
     np.testing.assert_allclose(recording.truth.poses[0], [0.97, 1.0, 0.0], atol=1e-9)
     with pytest.raises(InputError, match="log:2: a scan of another size"):
@@ -141,9 +146,9 @@ def test_lego(tmp_path):
 
 def test_wean():
     recording = wean.parse_wean(words(samples.wean_log()))
-    assert recording.laser.ranges_m.shape == (2, 180)
-    assert np.isinf(recording.laser.ranges_m[0, 179])
-    assert recording.sensors.laser.mount.x_m == pytest.approx(0.25)
+    assert recording.log("laser")["ranges_m"].shape == (2, 180)
+    assert np.isinf(recording.log("laser")["ranges_m"][0, 179])
+    assert recording.sensors["laser"].mount.x_m == pytest.approx(0.25)
     np.testing.assert_allclose(recording.wheels.position_m[-1], [0.1, 0.1])
     grid = wean.parse_grid(samples.wean_map(), "map")
     np.testing.assert_array_equal(grid.values, [[np.nan, 0.5, 1.0], [0.0, 0.25, np.nan]])
@@ -173,7 +178,7 @@ def test_real_intel_and_relations():
     recording = intel.read_intel(
         folder / "intel_raw_910.json.gz", folder / "intel_gmapping_910.json.gz"
     )
-    assert recording.laser.ranges_m.shape == (910, 180)
+    assert recording.log("laser")["ranges_m"].shape == (910, 180)
     assert recording.duration_s == pytest.approx(2651, abs=1)
     assert len(relations.read_relations(folder / "intel.relations.gz").stamps) == 2984
     assert len(relations.read_relations(DATA / "fr079_flirt/fr079.relations.gz").stamps) == 1685
@@ -182,12 +187,12 @@ def test_real_intel_and_relations():
 @needs_data
 def test_real_mrclam():
     recording = mrclam.read_mrclam(DATA / "mrclam6/MRCLAM_Dataset6.tar.xz", 5)
-    seen = recording.truth_at(recording.landmarks.stamps)
-    rows = np.repeat(np.arange(len(seen)), np.diff(recording.landmarks.splits))
-    landmark = recording.truth.world.landmarks[recording.truth.landmark_ids, :2]
+    seen = recording.truth_at(recording.log("stereo").stamps)
+    rows = np.repeat(np.arange(len(seen)), np.diff(recording.log("stereo").splits))
+    landmark = recording.truth.world.landmarks[true_ids(recording), :2]
     off = landmark - seen[rows, :2]
     bearing = np.arctan2(off[:, 1], off[:, 0]) - seen[rows, 2]
-    points = recording.landmarks.points_in_camera
+    points = recording.log("stereo")["points_in_camera"]
     error = np.arctan2(-points[:, 0], points[:, 2]) - bearing
     error = np.angle(np.exp(1j * error))
     known = np.isfinite(error)
@@ -206,10 +211,10 @@ def test_real_lego_and_wean():
         folder / "robot4_reference.txt.gz",
         folder / "robot_arena_landmarks.txt",
     )
-    assert recording.laser.ranges_m.shape == (278, 660)
+    assert recording.log("laser")["ranges_m"].shape == (278, 660)
     assert len(recording.truth.world.landmarks) == 6
     log = wean.read_wean(DATA / "wean_hall_mcl/robotdata1.log.gz")
-    assert len(log.laser.stamps) == 713
+    assert len(log.log("laser").stamps) == 713
     assert log.duration_s == pytest.approx(135.0, abs=0.1)
     grid = wean.read_grid(DATA / "wean_hall_mcl/wean.dat.gz")
     assert grid.values.shape == (800, 800)
@@ -220,6 +225,6 @@ def test_archive_with_packed_members(tmp_path):
     with tarfile.open(tmp_path / "a.tar", "w") as archive:
         for path in mrclam_folder(tmp_path).iterdir():
             archive.add(path, f"set/{path.name}")
-    assert mrclam.read_mrclam(tmp_path / "a.tar").landmarks is not None
+    assert "stereo" in mrclam.read_mrclam(tmp_path / "a.tar").logs
     assert json.dumps(mrclam.read_mrclam(tmp_path / "a.tar").config)
     assert RANGES

@@ -16,7 +16,7 @@ from experiments.papers.gil2008 import claims as judge
 from experiments.papers.gil2008 import recordings, scores, settings, study
 from experiments.runs.experiment import Experiment
 from experiments.sweeps.launch import planned
-from tests.fakes import circle, tracking_prior
+from tests.fakes import circle, tracking_prior, true_ids
 
 K_M = 5e-5
 SEEDS = range(1000, 1020)
@@ -45,8 +45,8 @@ def everything(*overrides):
 
 
 def ids_of(recording):
-    log = recording.landmarks
-    return [set(log.ids[a:b]) for a, b in itertools.pairwise(log.splits)]
+    log = recording.log("stereo")
+    return [set(log["ids"][a:b]) for a, b in itertools.pairwise(log.splits)]
 
 
 def test_fewer_observations_are_a_part_of_more(small):
@@ -54,7 +54,7 @@ def test_fewer_observations_are_a_part_of_more(small):
     for n_seen in (1, 3, 0):
         thin = recorded(f"sensors.stereo.max_observations={n_seen}")
         shown[n_seen] = ids_of(thin)
-        assert np.array_equal(thin.landmarks.ids, thin.truth.landmark_ids)
+        assert np.array_equal(thin.log("stereo")["ids"], true_ids(thin))
     assert max(map(len, shown[1])) == 1
     assert max(map(len, shown[3])) == 3
     assert all(a <= b <= c for a, b, c in zip(*shown.values(), strict=True))
@@ -62,19 +62,19 @@ def test_fewer_observations_are_a_part_of_more(small):
 
 def test_arms_keep_what_is_near(small):
     recording, near = everything(), recorded("sensors.stereo.max_distance_m=3.0")
-    distance = np.linalg.norm(near.landmarks.points_in_camera, axis=1)
-    assert 0 < len(distance) < len(recording.landmarks.ids)
+    distance = np.linalg.norm(near.log("stereo")["points_in_camera"], axis=1)
+    assert 0 < len(distance) < len(recording.log("stereo")["ids"])
     assert np.quantile(distance, 0.9) < 3.5  # the measured one is noisy
-    assert near.sensors.stereo.max_distance_m == 3.0
+    assert near.sensors["stereo"].max_distance_m == 3.0
     assert recordings.landmark_distances_m(near).max() <= 3.0
     nearest = recorded("sensors.stereo.max_observations=1", "sensors.stereo.selection=nearest")
-    mean = [np.mean(r.landmarks.points_in_camera[:, 2]) for r in (nearest, recording)]
+    mean = [np.mean(r.log("stereo")["points_in_camera"][:, 2]) for r in (nearest, recording)]
     assert mean[0] < 0.8 * mean[1]
 
 
 def test_walls_hide_landmarks(small):
     free, hidden = (everything(f"recording.occluded={o}") for o in (False, True))
-    assert len(free.landmarks.ids) >= len(hidden.landmarks.ids)
+    assert len(free.log("stereo")["ids"]) >= len(hidden.log("stereo")["ids"])
     assert np.array_equal(free.truth.poses, hidden.truth.poses)
 
 
@@ -95,7 +95,9 @@ def test_further_wheel_errors_keep_their_law(small):
 
 def test_noise_of_descriptors_alone_leaves_the_images(small):
     first, second = (everything(f"sensors.stereo.sigma_descriptor={s}") for s in (0.1, 0.9))
-    assert np.array_equal(first.landmarks.points_in_camera, second.landmarks.points_in_camera)
+    assert np.array_equal(
+        first.log("stereo")["points_in_camera"], second.log("stereo")["points_in_camera"]
+    )
 
 
 def test_recordings_with_other_cameras_have_other_keys():
@@ -133,7 +135,7 @@ def test_association_in_studies(small):
 
 def test_right_associations_are_counted():
     recording = circle(n_frames=4)
-    true = recording.truth.landmark_ids
+    true = true_ids(recording)
     _, first, inverse = np.unique(true, return_index=True, return_inverse=True)
     right = first[inverse]
     assert scores.right_share(recording, [right]) == 1.0

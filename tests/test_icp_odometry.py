@@ -10,9 +10,9 @@ from estimators.icp_odometry import IcpOdometry
 from experiments.evaluation.scan_bound import cast
 from sim import se2
 from sim.errors import InputError
-from sim.recording import Frame
 from sim.robot import RobotGeometry, arc_increment
-from sim.sensors import Laser, Mount, SensorSuite
+from sim.sensors import Laser, Mount
+from tests.fakes import blind, scan_frame, with_scan
 from tests.test_icp import BARE, ROOM
 
 TRACK_M = 0.3
@@ -24,7 +24,8 @@ STEP_M = np.array([0.055, 0.045])  # right and left wheel, each frame
 
 def prior(laser=LASER):
     robot = RobotGeometry(0.05, TRACK_M)
-    return Prior(robot, SensorSuite(laser=laser), START.copy(), P0.copy())
+    sensors = {} if laser is None else {"laser": laser}
+    return Prior(robot, sensors, START.copy(), P0.copy())
 
 
 def drive(walls, n_frames, travel_m=STEP_M, start=START, seed=0, wheel_noise_m=0.0, laser=LASER):
@@ -37,9 +38,8 @@ def drive(walls, n_frames, travel_m=STEP_M, start=START, seed=0, wheel_noise_m=0
             pose = se2.compose(pose, arc_increment(travel_m, TRACK_M))
             increments = travel_m + wheel_noise_m * rng.standard_normal(2)
         ranges = cast(walls, se2.compose(pose, laser.mount.pose), laser.bearings_rad)[0]
-        frames.append(
-            Frame(0.1 * i, 0.1 if i else 0.0, increments, laser.measure(ranges, rng), None)
-        )
+        scan = laser.measure(ranges, rng)
+        frames.append(scan_frame(0.1 * i, 0.1 if i else 0.0, increments, scan))
         poses.append(pose)
     return np.array(poses), frames
 
@@ -103,7 +103,7 @@ def test_frames_without_a_scan():
     poses, frames = drive(ROOM, 20)
     for i in range(20):
         if i % 4:
-            frames[i] = dataclasses.replace(frames[i], ranges_m=None)
+            frames[i] = blind(frames[i])
     beliefs = follow(IcpOdometry(), frames)
     assert np.abs(errors(beliefs, poses)).max() < 0.02
     traces = [np.trace(b.covariance) for b in beliefs]
@@ -124,7 +124,7 @@ def test_lost_scans_are_told_and_survived(bad, guess):
         # from elsewhere, turned about: no match within reach
         seen = cast(ROOM, np.array([4.0, 3.2, START[2] + np.pi + i]), LASER.bearings_rad)[0]
         lost = np.full(721, ranges) if ranges is not None else seen
-        frames[i] = dataclasses.replace(frames[i], ranges_m=lost.astype(np.float32))
+        frames[i] = with_scan(frames[i], lost)
     beliefs = follow(IcpOdometry(use_odometry_guess=guess), frames)
     told = [i for i, b in enumerate(beliefs) if "status" in b.extras]
     assert told == lost_at

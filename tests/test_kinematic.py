@@ -7,7 +7,7 @@ import pytest
 
 from sim.errors import InputError
 from sim.kinematic import KinematicBody, run_batch, wheel_commands
-from sim.robot import DifferentialDrive, Slip
+from sim.robot import DifferentialDrive
 from sim.route import TABLE_1, TICK_S, OpenLoop
 
 IDEAL = DifferentialDrive(wheel_radius_m=0.05, track_m=0.18)
@@ -17,7 +17,7 @@ ROUTE = OpenLoop(((0.5, 0.0, 1.0), (0.2, 0.9, 1.5), (0.0, -0.6, 1.0)))
 
 def test_body_rolls_along_exact_arcs():
     body = KinematicBody(IDEAL, [1.0, 2.0, 0.3], dt_s=1.0)
-    rolling = body.step(np.array([0.4, 0.1]))
+    rolling = body.step(0.4, 0.1)
     np.testing.assert_array_equal(rolling, [0.4, 0.1])
     turn, radius = 0.3 / 0.18, 0.25 / (0.3 / 0.18)
     expected = [
@@ -31,7 +31,7 @@ def test_body_rolls_along_exact_arcs():
 def test_heading_is_not_wrapped():
     body = KinematicBody(IDEAL, np.zeros(3), dt_s=1.0)
     for _ in range(4):
-        body.step(np.array([0.18, -0.18]))
+        body.step(0.18, -0.18)
     assert body.pose[2] == pytest.approx(8.0)
 
 
@@ -50,13 +50,14 @@ def test_batch_is_the_slip_law_tick_by_tick():
     profile = ROUTE.profile(NOISY)
     normals = rng.standard_normal((2, len(profile), 2))
     for run in range(2):
-        body, slip = KinematicBody(NOISY, np.zeros(3)), Slip.start(NOISY, TICK_S)
+        body, (right, left) = KinematicBody(NOISY, np.zeros(3)), NOISY.slips(TICK_S)
         encoder, ground = np.zeros(2), np.zeros(2)
         encoders = [encoder.copy()]
         for tick, velocity in enumerate(profile):
-            rolling = body.step(NOISY.wheel_speeds(*velocity) - slip.correction_mps)
-            encoder += slip.advance(rolling, normals[run, tick])
-            ground += rolling
+            speeds = NOISY.wheel_speeds(*velocity) - [right.correction_mps, left.correction_mps]
+            rolled, (z_right, z_left) = body.step(*speeds.tolist()), normals[run, tick].tolist()
+            encoder += right.advance(rolled[0], z_right), left.advance(rolled[1], z_left)
+            ground += rolled
             if (tick + 1) % 30 == 0:
                 encoders.append(encoder.copy())
         np.testing.assert_allclose(runs.end_poses[run], body.pose, atol=1e-9)
@@ -83,10 +84,11 @@ def test_encoder_follows_the_command_and_the_ground_wanders():
 
 
 def test_commands_use_the_nominal_track():
-    nominal = wheel_commands(IDEAL, ROUTE, nominal_track_m=0.36)
-    turn = ROUTE.profile(IDEAL)[:, 1]
+    robot = dataclasses.replace(IDEAL, nominal_track_m=0.36)
+    nominal = wheel_commands(robot, ROUTE)
+    turn = ROUTE.profile(robot)[:, 1]
     np.testing.assert_allclose(nominal[:, 0] - nominal[:, 1], turn * 0.36 * TICK_S, atol=1e-15)
-    runs = run_batch(IDEAL, TABLE_1["angular_1"], 1, np.random.default_rng(0), nominal_track_m=0.36)
+    runs = run_batch(robot, TABLE_1["angular_1"], 1, np.random.default_rng(0))
     assert runs.end_poses[0, 2] == pytest.approx(3.0)  # twice the 1.5 rad asked for
 
 
@@ -101,6 +103,13 @@ def test_encoder_counts_are_quantised():
     robot = dataclasses.replace(NOISY, encoder_tick_m=1e-3)
     counts = run_batch(robot, ROUTE, 1, np.random.default_rng(1)).encoder_m / 1e-3
     np.testing.assert_allclose(counts, np.round(counts), atol=1e-9)
+
+
+def test_batch_reads_the_encoders_by_the_nominal_radius():
+    robot = dataclasses.replace(IDEAL, nominal_wheel_radius_m=0.04)
+    runs = run_batch(robot, TABLE_1["linear_1"], 1, np.random.default_rng(0))
+    assert runs.encoder_m[0, -1] == pytest.approx([1.0, 1.0])  # as commanded
+    assert runs.ground_m[0, -1] == pytest.approx([1.25, 1.25])  # by the true radius
 
 
 def test_unmodelled_slip_is_refused():

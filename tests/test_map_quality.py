@@ -43,4 +43,4 @@ def test_entropy_is_that_of_a_gaussian():
 
 def test_a_recording_without_a_laser_is_refused():
     with pytest.raises(InputError, match="laser"):
-        map_points(dataclasses.replace(circle(), laser=None), estimate(circle()))
+        map_points(circle().without("laser"), estimate(circle()))

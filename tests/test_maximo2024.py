@@ -153,7 +153,7 @@ def test_rows_of_a_world(case):
     nearest = small["weighting"][0]["nearest_node_m"]
     assert nearest == pytest.approx(0.39, abs=0.02)
     chosen = worlds.options(case)
-    runs = worlds.starts(case, 3, chosen, settings.TOLERANCE * case.known_map.spacing_m)
+    runs = list(worlds.starts(case, 3, chosen, settings.TOLERANCE * case.known_map.spacing_m))
     assert [start for start, _, _ in runs] == [0, 42, 85]
     assert all(settled <= 40 for _, settled, _ in runs)
     chosen["estimate"] = "mode"

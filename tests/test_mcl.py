@@ -15,9 +15,8 @@ from experiments.gate.conform import check_estimator
 from sim import se2
 from sim.errors import InputError
 from sim.robot import RobotGeometry, wheel_variances
-from sim.sensors import SensorSuite
 from sim.world import World
-from tests.fakes import circle, tracking_prior
+from tests.fakes import blind, circle, tracking_prior, with_scan
 from tests.test_icp import ROOM
 from tests.test_icp_odometry import LASER, P0, START, TRACK_M, drive
 
@@ -27,9 +26,9 @@ WHEELS = {"kr": 1e-4, "kl": 1e-4}
 
 
 def prior(start=True, laser=LASER):
-    suite = SensorSuite(laser=laser)
+    sensors = {} if laser is None else {"laser": laser}
     robot = RobotGeometry(0.05, TRACK_M)
-    return Prior(robot, suite, START.copy() if start else None, P0 if start else None, MAP)
+    return Prior(robot, sensors, START.copy() if start else None, P0 if start else None, MAP)
 
 
 def follow(estimator, frames, given, seed=0):
@@ -149,9 +148,9 @@ def test_mapping_to_amcl():
 
 def test_scans_without_returns_and_none():
     poses, frames = drive(ROOM, 60, wheel_noise_m=NOISE_M)
-    blind = np.full(LASER.n_beams, np.inf, np.float32)
-    frames[20:30] = [dataclasses.replace(f, ranges_m=blind) for f in frames[20:30]]
-    frames[40:50] = [dataclasses.replace(f, ranges_m=None) for f in frames[40:50]]
+    empty = np.full(LASER.n_beams, np.inf)
+    frames[20:30] = [with_scan(f, empty) for f in frames[20:30]]
+    frames[40:50] = [blind(f) for f in frames[40:50]]
     beliefs = follow(Mcl(n_most=2000, **WHEELS), frames, prior())
     told = [i for i, b in enumerate(beliefs) if "status" in b.extras]
     assert told

@@ -11,13 +11,12 @@ from sim import se2
 from sim.errors import InputError
 from sim.recording import Frame
 from sim.robot import RobotGeometry, arc_increment
-from sim.sensors import SensorSuite
 
 TRACK_M = 0.19
 
 
 def prior(mean=(0.0, 0.0, 0.0)):
-    return Prior(RobotGeometry(0.05, TRACK_M), SensorSuite(), np.array(mean), np.zeros((3, 3)))
+    return Prior(RobotGeometry(0.05, TRACK_M), {}, np.array(mean), np.zeros((3, 3)))
 
 
 def drive(estimator, increments, duration_s=0.1, start=(0.0, 0.0, 0.0)):
@@ -87,7 +86,7 @@ def test_arc_is_exact_whatever_the_step():
 
 
 def test_a_start_pose_is_needed():
-    lost = Prior(RobotGeometry(0.05, TRACK_M), SensorSuite())
+    lost = Prior(RobotGeometry(0.05, TRACK_M), {})
     with pytest.raises(InputError, match="start pose"):
         Odometry(1e-5, 1e-5).reset(lost, np.random.default_rng(0))
 

@@ -19,7 +19,7 @@ from estimators.options import (
 )
 from sim.errors import InputError
 from sim.robot import RobotGeometry
-from sim.sensors import SensorSuite
+from sim.sensors import Encoder, Laser
 
 NUMBERS = {
     require_non_negative: ([0, 0.0, 1e-300, 2], [-1e-300, math.nan, math.inf, None, "1"]),
@@ -49,18 +49,28 @@ def test_choices_are_those_of_the_literal():
 
 
 def test_a_prior_without_what_an_estimator_needs_names_the_estimator():
-    bare = Prior(RobotGeometry(0.05, 0.2), SensorSuite())
-    for require, word in (
-        (start_pose, "start pose"),
-        (require_laser, "laser"),
-        (require_stereo, "stereo camera"),
-    ):
-        with pytest.raises(InputError, match=f"^mcl needs a {word}; "):
-            require(bare, "mcl")
+    bare = Prior(RobotGeometry(0.05, 0.2), {})
+    with pytest.raises(InputError, match=r"^mcl needs a start pose; "):
+        start_pose(bare, "mcl")
+    for require in (require_laser, require_stereo):
+        with pytest.raises(
+            InputError, match=r"^mcl: no sensor named front .there is none.; choose"
+        ):
+            require(bare, "front", "mcl")
+
+
+def test_a_sensor_is_found_by_its_name_and_must_be_of_its_kind():
+    sensors = {"encoder": Encoder(), "front": Laser(n_beams=3), "rear": Laser(n_beams=5)}
+    prior = Prior(RobotGeometry(0.05, 0.2), sensors)
+    assert require_laser(prior, "rear", "mcl") is sensors["rear"]
+    with pytest.raises(InputError, match=r"laser \(there is encoder, front, rear\); choose"):
+        require_laser(prior, "laser", "mcl")
+    with pytest.raises(InputError, match=r"^fastslam: sensor front is no StereoCamera but a Laser"):
+        require_stereo(prior, "front", "fastslam")
 
 
 def test_the_start_pose_is_a_copy():
-    prior = Prior(RobotGeometry(0.05, 0.2), SensorSuite(), np.zeros(3), np.eye(3))
+    prior = Prior(RobotGeometry(0.05, 0.2), {}, np.zeros(3), np.eye(3))
     start = start_pose(prior, "mcl")
     start.mean[0], start.covariance[0, 0] = 1.0, 2.0
     assert prior.mean[0] == 0.0

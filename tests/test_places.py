@@ -63,7 +63,7 @@ def test_descriptors_are_unit_vectors_found_again_by_place():
     world = place_world(UMH, 2)
     features = world.known_map.descriptors
     np.testing.assert_allclose(np.linalg.norm(features, axis=1), 1.0, atol=1e-5)
-    taken = world.recording.places.descriptors
+    taken = world.recording.log("place")["descriptor"]
     distances = np.linalg.norm(taken[:, None] - features[None], axis=2)
     offsets = measured(world)[2]
     assert retrieval(distances, offsets, 1.5 * UMH.spacing_m)["recall_at_1"] > 0.95
@@ -78,7 +78,9 @@ def test_resequenced_recordings_move_as_the_wheels_did():
     cut = places.resequenced(recording, rows)
     frames, whole = list(cut.frames()), list(recording.frames())
     for i, row in enumerate(rows):
-        np.testing.assert_array_equal(frames[i].place_descriptor, whole[row].place_descriptor)
+        np.testing.assert_array_equal(
+            frames[i].readings["place"]["descriptor"], whole[row].readings["place"]["descriptor"]
+        )
         if i:
             np.testing.assert_allclose(
                 frames[i].wheel_increments_m, whole[row].wheel_increments_m, atol=1e-9
@@ -111,7 +113,7 @@ def test_ones_own_arrays_run_from_one_yaml(tmp_path):
     np.save(tmp_path / "map_positions.npy", world.known_map.positions_m)
     np.save(tmp_path / "map_descriptors.npy", world.known_map.descriptors)
     np.save(tmp_path / "positions.npy", world.recording.truth.poses[:, :2])
-    np.save(tmp_path / "descriptors.npy", world.recording.places.descriptors)
+    np.save(tmp_path / "descriptors.npy", world.recording.log("place")["descriptor"])
     experiment = Experiment.compose(["study=maximo2024_own", f"data={tmp_path}"])
     recording = experiment.recording()
     known = experiment.prior(recording).map

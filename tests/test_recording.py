@@ -12,19 +12,9 @@ import pytest
 from experiments.runs.cache import cached, files, folder, limit_bytes, trim
 from sim.errors import InputError
 from sim.files import write_whole
-from sim.recording import (
-    CloudLog,
-    LandmarkLog,
-    LaserLog,
-    PlaceLog,
-    Recording,
-    Truth,
-    WheelLog,
-    load,
-    save,
-)
+from sim.recording import Log, Recording, Truth, WheelLog, joined, load, save
 from sim.robot import RobotGeometry
-from sim.sensors import Encoder, Laser, SensorSuite
+from sim.sensors import Encoder, Field, Laser, StereoCamera
 from sim.world import World
 
 
@@ -40,20 +30,30 @@ def small_recording(seed=0):
         look_alike=np.array([True, True, False]),
         places={"room": np.array([[0.0, 0, 4, 4]])},
     )
+    laser, camera = Laser(n_beams=5), StereoCamera()
     return Recording(
         frame_stamps=stamps,
         wheels=WheelLog(stamps, np.cumsum(rng.normal(size=(6, 2)), axis=0)),
         robot=RobotGeometry(0.05, 0.19),
-        sensors=SensorSuite(Encoder(100), laser=Laser(n_beams=5)),
-        laser=LaserLog(stamps[::2], rng.random((3, 5)).astype(np.float32)),
-        landmarks=LandmarkLog(
-            stamps[1::3],
-            np.array([0, 2, 3]),
-            rng.normal(size=(3, 3)),
-            np.array([0, 2, 1]),
-            rng.normal(size=(3, 4)).astype(np.float32),
+        sensors={"encoder": Encoder(100), "laser": laser, "stereo": camera},
+        logs={
+            "laser": Log.of(laser, stamps[::2], ranges_m=rng.random((3, 5))),
+            "stereo": Log.of(
+                camera,
+                stamps[1::3],
+                np.array([0, 2, 3]),
+                points_in_camera=rng.normal(size=(3, 3)),
+                ids=np.array([0, 2, 1]),
+                descriptors=rng.normal(size=(3, 4)),
+            ),
+        },
+        truth=Truth(
+            stamps,
+            rng.normal(size=(6, 3)),
+            rng.normal(size=(6, 2)),
+            {"stereo": {"true_ids": np.array([0, 2, 1])}},
+            world,
         ),
-        truth=Truth(stamps, rng.normal(size=(6, 3)), rng.normal(size=(6, 2)), world=world),
         config={"seed": seed, "robot": {"kr": 1e-5}},
         status="collision at 0.5 s",
     )
@@ -71,17 +71,30 @@ def test_round_trip_keeps_every_bit(tmp_path):
     for ours, theirs in zip(recording.frames(), back.frames(), strict=True):
         assert ours.stamp == theirs.stamp
         assert np.array_equal(ours.wheel_increments_m, theirs.wheel_increments_m)
+        assert ours.readings.keys() == theirs.readings.keys()
+        for name, reading in ours.readings.items():
+            for field, values in reading.items():
+                assert values.dtype == theirs.readings[name][field].dtype
+                assert np.array_equal(values, theirs.readings[name][field])
+    assert back.sensors == recording.sensors
+    assert back.truth.readings["stereo"]["true_ids"].tolist() == [0, 2, 1]
 
 
 def test_every_single_value_counts_in_the_checksum():
     recording = small_recording()
     before = recording.checksum
-    for log, name in (("wheels", "position_m"), ("laser", "ranges_m"), ("truth", "poses")):
-        array = getattr(getattr(recording, log), name)
+    for name, array in {
+        "wheels": recording.wheels.position_m,
+        "laser": recording.log("laser")["ranges_m"],
+        "splits": recording.log("stereo").splits,
+        "true ids": recording.truth.readings["stereo"]["true_ids"],
+        "poses": recording.truth.poses,
+    }.items():
         array.setflags(write=True)
         kept = array.flat[-1]
-        array.flat[-1] = np.nextafter(kept, array.dtype.type(9))
-        assert recording.checksum != before, f"{log}.{name}"
+        floats = array.dtype.kind == "f"
+        array.flat[-1] = np.nextafter(kept, array.dtype.type(9)) if floats else kept + 1
+        assert recording.checksum != before, name
         array.flat[-1] = kept
     assert recording.checksum == before
     assert dataclasses.replace(recording, status="ok").checksum != before
@@ -89,17 +102,18 @@ def test_every_single_value_counts_in_the_checksum():
 
 def test_frames_show_each_sensor_when_it_fires():
     frames = list(small_recording().frames())
-    assert [f.ranges_m is not None for f in frames] == [True, False] * 3
-    assert [f.landmarks is not None for f in frames] == [False, True, False, False, True, False]
-    assert len(frames[1].landmarks.points_in_camera) == 2
-    assert frames[4].landmarks.ids.tolist() == [1]
+    assert ["laser" in f.readings for f in frames] == [True, False] * 3
+    assert ["stereo" in f.readings for f in frames] == [False, True, False, False, True, False]
+    assert len(frames[1].readings["stereo"]["points_in_camera"]) == 2
+    assert frames[4].readings["stereo"]["ids"].tolist() == [1]
     assert frames[0].duration_s == 0.0
     assert frames[0].wheel_increments_m.tolist() == [0.0, 0.0]
     total = sum(f.wheel_increments_m for f in frames)
     position = small_recording().wheels.position_m
     assert np.allclose(total, position[-1] - position[0])
     with pytest.raises(ValueError, match="read-only"):
-        frames[0].ranges_m[0] = 1.0
+        frames[0].readings["laser"]["ranges_m"][0] = 1.0
+    assert "true_ids" not in frames[1].readings["stereo"]
     assert not hasattr(frames[0], "truth")
 
 
@@ -109,7 +123,7 @@ def test_wheels_are_interpolated_between_their_stamps():
         frame_stamps=np.array([0.0, 0.25, 1.0]),
         wheels=WheelLog(stamps, np.array([[0.0, 0.0], [4.0, 2.0]])),
         robot=RobotGeometry(0.05, 0.19),
-        sensors=SensorSuite(),
+        sensors={},
     )
     increments = [f.wheel_increments_m.tolist() for f in recording.frames()]
     assert increments == [[0, 0], [1, 0.5], [3, 1.5]]
@@ -123,36 +137,183 @@ def test_truth_is_interpolated_the_short_way_round():
     assert np.isnan(outside).all()
 
 
-KNOWN = {
-    "known_truth": "no truth",
-    "known_world": "no map",
-    "known_laser": "no laser scans; choose sensors such as sensors=hokuyo",
-    "known_landmarks": "no landmark observations; choose sensors such as sensors=stereo_pixel",
-    "known_clouds": "no 3D lidar turns; choose sensors=lidar3d",
-    "known_places": "no place descriptors",
-}
-
-
-@pytest.mark.parametrize("name", KNOWN)
-def test_what_is_missing_is_named(name):
-    blind = dataclasses.replace(small_recording(), truth=None, laser=None, landmarks=None)
+def test_what_is_missing_is_named():
+    blind = dataclasses.replace(small_recording().without("laser").without("stereo"), truth=None)
     assert blind.world is None
-    with pytest.raises(InputError, match=KNOWN[name]):
-        getattr(blind, name)
+    with pytest.raises(InputError, match="no truth"):
+        _ = blind.known_truth
+    with pytest.raises(InputError, match="no map"):
+        _ = blind.known_world
+    with pytest.raises(InputError, match=r"no readings of a sensor laser \(there is none\)"):
+        blind.log("laser")
+    with pytest.raises(InputError, match=r"no sensor named laser \(there is encoder\); choose"):
+        blind.sensor("laser", Laser)
+    with pytest.raises(InputError, match=r"a sensor place \(there is laser, stereo\)"):
+        small_recording().log("place")
+    with pytest.raises(InputError, match="sensor laser is no StereoCamera but a Laser"):
+        small_recording().sensor("laser", StereoCamera)
+    with pytest.raises(InputError, match="no splits"):
+        _ = small_recording().log("laser").known_splits
 
 
 def test_what_is_there_is_given():
-    recording = dataclasses.replace(
-        small_recording(),
-        clouds=CloudLog(np.zeros(1), np.ones((1, 2, 3), np.float32)),
-        places=PlaceLog(np.zeros(1), np.ones((1, 4), np.float32)),
-    )
+    recording = small_recording()
     assert recording.known_truth is recording.truth
     assert recording.known_world is recording.world is recording.truth.world
-    assert recording.known_laser is recording.laser
-    assert recording.known_landmarks is recording.landmarks
-    assert recording.known_clouds is recording.clouds
-    assert recording.known_places is recording.places
+    for name, kind in (("laser", Laser), ("stereo", StereoCamera)):
+        assert recording.log(name) is recording.logs[name]
+        assert recording.sensor(name, kind) is recording.sensors[name]
+    log = recording.log("stereo")
+    assert log.known_splits is log.splits
+    assert log["ids"] is log.values["ids"]
+
+
+def test_a_log_is_added_changed_and_taken_away(tmp_path):
+    recording, rear = small_recording(), Laser(n_beams=2)
+    log = Log.of(rear, np.array([0.1]), ranges_m=np.ones((1, 2)))
+    more = recording.with_log("rear", log, rear)
+    assert [*more.logs] == ["laser", "stereo", "rear"]
+    assert [("laser" in f.readings, "rear" in f.readings) for f in more.frames()][:2] == [
+        (True, False),
+        (False, True),
+    ]
+    changed = more.with_log("rear", Log.of(rear, np.array([0.1]), ranges_m=np.zeros((1, 2))))
+    assert changed.sensors["rear"] is rear
+    assert changed.checksum != more.checksum
+    assert more.without("rear").checksum == recording.checksum
+    less = recording.without("stereo")
+    assert "stereo" not in less.sensors
+    assert "stereo" not in less.truth.readings
+    assert save(less, tmp_path / "less.npz") == load(tmp_path / "less.npz").checksum
+
+
+SCHEMA = {
+    "count": Field(dtype="i4"),
+    "colour": Field(dtype="u1", shape=(3,)),
+    "image": Field("m", "f4", (None, 2)),
+    "points": Field("m", shape=(2,), ragged=True),
+    "weights": Field(ragged=True),
+}
+
+
+def some_log(**changes):
+    """Two readings of a sensor with every kind of field; the second has no points."""
+    values = {
+        "count": np.array([1, 2], np.int32),
+        "colour": np.zeros((2, 3), np.uint8),
+        "image": np.zeros((2, 4, 2), np.float32),
+        "points": np.ones((3, 2)),
+        "weights": np.arange(3.0),
+    }
+    splits = changes.pop("splits", np.array([0, 3, 3]))
+    stamps = changes.pop("stamps", np.array([0.0, 0.5]))
+    return Log(SCHEMA, stamps, {**values, **changes}, splits)
+
+
+def test_a_log_gives_its_readings():
+    log = some_log()
+    log.check("s")
+    first, second = log.reading(0), log.reading(1)
+    assert {name: np.shape(values) for name, values in first.items()} == {
+        "count": (),
+        "colour": (3,),
+        "image": (4, 2),
+        "points": (3, 2),
+        "weights": (3,),
+    }
+    assert (first["count"], second["count"]) == (1, 2)
+    assert second["points"].shape == (0, 2)
+    again = joined(SCHEMA, log.stamps, [first, second], "s")
+    for name, values in log.values.items():
+        assert again[name].dtype == values.dtype
+        np.testing.assert_array_equal(again[name], values)
+    np.testing.assert_array_equal(again.splits, log.splits)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"count": np.zeros(2)}, r"s\.count must be i4, got float64"),
+        ({"count": np.zeros(3, np.int32)}, r"s\.count must have shape \(2\), got \(3,\)"),
+        ({"colour": np.zeros((2, 4), np.uint8)}, r"s\.colour must have shape \(2, 3\)"),
+        ({"image": np.zeros((2, 4, 3), np.float32)}, r"s\.image must have shape \(2, any, 2\)"),
+        ({"image": np.zeros((2, 4), np.float32)}, r"s\.image must have shape"),
+        ({"points": np.zeros((2, 2))}, r"s\.points must have shape \(3, 2\)"),
+        ({"weights": np.zeros(4)}, r"s\.weights must have shape \(3\)"),
+        ({"splits": None}, r"s\.splits must be there if a field is ragged"),
+        ({"splits": np.array([0, 3])}, r"s\.splits must be int64 of shape \(3,\)"),
+        ({"splits": np.array([0.0, 3.0, 3.0])}, r"s\.splits must be int64"),
+        ({"splits": np.array([1, 3, 3])}, "begin at 0"),
+        ({"splits": np.array([0, 4, 3])}, "not decrease"),
+        ({"stamps": np.array([0, 1])}, r"s\.stamps must be float64"),
+        ({"stamps": np.zeros((2, 1))}, r"s\.stamps must be float64"),
+    ],
+)
+def test_a_log_that_does_not_fit_its_schema(changes, words):
+    with pytest.raises(InputError, match=words):
+        some_log(**changes).check("s")
+
+
+def test_splits_without_a_ragged_field_are_refused():
+    schema = {"count": Field(dtype="i4")}
+    log = Log(schema, np.zeros(2), {"count": np.zeros(2, np.int32)}, np.array([0, 1, 2]))
+    with pytest.raises(InputError, match="only then"):
+        log.check("s")
+
+
+def test_log_of_a_sensor_wants_its_fields():
+    laser = Laser(n_beams=3)
+    log = Log.of(laser, np.zeros(2), ranges_m=np.ones((2, 3)))
+    assert log["ranges_m"].dtype == np.float32
+    for values in ({}, {"range_m": np.ones((2, 3))}, {"ranges_m": 1, "more": 2}):
+        with pytest.raises(InputError, match=r"a Laser has the fields \['ranges_m'\], got"):
+            Log.of(laser, np.zeros(2), **values)
+    with pytest.raises(InputError, match=r"Laser\.ranges_m must have shape \(2, 3\)"):
+        Log.of(laser, np.zeros(2), ranges_m=np.ones((2, 4)))
+    with pytest.raises(InputError, match="'true_ids'"):  # it belongs to the truth
+        Log.of(
+            StereoCamera(),
+            np.zeros(0),
+            np.zeros(1, np.int64),
+            points_in_camera=np.zeros((0, 3)),
+            ids=np.zeros(0),
+            descriptors=np.zeros((0, 2)),
+            true_ids=np.zeros(0),
+        )
+
+
+def test_readings_are_joined_by_their_field():
+    plain, ragged = Field(shape=(2,)), Field(dtype="i8", shape=(None,), ragged=True)
+    assert plain.joined([[1, 2], (3, 4), np.zeros(2)], "f").tolist() == [[1, 2], [3, 4], [0, 0]]
+    assert Field().joined([1.0, np.array(2.0)], "f").tolist() == [1.0, 2.0]
+    rows = ragged.joined([np.ones((2, 3)), np.zeros((0, 3)), np.ones((1, 3))], "f")
+    assert (rows.shape, rows.dtype) == ((3, 3), np.int64)
+    assert plain.joined([], "f").shape == (0, 2)
+    assert ragged.joined([], "f").shape == (0, 0)
+    with pytest.raises(InputError, match=r"f must have shape \(1, 2\), got \(1, 3\)"):
+        plain.joined([[1, 2, 3]], "f")
+    for field, readings in (
+        (plain, [[1, 2], [1, 2, 3]]),
+        (ragged, [np.ones((1, 3)), np.ones((1, 2))]),
+        (Field(), ["north"]),
+    ):
+        with pytest.raises(InputError, match="f: readings that do not go together"):
+            field.joined(readings, "f")
+    with pytest.raises(InputError, match=r"dtype must be one of .*'complex'"):
+        Field(dtype="complex")
+
+
+def test_ragged_fields_of_a_reading_have_as_many_rows():
+    """Sums that happen to agree would give rows to the wrong reading."""
+    schema = {"points": Field(shape=(2,), ragged=True), "ids": Field(dtype="i8", ragged=True)}
+    odd = [
+        {"points": np.ones((2, 2)), "ids": np.zeros(1)},
+        {"points": np.ones((1, 2)), "ids": np.zeros(2)},
+    ]
+    with pytest.raises(InputError, match=r"s\.ids has 1 rows? in a reading, s\.points 2"):
+        joined(schema, np.zeros(2), odd, "s")
+    with pytest.raises(InputError, match=r"s\.ids: readings that do not go together"):
+        joined(schema, np.zeros(1), [{"points": np.ones((1, 2)), "ids": 3}], "s")
 
 
 @pytest.mark.parametrize("damage", ["cut", "flip", "empty", "text", "other_zip"])

@@ -9,7 +9,6 @@ from sim.errors import InputError
 from sim.robot import (
     DifferentialDrive,
     RobotGeometry,
-    Slip,
     TravelWindow,
     arc_increment,
     arc_increment_jacobian,
@@ -41,6 +40,21 @@ def test_arc_jacobian_matches_finite_differences(wheels):
         assert np.allclose(numeric, exact[:, i], atol=1e-7)
 
 
+class Wheels:
+    """Both wheels' slip, of one robot or a batch, in arrays (..., 2)."""
+
+    def __init__(self, robot, dt_s):
+        self.slips = robot.slips(dt_s)
+
+    @property
+    def correction_mps(self):
+        return np.stack([slip.correction_mps for slip in self.slips], axis=-1)
+
+    def advance(self, rolling, normals):
+        parts = [s.advance(rolling[..., i], normals[..., i]) for i, s in enumerate(self.slips)]
+        return np.stack(parts, axis=-1)
+
+
 def test_right_wheel_turns_counter_clockwise():
     assert arc_increment([0.1, 0.0], 0.2)[2] > 0
     assert arc_increment_jacobian([0.1, 0.1], 0.2)[2].tolist() == pytest.approx([5.0, -5.0])
@@ -51,11 +65,11 @@ def test_slip_law_over_a_batch():
     robot = DifferentialDrive(0.05, 0.19, kr=1e-4, kl=3e-4)
     rng = np.random.default_rng(1)
     n_runs, n_ticks = 400, 600
-    slip = Slip.start(robot, DT_S, (n_runs,))
+    slip = Wheels(robot, DT_S)
     ground, encoder = np.zeros((n_runs, 2)), np.zeros((n_runs, 2))
     grounds, encoders = [], []
     for _ in range(n_ticks):
-        rolling = (0.5 - slip.correction_mps) * DT_S
+        rolling = np.broadcast_to(0.5 - slip.correction_mps, (n_runs, 2)) * DT_S
         encoder = encoder + slip.advance(rolling, rng.standard_normal((n_runs, 2)))
         ground = ground + rolling
         grounds.append(ground)
@@ -89,20 +103,63 @@ def test_slip_and_wheel_errors_are_one_law():
     robot = DifferentialDrive(0.05, 0.19, kr=1e-4, kl=3e-4)
     rolling = np.array([0.002, -0.001])
     normals = np.random.default_rng(4).standard_normal(2)
-    read = Slip.start(robot, DT_S).advance(rolling, normals)
+    read = Wheels(robot, DT_S).advance(rolling, normals)
     errors = wheel_errors(rolling, robot.slip_variance_per_m, np.random.default_rng(4))
     assert read.tolist() == (rolling + errors).tolist()
 
 
 def test_bias_makes_the_encoder_read_more():
     robot = DifferentialDrive(0.05, 0.19, bias_right=0.05)
-    slip = Slip.start(robot, DT_S)
+    slip = Wheels(robot, DT_S)
     encoder = ground = np.zeros(2)
     for _ in range(3000):
         rolling = (0.5 - slip.correction_mps) * DT_S
         encoder, ground = encoder + slip.advance(rolling, np.zeros(2)), ground + rolling
     assert (encoder / ground).tolist() == pytest.approx([1.05, 1.0])
     assert encoder[0] == pytest.approx(5.0, rel=2e-3)  # closed on the encoder, but for the lag
+
+
+@pytest.mark.parametrize("factor", [0.34, 3.0])
+def test_bias_up_to_a_factor_of_three_settles(factor):
+    """The wheel's loop, closed on the encoder, brings the encoder to the command."""
+    robot = DifferentialDrive(0.05, 0.19, bias_right=factor - 1.0)
+    slip = Wheels(robot, DT_S)
+    for _ in range(1500):
+        rolling = (0.5 - slip.correction_mps) * DT_S
+        read = slip.advance(rolling, np.zeros(2))
+    assert (read / DT_S).tolist() == pytest.approx([0.5, 0.5])
+    assert (rolling / DT_S).tolist() == pytest.approx([0.5 / factor, 0.5])
+
+
+def test_nominal_geometry_turns_commands_into_wheel_speeds():
+    robot = DifferentialDrive(0.05, 0.2, nominal_wheel_radius_m=0.04, nominal_track_m=0.1)
+    assert robot.nominal == RobotGeometry(0.04, 0.1)
+    rates = robot.wheel_speeds(0.4, 2.0) / 0.05
+    assert (rates * 0.04).tolist() == pytest.approx([0.4 + 0.1, 0.4 - 0.1])
+    right = DifferentialDrive(0.05, 0.2)
+    assert right.nominal == RobotGeometry(0.05, 0.2)
+    assert right.wheel_speeds(0.4, 2.0).tolist() == [0.4 + 0.2, 0.4 - 0.2]
+
+
+def test_pulses_are_counted_by_the_formula():
+    """Travel per pulse is 2 pi r / (pulses * gear), decristoforis2020, eq. (1)."""
+    robot = DifferentialDrive(0.05, 0.19, encoder_pulses_per_turn=13, gear_ratio=34.0)
+    quantum = 2 * math.pi * 0.05 / (13 * 34)
+    assert robot.encoder_quantum_m == pytest.approx(quantum)
+    read = robot.encoder_reading(np.array([[100.5, -0.5], [0.25, 441.0001]]) * quantum)
+    np.testing.assert_allclose(read / quantum, [[100, -1], [0, 441]], atol=1e-9)
+    turn = robot.encoder_reading(np.array([2 * math.pi * 0.05 + 1e-9] * 2))
+    assert turn / quantum == pytest.approx([442, 442])
+
+
+def test_counts_become_metres_by_the_nominal_radius():
+    """The wheel's angle is true, and the radius that makes it metres is the controller's."""
+    robot = DifferentialDrive(
+        0.05, 0.19, nominal_wheel_radius_m=0.06, encoder_pulses_per_turn=100, gear_ratio=2.0
+    )
+    turns = np.array([1.503, 0.2511])
+    read = robot.encoder_reading(turns * 2 * math.pi * 0.05)
+    assert (read / (2 * math.pi * 0.06) * 200).tolist() == pytest.approx([300, 50])
 
 
 def test_travel_window_does_not_inflate_travel_by_encoder_noise():
@@ -133,7 +190,21 @@ def test_wheel_variances_are_k_times_travel():
 
 @pytest.mark.parametrize(
     "change",
-    [{"kr": -1.0}, {"kl": math.nan}, {"track_m": 0.0}, {"bias_left": 2.0}, {"kr": math.inf}],
+    [
+        {"kr": -1.0},
+        {"kl": math.nan},
+        {"track_m": 0.0},
+        {"bias_left": 2.1},
+        {"bias_right": -0.7},
+        {"bias_right": math.nan},
+        {"kr": math.inf},
+        {"nominal_track_m": 0.0},
+        {"nominal_wheel_radius_m": math.nan},
+        {"encoder_pulses_per_turn": -1},
+        {"gear_ratio": 0.0},
+        {"gear_ratio": 34.0},  # without pulses
+        {"encoder_pulses_per_turn": 13, "encoder_tick_m": 1e-3},
+    ],
 )
 def test_impossible_robots_are_refused(change):
     with pytest.raises(InputError, match=f"robot.{next(iter(change))}"):

@@ -5,8 +5,9 @@ import pytest
 
 from sim.errors import InputError
 from sim.robot import DifferentialDrive, arc_increment
-from sim.route import TABLE_1, TICK_S, OpenLoop
+from sim.route import TABLE_1, TICK_S, GoToPoints, OpenLoop, Tour
 from sim.se2 import chain
+from sim.world import World
 
 ROBOT = DifferentialDrive(wheel_radius_m=0.05, track_m=0.18)
 ROUTES = {
@@ -91,3 +92,54 @@ def test_tick_length_does_not_change_the_promise():
 def test_bad_segments_are_named_by_their_place(segments, word):
     with pytest.raises(InputError, match=word):
         OpenLoop(segments)
+
+
+SQUARE = {
+    "points": ((1.0, 0.0), (1.0, 1.0)),
+    "speed_mps": 0.4,
+    "turn_rate_radps": 0.6,
+    "gain_distance": 1.0,
+    "gain_bearing": 2.0,
+    "turn_above_rad": 0.1,
+    "tolerance_m": 0.02,
+}
+
+
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        ({"points": ()}, r"route.points must be at least one point \[x, y\]"),
+        ({"points": ((1.0, "left"),)}, "route.points"),
+        ({"points": ((1.0, float("nan")),)}, "route.points"),
+        ({"tolerance_m": 0.0}, "route.tolerance_m must be a positive number"),
+        ({"feedback": "lidar"}, "route.feedback must be truth or odometry, got 'lidar'"),
+        ({"feedback": {"_target_": "mine.Mine"}}, "route.feedback names an onboard estimator"),
+    ],
+)
+def test_bad_points_gains_and_feedback_are_named(change, line):
+    with pytest.raises(InputError, match=line):
+        GoToPoints(**{**SQUARE, **change})
+    if "feedback" in change:
+        with pytest.raises(InputError, match=line):
+            Tour(**change)
+
+
+def test_points_are_of_the_frame_of_the_start_pose():
+    world = World(
+        "open", np.zeros((0, 4)), np.zeros((0, 2)), start_pose=np.array([2.0, 1.0, np.pi])
+    )
+    _, driver = GoToPoints(**SQUARE).start(world, ROBOT)
+    v, omega = driver.command(0, np.array([2.0, 1.0, np.pi]))
+    assert v > 0.0
+    assert omega == pytest.approx(0.0)
+    v, omega = driver.command(6, np.array([1.0, 1.0, np.pi]))  # at the first; the next is left
+    assert omega > 0.0
+
+
+def test_a_point_never_reached_leaves_the_route_incomplete():
+    world = World("open", np.zeros((0, 4)), np.zeros((0, 2)))
+    start, driver = GoToPoints(**SQUARE).start(world, ROBOT)
+    driver.command(0, start)
+    assert driver.trouble is None
+    driver.command(6 * 300 * 60, start)
+    assert driver.trouble == "incomplete"

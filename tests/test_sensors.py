@@ -2,7 +2,17 @@ import numpy as np
 import pytest
 
 from sim.errors import InputError
-from sim.sensors import Laser, Lidar3D, SensorSuite, StereoCamera, suite_from_config
+from sim.sensors import (
+    Encoder,
+    Gyroscope,
+    Laser,
+    Lidar3D,
+    PlaceDescriptor,
+    StereoCamera,
+    sensor_of,
+    sensors_from_config,
+)
+from sim.sensors.base import sensor_settings
 
 POINTS = np.array([[0.5, -0.2, 2.0], [2.5, 0.4, 5.0], [-4.0, 1.0, 8.0]])
 
@@ -80,29 +90,72 @@ def test_lidar_points_have_their_ranges_and_elevations():
     assert np.arcsin(points[-1, 2] / 7.0) == pytest.approx(lidar.elevation_max_rad)
 
 
+LASER, STEREO = "sim.sensors.laser.Laser", "sim.sensors.stereo.StereoCamera"
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"laser": {"n_beams": 0}}, "n_beams must be at least 1"),
-        ({"laser": {"n_beans": 7}}, r"unknown key sensors\.laser\.n_beans"),
-        ({"laser": {"n_beams": "many"}}, "whole number"),
-        ({"laser": {"sigma_range_m": float("nan")}}, "sigma_range_m"),
-        ({"lasr": {}}, r"unknown sensor sensors\.lasr"),
-        ({"stereo": {"selection": "best"}}, "nearest, random or spread"),
-        ({"laser": {"mount": {"z": 1}}}, r"sensors\.laser\.mount\.z"),
-        ({"encoder": {"rate_hz": -1}}, "rate_hz"),
+        ({"laser": {"_target_": LASER, "n_beams": 0}}, "n_beams must be at least 1"),
+        ({"front": {"_target_": LASER, "n_beans": 7}}, r"unknown key sensors\.front\.n_beans"),
+        ({"laser": {"_target_": LASER, "n_beams": "many"}}, "whole number"),
+        ({"laser": {"_target_": LASER, "sigma_range_m": float("nan")}}, "sigma_range_m"),
+        ({"stereo": {"_target_": STEREO, "selection": "best"}}, "nearest, random or spread"),
+        ({"laser": {"_target_": LASER, "mount": {"z": 1}}}, r"sensors\.laser\.mount\.z"),
+        (
+            {"encoder": {"_target_": "sim.sensors.encoder.Encoder", "rate_hz": -1}},
+            "rate_hz",
+        ),
+        ({"lasr": {}}, r"sensors\.lasr must be a mapping with _target_, such as"),
+        ({"laser": 3}, r"sensors\.laser must be a mapping with _target_"),
+        ({"laser": {"_target_": "sim.sensors.laser.Lasr"}}, "has no class Lasr"),
+        ({"laser": {"_target_": "sim.lasers.Laser"}}, r"no module sim\.lasers; is its folder"),
+        ({"laser": {"_target_": "Laser"}}, "must name a class"),
+        ({"laser": {"_target_": 3}}, "must name a class"),
+        ({"laser": {"_target_": "sim.settings.build"}}, r"laser\._target_=.* must be a dataclass"),
+        ({"laser": {"_target_": "sim.errors.InputError"}}, "must be a dataclass"),
+        ({"laser": {"_target_": "sim.robot.RobotGeometry", "wheel_radius_m": 1, "track_m": 1}},
+         r"RobotGeometry has no rate_hz; see sim\.sensors\.base"),
+        *(
+            ({name: {"_target_": LASER}}, "name must be one word of letters and digits")
+            for name in ("front laser", "front.laser", "front/laser", "", "1st", "läser", "a\n", 7)
+        ),
     ],
-)
+)  # fmt: skip
 def test_wrong_settings_name_their_key(settings, message):
-    with pytest.raises(InputError, match=message):
-        suite_from_config(settings)
+    with pytest.raises(InputError, match=message) as caught:
+        sensors_from_config(settings)
+    assert "\n" not in str(caught.value)
+
+
+def test_sensors_by_any_name_and_none_leaves_one_out():
+    sensors = sensors_from_config(
+        {"front": {"_target_": LASER, "n_beams": 3}, "rear_2": {"_target_": LASER}, "eye": None}
+    )
+    assert sensors == {"front": Laser(n_beams=3), "rear_2": Laser()}
+
+
+def test_a_missing_sensor_is_named():
+    sensors = {"laser": Laser(), "stereo": StereoCamera(), "lidar3d": Lidar3D()}
+    for name, sensor in sensors.items():
+        assert sensor_of(sensors, name, type(sensor)) is sensor
+        with pytest.raises(InputError, match=f"no sensor named {name} .there is none.; choose"):
+            sensor_of({}, name, type(sensor))
+    with pytest.raises(InputError, match="sensor laser is no Lidar3D but a Laser"):
+        sensor_of(sensors, "laser", Lidar3D)
 
 
 @pytest.mark.parametrize(
-    ("name", "preset"), [("laser", "hokuyo"), ("stereo", "stereo_pixel"), ("lidar3d", "lidar3d")]
+    "sensor",
+    [Encoder(None), Gyroscope(), Laser(100), Lidar3D(), PlaceDescriptor(), StereoCamera()],
+    ids=lambda sensor: type(sensor).__name__,
 )
-def test_a_missing_sensor_is_named(name, preset):
-    with pytest.raises(InputError, match=f"choose sensors that have one: sensors={preset}"):
-        getattr(SensorSuite(), f"known_{name}")
-    suite = SensorSuite(laser=Laser(), stereo=StereoCamera(), lidar3d=Lidar3D())
-    assert getattr(suite, f"known_{name}") is getattr(suite, name)
+def test_settings_make_the_same_sensor(sensor):
+    settings = sensor_settings(sensor)
+    assert sensors_from_config({"one": settings}) == {"one": sensor}
+    assert sensor_settings(sensors_from_config({"one": settings})["one"]) == settings
+
+
+def test_what_is_only_recorded_cannot_be_simulated():
+    with pytest.raises(InputError, match="choose sensors=lidar3d"):
+        PlaceDescriptor().start(np.random.default_rng(0))

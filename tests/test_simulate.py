@@ -11,9 +11,11 @@ from sim import se2
 from sim.errors import InputError
 from sim.robot import DifferentialDrive, arc_increment
 from sim.route import OpenLoop, Tour
-from sim.sensors import Encoder, Laser, Lidar3D, Mount, SensorSuite, StereoCamera
-from sim.simulate import overlaps, points_in_camera, record
+from sim.sensors import Encoder, Laser, Lidar3D, Mount, StereoCamera
+from sim.sensors.stereo import points_in_camera
+from sim.simulate import overlaps, record
 from sim.world import World
+from tests.fakes import true_ids
 
 EMPTY = World("open", np.zeros((0, 4)), np.zeros((0, 2)))
 PUZZLEBOT = DifferentialDrive(0.05, 0.19)
@@ -27,7 +29,7 @@ def streams(seed=0):
 
 
 def drive(robot, *segments, sensors=None, physics="bullet", seed=0, world=EMPTY, **options):
-    sensors = sensors or SensorSuite()
+    sensors = sensors or {"encoder": Encoder()}
     rays = "bullet" if physics == "bullet" else "exact"
     options = {"rays": rays, **options}
     return record(
@@ -60,7 +62,7 @@ def test_without_slip_the_track_is_the_nominal_one(robot):
 def test_slip_law_of_the_engine(k):
     """k within 5 %, wheels uncorrelated and white, for kr != kl."""
     robot = dataclasses.replace(PUZZLEBOT, kr=k, kl=2 * k)
-    recording = drive(robot, (0.5, 0.3, 50.0), sensors=SensorSuite(Encoder(100.0)), seed=1)
+    recording = drive(robot, (0.5, 0.3, 50.0), sensors={"encoder": Encoder(100.0)}, seed=1)
     ground = np.diff(recording.truth.wheel_travel_m, axis=0)
     error = np.diff(recording.wheels.position_m, axis=0) - ground
     found = np.sum(error**2, axis=0) / np.sum(np.abs(ground), axis=0)
@@ -86,7 +88,7 @@ def test_engine_and_kinematic_robot_agree_run_by_run():
 @pytest.mark.bullet
 def test_wheel_travel_integrates_to_the_true_pose():
     robot = dataclasses.replace(PUZZLEBOT, kr=1e-4, kl=1e-4)
-    truth = drive(robot, (0.4, 0.5, 8.0), sensors=SensorSuite(Encoder(100.0))).truth
+    truth = drive(robot, (0.4, 0.5, 8.0), sensors={"encoder": Encoder(100.0)}).truth
     pose = truth.poses[0]
     for increment in np.diff(truth.wheel_travel_m, axis=0):
         pose = se2.compose(pose, arc_increment(increment, robot.track_m))
@@ -114,16 +116,20 @@ def test_unmodelled_slip_is_off_unless_asked_for_and_adds_up_when_it_is():
 
 def test_frames_come_from_every_sensor_at_its_own_rate():
     world = Experiment.compose(["world=room", "seed=0"]).world()
-    sensors = SensorSuite(
-        Encoder(20.0), Laser(rate_hz=15.0, n_beams=31), StereoCamera(rate_hz=5.0), Lidar3D(1.0)
-    )
+    sensors = {
+        "encoder": Encoder(20.0),
+        "laser": Laser(rate_hz=15.0, n_beams=31),
+        "stereo": StereoCamera(rate_hz=5.0),
+        "lidar3d": Lidar3D(1.0),
+    }
     recording = drive(PUZZLEBOT, (0.2, 0.0, 2.0), sensors=sensors, physics="kinematic", world=world)
     end = recording.frame_stamps[-1]
-    for log, rate in ((recording.laser, 15), (recording.landmarks, 5), (recording.clouds, 1)):
+    for name, rate in (("laser", 15), ("stereo", 5), ("lidar3d", 1)):
+        log = recording.log(name)
         assert len(log.stamps) == int(end * rate + 1e-9) + 1
         assert np.isin(log.stamps, recording.frame_stamps).all()
     frames = list(recording.frames())
-    assert sum(f.ranges_m is not None for f in frames) == len(recording.laser.stamps)
+    assert sum("laser" in f.readings for f in frames) == len(recording.log("laser").stamps)
     assert np.all(np.diff(recording.frame_stamps) > 0)
 
 
@@ -136,19 +142,19 @@ def test_stereo_sees_what_geometry_says():
     recording = record(
         world,
         ROBOCOM,
-        SensorSuite(Encoder(None), stereo=camera),
+        {"stereo": camera},
         Tour(distance_m=15.0),
         streams(),
         physics="kinematic",
         rays="exact",
     )
-    log, truth = recording.landmarks, recording.truth
-    assert len(log.points_in_camera) > 100
+    log, seen = recording.log("stereo"), world.landmarks[true_ids(recording)]
+    assert len(log["points_in_camera"]) > 100
     for row, stamp in enumerate(log.stamps):
         rows = slice(*log.splits[row : row + 2])
         pose = recording.truth_at(np.array([stamp]))[0]
-        expected = points_in_camera(camera, pose, world.landmarks[truth.landmark_ids[rows]])
-        assert np.allclose(log.points_in_camera[rows], expected, atol=1e-9)
+        expected = points_in_camera(camera, pose, seen[rows])
+        assert np.allclose(log["points_in_camera"][rows], expected, atol=1e-9)
         assert np.all(np.linalg.norm(expected, axis=1) <= 6.0)
         x, y, z = expected.T
         assert np.all(np.abs(x) <= z * np.tan(np.radians(40)) + 1e-9)
@@ -160,24 +166,24 @@ def test_selection_keeps_b_of_them(selection):
     world = Experiment.compose(["world=gil2008", "seed=3", "world.n_landmarks=800"]).world()
     exact = {"sigma_column_px": 0.0, "sigma_row_px": 0.0, "sigma_disparity_px": 0.0}
     camera = StereoCamera(rate_hz=1.0, max_observations=5, selection=selection, **exact)
-    sensors = SensorSuite(stereo=camera)
+    sensors = {"encoder": Encoder(), "stereo": camera}
 
-    def tour(suite):
+    def tour(sensors):
         route = Tour(distance_m=8.0)
-        return record(world, ROBOCOM, suite, route, streams(), physics="kinematic", rays="exact")
+        return record(world, ROBOCOM, sensors, route, streams(), physics="kinematic", rays="exact")
 
     recording = tour(sensors)
-    counts = np.diff(recording.landmarks.splits)
+    counts = np.diff(recording.log("stereo").splits)
     assert counts.max() == 5
     if selection == "nearest":
         every = dataclasses.replace(camera, max_observations=0)
-        whole = tour(SensorSuite(stereo=every))
-        log, kept = whole.landmarks, recording.truth.landmark_ids
+        whole = tour({**sensors, "stereo": every})
+        log, kept = whole.log("stereo"), true_ids(recording)
         for i in range(len(log.stamps)):
             rows = slice(*log.splits[i : i + 2])
-            distance = np.linalg.norm(log.points_in_camera[rows], axis=1)
-            nearest = whole.truth.landmark_ids[rows][np.argsort(distance)[:5]]
-            mine = kept[slice(*recording.landmarks.splits[i : i + 2])]
+            distance = np.linalg.norm(log["points_in_camera"][rows], axis=1)
+            nearest = true_ids(whole)[rows][np.argsort(distance)[:5]]
+            mine = kept[slice(*recording.log("stereo").splits[i : i + 2])]
             assert set(mine) == set(nearest)
 
 
@@ -185,8 +191,10 @@ def test_selection_keeps_b_of_them(selection):
 def test_the_robot_is_not_in_its_own_scan():
     world = Experiment.compose(["world=room", "seed=0"]).world()
     laser = Laser(n_beams=90, fov_rad=2 * np.pi, sigma_range_m=0.0, mount=Mount(z_m=0.05))
-    recording = drive(PUZZLEBOT, (0.1, 0, 1.0), sensors=SensorSuite(laser=laser), world=world)
-    assert recording.laser.ranges_m.min() > 0.3
+    recording = drive(
+        PUZZLEBOT, (0.1, 0, 1.0), sensors={"encoder": Encoder(), "laser": laser}, world=world
+    )
+    assert recording.log("laser")["ranges_m"].min() > 0.3
 
 
 @pytest.mark.bullet
@@ -204,7 +212,7 @@ def test_leaving_the_route_is_reported():
     recording = record(
         EMPTY,
         rough,
-        SensorSuite(),
+        {"encoder": Encoder()},
         Tour(speed_mps=1.0, waypoints=((0, 0), (6, 0), (6, 6)), tolerance_m=0.05),
         streams(),
         physics="kinematic",
@@ -227,7 +235,7 @@ def test_tours_are_driven_to_their_end(name, robot):
 def test_a_longer_distance_goes_round_again():
     tour = Tour(waypoints=((0, 0), (2, 0), (2, 2), (0, 2), (0, 0)), distance_m=19.0)
     recording = record(
-        EMPTY, PUZZLEBOT, SensorSuite(), tour, streams(), physics="kinematic", rays="exact"
+        EMPTY, PUZZLEBOT, {"encoder": Encoder()}, tour, streams(), physics="kinematic", rays="exact"
     )
     assert recording.status == "ok"
     assert np.sum(np.hypot(*np.diff(recording.truth.poses[:, :2], axis=0).T)) > 17.5
@@ -248,9 +256,9 @@ def test_footprint_overlap():
 
 def test_rates_must_divide_the_clock():
     with pytest.raises(InputError, match=r"sensors\.encoder\.rate_hz=7 does not divide"):
-        drive(PUZZLEBOT, (0.1, 0, 1), physics="kinematic", sensors=SensorSuite(Encoder(7.0)))
+        drive(PUZZLEBOT, (0.1, 0, 1), physics="kinematic", sensors={"encoder": Encoder(7.0)})
     with pytest.raises(InputError, match="no sensor fires"):
-        drive(PUZZLEBOT, (0.1, 0, 1), physics="kinematic", sensors=SensorSuite(Encoder(None)))
+        drive(PUZZLEBOT, (0.1, 0, 1), physics="kinematic", sensors={"encoder": Encoder(None)})
 
 
 @pytest.mark.slow

@@ -16,8 +16,8 @@ from experiments.gate.conform import check_estimator
 from sim import se2
 from sim.errors import InputError
 from sim.sensors import Mount, StereoCamera
-from sim.simulate import points_in_camera
-from tests.fakes import circle, tracking_prior
+from sim.sensors.stereo import points_in_camera
+from tests.fakes import circle, tracking_prior, with_field
 
 CAMERA = StereoCamera(mount=Mount(x_m=0.2, y_m=-0.1, z_m=0.5, yaw_rad=0.3))
 PIXELS = np.array([CAMERA.sigma_column_px, CAMERA.sigma_row_px, CAMERA.sigma_disparity_px])
@@ -299,7 +299,7 @@ def test_errors_are_within_their_covariances():
 
 def test_online_is_dead_reckoning_and_finish_can_be_asked_at_any_time():
     recording = circle(1, n_frames=40)
-    blind = dataclasses.replace(recording, landmarks=None)
+    blind = recording.without("stereo")
     prior = tracking_prior(recording)
     seeing, other = Smoother(), Smoother()
     rng = np.random.default_rng(0)
@@ -324,13 +324,11 @@ def test_online_is_dead_reckoning_and_finish_can_be_asked_at_any_time():
 def test_odd_observations_are_survived():
     """A start known exactly, one Frame, duplicates, points that no camera can see."""
     recording = circle(2, n_frames=40)
-    log = recording.landmarks
-    points, ids = log.points_in_camera.copy(), log.ids.copy()
+    log = recording.log("stereo")
+    points, ids = log["points_in_camera"].copy(), log["ids"].copy()
     points[3], points[4], points[5] = np.nan, [0.1, 0.0, 0.0], [0.1, 0.0, -2.0]
     ids[7] = ids[6]
-    odd = dataclasses.replace(
-        recording, landmarks=dataclasses.replace(log, points_in_camera=points, ids=ids)
-    )
+    odd = with_field(recording, "stereo", points_in_camera=points, ids=ids)
     prior = dataclasses.replace(tracking_prior(recording), covariance=np.zeros((3, 3)))
     smoother = Smoother(robust="cauchy")
     run(smoother, odd, prior, np.random.default_rng(0))

@@ -8,7 +8,7 @@ import pytest
 from estimators.stereo import StereoModel
 from sim.errors import InputError
 from sim.sensors import Mount, StereoCamera
-from sim.simulate import points_in_camera
+from sim.sensors.stereo import points_in_camera
 
 CAMERA = StereoCamera(mount=Mount(x_m=0.3, y_m=-0.1, z_m=0.6, yaw_rad=0.4))
 POSE = np.array([1.0, -2.0, 0.7])

@@ -307,7 +307,7 @@ def test_wrong_sweeps_end_in_one_line(arguments, words):
 
 def test_values_that_no_column_holds_fail_alone(name):
     done = estima("run", "-m", *SHORT, "seed=1,2,99999999999999999999999", f"name={name}",
-                  "robot.kr=1e-5,oops")  # fmt: skip
+                  "world.n_objects=6,many")  # fmt: skip
     assert done.returncode == 1, done.stderr
     assert "Traceback" not in done.stderr
     assert "3 of 6 runs" in done.stderr

@@ -20,9 +20,9 @@ from estimators.topological_map import (
 from sim import se2
 from sim.casting import cast_lidar
 from sim.errors import InputError
-from sim.recording import CloudLog, PlaceLog, Recording, Truth, WheelLog
+from sim.recording import Log, Recording, Truth, WheelLog
 from sim.robot import RobotGeometry
-from sim.sensors import Lidar3D, SensorSuite
+from sim.sensors import Lidar3D, PlaceDescriptor
 from tests.fakes import square_room
 
 LINE = np.column_stack([2.0 * np.arange(6), np.zeros(6)])
@@ -44,9 +44,9 @@ def ring_run(n=41, radius_m=2.5):
         stamps,
         WheelLog(stamps, travel),
         RobotGeometry(0.1, 2 * half),
-        SensorSuite(lidar3d=LIDAR),
+        {"lidar3d": LIDAR},
         truth=Truth(stamps, poses, world=world),
-        clouds=CloudLog(stamps, clouds),
+        logs={"lidar3d": Log.of(LIDAR, stamps, ranges_m=clouds)},
     )
 
 
@@ -137,7 +137,8 @@ def test_a_map_from_a_mapping_run():
     rows = [int(np.argmin(np.hypot(*(run.truth.poses[:, :2] - p).T))) for p in known.positions_m]
     np.testing.assert_allclose(known.headings_rad, run.truth.poses[rows, 2])
     np.testing.assert_array_equal(
-        known.descriptors[3], descriptors.scan_context(LIDAR, run.clouds.ranges_m[rows[3]])
+        known.descriptors[3],
+        descriptors.scan_context(LIDAR, run.log("lidar3d")["ranges_m"][rows[3]]),
     )
     # the slice is the planar scan of the walls, 4 m away at most by sqrt 2
     bearings = LIDAR.azimuths_rad
@@ -148,13 +149,14 @@ def test_a_map_from_a_mapping_run():
 
 def test_a_map_of_place_descriptors():
     run = ring_run()
-    places = PlaceLog(run.clouds.stamps, np.eye(41, dtype=np.float32))
-    known = from_recording(dataclasses.replace(run, places=places), spacing_m=1.0)
+    sensor = PlaceDescriptor()
+    log = Log.of(sensor, run.log("lidar3d").stamps, descriptor=np.eye(41))
+    known = from_recording(run.with_log("place", log, sensor), spacing_m=1.0)
     assert known.descriptor == ""
     assert known.descriptors.shape[1] == 41
     assert known.slices_m.size == 0
     with pytest.raises(InputError, match="3D clouds or place"):
-        from_recording(dataclasses.replace(run, clouds=None))
+        from_recording(run.without("lidar3d"))
 
 
 def test_the_slice_looks_up_rather_than_down():

@@ -16,8 +16,8 @@ from sim import se2
 from sim.errors import InputError
 from sim.recording import Frame
 from sim.robot import RobotGeometry
-from sim.sensors import SensorSuite
-from tests.fakes import place_route
+from sim.sensors import PlaceDescriptor
+from tests.fakes import blind, place_route, with_reading
 from tests.test_topological_map import LIDAR, ring_run
 
 PAPER = {
@@ -28,6 +28,7 @@ PAPER = {
     "estimate": "mean",
 }
 ROBOT = RobotGeometry(0.1, 0.4)
+PLACES = {"place": PlaceDescriptor()}
 
 
 def line_map(n=10, step_m=2.0, join=True):
@@ -35,15 +36,18 @@ def line_map(n=10, step_m=2.0, join=True):
     return from_arrays(positions, np.eye(n), break_m=None if join else 0.1)
 
 
-def frame(i, travel_m=2.0, descriptor=None, **options):
+def frame(i, travel_m=2.0, descriptor=None, cloud_ranges_m=None):
+    readings = {}
     if descriptor is not None:
-        options["place_descriptor"] = np.asarray(descriptor, np.float32)
-    return Frame(float(i), 1.0, np.array([travel_m, travel_m]), **options)
+        readings["place"] = {"descriptor": np.asarray(descriptor, np.float32)}
+    if cloud_ranges_m is not None:
+        readings["lidar3d"] = {"ranges_m": cloud_ranges_m}
+    return Frame(float(i), 1.0, np.array([travel_m, travel_m]), readings)
 
 
 def started(known, seed=0, sensors=None, **options):
     estimator = TopologicalMcl(**options)
-    prior = Prior(ROBOT, sensors or SensorSuite(), map=known)
+    prior = Prior(ROBOT, sensors or PLACES, map=known)
     estimator.reset(prior, np.random.default_rng(seed))
     return estimator
 
@@ -122,9 +126,7 @@ def test_paper_motion_hops_one_node_an_observation_and_not_before_the_first():
 def test_odometry_motion_follows_steps_of_any_length():
     """Known start and direction: after any number of steps the node is the one reached."""
     known = line_map(60)
-    prior = Prior(
-        ROBOT, SensorSuite(), np.array([10.0, 0.0, 0.0]), np.diag([1e-4, 1e-4, 1e-4]), known
-    )
+    prior = Prior(ROBOT, PLACES, np.array([10.0, 0.0, 0.0]), np.diag([1e-4, 1e-4, 1e-4]), known)
     for travel in (0.37, 2.0, 5.3):
         estimator = TopologicalMcl(
             p_stay=0.0, p_skip=0.0, p_turn=0.0, sigma_l_m=0.3, injection=0.0, particles_per_node=50
@@ -144,9 +146,7 @@ def test_odometry_motion_follows_steps_of_any_length():
 
 def test_stay_and_skip_spread_the_particles_without_bias():
     known = line_map(200)
-    prior = Prior(
-        ROBOT, SensorSuite(), np.array([40.0, 0.0, 0.0]), np.diag([1e-4, 1e-4, 1e-4]), known
-    )
+    prior = Prior(ROBOT, PLACES, np.array([40.0, 0.0, 0.0]), np.diag([1e-4, 1e-4, 1e-4]), known)
     estimator = TopologicalMcl(
         p_stay=0.2, p_skip=0.2, p_turn=0.0, sigma_l_m=0.3, particles_per_node=100, estimate="mean"
     )
@@ -225,7 +225,7 @@ def test_bad_descriptors_are_refused_or_passed_over():
     assert told.extras["status"] == "descriptor not finite"
     np.testing.assert_allclose(told.mean, before.mean, atol=1e-12)
     assert "status" not in estimator.step(frame(2, descriptor=np.eye(10)[4])).extras
-    suite = SensorSuite(lidar3d=LIDAR)
+    suite = {"lidar3d": LIDAR}
     blank = np.full((16, 360), np.inf, np.float32)
     with pytest.raises(InputError, match="come from elsewhere"):
         started(line_map(), sensors=suite).step(frame(0, cloud_ranges_m=blank))
@@ -262,18 +262,19 @@ def test_the_wheels_carry_a_registered_pose_over_a_gap():
     known = dataclasses.replace(  # distinct places in a room that looks alike
         known, descriptor="", descriptors=known.positions_m.astype(np.float32)
     )
-    suite = SensorSuite(lidar3d=LIDAR)
+    suite = {"lidar3d": LIDAR}
     prior = Prior(run_.robot, suite, truth[0], np.diag([0.01, 0.01, 0.01]), known)
     estimator = TopologicalMcl(particles_per_node=50)
     estimator.reset(prior, np.random.default_rng(0))
     spread = 0.0
-    blind = np.full((16, 360), 0.5, np.float32)  # all is near: no outline to register
+    shut_in = np.full((16, 360), 0.5, np.float32)  # all is near: no outline to register
     for i, frame_ in enumerate(run_.frames()):
         place = truth[i, :2].astype(np.float32)
-        cloud = blind if i in (20, 21) else frame_.cloud_ranges_m
-        seen = dataclasses.replace(frame_, cloud_ranges_m=cloud, place_descriptor=place)
+        seen = with_reading(frame_, "place", descriptor=place)
+        if i in (20, 21):
+            seen = with_reading(seen, "lidar3d", ranges_m=shut_in)
         if i == 22:
-            seen = dataclasses.replace(seen, cloud_ranges_m=None, place_descriptor=None)
+            seen = blind(seen)
         belief = estimator.step(seen)
         assert (belief.extras.get("refinement") == "ok") == (i not in (20, 21, 22))
         np.testing.assert_allclose(belief.mean[:2], truth[i, :2], atol=1e-3)
@@ -286,7 +287,7 @@ def test_the_wheels_carry_a_registered_pose_over_a_gap():
 
 def test_turns_are_those_between_outlines():
     run_ = ring_run()
-    outline = run_.clouds.ranges_m[5, 8]
+    outline = run_.log("lidar3d")["ranges_m"][5, 8]
     for beams in (0, 17, -120):
         turned = np.roll(outline, -beams)  # the robot turned counter-clockwise
         best = likely_turns_rad(turned, outline)[0]
@@ -302,7 +303,9 @@ def test_refinement_finds_the_pose_from_a_node_nearby():
     for row in (2, 9, 23):
         truth = run_.truth.poses[row]
         node = int(np.argmin(np.hypot(*(known.positions_m - truth[:2]).T)))
-        noisy = run_.clouds.ranges_m[row] + noise.normal(0, 0.01, (16, 360)).astype(np.float32)
+        noisy = run_.log("lidar3d")["ranges_m"][row] + noise.normal(0, 0.01, (16, 360)).astype(
+            np.float32
+        )
         found = refiner.refine(noisy, node, [])
         off = np.array(found.pose) - truth
         # a square room looks the same after a quarter turn: the heading of the node's is tried

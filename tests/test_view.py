@@ -60,7 +60,7 @@ def test_shown_frames_are_evenly_apart_and_hold_both_ends(recording):
 def test_the_scan_lies_on_the_walls_of_the_truth(recording):
     run = view.Playback(recording, np.array([0]))
     for stamp in recording.frame_stamps[[0, 17]]:
-        points = view.scan_points(run, stamp)
+        points = view.seen_points(run, "laser", stamp)
         assert len(points) == 61
         assert np.allclose(np.abs(points).max(axis=1), HALF_ROOM_M, atol=1e-5)
 
@@ -69,17 +69,18 @@ def test_with_an_estimate_the_scan_goes_where_it_is_believed_to_be(recording):
     shift = np.array([0.3, -0.2, 0.5])
     moved = se2.compose(shift, recording.truth_at(recording.frame_stamps))
     run = view.Playback(recording, np.array([0]), believed(recording, moved))
-    plain = view.scan_points(view.Playback(recording, np.array([0])), 1.0)
-    assert np.allclose(view.scan_points(run, 1.0), se2.transform(shift, plain), atol=1e-9)
+    plain = view.seen_points(view.Playback(recording, np.array([0])), "laser", 1.0)
+    assert np.allclose(view.seen_points(run, "laser", 1.0), se2.transform(shift, plain), atol=1e-9)
 
 
 def test_landmarks_seen_are_the_true_ones(recording):
-    seen = view.seen_landmarks(view.Playback(recording, np.array([0])), recording.frame_stamps[4])
+    run = view.Playback(recording, np.array([0]))
+    seen = view.seen_points(run, "stereo", recording.frame_stamps[4])
     true = recording.truth.world.landmarks[:, :2]
     nearest = np.hypot(*(seen[:, None] - true).transpose(2, 0, 1)).min(axis=1)
     assert len(seen) > 3
     assert np.median(nearest) < 0.4  # a stereo camera errs by some decimetres
-    assert len(view.seen_landmarks(view.Playback(recording, np.array([0])), -1.0)) == 0
+    assert len(view.seen_points(run, "stereo", -1.0)) == 0
 
 
 def test_outlines_lie_on_the_ellipse():

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from experiments.runs.experiment import Experiment
-from experiments.viewing.style import save_figure
-from experiments.viewing.world import draw_world, figure, world_figure
+from experiments.viewing.style import figure, save_figure
+from experiments.viewing.world import draw_world, world_figure
 from sim.errors import InputError
 from sim.world import World
 

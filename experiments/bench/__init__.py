@@ -1,7 +1,5 @@
 """Speeds and accuracies on one core, with their goals."""
 
-from __future__ import annotations
-
 import importlib
 
 from experiments.bench.measure import as_json as json_text

@@ -1,7 +1,5 @@
 """Speed of the exact rays, from random poses in the free space of a hall with random boxes."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,8 +1,7 @@
 """Speed of FastSLAM: a whole step, the landmark update alone, and how both grow with size."""
 
-from __future__ import annotations
-
 import itertools
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -17,9 +16,9 @@ from estimators.stereo import StereoModel
 from experiments.bench.measure import Measurement, median_time_s, timed_steps
 from experiments.evaluation.statistics import log_log_slope
 from sim.arrays import Array
-from sim.recording import LandmarkLog, Recording, WheelLog
+from sim.recording import Log, Recording, WheelLog
 from sim.robot import RobotGeometry, wheel_errors
-from sim.sensors import Encoder, SensorSuite, StereoCamera
+from sim.sensors import StereoCamera
 
 PAPER = StereoCamera(sigma_column_px=10.0, sigma_row_px=10.0, correlated=False)
 _TRACK_M, _STEP_M, _RADIUS_M, _K_M = 0.4, 0.4, 5.0, 5e-5
@@ -76,10 +75,17 @@ def circling(n_landmarks: int, n_seen: int, n_steps: int, camera: StereoCamera) 
         frame_stamps=stamps,
         wheels=WheelLog(stamps, np.cumsum(wheels, axis=0)),
         robot=RobotGeometry(0.1, _TRACK_M),
-        sensors=SensorSuite(Encoder(None), stereo=camera),
-        landmarks=LandmarkLog(
-            stamps, n_seen * np.arange(n_steps + 1), points.reshape(-1, 3), ids.ravel()
-        ),
+        sensors={"stereo": camera},
+        logs={
+            "stereo": Log.of(
+                camera,
+                stamps,
+                n_seen * np.arange(n_steps + 1),
+                points_in_camera=points.reshape(-1, 3),
+                ids=ids.ravel(),
+                descriptors=np.zeros((ids.size, 0)),
+            )
+        },
         config={"bench": "circling"},
     )
 
@@ -106,24 +112,22 @@ def update_ns(n_particles: int, n_landmarks: int, n_seen: int = 20) -> float:
     return 1e9 * median_time_s(one_image, images) / (n_particles * n_seen)
 
 
-def _steps() -> list[Measurement]:
+def _steps() -> Iterator[Measurement]:
     arms: dict[str, tuple[dict[str, Any], float | None, str]] = {
         "": ({}, 0.6, "FastSLAM 2.0, ESS < M/2"),
         "motion_": ({"proposal": "motion"}, 0.6, "FastSLAM 1.0, ESS < M/2"),
         "paper_": (_PAPER, None, "FastSLAM 1.0, multinomial at every image"),
         "pixel_": ({"camera": StereoCamera()}, None, "FastSLAM 2.0, ESS < M/2, noise of 1 px"),
     }
-    results = []
     for arm, (options, goal, note) in arms.items():
         seconds, share, _ = run_steps(1000, **_SIZE, **options)
         mean, last = 1e3 * float(seconds.mean()), 1e3 * float(np.quantile(seconds, 0.99))
         name = f"fastslam.{arm}step_m1000_n200_b20"
-        results += [
+        yield from (
             Measurement(f"{name}_ms", mean, "ms", goal, note=f"{note}; mean over all steps"),
             Measurement(f"{name}_p99_ms", last, "ms"),
             Measurement(f"{name}_resampled", share, "", note="share of steps that resample"),
-        ]
-    return results
+        )
 
 
 def cost_by_landmarks(n_repeats: int) -> pd.DataFrame:
@@ -137,25 +141,24 @@ def cost_by_landmarks(n_repeats: int) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def _by_size() -> list[Measurement]:
+def _by_size() -> Iterator[Measurement]:
     ms, bs = (250, 500, 1000, 2000, 4000), (5, 10, 20, 40)
     by_m = [float(run_steps(m, **_SIZE, n_steps=150)[0].mean()) for m in ms]
     by_b = [float(run_steps(1000, n_landmarks=200, n_seen=b, n_steps=150)[0].mean()) for b in bs]
-    results = [
+    yield from (
         Measurement("fastslam.slope_m", log_log_slope(ms, by_m), "", note=f"M in {ms}"),
         Measurement("fastslam.slope_b", log_log_slope(bs, by_b), "", note=f"B in {bs}"),
-    ]
+    )
     for maps, part in cost_by_landmarks(1).groupby("maps"):
         exponent = log_log_slope(part["n_landmarks"], part["step_ms"])
         kib = run_steps(1000, **_SIZE, n_steps=100, maps=maps)[2] / 1024
         note = f"N in {_NS}, resampling at every image"
-        results += [
+        yield from (
             Measurement(f"fastslam.slope_n_{maps}", exponent, "", note=note),
             Measurement(
                 f"fastslam.memory_{maps}_n200_kib", kib, "KiB", note="maps of one particle"
             ),
-        ]
-    return results
+        )
 
 
 def run() -> list[Measurement]:

@@ -1,7 +1,5 @@
 """Speed of reading logs."""
 
-from __future__ import annotations
-
 import tempfile
 import time
 from pathlib import Path

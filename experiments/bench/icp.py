@@ -11,11 +11,9 @@ the trace of F's position block. A failure is an error of more than 5 cm or 1 de
 in all medians.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import get_args
@@ -52,7 +50,7 @@ class Pair:
     bound: Array
 
 
-def run() -> list[Measurement]:
+def run() -> Iterator[Measurement]:
     """Both metrics over all classes, the covariances, and the peers that are installed."""
     classes = {
         f"{place}_{size}": [pair(place, size, seed) for seed in _SEEDS]
@@ -64,12 +62,11 @@ def run() -> list[Measurement]:
         **{metric: partial(_match, metric) for metric in get_args(Metric)},
         **{f"peer_{n}": match for n, match in peers.items() if importlib.util.find_spec(n)},
     }
-    results = _covariances(classes["room_small"])
+    yield from _covariances(classes["room_small"])
     for name, match in matchers.items():
         for kind, pairs in classes.items():
             chosen = pairs[:60] if name.startswith("peer") else pairs
-            results += _measured(f"icp.{name}.{kind}", match, chosen)
-    return results
+            yield from _measured(f"icp.{name}.{kind}", match, chosen)
 
 
 def pair(place: str, size: str, seed: int) -> Pair:

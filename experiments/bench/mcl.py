@@ -5,9 +5,8 @@ uses them all. Times are processor times of all threads, so that other programs 
 for little. MRPT claims 30 to 36 million.
 """
 
-from __future__ import annotations
-
 import time
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +22,7 @@ from sim.builders import office
 from sim.casting import SegmentCaster
 from sim.recording import Frame
 from sim.robot import RobotGeometry, arc_increment
-from sim.sensors import Laser, SensorSuite
+from sim.sensors import Laser
 from sim.world import World
 
 _LASER = Laser(n_beams=721, max_range_m=80.0, sigma_range_m=0.01)
@@ -32,7 +31,7 @@ _TRACK_M = 0.44
 _STEP_M = 0.25  # a scan is used every 0.2 m
 
 
-def run() -> list[Measurement]:
+def run() -> Iterator[Measurement]:
     """Whole updates while tracking, and look-ups near the robot and over all the floor."""
     world = office(
         rng=stream(0, "world"),
@@ -44,7 +43,7 @@ def run() -> list[Measurement]:
     )
     poses, travels, scans = _drive(world, 240)
     frames = [
-        Frame(0.5 * i, 0.5 if i else 0.0, travel, scan)
+        Frame(0.5 * i, 0.5 if i else 0.0, travel, {"laser": {"ranges_m": scan}})
         for i, (travel, scan) in enumerate(zip(travels, scans, strict=True))
     ]
     per_update = _N_PARTICLES * _LASER.n_beams
@@ -52,10 +51,10 @@ def run() -> list[Measurement]:
     size = f"{_LASER.n_beams} beams x {_N_PARTICLES} particles"
     whole = f"{size}; motion, weights, belief, resampling ({resampled:.0%} of updates)"
     rate = per_update / update_s
-    results = [
+    yield from (
         Measurement("mcl.particle_beams_per_s", rate, "1/s", 400e6, "higher", whole),
         Measurement("mcl.update_ms", update_s * 1e3, "ms", note=whole),
-    ]
+    )
     field, rng = likelihood_field(world, _LASER), np.random.default_rng(0)
     ends = [beam_ends(scan, _LASER, _LASER.n_beams) for scan in scans[::24]]
     spread = [0.1, 0.1, 0.03]
@@ -65,8 +64,7 @@ def run() -> list[Measurement]:
         inputs = zip(particles, ends, strict=True)
         rate = per_update / median_time_s(field.log_likelihood, inputs, clock=time.process_time)
         note = f"{size}; the look-up alone, particles {name}"
-        results.append(Measurement(f"mcl.lookups_{name}_per_s", rate, "1/s", None, "higher", note))
-    return results
+        yield Measurement(f"mcl.lookups_{name}_per_s", rate, "1/s", None, "higher", note)
 
 
 def _drive(world: World, n_frames: int) -> tuple[Array, Array, NDArray[np.float32]]:
@@ -100,7 +98,7 @@ def _updates(world: World, poses: Array, frames: list[Frame]) -> tuple[float, fl
     )
     prior = Prior(
         RobotGeometry(0.1, _TRACK_M),
-        SensorSuite(laser=_LASER),
+        {"laser": _LASER},
         poses[0].copy(),
         np.diag(np.square([0.1, 0.1, 0.03])),
         world,

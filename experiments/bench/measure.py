@@ -1,7 +1,5 @@
 """What a benchmark reports, how it takes time, and on which machine."""
 
-from __future__ import annotations
-
 import io
 import json
 import statistics

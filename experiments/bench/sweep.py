@@ -1,7 +1,5 @@
 """Overhead of a sweep over its runs, and the gain of two workers."""
 
-from __future__ import annotations
-
 import shutil
 import statistics
 import subprocess
@@ -60,7 +58,9 @@ def _overheads() -> list[Measurement]:
     def packed_s(repeats: int) -> float:
         many = experiment.replaced(repeats=repeats)
         path = many.rows_folder / f"{many.key}.parquet"
-        return time_s(lambda: write_rows(evaluate(many, recording), path), clock=time.process_time)
+        return time_s(
+            lambda: write_rows(evaluate(many, lambda: recording), path), clock=time.process_time
+        )
 
     def swept_s(n_runs: int) -> float:
         """Wall time of a sweep over values of a belief, the recording being cached."""

@@ -4,8 +4,6 @@ The wheel truth gives each interval's encoder error over the travel (`wheel_trut
 as in puzzlebot2024, candidates are simulated and their ends compared (`end_poses`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Literal
 

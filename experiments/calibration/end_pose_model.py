@@ -1,7 +1,5 @@
 """End poses of open-loop runs for given kr, kl, encoder gains and track."""
 
-from __future__ import annotations
-
 from typing import Literal, get_args
 
 import numpy as np

@@ -4,8 +4,6 @@ What identifies what: an end heading alone gives kr + kl; the full end pose also
 since a wheel that slips changes the distance too.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

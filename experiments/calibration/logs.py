@@ -6,8 +6,6 @@
 track from ticks and an overhead camera that sees no heading.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """What a calibration returns."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """kr, kl, encoder gains and track where the wheels' true travel is known."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

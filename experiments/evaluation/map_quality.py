@@ -1,7 +1,5 @@
 """Quality of a map of laser points: distance to the true walls, and entropy."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -10,6 +8,7 @@ from estimators.base import Estimate
 from sim import se2
 from sim.arrays import Array
 from sim.recording import Recording
+from sim.sensors import Laser
 from sim.world import World
 
 _CHUNK = 2000
@@ -20,10 +19,10 @@ def map_points(
     recording: Recording, estimate: Estimate, every_s: float = 1.0, every_beam: int = 8
 ) -> Array:
     """Laser points (N, 2), m, in map, placed by the estimated poses."""
-    laser, log = recording.sensors.known_laser, recording.known_laser
+    laser, log = recording.sensor("laser", Laser), recording.log("laser")
     keep = np.flatnonzero(np.diff(np.floor(log.stamps / every_s), prepend=-1.0) > 0)
     rows = np.searchsorted(estimate.stamps, log.stamps[keep] - 1e-9)
-    ranges = log.ranges_m[keep, ::every_beam].astype(float)
+    ranges = log["ranges_m"][keep, ::every_beam].astype(float)
     seen = np.isfinite(ranges) & (ranges < laser.max_range_m)
     bearings = laser.bearings_rad[::every_beam]
     rays = np.stack([np.cos(bearings), np.sin(bearings)], axis=1)

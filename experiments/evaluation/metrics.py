@@ -3,8 +3,6 @@
 Poses are (T, 3) m, m, rad at the same stamps. Squares are pooled before the root is taken.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Errors of many noisy registrations of one pair of poses, against their predicted covariances."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable

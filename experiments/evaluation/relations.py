@@ -4,8 +4,6 @@ An estimate is judged by the motion between pairs of its poses whose true relati
 common frame is needed, and an early error does not count in all later poses.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 
@@ -87,8 +85,7 @@ def relation_errors(
         known = np.isfinite(ends).all(axis=(1, 2))
     if not known.any():
         raise InputError("no relation has both stamps in the trajectory; are the clocks the same?")
-    motion = se2.between(ends[known, 0], ends[known, 1])
-    error = se2.between(relations.motion[known], motion)
+    error = se2.between(relations.motion[known], se2.between(ends[known, 0], ends[known, 1]))
     return RelationErrors(
         np.hypot(error[:, 0], error[:, 1]), np.abs(se2.wrap(error[:, 2])), np.flatnonzero(known)
     )

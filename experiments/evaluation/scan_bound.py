@@ -6,8 +6,6 @@ information sum dr^T dr / sigma^2 about the pose x. Both scans of a pair are noi
 covariance of their relative pose is at least the sum of the two poses' bounds.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from sim import se2
@@ -42,8 +40,7 @@ def cast(walls: Array, T_w_sensor: Array, bearings_rad: Array) -> tuple[Array, A
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = _cross(start, along) / across
         share = _cross(start, ray) / across
-    hit = (share >= 0.0) & (share <= 1.0) & (distance > 0.0)
-    distance = np.where(hit, distance, np.inf)
+    distance = np.where((share >= 0.0) & (share <= 1.0) & (distance > 0.0), distance, np.inf)
     nearest, ranges = distance.argmin(axis=1), distance.min(axis=1)
     normals = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.hypot(*along.T)[:, None]
     return ranges, np.where(np.isfinite(ranges)[:, None], normals[nearest], np.nan)

@@ -28,13 +28,14 @@ class Interval:
         return cls(value, value, value)
 
 
-def mean_interval(values: ArrayLike) -> Interval:
+def mean_interval(values: ArrayLike, level: float = 0.95) -> Interval:
     """Mean of independent values (N,) with its t interval; without bounds below two values."""
     sample = np.asarray(values, float)
     mean = float(sample.mean()) if len(sample) else math.nan
     if len(sample) < 2 or not math.isfinite(mean):
         return Interval(mean, math.nan, math.nan)
-    half = float(stats.t.ppf(0.975, len(sample) - 1) * sample.std(ddof=1) / math.sqrt(len(sample)))
+    error = sample.std(ddof=1) / math.sqrt(len(sample))
+    half = float(stats.t.ppf(0.5 + level / 2.0, len(sample) - 1) * error)
     return Interval(mean, mean - half, mean + half)
 
 
@@ -70,33 +71,15 @@ def bootstrap_interval(
     return Interval(statistic(data), float(low), float(high))
 
 
-def log_ratio_interval(first: ArrayLike, second: ArrayLike) -> Interval:
+def log_ratio_interval(first: ArrayLike, second: ArrayLike, level: float = 0.95) -> Interval:
     """Geometric mean of the paired ratios first / second, with the t interval of its log."""
-    found = mean_interval(_log_ratios(first, second))
+    found = mean_interval(_log_ratios(first, second), level)
     return Interval(*(math.exp(v) for v in (found.value, found.low, found.high)))
 
 
 def wilcoxon_p(first: ArrayLike, second: ArrayLike) -> float:
     """P of the one-sided signed-rank test that first is below second in paired logs."""
     return float(stats.wilcoxon(_log_ratios(first, second), alternative="less").pvalue)
-
-
-def equivalent(first: ArrayLike, second: ArrayLike, margin: float) -> tuple[Interval, float]:
-    """Two one-sided t tests in paired logs that the ratio lies within 1 / (1 + m) and 1 + m.
-
-    Returns the ratio's 90 % interval, which corresponds to the two tests, and the larger p.
-    """
-    logs = _log_ratios(first, second)
-    n, limit = len(logs), math.log1p(margin)
-    if n < 2:
-        return Interval(math.exp(logs.mean()) if n else math.nan, math.nan, math.nan), math.nan
-    mean, error = logs.mean(), logs.std(ddof=1) / math.sqrt(n)
-    with np.errstate(divide="ignore", invalid="ignore"):  # no spread at all: p is 0 or 1
-        p_low = stats.t.sf((mean + limit) / error, n - 1)
-        p_high = stats.t.cdf((mean - limit) / error, n - 1)
-    half = stats.t.ppf(0.95, n - 1) * error
-    ratio = Interval(*(math.exp(v) for v in (mean, mean - half, mean + half)))
-    return ratio, float(max(p_low, p_high))
 
 
 def page_trend_p(rows: ArrayLike) -> float:
@@ -107,12 +90,6 @@ def page_trend_p(rows: ArrayLike) -> float:
 def log_log_slope(x: ArrayLike, y: ArrayLike) -> float:
     """Exponent of the power law y = c x^a fitted to positive values (N,) in logs."""
     return float(np.polyfit(np.log(x), np.log(y), 1)[0])
-
-
-def anees_band(n_recordings: int, dof: int = 3) -> tuple[float, float]:
-    """95 % band of the mean NEES of independent recordings, over its degrees of freedom."""
-    low, high = (stats.chi2.ppf([0.025, 0.975], dof * n_recordings) / (dof * n_recordings)).tolist()
-    return low, high
 
 
 def _log_ratios(first: ArrayLike, second: ArrayLike) -> Array:

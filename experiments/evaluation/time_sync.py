@@ -1,7 +1,5 @@
 """Two trajectories with clocks of their own: which poses belong together."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """A paper's claim and the verdict on it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -57,8 +55,6 @@ class Claim:
         What the interval is judged by.
     verdict, reason
         The verdict; why, or where it holds, if that is not obvious.
-    role
-        A statistic without a criterion only accompanies the claim.
     """
 
     id: str
@@ -67,11 +63,11 @@ class Claim:
     criterion: str
     verdict: Verdict
     reason: str = ""
-    role: Role = Role.HEADLINE
 
-    def __post_init__(self) -> None:
-        if self.verdict is Verdict.SHOWN:
-            object.__setattr__(self, "role", Role.BESIDE)
+    @property
+    def role(self) -> Role:
+        """A statistic without a criterion only accompanies the claim."""
+        return Role.BESIDE if self.verdict is Verdict.SHOWN else Role.HEADLINE
 
 
 def judged(interval: Interval, at_least: float = -math.inf, at_most: float = math.inf) -> Verdict:
@@ -130,6 +126,15 @@ def lower(first: ArrayLike, second: ArrayLike) -> tuple[Interval, float, Verdict
     if p < 0.01 and float(np.median(np.log(above) - np.log(below))) < 0.0:
         return ratio, p, Verdict.REPRODUCED
     return ratio, p, Verdict.NOT_REPRODUCED if ratio.low >= 1.0 else Verdict.UNDECIDED
+
+
+def equivalent(first: ArrayLike, second: ArrayLike, margin: float) -> tuple[Interval, Verdict]:
+    """Whether a paired ratio lies within 1 / (1 + m) and 1 + m, by two one-sided t tests at 0.05.
+
+    They are made in logs. The ratio's 90 % interval, which is returned too, corresponds to them.
+    """
+    ratio = log_ratio_interval(first, second, level=0.90)
+    return ratio, judged(ratio, 1.0 / (1.0 + margin), 1.0 + margin)
 
 
 def overall(parts: Sequence[Verdict]) -> Verdict:

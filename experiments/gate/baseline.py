@@ -1,7 +1,5 @@
 """Baselines of a suite: read, checked against, renewed and written."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -144,7 +142,7 @@ def baseline_paths(suite: str, *, own: bool = False) -> dict[str, Path]:
 def check(
     suite_name: str,
     only: Sequence[str] = (),
-    on_progress: Callable[[float], None] | None = None,
+    on_progress: Callable[[float], None] = lambda _: None,
 ) -> list[Finding]:
     """Run a suite, or some of its estimators, and compare it with its baselines.
 
@@ -168,7 +166,7 @@ def accept(
     only: Sequence[str] = (),
     *,
     release: bool = False,
-    on_progress: Callable[[float], None] | None = None,
+    on_progress: Callable[[float], None] = lambda _: None,
 ) -> list[Path]:
     """Run a suite and make it the baseline, with the reason written into the file.
 

@@ -14,8 +14,6 @@ has several runs per recording, and d is the difference of their means. Two ques
 `worse` means yes to both; `better` likewise, in the other direction.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math
@@ -27,6 +25,7 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
+from experiments.evaluation.statistics import mean_interval
 from experiments.gate.suite import ERRORS
 from experiments.runs.seeds import stream
 from sim.arrays import Array
@@ -185,9 +184,8 @@ def examine(
     if same:  # by the same draws, as far as both go
         logs_then, logs_now = logs_then[:, :shared], logs_now[:, :shared]
     differences = logs_now.mean(axis=1) - logs_then.mean(axis=1)
-    mean = float(differences.mean())
-    half = float(stats.t.ppf(1.0 - ALPHA_GENERAL, n - 1) * differences.std(ddof=1) / math.sqrt(n))
-    ratios = (math.exp(mean), math.exp(mean - half), math.exp(mean + half))
+    mean = mean_interval(differences, 1.0 - 2.0 * ALPHA_GENERAL)
+    ratios = (math.exp(mean.value), math.exp(mean.low), math.exp(mean.high))
     if same:
         return Finding(*which, n, n_suite, *ratios, ones, ones, Change.IDENTICAL)
     p_general = general_p(differences)

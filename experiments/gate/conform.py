@@ -1,11 +1,9 @@
 """The checks that every estimator must pass.
 
-An estimator may state `needs`, a set of names among `wheels`, `laser`, `landmarks`, `cloud`,
-`place` and `map`. If it cannot be equivariant to the last digit (a grid, a global search), it
-states `global_or_grid = True` and is compared in distribution.
+An estimator may state `needs`: see `estimators.base.Estimator`. If it cannot be equivariant to
+the last digit (a grid, a global search), it states `global_or_grid = True` and is compared in
+distribution.
 """
-
-from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
@@ -23,21 +21,12 @@ from experiments.runs.targets import make
 from sim import se2
 from sim.arrays import Array
 from sim.errors import InputError
-from sim.recording import Recording
-from sim.sensors import SensorSuite
+from sim.recording import Frame, Recording
 from sim.world import World
 
 Make = Callable[[], Estimator]
 MOTION = np.array([3.0, -2.0, 0.7])  # the rigid motion of the world in the equivariance check
 N_SEEDS = 30  # runs of each arm when compared in distribution
-# What can be taken away: the sensor and the log that a need stands for
-_SENSOR_AND_LOG = {
-    "laser": ("laser", "laser"),
-    "landmarks": ("stereo", "landmarks"),
-    "cloud": ("lidar3d", "clouds"),
-}
-# Every recording has wheels, and a place descriptor comes from no sensor of the suite.
-_NEVER_MISSING = ("wheels", "place")
 _GRAIN = np.array([0.05, 0.05, 0.02])  # how far a grid may be off once turned: m, m, rad
 # Recordings to check on, each with a tracking prior and its map
 _ROOM = (
@@ -165,19 +154,18 @@ def _writable_copy(value: Any) -> Any:
     """Deep copy of a Frame whose arrays can be written to, so that a fault shows as a change."""
     if isinstance(value, np.ndarray):
         return value.copy()
+    if isinstance(value, Mapping):
+        return {name: _writable_copy(part) for name, part in value.items()}
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return type(value)(**{name: _writable_copy(part) for name, part in vars(value).items()})
     return value
 
 
-def _arrays(frame: Any) -> dict[str, Array]:
+def _arrays(frame: Frame) -> dict[str, Array]:
     """Arrays of a Frame, and of what it holds, by the names of their fields."""
-    found: dict[str, Array] = {}
-    for name, value in vars(frame).items():
-        if dataclasses.is_dataclass(value):
-            found |= _arrays(value)
-        elif isinstance(value, np.ndarray):
-            found[name] = value
+    found = {"wheel_increments_m": frame.wheel_increments_m}
+    for sensor, reading in frame.readings.items():
+        found |= {f"{sensor}.{name}": values for name, values in reading.items()}
     return found
 
 
@@ -190,8 +178,9 @@ def _reset(new: Make, recording: Recording, prior: Prior) -> str:
 def _equivariant(new: Make, recording: Recording, prior: Prior) -> str:
     """Move the world; the beliefs must move with it."""
     recording, moved = recording.cut(30), _moved_prior(prior)
+    elsewhere = _moved_readings(recording)
     if not getattr(new(), "global_or_grid", False):
-        here, there = walk(new(), recording, prior), walk(new(), recording, moved)
+        here, there = walk(new(), recording, prior), walk(new(), elsewhere, moved)
         if not all(np.isfinite(part).all() for part in (*here, *there)):
             return "not finite"
         tolerance = 1e-9 if _same(here, walk(new(), recording, prior, seed=1)) else 1e-6
@@ -199,8 +188,20 @@ def _equivariant(new: Make, recording: Recording, prior: Prior) -> str:
         return f"off by {fault:.2g} (allowed {tolerance:g})" if fault > tolerance else ""
     seeds = range(N_SEEDS)
     ends = np.array([walk(new(), recording, prior, seed)[0][-1] for seed in seeds])
-    moved_ends = np.array([walk(new(), recording, moved, N_SEEDS + s)[0][-1] for s in seeds])
+    moved_ends = np.array([walk(new(), elsewhere, moved, N_SEEDS + s)[0][-1] for s in seeds])
     return _differ(ends, se2.compose(se2.inverse(MOTION), moved_ends))
+
+
+def _moved_readings(recording: Recording) -> Recording:
+    """Return the recording with readings of places in map, as a beacon's, in the moved map."""
+    for name, log in recording.logs.items():
+        values = dict(log.values)
+        for key in (key for key, field in log.schema.items() if field.in_map):
+            values[key] = values[key].copy()
+            flat = values[key][..., :2].reshape(-1, 2).astype(np.float64)
+            values[key][..., :2] = se2.transform(MOTION, flat).reshape(values[key][..., :2].shape)
+        recording = recording.with_log(name, dataclasses.replace(log, values=values))
+    return recording
 
 
 def _differ(first: Array, second: Array) -> str:
@@ -278,19 +279,13 @@ def move_world(world: World, T_new_old: Array) -> World:
 def _missing(new: Make, recording: Recording, prior: Prior) -> str:
     """Take away what the estimator needs; it must then raise an InputError of one line."""
     for need in sorted(getattr(new(), "needs", ())):
-        blind, poorer = recording, prior
+        blind, poorer, estimator = recording, prior, new()
         if need == "map":
             poorer = dataclasses.replace(prior, map=None)
-        elif need in _SENSOR_AND_LOG:
-            sensor, log = _SENSOR_AND_LOG[need]
-            suite: SensorSuite = _without(prior.sensors, sensor)
-            poorer = dataclasses.replace(prior, sensors=suite)
-            blind = dataclasses.replace(_without(recording, log), sensors=suite)
-        elif need in _NEVER_MISSING:
-            continue
         else:
-            known = ", ".join([*_NEVER_MISSING, *_SENSOR_AND_LOG, "map"])
-            return f"unknown need {need!r}; known: {known}"
+            for option in need.split("|"):
+                blind = blind.without(getattr(estimator, option, option))
+            poorer = dataclasses.replace(prior, sensors=blind.sensors)
         try:
             walk(new(), blind, poorer)
         except InputError as error:
@@ -299,12 +294,6 @@ def _missing(new: Make, recording: Recording, prior: Prior) -> str:
             continue
         return f"runs without {need}, which it says it needs"
     return ""
-
-
-def _without(holder: Any, name: str) -> Any:
-    """Return the recording, or the sensors, with None in place of one of its parts."""
-    nothing: dict[str, Any] = {name: None}
-    return dataclasses.replace(holder, **nothing)
 
 
 _CHECKS: Mapping[str, Callable[[Make, Recording, Prior], str]] = {
@@ -319,7 +308,9 @@ _CHECKS: Mapping[str, Callable[[Make, Recording, Prior], str]] = {
 }
 
 
-def conform_target(target: str, arguments: Sequence[str]) -> list[CheckResult]:
+def conform_target(
+    target: str, arguments: Sequence[str], searched: Sequence[str] = ()
+) -> list[CheckResult]:
     """Check an estimator on a small recording.
 
     Parameters
@@ -327,14 +318,18 @@ def conform_target(target: str, arguments: Sequence[str]) -> list[CheckResult]:
     target
         An option of conf/estimator, or MODULE:CLASS.
     arguments
-        Hydra overrides of the option, or the constructor's arguments, key=value.
+        Hydra overrides of the option, or the constructor's arguments, key=value; overrides of
+        `sensors` say what the recording is made with.
+    searched
+        Override that names where else options are.
     """
+    sensors = [a for a in arguments if a.lstrip("+~").startswith("sensors")]
     if ":" in target or "." in target:
-        new = _of_class(target, arguments)
+        new = _of_class(target, [a for a in arguments if a not in sensors])
     else:
-        new = Experiment.compose([f"estimator={target}", *arguments]).estimator
-    recording, prior = example(places="place" in getattr(new(), "needs", ()))
-    return check_estimator(new, recording, prior)
+        new = Experiment.compose([*searched, f"estimator={target}", *arguments]).estimator
+    places = "place|lidar3d" in getattr(new(), "needs", ())
+    return check_estimator(new, *example([*searched, *sensors], places=places))
 
 
 def _of_class(target: str, arguments: Sequence[str]) -> Make:
@@ -353,14 +348,19 @@ def _of_class(target: str, arguments: Sequence[str]) -> Make:
     return lambda: make(settings, "estimator")
 
 
-def example(*, places: bool = False) -> tuple[Recording, Prior]:
+def example(sensors: Sequence[str] = (), *, places: bool = False) -> tuple[Recording, Prior]:
     """Return a short recording, and a tracking prior with its map.
 
     Parameters
     ----------
+    sensors
+        Overrides of the sensors.
     places
         A route of place descriptors, instead of a room seen by all other sensors but the 3D lidar.
     """
-    experiment = Experiment.compose(_PLACES if places else _ROOM)
+    usual: Sequence[str] = _PLACES if places else _ROOM
+    if any(override.startswith("sensors=") for override in sensors):
+        usual = [override for override in usual if not override.startswith("sensors")]
+    experiment = Experiment.compose([*usual, *sensors])
     recording = experiment.recording()
     return recording, experiment.prior(recording)

@@ -4,12 +4,10 @@ There are three kinds: a wrong entry of a derivative (or of the geometry behind 
 observations, and noise that is added or overestimated. Each has a size. No error is ever scaled.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from typing import Any
 from unittest import mock
 
@@ -21,10 +19,11 @@ from estimators.gaussian import Gaussian
 from estimators.scan_matching import Match, ScanMatcher
 from estimators.stereo import StereoModel
 from sim.arrays import Array
-from sim.recording import Frame, LandmarkSet
+from sim.recording import Frame
 from sim.robot import wheel_errors
+from sim.sensors import Laser, Reading, sensor_of
 
-Planted = Callable[[Estimator, np.random.Generator], AbstractContextManager[Estimator]]
+Planted = Callable[[Estimator, np.random.Generator], AbstractContextManager[object]]
 Fault = Callable[[float], Planted]  # of a size
 
 
@@ -38,15 +37,15 @@ def in_argument_of(
 
     def decorate(change: Callable[[Any, float, np.random.Generator], Any]) -> Fault:
         def fault(size: float) -> Planted:
-            @contextmanager
-            def plant(estimator: Estimator, rng: np.random.Generator) -> Iterator[Estimator]:
+            def plant(
+                estimator: Estimator, rng: np.random.Generator
+            ) -> AbstractContextManager[object]:
                 sound = getattr(estimator, method)
 
                 def faulty(argument: Any, *others: Any) -> Any:
                     return sound(change(argument, size, rng), *others)
 
-                with mock.patch.object(estimator, method, faulty):
-                    yield estimator
+                return mock.patch.object(estimator, method, faulty)
 
             return plant
 
@@ -63,15 +62,15 @@ def in_place_of(owner: Any, name: str) -> Callable[[Callable[..., Any]], Fault]:
 
     def decorate(wrong: Callable[..., Any]) -> Fault:
         def fault(size: float) -> Planted:
-            @contextmanager
-            def plant(estimator: Estimator, rng: np.random.Generator) -> Iterator[Estimator]:
+            def plant(
+                estimator: Estimator, rng: np.random.Generator
+            ) -> AbstractContextManager[object]:
                 sound = getattr(owner, name)
 
                 def faulty(*arguments: Any, **keywords: Any) -> Any:
                     return wrong(sound, size, *arguments, **keywords)
 
-                with mock.patch.object(owner, name, faulty):
-                    yield estimator
+                return mock.patch.object(owner, name, faulty)
 
             return plant
 
@@ -85,8 +84,7 @@ def lost(name: str) -> Fault:
 
     @in_argument_of("step")
     def fault(frame: Frame, share: float, rng: np.random.Generator) -> Frame:
-        nothing: dict[str, Any] = {name: None}
-        return dataclasses.replace(frame, **nothing) if rng.random() < share else frame
+        return _reading(frame, name, None) if rng.random() < share else frame
 
     return fault
 
@@ -94,12 +92,11 @@ def lost(name: str) -> Fault:
 @in_argument_of("step")
 def lost_landmarks(frame: Frame, share: float, rng: np.random.Generator) -> Frame:
     """Each observation of a landmark is dropped with some probability."""
-    seen = frame.landmarks
+    seen = frame.readings.get("stereo")
     if seen is None:
         return frame
-    kept = rng.random(len(seen.points_in_camera)) >= share
-    left: dict[str, Any] = {k: None if v is None else v[kept] for k, v in vars(seen).items()}
-    return dataclasses.replace(frame, landmarks=LandmarkSet(**left))
+    kept = rng.random(len(seen["points_in_camera"])) >= share
+    return _reading(frame, "stereo", {name: values[kept] for name, values in seen.items()})
 
 
 @in_argument_of("step")
@@ -119,36 +116,46 @@ def noisy_increments(frame: Frame, k: float, rng: np.random.Generator) -> Frame:
 @in_argument_of("step")
 def noisy_ranges(frame: Frame, sigma_m: float, rng: np.random.Generator) -> Frame:
     """Noise is added to the ranges."""
-    if frame.ranges_m is None:
+    scan = frame.readings.get("laser")
+    if scan is None:
         return frame
-    noise = sigma_m * rng.standard_normal(frame.ranges_m.shape)
-    return dataclasses.replace(frame, ranges_m=(frame.ranges_m + noise).astype(np.float32))
+    noise = sigma_m * rng.standard_normal(scan["ranges_m"].shape)
+    noisy = (scan["ranges_m"] + noise).astype(np.float32)
+    return _reading(frame, "laser", {"ranges_m": noisy})
 
 
 @in_argument_of("step")
 def noisy_descriptors(frame: Frame, sigma: float, rng: np.random.Generator) -> Frame:
     """Noise of this mean length is added to the place descriptors."""
-    seen = frame.place_descriptor
-    if seen is None:
+    place = frame.readings.get("place")
+    if place is None:
         return frame
+    seen = place["descriptor"]
     noise = sigma / math.sqrt(len(seen)) * rng.standard_normal(len(seen))
-    return dataclasses.replace(frame, place_descriptor=(seen + noise).astype(np.float32))
+    return _reading(frame, "place", {"descriptor": (seen + noise).astype(np.float32)})
+
+
+def _reading(frame: Frame, name: str, reading: Reading | None) -> Frame:
+    """Return the Frame with another reading of a sensor, or with none."""
+    others = {key: value for key, value in frame.readings.items() if key != name}
+    return dataclasses.replace(
+        frame, readings=others if reading is None else {**others, name: reading}
+    )
 
 
 @in_argument_of("step")
 def wrong_travel(frame: Frame, share: float, _: np.random.Generator) -> Frame:
     """The wheels' travel is believed too long, as by a wrong radius."""
-    travel = (1.0 + share) * frame.wheel_increments_m
-    return dataclasses.replace(frame, wheel_increments_m=travel)
+    return dataclasses.replace(frame, wheel_increments_m=(1.0 + share) * frame.wheel_increments_m)
 
 
 @in_argument_of("reset")
 def wrong_mount(prior: Prior, offset_m: float, _: np.random.Generator) -> Prior:
     """The laser is believed to be mounted further ahead than it is."""
-    laser = prior.sensors.known_laser
+    laser = sensor_of(prior.sensors, "laser", Laser)
     mount = dataclasses.replace(laser.mount, x_m=laser.mount.x_m + offset_m)
     laser = dataclasses.replace(laser, mount=mount)
-    return dataclasses.replace(prior, sensors=dataclasses.replace(prior.sensors, laser=laser))
+    return dataclasses.replace(prior, sensors={**prior.sensors, "laser": laser})
 
 
 @in_place_of(odometry, "relative_motion")
@@ -219,17 +226,17 @@ FAULTS: dict[str, dict[str, tuple[Fault, float]]] = {
     },
     "icp_odometry": {
         "derivative": (wrong_mount, 0.005),
-        "lost": (lost("ranges_m"), 0.2),
+        "lost": (lost("laser"), 0.2),
         "noise": (noisy_ranges, 0.005),
     },
     "ekf_icp": {
         "derivative": (wrong_between, 0.1),
-        "lost": (lost("ranges_m"), 0.2),
+        "lost": (lost("laser"), 0.2),
         "noise": (inflated_registration, 2.0),
     },
     "ekf_icp_paper": {
         "derivative": (wrong_observation, 0.1),
-        "lost": (lost("ranges_m"), 0.05),
+        "lost": (lost("laser"), 0.05),
         "noise": (inflated_registration, 1.0),
     },
     "ekf_slam": {
@@ -249,12 +256,12 @@ FAULTS: dict[str, dict[str, tuple[Fault, float]]] = {
     },
     "mcl": {
         "derivative": (wrong_wheels, 0.5),
-        "lost": (lost("ranges_m"), 0.3),
+        "lost": (lost("laser"), 0.3),
         "noise": (inflated_wheels, 1.0),
     },
     "topological_mcl": {
         "derivative": (wrong_travel, 0.2),
-        "lost": (lost("place_descriptor"), 0.1),
+        "lost": (lost("place"), 0.1),
         "noise": (noisy_descriptors, 0.3),
     },
 }

@@ -13,16 +13,14 @@ one estimator from its faulty runs.
     python -m experiments.gate.power --share 0.1    # a few minutes; rough
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import math
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -59,7 +57,7 @@ from experiments.runs.console import progress
 from experiments.runs.paths import SOURCE, results
 from experiments.runs.row import write_frame
 from experiments.runs.seeds import stream
-from experiments.viewing.style import BLUE, GREEN, ORANGE, WALL, figure, save_figure
+from experiments.viewing.style import BLUE, GREEN, ORANGE, WALL, save_figure, subplots
 from sim.arrays import Array
 from sim.files import write_whole
 
@@ -94,8 +92,7 @@ VARIANTS: dict[str, tuple[dict[str, str], bool]] = {
 }
 
 
-@contextmanager
-def reordered(estimator: Estimator, rng: np.random.Generator) -> Iterator[Estimator]:
+def reordered(estimator: Estimator, rng: np.random.Generator) -> AbstractContextManager[object]:
     """Draw one number before all others, so that each of them has another use."""
     sound = estimator.reset
 
@@ -103,8 +100,7 @@ def reordered(estimator: Estimator, rng: np.random.Generator) -> Iterator[Estima
         stream_.standard_normal()
         sound(prior, stream_)
 
-    with mock.patch.object(estimator, "reset", reset):
-        yield estimator
+    return mock.patch.object(estimator, "reset", reset)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -419,9 +415,7 @@ _KINDS = {"derivative": (BLUE, "o"), "lost": (ORANGE, "s"), "noise": (GREEN, "^"
 
 def detectable(power: pd.DataFrame, target: float) -> Figure:
     """Worsening that 95 % of checks find, of each estimator and kind of fault, beside the goal."""
-    page = figure(6.0, 3.4)
-    axes = page.subplots()
-    label = "worsening of the position error that 95 % of checks find, %"
+    page, axes = subplots(6.0, 3.4)
     names = list(dict.fromkeys(power["estimator"]))
     for k, (kind, (colour, marker)) in enumerate(_KINDS.items()):
         rows = power[power["fault"] == kind]
@@ -430,7 +424,7 @@ def detectable(power: pd.DataFrame, target: float) -> Figure:
     axes.axvline(100.0 * target, color=WALL, linestyle="--", linewidth=1.0)
     axes.set_yticks(range(len(names)), names)
     axes.invert_yaxis()
-    axes.set(xlim=(0.0, None), xlabel=label)
+    axes.set(xlim=(0.0, None), xlabel="worsening of the position error that 95 % of checks find, %")
     axes.legend(title="fault", loc="upper left", bbox_to_anchor=(1.0, 1.0))
     return page
 

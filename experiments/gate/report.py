@@ -1,7 +1,5 @@
 """Reports of a check: as text, to GitHub (annotations, a summary), and as JUnit XML."""
 
-from __future__ import annotations
-
 import math
 import os
 import sys
@@ -174,11 +172,11 @@ def _number(value: float, form: str, unit: str = "") -> str:
 
 def as_annotations(findings: Sequence[Finding]) -> str:
     """Give GitHub's workflow commands: an error for each alarm, a notice for each improvement."""
-    lines = []
-    for finding in _noteworthy(findings):
-        level, text = "error" if finding.alarms else "notice", sentence(finding)
-        lines.append(f"::{level} title=estima check::{text.replace('%', '%25')}")
-    return "\n".join(lines)
+    return "\n".join(
+        f"::{'error' if finding.alarms else 'notice'} title=estima check::"
+        + sentence(finding).replace("%", "%25")
+        for finding in _noteworthy(findings)
+    )
 
 
 def as_junit(findings: Sequence[Finding]) -> str:
@@ -186,13 +184,12 @@ def as_junit(findings: Sequence[Finding]) -> str:
     root = ET.Element("testsuites", name="estima check")
     for baseline in dict.fromkeys(f.baseline for f in findings):
         group = [f for f in findings if f.baseline == baseline]
-        n_failures = sum(f.alarms for f in group)
         suite = ET.SubElement(
             root,
             "testsuite",
             name=f"estima check, {baseline}",
             tests=str(len(group)),
-            failures=str(n_failures),
+            failures=str(sum(f.alarms for f in group)),
             errors="0",
         )
         for finding in group:

@@ -94,7 +94,7 @@ class Suite:
         return dataclasses.replace(self, estimators=chosen)
 
 
-Planted = Callable[[Estimator, np.random.Generator], AbstractContextManager[Estimator]]
+Planted = Callable[[Estimator, np.random.Generator], AbstractContextManager[object]]
 
 
 def read_suite(path: Path) -> Suite:
@@ -188,7 +188,7 @@ def run_suite(
     *,
     reseed: int = 0,
     planted: Mapping[str, Planted] | None = None,
-    on_progress: Callable[[float], None] | None = None,
+    on_progress: Callable[[float], None] = lambda _: None,
     n_jobs: int = -1,
 ) -> pd.DataFrame:
     """Errors of each run: `estimator`, `recording` (seed), `repeat`, and ERRORS.
@@ -200,7 +200,7 @@ def run_suite(
     reseed
         Number of the seeding of the estimators' streams.
     planted
-        Faults planted in estimators, by name: a context that yields the faulty one.
+        Faults planted in estimators, by name: a context in which the estimator is faulty.
     on_progress
         Called with the share of the recordings done.
 
@@ -228,8 +228,7 @@ def run_suite(
     )
     for i, part in enumerate(done, start=1):
         rows.extend(part)
-        if on_progress is not None:
-            on_progress(i / len(jobs))
+        on_progress(i / len(jobs))
     return pd.DataFrame(rows)
 
 
@@ -249,7 +248,7 @@ def _run_recording(
     for entry, experiment, planted in runs:
         for row in evaluate(
             experiment.replaced(seed=seed, world_seed=seed),
-            recording,
+            lambda: recording,
             streams=partial(_stream, f"estimator/{entry.name}", seed, reseed),
             planted=None if planted is None else _plant(planted, seed, reseed),
         ):
@@ -272,7 +271,7 @@ def _stream(axis: str, seed: int, reseed: int, repeat: int) -> np.random.Generat
 
 def _plant(
     planted: Planted, seed: int, reseed: int
-) -> Callable[[Estimator, int], AbstractContextManager[Estimator]]:
+) -> Callable[[Estimator, int], AbstractContextManager[object]]:
     return lambda estimator, repeat: planted(estimator, _stream("fault", seed, reseed, repeat))
 
 
@@ -282,19 +281,13 @@ def printable(text: str) -> str:
 
 
 def fingerprint(recording: Recording) -> float:
-    """Sum of weighted means over all that was measured, and over the true positions.
+    """Sum of weighted means over each sensor's first field, and over the true positions.
 
     Machines that differ in the last bits make recordings with different checksums, but with
     fingerprints that agree to a millionth; those of different recordings do not.
     """
-    parts = (
-        (recording.wheels, "position_m"),
-        (recording.laser, "ranges_m"),
-        (recording.landmarks, "points_in_camera"),
-        (recording.places, "descriptors"),
-        (recording.clouds, "ranges_m"),
-    )
-    logs = [getattr(log, name) for log, name in parts if log is not None]
+    first = [next(iter(log.values.values())) for log in recording.logs.values()]
+    logs = [recording.wheels.position_m, *first]
     if recording.truth is not None:
         logs.append(recording.truth.poses[:, :2])
     total = 0.0

@@ -1,7 +1,5 @@
 """The jobs of a study: which runs go together, and how all cores share them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from typing import Any, TypeVar
 

@@ -1,7 +1,5 @@
 """Make all papers' tables, figures and claims in results/, as `make reproduce` does."""
 
-from __future__ import annotations
-
 import importlib
 import os
 import sys
@@ -103,7 +101,7 @@ def reproduce_paper(paper: str, profile: Profile) -> list[Claim]:
         with progress(paper, 1.0) as on_progress:
             _part(paper, "study").run(profile, made, on_progress)
         _draw(made)
-        claims: list[Claim] = _part(paper, "claims").judge(made)
+        claims: list[Claim] = [] if paper in OWN else _part(paper, "claims").judge(made)
         for kind in ("tables", "arrays", "figures"):
             _put_in_place(made.folder / kind, place / kind, paper)
         command = f"estima reproduce --paper {paper}{' --full' * (profile is Profile.FULL)}"

@@ -1,7 +1,5 @@
 """What a study writes for its claims and figures: tables and arrays."""
 
-from __future__ import annotations
-
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping

@@ -3,8 +3,6 @@
 The claims are the rows of results/claims.csv; results/provenance.json says how they were made.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -54,7 +52,7 @@ def write_claims(
     The statistics of a claim stay in the order given: the paper's headline first.
     """
     origin = {"paper": paper, "profile": profile, "study": paper, "command": command}
-    rows = [{**vars(claim), **vars(claim.found), **origin} for claim in claims]
+    rows = [{**vars(claim), **vars(claim.found), "role": claim.role, **origin} for claim in claims]
     new = pd.DataFrame(rows, columns=list(COLUMNS)).astype(dict.fromkeys(_ENUMS, "str"))
     if path.exists():
         old = read_claims(path)

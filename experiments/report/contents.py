@@ -1,7 +1,5 @@
 """What the report shows, read from results/ into plain data."""
 
-from __future__ import annotations
-
 import base64
 import struct
 from collections import Counter

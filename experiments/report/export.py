@@ -1,7 +1,5 @@
 """Tables for papers and pages: LaTeX (booktabs) and Markdown."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path

@@ -3,8 +3,6 @@
 It is made only from what the studies left in results/, and is a single file.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import textwrap
+from difflib import get_close_matches
 
 import numpy as np
 import pandas as pd
@@ -12,7 +13,7 @@ from matplotlib.figure import Figure
 from experiments.evaluation.statistics import mean_interval
 from experiments.runs.columns import COLUMNS, title
 from experiments.sweeps.collect import measured, telling
-from experiments.viewing.style import CYCLE, figure
+from experiments.viewing.style import CYCLE, subplots
 from sim.errors import InputError
 
 _WIDE_X, _WIDE_Y = 20.0, 30.0  # an axis that spans more than this factor is logarithmic
@@ -34,15 +35,14 @@ def sweep_figure(table: pd.DataFrame, x: str, y: str, by: str | None = None) -> 
     """
     for column in filter(None, (x, y, by)):
         if column not in table:
-            near = [c for c in table.columns if column.split(".")[-1] in c]
-            hint = f"; did you mean {', '.join(near[:4])}?" if near else ""
-            raise InputError(f"the sweep has no column {column}{hint}")
+            raise InputError(
+                f"the sweep has no column {column}; there are {', '.join(_columns(table, column))}"
+            )
     if table[y].dtype.kind not in "fi":
         raise InputError(f"column {y} holds no numbers; there are {', '.join(measured(table))}")
     if table[[x, y]].dropna().empty:
         raise InputError(f"no run has both {x} and {y}")
-    page = figure(6.5, 4.0)
-    ax = page.subplots()
+    page, ax = subplots(6.5, 4.0)
     scale = COLUMNS[y].scale if y in COLUMNS else "log"
     logarithmic = scale == "log" and _spans(table[y], _WIDE_Y)
     numeric = table[x].dtype.kind in "fi"
@@ -82,6 +82,13 @@ def sweep_figure(table: pd.DataFrame, x: str, y: str, by: str | None = None) -> 
     return page
 
 
+def _columns(table: pd.DataFrame, wanted: str) -> list[str]:
+    """Columns of a table: those most like a wanted one, swept settings, results, and all others."""
+    near = get_close_matches(wanted, map(str, table), n=len(table.columns))
+    near += [name for name in table if wanted.rpartition(".")[2] in name]
+    return list(dict.fromkeys([*near, *telling(table), *measured(table), *table]))
+
+
 def _spans(values: pd.Series[float], factor: float) -> bool:
     """Whether positive values differ by more than a factor."""
     return bool(values.min() > 0.0 and values.max() > factor * values.min())
@@ -89,5 +96,5 @@ def _spans(values: pd.Series[float], factor: float) -> bool:
 
 def _interval(values: pd.Series[float], logarithmic: bool) -> tuple[float, ...]:
     """Mean and the bounds of its interval; those of the logarithm on a logarithmic axis."""
-    found = vars(mean_interval(np.log(values) if logarithmic else values))
-    return tuple(math.exp(v) if logarithmic else v for v in found.values())
+    found = vars(mean_interval(np.log(values) if logarithmic else values)).values()
+    return tuple(map(math.exp, found)) if logarithmic else tuple(found)

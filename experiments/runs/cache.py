@@ -3,8 +3,6 @@
 It holds at most $ESTIMA_CACHE_GIB (8 unless set); the least recently used go first.
 """
 
-from __future__ import annotations
-
 import fcntl
 import hashlib
 import json

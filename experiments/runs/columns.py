@@ -3,8 +3,6 @@
 This is the one schema of rows: by its name, a column is a setting, a metric, a status or an origin.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import dataclass
 from typing import Literal
@@ -35,7 +33,7 @@ class Column:
     better: Literal["lower", "higher"] | None = "lower"
 
 
-_OF_THE_RUN = {
+OF_THE_RUN = {
     "duration_s": Column("duration", "t", "s", "linear", None),
     "distance_m": Column("distance travelled", "d", "m", "linear", None),
 }
@@ -60,7 +58,7 @@ _OF_THE_PATH = {
     "rpe_10m_heading_rmse_rad": Column("heading RMSE over 10 m", "RPE heading 10 m", "rad"),
 }
 COLUMNS = {
-    **_OF_THE_RUN,
+    **OF_THE_RUN,
     **_OF_THE_PATH,
     **{
         f"revised_{name}": dataclasses.replace(

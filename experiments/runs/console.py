@@ -1,7 +1,5 @@
 """Terminal output: progress, and the one line that ends a failed command."""
 
-from __future__ import annotations
-
 import importlib
 import re
 import sys

@@ -1,14 +1,16 @@
 """The one runner: an experiment's rows."""
 
-from __future__ import annotations
-
+import functools
+import os
 from collections.abc import Callable, Collection
 from contextlib import AbstractContextManager, nullcontext
 
 import numpy as np
+from threadpoolctl import ThreadpoolController
 
 from estimators.base import Estimate, Estimator, Prior, run
 from experiments.evaluation.metrics import score
+from experiments.runs.columns import OF_THE_RUN
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome, Row, Status
 from experiments.runs.seeds import stream
@@ -16,33 +18,36 @@ from sim.errors import InputError
 from sim.recording import Recording
 
 Streams = Callable[[int], np.random.Generator]
-Planted = Callable[[Estimator, int], AbstractContextManager[Estimator]]
+Planted = Callable[[Estimator, int], AbstractContextManager[object]]
+Shown = Callable[[Recording], AbstractContextManager[Callable[[int], None]]]
 
 
 def evaluate(
     experiment: Experiment,
-    recording: Recording | None = None,
+    fetch: Callable[[], Recording] | None = None,
     *,
     streams: Streams | None = None,
     planted: Planted | None = None,
-    on_step: Callable[[int], None] | None = None,
-    on_estimate: Callable[[int, Estimate, Estimate | None], None] | None = None,
-    on_error: Callable[[Exception | SystemExit], None] | None = None,
+    shown: Shown | None = None,
+    on_estimate: Callable[[Recording, int, Estimate, Estimate | None], None] = lambda *_: None,
+    on_error: Callable[[Exception | SystemExit], None] = lambda _: None,
 ) -> list[Row]:
     """Run an experiment's estimator `repeats` times over its recording, and score each run.
 
     Parameters
     ----------
-    recording
-        In place of the experiment's own.
+    fetch
+        Gives the recording, once the configuration is known to fit together; by default the
+        experiment's own.
     streams
         The estimator's generator of each repeat; by default that of the axis `estimator/NAME`.
     planted
-        Gives the estimator with a fault in it, as a context, for each repeat.
-    on_step
-        Called with the number of Frames done.
+        Gives a context in which the estimator is faulty, for each repeat.
+    shown
+        Shows the progress over a recording: gives a function of the number of Frames done, as a
+        context around each repeat.
     on_estimate
-        Called with the repeat, its online estimate and the revised one (or None).
+        Called with the recording, the repeat, its online estimate and the revised one (or None).
     on_error
         Called with the exception that ended a run, which becomes its row's status.
 
@@ -58,8 +63,7 @@ def evaluate(
         If the configuration or the recording does not fit together.
     """
     experiment.check()
-    if recording is None:
-        recording = experiment.recording()
+    recording = fetch() if fetch else experiment.recording()
     prior = experiment.prior(recording)
     labels = experiment.labels(recording.checksum)
     axis = f"estimator/{experiment.estimator_name}"
@@ -69,19 +73,22 @@ def evaluate(
         rng = streams(repeat) if streams else stream(experiment.seed, axis, repeat)
         scores: Row = {}
         try:
-            with planted(estimator, repeat) if planted else nullcontext(estimator) as ready:
-                online, revised = estimates(ready, recording, prior, rng, experiment.keep, on_step)
+            with (
+                planted(estimator, repeat) if planted else nullcontext(),
+                shown(recording) if shown else nullcontext() as on_step,
+            ):
+                online, revised = estimates(
+                    estimator, recording, prior, rng, experiment.keep, on_step
+                )
             status = status_of(recording, online)
             scores = scored(recording, online, revised)
         except InputError:
             raise
         except (Exception, SystemExit) as error:
             status = Status.of_error(error)
-            if on_error is not None:
-                on_error(error)
+            on_error(error)
         else:
-            if on_estimate is not None:
-                on_estimate(repeat, online, revised)
+            on_estimate(recording, repeat, online, revised)
         rows.append({**labels, "repeat": repeat, **status.columns(), **scores})
     return rows
 
@@ -94,10 +101,27 @@ def estimates(
     keep: Collection[str] = (),
     on_step: Callable[[int], None] | None = None,
 ) -> tuple[Estimate, Estimate | None]:
-    """Online estimate of a run, and the revised one of an estimator that has `finish`."""
-    online = run(estimator, recording, prior, rng, keep, on_step)
-    finish = getattr(estimator, "finish", None)
-    return online, None if finish is None else finish()
+    """Online estimate of a run, and the revised one of an estimator that has `finish`.
+
+    BLAS uses one thread, unless the environment sets OMP_NUM_THREADS or OPENBLAS_NUM_THREADS: its
+    threads spin while they wait, and the matrices of filters are small.
+    """
+    with _one_blas_thread():
+        online = run(estimator, recording, prior, rng, keep, on_step)
+        finish = getattr(estimator, "finish", None)
+        return online, None if finish is None else finish()
+
+
+def _one_blas_thread() -> AbstractContextManager[object]:
+    asked = {"OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"} & set(os.environ)
+    return nullcontext() if asked else _blas().limit(limits=1, user_api="blas")
+
+
+@functools.cache
+def _blas() -> ThreadpoolController:
+    import scipy.linalg  # noqa: F401 its BLAS is found once it is loaded
+
+    return ThreadpoolController()
 
 
 def scored(recording: Recording, online: Estimate, revised: Estimate | None) -> Row:
@@ -105,11 +129,8 @@ def scored(recording: Recording, online: Estimate, revised: Estimate | None) -> 
     scores: Row = {**score(recording, online)}
     if revised is not None:
         found = score(recording, revised)
-        scores |= {f"revised_{k}": found[k] for k in found if k not in _OF_THE_RUN}
+        scores |= {f"revised_{k}": found[k] for k in found if k not in OF_THE_RUN}
     return scores
-
-
-_OF_THE_RUN = ("duration_s", "distance_m")
 
 
 def status_of(recording: Recording, online: Estimate) -> Status:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import math
 import re
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,14 +24,15 @@ from experiments.runs import paths
 from experiments.runs.cache import cached, key_of
 from experiments.runs.row import Row
 from experiments.runs.seeds import stream
-from experiments.runs.targets import find, make, targets
-from experiments.runs.version import version_with
+from experiments.runs.targets import checked, make, targets
+from experiments.runs.version import code_version, source_digest, version_with
 from sim import grid_file
+from sim.arrays import Array
 from sim.errors import InputError
 from sim.grid import OccupancyGrid
-from sim.recording import Recording, load
+from sim.recording import Frame, Recording, load
 from sim.robot import DifferentialDrive, RobotGeometry
-from sim.sensors import SensorSuite, suite_from_config
+from sim.sensors import Sensor, Sensors, sensors_from_config
 from sim.settings import build
 from sim.world import World
 
@@ -48,12 +50,6 @@ _KEYS = (
 _NOT_IN_KEY = ("name", "picture", "recording")
 _PHYSICS = ("bullet", "kinematic")
 _RAYS = ("bullet", "exact")
-# What an estimator may need of the sensors: the key that must be set, and presets that set it
-_SENSORS = {
-    "laser": ("laser", "lms291, hokuyo or laser_stereo"),
-    "landmarks": ("stereo", "stereo_pixel, stereo_paper or laser_stereo"),
-    "place": ("lidar3d", "lidar3d"),
-}
 
 
 @dataclass(frozen=True)
@@ -116,6 +112,10 @@ class Experiment:
             choices={**self.choices, "estimator": kind.__name__},
             own_estimator=estimator,
         )
+
+    def with_estimator(self, **settings: Any) -> Experiment:
+        """Return the experiment with other values of keys of its estimator."""
+        return self.replaced(estimator={**self.config["estimator"], **settings})
 
     def over(self, recording: Recording) -> Experiment:
         """Return the experiment over a recording in memory, identified by its checksum."""
@@ -184,21 +184,36 @@ class Experiment:
         return key_of(self._recording_settings())
 
     def labels(self, checksum: str) -> Row:
-        """Columns that state a row's origin: choices, all keys, versions, recording's checksum."""
-        settings = {k: v for k, v in self.config.items() if k not in ("keep", "picture")}
+        """Columns that state a row's origin: choices, keys, versions, the recording's checksum.
+
+        Settings that did not make the recording have no column.
+        """
+        applied = self._applied()
         brought = ("world", "sensors", "route") if self.config["recording"] is not None else ()
-        choices = {f"choice.{g}": name for g, name in self.choices.items() if g not in brought}
+        choices = {g: name for g, name in self.choices.items() if g in applied and g not in brought}
         return {
-            **choices,
-            **_flat(settings),
+            **{f"choice.{group}": name for group, name in choices.items()},
+            **_flat({k: v for k, v in applied.items() if k not in ("keep", "picture")}),
             "repeat": 0,
             "run_key": self.key,
             "code_version": self._code_version(),
             "recording_checksum": checksum,
         }
 
+    def _applied(self) -> Config:
+        """Settings without those of a simulation that a recording from a file takes the place of.
+
+        A function that makes the recording or the map may read all of them.
+        """
+        places = (self.config["recording"], self.config["prior"].get("map"))
+        made = any(isinstance(place, dict) and "_target_" in place for place in places)
+        if self.config["recording"] is None or made:
+            return self.config
+        unused = set(_SIMULATED_KEYS) - {"seed"}
+        return {key: value for key, value in self.config.items() if key not in unused}
+
     def _code_version(self) -> str:
-        return version_with(targets(self.config))
+        return version_with(targets(self._applied()))
 
     # What it names
 
@@ -219,7 +234,8 @@ class Experiment:
             raise InputError(f"keep must be a list of names, such as [ess], got {keep!r}")
         self.robot()
         self.sensors()
-        make(config["route"], "route")
+        self.route()
+        checked(config["world"], "world", ("rng",))
         stream(config["seed"], "slip")
         stream(config["world_seed"], "world", key="world_seed")
         self._check_simulation()
@@ -242,11 +258,16 @@ class Experiment:
         start, known_map = settings["start"], settings["map"]
         if start not in ("tracking", "global"):
             raise InputError(f"prior.start must be tracking or global, got {start!r}")
-        for key in ("sigma_position_m", "sigma_heading_rad") if start == "tracking" else ():
-            if not (isinstance(settings[key], (int, float)) and 0.0 <= settings[key] < np.inf):
-                raise InputError(f"prior.{key} must be zero or positive, got {settings[key]}")
-        named = known_map in ("none", "world") or _is_grid_file(known_map)
-        if not (named or isinstance(known_map, dict)):
+        for key in ("sigma_position_m", "sigma_heading_rad"):
+            sigma = settings[key]
+            number = isinstance(sigma, (int, float)) and not isinstance(sigma, bool)
+            if not (number and 0.0 <= sigma < math.inf):
+                raise InputError(f"prior.{key} must be zero or a positive number, got {sigma!r}")
+        believed = {key: settings[key] for key in ("wheel_radius_m", "track_m")}
+        build(RobotGeometry, {k: 1.0 if v is None else v for k, v in believed.items()}, "prior")
+        if isinstance(known_map, dict):
+            checked(known_map, "prior.map", ("config", "recording"))
+        elif known_map not in ("none", "world") and not _is_grid_file(known_map):
             raise InputError(
                 "prior.map must be none, world, a grid's .yaml file or a mapping with _target_, "
                 f"got {known_map!r}"
@@ -255,15 +276,16 @@ class Experiment:
     def _check_needs(self) -> None:
         """Check that the estimator gets the sensors and the map that it needs."""
         settings = self.config["estimator"]
-        estimator = self.own_estimator or find(settings.get("_target_"), "estimator")
-        needs = getattr(estimator, "needs", ())
-        simulated = self.config["recording"] is None
-        for need, (sensor, presets) in _SENSORS.items():
-            if need in needs and simulated and self.config["sensors"].get(sensor) is None:
-                raise InputError(
-                    f"estimator={self.estimator_name} needs a {sensor} sensor, and "
-                    f"sensors={self.choices.get('sensors')} has none; try sensors={presets}"
-                )
+        estimator = self.own_estimator or checked(settings, "estimator")
+        if str(settings.get("_target_")).startswith("estimators."):
+            self.estimator()  # its values too; one from elsewhere may take long to make
+        needs = frozenset(getattr(estimator, "needs", ()))
+        if self.config["recording"] is None:
+            self._check_sensors(f"estimator={self.estimator_name}", needs - {"map"}, settings)
+            onboard = self.config["route"].get("feedback")
+            if isinstance(onboard, dict):
+                steering = getattr(make(onboard, "route.feedback"), "needs", ())
+                self._check_sensors("route.feedback", frozenset(steering) - {"map"}, onboard)
         mapped = self.config["prior"]["map"] != "none" or settings.get("map_path")
         if "map" in needs and not mapped:
             raise InputError(
@@ -277,7 +299,7 @@ class Experiment:
         if not _is_grid_file(known_map):
             return
         grid_file.read_grid(known_map)
-        estimator = self.own_estimator or find(settings.get("_target_"), "estimator")
+        estimator = self.own_estimator or checked(settings, "estimator")
         kinds = getattr(estimator, "maps", None)
         if kinds and OccupancyGrid not in kinds and not settings.get("map_path"):
             names = " or ".join(kind.__name__ for kind in kinds)
@@ -285,6 +307,19 @@ class Experiment:
                 f"estimator={self.estimator_name} takes a {names}, and prior.map={known_map} is an "
                 "occupancy grid"
             )
+
+    def _check_sensors(self, who: str, needs: Iterable[str], settings: Config) -> None:
+        """Check that the robot has the sensors that an estimator needs."""
+        has = {name for name, sensor in self.config["sensors"].items() if sensor is not None}
+        for need in needs:
+            # an option of the estimator says how the sensor is called
+            names = [settings.get(option, option) for option in need.split("|")]
+            if not has.intersection(names):
+                presets = ", ".join(_presets_with(names)) or "one that has it"
+                raise InputError(
+                    f"{who} needs a sensor {' or '.join(names)}, and "
+                    f"sensors={self.choices.get('sensors')} has none; try sensors={presets}"
+                )
 
     def world(self) -> World:
         """Make the world, from its own stream."""
@@ -296,9 +331,9 @@ class Experiment:
         """Make the true robot."""
         return build(DifferentialDrive, self.config["robot"], "robot")
 
-    def sensors(self) -> SensorSuite:
+    def sensors(self) -> dict[str, Sensor]:
         """Make the sensors."""
-        return suite_from_config(self.config["sensors"])
+        return sensors_from_config(self.config["sensors"])
 
     def estimator(self) -> Estimator:
         """Make the estimator: anything with `reset` and `step`."""
@@ -342,7 +377,17 @@ class Experiment:
             rays=self.config["simulation"]["rays"],
             config={key: self.config[key] for key in _SIMULATED_KEYS},
             on_progress=on_progress,
+            onboard=self._onboard,
         )
+
+    def _onboard(
+        self, world: World, robot: RobotGeometry, sensors: Sensors, start: Array
+    ) -> Callable[[Frame], Array]:
+        """Start the estimator that the route's feedback names; it knows the start and the map."""
+        estimator: Estimator = make(self.config["route"]["feedback"], "route.feedback")
+        prior = Prior(robot, sensors, start.copy(), np.zeros((3, 3)), world)
+        estimator.reset(prior, stream(self.config["seed"], "onboard"))
+        return lambda frame: estimator.step(frame).mean
 
     def recording(self, on_progress: Callable[[float], None] | None = None) -> Recording:
         """Read the recording, find it in the cache, or simulate it.
@@ -362,7 +407,9 @@ class Experiment:
             recording = load(Path(wanted))
             self._compare_slip(recording)
             return recording
-        return cached(self.recording_key, lambda: self.simulate(on_progress))
+        recording = cached(self.recording_key, lambda: self.simulate(on_progress))
+        # a file does not choose what code runs, but the configuration does
+        return dataclasses.replace(recording, sensors=self.sensors())
 
     def _compare_slip(self, recording: Recording) -> None:
         """Warn if kr or kl are not those that the recording was made with."""
@@ -390,6 +437,11 @@ class Experiment:
             settings["world_file"] = _digest(Path(world_file))
             if (image := grid_file.image_of(Path(world_file))) is not None:
                 settings["world_image"] = _digest(image)
+        elsewhere = {target: source_digest(target) for target in sorted(targets(settings))}
+        if any(elsewhere.values()):  # a sensor, route or world of one's own, edited: another one
+            settings["sources"] = elsewhere
+        if any(target.startswith("estimators.") for target in elsewhere):  # one on board
+            settings["code"] = code_version()
         return settings
 
     def prior(self, recording: Recording) -> Prior:
@@ -432,10 +484,65 @@ def _check_shape(config: Config) -> None:
             raise InputError(f"{key} is missing; {remedy}")
         if key in _MAPPINGS and not isinstance(config[key], dict):
             raise InputError(f"{key} must hold keys, got {config[key]!r}")
+    for place in ("simulation", "prior"):
+        for name in config[place]:
+            _check_known(f"{place}.{name}")
     wanted = config["recording"]
     if not (wanted is None or isinstance(wanted, dict) or (isinstance(wanted, str) and wanted)):
         got = "nothing" if wanted == "" else repr(wanted)
         raise InputError(f"recording must be a path, null, or a mapping with _target_, got {got}")
+
+
+def _presets_with(names: Sequence[str]) -> list[str]:
+    """Options of conf/sensors that have one of these sensors."""
+    found = {path.stem: OmegaConf.load(path) for path in (paths.CONF / "sensors").glob("*.yaml")}
+    return sorted(preset for preset, sensors in found.items() if any(n in sensors for n in names))
+
+
+def searched(config_dir: str | Path | None) -> list[str]:
+    """Override that makes Hydra look for options in another folder too; none for None.
+
+    Raises
+    ------
+    InputError
+        If there is no such folder.
+    """
+    if config_dir is None:
+        return []
+    folder = Path(config_dir).resolve()
+    if not folder.is_dir():
+        raise InputError(f"--config-dir must name a folder, got {config_dir}")
+    return [f"hydra.searchpath=[{paths.quoted(f'file://{folder}')}]"]
+
+
+def _check_known(key: str) -> None:
+    """Check that a key is one of the configuration's own."""
+    if key not in _KEYS:
+        place = key.rpartition(".")[0]
+        known = [other for other in _KEYS if other.rpartition(".")[0] == place]
+        raise InputError(f"unknown key {key}; known: {', '.join(known)}")
+
+
+def check_added(hydra: Any) -> None:
+    """Check that no override adds a key that nothing reads.
+
+    A study's YAML may have keys of its own; the command line sets those without a +.
+
+    Parameters
+    ----------
+    hydra
+        Hydra's own settings of a composed configuration.
+
+    Raises
+    ------
+    InputError
+        Naming the key, and the known ones.
+    """
+    groups = {choice.partition("@")[0] for choice in hydra.runtime.choices}
+    for override in OverridesParser.create().parse_overrides(list(hydra.overrides.task)):
+        added = override.is_add() or override.is_force_add()
+        if added and override.key_or_group not in groups:
+            _check_known(override.key_or_group.partition(".")[0])
 
 
 def check_overrides(overrides: Sequence[str]) -> None:
@@ -461,6 +568,7 @@ def composed(overrides: Sequence[str]) -> tuple[DictConfig, Mapping[str, str]]:
     """Have Hydra, once initialized, compose a configuration; also give the options it chose."""
     check_overrides(overrides)
     cfg = compose("config", overrides=list(overrides), return_hydra_config=True)
+    check_added(cfg.hydra)
     choices = cfg.hydra.runtime.choices
     OmegaConf.set_struct(cfg, False)
     del cfg["hydra"]

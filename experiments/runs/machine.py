@@ -1,7 +1,5 @@
 """The machine that made a result, without the name of the computer or its user."""
 
-from __future__ import annotations
-
 import os
 import platform
 from contextlib import suppress

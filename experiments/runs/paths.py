@@ -1,7 +1,5 @@
 """Where the package keeps its own data, and where results go."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -54,8 +54,7 @@ class Status:
 
     def columns(self) -> Row:
         """Return the columns of a row."""
-        values = (self.outcome.value, self.code, self.detail)
-        return dict(zip(STATUS, values, strict=True))
+        return dict(zip(STATUS, (self.outcome.value, self.code, self.detail), strict=True))
 
 
 def check_row(row: Row) -> None:

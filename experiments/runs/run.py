@@ -1,7 +1,5 @@
 """The Hydra application: a configuration's rows, in results/runs/NAME/KEY.parquet."""
 
-from __future__ import annotations
-
 import sys
 import traceback
 from collections.abc import Callable, Sequence
@@ -17,7 +15,7 @@ from experiments.runs import paths
 from experiments.runs.columns import COLUMNS
 from experiments.runs.console import RunFailedError, end, progress
 from experiments.runs.evaluate import evaluate
-from experiments.runs.experiment import Experiment, check_overrides
+from experiments.runs.experiment import Experiment, check_added, check_overrides
 from experiments.runs.row import Outcome, Row, write_rows
 from sim.errors import InputError
 from sim.recording import Recording
@@ -38,24 +36,24 @@ def run_once(experiment: Experiment, draw: Draw) -> list[Row]:
     RunFailedError
         If a run failed; its row says how.
     """
-    experiment.check()
     folder, name = experiment.rows_folder / experiment.key, experiment.estimator_name
     path = folder.with_suffix(".parquet")
-    with progress("simulated seconds") as on_progress:
-        recording = experiment.recording(on_progress)
 
-    def keep(repeat: int, online: Estimate, _: Estimate | None) -> None:
+    def fetch() -> Recording:
+        with progress("simulated seconds") as on_progress:
+            return experiment.recording(on_progress)
+
+    def keep(recording: Recording, repeat: int, online: Estimate, _: Estimate | None) -> None:
         if repeat == 0 and experiment.picture:
             draw(recording, online, name, folder)
 
-    with progress(name, len(recording.frame_stamps)) as on_step:
-        rows = evaluate(
-            experiment,
-            recording,
-            on_step=on_step,
-            on_estimate=keep,
-            on_error=lambda error: traceback.print_exception(error),
-        )
+    rows = evaluate(
+        experiment,
+        fetch,
+        shown=lambda recording: progress(name, len(recording.frame_stamps)),
+        on_estimate=keep,
+        on_error=traceback.print_exception,
+    )
     write_rows(rows, path)
     _print(rows, [file for file in (path, folder / "run.png") if file.exists()])
     for row in rows:
@@ -70,6 +68,7 @@ def application(arguments: Sequence[str], draw: Draw) -> None:
     def run(cfg: DictConfig) -> None:
         try:
             hydra_settings = HydraConfig.get()
+            check_added(hydra_settings)
             choices = hydra_settings.runtime.choices
             if cfg.get("sweeps") or hydra_settings.sweeper.get("params"):
                 study = choices.get("study")

@@ -1,7 +1,5 @@
 """Independent random streams by axis, all from one study seed."""
 
-from __future__ import annotations
-
 import zlib
 
 import numpy as np

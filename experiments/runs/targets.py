@@ -1,13 +1,11 @@
 """Objects that a configuration names by `_target_`."""
 
-from __future__ import annotations
-
-import importlib
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 from sim.errors import InputError
+from sim.settings import find
 
 
 def make(settings: Mapping[str, Any], where: str, **injected: Any) -> Any:
@@ -27,47 +25,41 @@ def make(settings: Mapping[str, Any], where: str, **injected: Any) -> Any:
     InputError
         If the target cannot be found, or a key is unknown or missing.
     """
-    function = find(settings.get("_target_"), where)
-    target = settings["_target_"]
+    function = checked(settings, where, injected)
     arguments = {key: value for key, value in settings.items() if key != "_target_"}
     known = inspect.signature(function).parameters
-    variadic = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
-    open_ended = any(p.kind is inspect.Parameter.VAR_KEYWORD for p in known.values())
-    for key in arguments:
-        if key not in known and not open_ended:
-            free = ", ".join(k for k in known if k not in injected) or "none"
-            raise InputError(f"unknown key {where}.{key} for {target}; known: {free}")
-    for name, parameter in known.items():
-        required = parameter.default is inspect.Parameter.empty and parameter.kind not in variadic
-        if required and name not in arguments and name not in injected and name != "self":
-            raise InputError(f"{where}.{name} is missing; {target} needs it")
     try:
         return function(**arguments, **{k: v for k, v in injected.items() if k in known})
     except (TypeError, ValueError) as error:
-        raise InputError(f"{where} ({target}) does not accept its values: {error}") from error
+        raise InputError(
+            f"{where} ({settings['_target_']}) does not accept its values: {error}"
+        ) from error
 
 
-def find(target: Any, where: str) -> Callable[..., Any]:
-    """Import the class or function that a `_target_` names.
+def checked(
+    settings: Mapping[str, Any], where: str, injected: Collection[str] = ()
+) -> Callable[..., Any]:
+    """Return what `_target_` names, if it takes the other keys; `make` says more.
 
     Raises
     ------
     InputError
-        If there is none.
+        If the target cannot be found, or a key is unknown or missing.
     """
-    if not isinstance(target, str) or "." not in target:
-        raise InputError(f"{where}._target_ must name a class or function, such as mine.Mine")
-    module_name, _, name = target.rpartition(".")
-    try:
-        module = importlib.import_module(module_name)
-    except ModuleNotFoundError as error:
-        raise InputError(
-            f"{where}._target_={target}: no module {error.name}; is its folder on PYTHONPATH?"
-        ) from error
-    found = getattr(module, name, None)
-    if not callable(found):
-        raise InputError(f"{where}._target_={target}: {module_name} has no class {name}")
-    return found  # type: ignore[no-any-return]
+    function = find(settings.get("_target_"), where)
+    target = settings["_target_"]
+    known = inspect.signature(function).parameters
+    variadic = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
+    open_ended = any(p.kind is inspect.Parameter.VAR_KEYWORD for p in known.values())
+    for key in settings:
+        if key not in (*known, "_target_") and not open_ended:
+            free = ", ".join(k for k in known if k not in injected) or "none"
+            raise InputError(f"unknown key {where}.{key} for {target}; known: {free}")
+    for name, parameter in known.items():
+        required = parameter.default is inspect.Parameter.empty and parameter.kind not in variadic
+        if required and name not in settings and name not in injected and name != "self":
+            raise InputError(f"{where}.{name} is missing; {target} needs it")
+    return function
 
 
 def targets(tree: Any) -> set[str]:

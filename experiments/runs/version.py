@@ -1,7 +1,5 @@
 """Digests of the source code, so that results of different versions never mix silently."""
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import importlib.util

@@ -5,16 +5,15 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+import numpy as np
+import pandas as pd
 
 from experiments.runs.columns import ORIGIN, REPEAT, is_setting
 from experiments.runs.paths import results
 from experiments.runs.row import Outcome, read_rows
 from experiments.runs.version import code_version, version_with
 from sim.errors import InputError
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 _TIMES = ["step_time_us"]  # they differ from run to run
 _DRAWN = ["seed", "world_seed"]  # what `summary` averages over
@@ -84,8 +83,6 @@ def where(table: pd.DataFrame, conditions: Sequence[str]) -> pd.DataFrame:
     InputError
         If a column is not there, or no row meets them.
     """
-    import pandas as pd
-
     for condition in conditions:
         column, equals, wanted = condition.partition("=")
         if not equals or column not in table:
@@ -157,8 +154,6 @@ def summary(table: pd.DataFrame, against: str | None = None) -> pd.DataFrame:
         An estimator's name: errors (of the revised path, where there is one) are also given
         relative to that estimator's, on the same recordings.
     """
-    import numpy as np
-
     by = telling(table.drop(columns=_DRAWN, errors="ignore"))
     shown = [c for c in _MAIN if c in table and table[c].notna().any()]
     if against is not None:

@@ -4,8 +4,6 @@ The runs are composed once, here, and packed into jobs; each job reads its share
 workers compose nothing, and any of Hydra's launchers will do.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import os
@@ -68,6 +66,8 @@ def sweep(arguments: Sequence[str], config_dir: str | None = None) -> None:
 
     Raises
     ------
+    InputError
+        If a configuration does not fit together; then nothing is run.
     RunFailedError
         If a run failed; all others are done, and the rows of the failed ones say how.
     """
@@ -83,6 +83,8 @@ def sweep(arguments: Sequence[str], config_dir: str | None = None) -> None:
     folder = folders.pop()
     runs = list({run.key: run for run in every}.values())
     missing = [run for run in runs if _failure(folder, run.key) is not None]
+    for run in missing:
+        run.check()
     print(
         f"{len(runs)} run{'s' if len(runs) > 1 else ''}, {len(runs) - len(missing)} of them done "
         f"before: {paths.short(folder)}",
@@ -252,11 +254,7 @@ def run_and_record(experiment: Experiment, held: dict[str, Recording]) -> None:
     with write_whole(mark) as part:
         part.touch()
     try:
-        experiment.check()
-        if experiment.recording_key not in held:
-            held.clear()
-            held[experiment.recording_key] = experiment.recording()
-        rows = evaluate(experiment, held[experiment.recording_key])
+        rows = evaluate(experiment, lambda: _held(experiment, held))
         write_rows(rows, path)
         if any(row["status"] == Outcome.FAILED for row in rows):  # for those who watch
             path.with_suffix(".failed").touch()
@@ -264,6 +262,14 @@ def run_and_record(experiment: Experiment, held: dict[str, Recording]) -> None:
         _record_failure(experiment, Status.of_error(error))
     finally:
         mark.unlink(missing_ok=True)
+
+
+def _held(experiment: Experiment, held: dict[str, Recording]) -> Recording:
+    key = experiment.recording_key
+    if key not in held:
+        held.clear()
+        held[key] = experiment.recording()
+    return held[key]
 
 
 _DIED = Status(Outcome.FAILED, "died", "its process died (out of memory?)")

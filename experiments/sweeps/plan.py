@@ -1,10 +1,7 @@
 """The runs of a sweep: expand the swept values, compose each combination, pack them into jobs."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
 
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
@@ -14,7 +11,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from experiments.runs import paths
 from experiments.runs.console import unknown_key
-from experiments.runs.experiment import Experiment, check_overrides, composed
+from experiments.runs.experiment import Experiment, check_overrides, composed, searched
 from sim.errors import InputError
 
 
@@ -61,10 +58,7 @@ class _Composer:
     def __init__(self, config_dir: str | None) -> None:
         self._is_group: dict[str, bool] = {}
         self._bases: dict[tuple[str, ...], tuple[DictConfig, Mapping[str, str]]] = {}
-        self.extra: list[str] = []
-        if config_dir is not None:
-            folder = paths.quoted(f"file://{Path(config_dir).resolve()}")
-            self.extra = [f"hydra.searchpath=[{folder}]"]
+        self.extra = searched(config_dir)
 
     def experiment(self, overrides: list[str]) -> Experiment:
         """Resolve one combination."""

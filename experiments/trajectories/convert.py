@@ -1,7 +1,5 @@
 """Recordings and estimates into the files that other tools open, by the ending of the name."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

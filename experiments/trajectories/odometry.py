@@ -1,7 +1,5 @@
 """Estimates in the form of nav_msgs/Odometry, as CSV and JSON (puzzlebot2024, eqs. (10)-(11))."""
 
-from __future__ import annotations
-
 import csv
 import json
 import math
@@ -35,7 +33,7 @@ def covariance_6x6(covariances: Array) -> Array:
     return full
 
 
-def odometry_records(estimate: Estimate, frame_id: str = "odom") -> list[dict[str, Any]]:
+def odometry_records(estimate: Estimate) -> list[dict[str, Any]]:
     """One record like nav_msgs/Odometry per stamp.
 
     The twist is the mean velocity in base_link since the previous record, from differences of the
@@ -51,7 +49,7 @@ def odometry_records(estimate: Estimate, frame_id: str = "odom") -> list[dict[st
         vx, vy, turn = (float(v) for v in twists[i])
         records.append(
             {
-                "header": {"stamp": float(stamps[i]), "frame_id": frame_id},
+                "header": {"stamp": float(stamps[i]), "frame_id": "odom"},
                 "child_frame_id": "base_link",
                 "pose": {
                     "position": {"x": x, "y": y, "z": 0.0},

@@ -1,39 +1,25 @@
 """A recording in words."""
 
-from __future__ import annotations
-
 import numpy as np
 
-from sim.recording import Recording
+from sim.arrays import Array
+from sim.recording import Log, Recording
 
 
 def describe(recording: Recording) -> str:
     """Describe what a recording holds, in lines of text."""
-    logs = {
-        "wheels": recording.wheels,
-        "laser": recording.laser,
-        "landmarks": recording.landmarks,
-        "3D lidar": recording.clouds,
-        "places": recording.places,
-        "commands": recording.commands,
-    }
     lines = [
         f"status      {recording.status}",
         f"frames      {len(recording.frame_stamps)} over {recording.duration_s:.2f} s",
         f"robot       wheel radius {recording.robot.wheel_radius_m} m, "
         f"track {recording.robot.track_m} m",
     ]
-    for name, log in logs.items():
-        if log is None:
-            continue
-        lines.append(f"{name:<11} {len(log.stamps)} readings{_rate(log.stamps)}")
-        if log is recording.laser:
-            ranges_m = recording.laser.ranges_m
-            seen = 100 * np.isfinite(ranges_m).mean() if ranges_m.size else 0.0
-            lines.append(f"            {ranges_m.shape[1]} beams, {seen:.1f} % of them in range")
-        if log is recording.landmarks:
-            mean = len(recording.landmarks.points_in_camera) / max(len(log.stamps), 1)
-            lines.append(f"            {mean:.1f} landmarks an image")
+    lines.append(_line("wheels", recording.wheels.stamps))
+    for name, log in recording.logs.items():
+        lines.append(_line(name, log.stamps))
+        lines += [f"            {_field(log, field)}" for field in log.values]
+    if recording.commands is not None:
+        lines.append(_line("commands", recording.commands.stamps))
     if recording.truth is None:
         lines.append("truth       none")
     else:
@@ -50,7 +36,20 @@ def describe(recording: Recording) -> str:
     return "\n".join(lines)
 
 
-def _rate(stamps: np.ndarray) -> str:
-    if len(stamps) < 2:
-        return ""
-    return f", every {1000 * float(np.median(np.diff(stamps))):.1f} ms"
+def _line(name: str, stamps: Array) -> str:
+    rate = ""
+    if len(stamps) > 1:
+        rate = f", every {1000 * float(np.median(np.diff(stamps))):.1f} ms"
+    return f"{name:<11} {len(stamps)} readings{rate}"
+
+
+def _field(log: Log, name: str) -> str:
+    """What a field holds, in words."""
+    kind, values = log.schema[name], log[name]
+    shape = " x ".join(map(str, values.shape[1:]))
+    words = ", ".join(filter(None, (name, shape, kind.unit)))
+    if kind.ragged:
+        words += f", {len(values) / max(len(log.stamps), 1):.1f} rows a reading"
+    elif kind.dtype in ("f4", "f8") and values.size:
+        words += f", {100 * np.isfinite(values).mean():.1f} % finite"
+    return words

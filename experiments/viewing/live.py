@@ -4,8 +4,7 @@ The engine ends its process when it cannot open a window. So a display is looked
 window gets a process of its own; if that fails, one line says so.
 """
 
-from __future__ import annotations
-
+import math
 import multiprocessing
 import os
 import sys
@@ -14,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments.viewing.view import Playback, scan_points
+from experiments.viewing.view import Playback, bounds, seen
 from sim.arrays import Array
 from sim.errors import InputError
 from sim.world import World
@@ -114,7 +113,7 @@ def _play(engine: Any, run: Playback, seconds: float | None) -> None:
             if i % _TRAIL_EVERY == 0:
                 engine.addUserDebugLine([*before[:2], 0.02], [*pose[:2], 0.02], colours[name], 2)
                 trails[name] = pose
-        points = scan_points(run, float(stamp))[::3] if i % _SCAN_EVERY == 0 else np.zeros((0, 2))
+        points = seen(run, float(stamp))[::3] if i % _SCAN_EVERY == 0 else np.zeros((0, 2))
         if len(points):
             raised = np.column_stack([points, np.full(len(points), 0.2)]).tolist()
             scan = engine.addUserDebugPoints(raised, [_RED] * len(points), 3, **replaced)
@@ -123,15 +122,11 @@ def _play(engine: Any, run: Playback, seconds: float | None) -> None:
 
 
 def _aim(engine: Any, run: Playback, truth: Array) -> None:
-    """Look at the whole path from above."""
-    means = truth if run.estimate is None else run.estimate.means
-    way = np.concatenate([truth[:, :2], means[:, :2]])
-    way = way[np.isfinite(way).all(axis=1)]
-    if not len(way):
-        raise InputError("this log has no truth to show; name an estimator with --estimate")
-    low, high = way.min(axis=0), way.max(axis=0)
-    reach = 1.2 * float(np.hypot(*(high - low))) + 2.0
-    engine.resetDebugVisualizerCamera(reach, 0, -65, [*((low + high) / 2.0), 0.0])
+    """Look at the world and the whole path from above."""
+    x1, y1, x2, y2 = bounds(run, truth)
+    distance_m = 1.2 * math.hypot(x2 - x1, y2 - y1) + 2.0
+    middle = [(x1 + x2) / 2.0, (y1 + y2) / 2.0, 0.0]
+    engine.resetDebugVisualizerCamera(distance_m, 0, -65, middle)
 
 
 def _build_walls(engine: Any, world: World) -> None:

@@ -22,10 +22,10 @@ from sim.sensors import Laser
 _LONGEST_GAP_S = 3.0  # between poses; scans in longer ones are left out
 
 
-def laser_scans(recording: Recording) -> tuple[Array, Floats, Laser]:
+def laser_scans(recording: Recording, name: str = "laser") -> tuple[Array, Floats, Laser]:
     """Stamps (N,) s and ranges (N, beams) m of the scans, and their laser; InputError if none."""
-    log = recording.known_laser
-    return log.stamps, log.ranges_m, recording.sensors.known_laser
+    log = recording.log(name)
+    return log.stamps, log["ranges_m"], recording.sensor(name, Laser)
 
 
 def path_of(
@@ -79,14 +79,15 @@ def grid_along(
     *,
     resolution_m: float,
     max_range_m: float | None = None,
+    laser: str = "laser",
     on_progress: Callable[[int], None] | None = None,
 ) -> tuple[OccupancyGrid, int]:
-    """Grid of the recording's scans along a path, and the number of scans in it.
+    """Grid of the scans of one laser along a path, and the number of scans in it.
 
     Poses (T, 3) are interpolated at the scans' stamps; scans before the first, after the last or
     in gaps of more than 3 s are left out.
     """
-    scan_stamps, ranges_m, laser = laser_scans(recording)
+    scan_stamps, ranges_m, sensor = laser_scans(recording, laser)
     if len(stamps) < 2:
         raise InputError("a map needs a path of two poses or more")
     at_scans = interpolate(stamps, poses, scan_stamps, _LONGEST_GAP_S)
@@ -96,7 +97,7 @@ def grid_along(
     grid = map_scans(
         at_scans[placed],
         ranges_m[placed],
-        laser,
+        sensor,
         resolution_m=resolution_m,
         max_range_m=max_range_m,
         on_progress=on_progress,

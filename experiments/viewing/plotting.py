@@ -1,6 +1,4 @@
-"""Parts of many figures: 95 % ellipses, plain numbers on logarithmic axes, one legend."""
-
-from __future__ import annotations
+"""Parts of many figures: plans, 95 % ellipses, plain numbers on logarithmic axes, one legend."""
 
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -14,6 +12,11 @@ from matplotlib.ticker import LogLocator
 from numpy.typing import ArrayLike
 
 from experiments.evaluation.metrics import CHI2_95_2DOF
+
+
+def plan_axes(ax: Axes, **settings: Any) -> None:
+    """Make axes those of a plan in the map frame, in metres."""
+    ax.set(xlabel="x, m", ylabel="y, m", aspect="equal", **settings)
 
 
 def draw_ellipses(

@@ -1,16 +1,14 @@
 """One run at a glance: truth and estimate in the world, and the errors with their 2-sigma bands."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from estimators.base import Estimate
-from experiments.viewing.plotting import draw_ellipses
+from experiments.viewing.plotting import draw_ellipses, plan_axes
 from experiments.viewing.style import ESTIMATE, TRUTH, figure
-from experiments.viewing.world import draw_world
+from experiments.viewing.world import draw_world, sees_landmarks
 from sim import se2
 from sim.arrays import Array
 from sim.recording import Recording
@@ -22,7 +20,7 @@ def run_figure(recording: Recording, estimate: Estimate, name: str) -> Figure:
     halves: Any = page.subfigures(1, 2, width_ratios=(1.1, 1.0))
     map_axes = halves[0].subplots()
     if recording.world is not None:
-        draw_world(map_axes, recording.world, landmarks=recording.landmarks is not None)
+        draw_world(map_axes, recording.world, landmarks=sees_landmarks(recording))
     if recording.truth is not None:
         truth = recording.truth_at(estimate.stamps)
         map_axes.plot(*truth[:, :2].T, color=TRUTH, lw=1.6, label="truth")
@@ -31,7 +29,7 @@ def run_figure(recording: Recording, estimate: Estimate, name: str) -> Figure:
     map_axes.plot(*means[:, :2].T, color=ESTIMATE, lw=1.2, ls="--", label=name)
     some = np.linspace(0, len(means) - 1, 12).astype(int)[1:]
     draw_ellipses(map_axes, means[some], estimate.covariances[some], ec=ESTIMATE, fc="none", lw=0.8)
-    map_axes.set(xlabel="x, m", ylabel="y, m", aspect="equal")
+    plan_axes(map_axes)
     map_axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2)
     return page
 

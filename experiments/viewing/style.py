@@ -1,7 +1,5 @@
 """The style of all figures: size, fonts, and colours that colour-blind people can distinguish."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

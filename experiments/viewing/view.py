@@ -3,11 +3,10 @@
 The same `Playback` is drawn to a file here (MP4, GIF, HTML), and in a window by `viewing.live`.
 """
 
-from __future__ import annotations
-
 import base64
 import dataclasses
 import io
+import itertools
 import shutil
 import subprocess
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -25,23 +24,34 @@ from experiments.evaluation.metrics import CHI2_95_2DOF
 from experiments.runs.experiment import Experiment
 from experiments.runs.seeds import stream
 from experiments.viewing.grid import draw_grid
-from experiments.viewing.style import ESTIMATE, GREEN, ORANGE, RED, SKY, TRUTH, figure
-from experiments.viewing.world import draw_world
+from experiments.viewing.plotting import plan_axes
+from experiments.viewing.style import (
+    BLUE,
+    ESTIMATE,
+    GREEN,
+    ORANGE,
+    PURPLE,
+    RED,
+    SKY,
+    TRUTH,
+    YELLOW,
+    subplots,
+)
+from experiments.viewing.world import draw_world, sees_landmarks
 from sim import se2
 from sim.arrays import Array
 from sim.errors import InputError
 from sim.files import write_whole
 from sim.grid import OccupancyGrid
 from sim.recording import Frame, Recording
-from sim.sensors import Mount
 
 Picture = NDArray[np.uint8]
+_Layer = tuple[bool, str, str, str, dict[str, Any]]  # whether drawn, marker, colour, label, style
 SUFFIXES = (".mp4", ".gif", ".html")
 FPS = 10
 SECONDS = 20.0
 _EXTRAS = ("particles", "landmarks", "landmark_covariances")
 _MOST_PARTICLES = 1000  # drawn, of any number
-_GROUND_M = 0.3  # cloud points below are left out
 _DPI = 100
 
 
@@ -127,8 +137,7 @@ def estimate_of(
         return read_estimate(recording, path), "estimate"
     experiment = experiment_over(recording, source, overrides)
     if "keep_map" in experiment.config["estimator"]:
-        settings = {**experiment.config["estimator"], "keep_map": True}
-        experiment = experiment.replaced(estimator=settings)
+        experiment = experiment.with_estimator(keep_map=True)
     sparing = _Sparing(experiment.estimator(), set(rows.tolist()))
     rng, prior = stream(experiment.seed, f"estimator/{source}", 0), experiment.prior(recording)
     return run_estimator(sparing, recording, prior, rng, _EXTRAS, on_step), source
@@ -183,31 +192,21 @@ class _Sparing:
         return Belief(belief.mean, belief.covariance, copied)
 
 
-def scan_points(run: Playback, stamp: float) -> Array:
-    """Points (N, 2) in map of the last scan, or cloud, up to a time."""
-    sensors, scans, clouds = run.recording.sensors, run.recording.laser, run.recording.clouds
-    if scans is not None and (row := _last(scans.stamps, stamp)) >= 0:
-        laser, ranges = sensors.known_laser, np.asarray(scans.ranges_m[row], float)
-        seen = np.isfinite(ranges)
-        bearings = laser.bearings_rad[seen]
-        points = ranges[seen, None] * np.column_stack([np.cos(bearings), np.sin(bearings)])
-        return _in_map(run, scans.stamps[row], laser.mount, points)
-    if clouds is not None and (row := _last(clouds.stamps, stamp)) >= 0:
-        lidar = sensors.known_lidar3d
-        points = lidar.points_in_sensor(clouds.ranges_m[row])
-        points = points[points[:, 2] + lidar.mount.z_m > _GROUND_M, :2]
-        return _in_map(run, clouds.stamps[row], lidar.mount, points)
-    return np.zeros((0, 2))
-
-
-def seen_landmarks(run: Playback, stamp: float) -> Array:
-    """Points (N, 2) in map of the landmarks in the last image up to a time."""
-    log = run.recording.landmarks
-    if log is None or (row := _last(log.stamps, stamp)) < 0:
+def seen_points(run: Playback, name: str, stamp: float) -> Array:
+    """Points (N, 2) in map of a sensor's last reading up to a time."""
+    log, sensor = run.recording.logs[name], run.recording.sensors[name]
+    row = _last(log.stamps, stamp)
+    pose = run.pose_at(float(log.stamps[row])) if row >= 0 else np.full(3, np.nan)
+    if not np.isfinite(pose).all():
         return np.zeros((0, 2))
-    points = log.points_in_camera[slice(*log.splits[row : row + 2])]
-    flat = np.column_stack([points[:, 2], -points[:, 0]])  # z is forward, x to the right
-    return _in_map(run, log.stamps[row], run.recording.sensors.known_stereo.mount, flat)
+    drawn: Any = getattr(sensor, "points_in_base")(log.reading(row))  # noqa: B009
+    return se2.transform(pose, drawn[:, :2])
+
+
+def seen(run: Playback, stamp: float) -> Array:
+    """Points (N, 2) in map of all sensors' last readings up to a time."""
+    names = _sensor_layers(run.recording)
+    return np.concatenate([np.zeros((0, 2)), *(seen_points(run, name, stamp) for name in names)])
 
 
 def _last(stamps: Array, stamp: float) -> int:
@@ -215,22 +214,14 @@ def _last(stamps: Array, stamp: float) -> int:
     return int(np.searchsorted(stamps, stamp + 1e-9, side="right")) - 1
 
 
-def _in_map(run: Playback, stamp: float, mount: Mount, points_in_sensor: Array) -> Array:
-    pose = run.pose_at(float(stamp))
-    if not np.isfinite(pose).all():
-        return np.zeros((0, 2))
-    return se2.transform(se2.compose(pose, mount.pose), points_in_sensor)
-
-
-def ellipse_outlines(means: Array, covariances: Array, n_corners: int = 24) -> Array:
+def ellipse_outlines(means: Array, covariances: Array) -> Array:
     """95 % ellipses of means (N, 2), covariances (N, 2, 2) as one line, with gaps of NaN."""
     values, vectors = np.linalg.eigh(covariances)
     axes = vectors * np.sqrt(CHI2_95_2DOF * np.maximum(values, 0.0))[:, None, :]
-    angle = np.linspace(0.0, 2.0 * np.pi, n_corners + 1)
+    angle = np.linspace(0.0, 2.0 * np.pi, 25)
     circle = np.column_stack([np.cos(angle), np.sin(angle)])
     outlines = means[:, None, :] + circle @ axes.transpose(0, 2, 1)
-    gaps = np.full((len(means), 1, 2), np.nan)
-    return np.concatenate([outlines, gaps], axis=1).reshape(-1, 2)
+    return np.concatenate([outlines, np.full((len(means), 1, 2), np.nan)], axis=1).reshape(-1, 2)
 
 
 def pictures(run: Playback) -> Iterator[Picture]:
@@ -240,22 +231,20 @@ def pictures(run: Playback) -> Iterator[Picture]:
     """
     recording = run.recording
     truth = None if recording.truth is None else recording.truth_at(recording.frame_stamps)
-    x1, y1, x2, y2 = _bounds(run, truth)
-    height_in = float(np.clip(7.0 * (y2 - y1) / (x2 - x1), 2.0, 8.0)) + 1.2
-    page = figure(8.0, height_in)
+    x1, y1, x2, y2 = bounds(run, truth)
+    page, ax = subplots(8.0, float(np.clip(7.0 * (y2 - y1) / (x2 - x1), 2.0, 8.0)) + 1.2)
     page.set_dpi(_DPI)
-    ax = page.subplots()
     if run.grid is not None:
         draw_grid(ax, run.grid)
     if recording.world is not None:
-        draw_world(ax, recording.world, landmarks=recording.landmarks is not None)
+        draw_world(ax, recording.world, landmarks=sees_landmarks(recording))
     glyph = max(recording.robot.track_m / 2.0, 0.012 * (x2 - x1))  # visible on any map
     moving = {
         key: ax.plot([], [], style, color=color, label=label, animated=True, **more)[0]
         for key, (style, color, label, more) in _layers(run, truth is not None).items()
     }
     title = ax.text(0.0, 1.01, "", transform=ax.transAxes, animated=True)
-    ax.set(xlabel="x, m", ylabel="y, m", aspect="equal", xlim=(x1, x2), ylim=(y1, y2))
+    plan_axes(ax, xlim=(x1, x2), ylim=(y1, y2))
     handles, labels = ax.get_legend_handles_labels()
     page.legend(handles, labels, loc="outside lower center", ncols=4, fontsize="small")
     ax.set_title(" ")  # reserves the room
@@ -283,12 +272,10 @@ def _layers(run: Playback, known: bool) -> dict[str, tuple[str, str, str, dict[s
         any(value is not None and len(value) for value in extras.get(name, []))
         for name in ("particles", "landmarks")
     )
-    scanned = recording.laser is not None or recording.clouds is not None
     estimated = run.estimate is not None
-    layers: dict[str, tuple[bool, str, str, str, dict[str, Any]]] = {
+    layers: dict[str, _Layer] = {
         "particles": (particles, ".", SKY, "particles", {"ms": 3, "alpha": 0.6}),
-        "scan": (scanned, ".", RED, "scan", {"ms": 2}),
-        "seen": (recording.landmarks is not None, "x", ORANGE, "landmarks seen", {"ms": 5}),
+        **_sensor_layers(recording),
         "landmarks": (mapped, "-", GREEN, "landmarks, 95 %", {"lw": 0.8}),
         "truth": (known, "-", TRUTH, "truth", {"lw": 1.6}),
         "truth robot": (known, "-", TRUTH, "", {"lw": 1.4}),
@@ -299,13 +286,23 @@ def _layers(run: Playback, known: bool) -> dict[str, tuple[str, str, str, dict[s
     return {name: layer[1:] for name, layer in layers.items() if layer[0]}
 
 
+def _sensor_layers(recording: Recording) -> dict[str, _Layer]:
+    """Layers of the sensors whose readings can be drawn: dots of scans, crosses of landmarks."""
+    layers: dict[str, _Layer] = {}
+    shown = [n for n in recording.logs if hasattr(recording.sensors[n], "points_in_base")]
+    for name, color in zip(shown, itertools.cycle((RED, ORANGE, PURPLE, BLUE, YELLOW))):
+        few = recording.logs[name].splits is not None
+        layers[name] = (True, "x" if few else ".", color, name, {"ms": 5 if few else 2})
+    return layers
+
+
 def _instant(
     run: Playback, frame: int, truth: Array | None, glyph_m: float
 ) -> tuple[dict[str, Array], str]:
     """Points of every moving layer at a Frame, and the title."""
     stamps = run.recording.frame_stamps
     stamp = float(stamps[frame])
-    points = {"scan": scan_points(run, stamp), "seen": seen_landmarks(run, stamp)}
+    points = {name: seen_points(run, name, stamp) for name in _sensor_layers(run.recording)}
     words = f"t = {stamp - stamps[0]:.1f} s"
     if truth is not None:
         points["truth"] = truth[: frame + 1, :2]
@@ -338,7 +335,7 @@ def robot_outline(pose: Array, radius_m: float) -> Array:
     return np.concatenate([circle, front[None]])
 
 
-def _bounds(run: Playback, truth: Array | None) -> tuple[float, float, float, float]:
+def bounds(run: Playback, truth: Array | None) -> tuple[float, float, float, float]:
     """What the map shows: the world and the path, with a margin.
 
     A diverging estimate is followed to twice the size of all else.
@@ -372,15 +369,13 @@ def check_output(path: Path) -> None:
         raise InputError(f"{path}: MP4 needs ffmpeg, which is not installed; take .gif or .html")
 
 
-def save(run: Playback, path: Path, on_progress: Callable[[float], None], fps: int = FPS) -> None:
+def save(run: Playback, path: Path, on_progress: Callable[[float], None]) -> None:
     """Write the run as `.mp4` (needs ffmpeg), `.gif` or `.html`, whole or not at all.
 
     Parameters
     ----------
     on_progress
         Called with the share done.
-    fps
-        Pictures per second.
     """
     check_output(path)
 
@@ -391,13 +386,13 @@ def save(run: Playback, path: Path, on_progress: Callable[[float], None], fps: i
 
     write = {".mp4": _write_mp4, ".gif": _write_gif, ".html": _write_html}[path.suffix]
     with write_whole(path) as part:
-        write(counted(), part, fps)
+        write(counted(), part)
 
 
-def _write_mp4(images: Iterator[Picture], path: Path, fps: int) -> None:
+def _write_mp4(images: Iterator[Picture], path: Path) -> None:
     first = next(images)
     size = f"{first.shape[1]}x{first.shape[0]}"
-    raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", str(fps), "-i", "-"]
+    raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", str(FPS), "-i", "-"]
     command = ["ffmpeg", "-y", "-loglevel", "error", *raw, "-pix_fmt", "yuv420p", str(path)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         assert process.stdin is not None
@@ -421,13 +416,12 @@ def _reduced(image: Picture) -> Any:
     return Image.fromarray(image).quantize(96, method=Image.Quantize.FASTOCTREE)
 
 
-def _write_gif(images: Iterator[Picture], path: Path, fps: int) -> None:
+def _write_gif(images: Iterator[Picture], path: Path) -> None:
     first, *rest = (_reduced(image) for image in images)
-    duration_ms = round(1000 / fps)
-    first.save(path, format="GIF", save_all=True, append_images=rest, duration=duration_ms, loop=0)
+    first.save(path, "GIF", save_all=True, append_images=rest, duration=1000 // FPS, loop=0)
 
 
-def _write_html(images: Iterator[Picture], path: Path, fps: int) -> None:
+def _write_html(images: Iterator[Picture], path: Path) -> None:
     frames: list[str] = []
     for image in images:
         data = io.BytesIO()
@@ -437,7 +431,7 @@ def _write_html(images: Iterator[Picture], path: Path, fps: int) -> None:
         "width": image.shape[1],
         "height": image.shape[0],
         "last": len(frames) - 1,
-        "fps": fps,
+        "fps": FPS,
         "first": frames[0],
         "frames": ",\n".join(f'"{frame}"' for frame in frames),
     }

@@ -1,7 +1,5 @@
 """Worlds from above."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -10,6 +8,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from experiments.viewing.plotting import plan_axes
 from experiments.viewing.style import (
     BLACK,
     BLUE,
@@ -20,9 +19,10 @@ from experiments.viewing.style import (
     SKY,
     WALL,
     YELLOW,
-    figure,
+    subplots,
 )
 from sim.arrays import Array
+from sim.recording import Recording
 from sim.world import World
 
 _PLACES = {
@@ -34,6 +34,11 @@ _PLACES = {
     "door": BLACK,
 }
 _LASER_HEIGHT_M = 0.25  # faces that begin above it are drawn faintly
+
+
+def sees_landmarks(recording: Recording) -> bool:
+    """Whether a sensor observes any number of things at once, as a camera does landmarks."""
+    return any(log.splits is not None for log in recording.logs.values())
 
 
 def draw_world(
@@ -63,7 +68,7 @@ def draw_walls(ax: Axes, walls: Array, wall_z_m: Array, **style: Any) -> None:
     for rows, usual in ((~high, {"color": WALL}), (high, {"color": GREEN, "alpha": 0.5})):
         lines = list(walls[rows].reshape(-1, 2, 2))
         ax.add_collection(LineCollection(lines, **{"lw": 0.9, **usual, **style}))
-    ax.set(xlabel="x, m", ylabel="y, m", aspect="equal")
+    plan_axes(ax)
     ax.autoscale_view()
 
 
@@ -71,8 +76,7 @@ def world_figure(world: World) -> Figure:
     """One world with everything in it, and a legend above."""
     x1, y1, x2, y2 = world.bounds_m
     # The map's own height beside the labels, and room above it for title and legend
-    page = figure(9.0, float(np.clip(8.3 * (y2 - y1) / max(x2 - x1, 1.0), 2.0, 8.3)) + 1.5)
-    ax = page.subplots()
+    page, ax = subplots(9.0, float(np.clip(8.3 * (y2 - y1) / max(x2 - x1, 1.0), 2.0, 8.3)) + 1.5)
     draw_world(ax, world, places=True, tour=True)
     ax.set_title(world.name, loc="left")
     if ax.get_legend_handles_labels()[1]:

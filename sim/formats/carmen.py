@@ -28,9 +28,9 @@ from sim.errors import InputError
 from sim.files import write_whole
 from sim.formats import assemble
 from sim.formats.text import Rows, Words, read_words
-from sim.recording import LaserLog, Recording, Truth, WheelLog
+from sim.recording import Log, Recording, Truth, WheelLog
 from sim.robot import RobotGeometry, arc_increment
-from sim.sensors import Encoder, Laser, Mount, SensorSuite
+from sim.sensors import Encoder, Laser, Mount
 
 Poses = Literal["odometry", "reference"]
 
@@ -229,9 +229,9 @@ def scan_recording(
         frame_stamps=assemble.frame_stamps(wheels.stamps, [scan_stamps]),
         wheels=wheels,
         robot=RobotGeometry(wheel_radius_m, track_m),
-        sensors=SensorSuite(encoder=Encoder(rate_hz=None), laser=laser),
+        sensors={"encoder": Encoder(rate_hz=None), "laser": laser},
+        logs={"laser": Log.of(laser, scan_stamps.copy(), ranges_m=ranges_m.copy())},
         truth=truth,
-        laser=LaserLog(scan_stamps.copy(), ranges_m.copy()),
         config=config,
     )
 
@@ -279,9 +279,9 @@ def write_carmen(path: Path, recording: Recording) -> None:
     InputError
         If the recording has no laser, or the file cannot be written.
     """
-    laser, log = recording.sensors.laser, recording.laser
-    if laser is None or log is None:
+    if "laser" not in recording.logs:
         raise InputError(f"{path}: a CARMEN log is of a laser, and this recording has none")
+    laser, log = recording.sensor("laser", Laser), recording.log("laser")
     steps = arc_increment(np.diff(recording.wheels.position_m, axis=0), recording.robot.track_m)
     poses = assemble.chained(steps)
     heading = np.unwrap(poses[:, 2])
@@ -293,7 +293,7 @@ def write_carmen(path: Path, recording: Recording) -> None:
     step_rad = float(np.diff(laser.bearings_rad[:2])[0]) if n_beams > 1 else laser.fov_rad
     head = f"ROBOTLASER1 0 {start:.17g} {laser.fov_rad:.17g} {step_rad:.17g} "
     head += f"{laser.max_range_m:.17g} {laser.sigma_range_m:.17g} 0 {n_beams}"
-    for t, scan in zip(log.stamps, log.ranges_m, strict=True):
+    for t, scan in zip(log.stamps, log["ranges_m"], strict=True):
         at = [np.interp(t, recording.wheels.stamps, c) for c in (*poses[:, :2].T, heading)]
         of_laser = se2.compose(np.array(at), laser.mount.pose)
         numbers = " ".join(f"{r:.9g}" for r in np.where(np.isfinite(scan), scan, laser.max_range_m))

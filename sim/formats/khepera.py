@@ -20,7 +20,7 @@ from sim.formats.assemble import chained
 from sim.formats.text import json_number, read_bytes, read_members
 from sim.recording import Recording, Truth, WheelLog
 from sim.robot import RobotGeometry
-from sim.sensors import SensorSuite
+from sim.sensors import Encoder
 
 # What a rolled radian is taken to be until it is calibrated (the robot's data sheet)
 NOMINAL_DIAMETER_M, NOMINAL_AXLE_M = 0.041, 0.0885
@@ -127,7 +127,7 @@ def to_recording(
         frame_stamps=stamps,
         wheels=WheelLog(stamps.copy(), travel),
         robot=RobotGeometry(float(np.mean(wheel_diameters_m)) / 2.0, axle_m),
-        sensors=SensorSuite(),
+        sensors={"encoder": Encoder()},
         truth=Truth(stamps.copy(), poses),
         config={"source": "khepera"},
     )

@@ -14,6 +14,7 @@ gives that of the bearing.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -25,9 +26,9 @@ from sim.arrays import Array
 from sim.errors import InputError
 from sim.formats import assemble
 from sim.formats.text import Words, read_members, split_words
-from sim.recording import LandmarkLog, Recording, Truth
+from sim.recording import Log, Recording, Truth
 from sim.robot import RobotGeometry
-from sim.sensors import Encoder, Mount, SensorSuite, StereoCamera
+from sim.sensors import Encoder, Mount, StereoCamera
 from sim.world import World
 
 # An iRobot Create
@@ -100,7 +101,8 @@ def parse_mrclam(
     assemble.require_readings(len(truth), 2, where, "ground truth poses")
     wheels = assemble.wheels_from_velocities(odometry[:, 0].copy(), odometry[:, 1:], TRACK_M)
     ids = _landmark_rows(measured[:, 1], barcodes, landmarks[:, 0], notes)
-    log, true_ids = _observations(measured, ids, identifies, notes)
+    camera = dataclasses.replace(camera, identifies=identifies)
+    log, true_ids = _observations(measured, ids, camera, notes)
     z_m = np.full(len(landmarks), camera.mount.z_m)
     world = World(
         "mrclam",
@@ -112,9 +114,14 @@ def parse_mrclam(
         frame_stamps=assemble.frame_stamps(wheels.stamps, [log.stamps]),
         wheels=wheels,
         robot=RobotGeometry(WHEEL_RADIUS_M, TRACK_M),
-        sensors=SensorSuite(encoder=Encoder(rate_hz=None), stereo=camera),
-        truth=Truth(truth[:, 0].copy(), truth[:, 1:].copy(), landmark_ids=true_ids, world=world),
-        landmarks=log,
+        sensors={"encoder": Encoder(rate_hz=None), "stereo": camera},
+        logs={"stereo": log},
+        truth=Truth(
+            truth[:, 0].copy(),
+            truth[:, 1:].copy(),
+            readings={"stereo": {"true_ids": true_ids}},
+            world=world,
+        ),
         config={"source": "mrclam", "robot": robot, "notes": notes},
     )
 
@@ -133,8 +140,8 @@ def _landmark_rows(
 
 
 def _observations(
-    measured: Array, ids: NDArray[np.int64], identifies: bool, notes: assemble.Notes
-) -> tuple[LandmarkLog, NDArray[np.int64]]:
+    measured: Array, ids: NDArray[np.int64], camera: StereoCamera, notes: assemble.Notes
+) -> tuple[Log, NDArray[np.int64]]:
     """Landmark observations by image, in order, and the true ids of their rows."""
     forward = measured[:, 2] * np.cos(measured[:, 3])
     usable = (ids >= 0) & (forward > 0.0) & (measured[:, 2] > 0.0)
@@ -148,5 +155,6 @@ def _observations(
         [-range_m * np.sin(bearing), np.zeros_like(range_m), range_m * np.cos(bearing)], axis=1
     )
     splits = np.append(first, len(measured)).astype(np.int64)
-    shown = ids.copy() if identifies else np.zeros(0, np.int64)
-    return LandmarkLog(stamps, splits, points, ids=shown), ids
+    shown = {"ids": ids} if camera.identifies else {}
+    none = np.zeros((len(ids), 0), np.float32)
+    return Log.of(camera, stamps, splits, points_in_camera=points, **shown, descriptors=none), ids

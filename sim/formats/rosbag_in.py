@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,22 +32,27 @@ from sim.formats.rosbag import (
     TWIST,
     Track,
     library,
+    own_kind,
+    own_reading,
+    register,
     seconds,
+    topics_of,
     typestore,
 )
 from sim.formats.rosbag_bounds import check_bounds
-from sim.recording import (
-    CloudLog,
-    CommandLog,
-    LandmarkLog,
-    LaserLog,
-    PlaceLog,
-    Recording,
-    Truth,
-    WheelLog,
-)
+from sim.recording import CommandLog, Log, Recording, Truth, WheelLog, joined
+from sim.recording_format_1 import upgraded_sensors
 from sim.robot import RobotGeometry
-from sim.sensors import Encoder, Laser, Mount, SensorSuite, suite_from_config
+from sim.sensors import (
+    Encoder,
+    Laser,
+    Mount,
+    PlaceDescriptor,
+    Sensor,
+    StereoCamera,
+    point_cloud,
+)
+from sim.sensors.base import parted, schema_from_meta, sensors_from_meta
 from sim.settings import build
 from sim.world import World
 
@@ -58,9 +64,6 @@ _KINDS = {
     ABOUT: STRING,
     "/wheels": JOINTS,
     "/ground_truth/wheels": JOINTS,
-    "/landmarks": CLOUD,
-    "/points": CLOUD,
-    "/places": CLOUD,
     "/cmd_vel": TWIST,
     "/map": MARKERS,
 }
@@ -105,8 +108,7 @@ def read_bag(
     InputError
         Naming the file and what is wrong with it.
     """
-    topics = _messages(path)
-    about = _about(path, topics)
+    topics, about = _messages(path)
     notes: assemble.Notes = {}
     track = track_m or about.get("track_m") or NOMINAL_TRACK_M
     try:
@@ -119,7 +121,7 @@ def read_bag(
 
 def read_tracks(path: Path) -> dict[str, Track]:
     """Trajectories with covariances in a bag: name of the topic, without its slash, to track."""
-    topics = _messages(path)
+    topics, _ = _messages(path)
     try:
         return {
             name.lstrip("/"): _track(path, topics, name)
@@ -139,7 +141,7 @@ def _track(path: Path, topics: dict[str, _Topic], name: str) -> Track:
     covariance = np.array([m.pose.covariance for m in topic.messages]).reshape(-1, 6, 6)
     landmarks = np.zeros((0, 3))
     if f"{name}/map" in topics and topics[f"{name}/map"].kind == CLOUD:
-        points = _cloud(path, topics[f"{name}/map"].messages[-1])
+        points = point_cloud.columns(topics[f"{name}/map"].messages[-1])
         landmarks = np.stack([points[c] for c in "xyz"], axis=1).astype(np.float64)
     planar = covariance[(slice(None), *PLANAR)]
     return Track(stamps[rows], poses[rows], planar[rows], landmarks)
@@ -155,12 +157,20 @@ def _recording(
     wheel_radius_m: float,
 ) -> Recording:
     wheels = _wheels(path, topics, wanted[0], track_m, notes)
-    scans = _chosen(path, topics, wanted[1], "/scan", SCAN)
-    mounts = _transforms(topics)
-    laser, laser_log = _laser(path, scans, mounts, notes) if scans else (None, None)
+    sensors: Mapping[str, Sensor] = about.get("sensors", {"encoder": Encoder(rate_hz=None)})
+    logs: dict[str, Log] = {}
+    hidden: dict[str, dict[str, NDArray[Any]]] = {}
+    for name in about.get("topics", {}):
+        logs[name], hidden[name] = _sensor_log(topics, about, name)
+        camera = sensors[name]
+        if isinstance(camera, StereoCamera) and "ids" not in logs[name].values:
+            # in version 0.1 the settings did not always say that a camera does not identify
+            sensors = {**sensors, name: dataclasses.replace(camera, identifies=False)}
+    scans = None if about else _chosen(path, topics, wanted[1], "/scan", SCAN)
+    if scans is not None:
+        laser, logs["laser"] = _laser(path, scans, _transforms(topics), notes)
+        sensors = {**sensors, "laser": laser}
     reference = _chosen(path, topics, wanted[2], "/ground_truth", ODOMETRY, only_named=True)
-    landmarks, true_ids = _landmarks(path, topics)
-    clouds, places = _clouds(path, topics), _places(path, topics)
     truth = None
     if reference is not None:
         stamps, poses = _poses(reference)
@@ -169,50 +179,91 @@ def _recording(
         if "/ground_truth/wheels" in topics:
             travel = _joints(topics["/ground_truth/wheels"])[1]
         world = _world(topics.get("/map"), about.get("world"))
-        truth = Truth(stamps[rows], poses[rows], travel, true_ids, world)
-    sensors = SensorSuite(encoder=Encoder(rate_hz=None), laser=laser)
+        hidden = {name: values for name, values in hidden.items() if values}
+        truth = Truth(stamps[rows], poses[rows], travel, hidden, world)
     robot = RobotGeometry(wheel_radius_m, track_m)
-    logs = [log.stamps for log in (laser_log, landmarks, clouds, places) if log is not None]
-    frames = assemble.frame_stamps(wheels.stamps, logs)
+    frames = assemble.frame_stamps(wheels.stamps, [log.stamps for log in logs.values()])
     config: dict[str, Any] = {"source": "rosbag", "notes": notes}
     if about:
-        sensors, robot = suite_from_config(about["sensors"]), about["robot"]
-        frames, config = about["frames"], about["config"]
+        robot, frames, config = about["robot"], about["frames"], about["config"]
     return Recording(
         frame_stamps=frames,
         wheels=wheels,
         robot=robot,
         sensors=sensors,
+        logs=logs,
         truth=truth,
-        laser=laser_log,
-        landmarks=landmarks,
-        clouds=clouds,
-        places=places,
         commands=_commands(topics),
         config=config,
         status=str(about.get("status", "ok")),
     )
 
 
-def _about(path: Path, topics: dict[str, _Topic]) -> dict[str, Any]:
-    """What `write_bag` noted about the recording; empty for any other bag."""
-    topic = topics.get(ABOUT)
-    if topic is None:
-        return {}
+def _about(path: Path, message: Any, topics: Collection[str]) -> dict[str, Any]:
+    """What `write_bag` noted about the recording in a bag of these topics."""
     try:
-        written = json.loads(topic.messages[0].data)
+        written = json.loads(message.data)
         robot = build(RobotGeometry, written["robot"], "robot")
+        if "topics" in written:
+            schemas = {k: schema_from_meta(fields) for k, fields in written["schemas"].items()}
+            sensors = sensors_from_meta(written["sensors"], schemas)
+            logged = {name: str(topic) for name, topic in written["topics"].items()}
+        else:  # version 0.1
+            sensors = sensors_from_meta(upgraded_sensors(written["sensors"]), {})
+            if "/places" in topics:
+                sensors["place"] = PlaceDescriptor()
+            logged = {name: t for name, t in topics_of(sensors).items() if t in topics}
+            schemas = {name: sensors[name].schema for name in logged}
         return {
             "robot": robot,
             "track_m": robot.track_m,
-            "sensors": dict(written["sensors"]),
+            "sensors": sensors,
+            "schemas": {name: schemas[name] for name in logged},
+            "topics": logged,
             "config": dict(written["config"]),
             "status": written["status"],
             "frames": seconds(np.array(written["frame_stamps_ns"], np.int64)),
             "world": written["world"],
         }
-    except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
+    except (*_BAD_CONTENT, RecursionError) as error:
         raise InputError(f"{path}: {ABOUT} is not as it was written ({error})") from error
+
+
+def _kinds(about: dict[str, Any], store: Any) -> set[str]:
+    """Message types of the sensors' topics; those of our own are registered."""
+    kinds = set()
+    for name, schema in about.get("schemas", {}).items():
+        seen, hidden = parted(schema)
+        if hasattr(about["sensors"][name], "ros_message"):
+            kinds.add(about["sensors"][name].ros_message)
+        else:
+            kinds.add(own_kind(name))
+            register(store, own_kind(name), seen)
+        if hidden:
+            kinds.add(own_kind(name, truth=True))
+            register(store, own_kind(name, truth=True), hidden)
+    return kinds
+
+
+def _sensor_log(
+    topics: dict[str, _Topic], about: dict[str, Any], name: str
+) -> tuple[Log, dict[str, NDArray[Any]]]:
+    """Log of a sensor of ours, and what its schema marks as truth."""
+    sensor, topic = about["sensors"][name], topics.get(about["topics"][name], _Topic("", [], []))
+    seen, hidden = parted(about["schemas"][name])
+    if hasattr(sensor, "ros_message"):
+        readings = [sensor.from_ros(message) for message in topic.messages]
+        # in version 0.1 true ids lay among the observations, and ids were there if observed
+        seen = {key: field for key, field in seen.items() if all(key in r for r in readings)}
+    else:
+        readings = [own_reading(seen, message) for message in topic.messages]
+    true = readings
+    if f"/ground_truth/sensors/{name}" in topics:
+        messages = topics[f"/ground_truth/sensors/{name}"].messages
+        true = [own_reading(hidden, message) for message in messages]
+    hidden = {key: field for key, field in hidden.items() if all(key in r for r in true)}
+    log = joined(seen, _stamps(topic), readings, name)
+    return log, {key: field.joined([r[key] for r in true], key) for key, field in hidden.items()}
 
 
 def _chosen(
@@ -256,7 +307,7 @@ def _wheels(
 
 def _laser(
     path: Path, topic: _Topic, mounts: dict[str, Array], notes: assemble.Notes
-) -> tuple[Laser, LaserLog]:
+) -> tuple[Laser, Log]:
     first = topic.messages[0]
     n_beams, step = len(first.ranges), float(first.angle_increment)
     odd = [i for i, m in enumerate(topic.messages) if len(m.ranges) != n_beams]
@@ -289,46 +340,7 @@ def _laser(
         max_range_m=highest,
         mount=Mount(x, y, z, math.remainder(yaw, 2.0 * math.pi)),
     )
-    return laser, LaserLog(stamps[rows], ranges)
-
-
-def _landmarks(
-    path: Path, topics: dict[str, _Topic]
-) -> tuple[LandmarkLog | None, NDArray[np.int64]]:
-    none = np.zeros(0, np.int64)
-    topic = topics.get("/landmarks")
-    if topic is None:
-        return None, none
-    images = [_cloud(path, message) for message in topic.messages]
-    rows: NDArray[Any] = np.concatenate(images)
-    names = rows.dtype.names or ()
-    splits = np.cumsum([0, *(len(image) for image in images)]).astype(np.int64)
-    wide = [n for n in names if n[0] == "d" and n[1:].isdigit()]
-    descriptors = np.zeros((0, 0), np.float32)
-    if wide:
-        descriptors = np.stack([rows[n] for n in wide], axis=1).astype(np.float32)
-    ids = rows["id"].astype(np.int64) if "id" in names else none
-    true_ids = rows["true_id"].astype(np.int64) if "true_id" in names else none
-    points = np.stack([rows[c] for c in "xyz"], axis=1).astype(np.float64)
-    return LandmarkLog(_stamps(topic), splits, points, ids, descriptors), true_ids
-
-
-def _clouds(path: Path, topics: dict[str, _Topic]) -> CloudLog | None:
-    topic = topics.get("/points")
-    if topic is None or ABOUT not in topics:
-        return None
-    turns = [
-        _cloud(path, m)["range"].astype(np.float32).reshape(m.height, -1) for m in topic.messages
-    ]
-    return CloudLog(_stamps(topic), np.stack(turns))
-
-
-def _places(path: Path, topics: dict[str, _Topic]) -> PlaceLog | None:
-    topic = topics.get("/places")
-    if topic is None or ABOUT not in topics:
-        return None
-    rows = [_cloud(path, message)["value"].astype(np.float32) for message in topic.messages]
-    return PlaceLog(_stamps(topic), np.stack(rows))
+    return laser, Log.of(laser, stamps[rows], ranges_m=ranges)
 
 
 def _commands(topics: dict[str, _Topic]) -> CommandLog | None:
@@ -353,24 +365,6 @@ def _world(topic: _Topic | None, name: str | None) -> World | None:
         wall_z_m=np.stack([feet[::2, 2], tops[::2, 2]], axis=1),
         landmarks=points["landmarks"],
     )
-
-
-def _cloud(path: Path, message: Any) -> NDArray[Any]:
-    """Points of a PointCloud2 as a structured array."""
-    kinds = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-    order = ">" if message.is_bigendian else "<"
-    dtype = np.dtype(
-        {
-            "names": [f.name for f in message.fields],
-            "formats": [order + kinds[f.datatype] for f in message.fields],
-            "offsets": [f.offset for f in message.fields],
-            "itemsize": message.point_step,
-        }
-    )
-    n_points, data = message.width * message.height, np.asarray(message.data, np.uint8)
-    if len(data) != n_points * message.point_step:
-        raise InputError(f"{path}: a point cloud promises {n_points} points and does not hold them")
-    return np.frombuffer(data.tobytes(), dtype)
 
 
 def _joints(topic: _Topic) -> tuple[Array, Array]:
@@ -473,17 +467,26 @@ def _tf_odometry(topics: dict[str, _Topic]) -> tuple[Array, Array]:
     return seconds(np.array(stamps, np.int64)), np.array(poses, float).reshape(-1, 3)
 
 
-def _messages(path: Path) -> dict[str, _Topic]:
-    """All messages of the types we read, by topic."""
+def _messages(path: Path) -> tuple[dict[str, _Topic], dict[str, Any]]:
+    """All messages of the types we read, by topic; and what the bag says about a recording."""
     library()
     if not path.exists():
         raise InputError(f"{path}: no such bag")
     topics: dict[str, _Topic] = {}
+    about: dict[str, Any] = {}
     try:
         check_bounds(path)
-        with _reader(path) as (reader, deserialize):
+        with _reader(path) as (reader, store, deserialize):
+            notes = [c for c in reader.connections if (c.topic, c.msgtype) == (ABOUT, STRING)]
+            for connection, _, data in reader.messages(notes) if notes else ():
+                message = deserialize(data, connection.msgtype)
+                about = _about(path, message, {c.topic for c in reader.connections})
+                break
+            kinds = {*READ, *_kinds(about, store)}
             wanted = [
-                c for c in reader.connections if c.msgtype == _KINDS.get(c.topic, c.msgtype) in READ
+                c
+                for c in reader.connections
+                if c.msgtype == _KINDS.get(c.topic, c.msgtype) in kinds
             ]
             count = 0
             for connection, time, data in reader.messages(wanted) if wanted else ():
@@ -505,11 +508,11 @@ def _messages(path: Path) -> dict[str, _Topic]:
         raise InputError(f"{path}: damaged or not a bag ({reason})") from error
     if not topics:
         raise InputError(f"{path}: holds no odometry, scans or transforms")
-    return topics
+    return topics, about
 
 
 @contextmanager
-def _reader(path: Path) -> Iterator[tuple[Any, Any]]:
+def _reader(path: Path) -> Iterator[tuple[Any, Any, Any]]:
     with path.open("rb") if path.is_file() else tempfile.TemporaryFile() as file:
         ros1 = file.read(13) == b"#ROSBAG V2.0\n"
     store = typestore(ros1=ros1)
@@ -517,9 +520,9 @@ def _reader(path: Path) -> Iterator[tuple[Any, Any]]:
         from rosbags.rosbag1 import Reader as Reader1
 
         with Reader1(path) as reader1:
-            yield reader1, store.deserialize_ros1
+            yield reader1, store, store.deserialize_ros1
     else:
         from rosbags.rosbag2 import Reader
 
         with Reader(path) as reader:
-            yield reader, store.deserialize_cdr
+            yield reader, store, store.deserialize_cdr

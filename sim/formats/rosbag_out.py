@@ -7,12 +7,11 @@ import json
 import math
 import shutil
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sim import se2
 from sim.arrays import Array
@@ -26,17 +25,22 @@ from sim.formats.rosbag import (
     ODOMETRY,
     PLANAR,
     POSE,
-    SCAN,
     STRING,
     TF,
     TWIST,
     Track,
     library,
     nanoseconds,
+    own_fields,
+    own_kind,
+    register,
+    topics_of,
     typestore,
 )
-from sim.recording import LandmarkLog, Recording, Truth
+from sim.recording import Log, Recording, Truth, described
 from sim.robot import arc_increment
+from sim.sensors import Mount, point_cloud
+from sim.sensors.base import is_ours
 
 _MARKER_POINTS, _MARKER_LINES = 8, 5
 _OPTICAL = np.array([-0.5, 0.5, -0.5, 0.5])  # quaternion of the optical frame on the camera
@@ -108,18 +112,31 @@ class _Bag:
     def __exit__(self, *_: object) -> None:
         self._writer.close()
 
-    def make(self, kind: str, **fields: Any) -> Any:
-        """A message or part of one; what is not given is zero or empty."""
+    def make(self, kind: str, /, **fields: Any) -> Any:
+        """A message or part of one; what is not given is zero or empty.
+
+        A mapping in place of a part, or a list of them, is made into it.
+        """
         if kind not in self._blanks:
             self._blanks[kind] = _blank(self._store, kind)
-        return dataclasses.replace(self._blanks[kind], **fields)
+        types = dict(self._store.fielddefs[kind][1])
+        return dataclasses.replace(
+            self._blanks[kind], **{k: self._part(types[k], v) for k, v in fields.items()}
+        )
+
+    def _part(self, kind: tuple[Any, Any], value: Any) -> Any:
+        if isinstance(value, dict):
+            return self.make(kind[1], **value)
+        if isinstance(value, list) and value and isinstance(value[0], dict):
+            return [self.make(kind[1][0][1], **part) for part in value]
+        return value
 
     def header(self, stamp: float, frame: str) -> Any:
         whole, rest = divmod(nanoseconds(stamp), 10**9)
         time = self.make("builtin_interfaces/msg/Time", sec=whole, nanosec=rest)
         return self.make("std_msgs/msg/Header", stamp=time, frame_id=frame)
 
-    def write(self, topic: str, kind: str, stamp: float, **fields: Any) -> None:
+    def write(self, topic: str, kind: str, stamp: float, /, **fields: Any) -> None:
         """Write a message."""
         if topic not in self._connections:
             self._connections[topic] = self._writer.add_connection(
@@ -185,36 +202,19 @@ class _Bag:
                 position=pair.astype(np.float64),
             )
 
-    def cloud(
-        self, topic: str, stamp: float, frame: str, columns: NDArray[Any], height: int = 1
+    def readings(
+        self, topic: str, kind: str, frame: str, stamps: Array, contents: Iterable[dict[str, Any]]
     ) -> None:
-        """A structured array (N,) as a point cloud."""
-        codes = {"f8": 8, "f4": 7, "i4": 5}
-        assert columns.dtype.fields is not None
-        fields = [
-            self.make(
-                "sensor_msgs/msg/PointField",
-                name=name,
-                offset=offset,
-                datatype=codes[kind.str[1:]],
-                count=1,
-            )
-            for name, (kind, offset, *_) in columns.dtype.fields.items()
-        ]
-        step, width = columns.dtype.itemsize, len(columns) // height
-        self.write(
-            topic,
-            CLOUD,
-            stamp,
-            header=self.header(stamp, frame),
-            height=height,
-            width=width,
-            fields=fields,
-            point_step=step,
-            row_step=step * width,
-            data=np.frombuffer(columns.tobytes(), np.uint8),
-            is_dense=True,
-        )
+        """Messages of a sensor: fields but for the header."""
+        for stamp, fields in zip(stamps, contents, strict=True):
+            self.write(topic, kind, stamp, header=self.header(stamp, frame), **fields)
+
+    def own_readings(self, topic: str, kind: str, frame: str, log: Log) -> None:
+        """Messages made by the log's schema."""
+        register(self._store, kind, log.schema)
+        rows = range(len(log.stamps))
+        contents = (own_fields(log.schema, log.reading(row)) for row in rows)
+        self.readings(topic, kind, frame, log.stamps, contents)
 
     def marker(self, number: int, name: str, kind: int, points: Array, width_m: float) -> Any:
         return self.make(
@@ -235,13 +235,15 @@ class _Bag:
 
 def _write_recording(bag: _Bag, recording: Recording) -> None:
     wheels, first = recording.wheels, float(recording.frame_stamps[0])
+    logged = {name: recording.sensors[name] for name in recording.logs}
+    usual = topics_of(logged)
+    # a class from elsewhere is not imported to read its messages, so its readings are also there
+    # by their schema
+    topics = {n: t if is_ours(logged[n]) else f"/sensors/{n}" for n, t in usual.items()}
     about = {
-        "robot": dataclasses.asdict(recording.robot),
-        "sensors": dataclasses.asdict(recording.sensors),
-        "config": recording.config,
-        "status": recording.status,
+        **described(recording),
+        "topics": topics,
         "frame_stamps_ns": [nanoseconds(s) for s in recording.frame_stamps],
-        "world": recording.world.name if recording.world else None,
     }
     bag.write(ABOUT, STRING, first, data=json.dumps(about))
     _write_mounts(bag, recording, first)
@@ -249,38 +251,8 @@ def _write_recording(bag: _Bag, recording: Recording) -> None:
     poses = chained(steps)
     bag.odometry("/odom", "odom", wheels.stamps, poses, np.zeros((len(poses), 3, 3)))
     bag.joints("/wheels", wheels.stamps, wheels.position_m)
-    if recording.laser is not None and recording.sensors.laser is not None:
-        laser, bearings = recording.sensors.laser, recording.sensors.laser.bearings_rad
-        step = float(bearings[1] - bearings[0]) if len(bearings) > 1 else 0.0
-        for stamp, ranges in zip(recording.laser.stamps, recording.laser.ranges_m, strict=True):
-            bag.write(
-                "/scan",
-                SCAN,
-                stamp,
-                header=bag.header(stamp, "laser"),
-                angle_min=float(bearings[0]),
-                angle_max=float(bearings[-1]),
-                angle_increment=step,
-                scan_time=1.0 / laser.rate_hz,
-                range_min=laser.min_range_m,
-                range_max=laser.max_range_m,
-                ranges=ranges,
-            )
-    if recording.landmarks is not None:
-        _write_landmarks(bag, recording, recording.landmarks)
-    if recording.clouds is not None and recording.sensors.lidar3d is not None:
-        lidar = recording.sensors.lidar3d
-        for stamp, turn in zip(recording.clouds.stamps, recording.clouds.ranges_m, strict=True):
-            ranges = np.where(np.isfinite(turn), turn, np.nan)
-            unit = lidar.points_in_sensor(np.ones(turn.shape))
-            parts = {c: unit[:, i] * ranges.ravel() for i, c in enumerate("xyz")}
-            columns = _columns({**parts, "range": turn.ravel()})
-            bag.cloud("/points", stamp, "lidar3d", columns, height=turn.shape[0])
-    if recording.places is not None:
-        for stamp, values in zip(
-            recording.places.stamps, recording.places.descriptors, strict=True
-        ):
-            bag.cloud("/places", stamp, "base_link", _columns({"value": values}))
+    for name, topic in topics.items():
+        _write_sensor(bag, recording, name, topic, usual[name])
     if recording.commands is not None:
         log = recording.commands
         for stamp, (v, omega) in zip(log.stamps, log.velocity, strict=True):
@@ -291,49 +263,38 @@ def _write_recording(bag: _Bag, recording: Recording) -> None:
 
 
 def _write_mounts(bag: _Bag, recording: Recording, stamp: float) -> None:
-    sensors = recording.sensors
-    named = {"laser": sensors.laser, "camera": sensors.stereo, "lidar3d": sensors.lidar3d}
     transforms = []
-    for frame, sensor in named.items():
-        if sensor is None:
+    for name, sensor in recording.sensors.items():
+        mount = getattr(sensor, "mount", None)
+        if not isinstance(mount, Mount):
             continue
-        pose = bag.pose(sensor.mount.pose, sensor.mount.z_m)
-        turn = pose.orientation
-        if frame == "camera":  # the optical frame: z forward, x right, y down
-            q = _times(np.array([turn.x, turn.y, turn.z, turn.w]), _OPTICAL)
-            turn = bag.make(
-                "geometry_msgs/msg/Quaternion",
-                **dict(zip("xyzw", (float(v) for v in q), strict=True)),
-            )
-        p = pose.position
-        transform = bag.make(
-            "geometry_msgs/msg/Transform",
-            translation=bag.make("geometry_msgs/msg/Vector3", x=p.x, y=p.y, z=p.z),
-            rotation=turn,
-        )
-        transforms.append(
-            bag.make(
-                "geometry_msgs/msg/TransformStamped",
-                header=bag.header(stamp, "base_link"),
-                child_frame_id=frame,
-                transform=transform,
-            )
-        )
+        turn = np.array([0.0, 0.0, math.sin(mount.yaw_rad / 2), math.cos(mount.yaw_rad / 2)])
+        if getattr(sensor, "ros_optical", False):  # z forward, x right, y down
+            turn = _times(turn, _OPTICAL)
+        transform = {
+            "translation": {"x": mount.x_m, "y": mount.y_m, "z": mount.z_m},
+            "rotation": dict(zip("xyzw", turn.tolist(), strict=True)),
+        }
+        header = bag.header(stamp, "base_link")
+        transforms.append({"header": header, "child_frame_id": name, "transform": transform})
     if transforms:
         bag.write("/tf_static", TF[0], stamp, transforms=transforms)
 
 
-def _write_landmarks(bag: _Bag, recording: Recording, log: LandmarkLog) -> None:
-    parts: dict[str, NDArray[Any]] = {c: log.points_in_camera[:, i] for i, c in enumerate("xyz")}
-    if len(log.ids):
-        parts["id"] = log.ids.astype(np.int32)
-    true_ids = recording.truth.landmark_ids if recording.truth else np.zeros(0, np.int64)
-    if len(true_ids) == len(log.points_in_camera) > 0:
-        parts["true_id"] = true_ids.astype(np.int32)
-    parts |= {f"d{i}": column for i, column in enumerate(log.descriptors.T)}
-    columns = _columns(parts)
-    for i, stamp in enumerate(log.stamps):
-        bag.cloud("/landmarks", stamp, "camera", columns[log.splits[i] : log.splits[i + 1]])
+def _write_sensor(bag: _Bag, recording: Recording, name: str, topic: str, usual: str) -> None:
+    sensor: Any = recording.sensors[name]
+    log = recording.logs[name]
+    frame = name if isinstance(getattr(sensor, "mount", None), Mount) else "base_link"
+    if hasattr(sensor, "ros_message"):
+        contents = (sensor.to_ros(log.reading(row)) for row in range(len(log.stamps)))
+        bag.readings(usual, sensor.ros_message, frame, log.stamps, contents)
+    if topic != usual or not hasattr(sensor, "ros_message"):
+        bag.own_readings(topic, own_kind(name), frame, log)
+    hidden = recording.truth.readings.get(name) if recording.truth is not None else None
+    if hidden:
+        schema = {key: field for key, field in sensor.schema.items() if key in hidden}
+        true = Log(schema, log.stamps, hidden, log.splits)
+        bag.own_readings(f"/ground_truth/sensors/{name}", own_kind(name, truth=True), frame, true)
 
 
 def _write_truth(bag: _Bag, truth: Truth, first: float) -> None:
@@ -366,8 +327,8 @@ def _write_track(bag: _Bag, name: str, track: Track) -> None:
             pose=bag.uncertain_pose(track.means[i], track.covariances[i]),
         )
     if len(track.landmarks):
-        columns = _columns({c: track.landmarks[:, i] for i, c in enumerate("xyz")})
-        bag.cloud(f"/{name}/map", float(track.stamps[-1]), "map", columns)
+        columns = {c: track.landmarks[:, i] for i, c in enumerate("xyz")}
+        bag.readings(f"/{name}/map", CLOUD, "map", track.stamps[-1:], [point_cloud.fields(columns)])
 
 
 def covariance_6x6(planar: Array) -> Array:
@@ -381,15 +342,6 @@ def _times(a: Array, b: Array) -> Array:
     """Product of quaternions x, y, z, w."""
     vector = a[3] * b[:3] + b[3] * a[:3] + np.cross(a[:3], b[:3])
     return np.array([*vector, a[3] * b[3] - a[:3] @ b[:3]])
-
-
-def _columns(parts: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
-    """A structured array of named columns."""
-    kinds = [(name, values.dtype) for name, values in parts.items()]
-    out = np.zeros(len(next(iter(parts.values()))), dtype=kinds)
-    for name, values in parts.items():
-        out[name] = values
-    return out
 
 
 def _blank(store: Any, kind: str) -> Any:

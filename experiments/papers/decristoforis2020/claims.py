@@ -1,7 +1,5 @@
 """The claims DC1-DC6 of decristoforis2020."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

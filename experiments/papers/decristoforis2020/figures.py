@@ -1,7 +1,5 @@
 """The figures of decristoforis2020, and those that our studies add."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

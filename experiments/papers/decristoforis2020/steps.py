@@ -1,7 +1,5 @@
 """Registration from scan to scan: the errors of its steps, and the shape of its ellipses."""
 
-from __future__ import annotations
-
 import functools
 import math
 
@@ -17,6 +15,7 @@ from experiments.runs.row import Row
 from sim import se2
 from sim.arrays import Array
 from sim.recording import Recording
+from sim.sensors import Laser
 from sim.world import World
 
 
@@ -32,7 +31,7 @@ def step_errors(recording: Recording, world: World, estimate: Estimate) -> Row:
         `correlation_lag_1` to `_5`; `nees_over_3` of one step, and of all in 1 s and 10 s as
         `accumulated_over_predicted_`; RMS `step_error_` and `step_bound_`, m and rad.
     """
-    truth, laser = recording.truth_at(recording.frame_stamps), recording.sensors.known_laser
+    truth, laser = recording.truth_at(recording.frame_stamps), recording.sensor("laser", Laser)
     motions, true_motions = (se2.between(p[:-1], p[1:]) for p in (estimate.means, truth))
     off = motions - true_motions
     off[:, 2] = se2.wrap(off[:, 2])

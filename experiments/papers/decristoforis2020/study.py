@@ -1,7 +1,5 @@
 """The studies of decristoforis2020: registration, its covariance, and fusion with odometry."""
 
-from __future__ import annotations
-
 import math
 import operator
 import timeit
@@ -43,6 +41,7 @@ from experiments.runs.row import Row
 from experiments.runs.seeds import stream
 from experiments.sweeps.plan import planned
 from sim.recording import Recording
+from sim.sensors import Laser, sensor_of
 
 Tables = dict[str, pd.DataFrame]
 Job = tuple[float, Callable[..., Tables], Sequence[Any]]  # cost, function, arguments
@@ -144,7 +143,7 @@ def _run(
     """
     seen: list[Estimate] = []
     (found,) = evaluate(
-        experiment, recording, on_estimate=lambda _, online, __: seen.append(online)
+        experiment, lambda: recording, on_estimate=lambda _, __, online, ___: seen.append(online)
     )
     if not seen:
         raise RunFailedError(f"{experiment.name}: {found['status_code']}: {found['status_detail']}")
@@ -234,7 +233,7 @@ def _scenes(seed: int, place: str, n_repeats: int) -> Tables:
     """Many registrations of one pair of poses in a place, and all covariances of them."""
     study, part = PLACES[place]
     experiment = Experiment.compose([f"study=decristoforis2020_{study}", f"seed={seed}"])
-    laser = experiment.sensors().known_laser
+    laser = sensor_of(experiment.sensors(), "laser", Laser)
     rng = stream(seed, f"scenes/{place}")
     (scene,) = scenes(experiment.world(), part, laser.mount.pose, rng, 1)
     found = measured(scene, laser, rng, n_repeats, max(2, n_repeats // 4))

@@ -5,8 +5,6 @@ anything is compared. Errors of position and map are those of the revised path a
 best particle, as the paper has them, raw and rigidly aligned.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterator
 from typing import Any
@@ -18,13 +16,12 @@ from scipy import stats
 
 from experiments.evaluation.statistics import (
     Interval,
-    equivalent,
     log_log_slope,
     log_ratio_interval,
     mean_interval,
     page_trend_p,
 )
-from experiments.evaluation.verdict import Claim, Verdict, banded, judged
+from experiments.evaluation.verdict import Claim, Verdict, banded, equivalent
 from experiments.papers.gil2008.settings import P0
 from experiments.papers.results import Results
 from sim.arrays import Array
@@ -241,6 +238,6 @@ def _equivalence(
     claim_id: str, label: str, first: ArrayLike, second: ArrayLike, margin: float
 ) -> Claim:
     """Judge two one-sided tests that the paired ratio lies within 1 / (1 + m) and 1 + m."""
-    found, _ = equivalent(first, second, margin)
-    low, high = 1.0 / (1.0 + margin), 1.0 + margin
-    return Claim(claim_id, label, found, f"within {low:.2g} and {high:g}", judged(found, low, high))
+    found, verdict = equivalent(first, second, margin)
+    criterion = f"within {1.0 / (1.0 + margin):.2g} and {1.0 + margin:g}"
+    return Claim(claim_id, label, found, criterion, verdict)

@@ -12,7 +12,13 @@ from matplotlib.figure import Figure
 from experiments.evaluation.metrics import rms
 from experiments.papers.gil2008.claims import pooled
 from experiments.papers.results import Results
-from experiments.viewing.plotting import draw_ellipses, plain_log, plain_ticks, with_legend
+from experiments.viewing.plotting import (
+    draw_ellipses,
+    plain_log,
+    plain_ticks,
+    plan_axes,
+    with_legend,
+)
 from experiments.viewing.style import (
     BLACK,
     BLUE,
@@ -74,7 +80,7 @@ def maps(run: Arrays) -> Figure:
     left.set_title("walls and objects", loc="left")
     draw_ellipses(right, run["landmarks"], run["landmark_covariances"], color=SKY, alpha=0.4, lw=0)
     right.plot(*run["landmarks"][:, :2].T, ".", color=BLUE, ms=3)
-    right.set(xlabel="x, m", ylabel="y, m", aspect="equal")
+    plan_axes(right)
     right.set_title("map of landmarks, with 95 % ellipses", loc="left")
     return page
 
@@ -104,7 +110,7 @@ def particles_along_a_motion(motion: Arrays) -> Figure:
     ax.plot(*motion["particles"][..., :2].T, ".", color=BLUE, ms=1.5)
     ax.plot(*motion["line"][:, :2].T, color=BLACK, label="odometry")
     ax.plot([], [], ".", color=BLUE, label="particles")
-    ax.set(xlabel="x, m", ylabel="y, m", aspect="equal")
+    plan_axes(ax)
     ax.legend()
     return page
 
@@ -121,7 +127,7 @@ def association_ellipses() -> Figure:
         ax.plot(*mean, "o", color=colour, label=f"landmark {name}, distance {d:.1f}")
     draw_ellipses(ax, [z], [R], fill=False, color=RED, lw=1.5, ls="--")
     ax.plot(*z, "x", color=RED, label="measurement")
-    ax.set(xlabel="x, m", ylabel="y, m", aspect="equal", xlim=(-0.9, 1.9), ylim=(-1.0, 1.9))
+    plan_axes(ax, xlim=(-0.9, 1.9), ylim=(-1.0, 1.9))
     ax.legend(loc="upper left")
     return page
 
@@ -150,8 +156,14 @@ def world_3d(run: Arrays) -> Figure:
         ax.plot(*_ellipsoid(mean, covariance), color=RED, lw=0.3)
         ax.plot(*np.array([eye, mean]).T, color=SKY, lw=0.5)
     ax.plot(*landmarks[near(landmarks)].T, ".", color=BLUE, ms=2)
-    ax.set(xlim=pose[0] + np.array([-reach, reach]), ylim=pose[1] + np.array([-reach, reach]))
-    ax.set(zlim=(0.0, 3.0), xlabel="x, m", ylabel="y, m", zlabel="z, m")
+    ax.set(
+        xlim=pose[0] + np.array([-reach, reach]),
+        ylim=pose[1] + np.array([-reach, reach]),
+        zlim=(0.0, 3.0),
+        xlabel="x, m",
+        ylabel="y, m",
+        zlabel="z, m",
+    )
     ax.set_box_aspect((2.0 * reach, 2.0 * reach, 3.0), zoom=1.25)
     return page
 
@@ -328,8 +340,8 @@ def by_association(association: pd.DataFrame) -> Figure:
         plain_log(left.xaxis)
         right.set(xlim=(0.0, 1.0))
         right.tick_params(axis="y", left=False, labelleft=False)
-    grid[-1, 0].set_xlabel("path error over odometry's (each world; diamonds: RMS)")
-    grid[-1, 1].set_xlabel("share of right associations")
+    left.set(xlabel="path error over odometry's (each world; diamonds: RMS)")
+    right.set(xlabel="share of right associations")
     return page
 
 

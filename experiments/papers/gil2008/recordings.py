@@ -19,10 +19,11 @@ from experiments.runs.experiment import Config, Experiment
 from experiments.runs.seeds import stream
 from sim.arrays import Array
 from sim.errors import InputError
-from sim.recording import LandmarkLog, Recording, WheelLog
+from sim.rays import ExactRays
+from sim.recording import Log, Recording, WheelLog, joined
 from sim.robot import wheel_errors
-from sim.sensors import StereoCamera, suite_from_config
-from sim.simulate import ExactRays, LandmarkEye
+from sim.sensors import StereoCamera, View, sensor_of, sensors_from_config
+from sim.sensors.base import parted, sensor_settings
 from sim.world import World
 
 
@@ -79,23 +80,29 @@ def whole(config: Config) -> Recording:
     rng = stream(scene.seed, f"gil2008/images/{dataclasses.replace(scene, sigma_descriptor=0.0)}")
     world = _alike(driven.known_world, scene.alike_share, rng)
     camera = dataclasses.replace(
-        camera, max_distance_m=max(FARTHEST_M, camera.max_distance_m), max_observations=0
+        camera,
+        max_distance_m=max(FARTHEST_M, camera.max_distance_m),
+        max_observations=0,
+        identifies=True,
     )
-    eye = LandmarkEye(world, camera, rng)
-    rays: Any = ExactRays(world, None) if scene.occluded else _NoWalls()
-    stamps = driven.known_landmarks.stamps
-    images = [eye.observe(rays, pose) for pose in driven.truth_at(stamps)]
-    points, ids, descriptors = (list(part) for part in zip(*images, strict=True))
-    true_ids = np.concatenate(ids)
-    splits = np.cumsum([0, *map(len, ids)])
+    eye = camera.start(rng)
+    rays: Any = ExactRays(world) if scene.occluded else _NoWalls()
+    stamps = driven.log("stereo").stamps
+    poses = driven.truth_at(stamps)
+    eye.begin(View(stamps[0], poses[0], world, rays, stamps[0], poses[0]))
+    images = [
+        eye(View(stamp, pose, world, rays, stamp, pose))
+        for stamp, pose in zip(stamps.tolist(), poses, strict=True)
+    ]
+    seen, hidden = parted(camera.schema)
+    log, true = (joined(schema, stamps, images, "images") for schema in (seen, hidden))
+    driven = driven.with_log("stereo", log, camera)
     return dataclasses.replace(
         driven,
-        landmarks=LandmarkLog(
-            stamps, splits, np.concatenate(points), true_ids, np.concatenate(descriptors)
-        ),
         wheels=driven.wheels if scene.draw == 0 else _wheels(driven, scene, config),
-        sensors=dataclasses.replace(driven.sensors, stereo=camera),
-        truth=dataclasses.replace(driven.known_truth, landmark_ids=true_ids, world=world),
+        truth=dataclasses.replace(
+            driven.known_truth, readings={"stereo": true.values}, world=world
+        ),
     )
 
 
@@ -105,50 +112,56 @@ def thinned(recording: Recording, config: Config) -> Recording:
     Landmarks are kept by their true distance. The same random order is used for every B, so the
     observations of a smaller B are a subset of those of a larger one.
     """
-    log, truth = recording.known_landmarks, recording.known_truth
+    log, truth = recording.log("stereo"), recording.known_truth
     camera, scene = _camera(config), Scene.of(config)
     rng = stream(scene.seed, "gil2008/choice", scene.draw)
-    image = np.repeat(np.arange(len(log.stamps)), np.diff(log.splits))
+    splits = log.known_splits
+    image = np.repeat(np.arange(len(log.stamps)), np.diff(splits))
     distance = landmark_distances_m(recording)
     order = distance if camera.selection == "nearest" else rng.random(len(distance))
     kept = distance <= camera.max_distance_m
     if camera.max_observations:
         ranked = np.lexsort((order, ~kept, image))
         rank = np.empty(len(image), np.int64)
-        rank[ranked] = np.arange(len(image)) - log.splits[image[ranked]]
+        rank[ranked] = np.arange(len(image)) - splits[image[ranked]]
         kept &= rank < camera.max_observations
+    schema, _ = parted(camera.schema)
+    left = Log.of(
+        camera,
+        log.stamps,
+        np.concatenate([[0], np.cumsum(kept)])[splits],
+        **{name: log[name][kept] for name in schema},
+    )
+    true = {name: values[kept] for name, values in truth.readings["stereo"].items()}
     return dataclasses.replace(
-        recording,
-        landmarks=dataclasses.replace(
-            log,
-            splits=np.concatenate([[0], np.cumsum(kept)])[log.splits],
-            points_in_camera=log.points_in_camera[kept],
-            ids=log.ids[kept] if camera.identifies else np.zeros(0, np.int64),
-            descriptors=log.descriptors[kept],
-        ),
-        sensors=dataclasses.replace(recording.sensors, stereo=camera),
-        truth=dataclasses.replace(truth, landmark_ids=truth.landmark_ids[kept]),
+        recording.with_log("stereo", left, camera),
+        truth=dataclasses.replace(truth, readings={"stereo": true}),
     )
 
 
 def landmark_distances_m(recording: Recording) -> Array:
     """True distance (K,) from the camera to the landmark of each observation, m."""
-    log, camera = recording.known_landmarks, recording.sensors.known_stereo
-    where = np.repeat(recording.truth_at(log.stamps), np.diff(log.splits), axis=0)
+    log, camera = recording.log("stereo"), recording.sensor("stereo", StereoCamera)
+    where = np.repeat(recording.truth_at(log.stamps), np.diff(log.known_splits), axis=0)
     where[:, 2] = camera.mount.z_m
-    true = recording.known_world.landmarks[recording.known_truth.landmark_ids]
+    true = recording.known_world.landmarks[true_ids(recording)]
     return np.asarray(np.linalg.norm(true - where, axis=1))
+
+
+def true_ids(recording: Recording) -> NDArray[np.int64]:
+    """True landmark (K,) of each observation."""
+    return recording.known_truth.readings["stereo"]["true_ids"]
 
 
 def _drive(config: Config) -> Experiment:
     """Drive of a configuration's robot; it does not depend on the camera."""
-    camera = dataclasses.asdict(StereoCamera(rate_hz=_camera(config).rate_hz))
+    camera = sensor_settings(StereoCamera(rate_hz=_camera(config).rate_hz))
     sensors = {**config["sensors"], "stereo": camera}
     return Experiment({**config, "recording": None, "sensors": sensors})
 
 
 def _camera(config: Config) -> StereoCamera:
-    camera = suite_from_config(config["sensors"]).known_stereo
+    camera = sensor_of(sensors_from_config(config["sensors"]), "stereo", StereoCamera)
     if camera.selection == "spread":
         raise InputError("gil2008 needs sensors.stereo.selection=random or nearest, got spread")
     return camera

@@ -1,7 +1,5 @@
 """What gil2008 measures of a run besides its path: map, associations, error on revisited ground."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
@@ -10,6 +8,7 @@ from numpy.typing import NDArray
 
 from estimators.base import Estimate
 from experiments.evaluation.metrics import alignment, position_errors_m, rms, travelled_m
+from experiments.papers.gil2008.recordings import true_ids
 from experiments.papers.gil2008.settings import LAG_M, WITHIN_M
 from experiments.runs.row import Row
 from sim import se2
@@ -50,7 +49,7 @@ def right_share(recording: Recording, associations: Sequence[NDArray[np.int64]])
 
     One that starts a landmark is right if that landmark had not been seen before.
     """
-    true = recording.known_truth.landmark_ids
+    true = true_ids(recording)
     given = np.concatenate(associations)
     first = np.zeros(len(true), bool)
     first[np.unique(true, return_index=True)[1]] = True
@@ -60,11 +59,11 @@ def right_share(recording: Recording, associations: Sequence[NDArray[np.int64]])
 
 def matching_precision(recording: Recording) -> float:
     """Share of observations whose descriptor is nearest to that of their landmark's first one."""
-    log, truth = recording.known_landmarks, recording.known_truth
-    ids, first = np.unique(truth.landmark_ids, return_index=True)
-    again = np.delete(np.arange(len(truth.landmark_ids)), first)
-    nearest = np.argmax(log.descriptors[again] @ log.descriptors[first].T, axis=1)
-    return float(np.mean(ids[nearest] == truth.landmark_ids[again]))
+    descriptors, true = recording.log("stereo")["descriptors"], true_ids(recording)
+    ids, first = np.unique(true, return_index=True)
+    again = np.delete(np.arange(len(true)), first)
+    nearest = np.argmax(descriptors[again] @ descriptors[first].T, axis=1)
+    return float(np.mean(ids[nearest] == true[again]))
 
 
 def revisited(truth: Array) -> NDArray[np.bool_]:

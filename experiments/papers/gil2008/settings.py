@@ -1,7 +1,5 @@
 """Constants of the gil2008 studies; the configuration is in conf/study/gil2008*.yaml."""
 
-from __future__ import annotations
-
 from experiments.evaluation.verdict import Profile
 
 # Each study's table, and the estimator's keys that name its rows

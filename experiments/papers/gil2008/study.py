@@ -4,8 +4,6 @@ Each table is a study of conf/study, whose swept values are its runs. Runs over 
 recording.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from itertools import accumulate
@@ -32,8 +30,9 @@ from sim import se2
 from sim.arrays import Array
 from sim.recording import Recording
 from sim.robot import arc_increment, wheel_errors
+from sim.sensors import StereoCamera
 
-Run = tuple[str, Experiment]  # the table its rows go to; its configuration
+TableRun = tuple[str, Experiment]  # the table its rows go to; its configuration
 
 _SCORES = (
     "ate_rmse_m",
@@ -73,7 +72,7 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
     on_progress(1.0)
 
 
-def plan(profile: Profile) -> Iterator[Run]:
+def plan(profile: Profile) -> Iterator[TableRun]:
     """All runs; the quick profile has the same ones over fewer worlds, with fewer repeats.
 
     They are composed for one world; the others differ only in their seed.
@@ -87,7 +86,7 @@ def plan(profile: Profile) -> Iterator[Run]:
                     yield table, one.replaced(seed=seed, world_seed=seed, repeats=repeats)
 
 
-def rows_of(runs: Sequence[Run]) -> list[tuple[str, Row]]:
+def rows_of(runs: Sequence[TableRun]) -> list[tuple[str, Row]]:
     """Table and row of every run over one scene."""
     first = runs[0][1]
     scene, recording = Scene.of(first.config), whole(first.config)
@@ -122,13 +121,13 @@ def labels_of(table: str, experiment: Experiment) -> Row:
 
 def _shown(recording: Recording) -> Row:
     """What the images of a recording show."""
-    camera, log = recording.sensors.known_stereo, recording.known_landmarks
+    camera, log = recording.sensor("stereo", StereoCamera), recording.log("stereo")
     far = landmark_distances_m(recording) > 10.0
     return {
         "max_distance_m": camera.max_distance_m,
         "n_seen": camera.max_observations,
         "rule": camera.selection,
-        "observations_per_image": float(np.mean(np.diff(log.splits))),
+        "observations_per_image": float(np.mean(np.diff(log.known_splits))),
         "share_beyond_10_m": float(np.mean(far)) if len(far) else 0.0,
     }
 
@@ -154,7 +153,7 @@ def write_arrays(out: Results) -> None:
     """Write what the figures draw of one recording, and particles along a motion."""
     path = Experiment.compose(["study=gil2008"])
     recording = path.recording()
-    log, world = recording.known_landmarks, recording.known_world
+    log, world = recording.log("stereo"), recording.known_world
     estimated = {}
     for name in ("odometry", "fastslam", "smoother"):
         one = Experiment.compose(["study=gil2008", f"estimator={name}"])
@@ -162,13 +161,15 @@ def write_arrays(out: Results) -> None:
         online, revised = estimates(one.estimator(), recording, one.prior(recording), rng)
         estimated[name] = revised or online
     best, along = estimated["fastslam"], recording.truth_at(recording.frame_stamps)
-    rows = np.repeat(np.searchsorted(best.stamps, log.stamps), np.diff(log.splits))
-    model = StereoModel.of(recording.sensors.known_stereo)
+    rows = np.repeat(np.searchsorted(best.stamps, log.stamps), np.diff(log.known_splits))
+    model = StereoModel.of(recording.sensor("stereo", StereoCamera))
     placed = {
-        f"placed_by_{name}": model.place(estimated[name].means[rows], log.points_in_camera)[:, :2]
+        f"placed_by_{name}": model.place(estimated[name].means[rows], log["points_in_camera"])[
+            :, :2
+        ]
         for name in ("odometry", "fastslam")
     }
-    busiest = int(np.argmax(np.diff(log.splits)))
+    busiest = int(np.argmax(np.diff(log.known_splits)))
     pictured = {
         "walls": world.walls,
         "wall_z_m": world.wall_z_m,
@@ -183,7 +184,7 @@ def write_arrays(out: Results) -> None:
     out.write_arrays(
         "path",
         revisited=scores.revisited(along[::4]),
-        in_image=np.isin(best.map["ids"], log.ids[slice(*log.splits[busiest : busiest + 2])]),
+        in_image=np.isin(best.map["ids"], log.reading(busiest)["ids"]),
         **{name: values.astype(np.float32) for name, values in pictured.items()},
     )
     line, particles = particles_along_a_motion(stream(path.seed, "figure"))

@@ -12,12 +12,11 @@ import pandas as pd
 
 from experiments.evaluation.statistics import (
     Interval,
-    equivalent,
     log_ratio_interval,
     mean_interval,
     share_interval,
 )
-from experiments.evaluation.verdict import Claim, Verdict, banded, holds, judged, lower, overall
+from experiments.evaluation.verdict import Claim, Verdict, banded, equivalent, holds, lower, overall
 from experiments.papers.maximo2024.settings import NAMES, RECOVERED_WITHIN, WITHIN
 from experiments.papers.results import Results
 
@@ -62,13 +61,13 @@ def mx1(weighting: pd.DataFrame, quality: pd.DataFrame) -> Iterator[Claim]:
             share = _share("MX1", statistic, errors["M3"] > 5.0 * errors["M2"], at_least=0.8)
             yield replace(share, reason=_where_m3_fails(quality, "oxford"))
         if name == "umh":
-            ratio, p = equivalent(errors["M3"], errors["M2"], 0.25)
+            ratio, verdict = equivalent(errors["M3"], errors["M2"], 0.25)
             yield Claim(
                 "MX1",
                 "error of M3 over M2, UMH (90 % interval)",
                 ratio,
                 "within 25 % by two one-sided tests",
-                _equal(ratio, p, 0.25),
+                verdict,
                 _where_m3_fails(quality, "umh"),
             )
     yield from _m2_below_m1("MX1", "error", weighting, quality)
@@ -106,13 +105,6 @@ def _where_less(quality: pd.DataFrame, column: str) -> str:
     return "" if part.empty else f"with shared parameters at {where}"
 
 
-def _equal(ratio: Interval, p: float, margin: float) -> Verdict:
-    """Judge two one-sided tests: equivalent, clearly different, or undecided."""
-    if p < 0.05:
-        return Verdict.REPRODUCED
-    return judged(ratio, at_least=1.0 / (1.0 + margin), at_most=1.0 + margin)
-
-
 def m3_failures(quality: pd.DataFrame, name: str) -> pd.DataFrame:
     """Share of worlds with M3 worse than 5 times M2, by noise weight (rows) and B (columns)."""
     part = quality[quality["geometry"] == name]
@@ -141,7 +133,7 @@ def mx2(particles: pd.DataFrame, times: pd.DataFrame) -> Iterator[Claim]:
             "(90 % interval)",
             ratios[worst][0],
             "within 5 % by two one-sided tests, for 2, 6 and 8",
-            overall([_equal(ratio, p, 0.05) for ratio, p in ratios.values()]),
+            overall([verdict for _, verdict in ratios.values()]),
         )
     for name, part in times.groupby("geometry", sort=False):
         rising = bool(np.all(np.diff(part.sort_values("particles")["time_s"]) > 0.0))

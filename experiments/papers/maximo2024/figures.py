@@ -1,7 +1,5 @@
 """The figures of maximo2024, from its tables and arrays."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -21,7 +19,7 @@ from experiments.papers.maximo2024.settings import (
     RECOVERED_WITHIN,
 )
 from experiments.papers.results import Results
-from experiments.viewing.plotting import plain_log, with_legend
+from experiments.viewing.plotting import plain_log, plan_axes, with_legend
 from experiments.viewing.style import BLACK, BLUE, CYCLE, GREEN, ORANGE, RED, SKY, WALL, subplots
 
 Arrays = dict[str, NDArray[Any]]
@@ -64,7 +62,7 @@ def data(campus: Arrays) -> Figure:
     shown = np.concatenate([line.get_xydata() for line in ax.get_lines()])
     near = shown[np.hypot(*(shown - here.mean(axis=0)).T) < 40.0]
     xlim, ylim = zip(near.min(axis=0) - 4.0, near.max(axis=0) + 4.0, strict=True)
-    _plan(ax, xlim=xlim, ylim=ylim)
+    plan_axes(ax, xlim=xlim, ylim=ylim)
     return with_legend(page, ncols=2)
 
 
@@ -79,7 +77,7 @@ def clusters(drawn: dict[str, Arrays]) -> Figure:
         ax.plot(*nodes, color=WALL, lw=0.4)
         ax.scatter(*nodes, c=colours, cmap="nipy_spectral", s=9, zorder=2)
         kind = f" ({DRAWN_DESCRIPTOR})" if name.startswith("campus") else ""
-        _plan(ax, title=NAMES[name] + kind)
+        plan_axes(ax, title=NAMES[name] + kind)
     return page
 
 
@@ -91,7 +89,7 @@ def map_and_route(drawn: dict[str, Arrays]) -> Figure:
         ax.add_collection(LineCollection(walls, colors=WALL, linewidths=0.5))
         ax.plot(*place["queries_m"].T, ".", color=RED, ms=2, label="queries")
         ax.plot(*place["nodes_m"].T, ".", color=BLUE, ms=2, label="nodes of the map")
-        _plan(ax, title=NAMES[name])
+        plan_axes(ax, title=NAMES[name])
     return with_legend(page, ncols=2)
 
 
@@ -144,7 +142,7 @@ def particles(route: Arrays) -> Figure:
         ax.plot(*robot, "+", color=RED, ms=14, mew=1.5, label="robot")
         ax.plot(*mean, "x", color=BLACK, ms=8, label="estimate")
         error = np.hypot(*(mean - robot))
-        _plan(ax, title=f"iteration {step}: on {len(places)} nodes, error {error:.1f} m")
+        plan_axes(ax, title=f"iteration {step}: on {len(places)} nodes, error {error:.1f} m")
     return with_legend(page, ncols=4)
 
 
@@ -198,10 +196,15 @@ def quality(table: pd.DataFrame) -> Figure:
         ax.imshow(shares, cmap="Blues", vmin=0.0, vmax=1.4, aspect="auto", origin="lower")
         for (i, j), share in np.ndenumerate(shares):
             ax.text(j, i, f"{share:.2f}", ha="center", va="center")
-        ax.set_xticks(range(shares.shape[1]), shares.columns)
-        ax.set_yticks(range(len(shares)), [f"{w:g} ({recall[w]:.2f})" for w in shares.index])
-        title = f"{NAMES[name]}: share of worlds\nwith M3 worse than 5 times M2"
-        ax.set(xlabel="B", ylabel="noise weight (recall@1)", title=title)
+        ax.set(
+            xlabel="B",
+            xticks=range(shares.shape[1]),
+            xticklabels=shares.columns,
+            ylabel="noise weight (recall@1)",
+            yticks=range(len(shares)),
+            yticklabels=[f"{w:g} ({recall[w]:.2f})" for w in shares.index],
+            title=f"{NAMES[name]}: share of worlds\nwith M3 worse than 5 times M2",
+        )
         ax.spines[:].set_visible(False)
     return page
 
@@ -256,11 +259,6 @@ def _columns(
     page, axes = subplots(*size, sharex=n_rows > 1, sharey=sharey, squeeze=False)
     parts = [table[table["geometry"] == name] for name in names]
     return page, list(zip(axes.T, names, parts, strict=True))
-
-
-def _plan(ax: Axes, **settings: Any) -> None:
-    """Label the axes of a plan in the map frame, metres."""
-    ax.set(xlabel="x, m", ylabel="y, m", aspect="equal", **settings)
 
 
 def _log_scale(ax: Axes, bottom: float | None = None) -> None:

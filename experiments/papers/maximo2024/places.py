@@ -4,8 +4,6 @@ maximo2024 works on two routes whose clouds and network are not available. Their
 printed, or from positions that the user has; a synthetic field of descriptors replaces the network.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable
@@ -26,9 +24,9 @@ from experiments.runs.seeds import stream
 from sim import se2
 from sim.arrays import Array
 from sim.errors import InputError
-from sim.recording import CloudLog, PlaceLog, Recording, Truth, WheelLog
+from sim.recording import Log, Recording, Truth, WheelLog
 from sim.robot import RobotGeometry, wheel_errors
-from sim.sensors import SensorSuite
+from sim.sensors import Lidar3D, PlaceDescriptor
 
 # Noisy unit descriptors (K, 512) at points (K, 2) m
 Describe = Callable[[Array, np.random.Generator], NDArray[np.float32]]
@@ -37,6 +35,7 @@ N_STRETCHES = 40  # the paper's k-means clusters
 SIZE = 512  # of the paper's descriptors
 OXFORD_RUN = "2015-08-12-15-04-18"
 _CAR = RobotGeometry(wheel_radius_m=0.3, track_m=1.5)
+_PLACE = PlaceDescriptor()
 
 
 @dataclass(frozen=True)
@@ -227,9 +226,9 @@ def query_recording(
         stamps,
         WheelLog(stamps, np.concatenate([np.zeros((1, 2)), rolled])),
         _CAR,
-        SensorSuite(),
+        sensors={"place": _PLACE},
+        logs={"place": Log.of(_PLACE, stamps, descriptor=descriptors)},
         truth=Truth(stamps, np.column_stack([positions_m, se2.wrap(heading)])),
-        places=PlaceLog(stamps, np.asarray(descriptors, np.float32)),
         config={"places": "queries along a route"},
     )
 
@@ -240,8 +239,8 @@ def resequenced(recording: Recording, rows: NDArray[np.int64]) -> Recording:
     Rows 100, 101, ... start elsewhere on the route; a jump in the rows is a kidnapping that the
     wheels do not show. Rows count the place descriptors or, without them, the clouds.
     """
-    places, clouds = recording.places, recording.clouds
-    stamps = (places or recording.known_clouds).stamps
+    kept = [name for name in ("place", "lidar3d") if name in recording.logs]
+    stamps = recording.log(kept[0] if kept else "lidar3d").stamps
     rolled = np.stack(
         [np.interp(stamps, recording.wheels.stamps, p) for p in recording.wheels.position_m.T],
         axis=1,
@@ -253,20 +252,18 @@ def resequenced(recording: Recording, rows: NDArray[np.int64]) -> Recording:
         frame_stamps=new_stamps,
         wheels=WheelLog(new_stamps, np.cumsum(steps[rows], axis=0)),
         truth=Truth(new_stamps, recording.truth_at(stamps)[rows]),
-        laser=None,
-        landmarks=None,
+        logs={name: recording.log(name).taken(rows, new_stamps) for name in kept},
         commands=None,
-        places=PlaceLog(new_stamps, places.descriptors[rows]) if places else None,
-        clouds=CloudLog(new_stamps, clouds.ranges_m[rows]) if clouds else None,
     )
 
 
 def described(recording: Recording, descriptor: str) -> Recording:
     """The recording with a place descriptor for each of its clouds."""
-    lidar, clouds = recording.sensors.known_lidar3d, recording.known_clouds
+    lidar, clouds = recording.sensor("lidar3d", Lidar3D), recording.log("lidar3d")
     kind = describers.kind(descriptor)
-    rows = np.array([kind.describe(lidar, turn) for turn in clouds.ranges_m])
-    return dataclasses.replace(recording, places=PlaceLog(clouds.stamps.copy(), rows))
+    rows = np.array([kind.describe(lidar, turn) for turn in clouds["ranges_m"]])
+    places = Log.of(_PLACE, clouds.stamps.copy(), descriptor=rows)
+    return recording.with_log("place", places, _PLACE)
 
 
 # What a configuration names under `recording` and `prior.map`.

@@ -1,7 +1,5 @@
 """Constants of the study of maximo2024: sizes, seeds, chosen parameters, what the paper prints."""
 
-from __future__ import annotations
-
 from experiments.evaluation.verdict import Profile
 from experiments.runs.paths import SOURCE
 

@@ -5,8 +5,6 @@ queries and descriptors of its own. Parameters are chosen on seeds below 100 by 
 on seeds from 1000 on.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Callable
@@ -61,6 +59,7 @@ from experiments.runs.seeds import stream
 from sim import se2
 from sim.arrays import Array
 from sim.recording import Recording
+from sim.sensors import Lidar3D
 
 Arrays = dict[str, NDArray[np.generic]]
 
@@ -230,12 +229,12 @@ def campus_arrays(name: str) -> Arrays:
 
 def _clouds(recording: Recording, points_m: Array) -> tuple[Array, NDArray[np.float32]]:
     """Where the clouds nearest to points (4, 2) were taken, and what they show above ground."""
-    lidar, clouds = recording.sensors.known_lidar3d, recording.known_clouds
+    lidar, clouds = recording.sensor("lidar3d", Lidar3D), recording.log("lidar3d")
     poses = recording.truth_at(clouds.stamps)
     rows = [int(np.argmin(np.hypot(*(poses[:, :2] - point).T))) for point in points_m]
     shown = []
     for row in rows:
-        points = lidar.points_in_sensor(clouds.ranges_m[row])
+        points = lidar.points_in_sensor(clouds["ranges_m"][row])
         points = points[points[:, 2] + lidar.mount.z_m > 0.3]
         shown.append(se2.transform(poses[row], points[:, :2]))
     drawn = np.concatenate(shown)

@@ -3,8 +3,6 @@
 A world is a route with a synthetic field of descriptors, or a campus with simulated clouds.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Iterator
@@ -121,9 +119,8 @@ def localize(
         In place of the case's own.
     """
     taken = case.recording if recording is None else recording
-    estimator = {**case.experiment.config["estimator"], **settings}
     estimate = run(
-        case.experiment.replaced(estimator=estimator).estimator(),
+        case.experiment.with_estimator(**settings).estimator(),
         taken,
         Prior(taken.robot, taken.sensors, map=case.known_map),
         rng,
@@ -198,14 +195,13 @@ def _errors(walks: list[Walk]) -> Rows:
 
 def starts(
     case: Case, n_starts: int, settings: dict[str, Any], tolerance_m: float
-) -> list[tuple[int, float, Walk]]:
+) -> Iterator[tuple[int, float, Walk]]:
     """Figure 5: starts all along the route, the step at which each is localized, and its run."""
-    runs, length = [], WITHIN + HELD
+    length = WITHIN + HELD
     for start in map(int, np.linspace(0, len(case.recording.frame_stamps) - length - 1, n_starts)):
         part = resequenced(case.recording, np.arange(start, start + length))
         walk = localize(case, settings, stream(case.seed, "estimator/starts", start), part)
-        runs.append((start, settled_at(walk.errors_m, tolerance_m), walk))
-    return runs
+        yield start, settled_at(walk.errors_m, tolerance_m), walk
 
 
 def kidnapping_rows(
@@ -262,9 +258,9 @@ def quality_rows(name: str, seed: int) -> Iterator[Row]:
 
 def _retrieval(known_map: TopologicalMap, recording: Recording) -> dict[str, float]:
     """Retrieval quality; right is a node within 25 m in Oxford, else within 1.5 spacings."""
-    places, kind = recording.known_places, describers.KINDS.get(known_map.descriptor)
+    places, kind = recording.log("place"), describers.KINDS.get(known_map.descriptor)
     compare = kind.distances if kind else describers.euclidean
-    distances = np.array([compare(row, known_map.descriptors) for row in places.descriptors])
+    distances = np.array([compare(row, known_map.descriptors) for row in places["descriptor"]])
     here = recording.truth_at(places.stamps)[:, :2]
     within_m = 25.0 if known_map.spacing_m > 15.0 else 1.5 * known_map.spacing_m
     return describers.retrieval(distances, gaps_m(here, known_map.positions_m), within_m)
@@ -326,7 +322,8 @@ def campus_rows(name: str, seed: int, n_repeats: int) -> dict[str, Rows]:
     case = cases[settings["descriptor"]]
     travel_m = np.median(np.abs(np.diff(taken.wheels.position_m[:, 0])))
     per_node = float(case.known_map.spacing_m / travel_m)
-    bare = replace(case, recording=replace(case.recording, clouds=None))
+    places = {"place": case.recording.log("place")}  # without the clouds
+    bare = replace(case, recording=replace(case.recording, logs=places))
     return {
         **weighting_rows(_one_query_a_node(bare), n_repeats),
         "clusters": clusters,

@@ -1,7 +1,5 @@
 """Figure of the study of global localization in offices."""
 
-from __future__ import annotations
-
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure

@@ -4,8 +4,6 @@ A robot drives the whole tour of each office once; starts are spread evenly alon
 filter begins without a pose and is judged over the next 40 m.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math

@@ -1,7 +1,5 @@
 """The figures of puzzlebot2024."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 
@@ -13,7 +11,7 @@ from numpy.typing import NDArray
 
 from experiments.papers.puzzlebot2024.settings import CALIBRATION_RUNS, NOMINAL, TABLE_1_K_M
 from experiments.papers.results import Results
-from experiments.viewing.plotting import draw_ellipses, plain_ticks, with_legend
+from experiments.viewing.plotting import draw_ellipses, plain_ticks, plan_axes, with_legend
 from experiments.viewing.style import BLACK, BLUE, CYCLE, ORANGE, subplots
 
 Arrays = Mapping[str, NDArray[Any]]
@@ -23,6 +21,11 @@ _METHODS = {
     "sampled": "end poses, sampled",
     "linearised": "end poses, linearised",
 }
+_ROBOTS = {
+    "puzzlebot": "nominal geometry right",
+    "puzzlebot_short_turns": "turns 0.44 of the command",
+}
+_FEEDBACKS = {"truth": "steered by the true pose", "odometry": "steered by odometry"}
 _PARAMETERS = {"kr": "$k_r$", "kl": "$k_l$"}
 
 
@@ -31,6 +34,9 @@ def draw(made: Results) -> dict[str, Figure]:
     drawn = made.arrays("drawn")
     return {
         "puzzlebot2024_ideal_and_real": ideal_and_real(drawn),
+        "puzzlebot2024_square_feedback": square_feedback(
+            made.table("square_feedback"), made.arrays("square_feedback")
+        ),
         "puzzlebot2024_ellipse_area": ellipse_area(
             made.table("areas"), made.table("crossover"), drawn
         ),
@@ -54,8 +60,30 @@ def ideal_and_real(square: Arrays) -> Figure:
         draw_ellipses(
             ax, means[some], covariances[some], "95 % ellipse", fill=False, color=BLUE, lw=0.9
         )
-        title = f"$k_r$ = {kr:.2g} m, $k_l$ = {kl:.2g} m"
-        ax.set(xlabel="x, m", ylabel="y, m", aspect="equal", title=title)
+        plan_axes(ax, title=f"$k_r$ = {kr:.2g} m, $k_l$ = {kl:.2g} m")
+    return with_legend(page, ncols=3)
+
+
+def square_feedback(table: pd.DataFrame, paths: Arrays) -> Figure:
+    """Draw the square as driven and as believed, by feedback and robot."""
+    page, axes = subplots(9.0, 8.6, 2, 2, sharex="row", sharey="row")
+    for line, (robot, its) in zip(axes, _ROBOTS.items(), strict=True):
+        for ax, (feedback, steered) in zip(line, _FEEDBACKS.items(), strict=True):
+            chosen = table["robot"].eq(robot) & table["feedback"].eq(feedback)
+            rows = np.flatnonzero(chosen)
+            ax.plot(*paths["wanted_m"].T, color=BLACK, lw=3.0, alpha=0.25, label="wanted square")
+            for name, color, label in (
+                ("true_m", ORANGE, "true path"),
+                ("believed_m", BLUE, "path by odometry"),
+            ):
+                ways = paths[name][rows]
+                ax.plot(*ways[1:].T, color=color, lw=0.4, alpha=0.5)
+                ax.plot(*ways[0].T, color=color, lw=1.2, label=label)
+                ax.plot(*ways[:, -1].T, ".", color=color, ms=5)
+            end_m = table.loc[chosen, "true_end_m"].median()
+            title = f"{its}, {steered}\nmedian end {end_m:.2f} m from the corner wanted"
+            ax.set_title(title, fontsize="medium")
+            ax.set(xlabel="x, m", ylabel="y, m", aspect="equal")
     return with_legend(page, ncols=3)
 
 
@@ -68,8 +96,12 @@ def ellipse_area(areas: pd.DataFrame, crossover: pd.DataFrame, straight: Arrays)
                 part["distance_m"], part["area_m2"], "-" if k < 5e-5 else "--", color=CYCLE[i],
                 label=f"{name}, k = {k:g} m",
             )  # fmt: skip
-    left.set(xlabel="distance rolled, m", ylabel="area of the 95 % ellipse, m²", yscale="log")
-    left.set_ylim(bottom=1e-6)
+    left.set(
+        xlabel="distance rolled, m",
+        ylabel="area of the 95 % ellipse, m²",
+        yscale="log",
+        ylim=(1e-6, None),
+    )
     _crossover(right, crossover, straight)
     return with_legend(page, ncols=3)
 
@@ -194,7 +226,11 @@ def coverage(table: pd.DataFrame) -> Figure:
                 color=CYCLE[i % 4 if linear else (i - 4) % 5],
                 label=str(name).replace("_", " "),
             )
-        ax.set(xlabel="k, m ($k_r$ = 1.5 k, $k_l$ = 0.5 k)", xscale="log", title=title)
-        ax.set_xlim(table["k_m"].min() * 0.7, table["k_m"].max() * 1.4)
+        ax.set(
+            xlabel="k, m ($k_r$ = 1.5 k, $k_l$ = 0.5 k)",
+            xscale="log",
+            xlim=(table["k_m"].min() * 0.7, table["k_m"].max() * 1.4),
+            title=title,
+        )
     axes[0].set_ylabel("share of runs")
     return with_legend(page, ncols=1, loc="outside right center")

@@ -1,7 +1,5 @@
 """Constants of the studies of puzzlebot2024; the runs' configuration is in conf/study."""
 
-from __future__ import annotations
-
 import math
 
 from experiments.evaluation.verdict import Profile
@@ -12,8 +10,10 @@ NOMINAL = DifferentialDrive(wheel_radius_m=0.05, track_m=0.19)  # conf/robot/puz
 CALIBRATIONS = {Profile.QUICK: 5, Profile.FULL: 200}  # of each robot, from its seed on
 COVERAGE_RUNS = {Profile.QUICK: 400, Profile.FULL: 10_000}
 ENGINE_OVERRIDES = {Profile.QUICK: ["seed=range(1000,1004)"], Profile.FULL: []}
+FEEDBACK_OVERRIDES = {Profile.QUICK: ["seed=range(1000,1004)"], Profile.FULL: []}
 CALIBRATION_RUNS = 20  # repetitions of each of the nine manoeuvres in one calibration
 SQUARE_RUNS = 40
+SQUARE_SAMPLES = 200  # of each path that is drawn
 TABLE_1_K_M = 1e-4
 AREA_K_M = (1e-5, 1e-4)
 LOOPS = {

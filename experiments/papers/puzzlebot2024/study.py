@@ -4,8 +4,6 @@ Thousands of runs come from the kinematic robot, which obeys the same slip law a
 are driven by PyBullet too, and both are compared.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math
@@ -34,9 +32,11 @@ from experiments.papers.puzzlebot2024.settings import (
     COVERAGE_RUNS,
     DESCENTS,
     ENGINE_OVERRIDES,
+    FEEDBACK_OVERRIDES,
     LOOPS,
     NOMINAL,
     SQUARE_RUNS,
+    SQUARE_SAMPLES,
     TABLE_1_K_M,
 )
 from experiments.papers.results import Results
@@ -49,7 +49,6 @@ from sim.kinematic import BatchRuns, run_batch
 from sim.recording import Recording, WheelLog
 from sim.robot import DifferentialDrive, RobotGeometry
 from sim.route import OpenLoop
-from sim.sensors import SensorSuite
 
 Routes = Mapping[str, OpenLoop]
 Driven = dict[tuple[str, str, int], Recording]  # keyed by physics, case and seed
@@ -74,7 +73,11 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
     once = table_1(next(arm for arm in covered if arm.k_m == TABLE_1_K_M))
     out.write_tables(calibration=calibrated, table_1=once)
     out.write_tables(coverage=coverage(covered, COVERAGE_RUNS[profile]))
-    on_progress(0.85)
+    on_progress(0.8)
+    ends, paths = square_feedback(*FEEDBACK_OVERRIDES[profile])
+    out.write_tables(square_feedback=ends)
+    out.write_arrays("square_feedback", **paths)
+    on_progress(0.9)
     driven = engine_recordings(*ENGINE_OVERRIDES[profile])
     out.write_tables(engine=engine_ends(driven), engine_k=engine_k(driven))
     on_progress(1.0)
@@ -123,8 +126,8 @@ def dead_reckoning(batch: BatchRuns, kr: float, kl: float) -> Estimate:
     """Odometry from the origin over the first run, with the nominal geometry."""
     geometry = RobotGeometry(NOMINAL.wheel_radius_m, NOMINAL.track_m)
     wheels = WheelLog(batch.stamps, batch.encoder_m[0])
-    recording = Recording(batch.stamps, wheels, geometry, SensorSuite())
-    prior = Prior(geometry, SensorSuite(), np.zeros(3), np.zeros((3, 3)))
+    recording = Recording(batch.stamps, wheels, geometry)
+    prior = Prior(geometry, mean=np.zeros(3), covariance=np.zeros((3, 3)))
     return run_estimator(Odometry(kr, kl), recording, prior, np.random.default_rng(0))
 
 
@@ -197,13 +200,48 @@ def drawn() -> dict[str, NDArray[np.float32]]:
     return {name: np.asarray(value, np.float32) for name, value in values.items()}
 
 
+def square_feedback(*overrides: str) -> tuple[pd.DataFrame, dict[str, NDArray[np.float32]]]:
+    """Drive the square steered by the true pose and by odometry, with each robot.
+
+    Returns
+    -------
+    table
+        A row each run: how far the robot ends from the last corner, by its true pose and by its
+        odometry, and the error of the odometry there.
+    paths
+        `wanted_m` (5, 2), the start and the corners; `true_m` and `believed_m` (N, T, 2), in the
+        order of the rows.
+    """
+    rows: list[Row] = []
+    paths: dict[str, list[Array]] = {"true_m": [], "believed_m": []}
+    for experiment in planned(["study=puzzlebot2024_square_feedback", *overrides]):
+        route, recording = experiment.route(), experiment.simulate()
+        prior, rng = experiment.prior(recording), np.random.default_rng(0)
+        believed = run_estimator(experiment.estimator(), recording, prior, rng).means[:, :2]
+        stamps = recording.frame_stamps
+        true = recording.truth_at(stamps)[:, :2]
+        corner = np.array(route.points[-1])
+        row = {
+            "robot": experiment.choices["robot"],
+            "feedback": route.feedback,
+            "seed": experiment.seed,
+            "status": recording.status,
+            "true_end_m": np.hypot(*(true[-1] - corner)),
+            "believed_end_m": np.hypot(*(believed[-1] - corner)),
+            "odometry_error_m": np.hypot(*(believed[-1] - true[-1])),
+        }
+        rows.append(row)
+        sampled_s = np.linspace(stamps[0], stamps[-1], SQUARE_SAMPLES)
+        for name, path in (("true_m", true), ("believed_m", believed)):
+            paths[name].append(np.stack([np.interp(sampled_s, stamps, c) for c in path.T], axis=1))
+    arrays = {"wanted_m": [(0.0, 0.0), *route.points], **paths}
+    return pd.DataFrame(rows), {k: np.asarray(v, np.float32) for k, v in arrays.items()}
+
+
 def calibrate_once(arm: Arm) -> list[CalibrationResult]:
     """Calibrate by all methods on the same runs: each manoeuvre 20 times."""
     rng, draws = stream(arm.seed, "slip"), stream(arm.seed, "samples")
-    batches = [
-        run_batch(arm.robot, route, CALIBRATION_RUNS, rng, nominal_track_m=NOMINAL.track_m)
-        for route in arm.routes.values()
-    ]
+    batches = [run_batch(arm.robot, route, CALIBRATION_RUNS, rng) for route in arm.routes.values()]
     manoeuvres = [
         Manoeuvre(route.profile(NOMINAL), batch.end_poses)
         for route, batch in zip(arm.routes.values(), batches, strict=True)

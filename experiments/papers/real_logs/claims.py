@@ -1,7 +1,5 @@
 """Claims RL1 to RL5: what the real logs must show."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

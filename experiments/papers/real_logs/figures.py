@@ -1,7 +1,5 @@
 """Figures of the real logs."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -13,6 +11,7 @@ from numpy.typing import NDArray
 
 from experiments.papers.real_logs.settings import GMAPPING, INTEL_DRAWN, MRCLAM_DRAWN
 from experiments.papers.results import Results
+from experiments.viewing.plotting import plan_axes
 from experiments.viewing.style import BLACK, CYCLE, subplots
 
 Arrays = Mapping[str, NDArray[Any]]
@@ -34,7 +33,7 @@ def intel(relations: pd.DataFrame, paths: Arrays) -> Figure:
     for color, name in zip(CYCLE[1:], INTEL_DRAWN, strict=False):
         left.plot(*paths[name].T, color=color, lw=0.7, label=name)
     left.plot(*paths[GMAPPING].T, color=BLACK, lw=0.7, label="GMapping (reference)")
-    left.set(xlabel="x, m", ylabel="y, m", aspect="equal", title="Intel Research Lab")
+    plan_axes(left, title="Intel Research Lab")
     page.legend(*left.get_legend_handles_labels(), loc="outside lower left", ncols=2, fontsize=7)
     rows = relations[relations.log == "intel"]
     methods = list(dict.fromkeys(rows.method))[::-1]
@@ -64,15 +63,14 @@ def mrclam(errors: pd.DataFrame, paths: Arrays) -> Figure:
         at = np.searchsorted(robots, list(rows.groups)) + (i - len(by_method) / 2.0) * 0.09
         left.plot(at, rows.ate_rmse_m.mean(), "o", ms=4, color=color, label=method)
         middle.plot(at, rows.nees_mean.median(), "o", ms=4, color=color)
-    for ax in (left, middle):
-        ax.set_xticks(range(len(robots)), [f"R{r}" for r in robots])
-    left.set(ylabel="ATE from the true start, m", ylim=(0.0, None), title="MRCLAM 6")
-    middle.set(yscale="log", ylabel="mean NEES (3 is consistent)")
+    ticks = {"xticks": range(len(robots)), "xticklabels": [f"R{robot}" for robot in robots]}
+    left.set(ylabel="ATE from the true start, m", ylim=(0.0, None), title="MRCLAM 6", **ticks)
+    middle.set(yscale="log", ylabel="mean NEES (3 is consistent)", **ticks)
     middle.axhline(3.0, color=BLACK, lw=0.7, ls=":")
     drawn = ("motion capture", *MRCLAM_DRAWN)
     for name, color in zip(drawn, (BLACK, CYCLE[1], CYCLE[0]), strict=True):
         right.plot(*paths[name].T, color=color, lw=0.8, label=name)
-    right.set(xlabel="x, m", ylabel="y, m", aspect="equal", title="robot 4")
+    plan_axes(right, title="robot 4")
     page.legend(*left.get_legend_handles_labels(), loc="outside lower left", ncols=4, fontsize=7)
     page.legend(*right.get_legend_handles_labels(), loc="outside lower right", fontsize=7)
     return page
@@ -107,11 +105,12 @@ def wean(fits: pd.DataFrame, drawn: Arrays) -> Figure:
         ax.plot(*drawn[f"ends_{row.log}"].T, ".", color=CYCLE[4], ms=1.2, label="beam ends")
         ax.plot(*drawn[f"path_{row.log}"].T, color=CYCLE[0], lw=1.2, label="path (ICP)")
         ax.plot(row.x_m, row.y_m, "o", color=CYCLE[0], ms=4)
-        ax.set(
-            xlim=drawn["extent_m"][:2], ylim=drawn["extent_m"][2:],
-            xlabel="x, m", ylabel="y, m", aspect="equal",
+        plan_axes(
+            ax,
+            xlim=drawn["extent_m"][:2],
+            ylim=drawn["extent_m"][2:],
             title=f"Wean Hall, log {row.log}: fit {row.score:.2f}, "
             f"start {math.degrees(row.yaw_rad):.0f}°",
-        )  # fmt: skip
+        )
     page.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=2, markerscale=6)
     return page

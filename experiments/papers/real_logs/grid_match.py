@@ -1,7 +1,5 @@
 """Where scans fit a grid map best, over all positions and headings, by correlation."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Recordings of the real logs that conf/study/real_logs_*.yaml name."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Literal
 
@@ -19,7 +17,7 @@ from sim.formats import intel as intel_lab
 from sim.formats.khepera import WheelLaserLog
 from sim.recording import Recording, WheelLog
 from sim.robot import RobotGeometry
-from sim.sensors import Mount
+from sim.sensors import Laser, Mount
 
 
 def intel(version: Literal["sparse", "logged", "calibrated"]) -> Recording:
@@ -65,7 +63,7 @@ def tracked(
 
 def tuned_until_s(logged: Recording) -> float:
     """End of the part of the Intel log that options were chosen on, s."""
-    return float(np.quantile(logged.known_laser.stamps, TUNED_SHARE))
+    return float(np.quantile(logged.log("laser").stamps, TUNED_SHARE))
 
 
 def calibrated_by_scans(recording: Recording, until_s: float) -> Recording:
@@ -75,7 +73,7 @@ def calibrated_by_scans(recording: Recording, until_s: float) -> Recording:
     """
     matcher = IcpOdometry(kr=3e-3, kl=3e-3, sigma_range_m=0.03, reference="previous")
     estimate = tracked(matcher, recording)
-    stamps, wheels = recording.known_laser.stamps, recording.wheels
+    stamps, wheels = recording.log("laser").stamps, recording.wheels
     rows = np.searchsorted(estimate.stamps, stamps)
     poses, travel = estimate.means[rows], _wheels_at(wheels, stamps)
     status = np.array([str(estimate.extras["registration_status"][i]) for i in rows])
@@ -86,23 +84,21 @@ def calibrated_by_scans(recording: Recording, until_s: float) -> Recording:
         se2.between(poses[:-1], poses[1:])[trusted],
     )
     right, left, axle_m, x, y, yaw = calibrate_wheels(log, 1.0, recording.robot.track_m).values
-    laser = recording.sensors.known_laser
+    laser = recording.sensor("laser", Laser)
     mount = Mount(x, y, laser.mount.z_m, laser.mount.yaw_rad + yaw)
     return dataclasses.replace(
         recording,
         wheels=WheelLog(wheels.stamps.copy(), wheels.position_m * np.array([right, left])),
         robot=RobotGeometry(recording.robot.wheel_radius_m, axle_m),
-        sensors=dataclasses.replace(
-            recording.sensors, laser=dataclasses.replace(laser, mount=mount)
-        ),
+        sensors={**recording.sensors, "laser": dataclasses.replace(laser, mount=mount)},
     )
 
 
-def calibrated_by_truth(recording: Recording, until_s: float = CALIBRATED_S) -> Recording:
-    """The recording with wheel gains and track fitted to the truth of its first `until_s`."""
+def calibrated_by_truth(recording: Recording) -> Recording:
+    """The recording with wheel gains and track fitted to the truth of its first `CALIBRATED_S`."""
     truth, wheels = recording.known_truth, recording.wheels
     begin = max(truth.stamps[0], wheels.stamps[0])
-    times = np.arange(begin, min(begin + until_s, truth.stamps[-1]), 0.02)
+    times = np.arange(begin, min(begin + CALIBRATED_S, truth.stamps[-1]), 0.02)
     heading = np.interp(times, truth.stamps, np.unwrap(truth.poses[:, 2]))
     x, y = (np.interp(times, truth.stamps, truth.poses[:, i]) for i in (0, 1))
     along = np.cos(heading[:-1]) * np.diff(x) + np.sin(heading[:-1]) * np.diff(y)

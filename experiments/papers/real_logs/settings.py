@@ -1,7 +1,5 @@
 """Constants of the studies of real logs; the runs' configuration is in conf/study."""
 
-from __future__ import annotations
-
 import math
 
 from experiments.evaluation.verdict import Profile

@@ -3,8 +3,6 @@
 The logs are not part of the project; they are expected in ../shared/data.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math
@@ -57,6 +55,7 @@ from sim.formats import carmen, lego, rawseeds, wean
 from sim.formats.khepera import read_khepera
 from sim.formats.relations import Relations, read_relations
 from sim.formats.text import read_members, read_words, split_words
+from sim.sensors import Laser
 
 Paths = dict[str, NDArray[np.float32]]  # (T, 2) m, by name
 
@@ -184,9 +183,9 @@ def _relation_rows(
         yield {"log": log, "method": method, "part": part, **found.summary(), **bounds}
 
 
-def _block_interval(errors: Array, stamps: Array, block_s: float = 60.0) -> dict[str, float]:
+def _block_interval(errors: Array, stamps: Array) -> dict[str, float]:
     """95 % bootstrap interval of a mean; relations that begin in the same minute stay together."""
-    _, blocks = np.unique(np.floor((stamps - stamps.min()) / block_s), return_inverse=True)
+    _, blocks = np.unique(np.floor((stamps - stamps.min()) / 60.0), return_inverse=True)
     sums, counts = np.bincount(blocks, errors), np.bincount(blocks)
     picks = np.random.default_rng(0).integers(len(sums), size=(2000, len(sums)))
     low, high = np.quantile(sums[picks].sum(axis=1) / counts[picks].sum(axis=1), [0.025, 0.975])
@@ -310,12 +309,12 @@ def wean_fit(logs: str) -> tuple[pd.DataFrame, dict[str, NDArray[Any]]]:
     studies = planned(["study=real_logs_wean", f"recording.number={logs}"])
     for number, run in zip(logs.split(","), studies, strict=True):
         recording = run.recording()
-        laser, scans = recording.sensors.known_laser, recording.known_laser
+        laser, scans = recording.sensor("laser", Laser), recording.log("laser")
         estimate = tracked(run.estimator(), recording)
         poses = estimate.means[np.searchsorted(estimate.stamps, scans.stamps)]
         travelled = travelled_m(poses)
         chosen = np.searchsorted(travelled, np.arange(0.0, min(travelled[-1], 15.0), 0.5))
-        ranges = scans.ranges_m[chosen][:, ::3].astype(np.float64)
+        ranges = scans["ranges_m"][chosen][:, ::3].astype(np.float64)
         points = beam_points(ranges, laser.bearings_rad[::3], laser.mount.pose, poses[chosen])
         for one_means, mirrored in itertools.product(("free", "occupied"), (False, True)):
             read = dataclasses.replace(grid, free_is_one=one_means == "free")

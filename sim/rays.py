@@ -1,0 +1,81 @@
+"""Rays in a world: by the exact caster, or by the physics engine; the geometry is the same."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.arrays import Array
+from sim.world import World
+
+_SURFACE_M = 0.005  # a landmark this near the face that a ray hits is seen
+
+
+class ExactRays:
+    """The caster of `sim.casting`, imported only where it is used: it needs a compiler."""
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+        self._casters: dict[Any, Any] = {}
+
+    def scan(self, scanner: Any, pose: Array) -> Array:
+        """Ranges (beams,) m of a scanner on the robot at a pose (3,); inf without a return."""
+        if scanner not in self._casters:
+            from sim.casting import SegmentCaster
+
+            self._casters[scanner] = SegmentCaster(self._world, scanner)
+        ranges: Array = self._casters[scanner].cast(scanner.mount.in_map(pose))
+        return ranges
+
+    def cloud(self, lidar: Any, pose: Array) -> Array:
+        """Ranges (rings, azimuths) m of a lidar on the robot at a pose (3,)."""
+        from sim.casting import cast_lidar
+
+        return cast_lidar(self._world, lidar, lidar.mount.in_map(pose))
+
+    def sees(self, origin: Array, points: Array) -> NDArray[np.bool_]:
+        """Whether nothing stands between a point (3,) and each of others (K, 3)."""
+        from sim.casting import visible
+
+        return visible(self._world, origin, points)
+
+
+class BulletRays:
+    """The physics engine's rays."""
+
+    def __init__(self, bullet: Any) -> None:
+        self._bullet = bullet
+
+    def scan(self, scanner: Any, pose: Array) -> Array:
+        """Ranges (beams,) m of a scanner on the robot at a pose (3,); inf without a return."""
+        planar = scanner.mount.in_map(pose)
+        angles = planar[2] + scanner.bearings_rad
+        starts = np.tile([planar[0], planar[1], scanner.mount.z_m], (len(angles), 1))
+        way = np.stack([np.cos(angles), np.sin(angles), np.zeros_like(angles)], axis=-1)
+        return self._ranges(starts, way, scanner.max_range_m, ground=False)
+
+    def cloud(self, lidar: Any, pose: Array) -> Array:
+        """Ranges (rings, azimuths) m of a lidar on the robot at a pose (3,)."""
+        planar = lidar.mount.in_map(pose)
+        elevation = np.repeat(lidar.elevations_rad, lidar.n_azimuths)
+        azimuth = np.tile(planar[2] + lidar.azimuths_rad, lidar.n_rings)
+        flat = np.cos(elevation)
+        way = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=-1)
+        starts = np.tile([planar[0], planar[1], lidar.mount.z_m], (len(way), 1))
+        ranges = self._ranges(starts, way, lidar.max_range_m, ground=True)
+        return ranges.reshape(lidar.n_rings, lidar.n_azimuths)
+
+    def sees(self, origin: Array, points: Array) -> NDArray[np.bool_]:
+        """Whether nothing stands between a point (3,) and each of others (K, 3)."""
+        if len(points) == 0:
+            return np.zeros(0, bool)
+        distance = np.linalg.norm(points - origin, axis=1)
+        share = self._bullet.cast(np.broadcast_to(origin, points.shape), points)
+        seen: NDArray[np.bool_] = share * distance >= distance - _SURFACE_M
+        return seen
+
+    def _ranges(self, starts: Array, way: Array, reach_m: float, *, ground: bool) -> Array:
+        share = self._bullet.cast(starts, starts + reach_m * way, ground=ground)
+        return np.where(share < 1.0, share * reach_m, np.inf)

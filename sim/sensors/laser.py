@@ -1,0 +1,110 @@
+"""A planar laser scanner. Ranges that see nothing are +inf, as REP-117 asks."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sim.arrays import Array
+from sim.errors import InputError
+from sim.sensors.base import Field, Mount, Probe, Reading, Schema
+from sim.settings import check_numbers
+
+
+@dataclass(frozen=True)
+class Laser:
+    """A planar laser scanner; beams run counter-clockwise from -fov/2 to +fov/2.
+
+    Parameters
+    ----------
+    rate_hz
+        Scans per second; a scan is taken at one instant.
+    n_beams, fov_rad
+        Beams and the angle between the first and the last one.
+    min_range_m, max_range_m
+        Returns outside are +inf.
+    sigma_range_m
+        Standard deviation of the Gaussian range noise.
+    mount
+        Where it sits on the robot.
+    """
+
+    ros_message: ClassVar = "sensor_msgs/msg/LaserScan"
+    ros_topic: ClassVar = "/scan"
+
+    rate_hz: float = 10.0
+    n_beams: int = 721
+    fov_rad: float = math.pi
+    min_range_m: float = 0.02
+    max_range_m: float = 80.0
+    sigma_range_m: float = 0.01
+    mount: Mount = field(default_factory=Mount)
+
+    def __post_init__(self) -> None:
+        check_numbers(
+            "sensors.laser", self, ("rate_hz", "max_range_m"), ("min_range_m", "sigma_range_m")
+        )
+        if self.n_beams < 1:
+            raise InputError(f"sensors.laser.n_beams must be at least 1, got {self.n_beams}")
+        if not 0.0 < self.fov_rad <= 2.0 * math.pi:
+            raise InputError(f"sensors.laser.fov_rad must lie in (0, 2 pi], got {self.fov_rad}")
+
+    @property
+    def bearings_rad(self) -> Array:
+        """Beam angles (n_beams,) in the sensor frame; a full circle does not repeat its seam."""
+        if self.n_beams == 1:
+            return np.zeros(1)
+        full = self.fov_rad > 2.0 * math.pi - 1e-9
+        return np.linspace(-self.fov_rad / 2, self.fov_rad / 2, self.n_beams, endpoint=not full)
+
+    @property
+    def schema(self) -> Schema:
+        """Ranges (n_beams,), +inf where nothing was seen."""
+        return {"ranges_m": Field("m", "f4", (self.n_beams,))}
+
+    def start(self, rng: np.random.Generator) -> Probe:
+        """Probe that casts the beams and adds the noise."""
+        return lambda view: {"ranges_m": self.measure(view.scan(self), rng)}
+
+    def measure(self, true_ranges_m: ArrayLike, rng: np.random.Generator) -> NDArray[np.float32]:
+        """Noisy ranges (..., n_beams), float32; +inf where nothing is in range."""
+        return noisy_ranges(self, true_ranges_m, rng)
+
+    def points_in_base(self, reading: Reading) -> Array:
+        """Points (N, 2), m, of the beams that saw something."""
+        ranges = np.asarray(reading["ranges_m"], float)
+        seen = np.isfinite(ranges)
+        bearings = self.bearings_rad[seen]
+        points = ranges[seen, None] * np.column_stack([np.cos(bearings), np.sin(bearings)])
+        return self.mount.points_in_base(points)
+
+    def to_ros(self, reading: Reading) -> dict[str, Any]:
+        """Fields of a LaserScan."""
+        bearings = self.bearings_rad
+        return {
+            "angle_min": float(bearings[0]),
+            "angle_max": float(bearings[-1]),
+            "angle_increment": float(bearings[1] - bearings[0]) if len(bearings) > 1 else 0.0,
+            "scan_time": 1.0 / self.rate_hz,
+            "range_min": self.min_range_m,
+            "range_max": self.max_range_m,
+            "ranges": reading["ranges_m"],
+        }
+
+    def from_ros(self, message: Any) -> Reading:
+        """Reading of a LaserScan."""
+        return {"ranges_m": np.asarray(message.ranges, np.float32)}
+
+
+def noisy_ranges(
+    sensor: Any, true_ranges_m: ArrayLike, rng: np.random.Generator
+) -> NDArray[np.float32]:
+    """Ranges with Gaussian noise, float32; +inf outside the sensor's limits."""
+    ranges = np.asarray(true_ranges_m, float)
+    noisy = np.maximum(ranges + sensor.sigma_range_m * rng.standard_normal(ranges.shape), 0.0)
+    seen = (ranges >= sensor.min_range_m) & (ranges <= sensor.max_range_m)
+    return np.where(seen, noisy, np.inf).astype(np.float32)
