@@ -16,6 +16,7 @@ from estimators.grid_mapping import _between, map_scans
 from estimators.likelihood_field import likelihood_field
 from estimators.mcl import Mcl
 from experiments.cli import app
+from experiments.gate.conform import check_estimator
 from experiments.runs.experiment import Experiment
 from experiments.runs.seeds import stream
 from experiments.viewing import view
@@ -391,6 +392,16 @@ def test_mcl_on_a_grid_is_about_as_good_as_on_walls():
         errors.append(np.hypot(*(found.means - recording.truth.poses)[:, :2].T))
     rms = [math.sqrt(np.mean(np.square(error))) for error in errors]
     assert rms[1] < max(1.3 * rms[0], 0.02)
+
+
+@pytest.mark.slow
+def test_mcl_conforms_on_a_grid():
+    recording = circle(n_frames=60)
+    known, sigma = of_world(recording, 0.05, 0.2), np.array([0.02, 0.02, 0.01])
+    start = recording.truth.poses[0], np.diag(np.square(sigma))
+    prior = Prior(recording.robot, recording.sensors, *start, known)
+    for result in check_estimator(lambda: Mcl(n_most=2000), recording, prior):
+        assert result.passed, f"{result.name}: {result.message}"
 
 
 # Mapping
