@@ -6,6 +6,11 @@ A beam that ends at distance d from the nearest wall has the likelihood
 
 looked up in a table over the floor. The table holds (log p(0) - log p(d)) / step in whole numbers
 of 16 bits, so that it stays in the processor's cache and a scan is a sum of integers.
+
+On an occupancy grid d is the distance to the middle of the nearest occupied cell, and zero in such
+a cell. A beam that ends where nothing is known has at least the likelihood 1 / z_max, since all its
+ranges are equally likely there (Thrun, Burgard, Fox 2005, Probabilistic Robotics, sec. 6.4); off
+the grid nothing is known. Only free cells are floor.
 """
 
 import math
@@ -19,6 +24,7 @@ from sim import se2
 from sim.arrays import Array, Floats, Ints
 from sim.compiled import njit
 from sim.errors import InputError
+from sim.grid import FREE_BELOW, OCCUPIED_ABOVE, OccupancyGrid
 from sim.sensors import Laser
 from sim.world import World
 
@@ -43,7 +49,8 @@ class LikelihoodField:
         Log likelihood of one count.
     free_cells
         Rows and columns (F, 2) of the cells where a robot can be: the largest connected floor off
-        the walls. What is shut in, such as the inside of furniture, does not count.
+        the walls. What is shut in, such as the inside of furniture, does not count, nor does what
+        a grid does not know to be free.
     """
 
     table: NDArray[np.uint16]
@@ -78,7 +85,7 @@ class LikelihoodField:
 
 
 def likelihood_field(
-    world: World,
+    known_map: World | OccupancyGrid,
     laser: Laser,
     *,
     cell_m: float = 0.05,
@@ -86,10 +93,12 @@ def likelihood_field(
     z_hit: float = 0.9,
     z_rand: float = 0.1,
 ) -> LikelihoodField:
-    """Work out the field of a world's walls at the height of the laser.
+    """Work out the field of a world's walls at the height of the laser, or of a grid.
 
     Parameters
     ----------
+    known_map
+        World or grid. A grid has no heights: it is taken to be of the laser's.
     sigma_m
         Spread of beam ends about the walls: range noise, half a cell, and errors of the map.
     z_hit, z_rand
@@ -100,39 +109,77 @@ def likelihood_field(
     InputError
         If no wall is at that height, or the table would be too large.
     """
-    low, high = world.wall_z_m[:, 0], world.wall_z_m[:, 1]
-    walls = world.walls[(low <= laser.mount.z_m) & (laser.mount.z_m <= high)]
-    if len(walls) == 0:
-        raise InputError(f"world {world.name} has no wall at the laser's {laser.mount.z_m} m")
+    walls, extent = _walls(known_map, laser)
     normal = z_hit / (sigma_m * math.sqrt(2.0 * math.pi))
     anywhere = z_rand / laser.max_range_m
     # Beyond this distance beams that hit are a thousandth of those that end anywhere
     reach_m = sigma_m * math.sqrt(2.0 * math.log(max(1000.0 * normal / anywhere, math.e)))
     reach_m = max(reach_m, 2.0 * _CLEARANCE_M)
-    ends = walls.reshape(-1, 2)
-    origin = np.floor((ends.min(axis=0) - reach_m) / cell_m) * cell_m - cell_m
-    columns, rows = np.ceil((ends.max(axis=0) + reach_m - origin) / cell_m).astype(int) + 1
+    origin = np.floor((extent.min(axis=0) - reach_m) / cell_m) * cell_m - cell_m
+    columns, rows = np.ceil((extent.max(axis=0) + reach_m - origin) / cell_m).astype(int) + 1
     if rows * columns > _MOST_CELLS:
+        where = "the grid" if isinstance(known_map, OccupancyGrid) else f"world {known_map.name}"
         raise InputError(
-            f"estimator.cell_m={cell_m} makes {rows * columns} cells of world {world.name}; "
-            "make it larger"
+            f"estimator.cell_m={cell_m} makes {rows * columns} cells of {where}; make it larger"
         )
     distances = _distances(walls, origin, cell_m, reach_m, rows, columns)
-    log_p = np.log(normal * np.exp(-0.5 * np.square(distances / sigma_m)) + anywhere)
+    p = normal * np.exp(-0.5 * np.square(distances / sigma_m)) + anywhere
+    floor = distances > _CLEARANCE_M
+    if isinstance(known_map, OccupancyGrid):
+        free, occupied = _states(known_map, origin, cell_m, rows, columns)
+        p[occupied] = normal + anywhere
+        unknown = ~(free | occupied)
+        p[unknown] = np.maximum(p[unknown], min(1.0 / laser.max_range_m, normal + anywhere))
+        floor &= free
+    else:
+        margin = round(reach_m / cell_m) + 1
+        within = np.zeros_like(floor)
+        within[margin:-margin, margin:-margin] = True
+        floor &= within  # the walls' rectangle
     at_wall, step = math.log(normal + anywhere), math.log1p(normal / anywhere) / _MOST
-    table = np.round((at_wall - log_p) / step).astype(np.uint16)
-    margin = round(reach_m / cell_m) + 1
-    return LikelihoodField(table, origin, cell_m, step, _free_cells(distances, margin))
+    table = np.round((at_wall - np.log(p)) / step).astype(np.uint16)
+    return LikelihoodField(table, origin, cell_m, step, _largest(floor))
 
 
-def _free_cells(distances_m: Array, margin: int) -> Ints:
-    """Cells (F, 2) of the largest connected floor off the walls, within the walls' rectangle."""
-    inner = distances_m[margin:-margin, margin:-margin] > _CLEARANCE_M
-    labels, count = ndimage.label(inner)
+def _walls(known_map: World | OccupancyGrid, laser: Laser) -> tuple[Array, Array]:
+    """Walls (W, 4) that the laser sees, m, and points (N, 2) that span the map.
+
+    Of a grid the walls are points: the middles of the occupied cells that have others beside them.
+    """
+    if isinstance(known_map, OccupancyGrid):
+        occupied = known_map.occupied
+        rim = occupied & ~ndimage.binary_erosion(occupied)
+        middles = known_map.middles_m(np.argwhere(rim))
+        if len(middles) == 0:
+            raise InputError("the grid of prior.map has no occupied cell")
+        return np.hstack([middles, middles]), known_map.corners_m
+    low, high = known_map.wall_z_m[:, 0], known_map.wall_z_m[:, 1]
+    walls = known_map.walls[(low <= laser.mount.z_m) & (laser.mount.z_m <= high)]
+    if len(walls) == 0:
+        raise InputError(f"world {known_map.name} has no wall at the laser's {laser.mount.z_m} m")
+    return walls, walls.reshape(-1, 2)
+
+
+def _states(
+    grid: OccupancyGrid, origin: Array, cell_m: float, rows: int, columns: int
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Whether the middle of each of the table's cells (rows, columns) is free, and is occupied."""
+    probability = np.empty((rows, columns), np.float32)
+    middles = np.empty((columns, 2))
+    middles[:, 0] = origin[0] + (np.arange(columns) + 0.5) * cell_m
+    for row in range(rows):
+        middles[:, 1] = origin[1] + (row + 0.5) * cell_m
+        probability[row] = grid.at(middles)
+    return probability < FREE_BELOW, probability > OCCUPIED_ABOVE
+
+
+def _largest(floor: NDArray[np.bool_]) -> Ints:
+    """Rows and columns (F, 2) of the cells of the largest connected floor."""
+    labels, count = ndimage.label(floor)
     if count == 0:
         return np.zeros((0, 2), np.int64)
-    largest = 1 + np.argmax(np.bincount(labels[inner], minlength=count + 1)[1:])
-    return np.argwhere(labels == largest) + margin
+    largest = 1 + np.argmax(np.bincount(labels[floor], minlength=count + 1)[1:])
+    return np.argwhere(labels == largest)
 
 
 def beam_ends(ranges_m: Floats, laser: Laser, n_beams: int) -> Floats:
@@ -155,7 +202,8 @@ def _distances(
     for w in range(len(walls)):
         x1, y1 = walls[w, 0] - origin[0], walls[w, 1] - origin[1]
         dx, dy = walls[w, 2] - walls[w, 0], walls[w, 3] - walls[w, 1]
-        per_square = 1.0 / (dx * dx + dy * dy)
+        length_square = dx * dx + dy * dy
+        per_square = 1.0 / length_square if length_square > 0.0 else 0.0  # of a point
         first_row = max(int((min(y1, y1 + dy) - reach_m) / cell_m), 0)
         last_row = min(int((max(y1, y1 + dy) + reach_m) / cell_m) + 1, rows)
         first = max(int((min(x1, x1 + dx) - reach_m) / cell_m), 0)

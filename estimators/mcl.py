@@ -32,6 +32,7 @@ from sim import se2
 from sim.arrays import Array, Floats, Ints
 from sim.compiled import njit
 from sim.errors import InputError
+from sim.grid import OccupancyGrid
 from sim.recording import Frame
 from sim.world import World
 
@@ -40,7 +41,7 @@ _FARTHEST_M, _FARTHEST_RAD = 1.0, 0.5  # of what belongs to one hypothesis
 
 
 class Mcl:
-    """Monte Carlo localization with a likelihood field.
+    """Monte Carlo localization with a likelihood field of a world's walls or an occupancy grid.
 
     Parameters
     ----------
@@ -96,6 +97,7 @@ class Mcl:
     """
 
     needs = frozenset({"laser", "map"})
+    maps = (World, OccupancyGrid)
     global_or_grid = True
 
     def __init__(
@@ -172,8 +174,8 @@ class Mcl:
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Draw particles from the prior's pose, or from all the floor if there is none."""
         self._laser, self._rng = require_laser(prior, self.laser, "mcl"), rng
-        if not isinstance(prior.map, World):
-            raise InputError("mcl needs a map of walls; set prior.map=world")
+        if not isinstance(prior.map, self.maps):
+            raise InputError("mcl needs a map of walls; set prior.map=world, or to a grid's .yaml")
         self.wheels.reset(prior.robot.track_m)
         self._field = likelihood_field(
             prior.map,

@@ -200,6 +200,7 @@ class TopologicalMcl:
     """
 
     needs = frozenset({"place|lidar3d", "map"})  # one of the two sensors
+    maps = (TopologicalMap,)
     global_or_grid = True
 
     def __init__(

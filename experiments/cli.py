@@ -230,9 +230,13 @@ def view(
     world: Annotated[
         bool, typer.Option("--world", help="Draw the world of the overrides instead.")
     ] = False,
+    grid: Annotated[
+        Path | None,
+        typer.Option("--map", help="An occupancy grid (.yaml) to draw underneath, or alone."),
+    ] = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", help="File to write: .mp4, .gif or .html; a world: .png."),
+        typer.Option("--out", "-o", help="File to write: .mp4, .gif, .html; a world or map: .png."),
     ] = None,
     seconds: Annotated[
         float | None,
@@ -242,7 +246,7 @@ def view(
     ] = None,
     config_dir: ConfigDir = None,
 ) -> None:
-    """Show a run as an animation, in a window or in a file; or draw a world.
+    """Show a run as an animation, in a window or in a file; or draw a world or a map.
 
     It shows robot, scan, particles or landmarks, truth and estimate. Without -o it opens a window.
 
@@ -255,9 +259,18 @@ def view(
       estima view run.npz --estimate mcl prior.map=world estimator.n_most=2000 -o run.mp4
 
       estima view --world world=office seed=3 -o office.png
+
+      estima view run.npz -e ekf_icp --map map.yaml -o run.html
+
+      estima view --map map.yaml -o map.png
     """
     from experiments.runs.experiment import searched
 
+    if world and grid is not None:
+        raise InputError("--world and --map: draw one at a time")
+    if grid is not None and not what:
+        _draw_map(grid, out or Path("map.png"))
+        return
     if world:
         _draw_world([*searched(config_dir), *(what or [])], out or Path("world.png"))
         return
@@ -267,7 +280,8 @@ def view(
         raise InputError(f"--seconds must lie between 0 and 3600, got {seconds:g}")
     if estimate is None and len(what) > 1:
         raise InputError(f"{what[1]}: overrides need an estimator; add --estimate NAME")
-    _show_run(Path(what[0]), estimate, [*searched(config_dir), *what[1:]], out, seconds)
+    overrides = [*searched(config_dir), *what[1:]]
+    _show_run(Path(what[0]), estimate, overrides, out, seconds, grid)
 
 
 def _draw_world(overrides: list[str], out: Path) -> None:
@@ -280,16 +294,36 @@ def _draw_world(overrides: list[str], out: Path) -> None:
     print(out)
 
 
+def _draw_map(path: Path, out: Path) -> None:
+    from experiments.viewing.grid import grid_figure
+    from experiments.viewing.style import save_figure
+    from sim.grid_file import read_grid
+
+    save_figure(grid_figure(read_grid(path), path.stem), out)
+    print(out)
+
+
 def _show_run(
-    log: Path, source: str | None, overrides: list[str], out: Path | None, seconds: float | None
+    log: Path,
+    source: str | None,
+    overrides: list[str],
+    out: Path | None,
+    seconds: float | None,
+    grid: Path | None,
 ) -> None:
+    from dataclasses import replace
+
     from experiments.viewing import live, view
     from sim.formats.detect import read_any
+    from sim.grid_file import read_grid
 
+    if out is None and grid is not None:
+        raise InputError("--map is drawn in files only; add -o run.html, run.gif or run.mp4")
     if out is None:
         live.check_display()
     else:
         view.check_output(out)
+    known = None if grid is None else read_grid(grid)
     recording = read_any([log])
     length_s = seconds or (recording.duration_s if out is None else view.SECONDS)
     rows = view.shown_rows(recording, int(length_s * (live.FPS if out is None else view.FPS)))
@@ -301,9 +335,77 @@ def _show_run(
     if out is None:
         live.watch(shown, seconds)
         return
+    shown = replace(shown, grid=known)
     with progress(f"drawing {out.name}", 1.0) as on_progress:
         view.save(shown, out, on_progress)
     print(f"{out}: {len(rows)} pictures, {len(rows) / view.FPS:.1f} s")
+
+
+@app.command("map")
+def build_map(
+    what: Annotated[
+        list[str],
+        typer.Argument(help="A recording or a log of any format, then Hydra overrides."),
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="File to write, .yaml; beside it .pgm.")],
+    estimate: Annotated[
+        str,
+        typer.Option(
+            "--estimate",
+            "-e",
+            help="truth, an estimate.csv, its folder, or an estimator to run now.",
+        ),
+    ] = "truth",
+    resolution_m: Annotated[float, typer.Option("--resolution", help="Side of a cell, m.")] = 0.05,
+    max_range_m: Annotated[
+        float | None,
+        typer.Option("--max-range", help="Longer beams only clear, m [the laser's range]."),
+    ] = None,
+    raw: Annotated[
+        bool,
+        typer.Option("--raw", help="Keep probabilities in percent (mode raw), not three states."),
+    ] = False,
+    laser: Annotated[str, typer.Option(help="Name of the laser in the recording.")] = "laser",
+    config_dir: ConfigDir = None,
+) -> None:
+    """Build an occupancy grid from a recording's laser scans and any estimate of its path.
+
+    The files are those of ROS's map server. An estimator with a revised path gives that one.
+
+    Examples
+    --------
+      estima map run.npz -e ekf_icp -o map.yaml
+
+      estima map fr079.log.gz -e truth -o fr079.yaml --max-range 20
+
+      estima run world=office seed=3 sensors=lms291 estimator=mcl prior.map=map.yaml
+    """
+    from experiments.runs.experiment import searched
+    from experiments.viewing.grid import described
+    from experiments.viewing.map import grid_along, laser_scans, path_of
+    from sim.formats.detect import read_any
+    from sim.grid_file import check_name, write_grid
+
+    check_name(out)
+    if "=" in what[0]:
+        raise InputError(f"{what[0]}: name a recording first, such as run.npz")
+    recording = read_any([Path(what[0])])
+    n_all = len(laser_scans(recording, laser)[0])
+    with progress(estimate, len(recording.frame_stamps)) as on_step:
+        overrides = [*searched(config_dir), *what[1:]]
+        stamps, poses = path_of(recording, estimate, overrides, on_step)
+    with progress("mapping", n_all, "scans") as on_progress:
+        grid, n_scans = grid_along(
+            recording,
+            stamps,
+            poses,
+            resolution_m=resolution_m,
+            max_range_m=max_range_m,
+            laser=laser,
+            on_progress=on_progress,
+        )
+    write_grid(grid, out, "raw" if raw else "trinary")
+    print(f"{out}: {described(grid)}, from {n_scans} of {n_all} scans")
 
 
 @app.command()

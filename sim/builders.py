@@ -14,9 +14,12 @@ import numpy as np
 
 from sim.arrays import Array
 from sim.errors import InputError
-from sim.plan import Plan, box_corners, rectangle_corners
-from sim.world import World
-from sim.world_file import read_world
+from sim.grid_file import read_grid
+from sim.plan import WALL_HEIGHT_M, Plan, box_corners, rectangle_corners
+from sim.world import World, facing_second
+from sim.world_file import check_tour, read_world
+
+_MOST_GRID_WALLS = 200_000
 
 
 def empty(*, rng: np.random.Generator, tour_m: float) -> World:
@@ -29,6 +32,38 @@ def from_file(*, rng: np.random.Generator, path: str) -> World:
     """Read a user's world; see `sim.world_file` for the format. Nothing in it is random."""
     del rng
     return read_world(Path(path))
+
+
+def from_grid(*, rng: np.random.Generator, path: str, waypoints: list[list[float]]) -> World:
+    """Draw a world from an occupancy grid: a wall along each border of its occupied cells.
+
+    Parameters
+    ----------
+    path
+        The grid's YAML file; see `sim.grid_file`.
+    waypoints
+        [[x, y], ...] m: the tour. A grid has none of its own, so the route needs way-points if
+        these are fewer than two.
+    """
+    del rng
+    walls = read_grid(path).walls()
+    if len(walls) > _MOST_GRID_WALLS:
+        raise InputError(
+            f"{path}: {len(walls)} walls, and {_MOST_GRID_WALLS} are the most; clean the grid, or "
+            "make its cells larger"
+        )
+    try:
+        tour = np.array(waypoints, float).reshape(-1, 2)
+    except (TypeError, ValueError):
+        raise InputError(f"world.waypoints must be points [x, y], m, got {waypoints!r}") from None
+    check_tour(tour, walls, Path(path))
+    return World(
+        name=Path(path).stem,
+        walls=walls,
+        wall_z_m=np.tile([0.0, WALL_HEIGHT_M], (len(walls), 1)),
+        start_pose=facing_second(tour) if len(tour) >= 2 else np.zeros(3),
+        waypoints=tour,
+    )
 
 
 def room(

@@ -62,7 +62,7 @@ def read_world(path: Path) -> World:
     landmarks = _rows(document, "landmarks", 3, path)
     waypoints = _rows(document, "waypoints", 2, path)
     descriptors, alike = make_descriptors(np.random.default_rng(0), len(landmarks), 0.0)
-    _check_tour(waypoints, np.array(walls, float).reshape(-1, 4), path)
+    check_tour(waypoints, np.array(walls, float).reshape(-1, 4), path)
     named = document.get("places") or {}
     if not isinstance(named, Mapping):
         raise InputError(f"{path}: places must map names to lists of x_min, y_min, x_max, y_max")
@@ -85,7 +85,7 @@ def read_world(path: Path) -> World:
     )
 
 
-def _check_tour(waypoints: Any, walls: Any, path: Path) -> None:
+def check_tour(waypoints: Any, walls: Any, path: Path) -> None:
     """Refuse a tour that runs through a wall: no robot can follow it."""
     if len(walls) == 0:
         return

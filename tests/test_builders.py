@@ -14,7 +14,8 @@ from sim.plan import make_descriptors
 from sim.world_file import read_world
 
 ROOT = Path(__file__).resolve().parent.parent
-WORLDS = sorted(p.stem for p in (ROOT / "conf" / "world").glob("*.yaml"))
+OPTIONS = {path.stem for path in (ROOT / "conf" / "world").glob("*.yaml")}
+WORLDS = sorted(OPTIONS - {"from_grid"})  # a grid has no tour of its own
 CLEARANCE_M = 0.35
 
 

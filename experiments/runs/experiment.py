@@ -26,8 +26,10 @@ from experiments.runs.row import Row
 from experiments.runs.seeds import stream
 from experiments.runs.targets import checked, make, targets
 from experiments.runs.version import code_version, source_digest, version_with
+from sim import grid_file
 from sim.arrays import Array
 from sim.errors import InputError
+from sim.grid import OccupancyGrid
 from sim.recording import Frame, Recording, load
 from sim.robot import DifferentialDrive, RobotGeometry
 from sim.sensors import Sensor, Sensors, sensors_from_config
@@ -239,6 +241,7 @@ class Experiment:
         self._check_simulation()
         self._check_prior()
         self._check_needs()
+        self._check_map()
 
     def _check_simulation(self) -> None:
         simulation = self.config["simulation"]
@@ -264,9 +267,10 @@ class Experiment:
         build(RobotGeometry, {k: 1.0 if v is None else v for k, v in believed.items()}, "prior")
         if isinstance(known_map, dict):
             checked(known_map, "prior.map", ("config", "recording"))
-        elif known_map not in ("none", "world"):
+        elif known_map not in ("none", "world") and not _is_grid_file(known_map):
             raise InputError(
-                f"prior.map must be none, world or a mapping with _target_, got {known_map!r}"
+                "prior.map must be none, world, a grid's .yaml file or a mapping with _target_, "
+                f"got {known_map!r}"
             )
 
     def _check_needs(self) -> None:
@@ -287,6 +291,21 @@ class Experiment:
             raise InputError(
                 f"estimator={self.estimator_name} needs a map; set prior.map=world, or a mapping "
                 "with _target_"
+            )
+
+    def _check_map(self) -> None:
+        """Check that a grid can be read, and that the estimator can use one."""
+        known_map, settings = self.config["prior"]["map"], self.config["estimator"]
+        if not _is_grid_file(known_map):
+            return
+        grid_file.read_grid(known_map)
+        estimator = self.own_estimator or checked(settings, "estimator")
+        kinds = getattr(estimator, "maps", None)
+        if kinds and OccupancyGrid not in kinds and not settings.get("map_path"):
+            names = " or ".join(kind.__name__ for kind in kinds)
+            raise InputError(
+                f"estimator={self.estimator_name} takes a {names}, and prior.map={known_map} is an "
+                "occupancy grid"
             )
 
     def _check_sensors(self, who: str, needs: Iterable[str], settings: Config) -> None:
@@ -416,6 +435,8 @@ class Experiment:
         world_file = self.config["world"].get("path")
         if world_file is not None and Path(world_file).is_file():  # an edited file: another world
             settings["world_file"] = _digest(Path(world_file))
+            if (image := grid_file.image_of(Path(world_file))) is not None:
+                settings["world_image"] = _digest(image)
         elsewhere = {target: source_digest(target) for target in sorted(targets(settings))}
         if any(elsewhere.values()):  # a sensor, route or world of one's own, edited: another one
             settings["sources"] = elsewhere
@@ -441,12 +462,14 @@ class Experiment:
         return Prior(robot, recording.sensors, start + offset, np.diag(np.square(sigma)), known_map)
 
     def _map(self, recording: Recording) -> Any:
-        """Map of the prior: none, the recording's world, or what a mapping's function makes."""
+        """Map of the prior: none, the recording's world, a grid, or what a function makes."""
         wanted = self.config["prior"]["map"]
         if isinstance(wanted, dict):
             return make(wanted, "prior.map", config=self.config, recording=recording)
         if wanted == "none":
             return None
+        if _is_grid_file(wanted):
+            return grid_file.read_grid(wanted)
         if recording.world is None:
             raise InputError("prior.map=world, but the recording has no map; set prior.map=none")
         return recording.world
@@ -552,8 +575,15 @@ def composed(overrides: Sequence[str]) -> tuple[DictConfig, Mapping[str, str]]:
     return cfg, choices
 
 
+def _is_grid_file(known_map: Any) -> bool:
+    return isinstance(known_map, str) and Path(known_map).suffix in grid_file.SUFFIXES
+
+
 def files_digest(tree: Any) -> dict[str, str]:
-    """Digest of every file that a mapping names, and of the files in each folder it names."""
+    """Digest of every file that a mapping names, and of the files in each folder it names.
+
+    A grid's image counts with its YAML file.
+    """
     if isinstance(tree, dict):
         return {k: v for value in tree.values() for k, v in files_digest(value).items()}
     if not isinstance(tree, str) or not Path(tree).name:
@@ -561,6 +591,7 @@ def files_digest(tree: Any) -> dict[str, str]:
     path = Path(tree)
     try:
         files = [path] if path.is_file() else sorted(path.glob("*")) if path.is_dir() else []
+        files += [image for file in files if (image := grid_file.image_of(file)) is not None]
     except OSError:  # too long for a path, say
         return {}
     return {str(file): _digest(file) for file in files if file.is_file()}

@@ -23,6 +23,7 @@ from estimators.base import run as run_estimator
 from experiments.evaluation.metrics import CHI2_95_2DOF
 from experiments.runs.experiment import Experiment
 from experiments.runs.seeds import stream
+from experiments.viewing.grid import draw_grid
 from experiments.viewing.plotting import plan_axes
 from experiments.viewing.style import (
     BLUE,
@@ -41,6 +42,7 @@ from sim import se2
 from sim.arrays import Array
 from sim.errors import InputError
 from sim.files import write_whole
+from sim.grid import OccupancyGrid
 from sim.recording import Frame, Recording
 
 Picture = NDArray[np.uint8]
@@ -67,12 +69,15 @@ class Playback:
         Beliefs, or None. They have extras at the shown Frames.
     name
         Of the estimate.
+    grid
+        A map to draw underneath, or None.
     """
 
     recording: Recording
     rows: NDArray[np.int64]
     estimate: Estimate | None = None
     name: str = "estimate"
+    grid: OccupancyGrid | None = None
 
     def belief_row(self, stamp: float) -> int:
         """Row of the last belief up to a time; -1 before the first, or without an estimate."""
@@ -125,32 +130,48 @@ def estimate_of(
     tuple
         The estimate and its name.
     """
-    from experiments.trajectories.odometry import read_odometry_csv
-
     path = Path(source)
-    if path.is_dir():
-        path /= "estimate.csv"
-    if path.suffix == ".csv":
+    if path.suffix == ".csv" or path.is_dir():
         if overrides:
             raise InputError(f"{overrides[0]}: overrides are for estimators that are run now")
-        estimate, stamps = read_odometry_csv(path), recording.frame_stamps
-        if not ((estimate.stamps >= stamps[0]) & (estimate.stamps <= stamps[-1])).any():
-            raise InputError(f"{path}: no stamp of it lies within the recording; is it another's?")
-        sound = np.isfinite(estimate.means).all(axis=1)
-        if not sound.all():
-            raise InputError(f"{path}:{2 + int(np.argmin(sound))}: a pose that is not finite")
-        return estimate, "estimate"
-    robot = dataclasses.asdict(recording.robot)  # the recording's own, with its slip if it is known
-    made_with = recording.config.get("robot")
-    if isinstance(made_with, dict):  # else, of a log of many robots, the number of one
-        robot |= {key: value for key, value in made_with.items() if key in ("kr", "kl")}
-    given = [f"robot.{key}={value}" for key, value in robot.items()]
-    experiment = Experiment.compose([f"estimator={source}", *given, *overrides])
+        return read_estimate(recording, path), "estimate"
+    experiment = experiment_over(recording, source, overrides)
     if "keep_map" in experiment.config["estimator"]:
         experiment = experiment.with_estimator(keep_map=True)
     sparing = _Sparing(experiment.estimator(), set(rows.tolist()))
     rng, prior = stream(experiment.seed, f"estimator/{source}", 0), experiment.prior(recording)
     return run_estimator(sparing, recording, prior, rng, _EXTRAS, on_step), source
+
+
+def read_estimate(recording: Recording, path: Path) -> Estimate:
+    """Read a recording's estimate from a file, or from the folder of a run.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read, is not finite, or belongs to another recording.
+    """
+    from experiments.trajectories.odometry import read_odometry_csv
+
+    if path.is_dir():
+        path /= "estimate.csv"
+    estimate, stamps = read_odometry_csv(path), recording.frame_stamps
+    if not ((estimate.stamps >= stamps[0]) & (estimate.stamps <= stamps[-1])).any():
+        raise InputError(f"{path}: no stamp of it lies within the recording; is it another's?")
+    sound = np.isfinite(estimate.means).all(axis=1)
+    if not sound.all():
+        raise InputError(f"{path}:{2 + int(np.argmin(sound))}: a pose that is not finite")
+    return estimate
+
+
+def experiment_over(recording: Recording, estimator: str, overrides: Sequence[str]) -> Experiment:
+    """Experiment of an estimator's option over a recording, with the recording's own robot."""
+    robot = dataclasses.asdict(recording.robot)  # and its slip, if that is known
+    made_with = recording.config.get("robot")
+    if isinstance(made_with, dict):  # else, of a log of many robots, the number of one
+        robot |= {key: value for key, value in made_with.items() if key in ("kr", "kl")}
+    given = [f"robot.{key}={value}" for key, value in robot.items()]
+    return Experiment.compose([f"estimator={estimator}", *given, *overrides])
 
 
 class _Sparing:
@@ -213,6 +234,8 @@ def pictures(run: Playback) -> Iterator[Picture]:
     x1, y1, x2, y2 = bounds(run, truth)
     page, ax = subplots(8.0, float(np.clip(7.0 * (y2 - y1) / (x2 - x1), 2.0, 8.0)) + 1.2)
     page.set_dpi(_DPI)
+    if run.grid is not None:
+        draw_grid(ax, run.grid)
     if recording.world is not None:
         draw_world(ax, recording.world, landmarks=sees_landmarks(recording))
     glyph = max(recording.robot.track_m / 2.0, 0.012 * (x2 - x1))  # visible on any map
@@ -321,6 +344,8 @@ def bounds(run: Playback, truth: Array | None) -> tuple[float, float, float, flo
     known = np.zeros((0, 2)) if truth is None else truth[:, :2]
     if world is not None:
         known = np.concatenate([known, world.walls.reshape(-1, 2)])
+    if run.grid is not None:
+        known = np.concatenate([known, run.grid.corners_m])
     means = np.zeros((0, 2)) if run.estimate is None else run.estimate.means[:, :2]
     known, means = (points[np.isfinite(points).all(axis=1)] for points in (known, means))
     if len(known) and len(means):
