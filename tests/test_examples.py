@@ -11,6 +11,7 @@ WRITES = {
     "first_run": {"first_run.png"},
     "gate": {"gate.yaml", "gate.baselines", "results"},
     "own_estimator": set(),
+    "own_sensor": {"beacon.npz"},
     "own_world": {"own_world.png"},
     "real_log": {"room.log", "trajectory.tum"},
     "sweep_and_plot": {"sweep.png", "results"},
@@ -52,6 +53,17 @@ def test_own_estimator(example):
     assert own.startswith("Simple")
     assert odometry.startswith("odometry")
     assert own.split()[1:3] == odometry.split()[1:3], "the same means, another covariance"
+
+
+def test_own_sensor(example, monkeypatch):
+    monkeypatch.setattr(sys, "path", list(sys.path))  # the example extends it
+    said, written, names = example("own_sensor")
+    assert written == WRITES["own_sensor"]
+    assert [line.split()[0] for line in said.splitlines()] == [
+        *("laser", "rear", "beacon", "odometry", "ekf_icp", "fused")
+    ]
+    assert names["row"]["ate_rmse_m"] < 0.03
+    assert len((FOLDER / "beacon" / "beacon.py").read_text().splitlines()) < 40
 
 
 def test_own_world(example):

@@ -205,9 +205,9 @@ def test_the_commands(recording, tmp_path):
     save(recording, tmp_path / "a.npz")
     said = invoke("info", tmp_path / "a.npz")
     assert "beacons     " in said
-    assert "battery_v: a number in V, 100.0 % finite" in said
-    assert "strength: 2, 100.0 % finite" in said
-    assert "colours: 3, " in said
+    assert "battery_v, V, 100.0 % finite" in said
+    assert "strength, 2, 100.0 % finite" in said
+    assert "colours, 3, " in said
     assert "rows a reading" in said
     assert recording.checksum in said
     assert "true_ranges_m" not in said

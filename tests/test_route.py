@@ -112,8 +112,8 @@ SQUARE = {
         ({"points": ((1.0, "left"),)}, "route.points"),
         ({"points": ((1.0, float("nan")),)}, "route.points"),
         ({"tolerance_m": 0.0}, "route.tolerance_m must be a positive number"),
-        ({"feedback": "lidar"}, "route.feedback must be truth or odometry, got 'lidar'"),
-        ({"feedback": {"_target_": "mine.Mine"}}, "route.feedback names an onboard estimator"),
+        ({"feedback": "lidar"}, "route.feedback must be truth, odometry or a mapping.*'lidar'"),
+        ({"feedback": {"kr": 1e-4}}, "route.feedback must be truth, odometry or a mapping"),
     ],
 )
 def test_bad_points_gains_and_feedback_are_named(change, line):
