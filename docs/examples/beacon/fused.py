@@ -21,7 +21,7 @@ class Fused:
     def __init__(self, lasers=("laser",), beacon="beacon", kr=1e-4, kl=1e-4):
         self.lasers, self.beacon = list(lasers), beacon
         self.wheels = WheelPrediction(kr, kl)
-        self.matcher = ScanMatcher("point_to_line", "angular", "censi", None)
+        self.matcher = ScanMatcher("point_to_line", "censi", None)
 
     def reset(self, prior, rng):
         """Start from the prior's pose."""
