@@ -194,11 +194,11 @@ class Smoother:
         """
         if not self._stamps:
             raise InputError("smoother has seen no Frame; step before finish")
-        rows = sorted({0, *(row for row, _, _ in self._images), len(self._stamps) - 1})
+        rows = self._rows()
         problem, ids = self._problem(rows)
         solution = solve(
             problem,
-            np.array([self._dead_reckoned[row] for row in rows]),
+            self._start(rows),
             robust=self.robust,
             robust_sigma=self.robust_sigma,
             max_iterations=self.max_iterations,
@@ -217,6 +217,18 @@ class Smoother:
             },
             status=status if len(ids) else "no_landmarks",
         )
+
+    def problem(self) -> tuple[Problem, Array]:
+        """The least-squares problem over all Frames so far, and poses (T, 3) to start from."""
+        rows = self._rows()
+        return self._problem(rows)[0], self._start(rows)
+
+    def _rows(self) -> list[int]:
+        """Frames that are poses of the problem."""
+        return sorted({0, *(row for row, _, _ in self._images), len(self._stamps) - 1})
+
+    def _start(self, rows: list[int]) -> Array:
+        return np.array([self._dead_reckoned[row] for row in rows])
 
     def _problem(self, rows: list[int]) -> tuple[Problem, Ints]:
         """The problem over the Frames of these rows, and the id of each of its landmarks."""

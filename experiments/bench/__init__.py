@@ -15,6 +15,8 @@ SUITES = {
     "topological": ("topological",),
     "mcl": ("mcl",),
     "formats": ("formats",),
+    "smoothing": ("smoothing",),
+    "compile": ("compile",),
 }
 
 

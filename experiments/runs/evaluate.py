@@ -106,13 +106,14 @@ def estimates(
     BLAS uses one thread, unless the environment sets OMP_NUM_THREADS or OPENBLAS_NUM_THREADS: its
     threads spin while they wait, and the matrices of filters are small.
     """
-    with _one_blas_thread():
+    with one_blas_thread():
         online = run(estimator, recording, prior, rng, keep, on_step)
         finish = getattr(estimator, "finish", None)
         return online, None if finish is None else finish()
 
 
-def _one_blas_thread() -> AbstractContextManager[object]:
+def one_blas_thread() -> AbstractContextManager[object]:
+    """Context in which BLAS uses one thread, unless the environment asks for another number."""
     asked = {"OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"} & set(os.environ)
     return nullcontext() if asked else _blas().limit(limits=1, user_api="blas")
 

@@ -1,0 +1,92 @@
+"""Time to compile all numerical code, by two processes side by side as set-up does.
+
+`python -m experiments.bench.compile` fills the cache of compiled code that later runs read.
+"""
+
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Mapping
+
+from experiments.bench.measure import Measurement
+
+_PROCESSES = ("scans", "others")
+
+
+def run() -> Iterator[Measurement]:
+    """Wall time with an empty cache."""
+    with tempfile.TemporaryDirectory() as folder:
+        begun = time.perf_counter()
+        fill({"NUMBA_CACHE_DIR": folder})
+        seconds = time.perf_counter() - begun
+    note = "all numerical code, empty cache, two processes, imports included"
+    yield Measurement("compile.first_s", seconds, "s", 12.0, note=note)
+
+
+def fill(settings: Mapping[str, str]) -> None:
+    """Compile everything in two processes, whose environment has these settings too."""
+    with tempfile.TemporaryDirectory() as results:
+        environment = {**os.environ, "ESTIMA_RESULTS": results, **settings}
+        command = [sys.executable, "-m", "experiments.bench.compile"]
+        children = [subprocess.Popen([*command, name], env=environment) for name in _PROCESSES]
+        for child in children:
+            if child.wait():
+                raise subprocess.CalledProcessError(child.returncode, child.args)
+
+
+def _scans() -> None:
+    """Registration of scans, point to line, and its covariances."""
+    import numpy as np
+
+    from estimators import icp_covariance
+    from estimators.icp import prepare, register
+    from experiments.bench.icp import BEARINGS_RAD, pair
+
+    drawn = pair("room", "small", 0)
+    source, target = (prepare(r, BEARINGS_RAD) for r in (drawn.source_m, drawn.target_m))
+    found = register(source, target)
+    icp_covariance.censi(found, source, target, 0.01)
+    icp_covariance.censi(found, source, target, 0.01, matches="sliding")
+    icp_covariance.hessian(found)
+    icp_covariance.sampling(found, source, target, np.random.default_rng(0), 0.01)
+
+
+def _others() -> None:
+    """Casting, landmarks, particles, maps, calibration; at the end registration of points."""
+    import numpy as np
+
+    from estimators.grid_mapping import map_scans
+    from experiments.calibration.end_pose_model import EndPoseModel
+    from experiments.gate.conform import example, walk
+    from experiments.runs.experiment import Experiment
+    from sim.kinematic import run_batch
+    from sim.robot import DifferentialDrive
+    from sim.route import TABLE_1
+    from sim.sensors import Laser
+
+    robot, route = DifferentialDrive(0.05, 0.19), TABLE_1["linear_1"]
+    rng = np.random.default_rng(0)
+    run_batch(robot, route, 1, rng)
+    model = EndPoseModel(route.profile(robot), robot, rng, "sampled", n_samples=4)
+    model.moments(np.full(2, 1e-5), np.zeros(2), robot.track_m)
+    for places, overrides in (
+        (False, ["estimator=fastslam"]),
+        (False, ["estimator=fastslam", "estimator.association=mahalanobis"]),
+        (False, ["estimator=mcl"]),
+        (True, ["estimator=topological_mcl"]),
+        (False, ["estimator=icp_odometry", "estimator.metric=point_to_point"]),
+    ):
+        recording, prior = example(places=places)
+        if "estimator=mcl" in overrides:
+            laser, scan = recording.sensor("laser", Laser), recording.log("laser")["ranges_m"][:1]
+            map_scans(np.zeros((1, 3)), scan, laser, resolution_m=0.5)
+        walk(Experiment.compose(overrides).estimator(), recording.cut(12), prior)
+
+
+if __name__ == "__main__":
+    if len(sys.argv) > 1:
+        {"scans": _scans, "others": _others}[sys.argv[1]]()
+    else:
+        fill({})

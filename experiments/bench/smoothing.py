@@ -1,0 +1,49 @@
+"""Landmark methods over one drive through rooms: the batch solution, and EKF-SLAM."""
+
+import statistics
+import time
+from collections.abc import Iterator
+
+import numpy as np
+
+from estimators import smoother
+from experiments.bench.measure import Measurement, time_s
+from experiments.runs.evaluate import estimates, one_blas_thread
+from experiments.runs.experiment import Experiment
+from experiments.runs.seeds import stream
+
+_DRIVE = (
+    "world=rooms",
+    "sensors=laser_stereo",
+    "robot=robocom",
+    "route.distance_m=60",
+    "simulation.rays=exact",
+)
+
+
+def run() -> Iterator[Measurement]:
+    """Processor times over the drive, with one BLAS thread."""
+    experiment = Experiment.compose([*_DRIVE, "estimator=smoother"])
+    recording = experiment.simulate()
+    prior = experiment.prior(recording)
+    batch = smoother.Smoother(kr=experiment.robot().kr, kl=experiment.robot().kl)
+    batch.reset(prior, stream(0, "bench"))
+    for frame in recording.frames():
+        batch.step(frame)
+    problem, start = batch.problem()
+    note = f"{len(start)} poses, {len(np.unique(problem.landmark_rows))} landmarks"
+    with one_blas_thread():
+        solved, whole = (
+            statistics.median(time_s(call, clock=time.process_time) for _ in range(5))
+            for call in (lambda: smoother.solve(problem, start), batch.finish)
+        )
+    yield Measurement("smoother.solve_s", solved, "s", 0.15, note=note)
+    yield Measurement("smoother.covariances_s", whole, "s", 0.3, note=f"{note}, and every Frame")
+    slam = Experiment.compose([*_DRIVE, "estimator=ekf_slam"])
+
+    def run_slam() -> None:
+        estimates(slam.estimator(), recording, prior, stream(0, "bench"))
+
+    run_slam()
+    seconds = statistics.median(time_s(run_slam, clock=time.process_time) for _ in range(3))
+    yield Measurement("ekf_slam.run_s", seconds, "s", 0.35, note="all steps, one BLAS thread")
