@@ -37,7 +37,7 @@ def fill(settings: Mapping[str, str]) -> None:
 
 
 def _scans() -> None:
-    """Registration of scans, point to line, and its covariances."""
+    """Registration of scans by both metrics, and its covariances."""
     import numpy as np
 
     from estimators import icp_covariance
@@ -50,11 +50,12 @@ def _scans() -> None:
     icp_covariance.censi(found, source, target, 0.01)
     icp_covariance.censi(found, source, target, 0.01, matches="sliding")
     icp_covariance.hessian(found)
+    register(source, target, metric="point_to_point")
     icp_covariance.sampling(found, source, target, np.random.default_rng(0), 0.01)
 
 
 def _others() -> None:
-    """Casting, landmarks, particles, maps, calibration; at the end registration of points."""
+    """Casting, landmarks, particles, maps, calibration."""
     import numpy as np
 
     from estimators.grid_mapping import map_scans
@@ -76,7 +77,6 @@ def _others() -> None:
         (False, ["estimator=fastslam", "estimator.association=mahalanobis"]),
         (False, ["estimator=mcl"]),
         (True, ["estimator=topological_mcl"]),
-        (False, ["estimator=icp_odometry", "estimator.metric=point_to_point"]),
     ):
         recording, prior = example(places=places)
         if "estimator=mcl" in overrides:
