@@ -116,7 +116,7 @@ class Lineages:
         M.
     """
 
-    _PRUNE_EVERY = 64
+    _PRUNE_EVERY = 16
 
     def __init__(self, n_particles: int) -> None:
         self._poses: list[Array] = []
@@ -147,14 +147,22 @@ class Lineages:
             rows = parents[rows]
 
     def _prune(self) -> None:
-        alive, self._rows = np.unique(self._rows, return_inverse=True)
+        alive, self._rows = _distinct(self._rows, len(self._poses[-1]))
         for step in range(len(self._poses) - 1, -1, -1):
             if step < self._n_pruned and len(alive) == len(self._poses[step]):
                 break
             self._poses[step] = self._poses[step][alive]
             parents = self._parents[step][alive]
-            alive, self._parents[step] = np.unique(parents, return_inverse=True)
+            n_before = len(self._poses[step - 1]) if step else len(self._rows)
+            alive, self._parents[step] = _distinct(parents, n_before)
         self._n_pruned = len(self._poses)
+
+
+def _distinct(rows: Ints, n_rows: int) -> tuple[Ints, Ints]:
+    """Distinct ones of rows (M,) below `n_rows`, sorted, and the place of each row among them."""
+    taken = np.zeros(n_rows, bool)
+    taken[rows] = True
+    return np.flatnonzero(taken), (np.cumsum(taken) - 1)[rows]
 
 
 def _at(weights: Array, quantiles: Array) -> Ints:
