@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sim.arrays import Array, Floats
-from sim.errors import InputError
+from sim.errors import require
 from sim.sensors import Lidar3D
 
 N_RINGS, N_SECTORS, REACH_M = 20, 60, 80.0  # of Scan Context, as published
@@ -159,8 +159,7 @@ KINDS: dict[str, Kind] = {
 
 def kind(name: str) -> Kind:
     """Kind of a name."""
-    if name not in KINDS:
-        raise InputError(f"unknown descriptor {name!r}; known: {', '.join(KINDS)}")
+    require(name in KINDS, f"unknown descriptor {name!r}; known: {', '.join(KINDS)}")
     return KINDS[name]
 
 

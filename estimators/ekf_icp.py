@@ -27,7 +27,7 @@ from estimators.scan_matching import (
 )
 from estimators.wheels import WheelPrediction
 from sim.arrays import Array
-from sim.errors import InputError
+from sim.errors import require
 from sim.recording import Frame
 
 _PATIENCE = 2  # scans in a row that may fail before the newest becomes the key frame
@@ -114,11 +114,11 @@ class EkfIcp:
             register_turn_rad=register_turn_rad,
         )
         require_shares(shared_noise=shared_noise)
-        if gate_probability is not None and not 0.0 < gate_probability < 1.0:
-            raise InputError(
-                "estimator.gate_probability must lie between 0 and 1 or be null, "
-                f"got {gate_probability}"
-            )
+        require(
+            gate_probability is None or 0.0 < gate_probability < 1.0,
+            "estimator.gate_probability must lie between 0 and 1 or be null, "
+            f"got {gate_probability}",
+        )
         self.keyframe_distance_m, self.keyframe_turn_rad = keyframe_distance_m, keyframe_turn_rad
         self.register_distance_m = register_distance_m
         self.register_turn_rad = register_turn_rad

@@ -31,7 +31,7 @@ from estimators.wheels import WheelPrediction
 from sim import se2
 from sim.arrays import Array, Floats, Ints
 from sim.compiled import njit
-from sim.errors import InputError
+from sim.errors import require
 from sim.grid import OccupancyGrid
 from sim.recording import Frame
 from sim.world import World
@@ -156,10 +156,11 @@ class Mcl:
             alpha_fast=alpha_fast,
             recovery_ratio=recovery_ratio,
         )
-        if n_least > n_most:
-            raise InputError(f"estimator.n_least={n_least} is above n_most={n_most}")
-        if least_ess >= ess_share:
-            raise InputError(f"estimator.least_ess={least_ess} is not below ess_share={ess_share}")
+        require(n_least <= n_most, f"estimator.n_least={n_least} is above n_most={n_most}")
+        require(
+            least_ess < ess_share,
+            f"estimator.least_ess={least_ess} is not below ess_share={ess_share}",
+        )
         self.n_least, self.n_most, self.n_beams = n_least, n_most, n_beams
         self.kld_error, self.kld_quantile = kld_error, kld_quantile
         self.bin_m, self.bin_rad, self.beam_power = bin_m, bin_rad, beam_power
@@ -174,8 +175,10 @@ class Mcl:
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Draw particles from the prior's pose, or from all the floor if there is none."""
         self._laser, self._rng = require_laser(prior, self.laser, "mcl"), rng
-        if not isinstance(prior.map, self.maps):
-            raise InputError("mcl needs a map of walls; set prior.map=world, or to a grid's .yaml")
+        require(
+            isinstance(prior.map, self.maps),
+            "mcl needs a map of walls; set prior.map=world, or to a grid's .yaml",
+        )
         self.wheels.reset(prior.robot.track_m)
         self._field = likelihood_field(
             prior.map,

@@ -22,7 +22,7 @@ from estimators.options import (
 )
 from estimators.stereo import NoiseAt, NoiseModel, StereoModel
 from sim.arrays import Array, Floats, Ints
-from sim.errors import InputError
+from sim.errors import InputError, require
 from sim.sensors import Reading
 
 Association = Literal["known", "mahalanobis", "descriptor"]
@@ -123,11 +123,11 @@ class SlamFrontEnd:
         """
         camera = require_stereo(prior, self._stereo, self._estimator)
         start = start_pose(prior, self._estimator)
-        if self.association == "known" and not camera.identifies:
-            raise InputError(
-                "the camera does not identify landmarks; set estimator.association=mahalanobis "
-                "or descriptor"
-            )
+        require(
+            self.association != "known" or camera.identifies,
+            "the camera does not identify landmarks; set estimator.association=mahalanobis "
+            "or descriptor",
+        )
         camera = dataclasses.replace(camera, **self._sigmas)  # type: ignore[arg-type]
         self.camera = StereoModel.of(camera, self._noise_model, self._noise_at)
         # a landmark may be predicted beyond dmax and still be the one that was seen
@@ -175,11 +175,11 @@ class SlamFrontEnd:
         """
         if self.association != "descriptor":
             return np.zeros((len(image.points), 0))
-        if image.descriptors.shape[1] == 0 < len(image.points):
-            raise InputError(
-                f"{self._estimator}: observations without descriptors; set "
-                "estimator.association=mahalanobis"
-            )
+        require(
+            not (image.descriptors.shape[1] == 0 < len(image.points)),
+            f"{self._estimator}: observations without descriptors; set "
+            "estimator.association=mahalanobis",
+        )
         if len(self.origins) == 0:
             return np.zeros((len(image.points), 0))
         products = (image.descriptors @ self._descriptors.T).astype(np.float64)

@@ -31,7 +31,7 @@ from estimators.stereo import LEAST_DEPTH_M, StereoModel
 from estimators.wheels import WheelPrediction
 from sim import se2
 from sim.arrays import Array, Ints
-from sim.errors import InputError
+from sim.errors import require
 from sim.recording import Frame
 
 Robust = Literal["none", "huber", "cauchy"]
@@ -166,11 +166,11 @@ class Smoother:
         self._belief = self._belief.then(motion)
         seen = frame.readings.get(self.stereo)
         if seen is not None and len(seen["points_in_camera"]):
-            if "ids" not in seen:
-                raise InputError(
-                    "smoother needs to know which landmark is which; set "
-                    f"sensors.{self.stereo}.identifies=true"
-                )
+            require(
+                "ids" in seen,
+                "smoother needs to know which landmark is which; set "
+                f"sensors.{self.stereo}.identifies=true",
+            )
             points = seen["points_in_camera"]
             usable = self._camera.usable(points)
             if usable.any():
@@ -192,8 +192,7 @@ class Smoother:
             `landmark_covariances` (N, 3, 3); its status is `no_landmarks` when it is dead
             reckoning alone, and `not_converged` when the steps did not suffice.
         """
-        if not self._stamps:
-            raise InputError("smoother has seen no Frame; step before finish")
+        require(self._stamps, "smoother has seen no Frame; step before finish")
         rows = sorted({0, *(row for row, _, _ in self._images), len(self._stamps) - 1})
         problem, ids = self._problem(rows)
         solution = solve(

@@ -23,7 +23,7 @@ from estimators.place_refinement import Refiner
 from estimators.topological_map import TopologicalMap, load
 from sim import se2
 from sim.arrays import Array, Floats, Ints
-from sim.errors import InputError
+from sim.errors import InputError, require
 from sim.recording import Frame
 from sim.robot import arc_increment
 from sim.sensors import Lidar3D, sensor_of
@@ -236,8 +236,7 @@ class TopologicalMcl:
         if sigma_l_m is not None:
             require_positive(sigma_l_m=sigma_l_m)
         require_shares(p_stay=p_stay, p_skip=p_skip, p_turn=p_turn, injection=injection)
-        if p_stay + p_skip > 1.0:
-            raise InputError("estimator.p_stay and p_skip must not exceed 1 together")
+        require(p_stay + p_skip <= 1.0, "estimator.p_stay and p_skip must not exceed 1 together")
         self.weighting, self.n_nearest = weighting, n_nearest
         self.particles_per_node = particles_per_node
         self.sigma_l_m, self.sigma_m, self.motion = sigma_l_m, sigma_m, motion
@@ -248,16 +247,16 @@ class TopologicalMcl:
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Spread the particles over the nodes, weighted by the prior's pose if it has one."""
         known = prior.map if self.map_path is None else load(Path(self.map_path))
-        if not isinstance(known, TopologicalMap):
-            raise InputError(
-                "topological_mcl needs a topological map; set estimator.map_path, or prior.map "
-                "to the function that makes one"
-            )
+        require(
+            isinstance(known, TopologicalMap),
+            "topological_mcl needs a topological map; set estimator.map_path, or prior.map "
+            "to the function that makes one",
+        )
         self._rng, self._map, self._graph = rng, known, Graph(known)
-        if not {self.place, self.lidar3d} & set(prior.sensors):
-            raise InputError(
-                "topological_mcl needs place descriptors or a 3D lidar; choose sensors=lidar3d"
-            )
+        require(
+            {self.place, self.lidar3d} & set(prior.sensors),
+            "topological_mcl needs place descriptors or a 3D lidar; choose sensors=lidar3d",
+        )
         self._lidar = None
         if self.lidar3d in prior.sensors:
             self._lidar = sensor_of(prior.sensors, self.lidar3d, Lidar3D)
@@ -326,11 +325,11 @@ class TopologicalMcl:
                 return None, "empty cloud"
             observed = self._kind.describe(self._lidar, turn["ranges_m"])
         size = self._map.descriptors.shape[1]
-        if observed.shape != (size,):
-            raise InputError(
-                f"the map's descriptors have {size} numbers, the recording's have shape "
-                f"{observed.shape}; describe both by the same network"
-            )
+        require(
+            observed.shape == (size,),
+            f"the map's descriptors have {size} numbers, the recording's have shape "
+            f"{observed.shape}; describe both by the same network",
+        )
         if not np.isfinite(observed).all():
             return None, "descriptor not finite"
         return observed.astype(np.float32, copy=False), ""

@@ -13,7 +13,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from sim.arrays import Array
-from sim.errors import InputError
+from sim.errors import InputError, require
 from sim.grid_file import read_grid
 from sim.plan import WALL_HEIGHT_M, Plan, box_corners, rectangle_corners
 from sim.world import World, facing_second
@@ -47,11 +47,11 @@ def from_grid(*, rng: np.random.Generator, path: str, waypoints: list[list[float
     """
     del rng
     walls = read_grid(path).walls()
-    if len(walls) > _MOST_GRID_WALLS:
-        raise InputError(
-            f"{path}: {len(walls)} walls, and {_MOST_GRID_WALLS} are the most; clean the grid, or "
-            "make its cells larger"
-        )
+    require(
+        len(walls) <= _MOST_GRID_WALLS,
+        f"{path}: {len(walls)} walls, and {_MOST_GRID_WALLS} are the most; clean the grid, or "
+        "make its cells larger",
+    )
     try:
         tour = np.array(waypoints, float).reshape(-1, 2)
     except (TypeError, ValueError):
@@ -121,8 +121,10 @@ def rooms(
     The tour goes from room to room: round the outer ring, then, where there is one, round the
     ring inside it, and back.
     """
-    if n_x < 1 or n_y < 1 or n_x * n_y < 2:
-        raise InputError(f"world.n_x and n_y must make at least two rooms, got {n_x} x {n_y}")
+    require(
+        n_x >= 1 and n_y >= 1 and n_x * n_y >= 2,
+        f"world.n_x and n_y must make at least two rooms, got {n_x} x {n_y}",
+    )
     _positive(room_m=room_m - 2.0, door_m=door_m - 0.7, wall=room_m - door_m)
     plan = Plan()
     plan.rectangle((0, 0), (n_x * room_m, n_y * room_m))
@@ -213,10 +215,10 @@ def office(
     door; the west and the east one have cabinets. The rooms' widths, doors, niches and furniture
     are random. The tour goes round the western loop, then round both, into `rooms_visited` rooms.
     """
-    if not 1.8 < corridor_m <= 3.0:
-        raise InputError(f"world.corridor_m must lie between 1.8 and 3 m, got {corridor_m}")
-    if not 0 <= rooms_visited <= 22:
-        raise InputError(f"world.rooms_visited must lie in 0-22, got {rooms_visited}")
+    require(
+        1.8 < corridor_m <= 3.0, f"world.corridor_m must lie between 1.8 and 3 m, got {corridor_m}"
+    )
+    require(0 <= rooms_visited <= 22, f"world.rooms_visited must lie in 0-22, got {rooms_visited}")
     plan, c = Plan(), corridor_m
     W, H, south = 66.0, 42.0, 9.0
     passage = 44.0 + rng.uniform(0.0, 1.0)  # west side of the passage between the loops
@@ -432,8 +434,7 @@ def _town(
     trees_per_block: int,
 ) -> World:
     """Build blocks in a grid of streets; the tour is a closed way along the streets."""
-    if n_x < 1 or n_y < 1:
-        raise InputError(f"world.n_x and n_y must be at least 1, got {n_x} and {n_y}")
+    require(n_x >= 1 and n_y >= 1, f"world.n_x and n_y must be at least 1, got {n_x} and {n_y}")
     _positive(block_m=block_m - 30.0, street_m=street_m - 6.0)
     plan, pitch = Plan(), block_m + street_m
     corners = [(0, 0), (n_x, 0), (n_x, n_y), (0, n_y), (0, 0)]
@@ -521,5 +522,4 @@ def _rounded(
 
 def _positive(**margins: float) -> None:
     for name, margin in margins.items():
-        if not margin > 0.0:
-            raise InputError(f"world.{name} is too small for a robot to pass; make it larger")
+        require(margin > 0.0, f"world.{name} is too small for a robot to pass; make it larger")

@@ -17,7 +17,7 @@ from types import TracebackType
 import numpy as np
 
 from sim.arrays import Array
-from sim.errors import InputError
+from sim.errors import InputError, require
 from sim.robot import DifferentialDrive
 from sim.world import World
 
@@ -198,8 +198,7 @@ class BulletBody:
             flags=pybullet.GEOM_FORCE_CONCAVE_TRIMESH,
             physicsClientId=self._client,
         )
-        if shape < 0:
-            raise InputError(f"world {world.name}: the physics engine refused its walls")
+        require(shape >= 0, f"world {world.name}: the physics engine refused its walls")
         walls: int = pybullet.createMultiBody(0, shape, physicsClientId=self._client)
         self._surface(walls, -1, 0.5, _WALLS, _ROBOT | _RAYS)
         return walls

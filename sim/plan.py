@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sim.arrays import Array
-from sim.errors import InputError
+from sim.errors import InputError, require
 from sim.world import World, facing_second
 
 WALL_HEIGHT_M = 2.5
@@ -127,8 +127,7 @@ class Plan:
         InputError
             If there is no room for so many.
         """
-        if count < 0:
-            raise InputError(f"world: the number of objects must be zero or more, got {count}")
+        require(count >= 0, f"world: the number of objects must be zero or more, got {count}")
         least, most = np.array(low, float), np.array(high, float)
         paths = _near(self._paths(), least - clearance_m, most + clearance_m)
         faces = _near(np.array(self.faces, float).reshape(-1, 4), least, most)
@@ -205,10 +204,11 @@ class Plan:
 
     def _landmarks(self, rng: np.random.Generator, count: int, on_walls_share: float) -> Array:
         """Landmarks (count, 3), spread over walls and objects by the faces' lengths."""
-        if count < 0:
-            raise InputError(f"world.n_landmarks must be zero or more, got {count}")
-        if not 0.0 <= on_walls_share <= 1.0:
-            raise InputError(f"world.on_walls_share must lie in [0, 1], got {on_walls_share}")
+        require(count >= 0, f"world.n_landmarks must be zero or more, got {count}")
+        require(
+            0.0 <= on_walls_share <= 1.0,
+            f"world.on_walls_share must lie in [0, 1], got {on_walls_share}",
+        )
         if not self.faces:
             return np.zeros((0, 3))
         objects = np.array(self.on_object)
@@ -337,8 +337,10 @@ def make_descriptors(
     `look_alike_share` of the landmarks share theirs with another one, in pairs (the last three
     make a triple if their number is odd); the mask (count,) marks them.
     """
-    if not 0.0 <= look_alike_share <= 1.0:
-        raise InputError(f"world.look_alike_share must lie in [0, 1], got {look_alike_share}")
+    require(
+        0.0 <= look_alike_share <= 1.0,
+        f"world.look_alike_share must lie in [0, 1], got {look_alike_share}",
+    )
     raw = np.maximum(rng.standard_normal((count, DESCRIPTOR_SIZE)) - 0.4, 0.0) ** 1.5
     raw[:, 0] += 1e-3  # never all zero
     alike = np.zeros(count, bool)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sim.arrays import Array
-from sim.errors import InputError
+from sim.errors import InputError, require
 from sim.feedback import CONTROL_TICKS, check_feedback
 from sim.robot import DifferentialDrive, arc_increment
 from sim.se2 import chain, transform
@@ -51,8 +51,7 @@ class OpenLoop:
     def __post_init__(self) -> None:
         check_numbers("route", self, not_negative=("rest_s",))
         object.__setattr__(self, "segments", tuple(_merged(self.segments)))
-        if not self.segments:
-            raise InputError("route.segments is empty; give at least one [v, omega, duration]")
+        require(self.segments, "route.segments is empty; give at least one [v, omega, duration]")
 
     def start(self, world: World, robot: DifferentialDrive) -> tuple[Array, Replay]:
         """Start pose (3,) of the world, and the driver."""
@@ -143,8 +142,10 @@ class Tour:
         check_numbers(
             "route", self, ("speed_mps", "look_ahead_m", "tolerance_m", "turn_rate_radps")
         )
-        if self.distance_m is not None and not 0.0 < self.distance_m < math.inf:
-            raise InputError(f"route.distance_m must be positive, got {self.distance_m}")
+        require(
+            self.distance_m is None or 0.0 < self.distance_m < math.inf,
+            f"route.distance_m must be positive, got {self.distance_m}",
+        )
         if self.waypoints is not None:
             wanted = "route.waypoints must be null or at least two points [x, y], m"
             _check_points(self.waypoints, wanted, at_least=2)
@@ -152,11 +153,11 @@ class Tour:
     def start(self, world: World, robot: DifferentialDrive) -> tuple[Array, Pursuit]:
         """Start pose (3,) on the first way-point, facing the second, and the driver."""
         given = world.waypoints if self.waypoints is None else np.array(self.waypoints, float)
-        if given.ndim != 2 or given.shape[1] != 2 or len(given) < 2:
-            raise InputError(
-                f"route: world {world.name} has no tour of at least two way-points; give "
-                "route.waypoints=[[x, y], ...]"
-            )
+        require(
+            given.ndim == 2 and given.shape[1] == 2 and len(given) >= 2,
+            f"route: world {world.name} has no tour of at least two way-points; give "
+            "route.waypoints=[[x, y], ...]",
+        )
         path = _lengthened(given, self.distance_m)
         return facing_second(path), Pursuit(self, robot, path)
 
@@ -359,8 +360,7 @@ def _check_points(given: ArrayLike, wanted: str, at_least: int) -> None:
     except (TypeError, ValueError):
         raise InputError(f"{wanted}, got {given!r}") from None
     shaped = points.ndim == 2 and points.shape[1] == 2 and len(points) >= at_least
-    if not (shaped and np.isfinite(points).all()):
-        raise InputError(f"{wanted}, got {given!r}")
+    require(shaped and np.isfinite(points).all(), f"{wanted}, got {given!r}")
 
 
 def _lengthened(path: Array, distance_m: float | None) -> Array:
@@ -395,8 +395,10 @@ def _merged(segments: Iterable[Iterable[float]]) -> list[Segment]:
             v, omega, duration_s = (float(value) for value in segment)
         except (TypeError, ValueError):
             raise InputError(f"{where} must be [v, omega, duration], got {segment!r}") from None
-        if not all(map(math.isfinite, (v, omega, duration_s))) or duration_s <= 0.0:
-            raise InputError(f"{where} must be finite with a positive duration, got {segment!r}")
+        require(
+            all(map(math.isfinite, (v, omega, duration_s))) and duration_s > 0.0,
+            f"{where} must be finite with a positive duration, got {segment!r}",
+        )
         if merged and merged[-1][:2] == (v, omega):
             duration_s += merged.pop()[2]
         merged.append((v, omega, duration_s))

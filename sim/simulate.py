@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from sim import se2
 from sim.arrays import Array
-from sim.errors import InputError
+from sim.errors import InputError, require
 from sim.feedback import Feedback, Onboard, feedback_of
 from sim.kinematic import KinematicBody
 from sim.rays import BulletRays, ExactRays
@@ -116,15 +116,16 @@ def record(
         If a sensor's rate does not divide 300 Hz, if the robot overlaps a wall at its start, or
         if Bullet rays are asked for without Bullet physics.
     """
-    if rays == "bullet" and physics != "bullet":
-        raise InputError("rays=bullet needs physics=bullet; set rays=exact")
+    require(
+        rays != "bullet" or physics == "bullet", "rays=bullet needs physics=bullet; set rays=exact"
+    )
     periods = _periods(sensors)
     pose, driver = route.start(world, robot)
-    if overlaps(world, robot, pose):
-        raise InputError(
-            f"the robot overlaps a wall of world {world.name} at its start "
-            f"({pose[0]:.2f}, {pose[1]:.2f}); move the start pose or the wall"
-        )
+    require(
+        not overlaps(world, robot, pose),
+        f"the robot overlaps a wall of world {world.name} at its start "
+        f"({pose[0]:.2f}, {pose[1]:.2f}); move the start pose or the wall",
+    )
     feedback = feedback_of(route, robot, pose, sensors, world, onboard)
     logs: _Logs = defaultdict(list)
     with contextlib.ExitStack() as stack:
@@ -335,14 +336,13 @@ def _periods(sensors: Sensors) -> dict[str, int]:
         if rate is None:
             continue
         ticks = TICKS_PER_S / rate
-        if abs(ticks - round(ticks)) > 1e-6 or round(ticks) < 1:
-            raise InputError(
-                f"sensors.{name}.rate_hz={rate:g} does not divide the simulation's "
-                f"{TICKS_PER_S} Hz; choose one that does, such as 10, 20, 50, 75 or 100"
-            )
+        require(
+            abs(ticks - round(ticks)) <= 1e-6 and round(ticks) >= 1,
+            f"sensors.{name}.rate_hz={rate:g} does not divide the simulation's "
+            f"{TICKS_PER_S} Hz; choose one that does, such as 10, 20, 50, 75 or 100",
+        )
         periods[name] = round(ticks)
-    if not periods:
-        raise InputError("no sensor fires; set sensors.encoder.rate_hz or add a sensor")
+    require(periods, "no sensor fires; set sensors.encoder.rate_hz or add a sensor")
     return periods
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.arrays import Array
-from sim.errors import InputError
+from sim.errors import InputError, require
 
 
 def facing_second(waypoints: Array) -> Array:
@@ -65,17 +65,16 @@ class World:
             **{f"places.{k}": (v, (len(v), 4)) for k, v in self.places.items()},
         }
         for key, (values, shape) in shapes.items():
-            if np.shape(values) != shape:
-                raise InputError(
-                    f"world {self.name}: {key} must have shape {shape}, got {np.shape(values)}"
-                )
-            if not np.all(np.isfinite(values)):
-                raise InputError(f"world {self.name}: {key} must be finite numbers")
-        if len(self.descriptors) not in (0, len(self.landmarks)):
-            raise InputError(
-                f"world {self.name}: {len(self.descriptors)} descriptors for "
-                f"{len(self.landmarks)} landmarks"
+            require(
+                np.shape(values) == shape,
+                f"world {self.name}: {key} must have shape {shape}, got {np.shape(values)}",
             )
+            require(np.all(np.isfinite(values)), f"world {self.name}: {key} must be finite numbers")
+        require(
+            len(self.descriptors) in (0, len(self.landmarks)),
+            f"world {self.name}: {len(self.descriptors)} descriptors for "
+            f"{len(self.landmarks)} landmarks",
+        )
         length = np.hypot(*(self.walls[:, 2:] - self.walls[:, :2]).T)
         for bad in np.flatnonzero(length < 1e-6):
             raise InputError(f"world {self.name}: wall {bad} has no length; give it two ends")

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from estimators.base import Estimate
 from sim import se2
 from sim.arrays import Array
-from sim.errors import InputError
+from sim.errors import require
 from sim.recording import Recording
 
 CHI2_95_2DOF = 5.991464547107979  # 95 % quantile of chi-square with two degrees of freedom
@@ -139,8 +139,7 @@ def score(recording: Recording, estimate: Estimate) -> dict[str, float]:
         return row
     truth = recording.truth_at(estimate.stamps)
     known = np.isfinite(truth).all(axis=1)
-    if not known.any():
-        raise InputError("no estimate lies within the truth's time span; are the clocks the same?")
+    require(known.any(), "no estimate lies within the truth's time span; are the clocks the same?")
     truth, means, covariances = truth[known], estimate.means[known], estimate.covariances[known]
     fitted = aligned(truth, means)
     values = nees(truth, means, covariances)

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from experiments.evaluation.metrics import aligned, position_errors_m, rms
 from sim import se2
 from sim.arrays import Array
-from sim.errors import InputError
+from sim.errors import require
 
 Rows = NDArray[np.int64]
 
@@ -51,6 +51,5 @@ def aligned_ate_m(
     """
     estimate = interpolate(stamps, poses, truth_stamps, longest_gap_s)
     known = np.isfinite(estimate).all(axis=1)
-    if known.sum() < 3:
-        raise InputError("fewer than three true poses lie within the estimate's time span")
+    require(known.sum() >= 3, "fewer than three true poses lie within the estimate's time span")
     return rms(position_errors_m(truth[known], aligned(truth[known], estimate[known])))

@@ -13,7 +13,7 @@ from experiments.gate.compare import WHICH, Finding, compare, failed, how
 from experiments.gate.suite import ERRORS, Suite, read_suite, run_suite, suite_path
 from experiments.runs.paths import packaged, results
 from experiments.runs.version import code_version
-from sim.errors import InputError
+from sim.errors import InputError, require
 from sim.files import write_whole
 
 _COUNT = re.compile(r"(\d+) rows")  # in a baseline's first line, to recognise one cut short
@@ -180,8 +180,9 @@ def accept(
     list of Path
         Files written.
     """
-    if not reason.strip():
-        raise InputError('--accept needs a reason, such as --accept "faster matching, 2 % worse"')
+    require(
+        reason.strip(), '--accept needs a reason, such as --accept "faster matching, 2 % worse"'
+    )
     whole = read_suite(suite_path(suite_name))
     suite = whole.of(only)
     names = [entry.name for entry in suite.estimators]
@@ -189,11 +190,11 @@ def accept(
     paths = baseline_paths(suite_name)
     old = {key: read_baseline(path) for key, path in paths.items() if path.exists()}
     for key, path in paths.items():
-        if key not in old and len(names) < len(known):
-            raise InputError(
-                f"{path}: no baseline yet, and one of {', '.join(names)} alone would not do; "
-                "accept the whole suite, without --only"
-            )
+        require(
+            key in old or len(names) >= len(known),
+            f"{path}: no baseline yet, and one of {', '.join(names)} alone would not do; "
+            "accept the whole suite, without --only",
+        )
     rows = run_suite(suite, repeats_of(suite, of_baseline=True), on_progress=on_progress)
     bad = rows[failed(rows)]
     if len(bad):

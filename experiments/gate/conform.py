@@ -20,7 +20,7 @@ from experiments.runs.seeds import stream
 from experiments.runs.targets import make
 from sim import se2
 from sim.arrays import Array
-from sim.errors import InputError
+from sim.errors import InputError, require
 from sim.recording import Frame, Recording
 from sim.world import World
 
@@ -244,11 +244,11 @@ def _moved_prior(prior: Prior) -> Prior:
     if isinstance(known_map, World):
         known_map = move_world(known_map, MOTION)
     elif known_map is not None:
-        if not hasattr(known_map, "moved"):
-            raise InputError(
-                f"a map of type {type(known_map).__name__} cannot be moved with the world; give "
-                "it a method moved(T_new_old)"
-            )
+        require(
+            hasattr(known_map, "moved"),
+            f"a map of type {type(known_map).__name__} cannot be moved with the world; give "
+            "it a method moved(T_new_old)",
+        )
         known_map = known_map.moved(MOTION)
     if prior.mean is None or prior.covariance is None:
         return dataclasses.replace(prior, map=known_map)
@@ -336,15 +336,13 @@ def _of_class(target: str, arguments: Sequence[str]) -> Make:
     settings: Any = {"_target_": target.replace(":", ".")}
     remedy = "give MODULE:CLASS of an estimator, and its arguments as key=value"
     for argument in arguments:
-        if "=" not in argument:
-            raise InputError(f"{argument}: constructor arguments are key=value")
+        require("=" in argument, f"{argument}: constructor arguments are key=value")
     try:
         settings |= OmegaConf.to_object(OmegaConf.from_dotlist(list(arguments)))
         estimator = make(settings, "estimator")
     except (InputError, yaml.YAMLError) as error:
         raise InputError(f"{str(error).splitlines()[0]}; {remedy}") from error
-    if not callable(getattr(estimator, "step", None)):
-        raise InputError(f"{target} has no method step; {remedy}")
+    require(callable(getattr(estimator, "step", None)), f"{target} has no method step; {remedy}")
     return lambda: make(settings, "estimator")
 
 

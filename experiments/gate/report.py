@@ -15,7 +15,7 @@ from experiments.gate.compare import Change, Finding
 from experiments.gate.suite import printable
 from experiments.report.export import to_markdown
 from experiments.runs.console import progress
-from sim.errors import InputError
+from sim.errors import InputError, require
 from sim.files import write_whole
 
 LABELS = {"ate_rmse_m": "position", "ate_aligned_rmse_m": "aligned", "heading_rmse_rad": "heading"}
@@ -41,8 +41,7 @@ def run_check(
             for path in accept(suite, reason, only, release=release, on_progress=on_progress):
                 print(path)
         return False
-    if release:
-        raise InputError("--release goes with --accept REASON")
+    require(not release, "--release goes with --accept REASON")
     on_github = os.environ.get("GITHUB_ACTIONS") == "true"
     page = os.environ.get("GITHUB_STEP_SUMMARY") if on_github else None
     for report in (junit, summary, page):

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from sim import se2
 from sim.arrays import Array
-from sim.errors import InputError
+from sim.errors import require
 from sim.files import write_whole
 from sim.formats import assemble
 from sim.formats.text import Rows, Words, read_words
@@ -277,8 +277,10 @@ def write_carmen(path: Path, recording: Recording) -> None:
     InputError
         If the recording has no laser, or the file cannot be written.
     """
-    if "laser" not in recording.logs:
-        raise InputError(f"{path}: a CARMEN log is of a laser, and this recording has none")
+    require(
+        "laser" in recording.logs,
+        f"{path}: a CARMEN log is of a laser, and this recording has none",
+    )
     laser, log = recording.sensor("laser", Laser), recording.log("laser")
     steps = arc_increment(np.diff(recording.wheels.position_m, axis=0), recording.robot.track_m)
     poses = assemble.chained(steps)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.arrays import Array
-from sim.errors import InputError
+from sim.errors import InputError, require
 from sim.formats import assemble
 from sim.formats.rosbag import (
     ABOUT,
@@ -309,8 +309,10 @@ def _laser(
     first = topic.messages[0]
     n_beams, step = len(first.ranges), float(first.angle_increment)
     odd = [i for i, m in enumerate(topic.messages) if len(m.ranges) != n_beams]
-    if odd or n_beams < 1:
-        raise InputError(f"{path}: message {odd[0] if odd else 0} of the scans has another size")
+    require(
+        not odd and n_beams >= 1,
+        f"{path}: message {odd[0] if odd else 0} of the scans has another size",
+    )
     stamps = _stamps(topic)
     rows = assemble.in_order(stamps, "scans", notes)
     raw = np.stack([np.asarray(topic.messages[i].ranges, np.float32) for i in rows])
@@ -468,8 +470,7 @@ def _tf_odometry(topics: dict[str, _Topic]) -> tuple[Array, Array]:
 def _messages(path: Path) -> tuple[dict[str, _Topic], dict[str, Any]]:
     """All messages of the types we read, by topic; and what the bag says about a recording."""
     library()
-    if not path.exists():
-        raise InputError(f"{path}: no such bag")
+    require(path.exists(), f"{path}: no such bag")
     topics: dict[str, _Topic] = {}
     about: dict[str, Any] = {}
     try:
@@ -504,8 +505,7 @@ def _messages(path: Path) -> tuple[dict[str, _Topic], dict[str, Any]]:
     except Exception as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split())[:200]
         raise InputError(f"{path}: damaged or not a bag ({reason})") from error
-    if not topics:
-        raise InputError(f"{path}: holds no odometry, scans or transforms")
+    require(topics, f"{path}: holds no odometry, scans or transforms")
     return topics, about
 
 

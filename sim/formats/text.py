@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sim.arrays import Array
-from sim.errors import InputError
+from sim.errors import InputError, require
 
 Rows = NDArray[np.int64]
 
@@ -44,10 +44,10 @@ def read_bytes(path: Path, most_bytes: int = MOST_BYTES) -> bytes:
         with path.open("rb") as file:
             for part in _unpacked(file):
                 size += len(part)
-                if size > most_bytes:
-                    raise InputError(
-                        f"{path}: more than {MOST_BYTES >> 20} MiB of data; cut the log in parts"
-                    )
+                require(
+                    size <= most_bytes,
+                    f"{path}: more than {MOST_BYTES >> 20} MiB of data; cut the log in parts",
+                )
                 parts.append(part)
     except (OSError, EOFError, ValueError, zlib.error, lzma.LZMAError) as error:
         reason = getattr(error, "strerror", None) or error
