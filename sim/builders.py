@@ -6,7 +6,7 @@ conf/world/<name>.yaml and nowhere else.
 
 import math
 from collections.abc import Callable
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -129,21 +129,18 @@ def rooms(
     plan = Plan()
     plan.rectangle((0, 0), (n_x * room_m, n_y * room_m))
     door = [(room_m / 2, door_m)]
-    for i in range(n_x):
-        for j in range(n_y):
-            x, y = i * room_m, j * room_m
-            plan.place("room", x, y, x + room_m, y + room_m)
-            if i + 1 < n_x:
-                plan.wall((x + room_m, y), (x + room_m, y + room_m), gaps=door)
-                plan.door((x + room_m, y + room_m / 2), (1, 0))
-            if j + 1 < n_y:
-                plan.wall((x, y + room_m), (x + room_m, y + room_m), gaps=door)
-                plan.door((x + room_m / 2, y + room_m), (0, 1))
+    corners = [(i * room_m, j * room_m) for i in range(n_x) for j in range(n_y)]
+    for x, y in corners:
+        plan.place("room", x, y, x + room_m, y + room_m)
+        if x < (n_x - 1) * room_m:
+            plan.wall((x + room_m, y), (x + room_m, y + room_m), gaps=door)
+            plan.door((x + room_m, y + room_m / 2), (1, 0))
+        if y < (n_y - 1) * room_m:
+            plan.wall((x, y + room_m), (x + room_m, y + room_m), gaps=door)
+            plan.door((x + room_m / 2, y + room_m), (0, 1))
     plan.tour = [((i + 0.5) * room_m, (j + 0.5) * room_m) for i, j in _grid_tour(n_x, n_y)]
-    for i in range(n_x):
-        for j in range(n_y):
-            low = (i * room_m, j * room_m)
-            plan.furnish(rng, low, np.add(low, room_m).tolist(), objects_per_room)
+    for low in corners:
+        plan.furnish(rng, low, np.add(low, room_m).tolist(), objects_per_room)
     return plan.world(
         "rooms",
         rng,
@@ -238,18 +235,15 @@ def office(
         ]
         plan.wall((left, inner_high), (right, inner_high))
         if court:
-            low, high = (left + column, mouth), (right - column, inner_high)
-            plan.close(rectangle_corners(low, high))
+            plan.close(rectangle_corners((left + column, mouth), (right - column, inner_high)))
     rooms = [room for suite in suites for room in _suite(plan, rng, *suite)]
-    mid = c / 2
-    y0, y1 = south + mid, H - mid
-    x0, xm, x1 = mid, passage + mid, W - mid
+    x0, xm, x1 = c / 2, passage + c / 2, W - c / 2
+    y0, y1 = south + c / 2, H - c / 2
     plan.place("corridor_bare", c, H - c, passage, H)
     plan.place("corridor_objects", 0, inner_low, c, inner_high)
     plan.place("corridor_objects", W - c, inner_low, W, inner_high)
-    for x in (0.0, passage, W - c):
-        for y in (south, H - c):
-            plan.place("corner", x, y, x + c, y + c)
+    for x, y in product((0.0, passage, W - c), (south, H - c)):
+        plan.place("corner", x, y, x + c, y + c)
     loop = [(x0, y0), (xm, y0), (xm, y1), (x0, y1), (x0, y0)]
     second = [(x1, y0), (x1, y1), (xm, y1), (xm, y0), (x0, y0)]
     plan.tour = _with_visits([*loop, *second], rooms, rng, rooms_visited)
@@ -357,9 +351,8 @@ def _with_visits(
     path: list[tuple[float, float]], rooms: list[_Room], rng: np.random.Generator, count: int
 ) -> list[tuple[float, float]]:
     """Tour along the path that looks into `count` of the rooms, in and out by the door."""
-    chosen = [rooms[row] for row in rng.permutation(len(rooms))[:count]]
     stops: list[list[tuple[float, _Room, Array]]] = [[] for _ in path]
-    for room in chosen:
+    for room in (rooms[row] for row in rng.permutation(len(rooms))[:count]):
         feet = []
         for start, end in pairwise(np.array(path)):
             way = end - start
@@ -373,8 +366,7 @@ def _with_visits(
     for point, visits in zip(path, stops, strict=True):
         tour.append(point)
         for _, room, foot in sorted(visits, key=lambda stop: stop[0]):
-            inside = room.door + 2.0 * room.inward
-            tour += [(float(x), float(y)) for x, y in (foot, inside, foot)]
+            tour += [(float(x), float(y)) for x, y in (foot, room.door + 2.0 * room.inward, foot)]
     return tour
 
 
@@ -444,11 +436,10 @@ def _town(
     plan.tour = _rounded(path, radius_m=0.35 * street_m, spacing_m=4.0)
     for x, y in path[:-1]:
         plan.place("corner", *(v + d * street_m / 2 for d in (-1, 1) for v in (x, y)))
-    for i in range(n_x):
-        for j in range(n_y):
-            low = np.array([i * pitch, j * pitch])
-            build(plan, rng, low, block_m)
-            _trees(plan, rng, low, block_m, trees_per_block)
+    for cell in product(range(n_x), range(n_y)):
+        low = pitch * np.array(cell)
+        build(plan, rng, low, block_m)
+        _trees(plan, rng, low, block_m, trees_per_block)
     return plan.world(name, rng)
 
 
@@ -477,8 +468,7 @@ def _lawn(plan: Plan, rng: np.random.Generator, low: Array, block_m: float) -> N
         corners = box_corners(centre.tolist(), size.tolist(), yaw)
         if rng.random() < 0.5:  # an L: the corner that is cut out lies at a quarter of the box
             a, b, c, d = corners
-            mid = corners.mean(axis=0)
-            corners = np.array([a, b, (b + c) / 2, mid, (c + d) / 2, d])
+            corners = np.array([a, b, (b + c) / 2, corners.mean(axis=0), (c + d) / 2, d])
         plan.prism(corners, 0.0, top)
 
 

@@ -34,3 +34,9 @@ def write_whole(path: Path) -> Iterator[Path]:
     finally:
         with suppress(OSError):
             part.unlink()
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file, whole or not at all, as `write_whole` does."""
+    with write_whole(path) as part:
+        part.write_text(text, encoding="utf-8")

@@ -162,41 +162,52 @@ class Tour:
         return facing_second(path), Pursuit(self, robot, path)
 
 
-class Pursuit:
-    """Driver of a Tour: pure pursuit, 50 times a second, with limited acceleration."""
+class _Controller:
+    """Driver that steers 50 times a second with limited acceleration, and rests at its goal."""
 
-    def __init__(self, tour: Tour, robot: DifferentialDrive, path: Array) -> None:
-        self._tour, self._path = tour, path
-        self._along_m = _along_m(path)
+    def __init__(self, robot: DifferentialDrive, last_s: float) -> None:
         self._most = _accelerations(robot)
-        self._done_m, self._velocity = 0.0, np.zeros(2)
-        self._off_m = 0.0
-        self._rest_ticks: int | None = None
-        self._last_tick = round(300 * (4.0 * self._along_m[-1] / tour.speed_mps + 60.0))
-        self._late = False
+        self._velocity, self._rest_ticks = np.zeros(2), -1
+        self._last_tick, self._late = round(last_s / TICK_S), False
 
     def command(self, tick: int, pose: Array) -> Array | None:
-        """Velocity (2,) of the tick; None when the robot rests at the last way-point."""
-        if self._rest_ticks is not None:
+        """Velocity (2,) of the tick; None when the robot has rested at its goal."""
+        if self._rest_ticks >= 0:
             self._rest_ticks -= 1
             return None if self._rest_ticks < 0 else np.zeros(2)
         if tick % CONTROL_TICKS:
             return self._velocity
         self._late = tick >= self._last_tick
-        self._project(pose)
-        left_m = self._along_m[-1] - self._done_m
-        if left_m < 0.02 and self._velocity[0] < 0.05:
+        wanted = self._wanted(pose)
+        if wanted is None:
             self._rest_ticks = 60
             return np.zeros(2)
-        self._velocity = _limited(self._wanted(pose, left_m), self._velocity, self._most)
+        self._velocity = _limited(wanted, self._velocity, self._most)
         return self._velocity
 
     @property
     def trouble(self) -> str | None:
-        """`off_route` or `incomplete` (far too slow), else None."""
-        if self._off_m > self._tour.tolerance_m:
-            return "off_route"
+        """`incomplete` (far too slow), else None."""
         return "incomplete" if self._late else None
+
+    def _wanted(self, pose: Array) -> Array | None:
+        """Velocity (2,) to go for; None at the goal."""
+        raise NotImplementedError
+
+
+class Pursuit(_Controller):
+    """Driver of a Tour: pure pursuit."""
+
+    def __init__(self, tour: Tour, robot: DifferentialDrive, path: Array) -> None:
+        self._tour, self._path = tour, path
+        self._along_m = _along_m(path)
+        self._done_m, self._off_m = 0.0, 0.0
+        super().__init__(robot, 4.0 * self._along_m[-1] / tour.speed_mps + 60.0)
+
+    @property
+    def trouble(self) -> str | None:
+        """`off_route` or `incomplete` (far too slow), else None."""
+        return "off_route" if self._off_m > self._tour.tolerance_m else super().trouble
 
     def _project(self, pose: Array) -> None:
         """Advance the progress along the path to the nearest point not far ahead."""
@@ -218,11 +229,14 @@ class Pursuit:
                 best, done_m = gap, at_m
         self._done_m, self._off_m = done_m, best
 
-    def _wanted(self, pose: Array, left_m: float) -> Array:
+    def _wanted(self, pose: Array) -> Array | None:
+        self._project(pose)
+        left_m = self._along_m[-1] - self._done_m
+        if left_m < 0.02 and self._velocity[0] < 0.05:
+            return None
         tour = self._tour
         goal = self._point_at(self._done_m + tour.look_ahead_m)
-        bearing = math.atan2(goal[1] - pose[1], goal[0] - pose[0]) - pose[2]
-        bearing = math.atan2(math.sin(bearing), math.cos(bearing))
+        bearing = _bearing(goal - pose[:2], pose)
         distance = max(float(np.hypot(*(goal - pose[:2]))), 1e-3)
         brake = math.sqrt(2.0 * 0.8 * self._most[0] * max(left_m, 0.0))
         if abs(bearing) > 0.6:  # too sharp for an arc: slow down and turn on the spot
@@ -233,8 +247,7 @@ class Pursuit:
         return np.array([max(v, 0.01), min(max(omega, -limit), limit)])
 
     def _point_at(self, along_m: float) -> Array:
-        columns = [np.interp(along_m, self._along_m, self._path[:, i]) for i in (0, 1)]
-        return np.array(columns)
+        return np.array([np.interp(along_m, self._along_m, self._path[:, i]) for i in (0, 1)])
 
 
 @dataclass(frozen=True)
@@ -297,47 +310,32 @@ class GoToPoints:
         return world.start_pose, GoToPoint(self, robot, transform(world.start_pose, path))
 
 
-class GoToPoint:
-    """Driver of GoToPoints, 50 times a second, with limited acceleration."""
+class GoToPoint(_Controller):
+    """Driver of GoToPoints."""
 
     def __init__(self, route: GoToPoints, robot: DifferentialDrive, path: Array) -> None:
-        self._route, self._points = route, path[1:]
-        self._most = _accelerations(robot)
-        self._velocity, self._reached = np.zeros(2), 0
-        self._rest_ticks: int | None = None
+        self._route, self._points, self._reached = route, path[1:], 0
         turns_s = math.pi * len(self._points) / route.turn_rate_radps
-        slowest_s = 4.0 * (_along_m(path)[-1] / route.speed_mps + turns_s) + 60.0
-        self._last_tick, self._late = round(slowest_s / TICK_S), False
+        super().__init__(robot, 4.0 * (_along_m(path)[-1] / route.speed_mps + turns_s) + 60.0)
 
-    def command(self, tick: int, pose: Array) -> Array | None:
-        """Velocity (2,) of the tick; None when the robot rests at the last point."""
-        if self._rest_ticks is not None:
-            self._rest_ticks -= 1
-            return None if self._rest_ticks < 0 else np.zeros(2)
-        if tick % CONTROL_TICKS:
-            return self._velocity
-        self._late = tick >= self._last_tick
+    def _wanted(self, pose: Array) -> Array | None:
         route, offset = self._route, self._points[self._reached] - pose[:2]
         if np.hypot(*offset) <= route.tolerance_m:
             self._reached += 1
             if self._reached == len(self._points):
-                self._rest_ticks = 60
-                return np.zeros(2)
+                return None
             offset = self._points[self._reached] - pose[:2]
-        bearing = math.atan2(offset[1], offset[0]) - pose[2]
-        bearing = math.atan2(math.sin(bearing), math.cos(bearing))
+        bearing = _bearing(offset, pose)
         most = route.turn_rate_radps
         omega = min(max(route.gain_bearing * bearing, -most), most)
-        v = 0.0
-        if abs(bearing) <= route.turn_above_rad:
-            v = min(route.gain_distance * float(np.hypot(*offset)), route.speed_mps)
-        self._velocity = _limited(np.array([v, omega]), self._velocity, self._most)
-        return self._velocity
+        v = min(route.gain_distance * float(np.hypot(*offset)), route.speed_mps)
+        return np.array([v if abs(bearing) <= route.turn_above_rad else 0.0, omega])
 
-    @property
-    def trouble(self) -> str | None:
-        """`incomplete` (far too slow), else None."""
-        return "incomplete" if self._late else None
+
+def _bearing(offset: Array, pose: Array) -> float:
+    """Direction of an offset (2,) in map as the robot sees it, rad, in [-pi, pi]."""
+    bearing = math.atan2(offset[1], offset[0]) - pose[2]
+    return math.atan2(math.sin(bearing), math.cos(bearing))
 
 
 def _accelerations(robot: DifferentialDrive) -> Array:
@@ -365,8 +363,7 @@ def _check_points(given: ArrayLike, wanted: str, at_least: int) -> None:
 
 def _lengthened(path: Array, distance_m: float | None) -> Array:
     """Path (P, 2) cut or repeated to the wanted length, without points that coincide."""
-    keep = np.concatenate([[True], np.hypot(*np.diff(path, axis=0).T) > 1e-6])
-    path = path[keep]
+    path = path[np.concatenate([[True], np.hypot(*np.diff(path, axis=0).T) > 1e-6])]
     if distance_m is None:
         return path
     closed = bool(np.hypot(*(path[0] - path[-1])) < 1e-6)
@@ -409,8 +406,7 @@ def _trapezoid(segment: Segment, robot: DifferentialDrive) -> tuple[float, float
     """Plateau and ramp times, s, and the share of the velocity that the plateau reaches."""
     v, omega, duration_s = segment
     track_m = max(robot.track_m, robot.nominal.track_m)  # neither body nor wheels are hurried
-    fastest_mps = abs(v) + abs(omega) * track_m / 2.0
-    ramp_s = fastest_mps / robot.max_acceleration_mps2
+    ramp_s = (abs(v) + abs(omega) * track_m / 2.0) / robot.max_acceleration_mps2
     if ramp_s <= duration_s:
         return duration_s - ramp_s, ramp_s, 1.0
     # peak share p reached after p ramp_s: the area p^2 ramp_s must be the duration

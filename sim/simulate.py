@@ -187,9 +187,8 @@ class _Firing:
 
     def __call__(self, stamp: float, pose: Array) -> Reading | None:
         last = self._last
-        view = View(stamp, pose, last.world, last.rays, last.stamp, last.pose)
-        self._last = view
-        return self._probe(view)
+        self._last = View(stamp, pose, last.world, last.rays, last.stamp, last.pose)
+        return self._probe(self._last)
 
 
 def _drive(
@@ -215,8 +214,7 @@ def _drive(
         due = [name for name, period in periods.items() if tick % period == 0]
         wanted = driver.command(tick, feedback.pose(tick, pose, encoder))
         if due or wanted is None:
-            counts = robot.encoder_reading(encoder)
-            logs["/frames"].append((tick, (counts, travel.copy(), pose)))
+            logs["/frames"].append((tick, (robot.encoder_reading(encoder), travel.copy(), pose)))
         if due:
             readings = {name: probes[name](tick / TICKS_PER_S, pose) for name in due}
             shown = {name: reading for name, reading in readings.items() if reading is not None}

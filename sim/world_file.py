@@ -50,20 +50,17 @@ def read_world(path: Path) -> World:
         isinstance(document, Mapping), f"{path}: must hold keys such as walls, boxes, waypoints"
     )
     _check_keys(document, _KEYS, str(path))
-    walls, heights = [], []
-    for i, entry in enumerate(_list(document, "walls", path)):
-        ends, z = _wall(entry, f"{path}: walls[{i}]")
-        walls.append(ends)
-        heights.append(z)
+    faces = [
+        _wall(entry, f"{path}: walls[{i}]")
+        for i, entry in enumerate(_list(document, "walls", path))
+    ]
     for i, entry in enumerate(_list(document, "boxes", path)):
-        corners, top = _box(entry, f"{path}: boxes[{i}]")
-        for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-            walls.append([*a, *b])
-            heights.append([0.0, top])
+        faces += _box(entry, f"{path}: boxes[{i}]")
+    walls = np.array([ends for ends, _ in faces], float).reshape(-1, 4)
     landmarks = _rows(document, "landmarks", 3, path)
     waypoints = _rows(document, "waypoints", 2, path)
     descriptors, alike = make_descriptors(np.random.default_rng(0), len(landmarks), 0.0)
-    check_tour(waypoints, np.array(walls, float).reshape(-1, 4), path)
+    check_tour(waypoints, walls, path)
     named = document.get("places") or {}
     require(
         isinstance(named, Mapping),
@@ -77,8 +74,8 @@ def read_world(path: Path) -> World:
             )
     return World(
         name=str(document.get("name", path.stem)),
-        walls=np.array(walls, float).reshape(-1, 4),
-        wall_z_m=np.array(heights, float).reshape(-1, 2),
+        walls=walls,
+        wall_z_m=np.array([z for _, z in faces], float).reshape(-1, 2),
         landmarks=landmarks,
         descriptors=descriptors,
         look_alike=alike,
@@ -90,9 +87,7 @@ def read_world(path: Path) -> World:
 
 def check_tour(waypoints: Any, walls: Any, path: Path) -> None:
     """Refuse a tour that runs through a wall: no robot can follow it."""
-    if len(walls) == 0:
-        return
-    for i in range(len(waypoints) - 1):
+    for i in range(len(waypoints) - 1 if len(walls) else 0):
         leg = np.concatenate(waypoints[i : i + 2])[None]
         require(
             gaps_m(leg, walls).min() != 0.0,
@@ -107,9 +102,7 @@ def _start(document: Mapping[str, Any], waypoints: Any, path: Path) -> Any:
             document["start_pose"], 3, f"{path}: start_pose", "x, y, heading_deg"
         )
         return np.array([x, y, math.radians(degrees)])
-    if len(waypoints) >= 2:
-        return facing_second(waypoints)
-    return np.zeros(3)
+    return facing_second(waypoints) if len(waypoints) >= 2 else np.zeros(3)
 
 
 def _wall(entry: Any, where: str) -> tuple[list[float], list[float]]:
@@ -132,7 +125,8 @@ def _wall(entry: Any, where: str) -> tuple[list[float], list[float]]:
     return ends, z
 
 
-def _box(entry: Any, where: str) -> tuple[Any, float]:
+def _box(entry: Any, where: str) -> list[tuple[list[float], list[float]]]:
+    """Ends, and bottom and top, of the four faces."""
     require(
         isinstance(entry, Mapping),
         f"{where} must be a mapping of {', '.join(_BOX_KEYS)}, got {entry!r}",
@@ -149,7 +143,10 @@ def _box(entry: Any, where: str) -> tuple[Any, float]:
         (numbers["length"], numbers["width"]),
         math.radians(numbers["heading_deg"]),
     )
-    return corners, numbers["height"]
+    return [
+        ([*a, *b], [0.0, numbers["height"]])
+        for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)
+    ]
 
 
 def _check_keys(entry: Mapping[Any, Any], known: tuple[str, ...], where: str) -> None:
@@ -158,9 +155,7 @@ def _check_keys(entry: Mapping[Any, Any], known: tuple[str, ...], where: str) ->
 
 
 def _list(document: Mapping[str, Any], key: Any, path: Path, prefix: str = "") -> list[Any]:
-    value = document.get(key)
-    if value is None:
-        return []
+    value = [] if document.get(key) is None else document[key]
     require(isinstance(value, list), f"{path}: {prefix}{key} must be a list, got {value!r}")
     return list(value)
 

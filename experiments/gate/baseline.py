@@ -14,7 +14,7 @@ from experiments.gate.suite import ERRORS, Suite, read_suite, run_suite, suite_p
 from experiments.runs.paths import packaged, results
 from experiments.runs.version import code_version
 from sim.errors import InputError, require
-from sim.files import write_whole
+from sim.files import write_text
 
 _COUNT = re.compile(r"(\d+) rows")  # in a baseline's first line, to recognise one cut short
 _COLUMNS = (*WHICH, "checksum", "fingerprint", *ERRORS, "status")
@@ -94,8 +94,7 @@ def write_baseline(baseline: Baseline, path: Path) -> None:
     """Write a baseline: the number of its rows and its history as comments, then its rows."""
     head = "".join(f"# {line}\n" for line in (f"{len(baseline.rows)} rows", *baseline.history))
     table = baseline.rows[list(_COLUMNS)].to_csv(index=False, float_format="%.9g")
-    with write_whole(path) as part:
-        part.write_text(head + table, encoding="utf-8")
+    write_text(path, head + table)
 
 
 def renewed(

@@ -16,7 +16,7 @@ from experiments.gate.suite import printable
 from experiments.report.export import to_markdown
 from experiments.runs.console import progress
 from sim.errors import InputError, require
-from sim.files import write_whole
+from sim.files import write_text
 
 LABELS = {"ate_rmse_m": "position", "ate_aligned_rmse_m": "aligned", "heading_rmse_rad": "heading"}
 _MEANING = {
@@ -59,9 +59,9 @@ def run_check(
         findings = check(suite, only, on_progress)
     _say(as_text(findings, detectable))
     if junit is not None:
-        write_text(as_junit(findings), junit)
+        write_text(junit, as_junit(findings))
     if summary is not None:
-        write_text(as_markdown(findings, detectable), summary)
+        write_text(summary, as_markdown(findings, detectable))
     if on_github:
         _say(as_annotations(findings))
     if page:
@@ -204,12 +204,6 @@ def as_junit(findings: Sequence[Finding]) -> str:
                 ET.SubElement(case, "system-out").text = sentence(finding)
     ET.indent(root)
     return '<?xml version="1.0" encoding="utf-8"?>\n' + ET.tostring(root, encoding="unicode") + "\n"
-
-
-def write_text(text: str, path: Path) -> None:
-    """Write a report, whole or not at all."""
-    with write_whole(path) as part:
-        part.write_text(text, encoding="utf-8")
 
 
 def last_line(findings: Sequence[Finding]) -> str:

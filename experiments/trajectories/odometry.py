@@ -12,7 +12,7 @@ from estimators.base import Estimate
 from sim import se2
 from sim.arrays import Array
 from sim.errors import InputError, require
-from sim.files import write_whole
+from sim.files import write_text, write_whole
 
 # Entries of x, y, heading in row-major 6x6 covariances in order x, y, z, rotX, rotY, rotZ.
 PLANAR = (slice(None), [[0], [1], [5]], [0, 1, 5])
@@ -83,8 +83,7 @@ def write_odometry_json(estimate: Estimate, path: Path) -> None:
         text = json.dumps(odometry_records(estimate), allow_nan=False)
     except ValueError:
         raise InputError(f"{path}: the estimate is not finite; write it as CSV") from None
-    with write_whole(path) as part:
-        part.write_text(text)
+    write_text(path, text)
 
 
 def write_odometry_csv(estimate: Estimate, path: Path) -> None:

@@ -23,11 +23,11 @@ from numpy.typing import NDArray
 from sim import se2
 from sim.arrays import Array
 from sim.errors import require
-from sim.files import write_whole
+from sim.files import write_text
 from sim.formats import assemble
 from sim.formats.text import Rows, Words, read_words
 from sim.recording import Log, Recording, Truth, WheelLog
-from sim.robot import RobotGeometry, arc_increment
+from sim.robot import RobotGeometry
 from sim.sensors import Encoder, Laser, Mount
 
 Poses = Literal["odometry", "reference"]
@@ -109,15 +109,10 @@ def read_carmen(path: Path) -> CarmenLog:
 def parse_carmen(words: Words) -> CarmenLog:
     """The log in a file's words."""
     notes: assemble.Notes = {}
-    odometry_lines = words.lines_of(_ODOM)
-    odometry = words.finite(odometry_lines, 1, 7, "ODOM")
-    order = assemble.in_order(odometry[:, 6], "odometry", notes)
-    odometry = odometry[order]
+    odometry = words.finite(words.lines_of(_ODOM), 1, 7, "ODOM")
+    odometry = odometry[assemble.in_order(odometry[:, 6], "odometry", notes)]
     flaser, robotlaser = words.lines_of(_FLASER), words.lines_of(_ROBOTLASER)
-    if len(robotlaser) >= len(flaser):
-        lines, count_column = robotlaser, 8
-    else:
-        lines, count_column = flaser, 1
+    lines, count_column = (robotlaser, 8) if len(robotlaser) >= len(flaser) else (flaser, 1)
     assemble.require_readings(len(lines), 1, words.where, "FLASER or ROBOTLASER1 lines")
     counts = words.whole(lines, count_column, "the number of beams", 1, _MOST_BEAMS)
     n_beams = int(np.bincount(counts).argmax())
@@ -257,13 +252,9 @@ def _edges(words: Words, scan_lines: Rows) -> Array:
     words.refuse(above < 0, scan_lines, "a scan without its VERTEX2")
     ids = words.finite(vertices, 1, 1, "VERTEX2")[:, 0]
     values = words.finite(edges, 1, 5, "EDGE2")
-    motion: dict[tuple[float, float], Array] = {}
-    for row in values:
-        motion.setdefault((row[0], row[1]), row[2:])
-    chain = ids[above]
+    motion = {(row[0], row[1]): row[2:] for row in values[::-1]}  # the first of a pair counts
     unknown = np.full(3, np.nan)
-    pairs = pairwise(chain)
-    return np.array([motion.get((float(a), float(b)), unknown) for a, b in pairs])
+    return np.array([motion.get(pair, unknown) for pair in pairwise(ids[above])])
 
 
 def write_carmen(path: Path, recording: Recording) -> None:
@@ -282,8 +273,7 @@ def write_carmen(path: Path, recording: Recording) -> None:
         f"{path}: a CARMEN log is of a laser, and this recording has none",
     )
     laser, log = recording.sensor("laser", Laser), recording.log("laser")
-    steps = arc_increment(np.diff(recording.wheels.position_m, axis=0), recording.robot.track_m)
-    poses = assemble.chained(steps)
+    poses = assemble.rolled(recording.wheels, recording.robot.track_m)
     heading = np.unwrap(poses[:, 2])
     lines = [
         f"ODOM {x:.17g} {y:.17g} {a:.17g} 0 0 0 {t:.17g} estima {t:.17g}"
@@ -299,5 +289,4 @@ def write_carmen(path: Path, recording: Recording) -> None:
         numbers = " ".join(f"{r:.9g}" for r in np.where(np.isfinite(scan), scan, laser.max_range_m))
         both = " ".join(f"{v:.17g}" for v in (*of_laser, *at))
         lines.append(f"{head} {numbers} 0 {both} 0 0 0 0 0 {t:.17g} estima {t:.17g}")
-    with write_whole(path) as part:
-        part.write_text("\n".join(lines) + "\n")
+    write_text(path, "\n".join(lines) + "\n")

@@ -31,8 +31,7 @@ def parse_intel(data: bytes, where: str) -> tuple[Array, Array, Array]:
         Naming the file and the line (of the syntax) or the stamp that is wrong.
     """
     try:
-        tree = json.loads(data)
-        entries = tree["map"].items()
+        entries = json.loads(data)["map"].items()
     except json.JSONDecodeError as error:
         raise InputError(f"{where}:{error.lineno}: not JSON ({error.msg})") from None
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:

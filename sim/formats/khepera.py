@@ -120,8 +120,7 @@ def to_recording(
     steps = log.rolled_rad * np.array(wheel_diameters_m) / 2.0
     travel = np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
     laser = np.broadcast_to(np.array(T_base_laser), log.laser_motion.shape)
-    motion = se2.compose(laser, se2.compose(log.laser_motion, se2.inverse(laser)))
-    poses = chained(motion)
+    poses = chained(se2.compose(laser, se2.compose(log.laser_motion, se2.inverse(laser))))
     return Recording(
         frame_stamps=stamps,
         wheels=WheelLog(stamps.copy(), travel),

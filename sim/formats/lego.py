@@ -80,8 +80,7 @@ def parse_reference(words: Words) -> tuple[Array, Array]:
 
 def parse_cylinders(words: Words) -> Array:
     """Positions and diameters (N, 3), m, of the L lines."""
-    lines = words.lines_of("L")
-    return words.finite(lines, 2, 3, "an L line") / 1000.0
+    return words.finite(words.lines_of("L"), 2, 3, "an L line") / 1000.0
 
 
 def read_lego(

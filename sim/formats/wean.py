@@ -151,5 +151,4 @@ def parse_grid(data: bytes, where: str) -> Grid:
     if len(bad):
         line = int(np.searchsorted(cells.first, bad[0], side="right")) - 1
         raise cells.error(line, "a cell must be -1 or a number from 0 to 1")
-    values = np.where(cells.values < 0.0, np.nan, cells.values)
-    return Grid(values.reshape(n_x, n_y), cell_m)
+    return Grid(np.where(cells.values < 0.0, np.nan, cells.values).reshape(n_x, n_y), cell_m)
