@@ -219,8 +219,8 @@ class Mcl:
             else:
                 self._weigh(ends)
         now = self._belief.then(self._motion)
-        covariance = (now.covariance + now.covariance.T) / 2.0
-        return Belief(now.mean.copy(), covariance, {**self._extras, **extras})
+        symmetric = (now.covariance + now.covariance.T) / 2.0
+        return Belief(now.mean.copy(), symmetric, self._extras | extras)
 
     def _is_due(self) -> bool:
         """Whether the robot has come far enough since the last scan used."""
@@ -245,8 +245,7 @@ class Mcl:
         self._log_weights = self._weighed(of_scan)
         self._belief = self._summed_up()
         share = self._injected_share(of_scan, ends.shape[1])
-        poor = self._extras["ess"] < self.ess_share * len(self._poses)
-        if poor or share > 0.0:
+        if share > 0.0 or self._extras["ess"] < self.ess_share * len(self._poses):
             self._draw(share, ends)
 
     def _weighed(self, of_scan: Array) -> Array:
@@ -263,9 +262,7 @@ class Mcl:
                 poor = effective_sample_size(self._log_weights + middle * of_scan) < least
                 low, high = (low, middle) if poor else (middle, high)
             weights = self._log_weights + low * of_scan
-        if underflowed(weights):
-            return np.zeros(len(weights))
-        return weights - np.max(weights)
+        return np.zeros(len(weights)) if underflowed(weights) else weights - np.max(weights)
 
     def _injected_share(self, of_scan: Array, n_beams: int) -> float:
         """Share of particles to inject: the short average of the fit against the long one.

@@ -74,9 +74,9 @@ class Refiner:
                     best, best_node = found, candidate
                     if best.overlap > _GOOD_OVERLAP:
                         return self._posed(best, source, best_node)
-        if best is None:
-            return Refinement(None, None, status)
-        return self._posed(best, source, best_node)
+        return (
+            Refinement(None, None, status) if best is None else self._posed(best, source, best_node)
+        )
 
     def _target(self, node: int) -> PreparedScan:
         """Return a node's slice, prepared when it is first asked for."""

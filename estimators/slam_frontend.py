@@ -22,7 +22,7 @@ from estimators.options import (
 )
 from estimators.stereo import NoiseAt, NoiseModel, StereoModel
 from sim.arrays import Array, Floats, Ints
-from sim.errors import InputError, require
+from sim.errors import require, required
 from sim.sensors import Reading
 
 Association = Literal["known", "mahalanobis", "descriptor"]
@@ -145,11 +145,11 @@ class SlamFrontEnd:
         used = self.camera.usable(all_points)
         status = "" if used.all() else "observation without depth rejected"
         if self.association == "known" and used.any():
-            if all_ids is None:
-                raise InputError(
-                    f"{self._estimator}: observations without ids; set "
-                    "estimator.association=mahalanobis or descriptor"
-                )
+            all_ids = required(
+                all_ids,
+                f"{self._estimator}: observations without ids; set "
+                "estimator.association=mahalanobis or descriptor",
+            )
             rows = np.flatnonzero(used)
             first = np.unique(all_ids[rows], return_index=True)[1]
             if len(first) < len(rows):

@@ -257,9 +257,8 @@ class TopologicalMcl:
             {self.place, self.lidar3d} & set(prior.sensors),
             "topological_mcl needs place descriptors or a 3D lidar; choose sensors=lidar3d",
         )
-        self._lidar = None
-        if self.lidar3d in prior.sensors:
-            self._lidar = sensor_of(prior.sensors, self.lidar3d, Lidar3D)
+        has_lidar = self.lidar3d in prior.sensors
+        self._lidar = sensor_of(prior.sensors, self.lidar3d, Lidar3D) if has_lidar else None
         self._track_m = prior.robot.track_m
         self._kind = describers.KINDS.get(known.descriptor)
         self._node_of_state = np.concatenate([self._graph.tail, self._graph.head])
@@ -268,9 +267,8 @@ class TopologicalMcl:
         self._squares = np.einsum("nd,nd->n", known.descriptors, known.descriptors)
         self._sigma_l_m = self.sigma_l_m or known.spacing_m or 1.0
         self._near_m = 1.5 * max(known.spacing_m, 1.0)
-        self._refiner = None
-        if self.refine and known.slices_m.size and self._lidar is not None:
-            self._refiner = Refiner(known, self._lidar)
+        refines = self.refine and known.slices_m.size > 0
+        self._refiner = Refiner(known, self._lidar) if refines and self._lidar else None
         copy, node = np.indices((self.particles_per_node, len(known))).reshape(2, -1)
         self._edge = self._graph.first_out[node] + copy % self._graph.degree[node]
         self._along_m = np.zeros(len(node))
@@ -341,10 +339,10 @@ class TopologicalMcl:
         n_new = rng.binomial(n, self.injection) if self.injection > 0.0 else 0
         if n_new:
             slots = rng.choice(n, n_new, replace=False)
-            odds = np.zeros(len(nearest))
-            if self.weighting != "M1":
-                odds = -((_scaled(away) / self.sigma_m) ** 2)
-            node = nearest[resample(odds, n_new, rng, "multinomial")]
+            alike = (
+                np.zeros(len(nearest)) if self.weighting == "M1" else _scaled(away) / self.sigma_m
+            )
+            node = nearest[resample(-(alike**2), n_new, rng, "multinomial")]
             out = (rng.random(n_new) * self._graph.degree[node]).astype(np.int64)
             self._edge[slots] = self._graph.first_out[node] + out
             self._along_m[slots] = 0.0
@@ -446,8 +444,7 @@ class TopologicalMcl:
         mass = _sums(state, np.exp(self._log_weights), len(self._poses))
         held = np.flatnonzero(mass)
         shares, poses, nodes = mass[held], self._poses[held], self._node_of_state[held]
-        by_node = _sums(nodes, shares, len(known))
-        mode, mode_mass = self._mode(by_node)
+        mode, mode_mass = self._mode(_sums(nodes, shares, len(known)))
         if self.estimate == "mode":
             near = np.zeros(len(known), bool)
             near[self._about(mode)] = True
