@@ -29,8 +29,7 @@ class Kind:
 
 def euclidean(query: Floats, database: Floats) -> Array:
     """Distances (N,) from a descriptor (D,) to each of (N, D)."""
-    away: Array = np.linalg.norm((database - query).astype(np.float64), axis=1)
-    return away
+    return np.asarray(np.linalg.norm((database - query).astype(np.float64), axis=1))
 
 
 def polar_heights(points_in_sensor: ArrayLike, sensor_height_m: float) -> Array:
@@ -81,8 +80,7 @@ def ring_key(lidar: Lidar3D, ranges_m: Floats) -> Floats:
     Kim and Kim 2018, eq. (8); turning the robot changes nothing but the binning.
     """
     heights = polar_heights(lidar.points_in_sensor(ranges_m), lidar.mount.z_m)
-    row: Floats = np.mean(heights > 0.0, axis=1).astype(np.float32)
-    return row
+    return np.asarray(np.mean(heights > 0.0, axis=1).astype(np.float32))
 
 
 def _plane_axes() -> Array:

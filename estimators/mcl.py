@@ -319,8 +319,7 @@ class Mcl:
         n_headings = math.ceil(2.0 * math.pi / self.bin_rad)
         column = np.clip(x.astype(np.int64), 0, shape[0] - 1)
         row = np.clip(y.astype(np.int64), 0, shape[1] - 1)
-        bins: Ints = (row * shape[0] + column) * n_headings + heading % n_headings
-        return bins
+        return np.asarray((row * shape[0] + column) * n_headings + heading % n_headings)
 
     def _summed_up(self) -> Gaussian:
         """Belief of the weighted particles, and its extras."""
@@ -330,13 +329,13 @@ class Mcl:
         heaviest = bins == np.argmax(np.bincount(bins, weights))
         mean = weights[heaviest] @ poses[heaviest] / weights[heaviest].sum()
         for _ in range(2):
-            off = _offsets(poses, mean)
+            off = se2.difference(poses, mean)
             near = np.hypot(off[:, 0], off[:, 1]) < _FARTHEST_M
             near &= np.abs(off[:, 2]) < _FARTHEST_RAD
             held = float(weights[near].sum())
             if held > 0.0:
                 mean = mean + weights[near] @ off[near] / held
-        off = _offsets(poses, mean)
+        off = se2.difference(poses, mean)
         covariance = (off * weights[:, None]).T @ off
         mean[2] = se2.wrap(mean[2])
         self._extras = {
@@ -347,13 +346,6 @@ class Mcl:
             "injected": 0,
         }
         return Gaussian(mean, (covariance + covariance.T) / 2.0)
-
-
-def _offsets(poses: Array, mean: Array) -> Array:
-    """Poses (M, 3) less their mean (3,), headings wrapped."""
-    offsets = poses - mean
-    offsets[:, 2] = se2.wrap(offsets[:, 2])
-    return offsets
 
 
 def amcl_alphas(

@@ -183,8 +183,7 @@ class SlamFrontEnd:
         if len(self.origins) == 0:
             return np.zeros((len(image.points), 0))
         products = (image.descriptors @ self._descriptors.T).astype(np.float64)
-        unlikeness: Array = image.descriptors.shape[1] * self._rho * (self._rho - 2.0 * products)
-        return unlikeness
+        return np.asarray(image.descriptors.shape[1] * self._rho * (self._rho - 2.0 * products))
 
     def start(self, image: Image, rows: Ints | NDArray[np.bool_]) -> None:
         """Number the landmarks that these of the image's observations start."""

@@ -174,8 +174,7 @@ class Smoother:
             points = seen["points_in_camera"]
             usable = self._camera.usable(points)
             if usable.any():
-                row = len(self._stamps)
-                self._images.append((row, points[usable], seen["ids"][usable]))
+                self._images.append((len(self._stamps), points[usable], seen["ids"][usable]))
         self._stamps.append(frame.stamp)
         self._dead_reckoned.append(self._belief.mean)
         loose = motion.covariance + _sideways(motion) + _FLOOR
@@ -277,8 +276,7 @@ def solve(
     splits = np.searchsorted(problem.landmark_rows, np.arange(n_landmarks + 1))
     residuals = _Residuals(problem, splits, robust, robust_sigma)
 
-    by_depth = np.lexsort((problem.points_in_camera[:, 2], problem.landmark_rows))
-    nearest = by_depth[splits[:-1]]
+    nearest = np.lexsort((problem.points_in_camera[:, 2], problem.landmark_rows))[splits[:-1]]
     landmarks = problem.camera.place(
         poses[problem.pose_rows[nearest]], problem.points_in_camera[nearest]
     )
@@ -533,8 +531,7 @@ def _sideways(motion: Gaussian) -> Array:
     """
     x, y, turn = motion.mean
     normal = np.array([-math.sin(turn / 2.0), math.cos(turn / 2.0), 0.0])
-    added: Array = np.outer(normal, normal) * ((x**2 + y**2) * motion.covariance[2, 2] / 12.0)
-    return added
+    return np.asarray(np.outer(normal, normal) * ((x**2 + y**2) * motion.covariance[2, 2] / 12.0))
 
 
 def _merged(motions: list[Gaussian]) -> Gaussian:

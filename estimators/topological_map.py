@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from estimators import descriptors as describers
 from sim import se2
 from sim.arrays import Array, Floats, Ints
-from sim.errors import InputError, require
+from sim.errors import InputError, require, required
 from sim.files import write_whole
 from sim.recording import Recording
 from sim.sensors import Lidar3D
@@ -217,9 +217,10 @@ def from_recording(
         As in `from_arrays`; None: 0.75 times the spacing, which also closes a loop.
     """
     require(spacing_m > 0.0, f"spacing_m of a topological map must be positive, got {spacing_m}")
-    log = recording.logs.get("place") or recording.logs.get("lidar3d")
-    if log is None:
-        raise InputError("a topological map needs a recording with 3D clouds or place descriptors")
+    log = required(
+        recording.logs.get("place") or recording.logs.get("lidar3d"),
+        "a topological map needs a recording with 3D clouds or place descriptors",
+    )
     poses = recording.truth_at(log.stamps)
     rows: list[int] = []
     for row in np.flatnonzero(np.isfinite(poses).all(axis=1)):
@@ -251,8 +252,7 @@ def level_slice(lidar: Lidar3D, ranges_m: Floats) -> Floats:
     """
     elevations = lidar.elevations_rad
     ring = int(np.argmin(np.abs(elevations - 1e-6)))
-    level: Floats = (ranges_m[ring] * np.cos(elevations[ring])).astype(np.float32)
-    return level
+    return np.asarray((ranges_m[ring] * np.cos(elevations[ring])).astype(np.float32))
 
 
 _ARRAYS = ("positions_m", "descriptors", "edges", "headings_rad", "slices_m")

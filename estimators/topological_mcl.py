@@ -78,11 +78,9 @@ def node_log_weights(
     if weighting != "M1":
         exponents -= (_scaled(descriptor_distances) / sigma_m) ** 2
     if weighting == "M3":
-        product: Array = exponents.sum(axis=1)
-        return product
+        return np.asarray(exponents.sum(axis=1))
     highest = exponents.max(axis=1)
-    total: Array = highest + np.log(np.exp(exponents - highest[:, None]).sum(axis=1))
-    return total
+    return np.asarray(highest + np.log(np.exp(exponents - highest[:, None]).sum(axis=1)))
 
 
 def _scaled(distances: Array) -> Array:
@@ -94,8 +92,7 @@ def _scaled(distances: Array) -> Array:
 def _normalized(log_weights: Array) -> Array:
     """Finite log weights (M,) whose weights sum to one."""
     shifted = log_weights - log_weights.max()
-    normal: Array = shifted - math.log(np.exp(shifted).sum())
-    return normal
+    return np.asarray(shifted - math.log(np.exp(shifted).sum()))
 
 
 def _sums(places: Ints, values: Array, n: int) -> Array:
@@ -147,8 +144,7 @@ class Graph:
 
     def before(self, edges: Ints, uniform: Array) -> Ints:
         """Edge before each, for driving backwards."""
-        earlier: Ints = self.reverse[self.next(self.reverse[edges], uniform)]
-        return earlier
+        return np.asarray(self.reverse[self.next(self.reverse[edges], uniform)])
 
 
 class TopologicalMcl:
@@ -392,8 +388,7 @@ class TopologicalMcl:
         if self.motion == "paper":
             return self._edge
         past = self._along_m > 0.5 * self._graph.length_m.take(self._edge)
-        states: Ints = self._edge + len(self._graph.tail) * past
-        return states
+        return np.asarray(self._edge + len(self._graph.tail) * past)
 
     def _roll(self, wheel_increments_m: Array) -> None:
         """Move along the edges by the wheels' mean travel."""

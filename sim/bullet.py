@@ -12,7 +12,6 @@ import math
 import os
 import sys
 from collections.abc import Iterator
-from types import TracebackType
 
 import numpy as np
 
@@ -52,7 +51,7 @@ _RAYS, _WALLS, _GROUND, _ROBOT = 1, 2, 4, 8  # collision groups; rays are in the
 _TIPPED_RAD = 0.1
 
 
-class BulletBody:
+class BulletBody(contextlib.AbstractContextManager["BulletBody"]):
     """A world with one robot in the engine; a context manager that frees the engine.
 
     Parameters
@@ -88,15 +87,7 @@ class BulletBody:
         for _ in range(_SETTLE_TICKS):
             self.step(0.0, 0.0)
 
-    def __enter__(self) -> BulletBody:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:

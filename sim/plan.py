@@ -301,8 +301,7 @@ def _to_segment(points: Array, segments: Array) -> Array:
     length2 = np.maximum(np.sum(along**2, axis=-1), 1e-12)
     share = np.clip(np.sum(offset * along, axis=-1) / length2, 0.0, 1.0)
     rest = offset - share[..., None] * along
-    distance: Array = np.hypot(rest[..., 0], rest[..., 1])
-    return distance
+    return np.asarray(np.hypot(rest[..., 0], rest[..., 1]))
 
 
 def _turn(segments: Array, points: Array) -> Array:
@@ -319,8 +318,7 @@ def box_corners(centre: Sequence[float], size: Sequence[float] | Array, yaw_rad:
     """Corners (4, 2), m, counter-clockwise."""
     half = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * np.asarray(size) / 2
     cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
-    corners: Array = half @ np.array([[cos, sin], [-sin, cos]]) + np.asarray(centre)
-    return corners
+    return np.asarray(half @ np.array([[cos, sin], [-sin, cos]]) + np.asarray(centre))
 
 
 def regular(centre: Sequence[float], radius_m: float, sides: int) -> Array:

@@ -195,8 +195,7 @@ class RobotGeometry:
 
 def wheel_variances(travel_m: ArrayLike, kr: float, kl: float) -> Array:
     """Variances (..., 2) m^2 of wheel increments (..., 2): k |ds| (puzzlebot2024, eq. (5))."""
-    variances: Array = np.abs(np.asarray(travel_m, float)) * np.array([kr, kl])
-    return variances
+    return np.asarray(np.abs(np.asarray(travel_m, float)) * np.array([kr, kl]))
 
 
 def wheel_errors(travel_m: ArrayLike, variance_per_m: ArrayLike, rng: np.random.Generator) -> Array:
@@ -217,8 +216,7 @@ def wheel_errors(travel_m: ArrayLike, variance_per_m: ArrayLike, rng: np.random.
         Errors of the shape of `travel_m`.
     """
     travel = np.asarray(travel_m, float)
-    errors: Array = scaled_error(travel, variance_per_m, rng.standard_normal(travel.shape))
-    return errors
+    return np.asarray(scaled_error(travel, variance_per_m, rng.standard_normal(travel.shape)))
 
 
 def scaled_error(travel_m: Any, variance_per_m: Any, standard_normal: Any) -> Any:

@@ -82,8 +82,7 @@ class OpenLoop:
         """Pose (3,) that the commands promise at the end; heading unwrapped."""
         v, omega, duration_s = np.array(self.segments).T
         travel = np.stack([v + omega, v - omega], axis=1) * duration_s[:, None]
-        last: Array = chain(arc_increment(travel, 2.0), start)[-1]
-        return last
+        return np.asarray(chain(arc_increment(travel, 2.0), start)[-1])
 
 
 @dataclass(frozen=True)
@@ -347,8 +346,7 @@ def _accelerations(robot: DifferentialDrive) -> Array:
 def _limited(wanted: Array, velocity: Array, most: Array) -> Array:
     """Velocity (2,) a control period later, on the way to the wanted one."""
     step = CONTROL_TICKS * TICK_S * most
-    limited: Array = velocity + np.clip(wanted - velocity, -step, step)
-    return limited
+    return np.asarray(velocity + np.clip(wanted - velocity, -step, step))
 
 
 def _check_points(given: ArrayLike, wanted: str, at_least: int) -> None:

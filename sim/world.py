@@ -75,8 +75,7 @@ class World:
             f"world {self.name}: {len(self.descriptors)} descriptors for "
             f"{len(self.landmarks)} landmarks",
         )
-        length = np.hypot(*(self.walls[:, 2:] - self.walls[:, :2]).T)
-        for bad in np.flatnonzero(length < 1e-6):
+        for bad in np.flatnonzero(np.hypot(*(self.walls[:, 2:] - self.walls[:, :2]).T) < 1e-6):
             raise InputError(f"world {self.name}: wall {bad} has no length; give it two ends")
         for bad in np.flatnonzero(self.wall_z_m[:, 0] >= self.wall_z_m[:, 1]):
             raise InputError(f"world {self.name}: wall {bad} has its top below its bottom")

@@ -60,9 +60,8 @@ def from_wheel_truth(
         f"{ground.shape}",
     )
     (kr, right), (kl, left) = (_wheel(encoder[:, i], ground[:, i], geometry) for i in (0, 1))
-    track = None
-    if geometry and turns_rad is not None:
-        track = _track(ground, np.asarray(turns_rad, float))
+    turned = geometry and turns_rad is not None
+    track = _track(ground, np.asarray(turns_rad, float)) if turned else None
     return CalibrationResult("wheel_truth", kr, kl, right, left, track, len(encoder))
 
 

@@ -81,8 +81,7 @@ def nees(truth: Array, means: Array, covariances: Array) -> Array:
     Its mean is 3 for a consistent filter. A singular covariance, such as the zero one of a known
     start, predicts no error, so its stamp is left out, as is one that is not finite.
     """
-    error = means - truth
-    error[:, 2] = se2.wrap(error[:, 2])
+    error = se2.difference(means, truth)
     sigma = np.sqrt(np.maximum(np.diagonal(covariances, axis1=1, axis2=2), 0.0))
     finite = np.isfinite(error).all(axis=1) & np.isfinite(covariances).all(axis=(1, 2))
     usable = finite & np.all(sigma > 0.0, axis=1)

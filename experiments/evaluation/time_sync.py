@@ -29,9 +29,7 @@ def interpolate(stamps: Array, poses: Array, wanted: Array, longest_gap_s: float
     span = stamps[last] - stamps[last - 1]
     share = ((wanted - stamps[last - 1]) / span)[..., None]
     in_gap = (span > longest_gap_s) & (wanted > stamps[last - 1])
-    step = poses[last] - poses[last - 1]
-    step[..., 2] = se2.wrap(step[..., 2])
-    out: Array = poses[last - 1] + share * step
+    out: Array = poses[last - 1] + share * se2.difference(poses[last], poses[last - 1])
     out[..., 2] = se2.wrap(out[..., 2])
     out[(wanted < stamps[0]) | (wanted > stamps[-1]) | in_gap] = np.nan
     return out

@@ -224,12 +224,15 @@ def compare(
             _same_recordings(str(estimator), name, then, now)
             failure = _newly_failing(then, now)
             for error in ERRORS:
-                rng, which = (
-                    stream(0, f"exchange/{estimator}/{error}"),
+                finding = examine(
                     (str(estimator), error, name),
+                    by_repeat(then, error),
+                    by_repeat(now, error),
+                    stream(0, f"exchange/{estimator}/{error}"),
+                    n_draws,
+                    failure,
                 )
-                errors = (by_repeat(then, error), by_repeat(now, error))
-                findings.append(examine(which, *errors, rng, n_draws, failure))
+                findings.append(finding)
     return judge(findings)
 
 

@@ -130,10 +130,8 @@ def _causal(new: Make, recording: Recording, prior: Prior) -> str:
     """Compare beliefs with those on the recording cut short."""
     whole = walk(new(), recording, prior)
     half = len(recording.frame_stamps) // 2
-    cut = walk(new(), recording.cut(half), prior)
-    if not _same((whole[0][:half], whole[1][:half]), cut):
-        return f"the first {half} beliefs change when the recording ends there"
-    return ""
+    same = _same((whole[0][:half], whole[1][:half]), walk(new(), recording.cut(half), prior))
+    return "" if same else f"the first {half} beliefs change when the recording ends there"
 
 
 def _untouched(new: Make, recording: Recording, prior: Prior) -> str:
@@ -226,8 +224,7 @@ def _differ(first: Array, second: Array) -> str:
 
 def _gap(here: tuple[Array, Array], there: tuple[Array, Array]) -> float:
     """Largest difference of means and covariances once both are in the moved frame."""
-    difference = there[0] - se2.compose(MOTION, here[0])
-    difference[:, 2] = se2.wrap(difference[:, 2])
+    difference = se2.difference(there[0], se2.compose(MOTION, here[0]))
     turn = _turn()
     size = max(1.0, float(np.abs(here[1]).max()))
     spread = np.abs(there[1] - turn @ here[1] @ turn.T).max() / size

@@ -120,8 +120,7 @@ def noisy_ranges(frame: Frame, sigma_m: float, rng: np.random.Generator) -> Fram
     if scan is None:
         return frame
     noise = sigma_m * rng.standard_normal(scan["ranges_m"].shape)
-    noisy = (scan["ranges_m"] + noise).astype(np.float32)
-    return _reading(frame, "laser", {"ranges_m": noisy})
+    return _reading(frame, "laser", {"ranges_m": (scan["ranges_m"] + noise).astype(np.float32)})
 
 
 @in_argument_of("step")

@@ -224,8 +224,8 @@ def draw_check(
                 now, rest = drawn[:, :n_now], runs
             others = np.take_along_axis(rest, again, axis=1)
             for baseline, left in (("accepted", rest), ("release", others)):
-                which = (name, error, baseline)
-                findings.append(examine(which, left[:, :n_then], now, rng, _N_DRAWS))
+                then = left[:, :n_then]
+                findings.append(examine((name, error, baseline), then, now, rng, _N_DRAWS))
     return judge(findings)
 
 

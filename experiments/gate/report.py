@@ -210,12 +210,12 @@ def last_line(findings: Sequence[Finding]) -> str:
     """Say how the check ended."""
     alarmed = ", ".join(dict.fromkeys(f.estimator for f in findings if f.alarms))
     better = ", ".join(dict.fromkeys(f.estimator for f in findings if f.verdict is Change.BETTER))
-    parts = [f"worse: {alarmed}" if alarmed else "nothing is worse"]
-    if better:
-        parts.append(f"better: {better}")
-    if alarmed:
-        parts.append('if it is intended: check with --accept "REASON"')
-    return "; ".join(parts)
+    parts = (
+        f"worse: {alarmed}" if alarmed else "nothing is worse",
+        f"better: {better}" if better else "",
+        'if it is intended: check with --accept "REASON"' if alarmed else "",
+    )
+    return "; ".join(filter(None, parts))
 
 
 def _noteworthy(findings: Sequence[Finding]) -> list[Finding]:

@@ -218,8 +218,7 @@ def run_suite(
             if entry.recordings == group and entry.name in repeats
         ]
         if runs:
-            seeds = range(suite.first_seed, suite.first_seed + count)
-            jobs += [(seed, runs, reseed) for seed in seeds]
+            jobs += [(suite.first_seed + i, runs, reseed) for i in range(count)]
     rows: list[dict[str, Any]] = []
     done = Parallel(n_jobs=n_jobs, return_as="generator")(
         delayed(_run_recording)(*job) for job in jobs
@@ -255,13 +254,12 @@ def _run_recording(
                 not entry.revised or row["status"] != Outcome.OK or "revised_ate_rmse_m" in row,
                 f"{entry.name} has no finish; drop `revised` from the suite",
             )
-            status = "ok"
             # a collision is no fault of the estimator
-            if row["status"] == Outcome.FAILED and row["status_code"] != "recording":
-                status = printable(f"{row['status_code']}: {row['status_detail']}")
+            at_fault = row["status"] == Outcome.FAILED and row["status_code"] != "recording"
+            why = printable(f"{row['status_code']}: {row['status_detail']}") if at_fault else "ok"
             which = {"estimator": entry.name, "recording": seed, "repeat": row["repeat"]}
             errors = {name: row.get(prefix + name, math.nan) for name in ERRORS}
-            rows.append({**which, **origin, **errors, "status": status})
+            rows.append({**which, **origin, **errors, "status": why})
     return rows
 
 

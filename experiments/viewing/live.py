@@ -126,8 +126,7 @@ def _aim(engine: Any, run: Playback, truth: Array) -> None:
     """Look at the world and the whole path from above."""
     x1, y1, x2, y2 = bounds(run, truth)
     distance_m = 1.2 * math.hypot(x2 - x1, y2 - y1) + 2.0
-    middle = [(x1 + x2) / 2.0, (y1 + y2) / 2.0, 0.0]
-    engine.resetDebugVisualizerCamera(distance_m, 0, -65, middle)
+    engine.resetDebugVisualizerCamera(distance_m, 0, -65, [(x1 + x2) / 2.0, (y1 + y2) / 2.0, 0.0])
 
 
 def _build_walls(engine: Any, world: World) -> None:

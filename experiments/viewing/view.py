@@ -86,15 +86,17 @@ class Playback:
     def pose_at(self, stamp: float) -> Array:
         """Where the robot is believed to be, else where it is; NaN if neither is known."""
         row = self.belief_row(stamp)
-        if row >= 0 and self.estimate is not None:
-            return np.asarray(self.estimate.means[row])
-        return np.asarray(self.truth_at(np.array([stamp]))[0])
+        poses = (
+            self.truth_at(np.array([stamp]))
+            if self.estimate is None or row < 0
+            else self.estimate.means[row:]
+        )
+        return np.asarray(poses[0])
 
     def truth_at(self, stamps: Array) -> Array:
         """True poses (N, 3) at stamps (N,); NaN where they are not known."""
-        if self.recording.truth is None:
-            return np.full((len(stamps), 3), np.nan)
-        return self.recording.truth_at(stamps)
+        known = self.recording.truth is not None
+        return self.recording.truth_at(stamps) if known else np.full((len(stamps), 3), np.nan)
 
 
 def shown_rows(recording: Recording, n_shown: int) -> NDArray[np.int64]:

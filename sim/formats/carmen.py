@@ -116,8 +116,11 @@ def parse_carmen(words: Words) -> CarmenLog:
     assemble.require_readings(len(lines), 1, words.where, "FLASER or ROBOTLASER1 lines")
     counts = words.whole(lines, count_column, "the number of beams", 1, _MOST_BEAMS)
     n_beams = int(np.bincount(counts).argmax())
-    short = words.counts[lines] < count_column + 1 + counts
-    words.refuse(short, lines, "too few words for the ranges it promises")
+    words.refuse(
+        words.counts[lines] < count_column + 1 + counts,
+        lines,
+        "too few words for the ranges it promises",
+    )
     if np.any(counts != n_beams):
         notes["scans_of_other_size"] = int(np.sum(counts != n_beams))
         lines = lines[counts == n_beams]
@@ -138,7 +141,6 @@ def parse_carmen(words: Words) -> CarmenLog:
         start_angle, max_range = -math.pi / 2.0, _FLASER_MAX_RANGE_M
         resolution = math.pi / (n_beams - n_beams % 2) if n_beams > 1 else math.pi
     rows = assemble.in_order(stamps, "scans", notes)
-    edges = _edges(words, lines[rows])
     return CarmenLog(
         odometry_stamps=odometry[:, 6].copy(),
         odometry_poses=odometry[:, :3].copy(),
@@ -149,7 +151,7 @@ def parse_carmen(words: Words) -> CarmenLog:
         resolution_rad=float(resolution),
         max_range_m=float(max_range),
         T_base_laser=_mount(poses, laser_poses),
-        edges=edges,
+        edges=_edges(words, lines[rows]),
         is_graph=bool(len(words.lines_of("VERTEX2"))),
         notes=notes,
         where=words.where,
@@ -231,8 +233,7 @@ def scan_recording(
 
 def seen_ranges(raw_m: Array, max_range_m: float) -> NDArray[np.float32]:
     """Ranges with +inf where nothing was seen: at the maximum or beyond, zero, or no number."""
-    seen = (raw_m > 0.0) & (raw_m < max_range_m)
-    return np.where(seen, raw_m, np.inf).astype(np.float32)
+    return np.where((raw_m > 0.0) & (raw_m < max_range_m), raw_m, np.inf).astype(np.float32)
 
 
 def _mount(poses: Array, laser_poses: Array) -> Array:

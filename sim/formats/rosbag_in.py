@@ -366,10 +366,8 @@ def _world(topic: _Topic | None, name: str | None) -> World | None:
 
 def _joints(topic: _Topic) -> tuple[Array, Array]:
     """Stamps and positions (N, 2) of the right and the left wheel."""
-    pairs = []
-    for message in topic.messages:
-        where = {name: i for i, name in enumerate(message.name)}
-        pairs.append([message.position[where[f"{side}_wheel"]] for side in ("right", "left")])
+    rolled = [dict(zip(m.name, m.position, strict=True)) for m in topic.messages]
+    pairs = [[position["right_wheel"], position["left_wheel"]] for position in rolled]
     return _stamps(topic), np.array(pairs, float)
 
 

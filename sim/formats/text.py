@@ -164,12 +164,10 @@ class Words:
             Naming the first line that has too few words, or a word that is no number.
         """
         begin = self.first[lines] + column
-        short = begin + n_columns > self.first[lines + 1]
-        self.refuse(short, lines, f"too few words for {what}")
+        self.refuse(begin + n_columns > self.first[lines + 1], lines, f"too few words for {what}")
         wanted = begin[:, None] + np.arange(n_columns)
         self.refuse(~self.is_number[wanted].all(axis=1), lines, f"not a number in {what}")
-        numbers: Array = self.values[wanted]
-        return numbers
+        return np.asarray(self.values[wanted])
 
     def finite(self, lines: Rows, column: int | Rows, n_columns: int, what: str) -> Array:
         """As `numbers`, and they must be finite, and no larger than a log has reason to hold."""
