@@ -88,8 +88,9 @@ def _plane_axes() -> Array:
     azimuth = np.pi * np.arange(_M2DP_AZIMUTHS) / _M2DP_AZIMUTHS - np.pi / 2
     elevation = np.pi / 2 * np.arange(_M2DP_ELEVATIONS) / _M2DP_ELEVATIONS
     a, e = np.meshgrid(azimuth, elevation, indexing="ij")
-    normals = np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], axis=-1)
-    normals = normals.reshape(-1, 3)
+    normals = np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], axis=-1).reshape(
+        -1, 3
+    )
     along = np.array([1.0, 0.0, 0.0]) - normals[:, :1] * normals
     length = np.linalg.norm(along, axis=1, keepdims=True)
     along = np.where(length > 1e-9, along / np.maximum(length, 1e-9), [0.0, 1.0, 0.0])

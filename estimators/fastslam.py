@@ -207,14 +207,11 @@ class FastSLAM:
         if known:
             slots = self.front_end.known(image)
             self._maps.touch(slots[slots >= 0])
-        if self.proposal == "motion" or len(points) == 0:
-            poses = self._move(normals)
-            if not known:
-                slots = self._associate(image, np.zeros((3, 3)))
-        else:
-            self._move(np.zeros_like(normals))
-            if not known:
-                slots = self._associate(image, self._seen_spread())
+        by_motion = self.proposal == "motion" or len(points) == 0
+        poses = self._move(normals if by_motion else np.zeros_like(normals))
+        if not known:
+            slots = self._associate(image, np.zeros((3, 3)) if by_motion else self._seen_spread())
+        if not by_motion:
             gained += self._propose(normals, slots, points)
             poses = self._move(normals)
         gained += self._observe(slots, points)

@@ -23,7 +23,7 @@ from scipy import ndimage
 from sim import se2
 from sim.arrays import Array, Floats, Ints
 from sim.compiled import njit
-from sim.errors import InputError, require
+from sim.errors import require
 from sim.grid import FREE_BELOW, OCCUPIED_ABOVE, OccupancyGrid
 from sim.sensors import Laser
 from sim.world import World
@@ -116,11 +116,11 @@ def likelihood_field(
     reach_m = max(reach_m, 2.0 * _CLEARANCE_M)
     origin = np.floor((extent.min(axis=0) - reach_m) / cell_m) * cell_m - cell_m
     columns, rows = np.ceil((extent.max(axis=0) + reach_m - origin) / cell_m).astype(int) + 1
-    if rows * columns > _MOST_CELLS:
-        where = "the grid" if isinstance(known_map, OccupancyGrid) else f"world {known_map.name}"
-        raise InputError(
-            f"estimator.cell_m={cell_m} makes {rows * columns} cells of {where}; make it larger"
-        )
+    where = "the grid" if isinstance(known_map, OccupancyGrid) else f"world {known_map.name}"
+    require(
+        rows * columns <= _MOST_CELLS,
+        f"estimator.cell_m={cell_m} makes {rows * columns} cells of {where}; make it larger",
+    )
     distances = _distances(walls, origin, cell_m, reach_m, rows, columns)
     p = normal * np.exp(-0.5 * np.square(distances / sigma_m)) + anywhere
     floor = distances > _CLEARANCE_M
@@ -147,8 +147,7 @@ def _walls(known_map: World | OccupancyGrid, laser: Laser) -> tuple[Array, Array
     """
     if isinstance(known_map, OccupancyGrid):
         occupied = known_map.occupied
-        rim = occupied & ~ndimage.binary_erosion(occupied)
-        middles = known_map.middles_m(np.argwhere(rim))
+        middles = known_map.middles_m(np.argwhere(occupied & ~ndimage.binary_erosion(occupied)))
         require(len(middles) > 0, "the grid of prior.map has no occupied cell")
         return np.hstack([middles, middles]), known_map.corners_m
     low, high = known_map.wall_z_m[:, 0], known_map.wall_z_m[:, 1]

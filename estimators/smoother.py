@@ -218,7 +218,10 @@ class Smoother:
 
     def _problem(self, rows: list[int]) -> tuple[Problem, Ints]:
         """The problem over the Frames of these rows, and the id of each of its landmarks."""
-        merged = [_merged(self._motions[a + 1 : b + 1]) for a, b in itertools.pairwise(rows)]
+        merged = [
+            functools.reduce(Gaussian.then, self._motions[a + 1 : b + 1])
+            for a, b in itertools.pairwise(rows)
+        ]
         pose_of = {row: pose for pose, row in enumerate(rows)}
         seen = [np.zeros(0, np.int64), *(seen for _, _, seen in self._images)]
         ids, landmark_rows = np.unique(np.concatenate(seen), return_inverse=True)
@@ -532,11 +535,6 @@ def _sideways(motion: Gaussian) -> Array:
     x, y, turn = motion.mean
     normal = np.array([-math.sin(turn / 2.0), math.cos(turn / 2.0), 0.0])
     return np.asarray(np.outer(normal, normal) * ((x**2 + y**2) * motion.covariance[2, 2] / 12.0))
-
-
-def _merged(motions: list[Gaussian]) -> Gaussian:
-    """Several motions as one."""
-    return functools.reduce(Gaussian.then, motions)
 
 
 def _between(motions: list[Gaussian], ends: Array, joint: Array) -> list[Gaussian]:

@@ -374,8 +374,7 @@ class TopologicalMcl:
             mass = _sums(self._edge, np.exp(self._log_weights), len(self._graph.tail))
             held = np.flatnonzero(mass)
             if self.scheme == "multinomial":  # its copies of each come in one draw
-                copies = self._rng.multinomial(n, mass[held] / mass.sum())
-                self._edge = np.repeat(held, copies)
+                self._edge = np.repeat(held, self._rng.multinomial(n, mass[held] / mass.sum()))
             else:
                 self._edge = held[resample(np.log(mass[held]), n, self._rng, self.scheme)]
         else:

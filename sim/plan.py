@@ -135,8 +135,7 @@ class Plan:
             for _ in range(tries):
                 size = rng.uniform(*size_m, size=2)
                 yaw = rng.uniform(0.0, math.pi) if rng.random() < 0.6 else 0.0
-                centre = rng.uniform(least, most)
-                corners = box_corners(centre.tolist(), size, yaw)
+                corners = box_corners(rng.uniform(least, most).tolist(), size, yaw)
                 within = np.all((corners > least + _APART_M) & (corners < most - _APART_M))
                 if within and self._fits(corners, faces, paths, clearance_m):
                     self.prism(corners, 0.0, rng.uniform(*height_m))

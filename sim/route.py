@@ -165,7 +165,9 @@ class _Controller:
     """Driver that steers 50 times a second with limited acceleration, and rests at its goal."""
 
     def __init__(self, robot: DifferentialDrive, last_s: float) -> None:
-        self._most = _accelerations(robot)
+        linear = robot.max_acceleration_mps2
+        # (2,) of v and omega, m/s^2 and rad/s^2: half of a wheel's acceleration for each
+        self._most = np.array([0.5 * linear, linear / robot.nominal.track_m])
         self._velocity, self._rest_ticks = np.zeros(2), -1
         self._last_tick, self._late = round(last_s / TICK_S), False
 
@@ -181,7 +183,8 @@ class _Controller:
         if wanted is None:
             self._rest_ticks = 60
             return np.zeros(2)
-        self._velocity = _limited(wanted, self._velocity, self._most)
+        step = CONTROL_TICKS * TICK_S * self._most
+        self._velocity = self._velocity + np.clip(wanted - self._velocity, -step, step)
         return self._velocity
 
     @property
@@ -234,7 +237,8 @@ class Pursuit(_Controller):
         if left_m < 0.02 and self._velocity[0] < 0.05:
             return None
         tour = self._tour
-        goal = self._point_at(self._done_m + tour.look_ahead_m)
+        goal_m = self._done_m + tour.look_ahead_m
+        goal = np.array([np.interp(goal_m, self._along_m, way) for way in self._path.T])
         bearing = _bearing(goal - pose[:2], pose)
         distance = max(float(np.hypot(*(goal - pose[:2]))), 1e-3)
         brake = math.sqrt(2.0 * 0.8 * self._most[0] * max(left_m, 0.0))
@@ -244,9 +248,6 @@ class Pursuit(_Controller):
         omega = 2.0 * v * math.sin(bearing) / max(distance, 0.5 * tour.look_ahead_m)
         limit = tour.turn_rate_radps
         return np.array([max(v, 0.01), min(max(omega, -limit), limit)])
-
-    def _point_at(self, along_m: float) -> Array:
-        return np.array([np.interp(along_m, self._along_m, self._path[:, i]) for i in (0, 1)])
 
 
 @dataclass(frozen=True)
@@ -335,18 +336,6 @@ def _bearing(offset: Array, pose: Array) -> float:
     """Direction of an offset (2,) in map as the robot sees it, rad, in [-pi, pi]."""
     bearing = math.atan2(offset[1], offset[0]) - pose[2]
     return math.atan2(math.sin(bearing), math.cos(bearing))
-
-
-def _accelerations(robot: DifferentialDrive) -> Array:
-    """Limits (2,) of v and omega, m/s^2 and rad/s^2: half of a wheel's acceleration for each."""
-    linear = robot.max_acceleration_mps2
-    return np.array([0.5 * linear, linear / robot.nominal.track_m])
-
-
-def _limited(wanted: Array, velocity: Array, most: Array) -> Array:
-    """Velocity (2,) a control period later, on the way to the wanted one."""
-    step = CONTROL_TICKS * TICK_S * most
-    return np.asarray(velocity + np.clip(wanted - velocity, -step, step))
 
 
 def _check_points(given: ArrayLike, wanted: str, at_least: int) -> None:

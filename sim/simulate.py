@@ -276,16 +276,8 @@ class _Collisions:
         pose = self._body.pose
         if math.hypot(*(pose[:2] - self._at)) + self._reach_m < self._free_m:
             return None
-        self._at, self._free_m = pose[:2], _wall_distance_m(self._world, pose[:2])
+        self._at, self._free_m = pose[:2], self._world.clearance_m(pose[:2])
         return "collision" if overlaps(self._world, self._robot, pose) else None
-
-
-def _wall_distance_m(world: World, point: Array) -> float:
-    """Distance of a point (2,) to the nearest wall, m; inf without walls."""
-    start, along = world.walls[:, :2] - point, world.walls[:, 2:] - world.walls[:, :2]
-    share = np.clip(-np.sum(start * along, axis=1) / np.sum(along**2, axis=1), 0.0, 1.0)
-    gaps = start + share[:, None] * along
-    return float(np.hypot(*gaps.T).min(initial=np.inf))
 
 
 def _half_footprint_m(robot: DifferentialDrive) -> Array:
@@ -311,8 +303,7 @@ class _SlipEvents:
         """Encoder errors of the right and left wheel, m, of this tick."""
         if self._chance == 0.0:
             return 0.0, 0.0
-        begins = self._rng.random(2) < self._chance
-        self._left[begins] = _SLIP_EVENT_TICKS
+        self._left[self._rng.random(2) < self._chance] = _SLIP_EVENT_TICKS
         active = self._left > 0
         self._left[active] -= 1
         right, left = np.where(active, self._step_m * np.sign(rolling_m), 0.0).tolist()

@@ -106,9 +106,7 @@ class World:
 
     def clearance_m(self, point_in_world: Array) -> float:
         """Distance from a point (2,) to the nearest wall, m; inf in an empty world."""
-        if len(self.walls) == 0:
-            return float("inf")
         start, along = self.walls[:, :2], self.walls[:, 2:] - self.walls[:, :2]
         offset = np.asarray(point_in_world, float)[:2] - start
         share = np.clip(np.sum(offset * along, axis=1) / np.sum(along**2, axis=1), 0.0, 1.0)
-        return float(np.min(np.hypot(*(offset - share[:, None] * along).T)))
+        return float(np.hypot(*(offset - share[:, None] * along).T).min(initial=np.inf))

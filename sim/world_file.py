@@ -45,7 +45,8 @@ def read_world(path: Path) -> World:
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         where = getattr(error, "problem_mark", None)
         line = f":{where.line + 1}" if where is not None else ""
-        raise InputError(f"{path}{line}: not valid YAML ({_brief(error)})") from error
+        brief = " ".join(str(error).split())[:120]
+        raise InputError(f"{path}{line}: not valid YAML ({brief})") from error
     require(
         isinstance(document, Mapping), f"{path}: must hold keys such as walls, boxes, waypoints"
     )
@@ -184,7 +185,3 @@ def _number(value: Any, where: str) -> float:
         number = math.nan
     require(math.isfinite(number), f"{where}: {value!r} is not a finite number")
     return number
-
-
-def _brief(error: Exception) -> str:
-    return " ".join(str(error).split())[:120]

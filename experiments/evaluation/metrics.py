@@ -42,8 +42,7 @@ def alignment(truth: Array, means: Array) -> Array:
     """
     centre_truth, centre_means = truth[:, :2].mean(axis=0), means[:, :2].mean(axis=0)
     a, b = means[:, :2] - centre_means, truth[:, :2] - centre_truth
-    cross = np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
-    angle = math.atan2(cross, np.sum(a * b))
+    angle = math.atan2(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), np.sum(a * b))
     rotated = se2.transform(np.array([0.0, 0.0, angle]), centre_means[None])[0]
     return np.array([*(centre_truth - rotated), angle])
 

@@ -288,8 +288,8 @@ def _missing(new: Make, recording: Recording, prior: Prior) -> str:
         except InputError as error:
             if "\n" in str(error):
                 return f"without {need}: the message has several lines"
-            continue
-        return f"runs without {need}, which it says it needs"
+        else:
+            return f"runs without {need}, which it says it needs"
     return ""
 
 

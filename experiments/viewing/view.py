@@ -344,12 +344,15 @@ def bounds(run: Playback, truth: Array | None) -> tuple[float, float, float, flo
     A diverging estimate is followed to twice the size of all else.
     """
     world = run.recording.world
-    known = np.zeros((0, 2)) if truth is None else truth[:, :2]
-    if world is not None:
-        known = np.concatenate([known, world.walls.reshape(-1, 2)])
-    if run.grid is not None:
-        known = np.concatenate([known, run.grid.corners_m])
-    means = np.zeros((0, 2)) if run.estimate is None else run.estimate.means[:, :2]
+    none = np.zeros((0, 2))
+    known = np.concatenate(
+        [
+            none if truth is None else truth[:, :2],
+            none if world is None else world.walls.reshape(-1, 2),
+            none if run.grid is None else run.grid.corners_m,
+        ]
+    )
+    means = none if run.estimate is None else run.estimate.means[:, :2]
     known, means = (points[np.isfinite(points).all(axis=1)] for points in (known, means))
     if len(known) and len(means):
         low, high = known.min(axis=0), known.max(axis=0)

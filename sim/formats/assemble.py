@@ -47,12 +47,11 @@ def in_order(stamps: Array, name: str, notes: Notes) -> Rows:
     rows: Rows = np.argsort(stamps, kind="stable").astype(np.int64)
     ordered = stamps[rows]
     last_of_equal = np.append(ordered[1:] > ordered[:-1], True)[: len(rows)]
-    backward = int(np.sum(np.diff(stamps) < 0.0))
-    repeated = int(len(rows) - np.sum(last_of_equal))
-    if backward:
-        notes[f"{name}_backward"] = backward
-    if repeated:
-        notes[f"{name}_repeated"] = repeated
+    counts = {
+        "backward": int(np.sum(np.diff(stamps) < 0.0)),
+        "repeated": int(len(rows) - np.sum(last_of_equal)),
+    }
+    notes.update({f"{name}_{what}": count for what, count in counts.items() if count})
     rows = rows[last_of_equal]
     if len(rows) > 1:
         notes[f"{name}_longest_gap_s"] = round(float(np.max(np.diff(stamps[rows]))), 6)
