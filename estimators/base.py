@@ -8,7 +8,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 
 from sim.arrays import Array
-from sim.errors import InputError
+from sim.errors import InputError, require
 from sim.recording import Frame, Recording
 from sim.robot import RobotGeometry
 from sim.sensors import Sensors
@@ -161,16 +161,14 @@ def run(
     )
 
 
-def _check_belief(belief: object, estimator: Estimator) -> None:
+def _check_belief(belief: Any, estimator: Estimator) -> None:
     wanted = (
         f"{type(estimator).__name__}.step must return a Belief with a mean of shape (3,) "
         "and a covariance of shape (3, 3)"
     )
-    if not isinstance(belief, Belief):
-        raise InputError(f"{wanted}, got {type(belief).__name__}")
+    require(isinstance(belief, Belief), f"{wanted}, got {type(belief).__name__}")
     try:
         shapes = np.shape(belief.mean), np.shape(belief.covariance)
     except ValueError as error:  # ragged lists
         raise InputError(f"{wanted}: {error}") from error
-    if shapes != ((3,), (3, 3)):
-        raise InputError(f"{wanted}, got shapes {shapes[0]} and {shapes[1]}")
+    require(shapes == ((3,), (3, 3)), f"{wanted}, got shapes {shapes[0]} and {shapes[1]}")

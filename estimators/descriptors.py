@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sim.arrays import Array, Floats
-from sim.errors import InputError
+from sim.errors import require
 from sim.sensors import Lidar3D
 
 N_RINGS, N_SECTORS, REACH_M = 20, 60, 80.0  # of Scan Context, as published
@@ -29,8 +29,7 @@ class Kind:
 
 def euclidean(query: Floats, database: Floats) -> Array:
     """Distances (N,) from a descriptor (D,) to each of (N, D)."""
-    away: Array = np.linalg.norm((database - query).astype(np.float64), axis=1)
-    return away
+    return np.asarray(np.linalg.norm((database - query).astype(np.float64), axis=1))
 
 
 def polar_heights(points_in_sensor: ArrayLike, sensor_height_m: float) -> Array:
@@ -81,8 +80,7 @@ def ring_key(lidar: Lidar3D, ranges_m: Floats) -> Floats:
     Kim and Kim 2018, eq. (8); turning the robot changes nothing but the binning.
     """
     heights = polar_heights(lidar.points_in_sensor(ranges_m), lidar.mount.z_m)
-    row: Floats = np.mean(heights > 0.0, axis=1).astype(np.float32)
-    return row
+    return np.asarray(np.mean(heights > 0.0, axis=1).astype(np.float32))
 
 
 def _plane_axes() -> Array:
@@ -90,8 +88,9 @@ def _plane_axes() -> Array:
     azimuth = np.pi * np.arange(_M2DP_AZIMUTHS) / _M2DP_AZIMUTHS - np.pi / 2
     elevation = np.pi / 2 * np.arange(_M2DP_ELEVATIONS) / _M2DP_ELEVATIONS
     a, e = np.meshgrid(azimuth, elevation, indexing="ij")
-    normals = np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], axis=-1)
-    normals = normals.reshape(-1, 3)
+    normals = np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], axis=-1).reshape(
+        -1, 3
+    )
     along = np.array([1.0, 0.0, 0.0]) - normals[:, :1] * normals
     length = np.linalg.norm(along, axis=1, keepdims=True)
     along = np.where(length > 1e-9, along / np.maximum(length, 1e-9), [0.0, 1.0, 0.0])
@@ -159,8 +158,7 @@ KINDS: dict[str, Kind] = {
 
 def kind(name: str) -> Kind:
     """Kind of a name."""
-    if name not in KINDS:
-        raise InputError(f"unknown descriptor {name!r}; known: {', '.join(KINDS)}")
+    require(name in KINDS, f"unknown descriptor {name!r}; known: {', '.join(KINDS)}")
     return KINDS[name]
 
 

@@ -27,7 +27,7 @@ from estimators.scan_matching import (
 )
 from estimators.wheels import WheelPrediction
 from sim.arrays import Array
-from sim.errors import InputError
+from sim.errors import require
 from sim.recording import Frame
 
 _PATIENCE = 2  # scans in a row that may fail before the newest becomes the key frame
@@ -114,14 +114,13 @@ class EkfIcp:
             register_turn_rad=register_turn_rad,
         )
         require_shares(shared_noise=shared_noise)
-        if gate_probability is not None and not 0.0 < gate_probability < 1.0:
-            raise InputError(
-                "estimator.gate_probability must lie between 0 and 1 or be null, "
-                f"got {gate_probability}"
-            )
+        require(
+            gate_probability is None or 0.0 < gate_probability < 1.0,
+            "estimator.gate_probability must lie between 0 and 1 or be null, "
+            f"got {gate_probability}",
+        )
         self.keyframe_distance_m, self.keyframe_turn_rad = keyframe_distance_m, keyframe_turn_rad
-        self.register_distance_m = register_distance_m
-        self.register_turn_rad = register_turn_rad
+        self.register_distance_m, self.register_turn_rad = register_distance_m, register_turn_rad
         self.gate_probability, self.shared_noise = gate_probability, shared_noise
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
@@ -285,9 +284,8 @@ class EkfIcp:
     def _own_noise(self, scan: PreparedScan) -> Array:
         """Shared noise (3, 3) in map of a scan that was not registered: from one against itself."""
         found = self._matcher.match(scan, scan, STILL, self._laser, self._rng)
-        if found.failed:
-            return np.zeros((3, 3))
-        return rotated(self.shared_noise / 2.0 * found.known_covariance, self._mean[8])
+        noise = self.shared_noise / 2.0 * found.known_covariance
+        return np.zeros((3, 3)) if found.failed else rotated(noise, self._mean[8])
 
 
 def _from_twist(pose: Array) -> Array:

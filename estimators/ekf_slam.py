@@ -108,8 +108,7 @@ class EkfSlam:
         pose = Gaussian(self._mean[:3], self._covariance[:3, :3]).then(self._motion)
         if self.keep_map:
             extras |= {k: v for k, v in self.map.items() if k.startswith("landmark")}
-        covariance = (pose.covariance + pose.covariance.T) / 2.0
-        return Belief(pose.mean.copy(), covariance, extras)
+        return Belief(pose.mean.copy(), (pose.covariance + pose.covariance.T) / 2.0, extras)
 
     @property
     def map(self) -> dict[str, Array | Ints]:
@@ -148,10 +147,11 @@ class EkfSlam:
         """Take in one image; the extras that it gives."""
         image = self.front_end.read(seen)
         extras: dict[str, Any] = {"status": image.status} if image.status else {}
-        if self.front_end.association == "known":
-            slots = self.front_end.known(image)
-        else:
-            slots = self._associate(image.points, self.front_end.unlikeness(image))
+        slots = (
+            self.front_end.known(image)
+            if self.front_end.association == "known"
+            else self._associate(image.points, self.front_end.unlikeness(image))
+        )
         old = slots >= 0
         if old.any() and not self._update(slots[old], image.points[old]):
             extras["status"] = "update rejected: broken covariance, not positive definite"
@@ -166,8 +166,7 @@ class EkfSlam:
         slots = np.full(len(points), -1)
         if len(points) == 0 or self._n_landmarks == 0:
             return slots
-        landmarks = self._mean[3:].reshape(-1, 3)
-        predicted = self._camera.predict(self._mean[:3], landmarks)[0]
+        predicted = self._camera.predict(self._mean[:3], self._mean[3:].reshape(-1, 3))[0]
         near = predicted[:, 2] > LEAST_DEPTH_M
         candidates = np.flatnonzero(
             near & (np.linalg.norm(predicted, axis=1) < self.front_end.reach_m)
@@ -244,10 +243,7 @@ class EkfSlam:
         R = self._camera.innovation(predicted, points)[1]
         after = before + n
         if after > len(self._room):
-            size = after + after // 2
-            room = np.zeros((size, size))
-            room[:before, :before] = self._covariance
-            self._room = room
+            self._room = np.pad(self._covariance, (0, after + after // 2 - before))
         P = self._room[:after, :after]
         P[before:, :before] = by_pose @ P[:3, :before]
         P[:before, before:] = P[before:, :before].T

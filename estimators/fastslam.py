@@ -179,12 +179,11 @@ class FastSLAM:
             self._poses = self._move(self._normals())
             self._take_stock()
         belief = self._belief.then(self._rolled)
-        best = int(np.argmax(self._accumulated))
         extras |= {
             "particles": self._drawn,
             "log_weights": self._log_weights,
             "ess": self._ess,
-            "best": compose(self._drawn[best], self._rolled.mean)[0],
+            "best": compose(self._drawn[self._best], self._rolled.mean)[0],
         }
         if self.keep_map:
             extras |= {k: v for k, v in self.map.items() if k.startswith("landmark")}
@@ -208,14 +207,11 @@ class FastSLAM:
         if known:
             slots = self.front_end.known(image)
             self._maps.touch(slots[slots >= 0])
-        if self.proposal == "motion" or len(points) == 0:
-            poses = self._move(normals)
-            if not known:
-                slots = self._associate(image, np.zeros((3, 3)))
-        else:
-            self._move(np.zeros_like(normals))
-            if not known:
-                slots = self._associate(image, self._seen_spread())
+        by_motion = self.proposal == "motion" or len(points) == 0
+        poses = self._move(normals if by_motion else np.zeros_like(normals))
+        if not known:
+            slots = self._associate(image, np.zeros((3, 3)) if by_motion else self._seen_spread())
+        if not by_motion:
             gained += self._propose(normals, slots, points)
             poses = self._move(normals)
         gained += self._observe(slots, points)
@@ -228,8 +224,8 @@ class FastSLAM:
         self._log_weights = weights
         self._accumulated = self._accumulated + gained
         self._take_stock()
-        best = int(np.argmax(self._accumulated))
-        extras["associations"] = self.front_end.associations(image, self._landmarks(slots, best))
+        landmarks = self._landmarks(slots, self._best)
+        extras["associations"] = self.front_end.associations(image, landmarks)
 
     def finish(self) -> Estimate:
         """Path of the lineage of greatest accumulated weight, gil2008, eq. (20).
@@ -237,8 +233,7 @@ class FastSLAM:
         The covariances are those of all weighted lineages. They are zero where all lineages share
         one ancestor: a sign of particle depletion, not of a path known exactly.
         """
-        best = int(np.argmax(self._accumulated))
-        weights = normalize(self._log_weights)
+        best, weights = self._best, normalize(self._log_weights)
         n = len(self._lineages)
         drawn: list[Gaussian] = []
         for poses, rows in self._lineages.paths():
@@ -263,14 +258,17 @@ class FastSLAM:
         `origins` (N,) are the observations, counted over the run, that started them; `ids` (N,)
         are the sensor's, if it gives any.
         """
-        best = int(np.argmax(self._accumulated))
-        means, covariances, births = self._maps.of_particle(best)
-        return self.front_end.map(means, covariances, births)
+        return self.front_end.map(*self._maps.of_particle(self._best))
 
     @property
     def bytes_per_particle(self) -> float:
         """Memory of the maps over the number of particles."""
         return self._maps.bytes_per_particle
+
+    @property
+    def _best(self) -> int:
+        """Number of the particle of greatest accumulated weight."""
+        return int(np.argmax(self._accumulated))
 
     def _roll(self, frame: Frame) -> None:
         """Add the Frame's arc to the motion that is not yet drawn."""
@@ -401,8 +399,7 @@ class FastSLAM:
     def _resample(self) -> None:
         """Draw particles by their weights; survivors keep their place."""
         n = self.n_particles
-        drawn = resample(self._log_weights, n, self._rng, self.resampling)
-        ancestors = in_place(drawn, n)
+        ancestors = in_place(resample(self._log_weights, n, self._rng, self.resampling), n)
         self._maps.resample(ancestors)
         self._lineages.resample(ancestors)
         self._poses[:, :n] = np.take(self._poses, ancestors, axis=1)

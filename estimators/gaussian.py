@@ -94,11 +94,10 @@ def wheel_motion(travel_m: Array, variances_m2: Array, track_m: float) -> tuple[
     right, left = travel_m.tolist()
     forward, turn = (right + left) / 2.0, (right - left) / track_m
     half = turn / 2.0
+    cos, sin = math.cos(half), math.sin(half)
     if abs(half) < _SMALL_ANGLE_RAD:
         sinc, slope = 1.0 - half * half / 6.0, -half / 3.0
-        cos, sin = math.cos(half), math.sin(half)
     else:
-        cos, sin = math.cos(half), math.sin(half)
         sinc = sin / half
         slope = (cos - sinc) / half
     x, y = sinc * cos / 2.0, sinc * sin / 2.0
@@ -139,16 +138,14 @@ def update(
 def root(covariance: Array) -> Array:
     """Matrix (3, 3) whose product with its transpose is the covariance, which may be singular."""
     values, vectors = np.linalg.eigh(covariance)
-    columns: Array = vectors * np.sqrt(np.maximum(values, 0.0))
-    return columns
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
 def rotated(covariance: Array, angle_rad: float) -> Array:
     """Covariance (3, 3) of a pose in axes from which its own are turned by the angle."""
     cos, sin = math.cos(angle_rad), math.sin(angle_rad)
     R = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
-    turned: Array = R @ covariance @ R.T
-    return turned
+    return np.asarray(R @ covariance @ R.T)
 
 
 def wrap(angle_rad: float) -> float:

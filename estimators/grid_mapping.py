@@ -23,7 +23,7 @@ from scipy.special import expit
 from sim import se2
 from sim.arrays import Array, Floats, Ints
 from sim.compiled import njit
-from sim.errors import InputError
+from sim.errors import require
 from sim.grid import OccupancyGrid, check_size
 from sim.sensors import Laser
 
@@ -64,16 +64,16 @@ def map_scans(
     InputError
         If no beam has a return, or the grid would be too large.
     """
-    if not (math.isfinite(resolution_m) and resolution_m > 0.0):
-        raise InputError(f"the resolution must be a positive number, got {resolution_m}")
+    require(
+        math.isfinite(resolution_m) and resolution_m > 0.0,
+        f"the resolution must be a positive number, got {resolution_m}",
+    )
     most_m = laser.max_range_m if max_range_m is None else max_range_m
-    if not most_m > 0.0:
-        raise InputError(f"the greatest range must be a positive number, got {most_m}")
+    require(most_m > 0.0, f"the greatest range must be a positive number, got {most_m}")
     lasers = se2.compose(poses, laser.mount.pose)
     bearings = laser.bearings_rad
     seen = np.isfinite(ranges_m) & (ranges_m > laser.min_range_m) & (ranges_m < laser.max_range_m)
-    if not seen.any():
-        raise InputError("no scan has a return, so there is nothing to map")
+    require(seen.any(), "no scan has a return, so there is nothing to map")
     ranges = np.where(seen, ranges_m, np.float32(0.0)).astype(np.float32)
     low, high = _bounds(lasers, ranges, bearings, most_m)
     corner = np.floor(low / resolution_m) - 1.0  # whole cells, so that maps of a place agree

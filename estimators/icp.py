@@ -633,9 +633,8 @@ def register(
             pose, metric, "empty", np.full(n, -1), np.full(n, math.nan), np.zeros(n), 0, False,
             zero, zero, zero,
         )  # fmt: skip
-    window = heading_window_rad
-    if window is None:
-        window = math.pi / 6.0 if initial is None else 0.0
+    usual_window = math.pi / 6.0 if initial is None else 0.0
+    window = usual_window if heading_window_rad is None else heading_window_rad
     if gate_rad is None:
         gate_rad = _SEARCHED_RAD if window > 0.0 else _GUESSED_RAD
     settings = _Settings(max_iterations, increment_m, increment_rad, gate_m / 4.0, gate_rad / 4.0)

@@ -264,13 +264,13 @@ def split_directions(registration: Registration) -> tuple[Array, Array]:
 
 def _sandwich(A: Array, middle: Array, registration: Registration) -> Array:
     """A^-1 middle A^-1 within the directions that the scans hold; the rest is unknown."""
-    if registration.status != "degenerate":
+    if registration.status == "degenerate":
+        held, loose = split_directions(registration)
+        gain = held @ np.linalg.solve(held.T @ A @ held, held.T)
+        covariance: Array = gain @ middle @ gain.T + loose @ loose.T
+    else:
         inverse = np.linalg.inv(A)
-        covariance: Array = inverse @ middle @ inverse
-        return (covariance + covariance.T) / 2.0
-    held, loose = split_directions(registration)
-    gain = held @ np.linalg.solve(held.T @ A @ held, held.T)
-    covariance = gain @ middle @ gain.T + loose @ loose.T
+        covariance = inverse @ middle @ inverse
     return (covariance + covariance.T) / 2.0
 
 

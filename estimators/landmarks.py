@@ -111,8 +111,9 @@ class LandmarkMaps:
         more = max(n_slots, 2 * have, 8) - have
         self.place = np.concatenate([self.place, np.arange(len(self.data), len(self.data) + more)])
         self.data = np.concatenate([self.data, np.zeros((more, *self.data.shape[1:]))])
-        born = np.zeros((more, self.births.shape[1]), np.int64)
-        self.births = np.concatenate([self.births, born])
+        self.births = np.concatenate(
+            [self.births, np.zeros((more, self.births.shape[1]), np.int64)]
+        )
         self._epoch = np.concatenate([self._epoch, np.full(more, self._generation)])
 
     def resample(self, ancestors: Ints) -> None:
@@ -165,8 +166,7 @@ class LandmarkMaps:
 
     def birth_of(self, slots: Ints, particles: Ints | int) -> Ints:
         """Births of the slots, which have been touched, of particles."""
-        apart = self.births.shape[1] > 0
-        return self.births[slots, particles] if apart else slots
+        return self.births[slots, particles] if self.births.shape[1] > 0 else slots
 
     def nearby(self, state: Array, reach_m: float) -> Ints:
         """Slots that some particle has before its camera, within reach; all are touched."""

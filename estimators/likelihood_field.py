@@ -23,7 +23,7 @@ from scipy import ndimage
 from sim import se2
 from sim.arrays import Array, Floats, Ints
 from sim.compiled import njit
-from sim.errors import InputError
+from sim.errors import require
 from sim.grid import FREE_BELOW, OCCUPIED_ABOVE, OccupancyGrid
 from sim.sensors import Laser
 from sim.world import World
@@ -61,8 +61,7 @@ class LikelihoodField:
 
     def draw(self, n: int, rng: np.random.Generator) -> Array:
         """Poses (n, 3), uniform over the free floor and all headings."""
-        if len(self.free_cells) == 0:
-            raise InputError("the map has no floor off its walls to put particles on")
+        require(len(self.free_cells) > 0, "the map has no floor off its walls to put particles on")
         cells = self.free_cells[rng.integers(len(self.free_cells), size=n)]
         places: Array = self.origin_m + (cells[:, ::-1] + rng.random((n, 2))) * self.cell_m
         return np.column_stack([places, rng.uniform(-math.pi, math.pi, n)])
@@ -117,11 +116,11 @@ def likelihood_field(
     reach_m = max(reach_m, 2.0 * _CLEARANCE_M)
     origin = np.floor((extent.min(axis=0) - reach_m) / cell_m) * cell_m - cell_m
     columns, rows = np.ceil((extent.max(axis=0) + reach_m - origin) / cell_m).astype(int) + 1
-    if rows * columns > _MOST_CELLS:
-        where = "the grid" if isinstance(known_map, OccupancyGrid) else f"world {known_map.name}"
-        raise InputError(
-            f"estimator.cell_m={cell_m} makes {rows * columns} cells of {where}; make it larger"
-        )
+    where = "the grid" if isinstance(known_map, OccupancyGrid) else f"world {known_map.name}"
+    require(
+        rows * columns <= _MOST_CELLS,
+        f"estimator.cell_m={cell_m} makes {rows * columns} cells of {where}; make it larger",
+    )
     distances = _distances(walls, origin, cell_m, reach_m, rows, columns)
     p = normal * np.exp(-0.5 * np.square(distances / sigma_m)) + anywhere
     floor = distances > _CLEARANCE_M
@@ -148,15 +147,14 @@ def _walls(known_map: World | OccupancyGrid, laser: Laser) -> tuple[Array, Array
     """
     if isinstance(known_map, OccupancyGrid):
         occupied = known_map.occupied
-        rim = occupied & ~ndimage.binary_erosion(occupied)
-        middles = known_map.middles_m(np.argwhere(rim))
-        if len(middles) == 0:
-            raise InputError("the grid of prior.map has no occupied cell")
+        middles = known_map.middles_m(np.argwhere(occupied & ~ndimage.binary_erosion(occupied)))
+        require(len(middles) > 0, "the grid of prior.map has no occupied cell")
         return np.hstack([middles, middles]), known_map.corners_m
     low, high = known_map.wall_z_m[:, 0], known_map.wall_z_m[:, 1]
     walls = known_map.walls[(low <= laser.mount.z_m) & (laser.mount.z_m <= high)]
-    if len(walls) == 0:
-        raise InputError(f"world {known_map.name} has no wall at the laser's {laser.mount.z_m} m")
+    require(
+        len(walls) > 0, f"world {known_map.name} has no wall at the laser's {laser.mount.z_m} m"
+    )
     return walls, walls.reshape(-1, 2)
 
 

@@ -31,7 +31,7 @@ from estimators.wheels import WheelPrediction
 from sim import se2
 from sim.arrays import Array, Floats, Ints
 from sim.compiled import njit
-from sim.errors import InputError
+from sim.errors import require
 from sim.grid import OccupancyGrid
 from sim.recording import Frame
 from sim.world import World
@@ -156,10 +156,11 @@ class Mcl:
             alpha_fast=alpha_fast,
             recovery_ratio=recovery_ratio,
         )
-        if n_least > n_most:
-            raise InputError(f"estimator.n_least={n_least} is above n_most={n_most}")
-        if least_ess >= ess_share:
-            raise InputError(f"estimator.least_ess={least_ess} is not below ess_share={ess_share}")
+        require(n_least <= n_most, f"estimator.n_least={n_least} is above n_most={n_most}")
+        require(
+            least_ess < ess_share,
+            f"estimator.least_ess={least_ess} is not below ess_share={ess_share}",
+        )
         self.n_least, self.n_most, self.n_beams = n_least, n_most, n_beams
         self.kld_error, self.kld_quantile = kld_error, kld_quantile
         self.bin_m, self.bin_rad, self.beam_power = bin_m, bin_rad, beam_power
@@ -174,8 +175,10 @@ class Mcl:
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Draw particles from the prior's pose, or from all the floor if there is none."""
         self._laser, self._rng = require_laser(prior, self.laser, "mcl"), rng
-        if not isinstance(prior.map, self.maps):
-            raise InputError("mcl needs a map of walls; set prior.map=world, or to a grid's .yaml")
+        require(
+            isinstance(prior.map, self.maps),
+            "mcl needs a map of walls; set prior.map=world, or to a grid's .yaml",
+        )
         self.wheels.reset(prior.robot.track_m)
         self._field = likelihood_field(
             prior.map,
@@ -216,8 +219,8 @@ class Mcl:
             else:
                 self._weigh(ends)
         now = self._belief.then(self._motion)
-        covariance = (now.covariance + now.covariance.T) / 2.0
-        return Belief(now.mean.copy(), covariance, {**self._extras, **extras})
+        symmetric = (now.covariance + now.covariance.T) / 2.0
+        return Belief(now.mean.copy(), symmetric, self._extras | extras)
 
     def _is_due(self) -> bool:
         """Whether the robot has come far enough since the last scan used."""
@@ -242,8 +245,7 @@ class Mcl:
         self._log_weights = self._weighed(of_scan)
         self._belief = self._summed_up()
         share = self._injected_share(of_scan, ends.shape[1])
-        poor = self._extras["ess"] < self.ess_share * len(self._poses)
-        if poor or share > 0.0:
+        if share > 0.0 or self._extras["ess"] < self.ess_share * len(self._poses):
             self._draw(share, ends)
 
     def _weighed(self, of_scan: Array) -> Array:
@@ -260,9 +262,7 @@ class Mcl:
                 poor = effective_sample_size(self._log_weights + middle * of_scan) < least
                 low, high = (low, middle) if poor else (middle, high)
             weights = self._log_weights + low * of_scan
-        if underflowed(weights):
-            return np.zeros(len(weights))
-        return weights - np.max(weights)
+        return np.zeros(len(weights)) if underflowed(weights) else weights - np.max(weights)
 
     def _injected_share(self, of_scan: Array, n_beams: int) -> float:
         """Share of particles to inject: the short average of the fit against the long one.
@@ -319,8 +319,7 @@ class Mcl:
         n_headings = math.ceil(2.0 * math.pi / self.bin_rad)
         column = np.clip(x.astype(np.int64), 0, shape[0] - 1)
         row = np.clip(y.astype(np.int64), 0, shape[1] - 1)
-        bins: Ints = (row * shape[0] + column) * n_headings + heading % n_headings
-        return bins
+        return np.asarray((row * shape[0] + column) * n_headings + heading % n_headings)
 
     def _summed_up(self) -> Gaussian:
         """Belief of the weighted particles, and its extras."""
@@ -330,13 +329,13 @@ class Mcl:
         heaviest = bins == np.argmax(np.bincount(bins, weights))
         mean = weights[heaviest] @ poses[heaviest] / weights[heaviest].sum()
         for _ in range(2):
-            off = _offsets(poses, mean)
+            off = se2.difference(poses, mean)
             near = np.hypot(off[:, 0], off[:, 1]) < _FARTHEST_M
             near &= np.abs(off[:, 2]) < _FARTHEST_RAD
             held = float(weights[near].sum())
             if held > 0.0:
                 mean = mean + weights[near] @ off[near] / held
-        off = _offsets(poses, mean)
+        off = se2.difference(poses, mean)
         covariance = (off * weights[:, None]).T @ off
         mean[2] = se2.wrap(mean[2])
         self._extras = {
@@ -347,13 +346,6 @@ class Mcl:
             "injected": 0,
         }
         return Gaussian(mean, (covariance + covariance.T) / 2.0)
-
-
-def _offsets(poses: Array, mean: Array) -> Array:
-    """Poses (M, 3) less their mean (3,), headings wrapped."""
-    offsets = poses - mean
-    offsets[:, 2] = se2.wrap(offsets[:, 2])
-    return offsets
 
 
 def amcl_alphas(

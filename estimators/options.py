@@ -6,7 +6,7 @@ from typing import Any, TypeVar, get_args
 
 from estimators.base import Prior
 from estimators.gaussian import Gaussian
-from sim.errors import InputError
+from sim.errors import InputError, require
 from sim.sensors import Laser, StereoCamera, sensor_of
 
 S = TypeVar("S")
@@ -38,14 +38,18 @@ def require_shares(**options: float) -> None:
 def require_counts(**options: int) -> None:
     """Each option must be a whole number, one or more."""
     for name, count in options.items():
-        if isinstance(count, bool) or not isinstance(count, int) or count < 1:
-            raise InputError(f"estimator.{name} must be a whole number, at least 1, got {count!r}")
+        require(
+            not isinstance(count, bool) and isinstance(count, int) and count >= 1,
+            f"estimator.{name} must be a whole number, at least 1, got {count!r}",
+        )
 
 
 def _require(options: dict[str, float], wanted: str, holds: Callable[[float], bool]) -> None:
     for name, number in options.items():
-        if not isinstance(number, int | float) or not (math.isfinite(number) and holds(number)):
-            raise InputError(f"estimator.{name} must be {wanted}, got {number}")
+        require(
+            isinstance(number, int | float) and math.isfinite(number) and holds(number),
+            f"estimator.{name} must be {wanted}, got {number}",
+        )
 
 
 def start_pose(prior: Prior, estimator: str) -> Gaussian:

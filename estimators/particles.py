@@ -169,5 +169,4 @@ def _at(weights: Array, quantiles: Array) -> Ints:
     """Particles at quantiles in [0, 1) of the cumulated weights; never one of zero weight."""
     cumulated = np.cumsum(weights)
     drawn = np.searchsorted(cumulated, quantiles * cumulated[-1], side="right")
-    indices: Ints = np.minimum(drawn, np.flatnonzero(weights)[-1])
-    return indices
+    return np.asarray(np.minimum(drawn, np.flatnonzero(weights)[-1]))

@@ -14,7 +14,7 @@ from estimators.icp_covariance import censi
 from estimators.topological_map import TopologicalMap, level_slice
 from sim import se2
 from sim.arrays import Array, Floats
-from sim.errors import InputError
+from sim.errors import require
 from sim.sensors import Lidar3D
 
 _TURNS = 3  # headings tried, the best of the correlation
@@ -39,12 +39,12 @@ class Refiner:
     """Registers level slices of clouds with those of a map's nodes, which it keeps prepared."""
 
     def __init__(self, known_map: TopologicalMap, lidar: Lidar3D) -> None:
-        if known_map.slices_m.shape[1] != lidar.n_azimuths:
-            raise InputError(
-                f"the map's slices have {known_map.slices_m.shape[1]} beams, the lidar has "
-                f"{lidar.n_azimuths} azimuths; build the map with this lidar or set "
-                "estimator.refine=false"
-            )
+        require(
+            known_map.slices_m.shape[1] == lidar.n_azimuths,
+            f"the map's slices have {known_map.slices_m.shape[1]} beams, the lidar has "
+            f"{lidar.n_azimuths} azimuths; build the map with this lidar or set "
+            "estimator.refine=false",
+        )
         self._map, self._lidar = known_map, lidar
         self._bearings = lidar.azimuths_rad
         self._reach_m = 2.0 * max(known_map.spacing_m, 1.0)
@@ -74,9 +74,9 @@ class Refiner:
                     best, best_node = found, candidate
                     if best.overlap > _GOOD_OVERLAP:
                         return self._posed(best, source, best_node)
-        if best is None:
-            return Refinement(None, None, status)
-        return self._posed(best, source, best_node)
+        return (
+            Refinement(None, None, status) if best is None else self._posed(best, source, best_node)
+        )
 
     def _target(self, node: int) -> PreparedScan:
         """Return a node's slice, prepared when it is first asked for."""

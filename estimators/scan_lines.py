@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from sim.arrays import Array, Ints
 from sim.compiled import njit
-from sim.errors import InputError
+from sim.errors import require
 
 _NOISE_FLOOR_M = 0.002  # quantised ranges can look free of noise
 _MIN_LINE_POINTS = 3
@@ -117,15 +117,16 @@ def prepare(
     """
     ranges = np.ascontiguousarray(ranges_m, dtype=np.float64)
     bearings = np.ascontiguousarray(bearings_rad, dtype=np.float64)
-    if ranges.ndim != 1 or ranges.shape != bearings.shape:
-        raise InputError(
-            f"a scan needs one bearing a range, got shapes {ranges.shape} and {bearings.shape}"
-        )
+    require(
+        ranges.ndim == 1 and ranges.shape == bearings.shape,
+        f"a scan needs one bearing a range, got shapes {ranges.shape} and {bearings.shape}",
+    )
     full = False
     if len(bearings) > 1:
         steps = np.diff(bearings)
-        if not steps.min() > 0.0:
-            raise InputError("the bearings of a scan must rise from beam to beam; flip the scan")
+        require(
+            steps.min() > 0.0, "the bearings of a scan must rise from beam to beam; flip the scan"
+        )
         full = bool(bearings[-1] - bearings[0] + 1.5 * steps[0] > 2.0 * math.pi)
     return _prepare(ranges, bearings, float(max_range_m), full)
 

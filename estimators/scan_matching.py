@@ -158,10 +158,10 @@ class ScanMatcher:
         )
         if found.status in FAILED:
             return Match(guess, found.status, _NOTHING[:0], _EVERYTHING)
-        sigma_m = self.sigma_m(laser)
-        R = self._covariance_of(found, scan, reference, in_laser.covariance, sigma_m, rng)
-        measured = Gaussian(found.T_target_source, R)
-        motion, to_base = measured.seen_from(se2.inverse(mount))
+        R = self._covariance_of(
+            found, scan, reference, in_laser.covariance, self.sigma_m(laser), rng
+        )
+        motion, to_base = Gaussian(found.T_target_source, R).seen_from(se2.inverse(mount))
         if found.status != "degenerate":
             return Match(motion, found.status, _EVERYTHING, _NOTHING)
         in_base = [to_base @ part for part in icp_covariance.split_directions(found)]

@@ -22,7 +22,7 @@ from estimators.options import (
 )
 from estimators.stereo import NoiseAt, NoiseModel, StereoModel
 from sim.arrays import Array, Floats, Ints
-from sim.errors import InputError
+from sim.errors import require, required
 from sim.sensors import Reading
 
 Association = Literal["known", "mahalanobis", "descriptor"]
@@ -123,11 +123,11 @@ class SlamFrontEnd:
         """
         camera = require_stereo(prior, self._stereo, self._estimator)
         start = start_pose(prior, self._estimator)
-        if self.association == "known" and not camera.identifies:
-            raise InputError(
-                "the camera does not identify landmarks; set estimator.association=mahalanobis "
-                "or descriptor"
-            )
+        require(
+            self.association != "known" or camera.identifies,
+            "the camera does not identify landmarks; set estimator.association=mahalanobis "
+            "or descriptor",
+        )
         camera = dataclasses.replace(camera, **self._sigmas)  # type: ignore[arg-type]
         self.camera = StereoModel.of(camera, self._noise_model, self._noise_at)
         # a landmark may be predicted beyond dmax and still be the one that was seen
@@ -145,11 +145,11 @@ class SlamFrontEnd:
         used = self.camera.usable(all_points)
         status = "" if used.all() else "observation without depth rejected"
         if self.association == "known" and used.any():
-            if all_ids is None:
-                raise InputError(
-                    f"{self._estimator}: observations without ids; set "
-                    "estimator.association=mahalanobis or descriptor"
-                )
+            all_ids = required(
+                all_ids,
+                f"{self._estimator}: observations without ids; set "
+                "estimator.association=mahalanobis or descriptor",
+            )
             rows = np.flatnonzero(used)
             first = np.unique(all_ids[rows], return_index=True)[1]
             if len(first) < len(rows):
@@ -175,16 +175,15 @@ class SlamFrontEnd:
         """
         if self.association != "descriptor":
             return np.zeros((len(image.points), 0))
-        if image.descriptors.shape[1] == 0 < len(image.points):
-            raise InputError(
-                f"{self._estimator}: observations without descriptors; set "
-                "estimator.association=mahalanobis"
-            )
+        require(
+            not (image.descriptors.shape[1] == 0 < len(image.points)),
+            f"{self._estimator}: observations without descriptors; set "
+            "estimator.association=mahalanobis",
+        )
         if len(self.origins) == 0:
             return np.zeros((len(image.points), 0))
         products = (image.descriptors @ self._descriptors.T).astype(np.float64)
-        unlikeness: Array = image.descriptors.shape[1] * self._rho * (self._rho - 2.0 * products)
-        return unlikeness
+        return np.asarray(image.descriptors.shape[1] * self._rho * (self._rho - 2.0 * products))
 
     def start(self, image: Image, rows: Ints | NDArray[np.bool_]) -> None:
         """Number the landmarks that these of the image's observations start."""

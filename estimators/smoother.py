@@ -31,7 +31,7 @@ from estimators.stereo import LEAST_DEPTH_M, StereoModel
 from estimators.wheels import WheelPrediction
 from sim import se2
 from sim.arrays import Array, Ints
-from sim.errors import InputError
+from sim.errors import require
 from sim.recording import Frame
 
 Robust = Literal["none", "huber", "cauchy"]
@@ -166,16 +166,15 @@ class Smoother:
         self._belief = self._belief.then(motion)
         seen = frame.readings.get(self.stereo)
         if seen is not None and len(seen["points_in_camera"]):
-            if "ids" not in seen:
-                raise InputError(
-                    "smoother needs to know which landmark is which; set "
-                    f"sensors.{self.stereo}.identifies=true"
-                )
+            require(
+                "ids" in seen,
+                "smoother needs to know which landmark is which; set "
+                f"sensors.{self.stereo}.identifies=true",
+            )
             points = seen["points_in_camera"]
             usable = self._camera.usable(points)
             if usable.any():
-                row = len(self._stamps)
-                self._images.append((row, points[usable], seen["ids"][usable]))
+                self._images.append((len(self._stamps), points[usable], seen["ids"][usable]))
         self._stamps.append(frame.stamp)
         self._dead_reckoned.append(self._belief.mean)
         loose = motion.covariance + _sideways(motion) + _FLOOR
@@ -192,8 +191,7 @@ class Smoother:
             `landmark_covariances` (N, 3, 3); its status is `no_landmarks` when it is dead
             reckoning alone, and `not_converged` when the steps did not suffice.
         """
-        if not self._stamps:
-            raise InputError("smoother has seen no Frame; step before finish")
+        require(self._stamps, "smoother has seen no Frame; step before finish")
         rows = self._rows()
         problem, ids = self._problem(rows)
         solution = solve(
@@ -232,7 +230,10 @@ class Smoother:
 
     def _problem(self, rows: list[int]) -> tuple[Problem, Ints]:
         """The problem over the Frames of these rows, and the id of each of its landmarks."""
-        merged = [_merged(self._motions[a + 1 : b + 1]) for a, b in itertools.pairwise(rows)]
+        merged = [
+            functools.reduce(Gaussian.then, self._motions[a + 1 : b + 1])
+            for a, b in itertools.pairwise(rows)
+        ]
         pose_of = {row: pose for pose, row in enumerate(rows)}
         seen = [np.zeros(0, np.int64), *(seen for _, _, seen in self._images)]
         ids, landmark_rows = np.unique(np.concatenate(seen), return_inverse=True)
@@ -290,8 +291,7 @@ def solve(
     splits = np.searchsorted(problem.landmark_rows, np.arange(n_landmarks + 1))
     residuals = _Residuals(problem, splits, robust, robust_sigma)
 
-    by_depth = np.lexsort((problem.points_in_camera[:, 2], problem.landmark_rows))
-    nearest = by_depth[splits[:-1]]
+    nearest = np.lexsort((problem.points_in_camera[:, 2], problem.landmark_rows))[splits[:-1]]
     landmarks = problem.camera.place(
         poses[problem.pose_rows[nearest]], problem.points_in_camera[nearest]
     )
@@ -546,13 +546,7 @@ def _sideways(motion: Gaussian) -> Array:
     """
     x, y, turn = motion.mean
     normal = np.array([-math.sin(turn / 2.0), math.cos(turn / 2.0), 0.0])
-    added: Array = np.outer(normal, normal) * ((x**2 + y**2) * motion.covariance[2, 2] / 12.0)
-    return added
-
-
-def _merged(motions: list[Gaussian]) -> Gaussian:
-    """Several motions as one."""
-    return functools.reduce(Gaussian.then, motions)
+    return np.asarray(np.outer(normal, normal) * ((x**2 + y**2) * motion.covariance[2, 2] / 12.0))
 
 
 def _between(motions: list[Gaussian], ends: Array, joint: Array) -> list[Gaussian]:

@@ -203,8 +203,7 @@ class StereoModel:
         """Landmarks (..., 3) in map of measured points: g^-1 of gil2008, eq. (17)."""
         position, C = self.axes(pose)
         points = np.asarray(points_in_camera, dtype=np.float64)
-        placed: Array = position + np.einsum("...ji,...j->...i", C, points)
-        return placed
+        return np.asarray(position + np.einsum("...ji,...j->...i", C, points))
 
     def covariance(self, points_in_camera: ArrayLike) -> Array:
         """R (..., 3, 3), m^2, at points (..., 3) in the camera frame."""
@@ -225,8 +224,7 @@ class StereoModel:
         seen = np.asarray(measured, dtype=np.float64)
         v, at = seen - expected, seen if self.at_measured else expected
         if self.in_image:
-            depth = np.maximum(at[..., 2], LEAST_DEPTH_M)
-            v = v * (depth / seen[..., 2])[..., None]
+            v = v * (np.maximum(at[..., 2], LEAST_DEPTH_M) / seen[..., 2])[..., None]
         return v, self.covariance(at)
 
     def to_image(self, points_in_camera: ArrayLike) -> Array:

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from estimators import descriptors as describers
 from sim import se2
 from sim.arrays import Array, Floats, Ints
-from sim.errors import InputError
+from sim.errors import InputError, require, required
 from sim.files import write_whole
 from sim.recording import Recording
 from sim.sensors import Lidar3D
@@ -58,17 +58,18 @@ class TopologicalMap:
 
     def __post_init__(self) -> None:
         n = len(self.positions_m)
-        if n == 0:
-            raise InputError("a topological map needs at least one node")
+        require(n > 0, "a topological map needs at least one node")
         _check_positions(self.positions_m)
-        if self.descriptors.ndim != 2 or len(self.descriptors) != n or not self.descriptors.size:
-            raise InputError(
-                f"descriptors must have shape ({n}, D), one row a position, "
-                f"got {self.descriptors.shape}"
-            )
+        require(
+            self.descriptors.ndim == 2 and len(self.descriptors) == n and self.descriptors.size,
+            f"descriptors must have shape ({n}, D), one row a position, "
+            f"got {self.descriptors.shape}",
+        )
         _check_finite("descriptor", self.descriptors)
-        if self.edges.ndim != 2 or self.edges.shape[1] != 2:
-            raise InputError(f"edges must have shape (E, 2), got {self.edges.shape}")
+        require(
+            self.edges.ndim == 2 and self.edges.shape[1] == 2,
+            f"edges must have shape (E, 2), got {self.edges.shape}",
+        )
         first, second = self.edges.T
         wrong = (first < 0) | (second >= n) | (first >= second)
         if wrong.any():
@@ -77,16 +78,20 @@ class TopologicalMap:
                 f"edge {row} joins {first[row]} and {second[row]}; give two different nodes "
                 f"from 0 to {n - 1}, the smaller number first"
             )
-        if self.descriptor not in ("", *describers.KINDS):
-            raise InputError(
-                f"unknown descriptor {self.descriptor!r}; known: {', '.join(describers.KINDS)}"
-            )
+        require(
+            self.descriptor in ("", *describers.KINDS),
+            f"unknown descriptor {self.descriptor!r}; known: {', '.join(describers.KINDS)}",
+        )
         if len(self.headings_rad) == 0:
             object.__setattr__(self, "headings_rad", np.full(n, np.nan))
-        if self.headings_rad.shape != (n,):
-            raise InputError(f"headings must have shape ({n},), got {self.headings_rad.shape}")
-        if self.slices_m.ndim != 2 or len(self.slices_m) not in (0, n):
-            raise InputError(f"slices must have shape ({n}, A), got {self.slices_m.shape}")
+        require(
+            self.headings_rad.shape == (n,),
+            f"headings must have shape ({n},), got {self.headings_rad.shape}",
+        )
+        require(
+            self.slices_m.ndim == 2 and len(self.slices_m) in (0, n),
+            f"slices must have shape ({n}, A), got {self.slices_m.shape}",
+        )
         for f in dataclasses.fields(self):
             if isinstance(array := getattr(self, f.name), np.ndarray):
                 array.setflags(write=False)
@@ -184,8 +189,10 @@ def read_array(path: Path) -> Array:
     except (OSError, ValueError, EOFError) as error:
         reason = str(error).splitlines()[0]
         raise InputError(f"{path}: not a table of numbers ({reason}); give .npy or .csv") from error
-    if not np.issubdtype(table.dtype, np.number):
-        raise InputError(f"{path}: holds {table.dtype}, not numbers; give .npy or .csv of numbers")
+    require(
+        np.issubdtype(table.dtype, np.number),
+        f"{path}: holds {table.dtype}, not numbers; give .npy or .csv of numbers",
+    )
     return np.asarray(table, np.float64)
 
 
@@ -209,18 +216,17 @@ def from_recording(
     join_m
         As in `from_arrays`; None: 0.75 times the spacing, which also closes a loop.
     """
-    if not spacing_m > 0.0:
-        raise InputError(f"spacing_m of a topological map must be positive, got {spacing_m}")
-    log = recording.logs.get("place") or recording.logs.get("lidar3d")
-    if log is None:
-        raise InputError("a topological map needs a recording with 3D clouds or place descriptors")
+    require(spacing_m > 0.0, f"spacing_m of a topological map must be positive, got {spacing_m}")
+    log = required(
+        recording.logs.get("place") or recording.logs.get("lidar3d"),
+        "a topological map needs a recording with 3D clouds or place descriptors",
+    )
     poses = recording.truth_at(log.stamps)
     rows: list[int] = []
     for row in np.flatnonzero(np.isfinite(poses).all(axis=1)):
         if not rows or np.hypot(*(poses[row, :2] - poses[rows[-1], :2])) >= spacing_m:
             rows.append(int(row))
-    if not rows:
-        raise InputError("none of the clouds of the recording has a true pose; no map can be built")
+    require(rows, "none of the clouds of the recording has a true pose; no map can be built")
     slices = None
     if "place" in recording.logs:
         features, descriptor = log["descriptor"][rows], ""
@@ -246,8 +252,7 @@ def level_slice(lidar: Lidar3D, ranges_m: Floats) -> Floats:
     """
     elevations = lidar.elevations_rad
     ring = int(np.argmin(np.abs(elevations - 1e-6)))
-    level: Floats = (ranges_m[ring] * np.cos(elevations[ring])).astype(np.float32)
-    return level
+    return np.asarray((ranges_m[ring] * np.cos(elevations[ring])).astype(np.float32))
 
 
 _ARRAYS = ("positions_m", "descriptors", "edges", "headings_rad", "slices_m")
@@ -286,8 +291,9 @@ def load(path: str | Path) -> TopologicalMap:
         raise InputError(
             f"{path}: not a topological map ({reason}); build it again from its mapping run"
         ) from error
-    if version != FORMAT_VERSION:
-        raise InputError(f"{path}: format {version}, this version reads {FORMAT_VERSION}")
+    require(
+        version == FORMAT_VERSION, f"{path}: format {version}, this version reads {FORMAT_VERSION}"
+    )
     try:
         return TopologicalMap(descriptor=name, **arrays)
     except InputError as error:
@@ -295,8 +301,10 @@ def load(path: str | Path) -> TopologicalMap:
 
 
 def _check_positions(positions_m: Array) -> None:
-    if positions_m.ndim != 2 or positions_m.shape[1] != 2:
-        raise InputError(f"positions must have shape (N, 2), got {positions_m.shape}")
+    require(
+        positions_m.ndim == 2 and positions_m.shape[1] == 2,
+        f"positions must have shape (N, 2), got {positions_m.shape}",
+    )
     _check_finite("position", positions_m)
 
 

@@ -23,7 +23,7 @@ from estimators.place_refinement import Refiner
 from estimators.topological_map import TopologicalMap, load
 from sim import se2
 from sim.arrays import Array, Floats, Ints
-from sim.errors import InputError
+from sim.errors import InputError, require
 from sim.recording import Frame
 from sim.robot import arc_increment
 from sim.sensors import Lidar3D, sensor_of
@@ -78,11 +78,9 @@ def node_log_weights(
     if weighting != "M1":
         exponents -= (_scaled(descriptor_distances) / sigma_m) ** 2
     if weighting == "M3":
-        product: Array = exponents.sum(axis=1)
-        return product
+        return np.asarray(exponents.sum(axis=1))
     highest = exponents.max(axis=1)
-    total: Array = highest + np.log(np.exp(exponents - highest[:, None]).sum(axis=1))
-    return total
+    return np.asarray(highest + np.log(np.exp(exponents - highest[:, None]).sum(axis=1)))
 
 
 def _scaled(distances: Array) -> Array:
@@ -94,8 +92,7 @@ def _scaled(distances: Array) -> Array:
 def _normalized(log_weights: Array) -> Array:
     """Finite log weights (M,) whose weights sum to one."""
     shifted = log_weights - log_weights.max()
-    normal: Array = shifted - math.log(np.exp(shifted).sum())
-    return normal
+    return np.asarray(shifted - math.log(np.exp(shifted).sum()))
 
 
 def _sums(places: Ints, values: Array, n: int) -> Array:
@@ -147,8 +144,7 @@ class Graph:
 
     def before(self, edges: Ints, uniform: Array) -> Ints:
         """Edge before each, for driving backwards."""
-        earlier: Ints = self.reverse[self.next(self.reverse[edges], uniform)]
-        return earlier
+        return np.asarray(self.reverse[self.next(self.reverse[edges], uniform)])
 
 
 class TopologicalMcl:
@@ -236,8 +232,7 @@ class TopologicalMcl:
         if sigma_l_m is not None:
             require_positive(sigma_l_m=sigma_l_m)
         require_shares(p_stay=p_stay, p_skip=p_skip, p_turn=p_turn, injection=injection)
-        if p_stay + p_skip > 1.0:
-            raise InputError("estimator.p_stay and p_skip must not exceed 1 together")
+        require(p_stay + p_skip <= 1.0, "estimator.p_stay and p_skip must not exceed 1 together")
         self.weighting, self.n_nearest = weighting, n_nearest
         self.particles_per_node = particles_per_node
         self.sigma_l_m, self.sigma_m, self.motion = sigma_l_m, sigma_m, motion
@@ -248,19 +243,18 @@ class TopologicalMcl:
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Spread the particles over the nodes, weighted by the prior's pose if it has one."""
         known = prior.map if self.map_path is None else load(Path(self.map_path))
-        if not isinstance(known, TopologicalMap):
-            raise InputError(
-                "topological_mcl needs a topological map; set estimator.map_path, or prior.map "
-                "to the function that makes one"
-            )
+        require(
+            isinstance(known, TopologicalMap),
+            "topological_mcl needs a topological map; set estimator.map_path, or prior.map "
+            "to the function that makes one",
+        )
         self._rng, self._map, self._graph = rng, known, Graph(known)
-        if not {self.place, self.lidar3d} & set(prior.sensors):
-            raise InputError(
-                "topological_mcl needs place descriptors or a 3D lidar; choose sensors=lidar3d"
-            )
-        self._lidar = None
-        if self.lidar3d in prior.sensors:
-            self._lidar = sensor_of(prior.sensors, self.lidar3d, Lidar3D)
+        require(
+            {self.place, self.lidar3d} & set(prior.sensors),
+            "topological_mcl needs place descriptors or a 3D lidar; choose sensors=lidar3d",
+        )
+        has_lidar = self.lidar3d in prior.sensors
+        self._lidar = sensor_of(prior.sensors, self.lidar3d, Lidar3D) if has_lidar else None
         self._track_m = prior.robot.track_m
         self._kind = describers.KINDS.get(known.descriptor)
         self._node_of_state = np.concatenate([self._graph.tail, self._graph.head])
@@ -269,9 +263,8 @@ class TopologicalMcl:
         self._squares = np.einsum("nd,nd->n", known.descriptors, known.descriptors)
         self._sigma_l_m = self.sigma_l_m or known.spacing_m or 1.0
         self._near_m = 1.5 * max(known.spacing_m, 1.0)
-        self._refiner = None
-        if self.refine and known.slices_m.size and self._lidar is not None:
-            self._refiner = Refiner(known, self._lidar)
+        refines = self.refine and known.slices_m.size > 0
+        self._refiner = Refiner(known, self._lidar) if refines and self._lidar else None
         copy, node = np.indices((self.particles_per_node, len(known))).reshape(2, -1)
         self._edge = self._graph.first_out[node] + copy % self._graph.degree[node]
         self._along_m = np.zeros(len(node))
@@ -326,11 +319,11 @@ class TopologicalMcl:
                 return None, "empty cloud"
             observed = self._kind.describe(self._lidar, turn["ranges_m"])
         size = self._map.descriptors.shape[1]
-        if observed.shape != (size,):
-            raise InputError(
-                f"the map's descriptors have {size} numbers, the recording's have shape "
-                f"{observed.shape}; describe both by the same network"
-            )
+        require(
+            observed.shape == (size,),
+            f"the map's descriptors have {size} numbers, the recording's have shape "
+            f"{observed.shape}; describe both by the same network",
+        )
         if not np.isfinite(observed).all():
             return None, "descriptor not finite"
         return observed.astype(np.float32, copy=False), ""
@@ -342,10 +335,10 @@ class TopologicalMcl:
         n_new = rng.binomial(n, self.injection) if self.injection > 0.0 else 0
         if n_new:
             slots = rng.choice(n, n_new, replace=False)
-            odds = np.zeros(len(nearest))
-            if self.weighting != "M1":
-                odds = -((_scaled(away) / self.sigma_m) ** 2)
-            node = nearest[resample(odds, n_new, rng, "multinomial")]
+            alike = (
+                np.zeros(len(nearest)) if self.weighting == "M1" else _scaled(away) / self.sigma_m
+            )
+            node = nearest[resample(-(alike**2), n_new, rng, "multinomial")]
             out = (rng.random(n_new) * self._graph.degree[node]).astype(np.int64)
             self._edge[slots] = self._graph.first_out[node] + out
             self._along_m[slots] = 0.0
@@ -381,8 +374,7 @@ class TopologicalMcl:
             mass = _sums(self._edge, np.exp(self._log_weights), len(self._graph.tail))
             held = np.flatnonzero(mass)
             if self.scheme == "multinomial":  # its copies of each come in one draw
-                copies = self._rng.multinomial(n, mass[held] / mass.sum())
-                self._edge = np.repeat(held, copies)
+                self._edge = np.repeat(held, self._rng.multinomial(n, mass[held] / mass.sum()))
             else:
                 self._edge = held[resample(np.log(mass[held]), n, self._rng, self.scheme)]
         else:
@@ -395,8 +387,7 @@ class TopologicalMcl:
         if self.motion == "paper":
             return self._edge
         past = self._along_m > 0.5 * self._graph.length_m.take(self._edge)
-        states: Ints = self._edge + len(self._graph.tail) * past
-        return states
+        return np.asarray(self._edge + len(self._graph.tail) * past)
 
     def _roll(self, wheel_increments_m: Array) -> None:
         """Move along the edges by the wheels' mean travel."""
@@ -447,8 +438,7 @@ class TopologicalMcl:
         mass = _sums(state, np.exp(self._log_weights), len(self._poses))
         held = np.flatnonzero(mass)
         shares, poses, nodes = mass[held], self._poses[held], self._node_of_state[held]
-        by_node = _sums(nodes, shares, len(known))
-        mode, mode_mass = self._mode(by_node)
+        mode, mode_mass = self._mode(_sums(nodes, shares, len(known)))
         if self.estimate == "mode":
             near = np.zeros(len(known), bool)
             near[self._about(mode)] = True

@@ -6,14 +6,14 @@ conf/world/<name>.yaml and nowhere else.
 
 import math
 from collections.abc import Callable
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from sim.arrays import Array
-from sim.errors import InputError
+from sim.errors import InputError, require
 from sim.grid_file import read_grid
 from sim.plan import WALL_HEIGHT_M, Plan, box_corners, rectangle_corners
 from sim.world import World, facing_second
@@ -47,11 +47,11 @@ def from_grid(*, rng: np.random.Generator, path: str, waypoints: list[list[float
     """
     del rng
     walls = read_grid(path).walls()
-    if len(walls) > _MOST_GRID_WALLS:
-        raise InputError(
-            f"{path}: {len(walls)} walls, and {_MOST_GRID_WALLS} are the most; clean the grid, or "
-            "make its cells larger"
-        )
+    require(
+        len(walls) <= _MOST_GRID_WALLS,
+        f"{path}: {len(walls)} walls, and {_MOST_GRID_WALLS} are the most; clean the grid, or "
+        "make its cells larger",
+    )
     try:
         tour = np.array(waypoints, float).reshape(-1, 2)
     except (TypeError, ValueError):
@@ -121,27 +121,26 @@ def rooms(
     The tour goes from room to room: round the outer ring, then, where there is one, round the
     ring inside it, and back.
     """
-    if n_x < 1 or n_y < 1 or n_x * n_y < 2:
-        raise InputError(f"world.n_x and n_y must make at least two rooms, got {n_x} x {n_y}")
+    require(
+        n_x >= 1 and n_y >= 1 and n_x * n_y >= 2,
+        f"world.n_x and n_y must make at least two rooms, got {n_x} x {n_y}",
+    )
     _positive(room_m=room_m - 2.0, door_m=door_m - 0.7, wall=room_m - door_m)
     plan = Plan()
     plan.rectangle((0, 0), (n_x * room_m, n_y * room_m))
     door = [(room_m / 2, door_m)]
-    for i in range(n_x):
-        for j in range(n_y):
-            x, y = i * room_m, j * room_m
-            plan.place("room", x, y, x + room_m, y + room_m)
-            if i + 1 < n_x:
-                plan.wall((x + room_m, y), (x + room_m, y + room_m), gaps=door)
-                plan.door((x + room_m, y + room_m / 2), (1, 0))
-            if j + 1 < n_y:
-                plan.wall((x, y + room_m), (x + room_m, y + room_m), gaps=door)
-                plan.door((x + room_m / 2, y + room_m), (0, 1))
+    corners = [(i * room_m, j * room_m) for i in range(n_x) for j in range(n_y)]
+    for x, y in corners:
+        plan.place("room", x, y, x + room_m, y + room_m)
+        if x < (n_x - 1) * room_m:
+            plan.wall((x + room_m, y), (x + room_m, y + room_m), gaps=door)
+            plan.door((x + room_m, y + room_m / 2), (1, 0))
+        if y < (n_y - 1) * room_m:
+            plan.wall((x, y + room_m), (x + room_m, y + room_m), gaps=door)
+            plan.door((x + room_m / 2, y + room_m), (0, 1))
     plan.tour = [((i + 0.5) * room_m, (j + 0.5) * room_m) for i, j in _grid_tour(n_x, n_y)]
-    for i in range(n_x):
-        for j in range(n_y):
-            low = (i * room_m, j * room_m)
-            plan.furnish(rng, low, np.add(low, room_m).tolist(), objects_per_room)
+    for low in corners:
+        plan.furnish(rng, low, np.add(low, room_m).tolist(), objects_per_room)
     return plan.world(
         "rooms",
         rng,
@@ -213,10 +212,10 @@ def office(
     door; the west and the east one have cabinets. The rooms' widths, doors, niches and furniture
     are random. The tour goes round the western loop, then round both, into `rooms_visited` rooms.
     """
-    if not 1.8 < corridor_m <= 3.0:
-        raise InputError(f"world.corridor_m must lie between 1.8 and 3 m, got {corridor_m}")
-    if not 0 <= rooms_visited <= 22:
-        raise InputError(f"world.rooms_visited must lie in 0-22, got {rooms_visited}")
+    require(
+        1.8 < corridor_m <= 3.0, f"world.corridor_m must lie between 1.8 and 3 m, got {corridor_m}"
+    )
+    require(0 <= rooms_visited <= 22, f"world.rooms_visited must lie in 0-22, got {rooms_visited}")
     plan, c = Plan(), corridor_m
     W, H, south = 66.0, 42.0, 9.0
     passage = 44.0 + rng.uniform(0.0, 1.0)  # west side of the passage between the loops
@@ -236,18 +235,15 @@ def office(
         ]
         plan.wall((left, inner_high), (right, inner_high))
         if court:
-            low, high = (left + column, mouth), (right - column, inner_high)
-            plan.close(rectangle_corners(low, high))
+            plan.close(rectangle_corners((left + column, mouth), (right - column, inner_high)))
     rooms = [room for suite in suites for room in _suite(plan, rng, *suite)]
-    mid = c / 2
-    y0, y1 = south + mid, H - mid
-    x0, xm, x1 = mid, passage + mid, W - mid
+    x0, xm, x1 = c / 2, passage + c / 2, W - c / 2
+    y0, y1 = south + c / 2, H - c / 2
     plan.place("corridor_bare", c, H - c, passage, H)
     plan.place("corridor_objects", 0, inner_low, c, inner_high)
     plan.place("corridor_objects", W - c, inner_low, W, inner_high)
-    for x in (0.0, passage, W - c):
-        for y in (south, H - c):
-            plan.place("corner", x, y, x + c, y + c)
+    for x, y in product((0.0, passage, W - c), (south, H - c)):
+        plan.place("corner", x, y, x + c, y + c)
     loop = [(x0, y0), (xm, y0), (xm, y1), (x0, y1), (x0, y0)]
     second = [(x1, y0), (x1, y1), (xm, y1), (xm, y0), (x0, y0)]
     plan.tour = _with_visits([*loop, *second], rooms, rng, rooms_visited)
@@ -355,9 +351,8 @@ def _with_visits(
     path: list[tuple[float, float]], rooms: list[_Room], rng: np.random.Generator, count: int
 ) -> list[tuple[float, float]]:
     """Tour along the path that looks into `count` of the rooms, in and out by the door."""
-    chosen = [rooms[row] for row in rng.permutation(len(rooms))[:count]]
     stops: list[list[tuple[float, _Room, Array]]] = [[] for _ in path]
-    for room in chosen:
+    for room in (rooms[row] for row in rng.permutation(len(rooms))[:count]):
         feet = []
         for start, end in pairwise(np.array(path)):
             way = end - start
@@ -371,8 +366,7 @@ def _with_visits(
     for point, visits in zip(path, stops, strict=True):
         tour.append(point)
         for _, room, foot in sorted(visits, key=lambda stop: stop[0]):
-            inside = room.door + 2.0 * room.inward
-            tour += [(float(x), float(y)) for x, y in (foot, inside, foot)]
+            tour += [(float(x), float(y)) for x, y in (foot, room.door + 2.0 * room.inward, foot)]
     return tour
 
 
@@ -432,8 +426,7 @@ def _town(
     trees_per_block: int,
 ) -> World:
     """Build blocks in a grid of streets; the tour is a closed way along the streets."""
-    if n_x < 1 or n_y < 1:
-        raise InputError(f"world.n_x and n_y must be at least 1, got {n_x} and {n_y}")
+    require(n_x >= 1 and n_y >= 1, f"world.n_x and n_y must be at least 1, got {n_x} and {n_y}")
     _positive(block_m=block_m - 30.0, street_m=street_m - 6.0)
     plan, pitch = Plan(), block_m + street_m
     corners = [(0, 0), (n_x, 0), (n_x, n_y), (0, n_y), (0, 0)]
@@ -443,11 +436,10 @@ def _town(
     plan.tour = _rounded(path, radius_m=0.35 * street_m, spacing_m=4.0)
     for x, y in path[:-1]:
         plan.place("corner", *(v + d * street_m / 2 for d in (-1, 1) for v in (x, y)))
-    for i in range(n_x):
-        for j in range(n_y):
-            low = np.array([i * pitch, j * pitch])
-            build(plan, rng, low, block_m)
-            _trees(plan, rng, low, block_m, trees_per_block)
+    for cell in product(range(n_x), range(n_y)):
+        low = pitch * np.array(cell)
+        build(plan, rng, low, block_m)
+        _trees(plan, rng, low, block_m, trees_per_block)
     return plan.world(name, rng)
 
 
@@ -476,8 +468,7 @@ def _lawn(plan: Plan, rng: np.random.Generator, low: Array, block_m: float) -> N
         corners = box_corners(centre.tolist(), size.tolist(), yaw)
         if rng.random() < 0.5:  # an L: the corner that is cut out lies at a quarter of the box
             a, b, c, d = corners
-            mid = corners.mean(axis=0)
-            corners = np.array([a, b, (b + c) / 2, mid, (c + d) / 2, d])
+            corners = np.array([a, b, (b + c) / 2, corners.mean(axis=0), (c + d) / 2, d])
         plan.prism(corners, 0.0, top)
 
 
@@ -521,5 +512,4 @@ def _rounded(
 
 def _positive(**margins: float) -> None:
     for name, margin in margins.items():
-        if not margin > 0.0:
-            raise InputError(f"world.{name} is too small for a robot to pass; make it larger")
+        require(margin > 0.0, f"world.{name} is too small for a robot to pass; make it larger")

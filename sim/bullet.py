@@ -12,12 +12,11 @@ import math
 import os
 import sys
 from collections.abc import Iterator
-from types import TracebackType
 
 import numpy as np
 
 from sim.arrays import Array
-from sim.errors import InputError
+from sim.errors import InputError, require
 from sim.robot import DifferentialDrive
 from sim.world import World
 
@@ -52,7 +51,7 @@ _RAYS, _WALLS, _GROUND, _ROBOT = 1, 2, 4, 8  # collision groups; rays are in the
 _TIPPED_RAD = 0.1
 
 
-class BulletBody:
+class BulletBody(contextlib.AbstractContextManager["BulletBody"]):
     """A world with one robot in the engine; a context manager that frees the engine.
 
     Parameters
@@ -88,15 +87,7 @@ class BulletBody:
         for _ in range(_SETTLE_TICKS):
             self.step(0.0, 0.0)
 
-    def __enter__(self) -> BulletBody:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -198,8 +189,7 @@ class BulletBody:
             flags=pybullet.GEOM_FORCE_CONCAVE_TRIMESH,
             physicsClientId=self._client,
         )
-        if shape < 0:
-            raise InputError(f"world {world.name}: the physics engine refused its walls")
+        require(shape >= 0, f"world {world.name}: the physics engine refused its walls")
         walls: int = pybullet.createMultiBody(0, shape, physicsClientId=self._client)
         self._surface(walls, -1, 0.5, _WALLS, _ROBOT | _RAYS)
         return walls

@@ -58,8 +58,7 @@ class SegmentCaster:
         """Ranges (n_beams,), m, from a pose (3,) m, m, rad; +inf where nothing is in range."""
         if np.size(T_world_sensor) != 3:
             raise ValueError(f"cast needs one pose (3,), got {np.shape(T_world_sensor)}")
-        ranges: Array = self.cast_many(np.reshape(T_world_sensor, (1, 3)))[0]
-        return ranges
+        return np.asarray(self.cast_many(np.reshape(T_world_sensor, (1, 3)))[0])
 
     def cast_many(self, T_world_sensor: ArrayLike) -> Array:
         """Ranges (N, n_beams), m, from poses (N, 3) m, m, rad; +inf where nothing is in range."""

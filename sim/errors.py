@@ -23,3 +23,15 @@ def required(value: T | None, complaint: str) -> T:
     if value is None:
         raise InputError(complaint)
     return value
+
+
+def require(holds: object, complaint: str) -> None:
+    """Check a condition.
+
+    Raises
+    ------
+    InputError
+        With the complaint, if the condition does not hold.
+    """
+    if not holds:
+        raise InputError(complaint)

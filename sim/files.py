@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from sim.errors import InputError
+from sim.errors import InputError, require
 
 
 @contextmanager
@@ -18,8 +18,7 @@ def write_whole(path: Path) -> Iterator[Path]:
     InputError
         If the file cannot be written: full disk, no permission, a folder in its place.
     """
-    if not path.name or path.is_dir():
-        raise InputError(f"{path or '.'}: a folder; name the file to write")
+    require(path.name and not path.is_dir(), f"{path or '.'}: a folder; name the file to write")
     part = path.with_name(f".{path.stem}.{os.getpid()}.{secrets.token_hex(4)}.part{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -35,3 +34,9 @@ def write_whole(path: Path) -> Iterator[Path]:
     finally:
         with suppress(OSError):
             part.unlink()
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file, whole or not at all, as `write_whole` does."""
+    with write_whole(path) as part:
+        part.write_text(text, encoding="utf-8")

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from sim.arrays import Array
 from sim.compiled import njit
-from sim.errors import InputError
+from sim.errors import require
 from sim.robot import SLIP_TIME_CONSTANT_S, SMALL_ANGLE_RAD, DifferentialDrive
 from sim.route import TICK_S, OpenLoop
 
@@ -110,10 +110,10 @@ def run_batch(
     InputError
         If unmodelled slip is asked for, which only the simulator offers.
     """
-    if robot.unmodelled_slip > 0.0:
-        raise InputError("batches know the kr/kl law only; set robot.unmodelled_slip=0")
-    if n_runs < 1:
-        raise InputError(f"n_runs must be at least 1, got {n_runs}")
+    require(
+        robot.unmodelled_slip == 0.0, "batches know the kr/kl law only; set robot.unmodelled_slip=0"
+    )
+    require(n_runs >= 1, f"n_runs must be at least 1, got {n_runs}")
     commands_m = wheel_commands(robot, route)
     n_ticks = len(commands_m)
     every = max(1, round(sample_s / TICK_S))

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sim.arrays import Array
-from sim.errors import InputError
+from sim.errors import InputError, require
 from sim.world import World, facing_second
 
 WALL_HEIGHT_M = 2.5
@@ -127,8 +127,7 @@ class Plan:
         InputError
             If there is no room for so many.
         """
-        if count < 0:
-            raise InputError(f"world: the number of objects must be zero or more, got {count}")
+        require(count >= 0, f"world: the number of objects must be zero or more, got {count}")
         least, most = np.array(low, float), np.array(high, float)
         paths = _near(self._paths(), least - clearance_m, most + clearance_m)
         faces = _near(np.array(self.faces, float).reshape(-1, 4), least, most)
@@ -136,8 +135,7 @@ class Plan:
             for _ in range(tries):
                 size = rng.uniform(*size_m, size=2)
                 yaw = rng.uniform(0.0, math.pi) if rng.random() < 0.6 else 0.0
-                centre = rng.uniform(least, most)
-                corners = box_corners(centre.tolist(), size, yaw)
+                corners = box_corners(rng.uniform(least, most).tolist(), size, yaw)
                 within = np.all((corners > least + _APART_M) & (corners < most - _APART_M))
                 if within and self._fits(corners, faces, paths, clearance_m):
                     self.prism(corners, 0.0, rng.uniform(*height_m))
@@ -205,10 +203,11 @@ class Plan:
 
     def _landmarks(self, rng: np.random.Generator, count: int, on_walls_share: float) -> Array:
         """Landmarks (count, 3), spread over walls and objects by the faces' lengths."""
-        if count < 0:
-            raise InputError(f"world.n_landmarks must be zero or more, got {count}")
-        if not 0.0 <= on_walls_share <= 1.0:
-            raise InputError(f"world.on_walls_share must lie in [0, 1], got {on_walls_share}")
+        require(count >= 0, f"world.n_landmarks must be zero or more, got {count}")
+        require(
+            0.0 <= on_walls_share <= 1.0,
+            f"world.on_walls_share must lie in [0, 1], got {on_walls_share}",
+        )
         if not self.faces:
             return np.zeros((0, 3))
         objects = np.array(self.on_object)
@@ -301,8 +300,7 @@ def _to_segment(points: Array, segments: Array) -> Array:
     length2 = np.maximum(np.sum(along**2, axis=-1), 1e-12)
     share = np.clip(np.sum(offset * along, axis=-1) / length2, 0.0, 1.0)
     rest = offset - share[..., None] * along
-    distance: Array = np.hypot(rest[..., 0], rest[..., 1])
-    return distance
+    return np.asarray(np.hypot(rest[..., 0], rest[..., 1]))
 
 
 def _turn(segments: Array, points: Array) -> Array:
@@ -319,8 +317,7 @@ def box_corners(centre: Sequence[float], size: Sequence[float] | Array, yaw_rad:
     """Corners (4, 2), m, counter-clockwise."""
     half = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * np.asarray(size) / 2
     cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
-    corners: Array = half @ np.array([[cos, sin], [-sin, cos]]) + np.asarray(centre)
-    return corners
+    return np.asarray(half @ np.array([[cos, sin], [-sin, cos]]) + np.asarray(centre))
 
 
 def regular(centre: Sequence[float], radius_m: float, sides: int) -> Array:
@@ -337,8 +334,10 @@ def make_descriptors(
     `look_alike_share` of the landmarks share theirs with another one, in pairs (the last three
     make a triple if their number is odd); the mask (count,) marks them.
     """
-    if not 0.0 <= look_alike_share <= 1.0:
-        raise InputError(f"world.look_alike_share must lie in [0, 1], got {look_alike_share}")
+    require(
+        0.0 <= look_alike_share <= 1.0,
+        f"world.look_alike_share must lie in [0, 1], got {look_alike_share}",
+    )
     raw = np.maximum(rng.standard_normal((count, DESCRIPTOR_SIZE)) - 0.4, 0.0) ** 1.5
     raw[:, 0] += 1e-3  # never all zero
     alike = np.zeros(count, bool)

@@ -24,8 +24,7 @@ class ExactRays:
             from sim.casting import SegmentCaster
 
             self._casters[scanner] = SegmentCaster(self._world, scanner)
-        ranges: Array = self._casters[scanner].cast(scanner.mount.in_map(pose))
-        return ranges
+        return np.asarray(self._casters[scanner].cast(scanner.mount.in_map(pose)))
 
     def cloud(self, lidar: Any, pose: Array) -> Array:
         """Ranges (rings, azimuths) m of a lidar on the robot at a pose (3,)."""
@@ -71,8 +70,7 @@ class BulletRays:
             return np.zeros(0, bool)
         distance = np.linalg.norm(points - origin, axis=1)
         share = self._bullet.cast(np.broadcast_to(origin, points.shape), points)
-        seen: NDArray[np.bool_] = share * distance >= distance - _SURFACE_M
-        return seen
+        return np.asarray(share * distance >= distance - _SURFACE_M)
 
     def _ranges(self, starts: Array, way: Array, reach_m: float, *, ground: bool) -> Array:
         share = self._bullet.cast(starts, starts + reach_m * way, ground=ground)

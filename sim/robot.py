@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sim.arrays import Array
-from sim.errors import InputError
+from sim.errors import require
 from sim.settings import check_numbers
 
 SLIP_TIME_CONSTANT_S = 0.1
@@ -110,21 +110,21 @@ class DifferentialDrive:
                 check_numbers("robot", self, (name,))
         for name in ("bias_right", "bias_left"):
             value = getattr(self, name)
-            if not _LEAST_BIAS <= value <= _MOST_BIAS:
-                raise InputError(
-                    f"robot.{name} must lie in [{_LEAST_BIAS:g}, {_MOST_BIAS:g}], a factor of "
-                    f"three either way, got {value}"
-                )
-        if self.encoder_pulses_per_turn and self.encoder_tick_m:
-            raise InputError(
-                "robot.encoder_pulses_per_turn and robot.encoder_tick_m both set the encoder's "
-                "quantum; set one of them to 0"
+            require(
+                _LEAST_BIAS <= value <= _MOST_BIAS,
+                f"robot.{name} must lie in [{_LEAST_BIAS:g}, {_MOST_BIAS:g}], a factor of "
+                f"three either way, got {value}",
             )
-        if self.gear_ratio != 1.0 and not self.encoder_pulses_per_turn:
-            raise InputError(
-                "robot.gear_ratio has no effect without pulses; set robot.encoder_pulses_per_turn, "
-                "or robot.gear_ratio=1"
-            )
+        require(
+            not self.encoder_pulses_per_turn or not self.encoder_tick_m,
+            "robot.encoder_pulses_per_turn and robot.encoder_tick_m both set the encoder's "
+            "quantum; set one of them to 0",
+        )
+        require(
+            self.gear_ratio == 1.0 or self.encoder_pulses_per_turn,
+            "robot.gear_ratio has no effect without pulses; set robot.encoder_pulses_per_turn, "
+            "or robot.gear_ratio=1",
+        )
 
     @property
     def slip_variance_per_m(self) -> Array:
@@ -195,8 +195,7 @@ class RobotGeometry:
 
 def wheel_variances(travel_m: ArrayLike, kr: float, kl: float) -> Array:
     """Variances (..., 2) m^2 of wheel increments (..., 2): k |ds| (puzzlebot2024, eq. (5))."""
-    variances: Array = np.abs(np.asarray(travel_m, float)) * np.array([kr, kl])
-    return variances
+    return np.asarray(np.abs(np.asarray(travel_m, float)) * np.array([kr, kl]))
 
 
 def wheel_errors(travel_m: ArrayLike, variance_per_m: ArrayLike, rng: np.random.Generator) -> Array:
@@ -217,8 +216,7 @@ def wheel_errors(travel_m: ArrayLike, variance_per_m: ArrayLike, rng: np.random.
         Errors of the shape of `travel_m`.
     """
     travel = np.asarray(travel_m, float)
-    errors: Array = scaled_error(travel, variance_per_m, rng.standard_normal(travel.shape))
-    return errors
+    return np.asarray(scaled_error(travel, variance_per_m, rng.standard_normal(travel.shape)))
 
 
 def scaled_error(travel_m: Any, variance_per_m: Any, standard_normal: Any) -> Any:

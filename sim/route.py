@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sim.arrays import Array
-from sim.errors import InputError
+from sim.errors import InputError, require
 from sim.feedback import CONTROL_TICKS, check_feedback
 from sim.robot import DifferentialDrive, arc_increment
 from sim.se2 import chain, transform
@@ -51,8 +51,7 @@ class OpenLoop:
     def __post_init__(self) -> None:
         check_numbers("route", self, not_negative=("rest_s",))
         object.__setattr__(self, "segments", tuple(_merged(self.segments)))
-        if not self.segments:
-            raise InputError("route.segments is empty; give at least one [v, omega, duration]")
+        require(self.segments, "route.segments is empty; give at least one [v, omega, duration]")
 
     def start(self, world: World, robot: DifferentialDrive) -> tuple[Array, Replay]:
         """Start pose (3,) of the world, and the driver."""
@@ -83,8 +82,7 @@ class OpenLoop:
         """Pose (3,) that the commands promise at the end; heading unwrapped."""
         v, omega, duration_s = np.array(self.segments).T
         travel = np.stack([v + omega, v - omega], axis=1) * duration_s[:, None]
-        last: Array = chain(arc_increment(travel, 2.0), start)[-1]
-        return last
+        return np.asarray(chain(arc_increment(travel, 2.0), start)[-1])
 
 
 @dataclass(frozen=True)
@@ -143,8 +141,10 @@ class Tour:
         check_numbers(
             "route", self, ("speed_mps", "look_ahead_m", "tolerance_m", "turn_rate_radps")
         )
-        if self.distance_m is not None and not 0.0 < self.distance_m < math.inf:
-            raise InputError(f"route.distance_m must be positive, got {self.distance_m}")
+        require(
+            self.distance_m is None or 0.0 < self.distance_m < math.inf,
+            f"route.distance_m must be positive, got {self.distance_m}",
+        )
         if self.waypoints is not None:
             wanted = "route.waypoints must be null or at least two points [x, y], m"
             _check_points(self.waypoints, wanted, at_least=2)
@@ -152,50 +152,64 @@ class Tour:
     def start(self, world: World, robot: DifferentialDrive) -> tuple[Array, Pursuit]:
         """Start pose (3,) on the first way-point, facing the second, and the driver."""
         given = world.waypoints if self.waypoints is None else np.array(self.waypoints, float)
-        if given.ndim != 2 or given.shape[1] != 2 or len(given) < 2:
-            raise InputError(
-                f"route: world {world.name} has no tour of at least two way-points; give "
-                "route.waypoints=[[x, y], ...]"
-            )
+        require(
+            given.ndim == 2 and given.shape[1] == 2 and len(given) >= 2,
+            f"route: world {world.name} has no tour of at least two way-points; give "
+            "route.waypoints=[[x, y], ...]",
+        )
         path = _lengthened(given, self.distance_m)
         return facing_second(path), Pursuit(self, robot, path)
 
 
-class Pursuit:
-    """Driver of a Tour: pure pursuit, 50 times a second, with limited acceleration."""
+class _Controller:
+    """Driver that steers 50 times a second with limited acceleration, and rests at its goal."""
 
-    def __init__(self, tour: Tour, robot: DifferentialDrive, path: Array) -> None:
-        self._tour, self._path = tour, path
-        self._along_m = _along_m(path)
-        self._most = _accelerations(robot)
-        self._done_m, self._velocity = 0.0, np.zeros(2)
-        self._off_m = 0.0
-        self._rest_ticks: int | None = None
-        self._last_tick = round(300 * (4.0 * self._along_m[-1] / tour.speed_mps + 60.0))
-        self._late = False
+    def __init__(self, robot: DifferentialDrive, last_s: float) -> None:
+        linear = robot.max_acceleration_mps2
+        # (2,) of v and omega, m/s^2 and rad/s^2: half of a wheel's acceleration for each
+        self._most = np.array([0.5 * linear, linear / robot.nominal.track_m])
+        self._velocity, self._rest_ticks = np.zeros(2), -1
+        self._last_tick, self._late = round(last_s / TICK_S), False
 
     def command(self, tick: int, pose: Array) -> Array | None:
-        """Velocity (2,) of the tick; None when the robot rests at the last way-point."""
-        if self._rest_ticks is not None:
+        """Velocity (2,) of the tick; None when the robot has rested at its goal."""
+        if self._rest_ticks >= 0:
             self._rest_ticks -= 1
             return None if self._rest_ticks < 0 else np.zeros(2)
         if tick % CONTROL_TICKS:
             return self._velocity
         self._late = tick >= self._last_tick
-        self._project(pose)
-        left_m = self._along_m[-1] - self._done_m
-        if left_m < 0.02 and self._velocity[0] < 0.05:
+        wanted = self._wanted(pose)
+        if wanted is None:
             self._rest_ticks = 60
             return np.zeros(2)
-        self._velocity = _limited(self._wanted(pose, left_m), self._velocity, self._most)
+        step = CONTROL_TICKS * TICK_S * self._most
+        self._velocity = self._velocity + np.clip(wanted - self._velocity, -step, step)
         return self._velocity
 
     @property
     def trouble(self) -> str | None:
-        """`off_route` or `incomplete` (far too slow), else None."""
-        if self._off_m > self._tour.tolerance_m:
-            return "off_route"
+        """`incomplete` (far too slow), else None."""
         return "incomplete" if self._late else None
+
+    def _wanted(self, pose: Array) -> Array | None:
+        """Velocity (2,) to go for; None at the goal."""
+        raise NotImplementedError
+
+
+class Pursuit(_Controller):
+    """Driver of a Tour: pure pursuit."""
+
+    def __init__(self, tour: Tour, robot: DifferentialDrive, path: Array) -> None:
+        self._tour, self._path = tour, path
+        self._along_m = _along_m(path)
+        self._done_m, self._off_m = 0.0, 0.0
+        super().__init__(robot, 4.0 * self._along_m[-1] / tour.speed_mps + 60.0)
+
+    @property
+    def trouble(self) -> str | None:
+        """`off_route` or `incomplete` (far too slow), else None."""
+        return "off_route" if self._off_m > self._tour.tolerance_m else super().trouble
 
     def _project(self, pose: Array) -> None:
         """Advance the progress along the path to the nearest point not far ahead."""
@@ -217,11 +231,15 @@ class Pursuit:
                 best, done_m = gap, at_m
         self._done_m, self._off_m = done_m, best
 
-    def _wanted(self, pose: Array, left_m: float) -> Array:
+    def _wanted(self, pose: Array) -> Array | None:
+        self._project(pose)
+        left_m = self._along_m[-1] - self._done_m
+        if left_m < 0.02 and self._velocity[0] < 0.05:
+            return None
         tour = self._tour
-        goal = self._point_at(self._done_m + tour.look_ahead_m)
-        bearing = math.atan2(goal[1] - pose[1], goal[0] - pose[0]) - pose[2]
-        bearing = math.atan2(math.sin(bearing), math.cos(bearing))
+        goal_m = self._done_m + tour.look_ahead_m
+        goal = np.array([np.interp(goal_m, self._along_m, way) for way in self._path.T])
+        bearing = _bearing(goal - pose[:2], pose)
         distance = max(float(np.hypot(*(goal - pose[:2]))), 1e-3)
         brake = math.sqrt(2.0 * 0.8 * self._most[0] * max(left_m, 0.0))
         if abs(bearing) > 0.6:  # too sharp for an arc: slow down and turn on the spot
@@ -230,10 +248,6 @@ class Pursuit:
         omega = 2.0 * v * math.sin(bearing) / max(distance, 0.5 * tour.look_ahead_m)
         limit = tour.turn_rate_radps
         return np.array([max(v, 0.01), min(max(omega, -limit), limit)])
-
-    def _point_at(self, along_m: float) -> Array:
-        columns = [np.interp(along_m, self._along_m, self._path[:, i]) for i in (0, 1)]
-        return np.array(columns)
 
 
 @dataclass(frozen=True)
@@ -296,60 +310,32 @@ class GoToPoints:
         return world.start_pose, GoToPoint(self, robot, transform(world.start_pose, path))
 
 
-class GoToPoint:
-    """Driver of GoToPoints, 50 times a second, with limited acceleration."""
+class GoToPoint(_Controller):
+    """Driver of GoToPoints."""
 
     def __init__(self, route: GoToPoints, robot: DifferentialDrive, path: Array) -> None:
-        self._route, self._points = route, path[1:]
-        self._most = _accelerations(robot)
-        self._velocity, self._reached = np.zeros(2), 0
-        self._rest_ticks: int | None = None
+        self._route, self._points, self._reached = route, path[1:], 0
         turns_s = math.pi * len(self._points) / route.turn_rate_radps
-        slowest_s = 4.0 * (_along_m(path)[-1] / route.speed_mps + turns_s) + 60.0
-        self._last_tick, self._late = round(slowest_s / TICK_S), False
+        super().__init__(robot, 4.0 * (_along_m(path)[-1] / route.speed_mps + turns_s) + 60.0)
 
-    def command(self, tick: int, pose: Array) -> Array | None:
-        """Velocity (2,) of the tick; None when the robot rests at the last point."""
-        if self._rest_ticks is not None:
-            self._rest_ticks -= 1
-            return None if self._rest_ticks < 0 else np.zeros(2)
-        if tick % CONTROL_TICKS:
-            return self._velocity
-        self._late = tick >= self._last_tick
+    def _wanted(self, pose: Array) -> Array | None:
         route, offset = self._route, self._points[self._reached] - pose[:2]
         if np.hypot(*offset) <= route.tolerance_m:
             self._reached += 1
             if self._reached == len(self._points):
-                self._rest_ticks = 60
-                return np.zeros(2)
+                return None
             offset = self._points[self._reached] - pose[:2]
-        bearing = math.atan2(offset[1], offset[0]) - pose[2]
-        bearing = math.atan2(math.sin(bearing), math.cos(bearing))
+        bearing = _bearing(offset, pose)
         most = route.turn_rate_radps
         omega = min(max(route.gain_bearing * bearing, -most), most)
-        v = 0.0
-        if abs(bearing) <= route.turn_above_rad:
-            v = min(route.gain_distance * float(np.hypot(*offset)), route.speed_mps)
-        self._velocity = _limited(np.array([v, omega]), self._velocity, self._most)
-        return self._velocity
-
-    @property
-    def trouble(self) -> str | None:
-        """`incomplete` (far too slow), else None."""
-        return "incomplete" if self._late else None
+        v = min(route.gain_distance * float(np.hypot(*offset)), route.speed_mps)
+        return np.array([v if abs(bearing) <= route.turn_above_rad else 0.0, omega])
 
 
-def _accelerations(robot: DifferentialDrive) -> Array:
-    """Limits (2,) of v and omega, m/s^2 and rad/s^2: half of a wheel's acceleration for each."""
-    linear = robot.max_acceleration_mps2
-    return np.array([0.5 * linear, linear / robot.nominal.track_m])
-
-
-def _limited(wanted: Array, velocity: Array, most: Array) -> Array:
-    """Velocity (2,) a control period later, on the way to the wanted one."""
-    step = CONTROL_TICKS * TICK_S * most
-    limited: Array = velocity + np.clip(wanted - velocity, -step, step)
-    return limited
+def _bearing(offset: Array, pose: Array) -> float:
+    """Direction of an offset (2,) in map as the robot sees it, rad, in [-pi, pi]."""
+    bearing = math.atan2(offset[1], offset[0]) - pose[2]
+    return math.atan2(math.sin(bearing), math.cos(bearing))
 
 
 def _check_points(given: ArrayLike, wanted: str, at_least: int) -> None:
@@ -359,14 +345,12 @@ def _check_points(given: ArrayLike, wanted: str, at_least: int) -> None:
     except (TypeError, ValueError):
         raise InputError(f"{wanted}, got {given!r}") from None
     shaped = points.ndim == 2 and points.shape[1] == 2 and len(points) >= at_least
-    if not (shaped and np.isfinite(points).all()):
-        raise InputError(f"{wanted}, got {given!r}")
+    require(shaped and np.isfinite(points).all(), f"{wanted}, got {given!r}")
 
 
 def _lengthened(path: Array, distance_m: float | None) -> Array:
     """Path (P, 2) cut or repeated to the wanted length, without points that coincide."""
-    keep = np.concatenate([[True], np.hypot(*np.diff(path, axis=0).T) > 1e-6])
-    path = path[keep]
+    path = path[np.concatenate([[True], np.hypot(*np.diff(path, axis=0).T) > 1e-6])]
     if distance_m is None:
         return path
     closed = bool(np.hypot(*(path[0] - path[-1])) < 1e-6)
@@ -395,8 +379,10 @@ def _merged(segments: Iterable[Iterable[float]]) -> list[Segment]:
             v, omega, duration_s = (float(value) for value in segment)
         except (TypeError, ValueError):
             raise InputError(f"{where} must be [v, omega, duration], got {segment!r}") from None
-        if not all(map(math.isfinite, (v, omega, duration_s))) or duration_s <= 0.0:
-            raise InputError(f"{where} must be finite with a positive duration, got {segment!r}")
+        require(
+            all(map(math.isfinite, (v, omega, duration_s))) and duration_s > 0.0,
+            f"{where} must be finite with a positive duration, got {segment!r}",
+        )
         if merged and merged[-1][:2] == (v, omega):
             duration_s += merged.pop()[2]
         merged.append((v, omega, duration_s))
@@ -407,8 +393,7 @@ def _trapezoid(segment: Segment, robot: DifferentialDrive) -> tuple[float, float
     """Plateau and ramp times, s, and the share of the velocity that the plateau reaches."""
     v, omega, duration_s = segment
     track_m = max(robot.track_m, robot.nominal.track_m)  # neither body nor wheels are hurried
-    fastest_mps = abs(v) + abs(omega) * track_m / 2.0
-    ramp_s = fastest_mps / robot.max_acceleration_mps2
+    ramp_s = (abs(v) + abs(omega) * track_m / 2.0) / robot.max_acceleration_mps2
     if ramp_s <= duration_s:
         return duration_s - ramp_s, ramp_s, 1.0
     # peak share p reached after p ramp_s: the area p^2 ramp_s must be the duration

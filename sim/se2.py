@@ -45,6 +45,13 @@ def between(T_w_a: ArrayLike, T_w_b: ArrayLike) -> Array:
     return compose(inverse(T_w_a), T_w_b)
 
 
+def difference(first: Array, second: Array) -> Array:
+    """First less second, number by number, (..., 3); the heading is wrapped."""
+    off = first - second
+    off[..., 2] = wrap(off[..., 2])
+    return off
+
+
 def transform(T_a_b: ArrayLike, points_in_b: ArrayLike) -> Array:
     """Points (..., N, 2) of frame b, m, in frame a."""
     pose, points = np.asarray(T_a_b, dtype=np.float64), np.asarray(points_in_b, dtype=np.float64)
@@ -85,8 +92,7 @@ def between_jacobians(T_w_a: ArrayLike, T_w_b: ArrayLike) -> tuple[Array, Array]
     first, second = np.asarray(T_w_a, dtype=np.float64), np.asarray(T_w_b, dtype=np.float64)
     cos, sin = np.cos(first[..., 2]), np.sin(first[..., 2])
     relative = between(first, second)
-    shape = (*relative.shape[:-1], 3, 3)
-    by_second = np.zeros(shape)
+    by_second = np.zeros((*relative.shape[:-1], 3, 3))
     by_second[..., 0, 0] = by_second[..., 1, 1] = cos
     by_second[..., 0, 1], by_second[..., 1, 0] = sin, -sin
     by_second[..., 2, 2] = 1.0

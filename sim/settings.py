@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from types import NoneType, UnionType
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from sim.errors import InputError
+from sim.errors import InputError, require
 
 T = TypeVar("T")
 
@@ -29,19 +29,19 @@ def build(cls: type[T], settings: Mapping[str, Any], where: str) -> T:
     InputError
         For an unknown or missing key, or a value of the wrong type.
     """
-    if not isinstance(settings, Mapping):
-        raise InputError(f"{where} must be a mapping of keys to values, got {settings!r}")
+    require(
+        isinstance(settings, Mapping),
+        f"{where} must be a mapping of keys to values, got {settings!r}",
+    )
     fields = {f.name: f for f in dataclasses.fields(cls)}  # type: ignore[arg-type]
     values: dict[str, Any] = {}
     kinds = get_type_hints(cls)
     for key, value in settings.items():
-        if key not in fields:
-            raise InputError(f"unknown key {where}.{key}; known: {', '.join(fields)}")
+        require(key in fields, f"unknown key {where}.{key}; known: {', '.join(fields)}")
         values[key] = _checked(value, kinds[key], f"{where}.{key}")
     for name, f in fields.items():
         bare = f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING
-        if bare and name not in values:
-            raise InputError(f"{where}.{name} is missing")
+        require(not bare or name in values, f"{where}.{name} is missing")
     return cls(**values)
 
 
@@ -58,8 +58,10 @@ def check_numbers(
     for name in (*positive, *not_negative):
         value = getattr(settings, name)
         wanted = "a positive number" if name in positive else "zero or a positive number"
-        if not (math.isfinite(value) and (value > 0.0 or (value == 0.0 and name in not_negative))):
-            raise InputError(f"{where}.{name} must be {wanted}, got {value}")
+        require(
+            math.isfinite(value) and (value > 0.0 or (value == 0.0 and name in not_negative)),
+            f"{where}.{name} must be {wanted}, got {value}",
+        )
 
 
 def find(target: Any, where: str) -> Callable[..., Any]:
@@ -70,8 +72,10 @@ def find(target: Any, where: str) -> Callable[..., Any]:
     InputError
         If there is none.
     """
-    if not isinstance(target, str) or "." not in target:
-        raise InputError(f"{where}._target_ must name a class or function, such as mine.Mine")
+    require(
+        isinstance(target, str) and "." in target,
+        f"{where}._target_ must name a class or function, such as mine.Mine",
+    )
     module_name, _, name = target.rpartition(".")
     try:
         module = importlib.import_module(module_name)
@@ -79,9 +83,8 @@ def find(target: Any, where: str) -> Callable[..., Any]:
         raise InputError(
             f"{where}._target_={target}: no module {error.name}; is its folder on PYTHONPATH?"
         ) from error
-    found = getattr(module, name, None)
-    if not callable(found):
-        raise InputError(f"{where}._target_={target}: {module_name} has no class {name}")
+    found: Any = getattr(module, name, None)
+    require(callable(found), f"{where}._target_={target}: {module_name} has no class {name}")
     return found  # type: ignore[no-any-return]
 
 
@@ -91,14 +94,16 @@ def _checked(value: Any, kind: Any, where: str) -> Any:
         return value
     number = isinstance(value, (int, float)) and not isinstance(value, bool)
     if float in kinds:
-        if not number:
-            raise InputError(f"{where} must be a number, got {value!r}")
+        require(number, f"{where} must be a number, got {value!r}")
         return float(value)
     if int in kinds:
-        if not (number and float(value).is_integer()):
-            raise InputError(f"{where} must be a whole number, got {value!r}")
+        require(
+            number and float(value).is_integer(), f"{where} must be a whole number, got {value!r}"
+        )
         return int(value)
-    if bool in kinds and not isinstance(value, bool):
-        raise InputError(f"{where} must be true or false, got {value!r}")
+    require(
+        bool not in kinds or isinstance(value, bool),
+        f"{where} must be true or false, got {value!r}",
+    )
     part = next((k for k in kinds if isinstance(k, type) and dataclasses.is_dataclass(k)), None)
     return value if part is None or isinstance(value, part) else build(part, value, where)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from sim import se2
 from sim.arrays import Array
-from sim.errors import InputError
+from sim.errors import InputError, require
 from sim.feedback import Feedback, Onboard, feedback_of
 from sim.kinematic import KinematicBody
 from sim.rays import BulletRays, ExactRays
@@ -116,15 +116,16 @@ def record(
         If a sensor's rate does not divide 300 Hz, if the robot overlaps a wall at its start, or
         if Bullet rays are asked for without Bullet physics.
     """
-    if rays == "bullet" and physics != "bullet":
-        raise InputError("rays=bullet needs physics=bullet; set rays=exact")
+    require(
+        rays != "bullet" or physics == "bullet", "rays=bullet needs physics=bullet; set rays=exact"
+    )
     periods = _periods(sensors)
     pose, driver = route.start(world, robot)
-    if overlaps(world, robot, pose):
-        raise InputError(
-            f"the robot overlaps a wall of world {world.name} at its start "
-            f"({pose[0]:.2f}, {pose[1]:.2f}); move the start pose or the wall"
-        )
+    require(
+        not overlaps(world, robot, pose),
+        f"the robot overlaps a wall of world {world.name} at its start "
+        f"({pose[0]:.2f}, {pose[1]:.2f}); move the start pose or the wall",
+    )
     feedback = feedback_of(route, robot, pose, sensors, world, onboard)
     logs: _Logs = defaultdict(list)
     with contextlib.ExitStack() as stack:
@@ -186,9 +187,8 @@ class _Firing:
 
     def __call__(self, stamp: float, pose: Array) -> Reading | None:
         last = self._last
-        view = View(stamp, pose, last.world, last.rays, last.stamp, last.pose)
-        self._last = view
-        return self._probe(view)
+        self._last = View(stamp, pose, last.world, last.rays, last.stamp, last.pose)
+        return self._probe(self._last)
 
 
 def _drive(
@@ -214,8 +214,7 @@ def _drive(
         due = [name for name, period in periods.items() if tick % period == 0]
         wanted = driver.command(tick, feedback.pose(tick, pose, encoder))
         if due or wanted is None:
-            counts = robot.encoder_reading(encoder)
-            logs["/frames"].append((tick, (counts, travel.copy(), pose)))
+            logs["/frames"].append((tick, (robot.encoder_reading(encoder), travel.copy(), pose)))
         if due:
             readings = {name: probes[name](tick / TICKS_PER_S, pose) for name in due}
             shown = {name: reading for name, reading in readings.items() if reading is not None}
@@ -277,16 +276,8 @@ class _Collisions:
         pose = self._body.pose
         if math.hypot(*(pose[:2] - self._at)) + self._reach_m < self._free_m:
             return None
-        self._at, self._free_m = pose[:2], _wall_distance_m(self._world, pose[:2])
+        self._at, self._free_m = pose[:2], self._world.clearance_m(pose[:2])
         return "collision" if overlaps(self._world, self._robot, pose) else None
-
-
-def _wall_distance_m(world: World, point: Array) -> float:
-    """Distance of a point (2,) to the nearest wall, m; inf without walls."""
-    start, along = world.walls[:, :2] - point, world.walls[:, 2:] - world.walls[:, :2]
-    share = np.clip(-np.sum(start * along, axis=1) / np.sum(along**2, axis=1), 0.0, 1.0)
-    gaps = start + share[:, None] * along
-    return float(np.hypot(*gaps.T).min(initial=np.inf))
 
 
 def _half_footprint_m(robot: DifferentialDrive) -> Array:
@@ -312,8 +303,7 @@ class _SlipEvents:
         """Encoder errors of the right and left wheel, m, of this tick."""
         if self._chance == 0.0:
             return 0.0, 0.0
-        begins = self._rng.random(2) < self._chance
-        self._left[begins] = _SLIP_EVENT_TICKS
+        self._left[self._rng.random(2) < self._chance] = _SLIP_EVENT_TICKS
         active = self._left > 0
         self._left[active] -= 1
         right, left = np.where(active, self._step_m * np.sign(rolling_m), 0.0).tolist()
@@ -335,14 +325,13 @@ def _periods(sensors: Sensors) -> dict[str, int]:
         if rate is None:
             continue
         ticks = TICKS_PER_S / rate
-        if abs(ticks - round(ticks)) > 1e-6 or round(ticks) < 1:
-            raise InputError(
-                f"sensors.{name}.rate_hz={rate:g} does not divide the simulation's "
-                f"{TICKS_PER_S} Hz; choose one that does, such as 10, 20, 50, 75 or 100"
-            )
+        require(
+            abs(ticks - round(ticks)) <= 1e-6 and round(ticks) >= 1,
+            f"sensors.{name}.rate_hz={rate:g} does not divide the simulation's "
+            f"{TICKS_PER_S} Hz; choose one that does, such as 10, 20, 50, 75 or 100",
+        )
         periods[name] = round(ticks)
-    if not periods:
-        raise InputError("no sensor fires; set sensors.encoder.rate_hz or add a sensor")
+    require(periods, "no sensor fires; set sensors.encoder.rate_hz or add a sensor")
     return periods
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.arrays import Array
-from sim.errors import InputError
+from sim.errors import InputError, require
 
 
 def facing_second(waypoints: Array) -> Array:
@@ -65,19 +65,17 @@ class World:
             **{f"places.{k}": (v, (len(v), 4)) for k, v in self.places.items()},
         }
         for key, (values, shape) in shapes.items():
-            if np.shape(values) != shape:
-                raise InputError(
-                    f"world {self.name}: {key} must have shape {shape}, got {np.shape(values)}"
-                )
-            if not np.all(np.isfinite(values)):
-                raise InputError(f"world {self.name}: {key} must be finite numbers")
-        if len(self.descriptors) not in (0, len(self.landmarks)):
-            raise InputError(
-                f"world {self.name}: {len(self.descriptors)} descriptors for "
-                f"{len(self.landmarks)} landmarks"
+            require(
+                np.shape(values) == shape,
+                f"world {self.name}: {key} must have shape {shape}, got {np.shape(values)}",
             )
-        length = np.hypot(*(self.walls[:, 2:] - self.walls[:, :2]).T)
-        for bad in np.flatnonzero(length < 1e-6):
+            require(np.all(np.isfinite(values)), f"world {self.name}: {key} must be finite numbers")
+        require(
+            len(self.descriptors) in (0, len(self.landmarks)),
+            f"world {self.name}: {len(self.descriptors)} descriptors for "
+            f"{len(self.landmarks)} landmarks",
+        )
+        for bad in np.flatnonzero(np.hypot(*(self.walls[:, 2:] - self.walls[:, :2]).T) < 1e-6):
             raise InputError(f"world {self.name}: wall {bad} has no length; give it two ends")
         for bad in np.flatnonzero(self.wall_z_m[:, 0] >= self.wall_z_m[:, 1]):
             raise InputError(f"world {self.name}: wall {bad} has its top below its bottom")
@@ -108,9 +106,7 @@ class World:
 
     def clearance_m(self, point_in_world: Array) -> float:
         """Distance from a point (2,) to the nearest wall, m; inf in an empty world."""
-        if len(self.walls) == 0:
-            return float("inf")
         start, along = self.walls[:, :2], self.walls[:, 2:] - self.walls[:, :2]
         offset = np.asarray(point_in_world, float)[:2] - start
         share = np.clip(np.sum(offset * along, axis=1) / np.sum(along**2, axis=1), 0.0, 1.0)
-        return float(np.min(np.hypot(*(offset - share[:, None] * along).T)))
+        return float(np.hypot(*(offset - share[:, None] * along).T).min(initial=np.inf))

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from sim.errors import InputError
+from sim.errors import InputError, require
 from sim.plan import WALL_HEIGHT_M, box_corners, gaps_m, make_descriptors
 from sim.world import World, facing_second
 
@@ -45,27 +45,28 @@ def read_world(path: Path) -> World:
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         where = getattr(error, "problem_mark", None)
         line = f":{where.line + 1}" if where is not None else ""
-        raise InputError(f"{path}{line}: not valid YAML ({_brief(error)})") from error
-    if not isinstance(document, Mapping):
-        raise InputError(f"{path}: must hold keys such as walls, boxes, waypoints")
+        brief = " ".join(str(error).split())[:120]
+        raise InputError(f"{path}{line}: not valid YAML ({brief})") from error
+    require(
+        isinstance(document, Mapping), f"{path}: must hold keys such as walls, boxes, waypoints"
+    )
     _check_keys(document, _KEYS, str(path))
-    walls, heights = [], []
-    for i, entry in enumerate(_list(document, "walls", path)):
-        ends, z = _wall(entry, f"{path}: walls[{i}]")
-        walls.append(ends)
-        heights.append(z)
+    faces = [
+        _wall(entry, f"{path}: walls[{i}]")
+        for i, entry in enumerate(_list(document, "walls", path))
+    ]
     for i, entry in enumerate(_list(document, "boxes", path)):
-        corners, top = _box(entry, f"{path}: boxes[{i}]")
-        for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-            walls.append([*a, *b])
-            heights.append([0.0, top])
+        faces += _box(entry, f"{path}: boxes[{i}]")
+    walls = np.array([ends for ends, _ in faces], float).reshape(-1, 4)
     landmarks = _rows(document, "landmarks", 3, path)
     waypoints = _rows(document, "waypoints", 2, path)
     descriptors, alike = make_descriptors(np.random.default_rng(0), len(landmarks), 0.0)
-    check_tour(waypoints, np.array(walls, float).reshape(-1, 4), path)
+    check_tour(waypoints, walls, path)
     named = document.get("places") or {}
-    if not isinstance(named, Mapping):
-        raise InputError(f"{path}: places must map names to lists of x_min, y_min, x_max, y_max")
+    require(
+        isinstance(named, Mapping),
+        f"{path}: places must map names to lists of x_min, y_min, x_max, y_max",
+    )
     places = {str(k): _rows(named, k, 4, path, prefix="places.") for k in named}
     for name, rectangles in places.items():
         for bad in np.flatnonzero(np.any(rectangles[:, :2] >= rectangles[:, 2:], axis=1)):
@@ -74,8 +75,8 @@ def read_world(path: Path) -> World:
             )
     return World(
         name=str(document.get("name", path.stem)),
-        walls=np.array(walls, float).reshape(-1, 4),
-        wall_z_m=np.array(heights, float).reshape(-1, 2),
+        walls=walls,
+        wall_z_m=np.array([z for _, z in faces], float).reshape(-1, 2),
         landmarks=landmarks,
         descriptors=descriptors,
         look_alike=alike,
@@ -87,15 +88,13 @@ def read_world(path: Path) -> World:
 
 def check_tour(waypoints: Any, walls: Any, path: Path) -> None:
     """Refuse a tour that runs through a wall: no robot can follow it."""
-    if len(walls) == 0:
-        return
-    for i in range(len(waypoints) - 1):
+    for i in range(len(waypoints) - 1 if len(walls) else 0):
         leg = np.concatenate(waypoints[i : i + 2])[None]
-        if gaps_m(leg, walls).min() == 0.0:
-            raise InputError(
-                f"{path}: the way from waypoints[{i}] to waypoints[{i + 1}] runs through a wall or "
-                "a box; lead it round"
-            )
+        require(
+            gaps_m(leg, walls).min() != 0.0,
+            f"{path}: the way from waypoints[{i}] to waypoints[{i + 1}] runs through a wall or "
+            "a box; lead it round",
+        )
 
 
 def _start(document: Mapping[str, Any], waypoints: Any, path: Path) -> Any:
@@ -104,17 +103,14 @@ def _start(document: Mapping[str, Any], waypoints: Any, path: Path) -> Any:
             document["start_pose"], 3, f"{path}: start_pose", "x, y, heading_deg"
         )
         return np.array([x, y, math.radians(degrees)])
-    if len(waypoints) >= 2:
-        return facing_second(waypoints)
-    return np.zeros(3)
+    return facing_second(waypoints) if len(waypoints) >= 2 else np.zeros(3)
 
 
 def _wall(entry: Any, where: str) -> tuple[list[float], list[float]]:
     z = [0.0, WALL_HEIGHT_M]
     if isinstance(entry, Mapping):
         _check_keys(entry, ("from", "to", "z"), where)
-        if "from" not in entry or "to" not in entry:
-            raise InputError(f"{where} must have from: [x, y] and to: [x, y]")
+        require("from" in entry and "to" in entry, f"{where} must have from: [x, y] and to: [x, y]")
         ends = [
             *_numbers(entry["from"], 2, f"{where}.from", "x, y"),
             *_numbers(entry["to"], 2, f"{where}.to", "x, y"),
@@ -123,46 +119,46 @@ def _wall(entry: Any, where: str) -> tuple[list[float], list[float]]:
             z = _numbers(entry["z"], 2, f"{where}.z", "bottom, top")
     else:
         ends = _numbers(entry, 4, where, "x1, y1, x2, y2")
-    if math.dist(ends[:2], ends[2:]) < 1e-6:
-        raise InputError(f"{where} has no length; give it two different ends")
-    if z[0] >= z[1]:
-        raise InputError(f"{where} has its top at or below its bottom: {z}")
+    require(
+        math.dist(ends[:2], ends[2:]) >= 1e-6, f"{where} has no length; give it two different ends"
+    )
+    require(z[0] < z[1], f"{where} has its top at or below its bottom: {z}")
     return ends, z
 
 
-def _box(entry: Any, where: str) -> tuple[Any, float]:
-    if not isinstance(entry, Mapping):
-        raise InputError(f"{where} must be a mapping of {', '.join(_BOX_KEYS)}, got {entry!r}")
+def _box(entry: Any, where: str) -> list[tuple[list[float], list[float]]]:
+    """Ends, and bottom and top, of the four faces."""
+    require(
+        isinstance(entry, Mapping),
+        f"{where} must be a mapping of {', '.join(_BOX_KEYS)}, got {entry!r}",
+    )
     _check_keys(entry, _BOX_KEYS, where)
     for key in ("x", "y", "length", "width"):
-        if key not in entry:
-            raise InputError(f"{where}.{key} is missing")
+        require(key in entry, f"{where}.{key} is missing")
     values = {"heading_deg": 0.0, "height": WALL_HEIGHT_M, **entry}
     numbers = {k: _number(v, f"{where}.{k}") for k, v in values.items()}
     for key in ("length", "width", "height"):
-        if numbers[key] <= 0.0:
-            raise InputError(f"{where}.{key} must be positive, got {numbers[key]:g}")
+        require(numbers[key] > 0.0, f"{where}.{key} must be positive, got {numbers[key]:g}")
     corners = box_corners(
         (numbers["x"], numbers["y"]),
         (numbers["length"], numbers["width"]),
         math.radians(numbers["heading_deg"]),
     )
-    return corners, numbers["height"]
+    return [
+        ([*a, *b], [0.0, numbers["height"]])
+        for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)
+    ]
 
 
 def _check_keys(entry: Mapping[Any, Any], known: tuple[str, ...], where: str) -> None:
     for key in entry:
-        if key not in known:
-            raise InputError(f"{where}: unknown key {key!r}; known: {', '.join(known)}")
+        require(key in known, f"{where}: unknown key {key!r}; known: {', '.join(known)}")
 
 
 def _list(document: Mapping[str, Any], key: Any, path: Path, prefix: str = "") -> list[Any]:
-    value = document.get(key)
-    if value is None:
-        return []
-    if not isinstance(value, list):
-        raise InputError(f"{path}: {prefix}{key} must be a list, got {value!r}")
-    return value
+    value = [] if document.get(key) is None else document[key]
+    require(isinstance(value, list), f"{path}: {prefix}{key} must be a list, got {value!r}")
+    return list(value)
 
 
 def _rows(document: Mapping[str, Any], key: Any, width: int, path: Path, prefix: str = "") -> Any:
@@ -175,8 +171,10 @@ def _rows(document: Mapping[str, Any], key: Any, width: int, path: Path, prefix:
 
 
 def _numbers(entry: Any, count: int, where: str, names: str) -> list[float]:
-    if not isinstance(entry, list) or len(entry) != count:
-        raise InputError(f"{where} must be {count} numbers {names}, got {entry!r}")
+    require(
+        isinstance(entry, list) and len(entry) == count,
+        f"{where} must be {count} numbers {names}, got {entry!r}",
+    )
     return [_number(value, where) for value in entry]
 
 
@@ -185,10 +183,5 @@ def _number(value: Any, where: str) -> float:
         number = math.nan if isinstance(value, bool) else float(value)
     except (TypeError, ValueError):
         number = math.nan
-    if not math.isfinite(number):
-        raise InputError(f"{where}: {value!r} is not a finite number")
+    require(math.isfinite(number), f"{where}: {value!r} is not a finite number")
     return number
-
-
-def _brief(error: Exception) -> str:
-    return " ".join(str(error).split())[:120]

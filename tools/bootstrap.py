@@ -61,8 +61,7 @@ def environment() -> dict[str, str]:
 
 def pinned_uv() -> str:
     """Path of the pinned uv, installed beside the project on the first call."""
-    lock = (ROOT / "requirements-uv.lock").read_text().split()
-    version = lock[0].split("==")[1]
+    version = (ROOT / "requirements-uv.lock").read_text().split()[0].split("==")[1]
     uv = TOOL_DIR / "bin" / "uv"
     for candidate in (str(uv), shutil.which("uv")):
         if candidate and Path(candidate).exists():

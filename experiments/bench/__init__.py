@@ -4,7 +4,7 @@ import importlib
 
 from experiments.bench.measure import as_json as json_text
 from experiments.bench.measure import as_table
-from sim.errors import InputError
+from sim.errors import require
 
 # name -> modules of this package, each with `run()`
 SUITES = {
@@ -28,8 +28,7 @@ def run_bench(name: str, *, as_json: bool) -> str:
     InputError
         For an unknown name.
     """
-    if name not in (*SUITES, "all"):
-        raise InputError(f"unknown benchmark {name}; known: {', '.join(SUITES)}, all")
+    require(name in (*SUITES, "all"), f"unknown benchmark {name}; known: {', '.join(SUITES)}, all")
     results = [
         result
         for suite, modules in SUITES.items()

@@ -14,7 +14,7 @@ from experiments.calibration.result import CalibrationResult
 from experiments.calibration.wheel_truth import from_wheel_truth
 from sim import se2
 from sim.arrays import Array
-from sim.errors import InputError
+from sim.errors import InputError, require
 from sim.recording import Recording
 from sim.robot import DifferentialDrive
 from sim.route import TICK_S
@@ -45,23 +45,21 @@ def calibrate_recordings(
     InputError
         If the truth is missing, runs are not repeated, or there is too little travel.
     """
-    if not recordings:
-        raise InputError("no recordings to calibrate from; give at least one")
+    require(recordings, "no recordings to calibrate from; give at least one")
     if method == "wheel_truth":
         parts = [_wheel_intervals(r, i, interval_s) for i, r in enumerate(recordings)]
         encoder, ground, turns = (np.concatenate(p) for p in zip(*parts, strict=True))
         return from_wheel_truth(encoder, ground, turns, interval_s=interval_s, geometry=geometry)
-    if method != "end_poses":
-        raise InputError(f"method must be wheel_truth or end_poses, got {method!r}")
+    require(method == "end_poses", f"method must be wheel_truth or end_poses, got {method!r}")
     groups: dict[bytes, tuple[Array, list[Array]]] = {}
     for i, recording in enumerate(recordings):
         profile = _command_profile(recording, i)
         groups.setdefault(profile.tobytes(), (profile, []))[1].append(end_pose(recording, i))
-    if min(len(ends) for _, ends in groups.values()) < 2:
-        raise InputError(
-            "end poses need open-loop runs with the same commands, at least 2 of each; "
-            "give repetitions, or use the wheel truth"
-        )
+    require(
+        min(len(ends) for _, ends in groups.values()) >= 2,
+        "end poses need open-loop runs with the same commands, at least 2 of each; "
+        "give repetitions, or use the wheel truth",
+    )
     manoeuvres = [Manoeuvre(profile, np.array(ends)) for profile, ends in groups.values()]
     nominal = DifferentialDrive(**vars(recordings[0].robot))
     return from_end_poses(manoeuvres, nominal, rng or np.random.default_rng(0), geometry=geometry)
@@ -80,8 +78,7 @@ def _wheel_intervals(recording: Recording, i: int, interval_s: float) -> tuple[A
     for row in np.flatnonzero(known).tolist():
         if not rows or truth.stamps[row] - truth.stamps[rows[-1]] >= interval_s - 1e-9:
             rows.append(row)
-    if len(rows) < 2:
-        raise InputError(f"recording {i} is shorter than one interval of {interval_s:g} s")
+    require(len(rows) >= 2, f"recording {i} is shorter than one interval of {interval_s:g} s")
     encoder = [np.interp(truth.stamps[rows], wheels.stamps, way) for way in wheels.position_m.T]
     heading = np.unwrap(truth.poses[:, 2])[rows]
     return np.diff(encoder).T, np.diff(truth.wheel_travel_m[rows], axis=0), np.diff(heading)

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from sim.arrays import Array
 from sim.compiled import njit
-from sim.errors import InputError
+from sim.errors import require
 from sim.robot import SLIP_TIME_CONSTANT_S, DifferentialDrive
 from sim.route import TICK_S
 
@@ -43,8 +43,10 @@ class EndPoseModel:
         method: EndPoseMethod,
         n_samples: int = 256,
     ) -> None:
-        if method not in get_args(EndPoseMethod):
-            raise InputError(f"method must be sampled or linearised, got {method!r}")
+        require(
+            method in get_args(EndPoseMethod),
+            f"method must be sampled or linearised, got {method!r}",
+        )
         self._commands_m = nominal.wheel_speeds(*profile.T) * TICK_S
         self._knots = knots(self._commands_m)
         self._log_chart = abs(float(profile[:, 1].sum() * TICK_S)) < _LOG_CHART_UP_TO_RAD

@@ -15,7 +15,7 @@ from experiments.calibration.end_pose_model import EndPoseMethod, EndPoseModel
 from experiments.calibration.result import CalibrationResult
 from experiments.evaluation.statistics import Interval
 from sim.arrays import Array
-from sim.errors import InputError
+from sim.errors import require
 from sim.robot import DifferentialDrive
 from sim.route import TICK_S
 
@@ -76,13 +76,15 @@ def from_end_poses(
     """
     wanted = 5 if geometry else 2
     n_runs = np.array([len(m.end_poses) for m in manoeuvres])
-    if n_runs.sum() < wanted + 3:
-        raise InputError(
-            f"{n_runs.sum()} runs are too few for {wanted} unknowns; record at least {wanted + 3}"
-        )
+    require(
+        n_runs.sum() >= wanted + 3,
+        f"{n_runs.sum()} runs are too few for {wanted} unknowns; record at least {wanted + 3}",
+    )
     for i, manoeuvre in enumerate(manoeuvres):
-        if not np.all(np.isfinite(manoeuvre.end_poses)):
-            raise InputError(f"manoeuvre {i} has an end pose that is not finite; leave it out")
+        require(
+            np.all(np.isfinite(manoeuvre.end_poses)),
+            f"manoeuvre {i} has an end pose that is not finite; leave it out",
+        )
     models = [EndPoseModel(m.profile, nominal, rng, method) for m in manoeuvres]
     seen = [model.coordinates(m.end_poses) for model, m in zip(models, manoeuvres, strict=True)]
     means = np.array([y.mean(axis=0) for y in seen])
@@ -118,10 +120,10 @@ def _rough_k(manoeuvres: Sequence[Manoeuvre], nominal: DifferentialDrive) -> flo
         ds = np.abs(nominal.wheel_speeds(*manoeuvre.profile.T)).sum(axis=0) * TICK_S
         squares += float(np.sum((heading - heading.mean()) ** 2)) * nominal.track_m**2
         travel += (len(heading) - 1) * float(ds.sum())
-    if squares <= 0.0 or travel <= 0.0:
-        raise InputError(
-            "the end headings do not scatter; give repetitions of manoeuvres that move the robot"
-        )
+    require(
+        squares > 0.0 and travel > 0.0,
+        "the end headings do not scatter; give repetitions of manoeuvres that move the robot",
+    )
     return squares / travel
 
 

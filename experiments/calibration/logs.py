@@ -16,7 +16,7 @@ from scipy import optimize, stats
 from experiments.evaluation.statistics import Interval
 from sim import se2
 from sim.arrays import Array
-from sim.errors import InputError
+from sim.errors import require
 from sim.formats.assemble import chained
 from sim.formats.khepera import WheelLaserLog
 from sim.formats.lego import GEOMETRIC_TRACK_M, SCANNER_AHEAD_M, TICK_M, TickLog
@@ -76,8 +76,10 @@ def calibrate_wheels(
     InputError
         If there are too few intervals, or the robot never turned.
     """
-    if len(log.durations_s) < 12 or not np.any(log.laser_motion[:, 2]):
-        raise InputError("at least 12 intervals with turns are needed to calibrate the wheels")
+    require(
+        len(log.durations_s) >= 12 and np.any(log.laser_motion[:, 2]),
+        "at least 12 intervals with turns are needed to calibrate the wheels",
+    )
     weights = 1.0 / np.array([diameter_m / 20.0, diameter_m / 20.0, 0.05])
     sizes = diameter_m, diameter_m, axle_m
     scale = np.array([*sizes, 0.1, 0.1, 1.0])
@@ -86,8 +88,7 @@ def calibrate_wheels(
     yaws = np.arange(8) * math.pi / 4.0 - math.pi
     fits = [_fit(log, np.array([*sizes, 0.0, 0.0, yaw]), weights, some, scale) for yaw in yaws]
     fits = [fit for fit in fits if fit.x[:3].min() > 0.0]
-    if not fits:
-        raise InputError("wheels and laser do not agree; are right and left swapped?")
+    require(fits, "wheels and laser do not agree; are right and left swapped?")
     fit = min(fits, key=lambda found: float(found.cost))
     for _ in range(5):
         residual = _residual(log, fit.x)
@@ -176,8 +177,7 @@ def slip_of_turns(
             squares.append(off[whole].sum(axis=1) ** 2)
             paths.append(np.abs(travel[whole]).sum(axis=1))
     n = sum(map(len, squares))
-    if n < 10:
-        raise InputError(f"only {n} blocks of {block} intervals; use shorter blocks")
+    require(n >= 10, f"only {n} blocks of {block} intervals; use shorter blocks")
     square, path = np.concatenate(squares), np.concatenate(paths)
     picks = rng.integers(n, size=(n_resamples, n))
     spread = np.array([_law(square[pick], path[pick]) for pick in picks])

@@ -9,7 +9,7 @@ from scipy import stats
 from experiments.calibration.result import CalibrationResult
 from experiments.evaluation.statistics import Interval
 from sim.arrays import Array
-from sim.errors import InputError
+from sim.errors import require
 
 SHORTEST_INTERVAL_S = 0.02
 
@@ -49,20 +49,19 @@ def from_wheel_truth(
         If intervals are too short, do not match, or have too little travel.
     """
     encoder, ground = np.asarray(encoder_m, float), np.asarray(ground_m, float)
-    if interval_s < SHORTEST_INTERVAL_S - 1e-9:
-        raise InputError(
-            f"interval_s={interval_s:g} is too short: below {SHORTEST_INTERVAL_S:g} s the encoder "
-            "noise inflates the travel; use longer intervals"
-        )
-    if encoder.shape != ground.shape or encoder.ndim != 2 or encoder.shape[1] != 2:
-        raise InputError(
-            f"encoder and ground increments must both be (N, 2), got {encoder.shape} and "
-            f"{ground.shape}"
-        )
+    require(
+        interval_s >= SHORTEST_INTERVAL_S - 1e-9,
+        f"interval_s={interval_s:g} is too short: below {SHORTEST_INTERVAL_S:g} s the encoder "
+        "noise inflates the travel; use longer intervals",
+    )
+    require(
+        encoder.shape == ground.shape and encoder.ndim == 2 and encoder.shape[1] == 2,
+        f"encoder and ground increments must both be (N, 2), got {encoder.shape} and "
+        f"{ground.shape}",
+    )
     (kr, right), (kl, left) = (_wheel(encoder[:, i], ground[:, i], geometry) for i in (0, 1))
-    track = None
-    if geometry and turns_rad is not None:
-        track = _track(ground, np.asarray(turns_rad, float))
+    turned = geometry and turns_rad is not None
+    track = _track(ground, np.asarray(turns_rad, float)) if turned else None
     return CalibrationResult("wheel_truth", kr, kl, right, left, track, len(encoder))
 
 
@@ -70,14 +69,13 @@ def _wheel(encoder_m: Array, ground_m: Array, geometry: bool) -> tuple[Interval,
     """K of one wheel, m, and its bias."""
     travel = np.abs(ground_m)
     total_m = float(travel.sum())
-    if total_m <= 0.0:
-        raise InputError("a wheel never rolled; calibrate from runs that move both wheels")
+    require(total_m > 0.0, "a wheel never rolled; calibrate from runs that move both wheels")
     dof = total_m**2 / float(np.sum(travel**2))  # the number of intervals, if they are equal
-    if dof < 3.0:
-        raise InputError(
-            f"too little travel: {dof:.1f} effective intervals of wheel truth, at least 3 are "
-            "needed; record longer runs"
-        )
+    require(
+        dof >= 3.0,
+        f"too little travel: {dof:.1f} effective intervals of wheel truth, at least 3 are "
+        "needed; record longer runs",
+    )
     error = encoder_m - ground_m
     bias = float(np.sum(error * np.sign(ground_m))) / total_m if geometry else 0.0
     residual = error - bias * ground_m

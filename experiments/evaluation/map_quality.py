@@ -61,7 +61,5 @@ def mean_map_entropy(points: Array, rng: np.random.Generator, n_queries: int = 2
         for near in tree.query_ball_point(queries, 0.3)
         if len(near) >= 5
     ]
-    if not spreads:
-        return math.nan
     values = [0.5 * math.log(np.linalg.det(2.0 * math.pi * math.e * S)) for S in spreads]
-    return float(np.mean(values))
+    return float(np.mean(values)) if values else math.nan

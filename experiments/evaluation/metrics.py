@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from estimators.base import Estimate
 from sim import se2
 from sim.arrays import Array
-from sim.errors import InputError
+from sim.errors import require
 from sim.recording import Recording
 
 CHI2_95_2DOF = 5.991464547107979  # 95 % quantile of chi-square with two degrees of freedom
@@ -42,8 +42,7 @@ def alignment(truth: Array, means: Array) -> Array:
     """
     centre_truth, centre_means = truth[:, :2].mean(axis=0), means[:, :2].mean(axis=0)
     a, b = means[:, :2] - centre_means, truth[:, :2] - centre_truth
-    cross = np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
-    angle = math.atan2(cross, np.sum(a * b))
+    angle = math.atan2(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), np.sum(a * b))
     rotated = se2.transform(np.array([0.0, 0.0, angle]), centre_means[None])[0]
     return np.array([*(centre_truth - rotated), angle])
 
@@ -81,8 +80,7 @@ def nees(truth: Array, means: Array, covariances: Array) -> Array:
     Its mean is 3 for a consistent filter. A singular covariance, such as the zero one of a known
     start, predicts no error, so its stamp is left out, as is one that is not finite.
     """
-    error = means - truth
-    error[:, 2] = se2.wrap(error[:, 2])
+    error = se2.difference(means, truth)
     sigma = np.sqrt(np.maximum(np.diagonal(covariances, axis1=1, axis2=2), 0.0))
     finite = np.isfinite(error).all(axis=1) & np.isfinite(covariances).all(axis=(1, 2))
     usable = finite & np.all(sigma > 0.0, axis=1)
@@ -139,8 +137,7 @@ def score(recording: Recording, estimate: Estimate) -> dict[str, float]:
         return row
     truth = recording.truth_at(estimate.stamps)
     known = np.isfinite(truth).all(axis=1)
-    if not known.any():
-        raise InputError("no estimate lies within the truth's time span; are the clocks the same?")
+    require(known.any(), "no estimate lies within the truth's time span; are the clocks the same?")
     truth, means, covariances = truth[known], estimate.means[known], estimate.covariances[known]
     fitted = aligned(truth, means)
     values = nees(truth, means, covariances)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from experiments.evaluation.time_sync import interpolate, nearest
 from sim import se2
 from sim.arrays import Array
-from sim.errors import InputError
+from sim.errors import require
 from sim.formats.relations import Relations
 
 Rows = NDArray[np.int64]
@@ -74,8 +74,7 @@ def relation_errors(
     """
     order = np.argsort(stamps, kind="stable")
     stamps, poses = stamps[order], poses[order]
-    if len(stamps) < 2:
-        raise InputError("relations need a trajectory of at least two poses")
+    require(len(stamps) >= 2, "relations need a trajectory of at least two poses")
     if association == "near":
         rows = nearest(stamps, relations.stamps)
         known = np.all(np.abs(stamps[rows] - relations.stamps) <= tolerance_s, axis=1)
@@ -83,8 +82,7 @@ def relation_errors(
     else:
         ends = interpolate(stamps, poses, relations.stamps)
         known = np.isfinite(ends).all(axis=(1, 2))
-    if not known.any():
-        raise InputError("no relation has both stamps in the trajectory; are the clocks the same?")
+    require(known.any(), "no relation has both stamps in the trajectory; are the clocks the same?")
     error = se2.between(relations.motion[known], se2.between(ends[known, 0], ends[known, 1]))
     return RelationErrors(
         np.hypot(error[:, 0], error[:, 1]), np.abs(se2.wrap(error[:, 2])), np.flatnonzero(known)

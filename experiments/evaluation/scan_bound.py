@@ -83,8 +83,7 @@ def fisher_bound(
     jacobians = se2.between_jacobians(T_w_target, T_w_source)
     for pose, jacobian in zip((T_w_target, T_w_source), jacobians, strict=True):
         information = fisher_information(walls, pose, bearings_rad, sigma_range_m, max_range_m)
-        covariance = np.linalg.inv(information + _NO_INFORMATION * np.eye(3))
-        bound += jacobian @ covariance @ jacobian.T
+        bound += jacobian @ np.linalg.inv(information + _NO_INFORMATION * np.eye(3)) @ jacobian.T
     return bound
 
 

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from scipy import stats
 
 from sim.arrays import Array
-from sim.errors import InputError
+from sim.errors import InputError, require
 
 
 @dataclass(frozen=True)
@@ -101,8 +101,10 @@ def _log_ratios(first: ArrayLike, second: ArrayLike) -> Array:
         If the arms have different lengths, or a value has no logarithm.
     """
     above, below = np.asarray(first, float), np.asarray(second, float)
-    if above.shape != below.shape or above.ndim != 1:
-        raise InputError(f"paired arms must have equal lengths, got {above.shape}, {below.shape}")
+    require(
+        above.shape == below.shape and above.ndim == 1,
+        f"paired arms must have equal lengths, got {above.shape}, {below.shape}",
+    )
     for row in np.flatnonzero(~((above > 0.0) & (below > 0.0))):
         raise InputError(
             f"pair {row}: ratio {above[row]:g} / {below[row]:g} has no logarithm; leave out the "

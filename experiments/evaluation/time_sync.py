@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from experiments.evaluation.metrics import aligned, position_errors_m, rms
 from sim import se2
 from sim.arrays import Array
-from sim.errors import InputError
+from sim.errors import require
 
 Rows = NDArray[np.int64]
 
@@ -29,9 +29,7 @@ def interpolate(stamps: Array, poses: Array, wanted: Array, longest_gap_s: float
     span = stamps[last] - stamps[last - 1]
     share = ((wanted - stamps[last - 1]) / span)[..., None]
     in_gap = (span > longest_gap_s) & (wanted > stamps[last - 1])
-    step = poses[last] - poses[last - 1]
-    step[..., 2] = se2.wrap(step[..., 2])
-    out: Array = poses[last - 1] + share * step
+    out: Array = poses[last - 1] + share * se2.difference(poses[last], poses[last - 1])
     out[..., 2] = se2.wrap(out[..., 2])
     out[(wanted < stamps[0]) | (wanted > stamps[-1]) | in_gap] = np.nan
     return out
@@ -51,6 +49,5 @@ def aligned_ate_m(
     """
     estimate = interpolate(stamps, poses, truth_stamps, longest_gap_s)
     known = np.isfinite(estimate).all(axis=1)
-    if known.sum() < 3:
-        raise InputError("fewer than three true poses lie within the estimate's time span")
+    require(known.sum() >= 3, "fewer than three true poses lie within the estimate's time span")
     return rms(position_errors_m(truth[known], aligned(truth[known], estimate[known])))

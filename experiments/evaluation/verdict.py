@@ -79,9 +79,8 @@ def judged(interval: Interval, at_least: float = -math.inf, at_most: float = mat
         return Verdict.UNDECIDED
     if interval.low >= at_least and interval.high <= at_most:
         return Verdict.REPRODUCED
-    if interval.high < at_least or interval.low > at_most:
-        return Verdict.NOT_REPRODUCED
-    return Verdict.UNDECIDED
+    outside = interval.high < at_least or interval.low > at_most
+    return Verdict.NOT_REPRODUCED if outside else Verdict.UNDECIDED
 
 
 def banded(

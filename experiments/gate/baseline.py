@@ -13,8 +13,8 @@ from experiments.gate.compare import WHICH, Finding, compare, failed, how
 from experiments.gate.suite import ERRORS, Suite, read_suite, run_suite, suite_path
 from experiments.runs.paths import packaged, results
 from experiments.runs.version import code_version
-from sim.errors import InputError
-from sim.files import write_whole
+from sim.errors import InputError, require
+from sim.files import write_text
 
 _COUNT = re.compile(r"(\d+) rows")  # in a baseline's first line, to recognise one cut short
 _COLUMNS = (*WHICH, "checksum", "fingerprint", *ERRORS, "status")
@@ -94,8 +94,7 @@ def write_baseline(baseline: Baseline, path: Path) -> None:
     """Write a baseline: the number of its rows and its history as comments, then its rows."""
     head = "".join(f"# {line}\n" for line in (f"{len(baseline.rows)} rows", *baseline.history))
     table = baseline.rows[list(_COLUMNS)].to_csv(index=False, float_format="%.9g")
-    with write_whole(path) as part:
-        part.write_text(head + table, encoding="utf-8")
+    write_text(path, head + table)
 
 
 def renewed(
@@ -180,8 +179,9 @@ def accept(
     list of Path
         Files written.
     """
-    if not reason.strip():
-        raise InputError('--accept needs a reason, such as --accept "faster matching, 2 % worse"')
+    require(
+        reason.strip(), '--accept needs a reason, such as --accept "faster matching, 2 % worse"'
+    )
     whole = read_suite(suite_path(suite_name))
     suite = whole.of(only)
     names = [entry.name for entry in suite.estimators]
@@ -189,11 +189,11 @@ def accept(
     paths = baseline_paths(suite_name)
     old = {key: read_baseline(path) for key, path in paths.items() if path.exists()}
     for key, path in paths.items():
-        if key not in old and len(names) < len(known):
-            raise InputError(
-                f"{path}: no baseline yet, and one of {', '.join(names)} alone would not do; "
-                "accept the whole suite, without --only"
-            )
+        require(
+            key in old or len(names) >= len(known),
+            f"{path}: no baseline yet, and one of {', '.join(names)} alone would not do; "
+            "accept the whole suite, without --only",
+        )
     rows = run_suite(suite, repeats_of(suite, of_baseline=True), on_progress=on_progress)
     bad = rows[failed(rows)]
     if len(bad):

@@ -29,7 +29,7 @@ from experiments.evaluation.statistics import mean_interval
 from experiments.gate.suite import ERRORS
 from experiments.runs.seeds import stream
 from sim.arrays import Array
-from sim.errors import InputError
+from sim.errors import require
 
 ALPHA_REAL = 0.002  # of a whole check
 ALPHA_GENERAL = 0.05  # of one error of one estimator
@@ -224,12 +224,15 @@ def compare(
             _same_recordings(str(estimator), name, then, now)
             failure = _newly_failing(then, now)
             for error in ERRORS:
-                rng, which = (
-                    stream(0, f"exchange/{estimator}/{error}"),
+                finding = examine(
                     (str(estimator), error, name),
+                    by_repeat(then, error),
+                    by_repeat(now, error),
+                    stream(0, f"exchange/{estimator}/{error}"),
+                    n_draws,
+                    failure,
                 )
-                errors = (by_repeat(then, error), by_repeat(now, error))
-                findings.append(examine(which, *errors, rng, n_draws, failure))
+                findings.append(finding)
     return judge(findings)
 
 
@@ -240,22 +243,23 @@ def by_repeat(rows: pd.DataFrame, error: str) -> Array:
 
 def _same_recordings(estimator: str, name: str, then: pd.DataFrame, now: pd.DataFrame) -> None:
     remedy = "; check with --accept REASON to start a new baseline"
-    if then.empty:
-        raise InputError(f"the {name} baseline does not know {estimator}{remedy}")
+    require(not then.empty, f"the {name} baseline does not know {estimator}{remedy}")
     before, after = (
         rows.drop_duplicates("recording").set_index("recording") for rows in (then, now)
     )
-    if set(before.index) != set(after.index):
-        raise InputError(f"the {name} baseline of {estimator} has other recordings{remedy}")
+    require(
+        set(before.index) == set(after.index),
+        f"the {name} baseline of {estimator} has other recordings{remedy}",
+    )
     after = after.loc[before.index]
     away = np.abs(after["fingerprint"] - before["fingerprint"])
     near = away <= ROUNDING * np.abs(before["fingerprint"])  # false for NaN
     other = ~near & (after["checksum"] != before["checksum"])
-    if other.any():
-        raise InputError(
-            f"recording {other.idxmax()} of {estimator} is not that of the {name} baseline: what "
-            f"simulates it has changed, and errors cannot be compared run by run{remedy}"
-        )
+    require(
+        not other.any(),
+        f"recording {other.idxmax()} of {estimator} is not that of the {name} baseline: what "
+        f"simulates it has changed, and errors cannot be compared run by run{remedy}",
+    )
 
 
 def failed(rows: pd.DataFrame) -> pd.Series:

@@ -20,7 +20,7 @@ from experiments.runs.seeds import stream
 from experiments.runs.targets import make
 from sim import se2
 from sim.arrays import Array
-from sim.errors import InputError
+from sim.errors import InputError, require
 from sim.recording import Frame, Recording
 from sim.world import World
 
@@ -130,10 +130,8 @@ def _causal(new: Make, recording: Recording, prior: Prior) -> str:
     """Compare beliefs with those on the recording cut short."""
     whole = walk(new(), recording, prior)
     half = len(recording.frame_stamps) // 2
-    cut = walk(new(), recording.cut(half), prior)
-    if not _same((whole[0][:half], whole[1][:half]), cut):
-        return f"the first {half} beliefs change when the recording ends there"
-    return ""
+    same = _same((whole[0][:half], whole[1][:half]), walk(new(), recording.cut(half), prior))
+    return "" if same else f"the first {half} beliefs change when the recording ends there"
 
 
 def _untouched(new: Make, recording: Recording, prior: Prior) -> str:
@@ -226,8 +224,7 @@ def _differ(first: Array, second: Array) -> str:
 
 def _gap(here: tuple[Array, Array], there: tuple[Array, Array]) -> float:
     """Largest difference of means and covariances once both are in the moved frame."""
-    difference = there[0] - se2.compose(MOTION, here[0])
-    difference[:, 2] = se2.wrap(difference[:, 2])
+    difference = se2.difference(there[0], se2.compose(MOTION, here[0]))
     turn = _turn()
     size = max(1.0, float(np.abs(here[1]).max()))
     spread = np.abs(there[1] - turn @ here[1] @ turn.T).max() / size
@@ -244,11 +241,11 @@ def _moved_prior(prior: Prior) -> Prior:
     if isinstance(known_map, World):
         known_map = move_world(known_map, MOTION)
     elif known_map is not None:
-        if not hasattr(known_map, "moved"):
-            raise InputError(
-                f"a map of type {type(known_map).__name__} cannot be moved with the world; give "
-                "it a method moved(T_new_old)"
-            )
+        require(
+            hasattr(known_map, "moved"),
+            f"a map of type {type(known_map).__name__} cannot be moved with the world; give "
+            "it a method moved(T_new_old)",
+        )
         known_map = known_map.moved(MOTION)
     if prior.mean is None or prior.covariance is None:
         return dataclasses.replace(prior, map=known_map)
@@ -291,8 +288,8 @@ def _missing(new: Make, recording: Recording, prior: Prior) -> str:
         except InputError as error:
             if "\n" in str(error):
                 return f"without {need}: the message has several lines"
-            continue
-        return f"runs without {need}, which it says it needs"
+        else:
+            return f"runs without {need}, which it says it needs"
     return ""
 
 
@@ -336,15 +333,13 @@ def _of_class(target: str, arguments: Sequence[str]) -> Make:
     settings: Any = {"_target_": target.replace(":", ".")}
     remedy = "give MODULE:CLASS of an estimator, and its arguments as key=value"
     for argument in arguments:
-        if "=" not in argument:
-            raise InputError(f"{argument}: constructor arguments are key=value")
+        require("=" in argument, f"{argument}: constructor arguments are key=value")
     try:
         settings |= OmegaConf.to_object(OmegaConf.from_dotlist(list(arguments)))
         estimator = make(settings, "estimator")
     except (InputError, yaml.YAMLError) as error:
         raise InputError(f"{str(error).splitlines()[0]}; {remedy}") from error
-    if not callable(getattr(estimator, "step", None)):
-        raise InputError(f"{target} has no method step; {remedy}")
+    require(callable(getattr(estimator, "step", None)), f"{target} has no method step; {remedy}")
     return lambda: make(settings, "estimator")
 
 

@@ -27,6 +27,24 @@ Planted = Callable[[Estimator, np.random.Generator], AbstractContextManager[obje
 Fault = Callable[[float], Planted]  # of a size
 
 
+def _planted(owner_of: Callable[[Estimator], Any], name: str, wrong: Callable[..., Any]) -> Fault:
+    """Fault that puts `wrong(sound, size, rng, *arguments)` in place of an attribute."""
+
+    def fault(size: float) -> Planted:
+        def plant(estimator: Estimator, rng: np.random.Generator) -> AbstractContextManager[object]:
+            owner = owner_of(estimator)
+            sound = getattr(owner, name)
+
+            def faulty(*arguments: Any, **keywords: Any) -> Any:
+                return wrong(sound, size, rng, *arguments, **keywords)
+
+            return mock.patch.object(owner, name, faulty)
+
+        return plant
+
+    return fault
+
+
 def in_argument_of(
     method: str,
 ) -> Callable[[Callable[[Any, float, np.random.Generator], Any]], Fault]:
@@ -36,20 +54,11 @@ def in_argument_of(
     """
 
     def decorate(change: Callable[[Any, float, np.random.Generator], Any]) -> Fault:
-        def fault(size: float) -> Planted:
-            def plant(
-                estimator: Estimator, rng: np.random.Generator
-            ) -> AbstractContextManager[object]:
-                sound = getattr(estimator, method)
-
-                def faulty(argument: Any, *others: Any) -> Any:
-                    return sound(change(argument, size, rng), *others)
-
-                return mock.patch.object(estimator, method, faulty)
-
-            return plant
-
-        return fault
+        return _planted(
+            lambda estimator: estimator,
+            method,
+            lambda sound, size, rng, first, *others: sound(change(first, size, rng), *others),
+        )
 
     return decorate
 
@@ -61,20 +70,13 @@ def in_place_of(owner: Any, name: str) -> Callable[[Callable[..., Any]], Fault]:
     """
 
     def decorate(wrong: Callable[..., Any]) -> Fault:
-        def fault(size: float) -> Planted:
-            def plant(
-                estimator: Estimator, rng: np.random.Generator
-            ) -> AbstractContextManager[object]:
-                sound = getattr(owner, name)
-
-                def faulty(*arguments: Any, **keywords: Any) -> Any:
-                    return wrong(sound, size, *arguments, **keywords)
-
-                return mock.patch.object(owner, name, faulty)
-
-            return plant
-
-        return fault
+        return _planted(
+            lambda _: owner,
+            name,
+            lambda sound, size, _, *arguments, **keywords: wrong(
+                sound, size, *arguments, **keywords
+            ),
+        )
 
     return decorate
 
@@ -120,8 +122,7 @@ def noisy_ranges(frame: Frame, sigma_m: float, rng: np.random.Generator) -> Fram
     if scan is None:
         return frame
     noise = sigma_m * rng.standard_normal(scan["ranges_m"].shape)
-    noisy = (scan["ranges_m"] + noise).astype(np.float32)
-    return _reading(frame, "laser", {"ranges_m": noisy})
+    return _reading(frame, "laser", {"ranges_m": (scan["ranges_m"] + noise).astype(np.float32)})
 
 
 @in_argument_of("step")

@@ -59,7 +59,7 @@ from experiments.runs.row import write_frame
 from experiments.runs.seeds import stream
 from experiments.viewing.style import BLUE, GREEN, ORANGE, WALL, save_figure, subplots
 from sim.arrays import Array
-from sim.files import write_whole
+from sim.files import write_text
 
 TARGET = 0.10  # worsening that faults are graded to
 _NEAR = 0.01  # of it
@@ -224,8 +224,8 @@ def draw_check(
                 now, rest = drawn[:, :n_now], runs
             others = np.take_along_axis(rest, again, axis=1)
             for baseline, left in (("accepted", rest), ("release", others)):
-                which = (name, error, baseline)
-                findings.append(examine(which, left[:, :n_then], now, rng, _N_DRAWS))
+                then = left[:, :n_then]
+                findings.append(examine((name, error, baseline), then, now, rng, _N_DRAWS))
     return judge(findings)
 
 
@@ -406,8 +406,7 @@ def _write_measured(page: Path, text: str) -> None:
     """Put the text between the page's marks."""
     head, _, rest = page.read_text().partition(_BEGIN)
     tail = rest.partition(_END)[2]
-    with write_whole(page) as part:
-        part.write_text(f"{head}{_BEGIN}\n{text}\n{_END}{tail}")
+    write_text(page, f"{head}{_BEGIN}\n{text}\n{_END}{tail}")
 
 
 _KINDS = {"derivative": (BLUE, "o"), "lost": (ORANGE, "s"), "noise": (GREEN, "^")}

@@ -15,8 +15,8 @@ from experiments.gate.compare import Change, Finding
 from experiments.gate.suite import printable
 from experiments.report.export import to_markdown
 from experiments.runs.console import progress
-from sim.errors import InputError
-from sim.files import write_whole
+from sim.errors import InputError, require
+from sim.files import write_text
 
 LABELS = {"ate_rmse_m": "position", "ate_aligned_rmse_m": "aligned", "heading_rmse_rad": "heading"}
 _MEANING = {
@@ -41,8 +41,7 @@ def run_check(
             for path in accept(suite, reason, only, release=release, on_progress=on_progress):
                 print(path)
         return False
-    if release:
-        raise InputError("--release goes with --accept REASON")
+    require(not release, "--release goes with --accept REASON")
     on_github = os.environ.get("GITHUB_ACTIONS") == "true"
     page = os.environ.get("GITHUB_STEP_SUMMARY") if on_github else None
     for report in (junit, summary, page):
@@ -60,9 +59,9 @@ def run_check(
         findings = check(suite, only, on_progress)
     _say(as_text(findings, detectable))
     if junit is not None:
-        write_text(as_junit(findings), junit)
+        write_text(junit, as_junit(findings))
     if summary is not None:
-        write_text(as_markdown(findings, detectable), summary)
+        write_text(summary, as_markdown(findings, detectable))
     if on_github:
         _say(as_annotations(findings))
     if page:
@@ -207,22 +206,16 @@ def as_junit(findings: Sequence[Finding]) -> str:
     return '<?xml version="1.0" encoding="utf-8"?>\n' + ET.tostring(root, encoding="unicode") + "\n"
 
 
-def write_text(text: str, path: Path) -> None:
-    """Write a report, whole or not at all."""
-    with write_whole(path) as part:
-        part.write_text(text, encoding="utf-8")
-
-
 def last_line(findings: Sequence[Finding]) -> str:
     """Say how the check ended."""
     alarmed = ", ".join(dict.fromkeys(f.estimator for f in findings if f.alarms))
     better = ", ".join(dict.fromkeys(f.estimator for f in findings if f.verdict is Change.BETTER))
-    parts = [f"worse: {alarmed}" if alarmed else "nothing is worse"]
-    if better:
-        parts.append(f"better: {better}")
-    if alarmed:
-        parts.append('if it is intended: check with --accept "REASON"')
-    return "; ".join(parts)
+    parts = (
+        f"worse: {alarmed}" if alarmed else "nothing is worse",
+        f"better: {better}" if better else "",
+        'if it is intended: check with --accept "REASON"' if alarmed else "",
+    )
+    return "; ".join(filter(None, parts))
 
 
 def _noteworthy(findings: Sequence[Finding]) -> list[Finding]:

@@ -26,7 +26,7 @@ from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome
 from experiments.runs.seeds import stream
-from sim.errors import InputError
+from sim.errors import InputError, require
 from sim.recording import Recording
 
 ERRORS = ("ate_rmse_m", "ate_aligned_rmse_m", "heading_rmse_rad")
@@ -88,8 +88,7 @@ class Suite:
         """Return the same suite with these estimators only; with all if none is named."""
         known = {entry.name: entry for entry in self.estimators}
         for name in names:
-            if name not in known:
-                raise InputError(f"the suite has no estimator {name}; it has {', '.join(known)}")
+            require(name in known, f"the suite has no estimator {name}; it has {', '.join(known)}")
         chosen = tuple(entry for entry in self.estimators if not names or entry.name in names)
         return dataclasses.replace(self, estimators=chosen)
 
@@ -151,8 +150,7 @@ def read_suite(path: Path) -> Suite:
         ),
     ]
     for sound, complaint in checks:
-        if not sound:
-            raise InputError(f"{path}: {complaint}")
+        require(sound, f"{path}: {complaint}")
     return suite
 
 
@@ -220,8 +218,7 @@ def run_suite(
             if entry.recordings == group and entry.name in repeats
         ]
         if runs:
-            seeds = range(suite.first_seed, suite.first_seed + count)
-            jobs += [(seed, runs, reseed) for seed in seeds]
+            jobs += [(suite.first_seed + i, runs, reseed) for i in range(count)]
     rows: list[dict[str, Any]] = []
     done = Parallel(n_jobs=n_jobs, return_as="generator")(
         delayed(_run_recording)(*job) for job in jobs
@@ -253,15 +250,16 @@ def _run_recording(
             planted=None if planted is None else _plant(planted, seed, reseed),
         ):
             prefix = "revised_" if entry.revised else ""
-            if entry.revised and row["status"] == Outcome.OK and "revised_ate_rmse_m" not in row:
-                raise InputError(f"{entry.name} has no finish; drop `revised` from the suite")
-            status = "ok"
+            require(
+                not entry.revised or row["status"] != Outcome.OK or "revised_ate_rmse_m" in row,
+                f"{entry.name} has no finish; drop `revised` from the suite",
+            )
             # a collision is no fault of the estimator
-            if row["status"] == Outcome.FAILED and row["status_code"] != "recording":
-                status = printable(f"{row['status_code']}: {row['status_detail']}")
+            at_fault = row["status"] == Outcome.FAILED and row["status_code"] != "recording"
+            why = printable(f"{row['status_code']}: {row['status_detail']}") if at_fault else "ok"
             which = {"estimator": entry.name, "recording": seed, "repeat": row["repeat"]}
             errors = {name: row.get(prefix + name, math.nan) for name in ERRORS}
-            rows.append({**which, **origin, **errors, "status": status})
+            rows.append({**which, **origin, **errors, "status": why})
     return rows
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from estimators.base import Estimate
 from experiments.trajectories.odometry import write_odometry_csv, write_odometry_json
-from sim.errors import InputError
+from sim.errors import InputError, required
 from sim.formats.tum import write_tum
 from sim.recording import Recording, save
 
@@ -32,9 +32,10 @@ def write_recording(path: Path, recording: Recording) -> None:
 
         write_carmen(path, recording)
     elif path.suffix == ".tum":
-        if recording.truth is None:
-            raise InputError(f"{path}: the recording has no reference trajectory to write")
-        write_tum(path, recording.truth.stamps, recording.truth.poses)
+        truth = required(
+            recording.truth, f"{path}: the recording has no reference trajectory to write"
+        )
+        write_tum(path, truth.stamps, truth.poses)
     else:
         raise InputError(
             f"{path}: unknown ending {path.suffix!r}; known: .npz .mcap .bag .db3 .log .tum"
@@ -59,9 +60,8 @@ def write_estimate(path: Path, estimate: Estimate, recording: Recording | None =
         from sim.formats.rosbag import Track
         from sim.formats.rosbag_out import write_bag
 
-        landmarks = np.zeros((0, 3))
-        if isinstance(estimate.map, dict) and "landmarks" in estimate.map:
-            landmarks = np.asarray(estimate.map["landmarks"], float)
+        known = estimate.map if isinstance(estimate.map, dict) else {}
+        landmarks = np.asarray(known.get("landmarks", np.zeros((0, 3))), float)
         track = Track(estimate.stamps, estimate.means, estimate.covariances, landmarks)
         write_bag(path, recording, {"estimate": track})
     else:

@@ -11,8 +11,8 @@ import numpy as np
 from estimators.base import Estimate
 from sim import se2
 from sim.arrays import Array
-from sim.errors import InputError
-from sim.files import write_whole
+from sim.errors import InputError, require
+from sim.files import write_text, write_whole
 
 # Entries of x, y, heading in row-major 6x6 covariances in order x, y, z, rotX, rotY, rotZ.
 PLANAR = (slice(None), [[0], [1], [5]], [0, 1, 5])
@@ -83,15 +83,13 @@ def write_odometry_json(estimate: Estimate, path: Path) -> None:
         text = json.dumps(odometry_records(estimate), allow_nan=False)
     except ValueError:
         raise InputError(f"{path}: the estimate is not finite; write it as CSV") from None
-    with write_whole(path) as part:
-        part.write_text(text)
+    write_text(path, text)
 
 
 def write_odometry_csv(estimate: Estimate, path: Path) -> None:
     """Write one line per record; the 36 covariances are pose.covariance.0 to .35."""
     records = odometry_records(estimate)
-    if not records:
-        raise InputError(f"{path}: the estimate holds no belief; nothing to write")
+    require(records, f"{path}: the estimate holds no belief; nothing to write")
     with write_whole(path) as part, part.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(_flat_keys(records[0]))
@@ -116,8 +114,7 @@ def read_odometry_csv(path: Path) -> Estimate:
                     raise InputError(f"{path}:{number}: not an odometry record ({error})") from None
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path}: cannot read ({error})") from error
-    if not rows:
-        raise InputError(f"{path}: holds no record; write it with `estima run`")
+    require(rows, f"{path}: holds no record; write it with `estima run`")
     stamps, x, y, z, w, *covariances = np.array(rows).T
     heading = se2.wrap(2.0 * np.arctan2(z, w))
     full = np.stack(covariances, axis=1).reshape(-1, 6, 6)

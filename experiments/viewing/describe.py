@@ -37,9 +37,8 @@ def describe(recording: Recording) -> str:
 
 
 def _line(name: str, stamps: Array) -> str:
-    rate = ""
-    if len(stamps) > 1:
-        rate = f", every {1000 * float(np.median(np.diff(stamps))):.1f} ms"
+    lapses_ms = 1000 * np.diff(stamps)
+    rate = f", every {float(np.median(lapses_ms)):.1f} ms" if len(lapses_ms) else ""
     return f"{name:<11} {len(stamps)} readings{rate}"
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from experiments.viewing.view import Playback, bounds, seen
 from sim.arrays import Array
-from sim.errors import InputError
+from sim.errors import require
 from sim.world import World
 
 FPS = 20
@@ -30,8 +30,10 @@ _BLACK, _BLUE, _RED = (0.1, 0.1, 0.1), (0.0, 0.45, 0.7), (0.84, 0.37, 0.0)
 
 def check_display() -> None:
     """Refuse to open a window where there is nothing to show it on."""
-    if sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
-        raise InputError(f"there is no display for a window (DISPLAY is not set); {_REMEDY}")
+    require(
+        not sys.platform.startswith("linux") or os.environ.get("DISPLAY"),
+        f"there is no display for a window (DISPLAY is not set); {_REMEDY}",
+    )
 
 
 def watch(run: Playback, seconds: float | None = None) -> None:
@@ -51,8 +53,7 @@ def watch(run: Playback, seconds: float | None = None) -> None:
     process = multiprocessing.get_context("spawn").Process(target=_window, args=(run, seconds))
     process.start()
     process.join()
-    if process.exitcode:
-        raise InputError(f"the window could not be opened or was lost; {_REMEDY}")
+    require(not process.exitcode, f"the window could not be opened or was lost; {_REMEDY}")
 
 
 def _window(run: Playback, seconds: float | None) -> None:
@@ -125,8 +126,7 @@ def _aim(engine: Any, run: Playback, truth: Array) -> None:
     """Look at the world and the whole path from above."""
     x1, y1, x2, y2 = bounds(run, truth)
     distance_m = 1.2 * math.hypot(x2 - x1, y2 - y1) + 2.0
-    middle = [(x1 + x2) / 2.0, (y1 + y2) / 2.0, 0.0]
-    engine.resetDebugVisualizerCamera(distance_m, 0, -65, middle)
+    engine.resetDebugVisualizerCamera(distance_m, 0, -65, [(x1 + x2) / 2.0, (y1 + y2) / 2.0, 0.0])
 
 
 def _build_walls(engine: Any, world: World) -> None:

@@ -14,7 +14,7 @@ from experiments.runs.evaluate import estimates
 from experiments.runs.seeds import stream
 from experiments.viewing.view import experiment_over, read_estimate
 from sim.arrays import Array, Floats
-from sim.errors import InputError
+from sim.errors import InputError, require, required
 from sim.grid import OccupancyGrid
 from sim.recording import Recording
 from sim.sensors import Laser
@@ -47,13 +47,13 @@ def path_of(
     if overrides and (source == "truth" or file.suffix == ".csv" or file.is_dir()):
         raise InputError(f"{overrides[0]}: overrides are for estimators that are run now")
     if source == "truth":
-        if recording.truth is None:
-            raise InputError("this recording has no truth; name an estimator with -e")
-        return recording.truth.stamps, recording.truth.poses
-    if file.suffix == ".csv" or file.is_dir():
-        found = read_estimate(recording, file)
-    else:
-        found = _run(recording, source, overrides, on_step)
+        truth = required(recording.truth, "this recording has no truth; name an estimator with -e")
+        return truth.stamps, truth.poses
+    found = (
+        read_estimate(recording, file)
+        if file.suffix == ".csv" or file.is_dir()
+        else _run(recording, source, overrides, on_step)
+    )
     sound = np.isfinite(found.means).all(axis=1)
     return found.stamps[sound], found.means[sound]
 
@@ -88,12 +88,10 @@ def grid_along(
     in gaps of more than 3 s are left out.
     """
     scan_stamps, ranges_m, sensor = laser_scans(recording, laser)
-    if len(stamps) < 2:
-        raise InputError("a map needs a path of two poses or more")
+    require(len(stamps) >= 2, "a map needs a path of two poses or more")
     at_scans = interpolate(stamps, poses, scan_stamps, _LONGEST_GAP_S)
     placed = np.isfinite(at_scans).all(axis=1)
-    if not placed.any():
-        raise InputError("no scan lies within the time span of the path")
+    require(placed.any(), "no scan lies within the time span of the path")
     grid = map_scans(
         at_scans[placed],
         ranges_m[placed],

@@ -36,8 +36,7 @@ def run_figure(recording: Recording, estimate: Estimate, name: str) -> Figure:
 
 def _draw_errors(axes: Array, estimate: Estimate, truth: Array) -> None:
     """Draw the errors of x, y and heading, with the band that should hold 95 % of them."""
-    error = estimate.means - truth
-    error[:, 2] = se2.wrap(error[:, 2])
+    error = se2.difference(estimate.means, truth)
     units = {"x error, m": 1.0, "y error, m": 1.0, "heading error, deg": np.degrees(1.0)}
     for i, (ax, (label, unit)) in enumerate(zip(axes, units.items(), strict=True)):
         band = 1.96 * unit * np.sqrt(np.maximum(estimate.covariances[:, i, i], 0.0))

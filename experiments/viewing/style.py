@@ -8,7 +8,7 @@ from cycler import cycler
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from sim.errors import InputError
+from sim.errors import require
 from sim.files import write_whole
 
 # Okabe and Ito's palette.
@@ -45,8 +45,7 @@ def subplots(
 
 def save_figure(page: Figure, path: Path) -> None:
     """Write a figure whole, in the format of the path's suffix; its bytes carry no date."""
-    if path.suffix not in _SUFFIXES:
-        raise InputError(f"{path}: a picture is {', '.join(_SUFFIXES)}")
+    require(path.suffix in _SUFFIXES, f"{path}: a picture is {', '.join(_SUFFIXES)}")
     metadata = {"Software": None} if path.suffix == ".png" else {"Date": None}
     with write_whole(path) as part:
         page.savefig(part, dpi=130, metadata=metadata)

@@ -40,7 +40,7 @@ from experiments.viewing.style import (
 from experiments.viewing.world import draw_world, sees_landmarks
 from sim import se2
 from sim.arrays import Array
-from sim.errors import InputError
+from sim.errors import InputError, require
 from sim.files import write_whole
 from sim.grid import OccupancyGrid
 from sim.recording import Frame, Recording
@@ -86,15 +86,17 @@ class Playback:
     def pose_at(self, stamp: float) -> Array:
         """Where the robot is believed to be, else where it is; NaN if neither is known."""
         row = self.belief_row(stamp)
-        if row >= 0 and self.estimate is not None:
-            return np.asarray(self.estimate.means[row])
-        return np.asarray(self.truth_at(np.array([stamp]))[0])
+        poses = (
+            self.truth_at(np.array([stamp]))
+            if self.estimate is None or row < 0
+            else self.estimate.means[row:]
+        )
+        return np.asarray(poses[0])
 
     def truth_at(self, stamps: Array) -> Array:
         """True poses (N, 3) at stamps (N,); NaN where they are not known."""
-        if self.recording.truth is None:
-            return np.full((len(stamps), 3), np.nan)
-        return self.recording.truth_at(stamps)
+        known = self.recording.truth is not None
+        return self.recording.truth_at(stamps) if known else np.full((len(stamps), 3), np.nan)
 
 
 def shown_rows(recording: Recording, n_shown: int) -> NDArray[np.int64]:
@@ -156,11 +158,12 @@ def read_estimate(recording: Recording, path: Path) -> Estimate:
     if path.is_dir():
         path /= "estimate.csv"
     estimate, stamps = read_odometry_csv(path), recording.frame_stamps
-    if not ((estimate.stamps >= stamps[0]) & (estimate.stamps <= stamps[-1])).any():
-        raise InputError(f"{path}: no stamp of it lies within the recording; is it another's?")
+    require(
+        ((estimate.stamps >= stamps[0]) & (estimate.stamps <= stamps[-1])).any(),
+        f"{path}: no stamp of it lies within the recording; is it another's?",
+    )
     sound = np.isfinite(estimate.means).all(axis=1)
-    if not sound.all():
-        raise InputError(f"{path}:{2 + int(np.argmin(sound))}: a pose that is not finite")
+    require(sound.all(), f"{path}:{2 + int(np.argmin(sound))}: a pose that is not finite")
     return estimate
 
 
@@ -341,20 +344,22 @@ def bounds(run: Playback, truth: Array | None) -> tuple[float, float, float, flo
     A diverging estimate is followed to twice the size of all else.
     """
     world = run.recording.world
-    known = np.zeros((0, 2)) if truth is None else truth[:, :2]
-    if world is not None:
-        known = np.concatenate([known, world.walls.reshape(-1, 2)])
-    if run.grid is not None:
-        known = np.concatenate([known, run.grid.corners_m])
-    means = np.zeros((0, 2)) if run.estimate is None else run.estimate.means[:, :2]
+    none = np.zeros((0, 2))
+    known = np.concatenate(
+        [
+            none if truth is None else truth[:, :2],
+            none if world is None else world.walls.reshape(-1, 2),
+            none if run.grid is None else run.grid.corners_m,
+        ]
+    )
+    means = none if run.estimate is None else run.estimate.means[:, :2]
     known, means = (points[np.isfinite(points).all(axis=1)] for points in (known, means))
     if len(known) and len(means):
         low, high = known.min(axis=0), known.max(axis=0)
         reach = (high - low).max() / 2.0
         means = np.clip(means, low - reach, high + reach)
     corners = np.concatenate([known, means])
-    if not len(corners):
-        raise InputError("this log has no truth to show; name an estimator with --estimate")
+    require(len(corners), "this log has no truth to show; name an estimator with --estimate")
     low, high = corners.min(axis=0), corners.max(axis=0)
     margin = 0.05 * max((high - low).max(), 1.0) + run.recording.robot.track_m
     x1, y1, x2, y2 = (float(side) for side in (*(low - margin), *(high + margin)))
@@ -363,8 +368,7 @@ def bounds(run: Playback, truth: Array | None) -> tuple[float, float, float, flo
 
 def check_output(path: Path) -> None:
     """Refuse a file that could not be written, before anything is computed."""
-    if path.suffix not in SUFFIXES:
-        raise InputError(f"{path}: animations are {', '.join(SUFFIXES)}")
+    require(path.suffix in SUFFIXES, f"{path}: animations are {', '.join(SUFFIXES)}")
     if path.suffix == ".mp4" and shutil.which("ffmpeg") is None:
         raise InputError(f"{path}: MP4 needs ffmpeg, which is not installed; take .gif or .html")
 
@@ -405,8 +409,10 @@ def _write_mp4(images: Iterator[Picture], path: Path) -> None:
         except BrokenPipeError:
             pass  # its message says why
         message = process.stderr.read().decode(errors="replace").strip()
-    if process.returncode:
-        raise InputError(f"ffmpeg: {(message.splitlines() or ['failed'])[-1]}; take .gif or .html")
+    require(
+        not process.returncode,
+        f"ffmpeg: {(message.splitlines() or ['failed'])[-1]}; take .gif or .html",
+    )
 
 
 def _reduced(image: Picture) -> Any:

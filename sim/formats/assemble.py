@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 
 from sim import se2
 from sim.arrays import Array
-from sim.errors import InputError
+from sim.errors import require
 from sim.recording import WheelLog
+from sim.robot import arc_increment
 
 Rows = NDArray[np.int64]
 Notes = dict[str, Any]
@@ -46,12 +47,11 @@ def in_order(stamps: Array, name: str, notes: Notes) -> Rows:
     rows: Rows = np.argsort(stamps, kind="stable").astype(np.int64)
     ordered = stamps[rows]
     last_of_equal = np.append(ordered[1:] > ordered[:-1], True)[: len(rows)]
-    backward = int(np.sum(np.diff(stamps) < 0.0))
-    repeated = int(len(rows) - np.sum(last_of_equal))
-    if backward:
-        notes[f"{name}_backward"] = backward
-    if repeated:
-        notes[f"{name}_repeated"] = repeated
+    counts = {
+        "backward": int(np.sum(np.diff(stamps) < 0.0)),
+        "repeated": int(len(rows) - np.sum(last_of_equal)),
+    }
+    notes.update({f"{name}_{what}": count for what, count in counts.items() if count})
     rows = rows[last_of_equal]
     if len(rows) > 1:
         notes[f"{name}_longest_gap_s"] = round(float(np.max(np.diff(stamps[rows]))), 6)
@@ -124,6 +124,11 @@ def chained(steps: Array) -> Array:
     return poses
 
 
+def rolled(wheels: WheelLog, track_m: float) -> Array:
+    """Poses (N, 3) from the origin on by the wheels' travel; headings wrapped."""
+    return chained(arc_increment(np.diff(wheels.position_m, axis=0), track_m))
+
+
 def rate_hz(stamps: Array) -> float:
     """Median rate of stamps (N,) s, strictly increasing; 1 Hz for a single one."""
     return 1.0 / max(float(np.median(np.diff(stamps))), 1e-9) if len(stamps) > 1 else 1.0
@@ -147,5 +152,4 @@ def frame_stamps(
 
 def require_readings(count: int, least: int, where: str, what: str) -> None:
     """Refuse a log with too little in it."""
-    if count < least:
-        raise InputError(f"{where}: {count} {what}; at least {least} are needed for a recording")
+    require(count >= least, f"{where}: {count} {what}; at least {least} are needed for a recording")

@@ -22,12 +22,12 @@ from numpy.typing import NDArray
 
 from sim import se2
 from sim.arrays import Array
-from sim.errors import InputError
-from sim.files import write_whole
+from sim.errors import require
+from sim.files import write_text
 from sim.formats import assemble
 from sim.formats.text import Rows, Words, read_words
 from sim.recording import Log, Recording, Truth, WheelLog
-from sim.robot import RobotGeometry, arc_increment
+from sim.robot import RobotGeometry
 from sim.sensors import Encoder, Laser, Mount
 
 Poses = Literal["odometry", "reference"]
@@ -109,20 +109,18 @@ def read_carmen(path: Path) -> CarmenLog:
 def parse_carmen(words: Words) -> CarmenLog:
     """The log in a file's words."""
     notes: assemble.Notes = {}
-    odometry_lines = words.lines_of(_ODOM)
-    odometry = words.finite(odometry_lines, 1, 7, "ODOM")
-    order = assemble.in_order(odometry[:, 6], "odometry", notes)
-    odometry = odometry[order]
+    odometry = words.finite(words.lines_of(_ODOM), 1, 7, "ODOM")
+    odometry = odometry[assemble.in_order(odometry[:, 6], "odometry", notes)]
     flaser, robotlaser = words.lines_of(_FLASER), words.lines_of(_ROBOTLASER)
-    if len(robotlaser) >= len(flaser):
-        lines, count_column = robotlaser, 8
-    else:
-        lines, count_column = flaser, 1
+    lines, count_column = (robotlaser, 8) if len(robotlaser) >= len(flaser) else (flaser, 1)
     assemble.require_readings(len(lines), 1, words.where, "FLASER or ROBOTLASER1 lines")
     counts = words.whole(lines, count_column, "the number of beams", 1, _MOST_BEAMS)
     n_beams = int(np.bincount(counts).argmax())
-    short = words.counts[lines] < count_column + 1 + counts
-    words.refuse(short, lines, "too few words for the ranges it promises")
+    words.refuse(
+        words.counts[lines] < count_column + 1 + counts,
+        lines,
+        "too few words for the ranges it promises",
+    )
     if np.any(counts != n_beams):
         notes["scans_of_other_size"] = int(np.sum(counts != n_beams))
         lines = lines[counts == n_beams]
@@ -143,7 +141,6 @@ def parse_carmen(words: Words) -> CarmenLog:
         start_angle, max_range = -math.pi / 2.0, _FLASER_MAX_RANGE_M
         resolution = math.pi / (n_beams - n_beams % 2) if n_beams > 1 else math.pi
     rows = assemble.in_order(stamps, "scans", notes)
-    edges = _edges(words, lines[rows])
     return CarmenLog(
         odometry_stamps=odometry[:, 6].copy(),
         odometry_poses=odometry[:, :3].copy(),
@@ -154,7 +151,7 @@ def parse_carmen(words: Words) -> CarmenLog:
         resolution_rad=float(resolution),
         max_range_m=float(max_range),
         T_base_laser=_mount(poses, laser_poses),
-        edges=edges,
+        edges=_edges(words, lines[rows]),
         is_graph=bool(len(words.lines_of("VERTEX2"))),
         notes=notes,
         where=words.where,
@@ -236,8 +233,7 @@ def scan_recording(
 
 def seen_ranges(raw_m: Array, max_range_m: float) -> NDArray[np.float32]:
     """Ranges with +inf where nothing was seen: at the maximum or beyond, zero, or no number."""
-    seen = (raw_m > 0.0) & (raw_m < max_range_m)
-    return np.where(seen, raw_m, np.inf).astype(np.float32)
+    return np.where((raw_m > 0.0) & (raw_m < max_range_m), raw_m, np.inf).astype(np.float32)
 
 
 def _mount(poses: Array, laser_poses: Array) -> Array:
@@ -257,13 +253,9 @@ def _edges(words: Words, scan_lines: Rows) -> Array:
     words.refuse(above < 0, scan_lines, "a scan without its VERTEX2")
     ids = words.finite(vertices, 1, 1, "VERTEX2")[:, 0]
     values = words.finite(edges, 1, 5, "EDGE2")
-    motion: dict[tuple[float, float], Array] = {}
-    for row in values:
-        motion.setdefault((row[0], row[1]), row[2:])
-    chain = ids[above]
+    motion = {(row[0], row[1]): row[2:] for row in values[::-1]}  # the first of a pair counts
     unknown = np.full(3, np.nan)
-    pairs = pairwise(chain)
-    return np.array([motion.get((float(a), float(b)), unknown) for a, b in pairs])
+    return np.array([motion.get(pair, unknown) for pair in pairwise(ids[above])])
 
 
 def write_carmen(path: Path, recording: Recording) -> None:
@@ -277,11 +269,12 @@ def write_carmen(path: Path, recording: Recording) -> None:
     InputError
         If the recording has no laser, or the file cannot be written.
     """
-    if "laser" not in recording.logs:
-        raise InputError(f"{path}: a CARMEN log is of a laser, and this recording has none")
+    require(
+        "laser" in recording.logs,
+        f"{path}: a CARMEN log is of a laser, and this recording has none",
+    )
     laser, log = recording.sensor("laser", Laser), recording.log("laser")
-    steps = arc_increment(np.diff(recording.wheels.position_m, axis=0), recording.robot.track_m)
-    poses = assemble.chained(steps)
+    poses = assemble.rolled(recording.wheels, recording.robot.track_m)
     heading = np.unwrap(poses[:, 2])
     lines = [
         f"ODOM {x:.17g} {y:.17g} {a:.17g} 0 0 0 {t:.17g} estima {t:.17g}"
@@ -297,5 +290,4 @@ def write_carmen(path: Path, recording: Recording) -> None:
         numbers = " ".join(f"{r:.9g}" for r in np.where(np.isfinite(scan), scan, laser.max_range_m))
         both = " ".join(f"{v:.17g}" for v in (*of_laser, *at))
         lines.append(f"{head} {numbers} 0 {both} 0 0 0 0 0 {t:.17g} estima {t:.17g}")
-    with write_whole(path) as part:
-        part.write_text("\n".join(lines) + "\n")
+    write_text(path, "\n".join(lines) + "\n")

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from sim.arrays import Array
-from sim.errors import InputError
+from sim.errors import InputError, require
 from sim.formats import assemble
 from sim.formats.carmen import NOMINAL_RADIUS_M, NOMINAL_TRACK_M, scan_recording, seen_ranges
 from sim.formats.text import json_number, read_bytes, read_words
@@ -31,8 +31,7 @@ def parse_intel(data: bytes, where: str) -> tuple[Array, Array, Array]:
         Naming the file and the line (of the syntax) or the stamp that is wrong.
     """
     try:
-        tree = json.loads(data)
-        entries = tree["map"].items()
+        entries = json.loads(data)["map"].items()
     except json.JSONDecodeError as error:
         raise InputError(f"{where}:{error.lineno}: not JSON ({error.msg})") from None
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
@@ -77,8 +76,7 @@ def read_intel(
     rows = assemble.in_order(stamps, "scans", notes)
     assemble.require_readings(len(rows), 2, where, "scans")
     n_beams = ranges.shape[1]
-    if n_beams < 2:
-        raise InputError(f"{where}:1: scans of {n_beams} beams; at least 2 are needed")
+    require(n_beams >= 2, f"{where}:1: scans of {n_beams} beams; at least 2 are needed")
     stamps, poses, ranges = stamps[rows], poses[rows], ranges[rows]
     truth = None
     if reference is not None:

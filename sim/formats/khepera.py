@@ -13,7 +13,7 @@ import numpy as np
 
 from sim import se2
 from sim.arrays import Array
-from sim.errors import InputError
+from sim.errors import InputError, require
 from sim.formats.assemble import chained
 from sim.formats.text import json_number, read_bytes, read_members
 from sim.recording import Recording, Truth, WheelLog
@@ -54,8 +54,9 @@ def read_khepera(path: Path, member: str | None = None) -> WheelLaserLog:
     if member is None:
         return parse_khepera(read_bytes(path), str(path))
     members = read_members(path)
-    if member not in members:
-        raise InputError(f"{path}: holds no {member}; it has {', '.join(sorted(members)[:20])}")
+    require(
+        member in members, f"{path}: holds no {member}; it has {', '.join(sorted(members)[:20])}"
+    )
     return parse_khepera(members[member], f"{path}/{member}")
 
 
@@ -119,8 +120,7 @@ def to_recording(
     steps = log.rolled_rad * np.array(wheel_diameters_m) / 2.0
     travel = np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
     laser = np.broadcast_to(np.array(T_base_laser), log.laser_motion.shape)
-    motion = se2.compose(laser, se2.compose(log.laser_motion, se2.inverse(laser)))
-    poses = chained(motion)
+    poses = chained(se2.compose(laser, se2.compose(log.laser_motion, se2.inverse(laser))))
     return Recording(
         frame_stamps=stamps,
         wheels=WheelLog(stamps.copy(), travel),

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from sim.arrays import Array
 from sim.formats import assemble
-from sim.formats.carmen import scan_recording
+from sim.formats.carmen import scan_recording, seen_ranges
 from sim.formats.text import Words, read_words
 from sim.recording import Recording, Truth, WheelLog
 from sim.sensors import Laser, Mount
@@ -65,8 +65,7 @@ def parse_scans(words: Words) -> tuple[Array, NDArray[np.float32]]:
     stamps = words.finite(lines, 1, 1, "an S line")[:, 0] / 1000.0
     ranges = words.numbers(lines, 3, int(counts[0]), "ranges") / 1000.0
     rows = assemble.in_order(stamps, "scans", {})
-    seen = (ranges > 0.0) & (ranges < _MAX_RANGE_M)
-    return stamps[rows], np.where(seen, ranges, np.inf).astype(np.float32)[rows]
+    return stamps[rows], seen_ranges(ranges, _MAX_RANGE_M)[rows]
 
 
 def parse_reference(words: Words) -> tuple[Array, Array]:
@@ -80,8 +79,7 @@ def parse_reference(words: Words) -> tuple[Array, Array]:
 
 def parse_cylinders(words: Words) -> Array:
     """Positions and diameters (N, 3), m, of the L lines."""
-    lines = words.lines_of("L")
-    return words.finite(lines, 2, 3, "an L line") / 1000.0
+    return words.finite(words.lines_of("L"), 2, 3, "an L line") / 1000.0
 
 
 def read_lego(

@@ -101,12 +101,11 @@ def parse_mrclam(
     ids = _landmark_rows(measured[:, 1], barcodes, landmarks[:, 0], notes)
     camera = dataclasses.replace(camera, identifies=identifies)
     log, true_ids = _observations(measured, ids, camera, notes)
-    z_m = np.full(len(landmarks), camera.mount.z_m)
     world = World(
         "mrclam",
         walls=np.zeros((0, 4)),
         wall_z_m=np.zeros((0, 2)),
-        landmarks=np.column_stack([landmarks[:, 1:3], z_m]),
+        landmarks=np.column_stack([landmarks[:, 1:3], np.full(len(landmarks), camera.mount.z_m)]),
     )
     return Recording(
         frame_stamps=assemble.frame_stamps(wheels.stamps, [log.stamps]),

@@ -50,9 +50,7 @@ def parse_trajectory(words: Words) -> Trajectory:
     """The trajectory in a file's words; sorted by stamp, the last of equal stamps kept."""
     table = words.table((4, 13), "a Rawseeds trajectory")
     table = table[assemble.in_order(table[:, 0], "poses", {})]
-    covariances = np.zeros((0, 3, 3))
-    if table.shape[1] == 13:
-        covariances = table[:, 4:].reshape(-1, 3, 3)
+    covariances = table[:, 4:].reshape(-1, 3, 3) if table.shape[1] == 13 else np.zeros((0, 3, 3))
     return Trajectory(table[:, 0].copy(), table[:, 1:4].copy(), covariances)
 
 

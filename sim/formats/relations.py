@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from sim.arrays import Array
-from sim.files import write_whole
+from sim.files import write_text
 from sim.formats.text import Words, read_words
 
 
@@ -44,5 +44,4 @@ def write_relations(path: Path, relations: Relations) -> None:
     rows = np.zeros((len(relations.stamps), 8))
     rows[:, :2], rows[:, [2, 3, 7]] = relations.stamps, relations.motion
     lines = [" ".join(f"{value:.17g}" for value in row) + "\n" for row in rows]
-    with write_whole(path) as part:
-        part.write_text("".join(lines))
+    write_text(path, "".join(lines))

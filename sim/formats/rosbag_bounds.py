@@ -7,15 +7,17 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from sim.errors import InputError
+from sim.errors import InputError, require
 from sim.formats.text import MOST_BYTES
 
 
 def check_bounds(path: Path) -> None:
     """Refuse files that would unpack to more than is allowed, or run code of their own."""
     files = sorted(path.iterdir()) if path.is_dir() else [path]
-    if sum(file.stat().st_size for file in files) > MOST_BYTES:
-        raise InputError(f"{path}: more than {MOST_BYTES >> 20} MiB; cut the bag in parts")
+    require(
+        sum(file.stat().st_size for file in files) <= MOST_BYTES,
+        f"{path}: more than {MOST_BYTES >> 20} MiB; cut the bag in parts",
+    )
     left = MOST_BYTES
     for file in files:
         with file.open("rb") as stream:
@@ -35,8 +37,7 @@ def _unpacked_size(path: Path, chunks: Iterator[tuple[str, bytes]], most: int) -
     total = 0
     for kind, data in chunks:
         total += len(data) if kind in ("", "none") else _length(kind, data, most - total)
-        if total >= most:
-            raise InputError(f"{path}: unpacks to more than {MOST_BYTES >> 20} MiB")
+        require(total < most, f"{path}: unpacks to more than {MOST_BYTES >> 20} MiB")
     return total
 
 
@@ -108,5 +109,7 @@ def _check_tables(path: Path) -> None:
         reason = " ".join(str(error).split())[:200]
         raise InputError(f"{path}: damaged database ({reason})") from error
     for kind, sql in kinds:
-        if kind not in ("table", "index") or "virtual" in str(sql).lower():
-            raise InputError(f"{path}: a database with a {kind} of its own is no bag")
+        require(
+            kind in ("table", "index") and "virtual" not in str(sql).lower(),
+            f"{path}: a database with a {kind} of its own is no bag",
+        )

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.arrays import Array
-from sim.errors import InputError
+from sim.errors import InputError, require
 from sim.formats import assemble
 from sim.formats.rosbag import (
     ABOUT,
@@ -141,8 +141,7 @@ def _track(path: Path, topics: dict[str, _Topic], name: str) -> Track:
     if f"{name}/map" in topics and topics[f"{name}/map"].kind == CLOUD:
         points = point_cloud.columns(topics[f"{name}/map"].messages[-1])
         landmarks = np.stack([points[c] for c in "xyz"], axis=1).astype(np.float64)
-    planar = covariance[(slice(None), *PLANAR)]
-    return Track(stamps[rows], poses[rows], planar[rows], landmarks)
+    return Track(stamps[rows], poses[rows], covariance[(slice(None), *PLANAR)][rows], landmarks)
 
 
 def _recording(
@@ -173,9 +172,8 @@ def _recording(
     if reference is not None:
         stamps, poses = _poses(reference)
         rows = assemble.in_order(stamps, "truth", notes)
-        travel = np.zeros((0, 2))
-        if "/ground_truth/wheels" in topics:
-            travel = _joints(topics["/ground_truth/wheels"])[1]
+        rolling = topics.get("/ground_truth/wheels")
+        travel = np.zeros((0, 2)) if rolling is None else _joints(rolling)[1]
         world = _world(topics.get("/map"), about.get("world"))
         hidden = {name: values for name, values in hidden.items() if values}
         truth = Truth(stamps[rows], poses[rows], travel, hidden, world)
@@ -309,8 +307,10 @@ def _laser(
     first = topic.messages[0]
     n_beams, step = len(first.ranges), float(first.angle_increment)
     odd = [i for i, m in enumerate(topic.messages) if len(m.ranges) != n_beams]
-    if odd or n_beams < 1:
-        raise InputError(f"{path}: message {odd[0] if odd else 0} of the scans has another size")
+    require(
+        not odd and n_beams >= 1,
+        f"{path}: message {odd[0] if odd else 0} of the scans has another size",
+    )
     stamps = _stamps(topic)
     rows = assemble.in_order(stamps, "scans", notes)
     raw = np.stack([np.asarray(topic.messages[i].ranges, np.float32) for i in rows])
@@ -322,8 +322,7 @@ def _laser(
     if T_base_laser is None:
         notes["laser_mount"] = f"no transform to {first.header.frame_id}; taken to be at base_link"
         T_base_laser = np.eye(4)
-    upside_down = bool(T_base_laser[2, 2] < 0.0)
-    if upside_down:
+    if T_base_laser[2, 2] < 0.0:  # upside down
         start, step = -start, -step
     if step < 0.0:
         start, step, ranges = start + step * (n_beams - 1), -step, ranges[:, ::-1].copy()
@@ -367,10 +366,8 @@ def _world(topic: _Topic | None, name: str | None) -> World | None:
 
 def _joints(topic: _Topic) -> tuple[Array, Array]:
     """Stamps and positions (N, 2) of the right and the left wheel."""
-    pairs = []
-    for message in topic.messages:
-        where = {name: i for i, name in enumerate(message.name)}
-        pairs.append([message.position[where[f"{side}_wheel"]] for side in ("right", "left")])
+    rolled = [dict(zip(m.name, m.position, strict=True)) for m in topic.messages]
+    pairs = [[position["right_wheel"], position["left_wheel"]] for position in rolled]
     return _stamps(topic), np.array(pairs, float)
 
 
@@ -426,12 +423,17 @@ def _tf_messages(topics: dict[str, _Topic]) -> Iterator[Any]:
                 yield from message.transforms
 
 
+def _frames(stamped: Any) -> tuple[str, str]:
+    """Parent and child of a transform message."""
+    return stamped.header.frame_id.lstrip("/"), stamped.child_frame_id.lstrip("/")
+
+
 def _transforms(topics: dict[str, _Topic]) -> dict[str, Array]:
     """T_base_frame (4, 4) of every frame that the transforms join to the robot's base."""
     edges: dict[str, list[tuple[str, Array]]] = {}
     seen: set[tuple[str, str]] = set()
     for stamped in _tf_messages(topics):
-        parent, child = (n.lstrip("/") for n in (stamped.header.frame_id, stamped.child_frame_id))
+        parent, child = _frames(stamped)
         if (parent, child) in seen:
             continue
         seen.add((parent, child))
@@ -455,21 +457,18 @@ def _tf_odometry(topics: dict[str, _Topic]) -> tuple[Array, Array]:
     """Stamps and poses of odom -> base_link."""
     stamps, poses = [], []
     for stamped in _tf_messages(topics):
-        if stamped.header.frame_id.lstrip("/") != "odom":
-            continue
-        if stamped.child_frame_id.lstrip("/") not in _BASES:
-            continue
-        T = _matrix(stamped.transform)
-        stamps.append(stamped.header.stamp.sec * 10**9 + stamped.header.stamp.nanosec)
-        poses.append((T[0, 3], T[1, 3], math.atan2(T[1, 0], T[0, 0])))
+        parent, child = _frames(stamped)
+        if parent == "odom" and child in _BASES:
+            T = _matrix(stamped.transform)
+            stamps.append(stamped.header.stamp.sec * 10**9 + stamped.header.stamp.nanosec)
+            poses.append((T[0, 3], T[1, 3], math.atan2(T[1, 0], T[0, 0])))
     return seconds(np.array(stamps, np.int64)), np.array(poses, float).reshape(-1, 3)
 
 
 def _messages(path: Path) -> tuple[dict[str, _Topic], dict[str, Any]]:
     """All messages of the types we read, by topic; and what the bag says about a recording."""
     library()
-    if not path.exists():
-        raise InputError(f"{path}: no such bag")
+    require(path.exists(), f"{path}: no such bag")
     topics: dict[str, _Topic] = {}
     about: dict[str, Any] = {}
     try:
@@ -486,26 +485,23 @@ def _messages(path: Path) -> tuple[dict[str, _Topic], dict[str, Any]]:
                 for c in reader.connections
                 if c.msgtype == _KINDS.get(c.topic, c.msgtype) in kinds
             ]
-            count = 0
-            for connection, time, data in reader.messages(wanted) if wanted else ():
-                count += 1
+            messages = enumerate(reader.messages(wanted) if wanted else (), start=1)
+            for count, (connection, time, data) in messages:
                 if count > _MOST_MESSAGES:
                     raise InputError(
                         f"{path}: more than {_MOST_MESSAGES} messages; cut it in parts"
                     )
                 topic = topics.setdefault(connection.topic, _Topic(connection.msgtype, [], []))
-                if topic.kind != connection.msgtype:
-                    continue
-                topic.times.append(time)
-                topic.messages.append(deserialize(data, connection.msgtype))
+                if topic.kind == connection.msgtype:
+                    topic.times.append(time)
+                    topic.messages.append(deserialize(data, connection.msgtype))
     except InputError:
         raise
     # the library reports damaged files by exceptions of many kinds
     except Exception as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split())[:200]
         raise InputError(f"{path}: damaged or not a bag ({reason})") from error
-    if not topics:
-        raise InputError(f"{path}: holds no odometry, scans or transforms")
+    require(topics, f"{path}: holds no odometry, scans or transforms")
     return topics, about
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from sim import se2
 from sim.arrays import Array
 from sim.errors import InputError
-from sim.formats.assemble import chained
+from sim.formats.assemble import rolled
 from sim.formats.rosbag import (
     ABOUT,
     CLOUD,
@@ -38,7 +38,6 @@ from sim.formats.rosbag import (
     typestore,
 )
 from sim.recording import Log, Recording, Truth, described
-from sim.robot import arc_increment
 from sim.sensors import Mount, point_cloud
 from sim.sensors.base import is_ours
 
@@ -178,9 +177,6 @@ class _Bag:
         rates = motion / np.maximum(np.diff(stamps), 1e-9)[:, None]
         rates = np.concatenate([np.zeros((min(len(stamps), 1), 3)), rates])
         for i, stamp in enumerate(stamps):
-            velocity = self.make(
-                "geometry_msgs/msg/TwistWithCovariance", twist=self.twist(rates[i, 0], rates[i, 2])
-            )
             self.write(
                 topic,
                 ODOMETRY,
@@ -188,7 +184,7 @@ class _Bag:
                 header=self.header(stamp, frame),
                 child_frame_id="base_link",
                 pose=self.uncertain_pose(poses[i], covariances[i]),
-                twist=velocity,
+                twist={"twist": self.twist(rates[i, 0], rates[i, 2])},
             )
 
     def joints(self, topic: str, stamps: Array, travel_m: Array) -> None:
@@ -212,8 +208,7 @@ class _Bag:
     def own_readings(self, topic: str, kind: str, frame: str, log: Log) -> None:
         """Messages made by the log's schema."""
         register(self._store, kind, log.schema)
-        rows = range(len(log.stamps))
-        contents = (own_fields(log.schema, log.reading(row)) for row in rows)
+        contents = (own_fields(log.schema, log.reading(row)) for row in range(len(log.stamps)))
         self.readings(topic, kind, frame, log.stamps, contents)
 
     def marker(self, number: int, name: str, kind: int, points: Array, width_m: float) -> Any:
@@ -247,8 +242,7 @@ def _write_recording(bag: _Bag, recording: Recording) -> None:
     }
     bag.write(ABOUT, STRING, first, data=json.dumps(about))
     _write_mounts(bag, recording, first)
-    steps = arc_increment(np.diff(wheels.position_m, axis=0), recording.robot.track_m)
-    poses = chained(steps)
+    poses = rolled(wheels, recording.robot.track_m)
     bag.odometry("/odom", "odom", wheels.stamps, poses, np.zeros((len(poses), 3, 3)))
     bag.joints("/wheels", wheels.stamps, wheels.position_m)
     for name, topic in topics.items():
@@ -359,8 +353,6 @@ def _blank(store: Any, kind: str) -> Any:
         else:
             (inner, of), length = detail
             count = length if node == Nodetype.ARRAY else 0
-            if inner == Nodetype.BASE and of[0] != "string":
-                values[name] = np.zeros(count, np.dtype(of[0]))
-            else:
-                values[name] = []
+            numbers = inner == Nodetype.BASE and of[0] != "string"
+            values[name] = np.zeros(count, np.dtype(of[0])) if numbers else []
     return store.types[kind](**values)

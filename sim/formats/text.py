@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sim.arrays import Array
-from sim.errors import InputError
+from sim.errors import InputError, require
 
 Rows = NDArray[np.int64]
 
@@ -44,10 +44,10 @@ def read_bytes(path: Path, most_bytes: int = MOST_BYTES) -> bytes:
         with path.open("rb") as file:
             for part in _unpacked(file):
                 size += len(part)
-                if size > most_bytes:
-                    raise InputError(
-                        f"{path}: more than {MOST_BYTES >> 20} MiB of data; cut the log in parts"
-                    )
+                require(
+                    size <= most_bytes,
+                    f"{path}: more than {MOST_BYTES >> 20} MiB of data; cut the log in parts",
+                )
                 parts.append(part)
     except (OSError, EOFError, ValueError, zlib.error, lzma.LZMAError) as error:
         reason = getattr(error, "strerror", None) or error
@@ -164,12 +164,10 @@ class Words:
             Naming the first line that has too few words, or a word that is no number.
         """
         begin = self.first[lines] + column
-        short = begin + n_columns > self.first[lines + 1]
-        self.refuse(short, lines, f"too few words for {what}")
+        self.refuse(begin + n_columns > self.first[lines + 1], lines, f"too few words for {what}")
         wanted = begin[:, None] + np.arange(n_columns)
         self.refuse(~self.is_number[wanted].all(axis=1), lines, f"not a number in {what}")
-        numbers: Array = self.values[wanted]
-        return numbers
+        return np.asarray(self.values[wanted])
 
     def finite(self, lines: Rows, column: int | Rows, n_columns: int, what: str) -> Array:
         """As `numbers`, and they must be finite, and no larger than a log has reason to hold."""

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from sim.arrays import Array
-from sim.files import write_whole
+from sim.files import write_text
 from sim.formats.text import read_bytes, split_words
 
 
@@ -16,8 +16,7 @@ def write_tum(path: Path, stamps: Array, poses: Array) -> None:
     for stamp, (x, y, heading) in zip(stamps, poses, strict=True):
         qz, qw = math.sin(heading / 2.0), math.cos(heading / 2.0)
         lines.append(f"{stamp:.17g} {x:.17g} {y:.17g} 0 0 0 {qz:.17g} {qw:.17g}\n")
-    with write_whole(path) as part:
-        part.write_text("".join(lines))
+    write_text(path, "".join(lines))
 
 
 def read_tum(path: Path) -> tuple[Array, Array]:

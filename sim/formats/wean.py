@@ -15,7 +15,7 @@ import numpy as np
 
 from sim import se2
 from sim.arrays import Array
-from sim.errors import InputError
+from sim.errors import InputError, require
 from sim.formats import assemble
 from sim.formats.carmen import scan_recording, seen_ranges
 from sim.formats.text import Words, read_bytes, read_words, split_words
@@ -137,17 +137,18 @@ def parse_grid(data: bytes, where: str) -> Grid:
             raise InputError(f"{where}:{number}: a number is missing in the header") from None
         if end < 0:
             break
-    if not (0 < n_x <= _MOST_CELLS and 0 < n_y <= _MOST_CELLS and 0.0 < cell_m < 100.0):
-        raise InputError(f"{where}:{number}: no `global_map[0]: width height` of a map in it")
+    require(
+        0 < n_x <= _MOST_CELLS and 0 < n_y <= _MOST_CELLS and 0.0 < cell_m < 100.0,
+        f"{where}:{number}: no `global_map[0]: width height` of a map in it",
+    )
     cells = split_words(data[at:] if at else b"", where)
     cells.line_numbers[:] += number
-    if len(cells.values) != n_x * n_y:
-        raise InputError(
-            f"{where}:{number}: {n_x} x {n_y} cells are promised, {len(cells.values)} are there"
-        )
+    require(
+        len(cells.values) == n_x * n_y,
+        f"{where}:{number}: {n_x} x {n_y} cells are promised, {len(cells.values)} are there",
+    )
     bad = np.flatnonzero(~cells.is_number | ~(np.abs(cells.values) <= 1.0))
     if len(bad):
         line = int(np.searchsorted(cells.first, bad[0], side="right")) - 1
         raise cells.error(line, "a cell must be -1 or a number from 0 to 1")
-    values = np.where(cells.values < 0.0, np.nan, cells.values)
-    return Grid(values.reshape(n_x, n_y), cell_m)
+    return Grid(np.where(cells.values < 0.0, np.nan, cells.values).reshape(n_x, n_y), cell_m)
