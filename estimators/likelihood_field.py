@@ -59,6 +59,12 @@ class LikelihoodField:
     step: float
     free_cells: Ints
 
+    def holds(self, pose: Array) -> bool:
+        """Whether a pose (3,) lies on the table, rather than off the map."""
+        column, row = (np.asarray(pose[:2]) - self.origin_m) / self.cell_m
+        rows, columns = self.table.shape
+        return bool(0.0 <= row < rows and 0.0 <= column < columns)
+
     def draw(self, n: int, rng: np.random.Generator) -> Array:
         """Poses (n, 3), uniform over the free floor and all headings."""
         require(len(self.free_cells) > 0, "the map has no floor off its walls to put particles on")

@@ -188,6 +188,7 @@ class Mcl:
             z_hit=self.z_hit,
             z_rand=self.z_rand,
         )
+        self._off_map = prior.mean is not None and not self._field.holds(prior.mean)
         self._everywhere = prior.mean is None or prior.covariance is None
         if prior.mean is None or prior.covariance is None:
             self._poses = self._field.draw(self.n_most, rng)
@@ -207,7 +208,8 @@ class Mcl:
     def step(self, frame: Frame) -> Belief:
         """Roll by the wheels; with a scan from a new place, weight and resample."""
         self._motion = self._motion.then(self.wheels.predict(frame))
-        extras: dict[str, Any] = {}
+        extras: dict[str, Any] = {"status": "start off the map"} if self._off_map else {}
+        self._off_map = False
         scan = frame.readings.get(self.laser)
         if scan is not None and self._is_due():
             ends = beam_ends(scan["ranges_m"], self._laser, self.n_beams)

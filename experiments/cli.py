@@ -188,6 +188,9 @@ def convert(
     recording = read_any(log, robot)
     write_recording(out, recording)
     print(f"{out}: {recording.duration_s:.1f} s, {len(recording.frame_stamps)} frames")
+    dropped = [name for name in recording.logs if name != "laser"] if out.suffix == ".log" else []
+    if dropped:
+        print(f"left out, since a CARMEN log holds one laser: {', '.join(dropped)}")
 
 
 @app.command()
@@ -359,7 +362,10 @@ def build_map(
     resolution_m: Annotated[float, typer.Option("--resolution", help="Side of a cell, m.")] = 0.05,
     max_range_m: Annotated[
         float | None,
-        typer.Option("--max-range", help="Longer beams only clear, m [the laser's range]."),
+        typer.Option(
+            "--max-range",
+            help="Beams longer than this only clear cells; metres [the laser's range].",
+        ),
     ] = None,
     raw: Annotated[
         bool,

@@ -13,7 +13,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from sim.arrays import Array
-from sim.errors import InputError, require
+from sim.errors import InputError, require, required
 from sim.grid_file import read_grid
 from sim.plan import WALL_HEIGHT_M, Plan, box_corners, rectangle_corners
 from sim.world import World, facing_second
@@ -34,7 +34,7 @@ def from_file(*, rng: np.random.Generator, path: str) -> World:
     return read_world(Path(path))
 
 
-def from_grid(*, rng: np.random.Generator, path: str, waypoints: list[list[float]]) -> World:
+def from_grid(*, rng: np.random.Generator, path: str | None, waypoints: list[list[float]]) -> World:
     """Draw a world from an occupancy grid: a wall along each border of its occupied cells.
 
     Parameters
@@ -46,6 +46,7 @@ def from_grid(*, rng: np.random.Generator, path: str, waypoints: list[list[float
         these are fewer than two.
     """
     del rng
+    path = required(path, "world.path must name a grid's .yaml, such as one `estima map` wrote")
     walls = read_grid(path).walls()
     require(
         len(walls) <= _MOST_GRID_WALLS,

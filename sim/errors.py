@@ -1,5 +1,9 @@
 """The one exception for input that a user can mend."""
 
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import TypeVar
 
 T = TypeVar("T")
@@ -10,6 +14,28 @@ class InputError(Exception):
 
     The command line prints it as it is and exits with code 2.
     """
+
+
+@contextmanager
+def blaming(where: str) -> Iterator[None]:
+    """What a user's own code raises becomes an InputError: where it is named, what, which line.
+
+    Examples
+    --------
+    >>> with blaming("sensors.sonar"):
+    ...     1 / 0
+    Traceback (most recent call last):
+    sim.errors.InputError: sensors.sonar raised ZeroDivisionError: division by zero (<doctest sim.errors.blaming[0]>:2)
+    """  # noqa: E501 the message is one line
+    try:
+        yield
+    except InputError:
+        raise
+    except (Exception, SystemExit) as error:
+        last = traceback.extract_tb(error.__traceback__)[-1]
+        reason = " ".join(str(error).split()) or "nothing said"
+        place = f"{Path(last.filename).name}:{last.lineno}"
+        raise InputError(f"{where} raised {type(error).__name__}: {reason} ({place})") from error
 
 
 def required(value: T | None, complaint: str) -> T:

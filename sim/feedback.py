@@ -11,7 +11,7 @@ import numpy as np
 
 from sim import se2
 from sim.arrays import Array
-from sim.errors import InputError
+from sim.errors import InputError, blaming, require
 from sim.recording import Frame
 from sim.robot import DifferentialDrive, RobotGeometry, arc_increment
 from sim.sensors.base import Reading, Schema, Sensors, parted
@@ -91,7 +91,7 @@ class EstimatorFeedback:
     Parameters
     ----------
     step
-        Takes a Frame and returns a pose (3,); one that is not finite is left out.
+        Takes a Frame and returns a pose (3,), which must be finite.
     schemas
         Of each sensor: its fields without those that are truth.
     """
@@ -123,9 +123,16 @@ class EstimatorFeedback:
             for name, schema in self._schemas.items()
             if name in readings
         }
-        believed = self._step(Frame(stamp, stamp - last_s, reading_m - last_m, seen))
-        if np.isfinite(believed).all():
-            self._reckoned.restart(believed, reading_m)
+        with blaming("route.feedback"):
+            believed = np.asarray(
+                self._step(Frame(stamp, stamp - last_s, reading_m - last_m, seen)), float
+            )
+        require(
+            believed.shape == (3,) and np.isfinite(believed).all(),
+            f"route.feedback: the pose at {stamp:.2f} s must be three finite numbers, "
+            f"got {believed}",
+        )
+        self._reckoned.restart(believed, reading_m)
 
 
 Onboard = Callable[[World, RobotGeometry, Sensors, Array], Callable[[Frame], Array]]

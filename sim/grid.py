@@ -46,10 +46,14 @@ class OccupancyGrid:
             raise InputError(f"a grid has rows and columns, got shape {self.probability.shape}")
         if np.any(self.probability < 0.0) or np.any(self.probability > 1.0):
             raise InputError("a grid's probabilities lie in [0, 1], or are NaN where unknown")
-        if not (math.isfinite(self.resolution_m) and self.resolution_m > 0.0):
-            raise InputError(f"a grid's resolution is a positive number, got {self.resolution_m}")
-        if np.shape(self.origin) != (3,) or not np.all(np.isfinite(self.origin)):
-            raise InputError(f"a grid's origin is x, y, yaw, got {self.origin}")
+        if not 1e-4 <= self.resolution_m <= 100.0:
+            raise InputError(
+                f"a grid's resolution must lie between 0.1 mm and 100 m, got {self.resolution_m}"
+            )
+        if np.shape(self.origin) != (3,) or not np.all(np.abs(self.origin) <= 1e7):
+            raise InputError(
+                f"a grid's origin is x, y, yaw, within 10,000 km of map's, got {self.origin}"
+            )
 
     @property
     def free(self) -> NDArray[np.bool_]:

@@ -108,6 +108,12 @@ class DifferentialDrive:
         for name in ("nominal_wheel_radius_m", "nominal_track_m"):
             if getattr(self, name) is not None:
                 check_numbers("robot", self, (name,))
+                ratio = getattr(self, name) / getattr(self, name.removeprefix("nominal_"))
+                require(
+                    0.1 <= ratio <= 10.0,
+                    f"robot.{name} must lie within a factor of ten of the true one, "
+                    f"got {ratio:.3g} times it",
+                )
         for name in ("bias_right", "bias_left"):
             value = getattr(self, name)
             require(

@@ -393,7 +393,8 @@ def _trapezoid(segment: Segment, robot: DifferentialDrive) -> tuple[float, float
     """Plateau and ramp times, s, and the share of the velocity that the plateau reaches."""
     v, omega, duration_s = segment
     track_m = max(robot.track_m, robot.nominal.track_m)  # neither body nor wheels are hurried
-    ramp_s = (abs(v) + abs(omega) * track_m / 2.0) / robot.max_acceleration_mps2
+    hurry = max(robot.wheel_radius_m / robot.nominal.wheel_radius_m, 1.0)
+    ramp_s = hurry * (abs(v) + abs(omega) * track_m / 2.0) / robot.max_acceleration_mps2
     if ramp_s <= duration_s:
         return duration_s - ramp_s, ramp_s, 1.0
     # peak share p reached after p ramp_s: the area p^2 ramp_s must be the duration

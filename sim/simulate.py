@@ -19,13 +19,13 @@ from numpy.typing import NDArray
 
 from sim import se2
 from sim.arrays import Array
-from sim.errors import InputError, require
+from sim.errors import blaming, require
 from sim.feedback import Feedback, Onboard, feedback_of
 from sim.kinematic import KinematicBody
 from sim.rays import BulletRays, ExactRays
 from sim.recording import CommandLog, Log, Recording, Truth, WheelLog, joined
 from sim.robot import DifferentialDrive
-from sim.sensors.base import Probe, Rays, Reading, Sensor, Sensors, View, parted
+from sim.sensors.base import Rays, Reading, Sensor, Sensors, View, parted
 from sim.world import World
 
 Physics = Literal["bullet", "kinematic"]
@@ -126,6 +126,9 @@ def record(
         f"the robot overlaps a wall of world {world.name} at its start "
         f"({pose[0]:.2f}, {pose[1]:.2f}); move the start pose or the wall",
     )
+    for values in (pose, *vars(world).values()):  # a sensor looks at them, and must not change them
+        if isinstance(values, np.ndarray):
+            values.setflags(write=False)
     feedback = feedback_of(route, robot, pose, sensors, world, onboard)
     logs: _Logs = defaultdict(list)
     with contextlib.ExitStack() as stack:
@@ -166,7 +169,8 @@ def _probes(
     probes = {}
     for name in order:
         own = rng if name in _SHARE_NOISE else _stream_of(rng, name)
-        probes[name] = _Firing(sensors[name].start(own), View(0.0, start, world, rays, 0.0, start))
+        first = View(0.0, start, world, rays, 0.0, start)
+        probes[name] = _Firing(name, sensors[name], own, first)
     return probes
 
 
@@ -178,17 +182,31 @@ def _stream_of(rng: np.random.Generator, name: str) -> np.random.Generator:
 
 
 class _Firing:
-    """A probe, and what it saw last."""
+    """A sensor at work, and what it saw last."""
 
-    def __init__(self, probe: Probe, first: View) -> None:
-        self._probe, self._last = probe, first
-        if hasattr(probe, "begin"):
-            probe.begin(first)
+    def __init__(self, name: str, sensor: Sensor, rng: np.random.Generator, first: View) -> None:
+        self._where, self._schema, self._last = f"sensors.{name}", sensor.schema, first
+        with blaming(self._where):
+            self._probe = sensor.start(rng)
+            if hasattr(self._probe, "begin"):
+                self._probe.begin(first)
+        require(callable(self._probe), f"{self._where}: start must return a function of the view")
 
     def __call__(self, stamp: float, pose: Array) -> Reading | None:
         last = self._last
         self._last = View(stamp, pose, last.world, last.rays, last.stamp, last.pose)
-        return self._probe(self._last)
+        with blaming(self._where):
+            reading = self._probe(self._last)
+        if reading is None:
+            return None
+        require(
+            isinstance(reading, Mapping) and set(reading) == set(self._schema),
+            f"{self._where}: a reading must have the fields {[*self._schema]}, got {reading!r:.60}",
+        )
+        return {
+            key: field.taken(reading[key], f"{self._where}.{key}")
+            for key, field in self._schema.items()
+        }
 
 
 def _drive(
@@ -211,6 +229,7 @@ def _drive(
     tick, velocity, speeds = 0, (0.0, 0.0), (0.0, 0.0)
     while True:
         pose = body.pose
+        pose.setflags(write=False)
         due = [name for name, period in periods.items() if tick % period == 0]
         wanted = driver.command(tick, feedback.pose(tick, pose, encoder))
         if due or wanted is None:
@@ -324,6 +343,8 @@ def _periods(sensors: Sensors) -> dict[str, int]:
         rate = sensors[name].rate_hz
         if rate is None:
             continue
+        number = isinstance(rate, (int, float)) and 0.0 < rate < math.inf
+        require(number, f"sensors.{name}.rate_hz must be a positive number or null, got {rate!r}")
         ticks = TICKS_PER_S / rate
         require(
             abs(ticks - round(ticks)) <= 1e-6 and round(ticks) >= 1,
@@ -373,11 +394,6 @@ def _log(
 ) -> tuple[Log, dict[str, NDArray[Any]]]:
     """Log of a sensor, and what its schema marks as truth."""
     schema = sensor.schema
-    for reading in readings:
-        if set(reading) != set(schema):
-            raise InputError(
-                f"sensors.{name}: a reading has the fields {[*reading]}, its schema {[*schema]}"
-            )
     log = joined(schema, stamps, readings, f"sensors.{name}")
     seen, hidden = parted(schema)
     return (

@@ -521,7 +521,11 @@ def test_a_world_drawn_from_a_grid():
         from_grid(rng=np.random.default_rng(0), path=str(MAP), waypoints=[[1, 1], [7, 1]])
     with pytest.raises(InputError, match="waypoints"):
         from_grid(rng=np.random.default_rng(0), path=str(MAP), waypoints=[[1, "x"]])
-    without = Experiment.compose(["world=from_grid", "simulation.physics=kinematic"])
+    with pytest.raises(InputError, match=r"world\.path must name"):
+        Experiment.compose(["world=from_grid"]).world()
+    without = Experiment.compose(
+        ["world=from_grid", f"world.path={MAP}", "simulation.physics=kinematic"]
+    )
     with pytest.raises(InputError, match=r"no tour.*route\.waypoints"):
         without.simulate()
 

@@ -150,7 +150,7 @@ def test_what_is_missing_is_named():
         blind.sensor("laser", Laser)
     with pytest.raises(InputError, match=r"a sensor place \(there is laser, stereo\)"):
         small_recording().log("place")
-    with pytest.raises(InputError, match="sensor laser is no StereoCamera but a Laser"):
+    with pytest.raises(InputError, match="sensor laser is a Laser, not a StereoCamera"):
         small_recording().sensor("laser", StereoCamera)
     with pytest.raises(InputError, match="no splits"):
         _ = small_recording().log("laser").known_splits

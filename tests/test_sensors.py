@@ -141,7 +141,7 @@ def test_a_missing_sensor_is_named():
         assert sensor_of(sensors, name, type(sensor)) is sensor
         with pytest.raises(InputError, match=f"no sensor named {name} .there is none.; choose"):
             sensor_of({}, name, type(sensor))
-    with pytest.raises(InputError, match="sensor laser is no Lidar3D but a Laser"):
+    with pytest.raises(InputError, match="sensor laser is a Laser, not a Lidar3D"):
         sensor_of(sensors, "laser", Lidar3D)
 
 

@@ -1,4 +1,4 @@
-"""An estimator of one's own: any object with `reset` and `step`.
+"""Your own estimator: any object with `reset` and `step`.
 
 This one reckons from the wheels and says that its errors grow by a fixed variance per metre. To
 sweep it, or to name it on the command line, give it a YAML with `_target_` (see the README).

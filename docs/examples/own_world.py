@@ -1,4 +1,4 @@
-"""A world of one's own: walls, boxes, landmarks and a tour in a YAML, and a laser in it.
+"""Your own world: walls, boxes, landmarks and a tour in a YAML, and a laser in it.
 
 `estima view --world world=from_file world.path=my_world.yaml` draws it. Writes own_world.png into
 the current folder.

@@ -28,11 +28,12 @@ from experiments.runs.targets import checked, make, targets
 from experiments.runs.version import code_version, source_digest, version_with
 from sim import grid_file
 from sim.arrays import Array
-from sim.errors import InputError
+from sim.errors import InputError, blaming, require
 from sim.grid import OccupancyGrid
 from sim.recording import Frame, Recording, load
 from sim.robot import DifferentialDrive, RobotGeometry
 from sim.sensors import Sensor, Sensors, sensors_from_config
+from sim.sensors.base import RecordedSensor, sensor_settings
 from sim.settings import build
 from sim.world import World
 
@@ -284,7 +285,7 @@ class Experiment:
             self._check_sensors(f"estimator={self.estimator_name}", needs - {"map"}, settings)
             onboard = self.config["route"].get("feedback")
             if isinstance(onboard, dict):
-                steering = getattr(make(onboard, "route.feedback"), "needs", ())
+                steering = getattr(self._steering(), "needs", ())
                 self._check_sensors("route.feedback", frozenset(steering) - {"map"}, onboard)
         mapped = self.config["prior"]["map"] != "none" or settings.get("map_path")
         if "map" in needs and not mapped:
@@ -315,10 +316,11 @@ class Experiment:
             # an option of the estimator says how the sensor is called
             names = [settings.get(option, option) for option in need.split("|")]
             if not has.intersection(names):
-                presets = ", ".join(_presets_with(names)) or "one that has it"
+                presets = ", ".join(_presets_with(names))
+                remedy = f"try sensors={presets}" if presets else f"add sensors.{names[0]}"
                 raise InputError(
                     f"{who} needs a sensor {' or '.join(names)}, and "
-                    f"sensors={self.choices.get('sensors')} has none; try sensors={presets}"
+                    f"sensors={self.choices.get('sensors')} has none; {remedy}"
                 )
 
     def world(self) -> World:
@@ -384,10 +386,18 @@ class Experiment:
         self, world: World, robot: RobotGeometry, sensors: Sensors, start: Array
     ) -> Callable[[Frame], Array]:
         """Start the estimator that the route's feedback names; it knows the start and the map."""
-        estimator: Estimator = make(self.config["route"]["feedback"], "route.feedback")
+        estimator = self._steering()
         prior = Prior(robot, sensors, start.copy(), np.zeros((3, 3)), world)
-        estimator.reset(prior, stream(self.config["seed"], "onboard"))
+        with blaming("route.feedback"):
+            estimator.reset(prior, stream(self.config["seed"], "onboard"))
         return lambda frame: estimator.step(frame).mean
+
+    def _steering(self) -> Estimator:
+        """Make the estimator that the route's feedback names."""
+        estimator: Estimator = make(self.config["route"]["feedback"], "route.feedback")
+        whole = all(callable(getattr(estimator, name, None)) for name in ("reset", "step"))
+        require(whole, "route.feedback names no estimator: it has no reset and step")
+        return estimator
 
     def recording(self, on_progress: Callable[[float], None] | None = None) -> Recording:
         """Read the recording, find it in the cache, or simulate it.
@@ -406,10 +416,22 @@ class Experiment:
         if wanted is not None:
             recording = load(Path(wanted))
             self._compare_slip(recording)
-            return recording
+            return self._with_classes(recording)
         recording = cached(self.recording_key, lambda: self.simulate(on_progress))
         # a file does not choose what code runs, but the configuration does
         return dataclasses.replace(recording, sensors=self.sensors())
+
+    def _with_classes(self, recording: Recording) -> Recording:
+        """Return the recording with the classes of its sensors that the configuration names too."""
+        again = {
+            name: sensor_settings(sensor)
+            for name, sensor in recording.sensors.items()
+            if isinstance(sensor, RecordedSensor)
+            and (self.config["sensors"].get(name) or {}).get("_target_") == sensor.target
+        }
+        return dataclasses.replace(
+            recording, sensors={**recording.sensors, **sensors_from_config(again)}
+        )
 
     def _compare_slip(self, recording: Recording) -> None:
         """Warn if kr or kl are not those that the recording was made with."""

@@ -287,7 +287,8 @@ def write_carmen(path: Path, recording: Recording) -> None:
     for t, scan in zip(log.stamps, log["ranges_m"], strict=True):
         at = [np.interp(t, recording.wheels.stamps, c) for c in (*poses[:, :2].T, heading)]
         of_laser = se2.compose(np.array(at), laser.mount.pose)
-        numbers = " ".join(f"{r:.9g}" for r in np.where(np.isfinite(scan), scan, laser.max_range_m))
+        written = np.where(np.isfinite(scan), scan.astype(np.float64), laser.max_range_m)
+        numbers = " ".join(f"{r:.9g}" for r in written)
         both = " ".join(f"{v:.17g}" for v in (*of_laser, *at))
         lines.append(f"{head} {numbers} 0 {both} 0 0 0 0 0 {t:.17g} estima {t:.17g}")
     write_text(path, "\n".join(lines) + "\n")

@@ -68,7 +68,8 @@ def _kind_of_text(head: bytes, path: Path) -> str:
     if lines and lines[0].count(b",") == 6:
         return "rawseeds"
     raise InputError(
-        f"{path}: not a log of a known format; known: {', '.join(KINDS)} (see docs/formats.md)"
+        f"{path}: not a log of a known format; known: {', '.join(KINDS)} "
+        "(see docs/formats.md); a map's .yaml is drawn by `estima view --map`"
     )
 
 

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from sim import se2
 from sim.arrays import Array
-from sim.errors import InputError
+from sim.errors import InputError, blaming, require
 from sim.settings import build, find
 from sim.world import World
 
@@ -32,6 +32,7 @@ S = TypeVar("S")
 Reading = Mapping[str, NDArray[Any]]
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 _DTYPES = ("f8", "f4", "i8", "i4", "u1")
+_TAKEN = ("wheels", "commands", "truth")  # what else a recording holds
 _OWN = "sim.sensors."
 # What a class may offer beyond its settings; a file's settings cannot stand for it
 _OFFERS = ("points_in_base", "ros_message", "ros_topic", "ros_optical", "to_ros", "from_ros")
@@ -66,8 +67,35 @@ class Field:
     in_map: bool = False
 
     def __post_init__(self) -> None:
-        if self.dtype not in _DTYPES:
-            raise InputError(f"a field's dtype must be one of {_DTYPES}, got {self.dtype!r}")
+        require(
+            self.dtype in _DTYPES, f"a field's dtype must be one of {_DTYPES}, got {self.dtype!r}"
+        )
+        sizes = isinstance(self.shape, tuple) and all(
+            size is None or (isinstance(size, int) and size >= 0) for size in self.shape
+        )
+        require(sizes, f"a field's shape must be a tuple of sizes and None, got {self.shape!r}")
+        require(isinstance(self.unit, str), f"a field's unit must be a text, got {self.unit!r}")
+
+    def taken(self, value: Any, where: str) -> NDArray[Any]:
+        """Read-only copy of a reading's value, of the field's type.
+
+        Raises
+        ------
+        InputError
+            If it does not hold numbers, or numbers that the type cannot hold.
+        """
+        raw, whole = np.asarray(value), self.dtype[0] in "iu"
+        require(
+            raw.dtype.kind in ("biu" if whole else "biuf"),
+            f"{where} must hold {'whole ' if whole else ''}numbers, got {raw.dtype}",
+        )
+        if whole and raw.size:
+            least, most = np.iinfo(self.dtype).min, np.iinfo(self.dtype).max
+            fits = least <= raw.min() and raw.max() <= most
+            require(fits, f"{where} must lie in [{least}, {most}], as {self.dtype} does")
+        copy = np.array(raw, self.dtype)
+        copy.setflags(write=False)
+        return copy
 
     def check(self, values: NDArray[Any], n: int, where: str) -> None:
         """Check the values of `n` readings, or rows.
@@ -255,7 +283,10 @@ class RecordedSensor:
     def __getattr__(self, name: str) -> Any:
         settings = vars(self).get("settings", {})
         if name not in settings or name in _OFFERS:
-            raise AttributeError(f"the recorded sensor has no setting {name}")
+            raise AttributeError(
+                f"a recorded {vars(self).get('target')} has its settings, and no {name}; name its "
+                "class again: sensors=PRESET with its _target_"
+            )
         return settings[name]
 
     def start(self, rng: np.random.Generator) -> Probe:
@@ -275,8 +306,13 @@ def sensor_of(sensors: Sensors, name: str, kind: type[S] = object) -> S:  # type
         known = ", ".join(sensors) or "none"
         raise InputError(f"no sensor named {name} (there is {known}); choose sensors that have one")
     found = sensors[name]
+    if isinstance(found, RecordedSensor) and not isinstance(found, kind):
+        raise InputError(
+            f"sensor {name} was recorded as {found.target}, whose code a file does not choose; "
+            f"name it again: sensors=PRESET with its _target_ (and --config-dir)"
+        )
     if not isinstance(found, kind):
-        raise InputError(f"sensor {name} is no {kind.__name__} but a {type(found).__name__}")
+        raise InputError(f"sensor {name} is a {type(found).__name__}, not a {kind.__name__}")
     return found
 
 
@@ -349,20 +385,25 @@ def _made(kind: Any, settings: Mapping[str, Any], where: str) -> Sensor:
     if not (isinstance(kind, type) and dataclasses.is_dataclass(kind)):
         raise InputError(f"{where}._target_={settings['_target_']} must be a dataclass")
     made: Any = build(kind, {k: v for k, v in settings.items() if k != "_target_"}, where)
-    for name in ("rate_hz", "schema", "start"):
-        if not hasattr(made, name):
-            raise InputError(f"{where}: {settings['_target_']} has no {name}; see sim.sensors.base")
-    _check_fields(made.schema, where)
+    with blaming(where):
+        for name in ("rate_hz", "schema", "start"):
+            known = hasattr(made, name)
+            require(known, f"{where}: {settings['_target_']} has no {name}; see sim.sensors.base")
+        schema = made.schema
+    fields = isinstance(schema, Mapping) and all(isinstance(f, Field) for f in schema.values())
+    require(fields, f"{where}: the schema must be a mapping of names to Field, got {schema!r:.60}")
+    _check_fields(schema, where)
     sensor: Sensor = made
     return sensor
 
 
 def _place_of(name: Any) -> str:
     """Place of a sensor in the configuration; its name must be a word."""
-    if not isinstance(name, str) or not _NAME.fullmatch(name):
-        raise InputError(
-            f"sensors: a sensor's name must be one word of letters and digits, got {name!r}"
-        )
+    require(
+        isinstance(name, str) and _NAME.fullmatch(name) and name not in _TAKEN,
+        f"sensors: a sensor's name must be one word of letters and digits, and none of "
+        f"{', '.join(_TAKEN)}; got {name!r}",
+    )
     return f"sensors.{name}"
 
 
