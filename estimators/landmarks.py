@@ -111,9 +111,8 @@ class LandmarkMaps:
         more = max(n_slots, 2 * have, 8) - have
         self.place = np.concatenate([self.place, np.arange(len(self.data), len(self.data) + more)])
         self.data = np.concatenate([self.data, np.zeros((more, *self.data.shape[1:]))])
-        self.births = np.concatenate(
-            [self.births, np.zeros((more, self.births.shape[1]), np.int64)]
-        )
+        born = np.zeros((more, self.births.shape[1]), np.int64)
+        self.births = np.concatenate([self.births, born])
         self._epoch = np.concatenate([self._epoch, np.full(more, self._generation)])
 
     def resample(self, ancestors: Ints) -> None:

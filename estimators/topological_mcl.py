@@ -263,8 +263,11 @@ class TopologicalMcl:
         self._squares = np.einsum("nd,nd->n", known.descriptors, known.descriptors)
         self._sigma_l_m = self.sigma_l_m or known.spacing_m or 1.0
         self._near_m = 1.5 * max(known.spacing_m, 1.0)
-        refines = self.refine and known.slices_m.size > 0
-        self._refiner = Refiner(known, self._lidar) if refines and self._lidar else None
+        self._refiner = (
+            Refiner(known, self._lidar)
+            if self.refine and known.slices_m.size and self._lidar is not None
+            else None
+        )
         copy, node = np.indices((self.particles_per_node, len(known))).reshape(2, -1)
         self._edge = self._graph.first_out[node] + copy % self._graph.degree[node]
         self._along_m = np.zeros(len(node))
@@ -335,10 +338,8 @@ class TopologicalMcl:
         n_new = rng.binomial(n, self.injection) if self.injection > 0.0 else 0
         if n_new:
             slots = rng.choice(n, n_new, replace=False)
-            alike = (
-                np.zeros(len(nearest)) if self.weighting == "M1" else _scaled(away) / self.sigma_m
-            )
-            node = nearest[resample(-(alike**2), n_new, rng, "multinomial")]
+            unlike = 0.0 * away if self.weighting == "M1" else _scaled(away) / self.sigma_m
+            node = nearest[resample(-(unlike**2), n_new, rng, "multinomial")]
             out = (rng.random(n_new) * self._graph.degree[node]).astype(np.int64)
             self._edge[slots] = self._graph.first_out[node] + out
             self._along_m[slots] = 0.0

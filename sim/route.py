@@ -168,12 +168,13 @@ class _Controller:
         linear = robot.max_acceleration_mps2
         # (2,) of v and omega, m/s^2 and rad/s^2: half of a wheel's acceleration for each
         self._most = np.array([0.5 * linear, linear / robot.nominal.track_m])
-        self._velocity, self._rest_ticks = np.zeros(2), -1
+        self._velocity = np.zeros(2)
+        self._rest_ticks: int | None = None
         self._last_tick, self._late = round(last_s / TICK_S), False
 
     def command(self, tick: int, pose: Array) -> Array | None:
         """Velocity (2,) of the tick; None when the robot has rested at its goal."""
-        if self._rest_ticks >= 0:
+        if self._rest_ticks is not None:
             self._rest_ticks -= 1
             return None if self._rest_ticks < 0 else np.zeros(2)
         if tick % CONTROL_TICKS:

@@ -37,8 +37,8 @@ def describe(recording: Recording) -> str:
 
 
 def _line(name: str, stamps: Array) -> str:
-    lapses_ms = 1000 * np.diff(stamps)
-    rate = f", every {float(np.median(lapses_ms)):.1f} ms" if len(lapses_ms) else ""
+    gaps_s = np.diff(stamps)
+    rate = f", every {1000 * float(np.median(gaps_s)):.1f} ms" if len(gaps_s) else ""
     return f"{name:<11} {len(stamps)} readings{rate}"
 
 

@@ -366,7 +366,7 @@ def _world(topic: _Topic | None, name: str | None) -> World | None:
 
 def _joints(topic: _Topic) -> tuple[Array, Array]:
     """Stamps and positions (N, 2) of the right and the left wheel."""
-    rolled = [dict(zip(m.name, m.position, strict=True)) for m in topic.messages]
+    rolled = [dict(zip(m.name, m.position, strict=False)) for m in topic.messages]
     pairs = [[position["right_wheel"], position["left_wheel"]] for position in rolled]
     return _stamps(topic), np.array(pairs, float)
 
