@@ -47,6 +47,7 @@ RECOVERED_WITHIN = 20  # nodes
 KIDNAPPED_AFTER = 30  # steps
 CAMPUS_SHIFT_M = 1.0  # from the map's lane to the queries'
 
+BETWEEN_NODES_S = 2.56  # of Oxford, as the paper has it
 ITERATIONS = (0, 5, 10, 21)  # of figure 6
 DRAWN_DESCRIPTOR = "m2dp"  # of the campus
 # Tables 1 and 2: mean error and deviation, m
