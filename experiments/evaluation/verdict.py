@@ -1,7 +1,7 @@
 """A paper's claim and the verdict on it."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
@@ -214,7 +214,9 @@ def overall(parts: Sequence[Verdict]) -> Verdict:
 
 
 def conclude(
-    claims: Sequence[Claim], sentences: Mapping[str, str], unit: str = "recordings"
+    claims: Sequence[Claim],
+    sentences: Mapping[str, Callable[[Sequence[Claim]], str]],
+    unit: str = "recordings",
 ) -> list[Conclusion]:
     """Give each claim its verdict, which follows from its headlines alone, and its sentence.
 
@@ -224,7 +226,7 @@ def conclude(
     Parameters
     ----------
     sentences
-        What came out, by the claim's id.
+        For each claim's id, a function that says in plain words what its statistics came to.
     unit
         What intervals narrow with.
     """
@@ -232,7 +234,7 @@ def conclude(
     for claim in claims:
         by_id.setdefault(claim.id, []).append(claim)
     return [
-        Conclusion(key, verdict, _with_debt(sentences[key], verdict, rows, unit))
+        Conclusion(key, verdict, _with_debt(sentences[key](rows), verdict, rows, unit))
         for key, rows in by_id.items()
         for verdict in [headline_verdict([(row.role, row.verdict) for row in rows])]
     ]

@@ -49,9 +49,9 @@ def judge(made: Results) -> list[Claim]:
     ]
 
 
-def conclusions(made: Results, claims: Sequence[Claim]) -> list[Conclusion]:
+def conclusions(_made: Results, claims: Sequence[Claim]) -> list[Conclusion]:
     """Verdict and sentence of DC1-DC6."""
-    said: dict[str, Callable[[Sequence[Claim]], str]] = {
+    sentences: dict[str, Callable[[Sequence[Claim]], str]] = {
         "DC1": dc1_sentence,
         "DC2": dc2_sentence,
         "DC3": dc3_sentence,
@@ -59,8 +59,7 @@ def conclusions(made: Results, claims: Sequence[Claim]) -> list[Conclusion]:
         "DC5": dc5_sentence,
         "DC6": dc6_sentence,
     }
-    rows = {key: [claim for claim in claims if claim.id == key] for key in said}
-    return conclude(claims, {key: sentence(rows[key]) for key, sentence in said.items()})
+    return conclude(claims, sentences)
 
 
 def dc1(runs: pd.DataFrame, ordering: pd.DataFrame) -> list[Claim]:

@@ -75,9 +75,9 @@ def judge(made: Results) -> list[Claim]:
     ]
 
 
-def conclusions(made: Results, claims: Sequence[Claim]) -> list[Conclusion]:
+def conclusions(_made: Results, claims: Sequence[Claim]) -> list[Conclusion]:
     """Verdict and sentence of GI1-GI8."""
-    said: dict[str, Callable[[Sequence[Claim]], str]] = {
+    sentences: dict[str, Callable[[Sequence[Claim]], str]] = {
         "GI1": gi1_sentence,
         "GI2": gi2_sentence,
         "GI3": gi3_sentence,
@@ -87,8 +87,7 @@ def conclusions(made: Results, claims: Sequence[Claim]) -> list[Conclusion]:
         "GI7": gi7_sentence,
         "GI8": gi8_sentence,
     }
-    rows = {key: [claim for claim in claims if claim.id == key] for key in said}
-    return conclude(claims, {key: sentence(rows[key]) for key, sentence in said.items()}, "worlds")
+    return conclude(claims, sentences, "worlds")
 
 
 def pooled(table: pd.DataFrame, column: str, by: str) -> pd.DataFrame:

@@ -59,9 +59,9 @@ def judge(made: Results) -> list[Claim]:
     ]
 
 
-def conclusions(made: Results, claims: Sequence[Claim]) -> list[Conclusion]:
+def conclusions(_made: Results, claims: Sequence[Claim]) -> list[Conclusion]:
     """Verdict and sentence of MX1-MX8."""
-    said: dict[str, Callable[[Sequence[Claim]], str]] = {
+    sentences: dict[str, Callable[[Sequence[Claim]], str]] = {
         "MX1": mx1_sentence,
         "MX2": mx2_sentence,
         "MX3": mx3_sentence,
@@ -71,8 +71,7 @@ def conclusions(made: Results, claims: Sequence[Claim]) -> list[Conclusion]:
         "MX7": mx7_sentence,
         "MX8": mx8_sentence,
     }
-    rows = {key: [claim for claim in claims if claim.id == key] for key in said}
-    return conclude(claims, {key: sentence(rows[key]) for key, sentence in said.items()}, "worlds")
+    return conclude(claims, sentences, "worlds")
 
 
 def geometries(table: pd.DataFrame) -> list[str]:

@@ -39,16 +39,15 @@ def judge(made: Results) -> list[Claim]:
 
 
 def conclusions(_made: Results, claims: Sequence[Claim]) -> list[Conclusion]:
-    """Verdict and sentence of RL1 to RL5."""
-    said: dict[str, Callable[[Sequence[Claim]], str]] = {
+    """Verdict and sentence of RL1-RL5."""
+    sentences: dict[str, Callable[[Sequence[Claim]], str]] = {
         "RL1": rl1_sentence,
         "RL2": rl2_sentence,
         "RL3": rl3_sentence,
         "RL4": rl4_sentence,
         "RL5": rl5_sentence,
     }
-    rows = {key: [claim for claim in claims if claim.id == key] for key in said}
-    return conclude(claims, {key: sentence(rows[key]) for key, sentence in said.items()}, "logs")
+    return conclude(claims, sentences, "minutes of log")
 
 
 def rl1(ate: pd.DataFrame) -> list[Claim]:
@@ -92,7 +91,8 @@ def _difference(fused: pd.Series[float], rival: pd.Series[float], where: str) ->
     """Judge the paired difference of the errors over the same relations."""
     found = Interval(*(float(rival[f"difference_{end}_m"]) for end in ("mean", "low", "high")))
     label = f"translational error of {FUSION} less that of the other, m: {where}"
-    claim = banded("RL2", label, found, at_most=0.0, criterion="below 0")
+    minutes = int(rival["difference_minutes"])
+    claim = banded("RL2", label, found, at_most=0.0, criterion="below 0", n=minutes)
     return remarked(claim, _means(fused, rival))
 
 
@@ -118,7 +118,7 @@ def rl2_sentence(rows: Sequence[Claim]) -> str:
     parts = []
     for row in judged_rows:
         other = row.statistic.split(", Intel")[0].split("m: ")[-1].split("beside ")[-1]
-        parts.append(f"{row.reason.rsplit(' ', 2)[1]} m by {other}")
+        parts.append(f"{row.reason.split('the other ')[-1]} by {other}")
     fused = judged_rows[0].reason.split(",")[0]
     said = f"Mean translational error after the tuned part: {fused}, {', '.join(parts)}."
     if any(row.verdict is Verdict.UNDECIDED for row in judged_rows):
