@@ -32,6 +32,7 @@ from experiments.papers.real_logs.settings import (
     DRAWN_ROBOT,
     FASTSLAM_SEEDS,
     FREIBURG,
+    FUSION,
     GMAPPING,
     INTEL,
     INTEL_DRAWN,
