@@ -134,7 +134,7 @@ def more_to_settle(
         / (scale(limit) - scale(found.value))
         for limit in spanned
     ]
-    return math.ceil(n * max(factors) ** 2) - n
+    return math.ceil(round(n * max(factors) ** 2, 6)) - n
 
 
 def banded(

@@ -138,7 +138,7 @@ def gi1(particles: pd.DataFrame) -> Iterator[Claim]:
             growth, n = _growth(table, "revisit_ratio"), table["seed"].nunique()
             claim = banded("GI1", label, growth, at_most=REVISITS_GROW, criterion=criterion, n=n)
             if not is_long_enough:
-                claim = _undecided(claim, "odometry passes too: the path is too short")
+                claim = _undecided(claim, "odometry's is not clearly above it on these paths")
         else:
             nothing = Interval(np.nan, np.nan, np.nan)
             claim = Claim("GI1", label, nothing, criterion, Verdict.UNDECIDED, AGAIN)
