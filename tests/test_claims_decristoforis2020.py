@@ -66,6 +66,12 @@ def test_dc1_follows_the_order():
     assert equal["position RMSE, fusion over icp"] == "undecided"
 
 
+def test_dc1_tells_what_the_start_from_the_wheels_adds():
+    found = verdicts(claims.dc1(runs(**RIGHT, icp_guess=0.3), ordering({1e-6})))
+    assert found["position RMSE, icp_guess over icp"] == "reproduced"
+    assert found["position RMSE, fusion over icp_guess"] != "reproduced"
+
+
 def test_dc1_reads_exact_rays_at_10_hz_alone():
     wrong = runs(**RIGHT | {"fusion": 50.0}).assign(rays="bullet")
     found = verdicts(claims.dc1(pd.concat([runs(**RIGHT), wrong]), ordering({1e-6})))
