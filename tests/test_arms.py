@@ -156,7 +156,7 @@ def test_calibrations_see_the_same_runs(monkeypatch):
     assert [result.method for result in found] == ["wheel_truth", "sampled", "linearised"]
     for first, second in zip(*seen, strict=True):
         np.testing.assert_array_equal(first, second)
-    assert len({result.n_runs for result in found[1:]}) == 1
+    assert len({result.n_used for result in found[1:]}) == 1
 
 
 def test_arms_of_one_study_start_at_the_same_pose():

@@ -130,7 +130,13 @@ def test_dc1_to_dc6_follow_from_the_papers_own_arms():
 
 def covariances(**nees):
     rng = np.random.default_rng(2)
-    times = {"censi": 40.0, "censi_last": 40.0, "hessian": 20.0, "sampling": 2e4}
+    times = {
+        "hessian_points": 20.0,
+        "censi": 40.0,
+        "censi_last": 40.0,
+        "hessian": 20.0,
+        "sampling": 2e4,
+    }
     rows = [
         {
             "metric": metric, "place": place, "method": method, "seed": seed,
@@ -161,6 +167,13 @@ def test_dc4_wants_the_hessian_outside_and_the_others_inside():
     found = verdicts(claims.dc4(slow))
     assert found["time of sampling over Censi's closed form, point_to_line"] == "not_reproduced"
     assert found["time of Hessian over sampling, point_to_line"] == "not_reproduced"
+
+
+def test_dc4s_hessian_has_the_residuals_of_points_where_the_table_has_it():
+    table = covariances(hessian_points=1.0, hessian=2.0, sampling=1.0, censi_last=1.0, censi=1.0)
+    said = conclusion("DC4", claims.dc4_sentence, claims.dc4(table))
+    assert said.verdict == "not_reproduced"  # then it is accurate
+    assert "expects from the residuals of points" in said.sentence
 
 
 def test_anees_is_the_arithmetic_mean_over_scenes():
