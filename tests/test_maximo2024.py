@@ -124,7 +124,7 @@ def test_mx3_judges_every_weighting():
     slow = weighting(1.0, 1.5, 2.0, column="dispersion_m").assign(step=10)
     assert headlines(claims.mx3(slow, quality())) == ["not_reproduced", "not_reproduced"]
     found = conclusion("MX3", claims.mx3_sentence, claims.mx3(spread, quality()))
-    assert "M3 over M1 0.2 (p = " in found.sentence
+    assert "M3 over M1 on Oxford, made route: 0.2 (p = " in found.sentence
 
 
 def test_mx4_and_mx5_follow_their_tables():

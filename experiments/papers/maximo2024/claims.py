@@ -126,7 +126,9 @@ def mx1_sentence(rows: Sequence[Claim]) -> str:
     umh = [row for row in rows if "M3 over M2, UMH" in row.statistic]
     if umh:
         said += f" On UMH it has {plain(umh[0].found.value)} times M2's error."
-    return f"{said} With other parameters that the methods share, {oxford.reason.split('; ')[-1]}."
+    return (
+        f"{said} With other parameters that they share, on Oxford {oxford.reason.split('; ')[-1]}."
+    )
 
 
 def mx3(dispersion: pd.DataFrame, quality: pd.DataFrame) -> Iterator[Claim]:
@@ -148,10 +150,8 @@ def mx3_sentence(rows: Sequence[Claim]) -> str:
     for row in filter(_is_headline, rows):
         pair = row.statistic.removeprefix("dispersion of ").split(" at ")[0]
         p = row.reason.split("p = ")[-1].split(";")[0]
-        ratio = (
-            f"is {_OTHER_B}" if _OTHER_B in row.reason else f"{plain(row.found.value)} (p = {p})"
-        )
-        parts.append(f"{pair} {ratio} on {_where(row)}")
+        ratio = _OTHER_B if _OTHER_B in row.reason else f"{plain(row.found.value)} (p = {p})"
+        parts.append(f"{pair} on {_where(row)}: {ratio}")
     return f"Ratios of the dispersions after ten steps: {'; '.join(parts)}."
 
 

@@ -61,7 +61,7 @@ def rl1(ate: pd.DataFrame) -> list[Claim]:
 def rl1_sentence(rows: Sequence[Claim]) -> str:
     """Say how many errors come out to the printed digit."""
     (row,) = rows
-    return f"{percent(row.found.value)} ({row.reason}) of the errors have every printed digit."
+    return f"{percent(row.found.value)} {row.reason} errors have every printed digit."
 
 
 def rl2(relations: pd.DataFrame) -> Iterator[Claim]:
@@ -122,7 +122,9 @@ def rl2_sentence(rows: Sequence[Claim]) -> str:
     fused = judged_rows[0].reason.split(",")[0]
     said = f"Mean translational error after the tuned part: {fused}, {', '.join(parts)}."
     if any(row.verdict is Verdict.UNDECIDED for row in judged_rows):
-        said += " One log is too short to tell the nearest of them from fusion."
+        said += " The log is too short to tell the nearest of them from fusion."
+        if not any(row.more for row in judged_rows):
+            said += " The next full run will say how much longer a log would settle it."
     return said
 
 
@@ -156,8 +158,13 @@ def rl3_sentence(rows: Sequence[Claim]) -> str:
     for row in (row for row in rows if row.role is Role.HEADLINE):
         method = row.statistic.removeprefix("ATE of ").split(", wider")[0]
         least, most = plain(row.found.low), plain(row.found.high)
-        parts.append(f"{method} ids {least} to {most} ({row.reason.split('; ')[-1]})")
-    return f"Error over that of calibrated dead reckoning, by robot: {'; '.join(parts)}."
+        robots, *failing = row.reason.split("; ")
+        but = f" (not below on {failing[0].removeprefix('not on ')})" if failing else ""
+        parts.append(f"{method} ids {least} to {most}{but}")
+    return (
+        f"Error over that of calibrated dead reckoning, least and greatest of {robots}: "
+        f"{'; '.join(parts)}."
+    )
 
 
 def rl4(wheels: pd.DataFrame, lego: pd.DataFrame) -> list[Claim]:
