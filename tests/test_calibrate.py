@@ -126,6 +126,20 @@ def test_the_analytic_covariance_is_that_of_the_odometry_filter(route):
     )
 
 
+@pytest.mark.parametrize("method", ["sampled", "linearised"])
+def test_gain_errors_scale_the_spread_of_the_end_poses(method):
+    """On the ground the variance is k |ds| / (1 + bias)^2; a small k keeps the model linear."""
+    route, robot = OpenLoop(((0.4, 0.6, 5.0),)), slipping(1e-6, geometry=True)
+    robot = dataclasses.replace(robot, bias_right=0.5, bias_left=0.5)
+    rng = np.random.default_rng(6)
+    runs = run_batch(robot, route, 4000, rng)
+    model = EndPoseModel(route.profile(NOMINAL), NOMINAL, rng, method, 256)
+    seen = model.coordinates(runs.end_poses)
+    _, covariance = model.moments(robot.slip_variance_per_m, robot.slip_bias, robot.track_m)
+    ratio = np.linalg.eigvals(np.linalg.solve(covariance, np.cov(seen.T))).real
+    np.testing.assert_allclose(ratio, 1.0, atol=0.12)
+
+
 def test_a_plateau_has_no_turning_points():
     for name, route in TABLE_1.items():
         commands = NOMINAL.wheel_speeds(*route.profile(NOMINAL).T)

@@ -40,6 +40,9 @@ def test_nees_distinguishes_a_fitting_covariance_from_a_wrong_one(world, monkeyp
     assert 0.7 < found.loc["censi", "nees_over_dof"] < 1.4
     assert 0.8 < found.loc["censi", "determinant_ratio"] < 1.25
     assert found.loc["hessian", "nees_over_dof"] > 1.4
+    # the target's noise, which fitted lines average away, is in the residuals of points
+    lines, points = (found.loc[name, "nees_over_dof"] for name in ("hessian", "hessian_points"))
+    assert lines / points == pytest.approx(2.0, rel=0.25)
     assert found.loc["sampling", "time_us"] > 10.0 * found.loc["censi", "time_us"]
     assert found.loc["censi", "bound_m"] < 1.5 * found.loc["censi", "error_m"]
     assert (found["used_share"] == 1.0).all()

@@ -12,10 +12,15 @@ import pytest
 from matplotlib.figure import Figure
 
 from experiments.evaluation.statistics import Interval
-from experiments.evaluation.verdict import Claim, Profile, Verdict
+from experiments.evaluation.verdict import Claim, Conclusion, Profile, Verdict, beside
 from experiments.report import contents
 from experiments.report import page as report
-from experiments.report.claims import note_provenance, read_claims, write_claims
+from experiments.report.claims import (
+    note_provenance,
+    read_claims,
+    write_claims,
+    write_verdicts,
+)
 from experiments.report.export import to_latex, to_markdown
 from experiments.runs.row import write_frame
 from sim.errors import InputError
@@ -36,7 +41,7 @@ def results(tmp_path_factory):
     quick = [
         claim("PB4", "reproduced"),
         claim("PB4", "not_reproduced", "the unfavourable", 0.25, "<b>at large k</b>"),
-        claim("PB4", "not_reproduced", "the second of the worst"),
+        beside(claim("PB4", "undecided", "of our own")),
     ]
     full = [
         claim("PB1", "reproduced"),
@@ -47,6 +52,13 @@ def results(tmp_path_factory):
     one = read_claims(path)
     write_claims(quick, path, paper="puzzlebot2024", profile=Profile.QUICK, command=command)
     write_frame(pd.concat([one, read_claims(path)]), path)
+    write_verdicts(
+        [Conclusion("PB4", Verdict.NOT_REPRODUCED, "The ellipse holds <b>61 %</b> at 1e-3 m.")],
+        folder / "verdicts.csv",
+        paper="puzzlebot2024",
+        says={"PB4": "The real robot stays in it."},
+        profile=Profile.FULL,
+    )
     (folder / "figures").mkdir()
     for name in ("puzzlebot2024_coverage", "puzzlebot2024_surprise", "mcl_office_found"):
         page = Figure(figsize=(6.0, 3.0))
@@ -118,14 +130,18 @@ def test_structure_that_readers_and_their_aids_rely_on(text):
     assert "prefers-color-scheme: dark" in text
 
 
-def test_claims_come_first_and_the_first_of_the_worst_verdict_speaks(text):
+def test_each_claim_is_one_row_with_its_statistics_below(text):
     page = Outline(text)
     rows = {e["id"]: e["text"] for e in page.all("tbody") if "id" in e}
     assert "0.5 [0.4, 0.6]" in rows["claim-PB1"]
-    head = rows["claim-PB4"].split("PB4: all 3 statistics")[0]
-    assert "the unfavourable: 0.25 [0.4, 0.6]" in head
-    assert "mixed: 1 reproduced, 2 not reproduced (quick)" in head
-    assert "the first of the worst verdict" in page.all("caption")[0]["text"]
+    head, folded = rows["claim-PB4"].split("PB4: statistics (3)")
+    assert "The ellipse holds <b>61 %</b> at 1e-3 m." in head
+    assert head.strip().endswith("not reproduced (quick)")
+    assert folded.index("the unfavourable") < folded.index("of our own")  # headlines first
+    assert "0.25 [0.4, 0.6]" in folded
+    assert "follows from its headline statistics" in page.all("caption")[0]["text"]
+    assert "3 claims, by 5 statistics" in page.all("header")[0]["text"]
+    assert "1 reproduced, 1 not reproduced, 1 undecided" in page.all("header")[0]["text"]
     assert "of 95 % unless the statistic says otherwise" in page.all("header")[0]["text"]
     assert "not judged yet" in rows["claim-GI8"]
     assert "nobody described" in rows["claim-ZZ9"]
@@ -137,7 +153,7 @@ def test_a_figure_without_a_caption_still_shows(text):
     page = Outline(text)
     figures = {e["id"]: e["text"] for e in page.all("figure")}
     assert figures["puzzlebot2024_surprise"].strip() == "surprise"
-    assert "PB4: mixed" in figures["puzzlebot2024_coverage"]
+    assert "PB4: not reproduced (quick). The ellipse holds" in figures["puzzlebot2024_coverage"]
     assert "Not made yet: puzzlebot2024_ideal_and_real" in page.all("main")[0]["text"]
 
 
@@ -256,10 +272,10 @@ def test_the_keyboard_skips_to_the_claims_and_opens_details(tab):
     tab.press("Enter", text="\r")
     assert tab.becomes("location.hash == '#claims'")
     tab.press("Tab")
-    assert tab.js("document.activeElement.textContent") == "PB4: all 3 statistics"
+    assert tab.js("document.activeElement.textContent") == "PB1: statistics (1)"
     assert tab.js("getComputedStyle(document.activeElement).outlineStyle") == "solid"
     tab.press("Enter", text="\r")
-    assert tab.becomes("document.querySelector('#claim-PB4 details').open")
+    assert tab.becomes("document.querySelector('#claim-PB1 details').open")
 
 
 def test_what_scrolls_sideways_can_be_reached_by_keyboard(tab):

@@ -8,9 +8,9 @@ import pandas as pd
 import pytest
 
 from experiments.evaluation.statistics import Interval
-from experiments.evaluation.verdict import Claim, Verdict
+from experiments.evaluation.verdict import Claim, Verdict, conclude
 from experiments.papers import reproduce as module
-from experiments.report.claims import read_claims
+from experiments.report.claims import read_claims, read_verdicts
 from experiments.runs.row import write_frame
 from experiments.viewing.style import figure
 from sim.errors import InputError
@@ -39,10 +39,13 @@ def study(*, names=("runs", "noise"), fails=False):
         found = Interval(0.5, 0.4, 0.6)
         return [Claim("GI1", "a share", found, "above 0", Verdict.REPRODUCED)]
 
+    def conclusions(made, claims):
+        return conclude(claims, {"GI1": lambda rows: f"The share is {rows[0].found.value}."})
+
     return {
         "study": SimpleNamespace(run=run),
         "figures": SimpleNamespace(draw=draw),
-        "claims": SimpleNamespace(judge=judge),
+        "claims": SimpleNamespace(judge=judge, conclusions=conclusions),
     }
 
 
@@ -89,6 +92,30 @@ def test_a_quick_run_replaces_everything_and_says_so(results, monkeypatch, capsy
     assert "judged" not in capsys.readouterr().err
 
 
+def test_each_claim_gets_one_row_with_its_sentence(results, capsys):
+    (row,) = read_verdicts(results / "verdicts.csv").to_dict("records")
+    assert row == {
+        "id": "GI1",
+        "paper": PAPER,
+        "says": "The error of odometry grows without bound, that of the filter stays bounded.",
+        "verdict": "reproduced",
+        "sentence": "The share is 0.5.",
+    }
+    module.reproduce(only=PAPER)
+    (row,) = read_verdicts(results / "verdicts.csv").to_dict("records")
+    assert row["sentence"] == "The share is 0.5. (Quick profile: few repeats.)"
+    assert "GI1: reproduced. The share is 0.5." in capsys.readouterr().out
+
+
+def test_claims_are_judged_again_from_disk(results, monkeypatch):
+    before = state(results)
+    (results / "claims.csv").unlink()
+    (results / "verdicts.csv").unlink()
+    module.judge_again(PAPER)
+    assert state(results) == before
+    assert len(read_verdicts(results / "verdicts.csv")) == 1
+
+
 def test_an_interrupted_run_leaves_the_results_as_they_were(results, monkeypatch):
     before = {path: path.read_bytes() for path in results.rglob("*.*") if path.is_file()}
     take(monkeypatch, study(names=("runs", "other"), fails=True))
@@ -102,6 +129,9 @@ def test_what_cannot_be_replaced_or_added_to_is_named(results):
     path.unlink()
     path.mkdir()
     with pytest.raises(InputError, match=r"gil2008_runs\.png: cannot be replaced"):
+        module.reproduce(only=PAPER)
+    (results / "verdicts.csv").write_text("id,paper")
+    with pytest.raises(InputError, match=r"verdicts\.csv: the last row is cut off"):
         module.reproduce(only=PAPER)
     (results / "claims.csv").write_text("id,paper")
     with pytest.raises(InputError, match=r"claims\.csv: the last row is cut off"):

@@ -44,11 +44,11 @@ def test_share_interval_is_conservative():
 def test_equivalence_and_trend():
     rng = np.random.default_rng(2)
     a = rng.lognormal(0, 0.1, 100)
-    _, same = equivalent(a * rng.lognormal(0.0, 0.1, 100), a, 0.25)
-    ratio, other = equivalent(a * rng.lognormal(0.4, 0.1, 100), a, 0.25)
-    assert same == "reproduced"
-    assert other == "not_reproduced"
-    assert ratio.value == pytest.approx(np.exp(0.4), rel=0.05)
+    same = equivalent("", "", a * rng.lognormal(0.0, 0.1, 100), a, 0.25)
+    other = equivalent("", "", a * rng.lognormal(0.4, 0.1, 100), a, 0.25)
+    assert same.verdict == "reproduced"
+    assert other.verdict == "not_reproduced"
+    assert other.found.value == pytest.approx(np.exp(0.4), rel=0.05)
     falling = np.arange(5)[::-1] + 0.8 * rng.standard_normal((20, 5))
     assert statistics.page_trend_p(falling) < 1e-4
     assert statistics.page_trend_p(-falling) > 0.5
@@ -64,7 +64,7 @@ def test_too_few_data_decide_nothing():
         statistics.bootstrap_interval([], lambda v: float(v.mean()), rng),
         statistics.share_interval(0, 0),
         statistics.log_ratio_interval([1.0], [1.0]),
-        equivalent([1.0], [1.0], 0.25)[0],
+        equivalent("", "", [1.0], [1.0], 0.25).found,
     ):
         assert judged(found, 0.5, 2.0) == "undecided"
 
@@ -94,17 +94,18 @@ def test_the_bootstrap_of_few_recordings_is_wide_enough():
 
 
 def test_equivalence_without_spread():
-    ratio, verdict = equivalent([1.1, 2.2, 3.3], [1.0, 2.0, 3.0], 0.25)
-    assert ratio.value == pytest.approx(1.1)
-    assert verdict == "reproduced"
-    assert equivalent([2.0, 4.0], [1.0, 2.0], 0.25)[1] == "not_reproduced"
+    same = equivalent("", "", [1.1, 2.2, 3.3], [1.0, 2.0, 3.0], 0.25)
+    assert same.found.value == pytest.approx(1.1)
+    assert same.verdict == "reproduced"
+    assert equivalent("", "", [2.0, 4.0], [1.0, 2.0], 0.25).verdict == "not_reproduced"
 
 
 def test_equivalence_errs_as_often_as_it_says():
     """At the margin itself, the test wrongly finds equivalence in about 5 % of samples."""
     rng, n = np.random.default_rng(7), 600
     found = [
-        equivalent(rng.lognormal(np.log(1.25), 0.1, 30), np.ones(30), 0.25)[1] for _ in range(n)
+        equivalent("", "", rng.lognormal(np.log(1.25), 0.1, 30), np.ones(30), 0.25).verdict
+        for _ in range(n)
     ]
     assert 0.025 < found.count("reproduced") / n < 0.08
 

@@ -84,4 +84,4 @@ def test_the_quick_profile_has_a_job_of_every_kind(tmp_path):
     quick = study._jobs(False, Results(tmp_path, "decristoforis2020"))
     assert {function for _, function, _ in quick} == {f for _, f, _ in small(False, None)}
     drives = [arguments[0] for _, function, arguments in quick if function is study._drive]
-    assert [len(group) for group in drives] == [5, 5, 5, 5, 4, 4]
+    assert [len(group) for group in drives] == [6, 6, 6, 6, 4, 4]

@@ -62,7 +62,7 @@ class EndPoseModel:
         """Mean (3,) and covariance (3, 3) of the coordinates."""
         travel = _mean_travel(self._commands_m, self._knots, bias, TICK_S / SLIP_TIME_CONSTANT_S)
         if self._linearised:
-            return _linearised_moments(travel, k, track_m)
+            return _linearised_moments(travel, k * (1.0 + bias) ** -2.0, track_m)
         scale = np.sqrt(k) * (1.0 + bias) ** -1.5
         return _sampled_moments(travel, self._noise, scale, track_m, self._log_chart)
 
@@ -116,9 +116,10 @@ def _mean_travel(commands_m: Array, knots: Ticks, bias: Array, lag_share: float)
 
 @njit()
 def _linearised_moments(travel: Array, k: Array, track_m: float) -> tuple[Array, Array]:
-    """Pose (3,) and analytic covariance (3, 3) after wheel travels (S, 2).
+    """Pose (3,) and analytic covariance (3, 3) after wheel travels (S, 2) on the ground.
 
-    puzzlebot2024, eq. (2), with the second form of eq. (6), its last row's sign settled.
+    puzzlebot2024, eq. (2), with the second form of eq. (6), its last row's sign settled. k is the
+    variance of the ground travel a metre: that of the encoder, over (1 + bias)^2.
     """
     forward = (travel[:, 0] + travel[:, 1]) / 2.0
     half = (travel[:, 0] - travel[:, 1]) / (2.0 * track_m)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
+from scipy.spatial import KDTree
 
 from estimators import icp_covariance
 from estimators.icp import Metric, PreparedScan, Registration, prepare, register
@@ -119,11 +120,39 @@ def _methods(sigma: float, rng: np.random.Generator) -> dict[str, Method]:
         "censi_sliding": lambda f, s, t: icp_covariance.censi(f, s, t, sigma, matches="sliding"),
         "censi_last": lambda f, s, t: icp_covariance.censi(f, s, t, sigma, scans="last"),
         "hessian": lambda f, s, t: icp_covariance.hessian(f),
+        "hessian_points": hessian_of_points,
         "unscented_censi": lambda f, s, t: icp_covariance.unscented_censi(
             f, s, t, of_guess, sigma, matches="sliding"
         ),
         "sampling": lambda f, s, t: icp_covariance.sampling(f, s, t, rng, sigma, n_samples=50),
     }
+
+
+def hessian_of_points(found: Registration, source: PreparedScan, target: PreparedScan) -> Array:
+    """Covariance (3, 3) from the Hessian, with the residual variance of points against points.
+
+    A point's residual is its distance, along the normal of the line that it was matched with, from
+    the measured point that lies beside it on that line. Residuals against the fitted line miss the
+    target's noise. Point to point they are the registration's own.
+    """
+    covariance = icp_covariance.hessian(found)
+    kept = np.flatnonzero((found.weights > 0.0) & (found.matches >= 0))
+    if found.metric == "point_to_point" or len(kept) == 0:
+        return covariance
+    moved = se2.transform(found.T_target_source, source.points[kept])
+    residuals = np.full(len(kept), np.nan)
+    for line in np.unique(found.matches[kept]):
+        of_line = found.matches[kept] == line
+        seen = target.points[target.line_of_point == line]
+        if len(seen) == 0:
+            continue
+        normal = target.segments[line, :2]
+        tangent = np.array([-normal[1], normal[0]])
+        _, beside = KDTree(seen @ tangent[:, None]).query(moved[of_line] @ tangent[:, None])
+        residuals[of_line] = (moved[of_line] - seen[beside]) @ normal
+    known = np.isfinite(residuals)
+    weights, own = found.weights[kept][known], found.residuals_m[kept][known]
+    return covariance * float(weights @ residuals[known] ** 2) / float(weights @ own**2)
 
 
 def _nees_share(error: Array, covariance: Array, found: Registration) -> float:

@@ -8,14 +8,17 @@ import time
 from pathlib import Path
 from types import ModuleType
 
-from experiments.evaluation.verdict import Claim, Profile
+from experiments.evaluation.verdict import Claim, Conclusion, Profile
 from experiments.papers.results import Results
 from experiments.report.claims import (
     note_provenance,
     read_claims,
     read_provenance,
+    read_verdicts,
     write_claims,
+    write_verdicts,
 )
+from experiments.report.contents import findings
 from experiments.report.page import write_report
 from experiments.runs.console import progress
 from experiments.runs.paths import results, short
@@ -25,6 +28,7 @@ from sim.errors import InputError
 PAPERS = ("puzzlebot2024", "decristoforis2020", "maximo2024", "gil2008")
 LOGS = ("real_logs",)  # run only where the logs are
 OWN = ("mcl_office",)  # our own study, which judges no claim: run only when named
+Judgement = tuple[list[Claim], list[Conclusion]]
 _APART = "_tuning"  # the table on other seeds from which parameters were chosen
 
 
@@ -40,6 +44,7 @@ def reproduce(*, full: bool = False, only: str | None = None) -> None:
     """
     place = results()
     read_claims(place / "claims.csv")  # a damaged table ends the command before hours are spent
+    read_verdicts(place / "verdicts.csv")
     profile, made = Profile.FULL if full else Profile.QUICK, read_provenance(place)
     for paper in _chosen(only):
         begun = time.monotonic()
@@ -52,10 +57,10 @@ def reproduce(*, full: bool = False, only: str | None = None) -> None:
                 "them back",
                 file=sys.stderr,
             )
-        _print(reproduce_paper(paper, profile))
+        _print(*reproduce_paper(paper, profile))
         print(f"{paper}: {time.monotonic() - begun:.0f} s", file=sys.stderr)
     write_report(place)
-    names = ("report.html", "claims.csv", "figures", "tables")
+    names = ("report.html", "verdicts.csv", "claims.csv", "figures", "tables")
     print(", ".join(f"{name.split('.')[0]}: {short(place / name)}" for name in names))
 
 
@@ -88,8 +93,29 @@ def redraw(only: str | None = None) -> None:
         print(f"{paper}: {time.monotonic() - begun:.0f} s", file=sys.stderr)
 
 
-def reproduce_paper(paper: str, profile: Profile) -> list[Claim]:
-    """Run one paper's study, and put its files, claims and origin in place.
+def judge_again(only: str | None = None) -> None:
+    """Judge the claims again, from the tables that the studies left, and write the report.
+
+    Raises
+    ------
+    InputError
+        If the tables are damaged.
+    """
+    place, made = results(), read_provenance(results())
+    for paper in _chosen(only):
+        if paper in OWN or not any((place / "tables").glob(f"{paper}_*.csv")):
+            continue
+        profile = Profile(made.get(paper, {}).get("profile", Profile.QUICK))
+        tables = Results(place, paper)
+        with tables.as_found():
+            judged = _judgement(tables)
+        _write(judged, place, paper, profile)
+        _print(*judged)
+    write_report(place)
+
+
+def reproduce_paper(paper: str, profile: Profile) -> Judgement:
+    """Run one paper's study, and put its files, claims, verdicts and origin in place.
 
     The files are written elsewhere first, so an interrupted run leaves the results as they were.
     """
@@ -101,13 +127,28 @@ def reproduce_paper(paper: str, profile: Profile) -> list[Claim]:
         with progress(paper, 1.0) as on_progress:
             _part(paper, "study").run(profile, made, on_progress)
         _draw(made)
-        claims: list[Claim] = [] if paper in OWN else _part(paper, "claims").judge(made)
+        judged: Judgement = ([], []) if paper in OWN else _judgement(made)
         for kind in ("tables", "arrays", "figures"):
             _put_in_place(made.folder / kind, place / kind, paper)
-        command = f"estima reproduce --paper {paper}{' --full' * (profile is Profile.FULL)}"
-        write_claims(claims, place / "claims.csv", paper=paper, profile=profile, command=command)
+        _write(judged, place, paper, profile)
         note_provenance(place, paper, profile, time.monotonic() - begun)
-    return claims
+    return judged
+
+
+def _judgement(made: Results) -> Judgement:
+    """Statistics of a paper's claims, and the one verdict on each claim."""
+    module = _part(made.paper, "claims")
+    claims = module.judge(made)
+    return claims, module.conclusions(made, claims)
+
+
+def _write(judged: Judgement, place: Path, paper: str, profile: Profile) -> None:
+    claims, conclusions = judged
+    command = f"estima reproduce --paper {paper}{' --full' * (profile is Profile.FULL)}"
+    write_claims(claims, place / "claims.csv", paper=paper, profile=profile, command=command)
+    says = findings(paper)["claims"]
+    path = place / "verdicts.csv"
+    write_verdicts(conclusions, path, paper=paper, says=says, profile=profile)
 
 
 def _draw(made: Results) -> None:
@@ -143,11 +184,14 @@ def _part(paper: str, name: str) -> ModuleType:
     return importlib.import_module(f"experiments.papers.{paper}.{name}")
 
 
-def _print(claims: list[Claim]) -> None:
+def _print(claims: list[Claim], conclusions: list[Conclusion]) -> None:
     for claim in claims:
         found = claim.found
         interval = f"{found.value:.4g} [{found.low:.4g}, {found.high:.4g}]"
+        said = "; ".join(filter(None, [claim.criterion, claim.reason]))
         print(
-            f"{claim.id}  {claim.verdict.label:<15} {claim.statistic}: {interval} "
-            f"({claim.criterion})"
+            f"{claim.id}  {claim.role:<8}  {claim.verdict.label:<15} {claim.statistic}: {interval} "
+            f"({said})"
         )
+    for each in conclusions:
+        print(f"{each.id}: {each.verdict.label}. {each.sentence}")

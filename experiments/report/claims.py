@@ -1,23 +1,25 @@
 """What studies leave for the report besides tables and figures: judged claims, and their origin.
 
-The claims are the rows of results/claims.csv; results/provenance.json says how they were made.
+The rows of results/claims.csv are the claims' statistics, those of results/verdicts.csv the one
+verdict on each claim; results/provenance.json says how they were made.
 """
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from experiments.evaluation.verdict import Claim, Profile, Role, Verdict
+from experiments.evaluation.verdict import Claim, Conclusion, Profile, Role, Verdict
 from experiments.runs.machine import machine
 from experiments.runs.row import read_rows, write_frame
 from experiments.runs.version import code_version
 from sim.errors import InputError
 from sim.files import write_whole
 
+VERDICT_COLUMNS = ("id", "paper", "says", "verdict", "sentence")
 _NUMBERS = ("value", "low", "high")
 _ENUMS = {"role": Role, "verdict": Verdict, "profile": Profile}
 COLUMNS = (
@@ -37,7 +39,7 @@ COLUMNS = (
 _TEXTS = {
     "id": (r"\w+", "a word"),
     "paper": (r"[a-z][a-z0-9_]*", "a paper's short name"),
-    "statistic": (r"(?s).+", "a text"),
+    **dict.fromkeys(("statistic", "says", "sentence"), (r"(?s).+", "a text")),
     **{name: ("|".join(kind), f"one of {', '.join(kind)}") for name, kind in _ENUMS.items()},
 }
 _ORIGIN = ("profile", "seconds", "code_version")
@@ -49,15 +51,50 @@ def write_claims(
 ) -> None:
     """Replace a paper's claims in the table; other papers keep their rows.
 
-    The statistics of a claim stay in the order given: the paper's headline first.
+    The statistics of a claim stay in the order given.
     """
     origin = {"paper": paper, "profile": profile, "study": paper, "command": command}
-    rows = [{**vars(claim), **vars(claim.found), "role": claim.role, **origin} for claim in claims]
+    rows = [{**vars(claim), **vars(claim.found), **origin} for claim in claims]
     new = pd.DataFrame(rows, columns=list(COLUMNS)).astype(dict.fromkeys(_ENUMS, "str"))
-    if path.exists():
-        old = read_claims(path)
-        new = pd.concat([old[old["paper"] != paper], new], ignore_index=True)
-    write_frame(new.sort_values("id", kind="stable"), path)
+    _replace(new, read_claims(path), path, paper)
+
+
+def write_verdicts(
+    conclusions: Sequence[Conclusion],
+    path: Path,
+    *,
+    paper: str,
+    says: Mapping[str, str],
+    profile: Profile,
+) -> None:
+    """Replace a paper's verdicts in the table; other papers keep theirs.
+
+    Parameters
+    ----------
+    says
+        What the paper says, by the claim's id.
+    profile
+        `quick` is said in the sentences.
+    """
+    mark = " (Quick profile: few repeats.)" if profile is Profile.QUICK else ""
+    rows = [
+        {
+            **vars(each),
+            "verdict": str(each.verdict),
+            "sentence": each.sentence + mark,
+            "paper": paper,
+            "says": says[each.id],
+        }
+        for each in conclusions
+    ]
+    new = pd.DataFrame(rows, columns=list(VERDICT_COLUMNS))
+    _replace(new, read_verdicts(path), path, paper)
+
+
+def _replace(new: pd.DataFrame, old: pd.DataFrame, path: Path, paper: str) -> None:
+    kept = old[old["paper"] != paper]
+    whole = pd.concat([kept, new], ignore_index=True) if len(kept) else new
+    write_frame(whole.sort_values("id", kind="stable"), path)
 
 
 def read_claims(path: Path) -> pd.DataFrame:
@@ -68,18 +105,34 @@ def read_claims(path: Path) -> pd.DataFrame:
     InputError
         If the last row is cut off, or a row is a duplicate or has an invalid cell.
     """
+    table = _read(path, COLUMNS, ["paper", "id", "statistic"])
+    return table.assign(reason=table["reason"].fillna("")).astype(dict.fromkeys(_NUMBERS, float))
+
+
+def read_verdicts(path: Path) -> pd.DataFrame:
+    """Read the table of verdicts, checked; without rows if there is none.
+
+    Raises
+    ------
+    InputError
+        If the last row is cut off, or a row is a duplicate or has an invalid cell.
+    """
+    return _read(path, VERDICT_COLUMNS, ["id"])
+
+
+def _read(path: Path, columns: Sequence[str], key: list[str]) -> pd.DataFrame:
+    """Read a table of claims or verdicts, checked."""
     if not path.exists():
-        return pd.DataFrame(columns=list(COLUMNS))
+        return pd.DataFrame(columns=list(columns))
     if path.is_file() and not path.read_bytes().endswith(b"\n"):
         raise InputError(f"{path}: the last row is cut off; {_REMEDY}")
     try:
         table = read_rows(path)
     except InputError as error:
-        raise InputError(f"{path}: cannot read the claims; {_REMEDY}") from error
-    for name in [name for name in COLUMNS if name not in table]:
+        raise InputError(f"{path}: cannot read the {path.stem}; {_REMEDY}") from error
+    for name in [name for name in columns if name not in table]:
         raise InputError(f"{path}: no column {name}; {_REMEDY}")
-    table["reason"] = table["reason"].fillna("")
-    for name in (*_TEXTS, *_NUMBERS):
+    for name in [name for name in (*_TEXTS, *_NUMBERS) if name in columns]:
         pattern, wanted = _TEXTS.get(name, ("", "a number"))
         cells = table[name]
         if pattern:
@@ -89,9 +142,9 @@ def read_claims(path: Path) -> pd.DataFrame:
         for row in np.flatnonzero(~good):
             cell = f"{name} is {cells.tolist()[row]!r}, not {wanted}"
             raise InputError(f"{path}, row {row + 2}: {cell}; {_REMEDY}")
-    for row in np.flatnonzero(table.duplicated(["paper", "id", "statistic"])):
+    for row in np.flatnonzero(table.duplicated(key)):
         raise InputError(f"{path}, row {row + 2}: a duplicate; {_REMEDY}")
-    return table.astype(dict.fromkeys(_NUMBERS, float))
+    return table
 
 
 def note_provenance(results: Path, paper: str, profile: str, seconds: float) -> None:

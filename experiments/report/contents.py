@@ -10,8 +10,8 @@ from typing import Any
 import pandas as pd
 import yaml
 
-from experiments.evaluation.verdict import Profile, Verdict
-from experiments.report.claims import read_claims, read_provenance, this_code
+from experiments.evaluation.verdict import Profile, Role, Verdict, headline_verdict
+from experiments.report.claims import read_claims, read_provenance, read_verdicts, this_code
 from experiments.report.export import as_text, numeric
 from experiments.runs.paths import CONF, SOURCE
 from experiments.runs.row import read_rows
@@ -28,7 +28,6 @@ OWN = {
 SMALL_ROWS, SMALL_COLUMNS = 60, 20  # a table up to here is shown whole
 FIRST_ROWS = 5  # of a larger one
 _FOLDER = SOURCE / "experiments" / "papers"
-_WORST_FIRST = (Verdict.NOT_REPRODUCED, Verdict.UNDECIDED, Verdict.REPRODUCED, Verdict.SHOWN)
 _REMEDY = "restore it by `git checkout`, or delete it and run `estima reproduce`"
 
 
@@ -38,7 +37,8 @@ def contents(results: Path, on_progress: Callable[[float], None]) -> dict[str, A
     made = read_provenance(results)
     papers = [*PAPERS, *sorted(set(table["paper"]) - set(PAPERS))]
     about = {name: findings(name) for name in (*papers, *OWN)}
-    claims = judged_claims(table, about)
+    sentences = read_verdicts(results / "verdicts.csv").set_index("id")["sentence"].to_dict()
+    claims = judged_claims(table, about, sentences)
     commands = {name: [f"estima reproduce --paper {name}"] for name in papers} | OWN
     commands |= {str(k): list(v.unique()) for k, v in table.groupby("paper")["command"]}
     studies = {}
@@ -48,7 +48,7 @@ def contents(results: Path, on_progress: Callable[[float], None]) -> dict[str, A
     known = tuple(f"{name}_" for name in about)
     files = [*(results / "figures").glob("*.png"), *(results / "tables").glob("*.csv")]
     origins = made | {"this page": this_code()}
-    counts = Counter(table["verdict"])
+    counts = Counter(claim["ruling"] for claim in claims.values() if claim["statistics"])
     return {
         "claims": claims,
         "n_statistics": len(table),
@@ -82,42 +82,43 @@ def findings(name: str) -> dict[str, Any]:
     return {"title": name, "about": "", "claims": {}, "figures": {}, **found}
 
 
-def judged_claims(table: pd.DataFrame, about: Mapping[str, Entry]) -> Mapping[str, Entry]:
-    """Every claim by its id: those with a sentence in their order, then the others.
+def judged_claims(
+    table: pd.DataFrame, about: Mapping[str, Entry], sentences: Mapping[str, str]
+) -> Mapping[str, Entry]:
+    """Every claim by its id: those of the papers' findings in their order, then the others.
 
-    Each has its `statistics`, the rows of the table; the first of the `worst` verdict, which stands
-    for it; the first of each verdict as `examples`; its `verdict` in words, and its `style`.
+    Each has what the paper `says`; its `statistics`, the rows of the table, headlines first; its
+    `ruling`, the verdict that follows from the headlines, also in words (`verdict`) with a `style`;
+    and the `sentence` on what came out.
     """
-    sentences = {key: text for page in about.values() for key, text in page["claims"].items()}
-    rows: dict[str, list[Entry]] = {key: [] for key in sentences}
-    for row in table.sort_values("id", kind="stable").to_dict("records"):
-        rows.setdefault(row["id"], []).append({**row, "verdict": Verdict(row["verdict"])})
-    claims = {}
-    for key, statistics in rows.items():
-        first = {row["verdict"]: row for row in reversed(statistics)}
-        claims[key] = {
+    says = {key: text for page in about.values() for key, text in page["claims"].items()}
+    rows: dict[str, list[Entry]] = {key: [] for key in says}
+    for row in table.sort_values(["id", "role"], ascending=[True, False], kind="stable").to_dict(
+        "records"
+    ):
+        typed = {"verdict": Verdict(row["verdict"]), "role": Role(row["role"])}
+        rows.setdefault(row["id"], []).append({**row, **typed})
+    return {
+        key: {
             "id": key,
+            "says": says.get(key, ""),
             "sentence": sentences.get(key, ""),
             "statistics": statistics,
-            "worst": next((first[verdict] for verdict in _WORST_FIRST if verdict in first), None),
-            "examples": [first[verdict] for verdict in Verdict if verdict in first],
             **verdict_on(statistics),
         }
-    return claims
+        for key, statistics in rows.items()
+    }
 
 
-def verdict_on(statistics: Sequence[Entry]) -> dict[str, str]:
-    """Verdict on a claim in words, and its style; what is only shown does not count."""
-    found = Counter(row["verdict"] for row in statistics)
-    counts = {v: found[v] for v in Verdict if found[v] and v is not Verdict.SHOWN}
+def verdict_on(statistics: Sequence[Entry]) -> Entry:
+    """The one verdict on a claim, also in words, and its style."""
+    ruling = headline_verdict([(row["role"], row["verdict"]) for row in statistics])
+    if not statistics:
+        return {"ruling": ruling, "verdict": "not judged yet", "style": "quiet"}
     quick = " (quick)" if any(row["profile"] == Profile.QUICK for row in statistics) else ""
-    if len(counts) > 1:
-        parts = ", ".join(f"{n} {verdict.label}" for verdict, n in counts.items())
-        return {"verdict": f"mixed: {parts}{quick}", "style": "partly"}
-    for verdict in counts:
-        return {"verdict": verdict.label + quick, "style": verdict.value}
-    words = f"shown, not judged{quick}" if statistics else "not judged yet"
-    return {"verdict": words, "style": "quiet"}
+    if ruling is Verdict.SHOWN:
+        return {"ruling": ruling, "verdict": f"shown, not judged{quick}", "style": "quiet"}
+    return {"ruling": ruling, "verdict": ruling.label + quick, "style": ruling.value}
 
 
 def study(results: Path, name: str, about: Entry, claims: Mapping[str, Entry]) -> Entry:

@@ -3,6 +3,7 @@
 It is made only from what the studies left in results/, and is a single file.
 """
 
+import math
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -48,7 +49,9 @@ def write_report(results: Path, on_progress: Callable[[float], None] = lambda _:
 
 
 def interval(row: Mapping[str, Any]) -> str:
-    """A value and its interval; the value alone where nothing is random."""
+    """A value and its interval; the value alone where nothing is random; empty if unknown."""
+    if math.isnan(row["value"]):
+        return ""
     value, low, high = (plain(row[name]) for name in ("value", "low", "high"))
     return value if row["low"] == row["high"] == row["value"] else f"{value} [{low}, {high}]"
 

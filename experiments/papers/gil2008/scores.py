@@ -1,5 +1,6 @@
 """What gil2008 measures of a run besides its path: map, associations, error on revisited ground."""
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -73,9 +74,16 @@ def revisited(truth: Array) -> NDArray[np.bool_]:
     return np.asarray(np.any(near & (travelled[:, None] - travelled > LAG_M), axis=1))
 
 
-def revisited_slope(truth: Array, means: Array) -> float:
-    """Growth of the position error by distance over revisited ground, m per m."""
-    rows = np.flatnonzero(revisited(truth[::4])) * 4
-    if len(rows) < 10:
-        return float("nan")
-    return float(np.polyfit(travelled_m(truth)[rows], position_errors_m(truth, means)[rows], 1)[0])
+def revisit_ratio(truth: Array, means: Array) -> float:
+    """RMS position error at later visits of a place over that at the first visit of it.
+
+    Every pose on revisited ground is paired with the first one near it; NaN below ten pairs.
+    """
+    some, travelled = truth[::4, :2], travelled_m(truth)[::4]
+    near = np.hypot(*(some[:, None] - some[None]).transpose(2, 0, 1)) < WITHIN_M
+    before = near & (travelled[:, None] - travelled > LAG_M)
+    later = np.flatnonzero(before.any(axis=1))
+    if len(later) < 10:
+        return math.nan
+    errors = position_errors_m(truth, means)[::4]
+    return rms(errors[later]) / rms(errors[np.argmax(before[later], axis=1)])

@@ -13,7 +13,7 @@ LABELS: dict[str, tuple[str, ...]] = {
     "resampling": ("resampling", "ess_share"),
     "noise": ("noise_at",),
 }
-N_WORLDS = {Profile.FULL: 20, Profile.QUICK: 2}
+N_WORLDS = {Profile.FULL: 50, Profile.QUICK: 2}
 N_REPEATS = {Profile.FULL: 20, Profile.QUICK: 3}  # of a run
 N_DRAWS = {Profile.FULL: 5, Profile.QUICK: 2}  # of the wheel errors
 N_TIMINGS = {Profile.FULL: 5, Profile.QUICK: 2}

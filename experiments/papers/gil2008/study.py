@@ -96,7 +96,7 @@ def rows_of(runs: Sequence[TableRun]) -> list[tuple[str, Row]]:
     common: Row = {
         **dataclasses.asdict(scene),
         "odometry_rmse_m": rms(position_errors_m(truth, odometry.means)),
-        "odometry_slope": scores.revisited_slope(truth, odometry.means),
+        "odometry_revisit_ratio": scores.revisit_ratio(truth, odometry.means),
         "matching_precision": scores.matching_precision(recording),
     }
     rows = []
@@ -142,7 +142,7 @@ def one_run(experiment: Experiment, recording: Recording, rng: np.random.Generat
     return {
         **status_of(recording, online).columns(),
         **{key: found[key] for key in _SCORES},
-        "slope": scores.revisited_slope(recording.truth_at(revised.stamps), revised.means),
+        "revisit_ratio": scores.revisit_ratio(recording.truth_at(revised.stamps), revised.means),
         "step_mean_us": 1e6 * float(online.step_seconds.mean()),
         **scores.map_scores(recording, revised.map),
         **scores.filter_scores(recording, online),

@@ -75,7 +75,7 @@ def case_of(name: str, seed: int, *overrides: str) -> Case:
 def options(
     case: Case, method: str = "M2", parameters: tuple[float, float, int] | None = None
 ) -> dict[str, Any]:
-    """Keys of the estimator: a method with the parameters chosen for its geometry, or others.
+    """Keys of the estimator: a method, with the parameters chosen for the geometry or others.
 
     The campus takes those of UMH, untuned, in units of its own spacing.
 
@@ -85,7 +85,7 @@ def options(
         sigma_l in node spacings, sigma_m, B.
     """
     like = "oxford" if case.name.startswith("oxford") else "umh"
-    sigma_l, sigma_m, n_nearest = parameters or TUNED[like, method]
+    sigma_l, sigma_m, n_nearest = parameters or TUNED[like]
     return {
         "weighting": method,
         "sigma_l_m": sigma_l * case.known_map.spacing_m,
@@ -156,13 +156,14 @@ def weighting_rows(case: Case, n_repeats: int) -> dict[str, Rows]:
         settings = options(case, method[:2])
         settings |= {"estimate": "mode"} if method == "M2_mode" else {}
         walks = _repeated(case, settings, "estimator/topological_mcl", n_repeats)
+        label = {"method": method, "n_nearest": settings["n_nearest"]}
         tables["weighting"] += [
-            {"method": method, **row, "nearest_node_m": nearest_m} for row in _errors(walks)
+            {**label, **row, "nearest_node_m": nearest_m} for row in _errors(walks)
         ]
         spread = np.mean([walk.dispersions_m[: WITHIN + 1] for walk in walks], axis=0)
         error = np.mean([walk.errors_m[: WITHIN + 1] for walk in walks], axis=0)
         tables["dispersion"] += [
-            {"method": method, "step": i, "dispersion_m": float(away), "error_m": float(off)}
+            {**label, "step": i, "dispersion_m": float(away), "error_m": float(off)}
             for i, (away, off) in enumerate(zip(spread, error, strict=True))
         ]
     return tables

@@ -37,11 +37,12 @@ KHEPERA = {  # published: right and left diameter, axle, m
 LEGO_START_RAD = math.radians(213.0)
 
 # Names of the runs of conf/study/real_logs_*.yaml, in their order
+LOGGED = "odometry, as logged"
 FUSION = "EKF of wheels and ICP"
 GMAPPING = "GMapping, 910 poses"
 INTEL = (
     "odometry, 910 scans",
-    "odometry, as logged",
+    LOGGED,
     "odometry, calibrated",
     "ICP alone",
     "ICP from the wheels",

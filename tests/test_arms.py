@@ -1,0 +1,170 @@
+"""What is compared differs in nothing but what is compared: starts, stops, seeds, beliefs."""
+
+import json
+
+import numpy as np
+import pytest
+
+from experiments.papers.decristoforis2020 import study as decristoforis2020
+from experiments.papers.gil2008 import settings, study
+from experiments.papers.gil2008.recordings import Scene
+from experiments.papers.puzzlebot2024 import study as puzzlebot2024
+from experiments.papers.real_logs.settings import FUSION, INTEL
+from experiments.runs.experiment import Experiment
+from experiments.sweeps.plan import planned
+
+STEREO = {"sensors.stereo.correlated", "sensors.stereo.sigma_column_px"} | {
+    "sensors.stereo.sigma_row_px"
+}
+CHOSEN = {"fastslam": 7.81, "ekf_slam": 7.81, "fastslam_paper": 7.81}  # thresholds of distance
+
+
+def flat(config, prefix=""):
+    for key, value in config.items():
+        if isinstance(value, dict):
+            yield from flat(value, f"{prefix}{key}.")
+        else:
+            yield prefix + key, json.dumps(value)
+
+
+def differing(experiments):
+    """Keys, but those of the estimator, in which experiments differ."""
+    configs = [dict(flat(experiment.config)) for experiment in experiments]
+    keys = set().union(*configs)
+    found = {key for key in keys if len({config.get(key) for config in configs}) > 1}
+    return {key for key in found if not key.startswith("estimator.")}
+
+
+def of_one_seed(name):
+    return [run for run in planned([f"study={name}", "seed=1000"]) if run.seed == 1000]
+
+
+@pytest.mark.parametrize(
+    ("table", "compared"),
+    [
+        ("particles", {"recording.draw"}),
+        ("distance", {"recording.occluded"} | {
+            f"sensors.stereo.{key}" for key in ("max_distance_m", "max_observations", "selection")
+        }),
+        ("association", {"sensors.stereo.identifies", "sensors.stereo.sigma_descriptor"}),
+        ("observations", {"sensors.stereo.max_observations"}),
+    ],
+)  # fmt: skip
+def test_runs_of_gil2008_differ_in_what_their_table_compares(table, compared):
+    runs = of_one_seed(f"gil2008_{table}")
+    noises = {False: [], True: []}
+    for run in runs:
+        noises[run.config["sensors"]["stereo"]["correlated"]].append(run)
+    assert differing(runs) <= compared | STEREO
+    for part in filter(None, noises.values()):  # within one noise
+        assert differing(part) <= compared
+        scenes = {Scene.of(run.config) for run in part}
+        beliefs = {(run.config["estimator"]["kr"], run.config["estimator"]["kl"]) for run in part}
+        assert len(beliefs) == 1
+        if table == "observations":
+            assert len(scenes) == 1  # one recording for all
+
+
+def test_filters_that_guess_associations_have_the_same_gate():
+    for run in of_one_seed("gil2008_association"):
+        own = run.config["estimator"]
+        if own["association"] != "mahalanobis" or run.config["sensors"]["stereo"]["correlated"]:
+            continue
+        assert own["d0"] == CHOSEN[run.estimator_name]
+        assert not run.config["sensors"]["stereo"]["identifies"]
+
+
+def test_particle_filters_are_compared_by_the_same_m_and_repeats():
+    runs = of_one_seed("gil2008_particles")
+    own = {}
+    for run in runs:
+        if (
+            run.config["recording"]["draw"] == 0
+            and not run.config["sensors"]["stereo"]["correlated"]
+        ):
+            own.setdefault(run.estimator_name, []).append(
+                (run.config["estimator"]["n_particles"], run.repeats)
+            )
+    assert own["fastslam"] == own["fastslam_paper"]
+    assert settings.SEED == 1000
+
+
+def test_methods_of_decristoforis2020_share_drive_and_beliefs():
+    (group,) = decristoforis2020._planned("methods", 1)
+    assert differing(group) == {"method"}
+    assert len({run.recording_key for run in group}) == 1
+    beliefs = ("kr", "kl", "sigma_range_m", "metric", "search", "window_s", "covariance")
+    for key in beliefs:
+        assert len({run.config["estimator"].get(key, "") for run in group} - {""}) == 1, key
+    by_method = {run.config["method"]: dict(flat(run.config["estimator"])) for run in group}
+    started, alone = by_method["icp_guess"], by_method["icp"]
+    assert {key for key in alone if alone[key] != started[key]} == {"use_odometry_guess"}
+
+
+def test_every_point_of_the_ordering_has_all_methods_over_one_drive():
+    for group in decristoforis2020._planned("ordering", 1):
+        assert differing(group) == {"method"}
+        assert {run.config["method"] for run in group} >= set(decristoforis2020.CHECKED)
+
+
+def test_metrics_register_the_same_scans(monkeypatch):
+    asked = []
+
+    def register(source, target, guess=None, **options):
+        asked.append((source, target, guess, options))
+        return found(source, target, guess, **options)
+
+    found = decristoforis2020.register
+    monkeypatch.setattr(decristoforis2020, "register", register)
+    decristoforis2020._metrics(1000, "room_small")
+    first, *others = asked
+    for source, target, guess, options in others:
+        assert source is first[0]
+        assert target is first[1]
+        assert guess is first[2]
+        assert set(options) == {"metric"}
+
+
+def test_intels_fusion_and_its_rivals_read_the_same_log():
+    runs = dict(zip(INTEL, planned(["study=real_logs_intel"]), strict=True))
+    rivals = [runs[name] for name in ("ICP alone", "ICP from the wheels", FUSION)]
+    assert differing(rivals) <= {"recording.version", "method"}
+    wheels = [runs[name].recording_key for name in ("ICP from the wheels", FUSION)]
+    assert len(set(wheels)) == 1
+
+
+def test_bullet_and_kinematic_robots_drive_the_same_routes_with_the_same_noise():
+    runs = of_one_seed("puzzlebot2024_engine")
+    assert differing(runs) == {"route.segments", "simulation.physics"}
+    by_physics = {}
+    for run in runs:
+        by_physics.setdefault(run.config["simulation"]["physics"], []).append(run.choices["route"])
+    assert by_physics["bullet"] == by_physics["kinematic"]
+
+
+def test_calibrations_see_the_same_runs(monkeypatch):
+    arm = puzzlebot2024.arms("calibration")[0]
+    seen = []
+    calibrate = puzzlebot2024.from_end_poses
+
+    def from_end_poses(manoeuvres, *args, **options):
+        seen.append([m.end_poses for m in manoeuvres])
+        return calibrate(manoeuvres, *args, **options)
+
+    monkeypatch.setattr(puzzlebot2024, "from_end_poses", from_end_poses)
+    found = puzzlebot2024.calibrate_once(arm)
+    assert [result.method for result in found] == ["wheel_truth", "sampled", "linearised"]
+    for first, second in zip(*seen, strict=True):
+        np.testing.assert_array_equal(first, second)
+    assert len({result.n_used for result in found[1:]}) == 1
+
+
+def test_arms_of_one_study_start_at_the_same_pose():
+    experiment = Experiment.compose(["study=gil2008", "seed=1000"])
+    names = ("fastslam", "fastslam_paper", "ekf_slam", "smoother")
+    priors = [
+        Experiment.compose(["study=gil2008", "seed=1000", f"estimator={name}"]).config["prior"]
+        for name in names
+    ]
+    assert all(prior == experiment.config["prior"] for prior in priors)
+    assert study.labels_of("association", experiment)["filter"] == "fastslam2"
