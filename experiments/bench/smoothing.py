@@ -6,7 +6,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from estimators import smoother
+from estimators.least_squares import solve
+from estimators.smoother import Smoother
 from experiments.bench.measure import Measurement, time_s
 from experiments.runs.evaluate import estimates, one_blas_thread
 from experiments.runs.experiment import Experiment
@@ -26,7 +27,7 @@ def run() -> Iterator[Measurement]:
     experiment = Experiment.compose([*_DRIVE, "estimator=smoother"])
     recording = experiment.simulate()
     prior = experiment.prior(recording)
-    batch = smoother.Smoother(kr=experiment.robot().kr, kl=experiment.robot().kl)
+    batch = Smoother(kr=experiment.robot().kr, kl=experiment.robot().kl)
     batch.reset(prior, stream(0, "bench"))
     for frame in recording.frames():
         batch.step(frame)
@@ -35,7 +36,7 @@ def run() -> Iterator[Measurement]:
     with one_blas_thread():
         solved, whole = (
             statistics.median(time_s(call, clock=time.process_time) for _ in range(5))
-            for call in (lambda: smoother.solve(problem, start), batch.finish)
+            for call in (lambda: solve(problem, start), batch.finish)
         )
     yield Measurement("smoother.solve_s", solved, "s", 0.15, note=note)
     yield Measurement("smoother.covariances_s", whole, "s", 0.3, note=f"{note}, and every Frame")
