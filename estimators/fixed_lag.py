@@ -31,9 +31,10 @@ using the Bayes tree, IJRR 31, 2012.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from estimators.base import Belief, Estimate, Prior
@@ -76,6 +77,9 @@ class FixedLag:
         W, the images whose poses are estimated together.
     iterations
         Gauss-Newton steps at every image.
+    keep_landmarks
+        Keep landmarks that the window sees no more, so that they count when they come back. If
+        not, time and memory do not grow with the map.
     window_s
         |ds| is netted over at least this time.
 
@@ -97,6 +101,7 @@ class FixedLag:
         kl: float = 1e-4,
         lag_images: int = 20,
         iterations: int = 1,
+        keep_landmarks: bool = True,
         window_s: float = 0.05,
         stereo: str = "stereo",
     ) -> None:
@@ -104,6 +109,7 @@ class FixedLag:
         self.wheels = WheelPrediction(kr, kl, window_s)
         require_counts(lag_images=lag_images, iterations=iterations)
         self.lag_images, self.iterations = lag_images, iterations
+        self.keep_landmarks = keep_landmarks
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Start from the prior's pose, with an empty map."""
@@ -231,11 +237,13 @@ class FixedLag:
         e[new] += by_pose[new] @ (self._mean[:3] - self._poses[0] - moved)
         self._create(image.landmarks[new], e[new], by_pose[new], by_landmark[new])
         self._mean[2] = wrap(float(self._mean[2]))
-        # landmarks out of the window go with the prior, by their correlations
         idle = np.ones(self._n_prior, dtype=bool)
         for other in self._images:
             idle[other.landmarks[other.landmarks < self._n_prior]] = False
-        self._landmarks[: self._n_prior][idle] = self._mean[3:].reshape(-1, 3)[idle]
+        if self.keep_landmarks:  # out of the window they go with the prior, by their correlations
+            self._landmarks[: self._n_prior][idle] = self._mean[3:].reshape(-1, 3)[idle]
+        else:
+            self._forget(idle)
         return taken
 
     def _move(self, motion: Gaussian) -> Array:
@@ -297,6 +305,19 @@ class FixedLag:
         P[before:, before:] = (own + own.T) / 2.0
         placed = self._landmarks[landmarks] + times(by_residual, e)
         self._mean = np.concatenate([self._mean, placed.ravel()])
+
+    def _forget(self, gone: NDArray[np.bool_]) -> None:
+        """Drop these (N,) of the prior's landmarks, and number the others without gaps."""
+        of_prior = np.concatenate([np.ones(3, dtype=bool), np.repeat(~gone, 3)])
+        self._room = self._covariance[np.ix_(of_prior, of_prior)]
+        self._mean = self._mean[of_prior]
+        kept = np.ones(len(self._landmarks), dtype=bool)
+        kept[: len(gone)] = ~gone
+        number = np.cumsum(kept) - 1
+        self._landmarks = self._landmarks[kept]
+        self._images = [replace(i, landmarks=number[i.landmarks]) for i in self._images]
+        old = self._landmark_of_id.items()
+        self._landmark_of_id = {i: int(number[n]) for i, n in old if kept[n]}
 
     def _whitened(self, poses: Array, landmarks: Ints, points: Array) -> tuple[Array, Array, Array]:
         """Residuals (K, 3) in standard deviations, and derivatives by the pose and landmark."""

@@ -91,6 +91,27 @@ def test_what_leaves_the_window_is_kept(lag_images):
     assert len(kept._images) == lag_images - 1
 
 
+def test_a_landmark_counts_again_unless_it_is_forgotten():
+    """Both are the same until a landmark comes back that the window does not see any more."""
+    recording, lag = circle(1, n_frames=400, kr=1e-4, kl=1e-4), 8
+    forgetful = FixedLag(**WHEELS, lag_images=lag, keep_landmarks=False)
+    short = follow(forgetful, recording)
+    long = follow(FixedLag(**WHEELS, lag_images=lag), recording)
+    last_image, back = {}, None
+    for row, frame in enumerate(recording.frames()):
+        if "stereo" in frame.readings and back is None:
+            ids = frame.readings["stereo"]["ids"].tolist()
+            if any(row // 2 - last_image.get(i, row // 2) > lag for i in ids):
+                back = row
+            last_image |= dict.fromkeys(ids, row // 2)
+    assert 20 < back < 390
+    np.testing.assert_allclose(short.means[:back], long.means[:back], atol=1e-9)
+    np.testing.assert_allclose(short.covariances[:back], long.covariances[:back], atol=1e-12)
+    assert np.trace(short.covariances[-1]) > 1.1 * np.trace(long.covariances[-1])
+    seen = np.unique(np.concatenate([image.landmarks for image in forgetful._images]))
+    np.testing.assert_array_equal(seen, np.arange(len(forgetful._landmarks)))
+
+
 def test_errors_are_within_their_covariances():
     """In the middle and at the end of many recordings."""
     squares = []
