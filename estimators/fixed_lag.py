@@ -5,23 +5,23 @@ The poses x_0 ... x_W of the last W images and the landmarks l seen from them mi
     |(x_0, l) - m|^2_P + sum_i |between(x_i-1, x_i) - u_i|^2_Q + sum_ij |h(x_i, l_j) - z_ij|^2_R
 
 by Gauss-Newton steps at every image (sibley2010, the sliding window filter). Everything in the
-window is linearised again at every step, which is what a filter cannot do.
+window is linearised again at every step, which a filter cannot do.
 
 The prior N(m, P) covers x_0 and all landmarks seen before, with all their correlations, so that
 a landmark that comes back after hundreds of images counts. The window needs the part of it on its
-own landmarks, and a part of a covariance is a marginal: the cost of a step does not grow with the
-map. When x_0 leaves, the terms that tie x_0 and x_1 become part of the prior, linearised at
-the window's estimates x*, l* of that moment:
+own landmarks, and a part of a covariance is a marginal, so a Gauss-Newton step does not grow with
+the map. When x_0 leaves, the terms that tie x_0 and x_1 and the image of x_1 become part of the
+prior, linearised at the window's estimates x*, l* of that moment:
 
     e + J_x (x_1 - x_1*) + J_l (l - l*) = noise,    x_1 = x_1* - B^-1 (r + A (x_0 - x_0*) - noise)
 
 with residuals e, r and A, B the derivatives of `between` at x_0*, x_1*. It is an update of
-EKF-SLAM, W images late. W = 1 is an iterated EKF-SLAM; a W beyond the run, full least squares.
+EKF-SLAM, W images late, and costs as much, O(K N^2). W = 1 is an iterated EKF-SLAM; a W beyond the run, full least squares.
 
 Marginalised terms keep their point of linearisation. Those of one landmark differ by what W images
-teach, so the heading gains next to no false information (huang2009; with first-estimate Jacobians
-of landmarks the errors of ten runs were the same at W = 20). A Bayes tree (kaess2012, iSAM2) would
-linearise old poses again too, where that pays.
+teach, so the heading gains next to no false information (huang2009). First-estimate Jacobians of
+the landmarks left the errors of ten runs as they were at W = 20. A Bayes tree (kaess2012, iSAM2)
+linearises old poses again too, where they have moved.
 
 Sources: Sibley, Matthies and Sukhatme, Sliding window filter with application to planetary landing,
 J. Field Robotics 27, 2010; Huang, Mourikis and Roumeliotis, A first-estimates Jacobian EKF for
