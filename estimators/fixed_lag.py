@@ -16,7 +16,8 @@ prior, linearised at the window's estimates x*, l* of that moment:
     e + J_x (x_1 - x_1*) + J_l (l - l*) = noise,    x_1 = x_1* - B^-1 (r + A (x_0 - x_0*) - noise)
 
 with residuals e, r and A, B the derivatives of `between` at x_0*, x_1*. It is an update of
-EKF-SLAM, W images late, and costs as much, O(K N^2). W = 1 is an iterated EKF-SLAM; a W beyond the run, full least squares.
+EKF-SLAM, W images late, and costs as much, O(K N^2). W = 1 is an iterated EKF-SLAM; a W beyond
+the run, full least squares.
 
 Marginalised terms keep their point of linearisation. Those of one landmark differ by what W images
 teach, so the heading gains next to no false information (huang2009). First-estimate Jacobians of
