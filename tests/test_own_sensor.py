@@ -113,7 +113,7 @@ def test_saved_and_loaded_its_class_is_not_needed(recording, tmp_path):
         _ = sensor.reach
     with pytest.raises(InputError, match=r"tests\.beacons\.Beacons cannot be simulated"):
         sensor.start(np.random.default_rng(0))
-    with pytest.raises(InputError, match="sensor beacons was recorded as tests.beacons.Beacons"):
+    with pytest.raises(InputError, match=r"sensor beacons was recorded as tests.beacons.Beacons"):
         back.sensor("beacons", Laser)
     assert save(back, tmp_path / "b.npz") == checksum
 

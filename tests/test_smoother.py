@@ -9,7 +9,9 @@ from scipy.optimize import least_squares
 
 from estimators.base import run
 from estimators.gaussian import Gaussian
-from estimators.smoother import Problem, Smoother, _between, _merged, solve
+from estimators.landmark_drive import _between, _merged
+from estimators.least_squares import Problem, solve
+from estimators.smoother import Smoother
 from estimators.stereo import LEAST_DEPTH_M, StereoModel
 from experiments.evaluation.metrics import nees
 from experiments.gate.conform import check_estimator

@@ -1,4 +1,4 @@
-"""Landmark methods over one drive through rooms: the batch solution, and EKF-SLAM."""
+"""Landmark methods over one drive through rooms: batch, EKF-SLAM and the fixed-lag smoother."""
 
 import statistics
 import time
@@ -6,9 +6,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from estimators import smoother
+from estimators.base import Estimator
+from estimators.base import run as run_estimator
+from estimators.least_squares import solve
+from estimators.smoother import Smoother
 from experiments.bench.measure import Measurement, time_s
-from experiments.runs.evaluate import estimates, one_blas_thread
+from experiments.runs.evaluate import one_blas_thread
 from experiments.runs.experiment import Experiment
 from experiments.runs.seeds import stream
 
@@ -26,7 +29,7 @@ def run() -> Iterator[Measurement]:
     experiment = Experiment.compose([*_DRIVE, "estimator=smoother"])
     recording = experiment.simulate()
     prior = experiment.prior(recording)
-    batch = smoother.Smoother(kr=experiment.robot().kr, kl=experiment.robot().kl)
+    batch = Smoother(kr=experiment.robot().kr, kl=experiment.robot().kl)
     batch.reset(prior, stream(0, "bench"))
     for frame in recording.frames():
         batch.step(frame)
@@ -35,15 +38,17 @@ def run() -> Iterator[Measurement]:
     with one_blas_thread():
         solved, whole = (
             statistics.median(time_s(call, clock=time.process_time) for _ in range(5))
-            for call in (lambda: smoother.solve(problem, start), batch.finish)
+            for call in (lambda: solve(problem, start), batch.finish)
         )
     yield Measurement("smoother.solve_s", solved, "s", 0.15, note=note)
     yield Measurement("smoother.covariances_s", whole, "s", 0.3, note=f"{note}, and every Frame")
-    slam = Experiment.compose([*_DRIVE, "estimator=ekf_slam"])
+    for name, goal in (("ekf_slam", 0.35), ("fixed_lag", 0.3)):
+        online = Experiment.compose([*_DRIVE, f"estimator={name}"]).estimator()
 
-    def run_slam() -> None:
-        estimates(slam.estimator(), recording, prior, stream(0, "bench"))
+        def steps(online: Estimator = online) -> None:
+            run_estimator(online, recording, prior, stream(0, "bench"))
 
-    run_slam()
-    seconds = statistics.median(time_s(run_slam, clock=time.process_time) for _ in range(3))
-    yield Measurement("ekf_slam.run_s", seconds, "s", 0.35, note="all steps, one BLAS thread")
+        with one_blas_thread():
+            steps()
+            seconds = statistics.median(time_s(steps, clock=time.process_time) for _ in range(3))
+        yield Measurement(f"{name}.run_s", seconds, "s", goal, note="all steps, one BLAS thread")

@@ -146,7 +146,7 @@ def hessian_of_points(found: Registration, source: PreparedScan, target: Prepare
         seen = target.points[target.line_of_point == line]
         if len(seen) == 0:
             continue
-        normal = target.segments[line, :2]
+        normal = target.segments.normals[line]
         tangent = np.array([-normal[1], normal[0]])
         _, beside = KDTree(seen @ tangent[:, None]).query(moved[of_line] @ tangent[:, None])
         residuals[of_line] = (moved[of_line] - seen[beside]) @ normal

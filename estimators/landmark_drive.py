@@ -1,0 +1,227 @@
+"""What a drive past identified landmarks has shown, and the least-squares solution over all of it.
+
+Shared by `estimators.smoother` and `estimators.fixed_lag`. Only the Frames with observations (and
+the first and last) are poses of the problem. Those between are filled in from the odometry on
+both sides, which loses nothing.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+
+import numpy as np
+
+from estimators.base import Estimate
+from estimators.gaussian import Gaussian, compose, wrap
+from estimators.least_squares import Problem, Robust, Solution, solve
+from estimators.stereo import StereoModel
+from sim.arrays import Array, Ints
+from sim.errors import InputError
+from sim.recording import Frame
+
+# What a motion and a start pose are uncertain by at least, so that both can be inverted
+_LEAST_SIGMA_M, _LEAST_SIGMA_RAD = 1e-5, 1e-5
+FLOOR = np.diag(np.square([_LEAST_SIGMA_M, _LEAST_SIGMA_M, _LEAST_SIGMA_RAD]))
+
+
+class LandmarkDrive:
+    """Motions and images of a drive, Frame by Frame.
+
+    Parameters
+    ----------
+    camera
+        What is believed of it.
+    start
+        Pose in map before the first Frame.
+    """
+
+    def __init__(self, camera: StereoModel, start: Gaussian) -> None:
+        self._camera = camera
+        self._start = Gaussian(start.mean, start.covariance + FLOOR)
+        self._stamps: list[float] = []
+        self._guesses: list[Array] = []
+        self._motions: list[Gaussian] = []  # of each Frame since the one before
+        self._images: list[tuple[int, Array, Ints]] = []
+
+    def add(
+        self, stamp: float, motion: Gaussian, guess: Array, seen: tuple[Array, Ints] | None
+    ) -> None:
+        """Append a Frame.
+
+        Parameters
+        ----------
+        motion
+            Since the Frame before, as `loosened` has it.
+        guess
+            (3,) of the pose in map, to start the solution from.
+        seen
+            Points (K, 3) m in the camera frame and ids (K,) of its observations; None without.
+        """
+        if seen is not None:
+            self._images.append((len(self._stamps), *seen))
+        self._stamps.append(stamp)
+        self._guesses.append(guess)
+        self._motions.append(motion)
+
+    def revised(self, robust: Robust, robust_sigma: float, max_iterations: int) -> Estimate:
+        """Least squares over all Frames so far; options as in `estimators.least_squares.solve`.
+
+        Returns
+        -------
+        Estimate
+            Its `map` is a mapping of `ids` (N,), `landmarks` (N, 3) m and `landmark_covariances`
+            (N, 3, 3); its status is `no_landmarks` when it is dead reckoning alone, and
+            `not_converged` when the steps did not suffice.
+
+        Raises
+        ------
+        InputError
+            If there is no Frame yet.
+        """
+        if not self._stamps:
+            raise InputError("the estimator has seen no Frame; step before finish")
+        rows = self._rows()
+        problem, ids = self._problem(rows)
+        solution = solve(
+            problem,
+            self._guessed(rows),
+            robust=robust,
+            robust_sigma=robust_sigma,
+            max_iterations=max_iterations,
+        )
+        means, covariances = self._filled_in(rows, solution)
+        status = "ok" if solution.converged else "not_converged"
+        return Estimate(
+            stamps=np.array(self._stamps),
+            means=means,
+            covariances=covariances,
+            kind="revised",
+            map={
+                "ids": ids,
+                "landmarks": solution.landmarks,
+                "landmark_covariances": solution.landmark_covariances,
+            },
+            status=status if len(ids) else "no_landmarks",
+        )
+
+    def problem(self) -> tuple[Problem, Array]:
+        """The least-squares problem over all Frames so far, and poses (T, 3) to start from."""
+        rows = self._rows()
+        return self._problem(rows)[0], self._guessed(rows)
+
+    def _rows(self) -> list[int]:
+        """Frames that are poses of the problem."""
+        return sorted({0, *(row for row, _, _ in self._images), len(self._stamps) - 1})
+
+    def _guessed(self, rows: list[int]) -> Array:
+        return np.array([self._guesses[row] for row in rows])
+
+    def _problem(self, rows: list[int]) -> tuple[Problem, Ints]:
+        """The problem over the Frames of these rows, and the id of each of its landmarks."""
+        merged = [_merged(self._motions[a + 1 : b + 1]) for a, b in itertools.pairwise(rows)]
+        pose_of = {row: pose for pose, row in enumerate(rows)}
+        seen = [np.zeros(0, np.int64), *(seen for _, _, seen in self._images)]
+        ids, landmark_rows = np.unique(np.concatenate(seen), return_inverse=True)
+        n = len(merged)
+        problem = Problem(
+            prior_mean=compose(self._start.mean, self._motions[0].mean)[0],
+            prior_covariance=self._start.covariance,
+            first=np.arange(n),
+            second=np.arange(1, n + 1),
+            motions=np.array([motion.mean for motion in merged]).reshape(n, 3),
+            motion_covariances=np.array([motion.covariance for motion in merged]).reshape(n, 3, 3),
+            camera=self._camera,
+            pose_rows=np.array([pose_of[row] for row, p, _ in self._images for _ in p], np.int64),
+            landmark_rows=landmark_rows.astype(np.int64),
+            points_in_camera=np.concatenate([np.zeros((0, 3)), *(p for _, p, _ in self._images)]),
+        )
+        return problem, ids
+
+    def _filled_in(self, rows: list[int], solution: Solution) -> tuple[Array, Array]:
+        """Means (T, 3) and covariances (T, 3, 3) of every Frame, between the solved ones too."""
+        n, n_poses = len(self._stamps), len(rows)
+        means, covariances = np.empty((n, 3)), np.empty((n, 3, 3))
+        means[rows], each = solution.poses, range(n_poses)
+        covariances[rows] = solution.covariance.reshape(n_poses, 3, n_poses, 3)[each, :, each]
+        for pose, (a, b) in enumerate(itertools.pairwise(rows)):
+            block = slice(3 * pose, 3 * pose + 6)
+            joint, ends = solution.covariance[block, block], solution.poses[pose : pose + 2]
+            between = _between(self._motions[a + 1 : b + 1], ends, joint)
+            for row, belief in enumerate(between, start=a + 1):
+                means[row], covariances[row] = belief.mean, belief.covariance
+        return means, covariances
+
+
+def observed(
+    frame: Frame, sensor: str, camera: StereoModel, estimator: str
+) -> tuple[Array, Ints] | None:
+    """Points (K, 3) and ids (K,) of a Frame's observations that can be used; None without any.
+
+    Raises
+    ------
+    InputError
+        If the camera gives no ids.
+    """
+    seen = frame.readings.get(sensor)
+    if seen is None or not len(seen["points_in_camera"]):
+        return None
+    if "ids" not in seen:
+        raise InputError(
+            f"{estimator} needs to know which landmark is which; set "
+            f"sensors.{sensor}.identifies=true"
+        )
+    usable = camera.usable(seen["points_in_camera"])
+    if not usable.any():
+        return None
+    return seen["points_in_camera"][usable], seen["ids"][usable]
+
+
+def loosened(motion: Gaussian) -> Gaussian:
+    """Motion of a Frame with what least squares needs beside slip: sideways play, and a floor."""
+    return Gaussian(motion.mean, motion.covariance + _sideways(motion) + FLOOR)
+
+
+def _sideways(motion: Gaussian) -> Array:
+    """Covariance (3, 3) that slip adds within a Frame because it is spread along the way.
+
+    The arc takes each wheel to turn evenly. A heading that wanders by the variance s^2 over the
+    way d also leaves it sideways, by d^2 s^2 / 12 beyond what the final heading accounts for.
+    """
+    x, y, turn = motion.mean
+    normal = np.array([-math.sin(turn / 2.0), math.cos(turn / 2.0), 0.0])
+    added: Array = np.outer(normal, normal) * ((x**2 + y**2) * motion.covariance[2, 2] / 12.0)
+    return added
+
+
+def _merged(motions: list[Gaussian]) -> Gaussian:
+    """Several motions as one."""
+    return functools.reduce(Gaussian.then, motions)
+
+
+def _between(motions: list[Gaussian], ends: Array, joint: Array) -> list[Gaussian]:
+    """Poses between two solved ones (2, 3) of this joint covariance (6, 6).
+
+    Given both ends, a pose between is the odometry from the first, corrected by its share of
+    what the odometry misses the second by.
+    """
+    # motions from the start to each pose between, and from there to the end
+    so_fars = list(itertools.accumulate(motions[:-1], Gaussian.then))
+    rests = list(itertools.accumulate(motions[:0:-1], lambda rest, motion: motion.then(rest)))
+    poses = []
+    for so_far, rest in zip(so_fars, reversed(rests), strict=True):
+        at, F, by_motion = compose(ends[0], so_far.mean)
+        reached, H, by_rest = compose(at, rest.mean)
+        missed = ends[1] - reached
+        missed[2] = math.remainder(missed[2], 2.0 * math.pi)
+        P = by_motion @ so_far.covariance @ by_motion.T
+        R = by_rest @ rest.covariance @ by_rest.T
+        K = np.linalg.solve(H @ P @ H.T + R, H @ P).T
+        keep = np.eye(3) - K @ H
+        by_ends = np.hstack([keep @ F, K])
+        covariance = keep @ P @ keep.T + K @ R @ K.T + by_ends @ joint @ by_ends.T
+        mean = at + K @ missed
+        mean[2] = wrap(mean[2])
+        poses.append(Gaussian(mean, (covariance + covariance.T) / 2.0))
+    return poses
