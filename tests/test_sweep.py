@@ -1,6 +1,7 @@
 """Sweeps: what is expanded, composed and packed, and what is left after failures and kills."""
 
 import os
+import re
 import shlex
 import signal
 import subprocess
@@ -352,6 +353,43 @@ def test_values_that_no_column_holds_fail_alone(name):
         assert "a picture is .png" in plotted.stderr
     finally:
         out.unlink(missing_ok=True)
+
+
+def test_a_sweep_without_a_name_has_one_of_its_own(tmp_path):
+    place = {"ESTIMA_RESULTS": str(tmp_path)}
+    first = estima("run", "-m", *SHORT, "seed=0,1", **place)
+    again = estima("run", "-m", "seed=0,1", *SHORT, "hydra/launcher=basic", **place)
+    other = estima("run", "-m", *SHORT, "seed=0,1,2", **place)
+    assert "2 runs, 0 of them done before" in first.stderr
+    assert "2 runs, 2 of them done before" in again.stderr
+    assert "3 runs, 0 of them done before" in other.stderr
+    folders = {path.name for path in (tmp_path / "runs").iterdir()}
+    assert len(folders) == 2
+    for own in folders:
+        assert re.fullmatch("sweep_[0-9a-f]{8}", own)
+        assert own in first.stderr + other.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["-m", "hydra/sweeper=optuna"], ["hydra/sweeper", "every combination"]),
+        (["-m", "hydra.sweep.dir=/tmp/x"], ["hydra.sweep.dir", "set name"]),
+        (["hydra.run.dir=/tmp/x"], ["hydra.run.dir", "--results"]),
+        (["hydra.verbose=true"], ["hydra.verbose", "no log"]),
+        (["-m", "robot.kr=interval(0,1)"], ["interval(0,1)", "range(0,1,0.1)"]),
+        (["-m", "route=glob(nothing*)"], ["empty range or list"]),
+        (["-m", "--info"], ["--info", "leave out -m"]),
+        (["-m", "--cfg", "job"], ["--cfg", "leave out -m"]),
+    ],
+)
+def test_what_hydra_would_ignore_is_refused(arguments, words):
+    refused(estima("run", *arguments, *QUICK, "seed=0"), *words)
+
+
+def test_globs_choose_options():
+    runs = list(plan.planned(["route=glob(linear_*)", "simulation.physics=kinematic"]))
+    assert [run.choices["route"] for run in runs] == [f"linear_{i}" for i in range(1, 5)]
 
 
 def test_a_missing_value_can_be_given_in_a_sweep(tmp_path):

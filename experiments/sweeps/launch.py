@@ -245,14 +245,24 @@ def _clear_plans(folder: Path) -> None:
     for plan in folder.glob("plan-*.json"):
         try:
             node, planner = json.loads(plan.read_text())["planner"]
-            if node == platform.node():
-                os.kill(planner, 0)  # is it there?
-        except ProcessLookupError:
-            _remove(plan)
-            for part in folder.glob(f".rows-{plan.stem.removeprefix('plan-')}*.part*"):
-                part.unlink(missing_ok=True)
+            if node != platform.node() or _is_there(planner):
+                continue
         except (OSError, ValueError, KeyError, TypeError):
             continue
+        _remove(plan)
+        for part in folder.glob(f".rows-{plan.stem.removeprefix('plan-')}*.part*"):
+            part.unlink(missing_ok=True)
+
+
+def _is_there(process: int) -> bool:
+    """Whether a process of this machine lives."""
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:  # another user's
+        return True
+    return True
 
 
 _UNNAMED = "run"  # the default of conf/config.yaml
@@ -291,7 +301,11 @@ def job_application(cfg: DictConfig) -> None:
 
 def _end_with(node: str, planner: int) -> None:
     """End this process when the planner is killed, if the planner started it."""
-    if platform.node() != node or os.getppid() != planner or os.getpid() == planner:
+    if platform.node() != node or os.getpid() == planner:
+        return
+    if os.getppid() != planner:  # started by a launcher's own processes, or left behind just now
+        if not _is_there(planner):
+            os._exit(1)
         return
 
     def watch() -> None:
