@@ -288,7 +288,7 @@ def test_workers_end_with_a_killed_sweep(name):
          "seed=range(0,400)"],
         cwd=ROOT, stderr=subprocess.PIPE, env={**os.environ, "PYTHONPATH": str(ROOT)},
     )  # fmt: skip
-    while not list(folder(name).glob("rows-*")):
+    while len(list(folder(name).glob("rows-*"))) < 2:  # both workers are at work
         assert process.poll() is None
         time.sleep(0.1)
     process.kill()
