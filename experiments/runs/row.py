@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 Row = dict[str, str | int | float | bool | None]
 _TEXTS = (*STATUS, *ORIGIN)
-_WITH_DIGEST = re.compile(r".+\.([0-9a-f]{16})\.parquet")
+WITH_DIGEST = re.compile(r".+\.([0-9a-f]{16})\.parquet")
 _NONE = type(None)
 
 
@@ -173,7 +173,7 @@ def read_parquet(path: Path, columns: list[str] | None = None, *, remedy: str = 
         if path.exists() and not path.is_file():
             raise ValueError("not a file")  # a FIFO would wait for ever
         content = path.read_bytes()
-        named = _WITH_DIGEST.fullmatch(path.name)
+        named = WITH_DIGEST.fullmatch(path.name)
         if named and hashlib.sha256(content).hexdigest()[:16] != named[1]:
             raise ValueError("it does not match its checksum")
         # one thread: Arrow's own, started for a small file, can crash at exit

@@ -23,7 +23,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from experiments.runs.columns import REPEAT
-from experiments.runs.row import Outcome, Row, as_tables, check_row, joined, read_parquet, read_rows
+from experiments.runs.row import (
+    WITH_DIGEST,
+    Outcome,
+    Row,
+    as_tables,
+    check_row,
+    joined,
+    read_parquet,
+    read_rows,
+)
 from sim.errors import InputError
 from sim.files import write_whole
 
@@ -61,9 +70,7 @@ class Journal:
         self._append(_BEGUN, key, 0)
 
     def append(self, rows: Sequence[Row]) -> None:
-        """Append the rows of a run."""
-        for row in rows:
-            check_row(row)
+        """Append the rows of a run, which `check_row` has passed."""
         if any(row["status"] == Outcome.FAILED for row in rows):
             self._append(_FAILED, rows, 0)
         elif all(list(row) == list(self._basis) for row in rows):
@@ -213,6 +220,11 @@ def journal_lines(content: bytes) -> Iterator[tuple[str, list[Row]]]:
         elif kind == _WHOLE:
             basis, basis_crc = payload[0], crc
         yield payload[0]["run_key"], payload
+
+
+def is_own(path: Path) -> bool:
+    """Whether a file of rows carries checksums: a journal, or a name with a digest."""
+    return path.suffix == JOURNAL or WITH_DIGEST.fullmatch(path.name) is not None
 
 
 def compact(path: Path) -> None:

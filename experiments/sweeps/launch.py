@@ -28,7 +28,7 @@ from experiments.runs import paths, store
 from experiments.runs.console import RunFailedError, progress
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment, check_hydra
-from experiments.runs.row import Outcome, Row, Status
+from experiments.runs.row import Outcome, Row, Status, check_row
 from experiments.sweeps.plan import Family, Numbers, Plan, packed, plan_of
 from sim.errors import InputError
 from sim.files import write_whole
@@ -99,6 +99,7 @@ def sweep(arguments: Sequence[str], config_dir: str | None = None) -> None:
     if not len(runs):
         return
     _launch_all(plan, runs, folder, launching)
+    store.tidy(folder, lambda journal: _plan_of(folder, journal).exists())
     found = store.ended(folder)
     bad = runs[~np.isin(plan.keys[runs], found.done)]
     if len(bad):
@@ -128,8 +129,10 @@ def check(plan: Plan, runs: Numbers) -> None:
 
 
 def _drop(path: Path, error: InputError) -> None:
-    """Remove a damaged file of rows; its runs are done again."""
-    print(f"estima: {error}; its runs are done again", file=sys.stderr)
+    """Remove a damaged file of rows, so that its runs are done again; not one of other names."""
+    if not store.is_own(path):
+        raise error
+    print(f"estima: {path} does not match its checksum; its runs are done again", file=sys.stderr)
     path.unlink(missing_ok=True)
 
 
@@ -208,7 +211,6 @@ def _launch_all(plan: Plan, runs: Numbers, folder: Path, launching: Sequence[str
                 left = left[~np.isin(plan.keys[left], keys)]
     finally:
         _remove(jobs.plan)
-        store.tidy(folder, lambda journal: _plan_of(folder, journal).exists())
 
 
 def _launch(plan: Plan, runs: Numbers, jobs: Jobs, launching: Sequence[str]) -> Exception | None:
@@ -332,6 +334,8 @@ def run_and_record(
     journal.begin(experiment.key)
     try:
         rows = evaluate(experiment, lambda: _held(experiment, held))
+        for row in rows:
+            check_row(row)
     except (Exception, SystemExit) as error:
         rows = [_failure(experiment, Status.of_error(error))]
     journal.append(rows)
@@ -373,7 +377,7 @@ def _watched(jobs: Jobs, n_runs: int) -> Iterator[None]:
                     counts[journal] = _counted(journal, jobs.sizes[journal], counts.get(journal))
                 done, failed = (sum(count[i] for count in counts.values()) for i in (1, 2))
                 if over:
-                    found = store.ended(jobs.folder, f"rows-{jobs.name}")
+                    found = store.ended(jobs.folder, f"rows-{jobs.name}", lambda *_: None)
                     done, failed = len(found.done) + len(found.failed), len(found.failed)
                 if done:
                     on_progress(min(done, n_runs), failed)

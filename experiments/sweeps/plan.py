@@ -280,11 +280,7 @@ def _values(override: Override, key: str) -> Sequence[Any]:
     elements = list(override.sweep_iterator())
     if all(isinstance(e, (int, float)) or e is None for e in elements):
         return elements
-    texts = (
-        Override._get_value_element_as_str(e)  # Hydra offers it for no single value
-        for e in elements
-    )
-    return [f"{key}={text}" for text in texts]
+    return [f"{key}={text}" for text in override.sweep_string_iterator()]
 
 
 def _grid(
