@@ -483,7 +483,7 @@ def plot(
 ) -> None:
     """Draw a column of a sweep against a swept setting, with 95 % intervals.
 
-    Example: estima plot run --x robot.kr --y ate_rmse_m --by choice.estimator
+    Example: estima plot slip --x robot.kr --y ate_rmse_m --by choice.estimator
     """
     from experiments.report.plot import sweep_figure
     from experiments.sweeps.collect import collect, where

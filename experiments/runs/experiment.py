@@ -613,8 +613,17 @@ def _digest(path: Path) -> str:
 
 def leaf_digest(leaf: tuple[str, ...], value: Any) -> int:
     """Return 64 bits of a digest of a plain value and its place in the configuration."""
-    text = json.dumps([leaf, value], sort_keys=True)
-    return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest())
+    return next(leaf_digests(leaf, [value]))
+
+
+def leaf_digests(leaf: tuple[str, ...], values: Iterable[Any]) -> Iterator[int]:
+    """Give the digest of each of many values of one leaf."""
+    place = hashlib.blake2b(json.dumps(leaf).encode(), digest_size=8)
+    for value in values:
+        nested = isinstance(value, (list, dict))
+        digest = place.copy()
+        digest.update((json.dumps(value, sort_keys=True) if nested else json.dumps(value)).encode())
+        yield int.from_bytes(digest.digest())
 
 
 def _leaves(tree: Mapping[str, Any], above: tuple[str, ...] = ()) -> Iterator[tuple[Any, Any]]:

@@ -31,7 +31,7 @@ from experiments.runs.experiment import (
     Experiment,
     check_overrides,
     composed,
-    leaf_digest,
+    leaf_digests,
     searched,
 )
 from sim.errors import InputError
@@ -72,7 +72,7 @@ class Axis:
     @functools.cached_property
     def _each(self) -> Digests:
         """Digest of each leaf with each value."""
-        every = (leaf_digest(leaf, value) for leaf in self.leaves for value in self.values)
+        every = itertools.chain(*(leaf_digests(leaf, self.values) for leaf in self.leaves))
         shape = len(self.leaves), len(self.values)
         return np.fromiter(every, np.uint64, math.prod(shape)).reshape(shape)
 
