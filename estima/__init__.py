@@ -300,6 +300,8 @@ def plot(
     y: str = "ate_rmse_m",
     by: str | None = None,
     path: str | Path | None = None,
+    *,
+    pool: bool = False,
 ) -> Figure:
     """Draw a column of a sweep against another one: means over recordings, with 95 % intervals.
 
@@ -313,6 +315,8 @@ def plot(
         One line for each value of this column.
     path
         File to write: .png, .pdf or .svg.
+    pool
+        Average over different worlds, estimators and logs too, rather than refuse it.
 
     Raises
     ------
@@ -336,7 +340,8 @@ def plot(
             raise InputError(
                 f"the table has no column {column}; estima.plot takes what estima.sweep returned"
             )
-    return _saved(sweep_figure(table[table["status"] != Outcome.FAILED], x, y, by), path)
+    figure = sweep_figure(table[table["status"] != Outcome.FAILED], x, y, by, pool=pool)
+    return _saved(figure, path)
 
 
 def _experiment(overrides: tuple[str, ...]) -> Experiment:

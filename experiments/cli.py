@@ -95,7 +95,10 @@ def run(context: typer.Context) -> None:
     os.environ["HYDRA_FULL_ERROR"] = "1"  # errors come to `main`, which puts them in a line
     arguments = context.args
     many = {"-m", "--multirun"} & set(arguments)
-    if many and not {"--hydra-help", "--cfg", "-c", "--info", "-i"} & set(arguments):
+    shown = {"--cfg", "-c", "--info", "-i"} & set(arguments)
+    if many and shown:
+        raise InputError(f"{shown.pop()} shows one configuration; leave out -m and the lists")
+    if many and "--hydra-help" not in arguments:
         from experiments.sweeps.launch import sweep_arguments
 
         sweep_arguments([a for a in arguments if a not in many])
@@ -198,6 +201,7 @@ def options(
     group: Annotated[
         str | None, typer.Argument(help="world, robot, ..., study; or metrics.")
     ] = None,
+    config_dir: ConfigDir = None,
 ) -> None:
     """List the configuration groups and their options, or the metrics of a run.
 
@@ -211,10 +215,13 @@ def options(
     if group == "metrics":
         print(columns.as_text())
         return
+    if config_dir is not None and not config_dir.is_dir():
+        raise InputError(f"--config-dir must name a folder, got {config_dir}")
     if group not in (None, *groups):
         raise InputError(f"no group {group}; there are: {', '.join(groups)}, metrics")
     for name in groups if group is None else (group,):
-        names = sorted(path.stem for path in (paths.CONF / name).glob("*.yaml"))
+        folders = [paths.CONF, *([config_dir] if config_dir else [])]
+        names = sorted({path.stem for folder in folders for path in (folder / name).glob("*.yaml")})
         print(f"{name:>10}: {', '.join(names)}")
 
 
@@ -577,11 +584,14 @@ def plot(
     ),
     by: Annotated[str | None, typer.Option(help="One line a value of this.")] = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="Picture to write.")] = Path("plot.png"),
+    pool: Annotated[
+        bool, typer.Option("--pool", help="Average over worlds, estimators and logs too.")
+    ] = False,
     only: Where = None,
 ) -> None:
     """Draw a column of a sweep against a swept setting, with 95 % intervals.
 
-    Example: estima plot run --x robot.kr --y ate_rmse_m --by choice.estimator
+    Example: estima plot slip --x robot.kr --y ate_rmse_m --by choice.estimator
     """
     from experiments.report.plot import sweep_figure
     from experiments.sweeps.collect import collect, where
@@ -592,7 +602,7 @@ def plot(
     if failed.any():
         print(f"{failed.sum()} of {len(rows)} runs failed; they are left out", file=sys.stderr)
         rows = rows[~failed]
-    save_figure(sweep_figure(rows, x, y, by), out)
+    save_figure(sweep_figure(rows, x, y, by, pool=pool), out)
     print(out)
 
 

@@ -10,8 +10,14 @@ from sim.errors import InputError, require
 
 
 @contextmanager
-def write_whole(path: Path) -> Iterator[Path]:
+def write_whole(path: Path, *, durable: bool = True) -> Iterator[Path]:
     """Give a path beside `path` to write to; move it into place if all went well.
+
+    Parameters
+    ----------
+    durable
+        Wait until the disk has the content, some milliseconds; not needed for what is checked
+        against a checksum and can be made again.
 
     Raises
     ------
@@ -24,7 +30,8 @@ def write_whole(path: Path) -> Iterator[Path]:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield part
         with part.open("rb+") as written:
-            os.fsync(written.fileno())
+            if durable:
+                os.fsync(written.fileno())
         os.replace(part, path)
     except OSError as error:
         raise InputError(

@@ -375,10 +375,15 @@ _UNREADABLE = (
 )
 
 
-def save(recording: Recording, path: Path) -> str:
+def save(recording: Recording, path: Path, *, durable: bool = True) -> str:
     """Write a recording; return its checksum.
 
     The file appears whole or not at all: it is written beside its place and then moved there.
+
+    Parameters
+    ----------
+    durable
+        As for `sim.files.write_whole`.
 
     Raises
     ------
@@ -388,7 +393,7 @@ def save(recording: Recording, path: Path) -> str:
     arrays, meta = _arrays(recording), described(recording)
     checksum = _digest(arrays, meta)
     meta_bytes = np.frombuffer(json.dumps({**meta, "checksum": checksum}).encode(), np.uint8)
-    with write_whole(path) as part, part.open("wb") as file:
+    with write_whole(path, durable=durable) as part, part.open("wb") as file:
         np.savez(file, allow_pickle=False, meta=meta_bytes, **arrays)
     return checksum
 

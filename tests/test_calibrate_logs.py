@@ -11,7 +11,7 @@ from estimators.odometry import Odometry
 from experiments.calibration.logs import calibrate_track, dead_reckoning_rms_m, scanner_positions
 from experiments.papers.real_logs import settings
 from experiments.papers.real_logs.grid_match import beam_points, best_fit
-from experiments.sweeps.launch import planned
+from experiments.sweeps.plan import planned
 from sim import se2
 from sim.formats.lego import TickLog, parse_motors, parse_reference
 from sim.formats.mrclam import CAMERA

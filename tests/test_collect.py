@@ -112,9 +112,12 @@ def test_plots_name_a_missing_column_and_average_recordings():
     expected = table[(table["choice.estimator"] == "a")].groupby("robot.kr")["ate_rmse_m"].mean()
     np.testing.assert_allclose(lines[0].get_ydata(), expected)
     assert "estimator" not in page.axes[0].get_title()
-    assert "estimator" in sweep_figure(rows(), "robot.kr", "ate_rmse_m").axes[0].get_title()
+    with pytest.raises(InputError, match=r"different values of choice\.estimator \(a, b\).*--pool"):
+        sweep_figure(rows(), "robot.kr", "ate_rmse_m")
+    pooled = sweep_figure(rows(), "robot.kr", "ate_rmse_m", pool=True)
+    assert "estimator" in pooled.axes[0].get_title()
     table = table.assign(ate_rmse_m=np.tile(np.repeat([1e-4, 1.0, 10.0], 2), 2))
-    page = sweep_figure(table, "robot.kr", "ate_rmse_m")
+    page = sweep_figure(table, "robot.kr", "ate_rmse_m", pool=True)
     geometric = np.exp(np.log(table["ate_rmse_m"]).groupby(table["robot.kr"]).mean())
     np.testing.assert_allclose(page.axes[0].get_lines()[0].get_ydata(), geometric)
     assert page.axes[0].get_yscale() == "log"
@@ -149,6 +152,6 @@ def test_columns_say_their_unit():
         assert column.unit.replace("^", "") == unit
         assert title(name).endswith(column.unit)
     assert title("ate_rmse_m", short=True) == "ATE, m"
-    page = sweep_figure(rows(), "robot.kr", "ate_rmse_m")
+    page = sweep_figure(rows(), "robot.kr", "ate_rmse_m", pool=True)
     assert page.axes[0].get_ylabel() == "position RMSE, m"
     assert page.axes[0].get_xlabel() == "robot.kr"

@@ -15,7 +15,7 @@ from experiments.gate.conform import walk
 from experiments.papers.gil2008 import claims as judge
 from experiments.papers.gil2008 import recordings, scores, settings, study
 from experiments.runs.experiment import Experiment
-from experiments.sweeps.launch import planned
+from experiments.sweeps.plan import planned
 from tests.fakes import circle, tracking_prior, true_ids
 
 K_M = 5e-5

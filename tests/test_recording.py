@@ -409,6 +409,11 @@ def test_the_cache_makes_once_and_mends_damage(tmp_path, monkeypatch):
     assert len(made) == 2
     cached("b", make)
     assert len(made) == 3
+    (folder() / "b.npz").write_bytes(path.read_bytes())  # the recording of another key
+    cached("b", make)
+    assert len(made) == 4
+    assert cached("b", make).config == small_recording().config
+    assert {file.suffix for file in folder().iterdir()} == {".npz"}
 
 
 def test_the_cache_drops_what_was_used_longest_ago_but_nothing_in_use(tmp_path, monkeypatch):

@@ -1,6 +1,7 @@
 """Sweeps: what is expanded, composed and packed, and what is left after failures and kills."""
 
 import os
+import re
 import shlex
 import signal
 import subprocess
@@ -49,16 +50,44 @@ def clear(name):
         folder(name).rmdir()
 
 
-def test_combinations_are_those_of_the_last_values():
-    found = list(plan.combinations(["seed=range(0,3)", "robot.kr=1e-5,1e-4", "seed=7,8", "a=b"]))
-    assert found == [
-        ["seed=7", "robot.kr=1e-05", "a=b"],
-        ["seed=7", "robot.kr=0.0001", "a=b"],
-        ["seed=8", "robot.kr=1e-05", "a=b"],
-        ["seed=8", "robot.kr=0.0001", "a=b"],
-    ]
-    with pytest.raises(InputError, match="interval"):
-        list(plan.combinations(["robot.kr=interval(0,1)"]))
+def test_the_last_values_of_a_key_are_swept():
+    found = plan.swept(["seed=range(0,3)", "robot.kr=1e-5,1e-4", "seed=7,8", "a=b"])
+    assert found == {"seed": [7, 8], "robot.kr": [1e-5, 1e-4], "a": ["a=b"]}
+    assert plan.swept(["seed=range(0,1000000)"])["seed"] == range(1000000)
+    with pytest.raises(InputError, match=r"interval.*lists and ranges"):
+        plan.swept(["robot.kr=interval(0,1)"])
+
+
+def test_a_million_runs_are_planned_as_each_of_them_alone():
+    every = plan.plan_of(["seed=range(0,1000)", "robot.kr=range(1,101,0.1)", "robot.kl=${robot.kr}",
+                          "simulation.physics=kinematic"])  # fmt: skip
+    assert len(every.keys) == len(np.unique(every.keys)) == 10**6
+    assert len(every.families) == 1
+    for i in (0, 1, 500_123, 999_999):
+        run = every.experiment(i)
+        c = run.config
+        alone = Experiment.compose(
+            [f"seed={i // 1000}", f"robot.kr={c['robot']['kr']}", "robot.kl=${robot.kr}",
+             "simulation.physics=kinematic"]
+        )  # fmt: skip
+        assert c == alone.replaced(picture=False).config
+        assert int(alone.key, 16) == every.keys[i]
+
+
+def test_keys_of_a_plan_are_those_of_its_runs(tmp_path):
+    given = ["estimator=glob(ekf_icp*)", "seed=2,1", "simulation.physics=kinematic,bullet",
+             "sensors=lms291", "prior.track_m=null,0.2", "world.n_objects=3,6",
+             "estimator.kr=1e-5,1e-4"]  # fmt: skip
+    every = plan.plan_of(given)
+    assert len(every.keys) == len(np.unique(every.keys)) == 64
+    recordings = {}
+    for i, key in enumerate(every.keys):
+        run = every.experiment(i)
+        assert int(run.key, 16) == key
+        recordings.setdefault(run.recording_key, set()).add(every.recordings[i])
+    assert len(recordings) == 8
+    assert all(len(same) == 1 for same in recordings.values())
+    assert [every.experiment(i).seed for i in range(0, 64, 16)] == [2, 1, 2, 1]
 
 
 def test_the_quick_composer_resolves_as_hydra_does():
@@ -137,14 +166,13 @@ def test_keys_know_the_files_that_a_mapping_names(tmp_path):
 
 
 def test_packing_keeps_recordings_together():
-    experiment = Experiment.compose([])
-    runs = [experiment.replaced(seed=seed, repeats=r) for seed in range(6) for r in (1, 2)]
-    jobs = plan.packed(runs, 3)
-    assert sorted(run.key for job in jobs for run in job) == sorted(run.key for run in runs)
+    every = plan.plan_of(["repeats=1,2", "seed=range(0,6)"])
+    jobs = plan.packed(every.recordings, 3)
+    assert sorted(np.concatenate(jobs)) == list(range(12))
     assert len(jobs) == 3
     for job in jobs:
-        assert len({run.config["seed"] for run in job}) == 2
-    assert max(len(job) for job in plan.packed(runs, 100)) == 1
+        assert len({every.experiment(i).seed for i in job}) == 2
+    assert max(len(job) for job in plan.packed(every.recordings, 100)) == 1
 
 
 def test_failed_runs_leave_rows_and_the_rest_goes_on(name, tmp_path):
@@ -169,11 +197,12 @@ def test_failed_runs_leave_rows_and_the_rest_goes_on(name, tmp_path):
     rows = table_of(name)
     assert len(rows) == 4
     assert sorted(rows["status"] == "ok") == [False, False, True, True]
-    stamps = {p: p.stat().st_mtime_ns for p in folder(name).glob("*.parquet")}
+    before = set(folder(name).glob("*.parquet"))
     again = estima(*sweep_, PYTHONPATH=f"{ROOT}:{tmp_path}")
     assert "2 of them done before" in again.stderr
-    later = {p for p in folder(name).glob("*.parquet") if p.stat().st_mtime_ns > stamps[p]}
-    assert len(later) == 2  # only what had failed
+    later = set(folder(name).glob("*.parquet")) - before
+    assert sum(len(read_rows(path)) for path in later) == 2  # only what had failed
+    assert len(table_of(name)) == 4
 
 
 def own_estimator(folder, body):
@@ -216,7 +245,7 @@ def test_an_estimator_that_ends_its_process_costs_its_own_runs(name, tmp_path, b
     assert (bad["status"] == "failed").all()
     assert (bad["status_code"] + ": " + bad["status_detail"]).str.contains(words).all()
     assert len(rows) == 4
-    assert {path.suffix for path in folder(name).iterdir()} <= {".parquet", ".failed"}
+    assert {path.suffix for path in folder(name).iterdir()} == {".parquet"}
 
 
 def test_rows_of_an_edited_estimator_do_not_mix(name, tmp_path, monkeypatch, capsys):
@@ -259,7 +288,7 @@ def test_workers_end_with_a_killed_sweep(name):
          "seed=range(0,400)"],
         cwd=ROOT, stderr=subprocess.PIPE, env={**os.environ, "PYTHONPATH": str(ROOT)},
     )  # fmt: skip
-    while not list(folder(name).glob("*.parquet")):
+    while len(list(folder(name).glob("rows-*"))) < 2:  # both workers are at work
         assert process.poll() is None
         time.sleep(0.1)
     process.kill()
@@ -277,7 +306,7 @@ def test_a_terminated_sweep_says_so_and_leaves_no_plan(name):
          "seed=range(0,400)"],
         cwd=ROOT, stderr=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": str(ROOT)},
     )  # fmt: skip
-    while not list(folder(name).glob("*.parquet")):
+    while not list(folder(name).glob("rows-*")):
         assert process.poll() is None
         time.sleep(0.1)
     process.terminate()
@@ -326,6 +355,43 @@ def test_values_that_no_column_holds_fail_alone(name):
         out.unlink(missing_ok=True)
 
 
+def test_a_sweep_without_a_name_has_one_of_its_own(tmp_path):
+    place = {"ESTIMA_RESULTS": str(tmp_path)}
+    first = estima("run", "-m", *SHORT, "seed=0,1", **place)
+    again = estima("run", "-m", "seed=0,1", *SHORT, "hydra/launcher=basic", **place)
+    other = estima("run", "-m", *SHORT, "seed=0,1,2", **place)
+    assert "2 runs, 0 of them done before" in first.stderr
+    assert "2 runs, 2 of them done before" in again.stderr
+    assert "3 runs, 0 of them done before" in other.stderr
+    folders = {path.name for path in (tmp_path / "runs").iterdir()}
+    assert len(folders) == 2
+    for own in folders:
+        assert re.fullmatch("sweep_[0-9a-f]{8}", own)
+        assert own in first.stderr + other.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["-m", "hydra/sweeper=optuna"], ["hydra/sweeper", "every combination"]),
+        (["-m", "hydra.sweep.dir=/tmp/x"], ["hydra.sweep.dir", "set name"]),
+        (["hydra.run.dir=/tmp/x"], ["hydra.run.dir", "--results"]),
+        (["hydra.verbose=true"], ["hydra.verbose", "no log"]),
+        (["-m", "robot.kr=interval(0,1)"], ["interval(0,1)", "range(0,1,0.1)"]),
+        (["-m", "route=glob(nothing*)"], ["empty range or list"]),
+        (["-m", "--info"], ["--info", "leave out -m"]),
+        (["-m", "--cfg", "job"], ["--cfg", "leave out -m"]),
+    ],
+)
+def test_what_hydra_would_ignore_is_refused(arguments, words):
+    refused(estima("run", *arguments, *QUICK, "seed=0"), *words)
+
+
+def test_globs_choose_options():
+    runs = list(plan.planned(["route=glob(linear_*)", "simulation.physics=kinematic"]))
+    assert [run.choices["route"] for run in runs] == [f"linear_{i}" for i in range(1, 5)]
+
+
 def test_a_missing_value_can_be_given_in_a_sweep(tmp_path):
     runs = list(plan.planned(["study=maximo2024_own", f"data={tmp_path}", "seed=0,1"]))
     assert len(runs) == 2
@@ -336,15 +402,18 @@ def test_files_that_are_not_the_runs_rows(name):
     swept_ = ["run", "-m", *SHORT, "seed=0,1,2", f"name={name}"]
     assert estima(*swept_).returncode == 0
     expected = table_of(name)
-    first, second, third = sorted(folder(name).glob("*.parquet"))
+    first, second, *_ = sorted(folder(name).glob("*.parquet"))
     first.write_bytes(second.read_bytes())
-    pd.DataFrame({"a": [1]}).to_parquet(third)
     again = estima(*swept_)
-    assert "1 of them done before" in again.stderr
+    assert f"{first} does not match its checksum; its runs are done again" in again.stderr
     assert again.returncode == 0, again.stderr
     pd.testing.assert_frame_equal(table_of(name), expected, check_exact=True)
     expected.to_parquet(folder(name) / "all.parquet")
     assert len(table_of(name)) == 3  # each row once
+    (folder(name) / "all.parquet").unlink()
+    os.mkfifo(folder(name) / "rows-fifo.parquet")
+    refused(estima(*swept_), "not a file of rows; remove it")
+    (folder(name) / "rows-fifo.parquet").unlink()
 
 
 @pytest.mark.parametrize("launcher", ["basic", "submitit_local", "ray"])

@@ -10,6 +10,7 @@ from sim.errors import require
 SUITES = {
     "sim": ("recording", "casting"),
     "sweep": ("sweep",),
+    "sweep_scale": ("sweep_scale",),
     "icp": ("icp", "ekf_icp"),
     "fastslam": ("fastslam",),
     "topological": ("topological",),

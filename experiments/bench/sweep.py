@@ -5,19 +5,19 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from estimators.base import run as run_estimator
 from experiments.bench.measure import Measurement, median_time_s, time_s
-from experiments.runs import paths
-from experiments.runs.evaluate import evaluate
+from experiments.runs import paths, store
 from experiments.runs.experiment import Experiment
-from experiments.runs.row import write_rows
 from experiments.runs.seeds import stream
 from experiments.sweeps.launch import run_and_record
+from sim.recording import Recording
 
 _NAME = "bench_sweep"
 _SHORT = ["simulation.physics=kinematic", "simulation.rays=exact", "route=linear_1"]
+_CHEAP = ["world=empty", "route.segments=[[0.2,0.0,1.0]]", "route.rest_s=0"]
 _LONG = [
     "world=room",
     "sensors=lms291",
@@ -35,6 +35,13 @@ def run() -> list[Measurement]:
     try:
         return [
             *_overheads(),
+            Measurement(
+                "sweep.cheapest_run_ms",
+                _cheapest_run_ms(),
+                "ms",
+                8.0,
+                note="odometry, encoder, an empty hall, 1 s, kinematic; recording included",
+            ),
             _speedup(24, None),  # too short to make up for the workers' start-up
             _speedup(200, 1.8),
             Measurement(
@@ -48,7 +55,7 @@ def run() -> list[Measurement]:
 def _overheads() -> list[Measurement]:
     experiment = Experiment.compose([*_SHORT, f"name={_NAME}", "picture=false"])
     recording = experiment.recording()
-    run_and_record(experiment, {experiment.recording_key: recording})
+    _packed_s([experiment], {experiment.recording_key: recording})
     prior, estimator = experiment.prior(recording), experiment.estimator()
     own_s = median_time_s(
         lambda: run_estimator(estimator, recording, prior, stream(0, "bench")),
@@ -57,10 +64,7 @@ def _overheads() -> list[Measurement]:
 
     def packed_s(repeats: int) -> float:
         many = experiment.replaced(repeats=repeats)
-        path = many.rows_folder / f"{many.key}.parquet"
-        return time_s(
-            lambda: write_rows(evaluate(many, lambda: recording), path), clock=time.process_time
-        )
+        return _packed_s([many], {many.recording_key: recording})
 
     def swept_s(n_runs: int) -> float:
         """Wall time of a sweep over values of a belief, the recording being cached."""
@@ -78,6 +82,25 @@ def _overheads() -> list[Measurement]:
         Measurement("sweep.overhead_packed_ms", overhead_ms(packed_s), "ms", 10.0, note=packed),
         Measurement("sweep.overhead_job_ms", overhead_ms(swept_s), "ms", 60.0, note=job),
     ]
+
+
+def _cheapest_run_ms() -> float:
+    """Processor time of a run of the cheapest kind in a job, recording included."""
+    short = Experiment.compose([*_SHORT, *_CHEAP, f"name={_NAME}", "picture=false"])
+    first = time.time_ns() % 10**9  # seeds that the cache does not have
+    runs = [short.replaced(seed=seed, world_seed=seed) for seed in range(first, first + 300)]
+    _packed_s(runs[:20], {})
+    return 1e3 * _packed_s(runs[20:], {}) / len(runs[20:])
+
+
+def _packed_s(runs: Sequence[Experiment], held: dict[str, Recording]) -> float:
+    """Processor time of runs in one job, their rows included."""
+    begun = time.process_time()
+    with store.journal(runs[0].rows_folder / f"bench{store.JOURNAL}") as journal:
+        for experiment in runs:
+            run_and_record(experiment, held, journal)
+    store.compact(journal.path)
+    return time.process_time() - begun
 
 
 def _speedup(n_runs: int, goal: float | None) -> Measurement:

@@ -17,21 +17,30 @@ from experiments.viewing.style import CYCLE, subplots
 from sim.errors import InputError
 
 _WIDE_X, _WIDE_Y = 20.0, 30.0  # an axis that spans more than this factor is logarithmic
+_KINDS = ("choice.world", "choice.estimator", "recording")  # not averaged over unless asked
 # How far the bars of several lines are moved, so that none hides another
 _BESIDE = 0.006  # share of the axis
 _BESIDE_WORD = 0.08  # among words, which are 1 apart
 
 
-def sweep_figure(table: pd.DataFrame, x: str, y: str, by: str | None = None) -> Figure:
+def sweep_figure(
+    table: pd.DataFrame, x: str, y: str, by: str | None = None, *, pool: bool = False
+) -> Figure:
     """Mean of `y` over the recordings, with 95 % intervals, against `x`; one line per `by`.
 
     Repeats over one recording are averaged first: the recording is the unit of inference. On a
     logarithmic axis means and intervals are those of the logarithm.
 
+    Parameters
+    ----------
+    pool
+        Average over different worlds, estimators and logs too, rather than refuse it.
+
     Raises
     ------
     InputError
-        If a column is not in the table, y has no numbers, or no run has both x and y.
+        If a column is not in the table, y has no numbers, no run has both x and y, or a point
+        would pool what differs in kind.
     """
     for column in filter(None, (x, y, by)):
         if column not in table:
@@ -42,6 +51,14 @@ def sweep_figure(table: pd.DataFrame, x: str, y: str, by: str | None = None) -> 
         raise InputError(f"column {y} holds no numbers; there are {', '.join(measured(table))}")
     if table[[x, y]].dropna().empty:
         raise InputError(f"no run has both {x} and {y}")
+    points = table.groupby([x] if by is None else [x, by])
+    for column in () if pool else [kind for kind in _KINDS if kind in table]:
+        if points[column].nunique().max() > 1:
+            there = ", ".join(map(str, sorted(table[column].dropna().unique())[:8]))
+            raise InputError(
+                f"a point would pool different values of {column} ({there}); draw a line for each "
+                f"with --by {column}, keep one with --where {column}=..., or average with --pool"
+            )
     page, ax = subplots(6.5, 4.0)
     scale = COLUMNS[y].scale if y in COLUMNS else "log"
     logarithmic = scale == "log" and _spans(table[y], _WIDE_Y)

@@ -3,15 +3,18 @@
 It holds at most $ESTIMA_CACHE_GIB (8 unless set); the least recently used go first.
 """
 
+import dataclasses
 import fcntl
 import hashlib
 import json
 import os
 import sys
+import time
+import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from experiments.runs import paths
 from experiments.runs.version import SIMULATION, code_version
@@ -19,6 +22,9 @@ from sim.errors import InputError
 from sim.recording import Recording, load, save
 
 _LIMIT_GIB = 8.0
+_TRIMS_PER_LIMIT = 64  # so often is the cache trimmed while as much is written as it holds
+_ABANDONED_S = 3600.0  # what is still half-written then, nobody writes
+_KEY = "cache_key"  # in the configuration that an entry holds
 
 
 def folder() -> Path:
@@ -36,22 +42,40 @@ def cached(key: str, make: Callable[[], Recording]) -> Recording:
     """Recording of the key, from the cache, or made now and cached.
 
     Safe with several processes: the second waits for the first and reads its file. A file that
-    does not match its checksum is dropped and made again.
+    does not match its checksum, or holds the recording of another key, is dropped and made again.
     """
     path = folder() / f"{key}.npz"
+    limit = limit_bytes()
     with _locked(path):
         if path.exists():
             try:
-                recording = load(path)
+                recording = _entry(path, key)
                 os.utime(path)
                 return recording
             except InputError as error:
                 print(f"estima: {error}; making it again", file=sys.stderr)
                 path.unlink(missing_ok=True)
         recording = make()
-        save(recording, path)
-        trim(limit_bytes())
+        entry = dataclasses.replace(recording, config={**recording.config, _KEY: key})
+        save(entry, path, durable=False)
+        size = path.stat().st_size
+    if _draw(key) * limit < size * _TRIMS_PER_LIMIT:
+        trim(limit)
     return recording
+
+
+def _entry(path: Path, key: str) -> Recording:
+    """Read a recording of the cache, which holds its own key, under its checksum."""
+    entry = load(path)
+    if entry.config.get(_KEY) != key:
+        raise InputError(f"{path}: the recording of another key")
+    settings = {name: value for name, value in entry.config.items() if name != _KEY}
+    return dataclasses.replace(entry, config=settings)
+
+
+def _draw(key: str) -> float:
+    """A number from 0 to 1 by a key, so that trimming, which looks at every file, is rare."""
+    return zlib.crc32(key.encode()) / 2**32
 
 
 def limit_bytes() -> float:
@@ -81,19 +105,26 @@ def files() -> list[tuple[Path, int]]:
 def trim(most_bytes: float) -> int:
     """Drop the least recently used recordings until the rest fit; return how many were dropped.
 
-    One that a process is reading or writing right now stays.
+    One that a process is reading or writing right now stays. What a process that was killed left
+    half-written goes too.
     """
+    for part in folder().glob(".*.part*"):
+        with suppress(FileNotFoundError):
+            if time.time() - part.stat().st_mtime > _ABANDONED_S:
+                part.unlink()
     kept, dropped = files(), 0
     excess = sum(size for _, size in kept) - most_bytes
     for path, size in kept:
         if excess <= 0.0:
             break
-        with path.with_suffix(".lock").open("w") as handle:
+        lock = path.with_suffix(".lock")
+        with lock.open("w") as handle:
             try:
                 fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 continue
             path.unlink(missing_ok=True)
+            lock.unlink(missing_ok=True)
         excess -= size
         dropped += 1
     return dropped
@@ -101,15 +132,31 @@ def trim(most_bytes: float) -> int:
 
 @contextmanager
 def _locked(path: Path) -> Iterator[None]:
-    """Hold an exclusive lock, which the system frees even if the process is killed."""
+    """Hold an exclusive lock, which the system frees even if the process is killed.
+
+    Its file goes with the lock; who waited for one that is gone takes the next.
+    """
+    lock = path.with_suffix(".lock")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle = path.with_suffix(".lock").open("w")
+        handle = _held(lock)
     except OSError as error:
         raise InputError(
             f"{path}: cannot write to the cache ({error.strerror}); free some space, or choose "
             "another folder of results with ESTIMA_RESULTS"
         ) from error
     with handle:
+        try:
+            yield
+        finally:
+            lock.unlink(missing_ok=True)
+
+
+def _held(lock: Path) -> TextIO:
+    while True:
+        handle = lock.open("w")
         fcntl.flock(handle, fcntl.LOCK_EX)
-        yield
+        with suppress(FileNotFoundError):
+            if os.path.samestat(os.fstat(handle.fileno()), lock.stat()):
+                return handle
+        handle.close()

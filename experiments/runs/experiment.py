@@ -8,7 +8,7 @@ import json
 import math
 import re
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -40,7 +40,7 @@ from sim.world import World
 Config = dict[str, Any]
 GROUPS = ("world", "robot", "sensors", "route", "estimator")
 _MAPPINGS = (*GROUPS, "simulation", "prior")
-_SIMULATED_KEYS = ("world", "robot", "sensors", "route", "simulation", "seed", "world_seed")
+SIMULATED_KEYS = ("world", "robot", "sensors", "route", "simulation", "seed", "world_seed")
 _KEYS = (
     *_MAPPINGS,
     *("seed", "world_seed", "repeats", "recording", "name", "picture", "keep"),
@@ -49,6 +49,7 @@ _KEYS = (
     *("prior.wheel_radius_m", "prior.track_m", "prior.map"),
 )
 _NOT_IN_KEY = ("name", "picture", "recording")
+_READ_OF_HYDRA = ("hydra/launcher", "hydra.launcher", "hydra.sweeper.params", "hydra.searchpath")
 _PHYSICS = ("bullet", "kinematic")
 _RAYS = ("bullet", "exact")
 
@@ -173,11 +174,16 @@ class Experiment:
 
     @property
     def key(self) -> str:
-        """Digest of what decides the rows: configuration, recording, map, code."""
+        """Digest of what decides the rows: configuration, recording, map, code.
+
+        It is the sum of a digest for each leaf, and one of files and code, modulo 2^64. So the
+        keys of a product of values are sums too, and a sweep of a million runs knows them at once.
+        """
         settings = {key: value for key, value in self.config.items() if key not in _NOT_IN_KEY}
         known_map = files_digest(self.config["prior"].get("map"))
-        parts = [settings, self._recording_settings(), known_map, self._code_version()]
-        return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
+        total = leaf_digest((), [self._recording_sources(), known_map, self._code_version()])
+        total += sum(leaf_digest(leaf, value) for leaf, value in _leaves(settings))
+        return f"{total % 2**64:016x}"
 
     @property
     def recording_key(self) -> str:
@@ -210,7 +216,7 @@ class Experiment:
         made = any(isinstance(place, dict) and "_target_" in place for place in places)
         if self.config["recording"] is None or made:
             return self.config
-        unused = set(_SIMULATED_KEYS) - {"seed"}
+        unused = set(SIMULATED_KEYS) - {"seed"}
         return {key: value for key, value in self.config.items() if key not in unused}
 
     def _code_version(self) -> str:
@@ -377,7 +383,7 @@ class Experiment:
             streams or {axis: stream(self.config["seed"], axis) for axis in ("slip", "sensors")},
             physics=self.config["simulation"]["physics"],
             rays=self.config["simulation"]["rays"],
-            config={key: self.config[key] for key in _SIMULATED_KEYS},
+            config={key: self.config[key] for key in SIMULATED_KEYS},
             on_progress=on_progress,
             onboard=self._onboard,
         )
@@ -447,24 +453,34 @@ class Experiment:
                     file=sys.stderr,
                 )
 
+    def _simulated(self) -> Config:
+        """Settings of the recording that would be simulated."""
+        return {key: self.config[key] for key in SIMULATED_KEYS}
+
     def _recording_settings(self) -> Config:
+        """What decides the recording."""
+        made = {} if isinstance(self.config["recording"], str) else self._simulated()
+        return {**made, **self._recording_sources()}
+
+    def _recording_sources(self) -> Config:
+        """Files and code that decide the recording, beside the simulation's settings."""
         wanted = self.config["recording"]
-        settings = {key: self.config[key] for key in _SIMULATED_KEYS}
         if isinstance(wanted, dict):  # its function may read all of the settings
-            return {**settings, "recording": wanted, "files": files_digest(wanted)}
+            return {"recording": wanted, "files": files_digest(wanted)}
         if wanted is not None:
             return {"recording": _digest(Path(wanted))}
+        sources: Config = {}
         world_file = self.config["world"].get("path")
         if world_file is not None and Path(world_file).is_file():  # an edited file: another world
-            settings["world_file"] = _digest(Path(world_file))
+            sources["world_file"] = _digest(Path(world_file))
             if (image := grid_file.image_of(Path(world_file))) is not None:
-                settings["world_image"] = _digest(image)
-        elsewhere = {target: source_digest(target) for target in sorted(targets(settings))}
+                sources["world_image"] = _digest(image)
+        elsewhere = {target: source_digest(target) for target in sorted(targets(self._simulated()))}
         if any(elsewhere.values()):  # a sensor, route or world of one's own, edited: another one
-            settings["sources"] = elsewhere
+            sources["sources"] = elsewhere
         if any(target.startswith("estimators.") for target in elsewhere):  # one on board
-            settings["code"] = code_version()
-        return settings
+            sources["code"] = code_version()
+        return sources
 
     def prior(self, recording: Recording) -> Prior:
         """Return what the estimator knows at the start."""
@@ -567,6 +583,28 @@ def check_added(hydra: Any) -> None:
             _check_known(override.key_or_group.partition(".")[0])
 
 
+def check_hydra(overrides: Sequence[str]) -> None:
+    """Check that no override is one of Hydra's own settings that nothing here reads.
+
+    Raises
+    ------
+    InputError
+        Naming what to do instead.
+    """
+    for override in overrides:
+        key = override.lstrip("+~").partition("=")[0]
+        if re.match(r"hydra\b", key) is None or key.startswith(_READ_OF_HYDRA):
+            continue
+        remedies = {
+            "hydra/sweeper": "-m runs every combination of the values; an optimizer may call "
+            "estima.sweep from Python",
+            "hydra.verbose": "there is no log; a failed run's row says how",
+        }
+        usual = "rows go to results/runs/NAME: set name, or --results for another folder"
+        remedy = next((remedies[start] for start in remedies if key.startswith(start)), usual)
+        raise InputError(f"{override}: {key} has no effect here; {remedy}")
+
+
 def check_overrides(overrides: Sequence[str]) -> None:
     """Check what Hydra itself does not: that each override has a key, and groups have names.
 
@@ -624,6 +662,30 @@ def _digest(path: Path) -> str:
         return hashlib.sha256(path.read_bytes()).hexdigest()
     except OSError as error:
         raise InputError(f"{path}: cannot read it ({error.strerror})") from error
+
+
+def leaf_digest(leaf: tuple[str, ...], value: Any) -> int:
+    """Return 64 bits of a digest of a plain value and its place in the configuration."""
+    return next(leaf_digests(leaf, [value]))
+
+
+def leaf_digests(leaf: tuple[str, ...], values: Iterable[Any]) -> Iterator[int]:
+    """Give the digest of each of many values of one leaf."""
+    place = hashlib.blake2b(json.dumps(leaf).encode(), digest_size=8)
+    for value in values:
+        nested = isinstance(value, (list, dict))
+        digest = place.copy()
+        digest.update((json.dumps(value, sort_keys=True) if nested else json.dumps(value)).encode())
+        yield int.from_bytes(digest.digest())
+
+
+def _leaves(tree: Mapping[str, Any], above: tuple[str, ...] = ()) -> Iterator[tuple[Any, Any]]:
+    """Every place of a configuration that holds no keys, and its value."""
+    for name, value in tree.items():
+        if isinstance(value, dict) and value:
+            yield from _leaves(value, (*above, name))
+        else:
+            yield (*above, name), value
 
 
 def _flat(tree: Mapping[str, Any], prefix: str = "") -> Row:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
-from collections.abc import Sequence
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from experiments.runs.columns import ORIGIN, STATUS
 from sim.errors import InputError
@@ -15,9 +18,12 @@ from sim.files import write_whole
 
 if TYPE_CHECKING:
     import pandas as pd
+    import pyarrow as pa
 
 Row = dict[str, str | int | float | bool | None]
 _TEXTS = (*STATUS, *ORIGIN)
+WITH_DIGEST = re.compile(r".+\.([0-9a-f]{16})\.parquet")
+_NONE = type(None)
 
 
 class Outcome(StrEnum):
@@ -132,34 +138,124 @@ def read_rows(path: Path, remedy: str = "") -> pd.DataFrame:
         If there is none, or a file cannot be read.
     """
     import pandas as pd
-    import pyarrow.parquet as pq
 
     files = [path]
     if path.is_dir():  # a killed process may have left a hidden file that it was writing
         files = sorted(file for file in path.glob("*.parquet") if file.name[0] != ".")
     if not files or not path.exists():
         raise InputError(f"{path}: no results here; run the study first")
-    frames = []
-    for file in files:
-        try:
-            if file.suffix == ".csv":  # a digest such as 12e4567 is not a number
-                texts = dict.fromkeys(_TEXTS, "str")
-                frames.append(pd.read_csv(file, dtype=texts, index_col=False))
-            else:  # one thread: Arrow's own, started for a small file, can crash at exit
-                read = pq.ParquetFile(file).read(use_threads=False)
-                frames.append(read.to_pandas(use_threads=False))
-        except (OSError, ValueError) as error:
-            ours = file.suffix == ".parquet" and file.parent.parent.name == "runs"
-            usual = "delete it and run again" if ours else "a table is a .parquet or .csv file"
-            why = (str(error).splitlines() or [""])[0]
-            raise InputError(
-                f"{file}: cannot read this table ({why}); {remedy or usual}"
-            ) from error
-    table = pd.concat(frames, ignore_index=True)[_merged([list(f.columns) for f in frames])]
-    for column in filter(lambda name: pd.api.types.is_object_dtype(table[name]), table):
-        if len({isinstance(value, str) for value in table[column].dropna()}) > 1:  # one type
-            table[column] = table[column].map(str, na_action="ignore")
-    return table
+    if path.is_dir():
+        return joined([read_parquet(file, remedy=remedy) for file in files])
+    if path.suffix != ".csv":
+        return read_parquet(path, remedy=remedy).to_pandas(use_threads=False)
+    with _reading(path, remedy):
+        texts = dict.fromkeys(_TEXTS, "str")  # a digest such as 12e4567 is not a number
+        return pd.read_csv(path, dtype=texts, index_col=False)
+
+
+def read_parquet(path: Path, columns: list[str] | None = None, *, remedy: str = "") -> pa.Table:
+    """Read a Parquet file; where its name holds the digest of its bytes, they must match.
+
+    Parameters
+    ----------
+    columns
+        Those to read, where they are there; by default all.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read, or is not what was written.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    with _reading(path, remedy):
+        if path.exists() and not path.is_file():
+            raise ValueError("not a file")  # a FIFO would wait for ever
+        content = path.read_bytes()
+        named = WITH_DIGEST.fullmatch(path.name)
+        if named and hashlib.sha256(content).hexdigest()[:16] != named[1]:
+            raise ValueError("it does not match its checksum")
+        # one thread: Arrow's own, started for a small file, can crash at exit
+        return pq.ParquetFile(pa.BufferReader(content)).read(columns=columns, use_threads=False)
+
+
+@contextmanager
+def _reading(path: Path, remedy: str) -> Iterator[None]:
+    """Turn an error of reading into one line."""
+    try:
+        yield
+    except (OSError, ValueError) as error:
+        ours = path.suffix == ".parquet" and path.parent.parent.name == "runs"
+        usual = "delete it and run again" if ours else "a table is a .parquet or .csv file"
+        why = (str(error).splitlines() or [""])[0]
+        raise InputError(f"{path}: cannot read this table ({why}); {remedy or usual}") from error
+
+
+def as_tables(rows: Iterable[Row]) -> list[pa.Table]:
+    """Rows as tables, each of rows with the same columns and types.
+
+    So what a table of all of them looks like does not depend on which rows were written together.
+    """
+    import pyarrow as pa
+
+    types = {str: pa.string(), bool: pa.bool_(), int: pa.int64(), float: pa.float64()}
+    groups: dict[tuple[tuple[str, type], ...], list[list[Any]]] = {}
+    for row in rows:
+        schema = tuple((name, type(value)) for name, value in row.items())
+        columns = groups.setdefault(schema, [[] for _ in schema])
+        for column, value in zip(columns, row.values(), strict=True):
+            column.append(value)
+    return [
+        pa.table(
+            {
+                name: pa.array(column, types.get(kind, pa.null() if kind is _NONE else None))
+                for (name, kind), column in zip(schema, columns, strict=True)
+            }
+        )
+        for schema, columns in groups.items()
+    ]
+
+
+def joined(tables: Sequence[pa.Table]) -> pd.DataFrame:
+    """One table of all rows; a column that some tables lack is empty there.
+
+    A column that mixes numbers, text or booleans becomes text.
+    """
+    import pyarrow as pa
+
+    columns = {}
+    for name in _merged(sorted({tuple(table.column_names) for table in tables})):
+        parts = [table[name] if name in table.column_names else None for table in tables]
+        kind = _common({part.type for part in parts if part is not None})
+        chunks = [
+            chunk
+            for part, table in zip(parts, tables, strict=True)
+            for chunk in ([pa.nulls(len(table), kind)] if part is None else _cast(part, kind))
+        ]
+        columns[name] = pa.chunked_array(chunks, kind)
+    return pa.table(columns).to_pandas(use_threads=False, split_blocks=True, self_destruct=True)
+
+
+def _common(kinds: set[pa.DataType]) -> pa.DataType:
+    """The type of a column whose parts have these types."""
+    import pyarrow as pa
+
+    known = {kind for kind in kinds if not pa.types.is_null(kind)}
+    if len(known) <= 1:
+        return next(iter(known), pa.null())
+    if all(pa.types.is_integer(kind) or pa.types.is_floating(kind) for kind in known):
+        return pa.float64()
+    return pa.string()
+
+
+def _cast(part: pa.ChunkedArray, kind: pa.DataType) -> list[pa.Array]:
+    """Chunks of a column as another type; texts are those that Python writes."""
+    import pyarrow as pa
+
+    if part.type == kind or not pa.types.is_string(kind) or pa.types.is_null(part.type):
+        return list((part if part.type == kind else part.cast(kind)).chunks)
+    return [pa.array([None if v is None else str(v) for v in part.to_pylist()], kind)]
 
 
 def _merged(orders: Sequence[Sequence[str]]) -> list[str]:
@@ -168,7 +264,7 @@ def _merged(orders: Sequence[Sequence[str]]) -> list[str]:
     So settings stay before results, even those that only some of the tables have.
     """
     merged: list[str] = []
-    for order in dict.fromkeys(map(tuple, orders)):
+    for order in orders:
         place = 0
         for name in order:
             if name not in merged:

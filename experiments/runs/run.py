@@ -1,4 +1,4 @@
-"""The Hydra application: a configuration's rows, in results/runs/NAME/KEY.parquet."""
+"""The Hydra application: a configuration's rows, in results/runs/NAME/KEY.DIGEST.parquet."""
 
 import sys
 import traceback
@@ -15,8 +15,9 @@ from experiments.runs import paths
 from experiments.runs.columns import COLUMNS
 from experiments.runs.console import RunFailedError, end, progress
 from experiments.runs.evaluate import evaluate
-from experiments.runs.experiment import Experiment, check_added, check_overrides
-from experiments.runs.row import Outcome, Row, write_rows
+from experiments.runs.experiment import Experiment, check_added, check_hydra, check_overrides
+from experiments.runs.row import Outcome, Row
+from experiments.runs.store import write_run
 from sim.errors import InputError
 from sim.recording import Recording
 
@@ -37,7 +38,6 @@ def run_once(experiment: Experiment, draw: Draw) -> list[Row]:
         If a run failed; its row says how.
     """
     folder, name = experiment.rows_folder / experiment.key, experiment.estimator_name
-    path = folder.with_suffix(".parquet")
 
     def fetch() -> Recording:
         with progress("simulated seconds") as on_progress:
@@ -54,7 +54,7 @@ def run_once(experiment: Experiment, draw: Draw) -> list[Row]:
         on_estimate=keep,
         on_error=traceback.print_exception,
     )
-    write_rows(rows, path)
+    path = write_run(rows, folder.parent)
     _print(rows, [file for file in (path, folder / "run.png") if file.exists()])
     for row in rows:
         if row["status"] == Outcome.FAILED:
@@ -80,13 +80,13 @@ def application(arguments: Sequence[str], draw: Draw) -> None:
             end(error)  # here, since Hydra would add a line of its own
 
     before = ["", *arguments]  # neither an option nor its value, which may hold a = too
-    check_overrides(
-        [
-            argument
-            for option, argument in zip(before, arguments, strict=False)
-            if "=" in argument and not argument.startswith("-") and not option.startswith("-")
-        ]
-    )
+    overrides = [
+        argument
+        for option, argument in zip(before, arguments, strict=False)
+        if "=" in argument and not argument.startswith("-") and not option.startswith("-")
+    ]
+    check_hydra(overrides)
+    check_overrides(overrides)
     sys.argv = ["estima run", *arguments]
     hydra.main(version_base="1.3", config_path=str(paths.CONF), config_name="config")(run)()
 

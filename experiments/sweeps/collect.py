@@ -11,7 +11,8 @@ import pandas as pd
 
 from experiments.runs.columns import ORIGIN, REPEAT, is_setting
 from experiments.runs.paths import results
-from experiments.runs.row import Outcome, read_rows
+from experiments.runs.row import Outcome
+from experiments.runs.store import read_runs
 from experiments.runs.version import code_version, version_with
 from sim.errors import InputError
 
@@ -52,14 +53,10 @@ def collect(name: str, *, all_versions: bool = False, times: bool = False) -> pd
     if path is None:
         there = sorted(p.name for p in runs.glob("*") if p.is_dir())
         raise InputError(f"no sweep named {name}; there are: {', '.join(there) or 'none'}")
-    table = read_rows(path)
+    table = read_runs(path)
     for column in ("status", REPEAT, *ORIGIN):
         if column not in table:
             raise InputError(f"{path}: not rows of runs, column {column} is missing")
-    duplicate = table.duplicated(["run_key", REPEAT])
-    if duplicate.any():
-        print(f"{path}: dropped {duplicate.sum()} duplicate rows", file=sys.stderr)
-        table = table[~duplicate]
     if not all_versions:
         mine = _of_this_code(table)
         if not mine.any():

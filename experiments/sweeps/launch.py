@@ -1,9 +1,10 @@
 """Many runs: skip what is done, and start the rest with Hydra's launcher.
 
-The runs are composed once, here, and packed into jobs; each job reads its share of the plan. So
+The runs are planned once, here, and packed into jobs; each job reads its own share of the plan. So
 workers compose nothing, and any of Hydra's launchers will do.
 """
 
+import hashlib
 import importlib.util
 import json
 import os
@@ -16,17 +17,19 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import hydra
+import numpy as np
 from omegaconf import DictConfig
 
-from experiments.runs import paths
+from experiments.runs import paths, store
 from experiments.runs.console import RunFailedError, progress
 from experiments.runs.evaluate import evaluate
-from experiments.runs.experiment import Experiment
-from experiments.runs.row import Outcome, Status, read_rows, write_rows
-from experiments.sweeps.plan import packed, planned
+from experiments.runs.experiment import Experiment, check_hydra
+from experiments.runs.row import Outcome, Row, Status, check_row
+from experiments.sweeps.plan import Family, Numbers, Plan, packed, plan_of
 from sim.errors import InputError
 from sim.files import write_whole
 from sim.recording import Recording
@@ -71,96 +74,158 @@ def sweep(arguments: Sequence[str], config_dir: str | None = None) -> None:
     RunFailedError
         If a run failed; all others are done, and the rows of the failed ones say how.
     """
+    check_hydra(arguments)
     launching = [a for a in arguments if a.lstrip("+~").startswith(_LAUNCHING)]
     _require_launcher(launching)
     own = [a for a in arguments if a not in launching]
-    every = list(planned(own, config_dir))
-    if not every:
+    plan = plan_of(own, config_dir)
+    if not len(plan.keys):
         raise InputError(f"no runs: a value of {' '.join(own)} is an empty range or list")
-    folders = {run.rows_folder for run in every}
-    if len(folders) > 1:
-        raise InputError("name is the folder of all the rows; a sweep has one, not several")
-    folder = folders.pop()
-    runs = list({run.key: run for run in every}.values())
-    missing = [run for run in runs if _failure(folder, run.key) is not None]
-    for run in missing:
-        run.check()
+    plan = plan.called(_name(plan, own, config_dir))
+    folder = plan.experiment(0).rows_folder
+    if not folder.is_dir() and folder.exists():
+        raise InputError(f"{folder}: not a folder; remove it, or choose another name")
+    _clear_plans(folder)
+    store.tidy(folder, lambda journal: _plan_of(folder, journal).exists())
+    keys, first = np.unique(plan.keys, return_index=True)
+    done = np.isin(keys, store.ended(folder, damaged=_drop).done)
+    runs = np.sort(first[~done])
+    check(plan, runs)
     print(
-        f"{len(runs)} run{'s' if len(runs) > 1 else ''}, {len(runs) - len(missing)} of them done "
+        f"{len(keys)} run{'s' if len(keys) > 1 else ''}, {done.sum()} of them done "
         f"before: {paths.short(folder)}",
         file=sys.stderr,
     )
-    if missing:
-        _launch_all(missing, folder, launching)
-    bad = [failure for run in runs if (failure := _failure(folder, run.key)) is not None]
-    if bad:
-        raise RunFailedError(f"{len(bad)} of {len(runs)} runs; first: {bad[0]}")
+    if not len(runs):
+        return
+    _launch_all(plan, runs, folder, launching)
+    store.tidy(folder, lambda journal: _plan_of(folder, journal).exists())
+    found = store.ended(folder)
+    bad = runs[~np.isin(plan.keys[runs], found.done)]
+    if len(bad):
+        why = found.failed.get(int(plan.keys[bad[0]]), "no row was written")
+        raise RunFailedError(f"{len(bad)} of {len(keys)} runs; first: {why}")
 
 
-def _failure(folder: Path, key: str) -> str | None:
-    """Return how a run failed, or that it has no rows yet; None if it is done."""
-    path = folder / f"{key}.parquet"
-    if not path.exists():
-        return "no row was written"
-    try:
-        rows = read_rows(path)
-    except InputError as error:
-        return str(error)
-    if not {"status", "run_key"} <= set(rows) or (rows["run_key"] != key).any():
-        return f"{path} holds other rows; delete it and run again"
-    failed = rows[rows["status"] == Outcome.FAILED]
-    if failed.empty:
+def _name(plan: Plan, own: Sequence[str], config_dir: str | None) -> str | None:
+    """A sweep's own name where none is given: a digest of its overrides; else None.
+
+    So the same command goes on where it stopped, and two sweeps do not pool their rows.
+    """
+    given = any(argument.lstrip("+").startswith("name=") for argument in own)
+    if given or plan.experiment(0).config["name"] != _UNNAMED:
         return None
-    return f"{failed['status_code'].iloc[0]}: {failed['status_detail'].iloc[0]}"
+    text = json.dumps([sorted(own), config_dir and str(Path(config_dir).resolve())])
+    return f"sweep_{hashlib.sha256(text.encode()).hexdigest()[:8]}"
 
 
-def _launch_all(runs: Sequence[Experiment], folder: Path, launching: Sequence[str]) -> None:
+def check(plan: Plan, runs: Numbers) -> None:
+    """Check runs before the first begins: all of a small family, and those along each axis."""
+    wanted = {(f, n) for f in np.unique(plan.family[runs]) for n in plan.families[f].spread()}
+    for i in runs if len(runs) <= len(wanted) else ():
+        plan.experiment(i).check()
+    for f, n in sorted(wanted) if len(runs) > len(wanted) else ():
+        plan.families[f].experiment(n).check()
+
+
+def _drop(path: Path, error: InputError) -> None:
+    """Remove a damaged file of rows, so that its runs are done again; not one of other names."""
+    if not store.is_own(path):
+        raise error
+    print(f"estima: {path} does not match its checksum; its runs are done again", file=sys.stderr)
+    path.unlink(missing_ok=True)
+
+
+@dataclass
+class Jobs:
+    """The jobs of a sweep, and their files.
+
+    Attributes
+    ----------
+    folder
+        Folder of the rows.
+    name
+        What the plan and the journals of this sweep are called; sorted as they begin.
+    sizes
+        Number of runs of each job, by its journal.
+    """
+
+    folder: Path
+    name: str = field(
+        default_factory=lambda: f"{time.time_ns():016x}-{os.getpid()}-{secrets.token_hex(3)}"
+    )
+    sizes: dict[Path, int] = field(default_factory=dict)
+
+    @property
+    def plan(self) -> Path:
+        """File that is there while the sweep runs."""
+        return self.folder / f"plan-{self.name}.json"
+
+    def add(self, plan: Plan, runs: Numbers) -> str:
+        """Write a job's share of the plan; return its number."""
+        number = len(self.sizes)
+        journal = self.folder / f"rows-{self.name}-{number}{store.JOURNAL}"
+        self.sizes[journal] = len(runs)
+        share = {
+            "planner": [platform.node(), os.getpid()],
+            "places": [os.getcwd(), str(paths.results())],
+            "journal": str(journal),
+            "families": plan.as_json(runs),
+        }
+        with write_whole(share_of(self.plan, number)) as part:
+            part.write_text(json.dumps(share))
+        return str(number)
+
+
+def share_of(plan: str | Path, job: int) -> Path:
+    """File of a job's share of the plan."""
+    return Path(f"{plan}.jobs") / f"share-{job}.json"
+
+
+def _plan_of(folder: Path, journal: str) -> Path:
+    """The plan that a journal belongs to."""
+    return folder / f"plan-{journal.removeprefix('rows-').rpartition('-')[0]}.json"
+
+
+def _launch_all(plan: Plan, runs: Numbers, folder: Path, launching: Sequence[str]) -> None:
     """Start the runs; find those at which a worker died, and go on with the rest."""
-    for run in runs:  # rows of an earlier failure, and files that are no rows
-        path = folder / f"{run.key}.parquet"
-        if path.is_dir():
-            raise InputError(f"{path}: a folder in place of a table; remove it")
-        if _failure(folder, run.key) is not None:
-            path.unlink(missing_ok=True)
-        path.with_suffix(".failed").unlink(missing_ok=True)
-        _begun(folder, run.key).unlink(missing_ok=True)
-    _clear_plans(folder)
-    with _watched(folder, {run.key for run in runs}):
-        left = list(runs)
-        while left:
-            died = _launch(left, folder, launching)
-            if died is None:
-                return
-            begun = [run for run in left if _begun(folder, run.key).exists()]
-            if not begun:
-                raise died
-            for run in begun:  # which of them was it?
-                if _launch([run], folder, [*launching, "hydra.launcher.n_jobs=2"]) is not None:
-                    _record_failure(run, _DIED)
-                _begun(folder, run.key).unlink(missing_ok=True)
-            left = [run for run in left if not (folder / f"{run.key}.parquet").exists()]
+    jobs = Jobs(folder)
+    with write_whole(jobs.plan) as part:
+        part.write_text(json.dumps({"planner": [platform.node(), os.getpid()]}))
+    try:
+        with _watched(jobs, len(runs)):
+            left = runs
+            while len(left):
+                died = _launch(plan, left, jobs, launching)
+                if died is None:
+                    return
+                begun = store.begun(folder, f"rows-{jobs.name}")
+                if not begun:
+                    raise died
+                for i in left[np.isin(plan.keys[left], np.array(list(begun), np.uint64))]:
+                    one = np.array([i])  # which of them was it?
+                    if _launch(plan, one, jobs, [*launching, "hydra.launcher.n_jobs=2"]):
+                        _record_death(plan.experiment(i), jobs)
+                over = store.ended(folder, f"rows-{jobs.name}")
+                keys = np.array([*over.done, *over.failed], np.uint64)
+                left = left[~np.isin(plan.keys[left], keys)]
+    finally:
+        _remove(jobs.plan)
 
 
-def _launch(runs: Sequence[Experiment], folder: Path, launching: Sequence[str]) -> Exception | None:
-    """Write the plan and start its jobs; return the error if a process of joblib's has died."""
+def _launch(plan: Plan, runs: Numbers, jobs: Jobs, launching: Sequence[str]) -> Exception | None:
+    """Write the shares and start their jobs; return the error if a process of joblib's has died."""
     from joblib.externals.loky.process_executor import TerminatedWorkerError
 
-    jobs = packed(runs, _JOBS_PER_WORKER * (os.cpu_count() or 1))
-    plan = folder / f"plan-{os.getpid()}-{secrets.token_hex(3)}.json"
-    content = {
-        "planner": [platform.node(), os.getpid()],
-        "places": [os.getcwd(), str(paths.results())],
-        "jobs": [[[r.config, r.choices] for r in job] for job in jobs],
-    }
-    with write_whole(plan) as part:
-        part.write_text(json.dumps(content))
+    parts = packed(plan.recordings[runs], _JOBS_PER_WORKER * (os.cpu_count() or 1))
+    numbers = [jobs.add(plan, runs[part]) for part in parts]
     arguments = sys.argv
     sys.argv = [
         "estima run",
         "-m",
         *launching,
-        f"plan={paths.quoted(plan)}",
-        f"job={','.join(str(number) for number in range(len(jobs)))}",
+        f"plan={paths.quoted(jobs.plan)}",
+        f"job={','.join(numbers)}",
     ]
     try:
         job_application()
@@ -169,7 +234,6 @@ def _launch(runs: Sequence[Experiment], folder: Path, launching: Sequence[str]) 
         return died
     finally:
         sys.argv = arguments
-        _remove(plan)
     return None
 
 
@@ -179,23 +243,31 @@ def _remove(plan: Path) -> None:
 
 
 def _clear_plans(folder: Path) -> None:
-    """Remove the plans of sweeps on this machine that were killed."""
+    """Remove the plans of sweeps on this machine that were killed, and what they were writing."""
     for plan in folder.glob("plan-*.json"):
         try:
             node, planner = json.loads(plan.read_text())["planner"]
-            if node == platform.node():
-                os.kill(planner, 0)  # is it there?
-        except ProcessLookupError:
-            _remove(plan)
+            if node != platform.node() or _is_there(planner):
+                continue
         except (OSError, ValueError, KeyError, TypeError):
             continue
+        _remove(plan)
+        for part in folder.glob(f".rows-{plan.stem.removeprefix('plan-')}*.part*"):
+            part.unlink(missing_ok=True)
 
 
-def _begun(folder: Path, key: str) -> Path:
-    """File that marks a run as being computed."""
-    return folder / f"{key}.begun"
+def _is_there(process: int) -> bool:
+    """Whether a process of this machine lives."""
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:  # another user's
+        return True
+    return True
 
 
+_UNNAMED = "run"  # the default of conf/config.yaml
 _LAUNCHING = ("hydra/launcher", "hydra.launcher")
 _EXTRAS = {"submitit": "slurm", "ray": "ray"}
 
@@ -216,19 +288,26 @@ def _require_launcher(launching: Sequence[str]) -> None:
 @hydra.main(version_base="1.3", config_path=str(paths.CONF), config_name="job")
 def job_application(cfg: DictConfig) -> None:
     """Run one job's share of the plan; a run that fails leaves its row, and the next follows."""
-    plan = json.loads(Path(cfg.plan).read_text())
-    _end_with(*plan["planner"])
-    if os.getpid() != plan["planner"][1]:  # joblib's workers stay, as they were, for later sweeps
-        folder, os.environ["ESTIMA_RESULTS"] = plan["places"]
+    share = json.loads(share_of(cfg.plan, cfg.job).read_text())
+    _end_with(*share["planner"])
+    if os.getpid() != share["planner"][1]:  # joblib's workers stay, as they were, for later sweeps
+        folder, os.environ["ESTIMA_RESULTS"] = share["places"]
         os.chdir(folder)
     held: dict[str, Recording] = {}
-    for config, choices in plan["jobs"][cfg.job]:
-        run_and_record(Experiment(config, choices), held)
+    with store.journal(Path(share["journal"])) as journal:
+        for family in share["families"]:
+            for experiment in Family.experiments(family):
+                run_and_record(experiment, held, journal)
+    store.compact(journal.path)
 
 
 def _end_with(node: str, planner: int) -> None:
     """End this process when the planner is killed, if the planner started it."""
-    if platform.node() != node or os.getppid() != planner or os.getpid() == planner:
+    if platform.node() != node or os.getpid() == planner:
+        return
+    if os.getppid() != planner:  # started by a launcher's own processes, or left behind just now
+        if not _is_there(planner):
+            os._exit(1)
         return
 
     def watch() -> None:
@@ -240,28 +319,26 @@ def _end_with(node: str, planner: int) -> None:
         threading.Thread(target=watch, name="planner", daemon=True).start()
 
 
-def run_and_record(experiment: Experiment, held: dict[str, Recording]) -> None:
+def run_and_record(
+    experiment: Experiment, held: dict[str, Recording], journal: store.Journal
+) -> None:
     """Run one experiment; what goes wrong becomes the status of its row.
 
     Parameters
     ----------
     held
         The last recording by its key; most runs of a job share it.
+    journal
+        Takes the rows.
     """
-    key = experiment.key
-    path = experiment.rows_folder / f"{key}.parquet"
-    mark = _begun(path.parent, key)
-    with write_whole(mark) as part:
-        part.touch()
+    journal.begin(experiment.key)
     try:
         rows = evaluate(experiment, lambda: _held(experiment, held))
-        write_rows(rows, path)
-        if any(row["status"] == Outcome.FAILED for row in rows):  # for those who watch
-            path.with_suffix(".failed").touch()
+        for row in rows:
+            check_row(row)
     except (Exception, SystemExit) as error:
-        _record_failure(experiment, Status.of_error(error))
-    finally:
-        mark.unlink(missing_ok=True)
+        rows = [_failure(experiment, Status.of_error(error))]
+    journal.append(rows)
 
 
 def _held(experiment: Experiment, held: dict[str, Recording]) -> Recording:
@@ -272,32 +349,38 @@ def _held(experiment: Experiment, held: dict[str, Recording]) -> Recording:
     return held[key]
 
 
-_DIED = Status(Outcome.FAILED, "died", "its process died (out of memory?)")
+def _failure(experiment: Experiment, status: Status) -> Row:
+    """Row of a run that left none itself."""
+    return {**experiment.labels(""), **status.columns()}
 
 
-def _record_failure(experiment: Experiment, status: Status) -> None:
-    """Leave a row that says how the run failed, unless it has left one itself."""
-    path = experiment.rows_folder / f"{experiment.key}.parquet"
-    if not path.exists():
-        write_rows([{**experiment.labels(""), **status.columns()}], path)
-    path.with_suffix(".failed").touch()
+def _record_death(experiment: Experiment, jobs: Jobs) -> None:
+    """Leave the row of a run whose process died."""
+    status = Status(Outcome.FAILED, "died", "its process died (out of memory?)")
+    path = jobs.folder / f"rows-{jobs.name}-{experiment.key}{store.JOURNAL}"
+    with store.journal(path) as journal:
+        journal.append([_failure(experiment, status)])
 
 
 @contextmanager
-def _watched(folder: Path, keys: set[str]) -> Iterator[None]:
+def _watched(jobs: Jobs, n_runs: int) -> Iterator[None]:
     """Show how many runs are done and failed, at what rate, and the time that remains."""
     ended = threading.Event()
 
-    def count(suffix: str) -> int:
-        return len({path.stem for path in folder.glob(f"*.{suffix}")} & keys)
-
     def watch() -> None:
-        with progress("", len(keys), "runs", summary=True) as on_progress:
+        counts: dict[Path, tuple[int, int, int]] = {}
+        with progress("", n_runs, "runs", summary=True) as on_progress:
             over = False
             while not over:
                 over = ended.wait(0.5)
-                if done := count("parquet"):
-                    on_progress(done, count("failed"))
+                for journal in list(jobs.sizes):
+                    counts[journal] = _counted(journal, jobs.sizes[journal], counts.get(journal))
+                done, failed = (sum(count[i] for count in counts.values()) for i in (1, 2))
+                if over:
+                    found = store.ended(jobs.folder, f"rows-{jobs.name}", lambda *_: None)
+                    done, failed = len(found.done) + len(found.failed), len(found.failed)
+                if done:
+                    on_progress(min(done, n_runs), failed)
 
     thread = threading.Thread(target=watch, daemon=True)
     thread.start()
@@ -306,3 +389,26 @@ def _watched(folder: Path, keys: set[str]) -> Iterator[None]:
     finally:
         ended.set()
         thread.join()
+
+
+def _counted(
+    journal: Path, n_runs: int, before: tuple[int, int, int] | None
+) -> tuple[int, int, int]:
+    """Bytes read of a journal, and the runs that ended and failed in them.
+
+    A journal that was there and is gone is that of a job that has ended.
+    """
+    place, done, failed = before or (0, 0, 0)
+    try:
+        with journal.open("rb") as file:
+            file.seek(place)
+            read = file.read()
+    except FileNotFoundError:
+        return (place, n_runs, failed) if before and place else (0, done, failed)
+    whole = read[: read.rfind(b"\n") + 1]
+    kinds = [line[store.KIND_AT] for line in whole.splitlines() if len(line) > store.KIND_AT]
+    return (
+        place + len(whole),
+        done + sum(kind in store.ENDED for kind in kinds),
+        failed + kinds.count(store.ENDED[-1]),
+    )

@@ -1,22 +1,230 @@
-"""The runs of a sweep: expand the swept values, compose each combination, pack them into jobs."""
+"""The runs of a sweep: which there are, what each is called, and how they are packed into jobs.
 
+The product of the swept values is never written out. Runs that differ only in plain values make
+a Family: one configuration, and the values that change in it. A run is a number in its family.
+"""
+
+from __future__ import annotations
+
+import functools
 import itertools
+import json
+import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
+import numpy as np
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
+from numpy.typing import NDArray
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from experiments.runs import paths
 from experiments.runs.console import unknown_key
-from experiments.runs.experiment import Experiment, check_overrides, composed, searched
+from experiments.runs.experiment import (
+    SIMULATED_KEYS,
+    Config,
+    Experiment,
+    check_overrides,
+    composed,
+    leaf_digests,
+    searched,
+)
 from sim.errors import InputError
+
+Leaf = tuple[str, ...]  # a place in the configuration: ("robot", "kr")
+Numbers = NDArray[np.int64]
+Digests = NDArray[np.uint64]
+_MOST_CHECKED = 1000  # runs of a family that are checked before the first begins
+
+
+@dataclass(frozen=True)
+class Axis:
+    """Values that a sweep gives to a key.
+
+    Attributes
+    ----------
+    leaves
+        The key's place, and those of the keys that follow it.
+    values
+        Plain values; a range is kept as one.
+    """
+
+    leaves: tuple[Leaf, ...]
+    values: Sequence[Any]
+
+    def digests(self, tops: frozenset[str] | None = None) -> Digests:
+        """What each value adds to a run's digest, beyond the first one; see `Experiment.key`.
+
+        Parameters
+        ----------
+        tops
+            Top-level keys of the leaves that count; by default all.
+        """
+        counted = [tops is None or leaf[0] in tops for leaf in self.leaves]
+        found: Digests = self._each[counted].sum(axis=0, dtype=np.uint64)
+        return found - found[:1]
+
+    @functools.cached_property
+    def _each(self) -> Digests:
+        """Digest of each leaf with each value."""
+        every = itertools.chain(*(leaf_digests(leaf, self.values) for leaf in self.leaves))
+        shape = len(self.leaves), len(self.values)
+        return np.fromiter(every, np.uint64, math.prod(shape)).reshape(shape)
+
+
+@dataclass(frozen=True)
+class Family:
+    """Runs that differ only in plain values: the product of the axes.
+
+    Attributes
+    ----------
+    config, choices
+        Those of the first run.
+    axes
+        What changes; the last one changes fastest.
+    """
+
+    config: Config
+    choices: Mapping[str, str]
+    axes: tuple[Axis, ...] = ()
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Number of values of each axis."""
+        return tuple(len(axis.values) for axis in self.axes)
+
+    def experiment(self, number: int) -> Experiment:
+        """One of the runs."""
+        config = self.config
+        for axis, place in zip(self.axes, np.unravel_index(number, self.shape), strict=True):
+            for leaf in axis.leaves:
+                config = _with(config, leaf, axis.values[int(place)])
+        return Experiment(config, self.choices)
+
+    def keys(self) -> Digests:
+        """Keys of all the runs, in the shape of the axes."""
+        return _sums(self.experiment(0).key, [axis.digests() for axis in self.axes])
+
+    def recordings(self) -> Digests:
+        """A digest for each run that is the same for runs of the same recording."""
+        from_file = isinstance(self.config["recording"], str)
+        tops = frozenset() if from_file else frozenset(SIMULATED_KEYS)
+        first = self.experiment(0).recording_key[:16]
+        return _sums(first, [axis.digests(tops) for axis in self.axes])
+
+    def spread(self, most: int = _MOST_CHECKED) -> list[int]:
+        """All runs of a small family; of a large one, runs along each axis, its ends included."""
+        if math.prod(self.shape) <= most:
+            return list(range(math.prod(self.shape)))
+        each = max(2, most // len(self.axes))
+        found = {0}
+        for i, length in enumerate(self.shape):
+            for place in np.linspace(0, length - 1, min(each, length)).astype(int):
+                at = [0] * len(self.axes)
+                at[i] = int(place)
+                found.add(int(np.ravel_multi_index(at, self.shape)))
+        return sorted(found)
+
+    def as_json(self, numbers: Numbers) -> Any:
+        """The family and the numbers of some of its runs, as plain values."""
+        axes = [
+            [a.leaves, {"range": [a.values.start, a.values.stop, a.values.step]}]
+            if isinstance(a.values, range)
+            else [a.leaves, a.values]
+            for a in self.axes
+        ]
+        return [self.config, self.choices, axes, numbers.tolist()]
+
+    @classmethod
+    def experiments(cls, stored: Any) -> Iterator[Experiment]:
+        """Runs of what `as_json` gave."""
+        config, choices, axes, numbers = stored
+        family = cls(
+            config,
+            choices,
+            tuple(
+                Axis(
+                    tuple(map(tuple, leaves)),
+                    range(*values["range"]) if isinstance(values, dict) else values,
+                )
+                for leaves, values in axes
+            ),
+        )
+        return map(family.experiment, numbers)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """All runs of a sweep, in the order of the arguments.
+
+    Attributes
+    ----------
+    families
+        What they are made of.
+    family, number
+        (N,) family of each run, and its number there.
+    keys
+        (N,) `Experiment.key` as a number.
+    recordings
+        (N,) the same for runs of the same recording.
+    """
+
+    families: Sequence[Family]
+    family: Numbers
+    number: Numbers
+    keys: Digests
+    recordings: Digests
+
+    def experiment(self, i: int) -> Experiment:
+        """One of the runs."""
+        return self.families[int(self.family[i])].experiment(int(self.number[i]))
+
+    def called(self, name: str | None) -> Plan:
+        """The plan with another name, if one is given; check that it has just one.
+
+        Raises
+        ------
+        InputError
+            If its runs have several names.
+        """
+        names = {f.config["name"] for f in self.families}
+        swept_ = any(("name",) in axis.leaves for f in self.families for axis in f.axes)
+        if len(names) > 1 or swept_:
+            raise InputError("name is the folder of all the rows; a sweep has one, not several")
+        if name is None:
+            return self
+        families = [replace(f, config={**f.config, "name": name}) for f in self.families]
+        return replace(self, families=families)
+
+    def as_json(self, runs: Numbers) -> list[Any]:
+        """Some of the runs as plain values, for a job."""
+        families = self.family[runs]
+        changes = np.flatnonzero(np.diff(families)) + 1
+        return [
+            self.families[self.family[part[0]]].as_json(self.number[part])
+            for part in np.split(runs, changes)
+        ]
 
 
 def planned(arguments: Sequence[str], config_dir: str | None = None) -> Iterator[Experiment]:
     """Runs of all combinations, in the order of the arguments."""
+    plan = plan_of(arguments, config_dir)
+    return map(plan.experiment, range(len(plan.keys)))
+
+
+def plan_of(arguments: Sequence[str], config_dir: str | None = None) -> Plan:
+    """Plan all combinations of a sweep's arguments.
+
+    Raises
+    ------
+    InputError
+        If an override is wrong, or a key is unknown.
+    """
     with initialize_config_dir(str(paths.CONF), version_base="1.3"):
         composer = _Composer(config_dir)
         composer.extra += [a for a in arguments if a.lstrip("+~").startswith("hydra.")]
@@ -26,27 +234,89 @@ def planned(arguments: Sequence[str], config_dir: str | None = None) -> Iterator
         check_overrides(fixed)
         study = compose("config", overrides=composer.extra + fixed, return_hydra_config=True)
         params: dict[str, str] = dict(study.hydra.sweeper.get("params") or {})
+        grids = []
         for part in study.get("sweeps") or [{}]:
             lines = [f"{key}={value}" for key, value in {**params, **part}.items()]
-            for overrides in combinations([*lines, *arguments]):
-                yield composer.experiment(overrides)
+            grids.append(_grid(swept([*lines, *arguments]), composer))
+    families = [family for part in grids for family in part[0]]
+    offsets = np.cumsum([0, *(len(part[0]) for part in grids)])
+    return Plan(
+        families,
+        np.concatenate([part[1] + low for part, low in zip(grids, offsets, strict=False)]),
+        *(np.concatenate([part[i] for part in grids]) for i in (2, 3, 4)),
+    )
 
 
-def combinations(lines: Sequence[str]) -> Iterator[list[str]]:
-    """Every combination of the swept values; a later line replaces an earlier one of its key."""
-    choices: dict[str, list[str]] = {}
-    for override in OverridesParser.create().parse_overrides(list(lines)):
+def swept(lines: Sequence[str]) -> dict[str, Sequence[Any]]:
+    """The swept values by key; a later line replaces an earlier one of its key.
+
+    A plain number or truth value is given as such, a range of whole numbers as a range; what else
+    there is, as the override's text.
+    """
+    loader = GlobalHydra.instance()
+    parser = OverridesParser.create(loader.config_loader() if loader.is_initialized() else None)
+    choices: dict[str, Sequence[Any]] = {}
+    for override in parser.parse_overrides(list(lines)):
         key = override.get_key_element()
-        if not override.is_sweep_override():
-            choices[key] = [f"{key}={override.get_value_element_as_str()}"]
-        elif override.is_discrete_sweep():
-            choices[key] = [f"{key}={value}" for value in override.sweep_string_iterator()]
-        else:
-            raise InputError(f"{override.input_line}: only lists and ranges of values can be swept")
         if override.is_delete():
             choices[key] = [override.input_line or key]
-    for combination in itertools.product(*choices.values()):
-        yield list(combination)
+        elif not override.is_sweep_override():
+            choices[key] = [f"{key}={override.get_value_element_as_str()}"]
+        elif not override.is_discrete_sweep():
+            raise InputError(
+                f"{override.input_line}: a sweep takes lists and ranges of values, such as "
+                f"{key}=0.1,0.2 or '{key}=range(0,1,0.1)'"
+            )
+        else:
+            choices[key] = _values(override, key)
+    return choices
+
+
+def _values(override: Override, key: str) -> Sequence[Any]:
+    """Values of a list, a range or a glob."""
+    whole = getattr(override.value(), "range", lambda: None)()
+    if isinstance(whole, range) and not override.value().shuffle:  # type: ignore[union-attr]
+        return whole
+    elements = list(override.sweep_iterator())
+    if all(isinstance(e, (int, float)) or e is None for e in elements):
+        return elements
+    return [f"{key}={text}" for text in override.sweep_string_iterator()]
+
+
+def _grid(
+    choices: Mapping[str, Sequence[Any]], composer: _Composer
+) -> tuple[list[Family], Numbers, Numbers, Digests, Digests]:
+    """Families of the product, and of each run: family, number, key and recording."""
+    shape = tuple(map(len, choices.values()))
+    if not math.prod(shape):
+        none, no_digest = np.zeros(0, np.int64), np.zeros(0, np.uint64)
+        return [], none, none, no_digest, no_digest
+    inner = [key for key in choices if len(choices[key]) > 1 and composer.may_follow(key, choices)]
+    outer = [key for key in choices if key not in inner]
+    texts = {key: [_text(key, value) for value in choices[key]] for key in outer}
+    for combination in itertools.product(*texts.values()):  # what is no axis in one is in none
+        _, _, axes = composer.composed(combination, {key: choices[key] for key in inner})
+        for key in [key for key in inner if key not in axes]:
+            inner.remove(key)
+            outer.append(key)
+    outer = [key for key in choices if key not in inner]
+    texts = {key: [_text(key, value) for value in choices[key]] for key in outer}
+    family, number = np.empty(shape, np.int64), np.empty(shape, np.int64)
+    keys, recordings = np.empty(shape, np.uint64), np.empty(shape, np.uint64)
+    families: list[Family] = []
+    for places in itertools.product(*(range(len(choices[key])) for key in outer)):
+        at = dict(zip(outer, places, strict=True))
+        cfg, chosen, axes = composer.composed(
+            [texts[key][place] for key, place in at.items()], {key: choices[key] for key in inner}
+        )
+        first = Experiment.resolved(cfg, chosen).replaced(picture=False)
+        made = Family(first.config, first.choices, tuple(axes[key] for key in inner))
+        cells = tuple(at.get(key, slice(None)) for key in choices)
+        family[cells] = len(families)
+        number[cells] = np.arange(math.prod(made.shape)).reshape(made.shape)
+        keys[cells], recordings[cells] = made.keys(), made.recordings()
+        families.append(made)
+    return families, family.ravel(), number.ravel(), keys.ravel(), recordings.ravel()
 
 
 class _Composer:
@@ -58,24 +328,59 @@ class _Composer:
     def __init__(self, config_dir: str | None) -> None:
         self._is_group: dict[str, bool] = {}
         self._bases: dict[tuple[str, ...], tuple[DictConfig, Mapping[str, str]]] = {}
+        self._parse = functools.lru_cache(maxsize=4096)(_parsed)
         self.extra = searched(config_dir)
 
-    def experiment(self, overrides: list[str]) -> Experiment:
-        """Resolve one combination."""
-        parsed = OverridesParser.create().parse_overrides(overrides)
-        plain = [o for o in parsed if self._is_plain(o)]
+    def may_follow(self, key: str, choices: Mapping[str, Sequence[Any]]) -> bool:
+        """Whether a swept key's values are plain, and no other override is above or below it."""
+        values = choices[key]
+        overrides = [self._parse(v) for v in values if isinstance(v, str)]
+        return all(
+            self._is_plain(o)
+            and (isinstance(o.value(), (str, int, float)) or o.value() is None)
+            and "${" not in str(o.value())
+            for o in [*overrides, self._parse(f"{key}=x")]
+        ) and not any(
+            (other.startswith(f"{key}.") or key.startswith(f"{other}."))
+            and self._is_plain(self._parse(f"{other}=x"))
+            for other in choices
+            if other[0] not in "+~"
+        )
+
+    def composed(
+        self, overrides: Sequence[str], followed: Mapping[str, Sequence[Any]]
+    ) -> tuple[DictConfig, Mapping[str, str], dict[str, Axis]]:
+        """Configuration with the first of the followed values; and the axes, where they can be.
+
+        A key is an axis where all that depends on it takes its value unchanged, and where no
+        file and no code is chosen by it.
+        """
+        parsed = [self._parse(o) for o in overrides]
         options = tuple(o.input_line or "" for o in parsed if not self._is_plain(o))
         if options not in self._bases:
             self._bases[options] = composed([*self.extra, *options])
         base, choices = self._bases[options]
         cfg = base.copy()
         OmegaConf.set_struct(cfg, True)
-        for override in plain:
-            key = override.key_or_group
-            if not _has(cfg, key):
-                raise InputError(unknown_key(key, cfg))
-            OmegaConf.update(cfg, key, override.value(), merge=True)
-        return Experiment.resolved(cfg, choices).replaced(picture=False)
+        for override in filter(self._is_plain, parsed):
+            _set(cfg, override.key_or_group, override.value())
+        values = {key: [self._plain(v) for v in swept_] if not isinstance(swept_, range) else swept_
+                  for key, swept_ in followed.items()}  # fmt: skip
+        was_leaf = {key for key in values if not OmegaConf.is_config(_select(cfg, key))}
+        for key, each in values.items():
+            _set(cfg, key, each[0])
+        following = _following(OmegaConf.to_container(cfg, resolve=False))
+        axes = {}
+        for key in was_leaf if following is not None else ():
+            leaf = tuple(key.split("."))
+            leaves = (leaf, *(following or {}).get(leaf, ()))
+            if not any(map(_decides_more, leaves)):
+                axes[key] = Axis(leaves, values[key])
+        return cfg, choices, axes
+
+    def _plain(self, value: Any) -> Any:
+        """A swept value, of which texts are still overrides."""
+        return self._parse(value).value() if isinstance(value, str) else value
 
     def _is_plain(self, override: Override) -> bool:
         """Whether it only sets a value, rather than choosing an option or adding a key."""
@@ -88,25 +393,99 @@ class _Composer:
         return not self._is_group[key]
 
 
+def _parsed(text: str) -> Override:
+    (override,) = OverridesParser.create().parse_overrides([text])
+    return override
+
+
+def _text(key: str, value: Any) -> str:
+    """A swept value as an override."""
+    return value if isinstance(value, str) else f"{key}={'null' if value is None else value}"
+
+
+def _set(cfg: DictConfig, key: str, value: Any) -> None:
+    if not _has(cfg, key):
+        raise InputError(unknown_key(key, cfg))
+    OmegaConf.update(cfg, key, value, merge=True)
+
+
 def _has(cfg: DictConfig, key: str) -> bool:
     """Whether the configuration has the key, even if its value is still missing."""
     parent, _, leaf = key.rpartition(".")
-    node = OmegaConf.select(cfg, parent) if parent else cfg
+    node = _select(cfg, parent) if parent else cfg
     if isinstance(node, ListConfig):
         return leaf.isdecimal() and int(leaf) < len(node)
     return isinstance(node, DictConfig) and leaf in node.keys()  # noqa: SIM118 `in node` says no to ???
 
 
-def packed(runs: Sequence[Experiment], n_jobs: int) -> list[list[Experiment]]:
-    """Runs in about `n_jobs` jobs; those of one recording stay together while there are enough."""
-    groups: dict[str, list[Experiment]] = {}
-    for run in runs:
-        groups.setdefault(run.recording_key, []).append(run)
-    size = max(1, -(-len(runs) // n_jobs))
-    jobs: list[list[Experiment]] = [[]]
-    for group in groups.values():
-        for part in (group[low : low + size] for low in range(0, len(group), size)):
-            if jobs[-1] and len(jobs[-1]) + len(part) > size:
-                jobs.append([])
-            jobs[-1] += part
+def _select(cfg: DictConfig, key: str) -> Any:
+    return OmegaConf.select(cfg, key, throw_on_resolution_failure=False)
+
+
+def _following(tree: Any) -> dict[Leaf, list[Leaf]] | None:
+    """Leaves by the leaf whose value they take, `${robot.kr}`.
+
+    None if a value is worked out in any other way, such as `${data}/map.npy`.
+    """
+    raw = dict(_leaves(tree))
+    found: dict[Leaf, list[Leaf]] = {}
+    for leaf, value in raw.items():
+        root, n_steps = leaf, 0
+        while isinstance(value, (str, list)) and "${" in json.dumps(value):
+            n_steps += 1
+            whole = re.fullmatch(r"\$\{([\w.]+)\}", value) if isinstance(value, str) else None
+            root = tuple(whole[1].split(".")) if whole else ()
+            if root not in raw or n_steps > len(raw):  # a circle
+                return None
+            value = raw[root]
+        if root != leaf:
+            found.setdefault(root, []).append(leaf)
+    return found
+
+
+def _leaves(tree: Mapping[str, Any], above: Leaf = ()) -> Iterator[tuple[Leaf, Any]]:
+    for name, value in tree.items():
+        if isinstance(value, dict):
+            yield from _leaves(value, (*above, str(name)))
+        else:
+            yield (*above, str(name)), value
+
+
+def _decides_more(leaf: Leaf) -> bool:
+    """Whether a leaf decides more than its own value: a file, code, or how rays are cast."""
+    files = leaf[0] == "recording" or leaf[:2] in (("prior", "map"), ("world", "path"))
+    return files or leaf[0] == "simulation" or leaf[-1] in ("_target_", "path")
+
+
+def _with(tree: Config, leaf: Leaf, value: Any) -> Config:
+    """The configuration with another value of a leaf."""
+    first, *rest = leaf
+    return {**tree, first: _with(tree[first], tuple(rest), value) if rest else value}
+
+
+def _sums(first: str, steps: Sequence[Digests]) -> Digests:
+    """A digest plus every combination of the axes' steps, modulo 2^64."""
+    total = np.array(int(first, 16), np.uint64)
+    for step in steps:
+        total = np.add.outer(total, step)
+    return total
+
+
+def packed(recordings: Digests, n_jobs: int) -> list[Numbers]:
+    """Places of runs in about `n_jobs` jobs; those of one recording stay together if they can.
+
+    Parameters
+    ----------
+    recordings
+        (N,) the same for runs of the same recording.
+    """
+    _, first, group = np.unique(recordings, return_index=True, return_inverse=True)
+    order = np.argsort(first[group], kind="stable")  # the recordings as they first appear
+    edges = np.flatnonzero(np.diff(group[order], append=-1)) + 1
+    size, low, jobs = max(1, -(-len(order) // n_jobs)), 0, []
+    while low < len(order):
+        fits = edges[np.searchsorted(edges, low + size, side="right") - 1]
+        high = int(fits) if low < fits <= low + size else min(low + size, len(order))
+        jobs.append(order[low:high])
+        low = high
     return jobs

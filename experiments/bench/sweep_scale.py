@@ -1,0 +1,139 @@
+"""A sweep of a million runs: its plan, its files, its resumption and its table.
+
+Planner, writer and reader are the real ones. The rows hold random metrics in place of a run's own,
+so the simulation is left out.
+"""
+
+import json
+import math
+import multiprocessing
+import resource
+import shutil
+import time
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from experiments.bench.measure import Measurement, time_s
+from experiments.runs import paths, store
+from experiments.runs.columns import COLUMNS
+from experiments.runs.experiment import Experiment
+from experiments.runs.row import Row, Status
+from experiments.sweeps import launch
+from experiments.sweeps.collect import collect, summary
+from experiments.sweeps.plan import Family, packed, plan_of
+
+T = TypeVar("T")
+_NAME = "bench_sweep_scale"
+_N_SEEDS, _N_VALUES = 2000, 500
+_N_RUNS = _N_SEEDS * _N_VALUES
+_N_JOBS = 8
+_SWEEP = (
+    "simulation.physics=kinematic",
+    f"seed=range(0,{_N_SEEDS})",
+    f"robot.kr=range(1,{_N_VALUES + 1},1)",
+    "robot.kl=${robot.kr}",
+    f"name={_NAME}",
+)
+
+
+def run() -> list[Measurement]:
+    """Times a run or row, bytes on disk, and the planner's memory, with 1,000,000 runs."""
+    folder = paths.results() / "runs" / _NAME
+    shutil.rmtree(folder, ignore_errors=True)
+    try:
+        (plan_s, shares), plan_mib = _alone(_planned)
+        with ProcessPoolExecutor(2, multiprocessing.get_context("spawn")) as pool:
+            list(pool.map(_written, shares))
+        for share in {share.parent for share in shares}:
+            shutil.rmtree(share)
+        sizes = [path.stat().st_size for path in folder.iterdir()]
+        resume_s, resume_mib = _alone(_resumed)
+        table_s, table_mib = _alone(_tabulated)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+    return [
+        Measurement(
+            "sweep.plan_us_per_run",
+            1e6 * plan_s / _N_RUNS,
+            "us",
+            200.0,
+            note="with the jobs' files",
+        ),
+        Measurement("sweep.resume_us_per_run", 1e6 * resume_s / _N_RUNS, "us", 60.0),
+        Measurement(
+            "sweep.table_us_per_row",
+            1e6 * table_s / _N_RUNS,
+            "us",
+            25.0,
+            note=f"read and averaged; {table_mib:.0f} MiB of memory",
+        ),
+        Measurement(
+            "sweep.bytes_per_row", sum(sizes) / _N_RUNS, "B", 1500.0, note=f"{len(sizes)} files"
+        ),
+        Measurement("sweep.planner_memory_mib", max(plan_mib, resume_mib), "MiB", 1024.0),
+    ]
+
+
+def _alone(function: Callable[[], T]) -> tuple[T, float]:
+    """What a function returns in a process of its own, and the memory it took, MiB."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        found = pool.submit(function).result()
+        return found, pool.submit(_peak_mib).result()
+
+
+def _peak_mib() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+
+
+def _planned() -> tuple[float, list[Path]]:
+    """Seconds from the arguments to the jobs' shares, and these."""
+    begun = time.perf_counter()
+    plan = plan_of(_SWEEP)
+    runs = np.arange(len(plan.keys))
+    launch.check(plan, runs)
+    jobs = launch.Jobs(plan.experiment(0).rows_folder)
+    for part in packed(plan.recordings, _N_JOBS):
+        jobs.add(plan, part)
+    seconds = time.perf_counter() - begun
+    return seconds, [launch.share_of(jobs.plan, number) for number in range(len(jobs.sizes))]
+
+
+def _written(share: Path) -> None:
+    """Rows of a job, as its journal and then as Parquet."""
+    stored = json.loads(share.read_text())
+    rng = np.random.default_rng(len(share.name))
+    with store.journal(Path(stored["journal"])) as journal:
+        for family in stored["families"]:
+            labels = next(Family.experiments(family)).labels("")
+            for experiment in Family.experiments(family):
+                journal.begin(str(labels["run_key"]))
+                journal.append([_row(labels, experiment, rng)])
+    store.compact(journal.path)
+
+
+def _row(labels: Row, experiment: Experiment, rng: np.random.Generator) -> Row:
+    changed = experiment.config["robot"]
+    row: Row = {**labels, "seed": experiment.seed, "world_seed": experiment.seed}
+    row |= {f"robot.{name}": value for name, value in changed.items() if name in ("kr", "kl")}
+    row |= {"estimator.kr": changed["kr"], "estimator.kl": changed["kl"]}
+    row |= {"run_key": experiment.key, "recording_checksum": rng.bytes(32).hex()}
+    metrics = dict(zip(COLUMNS, rng.random(len(COLUMNS)).tolist(), strict=True))
+    return {**row, **Status().columns(), **metrics}
+
+
+def _resumed() -> float:
+    """Seconds of the sweep, all of whose runs are done."""
+    return time_s(launch.sweep, _SWEEP)
+
+
+def _tabulated() -> float:
+    def table() -> None:
+        shown = summary(collect(_NAME, times=True))
+        assert shown["runs"].sum() == _N_RUNS
+        assert math.isclose(shown["ate_rmse_m"].mean(), 0.5, abs_tol=0.01)
+
+    return time_s(table)
