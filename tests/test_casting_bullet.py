@@ -16,7 +16,8 @@ from sim.sensors import Laser, Lidar3D, Mount
 pytestmark = pytest.mark.bullet
 
 ROOT = Path(__file__).resolve().parent.parent
-WORLDS = {p.stem: p for p in sorted((ROOT / "conf" / "world").glob("*.yaml"))}
+PRESETS = {p.stem: p for p in sorted((ROOT / "conf" / "world").glob("*.yaml"))}
+WORLDS = {name: path for name, path in PRESETS.items() if name != "from_grid"}  # has no walls yet
 LASER = Laser(fov_rad=2 * np.pi, n_beams=720)
 LIDAR = Lidar3D(mount=Mount(z_m=0.6))
 TOLERANCE_M = 1e-3

@@ -13,6 +13,12 @@ from collections.abc import Iterator, Mapping
 from experiments.bench.measure import Measurement
 
 _PROCESSES = ("scans", "others")
+_ROOM = (
+    "world=room",
+    "sensors=laser_stereo",
+    "route.distance_m=2",
+    "simulation.physics=kinematic",
+)
 
 
 def run() -> Iterator[Measurement]:
@@ -60,7 +66,7 @@ def _others() -> None:
 
     from estimators.grid_mapping import map_scans
     from experiments.calibration.end_pose_model import EndPoseModel
-    from experiments.gate.conform import example, walk
+    from experiments.runs.evaluate import estimates
     from experiments.runs.experiment import Experiment
     from sim.kinematic import run_batch
     from sim.robot import DifferentialDrive
@@ -72,17 +78,19 @@ def _others() -> None:
     run_batch(robot, route, 1, rng)
     model = EndPoseModel(route.profile(robot), robot, rng, "sampled", n_samples=4)
     model.moments(np.full(2, 1e-5), np.zeros(2), robot.track_m)
-    for places, overrides in (
-        (False, ["estimator=fastslam"]),
-        (False, ["estimator=fastslam", "estimator.association=mahalanobis"]),
-        (False, ["estimator=mcl"]),
-        (True, ["estimator=topological_mcl"]),
+    for overrides in (
+        [*_ROOM, "estimator=fastslam"],
+        [*_ROOM, "estimator=fastslam", "estimator.association=mahalanobis"],
+        [*_ROOM, "estimator=mcl", "prior.map=world"],
+        ["study=maximo2024_umh"],
     ):
-        recording, prior = example(places=places)
+        experiment = Experiment.compose(overrides)
+        recording = experiment.recording()
         if "estimator=mcl" in overrides:
             laser, scan = recording.sensor("laser", Laser), recording.log("laser")["ranges_m"][:1]
             map_scans(np.zeros((1, 3)), scan, laser, resolution_m=0.5)
-        walk(Experiment.compose(overrides).estimator(), recording.cut(12), prior)
+        prior = experiment.prior(recording)
+        estimates(experiment.estimator(), recording.cut(12), prior, rng)
 
 
 if __name__ == "__main__":
