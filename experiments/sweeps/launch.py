@@ -288,7 +288,10 @@ def _require_launcher(launching: Sequence[str]) -> None:
 @hydra.main(version_base="1.3", config_path=str(paths.CONF), config_name="job")
 def job_application(cfg: DictConfig) -> None:
     """Run one job's share of the plan; a run that fails leaves its row, and the next follows."""
-    share = json.loads(share_of(cfg.plan, cfg.job).read_text())
+    try:
+        share = json.loads(share_of(cfg.plan, cfg.job).read_text())
+    except OSError as error:
+        raise InputError(f"{cfg.plan}: the plan is gone; start the sweep again") from error
     _end_with(*share["planner"])
     if os.getpid() != share["planner"][1]:  # joblib's workers stay, as they were, for later sweeps
         folder, os.environ["ESTIMA_RESULTS"] = share["places"]
