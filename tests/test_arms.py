@@ -93,7 +93,7 @@ def test_methods_of_decristoforis2020_share_drive_and_beliefs():
     (group,) = decristoforis2020._planned("methods", 1)
     assert differing(group) == {"method"}
     assert len({run.recording_key for run in group}) == 1
-    beliefs = ("kr", "kl", "sigma_range_m", "metric", "search", "window_s", "covariance")
+    beliefs = ("kr", "kl", "sigma_range_m", "metric", "window_s", "covariance")
     for key in beliefs:
         assert len({run.config["estimator"].get(key, "") for run in group} - {""}) == 1, key
     by_method = {run.config["method"]: dict(flat(run.config["estimator"])) for run in group}

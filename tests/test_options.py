@@ -65,7 +65,7 @@ def test_a_sensor_is_found_by_its_name_and_must_be_of_its_kind():
     assert require_laser(prior, "rear", "mcl") is sensors["rear"]
     with pytest.raises(InputError, match=r"laser \(there is encoder, front, rear\); choose"):
         require_laser(prior, "laser", "mcl")
-    with pytest.raises(InputError, match=r"^fastslam: sensor front is no StereoCamera but a Laser"):
+    with pytest.raises(InputError, match=r"^fastslam: sensor front is a Laser, not a StereoCamera"):
         require_stereo(prior, "front", "fastslam")
 
 
