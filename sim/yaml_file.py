@@ -46,7 +46,7 @@ def read_yaml(path: Path, most_bytes: int = MOST_BYTES) -> Any:
     except _MALFORMED as error:
         where = getattr(error, "problem_mark", None)
         line = f":{where.line + 1}" if where is not None else ""
-        brief = " ".join(str(error).split())[:120]
+        brief = " ".join(str(getattr(error, "problem", None) or error).split())[:120]
         raise InputError(f"{path}{line}: not valid YAML ({brief})") from error
     finally:
         if loader is not None:
