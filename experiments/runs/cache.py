@@ -139,6 +139,7 @@ def _locked(path: Path) -> Iterator[None]:
     Its file goes with the lock; who waited for one that is gone takes the next.
     """
     lock = path.with_suffix(".lock")
+    require_file(lock)  # a pipe would wait for ever
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         handle = _held(lock)
