@@ -17,6 +17,7 @@ from sim.errors import InputError
 
 if TYPE_CHECKING:
     from estimators.base import Estimate
+    from experiments.runs.experiment import Experiment
     from sim.recording import Recording
     from sim.robot import DifferentialDrive
 
@@ -109,14 +110,16 @@ def run(context: typer.Context) -> None:
     application(arguments, _draw_run)
 
 
-def _draw_run(recording: Recording, estimate: Estimate, name: str, folder: Path) -> None:
+def _draw_run(
+    recording: Recording, estimate: Estimate, experiment: Experiment, folder: Path
+) -> None:
     """Write the picture and the trajectory of a single run."""
-    from experiments.trajectories.odometry import write_odometry_csv
+    from experiments.trajectories.convert import write_estimate
     from experiments.viewing.run_figure import run_figure
     from experiments.viewing.style import save_figure
 
-    write_odometry_csv(estimate, folder / "estimate.csv")
-    save_figure(run_figure(recording, estimate, name), folder / "run.png")
+    write_estimate(folder / "estimate.csv", estimate, recording, slip=experiment.believed_slip)
+    save_figure(run_figure(recording, estimate, experiment.estimator_name), folder / "run.png")
 
 
 @app.command()

@@ -292,8 +292,8 @@ def short_turns(ends: pd.DataFrame, found: pd.DataFrame) -> Figure:
         right.plot([low, high], [i, i], color=BLUE, lw=2.0)
         right.plot(value, i, "o", color=BLUE, ms=5, label="found, 95 % interval" if not i else None)
         if nominal > 0.0:
-            label = "what the controller takes" if row.parameter == "bias_right" else None
-            right.plot(nominal, i + 0.18, "v", color=ORANGE, label=label)
+            named = {"label": "what the controller takes"} if row.parameter == "track_m" else {}
+            right.plot(nominal, i + 0.18, "v", color=ORANGE, **named)
     right.axvline(1.0, color=BLACK, lw=0.8)
     right.set(
         xlabel="over the truth",
