@@ -296,6 +296,7 @@ class FastSLAM:
     def _take_stock(self) -> None:
         """Moments of the particles as they are drawn and weighted."""
         self._drawn = np.ascontiguousarray(self._poses[:3, : self.n_particles].T)
+        self._drawn[:, 2] = se2.wrap(self._drawn[:, 2])
         self._lineages.append(self._drawn)
         self._rolled = STILL
         weights = normalize(self._log_weights)
