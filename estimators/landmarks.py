@@ -403,8 +403,8 @@ def move(
 ) -> Array:
     """Compose poses (5, lanes) with the increment (3,) + root (3, 3) normals (3, lanes).
 
-    A pose is x, y, heading (not wrapped), and the heading's cosine and sine. Writes the geometry of the state.
-    `mount` (4,) is x, y of the camera, and cosine and sine of its yaw.
+    A pose is x, y, heading (not wrapped), and the heading's cosine and sine. Writes the geometry
+    of the state. `mount` (4,) is x, y of the camera, and cosine and sine of its yaw.
     """
     x, y, heading, cos, sin = poses
     dx, dy, turn = increment[:, None] + root @ normals

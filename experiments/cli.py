@@ -614,11 +614,13 @@ def reproduce(
         bool, typer.Option("--figures-only", help="Draw again what is in results/.")
     ] = False,
 ) -> None:
-    """Make the papers' figures, tables and claims, into results/.
+    """Make the papers' figures, tables and claims, in results/quick/ or, in full, in results/.
 
     Examples
     --------
       estima reproduce --paper puzzlebot2024
+
+      estima reproduce --full
 
       estima reproduce --figures-only
     """

@@ -108,7 +108,8 @@ class Results:
 
     @property
     def _remedy(self) -> str:
-        return f"run `estima reproduce --paper {self.paper}`"
+        full = "" if self.folder.name == "quick" else "--full "
+        return f"run `estima reproduce {full}--paper {self.paper}`"
 
 
 class _Arrays(dict[str, NDArray[np.generic]]):

@@ -39,7 +39,7 @@ def contents(results: Path, on_progress: Callable[[float], None]) -> dict[str, A
     about = {name: findings(name) for name in (*papers, *OWN)}
     sentences = read_verdicts(results / "verdicts.csv").set_index("id")["sentence"].to_dict()
     claims = judged_claims(table, about, sentences)
-    commands = {name: [f"estima reproduce --paper {name}"] for name in papers} | OWN
+    commands = {name: [f"estima reproduce --full --paper {name}"] for name in papers} | OWN
     commands |= {str(k): list(v.unique()) for k, v in table.groupby("paper")["command"]}
     studies = {}
     for done, (name, page) in enumerate(about.items(), start=1):
