@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
+import shlex
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
@@ -20,12 +21,14 @@ import numpy as np
 import pandas as pd
 import yaml
 
-from estimators.base import Estimator
+from estimators.base import Estimate, Estimator
 from experiments.runs import paths
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome
 from experiments.runs.seeds import stream
+from experiments.viewing.run_figure import run_figure
+from experiments.viewing.style import save_figure
 from sim.errors import InputError, require
 from sim.recording import Recording
 
@@ -227,6 +230,35 @@ def run_suite(
         rows.extend(part)
         on_progress(i / len(jobs))
     return pd.DataFrame(rows)
+
+
+def draw_run(suite: Suite, estimator: str, recording: int, path: Path) -> bool:
+    """Draw the first run of an estimator over a recording of a suite; False if it fails."""
+    (entry,) = suite.of([estimator]).estimators
+
+    def draw(made: Recording, _: int, online: Estimate, revised: Estimate | None) -> None:
+        judged = revised if entry.revised and revised is not None else online
+        save_figure(run_figure(made, judged, estimator), path)
+
+    rows = evaluate(
+        _experiment(suite, entry, {estimator: 1}).replaced(seed=recording, world_seed=recording),
+        streams=partial(_stream, f"estimator/{estimator}", recording, 0),
+        on_estimate=draw,
+    )
+    return rows[0]["status"] != Outcome.FAILED
+
+
+def command_of(suite: Suite, estimator: str, recording: int) -> str:
+    """Return the command that runs one estimator over one recording of a suite, and draws it."""
+    (entry,) = suite.of([estimator]).estimators
+    overrides = [
+        *suite.overrides[entry.recordings],
+        f"estimator={entry.name}",
+        *entry.overrides,
+        f"seed={recording}",
+        f"world_seed={recording}",
+    ]
+    return shlex.join(["estima", "run", *overrides])
 
 
 def _experiment(suite: Suite, entry: Entry, repeats: Mapping[str, int]) -> Experiment:
