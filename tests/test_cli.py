@@ -238,6 +238,17 @@ def test_calibration_from_recordings(tmp_path):
     refused(estima("calibrate", paths[0], paths[1], paths[0]), "same recording")
 
 
+def test_calibration_from_a_sheet():
+    sheet = str(ROOT / "docs" / "examples" / "end_poses.csv")
+    done = estima("calibrate", "--sheet", sheet, "robot=puzzlebot_short_turns", "--joint", "--json")
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert found["method"] == "sampled"
+    assert found["track_m"]["low"] < 0.19 < found["track_m"]["high"]
+    refused(estima("calibrate", "--sheet", sheet, "world=room"), "world=room", "robot")
+    refused(estima("calibrate", "--sheet", sheet, "--method", "wheel-truth"), "--method")
+
+
 def test_view_draws_a_world(tmp_path):
     out = tmp_path / "w.png"
     done = estima("view", "--world", "world=corridor", "-o", str(out))
