@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from experiments.runs import columns, paths
-from experiments.runs.console import end, progress
+from experiments.runs.console import end, progress, show
 from experiments.runs.row import Outcome, write_frame
 from experiments.runs.version import code_version
 from sim.errors import InputError
@@ -158,7 +158,7 @@ def info(
     from experiments.viewing.describe import describe
     from sim.formats.detect import read_any
 
-    print(describe(read_any(log, robot)))
+    show(describe(read_any(log, robot)))
 
 
 @app.command()
@@ -621,7 +621,7 @@ def table(
         rows = summary(rows, against)
     if out is None:
         shown = rows.rename(columns=lambda column: columns.title(column, short=True))
-        print(shown.to_string(index=False, na_rep="-", float_format=lambda v: f"{v:.4g}"))
+        show(shown.to_string(index=False, na_rep="-", float_format=lambda v: f"{v:.4g}"))
         return
     write_frame(rows, out)
     print(f"{out}: {len(rows)} rows, {len(rows.columns)} columns")

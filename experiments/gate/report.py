@@ -13,12 +13,12 @@ import pandas as pd
 
 from experiments.gate.baseline import accept, baseline_folder, baseline_paths, check, is_main
 from experiments.gate.compare import Change, Finding
-from experiments.gate.suite import command_of, draw_run, printable, read_suite, suite_path
-from experiments.report.export import to_markdown
+from experiments.gate.suite import command_of, draw_run, read_suite, suite_path
+from experiments.report.export import escaped, to_markdown
 from experiments.runs.columns import COLUMNS
-from experiments.runs.console import progress
+from experiments.runs.console import progress, show
 from experiments.runs.paths import results, short
-from sim.errors import InputError, require
+from sim.errors import InputError, printable, require
 from sim.files import write_text
 
 LABELS = {"ate_rmse_m": "position", "ate_aligned_rmse_m": "aligned", "heading_rmse_rad": "heading"}
@@ -42,7 +42,7 @@ def run_check(
     if reason is not None:
         with progress("checking the estimators", 1.0) as on_progress:
             accepted = accept(suite, reason, only, release=release, on_progress=on_progress)
-        _say(as_text(accepted.findings, hint=""))
+        show(as_text(accepted.findings, hint=""))
         for path in accepted.written:
             print(f"accepted: {short(path)}")
         left = [f for f in accepted.findings if f.alarms and f.baseline == "release"]
@@ -69,14 +69,14 @@ def run_check(
         )
     with progress("checking the estimators", 1.0) as on_progress:
         findings = check(suite, only, on_progress)
-    _say(as_text(findings, detectable, hint=_hint(suite, findings)))
-    _say(_where_to_look(suite, findings))
+    show(as_text(findings, detectable, hint=_hint(suite, findings)))
+    show(_where_to_look(suite, findings))
     if junit is not None:
         write_text(junit, as_junit(findings))
     if summary is not None:
         write_text(summary, as_markdown(findings, detectable))
     if on_github:
-        _say(as_annotations(findings))
+        show(as_annotations(findings))
     if page:
         with Path(page).open("a", encoding="utf-8") as file:
             file.write(as_markdown(findings, detectable))
@@ -93,12 +93,6 @@ def _check_writable(path: Path) -> None:
         raise InputError(
             f"{path}: cannot write a report there ({error.strerror}); choose another place"
         ) from error
-
-
-def _say(text: str) -> None:
-    """Print, with ? for characters that the terminal cannot show."""
-    encoding = sys.stdout.encoding or "utf-8"
-    print(text.encode(encoding, "replace").decode(encoding))
 
 
 def smallest_found() -> dict[str, float]:
@@ -188,7 +182,7 @@ def as_text(
 def as_markdown(findings: Sequence[Finding], detectable: Mapping[str, float] | None = None) -> str:
     """Give the same as Markdown, for a pull request's summary."""
     lines = ["## estima check", "", last_line(findings), ""]
-    lines += [*(f"- {sentence(finding)}" for finding in _noteworthy(findings)), ""]
+    lines += [*(f"- {escaped(sentence(f))}" for f in _noteworthy(findings)), ""]
     for table in _tables(findings, detectable):
         bold = table["verdict"].str.replace("^(worse|failed)", r"**\1**", regex=True)
         lines.append(to_markdown(table.assign(verdict=bold)))

@@ -8,8 +8,11 @@ from __future__ import annotations
 
 import dataclasses
 import math
+<<<<<<< HEAD
 import re
 import shlex
+=======
+>>>>>>> faults
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
@@ -19,7 +22,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import yaml
 
 from estimators.base import Estimate, Estimator
 from experiments.runs import paths
@@ -27,14 +29,18 @@ from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome
 from experiments.runs.seeds import stream
+<<<<<<< HEAD
 from experiments.viewing.run_figure import run_figure
 from experiments.viewing.style import save_figure
 from sim.errors import InputError, require
+=======
+from sim.errors import InputError, printable, require
+>>>>>>> faults
 from sim.recording import Recording
+from sim.yaml_file import read_yaml
 
 ERRORS = ("ate_rmse_m", "ate_aligned_rmse_m", "heading_rmse_rad")
 _RESEEDED = 1000  # streams of one seeding; repeats of the next start beyond them
-_UNPRINTABLE = re.compile("[^\x20-\x7e\xa0-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 _GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
 
 
@@ -107,11 +113,7 @@ def read_suite(path: Path) -> Suite:
     InputError
         If the file cannot be read, or a key is missing, unknown or of the wrong kind.
     """
-    try:
-        content = yaml.safe_load(path.read_text())
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        line = str(error).splitlines()[0]
-        raise InputError(f"{path}: cannot read this suite ({line})") from error
+    content = read_yaml(path)
     try:
         groups = content["recordings"]
         suite = Suite(
@@ -303,11 +305,6 @@ def _plant(
     planted: Planted, seed: int, reseed: int
 ) -> Callable[[Estimator, int], AbstractContextManager[object]]:
     return lambda estimator, repeat: planted(estimator, _stream("fault", seed, reseed, repeat))
-
-
-def printable(text: str) -> str:
-    """Replace by ? what XML 1.0 forbids and what would control a terminal."""
-    return _UNPRINTABLE.sub("?", text)
 
 
 def fingerprint(recording: Recording) -> float:
