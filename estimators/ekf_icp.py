@@ -55,7 +55,7 @@ class EkfIcp:
         How far the robot goes before it takes a new key frame.
     register_distance_m, register_turn_rad
         How far the robot is believed to go before another scan is registered: it must exceed one
-        of them. 0 and 0: every scan is.
+        of them. 0 and 0: every scan is. One cannot be set without the other.
     kr, kl
         Believed slip variance per metre of the wheels, m.
     lateral_slip_m
@@ -113,6 +113,11 @@ class EkfIcp:
             keyframe_turn_rad=keyframe_turn_rad,
             register_distance_m=register_distance_m,
             register_turn_rad=register_turn_rad,
+        )
+        require(
+            (register_distance_m > 0.0) == (register_turn_rad > 0.0),
+            "estimator.register_distance_m and register_turn_rad go together, since a scan is "
+            "registered once either is exceeded: set both, or neither",
         )
         require_shares(shared_noise=shared_noise)
         require(

@@ -572,7 +572,13 @@ def check(
 
 @app.command()
 def bench(
-    name: Annotated[str, typer.Argument(help="sim, ... or all.")] = "all",
+    name: Annotated[
+        str,
+        typer.Argument(
+            help="compile, fastslam, formats, icp, mcl, sim, smoothing, sweep, sweep_scale, "
+            "topological, or all."
+        ),
+    ] = "all",
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Measure speeds and accuracies on one core, beside their goals.

@@ -40,7 +40,7 @@ def read_yaml(path: Path, most_bytes: int = MOST_BYTES) -> Any:
         if root is None:
             return None
         _check(root, path)
-        return loader.construct_document(root)  # type: ignore[no-untyped-call]
+        return loader.construct_document(root)
     except RecursionError:
         raise InputError(f"{path}: nested more than {_MOST_DEPTH} deep") from None
     except _MALFORMED as error:
@@ -50,7 +50,7 @@ def read_yaml(path: Path, most_bytes: int = MOST_BYTES) -> Any:
         raise InputError(f"{path}{line}: not valid YAML ({brief})") from error
     finally:
         if loader is not None:
-            loader.dispose()  # type: ignore[no-untyped-call]
+            loader.dispose()
 
 
 def _check(root: yaml.Node, path: Path) -> None:

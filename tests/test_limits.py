@@ -25,7 +25,7 @@ def recording():
 def at(recording, offset_m):
     """The prior and its start, so far from the origin in both directions."""
     prior = fakes.tracking_prior(recording)
-    return dataclasses.replace(prior, mean=prior.mean + [offset_m, offset_m, 0.0])
+    return dataclasses.replace(prior, mean=prior.mean + np.array([offset_m, offset_m, 0.0]))
 
 
 @pytest.mark.parametrize("estimator", [EkfIcp, IcpOdometry])

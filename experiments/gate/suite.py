@@ -8,11 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-<<<<<<< HEAD
-import re
 import shlex
-=======
->>>>>>> faults
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
@@ -29,13 +25,9 @@ from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome
 from experiments.runs.seeds import stream
-<<<<<<< HEAD
 from experiments.viewing.run_figure import run_figure
 from experiments.viewing.style import save_figure
-from sim.errors import InputError, require
-=======
 from sim.errors import InputError, printable, require
->>>>>>> faults
 from sim.recording import Recording
 from sim.yaml_file import read_yaml
 
