@@ -15,10 +15,11 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import hydra
 import numpy as np
@@ -328,10 +329,7 @@ def _n_jobs(launching: Sequence[str]) -> int:
 
 @hydra.main(version_base="1.3", config_path=str(paths.CONF), config_name="job")
 def job_application(cfg: DictConfig) -> None:
-    """Run one job's share of the plan, but for what its journal has.
-
-    A run that fails leaves its row, and the next follows.
-    """
+    """Read one job's share of the plan, and run it."""
     try:
         share = json.loads(share_of(cfg.plan, cfg.job).read_text())
     except OSError as error:
@@ -340,6 +338,14 @@ def job_application(cfg: DictConfig) -> None:
     if os.getpid() != share["planner"][1]:  # joblib's workers stay, as they were, for later sweeps
         folder, os.environ["ESTIMA_RESULTS"] = share["places"]
         os.chdir(folder)
+    run_share(share)
+
+
+def run_share(share: Mapping[str, Any]) -> None:
+    """Run a job's share of the plan, as `Jobs.add` wrote it, but for what its journal has.
+
+    A run that fails leaves its row, and the next follows.
+    """
     held: dict[str, Recording] = {}
     path = Path(share["journal"])
     over = store.ended(path.parent, f"{path.stem}.")  # something if the launcher tries it again
