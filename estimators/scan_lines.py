@@ -109,11 +109,11 @@ def prepare(
     Parameters
     ----------
     ranges_m
-        (N,) m; beams that are not finite, not positive or beyond `max_range_m` are left out.
+        (N,) m; beams that are not finite, not positive, at `max_range_m` or beyond are left out.
     bearings_rad
         (N,) beam angles in the sensor frame, rising, over at most a full circle.
     max_range_m
-        Farthest range to use.
+        The laser's; a range that is equal to it is no return.
     """
     ranges = np.ascontiguousarray(ranges_m, dtype=np.float64)
     bearings = np.ascontiguousarray(bearings_rad, dtype=np.float64)
@@ -128,7 +128,8 @@ def prepare(
             steps.min() > 0.0, "the bearings of a scan must rise from beam to beam; flip the scan"
         )
         full = bool(bearings[-1] - bearings[0] + 1.5 * steps[0] > 2.0 * math.pi)
-    return _prepare(ranges, bearings, float(max_range_m), full)
+    most_m = min(max_range_m, float(np.float32(max_range_m)))  # ranges may have been 32 bits
+    return _prepare(ranges, bearings, float(most_m), full)
 
 
 @njit()
@@ -377,7 +378,7 @@ def _describe(
 
 @njit(error_model="numpy", fastmath={"contract"})
 def _prepare(ranges: Array, bearings: Array, max_range: float, full_circle: bool) -> PreparedScan:
-    seen = (ranges > 0.0) & (ranges <= max_range) & (ranges < math.inf)
+    seen = (ranges > 0.0) & (ranges < max_range)
     beams = np.flatnonzero(seen)
     rays, points = np.empty((len(beams), 2)), np.empty((len(beams), 2))
     for k in range(len(beams)):

@@ -20,6 +20,7 @@ from experiments.runs import paths
 from experiments.runs.locks import locked
 from experiments.runs.version import SIMULATION, code_version
 from sim.errors import InputError
+from sim.files import require_file
 from sim.recording import Recording, load, save
 
 _LIMIT_GIB = 8.0
@@ -49,6 +50,7 @@ def cached(key: str, make: Callable[[], Recording]) -> Recording:
     limit = limit_bytes()
     with _locked(path):
         if path.exists():
+            require_file(path)
             try:
                 recording = _entry(path, key)
                 os.utime(path)

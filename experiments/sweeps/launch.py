@@ -134,8 +134,11 @@ def check(plan: Plan, runs: Numbers) -> None:
 
 
 def _drop(path: Path, error: InputError) -> None:
-    """Remove a damaged file of rows, so that its runs are done again; not one of other names."""
-    if not store.is_own(path):
+    """Remove a damaged file of rows, so that its runs are done again; not one of other names.
+
+    Nor one that cannot be read now: its rows may be sound.
+    """
+    if not store.is_own(path) or isinstance(error.__cause__, OSError):
         raise error
     print(f"estima: {path} does not match its checksum; its runs are done again", file=sys.stderr)
     path.unlink(missing_ok=True)
