@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from experiments.runs import columns, paths
-from experiments.runs.console import end, progress
+from experiments.runs.console import end, progress, show
 from experiments.runs.row import Outcome, write_frame
 from experiments.runs.version import code_version
 from sim.errors import InputError
@@ -158,7 +158,7 @@ def info(
     from experiments.viewing.describe import describe
     from sim.formats.detect import read_any
 
-    print(describe(read_any(log, robot)))
+    show(describe(read_any(log, robot)))
 
 
 @app.command()
@@ -572,7 +572,13 @@ def check(
 
 @app.command()
 def bench(
-    name: Annotated[str, typer.Argument(help="sim, ... or all.")] = "all",
+    name: Annotated[
+        str,
+        typer.Argument(
+            help="compile, fastslam, formats, icp, mcl, sim, smoothing, sweep, sweep_scale, "
+            "topological, or all."
+        ),
+    ] = "all",
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Measure speeds and accuracies on one core, beside their goals.
@@ -621,7 +627,7 @@ def table(
         rows = summary(rows, against)
     if out is None:
         shown = rows.rename(columns=lambda column: columns.title(column, short=True))
-        print(shown.to_string(index=False, na_rep="-", float_format=lambda v: f"{v:.4g}"))
+        show(shown.to_string(index=False, na_rep="-", float_format=lambda v: f"{v:.4g}"))
         return
     write_frame(rows, out)
     print(f"{out}: {len(rows)} rows, {len(rows.columns)} columns")
@@ -666,11 +672,13 @@ def reproduce(
         bool, typer.Option("--figures-only", help="Draw again what is in results/.")
     ] = False,
 ) -> None:
-    """Make the papers' figures, tables and claims, into results/.
+    """Make the papers' figures, tables and claims, in results/quick/ or, in full, in results/.
 
     Examples
     --------
       estima reproduce --paper puzzlebot2024
+
+      estima reproduce --full
 
       estima reproduce --figures-only
     """

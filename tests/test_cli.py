@@ -11,6 +11,7 @@ import pandas as pd
 import pytest
 
 from estimators.base import Belief
+from experiments.bench import SUITES
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import read_rows
@@ -41,6 +42,11 @@ def refused(done, *words):
     for word in words:
         assert word in lines[0]
     assert "Traceback" not in done.stderr
+
+
+def test_help_names_every_benchmark():
+    text = estima("bench", "--help").stdout
+    assert all(name in text for name in SUITES)
 
 
 def test_help_names_every_command():

@@ -36,6 +36,7 @@ from sim.sensors import Sensor, Sensors, sensors_from_config
 from sim.sensors.base import RecordedSensor, sensor_settings
 from sim.settings import build
 from sim.world import World
+from sim.yaml_file import read_yaml
 
 Config = dict[str, Any]
 GROUPS = ("world", "robot", "sensors", "route", "estimator")
@@ -549,13 +550,16 @@ def searched(config_dir: str | Path | None) -> list[str]:
     Raises
     ------
     InputError
-        If there is no such folder.
+        If there is no such folder, or one of its options is no YAML that can be read.
     """
     if config_dir is None:
         return []
     folder = Path(config_dir).resolve()
     if not folder.is_dir():
         raise InputError(f"--config-dir must name a folder, got {config_dir}")
+    for group in (*GROUPS, "study"):
+        for path in sorted((folder / group).glob("*.yaml")):
+            read_yaml(path)  # within bounds, which Hydra does not know
     return [f"hydra.searchpath=[{paths.quoted(f'file://{folder}')}]"]
 
 
