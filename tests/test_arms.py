@@ -48,6 +48,8 @@ def of_one_seed(name):
         }),
         ("association", {"sensors.stereo.identifies", "sensors.stereo.sigma_descriptor"}),
         ("observations", {"sensors.stereo.max_observations"}),
+        ("laps", set()),
+        ("repeats", {"recording.image_draw", "repeats"}),
     ],
 )  # fmt: skip
 def test_runs_of_gil2008_differ_in_what_their_table_compares(table, compared):
@@ -63,6 +65,31 @@ def test_runs_of_gil2008_differ_in_what_their_table_compares(table, compared):
         assert len(beliefs) == 1
         if table == "observations":
             assert len(scenes) == 1  # one recording for all
+
+
+def test_the_printed_filter_is_the_papers_and_alone_takes_r_at_the_measured_point():
+    own = Experiment.compose(["study=gil2008", "estimator=fastslam_paper"]).config["estimator"]
+    printed = ("motion", "multinomial", 1.0, "diagonal", "measured")
+    keys = ("proposal", "resampling", "ess_share", "noise_model", "noise_at")
+    assert tuple(own[key] for key in keys) == printed
+    for table in ("particles", "laps", "distance", "observations", "repeats", "association"):
+        for run in of_one_seed(f"gil2008_{table}"):
+            if run.estimator_name == "fastslam_paper":
+                assert tuple(run.config["estimator"][key] for key in keys) == printed
+
+
+def test_ekf_slam_is_compared_where_r_is_taken_at_the_same_point():
+    guessed = {}
+    for run in of_one_seed("gil2008_association"):
+        own, camera = run.config["estimator"], run.config["sensors"]["stereo"]
+        if own["association"] == "mahalanobis":
+            kind = (camera["correlated"], own["noise_at"])
+            guessed.setdefault(kind, set()).add(run.estimator_name)
+    assert guessed == {
+        (False, "measured"): {"fastslam_paper", "ekf_slam"},
+        (False, "predicted"): {"fastslam", "ekf_slam"},
+        (True, "predicted"): {"fastslam", "ekf_slam"},
+    }
 
 
 def test_filters_that_guess_associations_have_the_same_gate():
