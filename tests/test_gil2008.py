@@ -7,7 +7,6 @@ import json
 import numpy as np
 import pandas as pd
 import pytest
-import yaml
 from joblib import Parallel, delayed
 
 from estimators.fastslam import FastSLAM
@@ -16,7 +15,6 @@ from experiments.gate.conform import walk
 from experiments.papers.gil2008 import claims as judge
 from experiments.papers.gil2008 import recordings, scores, settings, study
 from experiments.papers.results import Results
-from experiments.runs import paths
 from experiments.runs.experiment import Experiment
 from experiments.sweeps.plan import planned
 from tests.fakes import circle, tracking_prior, true_ids
@@ -306,13 +304,6 @@ def test_sentences_of_former_tables_name_their_filter(tmp_path):
         made.write_tables(particles=table)
         (said,) = judge.conclusions(made, list(judge.gi1(table, laps())))
         assert ("R was taken at the predicted point" in said.sentence) is is_old
-
-
-def test_worlds_are_those_of_the_studies():
-    for table, n in settings.N_WORLDS.items():
-        study_of = yaml.safe_load((paths.CONF / f"study/gil2008_{table}.yaml").read_text())
-        params = study_of["hydra"]["sweeper"]["params"]
-        assert params.get("seed", "range(1000,1001)") == f"range(1000,{1000 + n})", table
 
 
 def test_gi2_and_gi3_tell_a_trend_from_none():

@@ -13,7 +13,7 @@ from experiments.evaluation.metrics import rms
 from experiments.papers.gil2008.claims import pooled
 from experiments.papers.gil2008.settings import CELL_M
 from experiments.papers.results import Results
-from experiments.viewing.grid import draw_grid
+from experiments.viewing.grid import UNKNOWN, draw_grid
 from experiments.viewing.plotting import (
     draw_ellipses,
     plain_log,
@@ -80,6 +80,7 @@ def maps(run: Arrays) -> Figure:
     """Figure 1: occupancy grid of the rooms, and landmarks as the best particles map them."""
     page, (left, *others) = subplots(13.0, 4.9, 1, 3, sharex=True, sharey=True)
     draw_grid(left, _grid(run, "truth"))
+    left.set(xlim=(-2.5, 32.5), ylim=(-2.5, 32.5), facecolor=UNKNOWN)
     left.set_title("occupancy grid, along the true path", loc="left")
     for ax, name in zip(others, _SHOWN, strict=True):
         colour, _, words = _FILTERS[name]
@@ -100,7 +101,7 @@ def corrected(run: Arrays) -> Figure:
     for ax, (name, title) in zip(axes, titles.items(), strict=True):
         draw_grid(ax, _grid(run, name))
         ax.set_title(title, loc="left")
-        ax.set(xlim=(x1, x2), ylim=(y1, y2))
+        ax.set(xlim=(x1, x2), ylim=(y1, y2), facecolor=UNKNOWN)
     return page
 
 
@@ -143,7 +144,7 @@ def world_3d(run: Arrays) -> Figure:
 
 
 def _draw_3d(ax: Any, run: Arrays, name: str) -> None:
-    pose, landmarks, reach = run["image_pose"], run[f"{name}_landmarks"], 6.0
+    pose, landmarks, reach = run[f"{name}_image_pose"], run[f"{name}_landmarks"], 6.0
     eye = np.array([pose[0], pose[1], 0.5])
 
     def near(points: Array) -> Any:
@@ -170,7 +171,7 @@ def _draw_3d(ax: Any, run: Arrays, name: str) -> None:
         ylabel="y, m",
         zlabel="z, m",
     )
-    ax.set_box_aspect((2.0 * reach, 2.0 * reach, 3.0), zoom=1.25)
+    ax.set_box_aspect((2.0 * reach, 2.0 * reach, 3.0), zoom=1.1)
 
 
 def path(run: Arrays) -> Figure:
@@ -282,17 +283,19 @@ def by_particles_over_worlds(particles: pd.DataFrame, bound: pd.DataFrame) -> Fi
 
 def by_distance(distance: pd.DataFrame) -> Figure:
     """Figure 9: dmax, by filter, choice of observations, walls and noise."""
-    page, axes = subplots(10.5, 4.4, 1, 2, sharex=True)
+    page, axes = subplots(11.5, 4.4, 1, 2, sharex=True)
     kinds = {
-        ("fastslam2", True, "paper", 0, "random"): (BLUE, "-", "all visible"),
-        ("paper", True, "paper", 0, "random"): (RED, "-", "all visible, as printed"),
-        ("fastslam2", True, "paper", 8, "random"): (GREEN, "-", "8 at random"),
-        ("fastslam2", True, "paper", 8, "nearest"): (SKY, "-", "8 nearest"),
-        ("fastslam2", False, "paper", 0, "random"): (BLUE, "--", "all, no walls"),
-        ("fastslam2", False, "paper", 8, "random"): (GREEN, "--", "8 at random, no walls"),
-        ("fastslam2", True, "pixel", 0, "random"): (PURPLE, "-", "all visible, 1 px"),
+        ("paper", True, "paper", 0, "random"): (RED, "-", "as printed, all visible"),
+        ("paper", False, "paper", 0, "random"): (RED, "--", "as printed, no walls"),
+        ("paper", True, "paper", 8, "random"): (ORANGE, "-", "as printed, 8 at random"),
+        ("paper", True, "paper", 8, "nearest"): (SKY, "-", "as printed, 8 nearest"),
+        ("fastslam2", True, "paper", 0, "random"): (BLUE, "-", "FastSLAM 2.0, all visible"),
+        ("fastslam2", False, "paper", 0, "random"): (BLUE, "--", "FastSLAM 2.0, no walls"),
+        ("fastslam2", True, "paper", 8, "random"): (GREEN, "-", "FastSLAM 2.0, 8 at random"),
+        ("fastslam2", True, "pixel", 0, "random"): (PURPLE, "-", "FastSLAM 2.0, all visible, 1 px"),
     }
-    parts = dict(list(distance.groupby(["filter", "occluded", "noise", "n_seen", "rule"])))
+    kind_of = ["filter", "occluded", "noise", "n_seen", "rule"]
+    parts = dict(list(distance[distance["draw"] == 0].groupby(kind_of)))
     for ax, (column, label) in zip(axes, _BOTH, strict=True):
         for kind, (colour, line, words) in kinds.items():
             if kind in parts:
@@ -329,14 +332,15 @@ def by_association(association: pd.DataFrame) -> Figure:
     """Error and share of right associations for every way to associate."""
     way = association["association"].where(association["filter"] != "ekf_slam", "ekf_slam")
     association = association.assign(way=pd.Categorical(way, list(_WAYS)))
-    by_noise = [
-        (noise, list(table.groupby(["way", "sigma_descriptor", "p0"], observed=True)))
-        for noise, table in association.groupby("noise", sort=False)
+    # EKF-SLAM stands by the particle filter that takes R at the same point
+    compared = [
+        (noise, table, list(table.groupby(["way", "sigma_descriptor", "p0"], observed=True)))
+        for (noise, _), table in association.groupby(["noise", "noise_at"], sort=False)
     ]
-    counts = [len(ways) for _, ways in by_noise]
+    counts = [len(ways) for _, _, ways in compared]
     size = (10.0, 0.36 * sum(counts) + 1.2, len(counts), 2)
     page, grid = subplots(*size, squeeze=False, sharey="row", height_ratios=counts)
-    for (noise, ways), (left, right) in zip(by_noise, grid, strict=True):
+    for (noise, table, ways), (left, right) in zip(compared, grid, strict=True):
         labels = []
         for i, ((name, sigma, p0), part) in enumerate(ways):
             colour, words = _WAYS[name]
@@ -353,7 +357,8 @@ def by_association(association: pd.DataFrame) -> Figure:
             ylim=(len(labels) - 0.4, -0.6),  # the first on top; both sides share the heights
             xscale="log",
         )
-        left.set_title(f"noise of {_NOISE[noise]}", loc="left")
+        name = next(name for name in table["filter"] if name in _FILTERS)
+        left.set_title(f"{_FILTERS[name][2]}, noise of {_NOISE[noise]}", loc="left")
         plain_log(left.xaxis)
         right.set(xlim=(0.0, 1.0))
         right.tick_params(axis="y", left=False, labelleft=False)

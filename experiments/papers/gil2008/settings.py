@@ -14,24 +14,11 @@ LABELS: dict[str, tuple[str, ...]] = {
     "resampling": ("resampling", "ess_share"),
     "noise": (),
 }
-# Worlds of each table in the full profile, as in its study's YAML
-N_WORLDS = {
-    "particles": 50,
-    "laps": 30,
-    "bound": 50,
-    "observations": 20,
-    "repeats": 1,
-    "distance": 50,
-    "association": 50,
-    "resampling": 20,
-    "noise": 20,
-}
-N_WORLDS_QUICK = 2
+QUICK_SEEDS = "range(1000,1002)"
 CELL_M = 0.1  # of the occupancy grids
-N_REPEATS = {Profile.FULL: 20, Profile.QUICK: 3}  # of a run, or of the images over one drive
-N_DRAWS = {Profile.FULL: 5, Profile.QUICK: 2}  # of the wheel errors
+N_REPEATS = {Profile.FULL: 20, Profile.QUICK: 2}  # of a run, or of the images over one drive
+N_DRAWS = {Profile.FULL: 8, Profile.QUICK: 2}  # of the wheel errors
 N_TIMINGS = {Profile.FULL: 5, Profile.QUICK: 2}
-SEED = 1000  # of the first world
 P0 = 1e-3  # in the rows of estimators without a p0
 FARTHEST_M = 20.0  # images are drawn with all landmarks within this distance
 LAG_M = 20.0  # ground is revisited when the robot was there at least this much path ago
