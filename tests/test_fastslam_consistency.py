@@ -47,5 +47,7 @@ def test_figure_shows_each_arm():
     drawn = [line for ax in page.axes for line in ax.get_lines()]
     assert all(line.get_ydata() == pytest.approx([2.0, 2.0]) for line in drawn)
     named = [text.get_text() for text in page.axes[2].get_legend().get_texts()]
-    assert named == ["as it is", "four times the slip", "EKF-SLAM", "batch"]
+    assert named == ["as it is", "four times the slip"]
+    shared = [text.get_text() for text in page.legends[0].get_texts()]
+    assert shared == ["M = 10", "EKF-SLAM", "batch"]
     assert "fastslam_consistency" not in reproduce._chosen(None)
