@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from experiments.papers.decristoforis2020 import study as decristoforis2020
-from experiments.papers.gil2008 import settings, study
+from experiments.papers.gil2008 import study
 from experiments.papers.gil2008.recordings import Scene
 from experiments.papers.puzzlebot2024 import study as puzzlebot2024
 from experiments.papers.real_logs.settings import FUSION, INTEL
@@ -48,6 +48,8 @@ def of_one_seed(name):
         }),
         ("association", {"sensors.stereo.identifies", "sensors.stereo.sigma_descriptor"}),
         ("observations", {"sensors.stereo.max_observations"}),
+        ("laps", set()),
+        ("repeats", {"recording.image_draw", "repeats"}),
     ],
 )  # fmt: skip
 def test_runs_of_gil2008_differ_in_what_their_table_compares(table, compared):
@@ -63,6 +65,46 @@ def test_runs_of_gil2008_differ_in_what_their_table_compares(table, compared):
         assert len(beliefs) == 1
         if table == "observations":
             assert len(scenes) == 1  # one recording for all
+
+
+def test_comparisons_of_distance_are_within_a_recording():
+    """The draws of 10 m and 20 m are the same, and so are their worlds."""
+    drawn = {}
+    for run in planned(["study=gil2008_distance", "seed=range(1000,1002)"]):
+        if run.estimator_name == "fastslam_paper":
+            camera = run.config["sensors"]["stereo"]
+            kind = (camera["max_observations"], camera["selection"])
+            kind += (run.config["recording"]["occluded"],)
+            which = (run.seed, run.config["recording"]["draw"])
+            drawn.setdefault((kind, camera["max_distance_m"]), set()).add(which)
+    for (kind, dmax), which in drawn.items():
+        if dmax == 10:
+            assert drawn[kind, 20] == which, kind
+
+
+def test_the_printed_filter_is_the_papers_and_alone_takes_r_at_the_measured_point():
+    own = Experiment.compose(["study=gil2008", "estimator=fastslam_paper"]).config["estimator"]
+    printed = ("motion", "multinomial", 1.0, "diagonal", "measured")
+    keys = ("proposal", "resampling", "ess_share", "noise_model", "noise_at")
+    assert tuple(own[key] for key in keys) == printed
+    for table in ("particles", "laps", "distance", "observations", "repeats", "association"):
+        for run in of_one_seed(f"gil2008_{table}"):
+            if run.estimator_name == "fastslam_paper":
+                assert tuple(run.config["estimator"][key] for key in keys) == printed
+
+
+def test_ekf_slam_is_compared_where_r_is_taken_at_the_same_point():
+    guessed = {}
+    for run in of_one_seed("gil2008_association"):
+        own, camera = run.config["estimator"], run.config["sensors"]["stereo"]
+        if own["association"] == "mahalanobis":
+            kind = (camera["correlated"], own["noise_at"])
+            guessed.setdefault(kind, set()).add(run.estimator_name)
+    assert guessed == {
+        (False, "measured"): {"fastslam_paper", "ekf_slam"},
+        (False, "predicted"): {"fastslam", "ekf_slam"},
+        (True, "predicted"): {"fastslam", "ekf_slam"},
+    }
 
 
 def test_filters_that_guess_associations_have_the_same_gate():
@@ -86,7 +128,6 @@ def test_particle_filters_are_compared_by_the_same_m_and_repeats():
                 (run.config["estimator"]["n_particles"], run.repeats)
             )
     assert own["fastslam"] == own["fastslam_paper"]
-    assert settings.SEED == 1000
 
 
 def test_methods_of_decristoforis2020_share_drive_and_beliefs():

@@ -57,9 +57,15 @@ _OF_THE_PATH = {
     "rpe_10m_rmse_m": Column("position RMSE over 10 m", "RPE 10 m", "m"),
     "rpe_10m_heading_rmse_rad": Column("heading RMSE over 10 m", "RPE heading 10 m", "rad"),
 }
+_OF_THE_MAP = {
+    "n_landmarks": Column("landmarks in the map", "N", "", "linear", None),
+    "map_rmse_m": Column("RMSE of the map's landmarks", "map", "m"),
+    "map_aligned_rmse_m": Column("RMSE of the map's landmarks after alignment", "map aligned", "m"),
+}
 COLUMNS = {
     **OF_THE_RUN,
     **_OF_THE_PATH,
+    **_OF_THE_MAP,
     **{
         f"revised_{name}": dataclasses.replace(
             column, label=f"{column.label}, revised path", symbol=f"{column.symbol} revised"

@@ -9,6 +9,7 @@ import numpy as np
 from threadpoolctl import ThreadpoolController
 
 from estimators.base import Estimate, Estimator, Prior, run
+from experiments.evaluation.map_quality import landmark_errors
 from experiments.evaluation.metrics import score
 from experiments.runs.columns import OF_THE_RUN
 from experiments.runs.experiment import Experiment
@@ -135,7 +136,8 @@ def _blas() -> ThreadpoolController:
 
 def scored(recording: Recording, online: Estimate, revised: Estimate | None) -> Row:
     """Scores of a run as columns; those of the revised path begin with `revised_`."""
-    scores: Row = {**score(recording, online)}
+    made = online.map if revised is None else revised.map
+    scores: Row = {**score(recording, online), **landmark_errors(recording, made)}
     if revised is not None:
         found = score(recording, revised)
         scores |= {f"revised_{k}": found[k] for k in found if k not in OF_THE_RUN}
