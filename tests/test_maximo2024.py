@@ -391,4 +391,5 @@ def test_every_job_of_the_study_is_of_a_judged_world():
     campuses = [name for what, name, _, _ in jobs if what == "campus"]
     assert len(campuses) >= 20
     for name in study.routes():
-        assert sum(job[:2] == ("weighting", name) for job in jobs) >= 20
+        weighted = [job for job in jobs if job[0] in ("weighting", "control") and job[1] == name]
+        assert len({seed for _, _, seed, _ in weighted}) == len(weighted) >= 20

@@ -112,13 +112,15 @@ Job = tuple[str, str, int, Profile]  # what to run, in which world
 
 def _jobs(profile: Profile) -> list[tuple[Job, float]]:
     """All jobs and how long they take, the longest first."""
+    decisive = sorted(headlines(routes()))
+    controls = [*CONTROLS, *(set(routes()) - set(decisive))]
     sizes = {
         "campus": (["campus"], N_CAMPUSES, 10.0),
         "runs": (["oxford_runs"] * POSITIONS.is_file(), N_RUN_SEEDS, 10.0),
         "route": (routes(), N_WORLDS, 6.0),
-        "weighting": (routes(), N_WEIGHTED, 3.0),
-        "control": (CONTROLS, N_WORLDS, 3.0),
-        "quality": (sorted(headlines(routes())), N_QUALITY_WORLDS, 3.0),
+        "weighting": (decisive, N_WEIGHTED, 3.0),
+        "control": (controls, N_WORLDS, 3.0),
+        "quality": (decisive, N_QUALITY_WORLDS, 3.0),
     }
     return [
         ((what, name, JUDGED_SEED + i, profile), cost)
