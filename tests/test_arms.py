@@ -191,9 +191,9 @@ def assert_alike(calls, *compared):
     """Runs differ in nothing but these settings; draws are the same."""
     first, *others = calls
     assert others
-    for settings, draw, stamps, poses in others:
-        differing = {key for key in settings if settings[key] != first[0][key]}
-        assert differing <= set(compared)
+    for own, draw, stamps, poses in others:
+        changed = {key for key in own if own[key] != first[0][key]}
+        assert changed <= set(compared)
         assert draw == first[1]
         np.testing.assert_array_equal(stamps, first[2])
         np.testing.assert_array_equal(poses, first[3])
