@@ -8,6 +8,8 @@ import pytest
 from experiments.papers.decristoforis2020 import study as decristoforis2020
 from experiments.papers.gil2008 import study
 from experiments.papers.gil2008.recordings import Scene
+from experiments.papers.maximo2024 import worlds
+from experiments.papers.maximo2024.settings import GRID_B, METHODS, QUALITIES
 from experiments.papers.puzzlebot2024 import study as puzzlebot2024
 from experiments.papers.real_logs.settings import FUSION, INTEL
 from experiments.runs.experiment import Experiment
@@ -209,3 +211,71 @@ def test_arms_of_one_study_start_at_the_same_pose():
     ]
     assert all(prior == experiment.config["prior"] for prior in priors)
     assert study.labels_of("association", experiment)["filter"] == "fastslam2"
+
+
+@pytest.fixture
+def asked(monkeypatch):
+    """What the filter of maximo2024 is run with: its settings, its draws, and its queries."""
+    calls = []
+
+    def localize(case, settings, rng, recording=None, keep=()):
+        taken = case.recording if recording is None else recording
+        calls.append((settings, rng.random(), taken.frame_stamps, taken.truth.poses))
+        n = len(taken.frame_stamps)
+        return worlds.Walk(np.zeros(n), np.zeros(n), None)
+
+    monkeypatch.setattr(worlds, "localize", localize)
+    return calls
+
+
+def assert_alike(calls, *compared):
+    """Runs differ in nothing but these settings; draws are the same."""
+    first, *others = calls
+    assert others
+    for own, draw, stamps, poses in others:
+        changed = {key for key in own if own[key] != first[0][key]}
+        assert changed <= set(compared)
+        assert draw == first[1]
+        np.testing.assert_array_equal(stamps, first[2])
+        np.testing.assert_array_equal(poses, first[3])
+    assert len({json.dumps(call[0]) for call in calls}) == len(calls)
+
+
+def test_weightings_of_maximo2024_differ_in_nothing_else(asked):
+    worlds.weighting_rows(worlds.case_of("umh", 5), 1)
+    assert_alike(asked, "weighting")
+    assert [settings["weighting"] for settings, *_ in asked] == ["M1", "M2", "M3"]
+
+
+def test_every_cell_of_the_map_compares_the_same_runs(asked):
+    list(worlds.quality_rows("umh", 5))
+    n = len(GRID_B) * len(METHODS)
+    assert len(asked) == n * len(QUALITIES)
+    for start in range(0, len(asked), n):
+        assert_alike(asked[start : start + n], "weighting", "n_nearest")
+
+
+def test_numbers_of_particles_are_compared_over_the_same_queries(asked):
+    case = worlds.case_of("umh", 5)
+    list(worlds.particle_rows(case, 1))
+    same_draws = [(settings, 0.0, *rest) for settings, _, *rest in asked]  # as many as particles
+    assert_alike(same_draws, "particles_per_node")
+    assert len({draw for _, draw, *_ in asked}) == len(asked)
+
+
+def test_kidnappings_with_and_without_injection_are_the_same(asked):
+    case = worlds.case_of("umh", 5)
+    list(worlds.kidnapping_rows(case, worlds.options(case), 0.05, 3, 30))
+    assert len(asked) == 6
+    for without, injected in zip(asked[::2], asked[1::2], strict=True):
+        assert_alike([without, injected], "injection")
+
+
+def test_methods_on_a_robot_of_mrclam_read_the_same_log():
+    by_robot = {}
+    for run in planned(["study=real_logs_mrclam"]):
+        by_robot.setdefault(run.config["recording"]["robot"], []).append(run)
+    for runs in by_robot.values():
+        rivals = [run for run in runs if run.config["recording"]["calibrated"]]
+        assert {run.estimator_name for run in rivals} == {"odometry", "fastslam", "ekf_slam"}
+        assert differing(rivals) <= {"recording.identifies"}
