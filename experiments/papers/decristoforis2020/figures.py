@@ -1,5 +1,6 @@
 """The figures of decristoforis2020, and those that our studies add."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from experiments.evaluation.statistics import log_ratio_interval
 from experiments.papers.decristoforis2020.claims import judged_runs, nees_intervals
 from experiments.papers.decristoforis2020.settings import CONSISTENT, PAPERS_OWN, PLACES
 from experiments.papers.results import Results
-from experiments.viewing.plotting import draw_ellipses, plain_ticks, with_legend
+from experiments.viewing.plotting import draw_ellipses, plain_ticks, plan_axes, with_legend
 from experiments.viewing.style import (
     BLUE,
     GREEN,
@@ -70,6 +71,8 @@ def draw(made: Results) -> dict[str, Figure]:
         "ordering": ordering(made.table("ordering")),
         "steps": steps(made.table("steps")),
     }
+    if made.has_arrays("log"):  # which is written where the log is
+        pages["log"] = real_log(made.arrays("log"), made.table("log_boxes"))
     return {f"{made.paper}_{name}": page for name, page in pages.items()}
 
 
@@ -171,6 +174,13 @@ def _of_drawn(drawn: pd.DataFrame, column: str, words: str) -> str:
 def boxes(table: pd.DataFrame) -> Figure:
     """Figure 4: absolute errors of position and heading over all recordings."""
     page, axes = subplots(8.0, 3.8, 1, 2)
+    _boxes(axes, table)
+    page.suptitle("all recordings; box: quartiles, whiskers: 1.5 times their distance", size=9)
+    return page
+
+
+def _boxes(axes: Sequence[Axes], table: pd.DataFrame) -> None:
+    """Box plots of both errors by method."""
     panels = (("position_m", "position error, m", 1.0), ("heading_rad", "heading error, deg", _DEG))
     for ax, (name, label, unit) in zip(axes, panels, strict=True):
         rows = table[table["error"] == name].set_index("method")
@@ -183,7 +193,23 @@ def boxes(table: pd.DataFrame) -> Figure:
         for patch, method in zip(drawn["boxes"], rows.index, strict=True):
             patch.set(facecolor=COLORS[method], alpha=0.6)
         ax.set(yscale="log", ylabel=label, ylim=(stats["q1"].min() / 10, None))
-    page.suptitle("all recordings; box: quartiles, whiskers: 1.5 times their distance", size=9)
+
+
+def real_log(log: Arrays, table: pd.DataFrame) -> Figure:
+    """Figures 1 and 3 to 5 over a real log: paths, errors, and maps by method."""
+    page = figure(10.0, 8.0)
+    top, bottom = page.subfigures(2, 1, height_ratios=(1.3, 1.0))  # type: ignore[misc]
+    left, *boxed = top.subplots(1, 3, width_ratios=(1.6, 1.0, 1.0))
+    left.plot(*log["truth"].T, color=COLORS["truth"], lw=1.0, label="a mapper's poses")
+    for method in PAPERS_OWN:
+        left.plot(*log[method].T, color=COLORS[method], lw=0.8, label=NAMES[method])
+    plan_axes(left)
+    _boxes(boxed, table)
+    top.legend(*left.get_legend_handles_labels(), loc="outside upper center", ncols=4)
+    for ax, method in zip(bottom.subplots(1, 3), PAPERS_OWN, strict=True):
+        ax.plot(*log[f"{method}_points"].T, ",", color=TRUTH, alpha=0.6)
+        plan_axes(ax)
+        ax.set_title(f"laser points by {NAMES[method]}", fontsize="medium")
     return page
 
 

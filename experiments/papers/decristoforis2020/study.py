@@ -40,6 +40,7 @@ from experiments.papers.decristoforis2020.settings import (
 )
 from experiments.papers.decristoforis2020.steps import ellipse_path, ellipse_summary, step_errors
 from experiments.papers.jobs import grouped, in_parallel
+from experiments.papers.real_logs.settings import DATA
 from experiments.papers.results import Results
 from experiments.runs.console import RunFailedError
 from experiments.runs.evaluate import evaluate
@@ -86,7 +87,9 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
         for name, frame in tables.items():
             parts.setdefault(name, []).append(frame)
     whole = {name: pd.concat(frames, ignore_index=True) for name, frames in parts.items()}
-    whole["boxes"] = _boxes(whole.pop("errors"))
+    whole["boxes"] = _boxes(judged_runs(whole.pop("errors")))
+    if "log_errors" in whole:
+        whole["log_boxes"] = _boxes(whole.pop("log_errors"))
     whole["covariances"] = whole["covariances"].sort_values(["metric", "method", "place", "seed"])
     whole["ordering"] = whole["ordering"][[*_NOISE, "ate_rmse_m", "heading_rmse_rad"]]
     out.write_tables(**whole)
@@ -102,8 +105,10 @@ def _jobs(full: bool, out: Results) -> list[Job]:
     seeds = range(JUDGED_SEED, JUDGED_SEED + n)
     (office,) = _planned("methods", 1, "route.distance_m=300.0", *shorter)
     first, *others = _planned("corridor", n)
+    on_log = list(planned(["study=decristoforis2020_log"])) if DATA.is_dir() else []
     return [
         (drawn, _drawn_office, [_only(PAPERS_OWN, office), out]),
+        *((0.5, _drawn_log, [group, out]) for group in ([on_log] if on_log else [])),
         *((drive, _drive, [group]) for group in _planned("methods", n_drives, *short)),
         *(
             (slow, _drive, [_only(CHECKED, group)])
@@ -253,6 +258,26 @@ def _drawn_office(group: Sequence[Experiment], out: Results) -> Tables:
     return {"drawn": pd.DataFrame(rows), "areas": pd.concat(inside)}
 
 
+def _drawn_log(group: Sequence[Experiment], out: Results) -> Tables:
+    """Scores and errors over a real log; writes its paths and map points."""
+    recording = group[0].recording()
+    arrays: dict[str, Any] = {}
+    rows, errors = [], []
+    for experiment in group:
+        row, estimate = _run(experiment, recording, {"method": "method"})
+        method, truth = str(row["method"]), recording.truth_at(estimate.stamps)
+        known = np.isfinite(truth).all(axis=1)
+        off_m = position_errors_m(truth[known], estimate.means[known])
+        off_rad = np.abs(heading_errors_rad(truth[known], estimate.means[known]))
+        errors.append(pd.DataFrame({"position_m": off_m, "heading_rad": off_rad, "method": method}))
+        rows.append(row)
+        points = map_points(recording, estimate, every_s=10.0, every_beam=2)
+        arrays |= {method: estimate.means[::5, :2], f"{method}_points": points.astype(np.float32)}
+    arrays["truth"] = recording.known_truth.poses[:, :2]
+    out.write_arrays("log", **arrays)
+    return {"log": pd.DataFrame(rows), "log_errors": pd.concat(errors)}
+
+
 def _within(path: pd.DataFrame, area: Array, margin_m: float) -> pd.DataFrame:
     """The first pass of a path through an area and a margin about it, a row every 5 cm."""
     x1, y1, x2, y2 = area
@@ -316,7 +341,7 @@ def _metrics(seed: int, kind: str) -> Tables:
 
 def _boxes(errors: pd.DataFrame) -> pd.DataFrame:
     """Quartiles and whiskers (1.5 times the interquartile range) of the pooled errors."""
-    by_method = judged_runs(errors).groupby("method")
+    by_method = errors.groupby("method")
     rows = [
         {"method": method, "error": name, "n": len(values), **boxplot_stats(values)[0]}
         for method in PAPERS_OWN
