@@ -16,7 +16,7 @@ from multiprocessing import get_context
 from pathlib import Path
 
 from experiments.bench.measure import Measurement, time_s, timed_steps
-from experiments.runs.evaluate import one_blas_thread
+from experiments.runs.evaluate import limited_blas
 from experiments.runs.experiment import Experiment
 from experiments.runs.seeds import stream
 
@@ -102,7 +102,7 @@ def _driven(name: str) -> Drive:
     estimator.reset(prior, stream(0, "bench"))
     drive = Drive([], [], {})
     by_minute = itertools.groupby(recording.frames(), lambda frame: int(frame.stamp // 60.0))
-    with one_blas_thread():
+    with limited_blas():
         for minute, frames in itertools.islice(by_minute, _MINUTES):
             times_s = [seconds for seconds, _ in timed_steps(estimator, frames)]
             drive.step_us.append(1e6 * statistics.fmean(times_s))
