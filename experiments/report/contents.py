@@ -25,6 +25,7 @@ OWN = {
     "leaderboard": ["estima run -m study=leaderboard"],
     "all_estimators": ["estima run -m study=all_estimators"],
     "mcl_office": ["estima reproduce --paper mcl_office --full"],
+    "fastslam_consistency": ["estima reproduce --paper fastslam_consistency --full"],
 }
 SMALL_ROWS, SMALL_COLUMNS = 60, 20  # a table up to here is shown whole
 FIRST_ROWS = 5  # of a larger one
@@ -40,7 +41,7 @@ def contents(results: Path, on_progress: Callable[[float], None]) -> dict[str, A
     about = {name: findings(name) for name in (*papers, *OWN)}
     sentences = read_verdicts(results / "verdicts.csv").set_index("id")["sentence"].to_dict()
     claims = judged_claims(table, about, sentences)
-    commands = {name: [f"estima reproduce --paper {name}"] for name in papers} | OWN
+    commands = {name: [f"estima reproduce --full --paper {name}"] for name in papers} | OWN
     commands |= {str(k): list(v.unique()) for k, v in table.groupby("paper")["command"]}
     studies = {}
     for done, (name, page) in enumerate(about.items(), start=1):

@@ -138,6 +138,12 @@ class Experiment:
         return self.choices.get("estimator") or str(self.config["estimator"]["_target_"])
 
     @property
+    def believed_slip(self) -> tuple[float, float] | None:
+        """The kr and kl that the estimator believes, m; None if it has no such options."""
+        settings = self.config["estimator"]
+        return (settings["kr"], settings["kl"]) if {"kr", "kl"} <= set(settings) else None
+
+    @property
     def seed(self) -> int:
         """Seed of every stream of randomness but the world's."""
         return int(self.config["seed"])

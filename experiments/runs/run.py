@@ -27,7 +27,7 @@ from experiments.runs.store import write_run
 from sim.errors import InputError
 from sim.recording import Recording
 
-Draw = Callable[[Recording, Estimate, str, Path], None]
+Draw = Callable[[Recording, Estimate, Experiment, Path], None]
 
 
 def run_once(experiment: Experiment, draw: Draw) -> list[Row]:
@@ -36,7 +36,7 @@ def run_once(experiment: Experiment, draw: Draw) -> list[Row]:
     Parameters
     ----------
     draw
-        Draws a recording and an estimate, with the estimator's name, into a folder.
+        Draws a recording and an estimate of an experiment into a folder.
 
     Raises
     ------
@@ -51,7 +51,7 @@ def run_once(experiment: Experiment, draw: Draw) -> list[Row]:
 
     def keep(recording: Recording, repeat: int, online: Estimate, _: Estimate | None) -> None:
         if repeat == 0 and experiment.picture:
-            draw(recording, online, name, folder)
+            draw(recording, online, experiment, folder)
 
     rows = evaluate(
         experiment,
