@@ -156,8 +156,8 @@ class ScanMatcher:
             reference,
             in_laser.mean,
             metric=self.metric,
-            gate_m=min(_LEAST_GATE_M + 4.0 * math.sqrt(xx + yy), _MOST_GATE_M),
-            gate_rad=min(_LEAST_GATE_RAD + 4.0 * math.sqrt(turn), _MOST_GATE_RAD),
+            gate_m=min(_LEAST_GATE_M + 4.0 * math.sqrt(max(xx + yy, 0.0)), _MOST_GATE_M),
+            gate_rad=min(_LEAST_GATE_RAD + 4.0 * math.sqrt(max(turn, 0.0)), _MOST_GATE_RAD),
             heading_window_rad=heading_window_rad,
             rules=self.rules,
         )

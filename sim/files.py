@@ -9,6 +9,14 @@ from pathlib import Path
 from sim.errors import InputError, require
 
 
+def require_file(path: Path) -> None:
+    """Refuse what is no file: a folder, or a pipe or device, which could be read for ever.
+
+    What is not there is left to the reader.
+    """
+    require(path.is_file() or not path.exists(), f"{path}: not a file; name a file")
+
+
 @contextmanager
 def write_whole(path: Path, *, durable: bool = True) -> Iterator[Path]:
     """Give a path beside `path` to write to; move it into place if all went well.

@@ -49,7 +49,7 @@ def test_ways_to_associate_stand_at_one_height_left_and_right():
     ]
     columns = ["filter", "association", "p0", "sigma_descriptor"]
     table = pd.concat(
-        pd.DataFrame(part, columns=columns).assign(noise=noise, seed=seed)
+        pd.DataFrame(part, columns=columns).assign(noise=noise, seed=seed, noise_at="predicted")
         for noise, part in (("paper", ways), ("pixel", ways[:2]))
         for seed in range(2)
     ).assign(revised_ate_rmse_m=1.0, odometry_rmse_m=2.0, right_share=0.5, matching_precision=0.9)

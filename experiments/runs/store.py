@@ -7,7 +7,6 @@ columns and types; the name of such a file holds the digest of its bytes. So any
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import io
 import json
@@ -15,7 +14,7 @@ import os
 import re
 import zlib
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from experiments.runs.columns import REPEAT
+from experiments.runs.locks import locked
 from experiments.runs.row import (
     WITH_DIGEST,
     Outcome,
@@ -64,6 +64,8 @@ class Journal:
         with _writing(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file = path.open("ab", buffering=0)
+            if self._file.tell():  # a job tried again: its last line may be half written
+                self._file.write(b"\n")
 
     def begin(self, key: str) -> None:
         """Note that a run begins."""
@@ -346,14 +348,11 @@ def _same(a: Any, b: Any) -> bool:
 
 @contextmanager
 def _alone(folder: Path) -> Iterator[None]:
-    """Hold the folder's lock, which the system frees even if the process is killed."""
-    with _writing(folder):
-        handle = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX)
+    """Hold the folder's lock."""
+    with ExitStack() as held:
+        with _writing(folder):
+            held.enter_context(locked(folder / ".tidy.lock"))
         yield
-    finally:
-        os.close(handle)
 
 
 @contextmanager

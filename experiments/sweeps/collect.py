@@ -20,10 +20,12 @@ _TIMES = ["step_time_us"]  # they differ from run to run
 _DRAWN = ["seed", "world_seed"]  # what `summary` averages over
 _MAIN = (
     "ate_rmse_m",
+    "ate_mean_m",
     "ate_aligned_rmse_m",
     "heading_rmse_rad",
     "heading_aligned_rmse_rad",
     "nees_mean",
+    "dispersion_final_m",
     "revised_ate_rmse_m",
     "revised_ate_aligned_rmse_m",
     "step_time_us",
