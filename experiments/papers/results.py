@@ -56,7 +56,7 @@ class Results:
         return table
 
     def has_table(self, name: str) -> bool:
-        """Whether the study left this table, or it came with the project."""
+        """Whether the study left this table: some need data that is not part of the project."""
         return self._path("tables", f"{name}.csv").exists()
 
     def write_arrays(self, name: str, **arrays: NDArray[np.generic]) -> None:

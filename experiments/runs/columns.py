@@ -36,10 +36,12 @@ class Column:
 OF_THE_RUN = {
     "duration_s": Column("duration", "t", "s", "linear", None),
     "distance_m": Column("distance travelled", "d", "m", "linear", None),
+    "dispersion_final_m": Column("final dispersion of the particles", "dispersion", "m"),
 }
 _OF_THE_PATH = {
     "step_time_us": Column("time per step", "step", "us"),
     "ate_rmse_m": Column("position RMSE", "ATE", "m"),
+    "ate_mean_m": Column("mean position error", "mean error", "m"),
     "ate_aligned_rmse_m": Column("position RMSE after alignment", "ATE aligned", "m"),
     "heading_rmse_rad": Column("heading RMSE", "heading", "rad"),
     "heading_aligned_rmse_rad": Column("heading RMSE after alignment", "heading aligned", "rad"),

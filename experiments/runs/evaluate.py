@@ -10,7 +10,7 @@ from threadpoolctl import ThreadpoolController
 
 from estimators.base import Estimate, Estimator, Prior, run
 from experiments.evaluation.map_quality import landmark_errors
-from experiments.evaluation.metrics import score
+from experiments.evaluation.metrics import SCORED_EXTRAS, score
 from experiments.runs.columns import OF_THE_RUN
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome, Row, Status
@@ -78,9 +78,8 @@ def evaluate(
                 planted(estimator, repeat) if planted else nullcontext(),
                 shown(recording) if shown else nullcontext() as on_step,
             ):
-                online, revised = estimates(
-                    estimator, recording, prior, rng, experiment.keep, on_step
-                )
+                keep = (*SCORED_EXTRAS, *experiment.keep)
+                online, revised = estimates(estimator, recording, prior, rng, keep, on_step)
             status = status_of(recording, online)
             scores = scored(recording, online, revised)
         except InputError:

@@ -90,7 +90,7 @@ def conclusions(made: Results, claims: Sequence[Claim]) -> list[Conclusion]:
     found = conclude(claims, sentences, "worlds")
     if "noise_at" in made.table("particles"):
         return found
-    other = f" R was taken at the predicted point; with R at the measured one, as printed, {AGAIN}."
+    other = f" R was taken at the predicted point; at the measured one, as printed, it is {AGAIN}."
     return [
         replace(each, sentence=each.sentence + other) if each.id != "GI8" else each
         for each in found
