@@ -384,7 +384,7 @@ def test_recordings_of_the_check_turn():
     ("text", "words"),
     [
         ("recordings: 3", "a suite holds"),
-        ("first_seed: [", "cannot read"),
+        ("first_seed: [", "not valid YAML"),
         (
             "first_seed: 1\nrecordings: {a: {count: 1, overrides: []}}\n"
             "estimators: {odometry: {recordings: a, repeats: [1, 1]}}",

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from estimators import descriptors as describers
 from experiments.evaluation.verdict import Verdict
-from experiments.papers.maximo2024.claims import COMPARISONS, geometries, judged_map
+from experiments.papers.maximo2024.claims import COMPARISONS, geometries, headlines, judged_map
 from experiments.papers.maximo2024.settings import (
+    CONTROLS,
     DRAWN_DESCRIPTOR,
     ITERATIONS,
     METHODS,
@@ -48,10 +49,12 @@ def draw(made: Results) -> dict[str, Figure]:
         "maximo2024_data": data(drawn["campus"]),
         "maximo2024_clusters": clusters(drawn),
         "maximo2024_map_and_route": map_and_route(drawn),
-        "maximo2024_dispersion": dispersion(made.table("dispersion")),
+        "maximo2024_dispersion": dispersion(_without_controls(made.table("dispersion"))),
         "maximo2024_starts": starts({name: drawn[name] for name in (oxford, "umh")}),
         "maximo2024_particles": particles(drawn[oxford]),
-        "maximo2024_table_1": table_1(made.table("table_1"), made.table("weighting")),
+        "maximo2024_table_1": table_1(
+            _without_controls(made.table("table_1")), made.table("weighting")
+        ),
         "maximo2024_table_2": table_2(made.table("table_2")),
         "maximo2024_quality": quality(made.table("quality")),
         "maximo2024_kidnapping": kidnapping(made.table("kidnapping")),
@@ -185,18 +188,20 @@ def table_1(table: pd.DataFrame, weighting: pd.DataFrame) -> Figure:
 
 def table_2(table: pd.DataFrame) -> Figure:
     """Table 2: error and time per node by the number of particles, beside the paper's."""
-    page, axes = subplots(9.0, 5.4, 2, 2)
+    table = table[table["geometry"].isin(headlines(table["geometry"]))]
+    page, columns = _columns(table, 4.2, 0.6, 5.4, n_rows=2)
     here, paper = {"fmt": "o-", "color": BLUE}, {"fmt": "D--", "color": RED}
-    parts = table.groupby("geometry", sort=False)
-    for (upper, lower), (name, part) in zip(axes.T, parts, strict=True):
+    for (upper, lower), name, part in columns:
         n = part["particles"]
         upper.errorbar(n, part["error_m"], part["sd_repeats_m"], label="here", capsize=3, **here)
         upper.errorbar(n, part["paper_m"], part["paper_sd_m"], label="paper", capsize=3, **paper)
         top = 1.6 * float(np.nanmax(part[["error_m", "paper_m"]]))
-        upper.set(title=NAMES[str(name)], ylabel="mean error, m", ylim=(0.0, top))
+        upper.set(title=NAMES[name], ylim=(0.0, top))
         lower.errorbar(n, 1e3 * part["time_s"], **here)
         lower.errorbar(n, 1e3 * part["paper_time_s"], **paper)
-        lower.set(xlabel="particles", ylabel="time a node, ms", yscale="log")
+        lower.set(xlabel="particles", yscale="log")
+    columns[0][0][0].set(ylabel="mean error, m")
+    columns[0][0][1].set(ylabel="time a node, ms")
     return with_legend(page, ncols=2)
 
 
@@ -283,6 +288,10 @@ def campus_errors(starts_table: pd.DataFrame, clusters_table: pd.DataFrame) -> F
     right.set(xlabel="", ylim=(0.0, 1.0), ylabel="share of queries")
     right.legend(loc="lower right", bbox_to_anchor=(1.0, 1.06), ncols=2)
     return page
+
+
+def _without_controls(table: pd.DataFrame) -> pd.DataFrame:
+    return table[~table["geometry"].isin(CONTROLS)]
 
 
 def _columns(
