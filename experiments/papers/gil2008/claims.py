@@ -249,8 +249,7 @@ def gi3_sentence(rows: Sequence[Claim]) -> str:
 
 def gi4(distance: pd.DataFrame) -> Iterator[Claim]:
     """GI4: the error falls with dmax."""
-    first = distance[distance["occluded"] & (distance["draw"] == 0)]
-    for words, is_beside, is_ours, part in _kinds(first):
+    for words, is_beside, is_ours, part in _kinds(distance[distance["occluded"]]):
         errors = pooled(part, POSITION, "max_distance_m")
         found = log_ratio_interval(errors[3], errors[10])
         label, n = f"position error, dmax = 3 m over 10 m: {words}", len(errors)
