@@ -296,6 +296,7 @@ class FastSLAM:
     def _take_stock(self) -> None:
         """Moments of the particles as they are drawn and weighted."""
         self._drawn = np.ascontiguousarray(self._poses[:3, : self.n_particles].T)
+        self._drawn[:, 2] = se2.wrap(self._drawn[:, 2])
         self._lineages.append(self._drawn)
         self._rolled = STILL
         weights = normalize(self._log_weights)
@@ -309,14 +310,11 @@ class FastSLAM:
         unlikeness = self.front_end.unlikeness(image)
         if len(points) == 0 or maps.n_slots == 0:
             return slots
-        candidates = maps.nearby(self._state, self.front_end.reach_m)
-        maps.touch(candidates)
+        near = maps.nearby(self._state, self.front_end.reach_m)
+        maps.touch(near)
         ekf.associate(
             maps.data,
-            candidates,
-            maps.place,
-            maps.counts,
-            maps.births,
+            ekf.Candidates(near, maps.place, maps.counts, maps.births),
             points,
             unlikeness,
             spread,

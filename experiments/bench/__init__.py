@@ -18,6 +18,7 @@ SUITES = {
     "formats": ("formats",),
     "smoothing": ("smoothing",),
     "compile": ("compile",),
+    "growth": ("growth",),
 }
 
 

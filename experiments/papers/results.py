@@ -1,7 +1,5 @@
 """What a study writes for its claims and figures: tables and arrays."""
 
-import zipfile
-import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,6 +13,7 @@ from experiments.runs.paths import short
 from experiments.runs.row import read_rows, write_frame
 from sim.errors import InputError
 from sim.files import write_whole
+from sim.npz import read_arrays
 
 # Errors of a table or array without its content; a query for a missing column is a NameError
 _MISFITS = (
@@ -75,9 +74,8 @@ class Results:
         """
         path = self._path("arrays", f"{name}.npz", to_read=True)
         try:
-            with np.load(path, allow_pickle=False) as file:
-                return _Arrays(file, short(path), self._remedy)
-        except (OSError, ValueError, TypeError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+            return _Arrays(read_arrays(path), short(path), self._remedy)
+        except InputError as error:
             raise InputError(f"{short(path)}: damaged ({error}); {self._remedy}") from error
 
     def has_arrays(self, name: str) -> bool:
@@ -112,7 +110,8 @@ class Results:
 
     @property
     def _remedy(self) -> str:
-        return f"run `estima reproduce --paper {self.paper}`"
+        full = "" if self.folder.name == "quick" else "--full "
+        return f"run `estima reproduce {full}--paper {self.paper}`"
 
 
 class _Arrays(dict[str, NDArray[np.generic]]):
