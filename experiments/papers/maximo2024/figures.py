@@ -249,8 +249,8 @@ def oxford_runs(table: pd.DataFrame) -> Figure:
     nearest = table.groupby("run")["nearest_node_m"].mean()
     ax.plot(np.arange(len(errors)), nearest, "_", color=WALL, ms=14, label="nearest node")
     ax.set_xticks(range(len(errors)), [run[:10] for run in errors.index], rotation=60, ha="right")
-    ax.set(ylabel="mean error over the route, m", xlabel="Oxford run")
-    _log_scale(ax)
+    ax.set(ylabel="mean error over the route, m", xlabel="Oxford run", yscale="log")
+    plain_log(ax.yaxis)
     return with_legend(page, ncols=4)
 
 
@@ -305,7 +305,7 @@ def _columns(
     """Page with one column per geometry: its axes, name and rows."""
     names = geometries(table)
     size = (width_in * len(names) + margin_in, height_in, n_rows, len(names))
-    page, axes = subplots(*size, sharex=n_rows > 1, sharey=sharey, squeeze=False)
+    page, axes = subplots(*size, sharex="col", sharey=sharey, squeeze=False)
     parts = [table[table["geometry"] == name] for name in names]
     return page, list(zip(axes.T, names, parts, strict=True))
 
