@@ -276,12 +276,13 @@ def _drawn_log(group: Sequence[Experiment], out: Results) -> Tables:
 
 
 def _within(path: pd.DataFrame, area: Array, margin_m: float) -> pd.DataFrame:
-    """The first pass of a path through an area and a margin about it, a row every 5 cm."""
+    """The longest pass of a path through an area and a margin about it, a row every 5 cm."""
     x1, y1, x2, y2 = area
     inside = path["x_m"].between(x1 - margin_m, x2 + margin_m)
     inside &= path["y_m"].between(y1 - margin_m, y2 + margin_m)
     rows = path[inside]
-    rows = rows[rows["distance_m"].diff().gt(1.0).cumsum() == 0]
+    passes = rows["distance_m"].diff().gt(1.0).cumsum()
+    rows = rows[passes == passes.mode().min()]
     return rows.groupby(rows["distance_m"] // 0.05).head(1)
 
 
