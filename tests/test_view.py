@@ -192,7 +192,7 @@ def test_html_plays_in_a_browser(run, tmp_path):
         tab.open((tmp_path / "run.html").as_uri())
         assert tab.js("document.images[0].naturalWidth") == 800
         last = len(run.rows) - 1
-        for _ in range(100):
+        for _ in range(400):
             if tab.js("+document.querySelector('input').value") == last:
                 break
             time.sleep(0.05)
