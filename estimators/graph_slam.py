@@ -21,6 +21,7 @@ Robots 4, 1997; Grisetti et al., A tutorial on graph-based SLAM, ITSM 2, 2010.
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -185,16 +186,23 @@ class GraphSlam:
         self._in_key = self._by_wheels = STILL  # base_link in the newest node's frame
         self._failures = 0
         self._path: list[_Placed] = []
+        self._stamps, self._now = [math.nan], math.nan
 
     @property
     def graph(self) -> PoseGraph:
         """Key frames and closures so far."""
         return self._graph
 
+    @property
+    def node_stamps(self) -> Array:
+        """(N,) s of the graph's nodes; NaN of the start."""
+        return np.array(self._stamps)
+
     def step(self, frame: Frame) -> Belief:
         """Move by the wheels; register a scan with the key frame; at a new one look for loops."""
         motion = loosened(self.wheels.predict(frame))
         self._in_key, self._by_wheels = self._in_key.then(motion), self._by_wheels.then(motion)
+        self._now = frame.stamp
         extras: dict[str, Any] = {}
         reading = frame.readings.get(self.laser)
         if reading is not None:
@@ -272,6 +280,7 @@ class GraphSlam:
             measured.append(_scaled(registered, 1.0 - self.shared_noise))
         self._graph.add(self._in_key.mean, measured)
         self._scans.append(scan)
+        self._stamps.append(self._now)
         self._signatures = np.vstack([self._signatures, signature(scan)])
         self._in_key = self._by_wheels = STILL
         self._failures = 0

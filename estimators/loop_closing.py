@@ -137,7 +137,7 @@ def within_gate(off: Array, covariance: Array, probability: float) -> bool:
 
 def signature(scan: PreparedScan) -> Array:
     """What a scan looks like, from any heading: logarithms (16,) of quantiles of its ranges."""
-    return np.asarray(np.log(np.quantile(scan.ranges_m, _QUANTILES)))
+    return np.asarray(np.log(np.quantile(scan.ranges_m, _QUANTILES)), dtype=np.float64)
 
 
 def look_alike(one: Array, others: Array) -> NDArray[np.bool_]:
@@ -161,4 +161,5 @@ def _starts(expected: Gaussian) -> Array:
     order = np.argsort(away, kind="stable")
     moved = (offsets * half)[order[away[order] < 1.0 + 1e-9]] @ axes.T
     turns = moved @ np.linalg.solve(P[:2, :2] + 1e-12 * np.eye(2), P[:2, 2])
-    return expected.mean + np.column_stack([moved, np.clip(turns, -_MOST_TURN_RAD, _MOST_TURN_RAD)])
+    turns = np.clip(turns, -_MOST_TURN_RAD, _MOST_TURN_RAD)
+    return np.asarray(expected.mean + np.column_stack([moved, turns]), dtype=np.float64)
