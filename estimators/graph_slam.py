@@ -12,7 +12,8 @@ registers all key frames that the solved graph shows to be near each other, and 
 As in `estimators.ekf_icp` each scan is modelled as seen from an apparent pose, whose error enters
 all its registrations. The nodes are the apparent poses: between them registrations have the share
 1 - `shared_noise` of their covariance R and are independent, and base_link is off its apparent pose
-by `shared_noise` R / 2.
+by `shared_noise` R / 2. Closures have all of R: from farther apart two scans show other walls, and
+share less of their errors.
 
 Sources: Lu and Milios, Globally consistent range scan alignment for environment mapping, Autonomous
 Robots 4, 1997; Grisetti et al., A tutorial on graph-based SLAM, ITSM 2, 2010.
@@ -346,13 +347,12 @@ class GraphSlam:
         found = self._search.register(scan, other, expected, self._rng)
         if found is None:
             return None
-        motion = _scaled(found, 1.0 - self.shared_noise)
-        off = se2.difference(motion.mean, expected.mean)
-        spread = expected.covariance + motion.covariance
+        off = se2.difference(found.mean, expected.mean)
+        spread = expected.covariance + found.covariance
         explained = within_gate(off, spread, self.loop_gate_probability)
-        if not (explained and self._search.worthwhile(expected.covariance, motion.covariance)):
+        if not (explained and self._search.worthwhile(expected.covariance, found.covariance)):
             return None
-        return Edge(first, second, motion)
+        return Edge(first, second, found)
 
 
 def _scaled(motion: Gaussian, share: float) -> Gaussian:

@@ -103,6 +103,20 @@ def test_a_wrong_closure_does_not_bend_the_graph():
     assert np.hypot(*(squarely.poses - truth)[:, :2].T).max() > 0.6
 
 
+def test_a_long_loop_closes_however_far_it_has_drifted():
+    """Closures that miss by hundreds of their own standard deviations still pull."""
+    rng = np.random.default_rng(7)
+    graph, truth, _ = lap(120, rng)
+    sharp = 1e-6 * np.eye(3)
+    edges = [
+        Edge(i, i + 100, Gaussian(se2.between(truth[i], truth[i + 100]), sharp))
+        for i in (10, 12, 14)
+    ]
+    assert graph._farthest(edges) > 100.0
+    graph.close(edges)
+    assert graph._farthest(edges) < 3.0
+
+
 def test_the_loss_of_closures_is_the_integral_of_its_weight():
     problem = Problem(np.zeros(3), np.eye(3), *(np.zeros(0, int),) * 2, *(np.zeros((0, 3)),) * 2)
     residuals = least_squares._Residuals(problem, np.zeros(1, int), "dcs", 3.0)

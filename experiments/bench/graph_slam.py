@@ -18,8 +18,8 @@ from estimators.base import Estimate
 from estimators.base import run as run_estimator
 from estimators.gaussian import Gaussian
 from estimators.graph_slam import GraphSlam
-from estimators.pose_graph import Edge
-from experiments.bench.measure import Measurement
+from estimators.pose_graph import Edge, PoseGraph
+from experiments.bench.measure import Measurement, time_s
 from experiments.evaluation.metrics import nees
 from experiments.runs.evaluate import one_blas_thread
 from experiments.runs.experiment import Experiment
@@ -40,6 +40,7 @@ _ROOMS = (
     "sensors=lms291",
     "sensors.laser.rate_hz=10",
     "sensors.laser.n_beams=181",
+    "route.speed_mps=0.7",
     "simulation.physics=kinematic",
     "simulation.rays=exact",
     "prior.sigma_position_m=1e-3",
@@ -171,8 +172,41 @@ def _nees(recording: Recording, estimate: Estimate) -> float:
     return float(np.nanmean(nees(truth, estimate.means, estimate.covariances)) / 3.0)
 
 
+def growth(lengths_m: tuple[float, ...] = (500.0, 1500.0, 5000.0)) -> Iterator[Measurement]:
+    """Time of a key frame and of a solution after laps of 100 m, a key frame each 0.5 m.
+
+    The graph alone, without scans: what grows with the length of the path. Every third key frame
+    closes the lap.
+    """
+    rng, noise, lap = stream(0, "bench"), np.diag([1e-5, 1e-5, 1e-6]), 200
+    step = np.array([0.5, 0.0, 2.0 * np.pi / lap])
+    graph = PoseGraph(Gaussian(np.zeros(3), 1e-6 * np.eye(3)), robust_sigma=5.0)
+    draws = rng.standard_normal((int(max(lengths_m) / 0.5), 3)) * np.sqrt(np.diag(noise))
+    for length_m in lengths_m:
+        begun, before = time.process_time(), len(graph)
+        while len(graph) < length_m / 0.5:
+            motion = step + draws[len(graph)]
+            graph.add(motion, [Gaussian(motion, noise)])
+            graph.newest_from(np.arange(len(graph) - 1), exact=False)
+        spent_s = (time.process_time() - begun) / (len(graph) - before)
+        closures = [
+            Edge(second - lap, second, Gaussian(np.zeros(3), noise))
+            for second in range(max(before, lap), len(graph), 3)
+        ]
+        graph.close(closures)
+        last = len(graph) - 1
+        extra = Edge(last - lap, last, Gaussian(np.zeros(3), noise))
+        solve_s = time_s(graph.close, [extra], 1e-4, clock=time.process_time)
+        note = f"{len(graph)} key frames, {len(graph.closures)} closures"
+        name = f"graph_slam.at_{length_m:.0f}_m"
+        yield Measurement(f"{name}.key_frame_ms", 1e3 * spent_s, "ms", note=note)
+        yield Measurement(f"{name}.closure_ms", 1e3 * solve_s, "ms", note="and its solution")
+
+
 def run() -> Iterator[Measurement]:
-    """Twenty judged drives of 300 m, five of them again with planted closures."""
+    """Growth; twenty judged drives of 300 m, five of them again with planted closures."""
+    with one_blas_thread():
+        yield from growth()
     runs = [run_rooms(seed) for seed in _JUDGED]
     note = "20 drives of 300 m through look-alike rooms"
     n_revisits = sum(r.revisits for r in runs)

@@ -58,7 +58,7 @@ def scored() -> tuple[pd.DataFrame, Recording, dict[str, Estimate]]:
     building = carmen.to_recording(graphs["intel"])
     runs: list[tuple[str, str, Recording, dict[str, Any]]] = [
         ("intel", "SEQUENTIAL edges", building, {}),
-        ("intel", "wheels, calibrated", intel("calibrated"), _WHEELED),
+        ("intel", "wheels, 910 scans", intel("sparse"), _WHEELED),
         ("fr079", "SEQUENTIAL edges", carmen.to_recording(graphs["fr079"]), {}),
     ]
     found: dict[str, Estimate] = {}
