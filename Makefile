@@ -6,8 +6,8 @@ FULL ?= 0
 .PHONY: help setup reproduce test test-all lint types format docs lock clean
 
 help:
-	@echo "make reproduce         figures, tables and claims into results/ (quick profile)"
-	@echo "make reproduce FULL=1  the judged profile"
+	@echo "make reproduce         figures, tables and claims from few repeats, into results/quick/"
+	@echo "make reproduce FULL=1  the judged ones, into results/"
 	@echo "make test              the default tests"
 	@echo "make test-all          the slow ones too"
 	@echo "make lint types        what a change must pass besides"

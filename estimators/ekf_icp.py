@@ -17,7 +17,7 @@ from scipy.special import chdtri
 
 from estimators.base import Belief, Prior
 from estimators.gaussian import STILL, Gaussian, between, compose, rotated, update, wrap
-from estimators.icp import Metric, PreparedScan
+from estimators.icp import Kernel, Metric, PreparedScan, Rules
 from estimators.options import require_laser, require_non_negative, require_shares, start_pose
 from estimators.scan_matching import (
     Covariance,
@@ -31,6 +31,7 @@ from sim.errors import require
 from sim.recording import Frame
 
 _PATIENCE = 2  # scans in a row that may fail before the newest becomes the key frame
+_ORIGIN_STEP_M = 1e4  # the start is taken this near to the origin: twists lose digits far from it
 _TINY = 1e-14  # keeps the update with a noiseless measurement solvable
 # Places in the state: key frame, last scan, robot, and for the time of an update the newest scan
 _KEY, _LAST, _POSE, _NEW = (slice(3 * i, 3 * i + 3) for i in range(4))
@@ -50,11 +51,13 @@ class EkfIcp:
     ----------
     metric, covariance, sigma_range_m
         As in `estimators.scan_matching.ScanMatcher`; each scan contributes half of the covariance.
+    trim, kernel, max_iterations, stop_error_m
+        As in `estimators.icp.Rules`.
     keyframe_distance_m, keyframe_turn_rad
         How far the robot goes before it takes a new key frame.
     register_distance_m, register_turn_rad
         How far the robot is believed to go before another scan is registered: it must exceed one
-        of them. 0 and 0: every scan is.
+        of them. 0 and 0: every scan is. One cannot be set without the other.
     kr, kl
         Believed slip variance per metre of the wheels, m.
     lateral_slip_m
@@ -101,9 +104,14 @@ class EkfIcp:
         shared_noise: float = 0.75,
         window_s: float = 0.05,
         laser: str = "laser",
+        trim: float = 0.0,
+        kernel: Kernel = "tukey",
+        max_iterations: int = 100,
+        stop_error_m: float = 0.0,
     ) -> None:
         self.laser = laser
-        self._matcher = ScanMatcher(metric, covariance, sigma_range_m)
+        rules = Rules(trim, kernel, max_iterations, stop_error_m)
+        self._matcher = ScanMatcher(metric, covariance, sigma_range_m, rules)
         self.wheels = WheelPrediction(
             kr, kl, window_s, lateral_slip_m=lateral_slip_m, encoder_tick_m=encoder_tick_m
         )
@@ -112,6 +120,11 @@ class EkfIcp:
             keyframe_turn_rad=keyframe_turn_rad,
             register_distance_m=register_distance_m,
             register_turn_rad=register_turn_rad,
+        )
+        require(
+            (register_distance_m > 0.0) == (register_turn_rad > 0.0),
+            "estimator.register_distance_m and register_turn_rad go together, since a scan is "
+            "registered once either is exceeded: set both, or neither",
         )
         require_shares(shared_noise=shared_noise)
         require(
@@ -127,12 +140,15 @@ class EkfIcp:
         """Start from the prior's pose; the first scan becomes the key frame."""
         self._laser, self._rng = require_laser(prior, self.laser, "ekf_icp"), rng
         start = start_pose(prior, "ekf_icp")
+        self._origin = np.append(np.rint(start.mean[:2] / _ORIGIN_STEP_M) * _ORIGIN_STEP_M, 0.0)
+        start = Gaussian(start.mean - self._origin, start.covariance)
         self.wheels.reset(prior.robot.track_m)
         self._key: PreparedScan | None = None
         self._last: PreparedScan | None = None
         # of the key frame's first degenerate match, as twists: as in `Match`
         self._directions: tuple[Array, Array] | None = None
-        # (9,): apparent poses of the key frame and of the last scan, pose of base_link; in map
+        # (9,): apparent poses of the key frame and of the last scan, pose of base_link; in map,
+        # less its origin here
         self._mean = np.tile(start.mean, 3)
         # of the twists in map that take the means to the true poses
         to_twist = _from_twist(-start.mean)
@@ -150,7 +166,8 @@ class EkfIcp:
             self._correct(self._matcher.prepare(scan["ranges_m"], self._laser), extras)
         by_twist = _from_twist(self._mean[_POSE])
         covariance = by_twist @ self._covariance[_POSE, _POSE] @ by_twist.T
-        return Belief(self._mean[_POSE].copy(), (covariance + covariance.T) / 2.0, extras)
+        mean = self._mean[_POSE] + self._origin
+        return Belief(mean, (covariance + covariance.T) / 2.0, extras)
 
     def _predict(self, frame: Frame) -> None:
         """Move the robot's pose by the wheels; the clones stay."""

@@ -19,6 +19,9 @@ from sim.arrays import Array, Ints
 from sim.recording import Frame
 from sim.sensors import Reading
 
+# One covariance holds the correlations of all landmarks: 1.2 GB of it
+_MOST_LANDMARKS, _MOST_OBSERVATIONS = 4000, 1000
+
 
 class EkfSlam:
     """Extended Kalman filter over pose and landmarks.
@@ -52,7 +55,8 @@ class EkfSlam:
     also `landmarks` (N, 3) and `landmark_covariances` (N, 3, 3); `status` when an image was not
     used.
 
-    A step costs O(K N^2): the whole covariance is touched.
+    A step costs O(K N^2): the whole covariance is touched. So the map holds at most 4000 landmarks;
+    `status` says when it is full, and when an image has more than 1000 observations.
     """
 
     needs = frozenset({"stereo"})
@@ -147,12 +151,19 @@ class EkfSlam:
         """Take in one image; the extras that it gives."""
         image = self.front_end.read(seen)
         extras: dict[str, Any] = {"status": image.status} if image.status else {}
+        if len(image.points) > _MOST_OBSERVATIONS:
+            image = image.of(np.arange(len(image.points)) < _MOST_OBSERVATIONS)
+            extras["status"] = f"observations beyond {_MOST_OBSERVATIONS} rejected"
         slots = (
             self.front_end.known(image)
             if self.front_end.association == "known"
             else self._associate(image.points, self.front_end.unlikeness(image))
         )
         old = slots >= 0
+        fits = old | (np.cumsum(~old) <= _MOST_LANDMARKS - self._n_landmarks)
+        if not fits.all():
+            image, slots, old = image.of(fits), slots[fits], old[fits]
+            extras["status"] = f"map full: landmarks beyond {_MOST_LANDMARKS} rejected"
         if old.any() and not self._update(slots[old], image.points[old]):
             extras["status"] = "update rejected: broken covariance, not positive definite"
         if not old.all():
@@ -243,7 +254,8 @@ class EkfSlam:
         R = self._camera.innovation(predicted, points)[1]
         after = before + n
         if after > len(self._room):
-            self._room = np.pad(self._covariance, (0, after + after // 2 - before))
+            wanted = min(after + after // 2, 3 + 3 * _MOST_LANDMARKS)
+            self._room = np.pad(self._covariance, (0, wanted - before))
         P = self._room[:after, :after]
         P[before:, :before] = by_pose @ P[:3, :before]
         P[:before, before:] = P[before:, :before].T

@@ -310,14 +310,11 @@ class FastSLAM:
         unlikeness = self.front_end.unlikeness(image)
         if len(points) == 0 or maps.n_slots == 0:
             return slots
-        candidates = maps.nearby(self._state, self.front_end.reach_m)
-        maps.touch(candidates)
+        near = maps.nearby(self._state, self.front_end.reach_m)
+        maps.touch(near)
         ekf.associate(
             maps.data,
-            candidates,
-            maps.place,
-            maps.counts,
-            maps.births,
+            ekf.Candidates(near, maps.place, maps.counts, maps.births),
             points,
             unlikeness,
             spread,

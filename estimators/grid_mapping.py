@@ -72,7 +72,7 @@ def map_scans(
     require(most_m > 0.0, f"the greatest range must be a positive number, got {most_m}")
     lasers = se2.compose(poses, laser.mount.pose)
     bearings = laser.bearings_rad
-    seen = np.isfinite(ranges_m) & (ranges_m > laser.min_range_m) & (ranges_m < laser.max_range_m)
+    seen = laser.returned(ranges_m)
     require(seen.any(), "no scan has a return, so there is nothing to map")
     ranges = np.where(seen, ranges_m, np.float32(0.0)).astype(np.float32)
     low, high = _bounds(lasers, ranges, bearings, most_m)

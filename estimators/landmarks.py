@@ -14,7 +14,7 @@ the image adds up. `_X + j` is where the number x of lane j lies in its block.
 """
 
 import math
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -403,8 +403,8 @@ def move(
 ) -> Array:
     """Compose poses (5, lanes) with the increment (3,) + root (3, 3) normals (3, lanes).
 
-    A pose is x, y, heading (not wrapped), and the heading's cosine and sine. Writes the geometry of the state.
-    `mount` (4,) is x, y of the camera, and cosine and sine of its yaw.
+    A pose is x, y, heading (not wrapped), and the heading's cosine and sine. Writes the geometry
+    of the state. `mount` (4,) is x, y of the camera, and cosine and sine of its yaw.
     """
     x, y, heading, cos, sin = poses
     dx, dy, turn = increment[:, None] + root @ normals
@@ -488,13 +488,31 @@ def propose(
             owed[1, lane] = u00 * u11 * u22
 
 
+class Candidates(NamedTuple):
+    """The landmarks that an image may show.
+
+    Attributes
+    ----------
+    near
+        (C,) slots to look at.
+    place
+        Row of each slot.
+    counts
+        (M,) slots of each particle; those beyond are not there.
+    births
+        (slots, M) number of each landmark.
+    """
+
+    near: Ints
+    place: Ints
+    counts: Ints
+    births: Ints
+
+
 @njit(**_FLOATS)
 def associate(
     maps: Array,
-    candidates: Ints,
-    place: Ints,
-    counts: Ints,
-    births: Ints,
+    candidates: Candidates,
     points: Array,
     unlikeness: Array,
     spread: Array,
@@ -510,18 +528,15 @@ def associate(
 
     Parameters
     ----------
-    candidates
-        Slots to look at, in rows `place`; those beyond `counts` (M,) of a particle are not there.
-    births
-        (N, M) what `unlikeness` (K, births) is looked up by.
     unlikeness
-        Added to the distance when choosing; a landmark is rejected where it is positive. (K, 0)
-        to choose by distance alone.
+        (K, births) added to the distance when choosing; a landmark is rejected where it is
+        positive. (K, 0) to choose by distance alone.
     spread
         (3, 3) covariance of the pose yet to be drawn, in axes of the camera.
     """
     described = unlikeness.shape[1] > 0
-    taken = np.zeros(len(candidates), np.bool_)
+    near, place, counts, births = candidates
+    taken = np.zeros(len(near), np.bool_)
     for m in range(len(counts)):
         block, j = m // LANES, m % LANES
         S = state[block]
@@ -537,8 +552,8 @@ def associate(
         for i in range(len(points)):
             seen = points[i, 0], points[i, 1], points[i, 2]
             best, chosen = math.inf, -1
-            for c in range(len(candidates)):
-                slot = candidates[c]
+            for c in range(len(near)):
+                slot = near[c]
                 if taken[c] or slot >= counts[m]:
                     continue
                 L = maps[place[slot], block]
@@ -565,7 +580,7 @@ def associate(
                     best, chosen = distance + unlike, c
             slots[i, m] = -1
             if chosen >= 0:
-                slots[i, m] = candidates[chosen]
+                slots[i, m] = near[chosen]
                 taken[chosen] = True
 
 

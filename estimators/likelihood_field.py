@@ -187,14 +187,31 @@ def _largest(floor: NDArray[np.bool_]) -> Ints:
 
 
 def beam_ends(ranges_m: Floats, laser: Laser, n_beams: int) -> Floats:
-    """Where beams end in base_link, (2, B) m: `n_beams` evenly spaced ones, less those unseen."""
-    n = min(n_beams, len(ranges_m))
-    chosen = ((np.arange(n) + 0.5) * (len(ranges_m) / n)).astype(np.int64)
-    ranges, bearings = np.asarray(ranges_m, float)[chosen], laser.bearings_rad[chosen]
-    seen = np.isfinite(ranges) & (ranges > laser.min_range_m) & (ranges < laser.max_range_m)
-    rays = np.column_stack([np.cos(bearings[seen]), np.sin(bearings[seen])])
-    ends = se2.transform(laser.mount.pose, rays * ranges[seen, None])
+    """Where beams end in base_link, (2, B) m: `n_beams` evenly spaced ones, less those unseen.
+
+    Beams without a reading (NaN) are not counted; if none of the chosen ones saw anything, they are
+    chosen among those that did.
+    """
+    require(
+        len(ranges_m) == laser.n_beams,
+        f"a scan of {len(ranges_m)} ranges, from a laser of {laser.n_beams} beams",
+    )
+    ranges = np.asarray(ranges_m, float)
+    seen = laser.returned(ranges)
+    chosen = _spread(np.flatnonzero(~np.isnan(ranges)), n_beams)
+    if not seen[chosen].any():
+        chosen = _spread(np.flatnonzero(seen), n_beams)
+    chosen = chosen[seen[chosen]]
+    bearings = laser.bearings_rad[chosen]
+    rays = np.column_stack([np.cos(bearings), np.sin(bearings)])
+    ends = se2.transform(laser.mount.pose, rays * ranges[chosen, None])
     return np.ascontiguousarray(ends.T, dtype=np.float32)
+
+
+def _spread(places: Ints, n_most: int) -> Ints:
+    """At most `n_most` of the places, evenly spaced."""
+    n = min(n_most, len(places))
+    return places[((np.arange(n) + 0.5) * (len(places) / max(n, 1))).astype(np.int64)]
 
 
 @njit()

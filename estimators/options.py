@@ -47,8 +47,11 @@ def require_counts(**options: int) -> None:
 def _require(options: dict[str, float], wanted: str, holds: Callable[[float], bool]) -> None:
     for name, number in options.items():
         require(
-            isinstance(number, int | float) and math.isfinite(number) and holds(number),
-            f"estimator.{name} must be {wanted}, got {number}",
+            isinstance(number, int | float)
+            and not isinstance(number, bool)
+            and math.isfinite(number)
+            and holds(number),
+            f"estimator.{name} must be {wanted}, got {number!r}",
         )
 
 

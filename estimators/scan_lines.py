@@ -19,6 +19,10 @@ from sim.compiled import njit
 from sim.errors import require
 
 _NOISE_FLOOR_M = 0.002  # quantised ranges can look free of noise
+_MEDIAN_OF_NORMAL = 0.6745  # median of |z|, z ~ N(0, 1)
+_LEAST_BENDS = 10  # second differences from which a noise can be told
+_STEEPEST = 0.5  # measured over expected range; below, a beam runs nearly along its line
+_MOST_GROWTH = 0.3  # of 1 / range at a line's end: a wall may go on 3.3 times as far
 _MIN_LINE_POINTS = 3
 _ADJACENT_BEAMS = 3  # lines whose ends are no farther apart may be one wall, or meet in a corner
 _SMOOTH_JOINT_RAD = 0.45  # neighbours that meet at less may be chords of one curve
@@ -109,11 +113,11 @@ def prepare(
     Parameters
     ----------
     ranges_m
-        (N,) m; beams that are not finite, not positive or beyond `max_range_m` are left out.
+        (N,) m; beams that are not finite, not positive, at `max_range_m` or beyond are left out.
     bearings_rad
         (N,) beam angles in the sensor frame, rising, over at most a full circle.
     max_range_m
-        Farthest range to use.
+        The laser's; a range that is equal to it is no return.
     """
     ranges = np.ascontiguousarray(ranges_m, dtype=np.float64)
     bearings = np.ascontiguousarray(bearings_rad, dtype=np.float64)
@@ -128,11 +132,12 @@ def prepare(
             steps.min() > 0.0, "the bearings of a scan must rise from beam to beam; flip the scan"
         )
         full = bool(bearings[-1] - bearings[0] + 1.5 * steps[0] > 2.0 * math.pi)
-    return _prepare(ranges, bearings, float(max_range_m), full)
+    most_m = min(max_range_m, float(np.float32(max_range_m)))  # ranges may have been 32 bits
+    return _prepare(ranges, bearings, float(most_m), full)
 
 
 @njit()
-def _ranked(values: Array, rank: int) -> float:
+def ranked(values: Array, rank: int) -> float:
     """The value at a place of the sorted values, without sorting them.
 
     `numpy.partition` does the same, but takes eleven seconds to compile.
@@ -165,9 +170,9 @@ def _noise(ranges: Array, rays: Array, beams: Ints) -> float:
         bend = a - 2.0 * cos * b + c
         found[n] = abs(bend) / math.sqrt(a**4 + 4.0 * cos * cos * b**4 + c**4)
         n += 1
-    if n < 10:
+    if n < _LEAST_BENDS:
         return _NOISE_FLOOR_M
-    return max(_ranked(found[:n], n // 2) / 0.6745, _NOISE_FLOOR_M)
+    return max(ranked(found[:n], n // 2) / _MEDIAN_OF_NORMAL, _NOISE_FLOOR_M)
 
 
 @njit(forceinline=True, error_model="numpy", fastmath={"contract"})
@@ -295,7 +300,7 @@ def _fit(ranges: Array, rays: Array, own: Ints, line: Array) -> tuple[float, ...
         u, v = rays[i, 0], rays[i, 1]
         inverse = line[0] * u + line[1] * v
         # beams nearly along the line would be given a range without end
-        expected = 1.0 / inverse if inverse * ranges[i] > 0.5 else ranges[i]
+        expected = 1.0 / inverse if inverse * ranges[i] > _STEEPEST else ranges[i]
         sums = _added(sums, expected**4, -(expected**2) * (ranges[i] - expected), u, v)
     by_1, by_2, determinant = _solved(sums)
     if not determinant > 0.0:
@@ -358,7 +363,9 @@ def _describe(
             a, b = rays[ends[k, side], 0], rays[ends[k, side], 1]
             turn = sin if side == 1 else -sin
             u, v = cos * a - turn * b, turn * a + cos * b
-            spans[k, side] = (v * n1 - u * n2) / max(m1 * u + m2 * v, 0.3 * (m1 * a + m2 * b))
+            spans[k, side] = (v * n1 - u * n2) / max(
+                m1 * u + m2 * v, _MOST_GROWTH * (m1 * a + m2 * b)
+            )
             end_rays[k, side, 0], end_rays[k, side, 1] = u, v
         s11, s12, s22 = information[k, 0], information[k, 1], information[k, 2]
         # variance of m across itself, as an angle: covariance of m is noise^2 S^-1
@@ -370,14 +377,15 @@ def _describe(
         angle = abs(math.atan2(a[0] * b[1] - a[1] * b[0], a[0] * b[0] + a[1] * b[1]))
         adjacent = beams[ends[k, 0]] - beams[ends[k - 1, 1]] <= _ADJACENT_BEAMS
         if adjacent and angle < _SMOOTH_JOINT_RAD:
-            variances[k - 1] += angle * angle / 12.0
-            variances[k] += angle * angle / 12.0
+            spread = angle * angle / 12.0  # variance of a direction anywhere between the two
+            variances[k - 1] += spread
+            variances[k] += spread
     return Segments(normals, distances, spans, end_rays, variances)
 
 
 @njit(error_model="numpy", fastmath={"contract"})
 def _prepare(ranges: Array, bearings: Array, max_range: float, full_circle: bool) -> PreparedScan:
-    seen = (ranges > 0.0) & (ranges <= max_range) & (ranges < math.inf)
+    seen = (ranges > 0.0) & (ranges < max_range)
     beams = np.flatnonzero(seen)
     rays, points = np.empty((len(beams), 2)), np.empty((len(beams), 2))
     for k in range(len(beams)):

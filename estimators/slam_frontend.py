@@ -4,6 +4,8 @@ Shared by `estimators.ekf_slam` and `estimators.fastslam`, whose filters choose 
 distance themselves.
 """
 
+from __future__ import annotations
+
 import dataclasses
 from dataclasses import dataclass
 from typing import Literal
@@ -56,6 +58,14 @@ class Image:
     descriptors: Floats
     used: NDArray[np.bool_]
     status: str
+
+    def of(self, kept: NDArray[np.bool_]) -> Image:
+        """Return the image with these (K,) of its observations only."""
+        used = self.used.copy()
+        used[np.flatnonzero(used)[~kept]] = False
+        ids = None if self.ids is None else self.ids[kept]
+        parts = self.points[kept], self.numbers[kept], ids, self.descriptors[kept]
+        return Image(*parts, used, self.status)
 
 
 class SlamFrontEnd:

@@ -6,8 +6,6 @@ It is built from a mapping run, or from arrays of one's own, and kept as an `.np
 from __future__ import annotations
 
 import dataclasses
-import zipfile
-import zlib
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -19,7 +17,8 @@ from estimators import descriptors as describers
 from sim import se2
 from sim.arrays import Array, Floats, Ints
 from sim.errors import InputError, require, required
-from sim.files import write_whole
+from sim.files import require_file, write_whole
+from sim.npz import UNREADABLE, read_arrays
 from sim.recording import Recording
 from sim.sensors import Lidar3D
 
@@ -179,6 +178,7 @@ def read_array(path: Path) -> Array:
     InputError
         If there is no such file or it holds something else.
     """
+    require_file(path)
     try:
         if path.suffix == ".npy":
             table = np.load(path, allow_pickle=False)
@@ -256,7 +256,6 @@ def level_slice(lidar: Lidar3D, ranges_m: Floats) -> Floats:
 
 
 _ARRAYS = ("positions_m", "descriptors", "edges", "headings_rad", "slices_m")
-_UNREADABLE = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error)
 
 
 def save(known_map: TopologicalMap, path: Path) -> None:
@@ -282,11 +281,11 @@ def load(path: str | Path) -> TopologicalMap:
         If the file is missing, damaged, or no topological map.
     """
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            version = int(archive["topological_map"])
-            name = archive["descriptor"].tobytes().decode()
-            arrays = {key: archive[key] for key in _ARRAYS}
-    except _UNREADABLE as error:
+        archive = read_arrays(Path(path))
+        version = int(archive["topological_map"])
+        name = archive["descriptor"].tobytes().decode()
+        arrays = {key: archive[key] for key in _ARRAYS}
+    except (InputError, *UNREADABLE) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(
             f"{path}: not a topological map ({reason}); build it again from its mapping run"
@@ -296,7 +295,7 @@ def load(path: str | Path) -> TopologicalMap:
     )
     try:
         return TopologicalMap(descriptor=name, **arrays)
-    except InputError as error:
+    except (InputError, *UNREADABLE) as error:
         raise InputError(f"{path}: {error}") from error
 
 

@@ -10,14 +10,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from experiments.runs import columns, paths
-from experiments.runs.console import end, progress
+from experiments.runs.console import end, progress, show
 from experiments.runs.row import Outcome, write_frame
 from experiments.runs.version import code_version
 from sim.errors import InputError
 
 if TYPE_CHECKING:
     from estimators.base import Estimate
+    from experiments.runs.experiment import Experiment
     from sim.recording import Recording
+    from sim.robot import DifferentialDrive
 
 app = typer.Typer(
     help="Estima: simulate differential-drive robots, run localization on the same recordings, "
@@ -108,14 +110,16 @@ def run(context: typer.Context) -> None:
     application(arguments, _draw_run)
 
 
-def _draw_run(recording: Recording, estimate: Estimate, name: str, folder: Path) -> None:
+def _draw_run(
+    recording: Recording, estimate: Estimate, experiment: Experiment, folder: Path
+) -> None:
     """Write the picture and the trajectory of a single run."""
-    from experiments.trajectories.odometry import write_odometry_csv
+    from experiments.trajectories.convert import write_estimate
     from experiments.viewing.run_figure import run_figure
     from experiments.viewing.style import save_figure
 
-    write_odometry_csv(estimate, folder / "estimate.csv")
-    save_figure(run_figure(recording, estimate, name), folder / "run.png")
+    write_estimate(folder / "estimate.csv", estimate, recording, slip=experiment.believed_slip)
+    save_figure(run_figure(recording, estimate, experiment.estimator_name), folder / "run.png")
 
 
 @app.command()
@@ -154,7 +158,7 @@ def info(
     from experiments.viewing.describe import describe
     from sim.formats.detect import read_any
 
-    print(describe(read_any(log, robot)))
+    show(describe(read_any(log, robot)))
 
 
 @app.command()
@@ -335,7 +339,8 @@ def _show_run(
         view.check_output(out)
     known = None if grid is None else read_grid(grid)
     recording = read_any([log])
-    length_s = seconds or (recording.duration_s if out is None else view.SECONDS)
+    drive_s = recording.duration_s
+    length_s = seconds or (drive_s if out is None else min(drive_s, view.SECONDS))
     rows = view.shown_rows(recording, int(length_s * (live.FPS if out is None else view.FPS)))
     shown = view.Playback(recording, rows)
     if source is not None:
@@ -345,10 +350,11 @@ def _show_run(
     if out is None:
         live.watch(shown, seconds)
         return
-    shown = replace(shown, grid=known)
+    shown = replace(shown, grid=known, seconds=length_s)
     with progress(f"drawing {out.name}", 1.0) as on_progress:
         view.save(shown, out, on_progress)
-    print(f"{out}: {len(rows)} pictures, {len(rows) / view.FPS:.1f} s")
+    speed = "real time" if length_s == drive_s else f"{drive_s / length_s:.3g} times real time"
+    print(f"{out}: {len(rows)} pictures, {length_s:.1f} s, {speed}")
 
 
 @app.command("map")
@@ -423,35 +429,83 @@ def build_map(
 
 @app.command()
 def calibrate(
-    recordings: Annotated[list[Path], typer.Argument(help="Recordings with truth, .npz.")],
+    what: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="RECORDINGS...",
+            help="Recordings with truth, .npz. With --sheet: overrides of the robot.",
+        ),
+    ] = None,
+    sheet: Annotated[
+        Path | None,
+        typer.Option(
+            help="End poses of open-loop runs, CSV: case, v_mps, omega_radps, duration_s, x_m, "
+            "y_m, heading_rad."
+        ),
+    ] = None,
     method: Annotated[
-        str, typer.Option(help="wheel-truth, or end-poses (only commands and final poses).")
-    ] = "wheel-truth",
+        str | None,
+        typer.Option(
+            help="wheel-truth, or end-poses (only commands and final poses) [wheel-truth]."
+        ),
+    ] = None,
     joint: Annotated[
         bool, typer.Option("--joint", help="Estimate wheel gains and the track too.")
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    config_dir: ConfigDir = None,
 ) -> None:
     """Estimate kr, kl (and wheel gains, track) with 95 % intervals.
 
-    Example: estima calibrate run1.npz run2.npz --joint
+    The geometry of a sheet's robot is its nominal one: that which its controller uses.
+
+    Examples
+    --------
+      estima calibrate run1.npz run2.npz --joint
+
+      estima calibrate --sheet runs.csv robot=puzzlebot --joint
     """
+    import numpy as np
+
     from experiments.calibration.calibrate import calibrate_recordings
+    from experiments.calibration.sheet import calibrate_sheet
     from sim.recording import load
 
-    if method not in ("wheel-truth", "end-poses"):
+    if method not in (None, "wheel-truth", "end-poses"):
         raise InputError(f"--method must be wheel-truth or end-poses, got {method!r}")
-    loaded = [load(path) for path in recordings]
-    first: dict[str, Path] = {}
-    for path, recording in zip(recordings, loaded, strict=True):
-        if recording.checksum in first:
-            raise InputError(f"{path} is the same recording as {first[recording.checksum]}")
-        first[recording.checksum] = path
-    kind: Any = method.replace("-", "_")
-    result = calibrate_recordings(loaded, kind, geometry=joint)
+    if sheet is not None:
+        if method == "wheel-truth":
+            raise InputError("--sheet holds end poses only; leave out --method wheel-truth")
+        result = calibrate_sheet(
+            sheet, _robot_of(what or [], config_dir), np.random.default_rng(0), geometry=joint
+        )
+    else:
+        if config_dir is not None:
+            raise InputError("--config-dir is for the robot of a --sheet; leave it out")
+        loaded = [load(Path(path)) for path in what or []]
+        first: dict[str, str] = {}
+        for path, recording in zip(what or [], loaded, strict=True):
+            if recording.checksum in first:
+                raise InputError(f"{path} is the same recording as {first[recording.checksum]}")
+            first[recording.checksum] = path
+        kind: Any = (method or "wheel-truth").replace("-", "_")
+        result = calibrate_recordings(loaded, kind, geometry=joint)
     print(result.as_json() if as_json else result.as_text())
     if not as_json:
-        print("  (puzzlebot2024's own gradient descent would return 0.5, whatever the recordings)")
+        print("  (puzzlebot2024's own gradient descent would return 0.5, whatever the data)")
+
+
+def _robot_of(overrides: list[str], config_dir: Path | None) -> DifferentialDrive:
+    """Make the robot that overrides choose; they may say nothing else."""
+    from experiments.runs.experiment import Experiment, searched
+
+    for override in overrides:
+        if not override.lstrip("+~").startswith(("robot=", "robot.")):
+            raise InputError(
+                f"{override}: with --sheet give the robot alone, such as robot=puzzlebot or "
+                "robot.track_m=0.19"
+            )
+    return Experiment.compose([*searched(config_dir), *overrides]).robot()
 
 
 @app.command()
@@ -520,7 +574,13 @@ def check(
 
 @app.command()
 def bench(
-    name: Annotated[str, typer.Argument(help="sim, ... or all.")] = "all",
+    name: Annotated[
+        str,
+        typer.Argument(
+            help="compile, fastslam, formats, icp, mcl, sim, smoothing, sweep, sweep_scale, "
+            "topological, or all."
+        ),
+    ] = "all",
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Measure speeds and accuracies on one core, beside their goals.
@@ -569,7 +629,7 @@ def table(
         rows = summary(rows, against)
     if out is None:
         shown = rows.rename(columns=lambda column: columns.title(column, short=True))
-        print(shown.to_string(index=False, na_rep="-", float_format=lambda v: f"{v:.4g}"))
+        show(shown.to_string(index=False, na_rep="-", float_format=lambda v: f"{v:.4g}"))
         return
     write_frame(rows, out)
     print(f"{out}: {len(rows)} rows, {len(rows.columns)} columns")
@@ -614,11 +674,13 @@ def reproduce(
         bool, typer.Option("--figures-only", help="Draw again what is in results/.")
     ] = False,
 ) -> None:
-    """Make the papers' figures, tables and claims, into results/.
+    """Make the papers' figures, tables and claims, in results/quick/ or, in full, in results/.
 
     Examples
     --------
       estima reproduce --paper puzzlebot2024
+
+      estima reproduce --full
 
       estima reproduce --figures-only
     """

@@ -1,5 +1,6 @@
-"""The one exception for input that a user can mend."""
+"""The one exception for input that a user can mend, and text that is safe to show."""
 
+import re
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -7,13 +8,30 @@ from pathlib import Path
 from typing import TypeVar
 
 T = TypeVar("T")
+# What controls a terminal or turns the direction of text, and what XML 1.0 forbids
+_UNPRINTABLE = re.compile(
+    "[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff\ufeff\ufffe\uffff]"
+)
+_BEGIN, _END = 1500, 500  # characters of a long message that are kept: its remedy comes last
 
 
 class InputError(Exception):
     """Wrong input, in one line that names the file, key or line and the remedy.
 
-    The command line prints it as it is and exits with code 2.
+    The command line prints it as it is and exits with code 2. What the message quotes from a file
+    is made printable, and cut if it is long.
     """
+
+    def __init__(self, message: str) -> None:
+        text = printable(" ".join(message.splitlines()))
+        if len(text) > _BEGIN + _END:
+            text = f"{text[:_BEGIN]} ... {text[-_END:]}"
+        super().__init__(text)
+
+
+def printable(text: str) -> str:
+    """Replace by ? what would control a terminal, and what XML 1.0 forbids."""
+    return _UNPRINTABLE.sub("?", text)
 
 
 @contextmanager

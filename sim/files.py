@@ -2,11 +2,22 @@
 
 import os
 import secrets
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from sim.errors import InputError, require
+
+
+def require_file(path: Path) -> None:
+    """Refuse what is no file: a folder, or a pipe or device, which could be read for ever.
+
+    What is not there is left to the reader.
+    """
+    with suppress(OSError, ValueError):
+        mode = path.stat().st_mode
+        require(stat.S_ISREG(mode), f"{path}: not a file; name a file, or remove it")
 
 
 @contextmanager

@@ -36,8 +36,9 @@ from PIL import Image
 
 from sim.arrays import Array, Floats
 from sim.errors import InputError
-from sim.files import write_whole
+from sim.files import require_file, write_whole
 from sim.grid import FREE_BELOW, OCCUPIED_ABOVE, OccupancyGrid, check_size
+from sim.yaml_file import read_yaml
 
 SUFFIXES = (".yaml", ".yml")
 _KEYS = {  # of a complete file, with what the map server writes
@@ -156,19 +157,7 @@ def check_name(path: Path) -> None:
 
 
 def _document(path: Path) -> Mapping[str, Any]:
-    try:
-        with path.open("rb") as file:
-            text = file.read(_MOST_BYTES + 1)
-        if len(text) > _MOST_BYTES:
-            raise InputError(f"{path}: longer than {_MOST_BYTES} bytes; not a grid's YAML file")
-        document = yaml.safe_load(text)
-    except OSError as error:
-        raise InputError(f"{path}: cannot read ({error.strerror}); check its name") from error
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        where = getattr(error, "problem_mark", None)
-        line = f":{where.line + 1}" if where is not None else ""
-        reason = " ".join(str(error).split())[:120]
-        raise InputError(f"{path}{line}: not valid YAML ({reason})") from error
+    document = read_yaml(path, _MOST_BYTES)
     if not isinstance(document, Mapping):
         raise InputError(f"{path}: must hold the keys {', '.join(_KEYS)}")
     return document
@@ -256,6 +245,7 @@ def _probability(meta: _Meta) -> Floats:
 def _shades(path: Path) -> tuple[Floats, Floats | None]:
     """Shades (rows, columns) from 0 (black) to 1, the mean of a pixel's colours; and opacities."""
     remedy = f"a grid's image is {', '.join(_FORMATS).replace('PPM', 'PGM')}"
+    require_file(path)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)

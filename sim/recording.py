@@ -10,7 +10,6 @@ import dataclasses
 import hashlib
 import json
 import zipfile
-import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,8 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.arrays import Array
-from sim.errors import InputError, required
+from sim.errors import InputError, require, required
 from sim.files import write_whole
+from sim.npz import UNREADABLE, read_arrays
+from sim.recording_check import check_recording
 from sim.recording_format_1 import upgraded
 from sim.robot import RobotGeometry
 from sim.sensors.base import (
@@ -360,21 +361,6 @@ class Recording:
         return dataclasses.replace(self, frame_stamps=self.frame_stamps[:n_frames].copy())
 
 
-# What NumPy, zipfile and json raise for files that are not what they should be
-_UNREADABLE = (
-    OSError,
-    ValueError,
-    KeyError,
-    TypeError,
-    AttributeError,
-    EOFError,
-    MemoryError,
-    NotImplementedError,
-    zipfile.BadZipFile,
-    zlib.error,
-)
-
-
 def save(recording: Recording, path: Path, *, durable: bool = True) -> str:
     """Write a recording; return its checksum.
 
@@ -414,25 +400,26 @@ def load(path: Path) -> Recording:
             f"{path}: not a recording; make one of a log with `estima convert {path} -o FILE.npz`"
         )
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            stored = {name: archive[name] for name in archive.files}
+        stored = read_arrays(path)
+        require("meta" in stored, "not a recording")
         meta = json.loads(stored.pop("meta").tobytes())
-        checksum = meta.pop("checksum")
-    except _UNREADABLE as error:
-        raise InputError(f"{path}: truncated or not a recording ({error}); {remedy}") from error
-    if meta.get("format") not in (1, FORMAT_VERSION):
-        raise InputError(
-            f"{path}: recording format {meta.get('format')}, this version reads up to "
-            f"{FORMAT_VERSION}; {remedy}"
+        require(isinstance(meta, dict), "not a recording")
+        checksum = meta.pop("checksum", None)
+        version = meta.get("format")
+        require(
+            version in (1, FORMAT_VERSION),
+            f"recording format {version}, this version reads up to {FORMAT_VERSION}",
         )
-    if _digest(stored, meta) != checksum:
-        raise InputError(f"{path}: the data do not match their checksum; {remedy}")
-    try:
-        if meta["format"] == 1:
+        require(_digest(stored, meta) == checksum, "the data do not match their checksum")
+        if version == 1:
             stored, meta = upgraded(stored, meta)
-        return _assemble(stored, meta)
-    except (InputError, *_UNREADABLE) as error:
-        raise InputError(f"{path}: {error}; {remedy}") from error
+        recording = _assemble(stored, meta)
+        check_recording(recording)
+    except KeyError as error:
+        raise InputError(f"{path}: {error.args[0]} is missing; {remedy}") from error
+    except (InputError, *UNREADABLE) as error:
+        raise InputError(f"{path}: {str(error).removeprefix(f'{path}: ')}; {remedy}") from error
+    return recording
 
 
 def _rows_at(frame_stamps: Array, log: Log) -> NDArray[np.int64]:
@@ -513,26 +500,44 @@ def _assemble(stored: dict[str, NDArray[Any]], meta: dict[str, Any]) -> Recordin
         raise InputError(f"readings of sensors that it does not describe: {sorted(unknown)}")
     for name, schema in schemas.items():
         seen, hidden_fields = parted(schema)
-        values = part(f"logs.{name}")
+        where = f"logs.{name}"
         logs[name] = Log(
-            seen, values["stamps"], {key: values[key] for key in seen}, values.get("splits")
+            seen,
+            stored[f"{where}.stamps"],
+            {key: stored[f"{where}.{key}"] for key in seen},
+            stored.get(f"{where}.splits"),
         )
         logs[name].check(name)
         if hidden_fields:
-            hidden[name] = part(f"truth.readings.{name}")
+            where = f"truth.readings.{name}"
+            hidden[name] = {key: stored[f"{where}.{key}"] for key in hidden_fields}
+            for key, kind in hidden_fields.items():
+                n_rows = logs[name].known_splits[-1] if kind.ragged else len(logs[name].stamps)
+                kind.check(hidden[name][key], int(n_rows), f"{where}.{key}")
     world = truth = None
     if meta["world"] is not None:
         world = World(name=meta["world"], places=part("world.places"), **part("world"))
     if part("truth"):
-        truth = Truth(**part("truth"), readings=hidden, world=world)
-    return Recording(
+        truth = Truth(
+            stored["truth.stamps"],
+            stored["truth.poses"],
+            stored["truth.wheel_travel_m"],
+            readings=hidden,
+            world=world,
+        )
+    recording = Recording(
         frame_stamps=stored["frame_stamps"],
-        wheels=WheelLog(**part("wheels")),
-        robot=RobotGeometry(**meta["robot"]),
+        wheels=WheelLog(stored["wheels.stamps"], stored["wheels.position_m"]),
+        robot=build(RobotGeometry, meta["robot"], "robot"),
         sensors=sensors_from_meta(meta["sensors"], schemas),
         logs=logs,
         truth=truth,
-        commands=CommandLog(**part("commands")) if part("commands") else None,
+        commands=CommandLog(stored["commands.stamps"], stored["commands.velocity"])
+        if part("commands")
+        else None,
         config=meta["config"],
         status=meta["status"],
     )
+    if unknown := set(stored) - set(_arrays(recording)):
+        raise InputError(f"arrays that nothing describes: {', '.join(sorted(unknown))}")
+    return recording

@@ -345,3 +345,33 @@ class TravelWindow:
         net_left = sum(entry[2] for entry in self._recent)
         share = duration_s / total_s
         return np.array([abs(net_right) * share, abs(net_left) * share])
+
+
+def twist_covariances(
+    duration_s: ArrayLike, travel_m: ArrayLike, track_m: float, kr: float, kl: float
+) -> Array:
+    """Covariances (T, 3, 3) of mean velocities in base_link, by the wheels' slip.
+
+    v = (ds_r + ds_l) / (2 dt) and omega = (ds_r - ds_l) / (b dt) have the covariance
+    J diag(kr |ds_r|, kl |ds_l|) J^T / dt^2 (puzzlebot2024, eqs. (5)-(6)). Wheels do not err
+    sideways. |ds| is that of a `TravelWindow`.
+
+    Parameters
+    ----------
+    duration_s
+        (T,) of the intervals, s. One without a duration has no velocity, and zeros here.
+    travel_m
+        Wheel increments (T, 2) over them, m.
+
+    Returns
+    -------
+    Array
+        In the order vx, vy, omega; m^2/s^2, rad^2/s^2.
+    """
+    durations, travel = np.asarray(duration_s, float), np.asarray(travel_m, float)
+    window = TravelWindow()
+    netted = [window.push(lapse, ds) for lapse, ds in zip(durations, travel, strict=True)]
+    variances = wheel_variances(np.reshape(netted, (-1, 2)), kr, kl)
+    by_wheels = np.array([[0.5, 0.5], [0.0, 0.0], [1.0 / track_m, -1.0 / track_m]])
+    per_s = np.divide(1.0, durations, out=np.zeros_like(durations), where=durations > 0.0)
+    return np.asarray(np.einsum("ij,tj,kj,t->tik", by_wheels, variances, by_wheels, per_s**2))

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from sim import se2
 from sim.arrays import Array
-from sim.errors import blaming, require
+from sim.errors import InputError, blaming, require
 from sim.feedback import Feedback, Onboard, feedback_of
 from sim.kinematic import KinematicBody
 from sim.rays import BulletRays, ExactRays
@@ -199,10 +199,11 @@ class _Firing:
             reading = self._probe(self._last)
         if reading is None:
             return None
-        require(
-            isinstance(reading, Mapping) and set(reading) == set(self._schema),
-            f"{self._where}: a reading must have the fields {[*self._schema]}, got {reading!r:.60}",
-        )
+        if not (isinstance(reading, Mapping) and set(reading) == set(self._schema)):
+            raise InputError(  # the text of an array takes longer than the reading
+                f"{self._where}: a reading must have the fields {[*self._schema]}, "
+                f"got {reading!r:.60}"
+            )
         return {
             key: field.taken(reading[key], f"{self._where}.{key}")
             for key, field in self._schema.items()

@@ -20,11 +20,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from sim.errors import InputError, require
 from sim.plan import WALL_HEIGHT_M, box_corners, gaps_m, make_descriptors
 from sim.world import World, facing_second
+from sim.yaml_file import read_yaml
 
 _KEYS = ("name", "walls", "boxes", "landmarks", "places", "waypoints", "start_pose")
 _BOX_KEYS = ("x", "y", "length", "width", "heading_deg", "height")
@@ -38,15 +38,7 @@ def read_world(path: Path) -> World:
     InputError
         Naming the file, the entry and what it must be.
     """
-    try:
-        document = yaml.safe_load(path.read_text())
-    except OSError as error:
-        raise InputError(f"{path}: cannot read ({error.strerror}); check world.path") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        where = getattr(error, "problem_mark", None)
-        line = f":{where.line + 1}" if where is not None else ""
-        brief = " ".join(str(error).split())[:120]
-        raise InputError(f"{path}{line}: not valid YAML ({brief})") from error
+    document = read_yaml(path)
     require(
         isinstance(document, Mapping), f"{path}: must hold keys such as walls, boxes, waypoints"
     )

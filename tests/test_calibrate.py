@@ -14,6 +14,7 @@ from experiments.papers.puzzlebot2024.study import (
     Arm,
     arms,
     calibrate_once,
+    convergence,
     ideal,
     report_gradient_descent,
 )
@@ -193,3 +194,16 @@ def test_the_studies_are_composed_of_table_1_and_robots_that_differ_in_slip():
     for arm in arms("calibration"):
         robot = dataclasses.replace(slipping(arm.k_m, arm.joint), nominal_track_m=NOMINAL.track_m)
         assert dataclasses.asdict(arm.robot) == pytest.approx(dataclasses.asdict(robot))
+
+
+def test_the_reports_plots_show_its_own_descent():
+    """As its programs compute it, with the forward difference of their gradient."""
+    for (_, part), v in zip(
+        convergence().groupby("data", sort=False), ((2.34674 - 2.445330811) / 5.0,
+        (1.06419 - 2.312493295) / 3.0), strict=True,
+    ):  # fmt: skip
+        k, errors = 1.0, []
+        for _ in range(101):
+            errors.append((2.0 * k * v - v) ** 2)
+            k -= 0.01 * ((2.0 * (k + 1e-5) * v - v) ** 2 - errors[-1]) / 1e-5
+        np.testing.assert_allclose(part["error"], errors, rtol=1e-4)

@@ -119,6 +119,31 @@ def test_pb3_judges_the_gains_and_the_track_of_the_joint_arm_apart():
     assert judged["coverage of the 95 % intervals of gains and track"].verdict == "not_reproduced"
 
 
+def test_pb3_shows_the_short_turns_and_judges_the_track_that_is_found():
+    ends = pd.DataFrame(
+        {
+            "omega_radps": [0.0, 0.5, 0.5, 0.8],
+            "ideal_heading_rad": [0.0, 1.5, 2.5, 2.4],
+            "real_heading_mean_rad": [0.01, 0.66, 1.10, 1.06],
+            "calibrated_heading_mean_rad": [0.01, 1.50, 2.51, 2.39],
+        }
+    )
+    right = pd.DataFrame(
+        {"parameter": ["kr", "track_m"], "truth": [1e-4, 0.19], "value": [1e-4, 0.190],
+         "low": [5e-5, 0.189], "high": [2e-4, 0.191]}
+    )  # fmt: skip
+    came, mended, track = claims.pb3_short_turns(ends, right)
+    assert came.found.value == pytest.approx(0.44, abs=0.002)
+    assert "0.44" in came.reason
+    assert mended.found.value == pytest.approx(1.0, abs=0.01)
+    assert track.verdict == "reproduced"
+    assert {c.role for c in (came, mended, track)} == {"beside"}
+    wrong = right.assign(value=right["value"] * 0.44, low=right["low"] * 0.44)
+    wrong["high"] = wrong["value"] * 1.01
+    *_, track = claims.pb3_short_turns(ends, wrong)
+    assert track.verdict == "not_reproduced"
+
+
 def test_pb4_names_the_k_at_which_the_band_is_left():
     runs = 4000
     shares = {1e-5: 0.95, 1e-4: 0.95, 1e-3: 0.80}

@@ -11,6 +11,7 @@ import pandas as pd
 import pytest
 
 from estimators.base import Belief
+from experiments.bench import SUITES
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import read_rows
@@ -41,6 +42,11 @@ def refused(done, *words):
     for word in words:
         assert word in lines[0]
     assert "Traceback" not in done.stderr
+
+
+def test_help_names_every_benchmark():
+    text = estima("bench", "--help").stdout
+    assert all(name in text for name in SUITES)
 
 
 def test_help_names_every_command():
@@ -236,6 +242,17 @@ def test_calibration_from_recordings(tmp_path):
     assert found["kl"]["low"] < 5e-5 < found["kl"]["high"]
     refused(estima("calibrate", *paths, "--method", "guess"), "--method")
     refused(estima("calibrate", paths[0], paths[1], paths[0]), "same recording")
+
+
+def test_calibration_from_a_sheet():
+    sheet = str(ROOT / "docs" / "examples" / "end_poses.csv")
+    done = estima("calibrate", "--sheet", sheet, "robot=puzzlebot_short_turns", "--joint", "--json")
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert found["method"] == "sampled"
+    assert found["track_m"]["low"] < 0.19 < found["track_m"]["high"]
+    refused(estima("calibrate", "--sheet", sheet, "world=room"), "world=room", "robot")
+    refused(estima("calibrate", "--sheet", sheet, "--method", "wheel-truth"), "--method")
 
 
 def test_view_draws_a_world(tmp_path):

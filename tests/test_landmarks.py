@@ -261,10 +261,7 @@ def test_association_is_the_least_distance_of_each_particle(described):
     assert np.array_equal(candidates, np.arange(8))
     ekf.associate(
         batch.maps.data,
-        candidates,
-        batch.maps.place,
-        batch.maps.counts,
-        births,
+        ekf.Candidates(candidates, batch.maps.place, batch.maps.counts, births),
         points,
         unlikeness,
         spread,

@@ -354,7 +354,7 @@ def test_every_flipped_byte_is_noticed_or_harmless(tmp_path):
 def test_pickles_are_refused(tmp_path):
     path = tmp_path / "a.npz"
     np.savez(path, meta=np.array([{"format": 1}], dtype=object))
-    with pytest.raises(InputError, match="not a recording"):
+    with pytest.raises(InputError, match=r"no file of arrays .*type object"):
         load(path)
 
 

@@ -15,8 +15,16 @@ from experiments.gate import baseline
 from experiments.gate import compare as regress
 from experiments.gate import report as regress_report
 from experiments.gate.compare import exchange_p, holm
-from experiments.gate.suite import ERRORS, fingerprint, read_suite, run_suite, suite_path
+from experiments.gate.suite import (
+    ERRORS,
+    command_of,
+    fingerprint,
+    read_suite,
+    run_suite,
+    suite_path,
+)
 from experiments.runs.experiment import Experiment
+from experiments.runs.paths import results
 from sim.errors import InputError
 
 QUICK = [
@@ -277,15 +285,16 @@ def test_failures_are_not_accepted(small, monkeypatch):
         baseline.accept(str(small), "reason")
 
 
-def test_accept_check_worsen_accept(small, monkeypatch):
+def test_accept_check_worsen_accept(small, monkeypatch, capsys):
     with pytest.raises(InputError, match="needs a reason"):
         baseline.accept(str(small), " ")
     with pytest.raises(InputError, match="no baseline yet"):
         baseline.check(str(small))
     with pytest.raises(InputError, match="no estimator ekf; it has odometry"):
         baseline.check(str(small), ["ekf"])
-    written = baseline.accept(str(small), "first")
-    assert [path.name for path in written] == ["check.csv", "release.csv"]
+    accepted = baseline.accept(str(small), "first")
+    assert [path.name for path in accepted.written] == ["check.csv", "release.csv"]
+    assert not accepted.findings
     assert {f.verdict for f in baseline.check(str(small))} == {"identical"}
 
     @contextmanager
@@ -302,15 +311,41 @@ def test_accept_check_worsen_accept(small, monkeypatch):
     monkeypatch.setattr(baseline, "run_suite", faulty)
     found = baseline.check(str(small))
     assert {f.baseline for f in found if f.alarms} == {"accepted", "release"}
-    # what is accepted passes from then on, against the release too, and both files say why
-    assert len(baseline.accept(str(small), "longer wheels")) == 2
+    assert all(then < now for f in found for _, then, now in f.worst)
+    # what is accepted is shown, and passes from then on; the release has to be asked for
+    capsys.readouterr()
+    assert not regress_report.run_check(str(small), "longer wheels")
+    shown = capsys.readouterr().out
+    assert "odometry, position error worse by" in shown
+    assert f'estima check --suite {small} --only odometry --accept "REASON" --release' in shown
+    assert {f.baseline for f in baseline.check(str(small)) if f.alarms} == {"release"}
+    again = baseline.accept(str(small), "longer wheels", release=True)
+    assert [path.name for path in again.written] == ["check.csv", "release.csv"]
     assert not any(f.alarms for f in baseline.check(str(small)))
-    for path in baseline.baseline_paths(str(small)).values():
-        history = baseline.read_baseline(path).history
-        assert [line.rsplit(": ", 1)[1] for line in history] == ["first", "longer wheels"]
-    # better than the release: that stays pinned
-    monkeypatch.setattr(baseline, "run_suite", partial(run_suite, n_jobs=1))
-    assert [p.name for p in baseline.accept(str(small), "mended")] == ["check.csv"]
+    reasons = {
+        key: [line.rsplit(": ", 1)[1] for line in baseline.read_baseline(path).history]
+        for key, path in baseline.baseline_paths(str(small)).items()
+    }
+    assert reasons == {
+        "accepted": ["first", "longer wheels", "longer wheels"],
+        "release": ["first", "longer wheels"],
+    }
+
+
+def test_a_worsening_names_its_worst_recordings_and_how_to_see_them(small, monkeypatch, capsys):
+    first_seed = read_suite(small).first_seed
+    rows = run_suite(read_suite(small), {"odometry": 1}, n_jobs=1)
+    baseline.accept(str(small), "first")
+    worse = rows.copy()
+    worse[list(ERRORS)] *= np.array([1.2, 1.5, 1.3])[:, None]
+    monkeypatch.setattr(baseline, "run_suite", lambda *_, **__: worse)
+    assert regress_report.run_check(str(small), None)
+    shown = capsys.readouterr().out
+    seeds = [line.split(":")[0] for line in shown.splitlines() if line.startswith("odometry, seed")]
+    assert seeds == [f"odometry, seed {first_seed + i}" for i in (1, 2, 0)]
+    picture = results() / "runs" / "check" / f"odometry_{first_seed + 1}.png"
+    assert picture.exists()
+    assert f"estimator=odometry seed={first_seed + 1} world_seed={first_seed + 1}" in shown
 
 
 def test_suite_of_the_check_is_sound():
@@ -318,6 +353,31 @@ def test_suite_of_the_check_is_sound():
     assert len({entry.name for entry in suite.estimators}) == len(suite.estimators) >= 9
     for entry in suite.estimators:
         assert entry.repeats[0] >= entry.repeats[1]
+    estimators = {entry.estimator for entry in suite.estimators}
+    assert {"ekf_icp_paper", "fastslam_paper", "fixed_lag"} <= estimators
+    by_engine = [
+        e for e in suite.estimators if "simulation.physics=bullet" in suite.overrides[e.recordings]
+    ]
+    assert len(by_engine) >= 3
+
+
+def test_an_entry_may_name_its_estimator(tmp_path):
+    """Two entries run one estimator over different recordings, each with rows of its own."""
+    group = "{count: 2, overrides: [world=empty, route=linear_4, simulation.physics=kinematic]}"
+    path = tmp_path / "mine.yaml"
+    path.write_text(
+        f"first_seed: 7\nrecordings: {{a: {group}, b: {group}}}\nestimators:\n"
+        "  odometry: {recordings: a, repeats: [1, 1]}\n"
+        "  again: {estimator: odometry, recordings: b, repeats: [1, 1], "
+        "overrides: [estimator.kr=1e-3]}\n"
+    )
+    suite = read_suite(path)
+    command = command_of(suite, "again", 7)
+    assert "estimator=odometry" in command
+    assert "estimator.kr=1e-3" in command
+    rows = run_suite(suite, {"odometry": 1, "again": 1}, n_jobs=1)
+    assert rows.groupby("estimator").size().to_dict() == {"again": 2, "odometry": 2}
+    assert set(rows["status"]) == {"ok"}
 
 
 def test_recordings_of_the_check_turn():
@@ -335,7 +395,7 @@ def test_recordings_of_the_check_turn():
     ("text", "words"),
     [
         ("recordings: 3", "a suite holds"),
-        ("first_seed: [", "cannot read"),
+        ("first_seed: [", "not valid YAML"),
         (
             "first_seed: 1\nrecordings: {a: {count: 1, overrides: []}}\n"
             "estimators: {odometry: {recordings: a, repeats: [1, 1]}}",
@@ -409,7 +469,8 @@ def findings():
         ]
     )
     baseline = pd.concat([table(name, then) for name in ("worse <&>", "better", "same")])
-    return regress.compare({"accepted": baseline}, now)
+    found = regress.compare({"accepted": baseline}, now)
+    return [dataclasses.replace(each, worst=()) for each in found]  # of no suite
 
 
 def test_reports_agree(monkeypatch, tmp_path, capsys):

@@ -169,7 +169,7 @@ def test_origin_and_command_are_shown(text):
     sections = {e.get("aria-labelledby"): e["text"] for e in Outline(text).all("section")}
     assert "<i>quick profile, 12 s" in sections["puzzlebot2024"]
     assert "<i>fast" in sections["machine"]
-    assert "estima reproduce --paper gil2008" in sections["gil2008"]
+    assert "estima reproduce --full --paper gil2008" in sections["gil2008"]
     assert "world: office" in sections["decristoforis2020"]  # its study's configuration
     assert np.__version__ in sections["machine"]
 
@@ -233,7 +233,7 @@ def test_a_damaged_figure_is_named(tmp_path, results):
         report.write_report(tmp_path)
     path.unlink()
     path.mkdir()
-    with pytest.raises(InputError, match=r"gil2008_8\.png: cannot read \(Is a directory\)"):
+    with pytest.raises(InputError, match=r"gil2008_8\.png: not a file; name a file, or remove it"):
         report.write_report(tmp_path)
 
 

@@ -40,7 +40,8 @@ def study(*, names=("runs", "noise"), fails=False):
         return [Claim("GI1", "a share", found, "above 0", Verdict.REPRODUCED)]
 
     def conclusions(made, claims):
-        return conclude(claims, {"GI1": lambda rows: f"The share is {rows[0].found.value}."})
+        says = {"GI1": lambda rows: f"The share is {rows[0].found.value}. Half of it."}
+        return conclude(claims, says)
 
     return {
         "study": SimpleNamespace(run=run),
@@ -78,33 +79,38 @@ ENDINGS = (".csv", ".npz", ".png")
 FULL = {f"{PAPER}_{n}{e}" for n in ("runs", "noise") for e in ENDINGS} | {f"{PAPER}_tuning.csv"}
 
 
-def test_a_quick_run_replaces_everything_and_says_so(results, monkeypatch, capsys):
-    assert state(results) == (FULL, "full", "reproduced, full", "full")
-    capsys.readouterr()
+def test_a_full_run_replaces_everything_and_a_quick_one_nothing(results, monkeypatch):
+    judged = state(results)
+    assert judged == (FULL, "full", "reproduced, full", "full")
     take(monkeypatch, study(names=("runs",)))
     module.reproduce(only=PAPER)
-    kept = {f"{PAPER}_{name}" for name in ("runs.csv", "runs.npz", "runs.png", "tuning.csv")}
-    assert state(results) == (kept, "quick", "reproduced, quick", "quick")
+    assert state(results) == judged
+    kept = {f"{PAPER}_{name}" for name in ("runs.csv", "runs.npz", "runs.png")}
+    assert state(results / "quick") == (kept, "quick", "reproduced, quick", "quick")
+    module.reproduce(full=True, only=PAPER)
+    kept.add(f"{PAPER}_tuning.csv")
+    assert state(results) == (kept, "full", "reproduced, full", "full")
     assert not list((results / "cache").iterdir())
-    line = "replaces the judged results of gil2008; `git checkout results` brings them back"
-    assert line in capsys.readouterr().err
-    module.reproduce(only=PAPER)
-    assert "judged" not in capsys.readouterr().err
 
 
-def test_each_claim_gets_one_row_with_its_sentence(results, capsys):
+def test_each_claim_gets_one_row_and_one_line(results, capsys):
     (row,) = read_verdicts(results / "verdicts.csv").to_dict("records")
     assert row == {
         "id": "GI1",
         "paper": PAPER,
         "says": "The error of odometry grows without bound, that of the filter stays bounded.",
         "verdict": "reproduced",
-        "sentence": "The share is 0.5.",
+        "sentence": "The share is 0.5. Half of it.",
     }
+    capsys.readouterr()
     module.reproduce(only=PAPER)
-    (row,) = read_verdicts(results / "verdicts.csv").to_dict("records")
-    assert row["sentence"] == "The share is 0.5. (Quick profile: few repeats.)"
-    assert "GI1: reproduced. The share is 0.5." in capsys.readouterr().out
+    (row,) = read_verdicts(results / "quick" / "verdicts.csv").to_dict("records")
+    assert row["sentence"] == "The share is 0.5. Half of it. (Quick profile: few repeats.)"
+    claim, blank, paper, page = capsys.readouterr().out.splitlines()
+    assert claim == "GI1  reproduced      The share is 0.5."
+    assert blank == ""
+    assert paper.startswith("gil2008: 1 reproduced (")
+    assert "quick/report.html" in page
 
 
 def test_claims_are_judged_again_from_disk(results, monkeypatch):
@@ -120,7 +126,7 @@ def test_an_interrupted_run_leaves_the_results_as_they_were(results, monkeypatch
     before = {path: path.read_bytes() for path in results.rglob("*.*") if path.is_file()}
     take(monkeypatch, study(names=("runs", "other"), fails=True))
     with pytest.raises(KeyboardInterrupt):
-        module.reproduce(only=PAPER)
+        module.reproduce(full=True, only=PAPER)
     assert before == {path: path.read_bytes() for path in results.rglob("*.*") if path.is_file()}
 
 
@@ -129,13 +135,13 @@ def test_what_cannot_be_replaced_or_added_to_is_named(results):
     path.unlink()
     path.mkdir()
     with pytest.raises(InputError, match=r"gil2008_runs\.png: cannot be replaced"):
-        module.reproduce(only=PAPER)
+        module.reproduce(full=True, only=PAPER)
     (results / "verdicts.csv").write_text("id,paper")
     with pytest.raises(InputError, match=r"verdicts\.csv: the last row is cut off"):
-        module.reproduce(only=PAPER)
+        module.reproduce(full=True, only=PAPER)
     (results / "claims.csv").write_text("id,paper")
     with pytest.raises(InputError, match=r"claims\.csv: the last row is cut off"):
-        module.reproduce(only=PAPER)
+        module.reproduce(full=True, only=PAPER)
 
 
 def test_figures_are_drawn_again_from_disk(results, monkeypatch, capsys):
@@ -144,7 +150,7 @@ def test_figures_are_drawn_again_from_disk(results, monkeypatch, capsys):
     module.redraw(only=PAPER)
     assert path.exists()
     (results / "arrays" / f"{PAPER}_runs.npz").write_bytes(b"PK")
-    with pytest.raises(InputError, match=r"gil2008_runs\.npz: damaged .*--paper gil2008"):
+    with pytest.raises(InputError, match=r"gil2008_runs\.npz: damaged .*--full --paper gil2008"):
         module.redraw(only=PAPER)
     (results / "arrays" / f"{PAPER}_runs.npz").unlink()
     with pytest.raises(InputError, match=r"gil2008_runs\.npz: missing"):
@@ -158,7 +164,7 @@ def test_figures_are_drawn_again_from_disk(results, monkeypatch, capsys):
             module.redraw(only=only)
 
 
-REMEDY = r"; run `estima reproduce --paper gil2008`$"
+REMEDY = r"; run `estima reproduce --full --paper gil2008`$"
 
 
 @pytest.mark.parametrize(

@@ -1,9 +1,9 @@
 """Sweeps: what is expanded, composed and packed, and what is left after failures and kills."""
 
+import json
 import os
 import re
 import shlex
-import signal
 import subprocess
 import sys
 import time
@@ -13,14 +13,16 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments.runs import cache
+from experiments.runs import cache, store
 from experiments.runs.experiment import Experiment, files_digest
 from experiments.runs.paths import results
-from experiments.runs.row import read_rows
+from experiments.runs.row import Status, read_rows
+from experiments.runs.store import read_runs
 from experiments.runs.version import source_digest
-from experiments.sweeps import plan
+from experiments.sweeps import launch, plan
 from experiments.sweeps.collect import collect
 from sim.errors import InputError
+from tests import kill_sweeps
 from tests.test_cli import QUICK, ROOT, estima, refused
 
 SHORT = [*QUICK, "route=linear_1"]
@@ -436,31 +438,66 @@ def test_launchers_give_the_same_table(name, launcher):
 
 
 @pytest.mark.slow
-def test_a_killed_sweep_resumes_to_the_same_table(name):
-    swept_ = [*SHORT, "seed=range(0,50)", "robot.kr=1e-5,1e-4", "estimator.window_s=0.05,0.1"]
-    whole = f"{name}_whole"
-    clear(whole)
-    rng = np.random.default_rng(0)
-    try:
-        command = [sys.executable, "-m", "experiments.cli", "run", "-m", *swept_, f"name={name}"]
-        for _ in range(5):
-            process = subprocess.Popen(
-                command, cwd=ROOT, stderr=subprocess.DEVNULL, start_new_session=True,
-                env={**os.environ, "PYTHONPATH": str(ROOT)},
-            )  # fmt: skip
-            time.sleep(float(rng.uniform(4.0, 9.0)))
-            os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
-        assert estima("run", "-m", *swept_, f"name={name}").returncode == 0
-        assert estima("run", "-m", *swept_, f"name={whole}").returncode == 0
-        for own in (name, whole):
-            rows = table_of(own).drop(columns="name")
-            rows.to_csv(folder(own) / "all.csv", index=False)
-        resumed, undisturbed = ((folder(o) / "all.csv").read_bytes() for o in (name, whole))
-        assert resumed == undisturbed
-        assert len(pd.read_csv(folder(name) / "all.csv")) == 200
-    finally:
-        clear(whole)
+@pytest.mark.parametrize("launcher", ["joblib", "ray"])
+def test_a_killed_sweep_comes_to_the_same_table(launcher, tmp_path):
+    if launcher == "ray":
+        pytest.importorskip("hydra_plugins.hydra_ray_launcher", reason="an extra, not installed")
+    (killed, undisturbed), counts, _ = kill_sweeps.run(tmp_path, launcher, n_kills=20, seed=0)
+    assert killed == undisturbed
+    assert sum(counts.values()) == 20
+    assert min(counts.values()) > 0
+
+
+def test_a_job_tried_again_goes_on(tmp_path, monkeypatch):
+    """As Ray and SLURM do it, in the midst of a line."""
+    every = plan.plan_of([*QUICK, "seed=range(0,4)"])
+    jobs = launch.Jobs(tmp_path, 1)
+    jobs.add(every, np.arange(4))
+    share = json.loads(launch.share_of(jobs.plan, 0).read_text())
+    ran = []
+
+    def run(experiment, _, journal):
+        ran.append(experiment.seed)
+        journal.begin(experiment.key)
+        journal.append([{**experiment.labels(""), "seed": experiment.seed, **Status().columns()}])
+        if len(ran) == 2:
+            with journal.path.open("a") as file:
+                file.write('0123abcd b"half a li')
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(launch, "run_and_record", run)
+    with pytest.raises(KeyboardInterrupt):
+        launch.run_share(share)
+    for _ in range(2):
+        launch.run_share(share)
+        assert ran == [0, 1, 2, 3]
+    assert sorted(read_runs(tmp_path)["seed"]) == [0, 1, 2, 3]
+
+
+def test_a_bad_combination_in_a_large_family_fails_alone(tmp_path):
+    """Each of its values is sound with the others' first, so no check finds it before."""
+    every = plan.plan_of(
+        [*SHORT, "sensors=hokuyo", "estimator=mcl", "prior.map=world", "seed=range(0,600)",
+         "estimator.n_least=100,5000", "estimator.n_most=20000,2000"]
+    )  # fmt: skip
+    assert len(every.families) == 1
+    launch.check(every, np.arange(2400))
+    with store.journal(tmp_path / "rows-0.journal") as journal:
+        for i in (1, 3):
+            launch.run_and_record(every.experiment(i), {}, journal)
+    rows = read_runs(tmp_path).set_index("estimator.n_least")
+    assert rows.loc[100, "status"] != "failed"
+    assert rows.loc[5000, "status"] == "failed"
+    assert "n_least" in rows.loc[5000, "status_detail"]
+
+
+def test_the_number_of_jobs():
+    runs = plan.plan_of([*QUICK, "seed=range(0,40)"])
+    assert len(plan.packed(runs.recordings, launch._n_jobs(["jobs=20"]))) == 20
+    assert launch._n_jobs([]) == launch._n_jobs(["jobs=null"]) > 0
+    for wrong in (["jobs=0"], ["jobs=many"], ["jobs=1", "jobs=2"]):
+        with pytest.raises(InputError, match="one whole number"):
+            launch._n_jobs(wrong)
 
 
 @pytest.mark.slow

@@ -19,6 +19,7 @@ SUITES = {
     "smoothing": ("smoothing",),
     "graph_slam": ("graph_slam",),
     "compile": ("compile",),
+    "growth": ("growth",),
 }
 
 

@@ -11,7 +11,7 @@ from estimators.base import run as run_estimator
 from estimators.least_squares import solve
 from estimators.smoother import Smoother
 from experiments.bench.measure import Measurement, time_s
-from experiments.runs.evaluate import one_blas_thread
+from experiments.runs.evaluate import limited_blas
 from experiments.runs.experiment import Experiment
 from experiments.runs.seeds import stream
 
@@ -35,7 +35,7 @@ def run() -> Iterator[Measurement]:
         batch.step(frame)
     problem, start = batch.problem()
     note = f"{len(start)} poses, {len(np.unique(problem.landmark_rows))} landmarks"
-    with one_blas_thread():
+    with limited_blas():
         solved, whole = (
             statistics.median(time_s(call, clock=time.process_time) for _ in range(5))
             for call in (lambda: solve(problem, start), batch.finish)
@@ -48,7 +48,7 @@ def run() -> Iterator[Measurement]:
         def steps(online: Estimator = online) -> None:
             run_estimator(online, recording, prior, stream(0, "bench"))
 
-        with one_blas_thread():
+        with limited_blas():
             steps()
             seconds = statistics.median(time_s(steps, clock=time.process_time) for _ in range(3))
         yield Measurement(f"{name}.run_s", seconds, "s", goal, note="all steps, one BLAS thread")

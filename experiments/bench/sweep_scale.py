@@ -95,8 +95,8 @@ def _planned() -> tuple[float, list[Path]]:
     plan = plan_of(_SWEEP)
     runs = np.arange(len(plan.keys))
     launch.check(plan, runs)
-    jobs = launch.Jobs(plan.experiment(0).rows_folder)
-    for part in packed(plan.recordings, _N_JOBS):
+    jobs = launch.Jobs(plan.experiment(0).rows_folder, _N_JOBS)
+    for part in packed(plan.recordings, jobs.count):
         jobs.add(plan, part)
     seconds = time.perf_counter() - begun
     return seconds, [launch.share_of(jobs.plan, number) for number in range(len(jobs.sizes))]

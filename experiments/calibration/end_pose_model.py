@@ -33,6 +33,8 @@ class EndPoseModel:
         The robot that the commands were meant for.
     rng
         For the samples; unused by `linearised`.
+    turn_rad
+        Largest turn of the real robot, which decides the coordinates; None: the commanded one.
     """
 
     def __init__(
@@ -42,6 +44,7 @@ class EndPoseModel:
         rng: np.random.Generator,
         method: EndPoseMethod,
         n_samples: int = 256,
+        turn_rad: float | None = None,
     ) -> None:
         require(
             method in get_args(EndPoseMethod),
@@ -49,7 +52,8 @@ class EndPoseModel:
         )
         self._commands_m = nominal.wheel_speeds(*profile.T) * TICK_S
         self._knots = knots(self._commands_m)
-        self._log_chart = abs(float(profile[:, 1].sum() * TICK_S)) < _LOG_CHART_UP_TO_RAD
+        turn_rad = float(profile[:, 1].sum() * TICK_S) if turn_rad is None else turn_rad
+        self._log_chart = abs(turn_rad) < _LOG_CHART_UP_TO_RAD
         self._linearised = method == "linearised"
         if not self._linearised:
             self._noise = _slip_paths(self._commands_m, self._knots, n_samples, rng)
@@ -57,6 +61,11 @@ class EndPoseModel:
     def coordinates(self, poses: Array) -> Array:
         """Coordinates (n, 3) of end poses (n, 3)."""
         return poses if self._linearised else _charted(poses, self._log_chart)
+
+    def end_without_slip(self, bias: Array, track_m: float) -> Array:
+        """End pose (3,) of a robot whose wheels only have their biases."""
+        travel = _mean_travel(self._commands_m, self._knots, bias, TICK_S / SLIP_TIME_CONSTANT_S)
+        return _linearised_moments(travel, np.zeros(2), track_m)[0]
 
     def moments(self, k: Array, bias: Array, track_m: float) -> tuple[Array, Array]:
         """Mean (3,) and covariance (3, 3) of the coordinates."""

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import optimize
 
 from experiments.calibration.end_pose_model import EndPoseMethod, EndPoseModel
 from experiments.calibration.result import CalibrationResult
@@ -20,6 +21,9 @@ from sim.robot import DifferentialDrive
 from sim.route import TICK_S
 
 Moments = tuple[Array, Array]
+
+# both biases, as `sim.robot` bounds them, and a track within a factor of ten
+_GEOMETRY = ((-0.67, -0.67, -math.log(10.0)), (2.0, 2.0, math.log(10.0)))
 
 
 @dataclass(frozen=True)
@@ -72,7 +76,8 @@ def from_end_poses(
     Raises
     ------
     InputError
-        If there are too few runs, or a pose is not finite.
+        If there are too few runs, a pose is not finite, or with `geometry` the manoeuvres do not
+        both turn and advance.
     """
     wanted = 5 if geometry else 2
     n_runs = np.array([len(m.end_poses) for m in manoeuvres])
@@ -85,7 +90,17 @@ def from_end_poses(
             np.all(np.isfinite(manoeuvre.end_poses)),
             f"manoeuvre {i} has an end pose that is not finite; leave it out",
         )
-    models = [EndPoseModel(m.profile, nominal, rng, method) for m in manoeuvres]
+    rolled = sum(np.abs(m.profile).sum(axis=0) for m in manoeuvres)
+    require(
+        not geometry or np.all(rolled > 0.0),
+        "wheel gains and track take both straights and turns to tell apart; add what is missing",
+    )
+    models = [
+        EndPoseModel(
+            m.profile, nominal, rng, method, turn_rad=float(np.abs(m.end_poses[:, 2]).max())
+        )
+        for m in manoeuvres
+    ]
     seen = [model.coordinates(m.end_poses) for model, m in zip(models, manoeuvres, strict=True)]
     means = np.array([y.mean(axis=0) for y in seen])
     scatters = np.array(
@@ -101,6 +116,8 @@ def from_end_poses(
 
     start = np.zeros(wanted)
     start[:2] = math.log(_rough_k(manoeuvres, nominal))
+    if geometry:
+        start[2:] = _rough_geometry(manoeuvres, models, nominal.track_m)
     best, information = _fisher_scoring(moments, start, means, scatters, n_runs)
     half = 1.959964 * np.sqrt(np.diag(np.linalg.inv(information)))
     bounds = np.stack([best, best - half, best + half], axis=1)
@@ -125,6 +142,24 @@ def _rough_k(manoeuvres: Sequence[Manoeuvre], nominal: DifferentialDrive) -> flo
         "the end headings do not scatter; give repetitions of manoeuvres that move the robot",
     )
     return squares / travel
+
+
+def _rough_geometry(
+    manoeuvres: Sequence[Manoeuvre], models: Sequence[EndPoseModel], track_m: float
+) -> Array:
+    """A first guess (3,) of the biases and of log(track / nominal), from the mean end poses.
+
+    From the nominal geometry the likelihood of a robot that is far from it has other maxima, where
+    slip explains what the track does.
+    """
+    ends = np.array([m.end_poses.mean(axis=0) for m in manoeuvres])
+
+    def off(unknowns: Array) -> Array:
+        track = track_m * math.exp(unknowns[2])
+        found = [model.end_without_slip(unknowns[:2], track) for model in models]
+        return np.asarray(found - ends).ravel()
+
+    return np.asarray(optimize.least_squares(off, np.zeros(3), bounds=_GEOMETRY).x)
 
 
 def _fisher_scoring(

@@ -17,6 +17,7 @@ from sim.recording import Recording
 CHI2_95_2DOF = 5.991464547107979  # 95 % quantile of chi-square with two degrees of freedom
 _SINGULAR = 1e-10  # least eigenvalue of a correlation matrix that can be trusted
 RPE_DISTANCES_M = (1.0, 10.0)
+SCORED_EXTRAS = ("dispersion_m",)  # Belief extras that `score` reads, of estimators that have them
 
 
 def position_errors_m(truth: Array, means: Array) -> Array:
@@ -101,6 +102,15 @@ def ellipse_area_m2(covariances: Array) -> Array:
     return np.asarray(math.pi * CHI2_95_2DOF * np.sqrt(np.maximum(determinant, 0.0)))
 
 
+def in_ellipse(truth: Array, mean: Array, covariance: Array) -> bool:
+    """Whether a true position lies in the 95 % ellipse of a pose's (3,) covariance (3, 3).
+
+    puzzlebot2024 asks it of the real robot and the ideal one's ellipse.
+    """
+    off = truth[:2] - mean[:2]
+    return bool(off @ np.linalg.solve(covariance[:2, :2], off) <= CHI2_95_2DOF)
+
+
 def travelled_m(path: Array) -> Array:
     """Distance (T,) travelled along a path (T, 2) or poses (T, 3) to each of its rows, m."""
     return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path[:, :2], axis=0).T))])
@@ -133,28 +143,34 @@ def score(recording: Recording, estimate: Estimate) -> dict[str, float]:
     row = {"duration_s": float(np.ptp(estimate.stamps)) if len(estimate.stamps) else 0.0}
     if len(estimate.step_seconds):
         row["step_time_us"] = float(1e6 * np.median(estimate.step_seconds))
+    dispersions = [v for v in estimate.extras.get("dispersion_m", ()) if v is not None]
+    if dispersions:
+        row["dispersion_final_m"] = float(dispersions[-1])
     if recording.truth is None:
         return row
     truth = recording.truth_at(estimate.stamps)
     known = np.isfinite(truth).all(axis=1)
     require(known.any(), "no estimate lies within the truth's time span; are the clocks the same?")
     truth, means, covariances = truth[known], estimate.means[known], estimate.covariances[known]
-    fitted = aligned(truth, means)
+    fitted, off = aligned(truth, means), position_errors_m(truth, means)
     values = nees(truth, means, covariances)
     counted = np.isfinite(values)
     row |= {
         "distance_m": float(np.sum(np.hypot(*np.diff(truth[:, :2], axis=0).T))),
-        "ate_rmse_m": rms(position_errors_m(truth, means)),
+        "ate_rmse_m": rms(off),
+        "ate_mean_m": float(np.mean(off)),
         "ate_aligned_rmse_m": rms(position_errors_m(truth, fitted)),
         "heading_rmse_rad": rms(heading_errors_rad(truth, means)),
         "heading_aligned_rmse_rad": rms(heading_errors_rad(truth, fitted)),
-        "final_position_error_m": float(position_errors_m(truth[-1:], means[-1:])[0]),
+        "final_position_error_m": float(off[-1]),
         "final_heading_error_rad": float(abs(heading_errors_rad(truth[-1:], means[-1:])[0])),
         "nees_counted_share": float(np.mean(counted)),
         "ellipse_area_final_m2": float(ellipse_area_m2(covariances[-1:])[0]),
     }
     if counted.any():
         row["nees_mean"] = float(np.mean(values[counted]))
+    if row["ellipse_area_final_m2"] > 0.0:
+        row["final_in_ellipse"] = float(in_ellipse(truth[-1], means[-1], covariances[-1]))
     for distance in RPE_DISTANCES_M:
         pairs = pairs_by_distance(truth, distance)
         if len(pairs):

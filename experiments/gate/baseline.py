@@ -1,5 +1,6 @@
 """Baselines of a suite: read, checked against, renewed and written."""
 
+import contextlib
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -18,6 +19,22 @@ from sim.files import write_text
 
 _COUNT = re.compile(r"(\d+) rows")  # in a baseline's first line, to recognise one cut short
 _COLUMNS = (*WHICH, "checksum", "fingerprint", *ERRORS, "status")
+
+
+@dataclass(frozen=True)
+class Accepted:
+    """What was accepted.
+
+    Attributes
+    ----------
+    written
+        Files.
+    findings
+        How it compares with the baselines that were there.
+    """
+
+    written: list[Path]
+    findings: list[Finding]
 
 
 @dataclass(frozen=True)
@@ -166,18 +183,11 @@ def accept(
     *,
     release: bool = False,
     on_progress: Callable[[float], None] = lambda _: None,
-) -> list[Path]:
+) -> Accepted:
     """Run a suite and make it the baseline, with the reason written into the file.
 
-    With `only`, the other estimators keep their baselines.
-
-    The release baseline stays pinned, except for estimators that are now worse: they are what the
-    reason is given for. With `release`, all of it is pinned again.
-
-    Returns
-    -------
-    list of Path
-        Files written.
+    With `only`, the other estimators keep their baselines. The release baseline stays as it is,
+    unless there is none, or `release` pins it to this too.
     """
     require(
         reason.strip(), '--accept needs a reason, such as --accept "faster matching, 2 % worse"'
@@ -202,30 +212,26 @@ def accept(
             f"{first['estimator']} fails on recording {first['recording']} ({how(first)}); a "
             "baseline of failures guards nothing"
         )
-    changes = {"accepted": names, "release": names}
-    if "release" in old and not release:
-        pinned = {"release": old["release"].rows}
-        changes["release"] = [
-            name for name in names if not _holds(pinned, rows[rows["estimator"] == name])
-        ]
+    findings = [f for key in old for f in _compared({key: old[key].rows}, rows)]
     written = []
     for key, path in baseline_paths(suite_name, own=True).items():
-        if changes[key]:
-            write_baseline(renewed(old.get(key), rows, changes[key], reason, known), path)
+        if key == "accepted" or release or key not in old:
+            write_baseline(renewed(old.get(key), rows, names, reason, known), path)
         elif path != paths[key]:  # the package's comes along
             write_baseline(old[key], path)
         else:
             continue
         written.append(path)
-    return written
+    return Accepted(written, findings)
 
 
-def _holds(pinned: dict[str, pd.DataFrame], rows: pd.DataFrame) -> bool:
-    """Whether an estimator is comparable with the pinned baseline, and not worse than it."""
-    try:
-        return not any(finding.alarms for finding in compare(pinned, rows))
-    except InputError:
-        return False
+def _compared(baseline: dict[str, pd.DataFrame], rows: pd.DataFrame) -> list[Finding]:
+    """Findings of those estimators that the baseline can be compared with."""
+    findings: list[Finding] = []
+    for _, of_one in rows.groupby("estimator", sort=False):
+        with contextlib.suppress(InputError):  # new, or on other recordings
+            findings += compare(baseline, of_one)
+    return findings
 
 
 def repeats_of(suite: Suite, *, of_baseline: bool) -> dict[str, int]:

@@ -38,6 +38,7 @@ N_DRAWS = 40_000
 _MOST_WAYS = 2**15 - 1  # to exchange a recording's runs; where there are more,
 _DRAWN_WAYS = 4096  # so many are drawn
 _PLAIN = 2.0  # standard deviations
+_N_WORST = 3
 _LEAST_ERROR = 1e-12  # zero has no logarithm
 WHICH = ("estimator", "recording", "repeat")
 
@@ -72,6 +73,9 @@ class Finding:
         How it compares.
     message
         What failed.
+    worst
+        Up to three recordings of the greatest ratio, by their seeds, with the error then and now;
+        of a failure, the first recording that fails.
     """
 
     estimator: str
@@ -86,6 +90,7 @@ class Finding:
     p_general: tuple[float, float]
     verdict: Change
     message: str = ""
+    worst: tuple[tuple[int, float, float], ...] = ()
 
     @property
     def alarms(self) -> bool:
@@ -159,6 +164,7 @@ def examine(
     rng: np.random.Generator,
     n_draws: int = N_DRAWS,
     failure: str = "",
+    recordings: Sequence[int] | None = None,
 ) -> Finding:
     """Compare one error on the recordings where all runs succeed; the verdict is still open.
 
@@ -172,6 +178,8 @@ def examine(
         (n, B) and (n, C) errors, not finite where a run failed.
     failure
         How runs fail now that did not then; the verdict is then `failed`.
+    recordings
+        Their seeds, to name the worst by; by default 0 to n - 1.
     """
     sound = np.isfinite(then).all(axis=1) & np.isfinite(now).all(axis=1)
     n, n_suite, ones = int(np.sum(sound)), len(then), (1.0, 1.0)
@@ -189,10 +197,15 @@ def examine(
     if same:
         return Finding(*which, n, n_suite, *ratios, ones, ones, Change.IDENTICAL)
     p_general = general_p(differences)
+    seeds = np.arange(n_suite) if recordings is None else np.asarray(recordings)
+    most = np.argsort(-differences, kind="stable")[:_N_WORST]
+    means = (np.exp(logs[most].mean(axis=1)).tolist() for logs in (logs_then, logs_now))
+    worst = tuple(zip(seeds[sound][most].tolist(), *means, strict=True))
     if then.shape[1] == 1:  # nothing random in it
-        return Finding(*which, n, n_suite, *ratios, (0.0, 0.0), p_general, Change.CHANGED)
-    p_real = exchange_p(logs_then, logs_now, rng, n_draws)
-    return Finding(*which, n, n_suite, *ratios, p_real, p_general, Change.EQUAL)
+        p_real, verdict = (0.0, 0.0), Change.CHANGED
+    else:
+        p_real, verdict = exchange_p(logs_then, logs_now, rng, n_draws), Change.EQUAL
+    return Finding(*which, n, n_suite, *ratios, p_real, p_general, verdict, worst=worst)
 
 
 def judge(findings: Sequence[Finding]) -> list[Finding]:
@@ -222,7 +235,8 @@ def compare(
         for estimator, now in current.groupby("estimator", sort=False):
             then = baseline[baseline["estimator"] == estimator]
             _same_recordings(str(estimator), name, then, now)
-            failure = _newly_failing(then, now)
+            failing = _newly_failing(then, now)
+            failure = failing[1] if failing else ""
             for error in ERRORS:
                 finding = examine(
                     (str(estimator), error, name),
@@ -231,7 +245,11 @@ def compare(
                     stream(0, f"exchange/{estimator}/{error}"),
                     n_draws,
                     failure,
+                    sorted(then["recording"].unique()),
                 )
+                if failing:
+                    worst = ((failing[0], math.nan, math.nan),)
+                    finding = dataclasses.replace(finding, worst=worst)
                 findings.append(finding)
     return judge(findings)
 
@@ -273,11 +291,12 @@ def how(run: pd.Series) -> str:
     return str(run["status"]) if run["status"] != "ok" else "errors that are not finite"
 
 
-def _newly_failing(then: pd.DataFrame, now: pd.DataFrame) -> str:
-    """How runs fail on recordings where none of the baseline's did; empty if none does."""
+def _newly_failing(then: pd.DataFrame, now: pd.DataFrame) -> tuple[int, str] | None:
+    """First recording where runs fail and none of the baseline's did, and how; None: no such."""
     bad = now[failed(now)]
     new = bad[~bad["recording"].isin(then.loc[failed(then), "recording"])]
     if new.empty:
-        return ""
+        return None
     first = new.iloc[0]
-    return f"{len(bad)} of {len(now)} runs fail; recording {first['recording']}: {how(first)}"
+    line = f"{len(bad)} of {len(now)} runs fail; recording {first['recording']}: {how(first)}"
+    return int(first["recording"]), line

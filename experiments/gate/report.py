@@ -2,6 +2,7 @@
 
 import math
 import os
+import shlex
 import sys
 import tempfile
 import xml.etree.ElementTree as ET
@@ -12,10 +13,12 @@ import pandas as pd
 
 from experiments.gate.baseline import accept, baseline_folder, baseline_paths, check, is_main
 from experiments.gate.compare import Change, Finding
-from experiments.gate.suite import printable
-from experiments.report.export import to_markdown
-from experiments.runs.console import progress
-from sim.errors import InputError, require
+from experiments.gate.suite import command_of, draw_run, read_suite, suite_path
+from experiments.report.export import escaped, to_markdown
+from experiments.runs.columns import COLUMNS
+from experiments.runs.console import progress, show
+from experiments.runs.paths import results, short
+from sim.errors import InputError, printable, require
 from sim.files import write_text
 
 LABELS = {"ate_rmse_m": "position", "ate_aligned_rmse_m": "aligned", "heading_rmse_rad": "heading"}
@@ -38,8 +41,17 @@ def run_check(
     """Do what `estima check` does; return whether it found a worsening."""
     if reason is not None:
         with progress("checking the estimators", 1.0) as on_progress:
-            for path in accept(suite, reason, only, release=release, on_progress=on_progress):
-                print(path)
+            accepted = accept(suite, reason, only, release=release, on_progress=on_progress)
+        show(as_text(accepted.findings, hint=""))
+        for path in accepted.written:
+            print(f"accepted: {short(path)}")
+        left = [f for f in accepted.findings if f.alarms and f.baseline == "release"]
+        if left and not release:
+            again = _options(suite, left)
+            print(
+                f"worse than the release baseline, and checks will say so until you pin it again: "
+                f'estima check{again} --accept "REASON" --release'
+            )
         return False
     require(not release, "--release goes with --accept REASON")
     on_github = os.environ.get("GITHUB_ACTIONS") == "true"
@@ -57,13 +69,14 @@ def run_check(
         )
     with progress("checking the estimators", 1.0) as on_progress:
         findings = check(suite, only, on_progress)
-    _say(as_text(findings, detectable))
+    show(as_text(findings, detectable, hint=_hint(suite, findings)))
+    show(_where_to_look(suite, findings))
     if junit is not None:
         write_text(junit, as_junit(findings))
     if summary is not None:
         write_text(summary, as_markdown(findings, detectable))
     if on_github:
-        _say(as_annotations(findings))
+        show(as_annotations(findings))
     if page:
         with Path(page).open("a", encoding="utf-8") as file:
             file.write(as_markdown(findings, detectable))
@@ -82,12 +95,6 @@ def _check_writable(path: Path) -> None:
         ) from error
 
 
-def _say(text: str) -> None:
-    """Print, with ? for characters that the terminal cannot show."""
-    encoding = sys.stdout.encoding or "utf-8"
-    print(text.encode(encoding, "replace").decode(encoding))
-
-
 def smallest_found() -> dict[str, float]:
     """Smallest worsening of each estimator, as a share, that 95 % of checks of the suite find."""
     power = baseline_folder() / "power.csv"  # what experiments.gate.power measured
@@ -101,6 +108,39 @@ def smallest_found() -> dict[str, float]:
         raise InputError(
             f"{power}: damaged ({why}); restore it, e.g. git checkout -- {power}"
         ) from error
+
+
+def _options(suite: str, findings: Sequence[Finding]) -> str:
+    """Options of `estima check` that name the suite, if it is another one, and the estimators."""
+    names = dict.fromkeys(finding.estimator for finding in findings)
+    chosen = [] if is_main(suite) else ["--suite", suite]
+    return " ".join(["", *chosen, *(f"--only {shlex.quote(name)}" for name in names)])
+
+
+def _hint(suite: str, findings: Sequence[Finding]) -> str:
+    """Command that accepts what is worse."""
+    worse = [finding for finding in findings if finding.alarms]
+    return f'if it is intended: estima check{_options(suite, worse)} --accept "REASON"'
+
+
+def _where_to_look(suite: str, findings: Sequence[Finding]) -> str:
+    """Worst recordings of each worsened estimator, and the command that draws the worst of them."""
+    lines = []
+    whole = read_suite(suite_path(suite))
+    for finding in {f.estimator: f for f in reversed(findings) if f.alarms and f.worst}.values():
+        unit = COLUMNS[finding.error].unit
+        lines += [
+            f"{finding.estimator}, seed {seed}: {LABELS[finding.error]} error "
+            f"{then:.3g} {unit} before, {now:.3g} {unit} now"
+            for seed, then, now in finding.worst
+            if math.isfinite(then)
+        ]
+        seed = finding.worst[0][0]
+        picture = results() / "runs" / "check" / f"{finding.estimator}_{seed}.png"
+        if draw_run(whole, finding.estimator, seed, picture):
+            lines.append(f"the worst of them: {short(picture)}")
+        lines.append(f"run it alone: {command_of(whole, finding.estimator, seed)}")
+    return "\n".join(lines)
 
 
 def sentence(finding: Finding) -> str:
@@ -120,25 +160,29 @@ def sentence(finding: Finding) -> str:
     )
 
 
-def as_text(findings: Sequence[Finding], detectable: Mapping[str, float] | None = None) -> str:
+def as_text(
+    findings: Sequence[Finding], detectable: Mapping[str, float] | None = None, hint: str = ""
+) -> str:
     """Tables for a terminal, a line for each finding that counts, and a last line.
 
     Parameters
     ----------
     detectable
         What `smallest_found` gives, if the suite is the one it was measured on.
+    hint
+        What to do if a worsening is intended.
     """
     lines = [f"{table.to_string(index=False)}\n" for table in _tables(findings, detectable)]
     lines += [sentence(finding) for finding in _noteworthy(findings)]
     if detectable:
         lines.append("finds: the smallest worsening that 95 % of checks find (docs/regression.md)")
-    return "\n".join([*lines, last_line(findings)])
+    return "\n".join([*lines, last_line(findings, hint)])
 
 
 def as_markdown(findings: Sequence[Finding], detectable: Mapping[str, float] | None = None) -> str:
     """Give the same as Markdown, for a pull request's summary."""
     lines = ["## estima check", "", last_line(findings), ""]
-    lines += [*(f"- {sentence(finding)}" for finding in _noteworthy(findings)), ""]
+    lines += [*(f"- {escaped(sentence(f))}" for f in _noteworthy(findings)), ""]
     for table in _tables(findings, detectable):
         bold = table["verdict"].str.replace("^(worse|failed)", r"**\1**", regex=True)
         lines.append(to_markdown(table.assign(verdict=bold)))
@@ -206,14 +250,14 @@ def as_junit(findings: Sequence[Finding]) -> str:
     return '<?xml version="1.0" encoding="utf-8"?>\n' + ET.tostring(root, encoding="unicode") + "\n"
 
 
-def last_line(findings: Sequence[Finding]) -> str:
-    """Say how the check ended."""
+def last_line(findings: Sequence[Finding], hint: str = "") -> str:
+    """Say how the check ended, with a hint if something is worse."""
     alarmed = ", ".join(dict.fromkeys(f.estimator for f in findings if f.alarms))
     better = ", ".join(dict.fromkeys(f.estimator for f in findings if f.verdict is Change.BETTER))
     parts = (
         f"worse: {alarmed}" if alarmed else "nothing is worse",
         f"better: {better}" if better else "",
-        'if it is intended: check with --accept "REASON"' if alarmed else "",
+        hint if alarmed else "",
     )
     return "; ".join(filter(None, parts))
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import re
+import shlex
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
@@ -18,20 +18,21 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import yaml
 
-from estimators.base import Estimator
+from estimators.base import Estimate, Estimator
 from experiments.runs import paths
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome
 from experiments.runs.seeds import stream
-from sim.errors import InputError, require
+from experiments.viewing.run_figure import run_figure
+from experiments.viewing.style import save_figure
+from sim.errors import InputError, printable, require
 from sim.recording import Recording
+from sim.yaml_file import read_yaml
 
 ERRORS = ("ate_rmse_m", "ate_aligned_rmse_m", "heading_rmse_rad")
 _RESEEDED = 1000  # streams of one seeding; repeats of the next start beyond them
-_UNPRINTABLE = re.compile("[^\x20-\x7e\xa0-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 _GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
 
 
@@ -42,6 +43,8 @@ class Entry:
     Attributes
     ----------
     name
+        What its rows and its streams are called.
+    estimator
         Option of conf/estimator.
     recordings
         Name of the group of recordings that it reads.
@@ -54,6 +57,7 @@ class Entry:
     """
 
     name: str
+    estimator: str
     recordings: str
     repeats: tuple[int, int]
     overrides: tuple[str, ...] = ()
@@ -104,11 +108,7 @@ def read_suite(path: Path) -> Suite:
     InputError
         If the file cannot be read, or a key is missing, unknown or of the wrong kind.
     """
-    try:
-        content = yaml.safe_load(path.read_text())
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        line = str(error).splitlines()[0]
-        raise InputError(f"{path}: cannot read this suite ({line})") from error
+    content = read_yaml(path)
     try:
         groups = content["recordings"]
         suite = Suite(
@@ -120,7 +120,8 @@ def read_suite(path: Path) -> Suite:
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise InputError(
             f"{path}: a suite holds first_seed, recordings (count, overrides) and estimators "
-            f"(recordings, repeats, overrides), as conf/suite/check.yaml does ({error!r})"
+            "(estimator, recordings, repeats, overrides, revised), as conf/suite/check.yaml does "
+            f"({error!r})"
         ) from error
     checks = [
         (
@@ -166,13 +167,15 @@ def _overrides(given: Any) -> tuple[str, ...]:
 
 def _entry(name: Any, given: dict[str, Any]) -> Entry:
     baseline, check = given["repeats"]
-    unknown = set(given) - {"recordings", "repeats", "overrides", "revised"}
+    unknown = set(given) - {"estimator", "recordings", "repeats", "overrides", "revised"}
     if unknown:
         raise KeyError(f"{name}.{sorted(map(str, unknown))[0]}")
     revised, group = given.get("revised", False), given["recordings"]
-    if not (isinstance(name, str) and isinstance(group, str) and isinstance(revised, bool)):
-        raise TypeError(f"{name}: name and recordings must be texts, revised true or false")
-    return Entry(name, group, (baseline, check), _overrides(given.get("overrides") or []), revised)
+    option = given.get("estimator", name)
+    if not (all(isinstance(t, str) for t in (name, option, group)) and isinstance(revised, bool)):
+        raise TypeError(f"{name}: names and recordings must be texts, revised true or false")
+    overrides = _overrides(given.get("overrides") or [])
+    return Entry(name, option, group, (baseline, check), overrides, revised)
 
 
 def suite_path(name: str) -> Path:
@@ -229,9 +232,42 @@ def run_suite(
     return pd.DataFrame(rows)
 
 
+def draw_run(suite: Suite, estimator: str, recording: int, path: Path) -> bool:
+    """Draw the first run of an estimator over a recording of a suite; False if it fails."""
+    (entry,) = suite.of([estimator]).estimators
+
+    def draw(made: Recording, _: int, online: Estimate, revised: Estimate | None) -> None:
+        judged = revised if entry.revised and revised is not None else online
+        save_figure(run_figure(made, judged, estimator), path)
+
+    rows = evaluate(
+        _experiment(suite, entry, {estimator: 1}).replaced(seed=recording, world_seed=recording),
+        streams=partial(_stream, f"estimator/{estimator}", recording, 0),
+        on_estimate=draw,
+    )
+    return rows[0]["status"] != Outcome.FAILED
+
+
+def command_of(suite: Suite, estimator: str, recording: int) -> str:
+    """Return the command that runs one estimator over one recording of a suite, and draws it."""
+    (entry,) = suite.of([estimator]).estimators
+    overrides = [
+        *suite.overrides[entry.recordings],
+        f"estimator={entry.estimator}",
+        *entry.overrides,
+        f"seed={recording}",
+        f"world_seed={recording}",
+    ]
+    return shlex.join(["estima", "run", *overrides])
+
+
 def _experiment(suite: Suite, entry: Entry, repeats: Mapping[str, int]) -> Experiment:
     """An estimator over its recordings, whatever their seed."""
-    overrides = [*suite.overrides[entry.recordings], f"estimator={entry.name}", *entry.overrides]
+    overrides = [
+        *suite.overrides[entry.recordings],
+        f"estimator={entry.estimator}",
+        *entry.overrides,
+    ]
     return Experiment.compose(overrides).replaced(repeats=repeats[entry.name])
 
 
@@ -271,11 +307,6 @@ def _plant(
     planted: Planted, seed: int, reseed: int
 ) -> Callable[[Estimator, int], AbstractContextManager[object]]:
     return lambda estimator, repeat: planted(estimator, _stream("fault", seed, reseed, repeat))
-
-
-def printable(text: str) -> str:
-    """Replace by ? what XML 1.0 forbids and what would control a terminal."""
-    return _UNPRINTABLE.sub("?", text)
 
 
 def fingerprint(recording: Recording) -> float:

@@ -2,13 +2,15 @@
 
 import importlib
 import os
+import re
 import sys
 import tempfile
 import time
+from collections import Counter
 from pathlib import Path
 from types import ModuleType
 
-from experiments.evaluation.verdict import Claim, Conclusion, Profile
+from experiments.evaluation.verdict import Claim, Conclusion, Profile, Verdict
 from experiments.papers.results import Results
 from experiments.report.claims import (
     note_provenance,
@@ -27,13 +29,14 @@ from sim.errors import InputError
 
 PAPERS = ("puzzlebot2024", "decristoforis2020", "maximo2024", "gil2008")
 LOGS = ("real_logs",)  # run only where the logs are
-OWN = ("mcl_office",)  # our own study, which judges no claim: run only when named
-Judgement = tuple[list[Claim], list[Conclusion]]
+OWN = ("mcl_office", "fastslam_consistency")  # our own, which judge no claim: run when named
 _APART = "_tuning"  # the table on other seeds from which parameters were chosen
 
 
 def reproduce(*, full: bool = False, only: str | None = None) -> None:
     """Run the studies, judge the claims, draw the figures, write the report.
+
+    The quick profile has a folder of its own, `results/quick`.
 
     Parameters
     ----------
@@ -42,26 +45,22 @@ def reproduce(*, full: bool = False, only: str | None = None) -> None:
     only
         A paper's short name, or None for all papers.
     """
-    place = results()
+    profile = Profile.FULL if full else Profile.QUICK
+    place = folder_of(profile)
     read_claims(place / "claims.csv")  # a damaged table ends the command before hours are spent
     read_verdicts(place / "verdicts.csv")
-    profile, made = Profile.FULL if full else Profile.QUICK, read_provenance(place)
+    lines = []
     for paper in _chosen(only):
         begun = time.monotonic()
         if paper in LOGS and (why := _part(paper, "study").missing()):
             print(f"{paper}: left out, {why}", file=sys.stderr)
             continue
-        if not full and made.get(paper, {}).get("profile") == Profile.FULL:
-            print(
-                f"{paper}: replaces the judged results of {paper}; `git checkout results` brings "
-                "them back",
-                file=sys.stderr,
-            )
-        _print(*reproduce_paper(paper, profile))
-        print(f"{paper}: {time.monotonic() - begun:.0f} s", file=sys.stderr)
-    write_report(place)
-    names = ("report.html", "verdicts.csv", "claims.csv", "figures", "tables")
-    print(", ".join(f"{name.split('.')[0]}: {short(place / name)}" for name in names))
+        conclusions = reproduce_paper(paper, profile)
+        _print(conclusions)
+        lines.append(f"{paper}: {_counts(conclusions)} ({time.monotonic() - begun:.0f} s)")
+    page = write_report(place)
+    print("\n".join(["", *lines]))
+    print(f"{short(page)} has the figures and tables behind them; open it in a browser")
 
 
 def redraw(only: str | None = None) -> None:
@@ -75,7 +74,7 @@ def redraw(only: str | None = None) -> None:
     place = results()
     present = [p for p in _chosen(only) if any((place / "tables").glob(f"{p}_*.csv"))]
     if not present:
-        command = f"estima reproduce --paper {only}" if only else "estima reproduce"
+        command = f"estima reproduce --full{f' --paper {only}' if only else ''}"
         raise InputError(
             f"{short(place / 'tables')}: no tables of {only or 'any paper'}; run `{command}`"
         )
@@ -108,42 +107,48 @@ def judge_again(only: str | None = None) -> None:
         profile = Profile(made.get(paper, {}).get("profile", Profile.QUICK))
         tables = Results(place, paper)
         with tables.as_found():
-            judged = _judgement(tables)
-        _write(judged, place, paper, profile)
-        _print(*judged)
+            claims, conclusions = _judgement(tables)
+        _write(claims, conclusions, place, paper, profile)
+        _print(conclusions)
     write_report(place)
 
 
-def reproduce_paper(paper: str, profile: Profile) -> Judgement:
+def reproduce_paper(paper: str, profile: Profile) -> list[Conclusion]:
     """Run one paper's study, and put its files, claims, verdicts and origin in place.
 
     The files are written elsewhere first, so an interrupted run leaves the results as they were.
     """
-    begun, place = time.monotonic(), results()
-    aside = place / "cache"  # which is not committed
+    begun, place = time.monotonic(), folder_of(profile)
+    aside = results() / "cache"  # which is not committed
     aside.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=aside, prefix=f"{paper}-") as name:
         made = Results(Path(name), paper)
         with progress(paper, 1.0) as on_progress:
             _part(paper, "study").run(profile, made, on_progress)
         _draw(made)
-        judged: Judgement = ([], []) if paper in OWN else _judgement(made)
+        claims, conclusions = ([], []) if paper in OWN else _judgement(made)
         for kind in ("tables", "arrays", "figures"):
             _put_in_place(made.folder / kind, place / kind, paper)
-        _write(judged, place, paper, profile)
+        _write(claims, conclusions, place, paper, profile)
         note_provenance(place, paper, profile, time.monotonic() - begun)
-    return judged
+    return conclusions
 
 
-def _judgement(made: Results) -> Judgement:
+def folder_of(profile: Profile) -> Path:
+    """Return the folder of the judged results, or of the quick ones, which leave those alone."""
+    return results() if profile is Profile.FULL else results() / "quick"
+
+
+def _judgement(made: Results) -> tuple[list[Claim], list[Conclusion]]:
     """Statistics of a paper's claims, and the one verdict on each claim."""
     module = _part(made.paper, "claims")
     claims = module.judge(made)
     return claims, module.conclusions(made, claims)
 
 
-def _write(judged: Judgement, place: Path, paper: str, profile: Profile) -> None:
-    claims, conclusions = judged
+def _write(
+    claims: list[Claim], conclusions: list[Conclusion], place: Path, paper: str, profile: Profile
+) -> None:
     command = f"estima reproduce --paper {paper}{' --full' * (profile is Profile.FULL)}"
     write_claims(claims, place / "claims.csv", paper=paper, profile=profile, command=command)
     says = findings(paper)["claims"]
@@ -184,14 +189,17 @@ def _part(paper: str, name: str) -> ModuleType:
     return importlib.import_module(f"experiments.papers.{paper}.{name}")
 
 
-def _print(claims: list[Claim], conclusions: list[Conclusion]) -> None:
-    for claim in claims:
-        found = claim.found
-        interval = f"{found.value:.4g} [{found.low:.4g}, {found.high:.4g}]"
-        said = "; ".join(filter(None, [claim.criterion, claim.reason]))
-        print(
-            f"{claim.id}  {claim.role:<8}  {claim.verdict.label:<15} {claim.statistic}: {interval} "
-            f"({said})"
-        )
+def _print(conclusions: list[Conclusion]) -> None:
     for each in conclusions:
-        print(f"{each.id}: {each.verdict.label}. {each.sentence}")
+        print(f"{each.id:<4} {each.verdict.label:<15} {first_sentence(each.sentence)}")
+
+
+def first_sentence(text: str) -> str:
+    """Return the text up to its first full stop that ends a sentence."""
+    return re.split(r"(?<=[a-z0-9)%][.:]) (?=[A-Z])", text, maxsplit=1)[0]
+
+
+def _counts(conclusions: list[Conclusion]) -> str:
+    """Say how many claims have which verdict, as in "3 reproduced, 1 undecided"."""
+    counts = Counter(each.verdict for each in conclusions)
+    return ", ".join(f"{counts[v]} {v.label}" for v in Verdict if v in counts) or "judges no claim"

@@ -1,7 +1,5 @@
 """What a study writes for its claims and figures: tables and arrays."""
 
-import zipfile
-import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,6 +13,7 @@ from experiments.runs.paths import short
 from experiments.runs.row import read_rows, write_frame
 from sim.errors import InputError
 from sim.files import write_whole
+from sim.npz import read_arrays
 
 # Errors of a table or array without its content; a query for a missing column is a NameError
 _MISFITS = (
@@ -56,6 +55,10 @@ class Results:
             raise InputError(f"{short(path)}: damaged (no rows); {self._remedy}")
         return table
 
+    def has_table(self, name: str) -> bool:
+        """Whether the study left this table: some need data that is not part of the project."""
+        return self._path("tables", f"{name}.csv").exists()
+
     def write_arrays(self, name: str, **arrays: NDArray[np.generic]) -> None:
         """Write named arrays to one file, compressed."""
         with write_whole(self._path("arrays", f"{name}.npz")) as part, part.open("wb") as file:
@@ -71,9 +74,8 @@ class Results:
         """
         path = self._path("arrays", f"{name}.npz", to_read=True)
         try:
-            with np.load(path, allow_pickle=False) as file:
-                return _Arrays(file, short(path), self._remedy)
-        except (OSError, ValueError, TypeError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+            return _Arrays(read_arrays(path), short(path), self._remedy)
+        except InputError as error:
             raise InputError(f"{short(path)}: damaged ({error}); {self._remedy}") from error
 
     def has_arrays(self, name: str) -> bool:
@@ -108,7 +110,8 @@ class Results:
 
     @property
     def _remedy(self) -> str:
-        return f"run `estima reproduce --paper {self.paper}`"
+        full = "" if self.folder.name == "quick" else "--full "
+        return f"run `estima reproduce {full}--paper {self.paper}`"
 
 
 class _Arrays(dict[str, NDArray[np.generic]]):

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
-import yaml
 
 from experiments.evaluation.verdict import Profile, Role, Verdict, headline_verdict
 from experiments.report.claims import read_claims, read_provenance, read_verdicts, this_code
@@ -16,6 +15,8 @@ from experiments.report.export import as_text, numeric
 from experiments.runs.paths import CONF, SOURCE
 from experiments.runs.row import read_rows
 from sim.errors import InputError
+from sim.files import require_file
+from sim.yaml_file import read_yaml
 
 Entry = Mapping[str, Any]
 PAPERS = ("puzzlebot2024", "decristoforis2020", "gil2008", "maximo2024")
@@ -24,6 +25,7 @@ OWN = {
     "leaderboard": ["estima run -m study=leaderboard"],
     "all_estimators": ["estima run -m study=all_estimators"],
     "mcl_office": ["estima reproduce --paper mcl_office --full"],
+    "fastslam_consistency": ["estima reproduce --paper fastslam_consistency --full"],
 }
 SMALL_ROWS, SMALL_COLUMNS = 60, 20  # a table up to here is shown whole
 FIRST_ROWS = 5  # of a larger one
@@ -39,7 +41,7 @@ def contents(results: Path, on_progress: Callable[[float], None]) -> dict[str, A
     about = {name: findings(name) for name in (*papers, *OWN)}
     sentences = read_verdicts(results / "verdicts.csv").set_index("id")["sentence"].to_dict()
     claims = judged_claims(table, about, sentences)
-    commands = {name: [f"estima reproduce --paper {name}"] for name in papers} | OWN
+    commands = {name: [f"estima reproduce --full --paper {name}"] for name in papers} | OWN
     commands |= {str(k): list(v.unique()) for k, v in table.groupby("paper")["command"]}
     studies = {}
     for done, (name, page) in enumerate(about.items(), start=1):
@@ -75,10 +77,7 @@ def contents(results: Path, on_progress: Callable[[float], None]) -> dict[str, A
 def findings(name: str) -> dict[str, Any]:
     """A paper's findings in our words: `title`, `about`, `claims` by id, `figures` by file name."""
     path = _FOLDER / name / "findings.yaml"
-    try:
-        found = yaml.safe_load(path.read_text(encoding="utf-8")) if path.exists() else {}
-    except yaml.YAMLError as error:
-        raise InputError(f"{path}: not YAML ({str(error).splitlines()[0]})") from error
+    found = read_yaml(path) if path.exists() else {}
     return {"title": name, "about": "", "claims": {}, "figures": {}, **found}
 
 
@@ -151,6 +150,7 @@ def picture(path: Path, about: Entry, claims: Mapping[str, Entry]) -> Entry:
     InputError
         If it is not a whole PNG.
     """
+    require_file(path)
     try:
         data = path.read_bytes()
     except OSError as error:

@@ -9,7 +9,7 @@ import pandas as pd
 
 from experiments.runs.columns import title
 from experiments.runs.row import read_rows
-from sim.errors import InputError
+from sim.errors import InputError, printable
 from sim.files import write_whole
 
 _LATEX = str.maketrans(
@@ -20,7 +20,7 @@ _LATEX = str.maketrans(
         **{character: f"\\{character}" for character in "&%$#_{}"},
     }
 )
-_MARKDOWN = str.maketrans({"\\": r"\\", "|": r"\|"})
+_MARKDOWN = str.maketrans({character: f"\\{character}" for character in "\\|<"})
 
 
 def read_table(path: Path) -> pd.DataFrame:
@@ -34,8 +34,12 @@ def read_table(path: Path) -> pd.DataFrame:
     try:
         frame = read_rows(path)
         as_csv = path.suffix == ".csv"
-        written = pd.read_csv(path, dtype="str", keep_default_na=False) if as_csv else frame
-    except (InputError, ValueError) as error:
+        written = (
+            pd.read_csv(path, dtype="str", keep_default_na=False, index_col=False)
+            if as_csv
+            else frame
+        )
+    except (InputError, ValueError, OverflowError) as error:
         why = [*str(error.__cause__ or "no table there").splitlines(), "unreadable"][0].rstrip(".")
         raise InputError(f"{path}: {why}; export-table needs a CSV or Parquet table") from error
     for name, column in list(frame.items()):
@@ -62,8 +66,9 @@ def plain(value: Any, digits: int = 4) -> str:
 
 def as_text(frame: pd.DataFrame, digits: int = 4) -> pd.DataFrame:
     """Every cell as `plain` writes it, under headings with units."""
-    cells = frame.set_axis([title(str(name)) for name in frame], axis=1).astype(object)
-    return cells.map(lambda value: " ".join(plain(value, digits).split()))
+    heads = [printable(" ".join(title(str(name)).split())) for name in frame]
+    cells = frame.set_axis(heads, axis=1).astype(object)
+    return cells.map(lambda value: printable(" ".join(plain(value, digits).split())))
 
 
 def numeric(frame: pd.DataFrame) -> list[bool]:
@@ -71,10 +76,15 @@ def numeric(frame: pd.DataFrame) -> list[bool]:
     return [dtype.kind in "iuf" for dtype in frame.dtypes]
 
 
+def escaped(text: str) -> str:
+    """Text in which Markdown and HTML find nothing of theirs."""
+    return text.translate(_MARKDOWN)
+
+
 def to_markdown(frame: pd.DataFrame, digits: int = 4) -> str:
     """Pipe table; columns of numbers are aligned to the right."""
-    cells = as_text(frame, digits).map(lambda text: text.translate(_MARKDOWN))
-    table: str = cells.rename(columns=lambda name: name.translate(_MARKDOWN)).to_markdown(
+    cells = as_text(frame, digits).map(escaped)
+    table: str = cells.rename(columns=escaped).to_markdown(
         index=False,
         tablefmt="pipe",
         disable_numparse=True,

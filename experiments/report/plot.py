@@ -11,7 +11,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from experiments.evaluation.statistics import mean_interval
-from experiments.runs.columns import COLUMNS, title
+from experiments.runs.columns import COLUMNS, REPEAT, title
 from experiments.sweeps.collect import measured, telling
 from experiments.viewing.style import CYCLE, subplots
 from sim.errors import InputError
@@ -28,8 +28,9 @@ def sweep_figure(
 ) -> Figure:
     """Mean of `y` over the recordings, with 95 % intervals, against `x`; one line per `by`.
 
-    Repeats over one recording are averaged first: the recording is the unit of inference. On a
-    logarithmic axis means and intervals are those of the logarithm.
+    Repeats over one recording are averaged first: the recording is the unit of inference. Where no
+    point has more than one recording, the intervals are over its repeats. On a logarithmic axis
+    means and intervals are those of the logarithm.
 
     Parameters
     ----------
@@ -59,6 +60,9 @@ def sweep_figure(
                 f"a point would pool different values of {column} ({there}); draw a line for each "
                 f"with --by {column}, keep one with --where {column}=..., or average with --pool"
             )
+    one_each = points["recording_checksum"].nunique().max() == 1
+    repeated = one_each and REPEAT in table and table[REPEAT].nunique() > 1
+    unit = REPEAT if repeated else "recording_checksum"
     page, ax = subplots(6.5, 4.0)
     scale = COLUMNS[y].scale if y in COLUMNS else "log"
     logarithmic = scale == "log" and _spans(table[y], _WIDE_Y)
@@ -67,7 +71,7 @@ def sweep_figure(
     wide = numeric and _spans(table[x], _WIDE_X)
     groups = [("", table)] if by is None else list(table.groupby(by))
     for i, (label, rows) in enumerate(groups):
-        recordings = rows.groupby([x, "recording_checksum"])[y].mean().dropna().groupby(level=0)
+        recordings = rows.groupby([x, unit])[y].mean().dropna().groupby(level=0)
         points = {name: _interval(values, logarithmic) for name, values in recordings}
         value, low, high = np.array(list(points.values())).reshape(-1, 3).T
         at = np.array([name if numeric else names.index(name) for name in points], float)
@@ -91,7 +95,8 @@ def sweep_figure(
     if not numeric:
         ax.set_xticks(range(len(names)), [str(n) for n in names], rotation=20, ha="right")
     pooled = [c for c in telling(table) if c not in (x, by, "seed", "world_seed")]
-    over = ", ".join(["recordings", *(c.removeprefix("choice.") for c in pooled)])
+    over = "repeats" if repeated else "recordings"
+    over = ", ".join([over, *(c.removeprefix("choice.") for c in pooled)])
     kind = "geometric mean" if logarithmic else "mean"
     ax.set_title(textwrap.fill(f"{kind} over {over}; 95 % intervals", 62), fontsize="small")
     if by is not None:

@@ -12,13 +12,15 @@ import sys
 import time
 import zlib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 from experiments.runs import paths
+from experiments.runs.locks import locked
 from experiments.runs.version import SIMULATION, code_version
 from sim.errors import InputError
+from sim.files import require_file
 from sim.recording import Recording, load, save
 
 _LIMIT_GIB = 8.0
@@ -48,6 +50,7 @@ def cached(key: str, make: Callable[[], Recording]) -> Recording:
     limit = limit_bytes()
     with _locked(path):
         if path.exists():
+            require_file(path)
             try:
                 recording = _entry(path, key)
                 os.utime(path)
@@ -118,6 +121,7 @@ def trim(most_bytes: float) -> int:
         if excess <= 0.0:
             break
         lock = path.with_suffix(".lock")
+        require_file(lock)
         with lock.open("w") as handle:
             try:
                 fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -132,31 +136,14 @@ def trim(most_bytes: float) -> int:
 
 @contextmanager
 def _locked(path: Path) -> Iterator[None]:
-    """Hold an exclusive lock, which the system frees even if the process is killed.
-
-    Its file goes with the lock; who waited for one that is gone takes the next.
-    """
-    lock = path.with_suffix(".lock")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle = _held(lock)
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot write to the cache ({error.strerror}); free some space, or choose "
-            "another folder of results with ESTIMA_RESULTS"
-        ) from error
-    with handle:
+    """Hold an exclusive lock on an entry."""
+    with ExitStack() as held:
         try:
-            yield
-        finally:
-            lock.unlink(missing_ok=True)
-
-
-def _held(lock: Path) -> TextIO:
-    while True:
-        handle = lock.open("w")
-        fcntl.flock(handle, fcntl.LOCK_EX)
-        with suppress(FileNotFoundError):
-            if os.path.samestat(os.fstat(handle.fileno()), lock.stat()):
-                return handle
-        handle.close()
+            path.parent.mkdir(parents=True, exist_ok=True)
+            held.enter_context(locked(path.with_suffix(".lock")))
+        except OSError as error:
+            raise InputError(
+                f"{path}: cannot lock it in the cache ({error.strerror}); free some space, or "
+                "choose another folder of results with ESTIMA_RESULTS"
+            ) from error
+        yield

@@ -36,10 +36,12 @@ class Column:
 OF_THE_RUN = {
     "duration_s": Column("duration", "t", "s", "linear", None),
     "distance_m": Column("distance travelled", "d", "m", "linear", None),
+    "dispersion_final_m": Column("final dispersion of the particles", "dispersion", "m"),
 }
 _OF_THE_PATH = {
     "step_time_us": Column("time per step", "step", "us"),
     "ate_rmse_m": Column("position RMSE", "ATE", "m"),
+    "ate_mean_m": Column("mean position error", "mean error", "m"),
     "ate_aligned_rmse_m": Column("position RMSE after alignment", "ATE aligned", "m"),
     "heading_rmse_rad": Column("heading RMSE", "heading", "rad"),
     "heading_aligned_rmse_rad": Column("heading RMSE after alignment", "heading aligned", "rad"),
@@ -51,15 +53,24 @@ _OF_THE_PATH = {
     "ellipse_area_final_m2": Column(
         "area of the final 95 % ellipse", "ellipse", "m^2", better=None
     ),
+    "final_in_ellipse": Column(
+        "share of final positions in the 95 % ellipse", "in ellipse", "", "linear", None
+    ),
     "nees_mean": Column("mean NEES (3 when consistent)", "NEES", better=None),
     "rpe_1m_rmse_m": Column("position RMSE over 1 m", "RPE 1 m", "m"),
     "rpe_1m_heading_rmse_rad": Column("heading RMSE over 1 m", "RPE heading 1 m", "rad"),
     "rpe_10m_rmse_m": Column("position RMSE over 10 m", "RPE 10 m", "m"),
     "rpe_10m_heading_rmse_rad": Column("heading RMSE over 10 m", "RPE heading 10 m", "rad"),
 }
+_OF_THE_MAP = {
+    "n_landmarks": Column("landmarks in the map", "N", "", "linear", None),
+    "map_rmse_m": Column("RMSE of the map's landmarks", "map", "m"),
+    "map_aligned_rmse_m": Column("RMSE of the map's landmarks after alignment", "map aligned", "m"),
+}
 COLUMNS = {
     **OF_THE_RUN,
     **_OF_THE_PATH,
+    **_OF_THE_MAP,
     **{
         f"revised_{name}": dataclasses.replace(
             column, label=f"{column.label}, revised path", symbol=f"{column.symbol} revised"

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, NoReturn
 
-from sim.errors import InputError
+from sim.errors import InputError, printable
 
 _QUIET_S = 2.0  # what ends sooner shows no progress
 _LINE_EVERY_S = 10.0  # where the output is a file
@@ -150,6 +150,18 @@ def _configuration_errors() -> tuple[type[Exception], ...]:
     return (hydra.HydraException, omegaconf.OmegaConfBaseException, malformed)
 
 
+def show(text: str) -> None:
+    """Print text that may come from a file, with ? for what the terminal cannot or must not show.
+
+    Those are characters that would control it, and those that its encoding lacks.
+    """
+    encoding = sys.stdout.encoding or "utf-8"
+    safe = "\n".join(printable(line) for line in text.split("\n"))
+    print(safe.encode(encoding, "replace").decode(encoding))
+
+
 def _say(message: str, code: int) -> NoReturn:
-    print(f"estima: {message}", file=sys.stderr)
+    line = printable(" ".join(f"estima: {message}".splitlines()))
+    encoding = sys.stderr.encoding or "utf-8"
+    print(line.encode(encoding, "replace").decode(encoding), file=sys.stderr)
     sys.exit(code)

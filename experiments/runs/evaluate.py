@@ -9,12 +9,13 @@ import numpy as np
 from threadpoolctl import ThreadpoolController
 
 from estimators.base import Estimate, Estimator, Prior, run
-from experiments.evaluation.metrics import score
+from experiments.evaluation.map_quality import landmark_errors
+from experiments.evaluation.metrics import SCORED_EXTRAS, score
 from experiments.runs.columns import OF_THE_RUN
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome, Row, Status
 from experiments.runs.seeds import stream
-from sim.errors import InputError
+from sim.errors import InputError, require
 from sim.recording import Recording
 
 Streams = Callable[[int], np.random.Generator]
@@ -77,9 +78,8 @@ def evaluate(
                 planted(estimator, repeat) if planted else nullcontext(),
                 shown(recording) if shown else nullcontext() as on_step,
             ):
-                online, revised = estimates(
-                    estimator, recording, prior, rng, experiment.keep, on_step
-                )
+                keep = (*SCORED_EXTRAS, *experiment.keep)
+                online, revised = estimates(estimator, recording, prior, rng, keep, on_step)
             status = status_of(recording, online)
             scores = scored(recording, online, revised)
         except InputError:
@@ -103,19 +103,27 @@ def estimates(
 ) -> tuple[Estimate, Estimate | None]:
     """Online estimate of a run, and the revised one of an estimator that has `finish`.
 
-    BLAS uses one thread, unless the environment sets OMP_NUM_THREADS or OPENBLAS_NUM_THREADS: its
-    threads spin while they wait, and the matrices of filters are small.
+    BLAS uses one thread, or as many as ESTIMA_BLAS_THREADS says: its threads spin while they wait,
+    and the matrices of filters are small.
     """
-    with one_blas_thread():
+    with limited_blas():
         online = run(estimator, recording, prior, rng, keep, on_step)
         finish = getattr(estimator, "finish", None)
         return online, None if finish is None else finish()
 
 
-def one_blas_thread() -> AbstractContextManager[object]:
-    """Context in which BLAS uses one thread, unless the environment asks for another number."""
-    asked = {"OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"} & set(os.environ)
-    return nullcontext() if asked else _blas().limit(limits=1, user_api="blas")
+def limited_blas() -> AbstractContextManager[object]:
+    """Context in which BLAS uses one thread, or as many as ESTIMA_BLAS_THREADS says.
+
+    The variables of BLAS itself do not count: the workers of a sweep find them set by joblib.
+    """
+    asked = os.environ.get("ESTIMA_BLAS_THREADS") or "1"
+    require(
+        asked.isdecimal() and int(asked) >= 1,
+        f"ESTIMA_BLAS_THREADS must be a whole number, at least 1, got {asked!r}",
+    )
+    limit: AbstractContextManager[object] = _blas().limit(limits=int(asked), user_api="blas")
+    return limit
 
 
 @functools.cache
@@ -127,7 +135,8 @@ def _blas() -> ThreadpoolController:
 
 def scored(recording: Recording, online: Estimate, revised: Estimate | None) -> Row:
     """Scores of a run as columns; those of the revised path begin with `revised_`."""
-    scores: Row = {**score(recording, online)}
+    made = online.map if revised is None else revised.map
+    scores: Row = {**score(recording, online), **landmark_errors(recording, made)}
     if revised is not None:
         found = score(recording, revised)
         scores |= {f"revised_{k}": found[k] for k in found if k not in OF_THE_RUN}

@@ -36,6 +36,7 @@ from sim.sensors import Sensor, Sensors, sensors_from_config
 from sim.sensors.base import RecordedSensor, sensor_settings
 from sim.settings import build
 from sim.world import World
+from sim.yaml_file import read_yaml
 
 Config = dict[str, Any]
 GROUPS = ("world", "robot", "sensors", "route", "estimator")
@@ -135,6 +136,12 @@ class Experiment:
     def estimator_name(self) -> str:
         """The chosen option, or the class of an estimator without one."""
         return self.choices.get("estimator") or str(self.config["estimator"]["_target_"])
+
+    @property
+    def believed_slip(self) -> tuple[float, float] | None:
+        """The kr and kl that the estimator believes, m; None if it has no such options."""
+        settings = self.config["estimator"]
+        return (settings["kr"], settings["kl"]) if {"kr", "kl"} <= set(settings) else None
 
     @property
     def seed(self) -> int:
@@ -543,13 +550,20 @@ def searched(config_dir: str | Path | None) -> list[str]:
     Raises
     ------
     InputError
-        If there is no such folder.
+        If there is no such folder, or one of its options is no YAML that can be read.
     """
     if config_dir is None:
         return []
     folder = Path(config_dir).resolve()
     if not folder.is_dir():
         raise InputError(f"--config-dir must name a folder, got {config_dir}")
+    for group in (*GROUPS, "study"):
+        for path in sorted((folder / group).glob("*.yaml")):
+            option = read_yaml(path)  # within bounds, which Hydra does not know
+            keys = option is None or (
+                isinstance(option, dict) and all(isinstance(key, str) for key in option)
+            )
+            require(keys, f"{path}: an option holds keys and their values")
     return [f"hydra.searchpath=[{paths.quoted(f'file://{folder}')}]"]
 
 

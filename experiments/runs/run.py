@@ -13,15 +13,21 @@ from omegaconf import DictConfig
 from estimators.base import Estimate
 from experiments.runs import paths
 from experiments.runs.columns import COLUMNS
-from experiments.runs.console import RunFailedError, end, progress
+from experiments.runs.console import RunFailedError, end, progress, show
 from experiments.runs.evaluate import evaluate
-from experiments.runs.experiment import Experiment, check_added, check_hydra, check_overrides
+from experiments.runs.experiment import (
+    Experiment,
+    check_added,
+    check_hydra,
+    check_overrides,
+    searched,
+)
 from experiments.runs.row import Outcome, Row
 from experiments.runs.store import write_run
 from sim.errors import InputError
 from sim.recording import Recording
 
-Draw = Callable[[Recording, Estimate, str, Path], None]
+Draw = Callable[[Recording, Estimate, Experiment, Path], None]
 
 
 def run_once(experiment: Experiment, draw: Draw) -> list[Row]:
@@ -30,7 +36,7 @@ def run_once(experiment: Experiment, draw: Draw) -> list[Row]:
     Parameters
     ----------
     draw
-        Draws a recording and an estimate, with the estimator's name, into a folder.
+        Draws a recording and an estimate of an experiment into a folder.
 
     Raises
     ------
@@ -45,7 +51,7 @@ def run_once(experiment: Experiment, draw: Draw) -> list[Row]:
 
     def keep(recording: Recording, repeat: int, online: Estimate, _: Estimate | None) -> None:
         if repeat == 0 and experiment.picture:
-            draw(recording, online, name, folder)
+            draw(recording, online, experiment, folder)
 
     rows = evaluate(
         experiment,
@@ -85,6 +91,10 @@ def application(arguments: Sequence[str], draw: Draw) -> None:
         for option, argument in zip(before, arguments, strict=False)
         if "=" in argument and not argument.startswith("-") and not option.startswith("-")
     ]
+    for option, argument in zip(before, arguments, strict=False):
+        name, equals, value = argument.partition("=")
+        if (name if equals else option) in ("--config-dir", "-cd"):
+            searched(value if equals else argument)
     check_hydra(overrides)
     check_overrides(overrides)
     sys.argv = ["estima run", *arguments]
@@ -104,11 +114,11 @@ _SHOWN = (
 def _print(rows: Sequence[Row], files: Sequence[Path]) -> None:
     first = rows[0]
     where = first.get("choice.world") or first.get("recording") or "a recording"
-    print(f"{first['choice.estimator']} on {where}, seed {first['seed']}: {first['status']}")
+    show(f"{first['choice.estimator']} on {where}, seed {first['seed']}: {first['status']}")
     for name in _SHOWN:
         values = [float(v) for row in rows if isinstance(v := row.get(name), (int, float))]
         if values:
             column, mean = COLUMNS[name], fmean(values)
-            print(f"  {column.label:<30} {mean:10.4g} {column.unit}")
+            show(f"  {column.label:<30} {mean:10.4g} {column.unit}")
     for path in files:
-        print(f"  {paths.short(path)}")
+        show(f"  {paths.short(path)}")

@@ -15,10 +15,11 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import hydra
 import numpy as np
@@ -34,7 +35,9 @@ from sim.errors import InputError
 from sim.files import write_whole
 from sim.recording import Recording
 
-_JOBS_PER_WORKER = 4  # enough to keep all busy to the end, few enough to cost little
+_JOBS_PER_CORE = 4  # enough to keep all busy to the end, few enough to cost little
+# What launchers raise when a process of theirs has died; Ray and submitit are extras
+_DIED = {"UncompletedJobError", "WorkerCrashedError", "NodeDiedError", "OutOfMemoryError"}
 
 
 def sweep_arguments(arguments: Sequence[str]) -> None:
@@ -63,7 +66,8 @@ def sweep(arguments: Sequence[str], config_dir: str | None = None) -> None:
     arguments
         Hydra's overrides. A study's `sweeps` are a list of further ones, each with its values;
         `hydra.sweeper.params` are swept where the arguments do not say otherwise. Those of
-        `hydra/launcher` and `hydra.launcher` go to the launcher.
+        `hydra/launcher` and `hydra.launcher` go to the launcher; `jobs` is the number of jobs
+        that the runs are packed into.
     config_dir
         A further folder of options.
 
@@ -77,6 +81,7 @@ def sweep(arguments: Sequence[str], config_dir: str | None = None) -> None:
     check_hydra(arguments)
     launching = [a for a in arguments if a.lstrip("+~").startswith(_LAUNCHING)]
     _require_launcher(launching)
+    n_jobs = _n_jobs(launching)
     own = [a for a in arguments if a not in launching]
     plan = plan_of(own, config_dir)
     if not len(plan.keys):
@@ -98,7 +103,7 @@ def sweep(arguments: Sequence[str], config_dir: str | None = None) -> None:
     )
     if not len(runs):
         return
-    _launch_all(plan, runs, folder, launching)
+    _launch_all(plan, runs, Jobs(folder, n_jobs), launching)
     store.tidy(folder, lambda journal: _plan_of(folder, journal).exists())
     found = store.ended(folder)
     bad = runs[~np.isin(plan.keys[runs], found.done)]
@@ -129,8 +134,11 @@ def check(plan: Plan, runs: Numbers) -> None:
 
 
 def _drop(path: Path, error: InputError) -> None:
-    """Remove a damaged file of rows, so that its runs are done again; not one of other names."""
-    if not store.is_own(path):
+    """Remove a damaged file of rows, so that its runs are done again; not one of other names.
+
+    Nor one that cannot be read now: its rows may be sound.
+    """
+    if not store.is_own(path) or isinstance(error.__cause__, OSError):
         raise error
     print(f"estima: {path} does not match its checksum; its runs are done again", file=sys.stderr)
     path.unlink(missing_ok=True)
@@ -144,6 +152,8 @@ class Jobs:
     ----------
     folder
         Folder of the rows.
+    count
+        How many there should be.
     name
         What the plan and the journals of this sweep are called; sorted as they begin.
     sizes
@@ -151,6 +161,7 @@ class Jobs:
     """
 
     folder: Path
+    count: int
     name: str = field(
         default_factory=lambda: f"{time.time_ns():016x}-{os.getpid()}-{secrets.token_hex(3)}"
     )
@@ -187,9 +198,8 @@ def _plan_of(folder: Path, journal: str) -> Path:
     return folder / f"plan-{journal.removeprefix('rows-').rpartition('-')[0]}.json"
 
 
-def _launch_all(plan: Plan, runs: Numbers, folder: Path, launching: Sequence[str]) -> None:
-    """Start the runs; find those at which a worker died, and go on with the rest."""
-    jobs = Jobs(folder)
+def _launch_all(plan: Plan, runs: Numbers, jobs: Jobs, launching: Sequence[str]) -> None:
+    """Start the runs; find those at which a worker of joblib's died, and go on with the rest."""
     with write_whole(jobs.plan) as part:
         part.write_text(json.dumps({"planner": [platform.node(), os.getpid()]}))
     try:
@@ -199,14 +209,14 @@ def _launch_all(plan: Plan, runs: Numbers, folder: Path, launching: Sequence[str
                 died = _launch(plan, left, jobs, launching)
                 if died is None:
                     return
-                begun = store.begun(folder, f"rows-{jobs.name}")
+                begun = store.begun(jobs.folder, f"rows-{jobs.name}")
                 if not begun:
                     raise died
                 for i in left[np.isin(plan.keys[left], np.array(list(begun), np.uint64))]:
                     one = np.array([i])  # which of them was it?
                     if _launch(plan, one, jobs, [*launching, "hydra.launcher.n_jobs=2"]):
                         _record_death(plan.experiment(i), jobs)
-                over = store.ended(folder, f"rows-{jobs.name}")
+                over = store.ended(jobs.folder, f"rows-{jobs.name}")
                 keys = np.array([*over.done, *over.failed], np.uint64)
                 left = left[~np.isin(plan.keys[left], keys)]
     finally:
@@ -214,16 +224,23 @@ def _launch_all(plan: Plan, runs: Numbers, folder: Path, launching: Sequence[str
 
 
 def _launch(plan: Plan, runs: Numbers, jobs: Jobs, launching: Sequence[str]) -> Exception | None:
-    """Write the shares and start their jobs; return the error if a process of joblib's has died."""
+    """Write the shares and start their jobs; return the error if a process of joblib's has died.
+
+    Raises
+    ------
+    RunFailedError
+        If a process of another launcher's has died.
+    """
     from joblib.externals.loky.process_executor import TerminatedWorkerError
 
-    parts = packed(plan.recordings[runs], _JOBS_PER_WORKER * (os.cpu_count() or 1))
+    parts = packed(plan.recordings[runs], jobs.count)
     numbers = [jobs.add(plan, runs[part]) for part in parts]
     arguments = sys.argv
     sys.argv = [
         "estima run",
         "-m",
         *launching,
+        *_for_cluster(launching),
         f"plan={paths.quoted(jobs.plan)}",
         f"job={','.join(numbers)}",
     ]
@@ -232,9 +249,27 @@ def _launch(plan: Plan, runs: Numbers, jobs: Jobs, launching: Sequence[str]) -> 
     except TerminatedWorkerError as error:
         died: Exception = error
         return died
+    except ConnectionError as error:  # Ray's
+        raise InputError(f"{error}; see hydra.launcher.ray.init.address") from error
+    except Exception as error:
+        if type(error).__name__ not in _DIED:
+            raise
+        raise RunFailedError(
+            f"a job's process died ({type(error).__name__}); what was finished is kept: start the "
+            "sweep again, with hydra/launcher=joblib to find a run that always kills its process"
+        ) from error
     finally:
         sys.argv = arguments
     return None
+
+
+def _for_cluster(launching: Sequence[str]) -> list[str]:
+    """What makes Ray's launcher leave out a setting that a running cluster refuses."""
+    memory = "hydra.launcher.ray.init.object_store_memory"
+    given = {argument.lstrip("+").partition("=")[0] for argument in launching}
+    if "hydra.launcher.ray.init.address" in given and memory not in given:
+        return [f"+{memory}=null"]
+    return []
 
 
 def _remove(plan: Path) -> None:
@@ -268,7 +303,7 @@ def _is_there(process: int) -> bool:
 
 
 _UNNAMED = "run"  # the default of conf/config.yaml
-_LAUNCHING = ("hydra/launcher", "hydra.launcher")
+_LAUNCHING = ("hydra/launcher", "hydra.launcher", "jobs=")
 _EXTRAS = {"submitit": "slurm", "ray": "ray"}
 
 
@@ -285,9 +320,19 @@ def _require_launcher(launching: Sequence[str]) -> None:
             )
 
 
+def _n_jobs(launching: Sequence[str]) -> int:
+    """Into how many jobs the runs are packed; see conf/job.yaml."""
+    given = [a.partition("=")[2] for a in launching if a.lstrip("+~").startswith("jobs=")]
+    if given in ([], ["null"]):
+        return _JOBS_PER_CORE * (os.cpu_count() or 1)
+    if len(given) > 1 or not given[0].isdecimal() or not int(given[0]):
+        raise InputError(f"jobs={','.join(given)}: give one whole number, 1 or more")
+    return int(given[0])
+
+
 @hydra.main(version_base="1.3", config_path=str(paths.CONF), config_name="job")
 def job_application(cfg: DictConfig) -> None:
-    """Run one job's share of the plan; a run that fails leaves its row, and the next follows."""
+    """Read one job's share of the plan, and run it."""
     try:
         share = json.loads(share_of(cfg.plan, cfg.job).read_text())
     except OSError as error:
@@ -296,12 +341,24 @@ def job_application(cfg: DictConfig) -> None:
     if os.getpid() != share["planner"][1]:  # joblib's workers stay, as they were, for later sweeps
         folder, os.environ["ESTIMA_RESULTS"] = share["places"]
         os.chdir(folder)
+    run_share(share)
+
+
+def run_share(share: Mapping[str, Any]) -> None:
+    """Run a job's share of the plan, as `Jobs.add` wrote it, but for what its journal has.
+
+    A run that fails leaves its row, and the next follows.
+    """
     held: dict[str, Recording] = {}
-    with store.journal(Path(share["journal"])) as journal:
+    path = Path(share["journal"])
+    over = store.ended(path.parent, f"{path.stem}.")  # something if the launcher tries it again
+    keys = {*over.done.tolist(), *over.failed}
+    with store.journal(path) as journal:
         for family in share["families"]:
             for experiment in Family.experiments(family):
-                run_and_record(experiment, held, journal)
-    store.compact(journal.path)
+                if not keys or int(experiment.key, 16) not in keys:
+                    run_and_record(experiment, held, journal)
+    store.compact(path)
 
 
 def _end_with(node: str, planner: int) -> None:

@@ -1,11 +1,16 @@
 """Recordings and estimates into the files that other tools open, by the ending of the name."""
 
+import math
 from pathlib import Path
 
 import numpy as np
 
 from estimators.base import Estimate
-from experiments.trajectories.odometry import write_odometry_csv, write_odometry_json
+from experiments.trajectories.odometry import (
+    wheel_twist_covariances,
+    write_odometry_csv,
+    write_odometry_json,
+)
 from sim.errors import InputError, required
 from sim.formats.tum import write_tum
 from sim.recording import Recording, save
@@ -15,6 +20,9 @@ _BAGS = (".mcap", ".bag", ".db3", "")
 
 def write_recording(path: Path, recording: Recording) -> None:
     """Write a Recording: .npz, a bag, .log (CARMEN), or .tum (its truth).
+
+    In a bag `/odom` has the covariance of its twist by the kr and kl that the recording was made
+    with; those of a real robot are not known, which zeros say.
 
     Raises
     ------
@@ -26,7 +34,7 @@ def write_recording(path: Path, recording: Recording) -> None:
     elif path.suffix in _BAGS:
         from sim.formats.rosbag_out import write_bag
 
-        write_bag(path, recording)
+        write_bag(path, recording, slip=_slip(recording))
     elif path.suffix == ".log":
         from sim.formats.carmen import write_carmen
 
@@ -42,29 +50,55 @@ def write_recording(path: Path, recording: Recording) -> None:
         )
 
 
-def write_estimate(path: Path, estimate: Estimate, recording: Recording | None = None) -> None:
+def write_estimate(
+    path: Path,
+    estimate: Estimate,
+    recording: Recording | None = None,
+    *,
+    slip: tuple[float, float] | None = None,
+) -> None:
     """Write an Estimate: .tum (also for evo), .csv, .json, or a bag with the Recording beside it.
+
+    Parameters
+    ----------
+    slip
+        Believed kr and kl, m: with the recording's wheels they give the twist's covariance, which
+        is zeros without them. It is that of dead reckoning; a laser may know better.
 
     Raises
     ------
     InputError
         If the ending is not known, or the file cannot be written.
     """
+    twists = None
+    if slip is not None:
+        wheels = required(recording, f"{path}: kr and kl tell nothing without the recording")
+        twists = wheel_twist_covariances(wheels, estimate.stamps, slip)
     if path.suffix == ".tum":
         write_tum(path, estimate.stamps, estimate.means)
     elif path.suffix == ".csv":
-        write_odometry_csv(estimate, path)
+        write_odometry_csv(estimate, path, twists)
     elif path.suffix == ".json":
-        write_odometry_json(estimate, path)
+        write_odometry_json(estimate, path, twists)
     elif path.suffix in _BAGS:
         from sim.formats.rosbag import Track
         from sim.formats.rosbag_out import write_bag
 
         known = estimate.map if isinstance(estimate.map, dict) else {}
         landmarks = np.asarray(known.get("landmarks", np.zeros((0, 3))), float)
-        track = Track(estimate.stamps, estimate.means, estimate.covariances, landmarks)
-        write_bag(path, recording, {"estimate": track})
+        track = Track(estimate.stamps, estimate.means, estimate.covariances, landmarks, twists)
+        write_bag(path, recording, {"estimate": track}, slip=slip)
     else:
         raise InputError(
             f"{path}: unknown ending {path.suffix!r}; known: .tum .csv .json .mcap .bag .db3"
         )
+
+
+def _slip(recording: Recording) -> tuple[float, float] | None:
+    """The kr and kl that a recording was made with, m; None if it does not say."""
+    made_with = recording.config.get("robot")
+    if not isinstance(made_with, dict):  # of a log of many robots, the number of one
+        return None
+    slip = [made_with.get(name) for name in ("kr", "kl")]
+    known = [float(k) for k in slip if isinstance(k, (int, float)) and 0.0 <= k < math.inf]
+    return (known[0], known[1]) if len(known) == 2 else None

@@ -12,7 +12,9 @@ from estimators.base import Estimate
 from sim import se2
 from sim.arrays import Array
 from sim.errors import InputError, require
-from sim.files import write_text, write_whole
+from sim.files import require_file, write_text, write_whole
+from sim.recording import Recording
+from sim.robot import twist_covariances as wheel_covariances
 
 # Entries of x, y, heading in row-major 6x6 covariances in order x, y, z, rotX, rotY, rotZ.
 PLANAR = (slice(None), [[0], [1], [5]], [0, 1, 5])
@@ -33,17 +35,46 @@ def covariance_6x6(covariances: Array) -> Array:
     return full
 
 
-def odometry_records(estimate: Estimate) -> list[dict[str, Any]]:
+def wheel_twist_covariances(
+    recording: Recording, stamps: Array, slip: tuple[float, float]
+) -> Array:
+    """Covariances (T, 3, 3) of the mean velocities between stamps (T,), by the wheels' slip.
+
+    The first stamp has no velocity, and zeros.
+
+    Parameters
+    ----------
+    slip
+        Believed kr and kl, m.
+    """
+    wheels = recording.wheels
+    position_m = np.column_stack([np.interp(stamps, wheels.stamps, w) for w in wheels.position_m.T])
+    travel_m = np.diff(position_m, axis=0, prepend=position_m[:1])
+    lapse = np.diff(stamps, prepend=stamps[:1])
+    return wheel_covariances(lapse, travel_m, recording.robot.track_m, *slip)
+
+
+def odometry_records(
+    estimate: Estimate, twist_covariances: Array | None = None
+) -> list[dict[str, Any]]:
     """One record like nav_msgs/Odometry per stamp.
 
     The twist is the mean velocity in base_link since the previous record, from differences of the
-    poses; its covariance is unknown, which the message's convention writes as zeros.
+    poses.
+
+    Parameters
+    ----------
+    twist_covariances
+        (T, 3, 3) of vx, vy, omega, such as `wheel_twist_covariances`; None: unknown, which the
+        message's convention writes as zeros.
     """
     stamps, poses = estimate.stamps, estimate.means
     motion = se2.log(se2.between(poses[:-1], poses[1:]))
     lapse = np.maximum(np.diff(stamps), 1e-9)[:, None]
     twists = np.concatenate([np.zeros((len(stamps[:1]), 3)), motion / lapse])
-    records = []
+    if twist_covariances is None:
+        twist_covariances = np.zeros((len(stamps), 3, 3))
+    twist_6x6, records = covariance_6x6(twist_covariances), []
     for i, covariance in enumerate(covariance_6x6(estimate.covariances)):
         x, y, heading = (float(v) for v in poses[i])
         vx, vy, turn = (float(v) for v in twists[i])
@@ -64,14 +95,16 @@ def odometry_records(estimate: Estimate) -> list[dict[str, Any]]:
                 "twist": {
                     "linear": {"x": vx, "y": vy, "z": 0.0},
                     "angular": {"x": 0.0, "y": 0.0, "z": turn},
-                    "covariance": [0.0] * 36,
+                    "covariance": twist_6x6[i].ravel().tolist(),
                 },
             }
         )
     return records
 
 
-def write_odometry_json(estimate: Estimate, path: Path) -> None:
+def write_odometry_json(
+    estimate: Estimate, path: Path, twist_covariances: Array | None = None
+) -> None:
     """Write the records as a JSON list.
 
     Raises
@@ -80,15 +113,17 @@ def write_odometry_json(estimate: Estimate, path: Path) -> None:
         If the estimate is not finite, which JSON cannot express.
     """
     try:
-        text = json.dumps(odometry_records(estimate), allow_nan=False)
+        text = json.dumps(odometry_records(estimate, twist_covariances), allow_nan=False)
     except ValueError:
         raise InputError(f"{path}: the estimate is not finite; write it as CSV") from None
     write_text(path, text)
 
 
-def write_odometry_csv(estimate: Estimate, path: Path) -> None:
-    """Write one line per record; the 36 covariances are pose.covariance.0 to .35."""
-    records = odometry_records(estimate)
+def write_odometry_csv(
+    estimate: Estimate, path: Path, twist_covariances: Array | None = None
+) -> None:
+    """Write one line per record; covariances are pose.covariance.0 to .35, and of the twist."""
+    records = odometry_records(estimate, twist_covariances)
     require(records, f"{path}: the estimate holds no belief; nothing to write")
     with write_whole(path) as part, part.open("w", newline="") as file:
         writer = csv.writer(file)
@@ -105,6 +140,7 @@ def read_odometry_csv(path: Path) -> Estimate:
         Naming the file and the line that cannot be read.
     """
     rows = []
+    require_file(path)
     try:
         with path.open(newline="") as file:
             for number, row in enumerate(csv.DictReader(file), start=2):

@@ -3,6 +3,7 @@
 import numpy as np
 
 from sim.arrays import Array
+from sim.errors import printable
 from sim.recording import Log, Recording
 
 
@@ -33,7 +34,7 @@ def describe(recording: Recording) -> str:
     if "seed" in recording.config:
         lines.append(f"seed        {recording.config['seed']}")
     lines.append(f"checksum    {recording.checksum}")
-    return "\n".join(lines)
+    return "\n".join(printable(" ".join(line.splitlines())) for line in lines)
 
 
 def _line(name: str, stamps: Array) -> str:

@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from sim.errors import InputError
+from sim.files import require_file
 from sim.formats import carmen, khepera
 from sim.formats.intel import read_intel
 from sim.formats.lego import read_lego
@@ -13,6 +14,7 @@ from sim.formats.rosbag_in import read_bag
 from sim.formats.text import read_bytes, read_members
 from sim.formats.wean import read_wean
 from sim.recording import Recording, load
+from sim.recording_check import check_recording
 
 KINDS = ("recording", "rosbag", "mrclam", "carmen", "intel", "khepera", "lego", "rawseeds", "wean")
 _HEAD_BYTES = 1 << 16
@@ -28,6 +30,7 @@ def kind_of(path: Path) -> str:
     """
     if path.is_dir():
         return _kind_of_names([p.name for p in path.iterdir()], path)
+    require_file(path)
     try:
         with path.open("rb") as file:
             head = file.read(512)
@@ -91,8 +94,18 @@ def read_any(paths: Sequence[Path], robot: int = 1, member: str | None = None) -
     InputError
         If the format is not known, a file is missing, or cannot be read.
     """
+    kind = kind_of(paths[0])
+    recording = _read(paths, kind, robot, member)
+    if kind != "recording":  # which is checked as it is loaded
+        try:
+            check_recording(recording)
+        except InputError as error:
+            raise InputError(f"{paths[0]}: {error}") from error
+    return recording
+
+
+def _read(paths: Sequence[Path], kind: str, robot: int, member: str | None) -> Recording:
     first, rest = paths[0], paths[1:]
-    kind = kind_of(first)
     least, most = {"intel": (1, 2), "rawseeds": (2, 3), "lego": (2, 4)}.get(kind, (1, 1))
     if not least <= len(paths) <= most:
         wanted = f"{least} to {most} files" if most > 1 else "one file"

@@ -58,13 +58,15 @@ PLANAR = ([[0], [1], [5]], [0, 1, 5])
 class Track:
     """A trajectory with covariances: stamps (T,) s, means (T, 3), covariances (T, 3, 3).
 
-    `landmarks` (N, 3) m is the map that came with it, or empty.
+    `landmarks` (N, 3) m is the map that came with it, or empty. `twist_covariances` (T, 3, 3) are
+    those of its mean velocities, or None where they are unknown.
     """
 
     stamps: Array
     means: Array
     covariances: Array
     landmarks: Array = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
+    twist_covariances: Array | None = None
 
 
 def library() -> None:

@@ -38,6 +38,7 @@ from sim.formats.rosbag import (
     typestore,
 )
 from sim.recording import Log, Recording, Truth, described
+from sim.robot import twist_covariances
 from sim.sensors import Mount, point_cloud
 from sim.sensors.base import is_ours
 
@@ -46,7 +47,11 @@ _OPTICAL = np.array([-0.5, 0.5, -0.5, 0.5])  # quaternion of the optical frame o
 
 
 def write_bag(
-    path: Path, recording: Recording | None = None, tracks: Mapping[str, Track] | None = None
+    path: Path,
+    recording: Recording | None = None,
+    tracks: Mapping[str, Track] | None = None,
+    *,
+    slip: tuple[float, float] | None = None,
 ) -> None:
     """Write a Recording and estimates; the name's ending chooses the format.
 
@@ -57,6 +62,8 @@ def write_bag(
     ----------
     tracks
         Name of an estimate (it becomes its topic) to the estimate.
+    slip
+        kr and kl of the recording's wheels, m, which give `/odom` the covariance of its twist.
 
     Raises
     ------
@@ -72,7 +79,7 @@ def write_bag(
         target = part / (path.name if ros1 else path.stem)
         with _Bag(target, ros1=ros1, sqlite=path.suffix == ".db3") as bag:
             if recording is not None:
-                _write_recording(bag, recording)
+                _write_recording(bag, recording, slip)
             for name, track in (tracks or {}).items():
                 _write_track(bag, name, track)
         if path.suffix == ".mcap":
@@ -170,12 +177,20 @@ class _Bag:
         )
 
     def odometry(
-        self, topic: str, frame: str, stamps: Array, poses: Array, covariances: Array
+        self,
+        topic: str,
+        frame: str,
+        stamps: Array,
+        poses: Array,
+        covariances: Array,
+        twist_covariances: Array | None = None,
     ) -> None:
-        """Poses with the mean velocity since the one before."""
+        """Poses with the mean velocity since the one before; zeros where covariances are None."""
         motion = se2.log(se2.between(poses[:-1], poses[1:]))
         rates = motion / np.maximum(np.diff(stamps), 1e-9)[:, None]
         rates = np.concatenate([np.zeros((min(len(stamps), 1), 3)), rates])
+        if twist_covariances is None:
+            twist_covariances = np.zeros((len(stamps), 3, 3))
         for i, stamp in enumerate(stamps):
             self.write(
                 topic,
@@ -184,7 +199,10 @@ class _Bag:
                 header=self.header(stamp, frame),
                 child_frame_id="base_link",
                 pose=self.uncertain_pose(poses[i], covariances[i]),
-                twist={"twist": self.twist(rates[i, 0], rates[i, 2])},
+                twist={
+                    "twist": self.twist(rates[i, 0], rates[i, 2]),
+                    "covariance": covariance_6x6(twist_covariances[i]).ravel(),
+                },
             )
 
     def joints(self, topic: str, stamps: Array, travel_m: Array) -> None:
@@ -228,7 +246,7 @@ class _Bag:
         )
 
 
-def _write_recording(bag: _Bag, recording: Recording) -> None:
+def _write_recording(bag: _Bag, recording: Recording, slip: tuple[float, float] | None) -> None:
     wheels, first = recording.wheels, float(recording.frame_stamps[0])
     logged = {name: recording.sensors[name] for name in recording.logs}
     usual = topics_of(logged)
@@ -242,8 +260,14 @@ def _write_recording(bag: _Bag, recording: Recording) -> None:
     }
     bag.write(ABOUT, STRING, first, data=json.dumps(about))
     _write_mounts(bag, recording, first)
-    poses = rolled(wheels, recording.robot.track_m)
-    bag.odometry("/odom", "odom", wheels.stamps, poses, np.zeros((len(poses), 3, 3)))
+    track_m = recording.robot.track_m
+    poses, unknown = rolled(wheels, track_m), np.zeros((len(wheels.stamps), 3, 3))
+    twists = None
+    if slip is not None:
+        lapse = np.diff(wheels.stamps, prepend=wheels.stamps[:1])
+        travel_m = np.diff(wheels.position_m, axis=0, prepend=wheels.position_m[:1])
+        twists = twist_covariances(lapse, travel_m, track_m, *slip)
+    bag.odometry("/odom", "odom", wheels.stamps, poses, unknown, twists)
     bag.joints("/wheels", wheels.stamps, wheels.position_m)
     for name, topic in topics.items():
         _write_sensor(bag, recording, name, topic, usual[name])
@@ -311,7 +335,9 @@ def _write_truth(bag: _Bag, truth: Truth, first: float) -> None:
 
 
 def _write_track(bag: _Bag, name: str, track: Track) -> None:
-    bag.odometry(f"/{name}", "map", track.stamps, track.means, track.covariances)
+    bag.odometry(
+        f"/{name}", "map", track.stamps, track.means, track.covariances, track.twist_covariances
+    )
     for i, stamp in enumerate(track.stamps):
         bag.write(
             f"/{name}/pose",

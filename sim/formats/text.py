@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sim.arrays import Array
 from sim.errors import InputError, require
+from sim.files import require_file
 
 Rows = NDArray[np.int64]
 
@@ -38,6 +39,7 @@ def read_bytes(path: Path, most_bytes: int = MOST_BYTES) -> bytes:
     InputError
         If it cannot be read, is cut short, or unpacks to more than `most_bytes`.
     """
+    require_file(path)
     parts: list[bytes] = []
     size = 0
     try:
@@ -93,6 +95,8 @@ def read_members(path: Path) -> dict[str, bytes]:
     try:
         with tarfile.open(fileobj=io.BytesIO(data), mode="r:") as archive:
             for member in archive:
+                if member.size > len(data):  # a sparse file may promise any length
+                    raise ValueError(f"{member.name} of {member.size} bytes is longer than it")
                 file = archive.extractfile(member) if member.isfile() else None
                 if file is not None:
                     members[str(PurePosixPath(member.name))] = file.read()

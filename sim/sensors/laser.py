@@ -12,6 +12,8 @@ from sim.errors import InputError
 from sim.sensors.base import Field, Mount, Probe, Reading, Schema
 from sim.settings import check_numbers
 
+MOST_BEAMS = 1_000_000  # of one scan; more would be a mistake, and no memory holds them
+
 
 @dataclass(frozen=True)
 class Laser:
@@ -46,8 +48,11 @@ class Laser:
         check_numbers(
             "sensors.laser", self, ("rate_hz", "max_range_m"), ("min_range_m", "sigma_range_m")
         )
-        if self.n_beams < 1:
-            raise InputError(f"sensors.laser.n_beams must be at least 1, got {self.n_beams}")
+        if not 1 <= self.n_beams <= MOST_BEAMS:
+            raise InputError(
+                f"sensors.laser.n_beams must be at least 1, at most {MOST_BEAMS}, "
+                f"got {self.n_beams}"
+            )
         if not 0.0 < self.fov_rad <= 2.0 * math.pi:
             raise InputError(f"sensors.laser.fov_rad must lie in (0, 2 pi], got {self.fov_rad}")
 
@@ -71,6 +76,15 @@ class Laser:
     def measure(self, true_ranges_m: ArrayLike, rng: np.random.Generator) -> NDArray[np.float32]:
         """Noisy ranges (..., n_beams), float32; +inf where nothing is in range."""
         return noisy_ranges(self, true_ranges_m, rng)
+
+    def returned(self, ranges_m: ArrayLike) -> NDArray[np.bool_]:
+        """Whether each beam saw something: ranges at the limits or beyond, and NaN, are none.
+
+        A range of 32 bits at the maximum may be read as just below it.
+        """
+        ranges = np.asarray(ranges_m, float)
+        most_m = min(self.max_range_m, float(np.float32(self.max_range_m)))
+        return (ranges > self.min_range_m) & (ranges < most_m)
 
     def points_in_base(self, reading: Reading) -> Array:
         """Points (N, 2), m, of the beams that saw something."""

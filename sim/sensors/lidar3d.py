@@ -11,7 +11,7 @@ import sim.sensors.point_cloud as point_cloud
 from sim.arrays import Array
 from sim.errors import InputError
 from sim.sensors.base import Field, Mount, Probe, Reading, Schema
-from sim.sensors.laser import noisy_ranges
+from sim.sensors.laser import MOST_BEAMS, noisy_ranges
 from sim.settings import check_numbers
 
 _GROUND_M = 0.3  # points below are not drawn
@@ -39,9 +39,10 @@ class Lidar3D:
             "sensors.lidar3d", self, ("rate_hz", "max_range_m"), ("min_range_m", "sigma_range_m")
         )
         for name in ("n_rings", "n_azimuths"):
-            if getattr(self, name) < 1:
+            if not 1 <= getattr(self, name) <= MOST_BEAMS:
                 raise InputError(
-                    f"sensors.lidar3d.{name} must be at least 1, got {getattr(self, name)}"
+                    f"sensors.lidar3d.{name} must be at least 1, at most {MOST_BEAMS}, "
+                    f"got {getattr(self, name)}"
                 )
         low, high = self.elevation_min_rad, self.elevation_max_rad
         if not -math.pi / 2 < low <= high < math.pi / 2:

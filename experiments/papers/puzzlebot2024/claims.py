@@ -27,7 +27,7 @@ from experiments.evaluation.verdict import (
     plain,
     shown,
 )
-from experiments.papers.puzzlebot2024.settings import NOMINAL
+from experiments.papers.puzzlebot2024.settings import NOMINAL, REPORTED_TURN_RATIO
 from experiments.papers.results import Results
 from sim.arrays import Array
 
@@ -50,6 +50,7 @@ def judge(made: Results) -> list[Claim]:
         *pb1(),
         *pb2(made.table("areas"), made.table("crossover"), NOMINAL.track_m),
         *pb3(made.table("calibration"), made.table("gradient_descent"), made.table("engine_k")),
+        *pb3_short_turns(made.table("short_turns"), made.table("short_turns_found")),
         *pb4(made.table("coverage"), made.table("engine")),
     ]
 
@@ -168,6 +169,24 @@ def pb3(
     judgement = ("above 0.01: it depends on the data", holds(float(limits.max()) > 0.01))
     found = Interval.exact(float(limits.max()))
     yield Claim("PB3", what, found, *judgement, "it should estimate kr and kl", Role.BESIDE)
+
+
+def pb3_short_turns(ends: pd.DataFrame, found: pd.DataFrame) -> Iterator[Claim]:
+    """PB3: the robot of the report, whose turns come out at 0.44 of the command, is calibrated.
+
+    All beside: the report says how far the robot turns, and finds no cause.
+    """
+    turns = ends[ends["omega_radps"] != 0.0]
+    where = "the robot with the wrong track"
+    for who, label in (("real", "as it came"), ("calibrated", "with the track found")):
+        ratios = turns[f"{who}_heading_mean_rad"] / turns["ideal_heading_rad"]
+        what = f"turns over commanded ones, {where}, {label}"
+        reported = f"the report: {REPORTED_TURN_RATIO}" if who == "real" else ""
+        yield shown("PB3", what, mean_interval(ratios), reported)
+    row = found.set_index("parameter").loc["track_m"]
+    ratio = Interval(*(float(row[name] / row["truth"]) for name in ("value", "low", "high")))
+    what = f"track over the true one, {where}, gains and track by sampled end poses"
+    yield beside(banded("PB3", what, ratio, 0.98, 1.02))
 
 
 def pb3_sentence(rows: Sequence[Claim]) -> str:

@@ -1,6 +1,6 @@
 """The figures of puzzlebot2024."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -9,7 +9,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from experiments.papers.puzzlebot2024.settings import CALIBRATION_RUNS, NOMINAL, TABLE_1_K_M
+from experiments.papers.puzzlebot2024.settings import (
+    CALIBRATION_RUNS,
+    NOMINAL,
+    REPORTED_ENDS,
+    REPORTED_TURN_RATIO,
+    TABLE_1_K_M,
+)
 from experiments.papers.results import Results
 from experiments.viewing.plotting import draw_ellipses, plain_ticks, plan_axes, with_legend
 from experiments.viewing.style import BLACK, BLUE, CYCLE, ORANGE, subplots
@@ -42,6 +48,11 @@ def draw(made: Results) -> dict[str, Figure]:
         ),
         "puzzlebot2024_calibration": calibration(made.table("calibration")),
         "puzzlebot2024_table_1": table_1(made.table("table_1")),
+        "puzzlebot2024_table_1_short_turns": table_1_short_turns(made.table("short_turns")),
+        "puzzlebot2024_short_turns": short_turns(
+            made.table("short_turns"), made.table("short_turns_found")
+        ),
+        "puzzlebot2024_convergence": convergence(made.table("convergence")),
         "puzzlebot2024_coverage": coverage(made.table("coverage")),
     }
 
@@ -166,40 +177,159 @@ def _estimates(ax: Axes, part: pd.DataFrame, level: int, color: str) -> None:
 
 def table_1(table: pd.DataFrame) -> Figure:
     """Print table 1 of the report, with our robots' ends and kr, kl from each case alone."""
-    page, ax = subplots(9.0, 3.4)
-    ax.axis("off")
-    header = (
-        "case", "v, m/s", "ω, rad/s", "T, s", "ideal x, m", "real x, m", "ideal θ, rad",
-        "real θ, rad", "$k_r$, 1e-4 m", "$k_l$, 1e-4 m",
-    )  # fmt: skip
+    header = (*_OF_THE_CASE, "real x, m", "real θ, rad", "$k_r$, 1e-4 m", "$k_l$, 1e-4 m")
     cells = [
-        [
-            row.case.replace("_", " "),
-            f"{row.v_mps:g}",
-            f"{row.omega_radps:g}",
-            f"{row.duration_s:g}",
-            f"{row.ideal_x_m:.2f}",
+        (
+            *_case(row),
             f"{row.real_x_mean_m:z.3f} ± {row.real_x_sd_m:.3f}",
-            f"{row.ideal_heading_rad:.2f}",
             f"{row.real_heading_mean_rad:z.3f} ± {row.real_heading_sd_rad:.3f}",
             f"{1e4 * row.kr_m:.2f} [{1e4 * row.kr_low_m:.2f}, {1e4 * row.kr_high_m:.2f}]",
             f"{1e4 * row.kl_m:.2f} [{1e4 * row.kl_low_m:.2f}, {1e4 * row.kl_high_m:.2f}]",
-        ]
+        )
         for row in table.itertuples()
     ]
+    title = (
+        f"table 1, {CALIBRATION_RUNS} runs a case; true $k_r$ = {1.5e4 * TABLE_1_K_M:g}e-4 m, "
+        f"$k_l$ = {0.5e4 * TABLE_1_K_M:g}e-4 m"
+    )
+    return _printed(header, cells, title)
+
+
+def table_1_short_turns(table: pd.DataFrame) -> Figure:
+    """Print table 1 as driven by the robot with the wrong track, beside the report's own ends."""
+    header = (
+        *_OF_THE_CASE, "real x, m", "real θ, rad", "real θ\nover ideal",
+        "the report's\nreal end", "calibrated θ, rad",
+    )  # fmt: skip
+    cells = [
+        (
+            *_case(row),
+            f"{row.real_x_mean_m:z.3f} ± {row.real_x_sd_m:.3f}",
+            f"{row.real_heading_mean_rad:z.3f} ± {row.real_heading_sd_rad:.3f}",
+            f"{row.real_heading_mean_rad / row.ideal_heading_rad:.3f}" if row.omega_radps else "",
+            f"{REPORTED_ENDS[row.case]:.3f} {'rad' if row.omega_radps else 'm'}"
+            if row.case in REPORTED_ENDS
+            else "",
+            f"{row.calibrated_heading_mean_rad:z.3f} ± {row.calibrated_heading_sd_rad:.3f}",
+        )
+        for row in table.itertuples()
+    ]
+    title = (
+        f"table 1 by the robot that turns short, {CALIBRATION_RUNS} runs a case; "
+        f"the report: turns come out at {REPORTED_TURN_RATIO} of the ideal ones"
+    )
+    return _printed(header, cells, title)
+
+
+_OF_THE_CASE = ("case", "v, m/s", "ω, rad/s", "T, s", "ideal x, m", "ideal θ, rad")
+
+
+def _case(row: Any) -> tuple[str, ...]:
+    """Cells of a case's command and of the end that it promises."""
+    command = (f"{value:g}" for value in (row.v_mps, row.omega_radps, row.duration_s))
+    ideal = (f"{value:.2f}" for value in (row.ideal_x_m, row.ideal_heading_rad))
+    return row.case.replace("_", " "), *command, *ideal
+
+
+def _printed(header: Sequence[str], cells: Sequence[Sequence[str]], title: str) -> Figure:
+    """Draw a table."""
+    page, ax = subplots(9.0, 3.4)
+    ax.axis("off")
     drawn = ax.table(cells, colLabels=header, loc="center", cellLoc="center")
     drawn.auto_set_font_size(False)
     drawn.set_fontsize(7.5)
     drawn.auto_set_column_width(list(range(len(header))))
     drawn.scale(1.0, 1.35)
+    tall = any("\n" in name for name in header)
     for (row_number, _), cell in drawn.get_celld().items():
         cell.set_edgecolor("#cccccc")
         cell.set_text_props(weight="normal" if row_number else "bold")
-    ax.set_title(
-        f"table 1, {CALIBRATION_RUNS} runs a case; true $k_r$ = {1.5e4 * TABLE_1_K_M:g}e-4 m, "
-        f"$k_l$ = {0.5e4 * TABLE_1_K_M:g}e-4 m",
-        fontsize="medium",
+        if tall and row_number == 0:
+            cell.set_height(2.0 * cell.get_height())
+    ax.set_title(title, fontsize="medium")
+    return page
+
+
+def short_turns(ends: pd.DataFrame, found: pd.DataFrame) -> Figure:
+    """Draw turned against commanded, before and after calibration; and what it finds."""
+    page, (left, right) = subplots(9.0, 3.9, 1, 2)
+    turns = ends[ends["omega_radps"] != 0.0]
+    ideal = turns["ideal_heading_rad"]
+    far = np.array([0.0, 1.1 * ideal.max()])
+    left.plot(far, far, color=BLACK, lw=0.8, label="as commanded")
+    left.plot(
+        far,
+        REPORTED_TURN_RATIO * far,
+        color=BLACK,
+        lw=0.8,
+        ls="--",
+        label=f"{REPORTED_TURN_RATIO} of it, as the report says",
     )
+    for who, color, label in (
+        ("real", ORANGE, "as the robot came"),
+        ("calibrated", BLUE, "with the track found by calibration"),
+    ):
+        left.errorbar(
+            ideal,
+            turns[f"{who}_heading_mean_rad"],
+            turns[f"{who}_heading_sd_rad"],
+            fmt="o",
+            ms=4,
+            color=color,
+            label=label,
+        )
+    case_4 = float(ends.set_index("case").loc["angular_4", "ideal_heading_rad"])
+    left.plot(case_4, REPORTED_ENDS["angular_4"], "x", color=BLACK, label="the report's example")
+    left.set(xlabel="turn commanded, rad", ylabel="turn driven, rad")
+    left.legend(loc="upper left")
+    for i, row in enumerate(found.itertuples()):
+        is_gain = row.parameter.startswith("bias")
+        truth, *values = (
+            1.0 + value if is_gain else value
+            for value in (row.truth, row.low, row.value, row.high, row.nominal)
+        )
+        low, value, high, nominal = (value / truth for value in values)
+        right.plot([low, high], [i, i], color=BLUE, lw=2.0)
+        right.plot(value, i, "o", color=BLUE, ms=5, label="found, 95 % interval" if not i else None)
+        if nominal > 0.0:
+            named = {"label": "what the controller takes"} if row.parameter == "track_m" else {}
+            right.plot(nominal, i + 0.18, "v", color=ORANGE, **named)
+    right.axvline(1.0, color=BLACK, lw=0.8)
+    right.set(
+        xlabel="over the truth",
+        yticks=range(len(found)),
+        yticklabels=[_FOUND[name] for name in found["parameter"]],
+        ylim=(len(found) - 0.5, -0.6),
+        title="by end poses alone",
+    )
+    right.legend(loc="center left")
+    return page
+
+
+_FOUND = {
+    **_PARAMETERS,
+    "bias_right": "gain, right",
+    "bias_left": "gain, left",
+    "track_m": "track",
+}
+
+
+def convergence(table: pd.DataFrame) -> Figure:
+    """Draw the report's two plots of the error against the iteration, and its k beside them."""
+    page, axes = subplots(9.0, 3.6, 1, 2)
+    for ax, (name, unit), (data, part) in zip(
+        axes,
+        (("$k_l$", "(m/s)²"), ("$k_r$", "(rad/s)²")),
+        table.groupby("data", sort=False),
+        strict=True,
+    ):
+        ax.plot(part["iteration"], part["error"], color=BLUE)
+        ax.set(xlabel="iteration", ylabel=f"error, {unit}", ylim=(0.0, 1.05 * part["error"].max()))
+        example, after = str(data).partition(": ")[2], part["k"].iloc[-1]
+        ax.set_title(
+            f"{name}, {example}\n{name} = {after:.3f} after 100 iterations, 1/2 in the limit",
+            fontsize="medium",
+        )
     return page
 
 

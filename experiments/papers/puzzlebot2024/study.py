@@ -66,6 +66,7 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
         Called with the share of the work done.
     """
     out.write_tables(areas=areas(), crossover=crossover(), gradient_descent=gradient_descent())
+    out.write_tables(convergence=convergence())
     out.write_arrays("drawn", **drawn())
     calibrated = calibration(
         arms("calibration"), CALIBRATIONS[profile], lambda share: on_progress(0.05 + 0.65 * share)
@@ -73,6 +74,8 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
     covered = arms("coverage")
     once = table_1(next(arm for arm in covered if arm.k_m == TABLE_1_K_M))
     out.write_tables(calibration=calibrated, table_1=once)
+    ends, found = short_turns(*arms("short_turns"))
+    out.write_tables(short_turns=ends, short_turns_found=found)
     out.write_tables(coverage=coverage(covered, COVERAGE_RUNS[profile]))
     on_progress(0.8)
     ends, paths = square_feedback(*FEEDBACK_OVERRIDES[profile])
@@ -298,22 +301,10 @@ def table_1(arm: Arm) -> pd.DataFrame:
     for name, route in arm.routes.items():
         batch = run_batch(arm.robot, route, CALIBRATION_RUNS, rng)
         found = from_batches([batch], geometry=False)
-        v, omega, duration = route.segments[0]
-        promised, ends = route.ideal_end(), batch.end_poses
-        mean, spread = ends.mean(axis=0), ends.std(axis=0, ddof=1)
         rows.append(
             {
-                "case": name,
-                "v_mps": v,
-                "omega_radps": omega,
-                "duration_s": duration,
-                "ideal_x_m": promised[0],
-                "ideal_heading_rad": promised[2],
-                "real_x_mean_m": mean[0],
-                "real_x_sd_m": spread[0],
-                "real_y_sd_m": spread[1],
-                "real_heading_mean_rad": mean[2],
-                "real_heading_sd_rad": spread[2],
+                **_case(name, route),
+                **_spread("real", batch.end_poses),
                 "kr_m": found.kr.value,
                 "kr_low_m": found.kr.low,
                 "kr_high_m": found.kr.high,
@@ -323,6 +314,73 @@ def table_1(arm: Arm) -> pd.DataFrame:
             }
         )
     return pd.DataFrame(rows)
+
+
+def short_turns(arm: Arm) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Table 1 by a robot whose controller has a wrong track; calibrated, and driven again.
+
+    Returns
+    -------
+    ends
+        A row each case: ideal and real ends, and the ends when the controller takes the track that
+        was found (`calibrated`).
+    found
+        Wheel gains, track, kr and kl by the sampled likelihood of the first ends alone, with the
+        truth and with what the controller took.
+    """
+    rng, robot = stream(arm.seed, "slip"), arm.robot
+    nominal = DifferentialDrive(robot.nominal.wheel_radius_m, robot.nominal.track_m)
+    before = {
+        name: run_batch(robot, route, CALIBRATION_RUNS, rng).end_poses
+        for name, route in arm.routes.items()
+    }
+    manoeuvres = [Manoeuvre(arm.routes[name].profile(robot), ends) for name, ends in before.items()]
+    result = from_end_poses(manoeuvres, nominal, stream(arm.seed, "samples"), geometry=True)
+    mended = dataclasses.replace(robot, nominal_track_m=result.found["track_m"].value)
+    ends = [
+        {
+            **_case(name, route),
+            **_spread("real", before[name]),
+            **_spread("calibrated", run_batch(mended, route, CALIBRATION_RUNS, rng).end_poses),
+        }
+        for name, route in arm.routes.items()
+    ]
+    found = [
+        {
+            "parameter": name,
+            "truth": getattr(robot, name),
+            "nominal": getattr(nominal, name),
+            **dataclasses.asdict(interval),
+        }
+        for name, interval in result.found.items()
+    ]
+    return pd.DataFrame(ends), pd.DataFrame(found)
+
+
+def _case(name: str, route: OpenLoop) -> Row:
+    """Command of a case of table 1, and the end that it promises."""
+    v, omega, duration_s = route.segments[0]
+    x_m, _, heading_rad = route.ideal_end()
+    return {
+        "case": name,
+        "v_mps": v,
+        "omega_radps": omega,
+        "duration_s": duration_s,
+        "ideal_x_m": x_m,
+        "ideal_heading_rad": heading_rad,
+    }
+
+
+def _spread(who: str, ends: Array) -> Row:
+    """Mean and standard deviation of end poses (n, 3)."""
+    mean, spread = ends.mean(axis=0), ends.std(axis=0, ddof=1)
+    return {
+        f"{who}_x_mean_m": mean[0],
+        f"{who}_x_sd_m": spread[0],
+        f"{who}_y_sd_m": spread[1],
+        f"{who}_heading_mean_rad": mean[2],
+        f"{who}_heading_sd_rad": spread[2],
+    }
 
 
 def coverage(robots: list[Arm], n_runs: int) -> pd.DataFrame:
@@ -437,3 +495,22 @@ def gradient_descent() -> pd.DataFrame:
         k = report_gradient_descent(ideal, real, time_s, n_iterations=max(100, last))
         rows.append({"data": name, "k_after_100": k[100], "k_in_the_end": k[last]})
     return pd.DataFrame(rows)
+
+
+def convergence() -> pd.DataFrame:
+    """The 100 iterations that the report plots, on its example data, from the start on.
+
+    Returns
+    -------
+    pandas.DataFrame
+        `data`, `iteration`, `k`, and the `error` that is minimised, (2 k v - v)^2 with v in m/s or
+        rad/s.
+    """
+    parts = []
+    for name in itertools.islice(DESCENTS, 2):
+        ideal, real, time_s = DESCENTS[name]
+        k = report_gradient_descent(ideal, real, time_s)
+        error = ((2.0 * k - 1.0) * (real - ideal) / time_s) ** 2
+        columns = {"data": name, "iteration": np.arange(len(k)), "k": k, "error": error}
+        parts.append(pd.DataFrame(columns))
+    return pd.concat(parts, ignore_index=True)

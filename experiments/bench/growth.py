@@ -1,0 +1,138 @@
+"""How memory and the time of a step grow over a drive of half an hour, through every estimator.
+
+One drive is indoors, with a laser and a stereo camera, through sixteen rooms that are all seen
+after five minutes; the other is through a campus with a lidar. Each estimator has a process of its
+own.
+"""
+
+import collections
+import ctypes
+import gc
+import itertools
+import os
+import resource
+import statistics
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, TypeVar
+
+from estimators.base import Belief
+from experiments.bench.measure import Measurement, time_s, timed_steps
+from experiments.runs.evaluate import limited_blas
+from experiments.runs.experiment import Experiment
+from experiments.runs.seeds import stream
+
+T = TypeVar("T")
+_MINUTES = 30
+_ROOMS = (
+    "world=gil2008",
+    "robot=robocom",
+    "sensors=laser_stereo",
+    "simulation.physics=kinematic",
+    "prior.sigma_position_m=1e-3",
+    "prior.sigma_heading_rad=1e-4",
+)
+_CAMPUS = (
+    "study=maximo2024_campus",
+    "world.n_x=3",
+    "world.n_y=2",
+    "simulation.physics=kinematic",
+)
+_ON_CAMPUS = ("topological_mcl", "topological_mcl_paper")
+_IN_ROOMS = (
+    "odometry",
+    "icp_odometry",
+    "ekf_icp",
+    "ekf_icp_paper",
+    "mcl",
+    "ekf_slam",
+    "fastslam",
+    "fastslam_paper",
+    "fixed_lag",
+    "smoother",
+)
+_WITH_FINISH = ("fastslam", "fixed_lag", "smoother")
+_SETTLED = 6  # minutes until all rooms have been seen
+_FINISHED = (5, 10, 20, 30)  # minutes after which the whole path is solved for
+
+
+def run() -> Iterator[Measurement]:
+    """Step and memory at the end of the drive beside those at its beginning; times of `finish`."""
+    for name in (*_IN_ROOMS, *_ON_CAMPUS):
+        step_us, memory_mib = _alone(driven, name)
+        first, last = step_us[_SETTLED : _SETTLED + 3], step_us[-3:]
+        early, middle, late = (statistics.median(t) for t in (step_us[1:4], first, last))
+        yield Measurement(
+            f"growth.{name}.step_us",
+            late,
+            "us",
+            note=f"at the end; {early:.0f} in minutes 2-4, {middle:.0f} in 7-9",
+        )
+        yield Measurement(
+            f"growth.{name}.memory_mib",
+            memory_mib[-1] - memory_mib[_SETTLED],
+            "MiB",
+            note="at the end, beyond that after minute 7",
+        )
+    for name in _WITH_FINISH:
+        for minutes, (seconds, peak_mib) in _alone(finished, name).items():
+            note = f"peak {peak_mib:.0f} MiB"
+            yield Measurement(f"growth.{name}.finish_{minutes}min_s", seconds, "s", note=note)
+
+
+def _alone(function: Callable[[str], T], name: str) -> T:
+    """What a function returns in a process of its own."""
+    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+        return pool.submit(function, name).result()
+
+
+def driven(name: str) -> tuple[list[float], list[float]]:
+    """Mean processor time of a step in each minute, us, and memory after it, MiB."""
+    step_us, memory_mib = [], []
+    for _, steps in _minutes(name):
+        step_us.append(1e6 * statistics.fmean(seconds for seconds, _ in steps))
+        memory_mib.append(_memory_mib())
+    return step_us, memory_mib
+
+
+def finished(name: str) -> dict[int, tuple[float, float]]:
+    """Processor time of `finish`, s, and the most memory so far, MiB, by the minutes driven."""
+    found = {}
+    for minute, (estimator, steps) in enumerate(_minutes(name), start=1):
+        collections.deque(steps, maxlen=0)
+        if minute in _FINISHED:
+            seconds = time_s(estimator.finish, clock=time.process_time)
+            peak_kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+            found[minute] = seconds, peak_kib / 1024.0
+    return found
+
+
+def _minutes(name: str) -> Iterator[tuple[Any, Iterator[tuple[float, Belief]]]]:
+    """An estimator, and what `timed_steps` gives of each minute of its drive."""
+    experiment = _experiment(name)
+    recording = experiment.recording()
+    prior, estimator = experiment.prior(recording), experiment.estimator()
+    estimator.reset(prior, stream(0, "bench"))
+    by_minute = itertools.groupby(recording.frames(), lambda frame: int(frame.stamp // 60.0))
+    with limited_blas():
+        for _, frames in itertools.islice(by_minute, _MINUTES):
+            yield estimator, timed_steps(estimator, frames)
+
+
+def _experiment(name: str) -> Experiment:
+    """An estimator over the drive of its kind, of half an hour."""
+    drive, speed_mps = (_CAMPUS, 1.5) if name in _ON_CAMPUS else (_ROOMS, 0.5)
+    length = f"route.distance_m={60 * _MINUTES * speed_mps:g}"
+    known = ["prior.map=world"] if name == "mcl" else []
+    return Experiment.compose([*drive, length, f"estimator={name}", *known])
+
+
+def _memory_mib() -> float:
+    """Memory that the process needs now, without what it has freed."""
+    gc.collect()
+    ctypes.CDLL(None).malloc_trim(0)
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
