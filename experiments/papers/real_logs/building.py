@@ -18,6 +18,7 @@ import pandas as pd
 
 from estimators.base import Estimate
 from estimators.graph_slam import GraphSlam
+from estimators.odometry import Odometry
 from experiments.evaluation.relations import relation_errors
 from experiments.evaluation.time_sync import nearest
 from experiments.papers.real_logs.logs import intel, tracked
@@ -41,63 +42,69 @@ _WHEELED: dict[str, Any] = {
 }  # of the Intel robot, as for `ekf_icp`
 
 
-def scored() -> tuple[pd.DataFrame, Recording, dict[str, Estimate]]:
-    """Errors by log and method; the Intel log, and its estimates by name."""
+def intel_by_edges() -> tuple[carmen.CarmenLog, Recording]:
+    """The Intel log with the FLIRT poses, and a Recording whose wheels are its SEQUENTIAL edges."""
+    log = carmen.read_carmen(DATA / "intel_lab/intel-lab.flirt.log.gz")
+    return log, carmen.to_recording(log)
+
+
+def freiburg_by_edges() -> tuple[carmen.CarmenLog, Recording]:
+    """The same of Freiburg 079."""
+    log = carmen.read_carmen(DATA / "fr079_flirt/fr079.flirt.log.gz")
+    return log, carmen.to_recording(log)
+
+
+def scored(
+    name: str, wheels: str, recording: Recording, graph: carmen.CarmenLog, options: dict[str, Any]
+) -> tuple[list[Row], Estimate]:
+    """Errors of graph SLAM online and revised, and of the FLIRT poses; the revised estimate.
+
+    Parameters
+    ----------
+    name
+        `intel` or `fr079`.
+    wheels
+        What stands for them.
+    options
+        Of `estimators.graph_slam.GraphSlam`, beside those of all logs.
+    """
+    scans = recording.log("laser").stamps
+    folder = {"intel": "intel_lab", "fr079": "fr079_flirt"}[name]
+    relations = read_relations(DATA / folder / f"{name}.relations.gz")
+    judged = _shared(relations, scans, graph.scan_stamps)
+    estimator = GraphSlam(**_OPTIONS | options)
+    online = tracked(estimator, recording)
+    revised = estimator.finish()
+    at_scans = np.searchsorted(online.stamps, scans)
+    paths = {
+        "graph_slam, online": (scans, online.means[at_scans]),
+        "graph_slam, revised": (scans, revised.means[at_scans]),
+        "FLIRT poses": (graph.scan_stamps, graph.scan_poses),
+    }
     rows: list[Row] = []
-    graphs = {
-        name: carmen.read_carmen(DATA / path)
-        for name, path in (
-            ("intel", "intel_lab/intel-lab.flirt.log.gz"),
-            ("fr079", "fr079_flirt/fr079.flirt.log.gz"),
-        )
-    }
-    relations = {
-        "intel": read_relations(DATA / "intel_lab/intel.relations.gz"),
-        "fr079": read_relations(DATA / "fr079_flirt/fr079.relations.gz"),
-    }
-    building = carmen.to_recording(graphs["intel"])
-    runs: list[tuple[str, str, Recording, dict[str, Any]]] = [
-        ("intel", "SEQUENTIAL edges", building, {}),
-        ("intel", "wheels, 910 scans", intel("sparse"), _WHEELED),
-        ("fr079", "SEQUENTIAL edges", carmen.to_recording(graphs["fr079"]), {}),
-    ]
-    found: dict[str, Estimate] = {}
-    for log, wheels, recording, options in runs:
-        graph, scans = graphs[log], recording.log("laser").stamps
-        judged = _shared(relations[log], scans, graph.scan_stamps)
-        estimator = GraphSlam(**_OPTIONS | options)
-        online = tracked(estimator, recording)
-        paths = {"online": online, "revised": estimator.finish()}
-        if recording is building:
-            alone = GraphSlam(**_OPTIONS, loop_reach_m=1e-9, revisions=0)
-            found = paths | {"chain": tracked(alone, recording)}
-        at_scans = np.searchsorted(online.stamps, scans)
-        for name, path in paths.items():
-            errors = relation_errors(judged, scans, path.means[at_scans])
-            row: Row = {"log": log, "wheels": wheels, "method": f"graph_slam, {name}"}
-            rows.append({**row, **errors.summary()})
-        errors = relation_errors(judged, graph.scan_stamps, graph.scan_poses)
-        rows.append({"log": log, "wheels": wheels, "method": "FLIRT poses", **errors.summary()})
-        mean_m = KUEMMERLE[log]["graph"][0]
-        rows.append({"log": log, "method": "graph (printed)", "translation_mean_m": mean_m})
-    return pd.DataFrame(rows), building, found
+    for method, path in paths.items():
+        errors = relation_errors(judged, *path)
+        rows.append({"log": name, "wheels": wheels, "method": method, **errors.summary()})
+    mean_m = KUEMMERLE[name]["graph"][0]
+    rows.append({"log": name, "method": "graph (printed)", "translation_mean_m": mean_m})
+    return rows, revised
 
 
 def _shared(relations: Relations, *stamps: Array) -> Relations:
     """Relations whose stamps are near ones of all these (T,), s."""
     kept = np.ones(len(relations.stamps), dtype=bool)
     for known in stamps:
-        near = np.abs(known[nearest(known, relations.stamps)] - relations.stamps) <= _TOLERANCE_S
+        rows = nearest(known, relations.stamps)
+        near = np.abs(known[rows] - relations.stamps) <= _TOLERANCE_S
         kept &= near.all(axis=1)
     return Relations(relations.stamps[kept], relations.motion[kept])
 
 
-def draw(recording: Recording, found: dict[str, Estimate], folder: Path) -> Path:
-    """Grid maps along the chain of registrations and along the revised path."""
+def draw(recording: Recording, before: Estimate, after: Estimate, folder: Path) -> Path:
+    """Grid maps along two estimates, in one picture."""
     page = figure(11.0, 6.0)
-    titles = {"chain": "before", "revised": "after its loops are closed"}
-    for ax, (name, title) in zip(page.subplots(1, 2), titles.items(), strict=True):
-        path = found[name]
+    titles = {"by its edges alone": before, "with its loops closed": after}
+    for ax, (title, path) in zip(page.subplots(1, 2), titles.items(), strict=True):
         grid, _ = grid_along(
             recording, path.stamps, path.means, resolution_m=0.05, max_range_m=20.0
         )
@@ -110,9 +117,20 @@ def draw(recording: Recording, found: dict[str, Estimate], folder: Path) -> Path
     return picture
 
 
-if __name__ == "__main__":
-    table, log, estimates = scored()
+def _main(folders: list[str]) -> None:
+    graph, building = intel_by_edges()
     columns = ["log", "wheels", "method", "n_relations", "translation_mean_m", "translation_max_m"]
-    print(table[columns].to_string(index=False))
-    for folder in sys.argv[1:]:
-        print(draw(log, estimates, Path(folder)))
+    rows, revised = scored("intel", "SEQUENTIAL edges", building, graph, {})
+    print(pd.DataFrame(rows)[columns].to_string(index=False), flush=True)
+    before = tracked(Odometry(_OPTIONS["kr"], _OPTIONS["kl"]), building)
+    for folder in folders:
+        print(draw(building, before, revised, Path(folder)), flush=True)
+    log, recording = freiburg_by_edges()
+    rows, _ = scored("fr079", "SEQUENTIAL edges", recording, log, {})
+    print(pd.DataFrame(rows)[columns].to_string(index=False, header=False), flush=True)
+    rows, _ = scored("intel", "wheels, calibrated", intel("calibrated"), graph, _WHEELED)
+    print(pd.DataFrame(rows)[columns].to_string(index=False, header=False), flush=True)
+
+
+if __name__ == "__main__":
+    _main(sys.argv[1:])
