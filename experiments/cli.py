@@ -13,7 +13,7 @@ from experiments.runs import columns, paths
 from experiments.runs.console import end, progress, show
 from experiments.runs.row import Outcome, write_frame
 from experiments.runs.version import code_version
-from sim.errors import InputError
+from sim.errors import InputError, require
 
 if TYPE_CHECKING:
     from estimators.base import Estimate
@@ -75,10 +75,19 @@ def options_of_all(
 
 
 @app.command(context_settings=_PASS_ON)
-def run(context: typer.Context) -> None:
+def run(
+    context: typer.Context,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", "-o", help="File of the estimate to write too: .tum, .csv, .json, .mcap, .bag."
+        ),
+    ] = None,
+) -> None:
     """Make or read a recording, run an estimator over it, and write its row of results.
 
-    The arguments are Hydra's: `group=option`, `key=value`, `-m` for a sweep over values.
+    With -o it also writes the estimate, the revised one of an estimator that has it. The other
+    arguments are Hydra's: `group=option`, `key=value`, `-m` for a sweep over values.
 
     Examples
     --------
@@ -87,6 +96,8 @@ def run(context: typer.Context) -> None:
       estima run estimator=odometry world=office seed=3
 
       estima run robot.kr=1e-4 estimator.kr=1e-5 (truth and belief apart)
+
+      estima run estimator=ekf_icp sensors=hokuyo -o est.tum
 
       estima run -m robot.kr=1e-5,1e-4 seed="range(0,5)"
 
@@ -100,6 +111,11 @@ def run(context: typer.Context) -> None:
     shown = {"--cfg", "-c", "--info", "-i"} & set(arguments)
     if many and shown:
         raise InputError(f"{shown.pop()} shows one configuration; leave out -m and the lists")
+    if out is not None:
+        from experiments.trajectories.convert import check_estimate_name
+
+        require(not many, f"-o {out}: one file is of one run; leave out -m")
+        check_estimate_name(out)
     if many and "--hydra-help" not in arguments:
         from experiments.sweeps.launch import sweep_arguments
 
@@ -107,7 +123,7 @@ def run(context: typer.Context) -> None:
         return
     from experiments.runs.run import application
 
-    application(arguments, _draw_run)
+    application(arguments, _draw_run, out)
 
 
 def _draw_run(
@@ -171,11 +187,15 @@ def convert(
         ),
     ],
     robot: Annotated[int, typer.Option(help="Which robot of an MRCLAM set.")] = 1,
+    topic: Annotated[
+        str | None, typer.Option(help="Of a bag, the nav_msgs/Odometry to convert alone.")
+    ] = None,
 ) -> None:
-    """Convert a log to a recording, or a recording to a standard file.
+    """Convert a log to a recording, or a recording or an estimate to a standard file.
 
     The ending of the output chooses its format; without one it is a folder as `ros2 bag` writes.
-    `.tum` holds the reference trajectory.
+    `.tum` holds the reference trajectory of a recording. An estimate (.tum, .csv, or a --topic of a
+    bag) becomes .tum, .csv, .json or a bag.
 
     Examples
     --------
@@ -184,14 +204,26 @@ def convert(
       estima convert raw.json.gz corrected.json.gz -o intel.mcap
 
       estima convert MRCLAM_Dataset6.tar.xz --robot 3 -o robot3.npz
+
+      estima convert estimate.csv -o estimate.tum
     """
-    from experiments.trajectories.convert import write_recording
+    from experiments.trajectories.convert import is_estimate, write_estimate, write_recording
     from sim.formats.detect import read_any
 
     if not out.name:
         raise InputError(f"-o {out}: name the file to write, such as run.mcap")
     if out.exists() and any(path.exists() and out.samefile(path) for path in log):
         raise InputError(f"-o {out}: that is the log itself; give another name")
+    if topic is not None or is_estimate(log):
+        from experiments.trajectories.read import read_trajectory
+
+        require(len(log) == 1, f"{log[0]}: an estimate is one file, got {len(log)}")
+        estimate = read_trajectory(log[0], topic)
+        write_estimate(out, estimate)
+        print(
+            f"{out}: {len(estimate.stamps)} poses, {estimate.stamps[-1] - estimate.stamps[0]:.1f} s"
+        )
+        return
     recording = read_any(log, robot)
     write_recording(out, recording)
     print(f"{out}: {recording.duration_s:.1f} s, {len(recording.frame_stamps)} frames")
@@ -425,6 +457,116 @@ def build_map(
     print(f"{out}: {described(grid)}, from {n_scans} of {n_all} scans")
 
 
+Topic = Annotated[
+    str | None, typer.Option(help="Of a bag, the nav_msgs/Odometry to read [estimate].")
+]
+AlignBy = Annotated[
+    str, typer.Option("--align", help="Move it first: none, start (first pose), or se2.")
+]
+MatchBy = Annotated[
+    str,
+    typer.Option(
+        "--match",
+        help="True poses: interpolated at its stamps, or nearest (as evo associates).",
+    ),
+]
+Tolerance = Annotated[
+    float, typer.Option("--tolerance", help="Greatest difference of nearest stamps, s.")
+]
+Offset = Annotated[float, typer.Option("--offset", help="Added to the trajectory's stamps, s.")]
+
+
+@app.command()
+def score(
+    recording: Annotated[Path, typer.Argument(help="A recording (.npz) or a log with its truth.")],
+    trajectories: Annotated[
+        list[Path],
+        typer.Argument(help="What programs made of it: .tum, .csv of ours, .mcap, .bag."),
+    ],
+    align: AlignBy = "none",
+    match: MatchBy = "interpolated",
+    tolerance_s: Tolerance = 0.01,
+    offset_s: Offset = 0.0,
+    revised: Annotated[
+        bool, typer.Option("--revised", help="They are revised paths, not online ones.")
+    ] = False,
+    cpu_seconds: Annotated[
+        float | None, typer.Option(help="Processor time that making the trajectory took, s.")
+    ] = None,
+    topic: Topic = None,
+    estimator: Annotated[
+        str | None, typer.Option("--as", help="Name of the estimator in the row [the file's].")
+    ] = None,
+    name: Annotated[str, typer.Option(help="Folder of the rows in results/runs.")] = "score",
+    as_json: Annotated[bool, typer.Option("--json", help="Print the rows as JSON.")] = False,
+) -> None:
+    """Score trajectories of any program against a recording's truth, and write their rows.
+
+    It says what was scored, and the statistics that evo_ape and evo_rpe (pairs from the reference)
+    print. The rows are like those of `estima run`: `estima table` and `estima plot` take them.
+
+    Examples
+    --------
+      estima score run.npz mine.tum
+
+      estima score run.npz theirs.mcap --topic odometry/filtered --align start --as their_filter
+
+      estima score run.npz batch.tum --revised --cpu-seconds 2.5 --name leaderboard
+    """
+    import json
+
+    from experiments.runs.score import as_scoring, as_text, score_files
+
+    how = as_scoring(
+        align=align,
+        match=match,
+        tolerance_s=tolerance_s,
+        offset_s=offset_s,
+        revised=revised,
+        cpu_seconds=cpu_seconds,
+    )
+    results = score_files(recording, trajectories, how, topic=topic, estimator=estimator, name=name)
+    if as_json:
+        print(json.dumps([row for _, row, _ in results], indent=2))
+        return
+    for path, _, scored in results:
+        show(f"{path}\n{as_text(scored, how)}")
+    print(f"rows: estima table {name}")
+
+
+@app.command()
+def compare(
+    trajectories: Annotated[list[Path], typer.Argument(help="Trajectories of one drive.")],
+    recording: Annotated[
+        Path | None,
+        typer.Option(help="Recording with the truth; without it the first is the reference."),
+    ] = None,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Picture to write.")] = Path(
+        "compare.png"
+    ),
+    align: AlignBy = "none",
+    match: MatchBy = "interpolated",
+    tolerance_s: Tolerance = 0.01,
+    offset_s: Offset = 0.0,
+    topic: Topic = None,
+) -> None:
+    """Draw trajectories over one another with their errors over time, and print a table.
+
+    Examples
+    --------
+      estima compare mine.tum theirs.mcap --recording run.npz -o both.png
+
+      estima compare reference.tum mine.tum --align se2
+    """
+    from experiments.runs.score import as_scoring
+    from experiments.viewing.compare import compare_files
+
+    how = as_scoring(align=align, match=match, tolerance_s=tolerance_s, offset_s=offset_s)
+    table = compare_files(trajectories, recording, out, how, topic)
+    show(table.to_string(index=False, na_rep="-", float_format=lambda v: f"{v:.4g}"))
+    print(out)
+
+
 @app.command()
 def calibrate(
     what: Annotated[
@@ -618,6 +760,8 @@ def table(
 ) -> None:
     """Show the means of a sweep's errors, or with -o write all its rows.
 
+    The means are those of the best answers: of the revised path of a method that has one.
+
     Example: estima table leaderboard --against smoother
     """
     from experiments.sweeps.collect import collect, summary, where
@@ -637,9 +781,7 @@ def table(
 def plot(
     name: Annotated[str, typer.Argument(help="A sweep's name, or a folder or file of rows.")],
     x: Annotated[str, typer.Option(help="Swept setting, such as robot.kr.")],
-    y: Annotated[str, typer.Option(help="Result, such as ate_rmse_m (estima options metrics).")] = (
-        "ate_rmse_m"
-    ),
+    y: Annotated[str, typer.Option(help="Result (estima options metrics).")] = "answer_ate_rmse_m",
     by: Annotated[str | None, typer.Option(help="One line a value of this.")] = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="Picture to write.")] = Path("plot.png"),
     pool: Annotated[
@@ -649,7 +791,10 @@ def plot(
 ) -> None:
     """Draw a column of a sweep against a swept setting, with 95 % intervals.
 
-    Example: estima plot slip --x robot.kr --y ate_rmse_m --by choice.estimator
+    By default it is the position error of the best answers: of the revised path of a method that
+    has one, else of the online one.
+
+    Example: estima plot slip --x robot.kr --y heading_rmse_rad --by choice.estimator
     """
     from experiments.report.plot import sweep_figure
     from experiments.sweeps.collect import collect, where

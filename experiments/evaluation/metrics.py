@@ -133,16 +133,26 @@ def score(recording: Recording, estimate: Estimate) -> dict[str, float]:
     row = {"duration_s": float(np.ptp(estimate.stamps)) if len(estimate.stamps) else 0.0}
     if len(estimate.step_seconds):
         row["step_time_us"] = float(1e6 * np.median(estimate.step_seconds))
+    if estimate.cpu_seconds is not None:
+        row["cpu_time_us"] = 1e6 * estimate.cpu_seconds / max(len(estimate.stamps), 1)
     if recording.truth is None:
         return row
     truth = recording.truth_at(estimate.stamps)
     known = np.isfinite(truth).all(axis=1)
     require(known.any(), "no estimate lies within the truth's time span; are the clocks the same?")
-    truth, means, covariances = truth[known], estimate.means[known], estimate.covariances[known]
+    covariances = estimate.covariances[known]
+    return row | path_scores(truth[known], estimate.means[known], covariances)
+
+
+def path_scores(truth: Array, means: Array, covariances: Array) -> dict[str, float]:
+    """Scores of poses (T, 3) and covariances (T, 3, 3) against the true poses at their stamps.
+
+    Covariances that are all zeros are unknown: their scores are left out.
+    """
     fitted = aligned(truth, means)
     values = nees(truth, means, covariances)
     counted = np.isfinite(values)
-    row |= {
+    row = {
         "distance_m": float(np.sum(np.hypot(*np.diff(truth[:, :2], axis=0).T))),
         "ate_rmse_m": rms(position_errors_m(truth, means)),
         "ate_aligned_rmse_m": rms(position_errors_m(truth, fitted)),
@@ -150,9 +160,10 @@ def score(recording: Recording, estimate: Estimate) -> dict[str, float]:
         "heading_aligned_rmse_rad": rms(heading_errors_rad(truth, fitted)),
         "final_position_error_m": float(position_errors_m(truth[-1:], means[-1:])[0]),
         "final_heading_error_rad": float(abs(heading_errors_rad(truth[-1:], means[-1:])[0])),
-        "nees_counted_share": float(np.mean(counted)),
-        "ellipse_area_final_m2": float(ellipse_area_m2(covariances[-1:])[0]),
     }
+    if covariances.any():
+        row["nees_counted_share"] = float(np.mean(counted))
+        row["ellipse_area_final_m2"] = float(ellipse_area_m2(covariances[-1:])[0])
     if counted.any():
         row["nees_mean"] = float(np.mean(values[counted]))
     for distance in RPE_DISTANCES_M:
