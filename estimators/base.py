@@ -95,8 +95,8 @@ class Estimator(Protocol):
     """A localization method. It may also have `finish() -> Estimate`, the revised trajectory.
 
     An estimate of `finish` whose kind is `online` takes the place of the beliefs of the steps; None
-    stands for no trajectory. `program_seconds`, if it has that, is the processor time of programs
-    that it started and that have ended.
+    stands for no trajectory. With `answers_at_finish` its beliefs are no answer of its own.
+    `program_seconds` is the processor time of a program that does the work.
 
     `needs`, if it has that, is the set of its options that name a sensor it cannot do without
     (`laser`, whose value is the sensor's name), and `map`.

@@ -17,7 +17,7 @@ from scipy.special import chdtri
 
 from estimators.base import Belief, Prior
 from estimators.gaussian import STILL, Gaussian, between, compose, rotated, update, wrap
-from estimators.icp import Metric, PreparedScan
+from estimators.icp import Kernel, Metric, PreparedScan, Rules
 from estimators.options import require_laser, require_non_negative, require_shares, start_pose
 from estimators.scan_matching import (
     Covariance,
@@ -51,6 +51,8 @@ class EkfIcp:
     ----------
     metric, covariance, sigma_range_m
         As in `estimators.scan_matching.ScanMatcher`; each scan contributes half of the covariance.
+    trim, kernel, max_iterations, stop_error_m
+        As in `estimators.icp.Rules`.
     keyframe_distance_m, keyframe_turn_rad
         How far the robot goes before it takes a new key frame.
     register_distance_m, register_turn_rad
@@ -102,9 +104,14 @@ class EkfIcp:
         shared_noise: float = 0.75,
         window_s: float = 0.05,
         laser: str = "laser",
+        trim: float = 0.0,
+        kernel: Kernel = "tukey",
+        max_iterations: int = 100,
+        stop_error_m: float = 0.0,
     ) -> None:
         self.laser = laser
-        self._matcher = ScanMatcher(metric, covariance, sigma_range_m)
+        rules = Rules(trim, kernel, max_iterations, stop_error_m)
+        self._matcher = ScanMatcher(metric, covariance, sigma_range_m, rules)
         self.wheels = WheelPrediction(
             kr, kl, window_s, lateral_slip_m=lateral_slip_m, encoder_tick_m=encoder_tick_m
         )

@@ -11,7 +11,7 @@ import numpy as np
 
 from estimators.base import Belief, Prior
 from estimators.gaussian import STILL, Gaussian, update, wrap
-from estimators.icp import Metric, PreparedScan
+from estimators.icp import Kernel, Metric, PreparedScan, Rules
 from estimators.options import require_laser, require_non_negative, start_pose
 from estimators.scan_matching import (
     Covariance,
@@ -37,6 +37,8 @@ class EkfIcpPaper:
     ----------
     metric, covariance, sigma_range_m
         As in `estimators.scan_matching.ScanMatcher`.
+    trim, kernel, max_iterations, stop_error_m
+        As in `estimators.icp.Rules`.
     kr, kl
         Believed slip variance per metre of the wheels, m.
     lateral_slip_m
@@ -72,9 +74,14 @@ class EkfIcpPaper:
         turn_noise: float = 2.0,
         window_s: float = 0.05,
         laser: str = "laser",
+        trim: float = 0.0,
+        kernel: Kernel = "tukey",
+        max_iterations: int = 100,
+        stop_error_m: float = 0.0,
     ) -> None:
         self.laser = laser
-        self._matcher = ScanMatcher(metric, covariance, sigma_range_m)
+        rules = Rules(trim, kernel, max_iterations, stop_error_m)
+        self._matcher = ScanMatcher(metric, covariance, sigma_range_m, rules)
         self.wheels = WheelPrediction(kr, kl, window_s, lateral_slip_m=lateral_slip_m)
         require_non_negative(acceleration_noise=acceleration_noise, turn_noise=turn_noise)
         self.acceleration_noise, self.turn_noise = acceleration_noise, turn_noise

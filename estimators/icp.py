@@ -1,8 +1,8 @@
-"""Registration of two laser scans in the plane: point-to-point and point-to-line ICP.
+"""Registration of two laser scans in the plane: ICP from points to points, planes or lines.
 
-The lines are those of `estimators.scan_lines`. No share of the matches is trimmed, and gates
-narrow only after the increment has settled, so the few points that hold the robot along a corridor
-still count.
+The lines are those of `estimators.scan_lines`, cut from the whole scan; a plane is that of a
+point's neighbours. By default no share of the matches is trimmed, and gates narrow only after the
+increment has settled, so the few points that hold the robot along a corridor still count.
 
 Poses `T_target_source` take points of the source scan into the frame of the target scan.
 """
@@ -14,15 +14,16 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from estimators.options import require_choices
-from estimators.scan_lines import PreparedScan, Segments, prepare
+from estimators.options import require_choices, require_counts, require_non_negative
+from estimators.scan_lines import PreparedScan, Segments, prepare, ranked
 from sim.arrays import Array, Ints
 from sim.compiled import njit
-from sim.errors import InputError
+from sim.errors import InputError, require
 
-__all__ = ["PreparedScan", "Registration", "prepare", "register"]
+__all__ = ["PreparedScan", "Registration", "Rules", "prepare", "register"]
 
-Metric = Literal["point_to_line", "point_to_point"]
+Metric = Literal["point_to_line", "point_to_plane", "point_to_point"]
+Kernel = Literal["tukey", "huber", "none"]
 
 _COARSE_POINTS = 6  # points that stand for a line of the source until the poses are close
 # Errors of the heading, rad, that the second and the third stage may find: they bound how far
@@ -31,13 +32,50 @@ _TURN_THEN, _TURN_LAST = 0.01, 0.002
 _SEARCHED_RAD, _GUESSED_RAD = 0.08, 0.2  # after a search of the heading, and without
 _NO_GAIN = 1e-4  # fall of the cost, in squared standard deviations, that is worth no iteration
 _GRAZING = 0.001  # squared sine below which a beam along a wall is not trusted further
-_TUKEY = 6.0  # tuning constant, in standard deviations
+# Tuning constants, in standard deviations; without a kernel every match within the gate counts
+_WIDTHS = {"tukey": 6.0, "huber": 1.345, "none": math.inf}
+# Points of a plane, with its own. With 10 and more, corners bend the planes, and registrations of
+# successive scans (721 beams, 1 cm, tuning seeds) jump by decimetres now and then.
+_NEIGHBOURS = 6
 _LEAST_MEMBERS = 3  # points on a line before it holds a direction
 _AGREEMENT = 6.0  # range standard deviations from a line of the other scan
 LEAST_POINTS = 3  # of a scan that can be registered
 LEAST_OVERLAP = 0.6  # share of the source's points that must agree with the target
 LEAST_AGREEMENT = 0.5  # the same of those, in both scans, that bear on any one direction
 LEAST_INFORMATION = 4.0  # times the spurious information that the noise of the lines makes
+
+
+@dataclass(frozen=True)
+class Rules:
+    """Which matches count, and when iterations end.
+
+    Parameters
+    ----------
+    trim
+        Share of the matches, those farthest apart, that is left out of each iteration.
+    kernel
+        How matches within the last gate weigh by their distance: `tukey` leaves out those beyond 6
+        standard deviations, `huber` weakens those beyond 1.345, `none` counts all alike.
+    max_iterations
+        Most iterations of each of the stages, whose gates narrow from one to the next.
+    stop_error_m
+        Root mean square of the distances at which the pose is good enough (decristoforis2020, sec.
+        II-C); 0: iterations end when the pose rests.
+    """
+
+    trim: float = 0.0
+    kernel: Kernel = "tukey"
+    max_iterations: int = 100
+    stop_error_m: float = 0.0
+
+    def __post_init__(self) -> None:
+        require_choices(kernel=(self.kernel, Kernel))
+        require_counts(max_iterations=self.max_iterations)
+        require_non_negative(trim=self.trim, stop_error_m=self.stop_error_m)
+        require(self.trim < 1.0, f"estimator.trim must be below 1, got {self.trim}")
+
+
+_USUAL = Rules()
 
 
 @dataclass(frozen=True)
@@ -49,7 +87,7 @@ class Registration:
     T_target_source
         (3,) m, m, rad: takes points of the source into the frame of the target.
     metric
-        `point_to_line` or `point_to_point`.
+        `point_to_line`, `point_to_plane` or `point_to_point`.
     status
         `ok`; `empty` (a scan shows too little); `poor_overlap` (too few points agree, in all
         or of those that speak about some direction); `degenerate` (some direction is not held
@@ -57,7 +95,7 @@ class Registration:
     matches
         (K,) the target's line or point that each point was matched with, -1 for none.
     residuals_m
-        (K,) distance to the line (signed) or to the point; NaN without a match.
+        (K,) distance to the line or plane (signed), or to the point; NaN without a match.
     weights
         (K,) weight of each squared residual, 1/m^2; 0 for a point that does not count.
     iterations, converged
@@ -67,6 +105,8 @@ class Registration:
     information, information_noise
         (3, 3) information about the pose from the target's lines, and the spurious part that the
         noise of their directions adds even where there is none (all walls parallel, a circle).
+    planes
+        Of point to plane: that of each point of the target.
     """
 
     T_target_source: Array
@@ -80,6 +120,7 @@ class Registration:
     normal_matrix: Array
     information: Array
     information_noise: Array
+    planes: Segments | None = None
 
     @property
     def inliers(self) -> NDArray[np.bool_]:
@@ -97,18 +138,25 @@ class _Pair(NamedTuple):
 
     Attributes
     ----------
-    to_lines
-        Whether points are matched with lines of the target, or with its points.
+    whole_lines
+        Whether the target is cut into lines. They are well known, so a residual is weighed by the
+        range noise as it shows at the beam's incidence, and few points are enough to begin with.
+    along_normals
+        Whether residuals are distances from lines or planes, or between points.
     surface
-        Those: what the points of the source are matched with.
+        What the points of the source are matched with.
+    planes
+        What their distances are measured from, by the index of the match.
     noise_m
         Range noise of the noisier scan.
     """
 
     source: PreparedScan
     target: PreparedScan
-    to_lines: bool
+    whole_lines: bool
+    along_normals: bool
     surface: Segments
+    planes: Segments
     noise_m: float
 
 
@@ -117,13 +165,17 @@ class _Settings(NamedTuple):
 
     Attributes
     ----------
-    max_iterations, increment_m, increment_rad
+    max_iterations, trim, stop_error_m
+        See `Rules`.
+    increment_m, increment_rad
         See `register`.
     sigma_m, sigma_rad
         Standard deviations of the guess.
     """
 
     max_iterations: int
+    trim: float
+    stop_error_m: float
     increment_m: float
     increment_rad: float
     sigma_m: float
@@ -137,8 +189,9 @@ class _Stage(NamedTuple):
     ----------
     coarse
         Weigh by the distance itself, as Geman and McClure do, and hold the pose to the guess;
-        or else, as Tukey does, by standard deviations of the range noise as it shows at the
-        beam's incidence.
+        or else, as Tukey or Huber do, by standard deviations of the range noise.
+    huber
+        Of those two.
     gate_m
         Widest distance of a match.
     width
@@ -152,6 +205,7 @@ class _Stage(NamedTuple):
     """
 
     coarse: bool
+    huber: bool
     gate_m: float
     width: float
     reach_m: float
@@ -226,6 +280,43 @@ def _as_segments(scan: PreparedScan) -> Segments:
     n, (x, y) = len(scan.points), scan.points.T.copy()
     spans, end_rays = np.stack([y, y], axis=1), np.stack([scan.rays, scan.rays], axis=1)
     return Segments(np.tile([1.0, 0.0], (n, 1)), x, spans, end_rays, np.zeros(n))
+
+
+@njit(error_model="numpy")
+def _planes(points: Array, n_near: int) -> tuple[Array, Array]:
+    """Normals and offsets of the planes, by least squares, of each point's nearest neighbours.
+
+    They are looked for among as many beams to either side as there are neighbours.
+    """
+    n = len(points)
+    normals, offsets = np.empty((n, 2)), np.empty(n)
+    near, apart = np.empty(n_near, np.int64), np.empty(n_near)
+    for i in range(n):
+        found = 0
+        for j in range(max(i - n_near, 0), min(i + n_near + 1, n)):
+            d2 = (points[j, 0] - points[i, 0]) ** 2 + (points[j, 1] - points[i, 1]) ** 2
+            if found < n_near:
+                found += 1
+            elif d2 >= apart[found - 1]:
+                continue
+            place = found - 1
+            while place > 0 and apart[place - 1] > d2:
+                near[place], apart[place] = near[place - 1], apart[place - 1]
+                place -= 1
+            near[place], apart[place] = j, d2
+        x = y = xx = xy = yy = 0.0
+        for k in range(found):
+            x += points[near[k], 0] / found
+            y += points[near[k], 1] / found
+        for k in range(found):
+            dx, dy = points[near[k], 0] - x, points[near[k], 1] - y
+            xx += dx * dx
+            xy += dx * dy
+            yy += dy * dy
+        along = 0.5 * math.atan2(2.0 * xy, xx - yy)
+        normals[i, 0], normals[i, 1] = -math.sin(along), math.cos(along)
+        offsets[i] = normals[i, 0] * x + normals[i, 1] * y
+    return normals, offsets
 
 
 @njit(error_model="numpy", fastmath={"contract"})
@@ -377,6 +468,15 @@ def _match(
         fit.matches[i] = near
 
 
+@njit(error_model="numpy")
+def _trim(misses: Array, share: float) -> None:
+    """Make this share of the squared distances, the largest, infinite."""
+    found = misses[misses < math.inf]
+    kept = math.ceil((1.0 - share) * len(found))
+    if kept > 0:
+        misses[misses > ranked(found, kept - 1)] = math.inf
+
+
 @njit(forceinline=True, error_model="numpy", fastmath={"contract"})
 def _variance(n1: float, n2: float, vx: float, vy: float, noise_m: float) -> float:
     """Variance that the range noise of a beam (vx, vy) makes in the distance to a line."""
@@ -386,10 +486,12 @@ def _variance(n1: float, n2: float, vx: float, vy: float, noise_m: float) -> flo
 
 @njit(forceinline=True, error_model="numpy", fastmath={"contract"})
 def _weight(stage: _Stage, squared: float, variance: float) -> float:
-    """How much a squared residual counts, by Geman and McClure or by Tukey."""
+    """How much a squared residual counts, by Geman and McClure, Huber or Tukey."""
     ratio = squared / (variance * stage.width * stage.width)
     if stage.coarse:
         return 1.0 / (1.0 + ratio) ** 2
+    if stage.huber:
+        return 1.0 / math.sqrt(max(ratio, 1.0))
     return (1.0 - ratio) ** 2 if ratio < 1.0 else 0.0
 
 
@@ -398,7 +500,7 @@ def _linearise(
     pair: _Pair, stage: _Stage, sample: _Sample, pose: Array, fit: _Fit, misses: Array
 ) -> tuple[Array, Array]:
     """Normal equations of the points that are within the gate."""
-    source, surface, counts = pair.source, pair.surface, sample.counts
+    source, planes, counts = pair.source, pair.planes, sample.counts
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
     normal, gradient = np.zeros((3, 3)), np.zeros(3)
     for k in range(len(sample.points)):
@@ -408,11 +510,14 @@ def _linearise(
         if misses[k] > stage.gate_m * stage.gate_m:
             continue
         qx, qy = _turned(cos, sin, source.points[i, 0], source.points[i, 1])
-        if pair.to_lines:
-            n1, n2 = surface.normals[j, 0], surface.normals[j, 1]
+        if pair.along_normals:
+            n1, n2 = planes.normals[j, 0], planes.normals[j, 1]
             vx, vy = _turned(cos, sin, source.rays[i, 0], source.rays[i, 1])
-            miss = _off_line(surface, j, qx + pose[0], qy + pose[1])
-            variance = 1.0 if stage.coarse else _variance(n1, n2, vx, vy, pair.noise_m)
+            miss = _off_line(planes, j, qx + pose[0], qy + pose[1])
+            variance = pair.noise_m * pair.noise_m
+            if pair.whole_lines:
+                variance = _variance(n1, n2, vx, vy, pair.noise_m)
+            variance = 1.0 if stage.coarse else variance
             weight = _weight(stage, miss * miss, variance) * (counts[k] / variance)
             lever = _add_line(normal, weight, n1, n2, qx, qy)
             gradient[0] += weight * miss * n1
@@ -432,6 +537,17 @@ def _linearise(
     return normal, gradient
 
 
+@njit(error_model="numpy")
+def _error_m(sample: _Sample, fit: _Fit) -> float:
+    """Root mean square of the residuals that count."""
+    total, count = 0.0, 0
+    for i in sample.points:
+        if fit.weights[i] > 0.0:
+            total += fit.residuals[i] * fit.residuals[i]
+            count += 1
+    return math.sqrt(total / max(count, 1))
+
+
 @njit(error_model="numpy", fastmath={"contract"})
 def _align(
     pair: _Pair, settings: _Settings, stage: _Stage, sample: _Sample, guess: Array, pose: Array,
@@ -444,9 +560,13 @@ def _align(
     misses = np.empty(len(sample.points))
     for iteration in range(settings.max_iterations):
         _match(pair, stage.reach_m, sample, pose, iteration == 0, fit, misses)
+        if settings.trim > 0.0:
+            _trim(misses, settings.trim)
         normal, gradient = _linearise(pair, stage, sample, pose, fit, misses)
         if not normal[0, 0] + normal[1, 1] > 0.0:
             return iteration, False
+        if settings.stop_error_m > 0.0 and _error_m(sample, fit) < settings.stop_error_m:
+            return iteration, True
         no_gain = _NO_GAIN
         if stage.coarse:
             no_gain *= pair.noise_m**2
@@ -459,7 +579,7 @@ def _align(
         at_rest = moved < stage.slack * settings.increment_m
         at_rest &= turned < stage.slack * settings.increment_rad
         # along a direction that nothing holds the pose may wander without end
-        if at_rest or (pair.to_lines and gained < no_gain):
+        if at_rest or (pair.whole_lines and gained < no_gain):
             return iteration + 1, True
     return settings.max_iterations, False
 
@@ -473,7 +593,7 @@ def _judge(pair: _Pair, pose: Array, fit: _Fit) -> tuple[Array, Array, Array]:
     source, segments = pair.source, pair.target.segments
     normal, information, spurious = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
-    lines = fit.matches if pair.to_lines else pair.target.line_of_point[fit.matches]
+    lines = fit.matches if pair.whole_lines else pair.target.line_of_point[fit.matches]
     members = np.zeros(len(segments.normals), np.int64)
     for i in range(len(lines)):
         if fit.weights[i] > 0.0 and lines[i] >= 0:
@@ -485,14 +605,15 @@ def _judge(pair: _Pair, pose: Array, fit: _Fit) -> tuple[Array, Array, Array]:
         if not weight > 0.0:
             continue
         qx, qy = _turned(cos, sin, source.points[i, 0], source.points[i, 1])
-        if not pair.to_lines:
+        if pair.along_normals:
+            n1, n2 = pair.planes.normals[fit.matches[i], 0], pair.planes.normals[fit.matches[i], 1]
+            _add_line(normal, weight, n1, n2, qx, qy)
+        else:
             _add_point(normal, weight, qx, qy)
         if line < 0:
             continue
         n1, n2 = segments.normals[line, 0], segments.normals[line, 1]
-        if pair.to_lines:
-            _add_line(normal, weight, n1, n2, qx, qy)
-        else:
+        if not pair.whole_lines:
             vx, vy = _turned(cos, sin, source.rays[i, 0], source.rays[i, 1])
             weight = 1.0 / _variance(n1, n2, vx, vy, pair.noise_m)
         if members[line] >= _LEAST_MEMBERS:  # a point or two may be there by chance
@@ -567,7 +688,7 @@ def _register(
     few, every = _representatives(source), _Sample(np.arange(n), np.ones(n))
     iterations, converged = 0, False
     for stage in stages:
-        sample = few if pair.to_lines and stage.coarse else every
+        sample = few if pair.whole_lines and stage.coarse else every
         done, converged = _align(pair, settings, stage, sample, guess, pose, fit)
         iterations += done
     normal, information, spurious = _judge(pair, pose, fit)
@@ -591,7 +712,7 @@ def register(
     gate_m: float = 2.0,
     gate_rad: float | None = None,
     heading_window_rad: float | None = None,
-    max_iterations: int = 100,
+    rules: Rules = _USUAL,
     increment_m: float = 1e-5,
     increment_rad: float = 1e-5,
 ) -> Registration:
@@ -599,8 +720,11 @@ def register(
 
     Point to line minimises sum w (n.(R p + t) - d)^2 over the lines of the target (Chen and
     Medioni); w is one over the variance that the range noise has along the normal, so beams
-    that graze a wall, which feel its distance most finely, count most. Point to point minimises
-    sum w |R p + t - q|^2 over its nearest points (Besl and McKay).
+    that graze a wall, which feel its distance most finely, count most. Point to plane minimises
+    the same over the planes of the nearest points, each that of six nearest neighbours,
+    with one variance for all (decristoforis2020, sec. II-C). Point to point minimises
+    sum w |R p + t - q|^2 over the nearest points (Besl and McKay). The last two have the same
+    points, stages and end of iterations.
 
     Parameters
     ----------
@@ -614,8 +738,8 @@ def register(
     heading_window_rad
         Half the range of headings searched for agreement of the scans' lines before the first
         iteration; by default 30 degrees without an initial guess, and 0 (no search) with one.
-    max_iterations
-        Most iterations of each of the stages, whose gates narrow from one to the next.
+    rules
+        Which matches count, and when iterations end.
     increment_m, increment_rad
         Iterations end when both parts of the increment fall below these.
     """
@@ -625,9 +749,9 @@ def register(
             f"an initial guess is three finite numbers (x, y, heading), got {initial!r}"
         )
     require_choices("", metric=(metric, Metric))
-    to_lines = metric == "point_to_line"
+    whole_lines = metric == "point_to_line"
     too_few = min(len(source.points), len(target.points)) < LEAST_POINTS
-    if too_few or (to_lines and len(target.lines) == 0):
+    if too_few or (whole_lines and len(target.lines) == 0):
         n, zero = len(source.points), np.zeros((3, 3))
         return Registration(
             pose, metric, "empty", np.full(n, -1), np.full(n, math.nan), np.zeros(n), 0, False,
@@ -637,24 +761,35 @@ def register(
     window = usual_window if heading_window_rad is None else heading_window_rad
     if gate_rad is None:
         gate_rad = _SEARCHED_RAD if window > 0.0 else _GUESSED_RAD
-    settings = _Settings(max_iterations, increment_m, increment_rad, gate_m / 4.0, gate_rad / 4.0)
+    settings = _Settings(
+        rules.max_iterations, rules.trim, rules.stop_error_m, increment_m, increment_rad,
+        gate_m / 4.0, gate_rad / 4.0,
+    )  # fmt: skip
+    width, huber = _WIDTHS[rules.kernel], rules.kernel == "huber"
     reach_m, middle_m = 4.0 * gate_m / gate_rad, 0.5 / _TURN_THEN
-    # each is coarse or not, with its gate, width, reach and slack
-    if to_lines:
+    # each is coarse or not, with its kernel, gate, width, reach and slack
+    if whole_lines:
         stages: tuple[_Stage, ...] = (
-            _Stage(True, gate_m, 0.3, reach_m, 200.0),
-            _Stage(True, min(gate_m, 0.5), 0.1, middle_m, 200.0),
-            _Stage(False, min(gate_m, 0.3), 3.0 * _TUKEY, 0.3 / _TURN_LAST, 200.0),
-            _Stage(False, min(gate_m, 0.3), _TUKEY, math.inf, 1.0),
+            _Stage(True, False, gate_m, 0.3, reach_m, 200.0),
+            _Stage(True, False, min(gate_m, 0.5), 0.1, middle_m, 200.0),
+            _Stage(False, huber, min(gate_m, 0.3), 3.0 * width, 0.3 / _TURN_LAST, 200.0),
+            _Stage(False, huber, min(gate_m, 0.3), width, math.inf, 1.0),
         )
     else:
         stages = (
-            _Stage(True, gate_m, 0.5, reach_m, 10.0),
-            _Stage(True, min(gate_m, 0.5), 0.2, middle_m, 10.0),
-            _Stage(False, min(gate_m, 0.2), _TUKEY, math.inf, 1.0),
+            _Stage(True, False, gate_m, 0.5, reach_m, 10.0),
+            _Stage(True, False, min(gate_m, 0.5), 0.2, middle_m, 10.0),
+            _Stage(False, huber, min(gate_m, 0.2), width, math.inf, 10.0),
         )
-    surface = target.segments if to_lines else _as_segments(target)
-    pair = _Pair(source, target, to_lines, surface, max(source.noise_m, target.noise_m))
+    surface = target.segments if whole_lines else _as_segments(target)
+    planes = surface
+    if metric == "point_to_plane":
+        normals, offsets = _planes(target.points, _NEIGHBOURS)
+        planes = surface._replace(normals=normals, distances_m=offsets)
+    pair = _Pair(
+        source, target, whole_lines, metric != "point_to_point", surface, planes,
+        max(source.noise_m, target.noise_m),
+    )  # fmt: skip
     fit, iterations, converged, normal, information, spurious, agreed, denied = _register(
         pair, pose, window, settings, stages
     )
@@ -670,7 +805,7 @@ def register(
         status = "not_converged"
     return Registration(
         pose, metric, status, fit.matches, fit.residuals, fit.weights, iterations, converged,
-        normal, information, spurious,
+        normal, information, spurious, planes if metric == "point_to_plane" else None,
     )  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""Covariances of a registration of two scans, for both metrics of `estimators.icp`.
+"""Covariances of a registration of two scans, for all metrics of `estimators.icp`.
 
 All are of the three numbers (x, y, heading) of T_target_source. Where the scans do not hold a
 direction (a bare corridor, a round room) every method gives it the large variance of not knowing
@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from estimators.icp import LEAST_INFORMATION, PreparedScan, Registration, prepare, register
+from sim import se2
 from sim.arrays import Array, Ints
 from sim.compiled import njit
 
@@ -121,6 +122,27 @@ def _censi(
     return A, by_source, by_target
 
 
+def _censi_planes(
+    found: Registration, source: PreparedScan, target: PreparedScan
+) -> tuple[Array, Array, Array]:
+    """The same three of point to plane; normals are held, and a plane moves as its point does."""
+    assert found.planes is not None
+    rows = np.flatnonzero(found.weights > 0.0)
+    w, e, j = found.weights[rows], found.residuals_m[rows], found.matches[rows]
+    n1, n2 = found.planes.normals[j].T
+    turn = np.array([0.0, 0.0, found.T_target_source[2]])
+    qx, qy = se2.transform(turn, source.points[rows]).T
+    vx, vy = se2.transform(turn, source.rays[rows]).T
+    J = np.stack([n1, n2, n2 * qx - n1 * qy])
+    A = (w * J) @ J.T
+    A[2, 2] -= np.sum(w * e * (n1 * qx + n2 * qy))
+    by_range = w * (n1 * vx + n2 * vy) * J
+    by_range[2] += w * e * (n2 * vx - n1 * vy)
+    facing = n1 * target.rays[j, 0] + n2 * target.rays[j, 1]
+    shared: Array = np.stack([np.bincount(j, w * facing * row) for row in J])
+    return A, by_range @ by_range.T, shared @ shared.T
+
+
 def censi(
     registration: Registration,
     source: PreparedScan,
@@ -147,11 +169,14 @@ def censi(
     """
     if registration.status in ("empty", "poor_overlap"):
         return _unknown()
-    to_lines = registration.metric == "point_to_line"
-    A, by_source, by_target = _censi(
-        source, target, registration.T_target_source, to_lines, matches == "sliding",
-        registration.matches, registration.weights, registration.residuals_m,
-    )  # fmt: skip
+    if registration.planes is not None:
+        A, by_source, by_target = _censi_planes(registration, source, target)
+    else:
+        to_lines = registration.metric == "point_to_line"
+        A, by_source, by_target = _censi(
+            source, target, registration.T_target_source, to_lines, matches == "sliding",
+            registration.matches, registration.weights, registration.residuals_m,
+        )  # fmt: skip
     noise = source.noise_m if sigma_range_m is None else sigma_range_m
     middle = noise**2 * by_source
     if scans == "both":
@@ -169,7 +194,7 @@ def hessian(registration: Registration) -> Array:
         return _unknown()
     kept = registration.inliers
     cost = float(np.sum(registration.weights[kept] * registration.residuals_m[kept] ** 2))
-    numbers = int(np.count_nonzero(kept)) * (1 if registration.metric == "point_to_line" else 2)
+    numbers = int(np.count_nonzero(kept)) * (2 if registration.metric == "point_to_point" else 1)
     scale = cost / max(numbers - 3, 1)
     return _sandwich(registration.normal_matrix, scale * registration.normal_matrix, registration)
 

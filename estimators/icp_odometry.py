@@ -12,7 +12,7 @@ import numpy as np
 
 from estimators.base import Belief, Prior
 from estimators.gaussian import STILL, Gaussian
-from estimators.icp import Metric, PreparedScan
+from estimators.icp import Kernel, Metric, PreparedScan, Rules
 from estimators.options import require_choices, require_laser, require_non_negative, start_pose
 from estimators.scan_matching import (
     FAILED,
@@ -46,6 +46,8 @@ class IcpOdometry:
     ----------
     metric, covariance, sigma_range_m
         As in `estimators.scan_matching.ScanMatcher`.
+    trim, kernel, max_iterations, stop_error_m
+        As in `estimators.icp.Rules`.
     reference
         What a scan is registered against: the `previous` scan (decristoforis2020, eq. (5)), or a
         `keyframe`, kept until the robot has left it by more than the thresholds.
@@ -86,9 +88,14 @@ class IcpOdometry:
         kl: float = 1e-4,
         window_s: float = 0.05,
         laser: str = "laser",
+        trim: float = 0.0,
+        kernel: Kernel = "tukey",
+        max_iterations: int = 100,
+        stop_error_m: float = 0.0,
     ) -> None:
         self.laser = laser
-        self._matcher = ScanMatcher(metric, covariance, sigma_range_m)
+        rules = Rules(trim, kernel, max_iterations, stop_error_m)
+        self._matcher = ScanMatcher(metric, covariance, sigma_range_m, rules)
         self.wheels = WheelPrediction(kr, kl, window_s)
         require_choices(reference=(reference, Reference))
         require_non_negative(

@@ -137,7 +137,7 @@ def prepare(
 
 
 @njit()
-def _ranked(values: Array, rank: int) -> float:
+def ranked(values: Array, rank: int) -> float:
     """The value at a place of the sorted values, without sorting them.
 
     `numpy.partition` does the same, but takes eleven seconds to compile.
@@ -172,7 +172,7 @@ def _noise(ranges: Array, rays: Array, beams: Ints) -> float:
         n += 1
     if n < _LEAST_BENDS:
         return _NOISE_FLOOR_M
-    return max(_ranked(found[:n], n // 2) / _MEDIAN_OF_NORMAL, _NOISE_FLOOR_M)
+    return max(ranked(found[:n], n // 2) / _MEDIAN_OF_NORMAL, _NOISE_FLOOR_M)
 
 
 @njit(forceinline=True, error_model="numpy", fastmath={"contract"})

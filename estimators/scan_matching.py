@@ -19,6 +19,7 @@ from estimators.icp import (
     Metric,
     PreparedScan,
     Registration,
+    Rules,
     prepare,
     register,
 )
@@ -103,11 +104,14 @@ class ScanMatcher:
         only, as decristoforis2020 prints it. Point to point by `censi` lets matches slide.
     sigma_range_m
         Believed range noise; None for that of the prior's laser.
+    rules
+        Which matches count, and when iterations end.
     """
 
     metric: Metric
     covariance: Covariance
     sigma_range_m: float | None
+    rules: Rules = dataclasses.field(default_factory=Rules)
 
     def __post_init__(self) -> None:
         require_choices(
@@ -155,6 +159,7 @@ class ScanMatcher:
             gate_m=min(_LEAST_GATE_M + 4.0 * math.sqrt(max(xx + yy, 0.0)), _MOST_GATE_M),
             gate_rad=min(_LEAST_GATE_RAD + 4.0 * math.sqrt(max(turn, 0.0)), _MOST_GATE_RAD),
             heading_window_rad=heading_window_rad,
+            rules=self.rules,
         )
         if found.status in FAILED:
             return Match(guess, found.status, _NOTHING[:0], _EVERYTHING)

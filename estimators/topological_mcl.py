@@ -191,7 +191,8 @@ class TopologicalMcl:
     spacing, as the robot is near a node rather than on it.
 
     Belief extras: `particles` (M, 3), `log_weights` (M,), `ess` before resampling, `mode_share`
-    of the weight at the mode, `node`, and `refinement` (`ok`, or why not) where it was tried. An
+    of the weight at the mode, `node`, `dispersion_m` (mean distance of the particles from their
+    estimate, sec. 4.1), and `refinement` (`ok`, or why not) where it was tried. An
     observation that holds NaN, or a cloud that saw nothing, is passed over with a `status`.
     """
 
@@ -439,6 +440,7 @@ class TopologicalMcl:
         mass = _sums(state, np.exp(self._log_weights), len(self._poses))
         held = np.flatnonzero(mass)
         shares, poses, nodes = mass[held], self._poses[held], self._node_of_state[held]
+        every = shares / shares.sum()
         mode, mode_mass = self._mode(_sums(nodes, shares, len(known)))
         if self.estimate == "mode":
             near = np.zeros(len(known), bool)
@@ -457,6 +459,7 @@ class TopologicalMcl:
         extras |= {
             "mode_share": mode_mass / mass.sum(),
             "node": mode,
+            "dispersion_m": float(every @ np.hypot(*off.T)),
             "particles": self._poses.take(state, axis=0),
             "log_weights": self._log_weights.copy(),
         }

@@ -156,6 +156,7 @@ def corridor(
     rng: np.random.Generator,
     bare_m: float,
     objects_m: float,
+    bare_after_m: float,
     second_leg_m: float,
     curve_radius_m: float,
     third_leg_m: float,
@@ -164,10 +165,11 @@ def corridor(
     n_landmarks: int,
     look_alike_share: float,
 ) -> World:
-    """Build a bare stretch, one with objects, a sharp bend, a leg, a round curve, a last leg.
+    """Build a bare stretch, objects, a bare stretch, a sharp bend, a leg, a round curve, a leg.
 
-    Both turn left. The place `corridor_bare` stops 3 m short of the end wall and of the objects;
-    the radius is that of the middle of the corridor.
+    Both turn left. The place `corridor_bare` stops 3 m short of the end wall and of the objects,
+    and so do `leg_1` to `leg_3`, the bare stretches before, between and after the bends, where they
+    are longer than that; the radius is that of the middle of the corridor.
     """
     _positive(
         bare_m=bare_m - 6.0,
@@ -178,8 +180,8 @@ def corridor(
         curve_radius_m=curve_radius_m - width_m / 2 - 0.2,
     )
     plan, w, r = Plan(), width_m, curve_radius_m
-    x1, x2 = bare_m, bare_m + objects_m
-    top, xc = w + second_leg_m, bare_m + objects_m + w / 2
+    x1, x2 = bare_m, bare_m + objects_m + bare_after_m
+    end, top, xc = x1 + objects_m, w + second_leg_m, x2 + w / 2
     far = xc - r - third_leg_m
     angle = np.linspace(0.0, math.pi / 2, 13)
     arc = np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -188,13 +190,28 @@ def corridor(
     ends = [(far, top + r + w / 2), (far, top + r - w / 2)]
     plan.enclosure([(0, 0), (x2 + w, 0), *outer, *ends, *inner, (x2, w), (0, w)])
     plan.place("corridor_bare", 3.0, 0, x1 - 3.0, w)
-    plan.place("corridor_objects", x1, 0, x2, w)
+    plan.place("corridor_objects", x1, 0, end, w)
     plan.place("corner", x2, 0, x2 + w, w)
+    legs = (
+        (bare_after_m, (end + 3.0, 0, x2 - 3.0, w)),
+        (second_leg_m, (x2, w + 3.0, x2 + w, top - 3.0)),
+        (third_leg_m, (far + 3.0, top + r - w / 2, xc - r - 3.0, top + r + w / 2)),
+    )
+    for number, (length, area) in enumerate(legs, 1):
+        if length > 6.0:
+            plan.place(f"leg_{number}", *area)
     plan.place("curve", xc - r, top, x2 + w, top + r + w / 2)
     middle = [(float(x), float(y)) for x, y in centre + r * arc]
     plan.tour = [(1.0, w / 2), (xc, w / 2), *middle, (far + 1.0, top + r)]
-    _line_up(plan, rng, (x1, 0), (x2, w), n_objects)
+    _line_up(plan, rng, (x1, 0), (end, w), n_objects)
     return plan.world("corridor", rng, n_landmarks=n_landmarks, look_alike_share=look_alike_share)
+
+
+def corridors(*, rng: np.random.Generator, n_objects: list[int], **lengths_m: list[float]) -> World:
+    """Build a corridor whose sizes are drawn, each between the two ends given."""
+    drawn = {name: rng.uniform(ends[0], ends[1]) for name, ends in lengths_m.items()}
+    count = int(rng.integers(n_objects[0], n_objects[1] + 1))
+    return corridor(rng=rng, n_objects=count, n_landmarks=0, look_alike_share=0.0, **drawn)
 
 
 def office(

@@ -49,7 +49,7 @@ def test_ways_to_associate_stand_at_one_height_left_and_right():
     ]
     columns = ["filter", "association", "p0", "sigma_descriptor"]
     table = pd.concat(
-        pd.DataFrame(part, columns=columns).assign(noise=noise, seed=seed)
+        pd.DataFrame(part, columns=columns).assign(noise=noise, seed=seed, noise_at="predicted")
         for noise, part in (("paper", ways), ("pixel", ways[:2]))
         for seed in range(2)
     ).assign(revised_ate_rmse_m=1.0, odometry_rmse_m=2.0, right_share=0.5, matching_precision=0.9)
@@ -65,34 +65,31 @@ def test_ways_to_associate_stand_at_one_height_left_and_right():
 
 def runs(errors):
     rows = [
-        (seed, method, 10.0, "exact", (seed + 1) * value)
-        for seed in range(3)
-        for method, value in errors.items()
+        (seed, method, (seed + 1) * value) for seed in range(3) for method, value in errors.items()
     ]
-    columns = ["seed", "method", "rate_hz", "rays", "ate_rmse_m"]
-    return pd.DataFrame(rows, columns=columns)
+    return pd.DataFrame(rows, columns=["seed", "method", "ate_rmse_m"])
 
 
-def test_the_recording_drawn_is_told_beside_the_median():
-    told = decristoforis2020._of_all(
-        runs({"odometry": 1.0, "icp": 0.5, "fusion": 0.1}), "ate_rmse_m", "RMSE, m"
-    )
-    assert told == (
-        "seed 0: RMSE, m (median of 3 recordings): odometry 1.00 (2.00), ICP 0.50 (1.00), "
-        "fusion 0.10 (0.20)"
-    )
+def test_the_drive_drawn_tells_its_errors():
+    drawn = runs({"odometry": 1.0, "icp": 0.5, "fusion": 0.1}).query("seed == 0")
+    told = decristoforis2020._of_drawn(drawn.assign(distance_m=300.2), "ate_rmse_m", "RMSE, m")
+    assert told == "seed 0, 300 m: RMSE, m: odometry 1.00, ICP 0.50, fusion 0.10"
 
 
-def test_the_map_of_the_order_has_no_negative_zero_and_open_ends():
+def test_the_map_of_the_order_has_intervals_and_its_boundary():
     table = pd.concat(
-        runs({"odometry": 1e4, "icp": 1.001, "fusion": 1.0, "fusion_clone": 1.0}).assign(
+        runs({"odometry": 1e4, "icp": 1.0, "fusion": ratio, "fusion_clone": ratio}).assign(
             k_m=k, sigma_range_m=0.01, heading_rmse_rad=lambda t: t["ate_rmse_m"]
         )
-        for k in (1e-6, 1e-4)
+        for k, ratio in ((1e-6, 2.0), (1e-4, 0.5))
     )
     page = decristoforis2020.ordering(table)
-    texts = {text.get_text() for ax in page.axes for text in ax.texts}
-    assert texts == {"0.0", "-9.2"}
+    fused, alone, same = page.axes[:3]
+    assert [text.get_text() for text in fused.texts] == ["2\n2-2", "0.5\n0.5-0.5"]
+    (boundary,) = fused.lines
+    np.testing.assert_array_equal(boundary.get_xdata(), [0.5, 0.5])
+    assert not alone.lines  # better everywhere
+    assert {text.get_text() for text in same.texts} == {"1\n1-1"}
     assert page.axes[-1]._colorbar.extend == "both"
 
 

@@ -1,5 +1,6 @@
 """The other text formats: Intel JSON, relations, MRCLAM, Rawseeds, Lego, Wean Hall."""
 
+import functools
 import json
 import math
 import tarfile
@@ -123,6 +124,21 @@ def test_rawseeds(tmp_path):
         rawseeds.parse_sick(words("1, 2, 0, 5, 6\n2, 3, 0, 5, 6, 7\n"))
     with pytest.raises(InputError, match=r"log:1: .*quarter"):
         rawseeds.parse_sick(words("1, 2, 7, 5, 6\n"))
+
+
+def test_rawseeds_of_any_resolution_and_by_ticks(tmp_path):
+    odometry = write(tmp_path / "odo.csv", samples.rawseeds_odometry())
+    sick = write(tmp_path / "sick.csv", samples.rawseeds_sick())
+    read = functools.partial(rawseeds.read_rawseeds, odometry, sick)
+    recording = read(resolution_deg=0.25, m_per_tick=0.01)
+    bearings = recording.sensors["laser"].bearings_rad + recording.sensors["laser"].mount.yaw_rad
+    np.testing.assert_allclose(bearings, np.radians([-90, -89.75, -89.5, -89.25]), atol=1e-9)
+    steps = np.diff(recording.wheels.position_m, axis=0)
+    np.testing.assert_allclose(steps, np.tile([0.03, 0.04], (len(steps), 1)), atol=1e-12)
+    with pytest.raises(InputError, match="resolution_deg"):
+        read(resolution_deg=100.0)
+    with pytest.raises(InputError, match="m_per_tick"):
+        read(m_per_tick=0.0)
 
 
 def test_lego(tmp_path):

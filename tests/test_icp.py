@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial import KDTree
 
 from estimators import icp
-from estimators.icp import prepare, register
+from estimators.icp import Rules, prepare, register
 from experiments.bench.icp import BEARINGS_RAD, SIGMA_RANGE_M, pair
 from experiments.evaluation.scan_bound import cast, fisher_bound, fisher_information
 from sim import se2
@@ -187,7 +187,7 @@ def test_a_turned_sensor_sees_the_same_motion_turned(rng):
     np.testing.assert_allclose(turned.normal_matrix[2, 2], plain.normal_matrix[2, 2], rtol=1e-4)
 
 
-@pytest.mark.parametrize("metric", ["point_to_line", "point_to_point"])
+@pytest.mark.parametrize("metric", ["point_to_line", "point_to_plane", "point_to_point"])
 def test_result_is_a_minimum_with_its_normal_matrix(metric, rng):
     target = scan(ROOM, [0.3, 0.4, 0.7], rng)
     source = scan(ROOM, [0.35, 0.42, 0.72], rng)
@@ -196,6 +196,9 @@ def test_result_is_a_minimum_with_its_normal_matrix(metric, rng):
 
     def residuals(pose):
         moved = se2.transform(pose, source.points[kept])
+        if metric == "point_to_plane":
+            normals, offsets = (a[found.matches[kept]] for a in found.planes[:2])
+            return np.sum(normals * moved, axis=1) - offsets
         if metric == "point_to_line":
             m = target.lines[found.matches[kept]]
             return (np.sum(m * moved, axis=1) - 1.0) / np.linalg.norm(m, axis=1)
@@ -207,7 +210,7 @@ def test_result_is_a_minimum_with_its_normal_matrix(metric, rng):
         [(residuals(at + o) - residuals(at - o)) / (2 * step) for o in step * np.eye(3)], axis=1
     )
     weights = np.repeat(found.weights[kept], len(e) // kept.sum())
-    size = e if metric == "point_to_line" else np.hypot(*e.reshape(-1, 2).T)
+    size = e if metric != "point_to_point" else np.hypot(*e.reshape(-1, 2).T)
     np.testing.assert_allclose(found.residuals_m[kept], size, atol=1e-5)
     np.testing.assert_allclose(J.T @ (weights[:, None] * J), found.normal_matrix, rtol=1e-6)
     step = np.linalg.solve(found.normal_matrix, J.T @ (weights * e))
@@ -305,6 +308,21 @@ def test_directions_nobody_holds_are_degenerate(metric, bearings, rng):
         assert found.T_target_source[1:] == pytest.approx(motion[1:], abs=0.01)
 
 
+def test_rules_choose_the_matches_and_the_end(rng):
+    source, target = (scan(ROOM, at, rng) for at in ([0.35, 0.42, 0.72], [0.3, 0.4, 0.7]))
+    usual = register(source, target)
+    for rules in (Rules(trim=0.1), Rules(kernel="huber"), Rules(kernel="none")):
+        found = register(source, target, rules=rules)
+        assert not np.array_equal(found.weights, usual.weights)
+        np.testing.assert_allclose(found.T_target_source, usual.T_target_source, atol=0.01)
+    assert register(source, target, rules=Rules(trim=0.3)).overlap < 0.71
+    soon = register(source, target, rules=Rules(stop_error_m=0.1))
+    assert soon.iterations < usual.iterations
+    assert np.sqrt(np.mean(soon.residuals_m[soon.inliers] ** 2)) < 0.1
+    hurried = register(source, target, rules=Rules(max_iterations=1))
+    assert (hurried.iterations, hurried.converged) == (4, False)
+
+
 def test_identical_scans_do_not_move(rng):
     room = scan(ROOM, [0.3, 0.4, 0.7], rng)
     found = register(room, room)
@@ -327,6 +345,9 @@ def test_the_heading_search_goes_about_the_guess(rng):
     ],
 )
 def test_wrong_options_are_named(options, word):
+    for key, value in (("trim", 1.0), ("kernel", "cauchy"), ("max_iterations", 0)):
+        with pytest.raises(InputError, match=key):
+            Rules(**{key: value})
     room = scan(ROOM, [0.3, 0.4, 0.7])
     with pytest.raises(InputError, match=word):
         register(room, room, **options)

@@ -97,6 +97,40 @@ def test_derivatives(metric, rng):
     np.testing.assert_allclose(by_target, expected, rtol=1e-4, atol=1e-5 * by_target.max())
 
 
+def test_derivatives_of_point_to_plane(rng):
+    """By finite differences of the gradient, with matches, weights and normals held."""
+    found, source, target = registered(ROOM, [0.05, 0.02, 0.03], rng, "point_to_plane")
+    A, by_source, by_target = icp_covariance._censi_planes(found, source, target)
+    kept, step = found.inliers, 1e-6
+    matches, weights = found.matches[kept], found.weights[kept]
+    normals, offsets = (part[matches] for part in found.planes[:2])
+
+    def gradient(pose, source_m, target_m):
+        q = se2.transform([0.0, 0.0, pose[2]], source_m[kept, None] * source.rays[kept])
+        moved = (target_m - target.ranges_m)[:, None] * target.rays
+        off = np.sum(normals * (q + pose[:2] - moved[matches]), axis=1) - offsets
+        lever = normals[:, 1] * q[:, 0] - normals[:, 0] * q[:, 1]
+        return np.column_stack([normals, lever]).T @ (weights * off)
+
+    at = [found.T_target_source, source.ranges_m, target.ranges_m]
+
+    def slope(which):
+        columns = []
+        for k in range(len(at[which])):
+            ends = []
+            for sign in (step, -step):
+                moved = [value.copy() for value in at]
+                moved[which][k] += sign
+                ends.append(gradient(*moved))
+            columns.append((ends[0] - ends[1]) / (2.0 * step))
+        return np.stack(columns, axis=1)
+
+    np.testing.assert_allclose(A, slope(0), rtol=1e-4, atol=1e-6 * A.max())
+    for products, which in ((by_source, 1), (by_target, 2)):
+        B = slope(which)
+        np.testing.assert_allclose(products, B @ B.T, rtol=1e-4, atol=1e-5 * products.max())
+
+
 def test_information_of_a_line_is_that_of_its_fit(rng):
     """Refitting the lines of many noisy scans scatters them as their information says."""
     ranges = cast(CORNER, AT, BEARINGS_RAD)[0]

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy.spatial import KDTree
 
 from estimators import icp, scan_lines
 from estimators.icp import prepare
@@ -23,7 +24,8 @@ def scans(request):
 def pair_of(scans, to_lines):
     source, target = scans
     surface = target.segments if to_lines else icp._as_segments(target)
-    return icp._Pair(source, target, to_lines, surface, max(source.noise_m, target.noise_m))
+    noise_m = max(source.noise_m, target.noise_m)
+    return icp._Pair(source, target, to_lines, to_lines, surface, surface, noise_m)
 
 
 def fit_at(pair, pose=POSE):
@@ -54,7 +56,7 @@ def test_ranked_is_the_sorted_value():
     for n in (1, 2, 3, 50, 51):
         values = rng.integers(0, 20, n).astype(float)
         values[rng.random(n) < 0.1] = np.inf
-        assert [scan_lines._ranked(values, k) for k in range(n)] == sorted(values)
+        assert [scan_lines.ranked(values, k) for k in range(n)] == sorted(values)
 
 
 def test_noise_is_the_median_of_second_differences(scans):
@@ -199,7 +201,7 @@ def test_representatives_stand_for_the_root_of_a_lines_points(scans):
 def test_normal_equations_and_their_step(scans, to_lines, coarse):
     pair = pair_of(scans, to_lines)
     fit, misses, every = fit_at(pair)
-    stage = icp._Stage(coarse, 0.2, 0.1 if coarse else 6.0, math.inf, 1.0)
+    stage = icp._Stage(coarse, False, 0.2, 0.1 if coarse else 6.0, math.inf, 1.0)
     normal, gradient = icp._linearise(pair, stage, every, POSE, fit, misses)
     kept = misses <= 0.2**2
     assert np.array_equal(np.isnan(fit.residuals), ~kept)
@@ -236,7 +238,7 @@ def test_normal_equations_and_their_step(scans, to_lines, coarse):
 def test_information_is_that_of_the_lines(scans, to_lines):
     pair = pair_of(scans, to_lines)
     fit, misses, every = fit_at(pair)
-    stage = icp._Stage(False, 0.1, 6.0, math.inf, 1.0)
+    stage = icp._Stage(False, False, 0.1, 6.0, math.inf, 1.0)
     metric, _ = icp._linearise(pair, stage, every, POSE, fit, misses)
     normal, information, spurious = icp._judge(pair, POSE, fit)
     np.testing.assert_allclose(normal, metric, rtol=1e-12, atol=1e-12 * metric.max())
@@ -290,3 +292,32 @@ def test_points_agree_are_denied_or_cannot_be_judged(full_circle):
     np.testing.assert_allclose(full(denied), expected[0], atol=1e-9)
     np.testing.assert_allclose(full(agreed), expected[1], atol=1e-9)
     assert min(np.trace(denied), np.trace(agreed)) > 10.0
+
+
+def test_planes_are_those_of_the_nearest_neighbours(scans):
+    points = scans[0].points
+    normals, offsets = icp._planes(points, 6)
+    near = points[KDTree(points).query(points, k=6)[1]]
+    share = 0
+    for row, own in enumerate(near):
+        centre = own.mean(axis=0)
+        normal = np.linalg.svd(own - centre)[2][1]
+        if abs(normal @ normals[row]) > 1.0 - 1e-9:
+            share += 1
+            assert offsets[row] == pytest.approx(normals[row] @ centre)
+    assert share > 0.9 * len(points)  # at jumps of range neighbours may lie beyond the beams beside
+
+
+def test_trimming_leaves_out_the_farthest():
+    misses = np.array([0.3, np.inf, 0.1, 0.4, 0.2])
+    icp._trim(misses, 0.25)
+    np.testing.assert_array_equal(misses, [0.3, np.inf, 0.1, np.inf, 0.2])
+    icp._trim(misses, 0.999)
+    np.testing.assert_array_equal(misses, [np.inf, np.inf, 0.1, np.inf, np.inf])
+
+
+@pytest.mark.parametrize(("huber", "expected"), [(False, [0.25, 0.0]), (True, [1.0, 0.5])])
+def test_kernels_weigh_by_standard_deviations(huber, expected):
+    stage = icp._Stage(False, huber, 1.0, 2.0, math.inf, 1.0)
+    found = [icp._weight(stage, size**2 * 2.0**2 * 0.01, 0.01) for size in (0.5**0.5, 2.0)]
+    assert found == pytest.approx(expected)

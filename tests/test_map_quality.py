@@ -5,7 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from experiments.evaluation.map_quality import map_points, mean_map_entropy, wall_distances_m
+from experiments.evaluation.map_quality import (
+    landmark_errors,
+    map_points,
+    mean_map_entropy,
+    wall_distances_m,
+)
+from sim import se2
 from sim.errors import InputError
 from tests.fakes import circle, estimate
 
@@ -44,3 +50,21 @@ def test_entropy_is_that_of_a_gaussian():
 def test_a_recording_without_a_laser_is_refused():
     with pytest.raises(InputError, match="laser"):
         map_points(circle().without("laser"), estimate(circle()))
+
+
+def test_landmarks_are_compared_with_those_they_were_started_by():
+    recording = circle()
+    true = recording.truth.world.landmarks
+    turned = se2.transform(np.array([1.0, 2.0, 0.3]), true[:, :2])
+    made = {"landmarks": np.column_stack([turned, true[:, 2] + 0.1]), "ids": np.arange(len(true))}
+    found = landmark_errors(recording, made)
+    assert found["n_landmarks"] == len(true)
+    assert found["map_aligned_rmse_m"] == pytest.approx(0.1)
+    shift = np.linalg.norm(made["landmarks"] - true, axis=1)
+    assert found["map_rmse_m"] == pytest.approx(np.sqrt(np.mean(shift**2)))
+    seen = recording.truth.readings["stereo"]["true_ids"]
+    origins = np.array([0, len(seen) - 1])  # without ids, by the observation that started each
+    guessed = {"landmarks": true[seen[origins]] + [0.0, 0.0, 0.2], "origins": origins}
+    assert landmark_errors(recording, guessed)["map_rmse_m"] == pytest.approx(0.2)
+    assert landmark_errors(recording, None) == {}
+    assert landmark_errors(dataclasses.replace(recording, truth=None), made) == {}

@@ -6,11 +6,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments.evaluation.verdict import Role, conclude
-from experiments.papers.maximo2024 import claims, figures, settings, study, worlds
+from experiments.evaluation.verdict import Profile, Role, conclude
+from experiments.papers.maximo2024 import claims, figures, places, settings, study, worlds
 from experiments.papers.results import Results
+from experiments.runs.experiment import Experiment
 from experiments.runs.paths import SOURCE
 from experiments.runs.seeds import stream
+from experiments.sweeps.plan import planned
 
 
 @pytest.fixture(scope="module")
@@ -53,14 +55,15 @@ def conclusion(key, sentence, said):
 def test_mx1_follows_the_errors():
     said = list(claims.mx1(weighting(11.5, 9.6, 205.0), quality()))
     assert [c.verdict for c in said] == ["reproduced", "reproduced"]
-    assert said[0].reason == "M3 fails from B = 5 on"
-    assert said[1].reason.endswith("with other parameters at B = 10")
+    assert said[0].reason == "holds at B = 5, 10 of 2, 5, 10"
+    assert said[1].reason.startswith("holds at B = 10 of 2, 5, 10; p = ")
     found = conclusion("MX1", claims.mx1_sentence, said)
     assert found.verdict == "reproduced"
     assert "M3 is worse than 5 times M2 in 100 % of worlds on Oxford" in found.sentence
+    assert "Of the numbers B tried there, that holds at B = 5, 10" in found.sentence
     said = list(claims.mx1(weighting(10.0, 10.2, 11.0), quality(fails_from=99)))
     assert [c.verdict for c in said] == ["not_reproduced", "not_reproduced"]
-    assert said[0].reason == "M3 fails at no B tried"
+    assert said[0].reason == "holds at no B of 2, 5, 10"
     assert said[0].found.value == 0.0
     said = list(claims.mx1(weighting(10.0, 10.0, 11.0), quality(fails_from=99)))
     assert said[1].found.low < 1.0 < said[1].found.high
@@ -71,48 +74,109 @@ def test_mx1_follows_the_errors():
     assert said[0].verdict == "not_reproduced"
 
 
-def test_oxfords_m3_is_not_judged_by_a_table_that_has_it_at_another_b():
+def test_tables_of_an_earlier_study_are_not_judged():
     old = weighting(11.5, 9.6, 205.0).drop(columns="n_nearest")
     said = list(claims.mx1(old, quality()))
-    assert [c.verdict for c in said] == ["undecided", "reproduced"]
+    assert [c.verdict for c in said] == ["undecided", "undecided"]
     assert "next full run" in conclusion("MX1", claims.mx1_sentence, said).sentence
     spread = weighting(5.0, 2.0, 1.0, column="dispersion_m").assign(step=10)
     said = list(claims.mx3(spread.drop(columns="n_nearest"), quality()))
-    assert [c.verdict for c in said] == ["reproduced", "undecided"]
+    assert [c.verdict for c in said] == ["undecided", "undecided"]
+    assert "next full run" in conclusion("MX3", claims.mx3_sentence, said).sentence
 
 
 def test_the_papers_data_sets_are_the_headlines():
-    names = ("oxford", "oxford_real", "umh", "campus")
+    names = ("oxford", "oxford_real", "umh", "campus", "oxford_plane", "umh_plane")
     table = pd.concat([weighting(11.5, 9.6, 205.0, name) for name in names])
     qualities = pd.concat([quality(), quality(name="umh")])
     said = [c for c in claims.mx1(table, qualities) if "M2 over M1" in c.statistic]
-    assert [c.role for c in said] == ["beside", "headline", "headline", "beside"]
+    assert [c.role for c in said] == ["beside", "headline", "headline"] + ["beside"] * 3
+    assert claims.headlines(["oxford", "umh", "campus"]) == {"oxford", "umh"}
+
+
+def test_all_oxford_runs_stand_beside():
+    runs = pd.concat(
+        weighting(11.0, 10.0 if run < 12 else 12.0, 90.0, n=3, seed=run).assign(run=f"run {run}")
+        for run in range(15)
+    )
+    said = list(claims.mx1(weighting(11.5, 9.6, 205.0), quality(), runs))
+    assert [c.role for c in said[-2:]] == ["beside", "beside"]
+    assert [c.found.value for c in said[-2:]] == [12 / 15, 1.0]
+
+
+def test_the_map_judges_each_cell_as_the_study_is_judged():
+    table = quality()
+    (m2, m3, *_) = claims.COMPARISONS
+    cells = claims.judged_map(table, "oxford", m3).set_index("n_nearest")
+    assert list(cells.index) == [2, 5, 10]  # at B = 1 the weightings are the same filter
+    assert cells["verdict"].tolist() == ["not_reproduced", "reproduced", "reproduced"]
+    assert cells["value"].tolist() == [0.0, 1.0, 1.0]
+    whole = next(
+        c for c in claims.mx1(table[table["n_nearest"] == 10], table) if "M1" in c.statistic
+    )
+    cell = claims.judged_map(table, "oxford", m2).set_index("n_nearest").loc[10]
+    assert (cell["value"], cell["verdict"]) == (whole.found.value, whole.verdict)
+    page = figures.quality(table.assign(recall_at_1=0.9))
+    assert [len(ax.texts) for ax in page.axes] == [3] * 4
 
 
 def test_mx2_wants_equal_errors_and_rising_times():
     rows = weighting(1.0, 1.0, 1.0).replace({"method": {"M1": 2, "M2": 4, "M3": 8}})
     table = rows.rename(columns={"method": "per_node"})
-    times = pd.DataFrame(
-        {
-            "geometry": "oxford",
-            "particles": [794, 1588] * 2,
-            "repeat": [0, 0, 1, 1],
-            "time_s": [1.0e-4, 2.0e-4, 1.1e-4, 2.2e-4],
-            "paper_s": [0.26, 0.36] * 2,
-        }
-    )
-    said = list(claims.mx2(table, times))
-    assert [c.verdict for c in said] == ["reproduced"] * 4
+    said = list(claims.mx2(table, node_times()))
+    assert [c.verdict for c in said] == ["reproduced"] * 7
     assert said[3].found.low == pytest.approx(2.0 / 1.1)  # the interval spans the timings
+    assert said[6].found.value == pytest.approx(2.0)
     found = conclusion("MX2", claims.mx2_sentence, said)
     assert "The time grows up to 2 times" in found.sentence
+    assert "on Oxford is at least 2 times that on UMH" in found.sentence
     worse = table.assign(error_m=table["error_m"] * np.where(table["per_node"] == 2, 1.3, 1.0))
-    flat = times.assign(time_s=[0.5, 0.4, 0.51, 0.41])
-    said = list(claims.mx2(worse, flat))
-    assert [c.verdict for c in said] == ["not_reproduced"] * 4
-    assert said[0].reason == "2 particles a node"
+    assert next(iter(claims.mx2(worse, node_times()))).verdict == "not_reproduced"
+    assert next(iter(claims.mx2(worse, node_times()))).reason == "2 particles a node"
+
+
+def node_times():
+    """Two timings of a node by two numbers of particles, on each route."""
+    seconds = {"oxford": [1.0e-4, 2.0e-4, 1.1e-4, 2.2e-4], "umh": [0.5e-4, 1.0e-4, 0.55e-4, 1.1e-4]}
+    counts = {"oxford": [794, 1588], "umh": [272, 544]}
+    paper_s = {"oxford": [0.26, 0.36], "umh": [0.09, 0.12]}
+    return pd.concat(
+        pd.DataFrame(
+            {
+                "geometry": name,
+                "particles": counts[name] * 2,
+                "repeat": [0, 0, 1, 1],
+                "time_s": seconds[name],
+                "paper_s": paper_s[name] * 2,
+            }
+        )
+        for name in seconds
+    )
+
+
+def verdicts_of_times(times):
+    equal = weighting(1.0, 1.0, 1.0).replace({"method": {"M1": 2, "M2": 4, "M3": 8}})
+    table = equal.rename(columns={"method": "per_node"})
+    return {
+        words: [c.verdict for c in claims.mx2(table, times) if words in c.statistic]
+        for words in ("the paper's", "between nodes", "the fewest", "that of UMH")
+    }
+
+
+def test_mx2_fails_by_each_of_its_times():
+    times = node_times()
+    good = {"the paper's": 2, "between nodes": 1, "the fewest": 2, "that of UMH": 1}
+    assert verdicts_of_times(times) == {k: ["reproduced"] * n for k, n in good.items()}
     slower = times.assign(time_s=10.0 * times["time_s"])  # on another machine
-    assert [c.verdict for c in claims.mx2(table, slower)] == ["reproduced"] * 4
+    assert verdicts_of_times(slower) == verdicts_of_times(times)
+    slow = times.assign(time_s=1e4 * times["time_s"])
+    found = verdicts_of_times(slow)
+    assert set(found["the paper's"] + found["between nodes"]) == {"not_reproduced"}
+    flat = times.assign(time_s=np.where(times["particles"] % 397, 1.0, 2.0) * 1e-4)
+    flat.loc[flat["particles"].isin([1588, 544]), "time_s"] *= 0.5
+    assert set(verdicts_of_times(flat)["the fewest"]) == {"not_reproduced"}
+    as_fast = times.assign(time_s=np.where(times["geometry"] == "umh", 3e-4, times["time_s"]))
+    assert verdicts_of_times(as_fast)["that of UMH"] == ["not_reproduced"]
 
 
 def test_mx3_judges_every_weighting():
@@ -124,7 +188,7 @@ def test_mx3_judges_every_weighting():
     slow = weighting(1.0, 1.5, 2.0, column="dispersion_m").assign(step=10)
     assert headlines(claims.mx3(slow, quality())) == ["not_reproduced", "not_reproduced"]
     found = conclusion("MX3", claims.mx3_sentence, claims.mx3(spread, quality()))
-    assert "M3 over M1 on Oxford, made route: 0.2 (p = " in found.sentence
+    assert "M3 over M1 on Oxford, made route 0.2 (p = " in found.sentence
 
 
 def test_mx4_and_mx5_follow_their_tables():
@@ -180,11 +244,26 @@ def test_settling_has_to_last():
 
 def test_parameters_are_the_best_of_the_papers_choice():
     table = Results(SOURCE / "results", "maximo2024").table("tuning")
+    assert set(settings.TUNED) == set(table["geometry"])
     for name, chosen in settings.TUNED.items():
-        part = table[(table["geometry"] == name) & (table["method"] == "M2")]
-        part = part[part["n_nearest"] > 1]
+        part = table[table["geometry"] == name]
+        assert part["n_nearest"].min() == 2
         best = part.loc[part["error_m"].idxmin()]
         assert (best["sigma_l"], best["sigma_m"], best["n_nearest"]) == chosen
+
+
+def test_sweeps_have_the_parameters_of_the_study():
+    for name, (spacings, sigma_m, n_nearest) in settings.TUNED.items():
+        if name in places.GEOMETRIES:
+            own = Experiment.compose([f"study=maximo2024_{name}"]).config["estimator"]
+            far = round(spacings * places.GEOMETRIES[name].spacing_m, 2)
+            assert (own["sigma_l_m"], own["sigma_m"], own["n_nearest"]) == (far, sigma_m, n_nearest)
+    for study_name in ("weighting", "particles", "dispersion", "starts", "quality"):
+        for run in planned([f"study=maximo2024_{study_name}", "seed=1000"]):
+            alone = [f"study=maximo2024_{run.config['recording']['geometry']}"]
+            chosen = Experiment.compose(alone).config["estimator"]
+            for key in ("sigma_l_m", "sigma_m"):
+                assert run.config["estimator"][key] == chosen[key]
 
 
 def test_the_weightings_differ_in_nothing_else(case, monkeypatch):
@@ -204,17 +283,20 @@ def test_the_weightings_differ_in_nothing_else(case, monkeypatch):
         np.testing.assert_allclose(walk.errors_m, walks[0].errors_m)
 
     def repeated(_case, given, axis, n_repeats):
-        asked[given["weighting"], given.get("estimate")] = axis, n_repeats
+        asked[given["weighting"]] = axis, n_repeats, {**given, "weighting": "any"}
         return [walk]
 
     monkeypatch.setattr(worlds, "_repeated", repeated)
     worlds.weighting_rows(case, 3)
-    assert set(asked.values()) == {("estimator/topological_mcl", 3)}
+    assert list(asked) == list(settings.METHODS)
+    first, *others = asked.values()
+    assert first[:2] == ("estimator/topological_mcl", 3)
+    assert all(other == first for other in others)
 
 
 def test_a_walk_reports_error_and_dispersion(case):
     part = case.recording.cut(30)
-    walk = worlds.localize(case, worlds.options(case), stream(5, "test"), part)
+    walk = worlds.localize(case, worlds.options(case), stream(5, "test"), part, keep=("particles",))
     means = walk.estimate.means
     assert len(walk.errors_m) == len(means) == 30
     truth = case.recording.truth.poses[:30, :2]
@@ -229,10 +311,9 @@ def test_a_walk_reports_error_and_dispersion(case):
 
 def test_rows_of_a_world(case):
     small = worlds.weighting_rows(case, 1)
-    assert len(small["weighting"]) == 4
-    assert len(small["dispersion"]) == 4 * (settings.WITHIN + 1)
-    nearest = small["weighting"][0]["nearest_node_m"]
-    assert nearest == pytest.approx(0.39, abs=0.02)
+    assert len(small["weighting"]) == 3
+    assert len(small["dispersion"]) == 3 * (settings.WITHIN + 1)
+    assert small["weighting"][0]["nearest_node_m"] == pytest.approx(0.39, abs=0.02)
     chosen = worlds.options(case)
     runs = list(worlds.starts(case, 3, chosen, settings.TOLERANCE * case.known_map.spacing_m))
     assert [start for start, _, _ in runs] == [0, 42, 85]
@@ -281,7 +362,7 @@ def test_the_tracked_tables_and_arrays_redraw_every_figure():
 
 
 def test_examples_hold_what_the_figures_draw(case):
-    drawn = study.route_arrays(case)
+    drawn = study.route_arrays(case, 2)
     n = len(case.recording.frame_stamps)
     assert [int(np.argmax(np.isfinite(e))) for e in drawn["start_errors_m"]] == [0, n // 4, n // 2]
     assert np.isfinite(drawn["start_errors_m"][:, n // 2 :]).all()
@@ -289,3 +370,26 @@ def test_examples_hold_what_the_figures_draw(case):
     particles = drawn["particles_m"]
     assert len(particles) == len(drawn["means_m"]) == len(settings.ITERATIONS)
     np.testing.assert_allclose(particles.mean(axis=1), drawn["means_m"], rtol=1e-4)  # eq. (4)
+    table = study.figure_5({"umh": drawn}).set_index("start")
+    assert list(table.index) == [0, n // 4, n // 2]
+    assert table.loc[0, "error_m"] == pytest.approx(float(drawn["start_errors_m"][0].mean()))
+    assert table["paper_m"].tolist() == [0.41, 0.42, 0.58]
+
+
+def test_controls_and_headlines_share_map_and_parameters(case):
+    control = worlds.case_of("umh_plane", 5)
+    np.testing.assert_array_equal(control.known_map.descriptors, case.known_map.descriptors)
+    assert worlds.options(control) == worlds.options(case)
+    along, plane = (c.recording.truth.poses[:, :2] for c in (case, control))
+    assert not np.allclose(along, plane)
+
+
+def test_every_job_of_the_study_is_of_a_judged_world():
+    jobs = [job for job, _ in study._jobs(Profile.FULL)]
+    assert len(set(jobs)) == len(jobs)
+    assert min(seed for _, _, seed, _ in jobs) == settings.JUDGED_SEED
+    campuses = [name for what, name, _, _ in jobs if what == "campus"]
+    assert len(campuses) >= 20
+    for name in study.routes():
+        weighted = [job for job in jobs if job[0] in ("weighting", "control") and job[1] == name]
+        assert len({seed for _, _, seed, _ in weighted}) == len(weighted) >= 20

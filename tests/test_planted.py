@@ -35,6 +35,7 @@ def estimate(name, plant, seed=0):
     small = {
         "mcl": ["estimator.n_most=600", "estimator.n_least=300"],
         "fastslam": ["estimator.n_particles=20"],
+        "fastslam_paper": ["estimator.n_particles=20"],
     }
     made = composed(f"estimator={name}", *small.get(name, [])).estimator()
     rng = np.random.default_rng(1)
@@ -56,7 +57,7 @@ def test_each_fault_changes_the_estimate_and_is_gone_afterwards(name, kind):
 
 
 def test_every_estimator_of_the_suite_has_three_kinds_of_faults():
-    names = {entry.name for entry in read_suite(suite_path("check")).estimators}
+    names = {entry.estimator for entry in read_suite(suite_path("check")).estimators}
     assert names == set(FAULTS)
     assert all(set(kinds) == {"derivative", "lost", "noise"} for kinds in FAULTS.values())
 
@@ -92,7 +93,9 @@ def test_grading_finds_the_size_of_a_rise(power, start):
 def pool(rise, n=60):
     """One estimator that draws at random and one that does not, with a fault in either."""
     rng = np.random.default_rng(0)
-    suite = Suite(0, {"g": n}, {"g": ()}, (Entry("a", "g", (4, 2)), Entry("b", "g", (1, 1))))
+    suite = Suite(
+        0, {"g": n}, {"g": ()}, (Entry("a", "a", "g", (4, 2)), Entry("b", "b", "g", (1, 1)))
+    )
     hard = np.exp(rng.standard_normal((n, 1)))
 
     def runs(k, shift=0.0, spread=0.1):

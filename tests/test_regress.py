@@ -346,6 +346,27 @@ def test_suite_of_the_check_is_sound():
     assert len({entry.name for entry in suite.estimators}) == len(suite.estimators) >= 9
     for entry in suite.estimators:
         assert entry.repeats[0] >= entry.repeats[1]
+    estimators = {entry.estimator for entry in suite.estimators}
+    assert {"ekf_icp_paper", "fastslam_paper", "fixed_lag"} <= estimators
+    by_engine = [
+        e for e in suite.estimators if "simulation.physics=bullet" in suite.overrides[e.recordings]
+    ]
+    assert len(by_engine) >= 3
+
+
+def test_an_entry_may_name_its_estimator(tmp_path):
+    """Two entries run one estimator over different recordings, each with rows of its own."""
+    group = "{count: 2, overrides: [world=empty, route=linear_4, simulation.physics=kinematic]}"
+    path = tmp_path / "mine.yaml"
+    path.write_text(
+        f"first_seed: 7\nrecordings: {{a: {group}, b: {group}}}\nestimators:\n"
+        "  odometry: {recordings: a, repeats: [1, 1]}\n"
+        "  again: {estimator: odometry, recordings: b, repeats: [1, 1], "
+        "overrides: [estimator.kr=1e-3]}\n"
+    )
+    rows = run_suite(read_suite(path), {"odometry": 1, "again": 1}, n_jobs=1)
+    assert rows.groupby("estimator").size().to_dict() == {"again": 2, "odometry": 2}
+    assert set(rows["status"]) == {"ok"}
 
 
 def test_recordings_of_the_check_turn():

@@ -185,7 +185,7 @@ def test_a_kidnapped_robot_is_found_again_with_injection_only(injection):
     rows = np.concatenate([np.arange(12), np.arange(25, 40)])
     taken = places.resequenced(recording, rows)
     lost = dataclasses.replace(prior, mean=None, covariance=None)
-    estimator = TopologicalMcl(injection=injection, sigma_l_m=2.0)
+    estimator = TopologicalMcl(injection=injection, sigma_l_m=1.0)
     found = run(estimator, taken, lost, np.random.default_rng(1))
     errors = np.hypot(*(found.means[:, :2] - taken.truth.poses[:, :2]).T)
     assert np.all(errors[8:12] < 2.5)

@@ -5,21 +5,25 @@ after five minutes; the other is through a campus with a lidar. Each estimator h
 own.
 """
 
+import collections
 import itertools
 import os
+import resource
 import statistics
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any, TypeVar
 
+from estimators.base import Belief
 from experiments.bench.measure import Measurement, time_s, timed_steps
-from experiments.runs.evaluate import one_blas_thread
+from experiments.runs.evaluate import limited_blas
 from experiments.runs.experiment import Experiment
 from experiments.runs.seeds import stream
 
+T = TypeVar("T")
 _MINUTES = 30
 _ROOMS = (
     "world=gil2008",
@@ -48,34 +52,17 @@ _IN_ROOMS = (
     "fixed_lag",
     "smoother",
 )
+_WITH_FINISH = ("fastslam", "fixed_lag", "smoother")
 _SETTLED = 6  # minutes until all rooms have been seen
 _FINISHED = (5, 10, 20, 30)  # minutes after which the whole path is solved for
-
-
-@dataclass(frozen=True)
-class Drive:
-    """What an estimator took.
-
-    Attributes
-    ----------
-    step_us, memory_mib
-        Mean processor time of a step in each minute, and memory of the process after it.
-    finish_s
-        Processor time of `finish` by the minutes driven, if there is one.
-    """
-
-    step_us: list[float]
-    memory_mib: list[float]
-    finish_s: dict[int, float]
 
 
 def run() -> Iterator[Measurement]:
     """Step and memory at the end of the drive beside those at its beginning; times of `finish`."""
     for name in (*_IN_ROOMS, *_ON_CAMPUS):
-        with ProcessPoolExecutor(1, get_context("spawn")) as pool:  # memory of this one alone
-            drive = pool.submit(_driven, name).result()
-        first, last = drive.step_us[_SETTLED : _SETTLED + 3], drive.step_us[-3:]
-        early, middle, late = (statistics.median(t) for t in (drive.step_us[1:4], first, last))
+        step_us, memory_mib = _alone(driven, name)
+        first, last = step_us[_SETTLED : _SETTLED + 3], step_us[-3:]
+        early, middle, late = (statistics.median(t) for t in (step_us[1:4], first, last))
         yield Measurement(
             f"growth.{name}.step_us",
             late,
@@ -84,32 +71,53 @@ def run() -> Iterator[Measurement]:
         )
         yield Measurement(
             f"growth.{name}.memory_mib",
-            drive.memory_mib[-1] - drive.memory_mib[_SETTLED],
+            memory_mib[-1] - memory_mib[_SETTLED],
             "MiB",
             note="at the end, beyond that after minute 7",
         )
-        for minutes, seconds in drive.finish_s.items():
-            memory = drive.memory_mib[minutes - 1]
-            yield Measurement(
-                f"growth.{name}.finish_{minutes}min_s", seconds, "s", note=f"{memory:.0f} MiB"
-            )
+    for name in _WITH_FINISH:
+        for minutes, (seconds, peak_mib) in _alone(finished, name).items():
+            note = f"peak {peak_mib:.0f} MiB"
+            yield Measurement(f"growth.{name}.finish_{minutes}min_s", seconds, "s", note=note)
 
 
-def _driven(name: str) -> Drive:
+def _alone(function: Callable[[str], T], name: str) -> T:
+    """What a function returns in a process of its own."""
+    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+        return pool.submit(function, name).result()
+
+
+def driven(name: str) -> tuple[list[float], list[float]]:
+    """Mean processor time of a step in each minute, us, and memory after it, MiB."""
+    step_us, memory_mib = [], []
+    for _, steps in _minutes(name):
+        step_us.append(1e6 * statistics.fmean(seconds for seconds, _ in steps))
+        memory_mib.append(_memory_mib())
+    return step_us, memory_mib
+
+
+def finished(name: str) -> dict[int, tuple[float, float]]:
+    """Processor time of `finish`, s, and the most memory so far, MiB, by the minutes driven."""
+    found = {}
+    for minute, (estimator, steps) in enumerate(_minutes(name), start=1):
+        collections.deque(steps, maxlen=0)
+        if minute in _FINISHED:
+            seconds = time_s(estimator.finish, clock=time.process_time)
+            peak_kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+            found[minute] = seconds, peak_kib / 1024.0
+    return found
+
+
+def _minutes(name: str) -> Iterator[tuple[Any, Iterator[tuple[float, Belief]]]]:
+    """An estimator, and what `timed_steps` gives of each minute of its drive."""
     experiment = _experiment(name)
     recording = experiment.recording()
     prior, estimator = experiment.prior(recording), experiment.estimator()
     estimator.reset(prior, stream(0, "bench"))
-    drive = Drive([], [], {})
     by_minute = itertools.groupby(recording.frames(), lambda frame: int(frame.stamp // 60.0))
-    with one_blas_thread():
-        for minute, frames in itertools.islice(by_minute, _MINUTES):
-            times_s = [seconds for seconds, _ in timed_steps(estimator, frames)]
-            drive.step_us.append(1e6 * statistics.fmean(times_s))
-            drive.memory_mib.append(_memory_mib())
-            if minute + 1 in _FINISHED and hasattr(estimator, "finish"):
-                drive.finish_s[minute + 1] = time_s(estimator.finish, clock=time.process_time)
-    return drive
+    with limited_blas():
+        for _, frames in itertools.islice(by_minute, _MINUTES):
+            yield estimator, timed_steps(estimator, frames)
 
 
 def _experiment(name: str) -> Experiment:

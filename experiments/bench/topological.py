@@ -30,7 +30,7 @@ def run() -> Iterator[Measurement]:
         prior = experiment.prior(recording)
         for n_particles, paper_s in times_s.items():
             per_node = n_particles // len(prior.map)
-            filters = {"": experiment.with_estimator(particles_per_node=per_node).estimator()}
+            filters = {"": _filter(experiment, per_node)}
             if n_particles == max(times_s):
                 filters["_odometry"] = TopologicalMcl(particles_per_node=per_node)
             for suffix, estimator in filters.items():
@@ -41,6 +41,18 @@ def run() -> Iterator[Measurement]:
                     None if suffix else _GOAL_MS,
                     note=f"{name}, 512-d; paper {1e3 * paper_s:.0f} ms",
                 )
+
+
+def node_s(experiment: Experiment, n_particles: int) -> float:
+    """Median time of a node by an experiment's filter with this many particles in all."""
+    recording = experiment.recording()
+    prior = experiment.prior(recording)
+    per_node = n_particles // len(prior.map)
+    return _median_step_s(_filter(experiment, per_node), recording, prior)
+
+
+def _filter(experiment: Experiment, per_node: int) -> Estimator:
+    return experiment.with_estimator(particles_per_node=per_node).estimator()
 
 
 def _median_step_s(estimator: Estimator, recording: Recording, prior: Prior) -> float:

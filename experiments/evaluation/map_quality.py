@@ -1,10 +1,12 @@
-"""Quality of a map of laser points: distance to the true walls, and entropy."""
+"""Quality of a map: landmarks against the true ones; laser points against the walls; entropy."""
 
 import math
+from typing import Any
 
 import numpy as np
 
 from estimators.base import Estimate
+from experiments.evaluation.metrics import alignment, rms
 from sim import se2
 from sim.arrays import Array
 from sim.recording import Recording
@@ -13,6 +15,37 @@ from sim.world import World
 
 _CHUNK = 2000
 _LEAST_SIGMA_M = 1e-3  # points on one line have no spread across it
+
+
+def landmark_errors(recording: Recording, made: Any) -> dict[str, float]:
+    """Score a map of landmarks: their number, and RMS distances from the true ones.
+
+    Each landmark is compared with the true one of the observation that started it. The second RMS
+    is after the rigid motion in the plane that fits best. Nothing for what is no map of two
+    landmarks or more, and for a recording without true landmarks.
+
+    Parameters
+    ----------
+    made
+        An estimate's `map`: `landmarks` (N, 3) m, and their `ids` (N,), or `origins` (N,), the
+        observations that started them.
+    """
+    world = recording.truth.world if recording.truth else None
+    if world is None or not isinstance(made, dict) or len(made.get("landmarks", ())) < 2:
+        return {}
+    ids = made.get("ids")
+    if ids is None:
+        seen = [r["true_ids"] for r in recording.known_truth.readings.values() if "true_ids" in r]
+        if len(seen) != 1 or "origins" not in made:
+            return {}
+        ids = seen[0][made["origins"]]
+    found, true = made["landmarks"], world.landmarks[ids]
+    fitted = np.column_stack([se2.transform(alignment(true, found), found[:, :2]), found[:, 2]])
+    return {
+        "n_landmarks": len(true),
+        "map_rmse_m": rms(np.linalg.norm(found - true, axis=1)),
+        "map_aligned_rmse_m": rms(np.linalg.norm(fitted - true, axis=1)),
+    }
 
 
 def map_points(

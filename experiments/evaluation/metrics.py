@@ -17,6 +17,7 @@ from sim.recording import Recording
 CHI2_95_2DOF = 5.991464547107979  # 95 % quantile of chi-square with two degrees of freedom
 _SINGULAR = 1e-10  # least eigenvalue of a correlation matrix that can be trusted
 RPE_DISTANCES_M = (1.0, 10.0)
+SCORED_EXTRAS = ("dispersion_m",)  # Belief extras that `score` reads, of estimators that have them
 
 
 def position_errors_m(truth: Array, means: Array) -> Array:
@@ -135,6 +136,9 @@ def score(recording: Recording, estimate: Estimate) -> dict[str, float]:
         row["step_time_us"] = float(1e6 * np.median(estimate.step_seconds))
     if estimate.cpu_seconds is not None:
         row["cpu_time_us"] = 1e6 * estimate.cpu_seconds / max(len(estimate.stamps), 1)
+    dispersions = [v for v in estimate.extras.get("dispersion_m", ()) if v is not None]
+    if dispersions:
+        row["dispersion_final_m"] = float(dispersions[-1])
     if recording.truth is None:
         return row
     truth = recording.truth_at(estimate.stamps)
@@ -149,16 +153,17 @@ def path_scores(truth: Array, means: Array, covariances: Array) -> dict[str, flo
 
     Covariances that are all zeros are unknown: their scores are left out.
     """
-    fitted = aligned(truth, means)
+    fitted, off = aligned(truth, means), position_errors_m(truth, means)
     values = nees(truth, means, covariances)
     counted = np.isfinite(values)
     row = {
         "distance_m": float(np.sum(np.hypot(*np.diff(truth[:, :2], axis=0).T))),
-        "ate_rmse_m": rms(position_errors_m(truth, means)),
+        "ate_rmse_m": rms(off),
+        "ate_mean_m": float(np.mean(off)),
         "ate_aligned_rmse_m": rms(position_errors_m(truth, fitted)),
         "heading_rmse_rad": rms(heading_errors_rad(truth, means)),
         "heading_aligned_rmse_rad": rms(heading_errors_rad(truth, fitted)),
-        "final_position_error_m": float(position_errors_m(truth[-1:], means[-1:])[0]),
+        "final_position_error_m": float(off[-1]),
         "final_heading_error_rad": float(abs(heading_errors_rad(truth[-1:], means[-1:])[0])),
     }
     if covariances.any():

@@ -13,11 +13,11 @@ from estimators import icp_covariance
 from estimators.icp import Metric, PreparedScan, Registration, prepare, register
 from experiments.evaluation.scan_bound import cast, fisher_bound
 from sim import se2
-from sim.arrays import Array
+from sim.arrays import Array, Ints
 from sim.sensors import Laser
 from sim.world import World
 
-METRICS: tuple[Metric, ...] = ("point_to_line", "point_to_point")
+METRICS: tuple[Metric, ...] = ("point_to_plane", "point_to_line", "point_to_point")
 _GUESS_SIGMA = np.array([0.01, 0.01, math.radians(0.5)])
 
 
@@ -51,7 +51,7 @@ def scenes(
 def measured(
     scene: ScanScene, laser: Laser, rng: np.random.Generator, n_repeats: int, n_sampled: int
 ) -> pd.DataFrame:
-    """Rows (metric x method): NEES over dof, determinants, errors, times.
+    """Rows (metric x method): NEES over dof, determinants, errors, bias along the motion, times.
 
     Parameters
     ----------
@@ -91,6 +91,7 @@ def measured(
         nees, sizes, took_s = np.array(values).T
         off, registered_s = np.split(np.array(matches[metric]), [3], axis=1)
         actual = float(np.linalg.det(np.cov(off.T))) ** (1.0 / 6.0)
+        bias = off[:, :2].mean(axis=0) @ truth[:2] / float(truth[:2] @ truth[:2])
         rows.append(
             {
                 "place": scene.place,
@@ -102,6 +103,7 @@ def measured(
                 "registration_us": 1e6 * float(np.median(registered_s)),
                 "error_m": float(np.median(np.hypot(off[:, 0], off[:, 1]))),
                 "error_rad": float(np.median(np.abs(off[:, 2]))),
+                "bias_of_motion": float(bias),
                 "bound_m": math.sqrt(bound[0, 0] + bound[1, 1]),
                 "bound_rad": math.sqrt(bound[2, 2]),
                 "used_share": len(nees) / (n_sampled if name == "sampling" else n_repeats),
@@ -131,18 +133,30 @@ def _methods(sigma: float, rng: np.random.Generator) -> dict[str, Method]:
 def hessian_of_points(found: Registration, source: PreparedScan, target: PreparedScan) -> Array:
     """Covariance (3, 3) from the Hessian, with the residual variance of points against points.
 
-    A point's residual is its distance, along the normal of the line that it was matched with, from
-    the measured point that lies beside it on that line. Residuals against the fitted line miss the
-    target's noise. Point to point they are the registration's own.
+    A point's residual is its distance, along the normal of the line or plane that it was matched
+    with, from the measured point that lies beside it. Residuals against what is fitted to many
+    points miss the target's noise. Point to point they are the registration's own.
     """
     covariance = icp_covariance.hessian(found)
     kept = np.flatnonzero((found.weights > 0.0) & (found.matches >= 0))
     if found.metric == "point_to_point" or len(kept) == 0:
         return covariance
-    moved = se2.transform(found.T_target_source, source.points[kept])
-    residuals = np.full(len(kept), np.nan)
-    for line in np.unique(found.matches[kept]):
-        of_line = found.matches[kept] == line
+    moved, matches = se2.transform(found.T_target_source, source.points[kept]), found.matches[kept]
+    if found.planes is not None:
+        off = moved - target.points[matches]
+        residuals = np.sum(off * found.planes.normals[matches], axis=1)
+    else:
+        residuals = _off_points_of_lines(moved, matches, target)
+    known = np.isfinite(residuals)
+    weights, own = found.weights[kept][known], found.residuals_m[kept][known]
+    return covariance * float(weights @ residuals[known] ** 2) / float(weights @ own**2)
+
+
+def _off_points_of_lines(moved: Array, lines: Ints, target: PreparedScan) -> Array:
+    """Distances (K,) along the normals of the lines from the points beside; NaN without any."""
+    residuals = np.full(len(moved), np.nan)
+    for line in np.unique(lines):
+        of_line = lines == line
         seen = target.points[target.line_of_point == line]
         if len(seen) == 0:
             continue
@@ -150,9 +164,7 @@ def hessian_of_points(found: Registration, source: PreparedScan, target: Prepare
         tangent = np.array([-normal[1], normal[0]])
         _, beside = KDTree(seen @ tangent[:, None]).query(moved[of_line] @ tangent[:, None])
         residuals[of_line] = (moved[of_line] - seen[beside]) @ normal
-    known = np.isfinite(residuals)
-    weights, own = found.weights[kept][known], found.residuals_m[kept][known]
-    return covariance * float(weights @ residuals[known] ** 2) / float(weights @ own**2)
+    return residuals
 
 
 def _nees_share(error: Array, covariance: Array, found: Registration) -> float:

@@ -218,7 +218,7 @@ def inflated_camera(sound: Any, share: float, *arguments: Any, **keywords: Any) 
     return dataclasses.replace(model, variances_px2=(1.0 + share) * model.variances_px2)
 
 
-# Each fault with the size from which the search for its grade starts.
+# Each fault, by option of conf/estimator, with the size from which the search for its grade starts.
 FAULTS: dict[str, dict[str, tuple[Fault, float]]] = {
     "odometry": {
         "derivative": (wrong_track, 0.02),
@@ -252,6 +252,16 @@ FAULTS: dict[str, dict[str, tuple[Fault, float]]] = {
     },
     "fastslam": {
         "derivative": (wrong_wheels, 0.5),
+        "lost": (lost_landmarks, 0.2),
+        "noise": (inflated_camera, 2.0),
+    },
+    "fastslam_paper": {
+        "derivative": (wrong_wheels, 0.5),
+        "lost": (lost_landmarks, 0.2),
+        "noise": (inflated_camera, 2.0),
+    },
+    "fixed_lag": {
+        "derivative": (wrong_wheels, 1.0),
         "lost": (lost_landmarks, 0.2),
         "noise": (inflated_camera, 2.0),
     },

@@ -186,10 +186,14 @@ def fill_pool(
 
     n_runs = {entry.name: _RANDOM if entry.name in random else 1 for entry in suite.estimators}
     sound = arrays(runs_of("sound", lambda: run_suite(pooled, n_runs, reseed=1)))
-    kinds = [(name, kind) for name in n_runs for kind in FAULTS.get(name, {})]
+    kinds = [
+        (entry.name, kind, *fault)
+        for entry in suite.estimators
+        for kind, fault in FAULTS.get(entry.estimator, {}).items()
+    ]
     faulty = {}
-    for done, (name, kind) in enumerate(kinds, start=1):
-        rows = runs_of(f"{name}_{kind}", partial(graded, name, *FAULTS[name][kind]))
+    for done, (name, kind, fault, start) in enumerate(kinds, start=1):
+        rows = runs_of(f"{name}_{kind}", partial(graded, name, fault, start))
         of_error = {error: by_repeat(rows, error) for error in ERRORS}
         faulty[name, kind] = float(rows["size"].iloc[0]), of_error
         on_progress(done / len(kinds))

@@ -43,6 +43,8 @@ class Entry:
     Attributes
     ----------
     name
+        What its rows and its streams are called.
+    estimator
         Option of conf/estimator.
     recordings
         Name of the group of recordings that it reads.
@@ -55,6 +57,7 @@ class Entry:
     """
 
     name: str
+    estimator: str
     recordings: str
     repeats: tuple[int, int]
     overrides: tuple[str, ...] = ()
@@ -117,7 +120,8 @@ def read_suite(path: Path) -> Suite:
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise InputError(
             f"{path}: a suite holds first_seed, recordings (count, overrides) and estimators "
-            f"(recordings, repeats, overrides), as conf/suite/check.yaml does ({error!r})"
+            "(estimator, recordings, repeats, overrides, revised), as conf/suite/check.yaml does "
+            f"({error!r})"
         ) from error
     checks = [
         (
@@ -163,13 +167,15 @@ def _overrides(given: Any) -> tuple[str, ...]:
 
 def _entry(name: Any, given: dict[str, Any]) -> Entry:
     baseline, check = given["repeats"]
-    unknown = set(given) - {"recordings", "repeats", "overrides", "revised"}
+    unknown = set(given) - {"estimator", "recordings", "repeats", "overrides", "revised"}
     if unknown:
         raise KeyError(f"{name}.{sorted(map(str, unknown))[0]}")
     revised, group = given.get("revised", False), given["recordings"]
-    if not (isinstance(name, str) and isinstance(group, str) and isinstance(revised, bool)):
-        raise TypeError(f"{name}: name and recordings must be texts, revised true or false")
-    return Entry(name, group, (baseline, check), _overrides(given.get("overrides") or []), revised)
+    option = given.get("estimator", name)
+    if not (all(isinstance(t, str) for t in (name, option, group)) and isinstance(revised, bool)):
+        raise TypeError(f"{name}: names and recordings must be texts, revised true or false")
+    overrides = _overrides(given.get("overrides") or [])
+    return Entry(name, option, group, (baseline, check), overrides, revised)
 
 
 def suite_path(name: str) -> Path:
@@ -247,7 +253,7 @@ def command_of(suite: Suite, estimator: str, recording: int) -> str:
     (entry,) = suite.of([estimator]).estimators
     overrides = [
         *suite.overrides[entry.recordings],
-        f"estimator={entry.name}",
+        f"estimator={entry.estimator}",
         *entry.overrides,
         f"seed={recording}",
         f"world_seed={recording}",
@@ -257,7 +263,11 @@ def command_of(suite: Suite, estimator: str, recording: int) -> str:
 
 def _experiment(suite: Suite, entry: Entry, repeats: Mapping[str, int]) -> Experiment:
     """An estimator over its recordings, whatever their seed."""
-    overrides = [*suite.overrides[entry.recordings], f"estimator={entry.name}", *entry.overrides]
+    overrides = [
+        *suite.overrides[entry.recordings],
+        f"estimator={entry.estimator}",
+        *entry.overrides,
+    ]
     return Experiment.compose(overrides).replaced(repeats=repeats[entry.name])
 
 

@@ -55,6 +55,10 @@ class Results:
             raise InputError(f"{short(path)}: damaged (no rows); {self._remedy}")
         return table
 
+    def has_table(self, name: str) -> bool:
+        """Whether the study left this table: some need data that is not part of the project."""
+        return self._path("tables", f"{name}.csv").exists()
+
     def write_arrays(self, name: str, **arrays: NDArray[np.generic]) -> None:
         """Write named arrays to one file, compressed."""
         with write_whole(self._path("arrays", f"{name}.npz")) as part, part.open("wb") as file:

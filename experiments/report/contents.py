@@ -24,6 +24,7 @@ OWN = {
     "leaderboard": ["estima run -m study=leaderboard"],
     "all_estimators": ["estima run -m study=all_estimators"],
     "mcl_office": ["estima reproduce --paper mcl_office --full"],
+    "fastslam_consistency": ["estima reproduce --paper fastslam_consistency --full"],
 }
 SMALL_ROWS, SMALL_COLUMNS = 60, 20  # a table up to here is shown whole
 FIRST_ROWS = 5  # of a larger one

@@ -12,7 +12,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from experiments.evaluation.statistics import mean_interval
-from experiments.runs.columns import ANSWER, COLUMNS, PATH, title
+from experiments.runs.columns import ANSWER, COLUMNS, PATH, REPEAT, title
 from experiments.sweeps.collect import measured, telling, with_answers
 from experiments.viewing.style import CYCLE, subplots
 from sim.errors import InputError
@@ -32,8 +32,9 @@ def sweep_figure(
     A y such as `answer_ate_rmse_m` is that of the best answer, the revised path where there is one;
     what gives revised paths is marked so.
 
-    Repeats over one recording are averaged first: the recording is the unit of inference. On a
-    logarithmic axis means and intervals are those of the logarithm.
+    Repeats over one recording are averaged first: the recording is the unit of inference. Where no
+    point has more than one recording, the intervals are over its repeats. On a logarithmic axis
+    means and intervals are those of the logarithm.
 
     Parameters
     ----------
@@ -65,6 +66,9 @@ def sweep_figure(
                 f"a point would pool different values of {column} ({there}); draw a line for each "
                 f"with --by {column}, keep one with --where {column}=..., or average with --pool"
             )
+    one_each = points["recording_checksum"].nunique().max() == 1
+    repeated = one_each and REPEAT in table and table[REPEAT].nunique() > 1
+    unit = REPEAT if repeated else "recording_checksum"
     page, ax = subplots(6.5, 4.0)
     scale = COLUMNS[y].scale if y in COLUMNS else "log"
     logarithmic = scale == "log" and _spans(table[y], _WIDE_Y)
@@ -73,7 +77,7 @@ def sweep_figure(
     wide = numeric and _spans(table[x], _WIDE_X)
     groups = [("", table)] if by is None else list(table.groupby(by))
     for i, (label, rows) in enumerate(groups):
-        recordings = rows.groupby([x, "recording_checksum"])[y].mean().dropna().groupby(level=0)
+        recordings = rows.groupby([x, unit])[y].mean().dropna().groupby(level=0)
         points = {name: _interval(values, logarithmic) for name, values in recordings}
         value, low, high = np.array(list(points.values())).reshape(-1, 3).T
         at = np.array([name if numeric else names.index(name) for name in points], float)
@@ -97,7 +101,8 @@ def sweep_figure(
     if not numeric:
         ax.set_xticks(range(len(names)), [str(n) for n in names], rotation=20, ha="right")
     pooled = [c for c in telling(table) if c not in (x, by, "seed", "world_seed")]
-    over = ", ".join(["recordings", *(c.removeprefix("choice.") for c in pooled)])
+    over = "repeats" if repeated else "recordings"
+    over = ", ".join([over, *(c.removeprefix("choice.") for c in pooled)])
     kind = "geometric mean" if logarithmic else "mean"
     ax.set_title(textwrap.fill(f"{kind} over {over}; 95 % intervals", 62), fontsize="small")
     if by is not None:

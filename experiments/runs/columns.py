@@ -40,10 +40,12 @@ OF_THE_RUN = {
     "stamps_scored": Column("stamps scored", "scored", "", "linear", None),
     "stamps_left_out": Column("stamps without a true pose", "left out", "", "linear"),
     "longest_gap_s": Column("longest time without a pose", "gap", "s", "linear"),
+    "dispersion_final_m": Column("final dispersion of the particles", "dispersion", "m"),
 }
 _OF_THE_PATH = {
     "step_time_us": Column("time per step", "step", "us"),
     "ate_rmse_m": Column("position RMSE", "ATE", "m"),
+    "ate_mean_m": Column("mean position error", "mean error", "m"),
     "ate_aligned_rmse_m": Column("position RMSE after alignment", "ATE aligned", "m"),
     "heading_rmse_rad": Column("heading RMSE", "heading", "rad"),
     "heading_aligned_rmse_rad": Column("heading RMSE after alignment", "heading aligned", "rad"),
@@ -60,6 +62,11 @@ _OF_THE_PATH = {
     "rpe_1m_heading_rmse_rad": Column("heading RMSE over 1 m", "RPE heading 1 m", "rad"),
     "rpe_10m_rmse_m": Column("position RMSE over 10 m", "RPE 10 m", "m"),
     "rpe_10m_heading_rmse_rad": Column("heading RMSE over 10 m", "RPE heading 10 m", "rad"),
+}
+_OF_THE_MAP = {
+    "n_landmarks": Column("landmarks in the map", "N", "", "linear", None),
+    "map_rmse_m": Column("RMSE of the map's landmarks", "map", "m"),
+    "map_aligned_rmse_m": Column("RMSE of the map's landmarks after alignment", "map aligned", "m"),
 }
 
 
@@ -80,6 +87,7 @@ PATH = "answer"  # which path the answer is: online or revised
 COLUMNS = {
     **OF_THE_RUN,
     **_OF_THE_PATH,
+    **_OF_THE_MAP,
     **_of(REVISED, ", revised path", " revised"),
     **_of(ANSWER, ", best answer", " best"),
 }

@@ -11,7 +11,8 @@ import numpy as np
 from threadpoolctl import ThreadpoolController
 
 from estimators.base import Estimate, Estimator, Prior, run
-from experiments.evaluation.metrics import score
+from experiments.evaluation.map_quality import landmark_errors
+from experiments.evaluation.metrics import SCORED_EXTRAS, score
 from experiments.runs.columns import OF_THE_RUN
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome, Row, Status
@@ -79,9 +80,8 @@ def evaluate(
                 planted(estimator, repeat) if planted else nullcontext(),
                 shown(recording) if shown else nullcontext() as on_step,
             ):
-                online, revised = estimates(
-                    estimator, recording, prior, rng, experiment.keep, on_step
-                )
+                keep = (*SCORED_EXTRAS, *experiment.keep)
+                online, revised = estimates(estimator, recording, prior, rng, keep, on_step)
             status = status_of(recording, online)
             scores = scored(recording, online, revised)
         except InputError:
@@ -115,10 +115,11 @@ def estimates(
         online = run(estimator, recording, prior, rng, keep, on_step)
         finish = getattr(estimator, "finish", None)
         revised: Estimate | None = None if finish is None else finish()
-        spent = time.process_time() - begun + getattr(estimator, "program_seconds", 0.0)
+        own_s = time.process_time() - begun
+        spent_s = getattr(estimator, "program_seconds", own_s)  # without the transport to it
     if revised is not None and revised.kind == "online":
         online, revised = revised, None
-    return dataclasses.replace(online, cpu_seconds=spent), revised
+    return dataclasses.replace(online, cpu_seconds=spent_s), revised
 
 
 def limited_blas() -> AbstractContextManager[object]:
@@ -144,7 +145,8 @@ def _blas() -> ThreadpoolController:
 
 def scored(recording: Recording, online: Estimate, revised: Estimate | None) -> Row:
     """Scores of a run as columns; those of the revised path begin with `revised_`."""
-    scores: Row = {**score(recording, online)}
+    made = online.map if revised is None else revised.map
+    scores: Row = {**score(recording, online), **landmark_errors(recording, made)}
     if revised is not None:
         found = score(recording, revised)
         scores |= {f"revised_{k}": found[k] for k in found if k not in OF_THE_RUN}

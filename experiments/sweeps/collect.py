@@ -20,10 +20,12 @@ _TIMES = ["step_time_us", "cpu_time_us"]  # they differ from run to run
 _DRAWN = ["seed", "world_seed"]  # what `summary` averages over
 _MAIN = (
     "answer_ate_rmse_m",
+    "answer_ate_mean_m",
     "answer_ate_aligned_rmse_m",
     "answer_heading_rmse_rad",
     "answer_heading_aligned_rmse_rad",
     "answer_nees_mean",
+    "dispersion_final_m",
     "step_time_us",
     "cpu_time_us",
 )

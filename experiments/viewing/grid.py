@@ -14,6 +14,7 @@ from experiments.viewing.style import figure
 from sim.grid import OccupancyGrid
 
 _OCCUPIED, _FREE, _UNKNOWN = 0, 255, 222  # greys
+UNKNOWN = 3 * (_UNKNOWN / 255,)  # of the axes, off the grid
 
 
 def draw_grid(ax: Axes, grid: OccupancyGrid, **style: Any) -> None:
@@ -42,8 +43,7 @@ def grid_figure(grid: OccupancyGrid, title: str) -> Figure:
     page = figure(9.0, float(np.clip(8.3 * height_m / width_m, 2.0, 8.3)) + 0.9)
     ax = page.subplots()
     draw_grid(ax, grid)
-    grey = 3 * (_UNKNOWN / 255,)  # off the grid, too
-    ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), facecolor=grey)
+    ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), facecolor=UNKNOWN)
     ax.set_title(f"{title}: {described(grid)}", loc="left", fontsize="medium")
     return page
 

@@ -1,7 +1,7 @@
 """Rawseeds CSV: odometry, SICK scans, ground truth, and trajectories in the toolkit's layout.
 
 ODOMETRY_XYT   stamp, rolling counter, ticks right, ticks left, x, y, theta
-SICK_*         stamp, number of ranges, angular offset (1/4 degree), r1 .. r181
+SICK_*         stamp, number of ranges, angular offset (1/4 degree), r1 .. rN
 GROUNDTRUTH    stamp, x, y, theta, and the 3 x 3 covariance row by row
 trajectories   stamp, x, y, theta
 """
@@ -13,17 +13,18 @@ from pathlib import Path
 import numpy as np
 
 from sim.arrays import Array
+from sim.errors import require
 from sim.formats import assemble
 from sim.formats.carmen import scan_recording, seen_ranges
 from sim.formats.text import Words, read_words
-from sim.recording import Recording, Truth
+from sim.recording import Recording, Truth, WheelLog
 from sim.sensors import Laser, Mount
 
 TRACK_M, WHEEL_RADIUS_M = 0.48, 0.095  # of the Robocom the sets were recorded with, nominal
 FRONT_SICK = Mount(0.08, 0.0, 0.45)
 REAR_SICK = Mount(-0.463, 0.001, 0.454, math.pi)
 _MAX_RANGE_M = 80.0
-_MOST_BEAMS = 181
+_MOST_BEAMS = 3601
 
 
 @dataclass(frozen=True)
@@ -56,15 +57,22 @@ def parse_trajectory(words: Words) -> Trajectory:
 
 def parse_odometry(words: Words) -> tuple[Array, Array]:
     """Stamps (N,) s and poses (N, 3) of ODOMETRY_XYT, as they stand."""
+    stamps, _, poses = _odometry(words)
+    return stamps, poses
+
+
+def _odometry(words: Words) -> tuple[Array, Array, Array]:
+    """Stamps (N,) s, ticks (N, 2) of the right and left wheel, poses (N, 3), as they stand."""
     table = words.table(7, "Rawseeds odometry")
-    return table[:, 0].copy(), table[:, 4:].copy()
+    return table[:, 0].copy(), table[:, 2:4].copy(), table[:, 4:].copy()
 
 
-def parse_sick(words: Words) -> tuple[Array, Array, float, float]:
+def parse_sick(words: Words, resolution_deg: float = 1.0) -> tuple[Array, Array, float, float]:
     """Stamps (N,), ranges (N, n) m, start angle and step (rad) of a SICK file.
 
-    The offset counts quarter degrees from -90 on; steps are one degree.
+    The offset counts quarter degrees from -90 on; steps are of the resolution.
     """
+    step = math.radians(resolution_deg)
     lines = words.lines
     head = words.finite(lines, 0, 3, "stamp, count and offset")
     counts = words.whole(lines, 1, "the number of ranges", 1, _MOST_BEAMS)
@@ -73,9 +81,13 @@ def parse_sick(words: Words) -> tuple[Array, Array, float, float]:
     words.refuse(different, lines, "a scan of another size or offset than the first")
     if not 0.0 <= head[0, 2] < 4.0:
         raise words.error(0, "the angular offset must be 0 to 3 quarter degrees")
+    if not 0.0 < step * counts[0] <= 2.0 * math.pi + 1e-9:
+        raise words.error(
+            0, f"{counts[0]} ranges every {resolution_deg:g} degrees; state another resolution_deg"
+        )
     ranges = words.numbers(lines, 3, int(counts[0]), "ranges")
     start = -math.pi / 2.0 + math.radians(head[0, 2] / 4.0)
-    return head[:, 0].copy(), ranges, start, math.radians(1.0)
+    return head[:, 0].copy(), ranges, start, step
 
 
 def read_rawseeds(
@@ -86,6 +98,8 @@ def read_rawseeds(
     mount: Mount = FRONT_SICK,
     track_m: float = TRACK_M,
     wheel_radius_m: float = WHEEL_RADIUS_M,
+    resolution_deg: float = 1.0,
+    m_per_tick: float | None = None,
 ) -> Recording:
     """A Recording of odometry, one SICK scanner and, if there is one, a ground truth.
 
@@ -93,13 +107,25 @@ def read_rawseeds(
     ----------
     mount
         Where the scanner sits: `FRONT_SICK` or `REAR_SICK`.
+    resolution_deg
+        Angle between beams.
+    m_per_tick
+        Travel of a wheel per tick, where a line has the ticks since the one before; None to take
+        the wheels from the logged poses.
     """
     notes: assemble.Notes = {}
-    stamps, poses = parse_odometry(read_words(odometry))
+    stamps, ticks, poses = _odometry(read_words(odometry))
     rows = assemble.in_order(stamps, "odometry", notes)
     assemble.require_readings(len(rows), 2, str(odometry), "odometry readings")
-    wheels = assemble.wheels_from_poses(stamps[rows], poses[rows], track_m, notes)
-    times, ranges, start, step = parse_sick(read_words(scans))
+    if m_per_tick is None:
+        wheels = assemble.wheels_from_poses(stamps[rows], poses[rows], track_m, notes)
+    else:
+        require(
+            math.isfinite(m_per_tick) and m_per_tick != 0.0,
+            f"m_per_tick must be a number other than zero, got {m_per_tick}",
+        )
+        wheels = WheelLog(stamps[rows], m_per_tick * np.cumsum(ticks, axis=0)[rows])
+    times, ranges, start, step = parse_sick(read_words(scans), resolution_deg)
     rows = assemble.in_order(times, "scans", notes)
     times, ranges = times[rows], ranges[rows]
     fov = max(step * (ranges.shape[1] - 1), 1e-9)

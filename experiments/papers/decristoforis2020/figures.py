@@ -1,5 +1,6 @@
 """The figures of decristoforis2020, and those that our studies add."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from experiments.evaluation.statistics import log_ratio_interval
 from experiments.papers.decristoforis2020.claims import judged_runs, nees_intervals
 from experiments.papers.decristoforis2020.settings import CONSISTENT, PAPERS_OWN, PLACES
 from experiments.papers.results import Results
-from experiments.viewing.plotting import draw_ellipses, plain_ticks, with_legend
+from experiments.viewing.plotting import draw_ellipses, plain_ticks, plan_axes, with_legend
 from experiments.viewing.style import (
     BLUE,
     GREEN,
@@ -37,7 +38,7 @@ COLORS = {
     "odometry": ODOMETRY,
     "icp": GREEN,
     "fusion": BLUE,
-    "icp_keyframe": SKY,
+    "icp_guess": SKY,
     "fusion_clone": PURPLE,
 }
 NAMES = {
@@ -45,28 +46,33 @@ NAMES = {
     "odometry": "odometry",
     "icp": "ICP",
     "fusion": "fusion",
-    "icp_keyframe": "ICP, key frames",
-    "fusion_clone": "fusion, clone",
+    "icp_guess": "ICP from wheels",
+    "fusion_clone": "our fusion",
 }
 _DEG = float(np.degrees(1.0))
-_METHODS = ("censi", "censi_sliding", "censi_last", "hessian", "unscented_censi", "sampling")
+_METHODS = (
+    "censi_last", "hessian_points", "sampling", "censi", "censi_sliding", "hessian",
+    "unscented_censi",
+)  # fmt: skip
 
 
 def draw(made: Results) -> dict[str, Figure]:
     """Draw all figures, by file name."""
-    office, table = made.arrays("office"), made.table("runs")
+    office, table, drawn = made.arrays("office"), made.table("runs"), made.table("drawn")
     pages = {
         "1_route": route(office),
-        "2_ellipses": ellipses(made.arrays("corridor"), made.table("ellipse_path")),
-        "3_trajectories": trajectories(office, table),
+        "2_ellipses": ellipses(office, made.table("areas"), made.table("ellipse_path")),
+        "3_trajectories": trajectories(office, drawn),
         "4_errors": boxes(made.table("boxes")),
-        "5_maps": maps(office, table),
+        "5_maps": maps(office, drawn),
         "runs": runs(table),
         "covariances": covariances(made.table("covariances")),
         "beliefs": beliefs(made.table("beliefs")),
         "ordering": ordering(made.table("ordering")),
         "steps": steps(made.table("steps")),
     }
+    if made.has_arrays("log"):  # which is written where the log is
+        pages["log"] = real_log(made.arrays("log"), made.table("log_boxes"))
     return {f"{made.paper}_{name}": page for name, page in pages.items()}
 
 
@@ -76,8 +82,8 @@ def route(office: Arrays) -> Figure:
     draw_walls(ax, office["walls"], office["wall_z_m"])
     ax.plot(*office["truth"].T, color=BLUE, lw=1.2, label="route")
     ax.plot(*office["truth"][0], "o", color=BLUE, ms=5, label="start")
-    for name, area, color in (("A", "corner", RED), ("B", "corridor", GREEN)):
-        x1, y1, x2, y2 = office[area]
+    for name, color in (("A", RED), ("B", GREEN)):
+        x1, y1, x2, y2 = office[f"area_{name}"]
         ax.add_patch(Rectangle((x1, y1), x2 - x1, y2 - y1, color=color, alpha=0.3, lw=0))
         ax.annotate(
             name, (x1 if x1 < 1.0 else x2, (y1 + y2) / 2), (-12.0 if x1 < 1.0 else 12.0, 0.0),
@@ -87,62 +93,60 @@ def route(office: Arrays) -> Figure:
     return with_legend(page, ncols=2, loc="outside upper center")
 
 
-def ellipses(corridor: Arrays, path: pd.DataFrame) -> Figure:
-    """Figure 2: 95 % ellipses of registration from scan to scan, enlarged, and their axes."""
-    page = figure(9.0, 5.8)
-    top, bottom = page.subfigures(2, 1, height_ratios=(1.9, 1.0))  # type: ignore[misc]
-    left, right = top.subplots(1, 2, width_ratios=(1.0, 1.25))
-    scale = 0.6 / (2.45 * path["long_m"].quantile(0.9))
-    title = f"A: a curve (ellipses {scale:.0f} times their size)"
-    _enlarged_ellipses(left, corridor, path, "curve", scale, 0.75, title)
+def ellipses(office: Arrays, areas: pd.DataFrame, path: pd.DataFrame) -> Figure:
+    """Figure 2: 95 % ellipses of registration, enlarged, in figure 1's areas; their axes.
+
+    The axes are those along a corridor of the judged ones, with bare legs, objects and bends.
+    """
+    page = figure(9.0, 6.6)
+    top, bottom = page.subfigures(2, 1, height_ratios=(1.5, 1.0))  # type: ignore[misc]
+    scale = 0.6 / (2.45 * areas["long_m"].quantile(0.9))
+    for ax, name, what in zip(
+        top.subplots(1, 2), "AB", ("a curve", "a corridor with objects"), strict=True
+    ):
+        rows = areas[areas["area"] == name]
+        _enlarged_ellipses(ax, office, rows, scale, f"{name}: {what} (ellipses times {scale:.0f})")
+    ax = bottom.subplots()
     for name, color in (("long", BLUE), ("short", ORANGE)):
         sigma_mm = 1e3 * path[f"{name}_m"]
-        right.semilogy(path["distance_m"], sigma_mm, color=color, lw=1.0, label=f"{name} axis")
-    low, high = right.get_ylim()
-    for place, color, name, raised in (
-        ("corridor_bare", ORANGE, "bare", 2.2),
-        ("corridor_objects", GREEN, "objects", 2.2),
-        ("corner", RED, "corner", 1.2),
-        ("curve", SKY, "curve", 2.2),
+        ax.semilogy(path["distance_m"], sigma_mm, color=color, lw=1.0, label=f"{name} axis")
+    low, high = ax.get_ylim()
+    for place, color, name in (
+        ("corridor_bare", ORANGE, "bare"),
+        ("corridor_objects", GREEN, "objects"),
+        ("leg_1", ORANGE, "bare"),
+        ("corner", RED, "corner"),
+        ("leg_2", ORANGE, "bare"),
+        ("curve", SKY, "curve"),
+        ("leg_3", ORANGE, "bare"),
     ):
         inside = path.loc[path["place"] == place, "distance_m"]
         ends = inside.min(), inside.max()
-        right.axvspan(*ends, color=color, alpha=0.12, lw=0)
-        right.text(sum(ends) / 2, raised * high, name, ha="center", va="top", size=8)
-    right.set(
-        xlabel="distance, m", ylabel="standard deviation of a step, mm", ylim=(low, 2.5 * high)
-    )
-    right.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
-    title = f"B: a corridor, bare and with objects ({scale:.0f} times)"
-    _enlarged_ellipses(bottom.subplots(), corridor, path, "corridor", scale, 1.0, title)
+        ax.axvspan(*ends, color=color, alpha=0.12, lw=0)
+        ax.text(sum(ends) / 2, 2.2 * high, name, ha="center", va="top", size=8)
+    ax.set(xlabel="distance, m", ylabel="standard deviation\nof a step, mm", ylim=(low, 2.5 * high))
+    ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
     return page
 
 
 def _enlarged_ellipses(
-    ax: Axes,
-    corridor: Arrays,
-    path: pd.DataFrame,
-    place: str,
-    scale: float,
-    spacing_m: float,
-    title: str,
+    ax: Axes, office: Arrays, rows: pd.DataFrame, scale: float, title: str
 ) -> None:
-    """Draw enlarged ellipses, one every `spacing_m`, where the place's name begins with `place`."""
-    rows = path[path["place"].str.startswith(place, na=False)]
-    draw_walls(ax, corridor["walls"], corridor["wall_z_m"])
-    ax.plot(path["x_m"], path["y_m"], color=TRUTH, lw=0.6)
+    """Draw enlarged ellipses of one area, one every 0.75 m along the path."""
+    draw_walls(ax, office["walls"], office["wall_z_m"])
+    ax.plot(rows["x_m"], rows["y_m"], color=TRUTH, lw=0.6)
     along = rows["distance_m"].to_numpy()
-    drawn = rows.iloc[np.searchsorted(along, np.arange(along[0], along[-1], spacing_m))]
+    drawn = rows.iloc[np.searchsorted(along, np.arange(along[0], along[-1], 0.75))]
     squares_m2 = drawn[["xx_m2", "xy_m2", "xy_m2", "yy_m2"]].to_numpy().reshape(-1, 2, 2)
     draw_ellipses(ax, drawn[["x_m", "y_m"]], scale**2 * squares_m2, fill=False, color=BLUE, lw=0.9)
     ax.set(
-        xlim=(rows["x_m"].min() - 2.0, rows["x_m"].max() + 2.0),
-        ylim=(rows["y_m"].min() - 2.0, rows["y_m"].max() + 2.0),
+        xlim=(rows["x_m"].min() - 1.5, rows["x_m"].max() + 1.5),
+        ylim=(rows["y_m"].min() - 1.5, rows["y_m"].max() + 1.5),
     )
     ax.set_title(title, fontsize="medium")
 
 
-def trajectories(office: Arrays, table: pd.DataFrame) -> Figure:
+def trajectories(office: Arrays, drawn: pd.DataFrame) -> Figure:
     """Figure 3: trajectories of the three methods and the truth; errors against time below."""
     page = figure(9.0, 8.4)
     top, bottom = page.subfigures(2, 1, height_ratios=(2.2, 1.0))  # type: ignore[misc]
@@ -154,26 +158,29 @@ def trajectories(office: Arrays, table: pd.DataFrame) -> Figure:
         ax.plot(*office[method].T, style, color=COLORS[method], lw=1.2, label=NAMES[method])
         off = np.hypot(*(office[method] - office["truth"]).T)
         below.semilogy(office["stamp_s"], np.maximum(off, 1e-4), color=COLORS[method], lw=1.0)
-    ax.set_title(_of_all(table, "ate_rmse_m", "position RMSE, m"), size=9)
+    ax.set_title(_of_drawn(drawn, "ate_rmse_m", "position RMSE, m"), size=9)
     top.legend(*ax.get_legend_handles_labels(), loc="outside upper center", ncols=4)
     below.set(xlabel="time, s", ylabel="position error, m")
     return page
 
 
-def _of_all(table: pd.DataFrame, column: str, words: str) -> str:
-    """Each method's value for the recording drawn, and the median of all recordings."""
-    wide = judged_runs(table).pivot(index="seed", columns="method", values=column)
-    drawn = wide.index.min()  # the only one whose paths and points are stored
-    parts = ", ".join(
-        f"{NAMES[method]} {wide.loc[drawn, method]:.2f} ({wide[method].median():.2f})"
-        for method in PAPERS_OWN
-    )
-    return f"seed {drawn}: {words} (median of {len(wide)} recordings): {parts}"
+def _of_drawn(drawn: pd.DataFrame, column: str, words: str) -> str:
+    """Each method's value for the long drive that is drawn."""
+    values = drawn.set_index("method")[column]
+    parts = ", ".join(f"{NAMES[method]} {values[method]:.2f}" for method in PAPERS_OWN)
+    return f"seed {drawn['seed'].iloc[0]}, {drawn['distance_m'].iloc[0]:.0f} m: {words}: {parts}"
 
 
 def boxes(table: pd.DataFrame) -> Figure:
     """Figure 4: absolute errors of position and heading over all recordings."""
     page, axes = subplots(8.0, 3.8, 1, 2)
+    _boxes(axes, table)
+    page.suptitle("all recordings; box: quartiles, whiskers: 1.5 times their distance", size=9)
+    return page
+
+
+def _boxes(axes: Sequence[Axes], table: pd.DataFrame) -> None:
+    """Box plots of both errors by method."""
     panels = (("position_m", "position error, m", 1.0), ("heading_rad", "heading error, deg", _DEG))
     for ax, (name, label, unit) in zip(axes, panels, strict=True):
         rows = table[table["error"] == name].set_index("method")
@@ -186,11 +193,27 @@ def boxes(table: pd.DataFrame) -> Figure:
         for patch, method in zip(drawn["boxes"], rows.index, strict=True):
             patch.set(facecolor=COLORS[method], alpha=0.6)
         ax.set(yscale="log", ylabel=label, ylim=(stats["q1"].min() / 10, None))
-    page.suptitle("all recordings; box: quartiles, whiskers: 1.5 times their distance", size=9)
+
+
+def real_log(log: Arrays, table: pd.DataFrame) -> Figure:
+    """Figures 1 and 3 to 5 over a real log: paths, errors, and maps by method."""
+    page = figure(10.0, 8.0)
+    top, bottom = page.subfigures(2, 1, height_ratios=(1.3, 1.0))  # type: ignore[misc]
+    left, *boxed = top.subplots(1, 3, width_ratios=(1.6, 1.0, 1.0))
+    left.plot(*log["truth"].T, color=COLORS["truth"], lw=1.0, label="a mapper's poses")
+    for method in PAPERS_OWN:
+        left.plot(*log[method].T, color=COLORS[method], lw=0.8, label=NAMES[method])
+    plan_axes(left)
+    _boxes(boxed, table)
+    top.legend(*left.get_legend_handles_labels(), loc="outside upper center", ncols=4)
+    for ax, method in zip(bottom.subplots(1, 3), PAPERS_OWN, strict=True):
+        ax.plot(*log[f"{method}_points"].T, ",", color=TRUTH, alpha=0.6)
+        plan_axes(ax)
+        ax.set_title(f"laser points by {NAMES[method]}", fontsize="medium")
     return page
 
 
-def maps(office: Arrays, table: pd.DataFrame) -> Figure:
+def maps(office: Arrays, drawn: pd.DataFrame) -> Figure:
     """Figure 5: laser points placed by each method, over the true walls."""
     page, axes = subplots(10.0, 3.1, 1, 3, sharex=True, sharey=True)
     for ax, method in zip(axes, PAPERS_OWN, strict=True):
@@ -198,7 +221,7 @@ def maps(office: Arrays, table: pd.DataFrame) -> Figure:
         ax.plot(*office[f"{method}_points"].T, ",", color=TRUTH, alpha=0.8)
         ax.set_title(f"by {NAMES[method]}", fontsize="medium")
         ax.label_outer()
-    means = _of_all(table, "map_distance_m", "mean distance of points to walls, m")
+    means = _of_drawn(drawn, "map_distance_m", "mean distance of points to walls, m")
     page.suptitle(f"laser points (black) over the true walls (orange)\n{means}", size=9)
     return page
 
@@ -236,31 +259,34 @@ def runs(table: pd.DataFrame) -> Figure:
 
 def covariances(table: pd.DataFrame) -> Figure:
     """NEES of every covariance by metric and place, and its time."""
-    page, (*axes, times_axes) = subplots(9.5, 4.6, 1, 3, width_ratios=(1.2, 1.2, 0.8))
+    page, (*axes, times_axes) = subplots(11.0, 4.8, 1, 4, width_ratios=(1.0, 1.0, 1.0, 0.8))
     nees = nees_intervals(table)
     for ax, metric in zip(axes, METRICS, strict=True):
         ax.axvspan(*CONSISTENT, color=GREEN, alpha=0.2, lw=0)
         for j, (place, color) in enumerate(zip(PLACES, (BLUE, RED, ORANGE, GREEN), strict=True)):
             found = pd.DataFrame([nees[metric, place, method] for method in _METHODS])
             heights = np.arange(len(_METHODS)) + 0.16 * (j - 1.5)
+            low = np.maximum(found["low"], 0.1 * found["value"])  # an axis of logs has no zero
             ax.errorbar(
                 found["value"], heights, fmt="o", ms=4, color=color, label=place,
-                xerr=[found["value"] - found["low"], found["high"] - found["value"]],
+                xerr=[found["value"] - low, found["high"] - found["value"]],
             )  # fmt: skip
         ax.set(xscale="log", xlabel="NEES / dof", title=metric.replace("_", " "))
     times = table.groupby(["metric", "method"])["time_us"].median().unstack("metric")
-    for metric, marker, fill in zip(METRICS, "os", (TRUTH, "none"), strict=True):
+    for metric, marker, color in zip(METRICS, "os^", (BLUE, TRUTH, ORANGE), strict=True):
         times_axes.plot(
             times.loc[list(_METHODS), metric], range(len(_METHODS)), marker,
-            color=TRUTH, mfc=fill, label=metric.replace("_", " "),
+            color=color, mfc="none", label=metric.replace("_", " "),
         )  # fmt: skip
     times_axes.set(xscale="log", xlabel="time, us", title="time of one")
     times_axes.legend(loc="upper right", fontsize=7)
     for ax in (*axes, times_axes):
         ax.set_yticks(range(len(_METHODS)), [])
         ax.invert_yaxis()
-    axes[0].set(xlim=(0.4, 5.0), yticklabels=[m.replace("_", " ") for m in _METHODS])
-    plain_ticks(axes[0], [0.5, 1.0, 2.0, 4.0])
+    axes[0].set(yticklabels=[m.replace("_", " ") for m in _METHODS])
+    for ax in axes[:2]:
+        ax.set(xlim=(0.4, max(8.0, *ax.get_xlim())))
+        plain_ticks(ax, [0.5, 1.0, 2.0, 4.0, 8.0])
     return with_legend(page, ncols=4, loc="outside upper center")
 
 
@@ -291,33 +317,52 @@ def beliefs(table: pd.DataFrame) -> Figure:
 
 
 def ordering(table: pd.DataFrame) -> Figure:
-    """Where fusion beats ICP, and ICP odometry: log ratios over slip and range noise."""
-    page, axes = subplots(9.0, 5.6, 2, 3, sharex=True, sharey=True)
-    pairs = (("fusion", "icp"), ("icp", "odometry"), ("fusion_clone", "icp"))
+    """Where fusion beats ICP, and ICP odometry: ratios with intervals over slip and range noise."""
+    page, axes = subplots(11.0, 6.0, 2, 3, sharex=True, sharey=True)
+    pairs = (("fusion", "icp"), ("icp", "odometry"), ("fusion_clone", "fusion"))
     errors = (("ate_rmse_m", "position"), ("heading_rmse_rad", "heading"))
     cells = ["k_m", "sigma_range_m"]
     for row, (column, what) in zip(axes, errors, strict=True):
-        wide = np.log(table.pivot(index=[*cells, "seed"], columns="method", values=column))
+        wide = table.pivot(index=[*cells, "seed"], columns="method", values=column)
         for ax, (better, worse) in zip(row, pairs, strict=True):
-            median = (wide[better] - wide[worse]).groupby(level=cells).median().unstack("k_m")
-            drawn = _grid(ax, median)
+            found = wide.groupby(level=cells).apply(
+                lambda part, a=better, b=worse: pd.Series(
+                    vars(log_ratio_interval(part[a], part[b]))
+                )
+            )
+            drawn = _grid(ax, found)
             ax.set_title(f"{what}: {NAMES[better]} over {NAMES[worse]}", fontsize=8)
             ax.set(xlabel="kr = kl, m", ylabel="range noise, m")
             ax.label_outer()
-    label = "median log ratio of RMSE (blue: the first is better)"
+    label = "log of the mean ratio of RMSE (blue: the first is better)"
     page.colorbar(drawn, ax=axes, label=label, extend="both")
+    page.suptitle(
+        "mean ratio of errors, 95 % interval below; line: where the order turns; bold: the "
+        "interval lies clear of 1",
+        size=9,
+    )
     return page
 
 
-def _grid(ax: Axes, values: pd.DataFrame) -> Any:
-    """Cells of log ratios with their numbers."""
+def _grid(ax: Axes, found: pd.DataFrame) -> Any:
+    """Cells of ratios with their intervals, and the boundary at which the ratio is 1."""
+    ratio, low, high = (found[name].unstack("k_m") for name in ("value", "low", "high"))
+    logs = np.log(ratio.to_numpy())
     norm = TwoSlopeNorm(0.0, -3.0, 3.0)
-    drawn = ax.imshow(values.to_numpy(), cmap="RdBu_r", norm=norm, origin="lower", aspect="auto")
-    for (i, j), value in np.ndenumerate(values.to_numpy()):
+    drawn = ax.imshow(logs, cmap="RdBu_r", norm=norm, origin="lower", aspect="auto")
+    for (i, j), value in np.ndenumerate(logs):
         color = "white" if abs(value) > 2.0 else "black"
-        ax.text(j, i, f"{value:z.1f}", ha="center", va="center", size=7, color=color)
-    ax.set_xticks(range(values.shape[1]), [f"{k:g}" for k in values.columns], fontsize=7)
-    ax.set_yticks(range(values.shape[0]), [f"{s:g}" for s in values.index], fontsize=7)
+        ends = low.iat[i, j], high.iat[i, j]
+        clear = "bold" if ends[0] > 1.0 or ends[1] < 1.0 else "normal"
+        text = f"{ratio.iat[i, j]:.2g}\n{ends[0]:.2g}-{ends[1]:.2g}"
+        ax.text(j, i, text, ha="center", va="center", size=6, color=color, weight=clear)
+    below = logs < 0.0  # the boundary runs along the edges of cells
+    for i, j in np.argwhere(below[:, 1:] != below[:, :-1]):
+        ax.plot([j + 0.5, j + 0.5], [i - 0.5, i + 0.5], color=TRUTH, lw=2.0)
+    for i, j in np.argwhere(below[1:] != below[:-1]):
+        ax.plot([j - 0.5, j + 0.5], [i + 0.5, i + 0.5], color=TRUTH, lw=2.0)
+    ax.set_xticks(range(logs.shape[1]), [f"{k:g}" for k in ratio.columns], fontsize=7)
+    ax.set_yticks(range(logs.shape[0]), [f"{s:g}" for s in ratio.index], fontsize=7)
     return drawn
 
 

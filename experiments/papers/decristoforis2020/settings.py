@@ -1,9 +1,11 @@
 """Constants of the studies; the rest is in conf/study/decristoforis2020_*.yaml."""
 
 JUDGED_SEED = 1000  # seeds 0-99 are for tuning
+RATE_HZ = 75.0  # of the laser as printed, at which DC1 and DC6 are judged
 PAPERS_OWN = ("odometry", "icp", "fusion")
 CHECKED = (*PAPERS_OWN, "fusion_clone")  # also run at other rates, rays and noise
-NEES_AT_M = (5.0, 20.0, 50.0, 100.0, 200.0, 290.0)
+N_DRIVES, N_GEOMETRIES = 40, 20  # of DC1 and DC6; of DC2 to DC5
+NEES_AT_M = (5.0, 20.0, 50.0, 95.0)
 CONSISTENT = (0.8, 1.25)  # NEES over its degrees of freedom
 PLACES = {  # where pairs of scans are taken: study, and place of its world
     "corridor": ("corridor", "corridor_bare"),

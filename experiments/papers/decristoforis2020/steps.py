@@ -114,7 +114,10 @@ def ellipse_path(recording: Recording, world: World, estimate: Estimate) -> pd.D
 
 
 def ellipse_summary(path: pd.DataFrame) -> Row:
-    """What DC2 and DC3 ask of the ellipses along one path."""
+    """What DC2 and DC3 ask of the ellipses along one path.
+
+    A bend is compared with the bare legs before and after it, without their last 3 m.
+    """
     bare, objects = (path[path["place"] == f"corridor_{name}"] for name in ("bare", "objects"))
     tilt = np.abs(np.remainder(bare["direction_rad"] + math.pi / 2.0, math.pi) - math.pi / 2.0)
     row: Row = {
@@ -123,13 +126,12 @@ def ellipse_summary(path: pd.DataFrame) -> Row:
         "long_bare_m": float(bare["long_m"].median()),
         "long_objects_m": float(objects["long_m"].median()),
     }
-    for bend in ("curve", "corner"):
-        inside = path[path["place"] == bend]
-        start, end = inside["distance_m"].iloc[0], inside["distance_m"].iloc[-1]
-        before = path[path["distance_m"].between(start - 3.0, start - 0.5)]
-        after = path[path["distance_m"].between(end + 0.5, end + 3.0)]
+    for bend, legs in (("curve", ("leg_2", "leg_3")), ("corner", ("leg_1", "leg_2"))):
+        inside, before, after = (path[path["place"] == place] for place in (bend, *legs))
         smooth = inside["long_m"].rolling(5, center=True, min_periods=1).median()
-        turned = inside["direction_rad"][smooth.idxmax()] - before["direction_rad"].iloc[0]
+        # the mean direction of axes, which are the same when they are turned by pi
+        straight = 0.5 * np.angle(np.mean(np.exp(2j * before["direction_rad"])))
+        turned = inside["direction_rad"][smooth.idxmax()] - straight
         row |= {
             f"long_before_{bend}_m": float(before["long_m"].median()),
             f"long_in_{bend}_m": float(smooth.max()),

@@ -1,4 +1,8 @@
-"""The studies of decristoforis2020: registration, its covariance, and fusion with odometry."""
+"""The studies of decristoforis2020: registration, its covariance, and fusion with odometry.
+
+Drives are simulated with the rigid body; those of the ordering, which need many, with the kinematic
+one, of the same slip.
+"""
 
 import math
 import operator
@@ -26,13 +30,17 @@ from experiments.papers.decristoforis2020.claims import judged_runs
 from experiments.papers.decristoforis2020.settings import (
     CHECKED,
     JUDGED_SEED,
+    N_DRIVES,
+    N_GEOMETRIES,
     NEES_AT_M,
     PAIRS,
     PAPERS_OWN,
     PLACES,
+    RATE_HZ,
 )
 from experiments.papers.decristoforis2020.steps import ellipse_path, ellipse_summary, step_errors
 from experiments.papers.jobs import grouped, in_parallel
+from experiments.papers.real_logs.settings import DATA
 from experiments.papers.results import Results
 from experiments.runs.console import RunFailedError
 from experiments.runs.evaluate import evaluate
@@ -40,6 +48,7 @@ from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
 from experiments.runs.seeds import stream
 from experiments.sweeps.plan import planned
+from sim.arrays import Array
 from sim.recording import Recording
 from sim.sensors import Laser, sensor_of
 
@@ -78,43 +87,68 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
         for name, frame in tables.items():
             parts.setdefault(name, []).append(frame)
     whole = {name: pd.concat(frames, ignore_index=True) for name, frames in parts.items()}
-    whole["boxes"] = _boxes(whole.pop("errors"))
+    whole["boxes"] = _boxes(judged_runs(whole.pop("errors")))
+    if "log_errors" in whole:
+        whole["log_boxes"] = _boxes(whole.pop("log_errors"))
     whole["covariances"] = whole["covariances"].sort_values(["metric", "method", "place", "seed"])
     whole["ordering"] = whole["ordering"][[*_NOISE, "ate_rmse_m", "heading_rmse_rad"]]
     out.write_tables(**whole)
 
 
 def _jobs(full: bool, out: Results) -> list[Job]:
-    """Jobs of all studies; a drive of 300 m through an office costs 1."""
-    n, drive, check = (20, 1.0, 1.0) if full else (4, 0.13, 0.03)
-    short, shorter = ([], []) if full else (["route.distance_m=40.0"], ["route.distance_m=10.0"])
-    seeds = range(JUDGED_SEED, JUDGED_SEED + n)
-    drives = _planned("methods", n, *short)
-    fast = _planned("methods", 5 if full else 1, *shorter, "sensors.laser.rate_hz=75.0")
-    engine = _planned("methods", 3 if full else 1, *shorter, "simulation.rays=bullet")
-    first, *others = _planned("corridor", n)
+    """Jobs of all studies; a drive of 100 m through an office costs 1."""
+    n, n_drives = (N_GEOMETRIES, N_DRIVES) if full else (4, 4)
+    drive, slow, drawn = (1.0, 0.2, 2.5) if full else (0.15, 0.1, 0.6)
+    short, shorter = ([], []) if full else (["route.distance_m=8.0"], ["route.distance_m=60.0"])
+    ten_hz, engine = ["sensors.laser.rate_hz=10.0", *short], ["simulation.rays=bullet"]
     noise = [] if full else ["robot.kr=1e-6,1e-4", "sensors.laser.sigma_range_m=0.01"]
+    seeds = range(JUDGED_SEED, JUDGED_SEED + n)
+    (office,) = _planned("methods", 1, "route.distance_m=300.0", *shorter)
+    first, *others = _planned("corridor", n)
+    on_log = list(planned(["study=decristoforis2020_log"])) if DATA.is_dir() else []
     return [
-        *((drive, _drive, [group]) for group in drives),
-        *((check, _drive, [_only(CHECKED, group)]) for group in fast + engine),
+        (drawn, _drawn_office, [_only(PAPERS_OWN, office), out]),
+        *((0.5, _drawn_log, [group, out]) for group in ([on_log] if on_log else [])),
+        *((drive, _drive, [group]) for group in _planned("methods", n_drives, *short)),
         *(
-            (drive, _scored, ["beliefs", _BELIEF, group])
-            for group in _planned("beliefs", n, *short)
+            (slow, _drive, [_only(CHECKED, group)])
+            for group in (
+                *_planned("methods", 5 if full else 1, *ten_hz),
+                *_planned("methods", 3 if full else 1, *ten_hz, *engine),
+            )
         ),
-        (0.1 * drive, _drawn_office, [_only(PAPERS_OWN, drives[0]), out]),
-        (0.05, _closeup, [*first, out]),
-        *((0.05, _closeup, group) for group in others),
-        *((0.025, _scenes, [seed, p, 60 if full else 10]) for seed in seeds for p in PLACES),
         *(
-            (0.004, _metrics, [seed, kind])
+            (slow, _scored, ["beliefs", _BELIEF, group])
+            for group in _planned("beliefs", n // 2, *short)
+        ),
+        (0.2, _closeup, [first, out]),
+        *((0.2, _closeup, [group]) for group in others),
+        *((0.1, _scenes, [seed, place, 60 if full else 6]) for seed in seeds for place in PLACES),
+        *(
+            (0.005, _metrics, [seed, kind])
             for seed in range(JUDGED_SEED, JUDGED_SEED + 5 * n)
             for kind in PAIRS
         ),
         *(
-            (0.025, _scored, ["ordering", _NOISE, _only(CHECKED, group)])
-            for group in _planned("ordering", 4 if full else 1, *noise)
+            (0.2, _scored, ["ordering", _NOISE, _only(CHECKED, group)])
+            for group in _planned("ordering", 6 if full else 1, *noise, *short)
         ),
     ]
+
+
+def tune(out: Results) -> None:
+    """Errors of the printed filter by its process noise, on seeds of tuning.
+
+    The paper adjusts it by experiment. Takes about two minutes.
+    """
+    noise = {name: f"estimator.{name}" for name in ("acceleration_noise", "turn_noise")}
+    runs = planned(["study=decristoforis2020_tuning"])
+    groups = grouped(runs, lambda run: run.recording_key)
+    jobs = [("tuning", {"seed": "seed", **noise}, group) for group in groups]
+    rows = pd.concat(t["tuning"] for t in in_parallel(_scored, jobs, lambda _share: None))
+    scores = ["ate_rmse_m", "heading_rmse_rad", "nees_mean"]
+    means = rows.groupby(list(noise), as_index=False)[scores].mean()
+    out.write_tables(process_noise_tuning=means)
 
 
 def _planned(study: str, n_seeds: int, *overrides: str) -> list[list[Experiment]]:
@@ -166,11 +200,12 @@ def _drive(group: Sequence[Experiment]) -> Tables:
     """All methods over one recording: scores, maps, steps of registration, errors along it."""
     recording, world = group[0].recording(), group[0].world()
     truth = recording.truth_at(recording.frame_stamps)
+    every = round(5.0 * recording.sensor("laser", Laser).rate_hz)
     runs, steps, errors = [], [], []
     for experiment in group:
         row, estimate = _run(experiment, recording, _RUN)
         runs.append(row)
-        if row["rate_hz"] == 10.0:
+        if row["rate_hz"] == RATE_HZ:
             points = map_points(recording, estimate)
             row["map_distance_m"] = float(wall_distances_m(points, world).mean())
             row["map_entropy"] = mean_map_entropy(points, stream(experiment.seed, "map"))
@@ -182,7 +217,7 @@ def _drive(group: Sequence[Experiment]) -> Tables:
             "position_m": position_errors_m(truth, estimate.means),
             "heading_rad": np.abs(heading_errors_rad(truth, estimate.means)),
         }
-        errors.append(pd.DataFrame(origin | off)[::50])
+        errors.append(pd.DataFrame(origin | off)[::every])
     return {"runs": pd.DataFrame(runs), "steps": pd.DataFrame(steps), "errors": pd.concat(errors)}
 
 
@@ -193,40 +228,81 @@ def _scored(table: str, origin: dict[str, str], group: Sequence[Experiment]) -> 
 
 
 def _drawn_office(group: Sequence[Experiment], out: Results) -> Tables:
-    """Write what the figures draw: walls, areas, paths at one pose a second, map points."""
+    """One long drive: scores, and ellipses in areas like the paper's A and B.
+
+    Writes what the figures draw: walls, areas, paths at one pose a second, map points.
+    """
     recording, world = group[0].recording(), group[0].world()
     stamps = recording.frame_stamps
     keep = np.flatnonzero(np.diff(np.floor(stamps), prepend=-1.0) > 0)
+    areas = {"A": world.places["corner"][1], "B": world.places["corridor_objects"][0]}
     arrays = {
         "walls": world.walls,
         "wall_z_m": world.wall_z_m,
-        "corner": world.places["corner"][1],
-        "corridor": world.places["corridor_objects"][0],
+        **{f"area_{name}": area for name, area in areas.items()},
         "stamp_s": stamps[keep],
         "truth": recording.truth_at(stamps[keep])[:, :2],
     }
+    rows, inside = [], []
     for experiment in group:
         row, estimate = _run(experiment, recording, _RUN)
+        rows.append(row)
         points = map_points(recording, estimate)
         arrays[str(row["method"])] = estimate.means[keep, :2]
-        arrays[f"{row['method']}_points"] = points[:: max(1, len(points) // 5000)]
-    out.write_arrays("office", **{name: a.astype(np.float32) for name, a in arrays.items()})
-    return {}
+        arrays[f"{row['method']}_points"] = points.astype(np.float32)
+        row["map_distance_m"] = float(wall_distances_m(points, world).mean())
+        if row["method"] == "icp":
+            path = ellipse_path(recording, world, estimate)
+            inside = [_within(path, area, 2.0).assign(area=name) for name, area in areas.items()]
+    out.write_arrays("office", **arrays)
+    return {"drawn": pd.DataFrame(rows), "areas": pd.concat(inside)}
 
 
-def _closeup(experiment: Experiment, out: Results | None = None) -> Tables:
+def _drawn_log(group: Sequence[Experiment], out: Results) -> Tables:
+    """Scores and errors over a real log; writes its paths and map points."""
+    recording = group[0].recording()
+    arrays: dict[str, Any] = {}
+    rows, errors = [], []
+    for experiment in group:
+        row, estimate = _run(experiment, recording, {"method": "method"})
+        method, truth = str(row["method"]), recording.truth_at(estimate.stamps)
+        known = np.isfinite(truth).all(axis=1)
+        off_m = position_errors_m(truth[known], estimate.means[known])
+        off_rad = np.abs(heading_errors_rad(truth[known], estimate.means[known]))
+        errors.append(pd.DataFrame({"position_m": off_m, "heading_rad": off_rad, "method": method}))
+        rows.append(row)
+        points = map_points(recording, estimate, every_s=10.0, every_beam=2)
+        arrays |= {method: estimate.means[::5, :2], f"{method}_points": points.astype(np.float32)}
+    arrays["truth"] = recording.known_truth.poses[:, :2]
+    out.write_arrays("log", **arrays)
+    return {"log": pd.DataFrame(rows), "log_errors": pd.concat(errors)}
+
+
+def _within(path: pd.DataFrame, area: Array, margin_m: float) -> pd.DataFrame:
+    """The first pass of a path through an area and a margin about it, a row every 5 cm."""
+    x1, y1, x2, y2 = area
+    inside = path["x_m"].between(x1 - margin_m, x2 + margin_m)
+    inside &= path["y_m"].between(y1 - margin_m, y2 + margin_m)
+    rows = path[inside]
+    rows = rows[rows["distance_m"].diff().gt(1.0).cumsum() == 0]
+    return rows.groupby(rows["distance_m"] // 0.05).head(1)
+
+
+def _closeup(group: Sequence[Experiment], out: Results | None = None) -> Tables:
     """Ellipses of registration from scan to scan along a corridor and through its bends.
 
     With `out`, also write what the figure draws.
     """
-    recording, world = experiment.recording(), experiment.world()
-    _, estimate = _run(experiment, recording, {})
-    path = ellipse_path(recording, world, estimate)
-    tables = {"ellipses": pd.DataFrame([{"seed": experiment.seed, **ellipse_summary(path)}])}
-    if out is not None:
-        out.write_arrays("corridor", walls=world.walls, wall_z_m=world.wall_z_m)
-        tables["ellipse_path"] = pd.DataFrame({"seed": experiment.seed, **path})
-    return tables
+    recording, world = group[0].recording(), group[0].world()
+    rows, tables = [], {}
+    for experiment in group:
+        path = ellipse_path(recording, world, _run(experiment, recording, {})[1])
+        origin = {"seed": experiment.seed, "method": experiment.config["method"]}
+        rows.append(origin | ellipse_summary(path))
+        if out is not None and origin["method"] == "printed":
+            out.write_arrays("corridor", walls=world.walls, wall_z_m=world.wall_z_m)
+            tables["ellipse_path"] = path.assign(seed=experiment.seed)
+    return {"ellipses": pd.DataFrame(rows), **tables}
 
 
 def _scenes(seed: int, place: str, n_repeats: int) -> Tables:
@@ -241,7 +317,7 @@ def _scenes(seed: int, place: str, n_repeats: int) -> Tables:
 
 
 def _metrics(seed: int, kind: str) -> Tables:
-    """Both metrics on one of the benchmark's pairs: error and time, without an initial guess."""
+    """All metrics on one of the benchmark's pairs: error and time, without an initial guess."""
     place, size = kind.split("_")
     p = pair(place, size, seed)
     target, source = (prepare(r, BEARINGS_RAD) for r in (p.target_m, p.source_m))
@@ -265,7 +341,7 @@ def _metrics(seed: int, kind: str) -> Tables:
 
 def _boxes(errors: pd.DataFrame) -> pd.DataFrame:
     """Quartiles and whiskers (1.5 times the interquartile range) of the pooled errors."""
-    by_method = judged_runs(errors).groupby("method")
+    by_method = errors.groupby("method")
     rows = [
         {"method": method, "error": name, "n": len(values), **boxplot_stats(values)[0]}
         for method in PAPERS_OWN

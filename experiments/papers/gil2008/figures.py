@@ -11,7 +11,9 @@ from matplotlib.figure import Figure
 
 from experiments.evaluation.metrics import rms
 from experiments.papers.gil2008.claims import pooled
+from experiments.papers.gil2008.settings import CELL_M
 from experiments.papers.results import Results
+from experiments.viewing.grid import UNKNOWN, draw_grid
 from experiments.viewing.plotting import (
     draw_ellipses,
     plain_log,
@@ -22,7 +24,6 @@ from experiments.viewing.plotting import (
 from experiments.viewing.style import (
     BLACK,
     BLUE,
-    ESTIMATE,
     GREEN,
     ODOMETRY,
     ORANGE,
@@ -37,14 +38,16 @@ from experiments.viewing.style import (
 from experiments.viewing.world import draw_walls
 from sim import se2
 from sim.arrays import Array
+from sim.grid import OccupancyGrid
 
 Arrays = dict[str, Any]
 
 _FILTERS = {
-    "paper": (ORANGE, "o", "as printed"),
+    "paper": (RED, "o", "as printed"),
     "fastslam1": (GREEN, "^", "FastSLAM 1.0"),
     "fastslam2": (BLUE, "s", "FastSLAM 2.0"),
 }
+_SHOWN = ("paper", "fastslam2")  # of one drive
 _BATCH = PURPLE
 _NOISE = {"paper": "10 px", "pixel": "1 px"}
 _CHI_95_3D = 2.7955
@@ -74,33 +77,31 @@ def draw(made: Results) -> dict[str, Figure]:
 
 
 def maps(run: Arrays) -> Figure:
-    """Figure 1: the rooms, and the landmarks as the best particle maps them."""
-    page, (left, right) = subplots(10.0, 4.9, 1, 2, sharex=True, sharey=True)
-    draw_walls(left, run["walls"], run["wall_z_m"])
-    left.set_title("walls and objects", loc="left")
-    draw_ellipses(right, run["landmarks"], run["landmark_covariances"], color=SKY, alpha=0.4, lw=0)
-    right.plot(*run["landmarks"][:, :2].T, ".", color=BLUE, ms=3)
-    plan_axes(right)
-    right.set_title("map of landmarks, with 95 % ellipses", loc="left")
+    """Figure 1: occupancy grid of the rooms, and landmarks as the best particles map them."""
+    page, (left, *others) = subplots(13.0, 4.9, 1, 3, sharex=True, sharey=True)
+    draw_grid(left, _grid(run, "truth"))
+    left.set(xlim=(-2.5, 32.5), ylim=(-2.5, 32.5), facecolor=UNKNOWN)
+    left.set_title("occupancy grid, along the true path", loc="left")
+    for ax, name in zip(others, _SHOWN, strict=True):
+        colour, _, words = _FILTERS[name]
+        means, covariances = run[f"{name}_landmarks"], run[f"{name}_covariances"]
+        draw_ellipses(ax, means, covariances, color=colour, alpha=0.2, lw=0)
+        ax.plot(*means[:, :2].T, ".", color=colour, ms=3)
+        plan_axes(ax)
+        ax.set_title(f"landmarks with 95 % ellipses, {words}", loc="left")
     return page
 
 
 def corrected(run: Arrays) -> Figure:
-    """Figure 2: landmarks placed by odometry, against the map of SLAM."""
-    page, axes = subplots(10.0, 4.9, 1, 2, sharex=True, sharey=True)
-    corners = run["walls"].reshape(-1, 2)
-    xlim, ylim = zip(corners.min(axis=0) - 4, corners.max(axis=0) + 4, strict=True)
-    for ax, name, colour, title in zip(
-        axes,
-        ("odometry", "fastslam"),
-        (ODOMETRY, BLUE),
-        ("placed by odometry", "placed from the path of FastSLAM"),
-        strict=True,
-    ):
-        draw_walls(ax, run["walls"], run["wall_z_m"])
-        ax.plot(*run[f"placed_by_{name}"].T, ".", color=colour, ms=1.5)
+    """Figure 2: the occupancy grid along odometry, against those along the paths of SLAM."""
+    page, axes = subplots(13.0, 4.9, 1, 3, sharex=True, sharey=True)
+    titles = {"odometry": "along odometry"} | {n: f"along SLAM, {_FILTERS[n][2]}" for n in _SHOWN}
+    corners = np.concatenate([_grid(run, name).corners_m for name in titles])
+    (x1, y1), (x2, y2) = corners.min(axis=0), corners.max(axis=0)
+    for ax, (name, title) in zip(axes, titles.items(), strict=True):
+        draw_grid(ax, _grid(run, name))
         ax.set_title(title, loc="left")
-        ax.set(xlim=xlim, ylim=ylim)
+        ax.set(xlim=(x1, x2), ylim=(y1, y2), facecolor=UNKNOWN)
     return page
 
 
@@ -134,9 +135,16 @@ def association_ellipses() -> Figure:
 
 def world_3d(run: Arrays) -> Figure:
     """Figure 5: the world in three dimensions, with ellipsoids of the landmarks of one image."""
-    page = figure(8.0, 4.6)
-    ax: Any = page.add_subplot(projection="3d")
-    pose, landmarks, reach = run["image_pose"], run["landmarks"], 6.0
+    page = figure(13.0, 4.8)
+    for i, name in enumerate(_SHOWN):
+        ax: Any = page.add_subplot(1, 2, i + 1, projection="3d")
+        _draw_3d(ax, run, name)
+        ax.set_title(_FILTERS[name][2], loc="left")
+    return page
+
+
+def _draw_3d(ax: Any, run: Arrays, name: str) -> None:
+    pose, landmarks, reach = run[f"{name}_image_pose"], run[f"{name}_landmarks"], 6.0
     eye = np.array([pose[0], pose[1], 0.5])
 
     def near(points: Array) -> Any:
@@ -148,14 +156,13 @@ def world_3d(run: Arrays) -> Figure:
     ):
         ring = np.array([[x1, y1, bottom], [x2, y2, bottom], [x2, y2, top], [x1, y1, top]])
         ax.plot(*np.vstack([ring, ring[:1]]).T, color=WALL, lw=0.5)
-    means = run["fastslam"]
-    ax.plot(*np.where(near(means), means[:, :2].T, np.nan), 0.0, color=ESTIMATE, lw=1.0)
-    pictured = run["in_image"] & near(landmarks)
-    covariances = run["landmark_covariances"][pictured]
+    ax.plot(*np.where(near(run[name]), run[name][:, :2].T, np.nan), 0.0, color=BLACK, lw=1.0)
+    pictured = (run[f"{name}_in_image"] > 0) & near(landmarks)
+    covariances = run[f"{name}_covariances"][pictured]
     for mean, covariance in zip(landmarks[pictured], covariances, strict=True):
-        ax.plot(*_ellipsoid(mean, covariance), color=RED, lw=0.3)
+        ax.plot(*_ellipsoid(mean, covariance), color=GREEN, lw=0.3)
         ax.plot(*np.array([eye, mean]).T, color=SKY, lw=0.5)
-    ax.plot(*landmarks[near(landmarks)].T, ".", color=BLUE, ms=2)
+    ax.plot(*landmarks[near(landmarks)].T, ".", color=_FILTERS[name][0], ms=2)
     ax.set(
         xlim=pose[0] + np.array([-reach, reach]),
         ylim=pose[1] + np.array([-reach, reach]),
@@ -164,19 +171,20 @@ def world_3d(run: Arrays) -> Figure:
         ylabel="y, m",
         zlabel="z, m",
     )
-    ax.set_box_aspect((2.0 * reach, 2.0 * reach, 3.0), zoom=1.25)
-    return page
+    ax.set_box_aspect((2.0 * reach, 2.0 * reach, 3.0), zoom=1.1)
 
 
 def path(run: Arrays) -> Figure:
-    """Figure 6: true path, odometry and the best particle's path."""
-    page, ax = subplots(6.6, 6.4)
+    """Figure 6: true path, odometry and the best particles' paths."""
+    page, ax = subplots(6.6, 6.6)
     draw_walls(ax, run["walls"], run["wall_z_m"])
     ax.plot(*run["truth"][:, :2].T, color=TRUTH, lw=1.2, label="truth")
     ax.plot(*run["odometry"][:, :2].T, "--", color=ODOMETRY, lw=1.2, label="odometry")
-    best = run["fastslam"][::12]
-    ax.plot(*best[:, :2].T, "s", color=ESTIMATE, ms=2.5, mfc="none", label="FastSLAM, M = 200")
-    return with_legend(page, ncols=3, loc="outside upper center")
+    for name in _SHOWN:
+        colour, marker, words = _FILTERS[name]
+        best, label = run[name][::12], f"{words}, M = 200"
+        ax.plot(*best[:, :2].T, marker, color=colour, ms=3, mfc="none", label=label)
+    return with_legend(page, ncols=2, loc="outside upper center")
 
 
 def components(run: Arrays) -> Figure:
@@ -184,14 +192,15 @@ def components(run: Arrays) -> Figure:
     page, axes = subplots(10.0, 6.5, 3, 2, sharex=True)
     truth, along = run["truth"], run["travelled_m"]
     names = ("x, m", "y, m", "heading, rad")
-    for i, (name, (left, right)) in enumerate(zip(names, axes, strict=True)):
+    drawn = {
+        "odometry": (ODOMETRY, "odometry"),
+        **{name: (_FILTERS[name][0], f"{_FILTERS[name][2]}, M = 200") for name in _SHOWN},
+        "batch": (_BATCH, "batch"),
+    }
+    for i, (label_of_row, (left, right)) in enumerate(zip(names, axes, strict=True)):
         straighten, wrap = (np.unwrap, se2.wrap) if i == 2 else (np.asarray, np.asarray)
-        for key, colour, label in (
-            ("odometry", ODOMETRY, "odometry"),
-            ("fastslam", ESTIMATE, "FastSLAM, M = 200"),
-            ("smoother", _BATCH, "batch"),
-        ):
-            if key != "smoother":
+        for key, (colour, label) in drawn.items():
+            if key != "batch":
                 left.plot(along, straighten(run[key][:, i]), color=colour, lw=1.0)
             right.plot(along, wrap(run[key][:, i] - truth[:, i]), color=colour, lw=1.0, label=label)
         left.plot(along, straighten(truth[:, i]), color=TRUTH, lw=1.0, label="truth")
@@ -200,33 +209,42 @@ def components(run: Arrays) -> Figure:
             along[::4], low, high, where=run["revisited"], color=SKY, alpha=0.2, lw=0,
             label="revisited ground",
         )  # fmt: skip
-        left.set(ylabel=name)
-        right.set(ylabel=f"error of {name}", ylim=(low, high))
+        left.set(ylabel=label_of_row)
+        right.set(ylabel=f"error of {label_of_row}", ylim=(low, high))
     for ax in axes[-1]:
         ax.set_xlabel("path travelled, m")
     handles = [handle for ax in axes[0] for handle in ax.get_legend_handles_labels()[0]]
-    page.legend(handles=handles, loc="outside upper center", ncols=5)
+    page.legend(handles=handles, loc="outside upper center", ncols=3)
     return page
 
 
 def by_particles(repeats: pd.DataFrame, bound: pd.DataFrame) -> Figure:
-    """Figure 8, the paper's design: one recording, the filter repeated; bars of 2 sigma."""
-    page, axes = subplots(9.0, 4.0, 1, 2)
+    """Figure 8: one drive, with bars of two standard deviations over the runs.
+
+    Above as printed, each run with its own observations; below, all with the same.
+    """
+    page, grid = subplots(9.0, 7.0, 2, 2, sharex=True)
     best = bound[(bound["seed"] == repeats["seed"][0]) & (bound["noise"] == "paper")]
-    for ax, (column, label) in zip(axes, _BOTH, strict=True):
-        for j, (name, part) in enumerate(repeats.groupby("filter", sort=False)):
-            colour, marker, words = _FILTERS[str(name)]
-            found = part.groupby("n_particles")[column].agg(["mean", "std"])
-            ax.errorbar(
-                found.index * (1.0 + 0.06 * j), found["mean"], 2.0 * found["std"],
-                marker=marker, color=colour, label=words, capsize=2.5, lw=1.0, ms=4,
-            )  # fmt: skip
-        ax.axhline(float(best[column].iloc[0]), color=_BATCH, ls=":", label="batch bound")
-        ax.set(xscale="log", xlabel="particles M", ylabel=label, ylim=(0.0, None))
-        plain_ticks(ax, repeats["n_particles"], fontsize=8)
+    drawn = repeats["image_draw"] > 0
+    designs = {"observations drawn anew": repeats[drawn], "the same observations": repeats[~drawn]}
+    for axes, (design, table) in zip(grid, designs.items(), strict=True):
+        for ax, (column, label) in zip(axes, _BOTH, strict=True):
+            for j, (name, part) in enumerate(table.groupby("filter", sort=False)):
+                colour, marker, words = _FILTERS[str(name)]
+                found = part.groupby("n_particles")[column].agg(["mean", "std"])
+                ax.errorbar(
+                    found.index * (1.0 + 0.06 * j), found["mean"], 2.0 * found["std"],
+                    marker=marker, color=colour, label=words, capsize=2.5, lw=1.0, ms=4,
+                )  # fmt: skip
+            ax.axhline(float(best[column].iloc[0]), color=_BATCH, ls=":", label="batch bound")
+            ax.set(xscale="log", ylabel=label, ylim=(0.0, None))
+            ax.set_title(design, loc="left")
+            plain_ticks(ax, repeats["n_particles"], fontsize=8)
+    for ax in grid[-1]:
+        ax.set_xlabel("particles M")
+    n_runs = len(repeats[drawn]) // repeats.groupby(["filter", "n_particles"]).ngroups
     page.suptitle(
-        f"one recording, {repeats['repeat'].max() + 1} runs each; odometry errs by "
-        f"{repeats['odometry_rmse_m'][0]:.1f} m"
+        f"one drive, {n_runs} runs each; odometry errs by {repeats['odometry_rmse_m'][0]:.1f} m"
     )
     return with_legend(page, ncols=4)
 
@@ -265,17 +283,19 @@ def by_particles_over_worlds(particles: pd.DataFrame, bound: pd.DataFrame) -> Fi
 
 def by_distance(distance: pd.DataFrame) -> Figure:
     """Figure 9: dmax, by filter, choice of observations, walls and noise."""
-    page, axes = subplots(10.5, 4.4, 1, 2, sharex=True)
+    page, axes = subplots(11.5, 4.4, 1, 2, sharex=True)
     kinds = {
-        ("fastslam2", True, "paper", 0, "random"): (BLUE, "-", "all visible"),
-        ("paper", True, "paper", 0, "random"): (ORANGE, "-", "all visible, as printed"),
-        ("fastslam2", True, "paper", 8, "random"): (GREEN, "-", "8 at random"),
-        ("fastslam2", True, "paper", 8, "nearest"): (SKY, "-", "8 nearest"),
-        ("fastslam2", False, "paper", 0, "random"): (BLUE, "--", "all, no walls"),
-        ("fastslam2", False, "paper", 8, "random"): (GREEN, "--", "8 at random, no walls"),
-        ("fastslam2", True, "pixel", 0, "random"): (PURPLE, "-", "all visible, 1 px"),
+        ("paper", True, "paper", 0, "random"): (RED, "-", "as printed, all visible"),
+        ("paper", False, "paper", 0, "random"): (RED, "--", "as printed, no walls"),
+        ("paper", True, "paper", 8, "random"): (ORANGE, "-", "as printed, 8 at random"),
+        ("paper", True, "paper", 8, "nearest"): (SKY, "-", "as printed, 8 nearest"),
+        ("fastslam2", True, "paper", 0, "random"): (BLUE, "-", "FastSLAM 2.0, all visible"),
+        ("fastslam2", False, "paper", 0, "random"): (BLUE, "--", "FastSLAM 2.0, no walls"),
+        ("fastslam2", True, "paper", 8, "random"): (GREEN, "-", "FastSLAM 2.0, 8 at random"),
+        ("fastslam2", True, "pixel", 0, "random"): (PURPLE, "-", "FastSLAM 2.0, all visible, 1 px"),
     }
-    parts = dict(list(distance.groupby(["filter", "occluded", "noise", "n_seen", "rule"])))
+    kind_of = ["filter", "occluded", "noise", "n_seen", "rule"]
+    parts = dict(list(distance[distance["draw"] == 0].groupby(kind_of)))
     for ax, (column, label) in zip(axes, _BOTH, strict=True):
         for kind, (colour, line, words) in kinds.items():
             if kind in parts:
@@ -312,14 +332,15 @@ def by_association(association: pd.DataFrame) -> Figure:
     """Error and share of right associations for every way to associate."""
     way = association["association"].where(association["filter"] != "ekf_slam", "ekf_slam")
     association = association.assign(way=pd.Categorical(way, list(_WAYS)))
-    by_noise = [
-        (noise, list(table.groupby(["way", "sigma_descriptor", "p0"], observed=True)))
-        for noise, table in association.groupby("noise", sort=False)
+    # EKF-SLAM stands by the particle filter that takes R at the same point
+    compared = [
+        (noise, table, list(table.groupby(["way", "sigma_descriptor", "p0"], observed=True)))
+        for (noise, _), table in association.groupby(["noise", "noise_at"], sort=False)
     ]
-    counts = [len(ways) for _, ways in by_noise]
+    counts = [len(ways) for _, _, ways in compared]
     size = (10.0, 0.36 * sum(counts) + 1.2, len(counts), 2)
     page, grid = subplots(*size, squeeze=False, sharey="row", height_ratios=counts)
-    for (noise, ways), (left, right) in zip(by_noise, grid, strict=True):
+    for (noise, table, ways), (left, right) in zip(compared, grid, strict=True):
         labels = []
         for i, ((name, sigma, p0), part) in enumerate(ways):
             colour, words = _WAYS[name]
@@ -336,7 +357,8 @@ def by_association(association: pd.DataFrame) -> Figure:
             ylim=(len(labels) - 0.4, -0.6),  # the first on top; both sides share the heights
             xscale="log",
         )
-        left.set_title(f"noise of {_NOISE[noise]}", loc="left")
+        name = next(name for name in table["filter"] if name in _FILTERS)
+        left.set_title(f"{_FILTERS[name][2]}, noise of {_NOISE[noise]}", loc="left")
         plain_log(left.xaxis)
         right.set(xlim=(0.0, 1.0))
         right.tick_params(axis="y", left=False, labelleft=False)
@@ -396,6 +418,11 @@ def cost(table: pd.DataFrame) -> Figure:
     plain_log(ax.yaxis)
     ax.legend()
     return page
+
+
+def _grid(run: Arrays, name: str) -> OccupancyGrid:
+    """Grid of the scans along one path."""
+    return OccupancyGrid(run[f"{name}_grid"], CELL_M, run[f"{name}_origin"])
 
 
 def _by_filter(ax: Axes, table: pd.DataFrame, by: str, column: str) -> None:

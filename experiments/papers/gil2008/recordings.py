@@ -36,7 +36,9 @@ class Scene:
     seed
         Of the world and the drive through it.
     draw
-        0: the drive's own wheel errors; others are drawn over the same path.
+        0: the drive's own wheel errors; others are drawn over the same path, with other images.
+    image_draw
+        Which of the draws of images over the same wheel errors.
     noise
         `paper`: X, Y and Z have independent noise. `pixel`: the noise is drawn in the image.
     occluded
@@ -49,6 +51,7 @@ class Scene:
 
     seed: int
     draw: int = 0
+    image_draw: int = 0
     noise: str = "paper"
     occluded: bool = True
     sigma_px: float | None = None

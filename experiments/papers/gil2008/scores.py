@@ -1,35 +1,20 @@
-"""What gil2008 measures of a run besides its path: map, associations, error on revisited ground."""
+"""What gil2008 measures of a run besides path and map: associations, error on revisited ground."""
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from estimators.base import Estimate
-from experiments.evaluation.metrics import alignment, position_errors_m, rms, travelled_m
+from experiments.evaluation.metrics import position_errors_m, rms, travelled_m
 from experiments.papers.gil2008.recordings import true_ids
-from experiments.papers.gil2008.settings import LAG_M, WITHIN_M
+from experiments.papers.gil2008.settings import LAG_M, SETTLED_M, WITHIN_M
 from experiments.runs.row import Row
-from sim import se2
 from sim.arrays import Array
 from sim.recording import Recording
 
 KEEP = ("associations", "resampled")  # Belief extras that `filter_scores` reads
-
-
-def map_scores(recording: Recording, found: Any) -> Row:
-    """RMS distances of the map's landmarks from the true ones, raw and aligned in the plane."""
-    if not isinstance(found, dict) or len(found.get("ids", ())) < 2:
-        return {}
-    true, made = recording.known_world.landmarks[found["ids"]], found["landmarks"]
-    fitted = np.column_stack([se2.transform(alignment(true, made), made[:, :2]), made[:, 2]])
-    return {
-        "n_landmarks": len(true),
-        "map_rmse_m": rms(np.linalg.norm(made - true, axis=1)),
-        "map_aligned_rmse_m": rms(np.linalg.norm(fitted - true, axis=1)),
-    }
 
 
 def filter_scores(recording: Recording, online: Estimate) -> Row:
@@ -75,15 +60,18 @@ def revisited(truth: Array) -> NDArray[np.bool_]:
 
 
 def revisit_ratio(truth: Array, means: Array) -> float:
-    """RMS position error at later visits of a place over that at the first visit of it.
+    """RMS position error at later visits of places over that at the first visit of each.
 
-    Every pose on revisited ground is paired with the first one near it; NaN below ten pairs.
+    Every pose on revisited ground is paired with the first one near it. Places first visited on the
+    first 20 m are left out: near the known start every error is small at first. NaN below ten
+    pairs.
     """
     some, travelled = truth[::4, :2], travelled_m(truth)[::4]
     near = np.hypot(*(some[:, None] - some[None]).transpose(2, 0, 1)) < WITHIN_M
     before = near & (travelled[:, None] - travelled > LAG_M)
-    later = np.flatnonzero(before.any(axis=1))
+    first = np.argmax(before, axis=1)
+    later = np.flatnonzero(before.any(axis=1) & (travelled[first] >= SETTLED_M))
     if len(later) < 10:
         return math.nan
     errors = position_errors_m(truth, means)[::4]
-    return rms(errors[later]) / rms(errors[np.argmax(before[later], axis=1)])
+    return rms(errors[later]) / rms(errors[first[later]])

@@ -5,20 +5,22 @@ from experiments.evaluation.verdict import Profile
 # Each study's table, and the estimator's keys that name its rows
 LABELS: dict[str, tuple[str, ...]] = {
     "particles": ("n_particles",),
+    "laps": (),
     "bound": (),
     "observations": (),
     "repeats": ("n_particles",),
     "distance": (),
     "association": ("association", "p0"),
     "resampling": ("resampling", "ess_share"),
-    "noise": ("noise_at",),
+    "noise": (),
 }
-N_WORLDS = {Profile.FULL: 50, Profile.QUICK: 2}
-N_REPEATS = {Profile.FULL: 20, Profile.QUICK: 3}  # of a run
-N_DRAWS = {Profile.FULL: 5, Profile.QUICK: 2}  # of the wheel errors
+QUICK_SEEDS = "range(1000,1002)"
+CELL_M = 0.1  # of the occupancy grids
+N_REPEATS = {Profile.FULL: 20, Profile.QUICK: 2}  # of a run, or of the images over one drive
+N_DRAWS = {Profile.FULL: 8, Profile.QUICK: 2}  # of the wheel errors
 N_TIMINGS = {Profile.FULL: 5, Profile.QUICK: 2}
-SEED = 1000  # of the first world
 P0 = 1e-3  # in the rows of estimators without a p0
 FARTHEST_M = 20.0  # images are drawn with all landmarks within this distance
 LAG_M = 20.0  # ground is revisited when the robot was there at least this much path ago
 WITHIN_M = 1.0  # and this near
+SETTLED_M = 20.0  # places first visited on so much path from the known start do not count

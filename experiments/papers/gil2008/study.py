@@ -5,6 +5,7 @@ recording.
 """
 
 import dataclasses
+import json
 from collections.abc import Callable, Iterator, Sequence
 from itertools import accumulate
 
@@ -13,7 +14,6 @@ import pandas as pd
 
 from estimators.base import run as walk
 from estimators.odometry import Odometry
-from estimators.stereo import StereoModel
 from experiments.bench.fastslam import cost_by_landmarks
 from experiments.evaluation.metrics import position_errors_m, rms, travelled_m
 from experiments.evaluation.verdict import Profile
@@ -26,6 +26,7 @@ from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
 from experiments.runs.seeds import stream
 from experiments.sweeps.plan import planned
+from experiments.viewing.map import grid_along
 from sim import se2
 from sim.arrays import Array
 from sim.recording import Recording
@@ -41,6 +42,9 @@ _SCORES = (
     "revised_ate_rmse_m",
     "revised_ate_aligned_rmse_m",
     "revised_heading_rmse_rad",
+    "n_landmarks",
+    "map_rmse_m",
+    "map_aligned_rmse_m",
 )
 _RUNS_PER_JOB = 40
 
@@ -59,7 +63,7 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
     """
     jobs = [
         [part[low : low + _RUNS_PER_JOB]]
-        for part in grouped(plan(profile), lambda run: Scene.of(run[1].config))
+        for part in grouped(plan(profile), _drawn_from)
         for low in range(0, len(part), _RUNS_PER_JOB)
     ]
     rows: dict[str, list[Row]] = {table: [] for table in settings.LABELS}
@@ -73,21 +77,24 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
 
 
 def plan(profile: Profile) -> Iterator[TableRun]:
-    """All runs; the quick profile has the same ones over fewer worlds, with fewer repeats.
-
-    They are composed for one world; the others differ only in their seed.
-    """
+    """All runs; the quick profile has the same ones over two worlds, with fewer repeats."""
+    n_draws, n_repeats = settings.N_DRAWS[profile], settings.N_REPEATS[profile]
     for table in settings.LABELS:
-        n_worlds = 1 if table == "repeats" else settings.N_WORLDS[profile]
-        for one in planned([f"study=gil2008_{table}", f"seed={settings.SEED}"]):
-            if one.config["recording"]["draw"] < settings.N_DRAWS[profile]:
-                repeats = min(one.repeats, settings.N_REPEATS[profile])
-                for seed in range(settings.SEED, settings.SEED + n_worlds):
-                    yield table, one.replaced(seed=seed, world_seed=seed, repeats=repeats)
+        few = profile is Profile.QUICK and table != "repeats"  # which has one world
+        for one in planned([f"study=gil2008_{table}", *few * [f"seed={settings.QUICK_SEEDS}"]]):
+            drawn = one.config["recording"]
+            if drawn["draw"] < n_draws and drawn["image_draw"] <= n_repeats:
+                yield table, one.replaced(repeats=min(one.repeats, n_repeats))
+
+
+def _drawn_from(run: TableRun) -> tuple[Scene, str]:
+    """What runs over one recording have in common."""
+    config = run[1].config
+    return Scene.of(config), json.dumps(config["route"])
 
 
 def rows_of(runs: Sequence[TableRun]) -> list[tuple[str, Row]]:
-    """Table and row of every run over one scene."""
+    """Table and row of every run over one recording."""
     first = runs[0][1]
     scene, recording = Scene.of(first.config), whole(first.config)
     truth, robot = recording.truth_at(recording.frame_stamps), first.robot()
@@ -105,7 +112,8 @@ def rows_of(runs: Sequence[TableRun]) -> list[tuple[str, Row]]:
         labels = labels_of(table, experiment)
         shown = common | labels | _shown(seen)
         for repeat in range(experiment.repeats):
-            rng = stream(scene.seed, f"estimator/{table}/{labels}", 100 * scene.draw + repeat)
+            index = 100 * scene.draw + scene.image_draw + repeat
+            rng = stream(scene.seed, f"estimator/{table}/{labels}", index)
             rows.append((table, {**shown, "repeat": repeat, **one_run(experiment, seen, rng)}))
     return rows
 
@@ -116,7 +124,8 @@ def labels_of(table: str, experiment: Experiment) -> Row:
     name = {"fastslam_paper": "paper", "smoother": "batch"}.get(choice, choice)
     if choice == "fastslam":
         name = {"motion": "fastslam1", "optimal": "fastslam2"}[chosen["proposal"]]
-    return {"filter": name} | {k: chosen.get(k, settings.P0) for k in settings.LABELS[table]}
+    labels = {"filter": name, "noise_at": chosen.get("noise_at", "predicted")}
+    return labels | {key: chosen.get(key, settings.P0) for key in settings.LABELS[table]}
 
 
 def _shown(recording: Recording) -> Row:
@@ -141,10 +150,9 @@ def one_run(experiment: Experiment, recording: Recording, rng: np.random.Generat
     found = scored(recording, online, revised)
     return {
         **status_of(recording, online).columns(),
-        **{key: found[key] for key in _SCORES},
+        **{key: found[key] for key in _SCORES if key in found},
         "revisit_ratio": scores.revisit_ratio(recording.truth_at(revised.stamps), revised.means),
         "step_mean_us": 1e6 * float(online.step_seconds.mean()),
-        **scores.map_scores(recording, revised.map),
         **scores.filter_scores(recording, online),
     }
 
@@ -152,43 +160,47 @@ def one_run(experiment: Experiment, recording: Recording, rng: np.random.Generat
 def write_arrays(out: Results) -> None:
     """Write what the figures draw of one recording, and particles along a motion."""
     path = Experiment.compose(["study=gil2008"])
-    recording = path.recording()
+    recording, scanned = path.recording(), Experiment.compose(["study=gil2008_scans"]).recording()
     log, world = recording.log("stereo"), recording.known_world
-    estimated = {}
-    for name in ("odometry", "fastslam", "smoother"):
-        one = Experiment.compose(["study=gil2008", f"estimator={name}"])
-        rng = stream(one.seed, "example")
-        online, revised = estimates(one.estimator(), recording, one.prior(recording), rng)
-        estimated[name] = revised or online
-    best, along = estimated["fastslam"], recording.truth_at(recording.frame_stamps)
-    rows = np.repeat(np.searchsorted(best.stamps, log.stamps), np.diff(log.known_splits))
-    model = StereoModel.of(recording.sensor("stereo", StereoCamera))
-    placed = {
-        f"placed_by_{name}": model.place(estimated[name].means[rows], log["points_in_camera"])[
-            :, :2
-        ]
-        for name in ("odometry", "fastslam")
-    }
+    along = recording.truth_at(recording.frame_stamps)
     busiest = int(np.argmax(np.diff(log.known_splits)))
     pictured = {
         "walls": world.walls,
         "wall_z_m": world.wall_z_m,
         "truth": along,
-        **{name: estimate.means for name, estimate in estimated.items()},
         "travelled_m": travelled_m(along),
-        "landmarks": best.map["landmarks"],
-        "landmark_covariances": best.map["landmark_covariances"],
-        **placed,
-        "image_pose": best.means[np.searchsorted(best.stamps, log.stamps[busiest])],
+        **_gridded("truth", scanned, scanned.known_truth.stamps, scanned.known_truth.poses),
     }
+    for option in ("odometry", "fastslam_paper", "fastslam", "smoother"):
+        one = Experiment.compose(["study=gil2008", f"estimator={option}"])
+        rng = stream(one.seed, "example")
+        online, revised = estimates(one.estimator(), recording, one.prior(recording), rng)
+        found, name = revised or online, str(labels_of("bound", one)["filter"])
+        pictured[name] = found.means
+        pictured |= _gridded(name, scanned, found.stamps, found.means)
+        if found.map:
+            in_image = np.isin(found.map["ids"], log.reading(busiest)["ids"])
+            pictured |= {
+                f"{name}_landmarks": found.map["landmarks"],
+                f"{name}_covariances": found.map["landmark_covariances"],
+                f"{name}_in_image": in_image,
+                f"{name}_image_pose": found.means[
+                    np.searchsorted(found.stamps, log.stamps[busiest])
+                ],
+            }
     out.write_arrays(
         "path",
         revisited=scores.revisited(along[::4]),
-        in_image=np.isin(best.map["ids"], log.reading(busiest)["ids"]),
         **{name: values.astype(np.float32) for name, values in pictured.items()},
     )
     line, particles = particles_along_a_motion(stream(path.seed, "figure"))
     out.write_arrays("motion", line=line.astype(np.float32), particles=particles.astype(np.float32))
+
+
+def _gridded(name: str, scanned: Recording, stamps: Array, poses: Array) -> dict[str, Array]:
+    """Occupancy grid of the scans along a path (T, 3), and its origin."""
+    grid, _ = grid_along(scanned, stamps, poses, resolution_m=settings.CELL_M)
+    return {f"{name}_grid": grid.probability, f"{name}_origin": grid.origin}
 
 
 def particles_along_a_motion(rng: np.random.Generator) -> tuple[Array, Array]:

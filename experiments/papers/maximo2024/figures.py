@@ -1,21 +1,26 @@
 """The figures of maximo2024, from its tables and arrays."""
 
+import textwrap
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from estimators import descriptors as describers
-from experiments.papers.maximo2024.claims import geometries, m3_failures
+from experiments.evaluation.verdict import Verdict
+from experiments.papers.maximo2024.claims import COMPARISONS, geometries, judged_map
 from experiments.papers.maximo2024.settings import (
     DRAWN_DESCRIPTOR,
     ITERATIONS,
     METHODS,
     NAMES,
+    PRINTED_5,
     RECOVERED_WITHIN,
 )
 from experiments.papers.results import Results
@@ -25,18 +30,22 @@ from experiments.viewing.style import BLACK, BLUE, CYCLE, GREEN, ORANGE, RED, SK
 Arrays = dict[str, NDArray[Any]]
 
 _COLOUR = {"M1": ORANGE, "M2": BLUE, "M3": GREEN}
-_FLOOR_M = {"oxford": 1.0, "oxford_real": 1.0, "umh": 0.03, "campus": 0.1, "campus_quick": 0.1}
+_FLOOR_M = {"oxford": 1.0, "umh": 0.03, "campus": 0.1}
+_VERDICT = {
+    Verdict.REPRODUCED: "#9BD0A5",
+    Verdict.UNDECIDED: "#DDDDDD",
+    Verdict.NOT_REPRODUCED: "#F2B48C",
+}
 _RECALL = {"recall_at_1": "recall@1", "recall_at_1_percent": "recall@1 %"}
 
 
 def draw(made: Results) -> dict[str, Figure]:
     """All figures, by file name; the Oxford route is the real one where its positions are."""
     oxford = "oxford_real" if made.has_arrays("oxford_real") else "oxford"
-    campus_starts = made.table("campus_starts")
-    campus = str(campus_starts["geometry"].iloc[0])
-    drawn: dict[str, Arrays] = {name: made.arrays(name) for name in (oxford, "umh", campus)}
+    drawn: dict[str, Arrays] = {name: made.arrays(name) for name in (oxford, "umh", "campus")}
+    runs = {"maximo2024_runs": oxford_runs(made.table("runs"))} if made.has_table("runs") else {}
     return {
-        "maximo2024_data": data(drawn[campus]),
+        "maximo2024_data": data(drawn["campus"]),
         "maximo2024_clusters": clusters(drawn),
         "maximo2024_map_and_route": map_and_route(drawn),
         "maximo2024_dispersion": dispersion(made.table("dispersion")),
@@ -46,7 +55,8 @@ def draw(made: Results) -> dict[str, Figure]:
         "maximo2024_table_2": table_2(made.table("table_2")),
         "maximo2024_quality": quality(made.table("quality")),
         "maximo2024_kidnapping": kidnapping(made.table("kidnapping")),
-        "maximo2024_campus": campus_errors(campus_starts, made.table("clusters")),
+        "maximo2024_campus": campus_errors(made.table("campus_starts"), made.table("clusters")),
+        **runs,
     }
 
 
@@ -100,11 +110,11 @@ def dispersion(table: pd.DataFrame) -> Figure:
         for ax, value in zip(axes, ("dispersion_m", "error_m"), strict=True):
             steps = part.groupby(["method", "step"])[value].quantile([0.1, 0.5, 0.9]).unstack()
             for method in METHODS:
-                spread = steps.clip(lower=_FLOOR_M[name]).loc[method]
+                spread = steps.clip(lower=_FLOOR_M[name.partition("_")[0]]).loc[method]
                 ax.plot(spread[0.5], color=_COLOUR[method], label=method)
                 between = (spread.index, spread[0.1], spread[0.9])
                 ax.fill_between(*between, color=_COLOUR[method], alpha=0.15, lw=0)
-            _log_scale(ax, bottom=_FLOOR_M[name])
+            _log_scale(ax, bottom=_FLOOR_M[name.partition("_")[0]])
         axes[0].set(title=NAMES[name])
         axes[1].set(xlabel="step")
     columns[0][0][0].set(ylabel="dispersion, m")
@@ -113,19 +123,22 @@ def dispersion(table: pd.DataFrame) -> Figure:
 
 
 def starts(routes: dict[str, Arrays]) -> Figure:
-    """Figure 5: error of M2 along the route from three starts."""
-    page, axes = subplots(9.0, 3.8, 1, 2)
+    """Figure 5: error of M2 along the route from three starts, the mean of the repeats."""
+    page, axes = subplots(9.0, 4.2, 1, 2)
     for ax, (name, route) in zip(axes, routes.items(), strict=True):
-        for errors, colour in zip(route["start_errors_m"], CYCLE[:3], strict=True):
+        printed = PRINTED_5.get(name, (None,) * 3)
+        for errors, colour, paper in zip(route["start_errors_m"], CYCLE[:3], printed, strict=True):
             start = int(np.argmax(np.isfinite(errors)))
-            label = f"start {start}: mean {np.nanmean(errors):.2f} m"
+            label = f"start {start}: {np.nanmean(errors):.2f} ± {np.nanstd(errors):.2f} m"
+            if paper is not None:
+                label += f" (paper {paper[0]:.2f} ± {paper[1]:.2f})"
             ax.plot(errors, color=colour, lw=0.9, label=label)
             ax.plot(start, errors[start], "o", color=colour, ms=4)
         spacing = float(np.median(np.hypot(*np.diff(route["nodes_m"], axis=0).T)))
         ax.set_yscale("symlog", linthresh=spacing)
         top = 1000.0 if name.startswith("oxford") else 100.0  # room for the legend
         ax.set(xlabel="query", ylabel="error, m", title=NAMES[name], ylim=(0.0, top))
-        ax.legend(loc="upper right")
+        ax.legend(loc="upper right", fontsize=8)
     return page
 
 
@@ -188,25 +201,52 @@ def table_2(table: pd.DataFrame) -> Figure:
 
 
 def quality(table: pd.DataFrame) -> Figure:
-    """Where M3 fails: share of worlds, by the descriptors' noise and B, parameters shared."""
-    page, columns = _columns(table, 4.6, 0.0, 3.4)
-    for (ax,), name, part in columns:
-        shares = m3_failures(table, name)
-        recall = part.groupby("noise_weight")["recall_at_1"].mean()
-        ax.imshow(shares, cmap="Blues", vmin=0.0, vmax=1.4, aspect="auto", origin="lower")
-        for (i, j), share in np.ndenumerate(shares):
-            ax.text(j, i, f"{share:.2f}", ha="center", va="center")
-        ax.set(
-            xlabel="B",
-            xticks=range(shares.shape[1]),
-            xticklabels=shares.columns,
-            ylabel="noise weight (recall@1)",
-            yticks=range(len(shares)),
-            yticklabels=[f"{w:g} ({recall[w]:.2f})" for w in shares.index],
-            title=f"{NAMES[name]}: share of worlds\nwith M3 worse than 5 times M2",
-        )
-        ax.spines[:].set_visible(False)
+    """Each comparison of weightings and its verdict, by the descriptors' noise and B."""
+    names = geometries(table)
+    page, axes = subplots(11.5, 3.0 * len(names) + 0.6, len(names), len(COMPARISONS), squeeze=False)
+    for row, name in zip(axes, names, strict=True):
+        recall = table[table["geometry"] == name].groupby("noise_weight")["recall_at_1"].mean()
+        for ax, compare in zip(row, COMPARISONS, strict=True):
+            cells = judged_map(table, name, compare)
+            verdicts, values = (
+                cells.pivot_table(
+                    index="noise_weight", columns="n_nearest", values=v, aggfunc="first"
+                )
+                for v in ("verdict", "value")
+            )
+            colours = verdicts.map(lambda verdict: to_rgb(_VERDICT[verdict])).to_numpy()
+            ax.imshow(np.array([list(line) for line in colours]), aspect="auto", origin="lower")
+            for (i, j), value in np.ndenumerate(values):
+                ax.text(j, i, f"{value:.2f}", ha="center", va="center", fontsize=8)
+            ax.set(
+                xlabel="B",
+                xticks=range(values.shape[1]),
+                xticklabels=values.columns,
+                yticks=range(len(values)),
+                yticklabels=[f"{w:g} ({recall[w]:.2f})" for w in values.index],
+            )
+            label = str(cells["statistic"].iloc[0]).removesuffix(" (90 % interval)")
+            ax.set_title(textwrap.fill(label, 30), fontsize=9)
+            ax.spines[:].set_visible(False)
+        row[0].set(ylabel="noise weight (recall@1)")
+    handles = [Patch(color=colour, label=v.label) for v, colour in _VERDICT.items()]
+    page.legend(handles=handles, loc="outside lower center", ncols=3)
     return page
+
+
+def oxford_runs(table: pd.DataFrame) -> Figure:
+    """Error of each method on the positions of each Oxford run."""
+    page, ax = subplots(8.0, 4.0)
+    errors = table.groupby(["run", "method"])["error_m"].mean().unstack()
+    for i, method in enumerate(METHODS):
+        at = np.arange(len(errors)) + 0.15 * (i - 1)
+        ax.plot(at, errors[method], "o", color=_COLOUR[method], ms=4, label=method)
+    nearest = table.groupby("run")["nearest_node_m"].mean()
+    ax.plot(np.arange(len(errors)), nearest, "_", color=WALL, ms=14, label="nearest node")
+    ax.set_xticks(range(len(errors)), [run[:10] for run in errors.index], rotation=60, ha="right")
+    ax.set(ylabel="mean error over the route, m", xlabel="Oxford run")
+    _log_scale(ax)
+    return with_legend(page, ncols=4)
 
 
 def kidnapping(table: pd.DataFrame) -> Figure:

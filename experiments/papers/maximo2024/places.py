@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 import pandas as pd
@@ -31,6 +31,8 @@ from sim.sensors import Lidar3D, PlaceDescriptor
 # Noisy unit descriptors (K, 512) at points (K, 2) m
 Describe = Callable[[Array, np.random.Generator], NDArray[np.float32]]
 
+Offsets = Literal["along", "plane"]
+
 N_STRETCHES = 40  # the paper's k-means clusters
 SIZE = 512  # of the paper's descriptors
 OXFORD_RUN = "2015-08-12-15-04-18"
@@ -48,8 +50,11 @@ class Geometry:
         The map's, and the distance of successive nodes.
     offset_m, offset_sd_m
         Distance of a query to the nearest node.
+    share, share_sd
+        Where a query lies between two nodes, as a share of the way to the next; by these the
+        mean offset is the printed one.
     drift
-        Share of the offset that is new from one query to the next.
+        Share of a plane offset that is new from one query to the next.
     stretch_weight, place_weight, noise_weight
         How much of a descriptor is common to its stretch of the route, how much belongs to the
         place, and how much is noise of the single observation.
@@ -65,6 +70,8 @@ class Geometry:
     spacing_sd_m: float
     offset_m: float
     offset_sd_m: float
+    share: float
+    share_sd: float
     drift: float
     stretch_weight: float
     place_weight: float
@@ -73,8 +80,10 @@ class Geometry:
     interval_s: float
 
 
-OXFORD = Geometry("oxford", 397, 21.43, 3.19, 10.09, 5.25, 0.02, 1.0, 0.4, 0.8, 25.0, 2.56)
-UMH = Geometry("umh", 136, 2.32, 0.05, 0.39, 0.02, 0.02, 0.3, 1.0, 0.8, 3.0, 1.0)
+OXFORD = Geometry(
+    "oxford", 397, 21.43, 3.19, 10.09, 5.25, 0.5, 0.036, 0.02, 1.0, 0.4, 0.8, 25.0, 2.56
+)
+UMH = Geometry("umh", 136, 2.32, 0.05, 0.39, 0.02, 0.168, 0.0086, 0.02, 0.3, 1.0, 0.8, 3.0, 1.0)
 GEOMETRIES = {"oxford": OXFORD, "umh": UMH}
 
 
@@ -91,30 +100,48 @@ def gaps_m(points_m: Array, nodes_m: Array) -> Array:
     return np.asarray(np.hypot(*(points_m[:, None] - nodes_m[None]).transpose(2, 0, 1)))
 
 
-def oxford_positions(path: Path) -> Array:
-    """Positions (397, 2) m, east and north, of the paper's Oxford run, less their mean.
+def oxford_positions(path: Path, run: str = OXFORD_RUN) -> Array:
+    """Positions (N, 2) m, east and north, of an Oxford run's map, less their mean.
 
     Parameters
     ----------
     path
         The positions' `.csv.gz` with columns run_name, set, northing_m and easting_m.
+    run
+        One of `oxford_runs`; the paper's has 397 nodes.
 
     Raises
     ------
     InputError
-        If the file is missing or holds something else.
+        If the file is missing or holds something else, or not this run.
     """
+    table = _oxford_table(path)
+    chosen = table[table["run_name"] == run]
+    if len(chosen) < 2:
+        known = ", ".join(sorted(set(table["run_name"])))
+        raise InputError(f"{path}: no database positions of run {run!r}; it holds {known}")
+    positions = np.array(chosen[["easting_m", "northing_m"]], np.float64, order="C")
+    return np.asarray(positions - positions.mean(axis=0))
+
+
+def oxford_runs(path: Path) -> list[str]:
+    """Names of the runs in a file of `oxford_positions`, by date."""
+    return sorted(set(_oxford_table(path)["run_name"]))
+
+
+def _oxford_table(path: Path) -> pd.DataFrame:
+    """Positions of the maps of all runs: run_name, easting_m and northing_m, finite."""
     if not path.is_file():
         raise InputError(f"{path}: no such file; set positions to null for a made route")
     try:
         table = pd.read_csv(path, compression="gzip", float_precision="round_trip")
-        chosen = table[(table["run_name"] == OXFORD_RUN) & (table["set"] == "database")]
-        positions = np.array(chosen[["easting_m", "northing_m"]], np.float64, order="C")
+        table = table.loc[table["set"] == "database", ["run_name", "easting_m", "northing_m"]]
+        table = table.astype({"run_name": str, "easting_m": float, "northing_m": float})
     except (OSError, KeyError, ValueError, EOFError) as error:
         raise InputError(f"{path}: not the Oxford positions ({error}); leave it out") from error
-    if len(positions) < 2:
-        raise InputError(f"{path}: no database positions of run {OXFORD_RUN}")
-    return np.asarray(positions - positions.mean(axis=0))
+    if not np.isfinite(table[["easting_m", "northing_m"]]).all(axis=None):
+        raise InputError(f"{path}: a position is not finite; get the file again")
+    return table
 
 
 def route(geometry: Geometry, rng: np.random.Generator) -> Array:
@@ -134,8 +161,31 @@ def route(geometry: Geometry, rng: np.random.Generator) -> Array:
     return np.concatenate([np.zeros((1, 2)), np.cumsum(moves, axis=0)])
 
 
-def queries(nodes_m: Array, geometry: Geometry, rng: np.random.Generator) -> Array:
-    """Positions (N, 2) m of the queries, one per node, with the geometry's offsets.
+def queries(
+    nodes_m: Array, geometry: Geometry, rng: np.random.Generator, offsets: Offsets = "along"
+) -> Array:
+    """Positions (N, 2) m of the queries, one per node.
+
+    Map and queries are split from one recording of one drive (sec. 3), so a query lies on the
+    way to the next node. Its distance to the nearest node is the printed one in the mean. The
+    printed deviation in Oxford, 5.25 m, is more than nodes 21 m apart allow on the way, 1.6 m.
+
+    Parameters
+    ----------
+    offsets
+        `along` the route; `plane`: off it, with the printed mean and deviation.
+    """
+    if offsets not in get_args(Offsets):
+        raise InputError(f"offsets must be {' or '.join(get_args(Offsets))}, got {offsets!r}")
+    if offsets == "plane":
+        return _off_the_route(nodes_m, geometry, rng)
+    way = np.diff(nodes_m, axis=0, append=2.0 * nodes_m[-1:] - nodes_m[-2:-1])
+    shares = geometry.share + geometry.share_sd * rng.standard_normal((len(nodes_m), 1))
+    return np.asarray(nodes_m + shares * way)
+
+
+def _off_the_route(nodes_m: Array, geometry: Geometry, rng: np.random.Generator) -> Array:
+    """Queries (N, 2) m off the route, as a control.
 
     In Oxford the offset is a plane Gaussian that changes slowly (the printed mean and deviation
     of the distance, 10.09 and 5.25 m, are those of a Rayleigh law); in UMH it has a constant
@@ -189,14 +239,19 @@ def field(geometry: Geometry, nodes_m: Array, rng: np.random.Generator) -> Descr
     return describe
 
 
-def place_world(geometry: Geometry, seed: int, nodes_m: Array | None = None) -> PlaceWorld:
-    """Map and queries of one world: the route is generated unless positions are given."""
+def place_world(
+    geometry: Geometry, seed: int, nodes_m: Array | None = None, offsets: Offsets = "along"
+) -> PlaceWorld:
+    """Map and queries of one world: the route is generated unless positions are given.
+
+    The map does not depend on the queries.
+    """
     if nodes_m is None:
         nodes_m = route(geometry, stream(seed, "world"))
     rng = stream(seed, "places")
-    queries_m = queries(nodes_m, geometry, rng)
     describe = field(geometry, nodes_m, rng)
     known_map = from_arrays(nodes_m, describe(nodes_m, rng))
+    queries_m = queries(nodes_m, geometry, rng, offsets)
     seen, slip = describe(queries_m, rng), stream(seed, "slip")
     return PlaceWorld(known_map, query_recording(queries_m, seen, geometry.interval_s, slip))
 
@@ -273,7 +328,11 @@ def route_recording(
     config: dict[str, Any],
     geometry: str,
     positions: str | None = None,
+    positions_run: str = OXFORD_RUN,
     noise_weight: float | None = None,
+    offsets: Offsets = "along",
+    first_query: int = 0,
+    n_queries: int | None = None,
 ) -> Recording:
     """Queries of a route, by the configuration's world_seed.
 
@@ -281,34 +340,52 @@ def route_recording(
     ----------
     geometry
         `oxford` or `umh`.
-    positions
-        File of `oxford_positions`; None: the route is generated.
+    positions, positions_run
+        File and run of `oxford_positions`; None: the route is generated.
     noise_weight
         Of the descriptors; None: the geometry's own.
+    offsets
+        Of the queries, as in `queries`.
+    first_query, n_queries
+        Where the robot starts, and how many queries there are from there; None: all.
     """
-    return _route(config, geometry, positions, noise_weight).recording
+    whole = _route(config, geometry, positions, positions_run, noise_weight, offsets).recording
+    n = len(whole.frame_stamps)
+    if not 0 <= first_query <= n - 2:
+        raise InputError(f"recording.first_query must be from 0 to {n - 2}, got {first_query}")
+    most = n - first_query
+    if n_queries is not None and not 1 <= n_queries <= most:
+        raise InputError(f"recording.n_queries must be from 1 to {most}, got {n_queries}")
+    part = resequenced(whole, np.arange(first_query, n)) if first_query else whole
+    return part if n_queries is None else part.cut(n_queries)
 
 
 def route_map(
     config: dict[str, Any],
     geometry: str,
     positions: str | None = None,
+    positions_run: str = OXFORD_RUN,
     noise_weight: float | None = None,
 ) -> TopologicalMap:
     """Map of the same route."""
-    return _route(config, geometry, positions, noise_weight).known_map
+    return _route(config, geometry, positions, positions_run, noise_weight, "along").known_map
 
 
 def _route(
-    config: dict[str, Any], name: str, positions: str | None, noise_weight: float | None
+    config: dict[str, Any],
+    name: str,
+    positions: str | None,
+    run: str,
+    noise_weight: float | None,
+    offsets: Offsets,
 ) -> PlaceWorld:
     if name not in GEOMETRIES:
         raise InputError(f"geometry must be {' or '.join(GEOMETRIES)}, got {name!r}")
     geometry = GEOMETRIES[name]
     if noise_weight is not None:
         geometry = dataclasses.replace(geometry, noise_weight=noise_weight)
-    nodes = None if positions is None else oxford_positions(Path(positions))
-    return place_world(geometry, config["world_seed"], nodes)
+    nodes = None if positions is None else oxford_positions(Path(positions), run)
+    return place_world(geometry, config["world_seed"], nodes, offsets)
 
 
 def recording_from_files(

@@ -17,8 +17,10 @@ from estimators.topological_map import from_recording
 from experiments.bench import topological
 from experiments.evaluation.verdict import Profile
 from experiments.papers.jobs import in_parallel
-from experiments.papers.maximo2024.places import GEOMETRIES, resequenced
+from experiments.papers.maximo2024.claims import headlines
+from experiments.papers.maximo2024.places import oxford_runs, resequenced
 from experiments.papers.maximo2024.settings import (
+    CONTROLS,
     DRAWN_DESCRIPTOR,
     GRID_B,
     GRID_SIGMA_L,
@@ -26,16 +28,19 @@ from experiments.papers.maximo2024.settings import (
     HELD,
     ITERATIONS,
     JUDGED_SEED,
-    METHODS,
     N_CAMPUSES,
+    N_CLUSTERED_CAMPUSES,
     N_QUALITY_WORLDS,
     N_REPEATS,
+    N_RUN_SEEDS,
     N_STARTS,
     N_TIMINGS,
+    N_WEIGHTED,
     N_WORLDS,
     POSITIONS,
     PRINTED_1,
     PRINTED_2,
+    PRINTED_5,
     RECOVERED_WITHIN,
     TOLERANCE,
 )
@@ -52,6 +57,7 @@ from experiments.papers.maximo2024.worlds import (
     options,
     particle_rows,
     quality_rows,
+    run_rows,
     starts,
     weighting_rows,
 )
@@ -80,13 +86,10 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
     on_progress
         Called with the share of the work done.
     """
-    campus = "campus" if profile is Profile.FULL else "campus_quick"
-    oxford = "oxford_real" if POSITIONS.is_file() else "oxford"
-    routes = dict.fromkeys(["oxford", "umh", oxford])  # each once
-    jobs = [(campus, JUDGED_SEED + i, profile) for i in range(N_CAMPUSES[profile])]
-    jobs += [(name, JUDGED_SEED + i, profile) for name in routes for i in range(N_WORLDS[profile])]
+    jobs = _jobs(profile)
     rows: dict[str, Rows] = {}
-    for (name, seed, _), part in zip(jobs, in_parallel(_rows, jobs, on_progress), strict=True):
+    parts = in_parallel(_rows, [job for job, _ in jobs], on_progress, [cost for _, cost in jobs])
+    for ((_, name, seed, _), _), part in zip(jobs, parts, strict=True):
         for table, found in part.items():
             labelled = ({"geometry": name, "seed": seed, **row} for row in found)
             rows.setdefault(table, []).extend(labelled)
@@ -94,45 +97,78 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
     tables["times"] = times(N_TIMINGS[profile])
     tables["table_1"] = table_1(tables["weighting"])
     tables["table_2"] = table_2(tables["particles"], tables["times"])
+    drawn = {
+        name: route_arrays(case_of(name, JUDGED_SEED), N_REPEATS[profile]) for name in routes()
+    }
+    tables["figure_5"] = figure_5(drawn)
     out.write_tables(**tables)
-    for name in routes:
-        out.write_arrays(name, **route_arrays(case_of(name, JUDGED_SEED)))
-    out.write_arrays(campus, **campus_arrays(campus))
+    for name, arrays in drawn.items():
+        out.write_arrays(name, **arrays)
+    out.write_arrays("campus", **campus_arrays())
 
 
-def _rows(name: str, seed: int, profile: Profile) -> dict[str, Rows]:
-    """All rows of one world, by table."""
-    if name.startswith("campus"):
-        return campus_rows(name, seed, N_REPEATS[profile])
+Job = tuple[str, str, int, Profile]  # what to run, in which world
+
+
+def _jobs(profile: Profile) -> list[tuple[Job, float]]:
+    """All jobs and how long they take, the longest first."""
+    decisive = sorted(headlines(routes()))
+    controls = [*CONTROLS, *(set(routes()) - set(decisive))]
+    sizes = {
+        "campus": (["campus"], N_CAMPUSES, 10.0),
+        "runs": (["oxford_runs"] * POSITIONS.is_file(), N_RUN_SEEDS, 10.0),
+        "route": (routes(), N_WORLDS, 6.0),
+        "weighting": (decisive, N_WEIGHTED, 3.0),
+        "control": (controls, N_WORLDS, 3.0),
+        "quality": (decisive, N_QUALITY_WORLDS, 3.0),
+    }
+    return [
+        ((what, name, JUDGED_SEED + i, profile), cost)
+        for what, (names, n, cost) in sizes.items()
+        for i in range(n[profile])
+        for name in names
+    ]
+
+
+def _rows(what: str, name: str, seed: int, profile: Profile) -> dict[str, Rows]:
+    """All rows of a job, by table."""
+    n_repeats = N_REPEATS[profile]
+    if what == "campus":
+        with_clusters = seed < JUDGED_SEED + N_CLUSTERED_CAMPUSES
+        return campus_rows(seed, profile, with_clusters=with_clusters)
+    if what == "quality":
+        return {"quality": list(quality_rows(name, seed))}
+    if what == "runs":
+        found = [
+            {"run": run, **row}
+            for run in oxford_runs(POSITIONS)
+            for row in run_rows(run, seed, min(n_repeats, 2))
+        ]
+        return {"runs": found}
     case = case_of(name, seed)
+    if what in ("weighting", "control"):
+        return weighting_rows(case, n_repeats)
     settings, tolerance_m = options(case), TOLERANCE * case.known_map.spacing_m
     by_mode = settings | {"estimate": "mode"}
-    tables: dict[str, Rows] = {
-        **weighting_rows(case, N_REPEATS[profile]),
+    return {
         "starts": [
             {"start": start, "settled_at": settled}
             for start, settled, _ in starts(case, N_STARTS[profile], settings, tolerance_m)
         ],
         "kidnapping": list(kidnapping_rows(case, by_mode, 0.05, 5, RECOVERED_WITHIN + HELD)),
         "clusters": [cluster_row(case.known_map, case.recording, "synthetic", seed)],
+        "particles": list(particle_rows(case, n_repeats)),
     }
-    if name in GEOMETRIES:  # not again on the real positions
-        tables["particles"] = list(particle_rows(case, N_REPEATS[profile]))
-        if seed < JUDGED_SEED + N_QUALITY_WORLDS[profile]:
-            tables["quality"] = list(quality_rows(name, seed))
-    return tables
 
 
 def times(n_repeats: int) -> pd.DataFrame:
     """Table 2: time per node on one core, timed repeatedly after the other jobs have ended."""
     rows = []
-    for repeat in range(n_repeats):
-        measured = {measurement.name: measurement.value for measurement in topological.run()}
-        rows += [
-            (name, count, repeat, 1e-3 * measured[f"topological.node_{count}_ms"], paper_s)
-            for name, counts in topological.PAPER_S.items()
-            for count, paper_s in counts.items()
-        ]
+    for name in sorted(headlines(routes())):
+        experiment = case_of(name, JUDGED_SEED).experiment
+        for count, paper_s in topological.PAPER_S[name.removesuffix("_real")].items():
+            found = [topological.node_s(experiment, count) for _ in range(n_repeats)]
+            rows += [(name, count, repeat, time_s, paper_s) for repeat, time_s in enumerate(found)]
     return pd.DataFrame(rows, columns=["geometry", "particles", "repeat", "time_s", "paper_s"])
 
 
@@ -143,7 +179,7 @@ def table_1(weighting: pd.DataFrame) -> pd.DataFrame:
     """
     table = _over_worlds(weighting, "method")
     table[["paper_m", "paper_sd_m"]] = [
-        PRINTED_1.get((name.removesuffix("_real"), method), (math.nan, math.nan))
+        PRINTED_1.get((name.partition("_")[0], method), (math.nan, math.nan))
         for name, method in table.index
     ]
     table["nearest_node_m"] = weighting.groupby(table.index.names)["nearest_node_m"].mean()
@@ -154,9 +190,25 @@ def table_2(particles: pd.DataFrame, taken: pd.DataFrame) -> pd.DataFrame:
     """Errors and times by the number of particles, beside the paper's."""
     table = _over_worlds(particles, "particles").drop(columns="sd_worlds_m")
     table = table.join(taken.groupby(table.index.names)[["time_s", "paper_s"]].median())
-    table[["paper_m", "paper_sd_m"]] = [PRINTED_2[name][count] for name, count in table.index]
+    table[["paper_m", "paper_sd_m"]] = [
+        PRINTED_2[name.partition("_")[0]][count] for name, count in table.index
+    ]
     table["paper_time_s"] = table.pop("paper_s")
     return table.reset_index()
+
+
+def figure_5(drawn: dict[str, Arrays]) -> pd.DataFrame:
+    """Mean error of each start along the route, of all repeats, and its deviation; the paper's."""
+    unknown = ((math.nan, math.nan),) * 3
+    rows = [
+        (name, int(np.isnan(errors).sum()), np.nanmean(errors), np.nanstd(errors), *printed)
+        for name, arrays in drawn.items()
+        for errors, printed in zip(
+            arrays["start_errors_m"], PRINTED_5.get(name, unknown), strict=True
+        )
+    ]
+    columns = ["geometry", "start", "error_m", "sd_m", "paper_m", "paper_sd_m"]
+    return pd.DataFrame(rows, columns=columns)
 
 
 def _over_worlds(table: pd.DataFrame, by: str) -> pd.DataFrame:
@@ -171,23 +223,25 @@ def _over_worlds(table: pd.DataFrame, by: str) -> pd.DataFrame:
 # What the figures draw
 
 
-def route_arrays(case: Case) -> Arrays:
+def route_arrays(case: Case, n_repeats: int) -> Arrays:
     """Nodes, their clusters and queries; errors of M2 from three starts, particles of a fourth run.
 
     Returns
     -------
     dict
-        `nodes_m` (N, 2), `clusters` (N,), `queries_m` (K, 2); `start_errors_m` (3, K), NaN before
-        the start; at `ITERATIONS` `means_m` (4, 2) and `particles_m` (4, M, 2).
+        `nodes_m` (N, 2), `clusters` (N,), `queries_m` (K, 2); `start_errors_m` (3, K), means of
+        the repeats, NaN before the start; at `ITERATIONS` `means_m` (4, 2) and `particles_m`
+        (4, M, 2).
     """
     n = len(case.recording.frame_stamps)
     errors = np.full((3, n), np.nan)
     for i, start in enumerate((0, n // 4, n // 2)):
         part = resequenced(case.recording, np.arange(start, n))
-        rng = stream(case.seed, "estimator/figure", start)
-        errors[i, start:] = localize(case, options(case), rng, part).errors_m
+        rngs = [stream(case.seed, f"estimator/figure_5/{start}", k) for k in range(n_repeats)]
+        walks = [localize(case, options(case), rng, part).errors_m for rng in rngs]
+        errors[i, start:] = np.mean(walks, axis=0)
     rng, part = stream(case.seed, "estimator/figure", 6), case.recording.cut(ITERATIONS[-1] + 1)
-    found = localize(case, options(case), rng, part).estimate
+    found = localize(case, options(case), rng, part, keep=("particles",)).estimate
     steps = list(ITERATIONS)
     return {
         "nodes_m": case.known_map.positions_m,
@@ -199,7 +253,7 @@ def route_arrays(case: Case) -> Arrays:
     }
 
 
-def campus_arrays(name: str) -> Arrays:
+def campus_arrays() -> Arrays:
     """Nodes, their clusters, queries and walls; clouds of four nodes and of four queries.
 
     Returns
@@ -209,7 +263,7 @@ def campus_arrays(name: str) -> Arrays:
         clouds were taken, `map_spots_m` and `query_spots_m` (4, 2), and what they show above
         ground, `map_clouds_m` and `query_clouds_m` (P, 2).
     """
-    experiments = campus_runs(name, JUDGED_SEED)
+    experiments = campus_runs(JUDGED_SEED)
     mapping, taking = (experiment.recording() for experiment in experiments)
     spacing_m = experiments[0].config["prior"]["map"]["spacing_m"]
     known = from_recording(mapping, DRAWN_DESCRIPTOR, spacing_m)
@@ -250,24 +304,28 @@ def _clouds(recording: Recording, points_m: Array) -> tuple[Array, NDArray[np.fl
 # Choosing the parameters
 
 
-def tune(out: Results, n_worlds: int = 12) -> None:
-    """Mean error of every setting of the grid on seeds 0, 1, ...; M2's least is in `TUNED`.
+def tune(out: Results, n_worlds: int = 8) -> None:
+    """Mean error of M2 at every setting of the grid on seeds 0, 1, ...; the least is in `TUNED`.
 
-    Takes about ten minutes on two cores. All methods see the same worlds and draws.
+    Takes about ten minutes on two cores. The settings see the same worlds and draws.
     """
-    jobs = [(name, seed) for seed in range(n_worlds) for name in GEOMETRIES]
+    jobs = [(name, seed) for seed in range(n_worlds) for name in routes()]
     parts = in_parallel(_tuning_rows, jobs, lambda _share: None)
-    columns = ["geometry", "method", "sigma_l", "sigma_m", "n_nearest", "error_m"]
+    columns = ["geometry", "sigma_l", "sigma_m", "n_nearest", "error_m"]
     table = pd.DataFrame(list(itertools.chain.from_iterable(parts)), columns=columns)
-    out.write_tables(tuning=table.groupby(columns[:-1], as_index=False)["error_m"].mean())
+    by = table.groupby(columns[:-1], as_index=False, sort=False)
+    out.write_tables(tuning=by["error_m"].mean())
 
 
-def _tuning_rows(name: str, seed: int) -> list[tuple[str, str, float, float, int, float]]:
+def _tuning_rows(name: str, seed: int) -> list[tuple[str, float, float, int, float]]:
     case, rows = case_of(name, seed), []
-    grid = itertools.product(METHODS, GRID_SIGMA_L, GRID_SIGMA_M, GRID_B)
-    for method, sigma_l, sigma_m, n_nearest in grid:
-        if method == "M2" or sigma_m == 0.1:  # M1 and M3 do not depend on it
-            settings = options(case, method, (sigma_l, sigma_m, n_nearest))
-            walk = localize(case, settings, stream(seed, "estimator/tuning"))
-            rows.append((name, method, sigma_l, sigma_m, n_nearest, float(walk.errors_m.mean())))
+    for sigma_l, sigma_m, n_nearest in itertools.product(GRID_SIGMA_L, GRID_SIGMA_M, GRID_B):
+        settings = options(case, "M2", (sigma_l, sigma_m, n_nearest))
+        walk = localize(case, settings, stream(seed, "estimator/tuning"))
+        rows.append((name, sigma_l, sigma_m, n_nearest, float(walk.errors_m.mean())))
     return rows
+
+
+def routes() -> list[str]:
+    """Data sets of the paper: the real Oxford positions are among them where they are at hand."""
+    return ["oxford", *(["oxford_real"] if POSITIONS.is_file() else []), "umh"]

@@ -5,7 +5,7 @@ A world is a route with a synthetic field of descriptors, or a campus with simul
 
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,7 +16,8 @@ from scipy.cluster.vq import kmeans2
 from estimators import descriptors as describers
 from estimators.base import Estimate, Prior, run
 from estimators.topological_map import TopologicalMap, from_recording
-from experiments.evaluation.metrics import rms, travelled_m
+from experiments.evaluation.metrics import position_errors_m, rms, travelled_m
+from experiments.evaluation.verdict import Profile
 from experiments.papers.maximo2024.places import N_STRETCHES, UMH, described, gaps_m, resequenced
 from experiments.papers.maximo2024.settings import (
     CAMPUS_SHIFT_M,
@@ -24,12 +25,14 @@ from experiments.papers.maximo2024.settings import (
     HELD,
     KIDNAPPED_AFTER,
     METHODS,
+    N_CAMPUS_STARTS,
+    N_KIDNAPPINGS,
+    N_REPEATS,
     PER_NODE,
     POSITIONS,
     QUALITIES,
     QUALITY_STEPS,
     RECOVERED_WITHIN,
-    SHARED_SIGMA,
     TOLERANCE,
     TUNED,
     WITHIN,
@@ -63,10 +66,13 @@ class Case:
 
 
 def case_of(name: str, seed: int, *overrides: str) -> Case:
-    """World of a route; `oxford_real` has the real positions."""
-    lines = [f"study=maximo2024_{name.removesuffix('_real')}", f"seed={seed}", *overrides]
-    if name == "oxford_real":
+    """World of a route; `oxford_real` has the real positions, `_plane` queries off the route."""
+    route, _, kind = name.partition("_")
+    lines = [f"study=maximo2024_{route}", f"seed={seed}", *overrides]
+    if kind == "real":
         lines.append(f"positions='{POSITIONS}'")
+    if kind == "plane":
+        lines.append("recording.offsets=plane")
     experiment = Experiment.compose(lines)
     recording = experiment.recording()
     return Case(name, seed, experiment, experiment.prior(recording).map, recording)
@@ -84,8 +90,8 @@ def options(
     parameters
         sigma_l in node spacings, sigma_m, B.
     """
-    like = "oxford" if case.name.startswith("oxford") else "umh"
-    sigma_l, sigma_m, n_nearest = parameters or TUNED[like]
+    own = case.name.removesuffix("_plane")
+    sigma_l, sigma_m, n_nearest = parameters or TUNED[own if own in TUNED else "umh"]
     return {
         "weighting": method,
         "sigma_l_m": sigma_l * case.known_map.spacing_m,
@@ -108,8 +114,9 @@ def localize(
     settings: dict[str, Any],
     rng: np.random.Generator,
     recording: Recording | None = None,
+    keep: Sequence[str] = (),
 ) -> Walk:
-    """Localize globally; the dispersion is the particles' mean distance from the estimate.
+    """Localize globally.
 
     Parameters
     ----------
@@ -117,6 +124,8 @@ def localize(
         Keys of the estimator in place of the experiment's.
     recording
         In place of the case's own.
+    keep
+        Further Belief extras to record.
     """
     taken = case.recording if recording is None else recording
     estimate = run(
@@ -124,14 +133,10 @@ def localize(
         taken,
         Prior(taken.robot, taken.sensors, map=case.known_map),
         rng,
-        keep=("particles", "log_weights", "refinement"),
+        keep=("dispersion_m", "refinement", *keep),
     )
-    errors = np.hypot(*(estimate.means - taken.truth_at(taken.frame_stamps))[:, :2].T)
-    spread, extras = np.empty(len(errors)), estimate.extras
-    for i, (cloud, logs) in enumerate(zip(extras["particles"], extras["log_weights"], strict=True)):
-        weights = np.exp(logs)
-        spread[i] = weights @ np.hypot(*(cloud[:, :2] - estimate.means[i, :2]).T) / weights.sum()
-    return Walk(errors, spread, estimate)
+    errors = position_errors_m(taken.truth_at(taken.frame_stamps), estimate.means)
+    return Walk(errors, np.array(estimate.extras["dispersion_m"]), estimate)
 
 
 def settled_at(errors_m: Array, tolerance_m: float) -> float:
@@ -144,17 +149,11 @@ def settled_at(errors_m: Array, tolerance_m: float) -> float:
 
 
 def weighting_rows(case: Case, n_repeats: int) -> dict[str, Rows]:
-    """Table 1 and figure 4: errors of each method over the whole route, and dispersions.
-
-    `M2_mode` is M2 with the mode's mean as its estimate in place of eq. (4).
-    """
+    """Table 1 and figure 4: errors of each method over the whole route, and dispersions."""
     tables: dict[str, Rows] = {"weighting": [], "dispersion": []}
-    taken = case.recording.truth_at(case.recording.frame_stamps)[:, :2]
-    # the least error of a topological estimate
-    nearest_m = float(gaps_m(taken, case.known_map.positions_m).min(axis=1).mean())
-    for method in (*METHODS, "M2_mode"):
-        settings = options(case, method[:2])
-        settings |= {"estimate": "mode"} if method == "M2_mode" else {}
+    nearest_m = _nearest_node_m(case)
+    for method in METHODS:
+        settings = options(case, method)
         walks = _repeated(case, settings, "estimator/topological_mcl", n_repeats)
         label = {"method": method, "n_nearest": settings["n_nearest"]}
         tables["weighting"] += [
@@ -167,6 +166,21 @@ def weighting_rows(case: Case, n_repeats: int) -> dict[str, Rows]:
             for i, (away, off) in enumerate(zip(spread, error, strict=True))
         ]
     return tables
+
+
+def _nearest_node_m(case: Case) -> float:
+    """Mean distance of the queries to the nearest node, m."""
+    taken = case.recording.truth_at(case.recording.frame_stamps)[:, :2]
+    return float(gaps_m(taken, case.known_map.positions_m).min(axis=1).mean())
+
+
+def run_rows(positions_run: str, seed: int, n_repeats: int) -> Iterator[Row]:
+    """Table 1 on the positions of any Oxford run."""
+    case = case_of("oxford_real", seed, f"positions_run={positions_run}")
+    label = {"nodes": len(case.known_map), "nearest_node_m": _nearest_node_m(case)}
+    for method in METHODS:
+        walks = _repeated(case, options(case, method), "estimator/topological_mcl", n_repeats)
+        yield from ({"method": method, **label, **row} for row in _errors(walks))
 
 
 def particle_rows(case: Case, n_repeats: int) -> Iterator[Row]:
@@ -238,15 +252,14 @@ def kidnapping_rows(
 
 
 def quality_rows(name: str, seed: int) -> Iterator[Row]:
-    """Map of M1-M3 over the descriptors' noise and B, with the same sigmas for all methods."""
+    """Map of M1-M3 over the descriptors' noise and B, all else as in `weighting_rows`."""
     for noise in QUALITIES:
         case = case_of(name, seed, f"recording.noise_weight={noise}")
         recall = _retrieval(case.known_map, case.recording)["recall_at_1"]
         part = case.recording.cut(QUALITY_STEPS)
         for n_nearest, method in itertools.product(GRID_B, METHODS):
-            settings = options(case, method, (*SHARED_SIGMA, n_nearest))
-            rng = stream(seed, "estimator/quality")
-            walk = localize(case, settings | {"particles_per_node": 2}, rng, part)
+            settings = options(case, method) | {"n_nearest": n_nearest}
+            walk = localize(case, settings, stream(seed, "estimator/quality"), part)
             yield {
                 "noise_weight": noise,
                 "recall_at_1": recall,
@@ -291,14 +304,10 @@ def cluster_row(known_map: TopologicalMap, recording: Recording, descriptor: str
 # A campus
 
 
-def campus_runs(name: str, seed: int) -> tuple[Experiment, Experiment]:
-    """Mapping run and query run through one campus, the queries one lane to the left.
-
-    `campus` is driven by PyBullet, `campus_quick` by the kinematic robot.
-    """
-    physics = "bullet" if name == "campus" else "kinematic"
+def campus_runs(seed: int) -> tuple[Experiment, Experiment]:
+    """Mapping run and query run through one campus, the queries one lane to the left."""
     mapping = Experiment.compose(
-        ["study=maximo2024_campus", f"seed={seed}", f"simulation.physics={physics}"]
+        ["study=maximo2024_campus", f"seed={seed}", "simulation.physics=kinematic"]
     )
     way = mapping.world().waypoints
     along = np.gradient(way, axis=0)
@@ -308,28 +317,36 @@ def campus_runs(name: str, seed: int) -> tuple[Experiment, Experiment]:
     return mapping, mapping.replaced(seed=seed + 500, route=route)  # the same world_seed
 
 
-def campus_rows(name: str, seed: int, n_repeats: int) -> dict[str, Rows]:
-    """All that is judged on simulated clouds, in one campus."""
-    mapping, taking = campus_runs(name, seed)
+def campus_rows(seed: int, profile: Profile, *, with_clusters: bool) -> dict[str, Rows]:
+    """All that is judged on simulated clouds, in one campus.
+
+    Parameters
+    ----------
+    with_clusters
+        Describe the clouds in every way, and cluster them.
+    """
+    mapping, taking = campus_runs(seed)
     mapped, taken = mapping.recording(), taking.recording()
-    settings, cases, clusters = mapping.config["prior"]["map"], {}, []
-    for descriptor in describers.KINDS:
+    settings = mapping.config["prior"]["map"]
+    tables: dict[str, Rows] = {"clusters": []}
+    for descriptor in describers.KINDS if with_clusters else ():
         known = from_recording(mapped, descriptor, settings["spacing_m"])
         fine = from_recording(mapped, descriptor, UMH.spacing_m)
         queries = described(taken, descriptor)
         row = cluster_row(fine, queries, descriptor, seed)
-        clusters.append({**row, **_retrieval(known, queries)})
-        cases[descriptor] = Case(name, seed, taking, known, queries)
-    case = cases[settings["descriptor"]]
+        tables["clusters"].append({**row, **_retrieval(known, queries)})
+    known = from_recording(mapped, settings["descriptor"], settings["spacing_m"])
+    case = Case("campus", seed, taking, known, described(taken, settings["descriptor"]))
     travel_m = np.median(np.abs(np.diff(taken.wheels.position_m[:, 0])))
-    per_node = float(case.known_map.spacing_m / travel_m)
+    per_node = float(known.spacing_m / travel_m)
     places = {"place": case.recording.log("place")}  # without the clouds
     bare = replace(case, recording=replace(case.recording, logs=places))
+    n_trials, n_after = N_KIDNAPPINGS[profile], 4 * RECOVERED_WITHIN
     return {
-        **weighting_rows(_one_query_a_node(bare), n_repeats),
-        "clusters": clusters,
-        "campus_starts": list(_campus_starts(case)),
-        "kidnapping": list(kidnapping_rows(bare, {}, 0.02, 25, 4 * RECOVERED_WITHIN, per_node)),
+        **tables,
+        **weighting_rows(_one_query_a_node(bare), N_REPEATS[profile]),
+        "campus_starts": list(_campus_starts(case, N_CAMPUS_STARTS[profile])),
+        "kidnapping": list(kidnapping_rows(bare, {}, 0.02, n_trials, n_after, per_node)),
     }
 
 
@@ -342,10 +359,10 @@ def _one_query_a_node(case: Case) -> Case:
     return replace(case, experiment=experiment, recording=resequenced(case.recording, rows))
 
 
-def _campus_starts(case: Case) -> Iterator[Row]:
-    """Default filter from 60 starts: when it is localized, and how accurately once refined."""
+def _campus_starts(case: Case, n_starts: int) -> Iterator[Row]:
+    """Default filter from starts along the way: when it is localized, and how well once refined."""
     spacing_m = case.known_map.spacing_m
-    for start, settled, walk in starts(case, 60, {}, spacing_m):
+    for start, settled, walk in starts(case, n_starts, {}, spacing_m):
         after = walk.errors_m[int(settled) :] if math.isfinite(settled) else np.array([math.nan])
         refinement = walk.estimate.extras["refinement"]
         yield {

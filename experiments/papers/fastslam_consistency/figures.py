@@ -1,0 +1,52 @@
+"""Figure of the study of FastSLAM's consistency."""
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from experiments.papers.results import Results
+from experiments.viewing.plotting import plain_log, with_legend
+from experiments.viewing.style import BLACK, BLUE, GREEN, ORANGE, PURPLE, RED, SKY, WALL, subplots
+
+_COLOURS = (SKY, GREEN, ORANGE, RED, BLUE, PURPLE, WALL)
+_NAMES = {"fastslam1": "FastSLAM 1.0", "fastslam2": "FastSLAM 2.0"}
+
+
+def draw(made: Results) -> dict[str, Figure]:
+    """Draw the study's figure."""
+    return {"fastslam_consistency_nees": by_distance(made.table("nees"))}
+
+
+def by_distance(table: pd.DataFrame) -> Figure:
+    """Mean NEES / 3 over worlds against distance: by particles and proposal, and what was tried."""
+    page, axes = subplots(13.0, 4.9, 1, 3, sharex=True, sharey=True)
+    plain = table[table["remedy"] == "none"]
+    for ax, (name, words) in zip(axes, _NAMES.items(), strict=False):
+        own = plain[plain["filter"] == name]
+        for (m, part), colour in zip(own.groupby("n_particles"), _COLOURS, strict=False):
+            _line(ax, part, f"M = {m:,}", marker="o", color=colour)
+        ax.set_title(words, loc="left")
+    most = plain[(plain["filter"] == "fastslam2") & (plain["n_particles"] == 1000)]
+    _line(axes[2], most, "as it is", marker="o", color=BLUE)
+    tried = table[table["remedy"] != "none"].groupby("remedy", sort=False)
+    for (words, part), colour in zip(tried, (GREEN, ORANGE, RED, PURPLE), strict=False):
+        _line(axes[2], part, words, marker="s", color=colour)
+    axes[2].legend(fontsize=8)
+    axes[2].set_title("FastSLAM 2.0, M = 1,000, changed", loc="left")
+    for ax in axes:
+        for name, words, line in (("ekf_slam", "EKF-SLAM", "--"), ("batch", "batch", ":")):
+            _line(ax, plain[plain["filter"] == name], words, ls=line, color=BLACK)
+        ax.axhspan(0.8, 1.25, color=WALL, alpha=0.15, lw=0)
+        ax.set(xlabel="path travelled, m", yscale="log")
+    plain_log(axes[0].yaxis, (1.0, 3.0))
+    axes[0].set_ylabel("mean NEES / 3 (1: consistent)")
+    return with_legend(page, ncols=9)
+
+
+def _line(ax: Axes, part: pd.DataFrame, label: str, **style: object) -> None:
+    """Mean over worlds at each distance, / 3."""
+    means = part.groupby("distance_m")["nees"].mean() / 3.0
+    usable = means[np.isfinite(means)]
+    options = {"lw": 1.2, "ms": 3.5, **style}
+    ax.plot(usable.index, usable, label=label, **options)  # type: ignore[arg-type]
