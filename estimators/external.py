@@ -11,13 +11,10 @@ import numpy as np
 import orjson
 
 from estimators.base import Belief, Estimate, Prior
-from estimators.program import Program, ProgramError, require_limits, words_of
+from estimators.program import Program, ProgramError, map_message, require_limits, words_of
 from sim.arrays import Array
-from sim.errors import InputError, require
-from sim.grid import OccupancyGrid
 from sim.recording import Frame
 from sim.sensors.base import sensor_settings
-from sim.world import World
 
 PROTOCOL = 1
 _STEP_BYTES, _FINISH_BYTES = 1 << 20, 1 << 28  # of an answer
@@ -119,12 +116,14 @@ class External:
             found = np.zeros(0, object)
         if found.dtype.kind not in "if" or found.shape != shape:
             sizes = " x ".join(map(str, shape))
-            raise self._wrong(f"must answer with {key}, {sizes} numbers; got {answer.get(key)!r:.60}")
+            raise self._wrong(
+                f"must answer with {key}, {sizes} numbers; got {answer.get(key)!r:.60}"
+            )
         return found.astype(np.float64)
 
     def _wrong(self, what: str) -> ProgramError:
         assert self._program is not None
-        self._program.close()
+        self._program.close(0.0)
         return ProgramError(f"{self._program.name} {what}")
 
 
@@ -142,26 +141,3 @@ def reset_message(prior: Prior, seed: int) -> dict[str, Any]:
         "prior": first,
         "map": map_message(prior.map),
     }
-
-
-def map_message(known_map: Any) -> dict[str, Any] | None:
-    """A map as plain arrays: a world's walls and landmarks, or a grid; where it starts is left out.
-
-    Raises
-    ------
-    InputError
-        If it is of another kind.
-    """
-    if known_map is None:
-        return None
-    if isinstance(known_map, World):
-        keys = ("walls", "wall_z_m", "landmarks", "descriptors")
-        return {"kind": "world", **{k: np.ascontiguousarray(getattr(known_map, k)) for k in keys}}
-    if isinstance(known_map, OccupancyGrid):
-        fields = {k: np.ascontiguousarray(v) if isinstance(v, np.ndarray) else v
-                  for k, v in vars(known_map).items()}  # fmt: skip
-        return {"kind": "grid", **fields}
-    raise InputError(
-        f"a program takes a world or a grid as its map, got a {type(known_map).__name__}; set "
-        "prior.map=none, world or GRID.yaml"
-    )

@@ -13,9 +13,8 @@ import numpy as np
 import orjson
 
 from estimators.base import Belief, Estimate, Prior
-from estimators.external import map_message
 from estimators.options import require_choices
-from estimators.program import Program, ProgramError, require_limits, words_of
+from estimators.program import Program, ProgramError, map_message, require_limits, words_of
 from sim import se2
 from sim.errors import InputError, require, required
 from sim.files import write_text
@@ -133,9 +132,8 @@ class Offline:
             return "map.yaml", lambda path: write_grid(known_map, path, "raw")
 
         def write(path: Path) -> None:
-            message = required(
-                map_message(known_map), "estimator.command names {map}; set prior.map=world or a grid"
-            )
+            complaint = "estimator.command names {map}; set prior.map=world or a grid"
+            message = required(map_message(known_map), complaint)
             text = orjson.dumps(message, option=orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_INDENT_2)
             write_text(path, text.decode())
 

@@ -18,7 +18,11 @@ from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any
 
+import numpy as np
+
 from sim.errors import InputError, printable, require
+from sim.grid import OccupancyGrid
+from sim.world import World
 
 _TAIL = 2000  # bytes of its messages that are kept
 _CHUNK = 1 << 16
@@ -118,6 +122,8 @@ class Program:
             left_s = deadline - time.monotonic()
             if left_s <= 0.0:
                 raise self._error(f"gave no answer within {limit_s:g} s")
+            if self._stdout not in self._selector.get_map():
+                raise self._error("closed its output")
             if unsent and self._stdin not in self._selector.get_map():
                 self._selector.register(self._stdin, selectors.EVENT_WRITE)
             ready = self._read_ready(left_s)
@@ -145,23 +151,23 @@ class Program:
             if time.monotonic() > deadline:
                 raise self._error(f"did not end within {limit_s:g} s")
             if self._selector.get_map():
-                with suppress(ProgramError):  # it closed its output, and may go on
-                    self._read_ready(0.02)
-            else:
+                self._read_ready(0.02)
+            else:  # it closed its output, and may go on
                 time.sleep(0.02)
             self._said.clear()
         if code != 0:
             raise self._error("failed")
 
-    def close(self) -> float:
+    def close(self, patience_s: float = _PATIENCE_S) -> float:
         """Let it end, with its whole process group; return the processor time that it took, s.
 
-        Of processes that it started, those count for which it waited.
+        What has not ended by itself by then is ended. Of processes that it started, those count
+        for which it waited.
         """
         self._selector.close()
         with suppress(OSError):
             self._process.stdin.close()  # type: ignore[union-attr]
-        spent_s: float | None = self._finalizer.detach() and _end(self._process, _PATIENCE_S)
+        spent_s: float | None = self._finalizer.detach() and _end(self._process, patience_s)
         return spent_s or 0.0
 
     def _written(self, unsent: memoryview) -> memoryview:
@@ -180,11 +186,8 @@ class Program:
                 continue
             part = os.read(pipe, _CHUNK)
             kept += part
-            if part:
-                continue
-            self._selector.unregister(pipe)
-            if pipe == self._stdout and b"\n" not in self._said:
-                raise self._error("closed its output")
+            if not part:
+                self._selector.unregister(pipe)
         del self._messages[:-_TAIL]
         return ready
 
@@ -198,9 +201,9 @@ class Program:
                 break
             time.sleep(0.01)
         with suppress(OSError):
-            self._messages += os.read(self._stderr, _CHUNK)
+            self._messages += os.read(self._stderr, _CHUNK)[-_TAIL:]
         lines = self._messages.decode(errors="replace").strip().splitlines()
-        self.close()
+        self.close(0.0)
         last = f": {printable(lines[-1])[:300]}" if lines else ""
         return ProgramError(f"{self.name} {what}{last}")
 
@@ -233,3 +236,26 @@ def _end(process: subprocess.Popen[bytes], patience_s: float) -> float:
 
 def _quoted(text: bytes | bytearray) -> str:
     return repr(re.sub(r"\s+", " ", bytes(text[:60]).decode(errors="replace")))
+
+
+def map_message(known_map: Any) -> dict[str, Any] | None:
+    """A map as plain arrays: a world's walls and landmarks, or a grid; where it starts is left out.
+
+    Raises
+    ------
+    InputError
+        If it is of another kind.
+    """
+    if known_map is None:
+        return None
+    if isinstance(known_map, World):
+        keys = ("walls", "wall_z_m", "landmarks", "descriptors")
+        return {"kind": "world", **{k: np.ascontiguousarray(getattr(known_map, k)) for k in keys}}
+    if isinstance(known_map, OccupancyGrid):
+        fields = {k: np.ascontiguousarray(v) if isinstance(v, np.ndarray) else v
+                  for k, v in vars(known_map).items()}  # fmt: skip
+        return {"kind": "grid", **fields}
+    raise InputError(
+        f"a program takes a world or a grid as its map, got a {type(known_map).__name__}; set "
+        "prior.map=none, world or GRID.yaml"
+    )

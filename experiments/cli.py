@@ -717,7 +717,7 @@ def bench(
     name: Annotated[
         str,
         typer.Argument(
-            help="compile, fastslam, formats, icp, mcl, sim, smoothing, sweep, sweep_scale, "
+            help="compile, external, fastslam, formats, icp, mcl, sim, smoothing, sweep, sweep_scale, "
             "topological, or all."
         ),
     ] = "all",

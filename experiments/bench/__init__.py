@@ -19,6 +19,7 @@ SUITES = {
     "smoothing": ("smoothing",),
     "compile": ("compile",),
     "growth": ("growth",),
+    "external": ("external",),
 }
 
 

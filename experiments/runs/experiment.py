@@ -222,7 +222,7 @@ class Experiment:
         return {key: value for key, value in self.config.items() if key not in unused}
 
     def _code_version(self) -> str:
-        return version_with(targets(self._applied()))
+        return version_with(targets(self._applied()), self.config["estimator"].get("command"))
 
     # What it names
 

@@ -17,6 +17,7 @@ from experiments.runs.version import code_version, version_with
 from sim.errors import InputError
 
 _TIMES = ["step_time_us", "cpu_time_us"]  # they differ from run to run
+_COMMAND = "estimator.command"
 _DRAWN = ["seed", "world_seed"]  # what `summary` averages over
 _MAIN = (
     "answer_ate_rmse_m",
@@ -105,11 +106,13 @@ def _of_this_code(table: pd.DataFrame) -> pd.Series[bool]:
         If there are rows of several versions of a file that cannot be found here.
     """
     mine = table["code_version"].str.partition("+")[0] == code_version()
+    table = table if _COMMAND in table else table.assign(**{_COMMAND: None})
     targets = [column for column in table if str(column).endswith("_target_")]
     others = table[mine & table["code_version"].str.contains("+", regex=False)]
-    for names, rows in others.groupby(targets, dropna=False) if len(others) else ():
+    by = [*targets, _COMMAND]
+    for (*names, command), rows in others.groupby(by, dropna=False) if len(others) else ():
         given = [name for name in names if isinstance(name, str)]
-        here = version_with(given)
+        here = version_with(given, command)
         if "+" in here:
             mine[rows.index] = rows["code_version"] == here
         elif rows["code_version"].nunique() > 1:
