@@ -295,7 +295,7 @@ def load(path: str | Path) -> TopologicalMap:
     )
     try:
         return TopologicalMap(descriptor=name, **arrays)
-    except InputError as error:
+    except (InputError, *UNREADABLE) as error:
         raise InputError(f"{path}: {error}") from error
 
 

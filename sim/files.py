@@ -2,6 +2,7 @@
 
 import os
 import secrets
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -14,7 +15,9 @@ def require_file(path: Path) -> None:
 
     What is not there is left to the reader.
     """
-    require(path.is_file() or not path.exists(), f"{path}: not a file; name a file")
+    with suppress(OSError, ValueError):
+        mode = path.stat().st_mode
+        require(stat.S_ISREG(mode), f"{path}: not a file; name a file, or remove it")
 
 
 @contextmanager

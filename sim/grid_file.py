@@ -36,7 +36,7 @@ from PIL import Image
 
 from sim.arrays import Array, Floats
 from sim.errors import InputError
-from sim.files import write_whole
+from sim.files import require_file, write_whole
 from sim.grid import FREE_BELOW, OCCUPIED_ABOVE, OccupancyGrid, check_size
 from sim.yaml_file import read_yaml
 
@@ -245,6 +245,7 @@ def _probability(meta: _Meta) -> Floats:
 def _shades(path: Path) -> tuple[Floats, Floats | None]:
     """Shades (rows, columns) from 0 (black) to 1, the mean of a pixel's colours; and opacities."""
     remedy = f"a grid's image is {', '.join(_FORMATS).replace('PPM', 'PGM')}"
+    require_file(path)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)

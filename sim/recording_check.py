@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,14 +11,11 @@ from numpy.typing import NDArray
 from sim.errors import require
 from sim.sensors.base import RecordedSensor, parted
 
-if TYPE_CHECKING:
-    from sim.recording import Recording
-
 LARGEST = 1e12  # s, m: nothing that is recorded is beyond
 
 
-def check_recording(recording: Recording) -> None:
-    """Check shape, type, order and finiteness of what estimators and metrics rely on.
+def check_recording(recording: Any) -> None:
+    """Check shape, type, order and finiteness of what a Recording's users rely on.
 
     Readings may hold inf and NaN, where a sensor saw nothing.
 
@@ -52,7 +49,7 @@ def check_recording(recording: Recording) -> None:
     _check_texts(recording)
 
 
-def _check_texts(recording: Recording) -> None:
+def _check_texts(recording: Any) -> None:
     status, config = recording.status, recording.config
     require(isinstance(status, str) and status, f"status must be a text, got {status!r}")
     require(isinstance(config, dict), f"config must hold keys, got {config!r}")

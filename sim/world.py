@@ -75,6 +75,12 @@ class World:
             f"world {self.name}: {len(self.descriptors)} descriptors for "
             f"{len(self.landmarks)} landmarks",
         )
+        require(
+            np.ndim(self.descriptors) == 2
+            and np.shape(self.look_alike) in ((0,), (len(self.landmarks),)),
+            f"world {self.name}: descriptors must have shape (L, D), and look_alike (L,), of its "
+            f"{len(self.landmarks)} landmarks",
+        )
         for bad in np.flatnonzero(np.hypot(*(self.walls[:, 2:] - self.walls[:, :2]).T) < 1e-6):
             raise InputError(f"world {self.name}: wall {bad} has no length; give it two ends")
         for bad in np.flatnonzero(self.wall_z_m[:, 0] >= self.wall_z_m[:, 1]):

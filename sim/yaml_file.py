@@ -35,7 +35,7 @@ def read_yaml(path: Path, most_bytes: int = MOST_BYTES) -> Any:
     require(len(text) <= most_bytes, f"{path}: longer than {most_bytes} bytes")
     loader = None
     try:
-        loader = yaml.SafeLoader(text)
+        loader = yaml.SafeLoader(text.decode())
         root = loader.get_single_node()
         if root is None:
             return None

@@ -186,3 +186,20 @@ def place_route():
     start = recording.truth_at(recording.frame_stamps[:1])[0]
     spread = np.diag(np.square([0.5, 0.5, 0.1]))
     return recording, Prior(recording.robot, recording.sensors, start, spread, world.known_map)
+
+
+def outline(points, n=16):
+    """Descriptor (n,) of a cloud (P, 3): its points' mean distance by bearing."""
+    sector = ((np.arctan2(points[:, 1], points[:, 0]) / np.pi + 1.0) * n / 2).astype(int) % n
+    sums = np.bincount(sector, np.hypot(points[:, 0], points[:, 1]), minlength=n)
+    return sums / np.maximum(np.bincount(sector, minlength=n), 1)
+
+
+class Outline:
+    """The same as an object."""
+
+    def __init__(self, n):
+        self.n = n
+
+    def __call__(self, points):
+        return outline(points, self.n)

@@ -266,7 +266,14 @@ def test_every_claim_names_its_criterion():
 def test_tables_of_an_earlier_study_leave_the_claims_open(tmp_path):
     made = Results(tmp_path, "decristoforis2020")
     old = runs(**{k: v for k, v in RIGHT.items() if k != "icp_guess"})
-    metrics = pd.DataFrame({"metric": ["point_to_line", "point_to_point"]})
+    metrics = pd.DataFrame(
+        [
+            {"class": "room_small", "seed": seed, "metric": f"point_to_{to}"}
+            | dict.fromkeys(("error_m", "error_rad", "time_us"), 1.0 + seed % 3)
+            for to in ("line", "point")
+            for seed in SEEDS
+        ]
+    )
     made.write_tables(
         runs=old, ordering=ordering({1e-6}), ellipses=_ellipses(), metrics=metrics,
         covariances=covariances().query("metric != 'point_to_plane'"),

@@ -9,8 +9,33 @@ from pathlib import Path
 import pytest
 
 import estima
+from experiments.papers.puzzlebot2024 import study as puzzlebot2024
 
+# studies of questions of ours, beyond the parts of the papers
+NOT_OF_A_PART = {
+    "decristoforis2020_beliefs",
+    "decristoforis2020_ordering",
+    "gil2008_bound",
+    "puzzlebot2024_engine",
+}
 ROOT = Path(__file__).resolve().parent.parent
+
+
+def test_the_papers_page_names_what_there_is():
+    """Every study, option and file on the page exists, and every study of a paper is on it."""
+    page = (ROOT / "docs" / "papers.md").read_text().partition("\n## ")[2]
+    studies = set(re.findall(r"study=(\w+)", page))
+    there = {path.stem for path in (ROOT / "conf" / "study").glob("*.yaml")}
+    assert studies <= there
+    papers = ("puzzlebot2024_", "decristoforis2020_", "maximo2024_", "gil2008")
+    for group, option in re.findall(r" (world|robot|sensors|route|estimator)=(\w+)", page):
+        assert (ROOT / "conf" / group / f"{option}.yaml").exists(), option
+    for name in re.findall(r"`((?:sim|estimators|experiments|conf|docs)/[\w./]+\.\w+)`", page):
+        assert (ROOT / name).exists(), name
+    of_puzzlebot = page.partition("\n## ")[0]
+    for name in re.findall(r"`study\.(\w+)`", of_puzzlebot):
+        assert hasattr(puzzlebot2024, name), name
+    assert {name for name in there if name.startswith(papers)} - studies <= NOT_OF_A_PART
 
 
 @pytest.fixture(scope="module")

@@ -106,3 +106,40 @@ def test_shares_end_at_one():
     )
     right = maximo2024.campus_errors(starts, clusters).axes[1]
     assert np.array_equal(right.get_ylim(), (0.0, 1.0))
+
+
+def test_figures_1_and_2_of_gil2008_name_both_filters_and_fit_their_grids():
+    run = {}
+    for name in ("truth", "odometry", "paper", "fastslam2"):
+        grid = np.full((300, 300), np.nan, np.float32)
+        grid[100, :] = 0.9
+        run |= {f"{name}_grid": grid, f"{name}_origin": np.zeros(3)}
+    for name in ("paper", "fastslam2"):
+        run |= {
+            f"{name}_landmarks": np.ones((2, 3)),
+            f"{name}_covariances": np.tile(np.eye(3), (2, 1, 1)),
+        }
+    for page in (gil2008.maps(run), gil2008.corrected(run)):
+        titles = [ax.get_title(loc="left") for ax in page.axes]
+        assert "as printed" in titles[1]
+        assert "FastSLAM 2.0" in titles[2]
+        for ax in page.axes:
+            assert ax.get_xlabel() == "x, m"
+            assert np.ptp(ax.get_xlim()) < 40.0
+            assert np.ptp(ax.get_ylim()) < 40.0
+
+
+def test_figure_8_shows_both_designs():
+    rows = [
+        (m, name, draw, 2.0 if draw else 1.0)
+        for m, name in itertools.product((10, 200), ("paper", "fastslam2"))
+        for draw in (0, 0, 1, 2)
+    ]
+    table = pd.DataFrame(rows, columns=["n_particles", "filter", "image_draw", "error"])
+    table = table.assign(**dict.fromkeys(ERRORS, table["error"]))
+    table = table.assign(seed=1000, noise="paper", odometry_rmse_m=3.0)
+    page = gil2008.by_particles(table, table[:1])
+    for ax, mean in zip(page.axes, (2.0, 2.0, 1.0, 1.0), strict=True):
+        for drawn in ax.containers:
+            assert drawn.lines[0].get_ydata() == pytest.approx([mean, mean])
+    assert "2 runs each" in page.get_suptitle()

@@ -279,6 +279,17 @@ def test_gi1_holds_slam_against_odometry():
     assert "its error is 1 times that at the first visit, and odometry's 1.9" in said.sentence
 
 
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_laps_are_the_worlds_own_tour(seed):
+    """Objects keep clear of it alone; on another course the robot would hit them."""
+    course = Experiment.compose(["study=gil2008_laps", f"seed={seed}"])
+    tour = course.world().waypoints
+    assert course.config["route"]["waypoints"] is None
+    lap_m = np.hypot(*np.diff(tour, axis=0).T).sum()
+    assert lap_m == pytest.approx(60.0)
+    assert course.config["route"]["distance_m"] == 4 * lap_m
+
+
 def test_dead_reckoning_fails_gi1():
     """Odometry in the filter's place is told from a filter, or the course is called too short."""
     drive = sweep("n_particles", PARTICLES, lambda m: 3.0, filter="paper")

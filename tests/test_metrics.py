@@ -226,7 +226,7 @@ def test_stamps_outside_the_truth_are_left_out():
 
 def test_every_score_says_its_unit():
     recording = fakes.circle(n_frames=400)
-    pure = {"nees_mean", "nees_counted_share"}
+    pure = {"nees_mean", "nees_counted_share", "final_in_ellipse"}
     keys = set(metrics.score(recording, fakes.estimate(recording)))
     assert {
         *("ate_rmse_m", "ate_aligned_rmse_m", "heading_rmse_rad", "heading_aligned_rmse_rad"),
@@ -246,3 +246,13 @@ def test_score_of_a_perfect_estimate_is_zero():
     row = metrics.score(recording, estimate)
     for key in ("ate_rmse_m", "heading_rmse_rad", "final_position_error_m", "nees_mean"):
         assert row[key] == pytest.approx(0.0, abs=1e-12), key
+
+
+def test_a_position_lies_in_the_ellipse_or_not():
+    """Semi-axes of the 95 % ellipse are sqrt(5.991) sigmas; a quarter turn swaps them."""
+    covariance = np.diag([4.0, 1.0, 9.0])
+    for at, inside in (((4.89, 0.0), True), ((4.90, 0.0), False), ((0.0, 2.44), True),
+                       ((0.0, 2.45), False), ((4.0, 2.0), False)):  # fmt: skip
+        assert metrics.in_ellipse(np.array([*at, 5.0]), np.zeros(3), covariance) is inside
+    turned = np.diag([1.0, 4.0, 9.0])
+    assert not metrics.in_ellipse(np.array([4.89, 0.0, 0.0]), np.zeros(3), turned)

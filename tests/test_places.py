@@ -9,8 +9,10 @@ from estimators.descriptors import retrieval
 from experiments.papers.maximo2024 import places
 from experiments.papers.maximo2024.places import GEOMETRIES, OXFORD, UMH, place_world
 from experiments.papers.maximo2024.settings import POSITIONS
+from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from sim.errors import InputError
+from tests import fakes
 
 
 def measured(world):
@@ -176,3 +178,27 @@ def test_ones_own_arrays_run_from_one_yaml(tmp_path):
     np.save(tmp_path / "descriptors.npy", np.ones((3, 512)))
     with pytest.raises(InputError, match="as many descriptors"):
         experiment.recording()
+
+
+def test_a_network_of_ones_own_describes_clouds():
+    lines = ["study=maximo2024_network", "network._target_=tests.fakes.outline"]
+    experiment = Experiment.compose([*lines, "simulation.physics=kinematic", "route.distance_m=20"])
+    recording = experiment.recording()
+    seen = recording.log("place")["descriptor"]
+    points = recording.sensors["lidar3d"].points_in_sensor(recording.log("lidar3d")["ranges_m"][3])
+    np.testing.assert_allclose(seen[3], fakes.outline(points), rtol=1e-6)
+    assert experiment.prior(recording).map.descriptors.shape[1] == 16
+    (row,) = evaluate(experiment, lambda: recording)
+    assert row["status"] == "ok"
+    assert row["ate_mean_m"] < 10.0
+    for name in ("outline", "Outline"):  # a function, and a class, with a setting
+        network = {"_target_": f"tests.fakes.{name}", "n": 24}
+        other = places.described_run(experiment.config, network).log("place")["descriptor"]
+        np.testing.assert_allclose(other[3], fakes.outline(points, 24), rtol=1e-6)
+
+
+def test_a_network_that_answers_badly_is_named():
+    lines = ["study=maximo2024_network", "network._target_=numpy.atleast_2d"]
+    short = ["simulation.physics=kinematic", "route.distance_m=5"]
+    with pytest.raises(InputError, match=r"numpy.atleast_2d must return finite numbers of shape"):
+        Experiment.compose([*lines, *short]).recording()

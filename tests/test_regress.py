@@ -15,7 +15,14 @@ from experiments.gate import baseline
 from experiments.gate import compare as regress
 from experiments.gate import report as regress_report
 from experiments.gate.compare import exchange_p, holm
-from experiments.gate.suite import ERRORS, fingerprint, read_suite, run_suite, suite_path
+from experiments.gate.suite import (
+    ERRORS,
+    command_of,
+    fingerprint,
+    read_suite,
+    run_suite,
+    suite_path,
+)
 from experiments.runs.experiment import Experiment
 from experiments.runs.paths import results
 from sim.errors import InputError
@@ -364,7 +371,11 @@ def test_an_entry_may_name_its_estimator(tmp_path):
         "  again: {estimator: odometry, recordings: b, repeats: [1, 1], "
         "overrides: [estimator.kr=1e-3]}\n"
     )
-    rows = run_suite(read_suite(path), {"odometry": 1, "again": 1}, n_jobs=1)
+    suite = read_suite(path)
+    command = command_of(suite, "again", 7)
+    assert "estimator=odometry" in command
+    assert "estimator.kr=1e-3" in command
+    rows = run_suite(suite, {"odometry": 1, "again": 1}, n_jobs=1)
     assert rows.groupby("estimator").size().to_dict() == {"again": 2, "odometry": 2}
     assert set(rows["status"]) == {"ok"}
 
@@ -384,7 +395,7 @@ def test_recordings_of_the_check_turn():
     ("text", "words"),
     [
         ("recordings: 3", "a suite holds"),
-        ("first_seed: [", "cannot read"),
+        ("first_seed: [", "not valid YAML"),
         (
             "first_seed: 1\nrecordings: {a: {count: 1, overrides: []}}\n"
             "estimators: {odometry: {recordings: a, repeats: [1, 1]}}",

@@ -122,7 +122,7 @@ def test_representatives_are_spaced_by_beams_and_by_length(scans):
 def test_points_are_matched_with_the_nearest(scans, to_lines, reach_m, warm):
     source, target = scans
     surface = target.segments if to_lines else icp._as_segments(target)
-    both = icp._Pair(source, target, to_lines, surface, source.noise_m)
+    both = icp._Pair(source, target, to_lines, to_lines, surface, surface, source.noise_m)
     n = len(source.points)
     every = icp._Sample(np.arange(n), np.ones(n))
     fit, misses = icp._Fit(np.zeros(n, np.int64), np.zeros(n), np.zeros(n)), np.empty(n)

@@ -25,8 +25,11 @@ def shortened(experiment):
 
 def runs_of(name, folder):
     """One run of a study for each of its estimators."""
-    given = [f"data={own_places(folder)}"] if name == "maximo2024_own" else []
-    runs = list(planned([f"study={name}", *given]))
+    given = {
+        "maximo2024_own": f"data={own_places(folder)}",
+        "maximo2024_network": "network._target_=tests.fakes.outline",
+    }
+    runs = list(planned([f"study={name}", *([given[name]] if name in given else [])]))
     return list({run.estimator_name: run for run in reversed(runs)}.values())
 
 

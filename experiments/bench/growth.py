@@ -6,6 +6,8 @@ own.
 """
 
 import collections
+import ctypes
+import gc
 import itertools
 import os
 import resource
@@ -129,6 +131,8 @@ def _experiment(name: str) -> Experiment:
 
 
 def _memory_mib() -> float:
-    """Memory that the process holds now."""
+    """Memory that the process needs now, without what it has freed."""
+    gc.collect()
+    ctypes.CDLL(None).malloc_trim(0)
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 2**20

@@ -102,6 +102,15 @@ def ellipse_area_m2(covariances: Array) -> Array:
     return np.asarray(math.pi * CHI2_95_2DOF * np.sqrt(np.maximum(determinant, 0.0)))
 
 
+def in_ellipse(truth: Array, mean: Array, covariance: Array) -> bool:
+    """Whether a true position lies in the 95 % ellipse of a pose's (3,) covariance (3, 3).
+
+    puzzlebot2024 asks it of the real robot and the ideal one's ellipse.
+    """
+    off = truth[:2] - mean[:2]
+    return bool(off @ np.linalg.solve(covariance[:2, :2], off) <= CHI2_95_2DOF)
+
+
 def travelled_m(path: Array) -> Array:
     """Distance (T,) travelled along a path (T, 2) or poses (T, 3) to each of its rows, m."""
     return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path[:, :2], axis=0).T))])
@@ -171,6 +180,8 @@ def path_scores(truth: Array, means: Array, covariances: Array) -> dict[str, flo
         row["ellipse_area_final_m2"] = float(ellipse_area_m2(covariances[-1:])[0])
     if counted.any():
         row["nees_mean"] = float(np.mean(values[counted]))
+    if row["ellipse_area_final_m2"] > 0.0:
+        row["final_in_ellipse"] = float(in_ellipse(truth[-1], means[-1], covariances[-1]))
     for distance in RPE_DISTANCES_M:
         pairs = pairs_by_distance(truth, distance)
         if len(pairs):

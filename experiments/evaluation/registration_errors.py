@@ -91,7 +91,7 @@ def measured(
         nees, sizes, took_s = np.array(values).T
         off, registered_s = np.split(np.array(matches[metric]), [3], axis=1)
         actual = float(np.linalg.det(np.cov(off.T))) ** (1.0 / 6.0)
-        bias = off[:, :2].mean(axis=0) @ truth[:2] / float(truth[:2] @ truth[:2])
+        bias = np.median(off[:, :2] @ truth[:2]) / float(truth[:2] @ truth[:2])
         rows.append(
             {
                 "place": scene.place,

@@ -17,7 +17,7 @@ from experiments.runs.machine import machine
 from experiments.runs.row import read_rows, write_frame
 from experiments.runs.version import code_version
 from sim.errors import InputError
-from sim.files import write_whole
+from sim.files import require_file, write_whole
 
 VERDICT_COLUMNS = ("id", "paper", "says", "verdict", "sentence")
 _NUMBERS = ("value", "low", "high")
@@ -127,7 +127,7 @@ def _read(path: Path, columns: Sequence[str], key: list[str]) -> pd.DataFrame:
     if path.is_file() and not path.read_bytes().endswith(b"\n"):
         raise InputError(f"{path}: the last row is cut off; {_REMEDY}")
     try:
-        table = read_rows(path)
+        table = read_rows(path, texts=[name for name in columns if name not in _NUMBERS])
     except InputError as error:
         raise InputError(f"{path}: cannot read the {path.stem}; {_REMEDY}") from error
     for name in [name for name in columns if name not in table]:
@@ -169,11 +169,12 @@ def read_provenance(results: Path) -> dict[str, dict[str, Any]]:
         If the file cannot be read, or a paper lacks a key.
     """
     path = results / "provenance.json"
+    require_file(path)
     try:
         made: dict[str, dict[str, Any]] = json.loads(path.read_text())
     except FileNotFoundError:
         return {}
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{path}: cannot read ({error}); {_REMEDY}") from error
     if not isinstance(made, dict):
         raise InputError(f"{path}: must hold an object by paper; {_REMEDY}")
@@ -181,4 +182,7 @@ def read_provenance(results: Path) -> dict[str, dict[str, Any]]:
         missing = [key for key in _ORIGIN if not isinstance(how, dict) or key not in how]
         if missing:
             raise InputError(f"{path}: {paper} does not say its {', '.join(missing)}; {_REMEDY}")
+        for key, value in how.items():
+            if isinstance(value, (list, dict)):
+                raise InputError(f"{path}: {paper}.{key} must be a text or a number; {_REMEDY}")
     return made

@@ -15,6 +15,7 @@ from experiments.report.export import as_text, numeric
 from experiments.runs.paths import CONF, SOURCE
 from experiments.runs.row import read_rows
 from sim.errors import InputError
+from sim.files import require_file
 from sim.yaml_file import read_yaml
 
 Entry = Mapping[str, Any]
@@ -149,6 +150,7 @@ def picture(path: Path, about: Entry, claims: Mapping[str, Entry]) -> Entry:
     InputError
         If it is not a whole PNG.
     """
+    require_file(path)
     try:
         data = path.read_bytes()
     except OSError as error:

@@ -34,8 +34,12 @@ def read_table(path: Path) -> pd.DataFrame:
     try:
         frame = read_rows(path)
         as_csv = path.suffix == ".csv"
-        written = pd.read_csv(path, dtype="str", keep_default_na=False) if as_csv else frame
-    except (InputError, ValueError) as error:
+        written = (
+            pd.read_csv(path, dtype="str", keep_default_na=False, index_col=False)
+            if as_csv
+            else frame
+        )
+    except (InputError, ValueError, OverflowError) as error:
         why = [*str(error.__cause__ or "no table there").splitlines(), "unreadable"][0].rstrip(".")
         raise InputError(f"{path}: {why}; export-table needs a CSV or Parquet table") from error
     for name, column in list(frame.items()):

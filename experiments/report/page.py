@@ -10,10 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
 
 from experiments.evaluation.verdict import Profile
 from experiments.report.contents import contents
 from experiments.report.export import plain
+from sim.errors import printable
 from sim.files import write_whole
 
 
@@ -37,6 +39,7 @@ def write_report(results: Path, on_progress: Callable[[float], None] = lambda _:
     environment = Environment(
         loader=PackageLoader("experiments.report"),
         autoescape=True,
+        finalize=_printable,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
@@ -46,6 +49,13 @@ def write_report(results: Path, on_progress: Callable[[float], None] = lambda _:
     with write_whole(path) as part:
         part.write_text(environment.get_template("page.html").render(found), encoding="utf-8")
     return path
+
+
+def _printable(value: Any) -> Any:
+    """What a template shows, without control characters; what it has made itself stays."""
+    if not isinstance(value, str) or isinstance(value, Markup):
+        return value
+    return "\n".join(map(printable, value.split("\n")))
 
 
 def interval(row: Mapping[str, Any]) -> str:

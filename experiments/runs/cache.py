@@ -121,6 +121,7 @@ def trim(most_bytes: float) -> int:
         if excess <= 0.0:
             break
         lock = path.with_suffix(".lock")
+        require_file(lock)
         with lock.open("w") as handle:
             try:
                 fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)

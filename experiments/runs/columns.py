@@ -57,6 +57,9 @@ _OF_THE_PATH = {
     "ellipse_area_final_m2": Column(
         "area of the final 95 % ellipse", "ellipse", "m^2", better=None
     ),
+    "final_in_ellipse": Column(
+        "share of final positions in the 95 % ellipse", "in ellipse", "", "linear", None
+    ),
     "nees_mean": Column("mean NEES (3 when consistent)", "NEES", better=None),
     "rpe_1m_rmse_m": Column("position RMSE over 1 m", "RPE 1 m", "m"),
     "rpe_1m_heading_rmse_rad": Column("heading RMSE over 1 m", "RPE heading 1 m", "rad"),

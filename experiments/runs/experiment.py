@@ -563,7 +563,11 @@ def searched(config_dir: str | Path | None) -> list[str]:
         raise InputError(f"--config-dir must name a folder, got {config_dir}")
     for group in (*GROUPS, "study"):
         for path in sorted((folder / group).glob("*.yaml")):
-            read_yaml(path)  # within bounds, which Hydra does not know
+            option = read_yaml(path)  # within bounds, which Hydra does not know
+            keys = option is None or (
+                isinstance(option, dict) and all(isinstance(key, str) for key in option)
+            )
+            require(keys, f"{path}: an option holds keys and their values")
     return [f"hydra.searchpath=[{paths.quoted(f'file://{folder}')}]"]
 
 

@@ -7,6 +7,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TextIO
 
+from sim.files import require_file
+
 
 @contextmanager
 def locked(lock: Path) -> Iterator[None]:
@@ -24,6 +26,7 @@ def locked(lock: Path) -> Iterator[None]:
 
 def _held(lock: Path) -> TextIO:
     while True:
+        require_file(lock)  # a pipe would wait for ever
         handle = lock.open("w")
         fcntl.flock(handle, fcntl.LOCK_EX)
         with suppress(FileNotFoundError):

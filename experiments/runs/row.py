@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 import re
+import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from experiments.runs.columns import ORIGIN, STATUS
 from sim.errors import InputError
-from sim.files import write_whole
+from sim.files import require_file, write_whole
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -124,13 +125,16 @@ def write_frame(frame: pd.DataFrame, path: Path, digits: int = 10) -> None:
             frame.to_parquet(part, index=False)
 
 
-def read_rows(path: Path, remedy: str = "") -> pd.DataFrame:
+def read_rows(path: Path, remedy: str = "", texts: Sequence[str] = ()) -> pd.DataFrame:
     """Read a table, or all tables of a folder as one.
 
     Parameters
     ----------
     remedy
         What to do about a file that cannot be read, if the caller knows.
+    texts
+        Columns of a CSV file that hold text, besides those of every row, even if it looks like
+        numbers.
 
     Raises
     ------
@@ -148,9 +152,10 @@ def read_rows(path: Path, remedy: str = "") -> pd.DataFrame:
         return joined([read_parquet(file, remedy=remedy) for file in files])
     if path.suffix != ".csv":
         return read_parquet(path, remedy=remedy).to_pandas(use_threads=False)
+    require_file(path)
     with _reading(path, remedy):
-        texts = dict.fromkeys(_TEXTS, "str")  # a digest such as 12e4567 is not a number
-        return pd.read_csv(path, dtype=texts, index_col=False)
+        kinds = dict.fromkeys((*_TEXTS, *texts), "str")  # a digest such as 12e4567 is no number
+        return pd.read_csv(path, dtype=kinds, index_col=False)
 
 
 def read_parquet(path: Path, columns: list[str] | None = None, *, remedy: str = "") -> pa.Table:
@@ -177,15 +182,21 @@ def read_parquet(path: Path, columns: list[str] | None = None, *, remedy: str = 
         if named and hashlib.sha256(content).hexdigest()[:16] != named[1]:
             raise ValueError("it does not match its checksum")
         # one thread: Arrow's own, started for a small file, can crash at exit
-        return pq.ParquetFile(pa.BufferReader(content)).read(columns=columns, use_threads=False)
+        table = pq.ParquetFile(pa.BufferReader(content)).read(columns=columns, use_threads=False)
+        for field in table.schema:
+            if pa.types.is_nested(field.type):
+                raise ValueError(f"{field.name} holds {field.type}, not plain values")
+        return table
 
 
 @contextmanager
 def _reading(path: Path, remedy: str) -> Iterator[None]:
     """Turn an error of reading into one line."""
     try:
-        yield
-    except (OSError, ValueError) as error:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("error", "Length of header or names does not match")
+            yield
+    except (OSError, ValueError, TypeError, OverflowError, Warning) as error:
         ours = path.suffix == ".parquet" and path.parent.parent.name == "runs"
         usual = "delete it and run again" if ours else "a table is a .parquet or .csv file"
         why = (str(error).splitlines() or [""])[0]

@@ -46,6 +46,7 @@ _BEGUN, _WHOLE, _CHANGES, _FAILED = b"b=+!"
 ENDED = (_WHOLE, _CHANGES, _FAILED)  # kinds of lines of runs that have ended
 KIND_AT = 9  # place of the kind in a line, after the checksum
 _STATUS = ["run_key", "status", "status_code", "status_detail"]
+_KEY = re.compile("[0-9a-f]{16}")
 _SMALL_BYTES, _MOST_SMALL = 2**22, 100  # small files are merged when there are more of them
 
 
@@ -203,7 +204,7 @@ def begun(folder: Path, prefix: str) -> set[int]:
 def journal_lines(content: bytes) -> Iterator[tuple[str, list[Row]]]:
     """Walk through a journal: the key of a run that begins and no rows, or its key and rows.
 
-    Lines that do not match their checksum are passed over.
+    Lines that do not match their checksum, or hold something else, are passed over.
     """
     basis: Row = {}
     basis_crc = 0
@@ -213,15 +214,27 @@ def journal_lines(content: bytes) -> Iterator[tuple[str, list[Row]]]:
         crc = zlib.crc32(text, basis_crc if kind == _CHANGES else 0)
         if line[:KIND_AT] != b"%08x " % crc:
             continue
-        payload = json.loads(text[1:])
+        try:
+            payload = json.loads(text[1:])
+        except (ValueError, RecursionError):
+            continue
         if kind == _BEGUN:
-            yield payload, []
+            if isinstance(payload, str) and _KEY.fullmatch(payload):
+                yield payload, []
+            continue
+        if not (isinstance(payload, list) and payload and all(map(_is_flat, payload))):
             continue
         if kind == _CHANGES:
             payload = [{**basis, **changes} for changes in payload]
         elif kind == _WHOLE:
             basis, basis_crc = payload[0], crc
-        yield payload[0]["run_key"], payload
+        if all(isinstance(row.get("run_key"), str) for row in payload):
+            yield payload[0]["run_key"], payload
+
+
+def _is_flat(row: Any) -> bool:
+    """Whether something is a mapping to scalars."""
+    return isinstance(row, dict) and not any(isinstance(v, (list, dict)) for v in row.values())
 
 
 def is_own(path: Path) -> bool:
@@ -307,7 +320,8 @@ def _files(folder: Path, prefix: str = "") -> list[Path]:
     """Files of rows; what a killed process was writing is hidden, and is not among them."""
     names = sorted(p for p in folder.glob(f"{prefix}*") if p.suffix in (".parquet", JOURNAL))
     for path in names:
-        if path.name[0] != "." and path.exists() and not path.is_file():
+        there = path.exists() or path.is_symlink()  # or a job has turned it into Parquet meanwhile
+        if path.name[0] != "." and there and not path.is_file():
             raise InputError(f"{path}: not a file of rows; remove it")
     return [path for path in names if path.name[0] != "."]
 
@@ -333,9 +347,8 @@ def _as_numbers(keys: pa.ChunkedArray) -> NDArray[np.uint64]:
     except (ValueError, TypeError):
         packed = b""
     if len(packed) != 8 * len(texts):
-        pattern = re.compile("[0-9a-f]{16}")
         packed = b"".join(
-            bytes.fromhex(t) if isinstance(t, str) and pattern.fullmatch(t) else bytes(8)
+            bytes.fromhex(t) if isinstance(t, str) and _KEY.fullmatch(t) else bytes(8)
             for t in texts
         )
     return np.frombuffer(packed, ">u8").astype(np.uint64)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from experiments.runs.columns import ANSWER, ORIGIN, PATH, REPEAT, REVISED, is_setting
+from experiments.runs.columns import ANSWER, ORIGIN, PATH, REPEAT, REVISED, STATUS, is_setting
 from experiments.runs.paths import results
 from experiments.runs.row import Outcome
 from experiments.runs.store import read_runs
@@ -59,6 +59,9 @@ def collect(name: str, *, all_versions: bool = False, times: bool = False) -> pd
     for column in ("status", REPEAT, *ORIGIN):
         if column not in table:
             raise InputError(f"{path}: not rows of runs, column {column} is missing")
+    for column in (*STATUS, *ORIGIN):
+        if column in table and not pd.api.types.is_string_dtype(table[column]):
+            raise InputError(f"{path}: not rows of runs, column {column} holds no texts")
     if not all_versions:
         mine = _of_this_code(table)
         if not mine.any():
@@ -183,6 +186,9 @@ def summary(table: pd.DataFrame, against: str | None = None) -> pd.DataFrame:
     table = with_answers(table, _MAIN)
     by = telling(table.drop(columns=_DRAWN, errors="ignore"))
     shown = [c for c in _MAIN if c in table and table[c].notna().any()]
+    for column in shown:
+        if not pd.api.types.is_numeric_dtype(table[column]):
+            raise InputError(f"column {column} holds no numbers in some rows; see --where")
     if against is not None:
         column = f"ate_rmse_over_{against}"
         table = table.assign(**{column: np.log(_error_ratio(table, against))})

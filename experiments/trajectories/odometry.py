@@ -12,7 +12,7 @@ from estimators.base import Estimate
 from sim import se2
 from sim.arrays import Array
 from sim.errors import InputError, require
-from sim.files import write_text, write_whole
+from sim.files import require_file, write_text, write_whole
 from sim.recording import Recording
 from sim.robot import twist_covariances as wheel_covariances
 
@@ -140,6 +140,7 @@ def read_odometry_csv(path: Path) -> Estimate:
         Naming the file and the line that cannot be read.
     """
     rows = []
+    require_file(path)
     try:
         with path.open(newline="") as file:
             for number, row in enumerate(csv.DictReader(file), start=2):

@@ -50,7 +50,8 @@ class Laser:
         )
         if not 1 <= self.n_beams <= MOST_BEAMS:
             raise InputError(
-                f"sensors.laser.n_beams must lie in 1..{MOST_BEAMS}, got {self.n_beams}"
+                f"sensors.laser.n_beams must be at least 1, at most {MOST_BEAMS}, "
+                f"got {self.n_beams}"
             )
         if not 0.0 < self.fov_rad <= 2.0 * math.pi:
             raise InputError(f"sensors.laser.fov_rad must lie in (0, 2 pi], got {self.fov_rad}")

@@ -41,7 +41,8 @@ class Lidar3D:
         for name in ("n_rings", "n_azimuths"):
             if not 1 <= getattr(self, name) <= MOST_BEAMS:
                 raise InputError(
-                    f"sensors.lidar3d.{name} must lie in 1..{MOST_BEAMS}, got {getattr(self, name)}"
+                    f"sensors.lidar3d.{name} must be at least 1, at most {MOST_BEAMS}, "
+                    f"got {getattr(self, name)}"
                 )
         low, high = self.elevation_min_rad, self.elevation_max_rad
         if not -math.pi / 2 < low <= high < math.pi / 2:

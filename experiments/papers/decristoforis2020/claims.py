@@ -59,7 +59,7 @@ def judge(made: Results) -> list[Claim]:
         "DC2": "method" in ellipses,
         "DC3": "method" in ellipses,
         "DC4": "point_to_plane" in set(tables["covariances"]["metric"]),
-        "DC5": "point_to_plane" in set(tables["metrics"]["metric"]),
+        "DC5": True,
     }
     is_new["DC6"] = is_new["DC1"]
     judges: dict[str, Callable[[], Iterable[Claim]]] = {
@@ -250,7 +250,7 @@ def dc4(covariances: pd.DataFrame) -> Iterator[Claim]:
             bias = mean_interval(
                 table[table["place"] == place].groupby("seed")["bias_of_motion"].first()
             )
-            yield shown("DC4", f"mean error along the motion over it, {metric}, {place}", bias)
+            yield shown("DC4", f"median error along the motion over it, {metric}, {place}", bias)
         times = table.groupby(["method", "seed"])["time_us"].median().unstack("method").dropna()
         slower = log_ratio_interval(times["sampling"], times["censi_last"])
         label = f"time of sampling over Censi's closed form, {metric}"
@@ -281,7 +281,7 @@ def dc4_sentence(rows: Sequence[Claim]) -> str:
             f"scans, as Censi published it, the closed form has {over('censi')}, and "
             f"{over('censi', 'point_to_line')} with lines cut from the whole scan."
         )
-    bias = pick(rows, "mean error along", "point_to_point, corridor").found.value
+    bias = pick(rows, "median error along", "point_to_point, corridor").found.value
     return (
         f"{said} Point to point has a bias of {plain(bias)} of the motion in corridors: its "
         "minimum itself is off, which no covariance of noise can tell."
@@ -302,8 +302,11 @@ def dc5(metrics: pd.DataFrame) -> Iterator[Claim]:
     from the whole scan, which have stages of their own.
     """
     wide = metrics.pivot(index=["class", "seed"], columns="metric")
+    better_ones = [name for name in ("plane", "line") if f"point_to_{name}" in wide["error_m"]]
+    if "plane" not in better_ones:
+        yield _waiting("DC5")
     for kind in wide.index.unique("class"):
-        for better in ("plane", "line"):
+        for better in better_ones:
             for what, column, at_most in (
                 ("position error", "error_m", 1.0),
                 ("heading error", "error_rad", 1.0),

@@ -134,6 +134,9 @@ def _enlarged_ellipses(
 ) -> None:
     """Draw enlarged ellipses of one area, one every 0.75 m along the path."""
     draw_walls(ax, office["walls"], office["wall_z_m"])
+    ax.set_title(title, fontsize="medium")
+    if rows.empty:  # a short drive may not get there
+        return
     ax.plot(rows["x_m"], rows["y_m"], color=TRUTH, lw=0.6)
     along = rows["distance_m"].to_numpy()
     drawn = rows.iloc[np.searchsorted(along, np.arange(along[0], along[-1], 0.75))]
@@ -143,7 +146,6 @@ def _enlarged_ellipses(
         xlim=(rows["x_m"].min() - 1.5, rows["x_m"].max() + 1.5),
         ylim=(rows["y_m"].min() - 1.5, rows["y_m"].max() + 1.5),
     )
-    ax.set_title(title, fontsize="medium")
 
 
 def trajectories(office: Arrays, drawn: pd.DataFrame) -> Figure:

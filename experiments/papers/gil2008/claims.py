@@ -90,7 +90,7 @@ def conclusions(made: Results, claims: Sequence[Claim]) -> list[Conclusion]:
     found = conclude(claims, sentences, "worlds")
     if "noise_at" in made.table("particles"):
         return found
-    other = f" R was taken at the predicted point; with R at the measured one, as printed, {AGAIN}."
+    other = f" R was taken at the predicted point; at the measured one, as printed, it is {AGAIN}."
     return [
         replace(each, sentence=each.sentence + other) if each.id != "GI8" else each
         for each in found
@@ -249,8 +249,7 @@ def gi3_sentence(rows: Sequence[Claim]) -> str:
 
 def gi4(distance: pd.DataFrame) -> Iterator[Claim]:
     """GI4: the error falls with dmax."""
-    first = distance[distance["occluded"] & (distance["draw"] == 0)]
-    for words, is_beside, is_ours, part in _kinds(first):
+    for words, is_beside, is_ours, part in _kinds(distance[distance["occluded"]]):
         errors = pooled(part, POSITION, "max_distance_m")
         found = log_ratio_interval(errors[3], errors[10])
         label, n = f"position error, dmax = 3 m over 10 m: {words}", len(errors)

@@ -171,7 +171,7 @@ def _draw_3d(ax: Any, run: Arrays, name: str) -> None:
         ylabel="y, m",
         zlabel="z, m",
     )
-    ax.set_box_aspect((2.0 * reach, 2.0 * reach, 3.0), zoom=1.1)
+    ax.set_box_aspect((2.0 * reach, 2.0 * reach, 3.0), zoom=1.0)
 
 
 def path(run: Arrays) -> Figure:

@@ -183,7 +183,7 @@ def write_arrays(out: Results) -> None:
             pictured |= {
                 f"{name}_landmarks": found.map["landmarks"],
                 f"{name}_covariances": found.map["landmark_covariances"],
-                f"{name}_in_image": in_image,
+                f"{name}_in_image": in_image.astype(float),
                 f"{name}_image_pose": found.means[
                     np.searchsorted(found.stamps, log.stamps[busiest])
                 ],
@@ -200,7 +200,7 @@ def write_arrays(out: Results) -> None:
 def _gridded(name: str, scanned: Recording, stamps: Array, poses: Array) -> dict[str, Array]:
     """Occupancy grid of the scans along a path (T, 3), and its origin."""
     grid, _ = grid_along(scanned, stamps, poses, resolution_m=settings.CELL_M)
-    return {f"{name}_grid": grid.probability, f"{name}_origin": grid.origin}
+    return {f"{name}_grid": grid.probability.astype(float), f"{name}_origin": grid.origin}
 
 
 def particles_along_a_motion(rng: np.random.Generator) -> tuple[Array, Array]:

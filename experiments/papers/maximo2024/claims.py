@@ -325,14 +325,17 @@ def mx2_sentence(rows: Sequence[Claim]) -> str:
     """Say how the error and the time depend on the number of particles."""
     judged_rows = list(filter(_is_headline, rows))
     errors = [row for row in judged_rows if row.statistic.startswith("error")]
-    parts = [f"{plain(row.found.value, 3)} on {_place(row).split(', ', 1)[-1]}" for row in errors]
+    parts = [
+        f"{plain(row.found.value, 3)} times as large on {_place(row).split(', ', 1)[-1]}"
+        for row in errors
+    ]
     share, gap, grows = (
         max(row.found.value for row in judged_rows if words in row.statistic)
         for words in ("over the paper's", "between nodes", "the fewest")
     )
     slower = pick(judged_rows, "over that of UMH").found.value
     return (
-        f"Against 4 particles a node, other numbers change the error by a factor of at most "
+        f"Against 4 particles a node, the error with other numbers is at worst "
         f"{' and '.join(parts)}. The time grows up to {plain(grows)} times, is at most "
         f"{plain(100.0 * share)} % of the paper's and {plain(100.0 * gap)} % of the time between "
         f"nodes, and on Oxford is at least {plain(slower)} times that on UMH."

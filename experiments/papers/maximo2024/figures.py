@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from estimators import descriptors as describers
 from experiments.evaluation.verdict import Verdict
-from experiments.papers.maximo2024.claims import COMPARISONS, geometries, judged_map
+from experiments.papers.maximo2024.claims import COMPARISONS, geometries, headlines, judged_map
 from experiments.papers.maximo2024.settings import (
+    CONTROLS,
     DRAWN_DESCRIPTOR,
     ITERATIONS,
     METHODS,
@@ -48,10 +49,12 @@ def draw(made: Results) -> dict[str, Figure]:
         "maximo2024_data": data(drawn["campus"]),
         "maximo2024_clusters": clusters(drawn),
         "maximo2024_map_and_route": map_and_route(drawn),
-        "maximo2024_dispersion": dispersion(made.table("dispersion")),
+        "maximo2024_dispersion": dispersion(_without_controls(made.table("dispersion"))),
         "maximo2024_starts": starts({name: drawn[name] for name in (oxford, "umh")}),
         "maximo2024_particles": particles(drawn[oxford]),
-        "maximo2024_table_1": table_1(made.table("table_1"), made.table("weighting")),
+        "maximo2024_table_1": table_1(
+            _without_controls(made.table("table_1")), made.table("weighting")
+        ),
         "maximo2024_table_2": table_2(made.table("table_2")),
         "maximo2024_quality": quality(made.table("quality")),
         "maximo2024_kidnapping": kidnapping(made.table("kidnapping")),
@@ -185,18 +188,20 @@ def table_1(table: pd.DataFrame, weighting: pd.DataFrame) -> Figure:
 
 def table_2(table: pd.DataFrame) -> Figure:
     """Table 2: error and time per node by the number of particles, beside the paper's."""
-    page, axes = subplots(9.0, 5.4, 2, 2)
+    table = table[table["geometry"].isin(headlines(table["geometry"]))]
+    page, columns = _columns(table, 4.2, 0.6, 5.4, n_rows=2)
     here, paper = {"fmt": "o-", "color": BLUE}, {"fmt": "D--", "color": RED}
-    parts = table.groupby("geometry", sort=False)
-    for (upper, lower), (name, part) in zip(axes.T, parts, strict=True):
+    for (upper, lower), name, part in columns:
         n = part["particles"]
         upper.errorbar(n, part["error_m"], part["sd_repeats_m"], label="here", capsize=3, **here)
         upper.errorbar(n, part["paper_m"], part["paper_sd_m"], label="paper", capsize=3, **paper)
         top = 1.6 * float(np.nanmax(part[["error_m", "paper_m"]]))
-        upper.set(title=NAMES[str(name)], ylabel="mean error, m", ylim=(0.0, top))
+        upper.set(title=NAMES[name], ylim=(0.0, top))
         lower.errorbar(n, 1e3 * part["time_s"], **here)
         lower.errorbar(n, 1e3 * part["paper_time_s"], **paper)
-        lower.set(xlabel="particles", ylabel="time a node, ms", yscale="log")
+        lower.set(xlabel="particles", yscale="log")
+    columns[0][0][0].set(ylabel="mean error, m")
+    columns[0][0][1].set(ylabel="time a node, ms")
     return with_legend(page, ncols=2)
 
 
@@ -244,8 +249,8 @@ def oxford_runs(table: pd.DataFrame) -> Figure:
     nearest = table.groupby("run")["nearest_node_m"].mean()
     ax.plot(np.arange(len(errors)), nearest, "_", color=WALL, ms=14, label="nearest node")
     ax.set_xticks(range(len(errors)), [run[:10] for run in errors.index], rotation=60, ha="right")
-    ax.set(ylabel="mean error over the route, m", xlabel="Oxford run")
-    _log_scale(ax)
+    ax.set(ylabel="mean error over the route, m", xlabel="Oxford run", yscale="log")
+    plain_log(ax.yaxis)
     return with_legend(page, ncols=4)
 
 
@@ -285,6 +290,10 @@ def campus_errors(starts_table: pd.DataFrame, clusters_table: pd.DataFrame) -> F
     return page
 
 
+def _without_controls(table: pd.DataFrame) -> pd.DataFrame:
+    return table[~table["geometry"].isin(CONTROLS)]
+
+
 def _columns(
     table: pd.DataFrame,
     width_in: float,
@@ -296,7 +305,7 @@ def _columns(
     """Page with one column per geometry: its axes, name and rows."""
     names = geometries(table)
     size = (width_in * len(names) + margin_in, height_in, n_rows, len(names))
-    page, axes = subplots(*size, sharex=n_rows > 1, sharey=sharey, squeeze=False)
+    page, axes = subplots(*size, sharex="col", sharey=sharey, squeeze=False)
     parts = [table[table["geometry"] == name] for name in names]
     return page, list(zip(axes.T, names, parts, strict=True))
 

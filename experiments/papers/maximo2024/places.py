@@ -5,6 +5,8 @@ printed, or from positions that the user has; a synthetic field of descriptors r
 """
 
 import dataclasses
+import functools
+import inspect
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,17 +18,18 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from estimators import descriptors as describers
 from estimators.topological_map import TopologicalMap, from_arrays, from_recording, read_array
 from experiments.evaluation.metrics import travelled_m
 from experiments.runs.experiment import Experiment
 from experiments.runs.seeds import stream
+from experiments.runs.targets import make
 from sim import se2
-from sim.arrays import Array
+from sim.arrays import Array, Floats
 from sim.errors import InputError
 from sim.recording import Log, Recording, Truth, WheelLog
 from sim.robot import RobotGeometry, wheel_errors
 from sim.sensors import Lidar3D, PlaceDescriptor
+from sim.settings import find
 
 # Noisy unit descriptors (K, 512) at points (K, 2) m
 Describe = Callable[[Array, np.random.Generator], NDArray[np.float32]]
@@ -244,14 +247,16 @@ def place_world(
 ) -> PlaceWorld:
     """Map and queries of one world: the route is generated unless positions are given.
 
-    The map does not depend on the queries.
+    The map does not depend on queries along the route. Those in the plane are drawn before it, as
+    in former versions, so that `estima check` keeps its recordings.
     """
     if nodes_m is None:
         nodes_m = route(geometry, stream(seed, "world"))
     rng = stream(seed, "places")
+    before = queries(nodes_m, geometry, rng, offsets) if offsets == "plane" else None
     describe = field(geometry, nodes_m, rng)
     known_map = from_arrays(nodes_m, describe(nodes_m, rng))
-    queries_m = queries(nodes_m, geometry, rng, offsets)
+    queries_m = queries(nodes_m, geometry, rng, offsets) if before is None else before
     seen, slip = describe(queries_m, rng), stream(seed, "slip")
     return PlaceWorld(known_map, query_recording(queries_m, seen, geometry.interval_s, slip))
 
@@ -312,11 +317,10 @@ def resequenced(recording: Recording, rows: NDArray[np.int64]) -> Recording:
     )
 
 
-def described(recording: Recording, descriptor: str) -> Recording:
+def described(recording: Recording, describe: Callable[[Lidar3D, Floats], Floats]) -> Recording:
     """The recording with a place descriptor for each of its clouds."""
     lidar, clouds = recording.sensor("lidar3d", Lidar3D), recording.log("lidar3d")
-    kind = describers.kind(descriptor)
-    rows = np.array([kind.describe(lidar, turn) for turn in clouds["ranges_m"]])
+    rows = np.array([describe(lidar, turn) for turn in clouds["ranges_m"]])
     places = Log.of(_PLACE, clouds.stamps.copy(), descriptor=rows)
     return recording.with_log("place", places, _PLACE)
 
@@ -366,9 +370,10 @@ def route_map(
     positions: str | None = None,
     positions_run: str = OXFORD_RUN,
     noise_weight: float | None = None,
+    offsets: Offsets = "along",
 ) -> TopologicalMap:
     """Map of the same route."""
-    return _route(config, geometry, positions, positions_run, noise_weight, "along").known_map
+    return _route(config, geometry, positions, positions_run, noise_weight, offsets).known_map
 
 
 def _route(
@@ -407,7 +412,49 @@ def mapping_run(
     seed: int,
     spacing_m: float = 5.0,
     descriptor: str = "scan_context",
+    network: dict[str, Any] | None = None,
 ) -> TopologicalMap:
-    """Map from another run through the same world, whose slip and noise are those of `seed`."""
-    other = Experiment(config).replaced(seed=seed, recording=None)
-    return from_recording(other.recording(), descriptor, spacing_m)
+    """Map from another run through the same world, whose slip and noise are those of `seed`.
+
+    Parameters
+    ----------
+    descriptor, network
+        What describes its clouds: a name of `estimators.descriptors.KINDS`, or a network as in
+        `described_run`.
+    """
+    made = Experiment(config).replaced(seed=seed, recording=None).recording()
+    if network is not None:
+        made = described(made, _by_network(network))
+    return from_recording(made, descriptor, spacing_m)
+
+
+def described_run(config: dict[str, Any], network: dict[str, Any]) -> Recording:
+    """The simulated run, its clouds described by a network of one's own.
+
+    Parameters
+    ----------
+    network
+        `_target_` names a function of a cloud's points (P, 3) m in the lidar's frame that returns
+        a descriptor (D,); other keys go to it too. Or a class: they make an object, which is
+        called with the points.
+    """
+    made = Experiment(config).replaced(recording=None).recording()
+    return described(made, _by_network(network))
+
+
+def _by_network(settings: dict[str, Any]) -> Callable[[Lidar3D, Floats], Floats]:
+    target = find(settings.get("_target_"), "network")
+    own = {key: value for key, value in settings.items() if key != "_target_"}
+    is_class = inspect.isclass(target)
+    network = make(settings, "network") if is_class else functools.partial(target, **own)
+
+    def describe(lidar: Lidar3D, ranges_m: Floats) -> Floats:
+        row = np.asarray(network(lidar.points_in_sensor(ranges_m)), np.float32)
+        if row.ndim != 1 or not np.isfinite(row).all():
+            raise InputError(
+                f"network: {settings['_target_']} must return finite numbers of shape (D,), got "
+                f"shape {row.shape}"
+            )
+        return row
+
+    return describe

@@ -142,7 +142,7 @@ def _rows(what: str, name: str, seed: int, profile: Profile) -> dict[str, Rows]:
         found = [
             {"run": run, **row}
             for run in oxford_runs(POSITIONS)
-            for row in run_rows(run, seed, min(n_repeats, 2))
+            for row in run_rows(run, seed, max(n_repeats // 5, 1))
         ]
         return {"runs": found}
     case = case_of(name, seed)

@@ -332,11 +332,12 @@ def campus_rows(seed: int, profile: Profile, *, with_clusters: bool) -> dict[str
     for descriptor in describers.KINDS if with_clusters else ():
         known = from_recording(mapped, descriptor, settings["spacing_m"])
         fine = from_recording(mapped, descriptor, UMH.spacing_m)
-        queries = described(taken, descriptor)
+        queries = described(taken, describers.kind(descriptor).describe)
         row = cluster_row(fine, queries, descriptor, seed)
         tables["clusters"].append({**row, **_retrieval(known, queries)})
     known = from_recording(mapped, settings["descriptor"], settings["spacing_m"])
-    case = Case("campus", seed, taking, known, described(taken, settings["descriptor"]))
+    queries = described(taken, describers.kind(settings["descriptor"]).describe)
+    case = Case("campus", seed, taking, known, queries)
     travel_m = np.median(np.abs(np.diff(taken.wheels.position_m[:, 0])))
     per_node = float(known.spacing_m / travel_m)
     places = {"place": case.recording.log("place")}  # without the clouds
