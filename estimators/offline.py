@@ -117,7 +117,7 @@ class Offline:
             "mcap": ("log.mcap", lambda path: write_bag(path, recording)),
             "npz": ("log.npz", lambda path: save(recording, path)),
             "map": self._map_file(),
-            "start": ("start.txt", lambda path: write_text(path, _start_text(self._prior))),
+            "start": ("start.txt", lambda path: write_text(path, start_text(self._prior))),
         }
         places = {"seed": str(self._seed), "out": str(folder / f"out.{self.output}")}
         for key in set(self._used) & set(files):
@@ -144,7 +144,7 @@ def _filled(word: str, places: dict[str, str]) -> str:
     return re.sub(r"\{(\w+)\}", lambda found: places[found[1]], word)
 
 
-def _start_text(prior: Prior) -> str:
+def start_text(prior: Prior) -> str:
     """A line `x y heading` and the three rows of its covariance; empty if it is not known."""
     if prior.mean is None or prior.covariance is None:
         return ""

@@ -693,10 +693,20 @@ def check(
     ] = False,
     junit: Annotated[Path | None, typer.Option(help="JUnit XML to write.")] = None,
     summary: Annotated[Path | None, typer.Option(help="Markdown to write.")] = None,
+    candidate: Annotated[
+        Path | None,
+        typer.Option(help="Folder of trajectories that were made elsewhere, to judge instead."),
+    ] = None,
+    recordings: Annotated[
+        Path | None,
+        typer.Option(help="Only write the recordings for them, without the truth, to this folder."),
+    ] = None,
 ) -> None:
     """Compare all estimators' errors with the baseline; code 1 if one is worse.
 
-    Under GitHub Actions it also annotates, and adds to the job's summary.
+    Of a suite's entries with `elsewhere: true`, --candidate judges the trajectories GROUP_SEED.tum
+    (or .csv, .mcap; of several repeats GROUP_SEED.0.tum and so on) that any program made. Under
+    GitHub Actions it also annotates, and adds to the job's summary.
 
     Examples
     --------
@@ -705,10 +715,23 @@ def check(
       estima check --junit check.xml
 
       estima check --accept "descriptors of half the size: 2 % worse, twice as fast"
+
+      estima check --suite mine.yaml --recordings in
+
+      estima check --suite mine.yaml --candidate out
     """
+    if recordings is not None:
+        from experiments.gate.candidate import write_recordings
+        from experiments.gate.suite import read_suite, suite_path
+
+        chosen = read_suite(suite_path(suite)).of(only or []).made(elsewhere=True)
+        with progress("recordings", 1.0) as on_progress:
+            print(f"{recordings}: {write_recordings(chosen, recordings, on_progress)} recordings")
+        return
     from experiments.gate.report import run_check
 
-    if run_check(suite, accept, only or [], release=release, junit=junit, summary=summary):
+    reports = {"junit": junit, "summary": summary}
+    if run_check(suite, accept, only or [], release=release, candidate=candidate, **reports):
         raise typer.Exit(1)
 
 

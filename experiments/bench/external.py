@@ -34,10 +34,5 @@ def run() -> Iterator[Measurement]:
     estimator.reset(Prior(RobotGeometry(0.1, 0.3), mean=np.zeros(3), covariance=np.eye(3)), rng)
     median_s = median_time_s(estimator.step, [(frame,) for frame in frames])
     estimator.finish()
-    yield Measurement(
-        "external.roundtrip_us",
-        1e6 * median_s,
-        "us",
-        _GOAL_US,
-        note=f"{_N_BEAMS} beams, echo child",
-    )
+    note = f"{_N_BEAMS} beams, echo child"
+    yield Measurement("external.roundtrip_us", 1e6 * median_s, "us", _GOAL_US, note=note)

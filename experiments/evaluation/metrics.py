@@ -180,7 +180,7 @@ def path_scores(truth: Array, means: Array, covariances: Array) -> dict[str, flo
         row["ellipse_area_final_m2"] = float(ellipse_area_m2(covariances[-1:])[0])
     if counted.any():
         row["nees_mean"] = float(np.mean(values[counted]))
-    if row["ellipse_area_final_m2"] > 0.0:
+    if row.get("ellipse_area_final_m2", 0.0) > 0.0:
         row["final_in_ellipse"] = float(in_ellipse(truth[-1], means[-1], covariances[-1]))
     for distance in RPE_DISTANCES_M:
         pairs = pairs_by_distance(truth, distance)
