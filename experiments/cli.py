@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from experiments.runs import columns, paths
+from experiments.runs import columns, completion, paths
 from experiments.runs.console import end, progress, show
 from experiments.runs.row import Outcome, write_frame
 from experiments.runs.version import code_version
@@ -36,7 +36,11 @@ _PASS_ON = {
     "help_option_names": ["-h", "--help"],
 }
 Overrides = Annotated[
-    list[str] | None, typer.Argument(help="Hydra overrides, such as world=office seed=3.")
+    list[str] | None,
+    typer.Argument(
+        help="Hydra overrides, such as world=office seed=3.",
+        autocompletion=completion.overrides,
+    ),
 ]
 ConfigDir = Annotated[
     Path | None, typer.Option("--config-dir", "-cd", help="Folder with options of your own.")
@@ -77,6 +81,7 @@ def options_of_all(
 @app.command(context_settings=_PASS_ON)
 def run(
     context: typer.Context,
+    overrides: Overrides = None,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -106,7 +111,7 @@ def run(
       estima run --cfg job (print the configuration; estima options lists the groups)
     """
     os.environ["HYDRA_FULL_ERROR"] = "1"  # errors come to `main`, which puts them in a line
-    arguments = context.args
+    arguments = [*(overrides or []), *context.args]
     many = {"-m", "--multirun"} & set(arguments)
     shown = {"--cfg", "-c", "--info", "-i"} & set(arguments)
     if many and shown:
@@ -235,7 +240,10 @@ def convert(
 @app.command()
 def options(
     group: Annotated[
-        str | None, typer.Argument(help="world, robot, ..., study; or metrics.")
+        str | None,
+        typer.Argument(
+            help="world, robot, ..., study; or metrics.", autocompletion=completion.groups
+        ),
     ] = None,
     config_dir: ConfigDir = None,
 ) -> None:
@@ -247,7 +255,7 @@ def options(
 
       estima options metrics
     """
-    groups = ("world", "robot", "sensors", "route", "estimator", "study")
+    groups = completion.GROUPS
     if group == "metrics":
         print(columns.as_text())
         return
@@ -270,7 +278,10 @@ def view(
     estimate: Annotated[
         str | None,
         typer.Option(
-            "--estimate", "-e", help="An estimate.csv, its folder, or an estimator to run now."
+            "--estimate",
+            "-e",
+            help="An estimate.csv, its folder, or an estimator to run now.",
+            autocompletion=completion.estimators,
         ),
     ] = None,
     world: Annotated[
@@ -400,6 +411,7 @@ def build_map(
             "--estimate",
             "-e",
             help="truth, an estimate.csv, its folder, or an estimator to run now.",
+            autocompletion=completion.estimators,
         ),
     ] = "truth",
     resolution_m: Annotated[float, typer.Option("--resolution", help="Side of a cell, m.")] = 0.05,
@@ -651,11 +663,18 @@ def _robot_of(overrides: list[str], config_dir: Path | None) -> DifferentialDriv
 @app.command()
 def conform(
     target: Annotated[
-        str, typer.Argument(help="An option of conf/estimator, or MODULE:CLASS of an estimator.")
+        str,
+        typer.Argument(
+            help="An option of conf/estimator, or MODULE:CLASS of an estimator.",
+            autocompletion=completion.estimators,
+        ),
     ],
     arguments: Annotated[
         list[str] | None,
-        typer.Argument(help="Overrides of the option, or the constructor's arguments, key=value."),
+        typer.Argument(
+            help="Overrides of the option, or the constructor's arguments, key=value.",
+            autocompletion=completion.overrides,
+        ),
     ] = None,
     config_dir: ConfigDir = None,
 ) -> None:
@@ -680,13 +699,21 @@ def conform(
 @app.command()
 def check(
     suite: Annotated[
-        str, typer.Option(help="Suite of conf/suite, or a .yaml file; baselines lie beside it.")
+        str,
+        typer.Option(
+            help="Suite of conf/suite, or a .yaml file; baselines lie beside it.",
+            autocompletion=completion.suites,
+        ),
     ] = "check",
     accept: Annotated[
         str | None, typer.Option(help="Make this the baseline; the reason is kept in it.")
     ] = None,
     only: Annotated[
-        list[str] | None, typer.Option(help="An estimator; repeat it. Else all of the suite.")
+        list[str] | None,
+        typer.Option(
+            help="An estimator; repeat it. Else all of the suite.",
+            autocompletion=completion.estimators,
+        ),
     ] = None,
     release: Annotated[
         bool, typer.Option("--release", help="With --accept: pin the release baseline too.")
@@ -765,12 +792,21 @@ Where = Annotated[
 
 @app.command()
 def table(
-    name: Annotated[str, typer.Argument(help="A sweep's name, or a folder or file of rows.")],
+    name: Annotated[
+        str,
+        typer.Argument(
+            help="A sweep's name, or a folder or file of rows.", autocompletion=completion.sweeps
+        ),
+    ],
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="File to write, .csv or .parquet.")
     ] = None,
     against: Annotated[
-        str | None, typer.Option(help="Give errors relative to this estimator's, too.")
+        str | None,
+        typer.Option(
+            help="Give errors relative to this estimator's, too.",
+            autocompletion=completion.estimators,
+        ),
     ] = None,
     all_versions: Annotated[
         bool, typer.Option("--all-versions", help="Keep rows of other versions of the code.")
@@ -802,10 +838,24 @@ def table(
 
 @app.command()
 def plot(
-    name: Annotated[str, typer.Argument(help="A sweep's name, or a folder or file of rows.")],
-    x: Annotated[str, typer.Option(help="Swept setting, such as robot.kr.")],
-    y: Annotated[str, typer.Option(help="Result (estima options metrics).")] = "answer_ate_rmse_m",
-    by: Annotated[str | None, typer.Option(help="One line a value of this.")] = None,
+    name: Annotated[
+        str,
+        typer.Argument(
+            help="A sweep's name, or a folder or file of rows.", autocompletion=completion.sweeps
+        ),
+    ],
+    x: Annotated[
+        str,
+        typer.Option(help="Swept setting, such as robot.kr.", autocompletion=completion.settings),
+    ],
+    y: Annotated[
+        str,
+        typer.Option(help="Result (estima options metrics).", autocompletion=completion.metrics),
+    ] = "answer_ate_rmse_m",
+    by: Annotated[
+        str | None,
+        typer.Option(help="One line a value of this.", autocompletion=completion.settings),
+    ] = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="Picture to write.")] = Path("plot.png"),
     pool: Annotated[
         bool, typer.Option("--pool", help="Average over worlds, estimators and logs too.")

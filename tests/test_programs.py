@@ -1,5 +1,6 @@
 """Programs as estimators: what they are told, what they may do wrong, and that they end."""
 
+import dataclasses
 import json
 import os
 import shutil
@@ -16,6 +17,7 @@ from estimators.odometry import Odometry
 from estimators.offline import Offline, recording_of
 from estimators.program import ProgramError
 from experiments.gate.conform import check_estimator
+from experiments.gate.suite import read_suite, run_suite
 from experiments.runs.evaluate import estimates, evaluate
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome
@@ -359,6 +361,21 @@ def test_the_copy_holds_what_frames_show(recording, tmp_path):
                 assert np.array_equal(mine.readings[name][key], values)
     save(copy, tmp_path / "copy.npz")
     assert load(tmp_path / "copy.npz").truth is None
+
+
+@pytest.mark.skipif(shutil.which("g++") is None, reason="no C++ compiler")
+def test_the_suite_of_a_cpp_program_runs(tmp_path, monkeypatch):
+    suite = read_suite(EXAMPLES / "cpp_gate" / "suite.yaml")
+    overrides = (*suite.overrides["laser"], "route.distance_m=1", "sensors.laser.n_beams=11")
+    suite = dataclasses.replace(suite, counts={"laser": 1}, overrides={"laser": overrides})
+    subprocess.run(
+        ["g++", "-o", tmp_path / "external_odometry", EXAMPLES / "external_odometry.cpp"],
+        check=True,
+    )
+    monkeypatch.chdir(tmp_path)
+    rows = run_suite(suite, {"my_odometry": 1}, n_jobs=1)
+    assert rows["status"].tolist() == ["ok"]
+    assert 0.0 < rows["ate_rmse_m"][0] < 1.0
 
 
 def test_an_edited_program_is_another_version(tmp_path):
