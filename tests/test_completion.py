@@ -17,7 +17,8 @@ MOST_CPU_S = 0.3
 
 def complete(line, **environment):
     """What a shell offers at the end of a line."""
-    code = "import sys; sys.argv = ['estima']\nfrom experiments.cli import app; app(prog_name='estima')"
+    code = "import sys; sys.argv = ['estima']\n"
+    code += "from experiments.cli import app; app(prog_name='estima')"
     given = {
         "_ESTIMA_COMPLETE": "complete_fish",
         "_TYPER_COMPLETE_ARGS": line,

@@ -368,10 +368,8 @@ def test_the_suite_of_a_cpp_program_runs(tmp_path, monkeypatch):
     suite = read_suite(EXAMPLES / "cpp_gate" / "suite.yaml")
     overrides = (*suite.overrides["laser"], "route.distance_m=1", "sensors.laser.n_beams=11")
     suite = dataclasses.replace(suite, counts={"laser": 1}, overrides={"laser": overrides})
-    subprocess.run(
-        ["g++", "-o", tmp_path / "external_odometry", EXAMPLES / "external_odometry.cpp"],
-        check=True,
-    )
+    source = EXAMPLES / "external_odometry.cpp"
+    subprocess.run(["g++", "-o", tmp_path / "external_odometry", source], check=True)
     monkeypatch.chdir(tmp_path)
     rows = run_suite(suite, {"my_odometry": 1}, n_jobs=1)
     assert rows["status"].tolist() == ["ok"]
