@@ -11,6 +11,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from estimators.base import Estimate
+from estimators.program import ProgramError
 from experiments.runs import paths
 from experiments.runs.columns import COLUMNS
 from experiments.runs.console import RunFailedError, end, progress, show
@@ -63,7 +64,7 @@ def run_once(experiment: Experiment, draw: Draw, out: Path | None = None) -> lis
         fetch,
         shown=lambda recording: progress(name, len(recording.frame_stamps)),
         on_estimate=keep,
-        on_error=traceback.print_exception,
+        on_error=_trace,
     )
     path = write_run(rows, folder.parent)
     written = (path, folder / "run.png", *([out] if out is not None else []))
@@ -72,6 +73,12 @@ def run_once(experiment: Experiment, draw: Draw, out: Path | None = None) -> lis
         if row["status"] == Outcome.FAILED:
             raise RunFailedError(f"{row['status_code']}: {row['status_detail']}")
     return rows
+
+
+def _trace(error: Exception | SystemExit) -> None:
+    """Print where an error came from, unless it is a program's, whose own message says so."""
+    if not isinstance(error, ProgramError):
+        traceback.print_exception(error)
 
 
 def application(arguments: Sequence[str], draw: Draw, out: Path | None = None) -> None:
