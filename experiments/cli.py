@@ -382,7 +382,8 @@ def _show_run(
         view.check_output(out)
     known = None if grid is None else read_grid(grid)
     recording = read_any([log])
-    length_s = seconds or (recording.duration_s if out is None else view.SECONDS)
+    drive_s = recording.duration_s
+    length_s = seconds or (drive_s if out is None else min(drive_s, view.SECONDS))
     rows = view.shown_rows(recording, int(length_s * (live.FPS if out is None else view.FPS)))
     shown = view.Playback(recording, rows)
     if source is not None:
@@ -392,10 +393,11 @@ def _show_run(
     if out is None:
         live.watch(shown, seconds)
         return
-    shown = replace(shown, grid=known)
+    shown = replace(shown, grid=known, seconds=length_s)
     with progress(f"drawing {out.name}", 1.0) as on_progress:
         view.save(shown, out, on_progress)
-    print(f"{out}: {len(rows)} pictures, {len(rows) / view.FPS:.1f} s")
+    speed = "real time" if length_s == drive_s else f"{drive_s / length_s:.3g} times real time"
+    print(f"{out}: {len(rows)} pictures, {length_s:.1f} s, {speed}")
 
 
 @app.command("map")

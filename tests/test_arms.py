@@ -47,7 +47,7 @@ def of_one_seed(name):
     ("table", "compared"),
     [
         ("particles", {"recording.draw"}),
-        ("distance", {"recording.occluded"} | {
+        ("distance", {"recording.draw", "recording.occluded"} | {
             f"sensors.stereo.{key}" for key in ("max_distance_m", "max_observations", "selection")
         }),
         ("association", {"sensors.stereo.identifies", "sensors.stereo.sigma_descriptor"}),

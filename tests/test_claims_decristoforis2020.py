@@ -87,6 +87,10 @@ def test_dc1s_heading_over_10_m_is_judged_beside():
     rows = list(claims.dc1(table, ordering(set())))
     assert verdicts(rows)["heading over 10 m RMSE, fusion over icp"] == "not_reproduced"
     assert conclusion("DC1", claims.dc1_sentence, rows).verdict == "reproduced"
+    shorter = table.drop(columns="rpe_10m_heading_rmse_rad")  # drives of less than 10 m
+    rows = list(claims.dc1(shorter, ordering(set())))
+    assert not any("over 10 m" in row.statistic for row in rows)
+    assert "10 m" not in conclusion("DC1", claims.dc1_sentence, rows).sentence
 
 
 def test_the_order_holds_in_a_cell_only_if_all_intervals_do():

@@ -182,7 +182,7 @@ def test_the_image_may_lie_elsewhere(tmp_path):
         ({"occupied_thresh": None}, ["occupied_thresh is missing", "0.65"]),
         ({"image": 7}, ["image must be"]),
         ({"image": "none.pgm"}, ["none.pgm", "no such image"]),
-        ({"image": "."}, ["no image"]),
+        ({"image": "."}, ["not a file"]),
         ({"resolution": 0}, ["resolution must be positive"]),
         ({"resolution": -0.05}, ["resolution must be positive"]),
         ({"resolution": math.nan}, ["resolution must be a finite number"]),

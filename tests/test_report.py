@@ -233,7 +233,7 @@ def test_a_damaged_figure_is_named(tmp_path, results):
         report.write_report(tmp_path)
     path.unlink()
     path.mkdir()
-    with pytest.raises(InputError, match=r"gil2008_8\.png: cannot read \(Is a directory\)"):
+    with pytest.raises(InputError, match=r"gil2008_8\.png: not a file; name a file, or remove it"):
         report.write_report(tmp_path)
 
 

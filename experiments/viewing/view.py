@@ -71,6 +71,8 @@ class Playback:
         Of the estimate.
     grid
         A map to draw underneath, or None.
+    seconds
+        How long it plays, s; None: in real time.
     """
 
     recording: Recording
@@ -78,6 +80,17 @@ class Playback:
     estimate: Estimate | None = None
     name: str = "estimate"
     grid: OccupancyGrid | None = None
+    seconds: float | None = None
+
+    @property
+    def stamps(self) -> Array:
+        """Stamps (n,) of the rows shown, s."""
+        return self.recording.frame_stamps[self.rows]
+
+    @property
+    def fps(self) -> float:
+        """Pictures a second."""
+        return len(self.rows) / (self.seconds or max(float(np.ptp(self.stamps)), 1.0 / FPS))
 
     def belief_row(self, stamp: float) -> int:
         """Row of the last belief up to a time; -1 before the first, or without an estimate."""
@@ -306,7 +319,7 @@ def _instant(
     stamps = run.recording.frame_stamps
     stamp = float(stamps[frame])
     points = {name: seen_points(run, name, stamp) for name in _sensor_layers(run.recording)}
-    words = f"t = {stamp - stamps[0]:.1f} s"
+    words = f"{_clock(run, stamp)} s"
     if truth is not None:
         points["truth"] = truth[: frame + 1, :2]
         points["truth robot"] = robot_outline(truth[frame], glyph_m)
@@ -328,6 +341,12 @@ def _instant(
     if truth is not None and np.isfinite(truth[frame]).all():
         words += f", position error {np.hypot(*(mean - truth[frame])[:2]):.3f} m"
     return points, words
+
+
+def _clock(run: Playback, stamp: float) -> str:
+    """Time since the start, and the whole time."""
+    stamps = run.recording.frame_stamps
+    return f"{stamp - stamps[0]:.1f} of {stamps[-1] - stamps[0]:.1f}"
 
 
 def robot_outline(pose: Array, radius_m: float) -> Array:
@@ -390,13 +409,13 @@ def save(run: Playback, path: Path, on_progress: Callable[[float], None]) -> Non
 
     write = {".mp4": _write_mp4, ".gif": _write_gif, ".html": _write_html}[path.suffix]
     with write_whole(path) as part:
-        write(counted(), part)
+        write(run, counted(), part)
 
 
-def _write_mp4(images: Iterator[Picture], path: Path) -> None:
+def _write_mp4(run: Playback, images: Iterator[Picture], path: Path) -> None:
     first = next(images)
     size = f"{first.shape[1]}x{first.shape[0]}"
-    raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", str(FPS), "-i", "-"]
+    raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", f"{run.fps:.4f}", "-i", "-"]
     command = ["ffmpeg", "-y", "-loglevel", "error", *raw, "-pix_fmt", "yuv420p", str(path)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         assert process.stdin is not None
@@ -422,12 +441,13 @@ def _reduced(image: Picture) -> Any:
     return Image.fromarray(image).quantize(96, method=Image.Quantize.FASTOCTREE)
 
 
-def _write_gif(images: Iterator[Picture], path: Path) -> None:
+def _write_gif(run: Playback, images: Iterator[Picture], path: Path) -> None:
     first, *rest = (_reduced(image) for image in images)
-    first.save(path, "GIF", save_all=True, append_images=rest, duration=1000 // FPS, loop=0)
+    duration_ms = round(1000.0 / run.fps)
+    first.save(path, "GIF", save_all=True, append_images=rest, duration=duration_ms, loop=0)
 
 
-def _write_html(images: Iterator[Picture], path: Path) -> None:
+def _write_html(run: Playback, images: Iterator[Picture], path: Path) -> None:
     frames: list[str] = []
     for image in images:
         data = io.BytesIO()
@@ -437,7 +457,8 @@ def _write_html(images: Iterator[Picture], path: Path) -> None:
         "width": image.shape[1],
         "height": image.shape[0],
         "last": len(frames) - 1,
-        "fps": FPS,
+        "fps": f"{run.fps:.4f}",
+        "times": ", ".join(f'"{_clock(run, float(stamp))} s"' for stamp in run.stamps),
         "first": frames[0],
         "frames": ",\n".join(f'"{frame}"' for frame in frames),
     }
