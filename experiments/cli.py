@@ -769,7 +769,7 @@ def bench(
     name: Annotated[
         str,
         typer.Argument(
-            help="compile, external, fastslam, formats, icp, mcl, sim, smoothing, sweep, "
+            help="compile, external, fastslam, formats, growth, icp, mcl, sim, smoothing, sweep, "
             "sweep_scale, topological, or all."
         ),
     ] = "all",
