@@ -297,7 +297,7 @@ def sweep(*overrides: str, name: str | None = None) -> pd.DataFrame:
 def plot(
     table: pd.DataFrame,
     x: str,
-    y: str = "ate_rmse_m",
+    y: str = "answer_ate_rmse_m",
     by: str | None = None,
     path: str | Path | None = None,
     *,
