@@ -21,7 +21,7 @@ from estimators.graph_slam import GraphSlam
 from estimators.pose_graph import Edge, PoseGraph
 from experiments.bench.measure import Measurement, time_s
 from experiments.evaluation.metrics import nees
-from experiments.runs.evaluate import one_blas_thread
+from experiments.runs.evaluate import limited_blas
 from experiments.runs.experiment import Experiment
 from experiments.runs.seeds import stream
 from sim import se2
@@ -116,7 +116,7 @@ def run_rooms(
     experiment = Experiment.compose([*_ROOMS, f"seed={seed}", f"route.distance_m={distance_m}"])
     recording, robot = experiment.simulate(), experiment.robot()
     estimator = Planted(planted, stream(seed, "bench"), kr=robot.kr, kl=robot.kl, **options)
-    with one_blas_thread():
+    with limited_blas():
         begun = time.process_time()
         online = run_estimator(
             estimator, recording, experiment.prior(recording), stream(seed, "estimator/graph_slam")
@@ -205,7 +205,7 @@ def growth(lengths_m: tuple[float, ...] = (500.0, 1500.0, 5000.0)) -> Iterator[M
 
 def run() -> Iterator[Measurement]:
     """Growth; twenty judged drives of 300 m, five of them again with planted closures."""
-    with one_blas_thread():
+    with limited_blas():
         yield from growth()
     runs = [run_rooms(seed) for seed in _JUDGED]
     note = "20 drives of 300 m through look-alike rooms"
