@@ -3,6 +3,7 @@
 import io
 import json
 import os
+import platform
 import zipfile
 import zlib
 
@@ -13,7 +14,7 @@ import pytest
 from experiments.report.export import as_text, to_markdown
 from experiments.runs import store
 from experiments.runs.console import end, show
-from experiments.sweeps.launch import _drop
+from experiments.sweeps.launch import _drop, prepare
 from sim.errors import InputError, printable
 from sim.formats.detect import read_any
 from sim.npz import read_arrays
@@ -62,6 +63,9 @@ def test_cells_cannot_become_markup():
     assert as_text(frame).iloc[0, 0] == "a?[31m b?<i>"
     assert r"b?\<i>" in to_markdown(frame)
     assert r"a\<b" in to_markdown(frame)
+    links = to_markdown(pd.DataFrame({"a": ["[x](javascript:y)", "![](http://t/x.png)", "`b`"]}))
+    for text in (r"\[x\](javascript:y)", r"\!\[\](http://t/x.png)", r"\`b\`"):
+        assert text in links
 
 
 @pytest.mark.parametrize(
@@ -114,6 +118,21 @@ def test_a_pipe_is_refused_at_once(tmp_path, name):
     for read in (load, lambda path: read_any([path]), read_yaml):
         with pytest.raises(InputError, match=r"not a file|no such recording"):
             read(tmp_path / name)
+
+
+@pytest.mark.parametrize("name", ["rows-q.journal", "plan-x.json"])
+def test_a_pipe_among_the_rows_is_refused_at_once(tmp_path, name):
+    os.mkfifo(tmp_path / name)
+    with pytest.raises(InputError, match=f"{name}: not a file"):
+        prepare(tmp_path)
+
+
+@pytest.mark.parametrize("planner", ["1" + "0" * 23, "-" + "9" * 20, "1" * 5000, "[" * 5000])
+def test_a_forged_plan_is_left_alone(tmp_path, planner):
+    plan = tmp_path / "plan-y.json"
+    plan.write_text(f'{{"planner": ["{platform.node()}", {planner}]}}')
+    prepare(tmp_path)
+    assert plan.exists()
 
 
 def test_forged_lines_of_a_journal_are_passed_over():

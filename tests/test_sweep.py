@@ -15,7 +15,7 @@ import pytest
 
 from experiments.runs import cache, store
 from experiments.runs.experiment import Experiment, files_digest
-from experiments.runs.paths import results
+from experiments.runs.paths import quoted, results
 from experiments.runs.row import Status, read_rows
 from experiments.runs.store import read_runs
 from experiments.runs.version import source_digest
@@ -372,6 +372,14 @@ def test_a_sweep_without_a_name_has_one_of_its_own(tmp_path):
         assert own in first.stderr + other.stderr
 
 
+def test_the_last_value_of_a_key_decides_a_sweeps_own_name():
+    made = plan.plan_of(["seed=0,1"])
+    orders = (["robot.kr=1e-5", "robot.kr=1e-4"], ["robot.kr=1e-4", "robot.kr=1e-5"])
+    forward, back = (launch._name(made, ["seed=0,1", *order], None) for order in orders)
+    assert forward != back
+    assert forward == launch._name(made, ["robot.kr=1e-4", "seed=0,1"], None)
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -392,6 +400,14 @@ def test_what_hydra_would_ignore_is_refused(arguments, words):
 def test_globs_choose_options():
     runs = list(plan.planned(["route=glob(linear_*)", "simulation.physics=kinematic"]))
     assert [run.choices["route"] for run in runs] == [f"linear_{i}" for i in range(1, 5)]
+
+
+@pytest.mark.parametrize(
+    "name", ["a\\'b", "q${seed}x", "a\\${x}\\", "\\\\${x}'", "a b,c=[d]{e}", "ä$"]
+)
+def test_any_path_can_be_a_value(name):
+    experiment = Experiment.compose([f"recording={quoted(name)}"])
+    assert experiment.config["recording"] == name
 
 
 def test_a_missing_value_can_be_given_in_a_sweep(tmp_path):

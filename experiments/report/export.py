@@ -20,7 +20,7 @@ _LATEX = str.maketrans(
         **{character: f"\\{character}" for character in "&%$#_{}"},
     }
 )
-_MARKDOWN = str.maketrans({character: f"\\{character}" for character in "\\|<"})
+_MARKDOWN = str.maketrans({character: f"\\{character}" for character in "\\|<[]!`"})
 
 
 def read_table(path: Path) -> pd.DataFrame:

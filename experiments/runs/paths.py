@@ -1,6 +1,7 @@
 """Where the package keeps its own data, and where results go."""
 
 import os
+import re
 from pathlib import Path
 
 SOURCE = Path(__file__).resolve().parents[2]  # the clone, or the site-packages of a wheel
@@ -33,4 +34,8 @@ def short(path: Path) -> str:
 
 def quoted(text: object) -> str:
     """Return the text as a value of a Hydra override, whatever letters a path has."""
-    return "'" + str(text).replace("'", "\\'") + "'"
+    from hydra.core.override_parser.types import Quote, QuotedString
+
+    # no interpolation; a \ before one counts double
+    plain = re.sub(r"(\\*)\$\{", r"\1\1\\${", str(text))
+    return QuotedString(plain, Quote.single).with_quotes()

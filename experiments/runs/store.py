@@ -34,7 +34,7 @@ from experiments.runs.row import (
     read_rows,
 )
 from sim.errors import InputError
-from sim.files import write_whole
+from sim.files import require_file, write_whole
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -193,6 +193,7 @@ def begun(folder: Path, prefix: str) -> set[int]:
     """Keys of the runs that some journal shows as begun and not ended, as numbers."""
     found = set()
     for path in folder.glob(f"{prefix}*{JOURNAL}"):
+        require_file(path)
         last = ""
         for key, rows in journal_lines(path.read_bytes()):
             last = "" if rows else key
@@ -328,6 +329,7 @@ def _files(folder: Path, prefix: str = "") -> list[Path]:
 
 def _tables(path: Path, columns: list[str] | None = None) -> list[pa.Table]:
     """Tables of a file. A journal that became Parquet meanwhile is read as such."""
+    require_file(path)
     if path.suffix == ".parquet":
         return [read_parquet(path, columns)]
     try:

@@ -32,7 +32,7 @@ from experiments.runs.experiment import Experiment, check_hydra
 from experiments.runs.row import Outcome, Row, Status, check_row
 from experiments.sweeps.plan import Family, Numbers, Plan, packed, plan_of
 from sim.errors import InputError
-from sim.files import write_whole
+from sim.files import require_file, write_whole
 from sim.recording import Recording
 
 _JOBS_PER_CORE = 4  # enough to keep all busy to the end, few enough to cost little
@@ -90,8 +90,7 @@ def sweep(arguments: Sequence[str], config_dir: str | None = None) -> None:
     folder = plan.experiment(0).rows_folder
     if not folder.is_dir() and folder.exists():
         raise InputError(f"{folder}: not a folder; remove it, or choose another name")
-    _clear_plans(folder)
-    store.tidy(folder, lambda journal: _plan_of(folder, journal).exists())
+    prepare(folder)
     keys, first = np.unique(plan.keys, return_index=True)
     done = np.isin(keys, store.ended(folder, damaged=_drop).done)
     runs = np.sort(first[~done])
@@ -104,7 +103,7 @@ def sweep(arguments: Sequence[str], config_dir: str | None = None) -> None:
     if not len(runs):
         return
     _launch_all(plan, runs, Jobs(folder, n_jobs), launching)
-    store.tidy(folder, lambda journal: _plan_of(folder, journal).exists())
+    _tidy(folder)
     found = store.ended(folder)
     bad = runs[~np.isin(plan.keys[runs], found.done)]
     if len(bad):
@@ -120,7 +119,8 @@ def _name(plan: Plan, own: Sequence[str], config_dir: str | None) -> str | None:
     given = any(argument.lstrip("+").startswith("name=") for argument in own)
     if given or plan.experiment(0).config["name"] != _UNNAMED:
         return None
-    text = json.dumps([sorted(own), config_dir and str(Path(config_dir).resolve())])
+    last = {argument.partition("=")[0]: argument for argument in own}  # that one is swept
+    text = json.dumps([sorted(last.values()), config_dir and str(Path(config_dir).resolve())])
     return f"sweep_{hashlib.sha256(text.encode()).hexdigest()[:8]}"
 
 
@@ -277,14 +277,31 @@ def _remove(plan: Path) -> None:
     shutil.rmtree(f"{plan}.jobs", ignore_errors=True)
 
 
+def prepare(folder: Path) -> None:
+    """Tidy a folder of rows after sweeps that were killed.
+
+    Raises
+    ------
+    InputError
+        If a plan or a journal is no file, or cannot be read.
+    """
+    _clear_plans(folder)
+    _tidy(folder)
+
+
+def _tidy(folder: Path) -> None:
+    store.tidy(folder, lambda journal: _plan_of(folder, journal).exists())
+
+
 def _clear_plans(folder: Path) -> None:
     """Remove the plans of sweeps on this machine that were killed, and what they were writing."""
     for plan in folder.glob("plan-*.json"):
+        require_file(plan)
         try:
             node, planner = json.loads(plan.read_text())["planner"]
             if node != platform.node() or _is_there(planner):
                 continue
-        except (OSError, ValueError, KeyError, TypeError):
+        except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
             continue
         _remove(plan)
         for part in folder.glob(f".rows-{plan.stem.removeprefix('plan-')}*.part*"):
