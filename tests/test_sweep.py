@@ -14,7 +14,7 @@ import pandas as pd
 import pytest
 
 from experiments.runs import cache, store
-from experiments.runs.experiment import Experiment, files_digest
+from experiments.runs.experiment import Experiment, files_digest, searched
 from experiments.runs.paths import quoted, results
 from experiments.runs.row import Status, read_rows
 from experiments.runs.store import read_runs
@@ -395,6 +395,63 @@ def test_the_last_value_of_a_key_decides_a_sweeps_own_name():
 )
 def test_what_hydra_would_ignore_is_refused(arguments, words):
     refused(estima("run", *arguments, *QUICK, "seed=0"), *words)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["seed=range(0,1000000000000)"], "range.0,1000000000000.: .* at most 100,000,000 runs"),
+        (["robot.kr=range(0,1e12,0.1)"], "at most 100,000,000 runs"),
+        (["robot.kr=range(0,inf,0.1)"], "at most 100,000,000 runs"),
+        (["seed=range(0,20000)", "robot.kr=range(0,10000)"], "2e[+]08 runs: a sweep has at most"),
+        (["seed=range(0,5,0)"], "step of a range must not be 0"),
+        (["seed=1,2", "hydra.searchpath=[file:///nope]"], "there is no folder /nope"),
+    ],
+)
+def test_what_cannot_be_planned_is_refused_before_it_is_listed(arguments, words):
+    with pytest.raises(InputError, match=words):
+        plan.plan_of(arguments)
+
+
+@pytest.mark.parametrize("sweeps", ["3", "[3]", "[[seed]]"])
+def test_the_sweeps_of_a_study_are_a_list_of_mappings(tmp_path, sweeps):
+    option(tmp_path, f"sweeps: {sweeps}")
+    with pytest.raises(InputError, match="sweeps must be a list of mappings"):
+        plan.plan_of(["study=own", "seed=0,1"], str(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("text", "is_read"),
+    [
+        ("hydra: {sweeper: {params: {seed: '1,2'}}}", True),
+        ("hydra: {sweep: {dir: zzz}, verbose: true}", False),
+        ("hydra: {sweeper: {max_batch_size: 1}}", False),
+        ("hydra: {launcher: {n_jobs: 1}}", False),
+        ("hydra: 3", False),
+        ("defaults: [{override /hydra/launcher: basic}]", False),
+    ],
+)
+def test_a_studys_settings_of_hydra_that_nothing_reads_are_refused(tmp_path, text, is_read):
+    option(tmp_path, text)
+    if is_read:
+        assert len(plan.plan_of(["study=own"], str(tmp_path)).keys) == 2
+        return
+    with pytest.raises(InputError, match=r"own\.yaml: .*hydra\.sweeper\.params alone"):
+        searched(tmp_path)
+
+
+def option(folder_, text):
+    (folder_ / "study").mkdir()
+    (folder_ / "study" / "own.yaml").write_text(f"# @package _global_\n{text}\n")
+
+
+@pytest.mark.parametrize(
+    ("argument", "words"),
+    [("hydra.launcher.n_jobs=0", "or -1 for all"), ("+hydra.sweeper.params={}", "seed=1,2")],
+)
+def test_a_sweeps_wrong_settings_of_hydra(argument, words):
+    with pytest.raises(InputError, match=words):
+        launch.sweep(["seed=1,2", argument])
 
 
 def test_globs_choose_options():

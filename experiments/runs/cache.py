@@ -112,7 +112,7 @@ def trim(most_bytes: float) -> int:
     half-written goes too.
     """
     for part in folder().glob(".*.part*"):
-        with suppress(FileNotFoundError):
+        with suppress(OSError):  # gone, or not to be deleted
             if time.time() - part.stat().st_mtime > _ABANDONED_S:
                 part.unlink()
     kept, dropped = files(), 0
@@ -120,18 +120,28 @@ def trim(most_bytes: float) -> int:
     for path, size in kept:
         if excess <= 0.0:
             break
-        lock = path.with_suffix(".lock")
-        require_file(lock)
+        if _dropped(path):
+            excess -= size
+            dropped += 1
+    return dropped
+
+
+def _dropped(path: Path) -> bool:
+    """Drop a recording, unless a process is reading or writing it; return whether it is gone."""
+    lock = path.with_suffix(".lock")
+    require_file(lock)
+    try:
         with lock.open("w") as handle:
-            try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                continue
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
             path.unlink(missing_ok=True)
             lock.unlink(missing_ok=True)
-        excess -= size
-        dropped += 1
-    return dropped
+    except BlockingIOError:
+        return False
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot delete it ({error.strerror}); make its folder writable"
+        ) from error
+    return True
 
 
 @contextmanager

@@ -113,8 +113,16 @@ def end(error: BaseException) -> NoReturn:
             lines = [line.strip() for line in str(link).splitlines() if line.strip()]
             text = textwrap.shorten(" ".join(lines), 600, placeholder=" ...")
             _say(f"configuration: {text}; see estima run --cfg job", 2)
+        if isinstance(link, RecursionError) and _in_defaults(link):
+            _say("configuration: the defaults of an option lead back to itself", 2)
     traceback.print_exception(error)
     sys.exit(3)
+
+
+def _in_defaults(error: BaseException) -> bool:
+    """Whether an error comes from Hydra's search through the defaults of options."""
+    frames = traceback.walk_tb(error.__traceback__)
+    return any(f.f_globals.get("__name__") == "hydra._internal.defaults_list" for f, _ in frames)
 
 
 def unknown_key(key: str, config: Mapping[str, Any]) -> str:

@@ -50,7 +50,7 @@ _KEYS = (
     *("prior.wheel_radius_m", "prior.track_m", "prior.map"),
 )
 _NOT_IN_KEY = ("name", "picture", "recording")
-_READ_OF_HYDRA = ("hydra/launcher", "hydra.launcher", "hydra.sweeper.params", "hydra.searchpath")
+_READ_OF_HYDRA = ("hydra/launcher", "hydra.launcher", "hydra.searchpath")
 _PHYSICS = ("bullet", "kinematic")
 _RAYS = ("bullet", "exact")
 
@@ -561,6 +561,7 @@ def searched(config_dir: str | Path | None) -> list[str]:
     folder = Path(config_dir).resolve()
     if not folder.is_dir():
         raise InputError(f"--config-dir must name a folder, got {config_dir}")
+    require("${" not in str(folder), f"{folder}: Hydra takes ${{ for a value; rename the folder")
     for group in (*GROUPS, "study"):
         for path in sorted((folder / group).glob("*.yaml")):
             option = read_yaml(path)  # within bounds, which Hydra does not know
@@ -568,7 +569,27 @@ def searched(config_dir: str | Path | None) -> list[str]:
                 isinstance(option, dict) and all(isinstance(key, str) for key in option)
             )
             require(keys, f"{path}: an option holds keys and their values")
+            _check_hydra_of(path, option or {})
     return [f"hydra.searchpath=[{paths.quoted(f'file://{folder}')}]"]
+
+
+def _check_hydra_of(path: Path, option: Mapping[str, Any]) -> None:
+    """Check that an option's file has none of Hydra's settings that nothing here reads."""
+    hydra = option.get("hydra") or {}
+    sweeper = hydra.get("sweeper") or {} if isinstance(hydra, dict) else {}
+    read = {"sweeper": {"params": sweeper["params"]}} if "params" in sweeper else {}
+    chosen = [
+        group
+        for entry in option.get("defaults") or ()
+        for group in (entry if isinstance(entry, dict) else ())
+        if re.match(r"(override +)?/hydra/", group)
+    ]
+    if chosen or hydra not in (read, {}):
+        what = chosen[0] if chosen else "hydra"
+        raise InputError(
+            f"{path}: {what}: of Hydra's settings a file's hydra.sweeper.params alone has an "
+            "effect; give hydra/launcher and hydra.launcher on the command line"
+        )
 
 
 def _check_known(key: str) -> None:
@@ -616,6 +637,7 @@ def check_hydra(overrides: Sequence[str]) -> None:
         remedies = {
             "hydra/sweeper": "-m runs every combination of the values; an optimizer may call "
             "estima.sweep from Python",
+            "hydra.sweeper": "give the values themselves, such as seed=1,2",
             "hydra.verbose": "there is no log; a failed run's row says how",
         }
         usual = "rows go to results/runs/NAME: set name, or --results for another folder"
@@ -636,6 +658,11 @@ def check_overrides(overrides: Sequence[str]) -> None:
         if not key:
             raise InputError(f"{override.input_line}: no key before the =")
         named = override.is_sweep_override() or isinstance(value, (str, list))
+        if key == "hydra.searchpath" and isinstance(value, list):
+            for entry in value:
+                scheme, _, place = str(getattr(entry, "text", entry)).rpartition("://")
+                there = scheme not in ("", "file") or Path(place).is_dir()
+                require(there, f"{override.input_line}: there is no folder {place}")
         if key in (*GROUPS, "study") and not (named or override.is_delete()):
             raise InputError(
                 f"{override.input_line}: {key} must name one of `estima options {key}`"

@@ -98,20 +98,36 @@ def application(arguments: Sequence[str], draw: Draw, out: Path | None = None) -
         except Exception as error:
             end(error)  # here, since Hydra would add a line of its own
 
-    before = ["", *arguments]  # neither an option nor its value, which may hold a = too
-    overrides = [
-        argument
-        for option, argument in zip(before, arguments, strict=False)
-        if "=" in argument and not argument.startswith("-") and not option.startswith("-")
-    ]
-    for option, argument in zip(before, arguments, strict=False):
+    overrides, options = _split(arguments)
+    names = {option.partition("=")[0] for option in options}
+    if names & {"--shell-completion", "-sc"}:
+        raise InputError("--shell-completion is Hydra's; estima --install-completion is ours")
+    if names & {"--package", "-p"} and not names & {"--cfg", "-c"}:
+        raise InputError("--package has no effect without --cfg; leave it out")
+    for option, argument in zip(["", *options], options, strict=False):
         name, equals, value = argument.partition("=")
         if (name if equals else option) in ("--config-dir", "-cd"):
             searched(value if equals else argument)
     check_hydra(overrides)
     check_overrides(overrides)
-    sys.argv = ["estima run", *arguments]
+    sys.argv = ["estima run", *overrides, *options]  # Hydra takes overrides in one place only
     hydra.main(version_base="1.3", config_path=str(paths.CONF), config_name="config")(run)()
+
+
+_WITH_VALUE = (
+    *("--cfg", "-c", "--package", "-p", "--config-path", "-cp", "--config-name", "-cn"),
+    *("--config-dir", "-cd", "--experimental-rerun"),
+)
+
+
+def _split(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Overrides, and Hydra's options with their values, which may hold a = too."""
+    overrides: list[str] = []
+    options: list[str] = []
+    for before, argument in zip(["", *arguments], arguments, strict=False):
+        is_option = argument.startswith("-") or before in _WITH_VALUE or "=" not in argument
+        (options if is_option and argument[:1] != "~" else overrides).append(argument)
+    return overrides, options
 
 
 _SHOWN = (

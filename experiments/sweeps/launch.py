@@ -9,6 +9,7 @@ import importlib.util
 import json
 import os
 import platform
+import re
 import secrets
 import shutil
 import signal
@@ -80,7 +81,7 @@ def sweep(arguments: Sequence[str], config_dir: str | None = None) -> None:
     """
     check_hydra(arguments)
     launching = [a for a in arguments if a.lstrip("+~").startswith(_LAUNCHING)]
-    _require_launcher(launching)
+    _check_launcher(launching)
     n_jobs = _n_jobs(launching)
     own = [a for a in arguments if a not in launching]
     plan = plan_of(own, config_dir)
@@ -324,9 +325,11 @@ _LAUNCHING = ("hydra/launcher", "hydra.launcher", "jobs=")
 _EXTRAS = {"submitit": "slurm", "ray": "ray"}
 
 
-def _require_launcher(launching: Sequence[str]) -> None:
-    """Check that the launcher is installed; Hydra would only say that it knows none."""
+def _check_launcher(launching: Sequence[str]) -> None:
+    """Check that the launcher is installed, where Hydra would only say that it knows none."""
     for argument in launching:
+        if re.fullmatch(r"\+*hydra\.launcher\.n_jobs=[+-]?0+", argument):
+            raise InputError(f"{argument}: give the number of processes, or -1 for all cores")
         name = argument.partition("=")[2]
         plugin = name.partition("_")[0]
         chosen = argument.lstrip("+").startswith("hydra/launcher=") and plugin in _EXTRAS

@@ -19,7 +19,7 @@ import numpy as np
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override
+from hydra.core.override_parser.types import Override, RangeSweep
 from numpy.typing import NDArray
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
@@ -34,11 +34,13 @@ from experiments.runs.experiment import (
     leaf_digests,
     searched,
 )
-from sim.errors import InputError
+from sim.errors import InputError, require
 
 Leaf = tuple[str, ...]  # a place in the configuration: ("robot", "kr")
 Numbers = NDArray[np.int64]
 Digests = NDArray[np.uint64]
+_MOST_RUNS = 10**8  # of a sweep; a million take 0.3 GiB in the planner
+_TOO_MANY = f"a sweep has at most {_MOST_RUNS:,} runs; give fewer values, or several sweeps"
 _MOST_CHECKED = 1000  # runs of a family that are checked before the first begins
 
 
@@ -231,13 +233,16 @@ def plan_of(arguments: Sequence[str], config_dir: str | None = None) -> Plan:
         arguments = [a for a in arguments if a not in composer.extra]
         given = OverridesParser.create().parse_overrides(list(arguments))
         fixed = [o.input_line or "" for o in given if not o.is_sweep_override()]
-        check_overrides(fixed)
+        check_overrides([*composer.extra, *fixed])
         study = compose("config", overrides=composer.extra + fixed, return_hydra_config=True)
         params: dict[str, str] = dict(study.hydra.sweeper.get("params") or {})
-        grids = []
-        for part in study.get("sweeps") or [{}]:
+        parts = []
+        for part in _sweeps(study):
             lines = [f"{key}={value}" for key, value in {**params, **part}.items()]
-            grids.append(_grid(swept([*lines, *arguments]), composer))
+            parts.append(swept([*lines, *arguments]))
+        n_runs = sum(math.prod(map(len, part.values())) for part in parts)
+        require(n_runs <= _MOST_RUNS, f"{n_runs:.3g} runs: {_TOO_MANY}")
+        grids = [_grid(part, composer) for part in parts]
     families = [family for part in grids for family in part[0]]
     offsets = np.cumsum([0, *(len(part[0]) for part in grids)])
     return Plan(
@@ -245,6 +250,14 @@ def plan_of(arguments: Sequence[str], config_dir: str | None = None) -> Plan:
         np.concatenate([part[1] + low for part, low in zip(grids, offsets, strict=False)]),
         *(np.concatenate([part[i] for part in grids]) for i in (2, 3, 4)),
     )
+
+
+def _sweeps(study: DictConfig) -> Sequence[Mapping[str, Any]]:
+    """The sweeps of a study; one of no further values if there are none."""
+    sweeps = study.get("sweeps") or ListConfig([{}])
+    sound = isinstance(sweeps, ListConfig) and all(isinstance(part, DictConfig) for part in sweeps)
+    require(sound, f"sweeps must be a list of mappings of keys to values, got {sweeps}")
+    return list(sweeps)
 
 
 def swept(lines: Sequence[str]) -> dict[str, Sequence[Any]]:
@@ -274,9 +287,14 @@ def swept(lines: Sequence[str]) -> dict[str, Sequence[Any]]:
 
 def _values(override: Override, key: str) -> Sequence[Any]:
     """Values of a list, a range or a glob."""
-    whole = getattr(override.value(), "range", lambda: None)()
-    if isinstance(whole, range) and not override.value().shuffle:  # type: ignore[union-attr]
-        return whole
+    value = override.value()
+    if isinstance(value, RangeSweep):
+        require(value.step, f"{override.input_line}: the step of a range must not be 0")
+        length = (value.stop - value.start) // value.step  # type: ignore[operator]
+        require(length <= _MOST_RUNS, f"{override.input_line}: {_TOO_MANY}")
+        whole = value.range()
+        if isinstance(whole, range) and not value.shuffle:
+            return whole
     elements = list(override.sweep_iterator())
     if all(isinstance(e, (int, float)) or e is None for e in elements):
         return elements
