@@ -280,7 +280,7 @@ def view(
         typer.Option(
             "--estimate",
             "-e",
-            help="An estimate.csv, its folder, or an estimator to run now.",
+            help="A trajectory (.csv, .tum, .mcap), a run's folder, or an estimator to run now.",
             autocompletion=completion.estimators,
         ),
     ] = None,
@@ -412,7 +412,7 @@ def build_map(
         typer.Option(
             "--estimate",
             "-e",
-            help="truth, an estimate.csv, its folder, or an estimator to run now.",
+            help="truth, a trajectory (.csv, .tum), a run's folder, or an estimator to run now.",
             autocompletion=completion.estimators,
         ),
     ] = "truth",
