@@ -24,6 +24,9 @@ teach, so the heading gains next to no false information (huang2009). First-esti
 the landmarks left the errors of ten runs as they were at W = 20. A Bayes tree (kaess2012, iSAM2)
 linearises old poses again too, where they have moved.
 
+With a laser, the scans of consecutive images are registered, and their relative pose is one more
+measurement of u_i, of the covariance that `estimators.scan_matching` gives it.
+
 Sources: Sibley, Matthies and Sukhatme, Sliding window filter with application to planetary landing,
 J. Field Robotics 27, 2010; Huang, Mourikis and Roumeliotis, A first-estimates Jacobian EKF for
 improving SLAM consistency, ISER 2008 (2009); Kaess et al., iSAM2: incremental smoothing and mapping
@@ -40,6 +43,7 @@ from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from estimators.base import Belief, Estimate, Prior
 from estimators.gaussian import STILL, Gaussian, between, wrap
+from estimators.icp import PreparedScan
 from estimators.landmark_drive import FLOOR, LandmarkDrive, loosened, observed
 from estimators.least_squares import (
     LEAST_INFORMATION,
@@ -50,7 +54,8 @@ from estimators.least_squares import (
     transposed,
     whitening_of,
 )
-from estimators.options import require_counts, require_stereo, start_pose
+from estimators.options import require_counts, require_laser, require_stereo, start_pose
+from estimators.scan_matching import ScanMatcher
 from estimators.stereo import StereoModel
 from estimators.wheels import WheelPrediction
 from sim import se2
@@ -83,6 +88,11 @@ class FixedLag:
         not, time and memory do not grow with the map.
     window_s
         |ds| is netted over at least this time.
+    laser
+        Name of a laser whose scans are registered where a Frame has a scan beside its image; None
+        for none.
+    sigma_range_m
+        Believed range noise of it; None for its own.
 
     Notes
     -----
@@ -105,8 +115,11 @@ class FixedLag:
         keep_landmarks: bool = True,
         window_s: float = 0.05,
         stereo: str = "stereo",
+        laser: str | None = None,
+        sigma_range_m: float | None = None,
     ) -> None:
-        self.stereo = stereo
+        self.stereo, self.laser = stereo, laser
+        self._matcher = ScanMatcher("point_to_line", "censi", sigma_range_m)
         self.wheels = WheelPrediction(kr, kl, window_s)
         require_counts(lag_images=lag_images, iterations=iterations)
         self.lag_images, self.iterations = lag_images, iterations
@@ -118,6 +131,9 @@ class FixedLag:
         self._belief = start_pose(prior, "fixed_lag")
         self.wheels.reset(prior.robot.track_m)
         self._drive = LandmarkDrive(self._camera, self._belief)
+        self._laser = None if self.laser is None else require_laser(prior, self.laser, "fixed_lag")
+        self._scan: PreparedScan | None = None  # of the last image
+        self._rng = rng
         self._mean, self._room = self._belief.mean.copy(), self._belief.covariance + FLOOR
         self._motion = STILL  # since the last image
         self._images: list[_Image] = []
@@ -131,8 +147,13 @@ class FixedLag:
         loose = loosened(motion)
         self._belief, self._motion = self._belief.then(motion), self._motion.then(loose)
         seen = observed(frame, self.stereo, self._camera, "fixed_lag")
+        registered = None if seen is None else self._registered(frame)
+        if registered is not None:
+            self._motion = self._motion.with_measured(registered)
         status = "" if seen is None else self._see(*seen)
         self._drive.add(frame.stamp, loose, self._belief.mean, seen)
+        if registered is not None:
+            self._drive.tie(registered)
         covariance = (self._belief.covariance + self._belief.covariance.T) / 2.0
         return Belief(self._belief.mean.copy(), covariance, {"status": status} if status else {})
 
@@ -142,6 +163,18 @@ class FixedLag:
         It starts from the online estimate, and gives what `LandmarkDrive.revised` does.
         """
         return self._drive.revised("none", 3.0, 100)
+
+    def _registered(self, frame: Frame) -> Gaussian | None:
+        """Motion since the last image by the scans; None without both, or if that fails."""
+        before, self._scan = self._scan, None
+        reading = None if self.laser is None else frame.readings.get(self.laser)
+        if reading is None or self._laser is None:
+            return None
+        self._scan = self._matcher.prepare(reading["ranges_m"], self._laser)
+        if before is None or self._scan is None:
+            return None
+        found = self._matcher.match(self._scan, before, self._motion, self._laser, self._rng)
+        return None if found.failed else found.motion
 
     def _see(self, points: Array, ids: Ints) -> str:
         """Take in points (K, 3) and ids (K,) of an image; what went wrong, or nothing."""

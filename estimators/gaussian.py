@@ -31,6 +31,14 @@ class Gaussian:
         covariance += by_motion @ motion.covariance @ by_motion.T
         return Gaussian(mean, covariance)
 
+    def with_measured(self, other: Gaussian) -> Gaussian:
+        """Fuse with an independent measurement of the same pose; the headings are near."""
+        gain = np.linalg.solve(self.covariance + other.covariance, self.covariance).T
+        off = other.mean - self.mean
+        off[2] = wrap(off[2])
+        covariance = gain @ other.covariance
+        return Gaussian(self.mean + gain @ off, (covariance + covariance.T) / 2.0)
+
     def seen_from(self, T_base_sensor: Array) -> tuple[Gaussian, Array]:
         """Return the motion of a sensor that sits at this pose on the moving body.
 

@@ -44,6 +44,7 @@ class LandmarkDrive:
         self._guesses: list[Array] = []
         self._motions: list[Gaussian] = []  # of each Frame since the one before
         self._images: list[tuple[int, Array, Ints]] = []
+        self._ties: list[tuple[int, int, Gaussian]] = []
 
     def add(
         self, stamp: float, motion: Gaussian, guess: Array, seen: tuple[Array, Ints] | None
@@ -64,6 +65,10 @@ class LandmarkDrive:
         self._stamps.append(stamp)
         self._guesses.append(guess)
         self._motions.append(motion)
+
+    def tie(self, motion: Gaussian) -> None:
+        """Add another measurement of the motion between the last two images."""
+        self._ties.append((self._images[-2][0], self._images[-1][0], motion))
 
     def revised(self, robust: Robust, robust_sigma: float, max_iterations: int) -> Estimate:
         """Least squares over all Frames so far; options as in `estimators.least_squares.solve`.
@@ -124,12 +129,16 @@ class LandmarkDrive:
         pose_of = {row: pose for pose, row in enumerate(rows)}
         seen = [np.zeros(0, np.int64), *(seen for _, _, seen in self._images)]
         ids, landmark_rows = np.unique(np.concatenate(seen), return_inverse=True)
+        tied = [(pose_of[first], pose_of[second]) for first, second, _ in self._ties]
+        merged += [motion for _, _, motion in self._ties]
+        steps = [*itertools.pairwise(range(len(rows))), *tied]
+        first, second = np.array(steps, np.int64).reshape(-1, 2).T
         n = len(merged)
         problem = Problem(
             prior_mean=compose(self._start.mean, self._motions[0].mean)[0],
             prior_covariance=self._start.covariance,
-            first=np.arange(n),
-            second=np.arange(1, n + 1),
+            first=first,
+            second=second,
             motions=np.array([motion.mean for motion in merged]).reshape(n, 3),
             motion_covariances=np.array([motion.covariance for motion in merged]).reshape(n, 3, 3),
             camera=self._camera,

@@ -54,12 +54,15 @@ class Match:
         but for degenerate pairs.
     loose
         (3, 3) projection onto the directions that the scans do not hold.
+    overlap
+        Share of the scan's points that agree with the reference.
     """
 
     motion: Gaussian
     status: str
     held: Array
     loose: Array
+    overlap: float
 
     @property
     def failed(self) -> bool:
@@ -162,18 +165,18 @@ class ScanMatcher:
             rules=self.rules,
         )
         if found.status in FAILED:
-            return Match(guess, found.status, _NOTHING[:0], _EVERYTHING)
+            return Match(guess, found.status, _NOTHING[:0], _EVERYTHING, found.overlap)
         R = self._covariance_of(
             found, scan, reference, in_laser.covariance, self.sigma_m(laser), rng
         )
         motion, to_base = Gaussian(found.T_target_source, R).seen_from(se2.inverse(mount))
         if found.status != "degenerate":
-            return Match(motion, found.status, _EVERYTHING, _NOTHING)
+            return Match(motion, found.status, _EVERYTHING, _NOTHING, found.overlap)
         in_base = [to_base @ part for part in icp_covariance.split_directions(found)]
         coordinates = np.linalg.inv(np.hstack(in_base))
         n_held = in_base[0].shape[1]
         held, loose = coordinates[:n_held], in_base[1] @ coordinates[n_held:]
-        match = Match(motion, found.status, held, loose)
+        match = Match(motion, found.status, held, loose, found.overlap)
         # The directions themselves are uncertain: along a loose one that is slightly off, the
         # error of the registration and of the guess leaks into the held ones.
         off = coordinates[n_held:] @ (motion.mean - guess.mean)

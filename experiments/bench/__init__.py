@@ -17,6 +17,7 @@ SUITES = {
     "mcl": ("mcl",),
     "formats": ("formats",),
     "smoothing": ("smoothing",),
+    "graph_slam": ("graph_slam",),
     "compile": ("compile",),
     "growth": ("growth",),
     "external": ("external",),

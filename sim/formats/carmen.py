@@ -245,7 +245,11 @@ def _mount(poses: Array, laser_poses: Array) -> Array:
 
 
 def _edges(words: Words, scan_lines: Rows) -> Array:
-    """Motion between consecutive scans by EDGE2 lines; each scan follows its VERTEX2 line."""
+    """Motion between consecutive scans by EDGE2 lines; each scan follows its VERTEX2 line.
+
+    Only edges from a vertex to the next one count, not those that close loops. Stamps may order
+    scans otherwise than their vertices; such a motion is composed of the edges between.
+    """
     vertices, edges = words.lines_of("VERTEX2"), words.lines_of("EDGE2")
     if not len(vertices) or not len(edges) or len(scan_lines) < 2:
         return np.zeros((0, 3))
@@ -255,7 +259,16 @@ def _edges(words: Words, scan_lines: Rows) -> Array:
     values = words.finite(edges, 1, 5, "EDGE2")
     motion = {(row[0], row[1]): row[2:] for row in values[::-1]}  # the first of a pair counts
     unknown = np.full(3, np.nan)
-    return np.array([motion.get(pair, unknown) for pair in pairwise(ids[above])])
+    steps = np.array([motion.get(pair, unknown) for pair in pairwise(ids)]).reshape(-1, 3)
+    known = np.isfinite(steps).all(axis=1)
+    poses = se2.chain(np.where(known[:, None], steps, 0.0))
+    gaps = np.concatenate([[0], np.cumsum(~known)])
+    first, second = above[:-1], above[1:]
+    found = se2.between(poses[first], poses[second])
+    found[gaps[first] != gaps[second]] = np.nan
+    next_one = second == first + 1
+    found[next_one] = steps[first[next_one]]
+    return found
 
 
 def write_carmen(path: Path, recording: Recording) -> None:

@@ -1,0 +1,229 @@
+"""Graph SLAM among look-alike rooms: false closures, consistency and speed.
+
+The rooms are all alike: 42 squares without furniture. A closure is false if it is off the true
+motion by more than `FALSE_M` or `FALSE_RAD`. Of planted closures half lie anywhere; half are moved
+by the same 0.5 m, as if each place had a twin there.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from estimators.base import Estimate
+from estimators.base import run as run_estimator
+from estimators.gaussian import Gaussian
+from estimators.graph_slam import GraphSlam
+from estimators.pose_graph import Edge, PoseGraph
+from experiments.bench.measure import Measurement, time_s
+from experiments.evaluation.metrics import nees
+from experiments.runs.evaluate import limited_blas
+from experiments.runs.experiment import Experiment
+from experiments.runs.seeds import stream
+from sim import se2
+from sim.arrays import Array
+from sim.recording import Recording
+
+FALSE_M, FALSE_RAD = 0.1, 0.03
+_NEAR_M, _NEAR_RAD, _APART_M = 2.0, 0.8, 10.0  # of a revisit: to an old key frame; and path between
+_TWIN = np.array([0.5, 0.0, 0.0])
+_ROOMS = (
+    "world=rooms",
+    "world.n_x=7",
+    "world.n_y=6",
+    "world.objects_per_room=0",
+    "robot=robocom",
+    "sensors=lms291",
+    "sensors.laser.rate_hz=10",
+    "sensors.laser.n_beams=181",
+    "route.speed_mps=0.7",
+    "simulation.physics=kinematic",
+    "simulation.rays=exact",
+    "prior.sigma_position_m=1e-3",
+    "prior.sigma_heading_rad=1e-4",
+)
+_JUDGED = range(1000, 1020)
+
+
+class Planted(GraphSlam):
+    """Graph SLAM to whose candidates false ones are added, this share of all."""
+
+    def __init__(self, share: float, chance: np.random.Generator, **options: Any) -> None:
+        super().__init__(**options)
+        self._share, self._chance = share, chance
+        self.false: list[Edge] = []
+
+    def proposed(self) -> list[Edge]:
+        """True candidates and planted ones."""
+        found = super().proposed()
+        number = self._chance.poisson(len(found) * self._share / (1.0 - self._share))
+        newest = len(self.graph) - 1
+        for _ in range(number):
+            first = int(self._chance.integers(newest))
+            expected = se2.between(self.graph.poses[first], self.graph.poses[newest])
+            anywhere = self._chance.uniform([-3.0, -3.0, -1.5], [3.0, 3.0, 1.5])
+            off = _TWIN if self._chance.random() < 0.5 else anywhere
+            noise = self.graph.noise_of(newest)
+            self.false.append(Edge(first, newest, Gaussian(expected + off, noise)))
+        return [*found, *self.false[len(self.false) - number :]]
+
+
+@dataclass(frozen=True)
+class RoomRun:
+    """A drive through look-alike rooms.
+
+    Attributes
+    ----------
+    closures, false, planted
+        Closures believed by the end, those of them that are false, and false ones planted.
+    revisits, closed
+        Key frames near an old one, and those of them within 5 m of travel of a closure.
+    end_m, revised_end_m, worst_m
+        Errors of position at the end and the greatest one, online but for the second.
+    nees, revised_nees
+        Mean NEES / 3.
+    realtime_factor
+        Duration of the recording over processor time of all steps.
+    finish_s
+        Processor time of `finish`.
+    """
+
+    closures: int
+    false: int
+    planted: int
+    revisits: int
+    closed: int
+    end_m: float
+    revised_end_m: float
+    worst_m: float
+    nees: float
+    revised_nees: float
+    realtime_factor: float
+    finish_s: float
+
+
+def run_rooms(
+    seed: int, planted: float = 0.0, distance_m: float = 300.0, **options: Any
+) -> RoomRun:
+    """Drive through look-alike rooms, with this share of false candidates.
+
+    `options` are those of `estimators.graph_slam.GraphSlam`.
+    """
+    experiment = Experiment.compose([*_ROOMS, f"seed={seed}", f"route.distance_m={distance_m}"])
+    recording, robot = experiment.simulate(), experiment.robot()
+    estimator = Planted(planted, stream(seed, "bench"), kr=robot.kr, kl=robot.kl, **options)
+    with limited_blas():
+        begun = time.process_time()
+        online = run_estimator(
+            estimator, recording, experiment.prior(recording), stream(seed, "estimator/graph_slam")
+        )
+        stepped = time.process_time()
+        revised = estimator.finish()
+        finished = time.process_time()
+    duration_s = recording.frame_stamps[-1] - recording.frame_stamps[0]
+    errors_m, revised_m = (_error_m(recording, found) for found in (online, revised))
+    return RoomRun(
+        *_judged_closures(estimator, recording),
+        end_m=float(errors_m[-1]),
+        revised_end_m=float(revised_m[-1]),
+        worst_m=float(errors_m.max()),
+        nees=_nees(recording, online),
+        revised_nees=_nees(recording, revised),
+        realtime_factor=float(duration_s / (stepped - begun)),
+        finish_s=finished - stepped,
+    )
+
+
+def _judged_closures(estimator: Planted, recording: Recording) -> tuple[int, int, int, int, int]:
+    """Closures, false ones, planted ones, revisits and those closed; see `RoomRun`."""
+    closures = estimator.graph.closures
+    stamps = np.nan_to_num(estimator.node_stamps, nan=recording.frame_stamps[0])
+    truth = recording.truth_at(stamps)
+    false, closed_at = 0, []
+    for edge in closures:
+        off = se2.between(se2.between(truth[edge.first], truth[edge.second]), edge.motion.mean)
+        false += bool(np.hypot(off[0], off[1]) > FALSE_M or abs(off[2]) > FALSE_RAD)
+        closed_at.append(edge.second)
+    moved = np.hypot(*np.diff(truth[:, :2], axis=0).T)
+    travelled = np.concatenate([[0.0], np.cumsum(moved)])
+    revisits = []
+    for node in range(1, len(truth)):
+        old = truth[1:node][travelled[node] - travelled[1:node] > _APART_M]
+        off = se2.between(old, truth[node])
+        near = np.hypot(off[:, 0], off[:, 1]) < _NEAR_M
+        if np.any(near & (np.abs(off[:, 2]) < _NEAR_RAD)):
+            revisits.append(node)
+    at_m = travelled[np.array(closed_at, int)]
+    closed = sum(bool(np.any(np.abs(at_m - travelled[node]) < 5.0)) for node in revisits)
+    return len(closures), false, len(estimator.false), len(revisits), closed
+
+
+def _error_m(recording: Recording, estimate: Estimate) -> Array:
+    off = estimate.means[:, :2] - recording.truth_at(estimate.stamps)[:, :2]
+    return np.asarray(np.hypot(off[:, 0], off[:, 1]))
+
+
+def _nees(recording: Recording, estimate: Estimate) -> float:
+    truth = recording.truth_at(estimate.stamps)
+    return float(np.nanmean(nees(truth, estimate.means, estimate.covariances)) / 3.0)
+
+
+def growth(lengths_m: tuple[float, ...] = (500.0, 1500.0, 5000.0)) -> Iterator[Measurement]:
+    """Time of a key frame and of a solution after laps of 100 m, a key frame each 0.5 m.
+
+    The graph alone, without scans: what grows with the length of the path. Every third key frame
+    closes the lap.
+    """
+    rng, noise, lap = stream(0, "bench"), np.diag([1e-5, 1e-5, 1e-6]), 200
+    step = np.array([0.5, 0.0, 2.0 * np.pi / lap])
+    graph = PoseGraph(Gaussian(np.zeros(3), 1e-6 * np.eye(3)), robust_sigma=5.0)
+    draws = rng.standard_normal((int(max(lengths_m) / 0.5), 3)) * np.sqrt(np.diag(noise))
+    for length_m in lengths_m:
+        begun, before = time.process_time(), len(graph)
+        while len(graph) < length_m / 0.5:
+            motion = step + draws[len(graph)]
+            graph.add(motion, [Gaussian(motion, noise)])
+            graph.newest_from(np.arange(len(graph) - 1), exact=False)
+        spent_s = (time.process_time() - begun) / (len(graph) - before)
+        closures = [
+            Edge(second - lap, second, Gaussian(np.zeros(3), noise))
+            for second in range(max(before, lap), len(graph), 3)
+        ]
+        graph.close(closures)
+        last = len(graph) - 1
+        extra = Edge(last - lap, last, Gaussian(np.zeros(3), noise))
+        solve_s = time_s(graph.close, [extra], 1e-4, clock=time.process_time)
+        note = f"{len(graph)} key frames, {len(graph.closures)} closures"
+        name = f"graph_slam.at_{length_m:.0f}_m"
+        yield Measurement(f"{name}.key_frame_ms", 1e3 * spent_s, "ms", note=note)
+        yield Measurement(f"{name}.closure_ms", 1e3 * solve_s, "ms", note="and its solution")
+
+
+def run() -> Iterator[Measurement]:
+    """Growth; twenty judged drives of 300 m, five of them again with planted closures."""
+    with limited_blas():
+        yield from growth()
+    runs = [run_rooms(seed) for seed in _JUDGED]
+    note = "20 drives of 300 m through look-alike rooms"
+    n_revisits = sum(r.revisits for r in runs)
+    yield Measurement("graph_slam.false_closures", sum(r.false for r in runs), "", 0, note=note)
+    yield Measurement("graph_slam.closures", sum(r.closures for r in runs), "")
+    recall = sum(r.closed for r in runs) / n_revisits
+    yield Measurement("graph_slam.revisits_closed", recall, "", note=f"of {n_revisits}")
+    end_m = max(r.end_m for r in runs)
+    yield Measurement("graph_slam.end_error_m", end_m, "m", 0.3, note="the worst, online")
+    mean = float(np.mean([r.nees for r in runs]))
+    yield Measurement("graph_slam.nees_3", mean, "", 1.5, note="online")
+    mean = float(np.mean([r.revised_nees for r in runs]))
+    yield Measurement("graph_slam.revised_nees_3", mean, "", 1.5)
+    factor = min(r.realtime_factor for r in runs)
+    yield Measurement("graph_slam.realtime_factor_10hz", factor, "", 10, "higher", "the least")
+    for share in (0.1, 0.3, 0.5):
+        found = [run_rooms(seed, share) for seed in _JUDGED[:5]]
+        note = f"of {sum(r.planted for r in found)}; false candidates are {share:.0%} of all"
+        bent = sum(r.false for r in found)
+        yield Measurement(f"graph_slam.false_of_planted_{share:.0%}", bent, "", 0, note=note)
