@@ -140,7 +140,9 @@ def _draw_run(
     from experiments.viewing.style import save_figure
 
     write_estimate(folder / "estimate.csv", estimate, recording, slip=experiment.believed_slip)
-    save_figure(run_figure(recording, estimate, experiment.estimator_name), folder / "run.png")
+    revised = " (revised)" if estimate.kind == "revised" else ""
+    name = f"{experiment.estimator_name}{revised}"
+    save_figure(run_figure(recording, estimate, name), folder / "run.png")
 
 
 @app.command()
