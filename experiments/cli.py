@@ -771,8 +771,8 @@ def bench(
     name: Annotated[
         str,
         typer.Argument(
-            help="compile, external, fastslam, formats, growth, icp, mcl, sim, smoothing, sweep, "
-            "sweep_scale, topological, or all."
+            help="compile, external, fastslam, formats, graph_slam, growth, icp, mcl, sim, "
+            "smoothing, sweep, sweep_scale, topological, or all."
         ),
     ] = "all",
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
