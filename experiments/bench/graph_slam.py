@@ -21,7 +21,7 @@ from estimators.graph_slam import GraphSlam
 from estimators.pose_graph import Edge, PoseGraph
 from experiments.bench.measure import Measurement, time_s
 from experiments.evaluation.metrics import nees
-from experiments.runs.evaluate import one_blas_thread
+from experiments.runs.evaluate import limited_blas
 from experiments.runs.experiment import Experiment
 from experiments.runs.seeds import stream
 from sim import se2
@@ -30,7 +30,7 @@ from sim.recording import Recording
 
 FALSE_M, FALSE_RAD = 0.1, 0.03
 _NEAR_M, _NEAR_RAD, _APART_M = 2.0, 0.8, 10.0  # of a revisit: to an old key frame; and path between
-_TWIN = np.array([0.5, 0.0, 0.0])
+_TWIN_M = 0.5  # along x in map
 _ROOMS = (
     "world=rooms",
     "world.n_x=7",
@@ -66,7 +66,9 @@ class Planted(GraphSlam):
             first = int(self._chance.integers(newest))
             expected = se2.between(self.graph.poses[first], self.graph.poses[newest])
             anywhere = self._chance.uniform([-3.0, -3.0, -1.5], [3.0, 3.0, 1.5])
-            off = _TWIN if self._chance.random() < 0.5 else anywhere
+            heading = self.graph.poses[first, 2]
+            twin = _TWIN_M * np.array([np.cos(heading), -np.sin(heading), 0.0])
+            off = twin if self._chance.random() < 0.5 else anywhere
             noise = self.graph.noise_of(newest)
             self.false.append(Edge(first, newest, Gaussian(expected + off, noise)))
         return [*found, *self.false[len(self.false) - number :]]
@@ -116,7 +118,7 @@ def run_rooms(
     experiment = Experiment.compose([*_ROOMS, f"seed={seed}", f"route.distance_m={distance_m}"])
     recording, robot = experiment.simulate(), experiment.robot()
     estimator = Planted(planted, stream(seed, "bench"), kr=robot.kr, kl=robot.kl, **options)
-    with one_blas_thread():
+    with limited_blas():
         begun = time.process_time()
         online = run_estimator(
             estimator, recording, experiment.prior(recording), stream(seed, "estimator/graph_slam")
@@ -205,7 +207,7 @@ def growth(lengths_m: tuple[float, ...] = (500.0, 1500.0, 5000.0)) -> Iterator[M
 
 def run() -> Iterator[Measurement]:
     """Growth; twenty judged drives of 300 m, five of them again with planted closures."""
-    with one_blas_thread():
+    with limited_blas():
         yield from growth()
     runs = [run_rooms(seed) for seed in _JUDGED]
     note = "20 drives of 300 m through look-alike rooms"
