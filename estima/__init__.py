@@ -193,7 +193,7 @@ def run(*given: Any, estimator: str | Estimator | None = None) -> Run:
     (0.0001, True)
     >>> estima.run(*quick, estimator="ekf_icp")
     Traceback (most recent call last):
-    sim.errors.InputError: estimator=ekf_icp needs a sensor laser, and sensors=encoder has none; try sensors=hokuyo, laser_stereo, lms291
+    sim.errors.InputError: estimator=ekf_icp needs a sensor laser, and sensors=encoder has none; try sensors=hokuyo, laser_stereo, laser_stereo_lidar3d, lms291
     """  # noqa: E501 the message is one line
     from experiments.runs.evaluate import evaluate
     from sim.errors import InputError
@@ -237,7 +237,7 @@ def score(recording: Recording, estimate: Estimate) -> dict[str, float]:
     >>> recording = estima.simulate("simulation.physics=kinematic", "route=linear_1")
     >>> scores = estima.score(recording, estima.run(recording).online)
     >>> sorted(scores)[:2], scores["distance_m"] > 0.5
-    (['ate_aligned_rmse_m', 'ate_rmse_m'], True)
+    (['ate_aligned_rmse_m', 'ate_mean_m'], True)
     """
     from estimators.base import Estimate
     from experiments.evaluation.metrics import score
@@ -297,7 +297,7 @@ def sweep(*overrides: str, name: str | None = None) -> pd.DataFrame:
 def plot(
     table: pd.DataFrame,
     x: str,
-    y: str = "ate_rmse_m",
+    y: str = "answer_ate_rmse_m",
     by: str | None = None,
     path: str | Path | None = None,
     *,

@@ -46,7 +46,7 @@ class Belief:
     mean
         (3,) m, m, rad: base_link in map.
     covariance
-        (3, 3).
+        (3, 3); zeros where the method gives none.
     extras
         Named arrays for those who look closer: `particles` (M, 3), `log_weights` (M,), `ess`,
         `registration_covariance` (3, 3), `associations` (K,), `landmarks` (N, 3),
@@ -70,6 +70,8 @@ class Estimate:
         `online` (each belief saw only its past) or `revised` (best lineage, batch solution).
     step_seconds
         (T,) computing time of each step; empty for a revised estimate.
+    cpu_seconds
+        Processor time of the whole run, `finish` and programs included; None where not measured.
     map
         What the estimator made of the world, or None.
     extras
@@ -83,6 +85,7 @@ class Estimate:
     covariances: Array
     kind: Literal["online", "revised"] = "online"
     step_seconds: Array = field(default_factory=lambda: np.zeros(0))
+    cpu_seconds: float | None = None
     map: Any = None
     extras: dict[str, list[Any]] = field(default_factory=dict)
     status: str = "ok"
@@ -90,6 +93,10 @@ class Estimate:
 
 class Estimator(Protocol):
     """A localization method. It may also have `finish() -> Estimate`, the revised trajectory.
+
+    An estimate of `finish` whose kind is `online` takes the place of the beliefs of the steps; None
+    stands for no trajectory. With `answers_at_finish` its beliefs are no answer of its own.
+    `program_seconds` is the processor time of a program that does the work.
 
     `needs`, if it has that, is the set of its options that name a sensor it cannot do without
     (`laser`, whose value is the sensor's name), and `map`.

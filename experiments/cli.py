@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from experiments.runs import columns, paths
+from experiments.runs import columns, completion, paths
 from experiments.runs.console import end, progress, show
 from experiments.runs.row import Outcome, write_frame
 from experiments.runs.version import code_version
-from sim.errors import InputError
+from sim.errors import InputError, require
 
 if TYPE_CHECKING:
     from estimators.base import Estimate
@@ -36,7 +36,11 @@ _PASS_ON = {
     "help_option_names": ["-h", "--help"],
 }
 Overrides = Annotated[
-    list[str] | None, typer.Argument(help="Hydra overrides, such as world=office seed=3.")
+    list[str] | None,
+    typer.Argument(
+        help="Hydra overrides, such as world=office seed=3.",
+        autocompletion=completion.overrides,
+    ),
 ]
 ConfigDir = Annotated[
     Path | None, typer.Option("--config-dir", "-cd", help="Folder with options of your own.")
@@ -75,10 +79,20 @@ def options_of_all(
 
 
 @app.command(context_settings=_PASS_ON)
-def run(context: typer.Context) -> None:
+def run(
+    context: typer.Context,
+    overrides: Overrides = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", "-o", help="File of the estimate to write too: .tum, .csv, .json, .mcap, .bag."
+        ),
+    ] = None,
+) -> None:
     """Make or read a recording, run an estimator over it, and write its row of results.
 
-    The arguments are Hydra's: `group=option`, `key=value`, `-m` for a sweep over values.
+    With -o it also writes the estimate, the revised one of an estimator that has it. The other
+    arguments are Hydra's: `group=option`, `key=value`, `-m` for a sweep over values.
 
     Examples
     --------
@@ -88,6 +102,8 @@ def run(context: typer.Context) -> None:
 
       estima run robot.kr=1e-4 estimator.kr=1e-5 (truth and belief apart)
 
+      estima run estimator=ekf_icp sensors=hokuyo -o est.tum
+
       estima run -m robot.kr=1e-5,1e-4 seed="range(0,5)"
 
       estima run --config-dir mine estimator=mine (your own estimator)
@@ -95,11 +111,16 @@ def run(context: typer.Context) -> None:
       estima run --cfg job (print the configuration; estima options lists the groups)
     """
     os.environ["HYDRA_FULL_ERROR"] = "1"  # errors come to `main`, which puts them in a line
-    arguments = context.args
+    arguments = [*(overrides or []), *context.args]
     many = {"-m", "--multirun"} & set(arguments)
     shown = {"--cfg", "-c", "--info", "-i"} & set(arguments)
     if many and shown:
         raise InputError(f"{shown.pop()} shows one configuration; leave out -m and the lists")
+    if out is not None:
+        from experiments.trajectories.convert import check_estimate_name
+
+        require(not many, f"-o {out}: one file is of one run; leave out -m")
+        check_estimate_name(out)
     if many and "--hydra-help" not in arguments:
         from experiments.sweeps.launch import sweep_arguments
 
@@ -107,7 +128,7 @@ def run(context: typer.Context) -> None:
         return
     from experiments.runs.run import application
 
-    application(arguments, _draw_run)
+    application(arguments, _draw_run, out)
 
 
 def _draw_run(
@@ -119,7 +140,9 @@ def _draw_run(
     from experiments.viewing.style import save_figure
 
     write_estimate(folder / "estimate.csv", estimate, recording, slip=experiment.believed_slip)
-    save_figure(run_figure(recording, estimate, experiment.estimator_name), folder / "run.png")
+    revised = " (revised)" if estimate.kind == "revised" else ""
+    name = f"{experiment.estimator_name}{revised}"
+    save_figure(run_figure(recording, estimate, name), folder / "run.png")
 
 
 @app.command()
@@ -171,11 +194,15 @@ def convert(
         ),
     ],
     robot: Annotated[int, typer.Option(help="Which robot of an MRCLAM set.")] = 1,
+    topic: Annotated[
+        str | None, typer.Option(help="Of a bag, the nav_msgs/Odometry to convert alone.")
+    ] = None,
 ) -> None:
-    """Convert a log to a recording, or a recording to a standard file.
+    """Convert a log to a recording, or a recording or an estimate to a standard file.
 
     The ending of the output chooses its format; without one it is a folder as `ros2 bag` writes.
-    `.tum` holds the reference trajectory.
+    `.tum` holds the reference trajectory of a recording. An estimate (.tum, .csv, or a --topic of a
+    bag) becomes .tum, .csv, .json or a bag.
 
     Examples
     --------
@@ -184,14 +211,26 @@ def convert(
       estima convert raw.json.gz corrected.json.gz -o intel.mcap
 
       estima convert MRCLAM_Dataset6.tar.xz --robot 3 -o robot3.npz
+
+      estima convert estimate.csv -o estimate.tum
     """
-    from experiments.trajectories.convert import write_recording
+    from experiments.trajectories.convert import is_estimate, write_estimate, write_recording
     from sim.formats.detect import read_any
 
     if not out.name:
         raise InputError(f"-o {out}: name the file to write, such as run.mcap")
     if out.exists() and any(path.exists() and out.samefile(path) for path in log):
         raise InputError(f"-o {out}: that is the log itself; give another name")
+    if topic is not None or is_estimate(log):
+        from experiments.trajectories.read import read_trajectory
+
+        require(len(log) == 1, f"{log[0]}: an estimate is one file, got {len(log)}")
+        estimate = read_trajectory(log[0], topic)
+        write_estimate(out, estimate)
+        print(
+            f"{out}: {len(estimate.stamps)} poses, {estimate.stamps[-1] - estimate.stamps[0]:.1f} s"
+        )
+        return
     recording = read_any(log, robot)
     write_recording(out, recording)
     print(f"{out}: {recording.duration_s:.1f} s, {len(recording.frame_stamps)} frames")
@@ -203,7 +242,10 @@ def convert(
 @app.command()
 def options(
     group: Annotated[
-        str | None, typer.Argument(help="world, robot, ..., study; or metrics.")
+        str | None,
+        typer.Argument(
+            help="world, robot, ..., study; or metrics.", autocompletion=completion.groups
+        ),
     ] = None,
     config_dir: ConfigDir = None,
 ) -> None:
@@ -215,7 +257,7 @@ def options(
 
       estima options metrics
     """
-    groups = ("world", "robot", "sensors", "route", "estimator", "study")
+    groups = completion.GROUPS
     if group == "metrics":
         print(columns.as_text())
         return
@@ -238,7 +280,10 @@ def view(
     estimate: Annotated[
         str | None,
         typer.Option(
-            "--estimate", "-e", help="An estimate.csv, its folder, or an estimator to run now."
+            "--estimate",
+            "-e",
+            help="A trajectory (.csv, .tum, .mcap), a run's folder, or an estimator to run now.",
+            autocompletion=completion.estimators,
         ),
     ] = None,
     world: Annotated[
@@ -369,7 +414,8 @@ def build_map(
         typer.Option(
             "--estimate",
             "-e",
-            help="truth, an estimate.csv, its folder, or an estimator to run now.",
+            help="truth, a trajectory (.csv, .tum), a run's folder, or an estimator to run now.",
+            autocompletion=completion.estimators,
         ),
     ] = "truth",
     resolution_m: Annotated[float, typer.Option("--resolution", help="Side of a cell, m.")] = 0.05,
@@ -425,6 +471,116 @@ def build_map(
         )
     write_grid(grid, out, "raw" if raw else "trinary")
     print(f"{out}: {described(grid)}, from {n_scans} of {n_all} scans")
+
+
+Topic = Annotated[
+    str | None, typer.Option(help="Of a bag, the nav_msgs/Odometry to read [estimate].")
+]
+AlignBy = Annotated[
+    str, typer.Option("--align", help="Move it first: none, start (first pose), or se2.")
+]
+MatchBy = Annotated[
+    str,
+    typer.Option(
+        "--match",
+        help="True poses: interpolated at its stamps, or nearest (as evo associates).",
+    ),
+]
+Tolerance = Annotated[
+    float, typer.Option("--tolerance", help="Greatest difference of nearest stamps, s.")
+]
+Offset = Annotated[float, typer.Option("--offset", help="Added to the trajectory's stamps, s.")]
+
+
+@app.command()
+def score(
+    recording: Annotated[Path, typer.Argument(help="A recording (.npz) or a log with its truth.")],
+    trajectories: Annotated[
+        list[Path],
+        typer.Argument(help="What programs made of it: .tum, .csv of ours, .mcap, .bag."),
+    ],
+    align: AlignBy = "none",
+    match: MatchBy = "interpolated",
+    tolerance_s: Tolerance = 0.01,
+    offset_s: Offset = 0.0,
+    revised: Annotated[
+        bool, typer.Option("--revised", help="They are revised paths, not online ones.")
+    ] = False,
+    cpu_seconds: Annotated[
+        float | None, typer.Option(help="Processor time that making the trajectory took, s.")
+    ] = None,
+    topic: Topic = None,
+    estimator: Annotated[
+        str | None, typer.Option("--as", help="Name of the estimator in the row [the file's].")
+    ] = None,
+    name: Annotated[str, typer.Option(help="Folder of the rows in results/runs.")] = "score",
+    as_json: Annotated[bool, typer.Option("--json", help="Print the rows as JSON.")] = False,
+) -> None:
+    """Score trajectories of any program against a recording's truth, and write their rows.
+
+    It says what was scored, and the statistics that evo_ape and evo_rpe (pairs from the reference)
+    print. The rows are like those of `estima run`: `estima table` and `estima plot` take them.
+
+    Examples
+    --------
+      estima score run.npz mine.tum
+
+      estima score run.npz theirs.mcap --topic odometry/filtered --align start --as their_filter
+
+      estima score run.npz batch.tum --revised --cpu-seconds 2.5 --name leaderboard
+    """
+    import json
+
+    from experiments.runs.score import as_scoring, as_text, score_files
+
+    how = as_scoring(
+        align=align,
+        match=match,
+        tolerance_s=tolerance_s,
+        offset_s=offset_s,
+        revised=revised,
+        cpu_seconds=cpu_seconds,
+    )
+    results = score_files(recording, trajectories, how, topic=topic, estimator=estimator, name=name)
+    if as_json:
+        print(json.dumps([row for _, row, _ in results], indent=2))
+        return
+    for path, _, scored in results:
+        show(f"{path}\n{as_text(scored, how)}")
+    print(f"rows: estima table {name}")
+
+
+@app.command()
+def compare(
+    trajectories: Annotated[list[Path], typer.Argument(help="Trajectories of one drive.")],
+    recording: Annotated[
+        Path | None,
+        typer.Option(help="Recording with the truth; without it the first is the reference."),
+    ] = None,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Picture to write.")] = Path(
+        "compare.png"
+    ),
+    align: AlignBy = "none",
+    match: MatchBy = "interpolated",
+    tolerance_s: Tolerance = 0.01,
+    offset_s: Offset = 0.0,
+    topic: Topic = None,
+) -> None:
+    """Draw trajectories over one another with their errors over time, and print a table.
+
+    Examples
+    --------
+      estima compare mine.tum theirs.mcap --recording run.npz -o both.png
+
+      estima compare reference.tum mine.tum --align se2
+    """
+    from experiments.runs.score import as_scoring
+    from experiments.viewing.compare import compare_files
+
+    how = as_scoring(align=align, match=match, tolerance_s=tolerance_s, offset_s=offset_s)
+    table = compare_files(trajectories, recording, out, how, topic)
+    show(table.to_string(index=False, na_rep="-", float_format=lambda v: f"{v:.4g}"))
+    print(out)
 
 
 @app.command()
@@ -511,11 +667,18 @@ def _robot_of(overrides: list[str], config_dir: Path | None) -> DifferentialDriv
 @app.command()
 def conform(
     target: Annotated[
-        str, typer.Argument(help="An option of conf/estimator, or MODULE:CLASS of an estimator.")
+        str,
+        typer.Argument(
+            help="An option of conf/estimator, or MODULE:CLASS of an estimator.",
+            autocompletion=completion.estimators,
+        ),
     ],
     arguments: Annotated[
         list[str] | None,
-        typer.Argument(help="Overrides of the option, or the constructor's arguments, key=value."),
+        typer.Argument(
+            help="Overrides of the option, or the constructor's arguments, key=value.",
+            autocompletion=completion.overrides,
+        ),
     ] = None,
     config_dir: ConfigDir = None,
 ) -> None:
@@ -540,23 +703,41 @@ def conform(
 @app.command()
 def check(
     suite: Annotated[
-        str, typer.Option(help="Suite of conf/suite, or a .yaml file; baselines lie beside it.")
+        str,
+        typer.Option(
+            help="Suite of conf/suite, or a .yaml file; baselines lie beside it.",
+            autocompletion=completion.suites,
+        ),
     ] = "check",
     accept: Annotated[
         str | None, typer.Option(help="Make this the baseline; the reason is kept in it.")
     ] = None,
     only: Annotated[
-        list[str] | None, typer.Option(help="An estimator; repeat it. Else all of the suite.")
+        list[str] | None,
+        typer.Option(
+            help="An estimator; repeat it. Else all of the suite.",
+            autocompletion=completion.estimators,
+        ),
     ] = None,
     release: Annotated[
         bool, typer.Option("--release", help="With --accept: pin the release baseline too.")
     ] = False,
     junit: Annotated[Path | None, typer.Option(help="JUnit XML to write.")] = None,
     summary: Annotated[Path | None, typer.Option(help="Markdown to write.")] = None,
+    candidate: Annotated[
+        Path | None,
+        typer.Option(help="Folder of trajectories that were made elsewhere, to judge instead."),
+    ] = None,
+    recordings: Annotated[
+        Path | None,
+        typer.Option(help="Only write the recordings for them, without the truth, to this folder."),
+    ] = None,
 ) -> None:
     """Compare all estimators' errors with the baseline; code 1 if one is worse.
 
-    Under GitHub Actions it also annotates, and adds to the job's summary.
+    Of a suite's entries with `elsewhere: true`, --candidate judges the trajectories GROUP_SEED.tum
+    (or .csv, .mcap; of several repeats GROUP_SEED.0.tum and so on) that any program made. Under
+    GitHub Actions it also annotates, and adds to the job's summary.
 
     Examples
     --------
@@ -565,10 +746,23 @@ def check(
       estima check --junit check.xml
 
       estima check --accept "descriptors of half the size: 2 % worse, twice as fast"
+
+      estima check --suite mine.yaml --recordings in
+
+      estima check --suite mine.yaml --candidate out
     """
+    if recordings is not None:
+        from experiments.gate.candidate import write_recordings
+        from experiments.gate.suite import read_suite, suite_path
+
+        chosen = read_suite(suite_path(suite)).of(only or []).made(elsewhere=True)
+        with progress("recordings", 1.0) as on_progress:
+            print(f"{recordings}: {write_recordings(chosen, recordings, on_progress)} recordings")
+        return
     from experiments.gate.report import run_check
 
-    if run_check(suite, accept, only or [], release=release, junit=junit, summary=summary):
+    reports = {"junit": junit, "summary": summary}
+    if run_check(suite, accept, only or [], release=release, candidate=candidate, **reports):
         raise typer.Exit(1)
 
 
@@ -577,8 +771,8 @@ def bench(
     name: Annotated[
         str,
         typer.Argument(
-            help="compile, fastslam, formats, icp, mcl, sim, smoothing, sweep, sweep_scale, "
-            "topological, or all."
+            help="compile, external, fastslam, formats, graph_slam, growth, icp, mcl, sim, "
+            "smoothing, sweep, sweep_scale, topological, or all."
         ),
     ] = "all",
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
@@ -602,12 +796,21 @@ Where = Annotated[
 
 @app.command()
 def table(
-    name: Annotated[str, typer.Argument(help="A sweep's name, or a folder or file of rows.")],
+    name: Annotated[
+        str,
+        typer.Argument(
+            help="A sweep's name, or a folder or file of rows.", autocompletion=completion.sweeps
+        ),
+    ],
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="File to write, .csv or .parquet.")
     ] = None,
     against: Annotated[
-        str | None, typer.Option(help="Give errors relative to this estimator's, too.")
+        str | None,
+        typer.Option(
+            help="Give errors relative to this estimator's, too.",
+            autocompletion=completion.estimators,
+        ),
     ] = None,
     all_versions: Annotated[
         bool, typer.Option("--all-versions", help="Keep rows of other versions of the code.")
@@ -619,6 +822,8 @@ def table(
     only: Where = None,
 ) -> None:
     """Show the means of a sweep's errors, or with -o write all its rows.
+
+    The means are those of the best answers: of the revised path of a method that has one.
 
     Example: estima table leaderboard --against smoother
     """
@@ -637,12 +842,24 @@ def table(
 
 @app.command()
 def plot(
-    name: Annotated[str, typer.Argument(help="A sweep's name, or a folder or file of rows.")],
-    x: Annotated[str, typer.Option(help="Swept setting, such as robot.kr.")],
-    y: Annotated[str, typer.Option(help="Result, such as ate_rmse_m (estima options metrics).")] = (
-        "ate_rmse_m"
-    ),
-    by: Annotated[str | None, typer.Option(help="One line a value of this.")] = None,
+    name: Annotated[
+        str,
+        typer.Argument(
+            help="A sweep's name, or a folder or file of rows.", autocompletion=completion.sweeps
+        ),
+    ],
+    x: Annotated[
+        str,
+        typer.Option(help="Swept setting, such as robot.kr.", autocompletion=completion.settings),
+    ],
+    y: Annotated[
+        str,
+        typer.Option(help="Result (estima options metrics).", autocompletion=completion.metrics),
+    ] = "answer_ate_rmse_m",
+    by: Annotated[
+        str | None,
+        typer.Option(help="One line a value of this.", autocompletion=completion.settings),
+    ] = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="Picture to write.")] = Path("plot.png"),
     pool: Annotated[
         bool, typer.Option("--pool", help="Average over worlds, estimators and logs too.")
@@ -651,7 +868,10 @@ def plot(
 ) -> None:
     """Draw a column of a sweep against a swept setting, with 95 % intervals.
 
-    Example: estima plot slip --x robot.kr --y ate_rmse_m --by choice.estimator
+    By default it is the position error of the best answers: of the revised path of a method that
+    has one, else of the online one.
+
+    Example: estima plot slip --x robot.kr --y heading_rmse_rad --by choice.estimator
     """
     from experiments.report.plot import sweep_figure
     from experiments.sweeps.collect import collect, where

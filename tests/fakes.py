@@ -5,6 +5,8 @@ geometry here, so they also stand beside the simulator's as a second opinion.
 """
 
 import dataclasses
+import sys
+from pathlib import Path
 
 import numpy as np
 
@@ -18,6 +20,14 @@ from sim.world import World
 
 ROBOT = RobotGeometry(wheel_radius_m=0.05, track_m=0.19)
 HALF_ROOM_M = 4.0
+
+
+EXAMPLES = Path(__file__).resolve().parent.parent / "docs/examples"
+# Overrides of the options that run a program
+PROGRAMS = {
+    "external": [f"estimator.command=['{sys.executable}','{EXAMPLES}/external_odometry.py']"],
+    "offline": [f"estimator.command='sh {EXAMPLES}/offline_odometry.sh {{log}} {{start}} {{out}}'"],
+}
 
 
 def square_room(n_landmarks=40, seed=0):

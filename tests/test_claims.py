@@ -376,7 +376,7 @@ def test_intervals_of_two_one_sided_tests_are_named():
     ).assign(geometry="umh", noise="paper", filter="fastslam2")
     for column in gil2008.ERRORS:
         worlds[column] = worlds["error_m"]
-    no_times = pd.DataFrame({"geometry": []})
+    no_times = pd.DataFrame({"geometry": [], "particles": [], "time_s": []})
     said = [*gil2008.gi3(worlds), *maximo2024.mx2(worlds, no_times)]
     tested = [claim for claim in said if "significance" not in claim.statistic]
     assert len(tested) == 5

@@ -49,6 +49,7 @@ def test_settings_that_follow_from_others_are_not_named():
     table.insert(3, "estimator._target_", "module." + table["choice.estimator"])
     assert telling(table) == ["choice.estimator", "robot.kr", "seed"]
     assert list(summary(table).columns[:3]) == ["choice.estimator", "robot.kr", "runs"]
+    assert set(summary(table)["answer"]) == {"online"}
     table["robot.kl"] = np.tile([1.0, 2.0, 2.0], 4)  # now a setting of its own
     assert telling(table) == ["choice.estimator", "robot.kr", "robot.kl", "seed"]
 
@@ -80,6 +81,27 @@ def test_settings_of_some_estimators_only_are_settings(tmp_path):
     assert {"estimator.metric", "estimator.n_particles"} <= set(swept(together))
     assert {"found_by_b", "found_by_c"} <= set(measured(together))
     assert (summary(together).groupby("choice.estimator").size() == [2, 4, 4]).all()
+
+
+def test_a_method_stands_where_its_best_answer_is():
+    table = rows().assign(cpu_time_us=2.0, step_time_us=1.0)
+    batch = table["choice.estimator"] == "b"
+    table["revised_ate_rmse_m"] = np.where(batch, 0.25 * table["ate_rmse_m"], np.nan)
+    found = summary(table, against="a").set_index("choice.estimator")
+    assert found["answer"].to_dict() == {"a": "online", "b": "revised"}
+    means = table.groupby("choice.estimator")[["ate_rmse_m", "revised_ate_rmse_m"]].mean()
+    assert found["answer_ate_rmse_m"]["a"].mean() == pytest.approx(means["ate_rmse_m"]["a"])
+    assert found["answer_ate_rmse_m"]["b"].mean() == pytest.approx(means["revised_ate_rmse_m"]["b"])
+    assert (found["cpu_time_us"] == 2.0).all()
+    page = sweep_figure(table, "choice.estimator", "answer_ate_rmse_m", pool=True)
+    words = [label.get_text() for label in page.axes[0].get_xticklabels()]
+    assert words == ["a", "b (revised)"]
+    drawn = page.axes[0].get_lines()[0].get_ydata()
+    online = sweep_figure(table, "choice.estimator", "ate_rmse_m", pool=True)
+    assert drawn[0] == online.axes[0].get_lines()[0].get_ydata()[0]
+    assert drawn[1] != drawn[0]
+    with pytest.raises(InputError, match="answer_nees_mean"):
+        sweep_figure(table, "choice.estimator", "answer_nees_mean")
 
 
 def test_rows_are_chosen_by_conditions():

@@ -13,7 +13,7 @@ from experiments.runs.targets import make
 from sim.errors import InputError
 from sim.robot import DifferentialDrive, RobotGeometry
 from sim.sensors import sensors_from_config
-from tests.fakes import circle
+from tests.fakes import PROGRAMS, circle
 
 CONF = Path(__file__).resolve().parent.parent / "conf"
 
@@ -57,7 +57,7 @@ def test_routes_build(name):
 
 @pytest.mark.parametrize("name", options("estimator"))
 def test_estimators_build_and_state_every_key(name):
-    experiment = Experiment.compose([f"estimator={name}"])
+    experiment = Experiment.compose([f"estimator={name}", *PROGRAMS.get(name, [])])
     estimator = experiment.estimator()
     stated = set(experiment.config["estimator"]) - {"_target_"}
     assert stated == set(inspect.signature(type(estimator)).parameters)

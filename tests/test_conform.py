@@ -263,7 +263,10 @@ def test_the_sensors_can_be_chosen():
 
 
 OPTIONS = sorted(path.stem for path in (CONF / "estimator").glob("*.yaml"))
-FEWER = {"mcl": ["estimator.n_most=1000", "estimator.n_least=300"]}  # particles; else 20 s
+FEWER = {
+    "mcl": ["estimator.n_most=1000", "estimator.n_least=300"],  # particles; else 20 s
+    **fakes.PROGRAMS,
+}
 
 
 @pytest.mark.parametrize("name", OPTIONS)

@@ -75,12 +75,12 @@ def test_it_documents_the_api(site):
 
 
 def test_its_examples_are_the_scripts(site):
-    page = (ROOT / "docs" / "examples" / "index.md").read_text()
-    shown = re.findall(r'--8<-- "(.*?)"', page)
+    pages = [ROOT / "docs" / name for name in ("examples/index.md", "programs.md")]
+    shown = [name for page in pages for name in re.findall(r'--8<-- "(.*?)"', page.read_text())]
     assert sorted(shown) == sorted(
         str(path.relative_to(ROOT))
         for path in (ROOT / "docs" / "examples").rglob("*")
-        if path.suffix in (".py", ".yaml")
+        if path.suffix in (".py", ".yaml", ".cpp", ".sh", ".yml")
     )
     assert "Dead reckoning whose covariance" in (site[0] / "examples" / "index.html").read_text()
 

@@ -14,7 +14,9 @@ from scipy import stats
 from experiments.gate import baseline
 from experiments.gate import compare as regress
 from experiments.gate import report as regress_report
+from experiments.gate.candidate import candidate_rows, write_recordings
 from experiments.gate.compare import exchange_p, holm
+from experiments.gate.report import run_check
 from experiments.gate.suite import (
     ERRORS,
     command_of,
@@ -25,7 +27,10 @@ from experiments.gate.suite import (
 )
 from experiments.runs.experiment import Experiment
 from experiments.runs.paths import results
+from sim import se2
 from sim.errors import InputError
+from sim.formats import assemble, carmen
+from sim.formats.tum import write_tum
 
 QUICK = [
     "world=room",
@@ -378,6 +383,73 @@ def test_an_entry_may_name_its_estimator(tmp_path):
     rows = run_suite(suite, {"odometry": 1, "again": 1}, n_jobs=1)
     assert rows.groupby("estimator").size().to_dict() == {"again": 2, "odometry": 2}
     assert set(rows["status"]) == {"ok"}
+
+
+@pytest.fixture
+def elsewhere(tmp_path, monkeypatch):
+    """A suite whose trajectories are made elsewhere, and a folder of them by dead reckoning."""
+    path = tmp_path / "mine.yaml"
+    overrides = ", ".join([*QUICK, "sensors=hokuyo", "sensors.laser.n_beams=11"])
+    path.write_text(
+        f"first_seed: 5\nrecordings: {{room: {{count: 6, overrides: [{overrides}]}}}}\n"
+        "estimators:\n"
+        "  mine: {recordings: room, repeats: [2, 2], elsewhere: true}\n"
+        "  odometry: {recordings: room, repeats: [1, 1]}\n"
+    )
+    monkeypatch.setattr(baseline, "run_suite", partial(run_suite, n_jobs=1))
+    return path
+
+
+def trajectories(inputs, folder, noise_m=0.0, seed=0):
+    """Two repeats a recording of its odometry, moved by noise of a repeat's own."""
+    rng = np.random.default_rng(seed)
+    for log in sorted(inputs.glob("*.log")):
+        made = carmen.to_recording(carmen.read_carmen(log))
+        x0, y0, heading0 = np.loadtxt(log.with_suffix(".start.txt"), max_rows=1)
+        poses = assemble.rolled(made.wheels, made.robot.track_m)
+        for repeat in range(2):
+            drift = (0.01 * rng.random() + noise_m) * np.linspace(0, 1, len(poses))
+            moved = se2.compose(np.array([x0, y0, heading0]), poses)
+            moved[:, 0] += drift
+            write_tum(folder / f"{log.stem}.{repeat}.tum", made.wheels.stamps, moved)
+
+
+def test_trajectories_made_elsewhere_are_judged(elsewhere, tmp_path, capsys):
+    inputs, then, now, worse = (tmp_path / name for name in ("in", "then", "now", "worse"))
+    suite = read_suite(elsewhere).made(elsewhere=True)
+    assert write_recordings(suite, inputs) == 6
+    assert len(list(inputs.glob("*.start.txt"))) == 6
+    for folder, noise_m, seed in ((then, 0.0, 0), (now, 0.0, 1), (worse, 0.5, 2)):
+        trajectories(inputs, folder, noise_m, seed)
+    name = str(elsewhere)
+    with pytest.raises(InputError, match="no baseline yet"):
+        run_check(name, None, candidate=then)
+    run_check(name, "first", candidate=then)
+    run_check(name, "first", ["odometry"], release=True)
+    assert not run_check(name, None, ["odometry"])
+    assert not run_check(name, None, candidate=now)
+    assert run_check(name, None, candidate=worse)
+    assert "worse" in capsys.readouterr().out
+    (now / "room_7.1.tum").unlink()
+    (now / "room_6.0.tum").write_text("0 1 2\n")
+    lines = (now / "room_8.0.tum").read_text().splitlines()
+    (now / "room_8.0.tum").write_text("\n".join(lines[: len(lines) // 2]) + "\n")
+    rows = candidate_rows(suite, now, {"mine": 2}).set_index(["recording", "repeat"])["status"]
+    assert (rows == "ok").sum() == 9
+    assert rows[6, 0].startswith("unreadable")
+    assert rows[7, 1].startswith("missing")
+    assert rows[8, 0].startswith("gap")
+    assert run_check(name, None, candidate=now)
+    assert "3 of 12 runs fail" in capsys.readouterr().out
+
+
+def test_what_is_made_elsewhere_needs_its_trajectories(elsewhere, small, tmp_path):
+    with pytest.raises(InputError, match="no trajectories here"):
+        baseline.accept(str(elsewhere), "why", candidate=tmp_path / "none")
+    with pytest.raises(InputError, match="made elsewhere; check by --candidate DIR"):
+        read_suite(elsewhere).of(["mine"]).made(elsewhere=False)
+    with pytest.raises(InputError, match="marked `elsewhere: true`"):
+        baseline.check(str(small), candidate=tmp_path)
 
 
 def test_recordings_of_the_check_turn():

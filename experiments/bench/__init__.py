@@ -20,6 +20,7 @@ SUITES = {
     "graph_slam": ("graph_slam",),
     "compile": ("compile",),
     "growth": ("growth",),
+    "external": ("external",),
 }
 
 

@@ -143,6 +143,8 @@ def score(recording: Recording, estimate: Estimate) -> dict[str, float]:
     row = {"duration_s": float(np.ptp(estimate.stamps)) if len(estimate.stamps) else 0.0}
     if len(estimate.step_seconds):
         row["step_time_us"] = float(1e6 * np.median(estimate.step_seconds))
+    if estimate.cpu_seconds is not None:
+        row["cpu_time_us"] = 1e6 * estimate.cpu_seconds / max(len(estimate.stamps), 1)
     dispersions = [v for v in estimate.extras.get("dispersion_m", ()) if v is not None]
     if dispersions:
         row["dispersion_final_m"] = float(dispersions[-1])
@@ -151,11 +153,19 @@ def score(recording: Recording, estimate: Estimate) -> dict[str, float]:
     truth = recording.truth_at(estimate.stamps)
     known = np.isfinite(truth).all(axis=1)
     require(known.any(), "no estimate lies within the truth's time span; are the clocks the same?")
-    truth, means, covariances = truth[known], estimate.means[known], estimate.covariances[known]
+    covariances = estimate.covariances[known]
+    return row | path_scores(truth[known], estimate.means[known], covariances)
+
+
+def path_scores(truth: Array, means: Array, covariances: Array) -> dict[str, float]:
+    """Scores of poses (T, 3) and covariances (T, 3, 3) against the true poses at their stamps.
+
+    Covariances that are all zeros are unknown: their scores are left out.
+    """
     fitted, off = aligned(truth, means), position_errors_m(truth, means)
     values = nees(truth, means, covariances)
     counted = np.isfinite(values)
-    row |= {
+    row = {
         "distance_m": float(np.sum(np.hypot(*np.diff(truth[:, :2], axis=0).T))),
         "ate_rmse_m": rms(off),
         "ate_mean_m": float(np.mean(off)),
@@ -164,12 +174,13 @@ def score(recording: Recording, estimate: Estimate) -> dict[str, float]:
         "heading_aligned_rmse_rad": rms(heading_errors_rad(truth, fitted)),
         "final_position_error_m": float(off[-1]),
         "final_heading_error_rad": float(abs(heading_errors_rad(truth[-1:], means[-1:])[0])),
-        "nees_counted_share": float(np.mean(counted)),
-        "ellipse_area_final_m2": float(ellipse_area_m2(covariances[-1:])[0]),
     }
+    if covariances.any():
+        row["nees_counted_share"] = float(np.mean(counted))
+        row["ellipse_area_final_m2"] = float(ellipse_area_m2(covariances[-1:])[0])
     if counted.any():
         row["nees_mean"] = float(np.mean(values[counted]))
-    if row["ellipse_area_final_m2"] > 0.0:
+    if row.get("ellipse_area_final_m2", 0.0) > 0.0:
         row["final_in_ellipse"] = float(in_ellipse(truth[-1], means[-1], covariances[-1]))
     for distance in RPE_DISTANCES_M:
         pairs = pairs_by_distance(truth, distance)

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from experiments.gate.candidate import candidate_rows
 from experiments.gate.compare import WHICH, Finding, compare, failed, how
 from experiments.gate.suite import ERRORS, Suite, read_suite, run_suite, suite_path
 from experiments.runs.paths import packaged, results
@@ -159,20 +160,26 @@ def check(
     suite_name: str,
     only: Sequence[str] = (),
     on_progress: Callable[[float], None] = lambda _: None,
+    candidate: Path | None = None,
 ) -> list[Finding]:
     """Run a suite, or some of its estimators, and compare it with its baselines.
+
+    Parameters
+    ----------
+    candidate
+        Folder of trajectories that were made elsewhere, to judge in place of a run.
 
     Raises
     ------
     InputError
         If the suite or a baseline cannot be used.
     """
-    suite = read_suite(suite_path(suite_name)).of(only)
+    suite = read_suite(suite_path(suite_name)).of(only).made(elsewhere=candidate is not None)
     paths = baseline_paths(suite_name)
     if not paths["release"].exists():
         del paths["release"]
     baselines = {key: read_baseline(path).rows for key, path in paths.items()}
-    rows = run_suite(suite, repeats_of(suite, of_baseline=False), on_progress=on_progress)
+    rows = _rows(suite, repeats_of(suite, of_baseline=False), candidate, on_progress)
     return compare(baselines, rows)
 
 
@@ -183,6 +190,7 @@ def accept(
     *,
     release: bool = False,
     on_progress: Callable[[float], None] = lambda _: None,
+    candidate: Path | None = None,
 ) -> Accepted:
     """Run a suite and make it the baseline, with the reason written into the file.
 
@@ -193,18 +201,19 @@ def accept(
         reason.strip(), '--accept needs a reason, such as --accept "faster matching, 2 % worse"'
     )
     whole = read_suite(suite_path(suite_name))
-    suite = whole.of(only)
+    suite = whole.of(only).made(elsewhere=candidate is not None)
     names = [entry.name for entry in suite.estimators]
     known = [entry.name for entry in whole.estimators]
     paths = baseline_paths(suite_name)
+    alike = [e for e in whole.estimators if e.elsewhere == (candidate is not None)]
     old = {key: read_baseline(path) for key, path in paths.items() if path.exists()}
     for key, path in paths.items():
         require(
-            key in old or len(names) >= len(known),
+            key in old or len(names) >= len(alike),
             f"{path}: no baseline yet, and one of {', '.join(names)} alone would not do; "
             "accept the whole suite, without --only",
         )
-    rows = run_suite(suite, repeats_of(suite, of_baseline=True), on_progress=on_progress)
+    rows = _rows(suite, repeats_of(suite, of_baseline=True), candidate, on_progress)
     bad = rows[failed(rows)]
     if len(bad):
         first = bad.iloc[0]
@@ -223,6 +232,17 @@ def accept(
             continue
         written.append(path)
     return Accepted(written, findings)
+
+
+def _rows(
+    suite: Suite,
+    repeats: dict[str, int],
+    candidate: Path | None,
+    on_progress: Callable[[float], None],
+) -> pd.DataFrame:
+    if candidate is not None:
+        return candidate_rows(suite, candidate, repeats, on_progress)
+    return run_suite(suite, repeats, on_progress=on_progress)
 
 
 def _compared(baseline: dict[str, pd.DataFrame], rows: pd.DataFrame) -> list[Finding]:

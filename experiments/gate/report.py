@@ -37,11 +37,14 @@ def run_check(
     release: bool = False,
     junit: Path | None = None,
     summary: Path | None = None,
+    candidate: Path | None = None,
 ) -> bool:
     """Do what `estima check` does; return whether it found a worsening."""
     if reason is not None:
         with progress("checking the estimators", 1.0) as on_progress:
-            accepted = accept(suite, reason, only, release=release, on_progress=on_progress)
+            accepted = accept(
+                suite, reason, only, release=release, on_progress=on_progress, candidate=candidate
+            )
         show(as_text(accepted.findings, hint=""))
         for path in accepted.written:
             print(f"accepted: {short(path)}")
@@ -68,7 +71,7 @@ def run_check(
             file=sys.stderr,
         )
     with progress("checking the estimators", 1.0) as on_progress:
-        findings = check(suite, only, on_progress)
+        findings = check(suite, only, on_progress, candidate)
     show(as_text(findings, detectable, hint=_hint(suite, findings)))
     show(_where_to_look(suite, findings))
     if junit is not None:
@@ -136,6 +139,10 @@ def _where_to_look(suite: str, findings: Sequence[Finding]) -> str:
             if math.isfinite(then)
         ]
         seed = finding.worst[0][0]
+        (entry,) = whole.of([finding.estimator]).estimators
+        if entry.elsewhere:
+            lines.append(f"look at its trajectory of {entry.recordings}_{seed}")
+            continue
         picture = results() / "runs" / "check" / f"{finding.estimator}_{seed}.png"
         if draw_run(whole, finding.estimator, seed, picture):
             lines.append(f"the worst of them: {short(picture)}")

@@ -54,6 +54,8 @@ class Entry:
         Hydra overrides beside those of the recordings.
     revised
         Whether the trajectory of `finish` is judged, and not the online one.
+    elsewhere
+        Whether its trajectories are made elsewhere, and checked by `--candidate`.
     """
 
     name: str
@@ -62,6 +64,7 @@ class Entry:
     repeats: tuple[int, int]
     overrides: tuple[str, ...] = ()
     revised: bool = False
+    elsewhere: bool = False
 
 
 @dataclass(frozen=True)
@@ -94,6 +97,25 @@ class Suite:
         for name in names:
             require(name in known, f"the suite has no estimator {name}; it has {', '.join(known)}")
         chosen = tuple(entry for entry in self.estimators if not names or entry.name in names)
+        return dataclasses.replace(self, estimators=chosen)
+
+    def made(self, *, elsewhere: bool) -> Suite:
+        """Return the same suite with the estimators that it runs, or those that are run elsewhere.
+
+        Raises
+        ------
+        InputError
+            If there are none.
+        """
+        chosen = tuple(entry for entry in self.estimators if entry.elsewhere == elsewhere)
+        names = ", ".join(entry.name for entry in self.estimators)
+        require(
+            chosen,
+            f"no estimator of {names} is marked `elsewhere: true` in the suite; --candidate judges "
+            "those"
+            if elsewhere
+            else f"{names}: made elsewhere; check by --candidate DIR",
+        )
         return dataclasses.replace(self, estimators=chosen)
 
 
@@ -167,15 +189,20 @@ def _overrides(given: Any) -> tuple[str, ...]:
 
 def _entry(name: Any, given: dict[str, Any]) -> Entry:
     baseline, check = given["repeats"]
-    unknown = set(given) - {"estimator", "recordings", "repeats", "overrides", "revised"}
+    known = ("estimator", "recordings", "repeats", "overrides", "revised", "elsewhere")
+    unknown = set(given) - set(known)
     if unknown:
         raise KeyError(f"{name}.{sorted(map(str, unknown))[0]}")
-    revised, group = given.get("revised", False), given["recordings"]
-    option = given.get("estimator", name)
-    if not (all(isinstance(t, str) for t in (name, option, group)) and isinstance(revised, bool)):
-        raise TypeError(f"{name}: names and recordings must be texts, revised true or false")
+    texts = name, option, group = name, given.get("estimator", name), given["recordings"]
+    flags = revised, elsewhere = given.get("revised", False), given.get("elsewhere", False)
+    if not (all(isinstance(t, str) for t in texts) and all(isinstance(f, bool) for f in flags)):
+        raise TypeError(
+            f"{name}: names and recordings must be texts, revised and elsewhere true or false"
+        )
     overrides = _overrides(given.get("overrides") or [])
-    return Entry(name, option, group, (baseline, check), overrides, revised)
+    if elsewhere and (overrides or "estimator" in given):
+        raise TypeError(f"{name}: what is made elsewhere has neither estimator nor overrides here")
+    return Entry(name, option, group, (baseline, check), overrides, revised, elsewhere)
 
 
 def suite_path(name: str) -> Path:

@@ -196,7 +196,7 @@ def _print(conclusions: list[Conclusion]) -> None:
 
 def first_sentence(text: str) -> str:
     """Return the text up to its first full stop that ends a sentence."""
-    return re.split(r"(?<=[a-z0-9)%][.:]) (?=[A-Z])", text, maxsplit=1)[0]
+    return re.split(r"(?<=[a-z0-9)%]\.) (?=[A-Z])", text, maxsplit=1)[0]
 
 
 def _counts(conclusions: list[Conclusion]) -> str:

@@ -22,7 +22,13 @@ Entry = Mapping[str, Any]
 PAPERS = ("puzzlebot2024", "decristoforis2020", "gil2008", "maximo2024")
 # What belongs to no paper, by the prefix of its files' names, and the commands that make it.
 OWN = {
-    "leaderboard": ["estima run -m study=leaderboard"],
+    "leaderboard": [
+        "estima run -m study=leaderboard",
+        "estima plot leaderboard --x choice.estimator --by choice.world "
+        "-o results/figures/leaderboard_errors.png",
+        "estima table leaderboard --against smoother --times --means "
+        "-o results/tables/leaderboard_means.csv",
+    ],
     "all_estimators": ["estima run -m study=all_estimators"],
     "mcl_office": ["estima reproduce --paper mcl_office --full"],
     "fastslam_consistency": ["estima reproduce --paper fastslam_consistency --full"],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import textwrap
+from collections.abc import Sequence
 from difflib import get_close_matches
 
 import numpy as np
@@ -11,8 +12,8 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from experiments.evaluation.statistics import mean_interval
-from experiments.runs.columns import COLUMNS, REPEAT, title
-from experiments.sweeps.collect import measured, telling
+from experiments.runs.columns import ANSWER, COLUMNS, PATH, REPEAT, title
+from experiments.sweeps.collect import measured, telling, with_answers
 from experiments.viewing.style import CYCLE, subplots
 from sim.errors import InputError
 
@@ -27,6 +28,9 @@ def sweep_figure(
     table: pd.DataFrame, x: str, y: str, by: str | None = None, *, pool: bool = False
 ) -> Figure:
     """Mean of `y` over the recordings, with 95 % intervals, against `x`; one line per `by`.
+
+    A y such as `answer_ate_rmse_m` is that of the best answer, the revised path where there is one;
+    what gives revised paths is marked so.
 
     Repeats over one recording are averaged first: the recording is the unit of inference. Where no
     point has more than one recording, the intervals are over its repeats. On a logarithmic axis
@@ -43,6 +47,8 @@ def sweep_figure(
         If a column is not in the table, y has no numbers, no run has both x and y, or a point
         would pool what differs in kind.
     """
+    if y.startswith(ANSWER):
+        table = _marked(with_answers(table, [y]), [c for c in (x, by) if c is not None])
     for column in filter(None, (x, y, by)):
         if column not in table:
             raise InputError(
@@ -102,6 +108,17 @@ def sweep_figure(
     if by is not None:
         page.legend(title=title(by), loc="outside right upper")
     return page
+
+
+def _marked(table: pd.DataFrame, columns: Sequence[str]) -> pd.DataFrame:
+    """Mark the words of columns whose rows all have a revised path."""
+    revised = table[PATH] == "revised"
+    for column in columns:
+        if column in table and table[column].dtype.kind not in "fiub":
+            all_of = revised.groupby(table[column]).transform("all").fillna(False).astype(bool)
+            words = table[column].where(~all_of, table[column].astype(str) + " (revised)")
+            table = table.assign(**{column: words})
+    return table
 
 
 def _columns(table: pd.DataFrame, wanted: str) -> list[str]:

@@ -36,6 +36,10 @@ class Column:
 OF_THE_RUN = {
     "duration_s": Column("duration", "t", "s", "linear", None),
     "distance_m": Column("distance travelled", "d", "m", "linear", None),
+    "cpu_time_us": Column("processor time per Frame", "cpu", "us"),
+    "stamps_scored": Column("stamps scored", "scored", "", "linear", None),
+    "stamps_left_out": Column("stamps without a true pose", "left out", "", "linear"),
+    "longest_gap_s": Column("longest time without a pose", "gap", "s", "linear"),
     "dispersion_final_m": Column("final dispersion of the particles", "dispersion", "m"),
 }
 _OF_THE_PATH = {
@@ -67,16 +71,28 @@ _OF_THE_MAP = {
     "map_rmse_m": Column("RMSE of the map's landmarks", "map", "m"),
     "map_aligned_rmse_m": Column("RMSE of the map's landmarks after alignment", "map aligned", "m"),
 }
+
+
+def _of(prefix: str, label: str, symbol: str) -> dict[str, Column]:
+    """Return the columns of another path than the online one."""
+    return {
+        f"{prefix}{name}": dataclasses.replace(
+            column, label=f"{column.label}{label}", symbol=f"{column.symbol}{symbol}"
+        )
+        for name, column in _OF_THE_PATH.items()
+    }
+
+
+REVISED, ANSWER = "revised_", "answer_"
+PATH = "answer"  # which path the answer is: online or revised
+# The answer of a method is its revised path if it has one, else the online one. Its columns are not
+# in the files: tables and plots derive them (`sweeps.collect`).
 COLUMNS = {
     **OF_THE_RUN,
     **_OF_THE_PATH,
     **_OF_THE_MAP,
-    **{
-        f"revised_{name}": dataclasses.replace(
-            column, label=f"{column.label}, revised path", symbol=f"{column.symbol} revised"
-        )
-        for name, column in _OF_THE_PATH.items()
-    },
+    **_of(REVISED, ", revised path", " revised"),
+    **_of(ANSWER, ", best answer", " best"),
 }
 STATUS = ("status", "status_code", "status_detail")
 REPEAT = "repeat"  # counts the runs of an estimator over one recording

@@ -172,12 +172,7 @@ class Experiment:
         InputError
             If the name is not one word.
         """
-        name = self.config["name"]
-        if not (isinstance(name, str) and re.fullmatch(r"[\w.-]*\w", name)):
-            raise InputError(
-                f"name must be one word for a folder of results, such as slip_2, got {name!r}"
-            )
-        return paths.results() / "runs" / name
+        return rows_folder(self.config["name"])
 
     @property
     def key(self) -> str:
@@ -227,7 +222,7 @@ class Experiment:
         return {key: value for key, value in self.config.items() if key not in unused}
 
     def _code_version(self) -> str:
-        return version_with(targets(self._applied()))
+        return version_with(targets(self._applied()), self.config["estimator"].get("command"))
 
     # What it names
 
@@ -518,6 +513,15 @@ class Experiment:
         if recording.world is None:
             raise InputError("prior.map=world, but the recording has no map; set prior.map=none")
         return recording.world
+
+
+def rows_folder(name: Any) -> Path:
+    """Folder of rows of a name, which must be one word."""
+    if not (isinstance(name, str) and re.fullmatch(r"[\w.-]*\w", name)):
+        raise InputError(
+            f"name must be one word for a folder of results, such as slip_2, got {name!r}"
+        )
+    return paths.results() / "runs" / name
 
 
 def _check_shape(config: Config) -> None:

@@ -11,6 +11,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from estimators.base import Estimate
+from estimators.program import ProgramError
 from experiments.runs import paths
 from experiments.runs.columns import COLUMNS
 from experiments.runs.console import RunFailedError, end, progress, show
@@ -24,19 +25,22 @@ from experiments.runs.experiment import (
 )
 from experiments.runs.row import Outcome, Row
 from experiments.runs.store import write_run
+from experiments.trajectories.convert import write_estimate
 from sim.errors import InputError
 from sim.recording import Recording
 
 Draw = Callable[[Recording, Estimate, Experiment, Path], None]
 
 
-def run_once(experiment: Experiment, draw: Draw) -> list[Row]:
+def run_once(experiment: Experiment, draw: Draw, out: Path | None = None) -> list[Row]:
     """Run an experiment, write its rows, and draw the first repeat.
 
     Parameters
     ----------
     draw
         Draws a recording and an estimate of an experiment into a folder.
+    out
+        File of the first repeat's estimate, the revised one if there is one; None for no file.
 
     Raises
     ------
@@ -49,26 +53,36 @@ def run_once(experiment: Experiment, draw: Draw) -> list[Row]:
         with progress("simulated seconds") as on_progress:
             return experiment.recording(on_progress)
 
-    def keep(recording: Recording, repeat: int, online: Estimate, _: Estimate | None) -> None:
+    def keep(recording: Recording, repeat: int, online: Estimate, revised: Estimate | None) -> None:
+        answer = online if revised is None else revised
         if repeat == 0 and experiment.picture:
-            draw(recording, online, experiment, folder)
+            draw(recording, answer, experiment, folder)
+        if repeat == 0 and out is not None:
+            write_estimate(out, answer)
 
     rows = evaluate(
         experiment,
         fetch,
         shown=lambda recording: progress(name, len(recording.frame_stamps)),
         on_estimate=keep,
-        on_error=traceback.print_exception,
+        on_error=_trace,
     )
     path = write_run(rows, folder.parent)
-    _print(rows, [file for file in (path, folder / "run.png") if file.exists()])
+    written = (path, folder / "run.png", *([out] if out is not None else []))
+    _print(rows, [file for file in written if file.exists()])
     for row in rows:
         if row["status"] == Outcome.FAILED:
             raise RunFailedError(f"{row['status_code']}: {row['status_detail']}")
     return rows
 
 
-def application(arguments: Sequence[str], draw: Draw) -> None:
+def _trace(error: Exception | SystemExit) -> None:
+    """Print where an error came from, unless it is a program's, whose own message says so."""
+    if not isinstance(error, ProgramError):
+        traceback.print_exception(error)
+
+
+def application(arguments: Sequence[str], draw: Draw, out: Path | None = None) -> None:
     """Run one configuration by a command line's arguments; sweeps are those of `sweeps.launch`."""
 
     def run(cfg: DictConfig) -> None:
@@ -81,7 +95,7 @@ def application(arguments: Sequence[str], draw: Draw) -> None:
                 raise InputError(
                     f"study={study} sweeps values; add -m: estima run -m study={study}"
                 )
-            run_once(Experiment.resolved(cfg, choices), draw)
+            run_once(Experiment.resolved(cfg, choices), draw, out)
         except Exception as error:
             end(error)  # here, since Hydra would add a line of its own
 
@@ -107,7 +121,9 @@ _SHOWN = (
     "heading_rmse_rad",
     "final_position_error_m",
     "nees_mean",
+    "revised_ate_rmse_m",
     "step_time_us",
+    "cpu_time_us",
 )
 
 

@@ -3,8 +3,11 @@
 import functools
 import hashlib
 import importlib.util
+import json
+import shlex
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 from experiments.runs.paths import SOURCE
 
@@ -34,12 +37,33 @@ def code_version(parts: tuple[str, ...] = RUNS) -> str:
     return digest.hexdigest()[:12]
 
 
-def version_with(targets: Iterable[str]) -> str:
-    """Return the code's version, followed by + and a digest of targets from elsewhere, if any."""
+def version_with(targets: Iterable[str], command: Any = None) -> str:
+    """Return the code's version, followed by + and a digest of what is from elsewhere, if any.
+
+    Parameters
+    ----------
+    targets
+        What the configuration names by `_target_`.
+    command
+        Of a program that is the estimator; the files among its words count.
+    """
     found = {target: digest for target in sorted(targets) if (digest := source_digest(target))}
+    for path in command_files(command):
+        found[str(path)] = hashlib.sha256(path.read_bytes()).hexdigest()
     if not found:
         return code_version()
     return f"{code_version()}+{hashlib.sha256(repr(found).encode()).hexdigest()[:12]}"
+
+
+def command_files(command: Any) -> list[Path]:
+    """Files among the words of a command: a list, a line, or a list as a row has it (JSON)."""
+    try:
+        if isinstance(command, str):
+            command = json.loads(command) if command[:1] == "[" else shlex.split(command)
+        words = [word for word in command or () if isinstance(word, str)]
+        return [Path(word) for word in words if Path(word).is_file()]
+    except (ValueError, TypeError, OSError):  # no command; the estimator says so
+        return []
 
 
 @functools.cache

@@ -9,26 +9,26 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from experiments.runs.columns import ORIGIN, REPEAT, STATUS, is_setting
+from experiments.runs.columns import ANSWER, ORIGIN, PATH, REPEAT, REVISED, STATUS, is_setting
 from experiments.runs.paths import results
 from experiments.runs.row import Outcome
 from experiments.runs.store import read_runs
 from experiments.runs.version import code_version, version_with
 from sim.errors import InputError
 
-_TIMES = ["step_time_us"]  # they differ from run to run
+_TIMES = ["step_time_us", "cpu_time_us"]  # they differ from run to run
+_COMMAND = "estimator.command"
 _DRAWN = ["seed", "world_seed"]  # what `summary` averages over
 _MAIN = (
-    "ate_rmse_m",
-    "ate_mean_m",
-    "ate_aligned_rmse_m",
-    "heading_rmse_rad",
-    "heading_aligned_rmse_rad",
-    "nees_mean",
+    "answer_ate_rmse_m",
+    "answer_ate_mean_m",
+    "answer_ate_aligned_rmse_m",
+    "answer_heading_rmse_rad",
+    "answer_heading_aligned_rmse_rad",
+    "answer_nees_mean",
     "dispersion_final_m",
-    "revised_ate_rmse_m",
-    "revised_ate_aligned_rmse_m",
     "step_time_us",
+    "cpu_time_us",
 )
 _COUNTED = {"failed": Outcome.FAILED, "with_remarks": Outcome.REMARK}
 
@@ -109,11 +109,13 @@ def _of_this_code(table: pd.DataFrame) -> pd.Series[bool]:
         If there are rows of several versions of a file that cannot be found here.
     """
     mine = table["code_version"].str.partition("+")[0] == code_version()
+    table = table if _COMMAND in table else table.assign(**{_COMMAND: None})
     targets = [column for column in table if str(column).endswith("_target_")]
     others = table[mine & table["code_version"].str.contains("+", regex=False)]
-    for names, rows in others.groupby(targets, dropna=False) if len(others) else ():
+    by = [*targets, _COMMAND]
+    for (*names, command), rows in others.groupby(by, dropna=False) if len(others) else ():
         given = [name for name in names if isinstance(name, str)]
-        here = version_with(given)
+        here = version_with(given, command)
         if "+" in here:
             mine[rows.index] = rows["code_version"] == here
         elif rows["code_version"].nunique() > 1:
@@ -147,15 +149,41 @@ def measured(table: pd.DataFrame) -> list[str]:
     return [c for c in numbers if not is_setting(c) and c not in (REPEAT, *ORIGIN)]
 
 
+def with_answers(table: pd.DataFrame, names: Sequence[str]) -> pd.DataFrame:
+    """Add those columns of the best answers that can be derived, and which path that is.
+
+    A method's answer is its revised path if it has one, else the online one.
+
+    Parameters
+    ----------
+    names
+        Columns such as `answer_ate_rmse_m`; others are left alone.
+    """
+    revised = [column for column in table if str(column).startswith(REVISED)]
+    has = table[revised].notna().any(axis=1)
+    added = {PATH: np.where(has, "revised", "online")}
+    for name in names:
+        online = name.removeprefix(ANSWER)
+        if online != name and {online, REVISED + online} & set(table):
+            parts = [
+                table.get(c, pd.Series(np.nan, table.index)) for c in (REVISED + online, online)
+            ]
+            added[name] = np.where(has, *parts)
+    return table.assign(**added)
+
+
 def summary(table: pd.DataFrame, against: str | None = None) -> pd.DataFrame:
     """Mean of the main errors for each combination of the swept settings except the seeds.
+
+    Errors are those of the best answers; column `answer` says which path that is.
 
     Parameters
     ----------
     against
-        An estimator's name: errors (of the revised path, where there is one) are also given
-        relative to that estimator's, on the same recordings.
+        An estimator's name: errors are also given relative to that estimator's, on the same
+        recordings.
     """
+    table = with_answers(table, _MAIN)
     by = telling(table.drop(columns=_DRAWN, errors="ignore"))
     shown = [c for c in _MAIN if c in table and table[c].notna().any()]
     for column in shown:
@@ -170,23 +198,19 @@ def summary(table: pd.DataFrame, against: str | None = None) -> pd.DataFrame:
     if against is not None:
         found[column] = np.exp(found[column])
     found.insert(0, "runs", groups.size())
-    for place, (name, outcome) in enumerate(_COUNTED.items(), start=1):
+    found.insert(1, PATH, groups[PATH].agg(lambda s: "/".join(sorted(set(s)))))
+    for place, (name, outcome) in enumerate(_COUNTED.items(), start=2):
         found.insert(place, name, groups["status"].agg(lambda s, o=outcome: (s == o).sum()))
     return found.reset_index(drop=not by)
 
 
 def _error_ratio(table: pd.DataFrame, against: str) -> pd.Series[float]:
-    """Ratio of position error to an estimator's mean one on the same recording.
-
-    Errors are of the revised path where there is one, else of the online one.
-    """
+    """Ratio of position error, of the best answers, to an estimator's mean one on a recording."""
     one = table[table["choice.estimator"] == against]
     if one.empty:
         raise InputError(f"no rows of estimator {against}")
     if own := [c for c in telling(one) if c.startswith("estimator.")]:
         print(f"{against} is the mean over its {', '.join(own)}", file=sys.stderr)
-    error = table["ate_rmse_m"]
-    if "revised_ate_rmse_m" in table:
-        error = table["revised_ate_rmse_m"].fillna(error)
+    error = table["answer_ate_rmse_m"]
     reference = error[one.index].groupby(one["recording_checksum"]).mean()
     return error / table["recording_checksum"].map(reference)

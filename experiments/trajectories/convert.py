@@ -1,6 +1,7 @@
 """Recordings and estimates into the files that other tools open, by the ending of the name."""
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +12,12 @@ from experiments.trajectories.odometry import (
     write_odometry_csv,
     write_odometry_json,
 )
-from sim.errors import InputError, required
+from sim.errors import InputError, require, required
 from sim.formats.tum import write_tum
 from sim.recording import Recording, save
 
 _BAGS = (".mcap", ".bag", ".db3", "")
+ESTIMATES = (".tum", ".csv", ".json", *_BAGS)
 
 
 def write_recording(path: Path, recording: Recording) -> None:
@@ -89,9 +91,24 @@ def write_estimate(
         track = Track(estimate.stamps, estimate.means, estimate.covariances, landmarks, twists)
         write_bag(path, recording, {"estimate": track}, slip=slip)
     else:
-        raise InputError(
-            f"{path}: unknown ending {path.suffix!r}; known: .tum .csv .json .mcap .bag .db3"
-        )
+        check_estimate_name(path)
+
+
+def check_estimate_name(path: Path) -> None:
+    """Refuse a name that `write_estimate` could not write to, before anything is computed."""
+    require(
+        path.name and path.suffix in ESTIMATES,
+        f"{path}: unknown ending {path.suffix!r}; known: {' '.join(filter(None, ESTIMATES))}",
+    )
+
+
+def is_estimate(paths: Sequence[Path]) -> bool:
+    """Whether a log is an estimate by its name and its first bytes: .tum, or our .csv."""
+    if not paths[0].is_file():
+        return False
+    with paths[0].open("rb") as file:
+        ours = file.read(12) == b"header.stamp"
+    return paths[0].suffix == ".tum" or ours
 
 
 def _slip(recording: Recording) -> tuple[float, float] | None:

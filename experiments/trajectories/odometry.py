@@ -152,6 +152,8 @@ def read_odometry_csv(path: Path) -> Estimate:
         raise InputError(f"{path}: cannot read ({error})") from error
     require(rows, f"{path}: holds no record; write it with `estima run`")
     stamps, x, y, z, w, *covariances = np.array(rows).T
+    zero = np.hypot(z, w) < 0.5  # no rotation; that of an estimate that diverged is NaN
+    require(not zero.any(), f"{path}:{2 + int(np.argmax(zero))}: the quaternion's length must be 1")
     heading = se2.wrap(2.0 * np.arctan2(z, w))
     full = np.stack(covariances, axis=1).reshape(-1, 6, 6)
     return Estimate(stamps, np.column_stack([x, y, heading]), full[PLANAR])

@@ -1,0 +1,332 @@
+"""Rows of trajectories that other programs made of a recording."""
+
+import hashlib
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from estimators.base import Estimate
+from experiments.evaluation.metrics import (
+    RPE_DISTANCES_M,
+    alignment,
+    heading_errors_rad,
+    pairs_by_distance,
+    path_scores,
+    position_errors_m,
+    relative_errors,
+    rms,
+)
+from experiments.evaluation.time_sync import Rows, nearest
+from experiments.runs.columns import OF_THE_RUN, REVISED
+from experiments.runs.experiment import files_digest, rows_folder
+from experiments.runs.row import Row, Status
+from experiments.runs.store import write_run
+from experiments.runs.version import code_version
+from experiments.trajectories.read import read_trajectory
+from sim import se2
+from sim.arrays import Array
+from sim.errors import InputError, require
+from sim.formats.detect import read_any
+from sim.recording import Recording
+
+
+class Align(StrEnum):
+    """How a trajectory is moved before it is scored."""
+
+    NONE = "none"
+    START = "start"  # its first scored pose onto the true one
+    SE2 = "se2"  # least squares of the positions, no scale
+
+
+class Match(StrEnum):
+    """Which true pose belongs to a stamp."""
+
+    INTERPOLATED = "interpolated"
+    NEAREST = "nearest"  # as evo associates: the shorter trajectory's stamps with the other's
+
+
+@dataclass(frozen=True)
+class Scoring:
+    """How a trajectory is scored.
+
+    Attributes
+    ----------
+    align, match
+        How it is moved, and which true poses it meets.
+    tolerance_s
+        Greatest difference of stamps that match, of `nearest`.
+    offset_s
+        Added to the trajectory's stamps.
+    revised
+        Whether it is a revised path, not an online one.
+    cpu_seconds
+        Processor time of the whole run, if it is known.
+    """
+
+    align: Align = Align.NONE
+    match: Match = Match.INTERPOLATED
+    tolerance_s: float = 0.01
+    offset_s: float = 0.0
+    revised: bool = False
+    cpu_seconds: float | None = None
+
+    def __post_init__(self) -> None:
+        require(math.isfinite(self.offset_s), f"--offset must be finite, got {self.offset_s:g}")
+        require(
+            0.0 <= self.tolerance_s < math.inf,
+            f"--tolerance must be zero or a positive number, got {self.tolerance_s:g}",
+        )
+        spent = self.cpu_seconds
+        require(
+            spent is None or 0.0 <= spent < math.inf,
+            f"--cpu-seconds must be zero or a positive number, got {spent}",
+        )
+
+
+@dataclass(frozen=True)
+class Scored:
+    """A trajectory beside the truth.
+
+    Attributes
+    ----------
+    estimate, truth
+        The poses that are scored, moved and with the recording's clock, and the true ones (N, 3).
+    moved_by
+        (3,) T_map_trajectory that moved it, m, m, rad.
+    n_given
+        Poses of the trajectory.
+    n_left_out
+        Those that meet no true pose.
+    longest_gap_s
+        Longest time without a pose, between the recording's first Frame and its last.
+    """
+
+    estimate: Estimate
+    truth: Array
+    moved_by: Array
+    n_given: int
+    n_left_out: int
+    longest_gap_s: float
+
+
+def scored_against(recording: Recording, given: Estimate, how: Scoring) -> Scored:
+    """Match a trajectory with the truth, and move it.
+
+    Raises
+    ------
+    InputError
+        If the recording has no truth, or no pose meets a true one.
+    """
+    require(recording.truth is not None, "this recording has no truth to score against")
+    stamps = given.stamps + how.offset_s
+    rows: Rows
+    if how.match is Match.NEAREST:
+        rows, true_rows = _associated(stamps, recording.known_truth.stamps, how.tolerance_s)
+        truth = recording.known_truth.poses[true_rows]
+    else:
+        known = recording.truth_at(stamps)
+        rows = np.flatnonzero(np.isfinite(known).all(axis=1))
+        truth = known[rows]
+    start, end = recording.frame_stamps[[0, -1]]
+    true_start, true_end = recording.known_truth.stamps[[0, -1]]
+    require(
+        len(rows),
+        f"no pose meets a true one: the trajectory is from {stamps[0]:.9g} to {stamps[-1]:.9g} s, "
+        f"the truth from {true_start:.9g} to {true_end:.9g} s; set --offset",
+    )
+    means, covariances = given.means[rows], given.covariances[rows]
+    T = np.zeros(3)
+    if how.align is Align.START:
+        T = se2.compose(truth[0], se2.inverse(means[0]))
+    elif how.align is Align.SE2:
+        T = alignment(truth, means)
+    cos, sin = math.cos(T[2]), math.sin(T[2])
+    turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    moved = Estimate(stamps[rows], se2.compose(T, means), turn @ covariances @ turn.T)
+    instants = np.array([start, *stamps[rows][(stamps[rows] > start) & (stamps[rows] < end)], end])
+    left_out = len(stamps) - len(np.unique(rows))
+    return Scored(moved, truth, T, len(stamps), left_out, float(np.diff(instants).max(initial=0.0)))
+
+
+def _associated(stamps: Array, true_stamps: Array, tolerance_s: float) -> tuple[Rows, Rows]:
+    """Rows of both that belong together, as evo finds them: nearest stamps of the shorter one."""
+    longer = len(true_stamps) > len(stamps)
+    short, long = (stamps, true_stamps) if longer else (true_stamps, stamps)
+    rows = nearest(long, short)
+    near = np.abs(long[rows] - short) <= tolerance_s
+    pair: tuple[Rows, Rows] = np.flatnonzero(near), rows[near]
+    return pair if longer else (pair[1], pair[0])
+
+
+def statistics(errors: Array) -> dict[str, float]:
+    """What evo says of errors: rmse, mean, median, std, min, max, sse."""
+    size = np.abs(errors)
+    return {
+        "rmse": rms(size),
+        "mean": float(np.mean(size)),
+        "median": float(np.median(size)),
+        "std": float(np.std(size)),
+        "min": float(np.min(size)),
+        "max": float(np.max(size)),
+        "sse": float(np.sum(np.square(size))),
+    }
+
+
+def error_table(scored: Scored) -> dict[str, dict[str, float]]:
+    """Statistics of each error; those over a distance only where the truth is that long."""
+    truth, means = scored.truth, scored.estimate.means
+    found = {
+        "position error, m": statistics(position_errors_m(truth, means)),
+        "heading error, rad": statistics(heading_errors_rad(truth, means)),
+    }
+    for distance in RPE_DISTANCES_M:
+        pairs = pairs_by_distance(truth, distance)
+        if len(pairs):
+            errors = relative_errors(truth, means, pairs)
+            lengths = np.hypot(errors[:, 0], errors[:, 1])
+            found[f"position over {distance:g} m, m"] = statistics(lengths)
+            found[f"heading over {distance:g} m, rad"] = statistics(errors[:, 2])
+    return found
+
+
+def row_of(
+    recording: Recording,
+    scored: Scored,
+    how: Scoring,
+    *,
+    files: tuple[Path, Path],
+    estimator: str,
+    name: str,
+    repeat: int = 0,
+) -> Row:
+    """Return the row of a trajectory, as a run over the recording from its file has one.
+
+    Parameters
+    ----------
+    files
+        Of the recording and of the trajectory.
+    estimator, name
+        What made the trajectory, and the folder of the row.
+    """
+    given = {key: value for key, value in vars(how).items() if key != "cpu_seconds"}
+    settings = {f"trajectory.{key}": value for key, value in given.items()}
+    settings |= {"trajectory.align": how.align.value, "trajectory.match": how.match.value}
+    checksum = recording.checksum
+    origin = [checksum, sorted(files_digest({"file": str(files[1])}).values()), settings, estimator]
+    key = hashlib.sha256(json.dumps(origin).encode()).hexdigest()[:16]
+    seed = recording.config.get("seed")
+    row: Row = {
+        "choice.estimator": estimator,
+        "seed": seed if isinstance(seed, int) and not isinstance(seed, bool) else 0,
+        "repeats": 1,
+        "recording": str(files[0]),
+        "name": name,
+        "trajectory.file": str(files[1]),
+        **settings,
+        "repeat": repeat,
+        "run_key": key,
+        "code_version": code_version(),
+        "recording_checksum": checksum,
+        **Status().columns(),
+        "duration_s": float(np.ptp(scored.estimate.stamps)),
+        "stamps_scored": len(scored.truth),
+        "stamps_left_out": scored.n_left_out,
+        "longest_gap_s": scored.longest_gap_s,
+    }
+    if how.cpu_seconds is not None:
+        row["cpu_time_us"] = 1e6 * how.cpu_seconds / scored.n_given
+    scores = path_scores(scored.truth, scored.estimate.means, scored.estimate.covariances)
+    prefix = REVISED if how.revised else ""
+    return row | {k if k in OF_THE_RUN else f"{prefix}{k}": v for k, v in scores.items()}
+
+
+def score_files(
+    path: Path,
+    trajectories: Sequence[Path],
+    how: Scoring,
+    *,
+    topic: str | None = None,
+    estimator: str | None = None,
+    name: str = "score",
+) -> list[tuple[Path, Row, Scored]]:
+    """Score trajectories of a recording's file, and write their rows to results/runs/NAME.
+
+    Parameters
+    ----------
+    topic
+        Of trajectories in bags.
+    estimator
+        What made the trajectory; None: each is called by its file.
+    """
+    folder = rows_folder(name)
+    alone = len(trajectories) == 1 or (estimator is None and how.cpu_seconds is None)
+    require(alone, "--as and --cpu-seconds are of one trajectory; score them one by one")
+    names = [estimator or trajectory.stem for trajectory in trajectories]
+    require(
+        len(set(names)) == len(names),
+        f"two trajectories called {max(names, key=names.count)}; score them one by one with --as",
+    )
+    recording = read_any([path])
+    results = []
+    for trajectory, called in zip(trajectories, names, strict=True):
+        given = read_trajectory(trajectory, topic)
+        try:
+            scored = scored_against(recording, given, how)
+        except InputError as error:
+            raise InputError(f"{trajectory}: {error}") from error
+        row = row_of(recording, scored, how, files=(path, trajectory), estimator=called, name=name)
+        results.append((trajectory, row, scored))
+    for _, row, _ in results:
+        write_run([row], folder)
+    return results
+
+
+def as_text(scored: Scored, how: Scoring) -> str:
+    """Say what was scored, and the statistics of its errors."""
+    errors = error_table(scored)
+    heads = list(next(iter(errors.values())))
+    lines = [f"  {'':<24}" + "".join(f"{head:>19}" for head in heads)]
+    for error, values in errors.items():
+        lines.append(f"  {error:<24}" + "".join(f"{values[head]:>19.12g}" for head in heads))
+    return "\n".join([described(scored, how), *lines])
+
+
+def described(scored: Scored, how: Scoring) -> str:
+    """Say what was scored: stamps, gaps, alignment."""
+    stamps = scored.estimate.stamps
+    matching = (
+        "the truth is interpolated at their stamps"
+        if how.match is Match.INTERPOLATED
+        else f"each with the nearest true stamp within {how.tolerance_s:g} s"
+    )
+    x, y, heading = scored.moved_by
+    moved = {
+        Align.NONE: "not aligned",
+        Align.START: "aligned at the first scored pose",
+        Align.SE2: "aligned by SE(2), least squares",
+    }[how.align]
+    if how.align is not Align.NONE:
+        moved += f": moved by ({x:.6g} m, {y:.6g} m, {heading:.6g} rad)"
+    offset = f", {how.offset_s:+g} s on the stamps" if how.offset_s else ""
+    return (
+        f"  {scored.n_given} poses, {len(scored.truth)} scored from {stamps[0]:.9g} to "
+        f"{stamps[-1]:.9g} s, {scored.n_left_out} left out; {matching}{offset}\n"
+        f"  longest time without a pose: {scored.longest_gap_s:.3g} s\n"
+        f"  {'revised' if how.revised else 'online'} path, {moved}"
+    )
+
+
+def as_scoring(**options: Any) -> Scoring:
+    """Build a Scoring of the command line's words; InputError names the known ones."""
+    for key, kind in (("align", Align), ("match", Match)):
+        word = str(options[key])
+        if word not in list(kind):
+            raise InputError(f"--{key} must be one of {', '.join(kind)}, got {word}")
+        options[key] = kind(word)
+    return Scoring(**options)

@@ -1,0 +1,102 @@
+"""Trajectories of one drive over one another: paths, errors over time, and a table."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from estimators.base import Estimate
+from experiments.evaluation.metrics import heading_errors_rad, position_errors_m
+from experiments.runs.score import Scored, Scoring, error_table, scored_against
+from experiments.trajectories.read import read_trajectory
+from experiments.viewing.plotting import plan_axes
+from experiments.viewing.style import CYCLE, TRUTH, figure, save_figure
+from experiments.viewing.world import draw_world
+from sim.errors import InputError, require
+from sim.formats.detect import read_any
+from sim.recording import Recording, Truth, WheelLog
+from sim.robot import RobotGeometry
+
+_STYLES = ("-", "--", ":", "-.")
+
+
+def reference_of(first: Estimate) -> Recording:
+    """Recording whose truth is a trajectory, so that others can be compared with it."""
+    stamps = first.stamps
+    wheels = WheelLog(stamps, np.zeros((len(stamps), 2)))
+    truth = Truth(stamps, first.means)
+    return Recording(stamps.copy(), wheels, RobotGeometry(0.1, 0.3), truth=truth)
+
+
+def compare_files(
+    trajectories: Sequence[Path], log: Path | None, out: Path, how: Scoring, topic: str | None
+) -> pd.DataFrame:
+    """Draw trajectories beside a log's truth, or beside the first of them; return their table."""
+    names = [[path.stem for path in trajectories], [path.name for path in trajectories]]
+    short = next((n for n in names if len(set(n)) == len(n)), [str(path) for path in trajectories])
+    given = {n: read_trajectory(path, topic) for n, path in zip(short, trajectories, strict=True)}
+    reference = "truth"
+    if log is not None:
+        recording = read_any([log])
+    else:
+        require(len(given) >= 2, "one trajectory alone: add others, or --recording for the truth")
+        reference = next(iter(given))
+        recording = reference_of(given.pop(reference))
+    found = {}
+    for name, estimate in given.items():
+        try:
+            found[name] = scored_against(recording, estimate, how)
+        except InputError as error:
+            raise InputError(f"{name}: {error}") from error
+    save_figure(compare_figure(recording, found, reference), out)
+    return compare_table(found)
+
+
+def compare_table(found: Mapping[str, Scored]) -> pd.DataFrame:
+    """Root mean squares of all errors, greatest position error, and what was scored."""
+    rows = []
+    for name, scored in found.items():
+        errors = error_table(scored)
+        row: dict[str, object] = {"trajectory": name}
+        row |= {error: values["rmse"] for error, values in errors.items()}
+        row["greatest position error, m"] = errors["position error, m"]["max"]
+        row |= {"scored": len(scored.truth), "left out": scored.n_left_out}
+        rows.append({**row, "longest gap, s": scored.longest_gap_s})
+    return pd.DataFrame(rows)
+
+
+def compare_figure(recording: Recording, found: Mapping[str, Scored], reference: str) -> Figure:
+    """Paths in the plane on the left; errors of position and heading over time on the right.
+
+    Parameters
+    ----------
+    reference
+        What the others are compared with: `truth`, or a trajectory's name.
+    """
+    page = figure(10.0, 4.8)
+    halves: Any = page.subfigures(1, 2, width_ratios=(1.0, 1.15))
+    ax = halves[0].subplots()
+    if recording.world is not None:
+        draw_world(ax, recording.world, landmarks=False)
+    ax.plot(*recording.known_truth.poses[:, :2].T, color=TRUTH, lw=2.0, label=reference)
+    above, below = halves[1].subplots(2, 1, sharex=True)
+    for i, (name, scored) in enumerate(found.items()):
+        style = {"color": CYCLE[i % 6], "ls": _STYLES[i // 6 % 4], "lw": 1.1}
+        estimate, truth = scored.estimate, scored.truth
+        ax.plot(*estimate.means[:, :2].T, label=name, **style)
+        above.plot(estimate.stamps, position_errors_m(truth, estimate.means), **style)
+        off = np.degrees(np.abs(heading_errors_rad(truth, estimate.means)))
+        below.plot(estimate.stamps, off, **style)
+    plan_axes(ax)
+    above.set_ylabel("position error, m")
+    below.set_ylabel("heading error, deg")
+    below.set_xlabel("time, s")
+    for axes in (above, below):
+        axes.set_ylim(bottom=0.0)
+    above.set_title(f"difference from {reference}", fontsize="medium")
+    ncols = 3 if max(map(len, found)) < 16 else 1
+    ax.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=ncols, fontsize="small")
+    return page

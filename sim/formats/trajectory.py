@@ -1,0 +1,87 @@
+"""Trajectories of other programs: TUM files, and nav_msgs/Odometry in bags and MCAP files."""
+
+from pathlib import Path
+
+import numpy as np
+
+from sim.errors import InputError, require
+from sim.files import require_file
+from sim.formats.rosbag import Track
+from sim.formats.tum import read_tum
+
+_BAGS = (".mcap", ".bag", ".db3")
+_MAGIC = (b"#ROSBAG", b"\x89MCAP", b"SQLite format 3")
+_OTHERS = ("odom", "ground_truth")  # topics that are no estimate unless they are asked for
+
+
+def read_track(path: Path, topic: str | None = None) -> Track:
+    """Read a trajectory, with its covariances where the file has them, else with zeros.
+
+    Parameters
+    ----------
+    topic
+        Of a bag, the one to read; None: `estimate`, or the only one that is neither `odom` nor
+        `ground_truth`.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, or `check_track` refuses what it holds.
+    """
+    if path.is_dir() or path.suffix in _BAGS or _head(path).startswith(_MAGIC):
+        track = _of_bag(path, topic)
+    else:
+        require(topic is None, f"{path}: a topic is of a bag, and this is none")
+        stamps, means = read_tum(path)
+        track = Track(stamps, means, np.zeros((len(stamps), 3, 3)))
+    check_track(track, path)
+    return track
+
+
+def check_track(track: Track, path: Path) -> None:
+    """Check that a file's trajectory has poses, finite ones, at stamps that increase.
+
+    Raises
+    ------
+    InputError
+        Naming the file and the pose.
+    """
+    require(len(track.stamps), f"{path}: holds no pose")
+    sound = np.isfinite(track.stamps) & np.isfinite(track.means).all(axis=1)
+    require(sound.all(), f"{path}: pose {int(np.argmin(sound)) + 1} is not finite")
+    rising = np.diff(track.stamps) > 0.0
+    if not rising.all():
+        row = int(np.argmin(rising))
+        before, after = track.stamps[row : row + 2]
+        raise InputError(
+            f"{path}: stamps must increase; pose {row + 2} at {after:.9g} s follows one at "
+            f"{before:.9g} s"
+        )
+
+
+def _head(path: Path) -> bytes:
+    require_file(path)
+    try:
+        with path.open("rb") as file:
+            return file.read(16)
+    except OSError as error:
+        raise InputError(f"{path}: cannot read ({error.strerror})") from error
+
+
+def _of_bag(path: Path, topic: str | None) -> Track:
+    from sim.formats.rosbag_in import read_tracks
+
+    tracks = read_tracks(path)
+    if topic is None:
+        own = [name for name in tracks if name not in _OTHERS]
+        topic = "estimate" if "estimate" in own or len(own) != 1 else own[0]
+    track = tracks.get(topic.lstrip("/"))
+    if track is None:
+        raise InputError(
+            f"{path}: no nav_msgs/Odometry on {topic}; there is {', '.join(tracks) or 'none'}; "
+            "name one with --topic"
+        )
+    covariances = track.covariances.copy()
+    unknown = np.diagonal(covariances, axis1=1, axis2=2).min(axis=1, initial=0.0) < 0.0
+    covariances[unknown] = 0.0  # ROS marks by -1 what is not known
+    return Track(track.stamps, track.means, covariances)
