@@ -428,6 +428,7 @@ def test_the_sweeps_of_a_study_are_a_list_of_mappings(tmp_path, sweeps):
         ("hydra: {sweeper: {max_batch_size: 1}}", False),
         ("hydra: {launcher: {n_jobs: 1}}", False),
         ("hydra: 3", False),
+        ("hydra: {sweeper: 3}", False),
         ("defaults: [{override /hydra/launcher: basic}]", False),
     ],
 )

@@ -575,20 +575,18 @@ def searched(config_dir: str | Path | None) -> list[str]:
 
 def _check_hydra_of(path: Path, option: Mapping[str, Any]) -> None:
     """Check that an option's file has none of Hydra's settings that nothing here reads."""
-    hydra = option.get("hydra") or {}
-    sweeper = hydra.get("sweeper") or {} if isinstance(hydra, dict) else {}
-    read = {"sweeper": {"params": sweeper["params"]}} if "params" in sweeper else {}
-    chosen = [
-        group
-        for entry in option.get("defaults") or ()
-        for group in (entry if isinstance(entry, dict) else ())
-        if re.match(r"(override +)?/hydra/", group)
+    defaults = option.get("defaults")
+    entries = [e for e in defaults if isinstance(e, dict)] if isinstance(defaults, list) else []
+    set_here = [group for entry in entries for group in entry if "/hydra/" in str(group)]
+    set_here += [
+        ".".join(map(str, leaf))
+        for leaf, value in _leaves({"hydra": option.get("hydra")})
+        if value not in (None, {}) and leaf[:3] != ("hydra", "sweeper", "params")
     ]
-    if chosen or hydra not in (read, {}):
-        what = chosen[0] if chosen else "hydra"
+    if set_here:
         raise InputError(
-            f"{path}: {what}: of Hydra's settings a file's hydra.sweeper.params alone has an "
-            "effect; give hydra/launcher and hydra.launcher on the command line"
+            f"{path}: {set_here[0]}: of Hydra's settings a file's hydra.sweeper.params alone has "
+            "an effect; give hydra/launcher and hydra.launcher on the command line"
         )
 
 

@@ -66,7 +66,7 @@ def sweep(arguments: Sequence[str], config_dir: str | None = None) -> None:
     ----------
     arguments
         Hydra's overrides. A study's `sweeps` are a list of further ones, each with its values;
-        `hydra.sweeper.params` are swept where the arguments do not say otherwise. Those of
+        its `hydra.sweeper.params` are swept where the arguments do not say otherwise. Those of
         `hydra/launcher` and `hydra.launcher` go to the launcher; `jobs` is the number of jobs
         that the runs are packed into.
     config_dir
