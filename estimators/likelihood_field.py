@@ -80,6 +80,8 @@ class LikelihoodField:
         ends
             (2, B) where the beams end in base_link, m, as from `beam_ends`.
         """
+        if not np.isfinite(poses).all():  # compiled code would read beyond the table
+            raise FloatingPointError("poses of particles are not finite")
         counts = np.empty(len(poses), np.int64)
         rows, columns = self.table.shape
         _look_up(

@@ -485,7 +485,13 @@ class Experiment:
         return sources
 
     def prior(self, recording: Recording) -> Prior:
-        """Return what the estimator knows at the start."""
+        """Return what the estimator knows at the start.
+
+        Raises
+        ------
+        InputError
+            If a start pose is wanted, and the truth does not cover the first Frame.
+        """
         self._check_prior()
         settings = self.config["prior"]
         geometry = dataclasses.asdict(recording.robot)
@@ -497,7 +503,7 @@ class Experiment:
         sigma = np.array([settings["sigma_position_m"]] * 2 + [settings["sigma_heading_rad"]])
         start = np.zeros(3)
         if recording.truth is not None:
-            start = recording.truth_at(recording.frame_stamps[:1])[0]
+            start = _true_start(recording)
         offset = sigma * stream(self.config["seed"], "prior").standard_normal(3)
         return Prior(robot, recording.sensors, start + offset, np.diag(np.square(sigma)), known_map)
 
@@ -513,6 +519,20 @@ class Experiment:
         if recording.world is None:
             raise InputError("prior.map=world, but the recording has no map; set prior.map=none")
         return recording.world
+
+
+def _true_start(recording: Recording) -> Array:
+    """True pose (3,) at the first Frame."""
+    begin_s = float(recording.frame_stamps[0])
+    start: Array = recording.truth_at(recording.frame_stamps[:1])[0]
+    spans = recording.known_truth.stamps[[0, -1]]
+    require(
+        bool(np.isfinite(start).all()),
+        f"the first Frame is at {begin_s:.2f} s, and the truth spans {spans[0]:.2f} to "
+        f"{spans[1]:.2f} s: no start pose is known; cut the recording to the time of its truth, "
+        "or set prior.start=global",
+    )
+    return start
 
 
 def rows_folder(name: Any) -> Path:
