@@ -176,14 +176,15 @@ class Experiment:
 
     @property
     def key(self) -> str:
-        """Digest of what decides the rows: configuration, recording, map, code.
+        """Digest of what decides the rows: configuration, recording, map, files named, code.
 
         It is the sum of a digest for each leaf, and one of files and code, modulo 2^64. So the
         keys of a product of values are sums too, and a sweep of a million runs knows them at once.
         """
         settings = {key: value for key, value in self.config.items() if key not in _NOT_IN_KEY}
-        known_map = files_digest(self.config["prior"].get("map"))
-        total = leaf_digest((), [self._recording_sources(), known_map, self._code_version()])
+        files = files_digest(self.config["prior"].get("map"))
+        files |= files_of_options(self.config["estimator"])
+        total = leaf_digest((), [self._recording_sources(), files, self._code_version()])
         total += sum(leaf_digest(leaf, value) for leaf, value in _leaves(settings))
         return f"{total % 2**64:016x}"
 
@@ -477,6 +478,8 @@ class Experiment:
             sources["world_file"] = _digest(Path(world_file))
             if (image := grid_file.image_of(Path(world_file))) is not None:
                 sources["world_image"] = _digest(image)
+        if files := files_of_options(self.config["route"].get("feedback")):
+            sources["feedback_files"] = files
         elsewhere = {target: source_digest(target) for target in sorted(targets(self._simulated()))}
         if any(elsewhere.values()):  # a sensor, route or world of one's own, edited: another one
             sources["sources"] = elsewhere
@@ -693,6 +696,19 @@ def files_digest(tree: Any) -> dict[str, str]:
     except OSError:  # too long for a path, say
         return {}
     return {str(file): _digest(file) for file in files if file.is_file()}
+
+
+def files_of_options(options: Any) -> dict[str, str]:
+    """Digest of every file that an estimator's options name, a list's items included.
+
+    A word without a suffix or a slash is no file, but the name of a sensor or a method.
+    """
+    found: dict[str, str] = {}
+    for _, value in _leaves({"": options}):
+        for text in value if isinstance(value, list) else [value]:
+            if isinstance(text, str) and ("/" in text or Path(text).suffix):
+                found |= files_digest(text)
+    return found
 
 
 def _digest(path: Path) -> str:
