@@ -9,9 +9,12 @@ from estimators import ekf_slam
 from estimators.base import Prior, run
 from estimators.ekf_icp import EkfIcp
 from estimators.ekf_slam import EkfSlam
+from estimators.fastslam import FastSLAM
+from estimators.fixed_lag import FixedLag
 from estimators.icp_odometry import IcpOdometry
 from estimators.likelihood_field import beam_ends, likelihood_field
 from estimators.scan_lines import prepare
+from estimators.smoother import Smoother
 from experiments.runs.experiment import Experiment
 from sim.errors import InputError
 from sim.sensors import Laser
@@ -124,3 +127,20 @@ def test_poses_that_are_not_finite_do_not_reach_compiled_code(recording):
     field = likelihood_field(prior.map, recording.sensors["laser"])
     with pytest.raises(FloatingPointError, match="not finite"):
         field.log_likelihood(np.array([[0.0, np.nan, 0.0]]), np.ones((2, 4), np.float32))
+
+
+@pytest.mark.parametrize("estimator", [EkfSlam, FastSLAM, Smoother, FixedLag])
+@pytest.mark.parametrize("poor", [np.nan, np.inf, 1e300, 0.0, "duplicate"])
+def test_every_landmark_method_tells_what_it_rejects(recording, estimator, poor):
+    log = recording.log("stereo")
+    points, ids = log["points_in_camera"].copy(), log["ids"].copy()
+    if poor == "duplicate":
+        ids[1], word = ids[0], "duplicate id rejected"
+    else:
+        points[0], word = poor, "observation without depth rejected"
+    odd = fakes.with_field(recording, "stereo", points_in_camera=points, ids=ids)
+    prior = fakes.tracking_prior(recording)
+    found = [run(estimator(), r, prior, np.random.default_rng(0)) for r in (odd, recording)]
+    assert found[0].status.startswith(word)
+    assert found[1].status == "ok"
+    assert np.isfinite(found[0].means).all()
