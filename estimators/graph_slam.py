@@ -297,7 +297,7 @@ class GraphSlam:
         self._held = [*self._held, *found][-_MOST_HELD:]
         agreed = self._search.consistent(self._graph, self._held)
         believed = sum(e.second >= oldest for e in self._graph.closures[-self.loop_support :])
-        if len(agreed) + believed >= self.loop_support:
+        if agreed and len(agreed) + believed >= self.loop_support:
             self._held = [edge for edge in self._held if edge not in agreed]
             self._graph.close(agreed, _ONLINE_TOLERANCE)
 

@@ -108,7 +108,11 @@ class LoopSearch:
         return best.motion
 
     def consistent(self, graph: PoseGraph, edges: list[Edge]) -> list[Edge]:
-        """The largest set found in which each and each pair is consistent with the graph."""
+        """The largest set found in which each and each pair is consistent with the graph.
+
+        Empty if another set, which contradicts it, has more than half as many members: a place
+        may have a twin, and what follows will tell them apart.
+        """
         off, S = graph.joint_innovation(edges)
         k = len(edges)
         agree = np.empty((k, k), dtype=bool)
@@ -118,15 +122,25 @@ class LoopSearch:
                 agree[a, b] = agree[b, a] = within_gate(
                     off[both], S[np.ix_(both, both)], self.gate_probability
                 )
-        order = np.argsort(-agree.sum(axis=1), kind="stable").tolist()
-        best: list[int] = []
-        for seed in (i for i in order if agree[i, i]):
-            members = [seed]
-            for other in order:
-                if other != seed and agree[other, members].all():
-                    members.append(other)
-            best = max(best, members, key=len)
+        best = _largest_clique(agree, np.flatnonzero(agree.diagonal()))
+        against = agree.diagonal() & ~agree[:, best].all(axis=1)
+        rival = _largest_clique(agree, np.flatnonzero(against))
+        if 2 * len(rival) > len(best):
+            return []
         return [edges[i] for i in sorted(best)]
+
+
+def _largest_clique(agree: NDArray[np.bool_], of: Ints) -> list[int]:
+    """The largest set found, greedily from each of these, whose members all agree."""
+    order = of[np.argsort(-agree[np.ix_(of, of)].sum(axis=1), kind="stable")].tolist()
+    best: list[int] = []
+    for seed in order:
+        members = [seed]
+        for other in order:
+            if other != seed and agree[other, members].all():
+                members.append(other)
+        best = max(best, members, key=len)
+    return best
 
 
 def within_gate(off: Array, covariance: Array, probability: float) -> bool:

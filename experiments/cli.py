@@ -140,7 +140,9 @@ def _draw_run(
     from experiments.viewing.style import save_figure
 
     write_estimate(folder / "estimate.csv", estimate, recording, slip=experiment.believed_slip)
-    save_figure(run_figure(recording, estimate, experiment.estimator_name), folder / "run.png")
+    revised = " (revised)" if estimate.kind == "revised" else ""
+    name = f"{experiment.estimator_name}{revised}"
+    save_figure(run_figure(recording, estimate, name), folder / "run.png")
 
 
 @app.command()
@@ -280,7 +282,7 @@ def view(
         typer.Option(
             "--estimate",
             "-e",
-            help="An estimate.csv, its folder, or an estimator to run now.",
+            help="A trajectory (.csv, .tum, .mcap), a run's folder, or an estimator to run now.",
             autocompletion=completion.estimators,
         ),
     ] = None,
@@ -412,7 +414,7 @@ def build_map(
         typer.Option(
             "--estimate",
             "-e",
-            help="truth, an estimate.csv, its folder, or an estimator to run now.",
+            help="truth, a trajectory (.csv, .tum), a run's folder, or an estimator to run now.",
             autocompletion=completion.estimators,
         ),
     ] = "truth",

@@ -202,7 +202,11 @@ def test_results_need_a_folder(arguments):
 def test_a_malformed_option_names_its_file(tmp_path):
     (tmp_path / "estimator").mkdir()
     (tmp_path / "estimator" / "c.yaml").write_text("kr: [1\n  a: : b\n")
-    refused(estima("run", "--config-dir", str(tmp_path), "estimator=c", *QUICK), "c.yaml:2", "not valid YAML")
+    refused(
+        estima("run", "--config-dir", str(tmp_path), "estimator=c", *QUICK),
+        "c.yaml:2",
+        "not valid YAML",
+    )
 
 
 def test_damaged_recordings_are_refused(tmp_path):

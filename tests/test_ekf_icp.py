@@ -56,7 +56,7 @@ class _Perfect:
         a, b = int(reference[0]), int(scan[0])
         motion = se2.between(self.apparent[a], self.apparent[b])
         motion = motion + self.rng.multivariate_normal(np.zeros(3), (1 - self.share) * self.R)
-        return Match(Gaussian(motion, self.R), "ok", np.eye(3), np.zeros((3, 3)))
+        return Match(Gaussian(motion, self.R), "ok", np.eye(3), np.zeros((3, 3)), 1.0)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.7, 1.0])

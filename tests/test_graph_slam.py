@@ -147,6 +147,19 @@ def test_of_held_closures_those_that_agree_are_found():
     assert found == right
 
 
+def test_a_twin_of_a_place_makes_closures_wait():
+    """Closures that are all off by the same, as of a place that looks alike, against right ones."""
+    rng = np.random.default_rng(8)
+    graph, truth, _ = lap(120, rng)
+    right = [closure(truth, i, i + 85, rng) for i in (19, 21, 23, 25, 27, 29)]
+    twins = []
+    for i in (20, 22, 24, 26):
+        cos, sin = np.cos(truth[i, 2]), np.sin(truth[i, 2])
+        twins.append(closure(truth, i, i + 85, rng, off=(0.3 * cos, -0.3 * sin, 0.0)))  # in map
+    assert search().consistent(graph, [*right, *twins]) == []
+    assert search().consistent(graph, [*right, *twins[:2]]) == right
+
+
 def test_agrees_with_gtsam():
     gtsam = pytest.importorskip("gtsam")
     rng = np.random.default_rng(6)

@@ -86,7 +86,7 @@ def test_nothing_is_judged(tmp_path, monkeypatch):
     monkeypatch.setenv("ESTIMA_RESULTS", str(tmp_path))
     monkeypatch.setattr("experiments.papers.mcl_office.study.run", run)
     assert reproduce.reproduce_paper("mcl_office", Profile.QUICK) == []
-    assert (tmp_path / "figures" / "mcl_office_found.png").exists()
+    assert (tmp_path / "quick" / "figures" / "mcl_office_found.png").exists()
 
 
 @pytest.mark.slow

@@ -141,12 +141,16 @@ def test_each_claim_is_one_row_with_its_statistics_below(text):
     assert "0.25 [0.4, 0.6]" in folded
     assert "follows from its headline statistics" in page.all("caption")[0]["text"]
     assert "3 claims, by 5 statistics" in page.all("header")[0]["text"]
-    assert "1 reproduced, 1 not reproduced, 1 undecided" in page.all("header")[0]["text"]
+    (tile,) = (e["text"] for e in page.all("li") if "Covariance of dead" in e["text"])
+    assert tile.endswith("1 reproduced, 1 not reproduced, 1 undecided")
     assert "of 95 % unless the statistic says otherwise" in page.all("header")[0]["text"]
     assert "not judged yet" in rows["claim-GI8"]
     assert "nobody described" in rows["claim-ZZ9"]
     assert "<b>at large" not in text
-    assert text.index('id="claims"') < text.index('<h2 id="puzzlebot2024"')
+    order = ["claim-PB1", "claim-ZZ9", "claim-DC1"]  # each in its paper's section
+    places = [text.index(f'id="{name}"') for name in ("puzzlebot2024", *order)]
+    assert places == sorted(places)
+    assert text.index('id="leaderboard"') < places[0]
 
 
 def test_a_figure_without_a_caption_still_shows(text):
@@ -186,10 +190,12 @@ def test_constants_are_printed_as_they_are_written(results, tmp_path, monkeypatc
 
 
 def test_what_belongs_to_no_paper_comes_last_with_its_command(text):
-    own = {e.get("aria-labelledby"): e["text"] for e in Outline(text).all("section")}["own"]
+    page = Outline(text)
+    own = {e.get("aria-labelledby"): e["text"] for e in page.all("section")}["mcl_office"]
     assert "estima reproduce --paper mcl_office" in own
     assert "mcl_office_starts (2 rows, 2 columns)" in own
-    assert "Of no study here: nobody_knows.csv." in own
+    assert "Of no study here: nobody_knows.csv." in page.all("main")[0]["text"]
+    assert text.index('<h2 id="gil2008"') < text.index('<h2 id="mcl_office"')
     assert text.index('id="maximo2024"') < text.index('id="mcl_office_found"')
 
 
@@ -217,7 +223,7 @@ def test_an_origin_that_is_none_is_named(tmp_path, made, wrong):
 
 def test_an_empty_folder_gives_a_page_that_says_so(tmp_path):
     text = report.write_report(tmp_path).read_text()
-    assert "none yet" in text
+    assert "not judged yet" in text
     assert not Outline(text).all("img")
 
 
@@ -267,10 +273,10 @@ def test_a_browser_loads_it_whole_and_without_complaint(tab):
 
 def test_the_keyboard_skips_to_the_claims_and_opens_details(tab):
     tab.press("Tab")
-    assert tab.js("document.activeElement.textContent") == "Skip to the claims"
+    assert tab.js("document.activeElement.textContent") == "Skip to the results"
     assert tab.js("document.activeElement.getBoundingClientRect().left") >= 0  # it is shown
     tab.press("Enter", text="\r")
-    assert tab.becomes("location.hash == '#claims'")
+    assert tab.becomes("location.hash == '#leaderboard'")
     tab.press("Tab")
     assert tab.js("document.activeElement.textContent") == "PB1: statistics (1)"
     assert tab.js("getComputedStyle(document.activeElement).outlineStyle") == "solid"

@@ -30,7 +30,7 @@ from sim.recording import Recording
 
 FALSE_M, FALSE_RAD = 0.1, 0.03
 _NEAR_M, _NEAR_RAD, _APART_M = 2.0, 0.8, 10.0  # of a revisit: to an old key frame; and path between
-_TWIN = np.array([0.5, 0.0, 0.0])
+_TWIN_M = 0.5  # along x in map
 _ROOMS = (
     "world=rooms",
     "world.n_x=7",
@@ -66,7 +66,9 @@ class Planted(GraphSlam):
             first = int(self._chance.integers(newest))
             expected = se2.between(self.graph.poses[first], self.graph.poses[newest])
             anywhere = self._chance.uniform([-3.0, -3.0, -1.5], [3.0, 3.0, 1.5])
-            off = _TWIN if self._chance.random() < 0.5 else anywhere
+            heading = self.graph.poses[first, 2]
+            twin = _TWIN_M * np.array([np.cos(heading), -np.sin(heading), 0.0])
+            off = twin if self._chance.random() < 0.5 else anywhere
             noise = self.graph.noise_of(newest)
             self.false.append(Edge(first, newest, Gaussian(expected + off, noise)))
         return [*found, *self.false[len(self.false) - number :]]

@@ -3,7 +3,7 @@
 import base64
 import struct
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -51,17 +51,23 @@ def contents(results: Path, on_progress: Callable[[float], None]) -> dict[str, A
     commands |= {str(k): list(v.unique()) for k, v in table.groupby("paper")["command"]}
     studies = {}
     for done, (name, page) in enumerate(about.items(), start=1):
-        studies[name] = {**study(results, name, page, claims), "commands": commands[name]}
+        judged = [claims[key] for key in page["claims"]]
+        judged += [c for c in claims.values() if c["paper"] == name and c not in judged]
+        studies[name] = {
+            **study(results, name, page, claims),
+            "commands": commands[name],
+            "claims": judged,
+            "tally": tally(judged),
+        }
         on_progress(done / len(about))
     known = tuple(f"{name}_" for name in about)
     files = [*(results / "figures").glob("*.png"), *(results / "tables").glob("*.csv")]
     origins = made | {"this page": this_code()}
-    counts = Counter(claim["ruling"] for claim in claims.values() if claim["statistics"])
     return {
         "claims": claims,
         "n_statistics": len(table),
         "n_judged": table["id"].nunique(),
-        "tally": [f"{counts[verdict]} {verdict.label}" for verdict in Verdict if counts[verdict]],
+        "tally": tally(claims.values()),
         "n_quick": int((table["profile"] == Profile.QUICK).sum()),
         # a table that was cut off lacks these: claims without a verdict in papers that have some
         "missing": [
@@ -78,6 +84,12 @@ def contents(results: Path, on_progress: Callable[[float], None]) -> dict[str, A
         "details": list(dict.fromkeys(key for how in origins.values() for key in how)),
         "unknown": [paper for paper in papers if paper not in made],
     }
+
+
+def tally(claims: Iterable[Entry]) -> list[tuple[Verdict, int]]:
+    """How many claims came to each verdict; those that were not judged are left out."""
+    counts = Counter(claim["ruling"] for claim in claims if claim["statistics"])
+    return [(verdict, counts[verdict]) for verdict in Verdict if counts[verdict]]
 
 
 def findings(name: str) -> dict[str, Any]:
@@ -108,6 +120,7 @@ def judged_claims(
             "id": key,
             "says": says.get(key, ""),
             "sentence": sentences.get(key, ""),
+            "paper": statistics[0]["paper"] if statistics else "",
             "statistics": statistics,
             **verdict_on(statistics),
         }

@@ -54,10 +54,11 @@ def run_once(experiment: Experiment, draw: Draw, out: Path | None = None) -> lis
             return experiment.recording(on_progress)
 
     def keep(recording: Recording, repeat: int, online: Estimate, revised: Estimate | None) -> None:
+        answer = online if revised is None else revised
         if repeat == 0 and experiment.picture:
-            draw(recording, online, experiment, folder)
+            draw(recording, answer, experiment, folder)
         if repeat == 0 and out is not None:
-            write_estimate(out, online if revised is None else revised)
+            write_estimate(out, answer)
 
     rows = evaluate(
         experiment,

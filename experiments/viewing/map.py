@@ -12,7 +12,7 @@ from estimators.grid_mapping import map_scans
 from experiments.evaluation.time_sync import interpolate
 from experiments.runs.evaluate import estimates
 from experiments.runs.seeds import stream
-from experiments.viewing.view import experiment_over, read_estimate
+from experiments.viewing.view import experiment_over, is_file_of_estimate, read_estimate
 from sim.arrays import Array, Floats
 from sim.errors import InputError, require, required
 from sim.grid import OccupancyGrid
@@ -44,14 +44,14 @@ def path_of(
         Called with the number of Frames done.
     """
     file = Path(source)
-    if overrides and (source == "truth" or file.suffix == ".csv" or file.is_dir()):
+    if overrides and (source == "truth" or is_file_of_estimate(file)):
         raise InputError(f"{overrides[0]}: overrides are for estimators that are run now")
     if source == "truth":
         truth = required(recording.truth, "this recording has no truth; name an estimator with -e")
         return truth.stamps, truth.poses
     found = (
         read_estimate(recording, file)
-        if file.suffix == ".csv" or file.is_dir()
+        if is_file_of_estimate(file)
         else _run(recording, source, overrides, on_step)
     )
     sound = np.isfinite(found.means).all(axis=1)

@@ -23,6 +23,9 @@ from estimators.base import run as run_estimator
 from experiments.evaluation.metrics import CHI2_95_2DOF
 from experiments.runs.experiment import Experiment
 from experiments.runs.seeds import stream
+from experiments.trajectories.odometry import read_odometry_csv
+from experiments.trajectories.read import SUFFIXES as TRAJECTORIES
+from experiments.trajectories.read import read_trajectory
 from experiments.viewing.grid import draw_grid
 from experiments.viewing.plotting import plan_axes
 from experiments.viewing.style import (
@@ -131,8 +134,8 @@ def estimate_of(
     Parameters
     ----------
     source
-        A file `estimate.csv`, the folder of a run that has one, or the name of an estimator to run
-        over the recording.
+        A trajectory's file, the folder of a run with an `estimate.csv`, or the name of an estimator
+        to run over the recording.
     overrides
         Hydra overrides for that estimator.
     rows
@@ -146,7 +149,7 @@ def estimate_of(
         The estimate and its name.
     """
     path = Path(source)
-    if path.suffix == ".csv" or path.is_dir():
+    if is_file_of_estimate(path):
         if overrides:
             raise InputError(f"{overrides[0]}: overrides are for estimators that are run now")
         return read_estimate(recording, path), "estimate"
@@ -158,6 +161,11 @@ def estimate_of(
     return run_estimator(sparing, recording, prior, rng, _EXTRAS, on_step), source
 
 
+def is_file_of_estimate(path: Path) -> bool:
+    """Whether a word is a trajectory's file or a run's folder, and no estimator's name."""
+    return path.suffix in TRAJECTORIES or path.is_dir()
+
+
 def read_estimate(recording: Recording, path: Path) -> Estimate:
     """Read a recording's estimate from a file, or from the folder of a run.
 
@@ -166,11 +174,10 @@ def read_estimate(recording: Recording, path: Path) -> Estimate:
     InputError
         If it cannot be read, is not finite, or belongs to another recording.
     """
-    from experiments.trajectories.odometry import read_odometry_csv
-
     if path.is_dir():
         path /= "estimate.csv"
-    estimate, stamps = read_odometry_csv(path), recording.frame_stamps
+    stamps = recording.frame_stamps
+    estimate = read_odometry_csv(path) if path.suffix == ".csv" else read_trajectory(path)
     require(
         ((estimate.stamps >= stamps[0]) & (estimate.stamps <= stamps[-1])).any(),
         f"{path}: no stamp of it lies within the recording; is it another's?",

@@ -102,7 +102,7 @@ def _shared(relations: Relations, *stamps: Array) -> Relations:
 
 def draw(recording: Recording, before: Estimate, after: Estimate, folder: Path) -> Path:
     """Grid maps along two estimates, in one picture."""
-    page = figure(11.0, 6.0)
+    page = figure(11.0, 5.2)
     titles = {"by its edges alone": before, "with its loops closed": after}
     for ax, (title, path) in zip(page.subplots(1, 2), titles.items(), strict=True):
         grid, _ = grid_along(
