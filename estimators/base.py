@@ -28,6 +28,11 @@ class Prior:
         First belief, (3,) and (3, 3), m, m, rad in map; None for global localization.
     map
         World, OccupancyGrid or TopologicalMap, or None for SLAM.
+
+    Raises
+    ------
+    InputError
+        If the mean or the covariance is not finite.
     """
 
     robot: RobotGeometry
@@ -35,6 +40,11 @@ class Prior:
     mean: Array | None = None
     covariance: Array | None = None
     map: Any = None
+
+    def __post_init__(self) -> None:
+        for name, values in (("mean", self.mean), ("covariance", self.covariance)):
+            sound = values is None or bool(np.isfinite(values).all())
+            require(sound, f"the {name} of the prior must be finite, got {values}")
 
 
 @dataclass(frozen=True)

@@ -33,6 +33,7 @@ from sim.sensors import Reading
 
 Proposal = Literal["motion", "optimal"]
 
+_MOST_PARTICLES = 100_000  # a map of 100 landmarks each is about 1 GB
 _PLACING = 4  # observations after which the proposal is linearised again
 _MOST_DRIFT_RAD = 0.1  # heading spread at which motion is drawn without waiting for an image
 
@@ -118,7 +119,7 @@ class FastSLAM:
         stereo: str = "stereo",
     ) -> None:
         self.stereo = stereo
-        require_counts(n_particles=n_particles)
+        require_counts(_MOST_PARTICLES, n_particles=n_particles)
         require_choices(
             proposal=(proposal, Proposal), resampling=(resampling, Scheme), maps=(maps, Maps)
         )

@@ -100,8 +100,8 @@ class FixedLag:
     in the order in which they are seen; those of the prior come first. An image without usable
     observations is no pose of the window.
 
-    Extras: `status` when an image could not be solved for; the belief is then the odometry's from
-    the last one.
+    Extras: `status` when an observation could not be used, or an image not be solved for; the
+    belief is then the odometry's from the last one.
     """
 
     needs = frozenset({"stereo"})
@@ -146,11 +146,11 @@ class FixedLag:
         motion = self.wheels.predict(frame)
         loose = loosened(motion)
         self._belief, self._motion = self._belief.then(motion), self._motion.then(loose)
-        seen = observed(frame, self.stereo, self._camera, "fixed_lag")
+        seen, rejected = observed(frame, self.stereo, self._camera, "fixed_lag")
         registered = None if seen is None else self._registered(frame)
         if registered is not None:
             self._motion = self._motion.with_measured(registered)
-        status = "" if seen is None else self._see(*seen)
+        status = ("" if seen is None else self._see(*seen)) or rejected
         self._drive.add(frame.stamp, loose, self._belief.mean, seen)
         if registered is not None:
             self._drive.tie(registered)
@@ -178,8 +178,8 @@ class FixedLag:
 
     def _see(self, points: Array, ids: Ints) -> str:
         """Take in points (K, 3) and ids (K,) of an image; what went wrong, or nothing."""
-        ids, first = np.unique(ids, return_index=True)  # of duplicates the first
-        points = points[first]
+        order = np.argsort(ids)
+        ids, points = ids[order], points[order]
         pose = se2.compose(self._poses[-1], self._motion.mean)
         self._poses = np.vstack([self._poses, pose])
         number = self._landmark_of_id

@@ -16,6 +16,7 @@ import numpy as np
 from estimators.base import Estimate
 from estimators.gaussian import Gaussian, compose, wrap
 from estimators.least_squares import Problem, Robust, Solution, solve
+from estimators.slam_frontend import screened
 from estimators.stereo import StereoModel
 from sim.arrays import Array, Ints
 from sim.errors import InputError
@@ -165,8 +166,10 @@ class LandmarkDrive:
 
 def observed(
     frame: Frame, sensor: str, camera: StereoModel, estimator: str
-) -> tuple[Array, Ints] | None:
+) -> tuple[tuple[Array, Ints] | None, str]:
     """Points (K, 3) and ids (K,) of a Frame's observations that can be used; None without any.
+
+    And what is wrong with the others, as `screened` has it; empty if nothing is.
 
     Raises
     ------
@@ -175,16 +178,14 @@ def observed(
     """
     seen = frame.readings.get(sensor)
     if seen is None or not len(seen["points_in_camera"]):
-        return None
+        return None, ""
     if "ids" not in seen:
         raise InputError(
             f"{estimator} needs to know which landmark is which; set "
             f"sensors.{sensor}.identifies=true"
         )
-    usable = camera.usable(seen["points_in_camera"])
-    if not usable.any():
-        return None
-    return seen["points_in_camera"][usable], seen["ids"][usable]
+    used, status = screened(camera, seen["points_in_camera"], seen["ids"])
+    return (seen["points_in_camera"][used], seen["ids"][used]) if used.any() else None, status
 
 
 def loosened(motion: Gaussian) -> Gaussian:

@@ -80,6 +80,8 @@ class LikelihoodField:
         ends
             (2, B) where the beams end in base_link, m, as from `beam_ends`.
         """
+        if not np.isfinite(poses).all():  # compiled code would read beyond the table
+            raise FloatingPointError("poses of particles are not finite")
         counts = np.empty(len(poses), np.int64)
         rows, columns = self.table.shape
         _look_up(
@@ -120,13 +122,16 @@ def likelihood_field(
     # Beyond this distance beams that hit are a thousandth of those that end anywhere
     reach_m = sigma_m * math.sqrt(2.0 * math.log(max(1000.0 * normal / anywhere, math.e)))
     reach_m = max(reach_m, 2.0 * _CLEARANCE_M)
-    origin = np.floor((extent.min(axis=0) - reach_m) / cell_m) * cell_m - cell_m
-    columns, rows = np.ceil((extent.max(axis=0) + reach_m - origin) / cell_m).astype(int) + 1
+    with np.errstate(over="ignore", invalid="ignore"):  # counted in floats, which do not wrap
+        origin = np.floor((extent.min(axis=0) - reach_m) / cell_m) * cell_m - cell_m
+        sides = np.ceil((extent.max(axis=0) + reach_m - origin) / cell_m) + 1.0
+        n_cells = float(np.prod(sides))
     where = "the grid" if isinstance(known_map, OccupancyGrid) else f"world {known_map.name}"
     require(
-        rows * columns <= _MOST_CELLS,
-        f"estimator.cell_m={cell_m} makes {rows * columns} cells of {where}; make it larger",
+        n_cells <= _MOST_CELLS,
+        f"estimator.cell_m={cell_m} makes {n_cells:.3g} cells of {where}; make it larger",
     )
+    columns, rows = sides.astype(int).tolist()
     distances = _distances(walls, origin, cell_m, reach_m, rows, columns)
     p = normal * np.exp(-0.5 * np.square(distances / sigma_m)) + anywhere
     floor = distances > _CLEARANCE_M

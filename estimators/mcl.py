@@ -37,6 +37,8 @@ from sim.recording import Frame
 from sim.world import World
 
 _BISECTIONS = 12
+_MOST_PARTICLES, _MOST_TRIES = 10_000_000, 100_000_000  # 0.2 and 2 GB of poses
+_MOST_BINS = 250_000_000  # 2 GB
 _FARTHEST_M, _FARTHEST_RAD = 1.0, 0.5  # of what belongs to one hypothesis
 
 
@@ -132,7 +134,13 @@ class Mcl:
     ) -> None:
         self.laser = laser
         self.wheels = WheelPrediction(kr, kl, window_s)
-        require_counts(n_least=n_least, n_most=n_most, n_beams=n_beams, tries=tries)
+        require_counts(n_least=n_least, n_beams=n_beams, tries=tries)
+        require_counts(_MOST_PARTICLES, n_most=n_most)
+        require(
+            n_most * tries <= _MOST_TRIES,
+            f"estimator.n_most={n_most} and tries={tries} draw {n_most * tries} poses at once; "
+            f"at most {_MOST_TRIES} are drawn",
+        )
         require_choices(resampling=(resampling, Scheme))
         require_positive(
             kld_error=kld_error,
@@ -188,6 +196,7 @@ class Mcl:
             z_hit=self.z_hit,
             z_rand=self.z_rand,
         )
+        self._shape = self._shape_of_bins()
         self._off_map = prior.mean is not None and not self._field.holds(prior.mean)
         self._everywhere = prior.mean is None or prior.covariance is None
         if prior.mean is None or prior.covariance is None:
@@ -312,16 +321,28 @@ class Mcl:
         cube = (1.0 - a + math.sqrt(a) * self.kld_quantile) ** 3
         return math.ceil((k - 1) / (2.0 * self.kld_error) * cube)
 
+    def _shape_of_bins(self) -> tuple[int, int, int]:
+        """Numbers of bins along x, along y and in heading."""
+        sides_m = self._field.cell_m * np.array(self._field.table.shape[::-1])
+        with np.errstate(over="ignore"):  # counted in floats, which do not wrap
+            shape = np.ceil(np.array([*sides_m / self.bin_m, 2.0 * math.pi / self.bin_rad]))
+            n_bins = float(np.prod(shape))
+        require(
+            n_bins <= _MOST_BINS,
+            f"estimator.bin_m={self.bin_m} and bin_rad={self.bin_rad} make {n_bins:.3g} bins of "
+            "the map; make them larger",
+        )
+        columns, rows, headings = shape.astype(int).tolist()
+        return columns, rows, headings
+
     def _bins(self, poses: Array) -> Ints:
         """Number of the bin (M,) of each pose; what lies off the map counts to its rim."""
-        field = self._field
-        shape = np.ceil(field.cell_m * np.array(field.table.shape[::-1]) / self.bin_m).astype(int)
+        field, (columns, rows, n_headings) = self._field, self._shape
         x, y = ((poses[:, i] - field.origin_m[i]) / self.bin_m for i in (0, 1))
         heading = np.floor((poses[:, 2] + math.pi) / self.bin_rad).astype(np.int64)
-        n_headings = math.ceil(2.0 * math.pi / self.bin_rad)
-        column = np.clip(x.astype(np.int64), 0, shape[0] - 1)
-        row = np.clip(y.astype(np.int64), 0, shape[1] - 1)
-        return np.asarray((row * shape[0] + column) * n_headings + heading % n_headings)
+        column = np.clip(x.astype(np.int64), 0, columns - 1)
+        row = np.clip(y.astype(np.int64), 0, rows - 1)
+        return np.asarray((row * columns + column) * n_headings + heading % n_headings)
 
     def _summed_up(self) -> Gaussian:
         """Belief of the weighted particles, and its extras."""

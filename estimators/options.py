@@ -35,12 +35,16 @@ def require_shares(**options: float) -> None:
     _require(options, "a number in [0, 1]", lambda number: 0.0 <= number <= 1.0)
 
 
-def require_counts(**options: int) -> None:
-    """Each option must be a whole number, one or more."""
+def require_counts(most: int | None = None, /, **options: int) -> None:
+    """Each option must be a whole number, one or more, and no more than `most` if that is given."""
+    bounds = "at least 1" if most is None else f"from 1 to {most}"
     for name, count in options.items():
         require(
-            not isinstance(count, bool) and isinstance(count, int) and count >= 1,
-            f"estimator.{name} must be a whole number, at least 1, got {count!r}",
+            not isinstance(count, bool)
+            and isinstance(count, int)
+            and count >= 1
+            and (most is None or count <= most),
+            f"estimator.{name} must be a whole number, {bounds}, got {count!r}",
         )
 
 

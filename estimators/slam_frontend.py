@@ -1,7 +1,7 @@
 """What landmark SLAM does with an image before any filter: which observations, of which landmarks.
 
 Shared by `estimators.ekf_slam` and `estimators.fastslam`, whose filters choose landmarks by
-distance themselves.
+distance themselves. `screened` also serves `estimators.landmark_drive`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from estimators.options import (
 )
 from estimators.stereo import NoiseAt, NoiseModel, StereoModel
 from sim.arrays import Array, Floats, Ints
-from sim.errors import require, required
+from sim.errors import require
 from sim.sensors import Reading
 
 Association = Literal["known", "mahalanobis", "descriptor"]
@@ -66,6 +66,28 @@ class Image:
         ids = None if self.ids is None else self.ids[kept]
         parts = self.points[kept], self.numbers[kept], ids, self.descriptors[kept]
         return Image(*parts, used, self.status)
+
+
+def screened(
+    camera: StereoModel, points_in_camera: Array, ids: Ints | None
+) -> tuple[NDArray[np.bool_], str]:
+    """Which observations (A,) of an image can be used, and what is wrong with the others.
+
+    Parameters
+    ----------
+    points_in_camera
+        (A, 3) m.
+    ids
+        (A,), of duplicates only the first is used; None if they do not count.
+    """
+    used = camera.usable(points_in_camera)
+    status = "" if used.all() else "observation without depth rejected"
+    if ids is not None:
+        rows = np.flatnonzero(used)
+        first = np.unique(ids[rows], return_index=True)[1]
+        if len(first) < len(rows):
+            used, status = np.isin(np.arange(len(used)), rows[first]), "duplicate id rejected"
+    return used, status
 
 
 class SlamFrontEnd:
@@ -152,18 +174,13 @@ class SlamFrontEnd:
     def read(self, seen: Reading) -> Image:
         """Return the observations of an image that can be used; of duplicate ids the first."""
         all_points, all_ids = seen["points_in_camera"], seen.get("ids")
-        used = self.camera.usable(all_points)
-        status = "" if used.all() else "observation without depth rejected"
-        if self.association == "known" and used.any():
-            all_ids = required(
-                all_ids,
-                f"{self._estimator}: observations without ids; set "
-                "estimator.association=mahalanobis or descriptor",
-            )
-            rows = np.flatnonzero(used)
-            first = np.unique(all_ids[rows], return_index=True)[1]
-            if len(first) < len(rows):
-                used, status = np.isin(np.arange(len(used)), rows[first]), "duplicate id rejected"
+        known = self.association == "known"
+        used, status = screened(self.camera, all_points, all_ids if known else None)
+        require(
+            not (known and all_ids is None and used.any()),
+            f"{self._estimator}: observations without ids; set "
+            "estimator.association=mahalanobis or descriptor",
+        )
         self._n_blind = 0 if used.any() else self._n_blind + 1
         if self._n_blind >= _BLIND_IMAGES:
             status = f"no landmark in {self._n_blind} images"

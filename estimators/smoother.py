@@ -49,6 +49,8 @@ class Smoother:
     Only the Frames with observations (and the first and last) are poses of the problem. Those
     between are filled in from the odometry on both sides, which loses nothing. The wheels should
     be read at 10 Hz or more: an arc over 0.4 m misses more of a bend than slip adds.
+
+    Extras: `status` when an observation could not be used.
     """
 
     needs = frozenset({"stereo"})
@@ -81,9 +83,10 @@ class Smoother:
         """Keep what the Frame shows; the belief is dead reckoning alone."""
         motion = self.wheels.predict(frame)
         self._belief = self._belief.then(motion)
-        seen = observed(frame, self.stereo, self._camera, "smoother")
+        seen, status = observed(frame, self.stereo, self._camera, "smoother")
         self._drive.add(frame.stamp, loosened(motion), self._belief.mean, seen)
-        return Belief(self._belief.mean.copy(), self._belief.covariance.copy())
+        extras = {"status": status} if status else {}
+        return Belief(self._belief.mean.copy(), self._belief.covariance.copy(), extras)
 
     def finish(self) -> Estimate:
         """Least squares over all Frames so far: `LandmarkDrive.revised`."""

@@ -34,6 +34,7 @@ Resampling = Literal["ess", "always"]
 Summary = Literal["mode", "mean"]
 
 _ALL_AROUND = math.pi**2 / 3.0  # variance of an unknown heading, rad^2
+_MOST_PARTICLES = 10_000_000
 _MOST_HOPS = 100  # of one particle between two Frames
 _LEAST_HEADING = 0.01  # variance of the heading on an edge, rad^2
 _CARRIED_SHARE = 0.05  # error of the wheels' motion, as a share of it
@@ -248,6 +249,12 @@ class TopologicalMcl:
             isinstance(known, TopologicalMap),
             "topological_mcl needs a topological map; set estimator.map_path, or prior.map "
             "to the function that makes one",
+        )
+        n_particles = self.particles_per_node * len(known)
+        require(
+            n_particles <= _MOST_PARTICLES,
+            f"estimator.particles_per_node={self.particles_per_node} makes {n_particles} particles "
+            f"on a map of {len(known)} nodes; at most {_MOST_PARTICLES} are held",
         )
         self._rng, self._map, self._graph = rng, known, Graph(known)
         require(

@@ -177,3 +177,32 @@ def test_columns_say_their_unit():
     page = sweep_figure(rows(), "robot.kr", "ate_rmse_m", pool=True)
     assert page.axes[0].get_ylabel() == "position RMSE, m"
     assert page.axes[0].get_xlabel() == "robot.kr"
+
+
+def test_runs_of_equal_settings_and_different_keys_are_refused(tmp_path):
+    """As of a world file that was edited between two sweeps of one name."""
+
+    def kept(*tables):
+        pd.concat(tables).to_parquet(tmp_path / "x.parquet")
+        return len(collect(str(tmp_path), all_versions=True))
+
+    once = rows().assign(**{"simulation.physics": "kinematic", "world.path": "w.yaml"})
+    again = once.assign(run_key="k" + once["run_key"])
+    assert kept(once, once) == len(once)  # the same runs
+    assert kept(once, again.assign(seed=once["seed"] + 10)) == 2 * len(once)
+    assert kept(once, once.assign(repeat=1)) == 2 * len(once)
+    assert kept(once, again.assign(code_version="w")) == 2 * len(once)
+    unseen = {"seed": np.nan}  # an absent setting is equal to itself only
+    assert kept(once, again[:1].assign(**unseen)) == len(once) + 1
+    for refused in (again, again[3:4], again[3:4].assign(ate_rmse_m=9.0)):
+        with pytest.raises(InputError, match=rf"{len(refused)} rows .* name=.*delete {tmp_path}"):
+            kept(once, refused)
+    with pytest.raises(InputError, match="1 rows"):
+        kept(once, *(again[:1].assign(**unseen, run_key=key) for key in "ab"))
+
+    # over a recording from a file, some settings have no column: equal results are let pass
+    logged = {"simulation.physics": None, "recording": "a.npz"}
+    assert kept(once.assign(**logged), again.assign(**logged, step_time_us=1.0)) == 2 * len(once)
+    for changed in ({"ate_rmse_m": 9.0}, {"recording_checksum": "other"}):
+        with pytest.raises(InputError, match=f"{len(once)} rows"):
+            kept(once.assign(**logged), again.assign(**logged, **changed))

@@ -179,6 +179,7 @@ def test_says_what_is_missing(recording):
     "wrong",
     [
         {"n_particles": 0},
+        {"n_particles": 10**12},
         {"n_particles": 2.5},
         {"proposal": "bootstrap"},
         {"resampling": "none"},

@@ -217,6 +217,7 @@ def test_odd_observations_are_survived():
     odd = with_field(recording, "stereo", points_in_camera=points, ids=ids)
     prior = dataclasses.replace(tracking_prior(recording), covariance=np.zeros((3, 3)))
     online = follow(FixedLag(lag_images=4), odd, prior)
+    assert "rejected" in online.status
     assert np.abs(online.means - recording.truth.poses)[:, :2].max() < 0.15
     broken = FixedLag(lag_images=2)
     broken.reset(prior, np.random.default_rng(0))

@@ -126,5 +126,8 @@ def test_only_walls_at_the_lasers_height_count():
 
 
 def test_too_fine_a_table_is_refused():
-    with pytest.raises(InputError, match="cell_m"):
-        field(cell_m=1e-4)
+    for cell_m in (1e-4, 4e-10, 1e-300):  # whose cells int64 would not count
+        with pytest.raises(InputError, match=r"cell_m=.* cells of world room; make it larger"):
+            field(cell_m=cell_m)
+    with pytest.raises(InputError, match=r"cell_m=0\.05 makes inf cells"):
+        likelihood_field(world(ROOM * 1e300), LASER)

@@ -6,12 +6,16 @@ import numpy as np
 import pytest
 
 from estimators import ekf_slam
-from estimators.base import run
+from estimators.base import Prior, run
 from estimators.ekf_icp import EkfIcp
 from estimators.ekf_slam import EkfSlam
+from estimators.fastslam import FastSLAM
+from estimators.fixed_lag import FixedLag
 from estimators.icp_odometry import IcpOdometry
-from estimators.likelihood_field import beam_ends
+from estimators.likelihood_field import beam_ends, likelihood_field
 from estimators.scan_lines import prepare
+from estimators.smoother import Smoother
+from experiments.runs.experiment import Experiment
 from sim.errors import InputError
 from sim.sensors import Laser
 from tests import fakes
@@ -101,3 +105,42 @@ def test_a_range_at_the_maximum_is_no_return(most_m):
     assert scan.beams.tolist() == [1, 3]
     assert laser.returned(ranges).tolist() == [False, True, False, True, False]
     assert beam_ends(ranges, laser, 5).shape == (2, 2)
+
+
+def test_a_start_without_a_true_pose_is_refused(recording):
+    truth = recording.truth
+    shown = dataclasses.replace(truth, stamps=truth.stamps[3:], poses=truth.poses[3:])
+    late = dataclasses.replace(recording, truth=shown)
+    begin = f"{truth.stamps[3]:.2f}"
+    with pytest.raises(InputError, match=rf"truth spans {begin} to .*prior\.start=global"):
+        Experiment.compose().prior(late)
+    assert Experiment.compose(["prior.start=global"]).prior(late).mean is None
+    assert np.isfinite(Experiment.compose().prior(recording).mean).all()
+
+
+def test_poses_that_are_not_finite_do_not_reach_compiled_code(recording):
+    prior = fakes.tracking_prior(recording)
+    for poor in ({"mean": prior.mean * np.nan}, {"covariance": np.full((3, 3), np.inf)}):
+        with pytest.raises(InputError, match=f"the {next(iter(poor))} of the prior"):
+            dataclasses.replace(prior, **poor)
+    assert Prior(prior.robot).mean is None
+    field = likelihood_field(prior.map, recording.sensors["laser"])
+    with pytest.raises(FloatingPointError, match="not finite"):
+        field.log_likelihood(np.array([[0.0, np.nan, 0.0]]), np.ones((2, 4), np.float32))
+
+
+@pytest.mark.parametrize("estimator", [EkfSlam, FastSLAM, Smoother, FixedLag])
+@pytest.mark.parametrize("poor", [np.nan, np.inf, 1e300, 0.0, "duplicate"])
+def test_every_landmark_method_tells_what_it_rejects(recording, estimator, poor):
+    log = recording.log("stereo")
+    points, ids = log["points_in_camera"].copy(), log["ids"].copy()
+    if poor == "duplicate":
+        ids[1], word = ids[0], "duplicate id rejected"
+    else:
+        points[0], word = poor, "observation without depth rejected"
+    odd = fakes.with_field(recording, "stereo", points_in_camera=points, ids=ids)
+    prior = fakes.tracking_prior(recording)
+    found = [run(estimator(), r, prior, np.random.default_rng(0)) for r in (odd, recording)]
+    assert found[0].status.startswith(word)
+    assert found[1].status == "ok"
+    assert np.isfinite(found[0].means).all()

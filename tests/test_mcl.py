@@ -198,6 +198,13 @@ def test_wrong_input_is_named():
         ({"kr": np.nan}, "kr"),
         ({"resampling": "wheel"}, "systematic"),
         ({"least_ess": 0.5, "ess_share": 0.5}, "ess_share"),
+        ({"n_most": 10**12}, "n_most must be a whole number, from 1 to 10000000"),
+        ({"n_most": 10**6, "tries": 10**12}, "tries"),
     ):
         with pytest.raises(InputError, match=word):
             Mcl(**options)
+    for options in ({"bin_m": 1e-4}, {"bin_m": 1e-9}, {"bin_m": 5e-324}, {"bin_rad": 1e-300}):
+        with pytest.raises(
+            InputError, match=f"estimator.*{next(iter(options))}=.* bins of the map"
+        ):
+            Mcl(n_most=1000, **options).reset(prior(), rng)

@@ -167,6 +167,25 @@ def test_keys_know_the_files_that_a_mapping_names(tmp_path):
     assert files_digest({"a": "none", "b": "x" * 5000, "c": ".", "d": "/"}) == {}
 
 
+def test_keys_know_the_files_that_an_estimators_options_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    plain = Experiment.compose(["estimator=topological_mcl"])
+    before_files = plain.key, plain.recording_key
+    for name in ("a.npz", "b.npz", "laser", "stereo", "place", "lidar3d"):  # words are sensors
+        (tmp_path / name).write_bytes(b"1")
+    assert (plain.key, plain.recording_key) == before_files
+    feedback = {"_target_": "estimators.odometry.Odometry", "tables": ["none", "a.npz"]}
+    named = plain.with_estimator(map_path="a.npz")
+    steered = plain.replaced(route={**plain.config["route"], "feedback": feedback})
+    swept = ["estimator=topological_mcl", "estimator.map_path=a.npz,b.npz"]
+    old = named.key, steered.key, steered.recording_key, plan.plan_of(swept).keys[0]
+    (tmp_path / "a.npz").write_bytes(b"2")
+    new = named.key, steered.key, steered.recording_key, plan.plan_of(swept).keys[0]
+    assert all(a != b for a, b in zip(old, new, strict=True))
+    every = plan.plan_of(swept)
+    assert [int(every.experiment(i).key, 16) for i in range(2)] == every.keys.tolist()
+
+
 def test_packing_keeps_recordings_together():
     every = plan.plan_of(["repeats=1,2", "seed=range(0,6)"])
     jobs = plan.packed(every.recordings, 3)

@@ -253,6 +253,8 @@ def test_bad_settings_and_a_missing_map_are_named(tmp_path):
             started(known)
     with pytest.raises(InputError, match=r"no\.npz"):
         started(None, map_path=str(tmp_path / "no.npz"))
+    with pytest.raises(InputError, match=r"particles_per_node=1000000000000 .* at most 10000000"):
+        started(from_recording(ring_run(), "ring_key", 1.0), particles_per_node=10**12)
 
 
 def test_the_wheels_carry_a_registered_pose_over_a_gap():

@@ -176,14 +176,15 @@ class Experiment:
 
     @property
     def key(self) -> str:
-        """Digest of what decides the rows: configuration, recording, map, code.
+        """Digest of what decides the rows: configuration, recording, map, files named, code.
 
         It is the sum of a digest for each leaf, and one of files and code, modulo 2^64. So the
         keys of a product of values are sums too, and a sweep of a million runs knows them at once.
         """
         settings = {key: value for key, value in self.config.items() if key not in _NOT_IN_KEY}
-        known_map = files_digest(self.config["prior"].get("map"))
-        total = leaf_digest((), [self._recording_sources(), known_map, self._code_version()])
+        files = files_digest(self.config["prior"].get("map"))
+        files |= files_of_options(self.config["estimator"])
+        total = leaf_digest((), [self._recording_sources(), files, self._code_version()])
         total += sum(leaf_digest(leaf, value) for leaf, value in _leaves(settings))
         return f"{total % 2**64:016x}"
 
@@ -477,6 +478,8 @@ class Experiment:
             sources["world_file"] = _digest(Path(world_file))
             if (image := grid_file.image_of(Path(world_file))) is not None:
                 sources["world_image"] = _digest(image)
+        if files := files_of_options(self.config["route"].get("feedback")):
+            sources["feedback_files"] = files
         elsewhere = {target: source_digest(target) for target in sorted(targets(self._simulated()))}
         if any(elsewhere.values()):  # a sensor, route or world of one's own, edited: another one
             sources["sources"] = elsewhere
@@ -485,7 +488,13 @@ class Experiment:
         return sources
 
     def prior(self, recording: Recording) -> Prior:
-        """Return what the estimator knows at the start."""
+        """Return what the estimator knows at the start.
+
+        Raises
+        ------
+        InputError
+            If a start pose is wanted, and the truth does not cover the first Frame.
+        """
         self._check_prior()
         settings = self.config["prior"]
         geometry = dataclasses.asdict(recording.robot)
@@ -497,7 +506,7 @@ class Experiment:
         sigma = np.array([settings["sigma_position_m"]] * 2 + [settings["sigma_heading_rad"]])
         start = np.zeros(3)
         if recording.truth is not None:
-            start = recording.truth_at(recording.frame_stamps[:1])[0]
+            start = _true_start(recording)
         offset = sigma * stream(self.config["seed"], "prior").standard_normal(3)
         return Prior(robot, recording.sensors, start + offset, np.diag(np.square(sigma)), known_map)
 
@@ -513,6 +522,20 @@ class Experiment:
         if recording.world is None:
             raise InputError("prior.map=world, but the recording has no map; set prior.map=none")
         return recording.world
+
+
+def _true_start(recording: Recording) -> Array:
+    """True pose (3,) at the first Frame."""
+    begin_s = float(recording.frame_stamps[0])
+    start: Array = recording.truth_at(recording.frame_stamps[:1])[0]
+    spans = recording.known_truth.stamps[[0, -1]]
+    require(
+        bool(np.isfinite(start).all()),
+        f"the first Frame is at {begin_s:.2f} s, and the truth spans {spans[0]:.2f} to "
+        f"{spans[1]:.2f} s: no start pose is known; cut the recording to the time of its truth, "
+        "or set prior.start=global",
+    )
+    return start
 
 
 def rows_folder(name: Any) -> Path:
@@ -698,6 +721,19 @@ def files_digest(tree: Any) -> dict[str, str]:
     except OSError:  # too long for a path, say
         return {}
     return {str(file): _digest(file) for file in files if file.is_file()}
+
+
+def files_of_options(options: Any) -> dict[str, str]:
+    """Digest of every file that an estimator's options name, a list's items included.
+
+    A word without a suffix or a slash is no file, but the name of a sensor or a method.
+    """
+    found: dict[str, str] = {}
+    for _, value in _leaves({"": options}):
+        for text in value if isinstance(value, list) else [value]:
+            if isinstance(text, str) and ("/" in text or Path(text).suffix):
+                found |= files_digest(text)
+    return found
 
 
 def _digest(path: Path) -> str:

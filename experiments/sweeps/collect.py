@@ -48,7 +48,8 @@ def collect(name: str, *, all_versions: bool = False, times: bool = False) -> pd
     Raises
     ------
     InputError
-        If there are no rows, or none of this version of the code.
+        If there are no rows, or none of this version of the code; or if runs of different keys
+        have equal settings, because a file was edited between them, say.
     """
     runs = results() / "runs"
     path = next((p for p in (runs / name, Path(name)) if p.exists()), None)
@@ -72,9 +73,35 @@ def collect(name: str, *, all_versions: bool = False, times: bool = False) -> pd
         if not mine.all():
             print(f"left out {(~mine).sum()} rows of other code versions", file=sys.stderr)
         table = table[mine]
+    settings = swept(table)
+    _check_distinct(table, settings, path)
     if not times:
         table = table.drop(columns=_TIMES, errors="ignore")
-    return table.sort_values([*swept(table), "run_key", REPEAT], kind="stable", ignore_index=True)
+    return table.sort_values([*settings, "run_key", REPEAT], kind="stable", ignore_index=True)
+
+
+def _check_distinct(table: pd.DataFrame, settings: list[str], path: Path) -> None:
+    """Check that rows of equal settings are of one run; `settings` are those that differ.
+
+    Over a recording from a file, a setting that only a simulation reads has no column. Runs that
+    differ in nothing else have equal results, and are let pass.
+    """
+    by = [*settings, REPEAT, "code_version"]
+    twins = table[table.duplicated(by, keep=False)]
+    twins = twins[~twins.duplicated(["run_key", REPEAT, "code_version"])]
+    if "simulation.physics" in twins:
+        simulated = twins["simulation.physics"].notna()
+    else:
+        simulated = pd.Series(False, twins.index)
+    same = twins.drop(columns=["run_key", *_TIMES], errors="ignore").duplicated()
+    again = twins.duplicated(by) & (simulated | ~same)
+    if again.any():
+        one = twins[again].iloc[0]
+        raise InputError(
+            f"{path}: {again.sum()} rows have the settings of another run, but another run_key "
+            f"({one['run_key']}): a file was edited between, keep was changed, or a number was "
+            f"written otherwise (0 and 0.0); run it under another name=..., or delete {path} first"
+        )
 
 
 def where(table: pd.DataFrame, conditions: Sequence[str]) -> pd.DataFrame:

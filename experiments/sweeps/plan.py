@@ -31,6 +31,7 @@ from experiments.runs.experiment import (
     Experiment,
     check_overrides,
     composed,
+    files_of_options,
     leaf_digests,
     searched,
 )
@@ -392,7 +393,7 @@ class _Composer:
         for key in was_leaf if following is not None else ():
             leaf = tuple(key.split("."))
             leaves = (leaf, *(following or {}).get(leaf, ()))
-            if not any(map(_decides_more, leaves)):
+            if not any(_decides_more(leaf, values[key]) for leaf in leaves):
                 axes[key] = Axis(leaves, values[key])
         return cfg, choices, axes
 
@@ -469,8 +470,11 @@ def _leaves(tree: Mapping[str, Any], above: Leaf = ()) -> Iterator[tuple[Leaf, A
             yield (*above, str(name)), value
 
 
-def _decides_more(leaf: Leaf) -> bool:
+def _decides_more(leaf: Leaf, values: Sequence[Any]) -> bool:
     """Whether a leaf decides more than its own value: a file, code, or how rays are cast."""
+    if leaf[0] == "estimator" or leaf[:2] == ("route", "feedback"):
+        options = [] if isinstance(values, range) else list(values)
+        return leaf[-1] == "_target_" or bool(files_of_options(options))
     files = leaf[0] == "recording" or leaf[:2] in (("prior", "map"), ("world", "path"))
     return files or leaf[0] == "simulation" or leaf[-1] in ("_target_", "path")
 
