@@ -91,6 +91,7 @@ def test_what_leaves_the_window_is_kept(lag_images):
     assert len(kept._images) == lag_images - 1
 
 
+@pytest.mark.slow
 def test_a_landmark_counts_again_unless_it_is_forgotten():
     """Both are the same until a landmark comes back that the window does not see any more."""
     recording, lag = circle(1, n_frames=400, kr=1e-4, kl=1e-4), 8
@@ -112,6 +113,7 @@ def test_a_landmark_counts_again_unless_it_is_forgotten():
     np.testing.assert_array_equal(seen, np.arange(len(forgetful._landmarks)))
 
 
+@pytest.mark.slow
 def test_errors_are_within_their_covariances():
     """In the middle and at the end of many recordings."""
     squares = []
@@ -126,6 +128,7 @@ def test_errors_are_within_their_covariances():
     assert 0.7 < np.mean(squares) / 3.0 < 1.35
 
 
+@pytest.mark.slow
 def test_it_is_close_to_full_least_squares():
     """Errors over the whole run, of six recordings together."""
     mine, best = [], []
@@ -257,6 +260,7 @@ def test_wrong_input_is_named():
             FixedLag(**options)
 
 
+@pytest.mark.slow
 def test_a_laser_adds_what_its_registrations_are_worth():
     """Fused as in full least squares, consistent, and with smaller errors than without."""
     squares, with_laser, without = [], [], []

@@ -153,7 +153,6 @@ BAD = {
     "two_lines": (f"print('{_BELIEF}\\n{_BELIEF}', flush=True)", "after its answer|being asked"),
     "half_line": ("print('{\"mean\"', end='', flush=True); time.sleep(60)", "no answer within"),
     "endless_line": ("while True: sys.stdout.write('x' * 65536)", "more than 1048576 bytes"),
-    "endless_lines": (f"while True: print('{_BELIEF}')", "after its answer|being asked"),
     "binary": ("sys.stdout.buffer.write(b'\\xff\\xfe\\n'); sys.stdout.flush()", "no JSON object"),
 }  # fmt: skip
 
