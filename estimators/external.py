@@ -49,7 +49,7 @@ class External:
         self._program: Program | None = None
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
-        """Start the program anew, and tell it what is known."""
+        """Start the program, and tell it what is known."""
         message = reset_message(prior, int(rng.integers(2**32)))
         if self._program is not None:
             self._program.close()

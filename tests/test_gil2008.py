@@ -101,7 +101,7 @@ def test_noise_of_descriptors_alone_leaves_the_images(small):
     )
 
 
-def test_images_are_drawn_anew_over_the_same_wheels(small):
+def test_each_draw_has_its_own_images_over_the_same_wheels(small):
     first, again = (everything(f"recording.image_draw={i}") for i in (0, 1))
     assert np.array_equal(first.wheels.position_m, again.wheels.position_m)
     assert np.array_equal(first.truth.poses, again.truth.poses)

@@ -65,6 +65,8 @@ def test_errors_and_beliefs_are_sane(made):
 
 def test_steps_know_their_bound(made):
     steps = made.table("steps")
+    # of planes some -0.1 to 0.1; errors that drift together would come near 1
+    assert steps["correlation_lag_1"].between(-0.6, 0.3).all()
     assert (steps["step_error_rad"] > 0.5 * steps["step_bound_rad"]).all()
 
 

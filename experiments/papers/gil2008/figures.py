@@ -226,7 +226,10 @@ def by_particles(repeats: pd.DataFrame, bound: pd.DataFrame) -> Figure:
     page, grid = subplots(9.0, 7.0, 2, 2, sharex=True)
     best = bound[(bound["seed"] == repeats["seed"][0]) & (bound["noise"] == "paper")]
     drawn = repeats["image_draw"] > 0
-    designs = {"observations drawn anew": repeats[drawn], "the same observations": repeats[~drawn]}
+    designs = {
+        "new observations for each run": repeats[drawn],
+        "the same observations": repeats[~drawn],
+    }
     for axes, (design, table) in zip(grid, designs.items(), strict=True):
         for ax, (column, label) in zip(axes, _BOTH, strict=True):
             for j, (name, part) in enumerate(table.groupby("filter", sort=False)):
