@@ -456,10 +456,10 @@ def propose(
 ) -> None:
     """Turn standard normal draws (3, lanes) into draws of the motion's noise given the image.
 
-    With the motion's noise `stretch` `root` x, a stretch (lanes,) each, x ~ N(0, 1), and the state's
-    information I and i on the pose,
-    taken at x0 = `start` (3, lanes), x given the image is N(m, P): P^-1 = 1 + B^T I B,
-    m = P (B^T i + B^T I B x0), B = dpose/dx. A draw's importance weight, p(x) / q(x), is
+    With the motion's noise `stretch` `root` x, a stretch (lanes,) each, x ~ N(0, 1), and the
+    state's information I and i on the pose, taken at x0 = `start` (3, lanes), x given the image is
+    N(m, P): P^-1 = 1 + B^T I B, m = P (B^T i + B^T I B x0), B = dpose/dx. A draw's importance
+    weight, p(x) / q(x), is
     exp(owed[0] / 2) / owed[1], `owed` (2, lanes).
     """
     for block in range(len(state)):
