@@ -173,15 +173,30 @@ def record(
 def info(
     log: Annotated[list[Path], typer.Argument(help="A recording (.npz) or a log of any format.")],
     robot: Annotated[int, typer.Option(help="Which robot of an MRCLAM set.")] = 1,
+    check: Annotated[
+        bool,
+        typer.Option(
+            "--check", help="Warn of odd clocks, and of sensors that do not agree with the motion."
+        ),
+    ] = False,
 ) -> None:
     """Check a recording or a log and say what it holds.
 
-    Formats of several files take them all; docs/formats.md gives their order.
+    Formats of several files take them all; docs/formats.md gives their order. With --check it also
+    warns, a line each, of gaps, repeated and coarse stamps, delays between wheels and sensors,
+    gains, and ranges of a wrong scale.
     """
     from experiments.viewing.describe import describe
     from sim.formats.detect import read_any
 
-    show(describe(read_any(log, robot)))
+    recording = read_any(log, robot)
+    show(describe(recording))
+    if check:
+        from experiments.calibration.log_check import check_log
+
+        warnings = check_log(recording)
+        for warning in warnings or ["nothing odd found"]:
+            show(f"check       {warning}")
 
 
 @app.command()

@@ -49,7 +49,7 @@ _KEYS = (
     *("simulation.physics", "simulation.rays"),
     *("prior.start", "prior.sigma_position_m", "prior.sigma_heading_rad"),
     *("prior.wheel_radius_m", "prior.track_m", "prior.map"),
-    "scoring.longest_gap_s",
+    *("scoring.longest_gap_s", "scoring.after_s"),
 )
 _NOT_IN_KEY = ("name", "picture", "recording")
 _READ_OF_HYDRA = ("hydra/launcher", "hydra.launcher", "hydra.searchpath")
@@ -167,9 +167,9 @@ class Experiment:
         return list(self.config["keep"])
 
     @property
-    def longest_gap_s(self) -> float:
-        """Longest gap of the truth over which it is interpolated for the scores, s."""
-        return float(self.config["scoring"]["longest_gap_s"])
+    def scoring(self) -> dict[str, float]:
+        """Options of `experiments.evaluation.metrics.score`."""
+        return {name: float(value) for name, value in self.config["scoring"].items()}
 
     @property
     def picture(self) -> bool:
@@ -299,12 +299,12 @@ class Experiment:
             )
 
     def _check_scoring(self) -> None:
-        gap_s = self.config["scoring"]["longest_gap_s"]
-        number = isinstance(gap_s, (int, float)) and not isinstance(gap_s, bool)
-        if not (number and gap_s >= 0.0):
-            raise InputError(
-                f"scoring.longest_gap_s must be zero or a positive number, got {gap_s!r}"
-            )
+        for key, value in self.config["scoring"].items():
+            number = isinstance(value, (int, float)) and not isinstance(value, bool)
+            if not (number and value >= 0.0):
+                raise InputError(
+                    f"scoring.{key} must be zero or a positive number of seconds, got {value!r}"
+                )
 
     def _check_needs(self) -> None:
         """Check that the estimator gets the sensors and the map that it needs."""
