@@ -139,10 +139,10 @@ def score(
 
     Stamps outside the truth's span are left out, and so are those in a gap of the truth longer than
     `longest_gap_s`: they have no true pose. Those of the first `after_s` of the recording do not
-    count either: something may have been calibrated on them. `stamps_scored` and `stamps_left_out` count both. A
-    score that does not apply has no key: all but the times without a truth, the error over 10 m of
-    a shorter run, the NEES without a usable covariance. NaN means that the estimate itself is not
-    finite.
+    count either: something may have been calibrated on them. `stamps_scored` and `stamps_left_out`
+    count both kinds. A score that does not apply has no key: all but the times without a truth, the
+    error over 10 m of a shorter run, the NEES without a usable covariance. NaN means that the
+    estimate itself is not finite.
 
     Raises
     ------
