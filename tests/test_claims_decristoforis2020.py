@@ -7,7 +7,6 @@ import pytest
 from experiments.evaluation.registration_errors import METRICS
 from experiments.evaluation.verdict import conclude
 from experiments.papers.decristoforis2020 import claims
-from experiments.papers.results import Results
 
 SEEDS = np.arange(1000, 1020)
 
@@ -265,26 +264,3 @@ def test_every_claim_names_its_criterion():
         assert claim.criterion
         assert claim.found.low <= claim.found.value <= claim.found.high
     assert next(claims.dc2(ellipses())).found.value == pytest.approx(8.0, rel=0.1)
-
-
-def test_tables_of_an_earlier_study_leave_the_claims_open(tmp_path):
-    made = Results(tmp_path, "decristoforis2020")
-    old = runs(**{k: v for k, v in RIGHT.items() if k != "icp_guess"})
-    metrics = pd.DataFrame(
-        [
-            {"class": "room_small", "seed": seed, "metric": f"point_to_{to}"}
-            | dict.fromkeys(("error_m", "error_rad", "time_us"), 1.0 + seed % 3)
-            for to in ("line", "point")
-            for seed in SEEDS
-        ]
-    )
-    made.write_tables(
-        runs=old, ordering=ordering({1e-6}), ellipses=_ellipses(), metrics=metrics,
-        covariances=covariances().query("metric != 'point_to_plane'"),
-    )  # fmt: skip
-    judged = claims.judge(made)
-    said = claims.conclusions(made, judged)
-    assert [c.id for c in said] == ["DC1", "DC2", "DC3", "DC4", "DC5", "DC6"]
-    for each in said:
-        assert each.verdict == "undecided"
-        assert each.sentence.endswith("to be judged at the next full run.")

@@ -73,17 +73,6 @@ def test_mx1_follows_the_errors():
     assert said[0].verdict == "not_reproduced"
 
 
-def test_tables_of_an_earlier_study_are_not_judged():
-    old = weighting(11.5, 9.6, 205.0).drop(columns="n_nearest")
-    said = list(claims.mx1(old, quality()))
-    assert [c.verdict for c in said] == ["undecided", "undecided"]
-    assert "next full run" in conclusion("MX1", claims.mx1_sentence, said).sentence
-    spread = weighting(5.0, 2.0, 1.0, column="dispersion_m").assign(step=10)
-    said = list(claims.mx3(spread.drop(columns="n_nearest"), quality()))
-    assert [c.verdict for c in said] == ["undecided", "undecided"]
-    assert "next full run" in conclusion("MX3", claims.mx3_sentence, said).sentence
-
-
 def test_the_papers_data_sets_are_the_headlines():
     names = ("oxford", "oxford_real", "umh", "campus", "oxford_plane", "umh_plane")
     table = pd.concat([weighting(11.5, 9.6, 205.0, name) for name in names])
