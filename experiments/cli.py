@@ -882,12 +882,28 @@ def plot(
         typer.Option(help="Result (estima options metrics).", autocompletion=completion.metrics),
     ] = "answer_ate_rmse_m",
     by: Annotated[
-        str | None,
-        typer.Option(help="One line a value of this.", autocompletion=completion.settings),
+        list[str] | None,
+        typer.Option(
+            help="One line a value of this; repeat it for combinations.",
+            autocompletion=completion.settings,
+        ),
     ] = None,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Picture to write.")] = Path("plot.png"),
+    row: Annotated[
+        str | None,
+        typer.Option(help="One row of panels a value.", autocompletion=completion.settings),
+    ] = None,
+    col: Annotated[
+        str | None,
+        typer.Option(help="One column of panels a value.", autocompletion=completion.settings),
+    ] = None,
+    size: Annotated[
+        str, typer.Option(help="screen, or column or page of a paper (3.5 in, 7.16 in).")
+    ] = "screen",
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="Picture to write: .png, .pdf, .svg.")
+    ] = Path("plot.png"),
     pool: Annotated[
-        bool, typer.Option("--pool", help="Average over worlds, estimators and logs too.")
+        bool, typer.Option("--pool", help="Average over other settings that differ too.")
     ] = False,
     only: Where = None,
 ) -> None:
@@ -896,18 +912,25 @@ def plot(
     By default it is the position error of the best answers: of the revised path of a method that
     has one, else of the online one.
 
-    Example: estima plot slip --x robot.kr --y heading_rmse_rad --by choice.estimator
+    Examples
+    --------
+      estima plot slip --x robot.kr --y heading_rmse_rad --by choice.estimator
+
+      estima plot slip --x robot.kr --by choice.estimator --col choice.world --size page -o a.pdf
     """
-    from experiments.report.plot import sweep_figure
+    from experiments.report.plot import Size, sweep_figure
     from experiments.sweeps.collect import collect, where
     from experiments.viewing.style import save_figure
 
+    if size not in list(Size):
+        raise InputError(f"--size must be {', '.join(Size)}, got {size}")
     rows = where(collect(name, times=True), only or [])
     failed = rows["status"] == Outcome.FAILED
     if failed.any():
         print(f"{failed.sum()} of {len(rows)} runs failed; they are left out", file=sys.stderr)
         rows = rows[~failed]
-    save_figure(sweep_figure(rows, x, y, by, pool=pool), out)
+    page = sweep_figure(rows, x, y, by, row=row, col=col, size=size, pool=pool)
+    save_figure(page, out)
     print(out)
 
 

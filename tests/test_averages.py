@@ -87,11 +87,12 @@ def test_the_best_is_that_of_the_same_recordings_and_has_no_failures():
 @pytest.mark.parametrize(("ratio", "differs"), [(2.0, True), (1.0, False)])
 def test_differences_are_marked_by_paired_tests(ratio, differs):
     table = runs(ratio=ratio)
-    found = summary(table, against="a").set_index("choice.estimator")
+    compared = summary(table, against="a")
+    found = compared.set_index("choice.estimator")
     assert found["answer_ate_rmse_m_differs"].to_dict() == {"a": False, "b": differs}
     assert not found["answer_nees_mean_differs"].any()
     assert found["ate_rmse_over_a_low"]["b"] < ratio < found["ate_rmse_over_a_high"]["b"]
-    assert ("*: differs from a" in notes(found, "a")) is differs
+    assert ("*: differs from a" in notes(compared, "a")) is differs
 
 
 def test_p_of_pairs_is_scipys_and_equal_arms_never_differ():
