@@ -105,7 +105,10 @@ def test_the_order_holds_in_a_cell_only_if_all_intervals_do():
 def ellipses(**changed):
     """Ellipses as printed with changed values, and unchanged ones by lines."""
     return pd.concat(
-        [_ellipses(**changed).assign(method="printed"), _ellipses().assign(method="lines")]
+        [
+            _ellipses(**changed).assign(method="printed"),
+            *(_ellipses().assign(method=m) for m in ("printed_12", "printed_20", "lines")),
+        ]
     )
 
 
@@ -200,7 +203,7 @@ def test_dc4_wants_the_hessian_outside_and_the_others_inside():
     assert {c.found.value for c in biases} == {-0.25}
     assert len(biases) == 12
     assert {c.verdict for c in found} == {"reproduced", "shown"}
-    assert len([c for c in found if c.role == "headline"]) == 4 * 3 + 2
+    assert len([c for c in found if c.role == "headline"]) == 4 * 3 + 1
     assert sum("censi_sliding" in c.statistic for c in found) == 4  # point to point only
     wrong = covariances(hessian_points=1.0, sampling=2.0, censi_last=3.0)
     found = verdicts(claims.dc4(wrong))
