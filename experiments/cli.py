@@ -962,11 +962,43 @@ def reproduce(
 
 
 @app.command()
-def report() -> None:
-    """Write results/report.html from what the studies have written to results/.
+def report(
+    name: Annotated[
+        str | None,
+        typer.Argument(
+            help="A sweep's name, or a folder or file of rows; else all studies of the papers.",
+            autocompletion=completion.sweeps,
+        ),
+    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="File to write, .html.")] = None,
+    only: Where = None,
+) -> None:
+    """Write one page to open in a browser: of a sweep, or of the papers' studies in results/.
 
-    Example: estima report
+    A sweep's page has a chart whose axes, colours, panels and filters can be chosen, its means, its
+    best and worst runs, and its command. It needs no network.
+
+    Examples
+    --------
+      estima report
+
+      estima report slip
+
+      estima report slip --where choice.world=office -o office.html
     """
+    if out is not None and (name is None or out.suffix != ".html"):
+        raise InputError(f"-o {out}: give the name of a sweep, and a file that ends in .html")
+    if name is not None:
+        from experiments.report.sweep_page import write_sweep_page
+        from experiments.sweeps.collect import collect, folder_of, where
+
+        folder, called = folder_of(name), Path(name).name
+        written = out or folder.parent / f"{called}.html"
+        rows = where(collect(name, times=True), only or [])
+        write_sweep_page(rows, called, folder, written)
+        print(paths.short(written))
+        return
+    require(not only, "--where: name the sweep whose runs to keep")
     if not any((paths.results() / name).exists() for name in ("claims.csv", "figures", "tables")):
         raise InputError(
             f"{paths.short(paths.results())}: no claims, figures or tables to report; "

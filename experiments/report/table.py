@@ -26,7 +26,7 @@ from sim.files import write_whole
 
 DIGITS = 3
 FORMATS = (".tex", ".md", ".html", ".csv", ".parquet")
-_HTML = Form(lambda text: str(escape(text)), "<b>{}</b>", "<sup>*</sup>")
+HTML = Form(lambda text: str(escape(text)), "<b>{}</b>", "<sup>*</sup>")
 
 
 def check_name(path: Path) -> None:
@@ -77,7 +77,7 @@ def write_table(found: pd.DataFrame, note: str, path: Path, name: str) -> None:
     elif path.suffix == ".md":
         text = f"{escaped(note)}\n\n{to_markdown(frame, DIGITS)}"
     else:
-        cells = written(frame, _HTML, DIGITS)
+        cells = written(frame, HTML, DIGITS)
         text = render(
             "table.html",
             name=name,

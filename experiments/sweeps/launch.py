@@ -11,6 +11,7 @@ import os
 import platform
 import re
 import secrets
+import shlex
 import shutil
 import signal
 import sys
@@ -31,6 +32,7 @@ from experiments.runs.console import RunFailedError, progress
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment, check_hydra
 from experiments.runs.row import Outcome, Row, Status, check_row
+from experiments.sweeps.collect import COMMAND
 from experiments.sweeps.plan import Family, Numbers, Plan, packed, plan_of
 from sim.errors import InputError
 from sim.files import require_file, write_whole
@@ -92,6 +94,7 @@ def sweep(arguments: Sequence[str], config_dir: str | None = None) -> None:
     if not folder.is_dir() and folder.exists():
         raise InputError(f"{folder}: not a folder; remove it, or choose another name")
     prepare(folder)
+    _note_command(folder, arguments, config_dir)
     keys, first = np.unique(plan.keys, return_index=True)
     done = np.isin(keys, store.ended(folder, damaged=_drop).done)
     runs = np.sort(first[~done])
@@ -123,6 +126,18 @@ def _name(plan: Plan, own: Sequence[str], config_dir: str | None) -> str | None:
     last = {argument.partition("=")[0]: argument for argument in own}  # that one is swept
     text = json.dumps([sorted(last.values()), config_dir and str(Path(config_dir).resolve())])
     return f"sweep_{hashlib.sha256(text.encode()).hexdigest()[:8]}"
+
+
+def _note_command(folder: Path, arguments: Sequence[str], config_dir: str | None) -> None:
+    """Keep the command beside the rows, for pages that show them."""
+    path = folder / COMMAND
+    require_file(path)
+    given = [*(["--config-dir", config_dir] if config_dir else []), *arguments]
+    command = " ".join(shlex.join(["estima", "run", "-m", *given]).splitlines())
+    noted = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+    if command not in noted:
+        with write_whole(path) as part:
+            part.write_text("\n".join([*noted, command]) + "\n", encoding="utf-8")
 
 
 def check(plan: Plan, runs: Numbers) -> None:
