@@ -96,7 +96,7 @@ def run(
 
     Examples
     --------
-      estima run
+      estima run (a first look: study=first_run)
 
       estima run estimator=odometry world=office seed=3
 
@@ -124,11 +124,32 @@ def run(
     if many and "--hydra-help" not in arguments:
         from experiments.sweeps.launch import sweep_arguments
 
-        sweep_arguments([a for a in arguments if a not in many])
+        _show_sweep(*sweep_arguments([a for a in arguments if a not in many]))
         return
+    if not arguments:
+        arguments = ["study=first_run"]
+        print("estima run study=first_run (estima options lists what else there is)")
     from experiments.runs.run import application
 
     application(arguments, _draw_run, out)
+
+
+_FEW_RUNS, _FEW_LINES = 2000, 30
+
+
+def _show_sweep(folder: Path, n_runs: int) -> None:
+    """Print a sweep's small table, and what can be done next."""
+    from experiments.report.table import as_lines, notes
+    from experiments.sweeps.collect import collect
+    from experiments.sweeps.summary import ERROR, summary
+
+    if n_runs <= _FEW_RUNS:
+        rows = collect(str(folder))
+        found = summary(rows, metrics=[ERROR] if "ate_rmse_m" in rows else [])
+        if len(found) <= _FEW_LINES:
+            show(as_lines(found, notes(found, None)))
+    print(f"\nNext: estima table {folder.name} --against ESTIMATOR -o table.tex")
+    print(f"      estima report {folder.name}")
 
 
 def _draw_run(
@@ -647,8 +668,6 @@ def calibrate(
         kind: Any = (method or "wheel-truth").replace("-", "_")
         result = calibrate_recordings(loaded, kind, geometry=joint)
     print(result.as_json() if as_json else result.as_text())
-    if not as_json:
-        print("  (puzzlebot2024's own gradient descent would return 0.5, whatever the data)")
 
 
 def _robot_of(overrides: list[str], config_dir: Path | None) -> DifferentialDrive:
@@ -842,7 +861,7 @@ def table(
 
       estima table slip --rows -o slip.csv
     """
-    from experiments.report.table import as_lines, check_name, notes, write_table
+    from experiments.report.table import as_lines, check_name, notes, statuses, write_table
     from experiments.sweeps.collect import collect, where
     from experiments.sweeps.summary import summary
 
@@ -860,6 +879,8 @@ def table(
     note = notes(found, against)
     if out is None:
         show(as_lines(found, note))
+        if (rows["status"] != Outcome.OK).any():
+            show("\n" + "\n".join(f"{count} {words}" for words, count in statuses(rows)))
         return
     write_table(found, note, out, Path(name).name)
     print(f"{out}: {len(found)} rows")

@@ -121,9 +121,9 @@ def test_tables_are_sorted_by_keyboard(tab):
 def test_phones_and_dark_mode(tab, dark):
     tab.shape(390, 800, dark=dark)
     assert tab.becomes("document.getElementById('chart').getBoundingClientRect().width <= 390")
-    assert tab.js("document.documentElement.scrollWidth") <= 390
+    assert tab.becomes("document.documentElement.scrollWidth <= 390")
     ink = tab.js("getComputedStyle(document.body).color")
     assert tab.becomes(
-        f"getComputedStyle(document.querySelector('#chart .xtitle')).fill == '{ink}'"
+        f"getComputedStyle(document.querySelector('#chart .xtick text')).fill == '{ink}'"
     )
     assert tab.complaints() == []

@@ -16,7 +16,7 @@ from scipy import stats
 
 from experiments.report.export import numeric, plain, written
 from experiments.report.page import render
-from experiments.report.table import DIGITS, HTML, notes, shown
+from experiments.report.table import DIGITS, HTML, WORDS, notes, shown, statuses
 from experiments.runs import completion, paths
 from experiments.runs.columns import ANSWER, COLUMNS, ORIGIN, REPEAT, average_of, is_setting
 from experiments.runs.columns import title as titled
@@ -31,13 +31,7 @@ from sim.files import write_whole
 MOST_RUNS = 10_000  # with 1.2 MB of the charting library the page stays below 5 MB
 _DIGITS = 5  # of the numbers behind the chart
 _SHOWN_RUNS = 3  # best, and worst
-_MOST_REMARKS = 12
 _FEW = 12  # colours, and panels
-_WORDS = {
-    Outcome.OK: "ran to the end",
-    Outcome.REMARK: "ran, with a remark",
-    Outcome.FAILED: "failed",
-}
 
 
 def write_sweep_page(table: pd.DataFrame, name: str, folder: Path, out: Path) -> None:
@@ -71,7 +65,7 @@ def write_sweep_page(table: pd.DataFrame, name: str, folder: Path, out: Path) ->
         name=name,
         n_runs=len(table),
         data=_data(every, settings, metrics),
-        statuses=_statuses(table),
+        statuses=statuses(table),
         note=notes(found, None),
         head=[Markup(cell) for cell in means],
         numeric=numeric(shown(found)),
@@ -108,7 +102,7 @@ def _data(table: pd.DataFrame, settings: list[str], metrics: list[str]) -> Marku
         "recording": pd.factorize(table[RECORDING])[0].tolist(),
         "repeat": table[REPEAT].tolist(),
         "failed": (table["status"] == Outcome.FAILED).tolist(),
-        "status": [_WORDS[Outcome(s)] for s in table["status"]],
+        "status": [WORDS[Outcome(s)] for s in table["status"]],
         "drawn": list(DRAWN),
         "start": {"x": x, "y": first, "colour": rest[0], "panels": rest[1]},
         "t975": [round(float(stats.t.ppf(0.975, n)), 4) for n in range(1, 200)],
@@ -123,17 +117,6 @@ def _cells(column: pd.Series[Any]) -> list[Any]:
         return [float(f"{v:.{_DIGITS}g}") if math.isfinite(v) else None for v in column]
     return [None if pd.isna(v) else v if isinstance(v, (bool, int)) else printable(str(v))
             for v in column.tolist()]  # fmt: skip
-
-
-def _statuses(table: pd.DataFrame) -> list[tuple[str, int]]:
-    """How the runs ended, in words, with how often; numbers in details count as the same."""
-    detail = table["status_detail"].fillna("") if "status_detail" in table else ""
-    words = table["status"].map(lambda status: _WORDS[Outcome(status)])
-    same = pd.Series(detail, table.index).str.replace(r"\d+(\.\d+)?", "...", regex=True)
-    counts = (words + same.map(lambda text: f": {text}" if text else "")).value_counts()
-    rest = counts[_MOST_REMARKS:].sum()
-    found = list(counts[:_MOST_REMARKS].items())
-    return [*found, ("ended in other ways", int(rest))] if rest else found
 
 
 def _extremes(table: pd.DataFrame, settings: list[str]) -> list[Mapping[str, Any]]:

@@ -43,7 +43,7 @@ _JOBS_PER_CORE = 4  # enough to keep all busy to the end, few enough to cost lit
 _DIED = {"UncompletedJobError", "WorkerCrashedError", "NodeDiedError", "OutOfMemoryError"}
 
 
-def sweep_arguments(arguments: Sequence[str]) -> None:
+def sweep_arguments(arguments: Sequence[str]) -> tuple[Path, int]:
     """Sweep by a command line's arguments: overrides, and `--config-dir` with its folder."""
     overrides, config_dir = [], None
     rest = iter(arguments)
@@ -58,10 +58,10 @@ def sweep_arguments(arguments: Sequence[str]) -> None:
         else:
             overrides.append(argument)
     signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGINT))  # end as by Ctrl-C
-    sweep(overrides, config_dir)
+    return sweep(overrides, config_dir)
 
 
-def sweep(arguments: Sequence[str], config_dir: str | None = None) -> None:
+def sweep(arguments: Sequence[str], config_dir: str | None = None) -> tuple[Path, int]:
     """Run all combinations of the swept values, except those already done.
 
     Parameters
@@ -73,6 +73,11 @@ def sweep(arguments: Sequence[str], config_dir: str | None = None) -> None:
         that the runs are packed into.
     config_dir
         A further folder of options.
+
+    Returns
+    -------
+    folder, n_runs
+        Where the rows are, and how many runs the sweep has.
 
     Raises
     ------
@@ -105,14 +110,20 @@ def sweep(arguments: Sequence[str], config_dir: str | None = None) -> None:
         file=sys.stderr,
     )
     if not len(runs):
-        return
-    _launch_all(plan, runs, Jobs(folder, n_jobs), launching)
+        return folder, len(keys)
+    try:
+        _launch_all(plan, runs, Jobs(folder, n_jobs), launching)
+    except KeyboardInterrupt:
+        n_kept = np.isin(keys, store.ended(folder).done).sum()
+        print(f"{n_kept} of {len(keys)} runs are kept; run it again to go on", file=sys.stderr)
+        raise
     _tidy(folder)
     found = store.ended(folder)
     bad = runs[~np.isin(plan.keys[runs], found.done)]
     if len(bad):
         why = found.failed.get(int(plan.keys[bad[0]]), "no row was written")
         raise RunFailedError(f"{len(bad)} of {len(keys)} runs; first: {why}")
+    return folder, len(keys)
 
 
 def _name(plan: Plan, own: Sequence[str], config_dir: str | None) -> str | None:
