@@ -684,6 +684,54 @@ def _robot_of(overrides: list[str], config_dir: Path | None) -> DifferentialDriv
 
 
 @app.command()
+def tune(
+    study: Annotated[
+        str,
+        typer.Argument(
+            help="A study of conf/study that has a tune.", autocompletion=completion.studies
+        ),
+    ],
+    only: Annotated[list[str] | None, typer.Option(help="Only this estimator; repeat it.")] = None,
+    jobs: Annotated[int, typer.Option("--jobs", "-j", help="Processes.")] = 1,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="Folder of the YAMLs [results/tuned/estimator]."),
+    ] = None,
+    config_dir: ConfigDir = None,
+) -> None:
+    """Tune a study's estimators on seeds below 100, with one budget, and judge them on its own.
+
+    The trials are kept, so that the command goes on where it was interrupted. It writes
+    ESTIMATOR_tuned.yaml, tables of trials and gains, and their figure.
+
+    Examples
+    --------
+      estima tune peers --jobs 2
+
+      estima run --config-dir results/tuned estimator=ekf_icp_tuned sensors=hokuyo
+    """
+    from experiments.sweeps import tune as tuning
+    from experiments.viewing.style import save_figure
+
+    folder = str(config_dir) if config_dir else None
+    plan = tuning.tuning_of(study, folder)
+    found = []
+    with progress(f"tune {study}", 1.0) as on_progress:
+        for one in tuning.tune(
+            study, only or (), jobs=jobs, config_dir=folder, on_progress=on_progress
+        ):
+            found.append(one)
+    place = paths.results()
+    written = tuning.write(found, study, plan, out or place / "tuned" / "estimator")
+    trials, gains = tuning.trials_table(found), tuning.gains_table(found)
+    write_frame(trials, place / "tables" / f"{study}_trials_tuning.csv", digits=6)
+    write_frame(gains, place / "tables" / f"{study}_tuning.csv", digits=6)
+    save_figure(tuning.curves(trials, gains), place / "figures" / f"{study}_tuning.png")
+    show(gains.to_string(index=False, float_format=lambda v: f"{v:.4g}"))
+    print("\n".join(map(paths.short, written)))
+
+
+@app.command()
 def conform(
     target: Annotated[
         str,

@@ -29,6 +29,11 @@ OWN = {
         "estima table leaderboard --against smoother --times "
         "-o results/tables/leaderboard_means.csv",
     ],
+    "peers": [
+        "pip install 'estima[peers,tune]' && make peers",
+        "estima reproduce --paper peers --full",
+        "estima tune peers -o conf/estimator",
+    ],
     "all_estimators": ["estima run -m study=all_estimators"],
     "mcl_office": ["estima reproduce --paper mcl_office --full"],
     "fastslam_consistency": ["estima reproduce --paper fastslam_consistency --full"],

@@ -179,6 +179,9 @@ def _print(rows: Sequence[Row], files: Sequence[Path]) -> None:
     show(f"{first['choice.estimator']} on {where}, seed {first['seed']}{status}")
     if words := in_words(rows):
         show(f"  {words}")
+    if first.get("stamps_left_out"):
+        scored, left_out = first["stamps_scored"], first["stamps_left_out"]
+        show(f"  scored at {scored} frames; {left_out} others have no true pose")
     for name in _SHOWN:
         values = [float(v) for row in rows if isinstance(v := row.get(name), (int, float))]
         if values:
