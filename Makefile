@@ -3,11 +3,12 @@ PYTHON ?= python3
 ESTIMA := .venv/bin/estima
 FULL ?= 0
 
-.PHONY: help setup reproduce test test-all lint types format docs lock peers clean
+.PHONY: help setup reproduce report test test-all lint types format docs lock peers clean
 
 help:
 	@echo "make reproduce         figures, tables and claims from few repeats, into results/quick/"
 	@echo "make reproduce FULL=1  the judged ones, into results/"
+	@echo "make report            the page of results/, results/report.html"
 	@echo "make test              the default tests"
 	@echo "make test-all          the slow ones too"
 	@echo "make lint types        what a change must pass besides"
@@ -19,6 +20,9 @@ setup:
 
 reproduce: setup
 	@$(ESTIMA) reproduce $(if $(filter-out 0,$(FULL)),--full)
+
+report: setup
+	@$(ESTIMA) report
 
 test: setup
 	@.venv/bin/python -m pytest -n 2

@@ -96,7 +96,7 @@ def run(
 
     Examples
     --------
-      estima run
+      estima run (a first look: study=first_run)
 
       estima run estimator=odometry world=office seed=3
 
@@ -124,11 +124,32 @@ def run(
     if many and "--hydra-help" not in arguments:
         from experiments.sweeps.launch import sweep_arguments
 
-        sweep_arguments([a for a in arguments if a not in many])
+        _show_sweep(*sweep_arguments([a for a in arguments if a not in many]))
         return
+    if not arguments:
+        arguments = ["study=first_run"]
+        print("estima run study=first_run (estima options lists what else there is)")
     from experiments.runs.run import application
 
     application(arguments, _draw_run, out)
+
+
+_FEW_RUNS, _FEW_LINES = 2000, 30
+
+
+def _show_sweep(folder: Path, n_runs: int) -> None:
+    """Print a sweep's small table, and what can be done next."""
+    from experiments.report.table import as_lines, notes
+    from experiments.sweeps.collect import collect
+    from experiments.sweeps.summary import ERROR, summary
+
+    if n_runs <= _FEW_RUNS:
+        rows = collect(str(folder))
+        found = summary(rows, metrics=[ERROR] if "ate_rmse_m" in rows else [])
+        if len(found) <= _FEW_LINES:
+            show(as_lines(found, notes(found, None)))
+    print(f"\nNext: estima table {folder.name} --against ESTIMATOR -o table.tex")
+    print(f"      estima report {folder.name}")
 
 
 def _draw_run(
@@ -647,8 +668,6 @@ def calibrate(
         kind: Any = (method or "wheel-truth").replace("-", "_")
         result = calibrate_recordings(loaded, kind, geometry=joint)
     print(result.as_json() if as_json else result.as_text())
-    if not as_json:
-        print("  (puzzlebot2024's own gradient descent would return 0.5, whatever the data)")
 
 
 def _robot_of(overrides: list[str], config_dir: Path | None) -> DifferentialDrive:
@@ -890,7 +909,7 @@ def table(
 
       estima table slip --rows -o slip.csv
     """
-    from experiments.report.table import as_lines, check_name, notes, write_table
+    from experiments.report.table import as_lines, check_name, notes, statuses, write_table
     from experiments.sweeps.collect import collect, where
     from experiments.sweeps.summary import summary
 
@@ -908,6 +927,8 @@ def table(
     note = notes(found, against)
     if out is None:
         show(as_lines(found, note))
+        if (rows["status"] != Outcome.OK).any():
+            show("\n" + "\n".join(f"{count} {words}" for words, count in statuses(rows)))
         return
     write_table(found, note, out, Path(name).name)
     print(f"{out}: {len(found)} rows")
@@ -1010,11 +1031,43 @@ def reproduce(
 
 
 @app.command()
-def report() -> None:
-    """Write results/report.html from what the studies have written to results/.
+def report(
+    name: Annotated[
+        str | None,
+        typer.Argument(
+            help="A sweep's name, or a folder or file of rows; else all studies of the papers.",
+            autocompletion=completion.sweeps,
+        ),
+    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="File to write, .html.")] = None,
+    only: Where = None,
+) -> None:
+    """Write one page to open in a browser: of a sweep, or of the papers' studies in results/.
 
-    Example: estima report
+    A sweep's page has a chart whose axes, colours, panels and filters can be chosen, its means, its
+    best and worst runs, and its command. It needs no network.
+
+    Examples
+    --------
+      estima report
+
+      estima report slip
+
+      estima report slip --where choice.world=office -o office.html
     """
+    if out is not None and (name is None or out.suffix != ".html"):
+        raise InputError(f"-o {out}: give the name of a sweep, and a file that ends in .html")
+    if name is not None:
+        from experiments.report.sweep_page import write_sweep_page
+        from experiments.sweeps.collect import collect, folder_of, where
+
+        folder, called = folder_of(name), Path(name).name
+        written = out or folder.parent / f"{called}.html"
+        rows = where(collect(name, times=True), only or [])
+        write_sweep_page(rows, called, folder, written)
+        print(paths.short(written))
+        return
+    require(not only, "--where: name the sweep whose runs to keep")
     if not any((paths.results() / name).exists() for name in ("claims.csv", "figures", "tables")):
         raise InputError(
             f"{paths.short(paths.results())}: no claims, figures or tables to report; "

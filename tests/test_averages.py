@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from experiments.cli import app
 from experiments.evaluation.statistics import holm, mean_interval, paired_p
-from experiments.report.table import notes, write_table
+from experiments.report.table import notes, statuses, write_table
 from experiments.runs.columns import COLUMNS, Average
 from experiments.sweeps.averages import averages, unit_of
 from experiments.sweeps.summary import summary
@@ -159,6 +159,17 @@ def test_a_table_that_latex_would_refuse_is_found():
     for bad in (good.replace("1 & 2", "1 & 2 & 3"), good.replace("a &", "a_b &"), good + "}"):
         with pytest.raises(AssertionError):
             check_latex(bad)
+
+
+def test_statuses_are_words_with_counts():
+    table = runs(n=3, repeats=1).assign(status_detail="")
+    table.loc[:2, "status"] = "remark"
+    table.loc[:2, "status_detail"] = ["gated at 1.5 s", "gated at 20 s", "lost"]
+    assert statuses(table) == [
+        ("ran to the end", 3),
+        ("ran, with a remark: gated at ... s", 2),
+        ("ran, with a remark: lost", 1),
+    ]
 
 
 def test_the_command_refuses_other_endings_before_it_reads(tmp_path):

@@ -19,14 +19,22 @@ from experiments.report.export import (
 )
 from experiments.report.page import render
 from experiments.runs.columns import PATH
-from experiments.runs.row import write_frame
+from experiments.runs.row import Outcome, write_frame
 from experiments.sweeps.summary import COUNTS, MARKS
 from sim.errors import require
 from sim.files import write_whole
 
 DIGITS = 3
 FORMATS = (".tex", ".md", ".html", ".csv", ".parquet")
-_HTML = Form(lambda text: str(escape(text)), "<b>{}</b>", "<sup>*</sup>")
+HTML = Form(lambda text: str(escape(text)), "<b>{}</b>", "<sup>*</sup>")
+
+
+WORDS = {
+    Outcome.OK: "ran to the end",
+    Outcome.REMARK: "ran, with a remark",
+    Outcome.FAILED: "failed",
+}
+_MOST_REMARKS = 12
 
 
 def check_name(path: Path) -> None:
@@ -77,7 +85,7 @@ def write_table(found: pd.DataFrame, note: str, path: Path, name: str) -> None:
     elif path.suffix == ".md":
         text = f"{escaped(note)}\n\n{to_markdown(frame, DIGITS)}"
     else:
-        cells = written(frame, _HTML, DIGITS)
+        cells = written(frame, HTML, DIGITS)
         text = render(
             "table.html",
             name=name,
@@ -88,3 +96,14 @@ def write_table(found: pd.DataFrame, note: str, path: Path, name: str) -> None:
         )
     with write_whole(path) as part:
         part.write_text(text, encoding="utf-8")
+
+
+def statuses(table: pd.DataFrame) -> list[tuple[str, int]]:
+    """How the runs ended, in words, with how often; numbers in details count as the same."""
+    detail = table["status_detail"].fillna("") if "status_detail" in table else ""
+    words = table["status"].map(lambda status: WORDS[Outcome(status)])
+    same = pd.Series(detail, table.index).str.replace(r"\d+(\.\d+)?", "...", regex=True)
+    counts = (words + same.map(lambda text: f": {text}" if text else "")).value_counts()
+    rest = counts[_MOST_REMARKS:].sum()
+    found = list(counts[:_MOST_REMARKS].items())
+    return [*found, ("ended in other ways", int(rest))] if rest else found

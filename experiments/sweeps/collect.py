@@ -17,6 +17,7 @@ from sim.errors import InputError
 
 _TIMES = ["step_time_us", "cpu_time_us"]  # they differ from run to run
 _COMMAND = "estimator.command"
+COMMAND = "command.txt"  # beside the rows: the commands that made them
 DRAWN = ("seed", "world_seed")  # settings that only draw anew
 
 
@@ -38,11 +39,7 @@ def collect(name: str, *, all_versions: bool = False, times: bool = False) -> pd
         If there are no rows, or none of this version of the code; or if runs of different keys
         have equal settings, because a file was edited between them, say.
     """
-    runs = results() / "runs"
-    path = next((p for p in (runs / name, Path(name)) if p.exists()), None)
-    if path is None:
-        there = sorted(p.name for p in runs.glob("*") if p.is_dir())
-        raise InputError(f"no sweep named {name}; there are: {', '.join(there) or 'none'}")
+    path = folder_of(name)
     table = read_runs(path).copy()  # in one piece; else pandas warns
     for column in ("status", REPEAT, *ORIGIN):
         if column not in table:
@@ -65,6 +62,22 @@ def collect(name: str, *, all_versions: bool = False, times: bool = False) -> pd
     if not times:
         table = table.drop(columns=_TIMES, errors="ignore")
     return table.sort_values([*settings, "run_key", REPEAT], kind="stable", ignore_index=True)
+
+
+def folder_of(name: str) -> Path:
+    """Path of a sweep's rows, by its name or path.
+
+    Raises
+    ------
+    InputError
+        If there is none.
+    """
+    runs = results() / "runs"
+    path = next((p for p in (runs / name, Path(name)) if p.exists()), None)
+    if path is None:
+        there = sorted(p.name for p in runs.glob("*") if p.is_dir())
+        raise InputError(f"no sweep named {name}; there are: {', '.join(there) or 'none'}")
+    return path
 
 
 def _check_distinct(table: pd.DataFrame, settings: list[str], path: Path) -> None:
