@@ -132,13 +132,11 @@ def yaml_of(tuned: Tuned, study: str, tuning: Tuning) -> str:
     )
 
 
-def write(results: Sequence[Tuned], study: str, tuning: Tuning, folder: Path) -> list[Path]:
-    """Write a YAML for each winner, `ESTIMATOR_tuned.yaml`; return their paths."""
-    written = []
-    for tuned in results:
-        written.append(folder / f"{tuned.estimator}_tuned.yaml")
-        write_text(written[-1], yaml_of(tuned, study, tuning))
-    return written
+def write(tuned: Tuned, study: str, tuning: Tuning, folder: Path) -> Path:
+    """Write the winner's YAML, `ESTIMATOR_tuned.yaml`; return its path."""
+    path = folder / f"{tuned.estimator}_tuned.yaml"
+    write_text(path, yaml_of(tuned, study, tuning))
+    return path
 
 
 def trials_table(results: Sequence[Tuned]) -> pd.DataFrame:
@@ -259,15 +257,23 @@ def _tuned(
     complete = [t for t in finished if t.state == optuna.trial.TrialState.COMPLETE]
     best = min(complete, key=lambda t: t.value)
     values = {k: v for k, v in best.params.items() if v != default[k]}
-    each = Parallel(n_jobs=jobs)(
-        delayed(error_m)(experiment.with_estimator(**chosen))
-        for chosen in (default, values)
-        for experiment in judged
-    )
-    before, after = each[: len(judged)], each[len(judged) :]
+    before, after = (_judged(opened, chosen, judged, jobs) for chosen in (default, values))
     default_m, tuned_m = (math.exp(float(np.mean(np.log(e)))) for e in (before, after))
     gain = log_ratio_interval(after, before)
     return Tuned(name, values, _trials(finished), gain, default_m, tuned_m, len(judged))
+
+
+def _judged(
+    study: Any, values: Mapping[str, Any], judged: Sequence[Experiment], jobs: int
+) -> list[float]:
+    """Errors of these values on the judged recordings, m; the journal keeps them."""
+    key = json.dumps([_digest(judged, {}), values], sort_keys=True)
+    kept: dict[str, list[float]] = study.user_attrs.get("judged", {})
+    if key not in kept:
+        runs = (delayed(error_m)(experiment.with_estimator(**values)) for experiment in judged)
+        kept = {**kept, key: list(Parallel(n_jobs=jobs)(runs))}
+        study.set_user_attr("judged", kept)
+    return kept[key]
 
 
 def _work(
