@@ -38,6 +38,7 @@ def errors(methods: pd.DataFrame) -> Figure:
         for axes, label in ((left, "position error, RMS m"), (right, "processor time a Frame, us")):
             axes.set(xscale="log", xlabel=label, ylim=(-0.7, len(names) - 0.3))
             axes.grid(axis="y", color="0.92")
+        right.tick_params(axis="y", length=0)
         left.set_yticks(places, [name.replace(TUNED, " (tuned)") for name in names])
         right.set_yticks(places, [""] * len(names))
         left.set_title(f"{sensor} and wheels", fontsize=9, loc="left")
