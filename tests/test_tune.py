@@ -64,8 +64,11 @@ def test_it_finds_what_is_better_and_judges_it_elsewhere(study, tmp_path):
     (tuned,) = tuning.tune("toy", config_dir=folder)
     assert tuned.trials["state"].isin(["complete", "pruned"]).all()
     assert len(tuned.trials) == 12
-    assert tuned.trials["trial"].iloc[0] == 0
-    assert tuned.trials["window_s"].iloc[0] == 0.05  # the default
+    assert list(tuned.trials["trial"]) == [*range(1, 13)]
+    assert tuned.trials["mean_log_error"].notna().equals(tuned.trials["state"] == "complete")
+    best = tuned.trials.loc[tuned.trials["mean_log_error"].idxmin()]
+    assert best["best_so_far_m"] == tuned.trials["best_so_far_m"].iloc[-1]
+    assert tuned.values.items() <= json.loads(best["options"]).items()
     assert tuned.gain.value < 0.2
     assert tuned.gain.value == pytest.approx(tuned.tuned_m / tuned.default_m)
     assert tuned.n_judged == 4

@@ -25,6 +25,7 @@ import yaml
 from hydra import initialize_config_dir
 from joblib import Parallel, delayed
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
 from omegaconf import OmegaConf
 
 from experiments.evaluation.statistics import Interval, log_ratio_interval
@@ -55,7 +56,8 @@ class Tuned:
     values
         The winner's options that differ from the default.
     trials
-        A row a trial: `trial`, `state`, `seconds`, `mean_log_error`, `best_so_far_m`, the options.
+        A row a trial: `trial` from 1, `state`, `seconds`, `mean_log_error` (NaN if pruned),
+        `options` as JSON, `best_so_far_m`.
     gain
         Error of the winner over that of the default on the judged recordings, geometric mean.
     default_m, tuned_m
@@ -140,17 +142,10 @@ def write(tuned: Tuned, study: str, tuning: Tuning, folder: Path) -> Path:
 
 
 def trials_table(results: Sequence[Tuned]) -> pd.DataFrame:
-    """All trials, a row each, with their options as text."""
-    parts = []
-    for tuned in results:
-        options = [c for c in tuned.trials if c not in _OF_A_TRIAL]
-        texts = [
-            json.dumps(dict(row)) for _, row in tuned.trials[options].astype(object).iterrows()
-        ]
-        part = tuned.trials[list(_OF_A_TRIAL)].assign(options=texts)
-        part.insert(0, "estimator", tuned.estimator)
-        parts.append(part)
-    return pd.concat(parts, ignore_index=True)
+    """All trials, a row each."""
+    parts = [tuned.trials.assign(estimator=tuned.estimator) for tuned in results]
+    table = pd.concat(parts, ignore_index=True)
+    return table[["estimator", *(column for column in table if column != "estimator")]]
 
 
 def gains_table(results: Sequence[Tuned]) -> pd.DataFrame:
@@ -183,9 +178,9 @@ def curves(trials: pd.DataFrame, gains: pd.DataFrame) -> Figure:
         rows = trials[trials["estimator"] == name]
         style = {"color": CYCLE[i % len(CYCLE)], "ls": styles[i // len(CYCLE) % len(styles)]}
         best = rows["best_so_far_m"].to_numpy(float)
-        left.step(rows["trial"] + 1, best / best[0], where="post", label=name, **style)
+        left.step(rows["trial"], best / best[0], where="post", label=name, **style)
     left.set(xlabel="trials", ylabel="best error over the default's, tuning seeds", yscale="log")
-    left.legend(fontsize=7)
+    page.legend(loc="outside lower center", ncols=4, fontsize=8)
     places = np.arange(len(names))[::-1]
     at = gains["tuned_over_default"].to_numpy(float)
     reach = [at - gains["low"].to_numpy(float), gains["high"].to_numpy(float) - at]
@@ -194,12 +189,10 @@ def curves(trials: pd.DataFrame, gains: pd.DataFrame) -> Figure:
     right.set(xlabel="error of the tuned over that of the default, judged seeds", xscale="log")
     right.set_yticks(places, names)
     for axis in (left.yaxis, right.xaxis):
-        axis.set_major_formatter("{x:.2g}")
-        axis.set_minor_formatter("{x:.2g}")
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_formatter(NullFormatter())
     return page
-
-
-_OF_A_TRIAL = ("trial", "state", "seconds", "mean_log_error", "best_so_far_m")
 
 
 def _plan(
@@ -327,20 +320,19 @@ def _answer_m(row: Row) -> float:
 
 
 def _trials(finished: Sequence[Any]) -> pd.DataFrame:
-    """Trials as they were begun; a pruned one has no value."""
-    rows = [
-        {
-            "trial": trial.number,
-            "state": trial.state.name.lower(),
-            "seconds": trial.duration.total_seconds() if trial.duration else math.nan,
-            "mean_log_error": math.nan if trial.value is None else trial.value,
-            **trial.params,
-        }
-        for trial in sorted(finished, key=lambda t: t.number)
-    ]
-    table = pd.DataFrame(rows)
-    table.insert(4, "best_so_far_m", np.exp(table["mean_log_error"].cummin().ffill()))
-    return table
+    """Trials in the order in which they began; a pruned one has no value.
+
+    Optuna gives that the value of its last recording.
+    """
+    rows = []
+    for number, trial in enumerate(sorted(finished, key=lambda t: t.number), start=1):
+        state = trial.state.name.lower()
+        value = trial.value if state == "complete" else math.nan
+        options = json.dumps(trial.params)
+        seconds = trial.duration.total_seconds()
+        rows.append((number, state, seconds, value, options))
+    table = pd.DataFrame(rows, columns=["trial", "state", "seconds", "mean_log_error", "options"])
+    return table.assign(best_so_far_m=np.exp(table["mean_log_error"].cummin().ffill()))
 
 
 def _digest(drives: Sequence[Experiment], ranges: Mapping[str, Range]) -> str:
