@@ -25,7 +25,6 @@ import yaml
 from hydra import initialize_config_dir
 from joblib import Parallel, delayed
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullFormatter
 from omegaconf import OmegaConf
 
 from experiments.evaluation.statistics import Interval, log_ratio_interval
@@ -36,7 +35,7 @@ from experiments.runs.experiment import Experiment, composed, searched
 from experiments.runs.row import Outcome, Row
 from experiments.sweeps.plan import planned
 from experiments.sweeps.ranges import FIRST_JUDGED_SEED, Range, Tuning
-from experiments.viewing.style import CYCLE, subplots
+from experiments.viewing.style import CYCLE, plain_log_ticks, subplots
 from sim.errors import InputError, require
 from sim.files import write_text
 
@@ -188,10 +187,7 @@ def curves(trials: pd.DataFrame, gains: pd.DataFrame) -> Figure:
     right.axvline(1.0, color="0.6", lw=0.8, ls="--")
     right.set(xlabel="error of the tuned over that of the default, judged seeds", xscale="log")
     right.set_yticks(places, names)
-    for axis in (left.yaxis, right.xaxis):
-        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        axis.set_major_formatter("{x:g}")
-        axis.set_minor_formatter(NullFormatter())
+    plain_log_ticks(left.yaxis, right.xaxis)
     return page
 
 
