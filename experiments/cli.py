@@ -714,15 +714,14 @@ def tune(
     from experiments.viewing.style import save_figure
 
     folder = str(config_dir) if config_dir else None
-    plan = tuning.tuning_of(study, folder)
-    found = []
+    plan, place = tuning.tuning_of(study, folder), paths.results()
+    found, written = [], []
     with progress(f"tune {study}", 1.0) as on_progress:
-        for one in tuning.tune(
+        for tuned in tuning.tune(
             study, only or (), jobs=jobs, config_dir=folder, on_progress=on_progress
         ):
-            found.append(one)
-    place = paths.results()
-    written = tuning.write(found, study, plan, out or place / "tuned" / "estimator")
+            found.append(tuned)
+            written.append(tuning.write(tuned, study, plan, out or place / "tuned" / "estimator"))
     trials, gains = tuning.trials_table(found), tuning.gains_table(found)
     write_frame(trials, place / "tables" / f"{study}_trials_tuning.csv", digits=6)
     write_frame(gains, place / "tables" / f"{study}_tuning.csv", digits=6)

@@ -16,6 +16,7 @@ from estimators.base import Estimate, Prior
 from estimators.peers import MissingPackageError
 from experiments.papers.maximo2024.places import UMH, place_world
 from sim import se2
+from sim.errors import InputError
 from sim.recording import Frame, Log, Recording, Truth, WheelLog
 from sim.robot import RobotGeometry
 from sim.sensors import Encoder, Laser, Mount, StereoCamera
@@ -35,11 +36,13 @@ PROGRAMS = {
 
 @contextmanager
 def peers_may_be_missing():
-    """Skip the test, with the reason, where a peer's package is not installed."""
+    """Skip the test, with the reason, where a peer's package or program is not installed."""
     try:
         yield
-    except MissingPackageError as missing:
-        pytest.skip(str(missing))
+    except InputError as error:
+        if isinstance(error, MissingPackageError) or "no program build/peers/" in str(error):
+            pytest.skip(str(error))
+        raise
 
 
 def square_room(n_landmarks=40, seed=0):

@@ -232,6 +232,7 @@ MALFORMED = {
     "elsewhere.tum": _LINE.format(1e6).encode(),
     "binary.tum": bytes(range(256)),
     "utf16.tum": _LINE.format(0).encode("utf-16"),
+    "mark.tum": "\ufeff".encode(),
     "cut.tum": (_LINE.format(0) + "0.1 1 2").encode(),
     "empty.csv": b"",
     "header.csv": _CSV.encode(),

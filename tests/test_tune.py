@@ -64,8 +64,11 @@ def test_it_finds_what_is_better_and_judges_it_elsewhere(study, tmp_path):
     (tuned,) = tuning.tune("toy", config_dir=folder)
     assert tuned.trials["state"].isin(["complete", "pruned"]).all()
     assert len(tuned.trials) == 12
-    assert tuned.trials["trial"].iloc[0] == 0
-    assert tuned.trials["window_s"].iloc[0] == 0.05  # the default
+    assert list(tuned.trials["trial"]) == [*range(1, 13)]
+    assert tuned.trials["mean_log_error"].notna().equals(tuned.trials["state"] == "complete")
+    best = tuned.trials.loc[tuned.trials["mean_log_error"].idxmin()]
+    assert best["best_so_far_m"] == tuned.trials["best_so_far_m"].iloc[-1]
+    assert tuned.values.items() <= json.loads(best["options"]).items()
     assert tuned.gain.value < 0.2
     assert tuned.gain.value == pytest.approx(tuned.tuned_m / tuned.default_m)
     assert tuned.n_judged == 4
@@ -73,7 +76,7 @@ def test_it_finds_what_is_better_and_judges_it_elsewhere(study, tmp_path):
     assert {seed for seed, *_ in calls} == {*range(6), *range(1000, 1004)}
     assert "pruned" in set(tuned.trials["state"])
     plan = tuning.tuning_of("toy", folder)
-    (path,) = tuning.write([tuned], "toy", plan, tmp_path / "estimator")
+    path = tuning.write(tuned, "toy", plan, tmp_path / "estimator")
     assert set(yaml.safe_load(path.read_text())) == {"defaults", *tuned.values}
     with_folder = [f"hydra.searchpath=[file://{tmp_path}]", "estimator=odometry_tuned"]
     settings = Experiment.compose(with_folder).config["estimator"]
@@ -94,8 +97,9 @@ def test_it_goes_on_where_it_ended(study):
     assert len(tuned.trials) == 6
     assert 0 < sum(seed < 100 for seed, *_ in calls) <= 12  # two trials of six recordings
     calls.clear()
-    list(tuning.tune("toy", config_dir=write(trials=6)))
-    assert all(seed >= 1000 for seed, *_ in calls)
+    (again,) = tuning.tune("toy", config_dir=write(trials=6))
+    assert not calls
+    assert again.gain == tuned.gain
     assert n_first > 0
 
 

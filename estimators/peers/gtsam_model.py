@@ -9,10 +9,12 @@ from typing import Any
 import numpy as np
 
 from estimators.gaussian import Gaussian
+from estimators.landmark_drive import FLOOR
 from estimators.peers import package
 from estimators.peers.planar import matrix_of
 from estimators.stereo import StereoModel
-from sim.arrays import Array
+from sim import se2
+from sim.arrays import Array, Ints
 from sim.errors import require
 
 _FLAT_SIGMA = 1e-5  # height m, roll and pitch rad, of every pose
@@ -126,6 +128,63 @@ class GtsamModel:
         covariance = np.diag(np.full(6, _FREE_SIGMA**2))
         covariance[np.ix_(_IN_PLANE, _IN_PLANE)] = turn.T @ planar.covariance @ turn
         return self._gtsam.noiseModel.Gaussian.Covariance(covariance)
+
+
+class Isam2:
+    """GTSAM's iSAM2 over images; options as in `estimators.peers.gtsam_isam2.GtsamIsam2`.
+
+    Parameters
+    ----------
+    start
+        Pose in map before the first image.
+    """
+
+    def __init__(
+        self,
+        camera: StereoModel,
+        start: Gaussian,
+        relinearize_threshold: float = 0.1,
+        relinearize_skip: int = 10,
+        updates: int = 1,
+    ) -> None:
+        gtsam = package("gtsam", "gtsam")
+        self._camera, self._model, self._updates = camera, GtsamModel(camera), updates
+        params = gtsam.ISAM2Params()
+        params.setRelinearizeThreshold(relinearize_threshold)
+        params.relinearizeSkip = relinearize_skip
+        self._isam = gtsam.ISAM2(params)
+        graph, values = self._model.graph_and_values()
+        self._model.add_start(graph, Gaussian(start.mean, start.covariance + FLOOR))
+        self._model.add_pose(graph, values, 0, start.mean)
+        self._isam.update(graph, values)
+        self._pose, self._n_poses = start.mean, 1
+        self._known: set[int] = set()
+
+    def see(self, motion: Gaussian, points: Array, ids: Ints) -> Gaussian:
+        """Pose in map after an image of points (K, 3) m in the camera frame and ids (K,).
+
+        Parameters
+        ----------
+        motion
+            Since the last image, or the start.
+        """
+        model, i = self._model, self._n_poses
+        guess = se2.compose(self._pose, motion.mean)
+        graph, values = model.graph_and_values()
+        model.add_pose(graph, values, i, guess)
+        model.add_motion(graph, i - 1, i, motion)
+        for point, landmark in zip(points, ids.tolist(), strict=True):
+            model.add_seen(graph, i, landmark, point)
+            if landmark not in self._known:
+                self._known.add(landmark)
+                model.add_landmark(values, landmark, self._camera.place(guess, point))
+        self._isam.update(graph, values)
+        for _ in range(self._updates - 1):
+            self._isam.update()
+        key = model.pose_key(i)
+        self._pose, self._n_poses = model.planar(self._isam.calculateEstimatePose3(key)), i + 1
+        marginal = self._isam.marginalCovariance(key)
+        return Gaussian(self._pose, model.covariance(marginal, self._pose[2:]))
 
 
 def _turn(angle_rad: float) -> Array:

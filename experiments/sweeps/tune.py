@@ -35,7 +35,7 @@ from experiments.runs.experiment import Experiment, composed, searched
 from experiments.runs.row import Outcome, Row
 from experiments.sweeps.plan import planned
 from experiments.sweeps.ranges import FIRST_JUDGED_SEED, Range, Tuning
-from experiments.viewing.style import CYCLE, subplots
+from experiments.viewing.style import CYCLE, plain_log_ticks, subplots
 from sim.errors import InputError, require
 from sim.files import write_text
 
@@ -55,7 +55,8 @@ class Tuned:
     values
         The winner's options that differ from the default.
     trials
-        A row a trial: `trial`, `state`, `seconds`, `mean_log_error`, `best_so_far_m`, the options.
+        A row a trial: `trial` from 1, `state`, `seconds`, `mean_log_error` (NaN if pruned),
+        `options` as JSON, `best_so_far_m`.
     gain
         Error of the winner over that of the default on the judged recordings, geometric mean.
     default_m, tuned_m
@@ -132,27 +133,18 @@ def yaml_of(tuned: Tuned, study: str, tuning: Tuning) -> str:
     )
 
 
-def write(results: Sequence[Tuned], study: str, tuning: Tuning, folder: Path) -> list[Path]:
-    """Write a YAML for each winner, `ESTIMATOR_tuned.yaml`; return their paths."""
-    written = []
-    for tuned in results:
-        written.append(folder / f"{tuned.estimator}_tuned.yaml")
-        write_text(written[-1], yaml_of(tuned, study, tuning))
-    return written
+def write(tuned: Tuned, study: str, tuning: Tuning, folder: Path) -> Path:
+    """Write the winner's YAML, `ESTIMATOR_tuned.yaml`; return its path."""
+    path = folder / f"{tuned.estimator}_tuned.yaml"
+    write_text(path, yaml_of(tuned, study, tuning))
+    return path
 
 
 def trials_table(results: Sequence[Tuned]) -> pd.DataFrame:
-    """All trials, a row each, with their options as text."""
-    parts = []
-    for tuned in results:
-        options = [c for c in tuned.trials if c not in _OF_A_TRIAL]
-        texts = [
-            json.dumps(dict(row)) for _, row in tuned.trials[options].astype(object).iterrows()
-        ]
-        part = tuned.trials[list(_OF_A_TRIAL)].assign(options=texts)
-        part.insert(0, "estimator", tuned.estimator)
-        parts.append(part)
-    return pd.concat(parts, ignore_index=True)
+    """All trials, a row each."""
+    parts = [tuned.trials.assign(estimator=tuned.estimator) for tuned in results]
+    table = pd.concat(parts, ignore_index=True)
+    return table[["estimator", *(column for column in table if column != "estimator")]]
 
 
 def gains_table(results: Sequence[Tuned]) -> pd.DataFrame:
@@ -185,9 +177,9 @@ def curves(trials: pd.DataFrame, gains: pd.DataFrame) -> Figure:
         rows = trials[trials["estimator"] == name]
         style = {"color": CYCLE[i % len(CYCLE)], "ls": styles[i // len(CYCLE) % len(styles)]}
         best = rows["best_so_far_m"].to_numpy(float)
-        left.step(rows["trial"] + 1, best / best[0], where="post", label=name, **style)
+        left.step(rows["trial"], best / best[0], where="post", label=name, **style)
     left.set(xlabel="trials", ylabel="best error over the default's, tuning seeds", yscale="log")
-    left.legend(fontsize=7)
+    page.legend(loc="outside lower center", ncols=4, fontsize=8)
     places = np.arange(len(names))[::-1]
     at = gains["tuned_over_default"].to_numpy(float)
     reach = [at - gains["low"].to_numpy(float), gains["high"].to_numpy(float) - at]
@@ -195,13 +187,8 @@ def curves(trials: pd.DataFrame, gains: pd.DataFrame) -> Figure:
     right.axvline(1.0, color="0.6", lw=0.8, ls="--")
     right.set(xlabel="error of the tuned over that of the default, judged seeds", xscale="log")
     right.set_yticks(places, names)
-    for axis in (left.yaxis, right.xaxis):
-        axis.set_major_formatter("{x:.2g}")
-        axis.set_minor_formatter("{x:.2g}")
+    plain_log_ticks(left.yaxis, right.xaxis)
     return page
-
-
-_OF_A_TRIAL = ("trial", "state", "seconds", "mean_log_error", "best_so_far_m")
 
 
 def _plan(
@@ -259,15 +246,23 @@ def _tuned(
     complete = [t for t in finished if t.state == optuna.trial.TrialState.COMPLETE]
     best = min(complete, key=lambda t: t.value)
     values = {k: v for k, v in best.params.items() if v != default[k]}
-    each = Parallel(n_jobs=jobs)(
-        delayed(error_m)(experiment.with_estimator(**chosen))
-        for chosen in (default, values)
-        for experiment in judged
-    )
-    before, after = each[: len(judged)], each[len(judged) :]
+    before, after = (_judged(opened, chosen, judged, jobs) for chosen in (default, values))
     default_m, tuned_m = (math.exp(float(np.mean(np.log(e)))) for e in (before, after))
     gain = log_ratio_interval(after, before)
     return Tuned(name, values, _trials(finished), gain, default_m, tuned_m, len(judged))
+
+
+def _judged(
+    study: Any, values: Mapping[str, Any], judged: Sequence[Experiment], jobs: int
+) -> list[float]:
+    """Errors of these values on the judged recordings, m; the journal keeps them."""
+    key = json.dumps([_digest(judged, {}), values], sort_keys=True)
+    kept: dict[str, list[float]] = study.user_attrs.get("judged", {})
+    if key not in kept:
+        runs = (delayed(error_m)(experiment.with_estimator(**values)) for experiment in judged)
+        kept = {**kept, key: list(Parallel(n_jobs=jobs)(runs))}
+        study.set_user_attr("judged", kept)
+    return kept[key]
 
 
 def _work(
@@ -321,20 +316,19 @@ def _answer_m(row: Row) -> float:
 
 
 def _trials(finished: Sequence[Any]) -> pd.DataFrame:
-    """Trials as they were begun; a pruned one has no value."""
-    rows = [
-        {
-            "trial": trial.number,
-            "state": trial.state.name.lower(),
-            "seconds": trial.duration.total_seconds() if trial.duration else math.nan,
-            "mean_log_error": math.nan if trial.value is None else trial.value,
-            **trial.params,
-        }
-        for trial in sorted(finished, key=lambda t: t.number)
-    ]
-    table = pd.DataFrame(rows)
-    table.insert(4, "best_so_far_m", np.exp(table["mean_log_error"].cummin().ffill()))
-    return table
+    """Trials in the order in which they began; a pruned one has no value.
+
+    Optuna gives that the value of its last recording.
+    """
+    rows = []
+    for number, trial in enumerate(sorted(finished, key=lambda t: t.number), start=1):
+        state = trial.state.name.lower()
+        value = trial.value if state == "complete" else math.nan
+        options = json.dumps(trial.params)
+        seconds = trial.duration.total_seconds()
+        rows.append((number, state, seconds, value, options))
+    table = pd.DataFrame(rows, columns=["trial", "state", "seconds", "mean_log_error", "options"])
+    return table.assign(best_so_far_m=np.exp(table["mean_log_error"].cummin().ffill()))
 
 
 def _digest(drives: Sequence[Experiment], ranges: Mapping[str, Range]) -> str:

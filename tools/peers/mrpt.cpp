@@ -91,7 +91,7 @@ std::vector<Scan> read_log(const std::string& path) {
 
 void write_pose(std::ofstream& out, double stamp, const CPose2D& pose) {
   char line[200];
-  std::snprintf(line, sizeof line, "%.9f %.9g %.9g 0 0 0 %.12g %.12g\n", stamp, pose.x(), pose.y(),
+  std::snprintf(line, sizeof line, "%.9f %.17g %.17g 0 0 0 %.17g %.17g\n", stamp, pose.x(), pose.y(),
                 std::sin(pose.phi() / 2), std::cos(pose.phi() / 2));
   out << line;
 }

@@ -7,7 +7,7 @@ from matplotlib.lines import Line2D
 
 from experiments.papers.peers.settings import LASER, STEREO, TUNED
 from experiments.papers.results import Results
-from experiments.viewing.style import BLUE, ORANGE, WALL, subplots
+from experiments.viewing.style import BLUE, ORANGE, WALL, plain_log_ticks, subplots
 
 _WORLDS = {"room": "s", "rooms": "^", "office": "D"}
 
@@ -38,6 +38,8 @@ def errors(methods: pd.DataFrame) -> Figure:
         for axes, label in ((left, "position error, RMS m"), (right, "processor time a Frame, us")):
             axes.set(xscale="log", xlabel=label, ylim=(-0.7, len(names) - 0.3))
             axes.grid(axis="y", color="0.92")
+        right.tick_params(axis="y", length=0)
+        plain_log_ticks(left.xaxis, right.xaxis)
         left.set_yticks(places, [name.replace(TUNED, " (tuned)") for name in names])
         right.set_yticks(places, [""] * len(names))
         left.set_title(f"{sensor} and wheels", fontsize=9, loc="left")

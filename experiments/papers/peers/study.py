@@ -61,9 +61,9 @@ def missing(experiment: Experiment) -> str:
     InputError
         If the configuration is wrong.
     """
-    command = experiment.config["estimator"].get("command")
-    if command and shutil.which(command[0]) is None:
-        return f"there is no {command[0]}; `make peers` compiles it where libmrpt-slam-dev is"
+    program = (experiment.config["estimator"].get("command") or "").partition(" ")[0]
+    if program and shutil.which(program) is None:
+        return f"there is no {program}; `make peers` compiles it where libmrpt-slam-dev is"
     try:
         experiment.check()
     except MissingPackageError as error:
