@@ -14,6 +14,7 @@ from estimators.least_squares import Problem, solve
 from estimators.loop_closing import LoopSearch, look_alike, signature
 from estimators.odometry import Odometry
 from estimators.pose_graph import Edge, PoseGraph
+from estimators.scan_lines import without_sparse_lines
 from estimators.scan_matching import ScanMatcher
 from experiments.gate.conform import check_estimator
 from sim import se2
@@ -195,6 +196,22 @@ def test_scans_look_alike_from_any_heading():
     assert look_alike(marks[0], marks).tolist() == [True, True, True, False]
 
 
+def test_edges_far_behind_one_another_are_no_wall():
+    """Posts of doors in a row, one beam on each, 6 m apart on one line; and a wall."""
+    posts = np.array([[6.0, 1.2], [12.0, 1.2], [18.0, 1.2], [24.0, 1.2]])
+    wall = np.column_stack([np.full(30, 3.0), np.linspace(-2.0, -0.2, 30)])
+    points = np.concatenate([wall, posts[::-1]])
+    bearings = np.arctan2(points[:, 1], points[:, 0])
+    order = np.argsort(bearings)
+    scan = prepare(np.hypot(*points.T)[order], bearings[order])
+    assert len(scan.lines) == 2
+    kept = without_sparse_lines(scan, 1.5)
+    assert len(kept.lines) == len(kept.segments.normals) == len(kept.line_ends) == 1
+    assert np.count_nonzero(kept.line_of_point == 0) == 30
+    np.testing.assert_allclose(kept.lines[0], [1.0 / 3.0, 0.0], atol=1e-9)
+    assert without_sparse_lines(scan, 10.0) is scan
+
+
 # --- the estimator -------------------------------------------------------------------------------
 
 
@@ -291,6 +308,8 @@ def test_frames_without_scans_and_before_the_first():
 def test_bad_options_and_no_frames_are_refused():
     with pytest.raises(InputError, match="loop_support"):
         GraphSlam(loop_support=0)
+    with pytest.raises(InputError, match="most_gap_m"):
+        GraphSlam(most_gap_m=0.0)
     with pytest.raises(InputError, match="shared_noise"):
         GraphSlam(shared_noise=1.0)
     estimator = GraphSlam()
