@@ -3,6 +3,7 @@
 import dataclasses
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from estimators import least_squares
@@ -16,9 +17,12 @@ from estimators.odometry import Odometry
 from estimators.pose_graph import Edge, PoseGraph
 from estimators.scan_lines import without_sparse_lines
 from estimators.scan_matching import ScanMatcher
+from experiments.bench import graph_robustness
 from experiments.gate.conform import check_estimator
+from experiments.papers.real_logs import building
 from sim import se2
 from sim.errors import InputError
+from sim.formats.relations import Relations
 from sim.sensors import Laser
 from tests.fakes import circle, room_ranges_m, tracking_prior
 
@@ -210,6 +214,30 @@ def test_edges_far_behind_one_another_are_no_wall():
     assert np.count_nonzero(kept.line_of_point == 0) == 30
     np.testing.assert_allclose(kept.lines[0], [1.0 / 3.0, 0.0], atol=1e-9)
     assert without_sparse_lines(scan, 10.0) is scan
+
+
+def test_planted_drives_are_summed_by_share_and_threshold():
+    names = ["share", "support", "closures", "false", "planted", "revisits", "closed"]
+    drives = pd.DataFrame(
+        [
+            [0.0, 3, 10, 0, 0, 8, 8, 0.1],
+            [0.5, 3, 6, 1, 9, 8, 4, 0.1],
+            [0.5, 3, 4, 1, 9, 2, 1, 0.9],
+            [0.5, 5, 0, 0, 9, 5, 0, 0.2],
+        ],
+        columns=[*names, "revised_worst_m"],
+    )
+    sums = graph_robustness.table(drives)
+    assert sums.precision.tolist() == [1.0, 0.8, 1.0]
+    assert sums.recall.tolist() == [1.0, 0.5, 0.0]
+    assert sums.bent.tolist() == [0, 1, 0]
+
+
+def test_relations_of_unknown_stamps_and_of_a_scan_with_itself_judge_nothing():
+    stamps = np.array([[0.0, 10.0], [0.0, 0.02], [0.0, 20.0], [10.0, 20.0]])
+    relations = Relations(stamps, np.arange(12.0).reshape(4, 3))
+    known, others = np.array([0.01, 10.0, 19.0]), np.array([0.0, 0.02, 10.04, 20.0])
+    assert building._shared(relations, known, others).stamps.tolist() == [[0.0, 10.0]]
 
 
 # --- the estimator -------------------------------------------------------------------------------

@@ -61,11 +61,12 @@ class Grown:
 
 def grown() -> Iterator[Grown]:
     """Cost after each of `LENGTHS_M`, on one graph that grows."""
-    rng, before_mib = stream(0, "bench"), resident_mib()
+    rng = stream(0, "bench")
     graph = PoseGraph(Gaussian(np.zeros(3), 1e-6 * np.eye(3)), robust_sigma=5.0)
     search = LoopSearch(ScanMatcher("point_to_line", "censi", None), _LASER, 3.0, 1e-3, 2.0)
     scans = [_scan(rng)]
     marks = np.tile(signature(scans[0]), (1, 1))
+    before_mib = resident_mib()  # with the compiled code
     for length_m in LENGTHS_M:
         n, before, seconds = round(length_m / _KEY_FRAME_M), len(graph), []
         while len(graph) < n:

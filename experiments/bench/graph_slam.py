@@ -33,8 +33,6 @@ _NEAR_M, _NEAR_RAD, _APART_M = 2.0, 0.8, 10.0  # of a revisit: to an old key fra
 _TWIN_M = 0.5  # along x in map
 _ROOMS = (
     "world=rooms",
-    "world.n_x=7",
-    "world.n_y=6",
     "world.objects_per_room=0",
     "robot=robocom",
     "sensors=lms291",
@@ -110,13 +108,18 @@ class RoomRun:
 
 
 def run_rooms(
-    seed: int, planted: float = 0.0, distance_m: float = 300.0, **options: Any
+    seed: int,
+    planted: float = 0.0,
+    distance_m: float = 300.0,
+    rooms: tuple[int, int] = (7, 6),
+    **options: Any,
 ) -> RoomRun:
-    """Drive through look-alike rooms, with this share of false candidates.
+    """Drive through rows and columns of look-alike rooms, with this share of false candidates.
 
     `options` are those of `estimators.graph_slam.GraphSlam`.
     """
-    experiment = Experiment.compose([*_ROOMS, f"seed={seed}", f"route.distance_m={distance_m}"])
+    size = [f"world.n_x={rooms[0]}", f"world.n_y={rooms[1]}", f"route.distance_m={distance_m}"]
+    experiment = Experiment.compose([*_ROOMS, *size, f"seed={seed}"])
     recording, robot = experiment.recording(), experiment.robot()
     estimator = Planted(planted, stream(seed, "bench"), kr=robot.kr, kl=robot.kl, **options)
     with limited_blas():
