@@ -24,12 +24,15 @@ from experiments.papers.real_logs.logs import intel, intel_known_stamps, tracked
 from experiments.papers.real_logs.settings import DATA, KUEMMERLE, RESOLUTION_M
 from experiments.runs.row import Row
 from experiments.viewing.map import grid_along
+from sim import se2
 from sim.arrays import Array
 from sim.formats import carmen
 from sim.formats.relations import Relations, read_relations
 from sim.recording import Recording
+from sim.sensors import Laser
 
 _TOLERANCE_S = 0.05
+_ORIGIN = np.zeros(3)
 # Walls are no lines and people walk by: what the scans believe is ten times the laser's noise.
 # Chosen when no line was left out yet.
 _OPTIONS: dict[str, Any] = {
@@ -65,6 +68,7 @@ def scored(
     graph: carmen.CarmenLog,
     options: dict[str, Any],
     known_stamps: Array | None = None,
+    T_base_judged: Array = _ORIGIN,
 ) -> tuple[list[Row], Estimate]:
     """Errors of graph SLAM online and revised, and of the FLIRT poses; the revised estimate.
 
@@ -78,6 +82,8 @@ def scored(
         Of `estimators.graph_slam.GraphSlam`, beside those of all logs.
     known_stamps
         Of the scans that may be judged; None for all.
+    T_base_judged
+        (3,) the frame that the relations are of, in base_link.
     """
     scans = recording.log("laser").stamps
     folder = {"intel": "intel_lab", "fr079": "fr079_flirt"}[name]
@@ -89,8 +95,8 @@ def scored(
     revised = estimator.finish()
     at_scans = np.searchsorted(online.stamps, scans)
     paths = {
-        "graph_slam, online": (scans, online.means[at_scans]),
-        "graph_slam, revised": (scans, revised.means[at_scans]),
+        "graph_slam, online": (scans, se2.compose(online.means[at_scans], T_base_judged)),
+        "graph_slam, revised": (scans, se2.compose(revised.means[at_scans], T_base_judged)),
         "FLIRT poses": (graph.scan_stamps, graph.scan_poses),
     }
     rows: list[Row] = []
@@ -120,9 +126,13 @@ def closed_loops() -> tuple[pd.DataFrame, dict[str, NDArray[Any]]]:
     grids = _grids(recording, before=before, after=after)
     log, recording = freiburg_by_edges()
     rows += scored("fr079", "SEQUENTIAL edges", recording, log, {})[0]
-    recording = intel("calibrated")
+    recording, logged = intel("calibrated"), intel("logged")
+    mounts = [one.sensor("laser", Laser).mount.pose for one in (recording, logged)]
+    T_base_logged = se2.compose(mounts[0], se2.inverse(mounts[1]))  # calibration moved base_link
     known = intel_known_stamps(recording)
-    rows += scored("intel", "wheels, calibrated", recording, graph, _WHEELED, known)[0]
+    rows += scored("intel", "wheels, calibrated", recording, graph, _WHEELED, known, T_base_logged)[
+        0
+    ]
     return pd.DataFrame(rows), grids
 
 
