@@ -4,6 +4,7 @@ import math
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from estimators import landmarks as ekf
 from estimators.base import Belief, Estimate, Prior
@@ -71,11 +72,19 @@ class FastSLAM:
         As in `estimators.stereo.StereoModel.of`.
     sigma_column_px, sigma_row_px, sigma_disparity_px, sigma_descriptor
         Believed noise; None for that of the prior's camera.
+    gate_probability, repeat_s
+        Of known ids, as in `estimators.slam_frontend.SlamFrontEnd`: misread ones are left out, and
+        a landmark counts once in `repeat_s`.
     maps
         `shared` or `contiguous`, see `estimators.landmarks.LandmarkMaps`: the same bits, at
         different speeds.
     kr, kl
         Believed slip variance per metre of the wheels, m.
+    forward_slip_m
+        Believed variance per metre of what both wheels slip together, m.
+    slip_dof
+        Degrees of freedom of the slip, which is then Student's t: wheels that slip in bursts leave
+        a normal cloud behind. Each particle draws its own scale at each image. None: normal.
     window_s
         |ds| is netted over at least this time.
     keep_map
@@ -111,9 +120,13 @@ class FastSLAM:
         sigma_row_px: float | None = None,
         sigma_disparity_px: float | None = None,
         sigma_descriptor: float | None = None,
+        gate_probability: float | None = None,
+        repeat_s: float = 0.0,
         maps: Maps = "shared",
         kr: float = 5e-5,
         kl: float = 5e-5,
+        forward_slip_m: float = 0.0,
+        slip_dof: float | None = None,
         window_s: float = 0.05,
         keep_map: bool = False,
         stereo: str = "stereo",
@@ -125,7 +138,9 @@ class FastSLAM:
         )
         require_non_negative(ess_share=ess_share)
         require_positive(p0=p0)
-        self.wheels = WheelPrediction(kr, kl, window_s)
+        if slip_dof is not None:
+            require_positive(slip_dof=slip_dof)
+        self.wheels = WheelPrediction(kr, kl, window_s, forward_slip_m=forward_slip_m)
         self.front_end = SlamFrontEnd(
             "fastslam",
             stereo,
@@ -133,12 +148,15 @@ class FastSLAM:
             d0,
             noise_model,
             noise_at,
+            gate_probability,
+            repeat_s,
             sigma_column_px=sigma_column_px,
             sigma_row_px=sigma_row_px,
             sigma_disparity_px=sigma_disparity_px,
             sigma_descriptor=sigma_descriptor,
         )
         self.n_particles, self.proposal, self.resampling = n_particles, proposal, resampling
+        self.slip_dof = slip_dof
         self.ess_share, self.p0, self.maps, self.keep_map = ess_share, p0, maps, keep_map
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
@@ -154,6 +172,7 @@ class FastSLAM:
         self._state = ekf.new_state(self._maps.n_blocks)
         # lanes beyond the last particle are moved along, and never looked at
         self._n_lanes = self._maps.n_blocks * ekf.LANES
+        self._stretch = np.ones(self._n_lanes)
         turned = rotated(start.covariance, -float(start.mean[2]))
         scatter = root((turned + turned.T) / 2.0) @ rng.standard_normal((3, self._n_lanes))
         drawn = se2.compose(start.mean, scatter.T)
@@ -175,7 +194,7 @@ class FastSLAM:
         extras: dict[str, Any] = {"resampled": False}
         seen = frame.readings.get(self.stereo)
         if seen is not None:
-            self._see(seen, extras)
+            self._see(seen, frame.stamp, extras)
         elif self._rolled.covariance[2, 2] > _MOST_DRIFT_RAD**2:
             self._poses = self._move(self._normals())
             self._take_stock()
@@ -197,9 +216,9 @@ class FastSLAM:
             extras["resampled"] = True
         return Belief(belief.mean, belief.covariance, extras)
 
-    def _see(self, seen: Reading, extras: dict[str, Any]) -> None:
+    def _see(self, seen: Reading, stamp_s: float, extras: dict[str, Any]) -> None:
         """Take in one image."""
-        image = self.front_end.read(seen)
+        image = self.front_end.read(seen, stamp_s)
         if image.status:
             extras["status"] = image.status
         points, normals = image.points, self._normals()
@@ -207,7 +226,11 @@ class FastSLAM:
         known = self.front_end.association == "known"
         if known:
             slots = self.front_end.known(image)
+            if self.front_end.gated and len(slots):
+                passed = self._passed(image, slots)
+                image, slots, points = image.of(passed), slots[passed], points[passed]
             self._maps.touch(slots[slots >= 0])
+        self.front_end.counted(image, stamp_s)
         by_motion = self.proposal == "motion" or len(points) == 0
         poses = self._move(normals if by_motion else np.zeros_like(normals))
         if not known:
@@ -275,7 +298,7 @@ class FastSLAM:
         """Add the Frame's arc to the motion that is not yet drawn."""
         motion, root_ = self.wheels.predict_with_root(frame)
         if self._rolled is STILL:
-            self._rolled, self._root = motion, root_
+            self._rolled, self._root = motion, root_ if root_.shape[1] < 3 else np.zeros((3, 0))
         else:
             self._rolled, self._root = self._rolled.then(motion), np.zeros((3, 0))
 
@@ -286,13 +309,16 @@ class FastSLAM:
         rolled[:, :rank] = self._root if rank < 3 else root((covariance + covariance.T) / 2.0)
         normals = np.zeros((3, self._n_lanes))
         self._rng.standard_normal(out=normals[:rank])
+        if self.slip_dof is not None:  # Student's t: a normal over the root of its own chi-square
+            squares = self._rng.chisquare(self.slip_dof, self._n_lanes) / self.slip_dof
+            self._stretch = 1.0 / np.sqrt(squares)
         self._root = rolled
         return normals
 
     def _move(self, normals: Array) -> Array:
         """Poses (5, lanes) after the motion, and the state that belongs to them."""
-        mean, mount = self._rolled.mean, self._mount
-        return ekf.move(self._poses, mean, self._root, normals, mount, self._state)
+        mean, mount, noise = self._rolled.mean, self._mount, self._stretch * normals
+        return ekf.move(self._poses, mean, self._root, noise, mount, self._state)
 
     def _take_stock(self) -> None:
         """Moments of the particles as they are drawn and weighted."""
@@ -326,6 +352,19 @@ class FastSLAM:
         )
         return slots
 
+    def _passed(self, image: Image, slots: Ints) -> NDArray[np.bool_]:
+        """Which observations (K,) of landmarks in these slots pass the best particle's gate."""
+        camera, old = self.front_end.camera, slots >= 0
+        moved = Gaussian(self._drawn[self._best], np.zeros((3, 3))).then(self._rolled)
+        means, covariances, _ = self._maps.of_particle(self._best)
+        predicted, of_pose, of_landmark = camera.predict(moved.mean, means[slots[old]])
+        v, R = camera.innovation(predicted, image.points[old])
+        turned = of_landmark.transpose(0, 2, 1)
+        S = of_pose @ moved.covariance @ of_pose.transpose(0, 2, 1) + R
+        S += of_landmark @ covariances[slots[old]] @ turned
+        distances = np.sum(v * np.linalg.solve(S, v[..., None])[..., 0], axis=-1)
+        return self.front_end.passed(image, slots, distances, moved.mean)
+
     def _seen_spread(self) -> Array:
         """Covariance of the motion not yet drawn, in axes of the camera after it."""
         angle = -float(self._rolled.mean[2] + self.front_end.camera.mount[2])
@@ -344,10 +383,12 @@ class FastSLAM:
         start, owed = np.zeros_like(normals), np.empty((2, self._n_lanes))
         if len(rows):
             inform(maps, rows[:_PLACING], points[:_PLACING], state, camera)
-            ekf.propose(self._poses, self._root, state, np.zeros_like(normals), start, owed)
+            ekf.propose(
+                self._poses, self._root, self._stretch, state, np.zeros_like(normals), start, owed
+            )
             self._move(start)
         inform(maps, rows, points, state, camera)
-        ekf.propose(self._poses, self._root, state, start, normals, owed)
+        ekf.propose(self._poses, self._root, self._stretch, state, start, normals, owed)
         log_owed: Array = 0.5 * owed[0] - np.log(owed[1])
         return log_owed[: self.n_particles]
 

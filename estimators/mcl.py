@@ -1,12 +1,19 @@
 """Monte Carlo localization in a known map by a laser (the starting point of maximo2024, sec. 2.1).
 
 Particles roll by the wheels, are weighted by a likelihood field, and are resampled. Their number
-follows the spread of the belief (KLD sampling). When scans fit worse than their long-term average,
-particles are injected over all the floor (augmented MCL), drawn by the scan (sensor resetting).
+follows the spread of the belief (KLD sampling).
+
+The filter may be lost, and two ways back are offered. `average`: when scans fit worse than their
+long-term average, particles are injected over all the floor (augmented MCL), drawn by the scan
+(sensor resetting). `rivals`: a second set of particles, drawn by a scan over all the floor, follows
+the same wheels and scans for a while; if its best path explains them better than the best path of
+the belief by a margin, it becomes the belief, else another set is drawn. Both explain the same
+scans, so people before the laser and what the map lacks count against both alike, which an average
+over time mistakes for being lost.
 """
 
 import math
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -35,6 +42,8 @@ from sim.errors import require
 from sim.grid import OccupancyGrid
 from sim.recording import Frame
 from sim.world import World
+
+Recovery = Literal["none", "average", "rivals"]
 
 _BISECTIONS = 12
 _MOST_PARTICLES, _MOST_TRIES = 10_000_000, 100_000_000  # 0.2 and 2 GB of poses
@@ -72,10 +81,19 @@ class Mcl:
         Scheme, and share of the particles that the effective sample size must fall below.
     jitter_m, jitter_rad
         Spread added to each particle drawn, so that copies differ.
+    recovery
+        `none`, `average` or `rivals`, as above.
     alpha_slow, alpha_fast
-        Rates of the long and the short average of a beam's likelihood; 0 for no recovery.
+        Of `average`: rates of the long and the short average of a beam's likelihood; 0 for no
+        recovery.
     recovery_ratio
-        Particles are injected when the short average falls below this share of the long one.
+        Of `average`: particles are injected when the short average falls below this share of the
+        long one.
+    n_rivals, rival_scans
+        Of `rivals`: their number, and the scans after which they are judged.
+    rival_margin
+        Of `rivals`: how much greater the mean log likelihood of a beam must be along their best
+        path.
     kr, kl
         Believed slip variance per metre of the wheels, m; `amcl_alphas` converts them for AMCL.
     window_s
@@ -95,7 +113,7 @@ class Mcl:
     covariance is that of all particles about it, so it shows whether there are others. Extras, of
     the last scan used: `particles` (M, 3), `log_weights` (M,), `ess`, `hypothesis_weight`,
     `fit`, the likelihood of a beam at the best particle, and `injected`, the number of particles
-    injected; `status` when a scan saw nothing.
+    injected, those of rivals that became the belief included; `status` when a scan saw nothing.
     """
 
     needs = frozenset({"laser", "map"})
@@ -124,9 +142,13 @@ class Mcl:
         ess_share: float = 0.5,
         jitter_m: float = 0.01,
         jitter_rad: float = 0.005,
+        recovery: Recovery = "average",
         alpha_slow: float = 0.01,
         alpha_fast: float = 0.2,
         recovery_ratio: float = 0.9,
+        n_rivals: int = 2000,
+        rival_scans: int = 10,
+        rival_margin: float = 0.1,
         kr: float = 1e-4,
         kl: float = 1e-4,
         window_s: float = 0.05,
@@ -134,14 +156,20 @@ class Mcl:
     ) -> None:
         self.laser = laser
         self.wheels = WheelPrediction(kr, kl, window_s)
-        require_counts(n_least=n_least, n_beams=n_beams, tries=tries)
+        require_counts(
+            n_least=n_least,
+            n_beams=n_beams,
+            tries=tries,
+            n_rivals=n_rivals,
+            rival_scans=rival_scans,
+        )
         require_counts(_MOST_PARTICLES, n_most=n_most)
         require(
-            n_most * tries <= _MOST_TRIES,
-            f"estimator.n_most={n_most} and tries={tries} draw {n_most * tries} poses at once; "
-            f"at most {_MOST_TRIES} are drawn",
+            max(n_most, n_rivals) * tries <= _MOST_TRIES,
+            f"estimator.n_most={n_most}, n_rivals={n_rivals} and tries={tries} draw "
+            f"{max(n_most, n_rivals) * tries} poses at once; at most {_MOST_TRIES} are drawn",
         )
-        require_choices(resampling=(resampling, Scheme))
+        require_choices(resampling=(resampling, Scheme), recovery=(recovery, Recovery))
         require_positive(
             kld_error=kld_error,
             bin_m=bin_m,
@@ -163,6 +191,7 @@ class Mcl:
             alpha_slow=alpha_slow,
             alpha_fast=alpha_fast,
             recovery_ratio=recovery_ratio,
+            rival_margin=rival_margin,
         )
         require(n_least <= n_most, f"estimator.n_least={n_least} is above n_most={n_most}")
         require(
@@ -178,7 +207,8 @@ class Mcl:
         self.resampling, self.ess_share = resampling, ess_share
         self.jitter_m, self.jitter_rad = jitter_m, jitter_rad
         self.alpha_slow, self.alpha_fast = alpha_slow, alpha_fast
-        self.recovery_ratio = recovery_ratio
+        self.recovery, self.recovery_ratio = recovery, recovery_ratio
+        self.n_rivals, self.rival_scans, self.rival_margin = n_rivals, rival_scans, rival_margin
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Draw particles from the prior's pose, or from all the floor if there is none."""
@@ -206,6 +236,8 @@ class Mcl:
             self._poses = prior.mean + normals @ root(prior.covariance).T
             self._poses[:, 2] = se2.wrap(self._poses[:, 2])
         self._log_weights = np.zeros(len(self._poses))
+        self._explained = np.zeros(len(self._poses))  # by each path, since the rivals were drawn
+        self._rivals: Array | None = None
         self._motion = STILL  # since the last scan used
         # A beam errs along itself by the laser's noise, and by half a cell either way
         variance = self._laser.sigma_range_m**2 + self.cell_m**2 / 6.0
@@ -243,18 +275,25 @@ class Mcl:
         """Draw the motion since the last scan used, for each particle."""
         normals = self._rng.standard_normal(self._poses.shape)
         self._poses = self._poses.copy()  # the last Belief keeps its own
-        _move(self._poses, self._motion.mean, root(self._motion.covariance), normals)
+        by_normals = root(self._motion.covariance)
+        _move(self._poses, self._motion.mean, by_normals, normals)
+        if self._rivals is not None:
+            normals = self._rng.standard_normal(self._rivals.shape)
+            _move(self._rivals, self._motion.mean, by_normals, normals)
         self._motion = STILL
 
     def _weigh(self, ends: Floats) -> None:
         """Weight by one scan, sum up the belief, and resample if that is due."""
         if self._everywhere:
             self._poses, self._everywhere = self._drawn_by_scan(self.n_most, ends), False
+            self._explained = np.zeros(len(self._poses))
             self._belief = self._summed_up()
             return
         of_scan = self._field.log_likelihood(self._poses, ends)
         self._log_weights = self._weighed(of_scan)
         self._belief = self._summed_up()
+        if self.recovery == "rivals" and self._yielded(of_scan, ends):
+            return
         share = self._injected_share(of_scan, ends.shape[1])
         if share > 0.0 or self._extras["ess"] < self.ess_share * len(self._poses):
             self._draw(share, ends)
@@ -281,13 +320,49 @@ class Mcl:
         The fit is the geometric mean likelihood of a beam at the particle that fits best: the mean
         over the particles, as in augmented MCL, is poor for any belief that is still spread.
         """
-        if self.alpha_slow == 0.0:
-            return 0.0
         fit = math.exp(float(np.max(of_scan)) / n_beams)
+        self._extras["fit"] = fit
+        if self.recovery != "average" or self.alpha_slow == 0.0:
+            return 0.0
         self._slow += self.alpha_slow * (fit - self._slow)
         self._fast += self.alpha_fast * (fit - self._fast)
-        self._extras["fit"] = fit
         return max(0.0, 1.0 - self._fast / (self.recovery_ratio * self._slow))
+
+    def _yielded(self, of_scan: Array, ends: Floats) -> bool:
+        """Let the rivals see the scan too; whether the belief has given way to them.
+
+        `of_scan` (M,) are the log likelihoods of the belief's particles.
+        """
+        if self._rivals is None:
+            self._rivals = self._drawn_by_scan(self.n_rivals, ends)
+            self._rivals_explained = np.zeros(self.n_rivals)
+            self._explained, self._rival_beams, self._rivals_seen = np.zeros(len(of_scan)), 0, 0
+            return False
+        of_rivals = self._field.log_likelihood(self._rivals, ends)
+        self._explained = self._explained + of_scan
+        self._rivals_explained += of_rivals
+        self._rival_beams += ends.shape[1]
+        self._rivals_seen += 1
+        rivals, explained = self._rivals, self._rivals_explained
+        drawn = resample(self.beam_power * of_rivals, self.n_rivals, self._rng, self.resampling)
+        self._rivals, self._rivals_explained = self._jittered(rivals[drawn]), explained[drawn]
+        if self._rivals_seen < self.rival_scans:
+            return False
+        gain = (float(explained.max()) - float(self._explained.max())) / self._rival_beams
+        taken, self._rivals = self._rivals, None
+        if gain <= self.rival_margin:
+            return False
+        self._poses, self._log_weights = taken, np.zeros(len(taken))
+        self._explained = np.zeros(len(taken))
+        self._belief = self._summed_up()
+        self._extras["injected"] = len(taken)
+        return True
+
+    def _jittered(self, poses: Array) -> Array:
+        """Poses (M, 3), each moved a little, so that copies differ."""
+        jitter = self._rng.standard_normal(poses.shape)
+        moved: Array = poses + jitter * [self.jitter_m, self.jitter_m, self.jitter_rad]
+        return moved
 
     def _drawn_by_scan(self, n: int, ends: Floats) -> Array:
         """Poses (n, 3) over all the floor, drawn by how well the scan fits there."""
@@ -307,9 +382,8 @@ class Mcl:
             if n_injected > 0:
                 poses = np.concatenate([poses, self._drawn_by_scan(n_injected, ends)])
             needed = min(max(self._kld_number(poses), self.n_least), self.n_most)
-        jitter = self._rng.standard_normal(poses.shape)
-        self._poses = poses + jitter * [self.jitter_m, self.jitter_m, self.jitter_rad]
-        self._log_weights = np.zeros(n)
+        self._explained = np.append(self._explained[drawn], np.zeros(n_injected))
+        self._poses, self._log_weights = self._jittered(poses), np.zeros(n)
         self._extras["injected"] = n_injected
 
     def _kld_number(self, poses: Array) -> int:

@@ -665,6 +665,54 @@ def _robot_of(overrides: list[str], config_dir: Path | None) -> DifferentialDriv
 
 
 @app.command()
+def tune(
+    study: Annotated[
+        str,
+        typer.Argument(
+            help="A study of conf/study that has a tune.", autocompletion=completion.studies
+        ),
+    ],
+    only: Annotated[list[str] | None, typer.Option(help="Only this estimator; repeat it.")] = None,
+    jobs: Annotated[int, typer.Option("--jobs", "-j", help="Processes.")] = 1,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="Folder of the YAMLs [results/tuned/estimator]."),
+    ] = None,
+    config_dir: ConfigDir = None,
+) -> None:
+    """Tune a study's estimators on seeds below 100, with one budget, and judge them on its own.
+
+    The trials are kept, so that the command goes on where it was interrupted. It writes
+    ESTIMATOR_tuned.yaml, tables of trials and gains, and their figure.
+
+    Examples
+    --------
+      estima tune peers --jobs 2
+
+      estima run --config-dir results/tuned estimator=ekf_icp_tuned sensors=hokuyo
+    """
+    from experiments.sweeps import tune as tuning
+    from experiments.viewing.style import save_figure
+
+    folder = str(config_dir) if config_dir else None
+    plan = tuning.tuning_of(study, folder)
+    found = []
+    with progress(f"tune {study}", 1.0) as on_progress:
+        for one in tuning.tune(
+            study, only or (), jobs=jobs, config_dir=folder, on_progress=on_progress
+        ):
+            found.append(one)
+    place = paths.results()
+    written = tuning.write(found, study, plan, out or place / "tuned" / "estimator")
+    trials, gains = tuning.trials_table(found), tuning.gains_table(found)
+    write_frame(trials, place / "tables" / f"{study}_trials_tuning.csv", digits=6)
+    write_frame(gains, place / "tables" / f"{study}_tuning.csv", digits=6)
+    save_figure(tuning.curves(trials, gains), place / "figures" / f"{study}_tuning.png")
+    show(gains.to_string(index=False, float_format=lambda v: f"{v:.4g}"))
+    print("\n".join(map(paths.short, written)))
+
+
+@app.command()
 def conform(
     target: Annotated[
         str,
@@ -803,41 +851,66 @@ def table(
         ),
     ],
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="File to write, .csv or .parquet.")
+        Path | None,
+        typer.Option("--out", "-o", help="File to write: .tex, .md, .html, .csv, .parquet."),
     ] = None,
     against: Annotated[
         str | None,
         typer.Option(
-            help="Give errors relative to this estimator's, too.",
+            help="Compare with this estimator: relative errors, and paired tests.",
             autocompletion=completion.estimators,
+        ),
+    ] = None,
+    metric: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Result to show instead of the main ones; repeat it.",
+            autocompletion=completion.metrics,
         ),
     ] = None,
     all_versions: Annotated[
         bool, typer.Option("--all-versions", help="Keep rows of other versions of the code.")
     ] = False,
     times: Annotated[bool, typer.Option("--times", help="Keep computing times.")] = False,
-    means: Annotated[
-        bool, typer.Option("--means", help="With -o: write the means that are shown without it.")
+    every: Annotated[
+        bool, typer.Option("--rows", help="With -o: write every row, with all its columns.")
     ] = False,
     only: Where = None,
 ) -> None:
-    """Show the means of a sweep's errors, or with -o write all its rows.
+    """Show a sweep's mean errors with 95 % intervals, or write them for a paper.
 
-    The means are those of the best answers: of the revised path of a method that has one.
+    Errors are those of the best answers: of the revised path of a method that has one. The best on
+    the same recordings is bold. A .tex file goes into a LaTeX article by `input` as it is.
 
-    Example: estima table leaderboard --against smoother
+    Examples
+    --------
+      estima table leaderboard --against smoother
+
+      estima table slip --metric answer_ate_rmse_m --metric answer_nees_mean -o slip.tex
+
+      estima table slip --rows -o slip.csv
     """
-    from experiments.sweeps.collect import collect, summary, where
+    from experiments.report.table import as_lines, check_name, notes, write_table
+    from experiments.sweeps.collect import collect, where
+    from experiments.sweeps.summary import summary
 
-    rows = where(collect(name, all_versions=all_versions, times=times), only or [])
-    if out is None or means:
-        rows = summary(rows, against)
-    if out is None:
-        shown = rows.rename(columns=lambda column: columns.title(column, short=True))
-        show(shown.to_string(index=False, na_rep="-", float_format=lambda v: f"{v:.4g}"))
+    if out is not None:
+        check_name(out)
+    require(not every or out is not None, "--rows: name the file to write, such as -o rows.csv")
+    timed = times or any(column.endswith("_time_us") for column in metric or [])
+    rows = where(collect(name, all_versions=all_versions, times=timed), only or [])
+    if every and out is not None:
+        require(out.suffix in (".csv", ".parquet"), f"-o {out}: with --rows it is .csv or .parquet")
+        write_frame(rows, out)
+        print(f"{out}: {len(rows)} rows, {len(rows.columns)} columns")
         return
-    write_frame(rows, out)
-    print(f"{out}: {len(rows)} rows, {len(rows.columns)} columns")
+    found = summary(rows, against, metric or [])
+    note = notes(found, against)
+    if out is None:
+        show(as_lines(found, note))
+        return
+    write_table(found, note, out, Path(name).name)
+    print(f"{out}: {len(found)} rows")
 
 
 @app.command()
@@ -857,12 +930,28 @@ def plot(
         typer.Option(help="Result (estima options metrics).", autocompletion=completion.metrics),
     ] = "answer_ate_rmse_m",
     by: Annotated[
-        str | None,
-        typer.Option(help="One line a value of this.", autocompletion=completion.settings),
+        list[str] | None,
+        typer.Option(
+            help="One line a value of this; repeat it for combinations.",
+            autocompletion=completion.settings,
+        ),
     ] = None,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Picture to write.")] = Path("plot.png"),
+    row: Annotated[
+        str | None,
+        typer.Option(help="One row of panels a value.", autocompletion=completion.settings),
+    ] = None,
+    col: Annotated[
+        str | None,
+        typer.Option(help="One column of panels a value.", autocompletion=completion.settings),
+    ] = None,
+    size: Annotated[
+        str, typer.Option(help="screen, or column or page of a paper (3.5 in, 7.16 in).")
+    ] = "screen",
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="Picture to write: .png, .pdf, .svg.")
+    ] = Path("plot.png"),
     pool: Annotated[
-        bool, typer.Option("--pool", help="Average over worlds, estimators and logs too.")
+        bool, typer.Option("--pool", help="Average over other settings that differ too.")
     ] = False,
     only: Where = None,
 ) -> None:
@@ -871,18 +960,25 @@ def plot(
     By default it is the position error of the best answers: of the revised path of a method that
     has one, else of the online one.
 
-    Example: estima plot slip --x robot.kr --y heading_rmse_rad --by choice.estimator
+    Examples
+    --------
+      estima plot slip --x robot.kr --y heading_rmse_rad --by choice.estimator
+
+      estima plot slip --x robot.kr --by choice.estimator --col choice.world --size page -o a.pdf
     """
-    from experiments.report.plot import sweep_figure
+    from experiments.report.plot import Size, sweep_figure
     from experiments.sweeps.collect import collect, where
     from experiments.viewing.style import save_figure
 
+    if size not in list(Size):
+        raise InputError(f"--size must be {', '.join(Size)}, got {size}")
     rows = where(collect(name, times=True), only or [])
     failed = rows["status"] == Outcome.FAILED
     if failed.any():
         print(f"{failed.sum()} of {len(rows)} runs failed; they are left out", file=sys.stderr)
         rows = rows[~failed]
-    save_figure(sweep_figure(rows, x, y, by, pool=pool), out)
+    page = sweep_figure(rows, x, y, by, row=row, col=col, size=size, pool=pool)
+    save_figure(page, out)
     print(out)
 
 

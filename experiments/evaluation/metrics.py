@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 from estimators.base import Estimate
 from sim import se2
 from sim.arrays import Array
-from sim.errors import require
+from sim.errors import InputError
 from sim.recording import Recording
 
 CHI2_95_2DOF = 5.991464547107979  # 95 % quantile of chi-square with two degrees of freedom
 _SINGULAR = 1e-10  # least eigenvalue of a correlation matrix that can be trusted
 RPE_DISTANCES_M = (1.0, 10.0)
+LONGEST_GAP_S = 0.25  # of the truth, over which it is interpolated
 SCORED_EXTRAS = ("dispersion_m",)  # Belief extras that `score` reads, of estimators that have them
 
 
@@ -128,17 +129,21 @@ def nees_at_distances(truth: Array, means: Array, covariances: Array, distances_
     return np.where(rows >= 0, nees(truth, means, covariances)[rows], np.nan)
 
 
-def score(recording: Recording, estimate: Estimate) -> dict[str, float]:
+def score(
+    recording: Recording, estimate: Estimate, longest_gap_s: float = LONGEST_GAP_S
+) -> dict[str, float]:
     """Score an estimate against its recording's truth; units are in the keys.
 
-    Stamps outside the truth's span are left out. A score that does not apply has no key: all but
-    the times without a truth, the error over 10 m of a shorter run, the NEES without a usable
-    covariance. NaN means that the estimate itself is not finite.
+    Stamps outside the truth's span are left out, and so are those in a gap of the truth longer than
+    `longest_gap_s`: they have no true pose. `stamps_scored` and `stamps_left_out` count both. A
+    score that does not apply has no key: all but the times without a truth, the error over 10 m of
+    a shorter run, the NEES without a usable covariance. NaN means that the estimate itself is not
+    finite.
 
     Raises
     ------
     InputError
-        If no stamp of the estimate lies within the truth's span.
+        If no stamp of the estimate has a true pose.
     """
     row = {"duration_s": float(np.ptp(estimate.stamps)) if len(estimate.stamps) else 0.0}
     if len(estimate.step_seconds):
@@ -150,9 +155,18 @@ def score(recording: Recording, estimate: Estimate) -> dict[str, float]:
         row["dispersion_final_m"] = float(dispersions[-1])
     if recording.truth is None:
         return row
-    truth = recording.truth_at(estimate.stamps)
+    truth = recording.truth_at(estimate.stamps, longest_gap_s)
     known = np.isfinite(truth).all(axis=1)
-    require(known.any(), "no estimate lies within the truth's time span; are the clocks the same?")
+    if not known.any():
+        spanned = np.isfinite(recording.truth_at(estimate.stamps)).any()
+        complaint = "no estimate lies within the truth's time span; are the clocks the same?"
+        if spanned:
+            complaint = (
+                f"no estimate lies within {longest_gap_s:g} s between two true poses; raise "
+                "scoring.longest_gap_s"
+            )
+        raise InputError(complaint)
+    row |= {"stamps_scored": int(known.sum()), "stamps_left_out": int((~known).sum())}
     covariances = estimate.covariances[known]
     return row | path_scores(truth[known], estimate.means[known], covariances)
 

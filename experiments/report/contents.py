@@ -11,7 +11,7 @@ import pandas as pd
 
 from experiments.evaluation.verdict import Profile, Role, Verdict, headline_verdict
 from experiments.report.claims import read_claims, read_provenance, read_verdicts, this_code
-from experiments.report.export import as_text, numeric
+from experiments.report.export import as_text, folded, numeric
 from experiments.runs.paths import CONF, SOURCE
 from experiments.runs.row import read_rows
 from sim.errors import InputError
@@ -26,8 +26,13 @@ OWN = {
         "estima run -m study=leaderboard",
         "estima plot leaderboard --x choice.estimator --by choice.world "
         "-o results/figures/leaderboard_errors.png",
-        "estima table leaderboard --against smoother --times --means "
+        "estima table leaderboard --against smoother --times "
         "-o results/tables/leaderboard_means.csv",
+    ],
+    "peers": [
+        "pip install 'estima[peers,tune]' && make peers",
+        "estima reproduce --paper peers --full",
+        "estima tune peers -o conf/estimator",
     ],
     "all_estimators": ["estima run -m study=all_estimators"],
     "mcl_office": ["estima reproduce --paper mcl_office --full"],
@@ -195,7 +200,7 @@ def picture(path: Path, about: Entry, claims: Mapping[str, Entry]) -> Entry:
 
 def table(path: Path) -> Entry:
     """Read a table: whole if it is small, else its first rows."""
-    frame = read_rows(path)
+    frame = folded(read_rows(path))
     small = len(frame) <= SMALL_ROWS and frame.shape[1] <= SMALL_COLUMNS
     shown = as_text(frame if small else frame.head(FIRST_ROWS))
     note = "" if small else f"; the first {len(shown)}, the rest in the file"

@@ -12,7 +12,7 @@ from threadpoolctl import ThreadpoolController
 
 from estimators.base import Estimate, Estimator, Prior, run
 from experiments.evaluation.map_quality import landmark_errors
-from experiments.evaluation.metrics import SCORED_EXTRAS, score
+from experiments.evaluation.metrics import LONGEST_GAP_S, SCORED_EXTRAS, score
 from experiments.runs.columns import OF_THE_RUN
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome, Row, Status
@@ -83,7 +83,7 @@ def evaluate(
                 keep = (*SCORED_EXTRAS, *experiment.keep)
                 online, revised = estimates(estimator, recording, prior, rng, keep, on_step)
             status = status_of(recording, online)
-            scores = scored(recording, online, revised)
+            scores = scored(recording, online, revised, experiment.longest_gap_s)
         except InputError:
             raise
         except (Exception, SystemExit) as error:
@@ -143,12 +143,17 @@ def _blas() -> ThreadpoolController:
     return ThreadpoolController()
 
 
-def scored(recording: Recording, online: Estimate, revised: Estimate | None) -> Row:
+def scored(
+    recording: Recording,
+    online: Estimate,
+    revised: Estimate | None,
+    longest_gap_s: float = LONGEST_GAP_S,
+) -> Row:
     """Scores of a run as columns; those of the revised path begin with `revised_`."""
     made = online.map if revised is None else revised.map
-    scores: Row = {**score(recording, online), **landmark_errors(recording, made)}
+    scores: Row = {**score(recording, online, longest_gap_s), **landmark_errors(recording, made)}
     if revised is not None:
-        found = score(recording, revised)
+        found = score(recording, revised, longest_gap_s)
         scores |= {f"revised_{k}": found[k] for k in found if k not in OF_THE_RUN}
     return scores
 

@@ -40,7 +40,7 @@ from sim.yaml_file import read_yaml
 
 Config = dict[str, Any]
 GROUPS = ("world", "robot", "sensors", "route", "estimator")
-_MAPPINGS = (*GROUPS, "simulation", "prior")
+_MAPPINGS = (*GROUPS, "simulation", "prior", "scoring")
 SIMULATED_KEYS = ("world", "robot", "sensors", "route", "simulation", "seed", "world_seed")
 _KEYS = (
     *_MAPPINGS,
@@ -48,6 +48,7 @@ _KEYS = (
     *("simulation.physics", "simulation.rays"),
     *("prior.start", "prior.sigma_position_m", "prior.sigma_heading_rad"),
     *("prior.wheel_radius_m", "prior.track_m", "prior.map"),
+    "scoring.longest_gap_s",
 )
 _NOT_IN_KEY = ("name", "picture", "recording")
 _READ_OF_HYDRA = ("hydra/launcher", "hydra.launcher", "hydra.searchpath")
@@ -95,7 +96,8 @@ class Experiment:
                 f"{error.full_key} follows a key that is missing: {str(error).splitlines()[0]}; "
                 f"keep that key, or set {error.full_key} too"
             ) from error
-        config.pop("sweeps", None)
+        for of_sweeps in ("sweeps", "tune"):
+            config.pop(of_sweeps, None)
         _check_shape(config)
         simulation = config["simulation"]
         if simulation["rays"] is None:
@@ -157,6 +159,11 @@ class Experiment:
     def keep(self) -> list[str]:
         """Belief extras to record."""
         return list(self.config["keep"])
+
+    @property
+    def longest_gap_s(self) -> float:
+        """Longest gap of the truth over which it is interpolated for the scores, s."""
+        return float(self.config["scoring"]["longest_gap_s"])
 
     @property
     def picture(self) -> bool:
@@ -250,6 +257,7 @@ class Experiment:
         stream(config["world_seed"], "world", key="world_seed")
         self._check_simulation()
         self._check_prior()
+        self._check_scoring()
         self._check_needs()
         self._check_map()
 
@@ -281,6 +289,14 @@ class Experiment:
             raise InputError(
                 "prior.map must be none, world, a grid's .yaml file or a mapping with _target_, "
                 f"got {known_map!r}"
+            )
+
+    def _check_scoring(self) -> None:
+        gap_s = self.config["scoring"]["longest_gap_s"]
+        number = isinstance(gap_s, (int, float)) and not isinstance(gap_s, bool)
+        if not (number and gap_s >= 0.0):
+            raise InputError(
+                f"scoring.longest_gap_s must be zero or a positive number, got {gap_s!r}"
             )
 
     def _check_needs(self) -> None:
@@ -556,7 +572,7 @@ def _check_shape(config: Config) -> None:
             raise InputError(f"{key} is missing; {remedy}")
         if key in _MAPPINGS and not isinstance(config[key], dict):
             raise InputError(f"{key} must hold keys, got {config[key]!r}")
-    for place in ("simulation", "prior"):
+    for place in ("simulation", "prior", "scoring"):
         for name in config[place]:
             _check_known(f"{place}.{name}")
     wanted = config["recording"]

@@ -147,6 +147,9 @@ def _print(rows: Sequence[Row], files: Sequence[Path]) -> None:
     first = rows[0]
     where = first.get("choice.world") or first.get("recording") or "a recording"
     show(f"{first['choice.estimator']} on {where}, seed {first['seed']}: {first['status']}")
+    if first.get("stamps_left_out"):
+        scored, left_out = first["stamps_scored"], first["stamps_left_out"]
+        show(f"  scored at {scored} frames; {left_out} others have no true pose")
     for name in _SHOWN:
         values = [float(v) for row in rows if isinstance(v := row.get(name), (int, float))]
         if values:
