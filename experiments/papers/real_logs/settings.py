@@ -62,6 +62,7 @@ MRCLAM = (
 )
 MRCLAM_DRAWN = (MRCLAM[1], MRCLAM[3])
 
+RESOLUTION_M = 0.05  # of the grid maps
 TUNED_SHARE = 0.4  # of the Intel log, on which options were chosen; the rest judges
 TUNED_ROBOTS = (1, 2)  # of MRCLAM; robots 3 to 5 judge
 CALIBRATED_S = 300.0  # from the start of a log of MRCLAM
