@@ -5,11 +5,11 @@ follows the spread of the belief (KLD sampling).
 
 The filter may be lost, and two ways back are offered. `average`: when scans fit worse than their
 long-term average, particles are injected over all the floor (augmented MCL), drawn by the scan
-(sensor resetting). `rivals`: a second set of particles, drawn by a scan over all the floor, follows
-the same wheels and scans for a while; if its best path explains them better than the best path of
-the belief by a margin, it becomes the belief, else another set is drawn. Both explain the same
-scans, so people before the laser and what the map lacks count against both alike, which an average
-over time mistakes for being lost.
+(sensor resetting). `rivals`: a set of particles drawn by a scan over all the floor, and as many
+drawn from the belief, follow the same wheels and scans for a while; if the best path of the rivals
+explains them better than the best of the defenders by a margin, the rivals become the belief.
+People before the laser and what the map lacks count against both alike, which an average over time
+mistakes for being lost.
 """
 
 import math
@@ -19,7 +19,7 @@ import numpy as np
 
 from estimators.base import Belief, Prior
 from estimators.gaussian import STILL, Gaussian, root
-from estimators.likelihood_field import beam_ends, likelihood_field
+from estimators.likelihood_field import LikelihoodField, beam_ends, likelihood_field
 from estimators.options import (
     require_choices,
     require_counts,
@@ -45,6 +45,7 @@ from sim.world import World
 
 Recovery = Literal["none", "average", "rivals"]
 
+_OFF_WALLS = 2.0  # what a beam of a contest loses, in log likelihood, by ending off the walls
 _BISECTIONS = 12
 _MOST_PARTICLES, _MOST_TRIES = 10_000_000, 100_000_000  # 0.2 and 2 GB of poses
 _MOST_BINS = 250_000_000  # 2 GB
@@ -147,8 +148,8 @@ class Mcl:
         alpha_fast: float = 0.2,
         recovery_ratio: float = 0.9,
         n_rivals: int = 2000,
-        rival_scans: int = 10,
-        rival_margin: float = 0.1,
+        rival_scans: int = 15,
+        rival_margin: float = 0.2,
         kr: float = 1e-4,
         kl: float = 1e-4,
         window_s: float = 0.05,
@@ -226,6 +227,18 @@ class Mcl:
             z_hit=self.z_hit,
             z_rand=self.z_rand,
         )
+        if self.recovery == "rivals":
+            # off the walls every end is as unlikely: else beams that end short, at people, outweigh
+            # all others, and beams that end in the unknown are better than those
+            off_walls = math.exp(-_OFF_WALLS) * self._laser.max_range_m
+            self._bounded = likelihood_field(
+                prior.map,
+                self._laser,
+                cell_m=self.cell_m,
+                sigma_m=self.sigma_m,
+                z_hit=1.0,
+                z_rand=off_walls / (self.sigma_m * math.sqrt(2.0 * math.pi)),
+            )
         self._shape = self._shape_of_bins()
         self._off_map = prior.mean is not None and not self._field.holds(prior.mean)
         self._everywhere = prior.mean is None or prior.covariance is None
@@ -236,8 +249,7 @@ class Mcl:
             self._poses = prior.mean + normals @ root(prior.covariance).T
             self._poses[:, 2] = se2.wrap(self._poses[:, 2])
         self._log_weights = np.zeros(len(self._poses))
-        self._explained = np.zeros(len(self._poses))  # by each path, since the rivals were drawn
-        self._rivals: Array | None = None
+        self._contest: Array | None = None  # (2, n_rivals, 3) poses of defenders and rivals
         self._motion = STILL  # since the last scan used
         # A beam errs along itself by the laser's noise, and by half a cell either way
         variance = self._laser.sigma_range_m**2 + self.cell_m**2 / 6.0
@@ -277,22 +289,21 @@ class Mcl:
         self._poses = self._poses.copy()  # the last Belief keeps its own
         by_normals = root(self._motion.covariance)
         _move(self._poses, self._motion.mean, by_normals, normals)
-        if self._rivals is not None:
-            normals = self._rng.standard_normal(self._rivals.shape)
-            _move(self._rivals, self._motion.mean, by_normals, normals)
+        for poses in () if self._contest is None else self._contest:
+            _move(poses, self._motion.mean, by_normals, self._rng.standard_normal(poses.shape))
         self._motion = STILL
 
     def _weigh(self, ends: Floats) -> None:
         """Weight by one scan, sum up the belief, and resample if that is due."""
         if self._everywhere:
-            self._poses, self._everywhere = self._drawn_by_scan(self.n_most, ends), False
-            self._explained = np.zeros(len(self._poses))
+            self._poses = self._drawn_by_scan(self.n_most, ends, self._field)
+            self._everywhere = False
             self._belief = self._summed_up()
             return
         of_scan = self._field.log_likelihood(self._poses, ends)
         self._log_weights = self._weighed(of_scan)
         self._belief = self._summed_up()
-        if self.recovery == "rivals" and self._yielded(of_scan, ends):
+        if self.recovery == "rivals" and self._yielded(ends):
             return
         share = self._injected_share(of_scan, ends.shape[1])
         if share > 0.0 or self._extras["ess"] < self.ess_share * len(self._poses):
@@ -328,34 +339,35 @@ class Mcl:
         self._fast += self.alpha_fast * (fit - self._fast)
         return max(0.0, 1.0 - self._fast / (self.recovery_ratio * self._slow))
 
-    def _yielded(self, of_scan: Array, ends: Floats) -> bool:
-        """Let the rivals see the scan too; whether the belief has given way to them.
+    def _yielded(self, ends: Floats) -> bool:
+        """Let rivals and defenders see the scan too; whether the belief has given way.
 
-        `of_scan` (M,) are the log likelihoods of the belief's particles.
+        Both are as many, and are resampled alike at every scan: a wide cloud explains a scan worse
+        than a narrow one at the same place. The scan that draws them does not count.
         """
-        if self._rivals is None:
-            self._rivals = self._drawn_by_scan(self.n_rivals, ends)
-            self._rivals_explained = np.zeros(self.n_rivals)
-            self._explained, self._rival_beams, self._rivals_seen = np.zeros(len(of_scan)), 0, 0
+        n = self.n_rivals
+        if self._contest is None:
+            defenders = self._poses[resample(self._log_weights, n, self._rng, self.resampling)]
+            rivals = self._drawn_by_scan(n, ends, self._bounded)
+            self._contest = np.stack([self._jittered(defenders), rivals])
+            self._explained, self._n_explained, self._n_contested = np.zeros((2, n)), 0, 0
             return False
-        of_rivals = self._field.log_likelihood(self._rivals, ends)
-        self._explained = self._explained + of_scan
-        self._rivals_explained += of_rivals
-        self._rival_beams += ends.shape[1]
-        self._rivals_seen += 1
-        rivals, explained = self._rivals, self._rivals_explained
-        drawn = resample(self.beam_power * of_rivals, self.n_rivals, self._rng, self.resampling)
-        self._rivals, self._rivals_explained = self._jittered(rivals[drawn]), explained[drawn]
-        if self._rivals_seen < self.rival_scans:
+        for side in (0, 1):
+            of_scan = self._bounded.log_likelihood(self._contest[side], ends)
+            drawn = resample(self.beam_power * of_scan, n, self._rng, self.resampling)
+            self._explained[side] = (self._explained[side] + of_scan)[drawn]
+            self._contest[side] = self._jittered(self._contest[side][drawn])
+        self._n_explained += ends.shape[1]
+        self._n_contested += 1
+        if self._n_contested < self.rival_scans:
             return False
-        gain = (float(explained.max()) - float(self._explained.max())) / self._rival_beams
-        taken, self._rivals = self._rivals, None
-        if gain <= self.rival_margin:
+        defended, gained = self._explained.max(axis=1) / self._n_explained
+        rivals, self._contest = self._contest[1], None
+        if gained - defended <= self.rival_margin:
             return False
-        self._poses, self._log_weights = taken, np.zeros(len(taken))
-        self._explained = np.zeros(len(taken))
+        self._poses, self._log_weights = rivals, np.zeros(n)
         self._belief = self._summed_up()
-        self._extras["injected"] = len(taken)
+        self._extras["injected"] = n
         return True
 
     def _jittered(self, poses: Array) -> Array:
@@ -364,10 +376,10 @@ class Mcl:
         moved: Array = poses + jitter * [self.jitter_m, self.jitter_m, self.jitter_rad]
         return moved
 
-    def _drawn_by_scan(self, n: int, ends: Floats) -> Array:
+    def _drawn_by_scan(self, n: int, ends: Floats, field: LikelihoodField) -> Array:
         """Poses (n, 3) over all the floor, drawn by how well the scan fits there."""
-        tries = self._field.draw(n * self.tries, self._rng)
-        log_weights = self.beam_power * self._field.log_likelihood(tries, ends)
+        tries = field.draw(n * self.tries, self._rng)
+        log_weights = self.beam_power * field.log_likelihood(tries, ends)
         return tries[resample(log_weights, n, self._rng, self.resampling)]
 
     def _draw(self, injected_share: float, ends: Floats) -> None:
@@ -380,9 +392,8 @@ class Mcl:
             drawn = resample(self._log_weights, n - n_injected, self._rng, self.resampling)
             poses = self._poses[drawn]
             if n_injected > 0:
-                poses = np.concatenate([poses, self._drawn_by_scan(n_injected, ends)])
+                poses = np.concatenate([poses, self._drawn_by_scan(n_injected, ends, self._field)])
             needed = min(max(self._kld_number(poses), self.n_least), self.n_most)
-        self._explained = np.append(self._explained[drawn], np.zeros(n_injected))
         self._poses, self._log_weights = self._jittered(poses), np.zeros(n)
         self._extras["injected"] = n_injected
 

@@ -194,15 +194,30 @@ def record(
 def info(
     log: Annotated[list[Path], typer.Argument(help="A recording (.npz) or a log of any format.")],
     robot: Annotated[int, typer.Option(help="Which robot of an MRCLAM set.")] = 1,
+    check: Annotated[
+        bool,
+        typer.Option(
+            "--check", help="Warn of odd clocks, and of sensors that do not agree with the motion."
+        ),
+    ] = False,
 ) -> None:
     """Check a recording or a log and say what it holds.
 
-    Formats of several files take them all; docs/formats.md gives their order.
+    Formats of several files take them all; docs/formats.md gives their order. With --check it also
+    warns, a line each, of gaps, repeated and coarse stamps, delays between wheels and sensors,
+    gains, and ranges of a wrong scale.
     """
     from experiments.viewing.describe import describe
     from sim.formats.detect import read_any
 
-    show(describe(read_any(log, robot)))
+    recording = read_any(log, robot)
+    show(describe(recording))
+    if check:
+        from experiments.calibration.log_check import check_log
+
+        warnings = check_log(recording)
+        for warning in warnings or ["nothing odd found"]:
+            show(f"check       {warning}")
 
 
 @app.command()
@@ -610,7 +625,8 @@ def calibrate(
         list[str] | None,
         typer.Argument(
             metavar="RECORDINGS...",
-            help="Recordings with truth, .npz. With --sheet: overrides of the robot.",
+            help="Recordings with truth, .npz. With -o: one log of any format. With --sheet: "
+            "overrides of the robot.",
         ),
     ] = None,
     sheet: Annotated[
@@ -626,6 +642,19 @@ def calibrate(
             help="wheel-truth, or end-poses (only commands and final poses) [wheel-truth]."
         ),
     ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            "-o",
+            help="Of a real log: YAML file to write, for `estima run calibration=`; a picture of "
+            "the residuals goes beside it.",
+        ),
+    ] = None,
+    robot: Annotated[int | None, typer.Option(help="Which robot of an MRCLAM set.")] = None,
+    until_s: Annotated[
+        float | None, typer.Option("--until", help="Of a real log: its first seconds only.")
+    ] = None,
     joint: Annotated[
         bool, typer.Option("--joint", help="Estimate wheel gains and the track too.")
     ] = False,
@@ -634,6 +663,9 @@ def calibrate(
 ) -> None:
     """Estimate kr, kl (and wheel gains, track) with 95 % intervals.
 
+    With -o, of a real log: its wheels are compared with its truth, else its scans, else its
+    landmarks, and the delay of the wheels, the mount of the sensor and its noise are found too.
+
     The geometry of a sheet's robot is its nominal one: that which its controller uses.
 
     Examples
@@ -641,6 +673,8 @@ def calibrate(
       estima calibrate run1.npz run2.npz --joint
 
       estima calibrate --sheet runs.csv robot=puzzlebot --joint
+
+      estima calibrate intel.log.gz -o intel.yaml (a real log)
     """
     import numpy as np
 
@@ -648,6 +682,14 @@ def calibrate(
     from experiments.calibration.sheet import calibrate_sheet
     from sim.recording import load
 
+    if out is not None:
+        others = {"--sheet": sheet, "--method": method, "--config-dir": config_dir}
+        given = {**others, "--joint": joint or None, "--json": as_json or None}
+        for option in (name for name, value in given.items() if value is not None):
+            raise InputError(f"{option} is not of a real log; leave it or -o out")
+        _calibrate_log([Path(path) for path in what or []], out, robot or 1, until_s)
+        return
+    require(robot is None and until_s is None, "--robot and --until are of a real log; give -o too")
     if method not in (None, "wheel-truth", "end-poses"):
         raise InputError(f"--method must be wheel-truth or end-poses, got {method!r}")
     if sheet is not None:
@@ -668,6 +710,24 @@ def calibrate(
         kind: Any = (method or "wheel-truth").replace("-", "_")
         result = calibrate_recordings(loaded, kind, geometry=joint)
     print(result.as_json() if as_json else result.as_text())
+
+
+def _calibrate_log(log: list[Path], out: Path, robot: int, until_s: float | None) -> None:
+    """Calibrate a real log, and write its YAML file and its picture."""
+    from experiments.calibration.from_log import calibrate_log
+    from experiments.calibration.residual_figure import residual_figure
+    from experiments.runs.calibration import write_calibration
+    from experiments.viewing.style import save_figure
+    from sim.formats.detect import read_any
+
+    require(log, "no log to calibrate; name one")
+    require(out.suffix in (".yaml", ".yml"), f"-o {out}: a calibration is a .yaml file")
+    found = calibrate_log(read_any(log, robot), until_s)
+    show(found.as_text())
+    intervals = {name: [x.low, x.high] for name, x in found.intervals.items()}
+    write_calibration(out, found.calibration, intervals)
+    save_figure(residual_figure(found.residuals), out.with_suffix(".png"))
+    show(f"{out}, {out.with_suffix('.png')}")
 
 
 def _robot_of(overrides: list[str], config_dir: Path | None) -> DifferentialDrive:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from estimators.base import Estimate
 from sim import se2
 from sim.arrays import Array
-from sim.errors import InputError
+from sim.errors import InputError, require
 from sim.recording import Recording
 
 CHI2_95_2DOF = 5.991464547107979  # 95 % quantile of chi-square with two degrees of freedom
@@ -130,15 +130,19 @@ def nees_at_distances(truth: Array, means: Array, covariances: Array, distances_
 
 
 def score(
-    recording: Recording, estimate: Estimate, longest_gap_s: float = LONGEST_GAP_S
+    recording: Recording,
+    estimate: Estimate,
+    longest_gap_s: float = LONGEST_GAP_S,
+    after_s: float = 0.0,
 ) -> dict[str, float]:
     """Score an estimate against its recording's truth; units are in the keys.
 
     Stamps outside the truth's span are left out, and so are those in a gap of the truth longer than
-    `longest_gap_s`: they have no true pose. `stamps_scored` and `stamps_left_out` count both. A
-    score that does not apply has no key: all but the times without a truth, the error over 10 m of
-    a shorter run, the NEES without a usable covariance. NaN means that the estimate itself is not
-    finite.
+    `longest_gap_s`: they have no true pose. Those of the first `after_s` of the recording do not
+    count either: something may have been calibrated on them. `stamps_scored` and `stamps_left_out`
+    count both kinds. A score that does not apply has no key: all but the times without a truth, the
+    error over 10 m of a shorter run, the NEES without a usable covariance. NaN means that the
+    estimate itself is not finite.
 
     Raises
     ------
@@ -156,7 +160,9 @@ def score(
     if recording.truth is None:
         return row
     truth = recording.truth_at(estimate.stamps, longest_gap_s)
-    known = np.isfinite(truth).all(axis=1)
+    late = estimate.stamps >= recording.frame_stamps[0] + after_s
+    require(late.any(), f"scoring.after_s={after_s:g} is beyond the end of the recording")
+    known = np.isfinite(truth).all(axis=1) & late
     if not known.any():
         spanned = np.isfinite(recording.truth_at(estimate.stamps)).any()
         complaint = "no estimate lies within the truth's time span; are the clocks the same?"

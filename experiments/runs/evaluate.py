@@ -83,7 +83,7 @@ def evaluate(
                 keep = (*SCORED_EXTRAS, *experiment.keep)
                 online, revised = estimates(estimator, recording, prior, rng, keep, on_step)
             status = status_of(recording, online)
-            scores = scored(recording, online, revised, experiment.longest_gap_s)
+            scores = scored(recording, online, revised, **experiment.scoring)
         except InputError:
             raise
         except (Exception, SystemExit) as error:
@@ -148,12 +148,16 @@ def scored(
     online: Estimate,
     revised: Estimate | None,
     longest_gap_s: float = LONGEST_GAP_S,
+    after_s: float = 0.0,
 ) -> Row:
     """Scores of a run as columns; those of the revised path begin with `revised_`."""
     made = online.map if revised is None else revised.map
-    scores: Row = {**score(recording, online, longest_gap_s), **landmark_errors(recording, made)}
+    scores: Row = {
+        **score(recording, online, longest_gap_s, after_s),
+        **landmark_errors(recording, made),
+    }
     if revised is not None:
-        found = score(recording, revised, longest_gap_s)
+        found = score(recording, revised, longest_gap_s, after_s)
         scores |= {f"revised_{k}": found[k] for k in found if k not in OF_THE_RUN}
     return scores
 

@@ -54,7 +54,15 @@ def run_once(experiment: Experiment, draw: Draw, out: Path | None = None) -> lis
 
     def fetch() -> Recording:
         with progress("simulated seconds", _expected_s(experiment)) as on_progress:
-            return experiment.recording(on_progress)
+            recording = experiment.recording(on_progress)
+        slip = experiment.believed_slip
+        if "source" in recording.config and experiment.config["calibration"] is None and slip:
+            show(
+                f"believed of this real robot: kr={slip[0]:g} and kl={slip[1]:g} m, and the "
+                "geometry that the log's reader assumes; to find its own: "
+                "estima calibrate LOG -o cal.yaml, then calibration=cal.yaml"
+            )
+        return recording
 
     def keep(recording: Recording, repeat: int, online: Estimate, revised: Estimate | None) -> None:
         answer = online if revised is None else revised

@@ -85,7 +85,12 @@ def mrclam(errors: pd.DataFrame, paths: Arrays) -> Figure:
         left.plot(at, rows.ate_rmse_m.mean(), "o", ms=4, color=color, label=method)
         middle.plot(at, rows.nees_mean.median(), "o", ms=4, color=color)
     ticks = {"xticks": range(len(robots)), "xticklabels": [f"R{robot}" for robot in robots]}
-    left.set(ylabel="ATE from the true start, m", ylim=(0.0, None), title="MRCLAM 6", **ticks)
+    left.set(
+        ylabel="ATE after 300 s, from the true start, m",
+        ylim=(0.0, None),
+        title="MRCLAM 6",
+        **ticks,
+    )
     middle.set(yscale="log", ylabel="mean NEES (3 is consistent)", **ticks)
     middle.axhline(3.0, color=BLACK, lw=0.7, ls=":")
     drawn = ("motion capture", *MRCLAM_DRAWN)

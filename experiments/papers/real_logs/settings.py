@@ -56,10 +56,15 @@ MRCLAM = (
     "FastSLAM, known",
     "FastSLAM, known, wider noise",
     "FastSLAM, unknown, wider noise",
+    "FastSLAM, known, slip in bursts",
     "EKF-SLAM, known",
     "EKF-SLAM, known, wider noise",
     "EKF-SLAM, unknown, wider noise",
+    "EKF-SLAM, known, gated",
+    "EKF-SLAM, known, repeats once",
+    "EKF-SLAM, known, invariant",
 )
+MRCLAM_CHOSEN = ("slip in bursts", "invariant", "unknown, wider noise")  # the headlines of RL3
 MRCLAM_DRAWN = (MRCLAM[1], MRCLAM[3])
 
 RESOLUTION_M = 0.05  # of the grid maps

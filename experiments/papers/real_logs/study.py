@@ -29,6 +29,7 @@ from experiments.papers.real_logs.building import closed_loops
 from experiments.papers.real_logs.grid_match import beam_points, best_fit
 from experiments.papers.real_logs.logs import tracked, tuned_until_s
 from experiments.papers.real_logs.settings import (
+    CALIBRATED_S,
     DATA,
     DRAWN_ROBOT,
     FASTSLAM_SEEDS,
@@ -254,7 +255,7 @@ def _landmark_job(
 ) -> tuple[Row, NDArray[np.float32]]:
     log = run.recording()
     estimate = tracked(run.estimator(), log, seed, log.truth_at(log.frame_stamps[:1])[0])
-    found = score(log, estimate)
+    found = score(log, estimate, after_s=CALIBRATED_S)
     row: Row = {"robot": robot, "method": method, "seed": seed, "judged": robot not in TUNED_ROBOTS}
     row |= {key: found.get(key, math.nan) for key in _SCORES}
     return row, _path(estimate.means[::5])
