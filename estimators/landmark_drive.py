@@ -15,7 +15,7 @@ import numpy as np
 
 from estimators.base import Estimate
 from estimators.gaussian import Gaussian, compose, wrap
-from estimators.least_squares import Problem, Robust, Solution, solve
+from estimators.least_squares import Problem, Robust, solve
 from estimators.slam_frontend import screened
 from estimators.stereo import StereoModel
 from sim.arrays import Array, Ints
@@ -97,10 +97,10 @@ class LandmarkDrive:
             robust_sigma=robust_sigma,
             max_iterations=max_iterations,
         )
-        means, covariances = self._filled_in(rows, solution)
+        means, covariances = self.filled_in(solution.poses, solution.covariance)
         status = "ok" if solution.converged else "not_converged"
         return Estimate(
-            stamps=np.array(self._stamps),
+            stamps=self.stamps,
             means=means,
             covariances=covariances,
             kind="revised",
@@ -149,19 +149,33 @@ class LandmarkDrive:
         )
         return problem, ids
 
-    def _filled_in(self, rows: list[int], solution: Solution) -> tuple[Array, Array]:
-        """Means (T, 3) and covariances (T, 3, 3) of every Frame, between the solved ones too."""
+    def filled_in(self, poses: Array, joint_covariance: Array) -> tuple[Array, Array]:
+        """Means (T, 3) and covariances (T, 3, 3) of every Frame, between the solved ones too.
+
+        Parameters
+        ----------
+        poses
+            (N, 3) of the problem, solved.
+        joint_covariance
+            (3 N, 3 N); only that of neighbours is read.
+        """
+        rows = self._rows()
         n, n_poses = len(self._stamps), len(rows)
         means, covariances = np.empty((n, 3)), np.empty((n, 3, 3))
-        means[rows], each = solution.poses, range(n_poses)
-        covariances[rows] = solution.covariance.reshape(n_poses, 3, n_poses, 3)[each, :, each]
+        means[rows], each = poses, range(n_poses)
+        covariances[rows] = joint_covariance.reshape(n_poses, 3, n_poses, 3)[each, :, each]
         for pose, (a, b) in enumerate(itertools.pairwise(rows)):
             block = slice(3 * pose, 3 * pose + 6)
-            joint, ends = solution.covariance[block, block], solution.poses[pose : pose + 2]
+            joint, ends = joint_covariance[block, block], poses[pose : pose + 2]
             between = _between(self._motions[a + 1 : b + 1], ends, joint)
             for row, belief in enumerate(between, start=a + 1):
                 means[row], covariances[row] = belief.mean, belief.covariance
         return means, covariances
+
+    @property
+    def stamps(self) -> Array:
+        """(T,) s of all Frames so far."""
+        return np.array(self._stamps)
 
 
 def observed(

@@ -20,7 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimators.stereo import PackedCamera
-from sim import se2
 from sim.arrays import Array, Ints
 from sim.compiled import njit
 
@@ -398,6 +397,7 @@ def create(maps: Array, rows: Ints, points: Array, state: Array, camera: PackedC
             L[_XX + j], L[_XY + j], L[_XZ + j], L[_YY + j], L[_YZ + j], L[_ZZ + j] = R
 
 
+@njit(**_FLOATS)
 def move(
     poses: Array, increment: Array, root: Array, normals: Array, mount: Array, state: Array
 ) -> Array:
@@ -406,35 +406,40 @@ def move(
     A pose is x, y, heading (not wrapped), and the heading's cosine and sine. Writes the geometry
     of the state. `mount` (4,) is x, y of the camera, and cosine and sine of its yaw.
     """
-    x, y, heading, cos, sin = poses
-    dx, dy, turn = increment[:, None] + root @ normals
-    heading = heading + turn
-    x, y = x + cos * dx - sin * dy, y + sin * dx + cos * dy
-    cos, sin = np.cos(heading), np.sin(heading)
+    moved = np.empty_like(poses)
     at_x, at_y, cos_yaw, sin_yaw = mount
-    geometry = np.stack(
-        [
-            x + cos * at_x - sin * at_y,
-            y + sin * at_x + cos * at_y,
-            cos * cos_yaw - sin * sin_yaw,
-            sin * cos_yaw + cos * sin_yaw,
-            x,
-            y,
-        ]
-    )
-    by_block = geometry.reshape(_GEOMETRY, -1, LANES).swapaxes(0, 1)
-    state[:, : _GEOMETRY * LANES] = by_block.reshape(len(state), -1)
-    return np.stack([x, y, heading, cos, sin])
+    for lane in range(poses.shape[1]):
+        x, y, heading, cos, sin = poses[:, lane]
+        a, b, c = normals[:, lane]
+        dx = increment[0] + root[0, 0] * a + root[0, 1] * b + root[0, 2] * c
+        dy = increment[1] + root[1, 0] * a + root[1, 1] * b + root[1, 2] * c
+        heading += increment[2] + root[2, 0] * a + root[2, 1] * b + root[2, 2] * c
+        x, y = x + cos * dx - sin * dy, y + sin * dx + cos * dy
+        cos, sin = math.cos(heading), math.sin(heading)
+        moved[0, lane], moved[1, lane], moved[2, lane] = x, y, heading
+        moved[3, lane], moved[4, lane] = cos, sin
+        S, j = state[lane // LANES], lane % LANES
+        S[_CAMERA_X + j] = x + cos * at_x - sin * at_y
+        S[_CAMERA_Y + j] = y + sin * at_x + cos * at_y
+        S[_COS + j] = cos * cos_yaw - sin * sin_yaw
+        S[_SIN + j] = sin * cos_yaw + cos * sin_yaw
+        S[_BASE_X + j], S[_BASE_Y + j] = x, y
+    return moved
 
 
+@njit(**_FLOATS)
 def moments(poses: Array, weights: Array) -> tuple[Array, Array]:
     """Mean (3,) and covariance (3, 3) of weighted poses (M, 3); the mean heading is circular."""
     mean = weights @ poses
-    heading = poses[:, 2]
-    mean[2] = math.atan2(float(weights @ np.sin(heading)), float(weights @ np.cos(heading)))
+    cos = sin = 0.0
+    for m in range(len(poses)):
+        cos += weights[m] * math.cos(poses[m, 2])
+        sin += weights[m] * math.sin(poses[m, 2])
+    mean[2] = math.atan2(sin, cos)
     off = poses - mean
-    off[:, 2] = se2.wrap(off[:, 2])
-    return mean, off.T @ (off * weights[:, None])
+    for m in range(len(off)):
+        off[m, 2] -= 2.0 * math.pi * math.ceil((off[m, 2] - math.pi) / (2.0 * math.pi))
+    return mean, off.T @ (off * np.expand_dims(weights, 1))
 
 
 @njit(forceinline=True, **_FLOATS)

@@ -96,7 +96,7 @@ def run(
 
     Examples
     --------
-      estima run
+      estima run (a first look: study=first_run)
 
       estima run estimator=odometry world=office seed=3
 
@@ -124,11 +124,32 @@ def run(
     if many and "--hydra-help" not in arguments:
         from experiments.sweeps.launch import sweep_arguments
 
-        sweep_arguments([a for a in arguments if a not in many])
+        _show_sweep(*sweep_arguments([a for a in arguments if a not in many]))
         return
+    if not arguments:
+        arguments = ["study=first_run"]
+        print("estima run study=first_run (estima options lists what else there is)")
     from experiments.runs.run import application
 
     application(arguments, _draw_run, out)
+
+
+_FEW_RUNS, _FEW_LINES = 2000, 30
+
+
+def _show_sweep(folder: Path, n_runs: int) -> None:
+    """Print a sweep's small table, and what can be done next."""
+    from experiments.report.table import as_lines, notes
+    from experiments.sweeps.collect import collect
+    from experiments.sweeps.summary import ERROR, summary
+
+    if n_runs <= _FEW_RUNS:
+        rows = collect(str(folder))
+        found = summary(rows, metrics=[ERROR] if "ate_rmse_m" in rows else [])
+        if len(found) <= _FEW_LINES:
+            show(as_lines(found, notes(found, None)))
+    print(f"\nNext: estima table {folder.name} --against ESTIMATOR -o table.tex")
+    print(f"      estima report {folder.name}")
 
 
 def _draw_run(
@@ -689,8 +710,6 @@ def calibrate(
         kind: Any = (method or "wheel-truth").replace("-", "_")
         result = calibrate_recordings(loaded, kind, geometry=joint)
     print(result.as_json() if as_json else result.as_text())
-    if not as_json:
-        print("  (puzzlebot2024's own gradient descent would return 0.5, whatever the data)")
 
 
 def _calibrate_log(log: list[Path], out: Path, robot: int, until_s: float | None) -> None:
@@ -722,6 +741,53 @@ def _robot_of(overrides: list[str], config_dir: Path | None) -> DifferentialDriv
                 "robot.track_m=0.19"
             )
     return Experiment.compose([*searched(config_dir), *overrides]).robot()
+
+
+@app.command()
+def tune(
+    study: Annotated[
+        str,
+        typer.Argument(
+            help="A study of conf/study that has a tune.", autocompletion=completion.studies
+        ),
+    ],
+    only: Annotated[list[str] | None, typer.Option(help="Only this estimator; repeat it.")] = None,
+    jobs: Annotated[int, typer.Option("--jobs", "-j", help="Processes.")] = 1,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="Folder of the YAMLs [results/tuned/estimator]."),
+    ] = None,
+    config_dir: ConfigDir = None,
+) -> None:
+    """Tune a study's estimators on seeds below 100, with one budget, and judge them on its own.
+
+    The trials are kept, so that the command goes on where it was interrupted. It writes
+    ESTIMATOR_tuned.yaml, tables of trials and gains, and their figure.
+
+    Examples
+    --------
+      estima tune peers --jobs 2
+
+      estima run --config-dir results/tuned estimator=ekf_icp_tuned sensors=hokuyo
+    """
+    from experiments.sweeps import tune as tuning
+    from experiments.viewing.style import save_figure
+
+    folder = str(config_dir) if config_dir else None
+    plan, place = tuning.tuning_of(study, folder), paths.results()
+    found, written = [], []
+    with progress(f"tune {study}", 1.0) as on_progress:
+        for tuned in tuning.tune(
+            study, only or (), jobs=jobs, config_dir=folder, on_progress=on_progress
+        ):
+            found.append(tuned)
+            written.append(tuning.write(tuned, study, plan, out or place / "tuned" / "estimator"))
+    trials, gains = tuning.trials_table(found), tuning.gains_table(found)
+    write_frame(trials, place / "tables" / f"{study}_trials_tuning.csv", digits=6)
+    write_frame(gains, place / "tables" / f"{study}_tuning.csv", digits=6)
+    save_figure(tuning.curves(trials, gains), place / "figures" / f"{study}_tuning.png")
+    show(gains.to_string(index=False, float_format=lambda v: f"{v:.4g}"))
+    print("\n".join(map(paths.short, written)))
 
 
 @app.command()
@@ -863,41 +929,68 @@ def table(
         ),
     ],
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="File to write, .csv or .parquet.")
+        Path | None,
+        typer.Option("--out", "-o", help="File to write: .tex, .md, .html, .csv, .parquet."),
     ] = None,
     against: Annotated[
         str | None,
         typer.Option(
-            help="Give errors relative to this estimator's, too.",
+            help="Compare with this estimator: relative errors, and paired tests.",
             autocompletion=completion.estimators,
+        ),
+    ] = None,
+    metric: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Result to show instead of the main ones; repeat it.",
+            autocompletion=completion.metrics,
         ),
     ] = None,
     all_versions: Annotated[
         bool, typer.Option("--all-versions", help="Keep rows of other versions of the code.")
     ] = False,
     times: Annotated[bool, typer.Option("--times", help="Keep computing times.")] = False,
-    means: Annotated[
-        bool, typer.Option("--means", help="With -o: write the means that are shown without it.")
+    every: Annotated[
+        bool, typer.Option("--rows", help="With -o: write every row, with all its columns.")
     ] = False,
     only: Where = None,
 ) -> None:
-    """Show the means of a sweep's errors, or with -o write all its rows.
+    """Show a sweep's mean errors with 95 % intervals, or write them for a paper.
 
-    The means are those of the best answers: of the revised path of a method that has one.
+    Errors are those of the best answers: of the revised path of a method that has one. The best on
+    the same recordings is bold. A .tex file goes into a LaTeX article by `input` as it is.
 
-    Example: estima table leaderboard --against smoother
+    Examples
+    --------
+      estima table leaderboard --against smoother
+
+      estima table slip --metric answer_ate_rmse_m --metric answer_nees_mean -o slip.tex
+
+      estima table slip --rows -o slip.csv
     """
-    from experiments.sweeps.collect import collect, summary, where
+    from experiments.report.table import as_lines, check_name, notes, statuses, write_table
+    from experiments.sweeps.collect import collect, where
+    from experiments.sweeps.summary import summary
 
-    rows = where(collect(name, all_versions=all_versions, times=times), only or [])
-    if out is None or means:
-        rows = summary(rows, against)
-    if out is None:
-        shown = rows.rename(columns=lambda column: columns.title(column, short=True))
-        show(shown.to_string(index=False, na_rep="-", float_format=lambda v: f"{v:.4g}"))
+    if out is not None:
+        check_name(out)
+    require(not every or out is not None, "--rows: name the file to write, such as -o rows.csv")
+    timed = times or any(column.endswith("_time_us") for column in metric or [])
+    rows = where(collect(name, all_versions=all_versions, times=timed), only or [])
+    if every and out is not None:
+        require(out.suffix in (".csv", ".parquet"), f"-o {out}: with --rows it is .csv or .parquet")
+        write_frame(rows, out)
+        print(f"{out}: {len(rows)} rows, {len(rows.columns)} columns")
         return
-    write_frame(rows, out)
-    print(f"{out}: {len(rows)} rows, {len(rows.columns)} columns")
+    found = summary(rows, against, metric or [])
+    note = notes(found, against)
+    if out is None:
+        show(as_lines(found, note))
+        if (rows["status"] != Outcome.OK).any():
+            show("\n" + "\n".join(f"{count} {words}" for words, count in statuses(rows)))
+        return
+    write_table(found, note, out, Path(name).name)
+    print(f"{out}: {len(found)} rows")
 
 
 @app.command()
@@ -917,12 +1010,28 @@ def plot(
         typer.Option(help="Result (estima options metrics).", autocompletion=completion.metrics),
     ] = "answer_ate_rmse_m",
     by: Annotated[
-        str | None,
-        typer.Option(help="One line a value of this.", autocompletion=completion.settings),
+        list[str] | None,
+        typer.Option(
+            help="One line a value of this; repeat it for combinations.",
+            autocompletion=completion.settings,
+        ),
     ] = None,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Picture to write.")] = Path("plot.png"),
+    row: Annotated[
+        str | None,
+        typer.Option(help="One row of panels a value.", autocompletion=completion.settings),
+    ] = None,
+    col: Annotated[
+        str | None,
+        typer.Option(help="One column of panels a value.", autocompletion=completion.settings),
+    ] = None,
+    size: Annotated[
+        str, typer.Option(help="screen, or column or page of a paper (3.5 in, 7.16 in).")
+    ] = "screen",
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="Picture to write: .png, .pdf, .svg.")
+    ] = Path("plot.png"),
     pool: Annotated[
-        bool, typer.Option("--pool", help="Average over worlds, estimators and logs too.")
+        bool, typer.Option("--pool", help="Average over other settings that differ too.")
     ] = False,
     only: Where = None,
 ) -> None:
@@ -931,18 +1040,25 @@ def plot(
     By default it is the position error of the best answers: of the revised path of a method that
     has one, else of the online one.
 
-    Example: estima plot slip --x robot.kr --y heading_rmse_rad --by choice.estimator
+    Examples
+    --------
+      estima plot slip --x robot.kr --y heading_rmse_rad --by choice.estimator
+
+      estima plot slip --x robot.kr --by choice.estimator --col choice.world --size page -o a.pdf
     """
-    from experiments.report.plot import sweep_figure
+    from experiments.report.plot import Size, sweep_figure
     from experiments.sweeps.collect import collect, where
     from experiments.viewing.style import save_figure
 
+    if size not in list(Size):
+        raise InputError(f"--size must be {', '.join(Size)}, got {size}")
     rows = where(collect(name, times=True), only or [])
     failed = rows["status"] == Outcome.FAILED
     if failed.any():
         print(f"{failed.sum()} of {len(rows)} runs failed; they are left out", file=sys.stderr)
         rows = rows[~failed]
-    save_figure(sweep_figure(rows, x, y, by, pool=pool), out)
+    page = sweep_figure(rows, x, y, by, row=row, col=col, size=size, pool=pool)
+    save_figure(page, out)
     print(out)
 
 
@@ -974,11 +1090,43 @@ def reproduce(
 
 
 @app.command()
-def report() -> None:
-    """Write results/report.html from what the studies have written to results/.
+def report(
+    name: Annotated[
+        str | None,
+        typer.Argument(
+            help="A sweep's name, or a folder or file of rows; else all studies of the papers.",
+            autocompletion=completion.sweeps,
+        ),
+    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="File to write, .html.")] = None,
+    only: Where = None,
+) -> None:
+    """Write one page to open in a browser: of a sweep, or of the papers' studies in results/.
 
-    Example: estima report
+    A sweep's page has a chart whose axes, colours, panels and filters can be chosen, its means, its
+    best and worst runs, and its command. It needs no network.
+
+    Examples
+    --------
+      estima report
+
+      estima report slip
+
+      estima report slip --where choice.world=office -o office.html
     """
+    if out is not None and (name is None or out.suffix != ".html"):
+        raise InputError(f"-o {out}: give the name of a sweep, and a file that ends in .html")
+    if name is not None:
+        from experiments.report.sweep_page import write_sweep_page
+        from experiments.sweeps.collect import collect, folder_of, where
+
+        folder, called = folder_of(name), Path(name).name
+        written = out or folder.parent / f"{called}.html"
+        rows = where(collect(name, times=True), only or [])
+        write_sweep_page(rows, called, folder, written)
+        print(paths.short(written))
+        return
+    require(not only, "--where: name the sweep whose runs to keep")
     if not any((paths.results() / name).exists() for name in ("claims.csv", "figures", "tables")):
         raise InputError(
             f"{paths.short(paths.results())}: no claims, figures or tables to report; "

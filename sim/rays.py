@@ -1,11 +1,15 @@
 """Rays in a world: by the exact caster, or by the physics engine; the geometry is the same."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sim.arrays import Array
+from sim.robot import DifferentialDrive
+from sim.se2 import transform
+from sim.sensors.base import Rays
 from sim.world import World
 
 _SURFACE_M = 0.005  # a landmark this near the face that a ray hits is seen
@@ -37,6 +41,48 @@ class ExactRays:
         from sim.casting import visible
 
         return visible(self._world, origin, points)
+
+
+class AmongRobots:
+    """Rays in a world in which other robots stand, each a box of the size of its body.
+
+    Parameters
+    ----------
+    rays
+        Those of the world alone.
+    others
+        Gives the other robots and their poses (3,) as they are now.
+    """
+
+    def __init__(
+        self, rays: Rays, others: Callable[[], list[tuple[DifferentialDrive, Array]]]
+    ) -> None:
+        self._rays, self._others = rays, others
+
+    def _boxes(self) -> ExactRays:
+        others = self._others()
+        faces = np.concatenate([np.zeros((0, 4)), *(_faces(*other) for other in others)])
+        heights_m = np.repeat([robot.body_height_m for robot, _ in others], 4)
+        return ExactRays(World("robots", faces, np.stack([0.0 * heights_m, heights_m], axis=1)))
+
+    def scan(self, scanner: Any, pose: Array) -> Array:
+        """Ranges (beams,) m of a scanner on the robot at a pose (3,); inf without a return."""
+        return np.minimum(self._rays.scan(scanner, pose), self._boxes().scan(scanner, pose))
+
+    def cloud(self, lidar: Any, pose: Array) -> Array:
+        """Ranges (rings, azimuths) m of a lidar on the robot at a pose (3,)."""
+        return np.minimum(self._rays.cloud(lidar, pose), self._boxes().cloud(lidar, pose))
+
+    def sees(self, origin: Array, points: Array) -> NDArray[np.bool_]:
+        """Whether nothing stands between a point (3,) and each of others (K, 3)."""
+        return self._rays.sees(origin, points) & self._boxes().sees(origin, points)
+
+
+def _faces(robot: DifferentialDrive, pose: Array) -> Array:
+    """Sides (4, 4) of a robot's body, seen from above, m in map."""
+    x, y = robot.body_length_m / 2, robot.body_width_m / 2
+    corners = transform(pose, np.array([[x, y], [-x, y], [-x, -y], [x, -y]]))
+    return np.hstack([corners, np.roll(corners, -1, axis=0)])
 
 
 class BulletRays:

@@ -12,6 +12,7 @@ import json
 import math
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
@@ -41,6 +42,7 @@ from sim.settings import build
 from sim.world import World
 
 FORMAT_VERSION = 2
+REMEDY = "delete it and record again"
 S = TypeVar("S")
 
 
@@ -220,12 +222,15 @@ class Frame:
         (2,) encoder travel of the right and left wheel since the previous Frame, m.
     readings
         By sensor, the reading that it took at this instant: arrays by field.
+    robot
+        Number of the robot in its team; 0 for one alone.
     """
 
     stamp: float
     duration_s: float
     wheel_increments_m: Array
     readings: Mapping[str, Reading] = field(default_factory=dict)
+    robot: int = 0
 
 
 @dataclass(frozen=True)
@@ -261,7 +266,7 @@ class Recording:
     status: str = "ok"
 
     def __post_init__(self) -> None:
-        for array in _arrays(self).values():
+        for array in arrays_of(self).values():
             array.setflags(write=False)
 
     @property
@@ -311,8 +316,8 @@ class Recording:
             truth = dataclasses.replace(truth, readings=hidden)
         return dataclasses.replace(self, sensors=sensors, logs=logs, truth=truth)
 
-    def frames(self) -> Iterator[Frame]:
-        """Walk through the Frames in order.
+    def frames(self, robot: int = 0) -> Iterator[Frame]:
+        """Walk through the Frames in order, as those of the robot of this number.
 
         Wheel positions are interpolated at the Frame stamps; in simulation the encoders are read
         at every Frame, so the interpolation is exact there.
@@ -336,6 +341,7 @@ class Recording:
                     for name, rows in shown.items()
                     if rows[i] >= 0
                 },
+                robot=robot,
             )
 
     def truth_at(self, stamps: Array, longest_gap_s: float = math.inf) -> Array:
@@ -366,7 +372,7 @@ class Recording:
     @property
     def checksum(self) -> str:
         """SHA-256 over all the recording holds, as hex."""
-        return _digest(_arrays(self), described(self))
+        return _digest(arrays_of(self), described(self))
 
     def cut(self, n_frames: int) -> Recording:
         """The same recording, ended after `n_frames` Frames (the logs keep their tails)."""
@@ -388,7 +394,13 @@ def save(recording: Recording, path: Path, *, durable: bool = True) -> str:
     InputError
         If it cannot be written (full disk, no permission).
     """
-    arrays, meta = _arrays(recording), described(recording)
+    return write_arrays(path, arrays_of(recording), described(recording), durable=durable)
+
+
+def write_arrays(
+    path: Path, arrays: dict[str, NDArray[Any]], meta: dict[str, Any], *, durable: bool = True
+) -> str:
+    """Write arrays and plain values that describe them, whole; return their checksum."""
     checksum = _digest(arrays, meta)
     meta_bytes = np.frombuffer(json.dumps({**meta, "checksum": checksum}).encode(), np.uint8)
     with write_whole(path, durable=durable) as part, part.open("wb") as file:
@@ -404,34 +416,45 @@ def load(path: Path) -> Recording:
     InputError
         If the file is missing, truncated, altered, or not a recording.
     """
-    remedy = "delete it and record again"
     if not path.is_file():
         raise InputError(f"{path}: no such recording; make one with `estima record`")
     if path.suffix != ".npz" and not zipfile.is_zipfile(path):
         raise InputError(
             f"{path}: not a recording; make one of a log with `estima convert {path} -o FILE.npz`"
         )
-    try:
-        stored = read_arrays(path)
-        require("meta" in stored, "not a recording")
-        meta = json.loads(stored.pop("meta").tobytes())
-        require(isinstance(meta, dict), "not a recording")
-        checksum = meta.pop("checksum", None)
-        version = meta.get("format")
-        require(
-            version in (1, FORMAT_VERSION),
-            f"recording format {version}, this version reads up to {FORMAT_VERSION}",
-        )
-        require(_digest(stored, meta) == checksum, "the data do not match their checksum")
-        if version == 1:
+    with blamed(path, REMEDY):
+        stored, meta = checked_arrays(path)
+        require("team" not in meta, "it holds a team of robots, which `sim.team.load` reads")
+        if meta["format"] == 1:
             stored, meta = upgraded(stored, meta)
-        recording = _assemble(stored, meta)
-        check_recording(recording)
+        return assembled(stored, meta)
+
+
+@contextmanager
+def blamed(path: Path, remedy: str) -> Iterator[None]:
+    """Turn what a file may be wrong in into one line that names it, and the remedy."""
+    try:
+        yield
     except KeyError as error:
         raise InputError(f"{path}: {error.args[0]} is missing; {remedy}") from error
     except (InputError, *UNREADABLE) as error:
         raise InputError(f"{path}: {str(error).removeprefix(f'{path}: ')}; {remedy}") from error
-    return recording
+
+
+def checked_arrays(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+    """Arrays and plain values of a file, which match its checksum."""
+    stored = read_arrays(path)
+    require("meta" in stored, "not a recording")
+    meta = json.loads(stored.pop("meta").tobytes())
+    require(isinstance(meta, dict), "not a recording")
+    checksum = meta.pop("checksum", None)
+    version = meta.get("format")
+    require(
+        version in (1, FORMAT_VERSION),
+        f"recording format {version}, this version reads up to {FORMAT_VERSION}",
+    )
+    require(_digest(stored, meta) == checksum, "the data do not match their checksum")
+    return stored, meta
 
 
 def _rows_at(frame_stamps: Array, log: Log) -> NDArray[np.int64]:
@@ -442,7 +465,7 @@ def _rows_at(frame_stamps: Array, log: Log) -> NDArray[np.int64]:
     return np.where((found >= 0) & (log.stamps[found] == frame_stamps), found, -1)
 
 
-def _arrays(recording: Recording) -> dict[str, NDArray[Any]]:
+def arrays_of(recording: Recording) -> dict[str, NDArray[Any]]:
     """Every array of a recording under the name it is saved by."""
     arrays = {"frame_stamps": recording.frame_stamps}
     parts = {
@@ -498,7 +521,9 @@ def _digest(arrays: dict[str, NDArray[Any]], meta: dict[str, Any]) -> str:
     return digest.hexdigest()
 
 
-def _assemble(stored: dict[str, NDArray[Any]], meta: dict[str, Any]) -> Recording:
+def assembled(stored: dict[str, NDArray[Any]], meta: dict[str, Any]) -> Recording:
+    """Recording of its arrays and plain values, checked."""
+
     def part(prefix: str) -> dict[str, NDArray[Any]]:
         """Arrays directly under a name."""
         below = {
@@ -550,6 +575,7 @@ def _assemble(stored: dict[str, NDArray[Any]], meta: dict[str, Any]) -> Recordin
         config=meta["config"],
         status=meta["status"],
     )
-    if unknown := set(stored) - set(_arrays(recording)):
+    if unknown := set(stored) - set(arrays_of(recording)):
         raise InputError(f"arrays that nothing describes: {', '.join(sorted(unknown))}")
+    check_recording(recording)
     return recording

@@ -1,17 +1,19 @@
 """World + robot + sensors + route + random streams -> Recording.
 
 Time runs in ticks of 1/300 s. At each tick the wheels are driven, slip, and are read; each
-sensor fires at its own multiple of the tick.
+sensor fires at its own multiple of the tick. The robots of a team advance together, tick by tick.
 """
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
+import itertools
 import math
 import zlib
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -22,10 +24,11 @@ from sim.arrays import Array
 from sim.errors import InputError, blaming, require
 from sim.feedback import Feedback, Onboard, feedback_of
 from sim.kinematic import KinematicBody
-from sim.rays import BulletRays, ExactRays
+from sim.rays import AmongRobots, BulletRays, ExactRays
 from sim.recording import CommandLog, Log, Recording, Truth, WheelLog, joined
 from sim.robot import DifferentialDrive
 from sim.sensors.base import Rays, Reading, Sensor, Sensors, View, parted
+from sim.team import Team
 from sim.world import World
 
 Physics = Literal["bullet", "kinematic"]
@@ -75,6 +78,28 @@ class Route(Protocol):
         """Start pose (3,) and the driver."""
 
 
+@dataclass(frozen=True)
+class Member:
+    """One robot of a team, with what it carries and where it is sent.
+
+    Attributes
+    ----------
+    streams
+        Generators `slip` and `sensors`.
+    config
+        Kept in its recording: where it came from.
+    onboard
+        Starts the estimator that a route's feedback names.
+    """
+
+    robot: DifferentialDrive
+    sensors: Sensors
+    route: Route
+    streams: Mapping[str, np.random.Generator]
+    config: dict[str, Any] = field(default_factory=dict)
+    onboard: Onboard | None = None
+
+
 def record(
     world: World,
     robot: DifferentialDrive,
@@ -116,61 +141,130 @@ def record(
         If a sensor's rate does not divide 300 Hz, if the robot overlaps a wall at its start, or
         if Bullet rays are asked for without Bullet physics.
     """
+    member = Member(robot, sensors, route, streams, config or {}, onboard)
+    options: Any = {"physics": physics, "rays": rays, "on_progress": on_progress}
+    return record_team(world, [member], **options).robots[0]
+
+
+def record_team(
+    world: World,
+    members: Sequence[Member],
+    *,
+    physics: Physics = "bullet",
+    rays: RayKind = "bullet",
+    on_progress: Callable[[float], None] | None = None,
+) -> Team:
+    """Drive the routes of several robots at once and record what their sensors measure.
+
+    The robots see one another, and hide from one another what lies behind their bodies. They do not
+    collide. One that has ended its route stands there until all have.
+
+    Parameters and errors are those of `record`; a robot's own are in its `Member`.
+    """
     require(
         rays != "bullet" or physics == "bullet", "rays=bullet needs physics=bullet; set rays=exact"
     )
-    periods = _periods(sensors)
-    pose, driver = route.start(world, robot)
-    require(
-        not overlaps(world, robot, pose),
-        f"the robot overlaps a wall of world {world.name} at its start "
-        f"({pose[0]:.2f}, {pose[1]:.2f}); move the start pose or the wall",
-    )
-    for values in (pose, *vars(world).values()):  # a sensor looks at them, and must not change them
+    periods = [_periods(member.sensors) for member in members]
+    starts = [member.route.start(world, member.robot) for member in members]
+    for member, (pose, _) in zip(members, starts, strict=True):
+        require(
+            not overlaps(world, member.robot, pose),
+            f"the robot overlaps a wall of world {world.name} at its start "
+            f"({pose[0]:.2f}, {pose[1]:.2f}); move the start pose or the wall",
+        )
+    # a sensor looks at them, and must not change them
+    for values in (*(pose for pose, _ in starts), *vars(world).values()):
         if isinstance(values, np.ndarray):
             values.setflags(write=False)
-    feedback = feedback_of(route, robot, pose, sensors, world, onboard)
-    logs: _Logs = defaultdict(list)
+    now = dict(enumerate(pose for pose, _ in starts))  # poses at the tick
+    logs: list[_Logs] = [defaultdict(list) for _ in members]
+    statuses: dict[int, str] = {}
     with contextlib.ExitStack() as stack:
-        body: Body
-        caster: Rays
-        if physics == "bullet":
-            from sim.bullet import BulletBody
+        bodies, drives = [], {}
+        for number, member in enumerate(members):
+            start, driver = starts[number]
+            onboard, robot = member.onboard, member.robot
+            feedback = feedback_of(member.route, robot, start, member.sensors, world, onboard)
+            body, find_trouble, caster = _bodied(world, robot, start, physics, rays, stack)
+            probes = _probes(
+                world, member, _seeing(caster, members, now, number), start, _others(now, number)
+            )
+            slip, own = member.streams["slip"], periods[number]
+            drives[number] = _drive(
+                robot, own, body, driver, feedback, find_trouble, probes, slip, logs[number]
+            )
+            bodies.append(body)
+        for tick in itertools.count():
+            if len(members) > 1:
+                now.update(enumerate(body.pose for body in bodies))
+            for number, drive in [*drives.items()]:
+                try:
+                    next(drive)
+                except StopIteration as end:
+                    statuses[number] = end.value
+                    del drives[number]
+            if not drives:
+                break
+            if on_progress is not None and tick % TICKS_PER_S == 0:
+                on_progress(tick * DT_S)
+    return Team.on_one_clock(
+        [
+            _assemble(world, member, logs[number], statuses[number])
+            for number, member in enumerate(members)
+        ]
+    )
 
-            bullet = stack.enter_context(BulletBody(world, robot, pose))
-            body, find_trouble = bullet, lambda: bullet.trouble
-            caster = BulletRays(bullet) if rays == "bullet" else ExactRays(world)
-        else:
-            body = KinematicBody(robot, pose)
-            caster = ExactRays(world)
-            find_trouble = _Collisions(world, robot, body)
-        probes = _probes(world, sensors, caster, streams["sensors"], pose)
-        status = _drive(
-            robot,
-            periods,
-            body,
-            driver,
-            feedback,
-            find_trouble,
-            probes,
-            streams["slip"],
-            logs,
-            on_progress,
-        )
-    return _assemble(world, robot, sensors, logs, status, config or {})
+
+def _bodied(
+    world: World,
+    robot: DifferentialDrive,
+    start: Array,
+    physics: Physics,
+    rays: RayKind,
+    stack: contextlib.ExitStack,
+) -> tuple[Body, Callable[[], str | None], Rays]:
+    """Body of a robot, what looks for its troubles, and rays in its world."""
+    if physics == "bullet":
+        from sim.bullet import BulletBody
+
+        bullet = stack.enter_context(BulletBody(world, robot, start))
+        caster = BulletRays(bullet) if rays == "bullet" else ExactRays(world)
+        return bullet, lambda: bullet.trouble, caster
+    body = KinematicBody(robot, start)
+    return body, _Collisions(world, robot, body), ExactRays(world)
+
+
+def _others(now: Mapping[int, Array], number: int) -> Callable[[], Mapping[int, Array]]:
+    """Function that gives the poses of the other robots at this tick."""
+    return lambda: {other: pose for other, pose in now.items() if other != number}
+
+
+def _seeing(rays: Rays, members: Sequence[Member], now: Mapping[int, Array], number: int) -> Rays:
+    """Rays of one robot of a team."""
+    if len(members) == 1:
+        return rays
+    others = _others(now, number)
+    return AmongRobots(
+        rays, lambda: [(members[other].robot, pose) for other, pose in others().items()]
+    )
 
 
 def _probes(
-    world: World, sensors: Sensors, rays: Rays, rng: np.random.Generator, start: Array
+    world: World,
+    member: Member,
+    rays: Rays,
+    start: Array,
+    others: Callable[[], Mapping[int, Array]],
 ) -> dict[str, _Firing]:
     """Every sensor at work, those that share their noise first."""
+    sensors, rng = member.sensors, member.streams["sensors"]
     order = [*(name for name in _SHARE_NOISE if name in sensors)]
     order += [name for name in sensors if name not in order]
     probes = {}
     for name in order:
         own = rng if name in _SHARE_NOISE else _stream_of(rng, name)
-        first = View(0.0, start, world, rays, 0.0, start)
-        probes[name] = _Firing(name, sensors[name], own, first)
+        first = View(0.0, start, world, rays, 0.0, start, others())
+        probes[name] = _Firing(name, sensors[name], own, first, others)
     return probes
 
 
@@ -184,8 +278,16 @@ def _stream_of(rng: np.random.Generator, name: str) -> np.random.Generator:
 class _Firing:
     """A sensor at work, and what it saw last."""
 
-    def __init__(self, name: str, sensor: Sensor, rng: np.random.Generator, first: View) -> None:
+    def __init__(
+        self,
+        name: str,
+        sensor: Sensor,
+        rng: np.random.Generator,
+        first: View,
+        others: Callable[[], Mapping[int, Array]],
+    ) -> None:
         self._where, self._schema, self._last = f"sensors.{name}", sensor.schema, first
+        self._others = others
         with blaming(self._where):
             self._probe = sensor.start(rng)
             if hasattr(self._probe, "begin"):
@@ -193,8 +295,8 @@ class _Firing:
         require(callable(self._probe), f"{self._where}: start must return a function of the view")
 
     def __call__(self, stamp: float, pose: Array) -> Reading | None:
-        last = self._last
-        self._last = View(stamp, pose, last.world, last.rays, last.stamp, last.pose)
+        last, others = self._last, self._others()
+        self._last = View(stamp, pose, last.world, last.rays, last.stamp, last.pose, others)
         with blaming(self._where):
             reading = self._probe(self._last)
         if reading is None:
@@ -220,9 +322,8 @@ def _drive(
     probes: dict[str, _Firing],
     rng: np.random.Generator,
     logs: _Logs,
-    on_progress: Callable[[float], None] | None,
-) -> str:
-    """Run tick by tick until the route ends or something goes wrong; return the status."""
+) -> Generator[None, None, str]:
+    """Run a tick at each `next`, until the route ends or something goes wrong; the status."""
     right, left = robot.slips(DT_S)
     noise = _normals(rng)
     events = _SlipEvents(robot, rng)
@@ -251,8 +352,6 @@ def _drive(
             velocity = (*wanted,)
             speeds = (*robot.wheel_speeds(*velocity).tolist(),)
             logs["/commands"].append((tick, velocity))
-        if on_progress is not None and tick % TICKS_PER_S == 0:
-            on_progress(tick * DT_S)
         rolled = body.step(speeds[0] - right.correction_mps, speeds[1] - left.correction_mps)
         z_right, z_left = next(noise)
         extra_right, extra_left = events.error(rolled)
@@ -260,6 +359,7 @@ def _drive(
         encoder[1] += left.advance(rolled[1], z_left, extra_left)
         travel += rolled
         tick += 1
+        yield
 
 
 def overlaps(world: World, robot: DifferentialDrive, pose: Array) -> bool:
@@ -357,14 +457,7 @@ def _periods(sensors: Sensors) -> dict[str, int]:
     return periods
 
 
-def _assemble(
-    world: World,
-    robot: DifferentialDrive,
-    sensors: Sensors,
-    logs: _Logs,
-    status: str,
-    config: dict[str, Any],
-) -> Recording:
+def _assemble(world: World, member: Member, logs: _Logs, status: str) -> Recording:
     def read(name: str) -> tuple[Array, list[Any]]:
         ticks = np.array([tick for tick, _ in logs[name]], dtype=np.int64)
         return ticks / TICKS_PER_S, [reading for _, reading in logs[name]]
@@ -374,18 +467,18 @@ def _assemble(
     poses[:, 2] = se2.wrap(poses[:, 2])
     command_stamps, commands = read("/commands")
     made, hidden = {}, {}
-    for name, sensor in sensors.items():
+    for name, sensor in member.sensors.items():
         if sensor.schema:
             made[name], hidden[name] = _log(name, sensor, *read(name))
     return Recording(
         frame_stamps=stamps,
         wheels=WheelLog(stamps, encoder),
-        robot=robot.nominal,
-        sensors=sensors,
+        robot=member.robot.nominal,
+        sensors=member.sensors,
         logs=made,
         truth=Truth(stamps, poses, travel, {k: v for k, v in hidden.items() if v}, world),
         commands=CommandLog(command_stamps, np.array(commands, float).reshape(-1, 2)),
-        config=config,
+        config=member.config,
         status=status,
     )
 

@@ -284,6 +284,32 @@ def test_the_keyboard_skips_to_the_claims_and_opens_details(tab):
     assert tab.becomes("document.querySelector('#claim-PB1 details').open")
 
 
+def test_figures_open_enlarged_by_key_and_close_again(tab):
+    tab.js("document.querySelector('figure .enlarge').focus()")
+    tab.press("Enter", text="\r")
+    assert tab.becomes("document.querySelector('dialog').open")
+    assert tab.js("document.querySelector('dialog img').getBoundingClientRect().width") >= 600
+    tab.js("document.querySelector('dialog').click()")
+    assert tab.becomes("!document.querySelector('dialog').open")
+
+
+def test_tables_can_be_sorted(tab):
+    table = "document.querySelector('table.sortable')"
+    tab.js(f"{table}.closest('details').open = true")
+    tab.js(f"{table}.querySelector('th:last-child button').click()")
+    assert tab.js(f"{table}.querySelector('th:last-child').ariaSort") == "ascending"
+
+
+def test_the_first_screen_names_the_best_of_the_leaderboard(tmp_path):
+    path = tmp_path / "leaderboard_means.csv"
+    assert contents.best_of_worlds(path) == []
+    rows = {"choice.world": ["v", "v", "w"], "choice.estimator": ["a", "b", "b"]}
+    write_frame(pd.DataFrame({**rows, "answer_ate_rmse_m": [0.2, 0.1234, 0.3]}), path)
+    assert contents.best_of_worlds(path) == [("v", "b", "0.12"), ("w", "b", "0.3")]
+    write_frame(pd.DataFrame(rows), path)
+    assert contents.best_of_worlds(path) == []
+
+
 def test_what_scrolls_sideways_can_be_reached_by_keyboard(tab):
     assert tab.js("document.querySelectorAll('.scroll').length") > 3
     assert tab.js("[...document.querySelectorAll('.scroll')].every(e => e.tabIndex == 0)")

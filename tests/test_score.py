@@ -164,7 +164,7 @@ def test_a_row_is_an_ordinary_one(files, tmp_path, monkeypatch, capsys):
     assert "revised path, not aligned" in out
     code, out, err = run(monkeypatch, capsys, "table", "score", "--times")
     assert code == 0, err
-    assert [line.split()[:3] for line in out.splitlines()[1:]] == [
+    assert [line.split()[:3] for line in out.splitlines()[3:]] == [
         ["batch", "1", "revised"],
         ["est", "1", "online"],
     ]
@@ -232,6 +232,7 @@ MALFORMED = {
     "elsewhere.tum": _LINE.format(1e6).encode(),
     "binary.tum": bytes(range(256)),
     "utf16.tum": _LINE.format(0).encode("utf-16"),
+    "mark.tum": "\ufeff".encode(),
     "cut.tum": (_LINE.format(0) + "0.1 1 2").encode(),
     "empty.csv": b"",
     "header.csv": _CSV.encode(),

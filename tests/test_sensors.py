@@ -8,6 +8,7 @@ from sim.sensors import (
     Laser,
     Lidar3D,
     PlaceDescriptor,
+    RobotCamera,
     StereoCamera,
     sensor_of,
     sensors_from_config,
@@ -147,7 +148,15 @@ def test_a_missing_sensor_is_named():
 
 @pytest.mark.parametrize(
     "sensor",
-    [Encoder(None), Gyroscope(), Laser(100), Lidar3D(), PlaceDescriptor(), StereoCamera()],
+    [
+        Encoder(None),
+        Gyroscope(),
+        Laser(100),
+        Lidar3D(),
+        PlaceDescriptor(),
+        RobotCamera(),
+        StereoCamera(),
+    ],
     ids=lambda sensor: type(sensor).__name__,
 )
 def test_settings_make_the_same_sensor(sensor):

@@ -11,7 +11,7 @@ import pandas as pd
 
 from experiments.evaluation.verdict import Profile, Role, Verdict, headline_verdict
 from experiments.report.claims import read_claims, read_provenance, read_verdicts, this_code
-from experiments.report.export import as_text, numeric
+from experiments.report.export import as_text, folded, numeric, plain
 from experiments.runs.paths import CONF, SOURCE
 from experiments.runs.row import read_rows
 from sim.errors import InputError
@@ -26,8 +26,13 @@ OWN = {
         "estima run -m study=leaderboard",
         "estima plot leaderboard --x choice.estimator --by choice.world "
         "-o results/figures/leaderboard_errors.png",
-        "estima table leaderboard --against smoother --times --means "
+        "estima table leaderboard --against smoother --times "
         "-o results/tables/leaderboard_means.csv",
+    ],
+    "peers": [
+        "pip install 'estima[peers,tune]' && make peers",
+        "estima reproduce --paper peers --full",
+        "estima tune peers -o conf/estimator",
     ],
     "all_estimators": ["estima run -m study=all_estimators"],
     "mcl_office": ["estima reproduce --paper mcl_office --full"],
@@ -65,6 +70,7 @@ def contents(results: Path, on_progress: Callable[[float], None]) -> dict[str, A
     origins = made | {"this page": this_code()}
     return {
         "claims": claims,
+        "best": best_of_worlds(results / "tables" / "leaderboard_means.csv"),
         "n_statistics": len(table),
         "n_judged": table["id"].nunique(),
         "tally": tally(claims.values()),
@@ -84,6 +90,20 @@ def contents(results: Path, on_progress: Callable[[float], None]) -> dict[str, A
         "details": list(dict.fromkeys(key for how in origins.values() for key in how)),
         "unknown": [paper for paper in papers if paper not in made],
     }
+
+
+def best_of_worlds(path: Path) -> list[tuple[str, str, str]]:
+    """The estimator of the least position error in each world, and that error, of the leaderboard.
+
+    Empty if there is no such table.
+    """
+    columns = ["choice.world", "choice.estimator"]
+    found = read_rows(path) if path.exists() else pd.DataFrame()
+    error = next((c for c in ("answer_ate_rmse_m", "ate_rmse_m") if c in found), "")
+    if not error or not {*columns} <= {*found}:
+        return []
+    least = found.loc[found.groupby("choice.world")[error].idxmin()]
+    return [(str(w), str(e), plain(v, 2)) for w, e, v in least[[*columns, error]].to_numpy()]
 
 
 def tally(claims: Iterable[Entry]) -> list[tuple[Verdict, int]]:
@@ -195,7 +215,7 @@ def picture(path: Path, about: Entry, claims: Mapping[str, Entry]) -> Entry:
 
 def table(path: Path) -> Entry:
     """Read a table: whole if it is small, else its first rows."""
-    frame = read_rows(path)
+    frame = folded(read_rows(path))
     small = len(frame) <= SMALL_ROWS and frame.shape[1] <= SMALL_COLUMNS
     shown = as_text(frame if small else frame.head(FIRST_ROWS))
     note = "" if small else f"; the first {len(shown)}, the rest in the file"

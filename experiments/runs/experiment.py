@@ -98,7 +98,8 @@ class Experiment:
                 f"{error.full_key} follows a key that is missing: {str(error).splitlines()[0]}; "
                 f"keep that key, or set {error.full_key} too"
             ) from error
-        config.pop("sweeps", None)
+        for of_sweeps in ("sweeps", "tune"):
+            config.pop(of_sweeps, None)
         _check_shape(config)
         simulation = config["simulation"]
         if simulation["rays"] is None:

@@ -3,8 +3,8 @@
 A data set is a folder or a tar archive of `RobotN_Odometry.dat` (t v omega),
 `RobotN_Measurement.dat` (t barcode depth bearing), `RobotN_Groundtruth.dat` (t x y theta),
 `Landmark_Groundtruth.dat` (subject x y sigma_x sigma_y) and `Barcodes.dat` (subject barcode).
-Subjects that have no place in the landmark file are the other robots; they and unknown barcodes
-are dropped.
+Subjects that have no place in the landmark file are the other robots. Of one robot alone they are
+dropped, as unknown barcodes are; `read_team` keeps them as sightings.
 
 What the files call range is the depth d along the camera's optical axis: on all robots of set 6 its
 error relative to the motion capture is the same at every bearing when it is read so, and changes by
@@ -16,8 +16,10 @@ whose column error gives that of the bearing.
 
 import dataclasses
 import math
+import re
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +30,8 @@ from sim.formats import assemble
 from sim.formats.text import Words, read_members, split_words
 from sim.recording import Log, Recording, Truth
 from sim.robot import RobotGeometry
-from sim.sensors import Encoder, Mount, StereoCamera
+from sim.sensors import Encoder, Mount, RobotCamera, StereoCamera
+from sim.team import Team
 from sim.world import World
 
 # An iRobot Create
@@ -71,6 +74,44 @@ def read_mrclam(
         Naming the file and the line, or the file that is missing.
     """
     return parse_mrclam(read_members(path), str(path), robot, identifies, camera)
+
+
+def read_team(path: Path, camera: StereoCamera = CAMERA) -> Team:
+    """All robots of a data set, in the order of their numbers, on one clock.
+
+    Each has its sightings of the others in a log `robots`, under their numbers in the team. The
+    markers are taken to be at the camera's height, and as noisy as landmarks.
+
+    Raises
+    ------
+    InputError
+        As for `read_mrclam`.
+    """
+    members, where = read_members(path), str(path)
+    found = (re.fullmatch(r"Robot(\d+)_Odometry\.dat", name) for name in members)
+    robots = sorted(int(match[1]) for match in found if match)
+    sensor = RobotCamera(
+        **{f.name: getattr(camera, f.name) for f in dataclasses.fields(RobotCamera)[:-2]},
+        marker_z_m=camera.mount.z_m,
+        mount=camera.mount,
+    )
+    team = []
+    for robot in robots:
+        recording = parse_mrclam(members, where, robot, camera.identifies, camera)
+        name = f"Robot{robot}_Measurement.dat"
+        measured = split_words(members[name], f"{where}/{name}").table(4, "measurements")
+        barcodes = split_words(members["Barcodes.dat"], f"{where}/Barcodes.dat")
+        codes, notes = barcodes.table(2, "barcodes"), dict(recording.config["notes"])
+        # subject N is robot N
+        ids = _rows_of(measured[:, 1], codes, np.array(robots, float))
+        log, true_ids = _observations(measured, ids, sensor, notes)
+        notes["sightings_of_robots"] = len(true_ids)
+        hidden = {**recording.known_truth.readings, "robots": {"true_ids": true_ids}}
+        truth = dataclasses.replace(recording.known_truth, readings=hidden)
+        config = {**recording.config, "notes": notes}
+        recording = recording.with_log("robots", log, sensor)
+        team.append(dataclasses.replace(recording, truth=truth, config=config))
+    return Team.on_one_clock(team)
 
 
 def parse_mrclam(
@@ -130,19 +171,28 @@ def _landmark_rows(
     codes: Array, barcodes: Array, subjects: Array, notes: assemble.Notes
 ) -> NDArray[np.int64]:
     """Row of the landmark of each barcode; -1 for other robots and unknown codes."""
-    subject_of = {float(code): float(subject) for subject, code in barcodes}
-    row_of = {float(subject): row for row, subject in enumerate(subjects)}
-    rows = np.array([row_of.get(subject_of.get(float(c), math.nan), -1) for c in codes], np.int64)
-    unknown = sum(float(c) not in subject_of for c in codes)
+    rows = _rows_of(codes, barcodes, subjects)
+    known = {float(code) for _, code in barcodes}
+    unknown = sum(float(c) not in known for c in codes)
     notes["unknown_barcodes"] = int(unknown)
     notes["observations_of_robots"] = int(np.sum(rows < 0)) - int(unknown)
     return rows
 
 
+def _rows_of(codes: Array, barcodes: Array, subjects: Array) -> NDArray[np.int64]:
+    """Row of the subject of each barcode; -1 for other ones and unknown codes."""
+    subject_of = {float(code): float(subject) for subject, code in barcodes}
+    row_of = {float(subject): row for row, subject in enumerate(subjects)}
+    return np.array([row_of.get(subject_of.get(float(c), math.nan), -1) for c in codes], np.int64)
+
+
 def _observations(
-    measured: Array, ids: NDArray[np.int64], camera: StereoCamera, notes: assemble.Notes
+    measured: Array,
+    ids: NDArray[np.int64],
+    camera: StereoCamera | RobotCamera,
+    notes: assemble.Notes,
 ) -> tuple[Log, NDArray[np.int64]]:
-    """Landmark observations by image, in order, and the true ids of their rows."""
+    """Observations by image, in order, and the true ids of their rows."""
     ahead = np.abs(measured[:, 3]) < _MOST_BEARING_RAD
     usable = (ids >= 0) & ahead & (measured[:, 2] > 0.0)
     notes["observations_behind"] = int(np.sum((ids >= 0) & ~usable))
@@ -153,6 +203,7 @@ def _observations(
     depth_m, bearing = measured[:, 2], measured[:, 3]
     points = np.stack([-depth_m * np.tan(bearing), np.zeros_like(depth_m), depth_m], axis=1)
     splits = np.append(first, len(measured)).astype(np.int64)
-    shown = {"ids": ids} if camera.identifies else {}
-    none = np.zeros((len(ids), 0), np.float32)
-    return Log.of(camera, stamps, splits, points_in_camera=points, **shown, descriptors=none), ids
+    shown: dict[str, NDArray[Any]] = {"ids": ids} if camera.identifies else {}
+    if "descriptors" in camera.schema:
+        shown["descriptors"] = np.zeros((len(ids), 0), np.float32)
+    return Log.of(camera, stamps, splits, points_in_camera=points, **shown), ids

@@ -16,6 +16,7 @@ from sim.sensors.gyroscope import Gyroscope
 from sim.sensors.laser import Laser
 from sim.sensors.lidar3d import Lidar3D
 from sim.sensors.place import PlaceDescriptor
+from sim.sensors.robots import RobotCamera
 from sim.sensors.stereo import StereoCamera
 
 __all__ = [
@@ -27,6 +28,7 @@ __all__ = [
     "Mount",
     "PlaceDescriptor",
     "Reading",
+    "RobotCamera",
     "Schema",
     "Sensor",
     "Sensors",

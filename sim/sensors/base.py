@@ -15,7 +15,7 @@ import dataclasses
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from keyword import iskeyword
 from typing import Any, ClassVar, Protocol, TypeVar
 
@@ -170,6 +170,8 @@ class View:
         What stands there, and what casts rays in it.
     last_stamp, last_pose
         The same sensor's firing before; the present one at the first.
+    others
+        Of a team: the pose (3,) of each other robot, by its number.
     """
 
     stamp: float
@@ -178,6 +180,7 @@ class View:
     rays: Rays
     last_stamp: float
     last_pose: Array
+    others: Mapping[int, Array] = field(default_factory=dict)
 
     @property
     def duration_s(self) -> float:

@@ -198,6 +198,17 @@ def points_in_camera(camera: StereoCamera, pose: Array, points_in_world: Array) 
     return np.stack([-left, -offset[:, 2], forward], axis=-1)
 
 
+def in_field_of_view(camera: StereoCamera, points: Array) -> NDArray[np.bool_]:
+    """Which points (N, 3) of the camera frame are within its angles and its greatest distance."""
+    x, y, z = points.T
+    return np.asarray(
+        (z > 0.05)
+        & (np.abs(x) <= z * math.tan(camera.fov_horizontal_rad / 2))
+        & (np.abs(y) <= z * math.tan(camera.fov_vertical_rad / 2))
+        & (np.linalg.norm(points, axis=1) <= camera.max_distance_m)
+    )
+
+
 class LandmarkEye:
     """The stereo camera at work on the world's landmarks."""
 
@@ -217,16 +228,8 @@ class LandmarkEye:
         """Observe the landmarks in view."""
         camera, landmarks = self._camera, view.world.landmarks
         inside = points_in_camera(camera, view.pose, landmarks)
-        x, y, z = inside.T
-        field_of_view = (
-            (z > 0.05)
-            & (np.abs(x) <= z * math.tan(camera.fov_horizontal_rad / 2))
-            & (np.abs(y) <= z * math.tan(camera.fov_vertical_rad / 2))
-            & (np.linalg.norm(inside, axis=1) <= camera.max_distance_m)
-        )
-        ids = np.flatnonzero(field_of_view)
-        planar = camera.mount.in_map(view.pose)
-        origin = np.array([planar[0], planar[1], camera.mount.z_m])
+        origin = np.array([*camera.mount.in_map(view.pose)[:2], camera.mount.z_m])
+        ids = np.flatnonzero(in_field_of_view(camera, inside))
         ids = ids[view.sees(origin, landmarks[ids])]
         ids = self._choose(ids, inside)
         observed = camera.measure(inside[ids], self._rng)

@@ -28,12 +28,23 @@ def intel(version: Literal["sparse", "logged", "calibrated"]) -> Recording:
         return intel_lab.read_intel(
             folder / "intel_raw_910.json.gz", folder / "intel_gmapping_910.json.gz"
         )
-    logged, _ = intel_lab.read_thinned_intel(
+    logged, _ = _thinned_intel()
+    return calibrated_by_scans(logged, tuned_until_s(logged)) if version == "calibrated" else logged
+
+
+def intel_known_stamps(recording: Recording) -> Array:
+    """Stamps (N,) s of those scans of the log with all its scans whose stamps are not guessed."""
+    stamps: Array = recording.log("laser").stamps[_thinned_intel()[1].astype(np.int64)]
+    return stamps
+
+
+def _thinned_intel() -> tuple[Recording, Array]:
+    folder = DATA / "intel_lab"
+    return intel_lab.read_thinned_intel(
         folder / "intel_mrpt_scans_converted.txt.gz",
         folder / "intel_mrpt_ODO.txt.gz",
         folder / "intel_mrpt_reference_matches.csv.gz",
     )
-    return calibrated_by_scans(logged, tuned_until_s(logged)) if version == "calibrated" else logged
 
 
 def freiburg() -> Recording:

@@ -25,6 +25,7 @@ from experiments.evaluation.relations import relation_errors
 from experiments.evaluation.time_sync import aligned_ate_m
 from experiments.evaluation.verdict import Profile
 from experiments.papers.jobs import in_parallel
+from experiments.papers.real_logs.building import closed_loops
 from experiments.papers.real_logs.grid_match import beam_points, best_fit
 from experiments.papers.real_logs.logs import tracked, tuned_until_s
 from experiments.papers.real_logs.settings import (
@@ -90,6 +91,9 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
     ]
     out.write_tables(relations=pd.DataFrame([*errors, *freiburg_relations(), *printed]))
     out.write_arrays("intel", **paths)
+    found, grids = closed_loops()
+    out.write_tables(building=found)
+    out.write_arrays("building", **grids)
     on_progress(0.3)
     slam, paths = landmark_slam(profile, lambda share: on_progress(0.3 + 0.5 * share))
     out.write_arrays("mrclam", **paths)

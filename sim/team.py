@@ -1,0 +1,137 @@
+"""A team: one Recording a robot, on one clock and in one map."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from sim.arrays import Array
+from sim.errors import InputError, require
+from sim.recording import (
+    FORMAT_VERSION,
+    REMEDY,
+    Frame,
+    Recording,
+    arrays_of,
+    assembled,
+    blamed,
+    checked_arrays,
+    described,
+    write_arrays,
+)
+
+MOST_ROBOTS = 100
+
+
+@dataclass(frozen=True)
+class Team:
+    """Recordings of robots that drive at the same time, in the order of their numbers.
+
+    Wherever their time spans overlap their Frames have the same stamps, so that an instant has a
+    Frame of each robot. `on_one_clock` makes it so.
+
+    Raises
+    ------
+    InputError
+        If there is none, their stamps differ, or their worlds do.
+    """
+
+    robots: tuple[Recording, ...]
+
+    def __post_init__(self) -> None:
+        n = len(self.robots)
+        require(0 < n <= MOST_ROBOTS, f"a team has 1 to {MOST_ROBOTS} robots, got {n}")
+        for number, (recording, stamps) in enumerate(
+            zip(self.robots, _on_one_clock(self.robots), strict=True)
+        ):
+            require(
+                np.array_equal(recording.frame_stamps, stamps),
+                f"the Frames of robot {number} are not at the stamps of the others'",
+            )
+            first, own = self.robots[0].world, recording.world
+            same = (first is None) == (own is None)
+            if first is not None and own is not None:
+                same = np.array_equal(first.walls, own.walls)
+                same &= np.array_equal(first.landmarks, own.landmarks)
+            require(same, f"the world of robot {number} is not that of robot 0")
+
+    def __len__(self) -> int:
+        return len(self.robots)
+
+    @classmethod
+    def on_one_clock(cls, recordings: Sequence[Recording]) -> Team:
+        """Team of recordings in one time base: each gets Frames at the stamps of all of them."""
+        clock = _on_one_clock(recordings)
+        return cls(
+            tuple(
+                dataclasses.replace(recording, frame_stamps=stamps)
+                for recording, stamps in zip(recordings, clock, strict=True)
+            )
+        )
+
+    def instants(self) -> Iterator[tuple[Frame, ...]]:
+        """Walk through the instants in order: the Frames of the robots that have one then."""
+        frames = [recording.frames(number) for number, recording in enumerate(self.robots)]
+        waiting = [next(own, None) for own in frames]
+        while any(waiting):
+            now = min(frame.stamp for frame in waiting if frame)
+            due = [frame if frame and frame.stamp == now else None for frame in waiting]
+            yield tuple(frame for frame in due if frame)
+            waiting = [
+                next(own, None) if is_due else frame
+                for own, is_due, frame in zip(frames, due, waiting, strict=True)
+            ]
+
+
+def save(team: Team, path: Path) -> str:
+    """Write a team into one `.npz` file, whole; return its checksum.
+
+    Raises
+    ------
+    InputError
+        If it cannot be written.
+    """
+    arrays = {
+        f"{number}.{name}": values
+        for number, recording in enumerate(team.robots)
+        for name, values in arrays_of(recording).items()
+    }
+    meta = {"format": FORMAT_VERSION, "team": [described(robot) for robot in team.robots]}
+    return write_arrays(path, arrays, meta)
+
+
+def load(path: Path) -> Team:
+    """Read a team and check it against its checksum.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, altered, or holds no team.
+    """
+    with blamed(path, REMEDY):
+        stored, meta = checked_arrays(path)
+        parts = meta.get("team")
+        if not isinstance(parts, list):
+            raise InputError("it holds one robot, and no team")
+        own = [
+            {
+                name.removeprefix(f"{number}."): values
+                for name, values in stored.items()
+                if name.startswith(f"{number}.")
+            }
+            for number in range(len(parts))
+        ]
+        others = len(stored) - sum(map(len, own))
+        require(others == 0, f"{others} arrays are of no robot of its team")
+        return Team(tuple(map(assembled, own, parts)))
+
+
+def _on_one_clock(recordings: Sequence[Recording]) -> list[Array]:
+    """For each recording, the stamps of all within its own span."""
+    stamps = np.unique(np.concatenate([r.frame_stamps for r in recordings]))
+    spans = [(r.frame_stamps[0], r.frame_stamps[-1]) for r in recordings]
+    return [stamps[(stamps >= begin) & (stamps <= end)] for begin, end in spans]
