@@ -37,6 +37,7 @@ LARGEST_DELAY_S, _DELAY_STEP_S = 1.0, 0.01
 _N_PARTS = 8  # of the log, for the spread of a delay
 _FEWEST_BLOCKS = 10
 _RESAMPLES = 200
+_NO_SLIP_M = 1e-12  # kr or kl that is at its bound of zero
 _OUTLIER = 6.0  # in robust standard deviations
 _LONGEST_GAP_S = 0.5  # of the truth
 S = TypeVar("S")
@@ -282,6 +283,7 @@ def wheel_delay_s(wheels: WheelLog, reference: Reference) -> Interval:
     parts = np.array([best(part) for part in np.array_split(known, _N_PARTS)])
     spread = mean_interval(parts[np.isfinite(parts)])
     half = (spread.high - spread.low) / 2.0
+    whole = round(whole / _DELAY_STEP_S) * _DELAY_STEP_S  # no rounding errors of the steps
     return Interval(whole, whole - half, whole + half)
 
 
@@ -410,7 +412,8 @@ def _slip(
     picks = rng.integers(n, size=(_RESAMPLES, n))
     apart = np.array([law(pick) for pick in picks])
     difference = np.quantile(apart[:, 0] - apart[:, 1], [0.025, 0.975])
-    together = bool(difference[0] <= 0.0 <= difference[1])
+    none_at_zero = float(law(np.arange(n))[:2].min()) > _NO_SLIP_M
+    together = bool(difference[0] <= 0.0 <= difference[1]) or not none_at_zero
     spread = np.array([law(pick, True) for pick in picks]) if together else apart
     low, high = np.quantile(spread, [0.025, 0.975], axis=0)
     values = law(np.arange(n), together)
