@@ -77,7 +77,7 @@ def test_a_million_runs_are_planned_as_each_of_them_alone():
 
 
 def test_keys_of_a_plan_are_those_of_its_runs(tmp_path):
-    given = ["estimator=glob(ekf_icp*)", "seed=2,1", "simulation.physics=kinematic,bullet",
+    given = ["estimator=ekf_icp,ekf_icp_paper", "seed=2,1", "simulation.physics=kinematic,bullet",
              "sensors=lms291", "prior.track_m=null,0.2", "world.n_objects=3,6",
              "estimator.kr=1e-5,1e-4"]  # fmt: skip
     every = plan.plan_of(given)

@@ -99,11 +99,11 @@ def sweep(arguments: Sequence[str], config_dir: str | None = None) -> tuple[Path
     if not folder.is_dir() and folder.exists():
         raise InputError(f"{folder}: not a folder; remove it, or choose another name")
     prepare(folder)
-    _note_command(folder, arguments, config_dir)
     keys, first = np.unique(plan.keys, return_index=True)
     done = np.isin(keys, store.ended(folder, damaged=_drop).done)
     runs = np.sort(first[~done])
     check(plan, runs)
+    _note_command(folder, arguments, config_dir)
     print(
         f"{len(keys)} run{'s' if len(keys) > 1 else ''}, {done.sum()} of them done "
         f"before: {paths.short(folder)}",
