@@ -51,8 +51,8 @@ from experiments.runs.console import end, show
 from experiments.runs.experiment import Experiment, searched
 from experiments.runs.row import write_rows
 from experiments.sweeps.collect import collect
-from experiments.sweeps.summary import summary
 from experiments.sweeps.launch import sweep
+from experiments.sweeps.summary import summary
 from experiments.trajectories.odometry import read_odometry_csv, write_odometry_csv
 from experiments.viewing.describe import describe
 from sim import recording as recordings
