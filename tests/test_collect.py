@@ -275,3 +275,9 @@ def test_runs_of_equal_settings_and_different_keys_are_refused(tmp_path):
     for changed in ({"ate_rmse_m": 9.0}, {"recording_checksum": "other"}):
         with pytest.raises(InputError, match=f"{len(once)} rows"):
             kept(once.assign(**logged), again.assign(**logged, **changed))
+
+
+def test_a_message_names_the_nearest_columns_and_counts_the_rest(monkeypatch):
+    monkeypatch.setattr("experiments.report.plot._NAMED", 2)
+    with pytest.raises(InputError, match=r"nosuch; there are [\w.]+, [\w.]+ and \d+ more$"):
+        sweep_figure(rows(), "nosuch", "ate_rmse_m")

@@ -20,6 +20,7 @@ from experiments.viewing.plotting import plain_log, plain_ticks
 from experiments.viewing.style import SERIES, figure
 from sim.errors import InputError
 
+_NAMED = 12  # columns that a message names, the nearest first
 _FEW = 8  # values that are ticks of their own
 _DECADES = 100.0  # factor below which a logarithmic axis has plain numbers
 _WIDE = 10.0  # an axis whose values span this factor, or grow by factors, is logarithmic
@@ -137,7 +138,9 @@ def _check(table: pd.DataFrame, x: str, y: str, others: Sequence[str], *, pool: 
     for column in (x, y, *others):
         if column not in table:
             near = _metrics(table, y) if column == y else _columns(table, column)
-            raise InputError(f"the sweep has no column {column}; there are {', '.join(near)}")
+            more = f" and {len(near) - _NAMED} more" if len(near) > _NAMED else ""
+            there = ", ".join(near[:_NAMED])
+            raise InputError(f"the sweep has no column {column}; there are {there}{more}")
     if table[y].dtype.kind not in "fi":
         raise InputError(f"column {y} holds no numbers; there are {', '.join(measured(table))}")
     if table[[x, y]].dropna().empty:

@@ -34,6 +34,7 @@ from experiments.runs.experiment import Experiment, check_hydra
 from experiments.runs.row import Outcome, Row, Status, check_row
 from experiments.sweeps.collect import COMMAND
 from experiments.sweeps.plan import Family, Numbers, Plan, packed, plan_of
+from sim.compiled import announce_once_in
 from sim.errors import InputError
 from sim.files import require_file, write_whole
 from sim.recording import Recording
@@ -387,6 +388,7 @@ def job_application(cfg: DictConfig) -> None:
     if os.getpid() != share["planner"][1]:  # joblib's workers stay, as they were, for later sweeps
         folder, os.environ["ESTIMA_RESULTS"] = share["places"]
         os.chdir(folder)
+        announce_once_in(share_of(cfg.plan, cfg.job).parent / "compiling")
     run_share(share)
 
 
