@@ -21,6 +21,12 @@ LONGEST_GAP_S = 0.25  # of the truth, over which it is interpolated
 SCORED_EXTRAS = ("dispersion_m",)  # Belief extras that `score` reads, of estimators that have them
 
 
+def longest_pause_s(stamps: Array, start: float, end: float) -> float:
+    """Longest time from start to end without a stamp, s; the stamps increase."""
+    inside = stamps[(stamps > start) & (stamps < end)]
+    return float(np.diff([start, *inside, end]).max(initial=0.0))
+
+
 def position_errors_m(truth: Array, means: Array) -> Array:
     """Distances (T,) between true and estimated positions, m."""
     return np.asarray(np.hypot(*(means[:, :2] - truth[:, :2]).T))

@@ -126,8 +126,11 @@ def application(arguments: Sequence[str], draw: Draw, out: Path | None = None) -
             if experiment.config["recording"] is None:
                 show(f"Next: intervals over ten drives: {said} -m 'seed=range(0,10)'")
                 drive = shlex.join(["estima", "record", "-o", "run.npz", *overrides, *options])
-                play = shlex.join(["estima", "view", "run.npz", "-e", experiment.estimator_name])
-                show(f"      as it moves, in a window: {drive} && {play}")
+                if "command" not in experiment.config["estimator"]:  # `view` cannot be told it
+                    play = shlex.join(
+                        ["estima", "view", "run.npz", "-e", experiment.estimator_name]
+                    )
+                    show(f"      as it moves, in a window: {drive} && {play}")
         except Exception as error:
             end(error)  # here, since Hydra would add a line of its own
 
