@@ -52,7 +52,7 @@ def collect(name: str, *, all_versions: bool = False, times: bool = False) -> pd
         if not mine.any():
             raise InputError(
                 f"{path}: all {len(table)} rows are of other versions of the code; run the sweep "
-                "again, or see them with --all-versions"
+                f"again, or see them by `estima table {name} --all-versions`"
             )
         if not mine.all():
             print(f"left out {(~mine).sum()} rows of other code versions", file=sys.stderr)
