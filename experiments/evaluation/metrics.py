@@ -178,7 +178,7 @@ def score(
                 "scoring.longest_gap_s"
             )
         raise InputError(complaint)
-    row |= {"stamps_scored": int(known.sum()), "stamps_left_out": int((~known).sum())}
+    row |= {"stamps_scored": float(known.sum()), "stamps_left_out": float((~known).sum())}
     covariances = estimate.covariances[known]
     return row | path_scores(truth[known], estimate.means[known], covariances)
 

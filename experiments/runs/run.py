@@ -192,7 +192,7 @@ def _print(rows: Sequence[Row], files: Sequence[Path]) -> None:
         show(f"  {words}")
     if first.get("stamps_left_out"):
         scored, left_out = first["stamps_scored"], first["stamps_left_out"]
-        show(f"  scored at {scored} frames; {left_out} others have no true pose")
+        show(f"  scored at {scored:.0f} frames; {left_out:.0f} others have no true pose")
     for name in _SHOWN:
         values = [float(v) for row in rows if isinstance(v := row.get(name), (int, float))]
         if values:

@@ -237,8 +237,8 @@ def row_of(
         "recording_checksum": checksum,
         **status_of_pauses(recording, scored.estimate.stamps).columns(),
         "duration_s": float(np.ptp(scored.estimate.stamps)),
-        "stamps_scored": len(scored.truth),
-        "stamps_left_out": scored.n_left_out,
+        "stamps_scored": float(len(scored.truth)),
+        "stamps_left_out": float(scored.n_left_out),
         "longest_gap_s": scored.longest_gap_s,
     }
     if how.cpu_seconds is not None:

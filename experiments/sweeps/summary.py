@@ -69,7 +69,7 @@ def summary(
     unit = unit_of(table, [_GROUP])
     found = _counted(table)
     sound = table[table["status"] != Outcome.FAILED]
-    on = table.groupby(_GROUP)[RECORDING].agg(lambda s: "+".join(sorted(set(s))))
+    on = table.groupby(_GROUP)[RECORDING].agg(lambda s: "+".join(sorted(set(map(str, s)))))
     for name in shown:
         _add(found, name, averages(sound, [_GROUP], unit, name))
         found[f"{name}_best"] = _best(found[name].where(found["failed"] == 0), name, on)
@@ -82,7 +82,10 @@ def summary(
 def _counted(table: pd.DataFrame) -> pd.DataFrame:
     """How many runs a group has, which path answers, and how many failed or had a remark."""
     groups = table.groupby(_GROUP)
-    found = {"runs": groups.size(), PATH: groups[PATH].agg(lambda s: "/".join(sorted(set(s))))}
+    found = {
+        "runs": groups.size(),
+        PATH: groups[PATH].agg(lambda s: "/".join(sorted(set(map(str, s))))),
+    }
     for name, outcome in COUNTS.items():
         found[name] = (table["status"] == outcome).groupby(table[_GROUP]).sum()
     return pd.DataFrame(found)
