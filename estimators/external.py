@@ -5,14 +5,20 @@ does, and the first what the Prior does.
 """
 
 import dataclasses
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import orjson
 
 from estimators.base import Belief, Estimate, Prior
-from estimators.program import Program, ProgramError, map_message, require_limits, words_of
+from estimators.program import (
+    Program,
+    ProgramError,
+    map_message,
+    require_limits,
+    span_text,
+    words_of,
+)
 from sim.arrays import Array
 from sim.formats.trajectory import FARTHEST_M
 from sim.recording import Frame
@@ -135,11 +141,6 @@ class External:
         assert self._program is not None
         self._program.close(0.0)
         return ProgramError(f"{self._program.name} {what}")
-
-
-def span_text(stamps: Sequence[float] | Array) -> str:
-    """First and last stamp, as messages tell them."""
-    return f"{stamps[0]:.9g} to {stamps[-1]:.9g} s"
 
 
 def reset_message(prior: Prior, seed: int) -> dict[str, Any]:

@@ -13,9 +13,15 @@ import numpy as np
 import orjson
 
 from estimators.base import Belief, Estimate, Prior
-from estimators.external import span_text
 from estimators.options import require_choices
-from estimators.program import Program, ProgramError, map_message, require_limits, words_of
+from estimators.program import (
+    Program,
+    ProgramError,
+    map_message,
+    require_limits,
+    span_text,
+    words_of,
+)
 from sim import se2
 from sim.errors import InputError, require, required
 from sim.files import write_text

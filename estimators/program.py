@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from sim.arrays import Array
 from sim.errors import InputError, printable, require
 from sim.grid import OccupancyGrid
 from sim.world import World
@@ -261,3 +262,8 @@ def map_message(known_map: Any) -> dict[str, Any] | None:
         f"a program takes a world or a grid as its map, got a {type(known_map).__name__}; set "
         "prior.map=none, world or GRID.yaml"
     )
+
+
+def span_text(stamps: Sequence[float] | Array) -> str:
+    """First and last stamp, as messages tell them."""
+    return f"{stamps[0]:.9g} to {stamps[-1]:.9g} s"
