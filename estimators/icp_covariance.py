@@ -186,10 +186,7 @@ def censi(
     if scans == "both":
         noise = target.noise_m if sigma_range_m is None else sigma_range_m
         middle += noise**2 * by_target
-    if everywhere:
-        inverse = np.linalg.inv(A)
-        return np.asarray(inverse @ middle @ inverse.T)
-    return _sandwich(A, middle, registration)
+    return _sandwich(A, middle, registration, everywhere=everywhere)
 
 
 def hessian(registration: Registration) -> Array:
@@ -294,9 +291,11 @@ def split_directions(registration: Registration) -> tuple[Array, Array]:
     return unit[:, None] * directions[:, ~loose], unit[:, None] * directions[:, loose]
 
 
-def _sandwich(A: Array, middle: Array, registration: Registration) -> Array:
-    """A^-1 middle A^-1 within the directions that the scans hold; the rest is unknown."""
-    if registration.status == "degenerate":
+def _sandwich(
+    A: Array, middle: Array, registration: Registration, *, everywhere: bool = False
+) -> Array:
+    """A^-1 middle A^-1 within the directions that the scans hold; the rest, else, is unknown."""
+    if registration.status == "degenerate" and not everywhere:
         held, loose = split_directions(registration)
         gain = held @ np.linalg.solve(held.T @ A @ held, held.T)
         covariance: Array = gain @ middle @ gain.T + loose @ loose.T

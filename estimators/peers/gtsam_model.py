@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from estimators.gaussian import Gaussian
+from estimators.gaussian import Gaussian, rotated
 from estimators.landmark_drive import FLOOR
 from estimators.peers import package
 from estimators.peers.planar import matrix_of
@@ -124,9 +124,9 @@ class GtsamModel:
 
     def _noise(self, planar: Gaussian) -> Any:
         """Noise of a pose's tangent; it is in the axes of the pose itself."""
-        turn = _turn(planar.mean[2])
         covariance = np.diag(np.full(6, _FREE_SIGMA**2))
-        covariance[np.ix_(_IN_PLANE, _IN_PLANE)] = turn.T @ planar.covariance @ turn
+        in_pose = rotated(planar.covariance, -float(planar.mean[2]))
+        covariance[np.ix_(_IN_PLANE, _IN_PLANE)] = in_pose
         return self._gtsam.noiseModel.Gaussian.Covariance(covariance)
 
 

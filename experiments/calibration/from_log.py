@@ -117,7 +117,17 @@ def calibrate_log(recording: Recording, until_s: float | None = None) -> Found:
         If there is nothing to compare the wheels with, or too little of it.
     """
     part = recording if until_s is None else _cut(recording, until_s)
-    reference = reference_of(part)
+    return calibrate_against(reference_of(part), part)
+
+
+def calibrate_against(reference: Reference, part: Recording) -> Found:
+    """Calibrate a robot by a log whose reference is at hand.
+
+    Raises
+    ------
+    InputError
+        If there is too little of it.
+    """
     delay = wheel_delay_s(part.wheels, reference)
     shifted = WheelLog(part.wheels.stamps + delay.value, part.wheels.position_m)
     mount, mount_intervals = np.zeros(3), {}

@@ -6,7 +6,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from experiments.calibration.from_log import (
-    calibrate_log,
+    Reference,
+    calibrate_against,
     reference_of,
     wheel_delay_s,
 )
@@ -15,7 +16,7 @@ from sim.arrays import Array
 from sim.errors import InputError
 from sim.recording import Recording
 
-DELAY_S = 0.05  # a delay of the wheels above this is told
+DELAY_S = 0.05  # a delay of the wheels above this is reported
 GAIN = 0.01  # so is a gain or scale that is this far from 1
 TURN = 0.02  # and a track that is this share off
 _LONG_GAP = 20.0  # in median steps
@@ -26,7 +27,7 @@ def check_log(recording: Recording) -> list[str]:
     """Warnings, a line each; empty if nothing is odd.
 
     The clocks are checked of every log; wheels and sensors of a log with a truth, scans or
-    landmarks, against which `calibrate_log` compares them.
+    landmarks, against which `calibrate_against` compares them.
     """
     notes = recording.config.get("notes", {})
     warnings = [
@@ -76,9 +77,13 @@ def _clock(name: str, stamps: Array) -> list[str]:
 def _motion(recording: Recording) -> list[str]:
     """Compare the wheels and the sensors with the best that the log has."""
     try:
-        found = calibrate_log(recording)
+        reference = reference_of(recording)
     except InputError as error:
-        return _delay_alone(recording, str(error))
+        return [_not_compared(error)]
+    try:
+        found = calibrate_against(reference, recording)
+    except InputError as error:
+        return _delay_alone(recording, reference, error)
     wheels, warnings = found.calibration.wheels, []
     against = f"against the {found.source}"
     if (told := _told_delay(wheels.delay_s, against)) is not None:
@@ -128,15 +133,18 @@ def _by_bearing(depth_m: Array, error_m: Array, bearing_rad: Array) -> list[str]
     ]
 
 
-def _delay_alone(recording: Recording, complaint: str) -> list[str]:
+def _delay_alone(recording: Recording, reference: Reference, complaint: InputError) -> list[str]:
     """What can be said of a log that cannot be calibrated."""
     try:
-        reference = reference_of(recording)
         delay = wheel_delay_s(recording.wheels, reference)
     except InputError:
-        return [f"wheels and sensors are not compared: {complaint}"]
+        return [_not_compared(complaint)]
     told = _told_delay(delay.value, f"against the {reference.source}")
     return [told] if told is not None else []
+
+
+def _not_compared(complaint: InputError) -> str:
+    return f"wheels and sensors are not compared: {complaint}"
 
 
 def _told_delay(delay_s: float, against: str) -> str | None:

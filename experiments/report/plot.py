@@ -89,7 +89,7 @@ def sweep_figure(
     lines = _labels(means, by)
     if len(lines) > len(SERIES):
         raise InputError(
-            f"--by gives {len(lines)} lines; at most {len(SERIES)} can be told apart: keep some "
+            f"--by gives {len(lines)} lines; at most {len(SERIES)} differ in colour: keep some "
             "with --where, or give panels their own with --row or --col"
         )
     across, down = (_values(means, name) for name in (col, row))

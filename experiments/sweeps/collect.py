@@ -18,7 +18,7 @@ from sim.errors import InputError
 _TIMES = ["step_time_us", "cpu_time_us"]  # they differ from run to run
 _COMMAND = "estimator.command"
 COMMAND = "command.txt"  # beside the rows: the commands that made them
-DRAWN = ("seed", "world_seed")  # settings that only draw anew
+DRAWN = ("seed", "world_seed")  # settings that only draw other samples
 
 
 def collect(name: str, *, all_versions: bool = False, times: bool = False) -> pd.DataFrame:
