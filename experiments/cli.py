@@ -149,6 +149,7 @@ def _show_sweep(folder: Path, n_runs: int) -> None:
         if len(found) <= _FEW_LINES:
             show(as_lines(found, notes(found, None)))
     print(f"\nNext: estima table {folder.name} --against ESTIMATOR -o table.tex")
+    print(f"      estima plot {folder.name}")
     print(f"      estima report {folder.name}")
 
 
@@ -1064,15 +1065,18 @@ def plot(
     if failed.any():
         print(f"{failed.sum()} of {len(rows)} runs failed; they are left out", file=sys.stderr)
         rows = rows[~failed]
+    chosen = ""
     if x is None:
         taken = [each for each in (*(by or []), row, col) if each]
         x, *others = suggested(rows, taken)
         if not taken:
             by, col = others[:1], next(iter(others[1:]), None)
         words = [f"--x {x}", *(f"--by {each}" for each in by or []), f"--col {col}" if col else ""]
-        print(f"drawn with {' '.join(filter(None, words))}", file=sys.stderr)
+        chosen = f"drawn with {' '.join(filter(None, words))}"
     page = sweep_figure(rows, x, y, by, row=row, col=col, size=size, pool=pool)
     save_figure(page, out)
+    if chosen:
+        print(chosen, file=sys.stderr)
     print(out)
 
 

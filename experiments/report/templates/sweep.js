@@ -66,6 +66,10 @@ function grouped(rows, key) {
   return groups;
 }
 
+// Numbers as plots have them, and those of a logarithmic axis that spans little.
+const written = (v) => (v && Math.abs(v) < 1e-3 ? v.toExponential() : String(v));
+const NUMBERS = Array.from({ length: 36 }, (_, i) => [1, 2, 5].map((m) => Number(`${m}e${i - 18}`))).flat();
+
 const mean = (values) => values.reduce((sum, v) => sum + v, 0) / values.length;
 
 // Mean with its 95 % interval, if it is of three or more: the rule of tables and plots.
@@ -182,11 +186,12 @@ function draw() {
     const lines = { gridcolor: line, linecolor: line, zerolinecolor: line, automargin: true };
     layout[`xaxis${axis}`] = { ...lines, title: { text: p >= panelNames.length - across ? xs.title : "" },
       ...(numeric ? { type: byFactors(order) ? "log" : "linear",
-        ...(order.length <= 8 ? { tickvals: order, ticktext: order.map(String) } : {}) }
+        ...(order.length <= 8 ? { tickvals: order, ticktext: order.map(written) } : {}) }
         : { type: "category", categoryorder: "array", categoryarray: order }),
       ...(p ? { matches: "x" } : {}) };
     layout[`yaxis${axis}`] = { ...lines, title: { text: p % across ? "" : metric.title },
       type: log ? "log" : "linear", ...(log && decades >= 100 ? { dtick: 1 } : {}),
+      ...(log && decades < 100 ? { tickvals: NUMBERS, ticktext: NUMBERS.map(written) } : {}),
       exponentformat: "power", ...(p ? { matches: "y" } : {}) };
   });
   Plotly.react("chart", traces, layout,
