@@ -95,6 +95,8 @@ def _state(
 def end(error: BaseException) -> NoReturn:
     """End the program with one line for what the user can fix: code 2 for input, 1 for failures.
 
+    So it ends after an interrupt, with that one's message and code 130.
+
     An internal error ends with its traceback and code 3.
     """
     chain: list[BaseException] = [error]
@@ -106,7 +108,7 @@ def end(error: BaseException) -> NoReturn:
         if isinstance(link, RunFailedError):
             _say(f"the run failed: {link}", 1)
         if isinstance(link, KeyboardInterrupt):
-            _say("interrupted; what was finished is kept", 130)
+            _say(str(link) or "interrupted; what was finished is kept", 130)
         if isinstance(link, _configuration_errors()):
             if refusal := _refusal(link):
                 _say(refusal, 2)

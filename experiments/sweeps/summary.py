@@ -75,7 +75,8 @@ def summary(
         found[f"{name}_best"] = _best(found[name].where(found["failed"] == 0), name, on)
     if against is not None:
         _compare(found, sound, shown, against, _rows_of(against, sound))
-    found.attrs["rule"] = rule(unit, shown)
+    bounded = [found.loc[found[name].notna(), f"{name}_low"].notna() for name in shown]
+    found.attrs["rule"] = rule(unit, shown, [each for some in bounded for each in some])
     return found.set_axis(groups.size().index).reset_index(drop=not by)
 
 
