@@ -129,7 +129,9 @@ def dc1_sentence(rows: Sequence[Claim]) -> str:
             f"{plain(cloned[0].found.value)} and {plain(cloned[1].found.value)} times those of the "
             "printed one"
         )
-    return f"{said}."
+    share = pick(rows, "share of (k, range noise)").found.value
+    where = f"in {percent(share)}" if share else "in no part"
+    return f"{said}. The whole order holds {where} of a map of wheel slip and range noise."
 
 
 def dc2(ellipses: pd.DataFrame) -> Iterator[Claim]:
