@@ -40,7 +40,7 @@ def test_tables_know_settings_from_findings_and_compare_on_the_same_recordings()
     np.testing.assert_allclose(found.loc["a", "ate_rmse_over_a"], 1.0)
     np.testing.assert_allclose(found.loc["b", "ate_rmse_over_a"], 2.0)
     assert (found["runs"] == 3).all()
-    with pytest.raises(InputError, match="no rows of estimator c"):
+    with pytest.raises(InputError, match="no rows of estimator c; there are a, b"):
         summary(table, against="c")
 
 
