@@ -3,7 +3,9 @@
 import numpy as np
 import pandas as pd
 import pytest
+from typer.testing import CliRunner
 
+from experiments.cli import app
 from experiments.report.plot import _by_factors, sweep_figure
 from experiments.runs.columns import COLUMNS, ORIGIN, REPEAT, STATUS, is_setting, title
 from experiments.runs.evaluate import evaluate
@@ -40,7 +42,7 @@ def test_tables_know_settings_from_findings_and_compare_on_the_same_recordings()
     np.testing.assert_allclose(found.loc["a", "ate_rmse_over_a"], 1.0)
     np.testing.assert_allclose(found.loc["b", "ate_rmse_over_a"], 2.0)
     assert (found["runs"] == 3).all()
-    with pytest.raises(InputError, match="no rows of estimator c"):
+    with pytest.raises(InputError, match="no rows of estimator c; there are a, b"):
         summary(table, against="c")
 
 
@@ -201,6 +203,18 @@ def test_what_a_plot_is_drawn_by_is_chosen_where_it_is_not_given():
     assert len(twice.axes[0].containers) == 2
     with pytest.raises(InputError, match="against itself"):
         sweep_figure(rows(), "ate_rmse_m", "ate_rmse_m")
+
+
+def test_the_same_remedy_shows_rows_of_other_code_in_all_three(tmp_path):
+    rows().to_parquet(tmp_path / "x.parquet")
+    for arguments in (["table"], ["plot", "-o", "p.png"], ["report", "-o", "p.html"]):
+        command, *out = [str(tmp_path / a) if a.startswith("p.") else a for a in arguments]
+        refused = CliRunner().invoke(app, [command, str(tmp_path), *out])
+        assert "with --all-versions" in str(refused.exception)
+        done = CliRunner().invoke(app, [command, str(tmp_path), *out, "--all-versions"])
+        assert done.exit_code == 0
+        if command == "plot":
+            assert "drawn with --x robot.kr --by choice.estimator\n" in done.stderr
 
 
 def test_versions_of_the_code_are_told_apart():

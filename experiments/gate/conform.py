@@ -72,7 +72,7 @@ def check_estimator(
         A run with what the estimator needs, and a tracking prior with a proper covariance.
     """
     short = recording.cut(min(n_frames, len(recording.frame_stamps)))
-    results = []
+    results: list[CheckResult] = []
     for name, check in _CHECKS.items():
         try:
             fault = check(make_estimator, short, prior)

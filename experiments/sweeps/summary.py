@@ -112,7 +112,8 @@ def _rows_of(estimator: str, table: pd.DataFrame) -> pd.DataFrame:
     """Rows of the estimator that others are compared with."""
     one = table[table["choice.estimator"] == estimator]
     if one.empty:
-        raise InputError(f"no rows of estimator {estimator}")
+        there = ", ".join(sorted(table["choice.estimator"].unique()))
+        raise InputError(f"no rows of estimator {estimator}; there are {there}")
     if own := [c for c in telling(one) if c.startswith("estimator.")]:
         print(f"{estimator} is the mean over its {', '.join(own)}", file=sys.stderr)
     return one
