@@ -2,6 +2,7 @@
 
 import importlib
 import re
+import signal
 import sys
 import textwrap
 import time
@@ -108,6 +109,8 @@ def end(error: BaseException) -> NoReturn:
         if isinstance(link, RunFailedError):
             _say(f"the run failed: {link}", 1)
         if isinstance(link, KeyboardInterrupt):
+            for again in (signal.SIGINT, signal.SIGTERM):  # what is said is said whole
+                signal.signal(again, signal.SIG_IGN)
             _say(str(link) or "interrupted; what was finished is kept", 130)
         if isinstance(link, _configuration_errors()):
             if refusal := _refusal(link):
