@@ -1133,8 +1133,10 @@ def report(
 
       estima report slip --where choice.world=office -o office.html
     """
-    if out is not None and (name is None or out.suffix != ".html"):
-        raise InputError(f"-o {out}: give the name of a sweep, and a file that ends in .html")
+    if out is not None and name is None:
+        raise InputError(f"-o {out} is for the page of a sweep: estima report NAME -o {out}")
+    if out is not None and out.suffix != ".html":
+        raise InputError(f"-o {out}: a page is .html")
     if name is not None:
         from experiments.report.sweep_page import write_sweep_page
         from experiments.sweeps.collect import collect, folder_of, where

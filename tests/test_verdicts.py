@@ -72,7 +72,7 @@ def test_an_undecided_sentence_says_how_many_more_recordings_settle_it():
     assert verdict_of(GOOD).sentence == "There are 1 rows."
     unknown = dataclasses.replace(OPEN, more=0)
     assert verdict_of(unknown).sentence == "There are 1 rows."
-    assert "would settle the rest." in verdict_of(OPEN, unknown).sentence
+    assert "would settle what is open." in verdict_of(OPEN, unknown).sentence
     assert "57 more" in verdict_of(OPEN, dataclasses.replace(beside(OPEN), more=900)).sentence
 
 

@@ -281,7 +281,7 @@ def _with_debt(sentence: str, verdict: Verdict, rows: Sequence[Claim], unit: str
     more = max(row.more for row in open_ones)
     if not more:
         return sentence
-    what = "it" if all(row.more for row in open_ones) else "the rest"
+    what = "it" if all(row.more for row in open_ones) else "what is open"
     return f"{sentence} About {_rounded(more)} more {unit} would settle {what}."
 
 

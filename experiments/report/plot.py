@@ -126,11 +126,20 @@ def sweep_figure(
             ax.plot(at, alone[y], ".", color=colour, ms=4, alpha=0.5)
         words = [_named(name, value) for name, value in ((row, above), (col, left)) if name]
         ax.set_title("; ".join(words), fontsize="medium")
-    _scale(axes, names, means, wide=wide, numeric=numeric, log=_is_log(y, means["value"]))
+    _scale(
+        axes,
+        names,
+        means,
+        wide=wide,
+        numeric=numeric,
+        log=_is_log(y, means[["value", "low", "high"]].stack()),
+    )
     for ax in axes[-1]:
         ax.set_xlabel(title(x))
-    for ax in axes[:, 0]:
-        ax.set_ylabel(title(y))
+    if len(down) > 1:  # one label beside all, as one each would collide on a column's width
+        page.supylabel(title(y), fontsize=_FONT[chosen])
+    else:
+        axes[0, 0].set_ylabel(title(y))
     over = [c for c in telling(table) if c not in (*groups, *DRAWN)]
     parts = [
         rule(unit, [y], means["low"].notna()),

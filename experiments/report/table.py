@@ -42,6 +42,9 @@ def check_name(path: Path) -> None:
     require(path.suffix in FORMATS, f"-o {path}: a table is {', '.join(FORMATS)}")
 
 
+_TESTED = 6  # runs below which a paired test finds next to nothing
+
+
 def notes(found: pd.DataFrame, against: str | None) -> str:
     """How the numbers of a summary came about and what the marks mean, in a line."""
     best, differs = (found.filter(regex=f"_{mark}$").to_numpy(bool).any() for mark in MARKS)
@@ -50,6 +53,8 @@ def notes(found: pd.DataFrame, against: str | None) -> str:
         "Bold: the best on the same recordings." if best else "",
         f"*: differs from {against} (paired t tests over recordings; 5 % for the table, Holm)."
         if differs
+        else f"Too few recordings to test what differs from {against}."
+        if found["runs"].max() < _TESTED
         else f"Nothing differs from {against} by paired tests."
         if against
         else "",

@@ -78,7 +78,9 @@ def averages(table: pd.DataFrame, by: Sequence[str], unit: str, name: str) -> pd
         mean, n = groups.mean(), groups.size()
         half = stats.t.ppf(0.975, n - 1) * groups.std() / np.sqrt(n.where(n >= LEAST))
     found = pd.DataFrame({"value": mean, "low": mean - half, "high": mean + half})
-    return np.exp(found) if geometric else found
+    if geometric:
+        return np.exp(found)
+    return found.assign(low=found["low"].clip(lower=0.0)) if (values >= 0.0).all() else found
 
 
 def difference_p(ours: pd.Series[float], theirs: pd.Series[float], name: str) -> float:

@@ -171,11 +171,12 @@ def _by_neighbours(rows: Sequence[Claim]) -> str:
         for method in ("printed", "printed_12", "printed_20")
     )
     lines = pick(rows, "long over short", _HOW["lines"]).found.value
+    shrinks = percent(pick(rows, "near objects", _HOW["lines"]).found.value)
     return (
         f"It hangs on the normals: the ratio is {plain(of_6)} with planes of 6 points, "
         f"{plain(more[0])} and {plain(more[1])} with those of 12 and 20, and {plain(lines)} with "
         "lines cut from the whole scan, as the noise of a normal passes for information along the "
-        "corridor."
+        f"corridor. With those lines it shrinks to {shrinks} near objects."
     )
 
 
@@ -287,11 +288,13 @@ def dc4_sentence(rows: Sequence[Claim]) -> str:
             f"scans, as Censi published it, the closed form has {over('censi')}, and "
             f"{over('censi', 'point_to_line')} with lines cut from the whole scan."
         )
-    bias = pick(rows, "median error along", "point_to_point, corridor").found.value
-    return (
-        f"{said} Point to point has a bias of {plain(bias)} of the motion in corridors: its "
-        "minimum itself is off, which no covariance of noise can tell."
-    )
+    bias = pick(rows, "median error along", "point_to_point, corridor").found
+    if bias.low > 0.0 or bias.high < 0.0:
+        said += (
+            f" Point to point has a bias of {plain(bias.value)} of the motion in corridors: its "
+            "minimum itself is off, which no covariance of noise can tell."
+        )
+    return said
 
 
 def nees_intervals(covariances: pd.DataFrame) -> dict[tuple[str, str, str], Interval]:

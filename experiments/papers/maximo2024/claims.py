@@ -147,7 +147,7 @@ def mx1_sentence(rows: Sequence[Claim]) -> str:
     same = [row for row in judged_rows if "error of M3 over M2" in row.statistic]
     if same:
         said += f", and has {plain(same[0].found.value)} times M2's error on UMH"
-    where = f" Of the numbers B tried there, that {fails.reason}." if fails.reason else ""
+    where = f" Of the numbers B tried, that on Oxford {fails.reason}." if fails.reason else ""
     return f"{said}.{where}"
 
 
@@ -316,7 +316,7 @@ def mx2_sentence(rows: Sequence[Claim]) -> str:
     )
     slower = pick(judged_rows, "over that of UMH").found.value
     return (
-        f"Against 4 particles a node, the error with other numbers is at worst "
+        f"Against 4 particles a node, the error with another number is at its farthest "
         f"{' and '.join(parts)}. The time grows up to {plain(grows)} times, is at most "
         f"{plain(100.0 * share)} % of the paper's and {plain(100.0 * gap)} % of the time between "
         f"nodes, and on Oxford is at least {plain(slower)} times that on UMH."
@@ -442,13 +442,15 @@ def mx8(kidnapping: pd.DataFrame) -> list[Claim]:
 
 def mx8_sentence(rows: Sequence[Claim]) -> str:
     """Say how often a kidnapped robot is found again."""
-    least, most = (
-        [row.found.value for row in rows if f"{how} injection" in row.statistic]
+    found, lost = (
+        [row.found for row in rows if f"{how} injection" in row.statistic]
         for how in ("with", "without")
     )
     return (
-        f"With injection at least {percent(min(least))} of kidnapped robots are found again within "
-        f"{RECOVERED_WITHIN} nodes, on any route; without it at most {percent(max(most))}."
+        f"With injection {percent(min(f.value for f in found))} of kidnapped robots are found "
+        f"again within {RECOVERED_WITHIN} nodes, whatever the route (at least "
+        f"{percent(min(f.low for f in found))}); without it at most "
+        f"{percent(max(f.value for f in lost))}."
     )
 
 

@@ -119,12 +119,11 @@ def rl2_sentence(rows: Sequence[Claim]) -> str:
     for row in judged_rows:
         other = row.statistic.split(", Intel")[0].split("m: ")[-1].split("beside ")[-1]
         parts.append(f"{row.reason.split('the other ')[-1]} by {other}")
-    fused = judged_rows[0].reason.split(",")[0]
-    said = f"Mean translational error after the tuned part: {fused}, {', '.join(parts)}."
+    fused = judged_rows[0].reason.split(",")[0].removeprefix("fusion ")
+    parts = [f"{fused} by fusion", *parts]
+    said = f"Mean translational error after the tuned part: {'; '.join(parts)}."
     if any(row.verdict is Verdict.UNDECIDED for row in judged_rows):
         said += " The log is too short to tell the nearest of them from fusion."
-        if not any(row.more for row in judged_rows):
-            said += " The next full run will say how much longer a log would settle it."
     return said
 
 
