@@ -5,6 +5,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from experiments.papers.results import Results
+from experiments.viewing.plotting import plain_log
 from experiments.viewing.style import BLUE, RED, subplots
 
 
@@ -30,6 +31,7 @@ def errors(pairs: pd.DataFrame) -> Figure:
         )
         ax.set_xlabel("position error, RMS, m")
         ax.tick_params(axis="y", labelsize=7)
+        plain_log(ax.xaxis, (1.0,))
     for ax in list(axes.flat)[len(logs) :]:
         ax.set_axis_off()
     handles, labels = axes.flat[0].get_legend_handles_labels()
