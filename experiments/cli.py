@@ -731,6 +731,49 @@ def _calibrate_log(log: list[Path], out: Path, robot: int, until_s: float | None
     show(f"{out}, {out.with_suffix('.png')}")
 
 
+@app.command()
+def twin(
+    log: Annotated[list[Path], typer.Argument(help="A recording (.npz) or a log of any format.")],
+    out: Annotated[
+        Path,
+        typer.Option(
+            "--out", "-o", help="Study to write, .yaml; its world, way and log go beside it."
+        ),
+    ],
+    robot: Annotated[int, typer.Option(help="Which robot of an MRCLAM set.")] = 1,
+    split_s: Annotated[
+        float | None,
+        typer.Option("--split", help="Seconds of the log that it is calibrated on [half of it]."),
+    ] = None,
+) -> None:
+    """Make a twin of a real log: a simulation of what comes after its first half.
+
+    How the robot slips and its sensors err is found in the first half. The world and the way that
+    is driven are the log's. docs/twins.md says what a twin is and what it predicts.
+
+    Examples
+    --------
+      estima twin fr079.log.gz -o fr079.yaml
+
+      estima run -m study=fr079.yaml estimator=ekf_icp seed="range(0,20)" (what it predicts)
+
+      estima run study=fr079.yaml estimator=ekf_icp recording=fr079_log.npz (what the log shows)
+    """
+    from experiments.twin.make import make_twin
+    from experiments.twin.write import check_name, write_twin
+    from sim.formats.detect import read_any
+
+    check_name(out)
+    made = make_twin(read_any(log, robot), split_s)
+    show(made.found.as_text())
+    for path in write_twin(made, out):
+        show(paths.short(path))
+    show(f"Next: what it predicts: estima run -m study={out} estimator=odometry 'seed=range(0,20)'")
+    if made.rest.truth is not None:
+        beside = out.with_name(f"{out.stem}_log.npz")
+        show(f"      and the log: estima run study={out} estimator=odometry recording={beside}")
+
+
 def _robot_of(overrides: list[str], config_dir: Path | None) -> DifferentialDrive:
     """Make the robot that overrides choose; they may say nothing else."""
     from experiments.runs.experiment import Experiment, searched

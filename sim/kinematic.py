@@ -99,7 +99,7 @@ def run_batch(
     Parameters
     ----------
     robot
-        The true robot. Its unmodelled slip must be off.
+        The true robot. Its unmodelled and forward slip must be off.
     start
         (3,) common start pose.
     sample_s
@@ -108,10 +108,11 @@ def run_batch(
     Raises
     ------
     InputError
-        If unmodelled slip is asked for, which only the simulator offers.
+        If unmodelled or forward slip is asked for, which only the simulator offers.
     """
     require(
-        robot.unmodelled_slip == 0.0, "batches know the kr/kl law only; set robot.unmodelled_slip=0"
+        robot.unmodelled_slip == 0.0 and robot.forward_slip_m == 0.0,
+        "batches know the kr/kl law only; set robot.unmodelled_slip=0 and robot.forward_slip_m=0",
     )
     require(n_runs >= 1, f"n_runs must be at least 1, got {n_runs}")
     commands_m = wheel_commands(robot, route)

@@ -57,6 +57,8 @@ class DifferentialDrive:
         described by kr, kl and is 0 unless asked for.
     unmodelled_slip_m
         Encoder travel of one such event, m.
+    forward_slip_m
+        Variance per metre of what both wheels slip together, m: their encoders gain the same error.
     body_length_m, body_width_m, body_height_m, mass_kg
         The body, centred over the axle.
     max_acceleration_mps2
@@ -76,6 +78,7 @@ class DifferentialDrive:
     gear_ratio: float = 1.0
     unmodelled_slip: float = 0.0
     unmodelled_slip_m: float = 0.02
+    forward_slip_m: float = 0.0
     body_length_m: float = 0.18
     body_width_m: float = 0.14
     body_height_m: float = 0.10
@@ -103,6 +106,7 @@ class DifferentialDrive:
                 "encoder_pulses_per_turn",
                 "unmodelled_slip",
                 "unmodelled_slip_m",
+                "forward_slip_m",
             ),
         )
         for name in ("nominal_wheel_radius_m", "nominal_track_m"):

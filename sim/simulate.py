@@ -26,7 +26,7 @@ from sim.feedback import Feedback, Onboard, feedback_of
 from sim.kinematic import KinematicBody
 from sim.rays import AmongRobots, BulletRays, ExactRays
 from sim.recording import CommandLog, Log, Recording, Truth, WheelLog, joined
-from sim.robot import DifferentialDrive
+from sim.robot import DifferentialDrive, scaled_error
 from sim.sensors.base import Rays, Reading, Sensor, Sensors, View, parted
 from sim.team import Team
 from sim.world import World
@@ -326,7 +326,7 @@ def _drive(
     """Run a tick at each `next`, until the route ends or something goes wrong; the status."""
     right, left = robot.slips(DT_S)
     noise = _normals(rng)
-    events = _SlipEvents(robot, rng)
+    events, together = _SlipEvents(robot, rng), _ForwardSlip(robot, rng)
     encoder, travel = np.zeros(2), np.zeros(2)
     tick, velocity, speeds = 0, (0.0, 0.0), (0.0, 0.0)
     while True:
@@ -355,8 +355,9 @@ def _drive(
         rolled = body.step(speeds[0] - right.correction_mps, speeds[1] - left.correction_mps)
         z_right, z_left = next(noise)
         extra_right, extra_left = events.error(rolled)
-        encoder[0] += right.advance(rolled[0], z_right, extra_right)
-        encoder[1] += left.advance(rolled[1], z_left, extra_left)
+        both = together.error(rolled)
+        encoder[0] += right.advance(rolled[0], z_right, extra_right + both)
+        encoder[1] += left.advance(rolled[1], z_left, extra_left + both)
         travel += rolled
         tick += 1
         yield
@@ -428,6 +429,21 @@ class _SlipEvents:
         self._left[active] -= 1
         right, left = np.where(active, self._step_m * np.sign(rolling_m), 0.0).tolist()
         return right, left
+
+
+class _ForwardSlip:
+    """Slip that both wheels share."""
+
+    def __init__(self, robot: DifferentialDrive, rng: np.random.Generator) -> None:
+        self._variance_per_m = robot.forward_slip_m
+        self._normals = _normals(rng.spawn(1)[0])
+
+    def error(self, rolling_m: tuple[float, float]) -> float:
+        """Error of both encoders, m, of this tick."""
+        if self._variance_per_m == 0.0:
+            return 0.0
+        travel_m = (abs(rolling_m[0]) + abs(rolling_m[1])) / 2.0
+        return float(scaled_error(travel_m, self._variance_per_m, next(self._normals)[0]))
 
 
 def _normals(rng: np.random.Generator, block: int = 3000) -> Iterator[tuple[float, float]]:

@@ -53,6 +53,7 @@ ROOMS = (
     "bench",
     "report",
     "sweeps",
+    "twin",
     "calibration",
     "viewing",
     "runs",

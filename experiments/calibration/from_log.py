@@ -39,7 +39,8 @@ _FEWEST_BLOCKS = 10
 _RESAMPLES = 200
 _NO_SLIP_M = 1e-12  # kr or kl that is at its bound of zero
 _OUTLIER = 6.0  # in robust standard deviations
-_LONGEST_GAP_S = 0.5  # of the truth
+_LONGEST_GAP_S = 1.0  # of the truth
+_START = np.diag([1e-6] * 3)  # covariance of a known start
 S = TypeVar("S")
 MAD = 1.4826  # standard deviation of a normal over its median absolute deviation
 
@@ -92,12 +93,19 @@ class Residuals:
 
 @dataclass(frozen=True)
 class Found:
-    """A calibration, with the 95 % interval of each number by name, and what is left."""
+    """A calibration, with the 95 % interval of each number by name, and what is left.
+
+    Attributes
+    ----------
+    geometry_covariance
+        (3, 3) of the gains of the right and left wheel and the track, m.
+    """
 
     source: Source
     calibration: Calibration
     intervals: dict[str, Interval]
     residuals: Residuals
+    geometry_covariance: Array
 
     def as_text(self) -> str:
         """One line a number."""
@@ -159,6 +167,7 @@ def calibrate_against(reference: Reference, part: Recording) -> Found:
     wheels = Wheels(right.value, left_one.value, track_m.value, delay.value)
     sensors: dict[str, SensorBelief] = {}
     left = [np.zeros(0)] * 4
+    lasers = [name for name in part.logs if isinstance(part.sensors[name], Laser)]
     if reference.source is Source.SCANS:
         name, laser = _of_kind(part, Laser)
         # the reference moves the laser as the log mounts it; the mount found comes before that
@@ -170,7 +179,12 @@ def calibrate_against(reference: Reference, part: Recording) -> Found:
             moved = Interval(float(value), found.low + by, found.high + by)
             intervals[f"sensors.{name}.{key}"] = moved
         intervals |= {f"sensors.{name}.sigma_range_m": noise, f"{name}: outliers": share}
-    elif part.world is not None and any(
+    elif lasers and reference.source is Source.TRUTH:
+        # a truth errs from scan to scan by more than the laser does
+        noise, share, left = _laser_noise(part, lasers[0], _registered(part, lasers[0]))
+        sensors[lasers[0]] = SensorBelief(sigma_range_m=noise.value)
+        intervals |= {f"sensors.{lasers[0]}.sigma_range_m": noise, f"{lasers[0]}: outliers": share}
+    if part.world is not None and any(
         isinstance(sensor, StereoCamera) and sensor.identifies for sensor in part.sensors.values()
     ):
         name, camera = _of_kind(part, StereoCamera)
@@ -182,6 +196,7 @@ def calibrate_against(reference: Reference, part: Recording) -> Found:
         Calibration(wheels, slip, sensors),
         intervals,
         Residuals(blocks.stamps, turn, forward, path, *left),
+        np.cov(spread.T),
     )
 
 
@@ -220,41 +235,47 @@ def reference_of(recording: Recording) -> Reference:
     InputError
         If the log has none of them.
     """
-    kinds = {type(recording.sensors[name]) for name in recording.logs}
+    has_laser, has_camera = (
+        any(isinstance(recording.sensors[name], kind) for name in recording.logs)
+        for kind in (Laser, StereoCamera)
+    )
     if recording.truth is not None and len(recording.truth.stamps) > 2:
         stamps, poses = recording.truth.stamps, recording.truth.poses
         inside = (stamps >= recording.frame_stamps[0]) & (stamps <= recording.frame_stamps[-1])
         stamps, poses = stamps[inside], poses[inside]
         dense = len(stamps) > 2 and float(np.median(np.diff(stamps))) <= _LONGEST_GAP_S
-        if dense or Laser not in kinds:
+        if dense or not has_laser:
             return Reference(Source.TRUTH, stamps, poses, np.diff(stamps) <= _LONGEST_GAP_S)
-    prior = Prior(recording.robot, recording.sensors, np.zeros(3), np.diag([1e-6] * 3))
-    rng = np.random.default_rng(0)
-    if Laser in kinds:
-        name, _ = _of_kind(recording, Laser)
-        matcher = IcpOdometry(
-            kr=3e-3, kl=3e-3, sigma_range_m=0.03, reference="previous", laser=name
-        )
-        keep = ("registration_status",)
-        found = run_estimator(matcher, recording, prior, rng, keep)
-        stamps = recording.log(name).stamps
-        rows = np.flatnonzero(np.isin(found.stamps, stamps))
-        sound = [found.extras["registration_status"][i] not in FAILED for i in rows[1:]]
-        # the pose of the laser, as the log has its mount on the robot, is what was registered
-        return Reference(Source.SCANS, found.stamps[rows], found.means[rows], np.array(sound, bool))
+    if has_laser:
+        return _registered(recording, _of_kind(recording, Laser)[0])
     require(
-        StereoCamera in kinds,
+        has_camera,
         "the log has no truth, no scans and no landmarks to compare its wheels with",
     )
     name, _ = _of_kind(recording, StereoCamera)
+    prior = Prior(recording.robot, recording.sensors, np.zeros(3), _START)
     batch = Smoother(kr=1e-2, kl=1e-2, robust="cauchy", stereo=name)
-    run_estimator(batch, recording, prior, rng)
+    run_estimator(batch, recording, prior, np.random.default_rng(0))
     found = batch.finish()
     rows = np.flatnonzero(np.isin(found.stamps, recording.log(name).stamps))
     stamps = found.stamps[rows]
     return Reference(
         Source.LANDMARKS, stamps, found.means[rows], np.diff(stamps) <= 2.0 * INTERVAL_S
     )
+
+
+def _registered(recording: Recording, name: str) -> Reference:
+    """Poses of a laser by registering each of its scans to the one before.
+
+    What moves is the laser, as the log has its mount on the robot.
+    """
+    prior = Prior(recording.robot, recording.sensors, np.zeros(3), _START)
+    matcher = IcpOdometry(kr=3e-3, kl=3e-3, sigma_range_m=0.03, reference="previous", laser=name)
+    keep = ("registration_status",)
+    found = run_estimator(matcher, recording, prior, np.random.default_rng(0), keep)
+    rows = np.flatnonzero(np.isin(found.stamps, recording.log(name).stamps))
+    sound = [found.extras["registration_status"][i] not in FAILED for i in rows[1:]]
+    return Reference(Source.SCANS, found.stamps[rows], found.means[rows], np.array(sound, bool))
 
 
 def _travel_at(wheels: WheelLog, stamps: Array) -> Array:

@@ -28,7 +28,7 @@ from experiments.viewing.style import save_figure
 from sim.errors import InputError
 
 PAPERS = ("puzzlebot2024", "decristoforis2020", "maximo2024", "gil2008")
-LOGS = ("real_logs",)  # run only where the logs are
+LOGS = ("real_logs", "twins")  # run only where the logs are
 OWN = (
     "mcl_office",
     "fastslam_consistency",

@@ -30,6 +30,7 @@ from experiments.runs.version import code_version, source_digest, version_with
 from sim import grid_file
 from sim.arrays import Array
 from sim.errors import InputError, blaming, require
+from sim.files import write_text
 from sim.grid import OccupancyGrid
 from sim.recording import Frame, Recording, load
 from sim.robot import DifferentialDrive, RobotGeometry
@@ -79,7 +80,7 @@ class Experiment:
     def compose(cls, overrides: Sequence[str] = ()) -> Experiment:
         """Compose an experiment from Hydra's overrides, such as `world=office seed=3`."""
         with initialize_config_dir(str(paths.CONF), version_base="1.3"):
-            return cls.resolved(*composed(overrides))
+            return cls.resolved(*composed(with_study_file(overrides)))
 
     @classmethod
     def resolved(cls, cfg: DictConfig, choices: Mapping[str, str]) -> Experiment:
@@ -507,6 +508,8 @@ class Experiment:
             sources["world_file"] = _digest(Path(world_file))
             if (image := grid_file.image_of(Path(world_file))) is not None:
                 sources["world_image"] = _digest(image)
+        if way := files_digest(self.config["route"].get("path")):
+            sources["way"] = list(way.values())
         if files := files_of_options(self.config["route"].get("feedback")):
             sources["feedback_files"] = files
         elsewhere = {target: source_digest(target) for target in sorted(targets(self._simulated()))}
@@ -640,6 +643,33 @@ def searched(config_dir: str | Path | None) -> list[str]:
             require(keys, f"{path}: an option holds keys and their values")
             _check_hydra_of(path, option or {})
     return [f"hydra.searchpath=[{paths.quoted(f'file://{folder}')}]"]
+
+
+def with_study_file(overrides: Sequence[str]) -> list[str]:
+    """Overrides in which `study=FILE.yaml` is a name, and the folder in which Hydra looks for it.
+
+    Hydra knows an option by its name in a folder of its group, so a study that lies elsewhere is
+    copied to one.
+
+    Raises
+    ------
+    InputError
+        If there is no such file.
+    """
+    found: list[str] = []
+    for override in overrides:
+        key, _, value = override.partition("=")
+        path = Path(value)
+        if key != "study" or path.suffix != ".yaml":
+            found.append(override)
+            continue
+        require(path.is_file(), f"{override}: there is no such file")
+        place = path.resolve()
+        if place.parent.name != "study":
+            place = paths.results() / "cache" / "studies" / _digest(path)[:16] / "study" / path.name
+            write_text(place, path.read_text())
+        found += [*searched(place.parents[1]), f"study={path.stem}"]
+    return found
 
 
 def _check_hydra_of(path: Path, option: Mapping[str, Any]) -> None:

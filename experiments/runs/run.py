@@ -25,6 +25,7 @@ from experiments.runs.experiment import (
     check_hydra,
     check_overrides,
     searched,
+    with_study_file,
 )
 from experiments.runs.row import Outcome, Row
 from experiments.runs.store import write_run
@@ -122,10 +123,10 @@ def application(arguments: Sequence[str], draw: Draw, out: Path | None = None) -
                 )
             experiment = Experiment.resolved(cfg, choices)
             run_once(experiment, draw, out)
-            said = shlex.join(["estima", "run", *overrides, *options])
+            said = shlex.join(["estima", "run", *given, *options])
             if experiment.config["recording"] is None:
                 show(f"Next: intervals over ten drives: {said} -m 'seed=range(0,10)'")
-                drive = shlex.join(["estima", "record", "-o", "run.npz", *overrides, *options])
+                drive = shlex.join(["estima", "record", "-o", "run.npz", *given, *options])
                 if "command" not in experiment.config["estimator"]:  # `view` cannot be told it
                     play = shlex.join(
                         ["estima", "view", "run.npz", "-e", experiment.estimator_name]
@@ -134,7 +135,8 @@ def application(arguments: Sequence[str], draw: Draw, out: Path | None = None) -
         except Exception as error:
             end(error)  # here, since Hydra would add a line of its own
 
-    overrides, options = _split(arguments)
+    given, options = _split(arguments)
+    overrides = with_study_file(given)
     names = {option.partition("=")[0] for option in options}
     if names & {"--shell-completion", "-sc"}:
         raise InputError("--shell-completion is Hydra's; estima --install-completion is ours")

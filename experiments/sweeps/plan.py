@@ -34,6 +34,7 @@ from experiments.runs.experiment import (
     files_of_options,
     leaf_digests,
     searched,
+    with_study_file,
 )
 from sim.errors import InputError, require
 
@@ -228,6 +229,7 @@ def plan_of(arguments: Sequence[str], config_dir: str | None = None) -> Plan:
     InputError
         If an override is wrong, or a key is unknown.
     """
+    arguments = with_study_file(arguments)
     with initialize_config_dir(str(paths.CONF), version_base="1.3"):
         composer = _Composer(config_dir)
         composer.extra += [a for a in arguments if a.lstrip("+~").startswith("hydra.")]

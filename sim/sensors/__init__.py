@@ -16,6 +16,8 @@ from sim.sensors.gyroscope import Gyroscope
 from sim.sensors.laser import Laser
 from sim.sensors.lidar3d import Lidar3D
 from sim.sensors.place import PlaceDescriptor
+from sim.sensors.real_camera import RealCamera
+from sim.sensors.real_laser import RealLaser
 from sim.sensors.robots import RobotCamera
 from sim.sensors.stereo import StereoCamera
 
@@ -28,6 +30,8 @@ __all__ = [
     "Mount",
     "PlaceDescriptor",
     "Reading",
+    "RealCamera",
+    "RealLaser",
     "RobotCamera",
     "Schema",
     "Sensor",

@@ -1,0 +1,86 @@
+"""A laser with what real ones show beside noise: short readings, none at all, and scans dropped."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.arrays import Array, Ints
+from sim.errors import require
+from sim.sensors.base import Probe, Reading, View
+from sim.sensors.laser import Laser
+
+
+@dataclass(frozen=True)
+class RealLaser(Laser):
+    """A laser whose beams may end before the wall, or not come back.
+
+    Parameters
+    ----------
+    short_share, short_beams
+        Of the beams that would hit a wall, the share that end anywhere before it, such as on
+        someone who walks by (Thrun, Burgard, Fox 2005, sec. 6.3); and over how many neighbours it
+        is settled whether they do.
+    missing_share, missing_beams
+        Of the others, the share that do not come back, and over how many neighbours.
+    stamps
+        When it scans, s from the start: at the first firing from each of them on. None: at every
+        firing.
+    """
+
+    short_share: float = 0.0
+    short_beams: float = 1.0
+    missing_share: float = 0.0
+    missing_beams: float = 1.0
+    stamps: Sequence[float] | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("short_share", "missing_share"):
+            share = getattr(self, name)
+            require(0.0 <= share <= 1.0, f"sensors.laser.{name} must lie in [0, 1], got {share}")
+        for name in ("short_beams", "missing_beams"):
+            beams = getattr(self, name)
+            require(1.0 <= beams < np.inf, f"sensors.laser.{name} must be at least 1, got {beams}")
+        if self.stamps is not None:
+            numbers = all(isinstance(s, (int, float)) for s in self.stamps)
+            stamps = tuple(map(float, self.stamps)) if numbers else (np.nan,)
+            require(
+                bool(np.isfinite(stamps).all()) and bool((np.diff(stamps) > 0.0).all()),
+                "sensors.laser.stamps must be numbers of seconds that increase, or null",
+            )
+            object.__setattr__(self, "stamps", stamps)
+
+    def start(self, rng: np.random.Generator) -> Probe:
+        """Probe that casts the beams, and spoils some."""
+        due = iter(self.stamps or ())
+        next_s = next(due, np.inf) if self.stamps is not None else -np.inf
+
+        def probe(view: View) -> Reading | None:
+            nonlocal next_s
+            if view.stamp < next_s - 1e-9:
+                return None
+            while next_s <= view.stamp + 1e-9 and self.stamps is not None:
+                next_s = next(due, np.inf)
+            return {"ranges_m": self.measure(self._spoilt(view.scan(self), rng), rng)}
+
+        return probe
+
+    def _spoilt(self, true_m: Array, rng: np.random.Generator) -> Array:
+        """True ranges (beams,) m, some of them shorter, some inf."""
+        short, leader = _settled(len(true_m), self.short_share, self.short_beams, rng)
+        missing, _ = _settled(len(true_m), self.missing_share, self.missing_beams, rng)
+        obstacle_m = np.minimum((rng.random(len(true_m)) * true_m)[leader], true_m)
+        ends_m = np.where(missing, np.inf, true_m)
+        return np.where(short & np.isfinite(true_m), obstacle_m, ends_m)
+
+
+def _settled(
+    n: int, share: float, together: float, rng: np.random.Generator
+) -> tuple[NDArray[np.bool_], Ints]:
+    """Whether each of n beams fails, and the first of its group of neighbours, which fail alike."""
+    begins = rng.random(n) < 1.0 / together
+    begins[0] = True
+    leader = np.maximum.accumulate(np.where(begins, np.arange(n), 0))
+    return (rng.random(n) < share)[leader], leader
