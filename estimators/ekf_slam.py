@@ -26,6 +26,7 @@ from sim.recording import Frame
 _MOST_LANDMARKS, _MOST_OBSERVATIONS = 4000, 1000
 # Covariance of a robot that enters the map: wide, against what is measured then
 _ENTERS = np.diag(np.square([10.0, 10.0, 1.0]))
+_REFINEMENTS = 5
 
 
 class EkfSlam:
@@ -373,10 +374,12 @@ class EkfSlam:
     def _place(self, frame: Frame, image: Image | None, frames: Sequence[Frame]) -> None:
         """Give a robot of unknown start its place, if this instant shows it."""
         in_base, in_map = [np.zeros((0, 2))], [np.zeros((0, 2))]
+        slots, points = np.zeros(0, np.int64), np.zeros((0, 3))
         if image is not None:
             slots = self.front_end.known(image)
-            in_base.append(self._camera.place(np.zeros(3), image.points[slots >= 0])[..., :2])
-            in_map.append(self._landmarks[slots[slots >= 0], :2])
+            slots, points = slots[slots >= 0], image.points[slots >= 0]
+            in_base.append(self._camera.place(np.zeros(3), points)[..., :2])
+            in_map.append(self._landmarks[slots, :2])
         poses = {f.robot: self._pose_now(f.robot) for f in frames if self._is_placed[f.robot]}
         if self._sightings is not None:
             for seen in self._sightings.of_robot(frame, frames, poses):
@@ -385,9 +388,23 @@ class EkfSlam:
         pose = pose_by_points(np.concatenate(in_base), np.concatenate(in_map))
         if pose is not None:
             own = _own(frame.robot)
+            if len(slots) >= 2:
+                pose = self._refined(pose, slots, points)
             self._mean[own], self._covariance[own, own] = pose, _ENTERS
             self._motions[frame.robot] = STILL
             self._is_placed[frame.robot] = True
+
+    def _refined(self, pose: Array, slots: Ints, points: Array) -> Array:
+        """Pose that fits points (K, 3) of landmarks best, about which the update linearises."""
+        at = self._rows(slots)
+        spread = self._covariance[at[:, :, None], at[:, None, :]]
+        for _ in range(_REFINEMENTS):
+            predicted, H, of_landmark = self._camera.predict(pose, self._landmarks[slots])
+            v, R = self._camera.innovation(predicted, points)
+            weighted = np.linalg.solve(of_landmark @ spread @ of_landmark.transpose(0, 2, 1) + R, H)
+            information = np.einsum("kji,kjl->il", weighted, H)
+            pose = pose + np.linalg.solve(information, np.einsum("kji,kj->i", weighted, v))
+        return pose
 
     def _pose_now(self, robot: int) -> Array:
         return compose(self._mean[_own(robot)], self._motions[robot].mean)[0]

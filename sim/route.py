@@ -151,14 +151,43 @@ class Tour:
 
     def start(self, world: World, robot: DifferentialDrive) -> tuple[Array, Pursuit]:
         """Start pose (3,) on the first way-point, facing the second, and the driver."""
+        path = _lengthened(self._given(world), self.distance_m)
+        return facing_second(path), Pursuit(self, robot, path)
+
+    def _given(self, world: World) -> Array:
+        """Way-points (P, 2) to follow."""
         given = world.waypoints if self.waypoints is None else np.array(self.waypoints, float)
         require(
             given.ndim == 2 and given.shape[1] == 2 and len(given) >= 2,
             f"route: world {world.name} has no tour of at least two way-points; give "
             "route.waypoints=[[x, y], ...]",
         )
-        path = _lengthened(given, self.distance_m)
-        return facing_second(path), Pursuit(self, robot, path)
+        return given
+
+
+@dataclass(frozen=True)
+class TourFrom(Tour):
+    """A Tour that goes round, from any of its way-points on: of a team, each robot has its own.
+
+    Attributes
+    ----------
+    first
+        Way-point to begin at, counted from 0 and, beyond the last, from 0 again. A tour that does
+        not end where it begins is closed by a way back.
+    backwards
+        Whether it is driven against its direction.
+    """
+
+    first: int = 0
+    backwards: bool = False
+
+    def _given(self, world: World) -> Array:
+        path = super()._given(world)
+        if np.hypot(*(path[0] - path[-1])) < 1e-6:
+            path = path[:-1]
+        path = np.roll(path, -self.first, axis=0)
+        path = np.concatenate([path, path[:1]])
+        return path[::-1] if self.backwards else path
 
 
 class _Controller:
