@@ -3,21 +3,26 @@ PYTHON ?= python3
 ESTIMA := .venv/bin/estima
 FULL ?= 0
 
-.PHONY: help setup reproduce test test-all lint types format docs lock clean
+.PHONY: help setup reproduce report test test-all lint types format docs lock peers clean
 
 help:
 	@echo "make reproduce         figures, tables and claims from few repeats, into results/quick/"
 	@echo "make reproduce FULL=1  the judged ones, into results/"
+	@echo "make report            the page of results/, results/report.html"
 	@echo "make test              the default tests"
 	@echo "make test-all          the slow ones too"
 	@echo "make lint types        what a change must pass besides"
 	@echo "make docs              the documentation, into site/"
+	@echo "make peers             programs of other projects to compare with, into build/peers/"
 
 setup:
 	@$(PYTHON) tools/bootstrap.py
 
 reproduce: setup
 	@$(ESTIMA) reproduce $(if $(filter-out 0,$(FULL)),--full)
+
+report: setup
+	@$(ESTIMA) report
 
 test: setup
 	@.venv/bin/python -m pytest -n 2
@@ -44,6 +49,15 @@ docs: setup
 lock: setup
 	@.uv/bin/uv pip compile pyproject.toml --extra dev --extra docs --generate-hashes --no-emit-index-url \
 	  --no-header --no-annotate --universal --python-version 3.11 --quiet --output-file requirements.lock
+
+# MRPT's libraries are Debian's libmrpt-slam-dev; estimator=mrpt_icp and mrpt_rbpf run the program.
+MRPT_INCLUDES := $(addprefix -isystem ,$(wildcard /usr/include/mrpt/*/include)) -isystem /usr/include/eigen3
+MRPT_LIBRARIES := slam maps obs poses math tfest bayes random config rtti io serialization system core
+peers: build/peers/mrpt
+build/peers/mrpt: tools/peers/mrpt.cpp
+	@test -d /usr/include/mrpt/slam || { echo "MRPT is not here: apt-get install libmrpt-slam-dev"; exit 1; }
+	@mkdir -p build/peers
+	$(CXX) -std=c++17 -O2 $(MRPT_INCLUDES) -o $@ $< $(addprefix -lmrpt-,$(MRPT_LIBRARIES))
 
 clean:
 	rm -rf .venv .uv site results/runs results/cache

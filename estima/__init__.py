@@ -22,6 +22,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     import pandas as pd
     from matplotlib.figure import Figure
 
@@ -298,9 +300,12 @@ def plot(
     table: pd.DataFrame,
     x: str,
     y: str = "answer_ate_rmse_m",
-    by: str | None = None,
+    by: str | Sequence[str] | None = None,
     path: str | Path | None = None,
     *,
+    row: str | None = None,
+    col: str | None = None,
+    size: str = "screen",
     pool: bool = False,
 ) -> Figure:
     """Draw a column of a sweep against another one: means over recordings, with 95 % intervals.
@@ -312,11 +317,15 @@ def plot(
     x, y
         A swept setting, such as `robot.kr` or `choice.estimator`, and a score.
     by
-        One line for each value of this column.
+        One line for each value of this column, or for each combination of several.
     path
         File to write: .png, .pdf or .svg.
+    row, col
+        One row, one column of panels for each value of this column.
+    size
+        `screen`, or `column` or `page` of a paper.
     pool
-        Average over different worlds, estimators and logs too, rather than refuse it.
+        Average over other settings that differ too, rather than refuse it.
 
     Raises
     ------
@@ -329,7 +338,7 @@ def plot(
     >>> quick = ("simulation.physics=kinematic", "route=linear_1", "hydra/launcher=basic")
     >>> table = estima.sweep(*quick, "robot.kr=1e-5,1e-4", "seed=range(0,2)")
     >>> estima.plot(table, x="robot.kr", y="ate_rmse_m").axes[0].get_xlabel()
-    'robot.kr'
+    'kr (robot), m'
     """
     from experiments.report.plot import sweep_figure
     from experiments.runs.row import Outcome
@@ -340,7 +349,8 @@ def plot(
             raise InputError(
                 f"the table has no column {column}; estima.plot takes what estima.sweep returned"
             )
-    figure = sweep_figure(table[table["status"] != Outcome.FAILED], x, y, by, pool=pool)
+    rows = table[table["status"] != Outcome.FAILED]
+    figure = sweep_figure(rows, x, y, by, row=row, col=col, size=size, pool=pool)
     return _saved(figure, path)
 
 

@@ -51,7 +51,7 @@ class EkfIcp:
     ----------
     metric, covariance, sigma_range_m
         As in `estimators.scan_matching.ScanMatcher`; each scan contributes half of the covariance.
-    trim, kernel, max_iterations, stop_error_m
+    trim, kernel, max_iterations, stop_error_m, neighbours
         As in `estimators.icp.Rules`.
     keyframe_distance_m, keyframe_turn_rad
         How far the robot goes before it takes a new key frame.
@@ -108,9 +108,10 @@ class EkfIcp:
         kernel: Kernel = "tukey",
         max_iterations: int = 100,
         stop_error_m: float = 0.0,
+        neighbours: int = 6,
     ) -> None:
         self.laser = laser
-        rules = Rules(trim, kernel, max_iterations, stop_error_m)
+        rules = Rules(trim, kernel, max_iterations, stop_error_m, neighbours)
         self._matcher = ScanMatcher(metric, covariance, sigma_range_m, rules)
         self.wheels = WheelPrediction(
             kr, kl, window_s, lateral_slip_m=lateral_slip_m, encoder_tick_m=encoder_tick_m

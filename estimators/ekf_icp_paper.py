@@ -37,12 +37,12 @@ class EkfIcpPaper:
     ----------
     metric, covariance, sigma_range_m
         As in `estimators.scan_matching.ScanMatcher`.
-    trim, kernel, max_iterations, stop_error_m
+    trim, kernel, max_iterations, stop_error_m, neighbours
         As in `estimators.icp.Rules`.
     kr, kl
         Believed slip variance per metre of the wheels, m.
     lateral_slip_m
-        Variance per metre of the sideways slip, m.
+        Variance per metre of the sideways slip, m; the paper has none.
     acceleration_noise, turn_noise
         Standard deviation of the change of the velocities in one second, m/s and rad/s; it grows
         with the root of time.
@@ -51,10 +51,12 @@ class EkfIcpPaper:
 
     Notes
     -----
-    Increments are expressed in the axes of the robot at their end, where the heading of the
-    observation is. The change of velocity acts from the beginning of a step, so that a velocity
-    measured over the step corrects the whole of it. A registration that failed corrects nothing;
-    directions that the scans do not constrain are left to the wheels.
+    As printed but for these. Increments are expressed in the axes of the robot at their end,
+    where the heading of the observation is, and are those of the exact arc, with its Jacobian;
+    eqs. (1), (3) and (4) are their limit at small turns. The change of velocity acts from the
+    beginning of a step, so that a velocity measured over the step corrects the whole of it. A
+    registration that failed corrects nothing; directions that the scans do not constrain are
+    left to the wheels.
 
     Belief extras: `registration_covariance` (3, 3) of the motion since the previous scan,
     `registration_status`, and `status` if a scan was not used.
@@ -64,12 +66,12 @@ class EkfIcpPaper:
 
     def __init__(
         self,
-        metric: Metric = "point_to_line",
-        covariance: Covariance = "censi",
+        metric: Metric = "point_to_plane",
+        covariance: Covariance = "censi_last",
         sigma_range_m: float | None = None,
         kr: float = 1e-4,
         kl: float = 1e-4,
-        lateral_slip_m: float = 1e-7,
+        lateral_slip_m: float = 0.0,
         acceleration_noise: float = 1.0,
         turn_noise: float = 2.0,
         window_s: float = 0.05,
@@ -78,9 +80,10 @@ class EkfIcpPaper:
         kernel: Kernel = "tukey",
         max_iterations: int = 100,
         stop_error_m: float = 0.0,
+        neighbours: int = 6,
     ) -> None:
         self.laser = laser
-        rules = Rules(trim, kernel, max_iterations, stop_error_m)
+        rules = Rules(trim, kernel, max_iterations, stop_error_m, neighbours)
         self._matcher = ScanMatcher(metric, covariance, sigma_range_m, rules)
         self.wheels = WheelPrediction(kr, kl, window_s, lateral_slip_m=lateral_slip_m)
         require_non_negative(acceleration_noise=acceleration_noise, turn_noise=turn_noise)

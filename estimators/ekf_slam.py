@@ -7,20 +7,24 @@ of all robots, and one map.
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from estimators.base import Belief, Prior
 from estimators.gaussian import STILL, Gaussian, compose, wrap
-from estimators.options import require_positive
+from estimators.options import require_choices, require_positive
 from estimators.sightings import Sightings, dead_reckoning, pose_by_points, team_starts
 from estimators.slam_frontend import Association, Image, SlamFrontEnd
 from estimators.stereo import LEAST_DEPTH_M, NoiseAt, NoiseModel
 from estimators.wheels import WheelPrediction
 from sim.arrays import Array, Ints
+from sim.errors import require
 from sim.recording import Frame
+
+Errors = Literal["coordinates", "invariant"]
 
 # One covariance holds the correlations of all landmarks: 1.2 GB of it
 _MOST_LANDMARKS, _MOST_OBSERVATIONS = 4000, 1000
@@ -51,8 +55,20 @@ class EkfSlam:
         As in `estimators.stereo.StereoModel.of`.
     sigma_column_px, sigma_row_px, sigma_disparity_px, sigma_descriptor
         Believed noise; None for that of the prior's camera.
+    errors
+        What the covariance is of. `coordinates`: the differences of headings and positions.
+        `invariant`: the turn and shift of the whole map about the origin of the map frame, and what
+        is left of each landmark: x = R(e_turn) x_hat + e_x for every position x, the robot's too.
+        What is seen does not change with the turn, so no update can make the heading of the whole
+        map look known, which linearising at ever other estimates does (Barrau and Bonnabel, "An
+        EKF-SLAM algorithm with consistency properties", 2015).
+    gate_probability, repeat_s
+        Of known ids, as in `estimators.slam_frontend.SlamFrontEnd`: misread ones are left out, and
+        a landmark counts once in `repeat_s`.
     kr, kl
         Believed slip variance per metre of the wheels, m.
+    forward_slip_m
+        Believed variance per metre of what both wheels slip together, m.
     window_s
         |ds| is netted over at least this time.
     keep_map
@@ -85,8 +101,12 @@ class EkfSlam:
         sigma_row_px: float | None = None,
         sigma_disparity_px: float | None = None,
         sigma_descriptor: float | None = None,
+        errors: Errors = "coordinates",
+        gate_probability: float | None = None,
+        repeat_s: float = 0.0,
         kr: float = 5e-5,
         kl: float = 5e-5,
+        forward_slip_m: float = 0.0,
         window_s: float = 0.05,
         keep_map: bool = False,
         stereo: str = "stereo",
@@ -94,8 +114,10 @@ class EkfSlam:
         sighting_d0: float = 16.27,
     ) -> None:
         require_positive(sighting_d0=sighting_d0)
+        require_choices(errors=(errors, Errors))
         self.stereo, self.robots, self.sighting_d0 = stereo, robots, sighting_d0
-        self.wheels = WheelPrediction(kr, kl, window_s)
+        self.invariant = errors == "invariant"
+        self.wheels = WheelPrediction(kr, kl, window_s, forward_slip_m=forward_slip_m)
         self.front_end = SlamFrontEnd(
             "ekf_slam",
             stereo,
@@ -103,6 +125,8 @@ class EkfSlam:
             d0,
             noise_model,
             noise_at,
+            gate_probability,
+            repeat_s,
             sigma_column_px=sigma_column_px,
             sigma_row_px=sigma_row_px,
             sigma_disparity_px=sigma_disparity_px,
@@ -121,9 +145,13 @@ class EkfSlam:
         Raises
         ------
         InputError
-            If the robots do not carry the same sensors, or a start is unknown and the camera does
-            not identify landmarks.
+            If the robots do not carry the same sensors, a start is unknown and the camera does not
+            identify landmarks, or the errors are invariant.
         """
+        require(
+            len(priors) == 1 or not self.invariant,
+            "ekf_slam: errors=invariant is of one robot; set estimator.errors=coordinates",
+        )
         starts = team_starts(priors, self.front_end, "ekf_slam")
         self._sightings = Sightings.of(priors, self.robots, *self._noise, "ekf_slam")
         self._camera = self.front_end.camera
@@ -151,13 +179,12 @@ class EkfSlam:
             self._motions[frame.robot] = self._motions[frame.robot].then(motion)
         extras: list[dict[str, Any]] = [{} for _ in frames]
         for frame, found in zip(frames, extras, strict=True):
-            seen = frame.readings.get(self.stereo)
-            image = None if seen is None else self.front_end.read(seen)
+            image = self.front_end.read(frame) if self.stereo in frame.readings else None
             if not self._is_placed[frame.robot]:
                 self._place(frame, image, frames)
             if image is not None and self._is_placed[frame.robot]:
                 self._move(frame.robot)
-                found |= self._see(frame.robot, image)
+                found |= self._see(frame, image)
         for frame in frames:
             if self._sightings is not None and self._is_placed[frame.robot]:
                 self._sight(self._sightings, frame, frames)
@@ -166,8 +193,7 @@ class EkfSlam:
     def _belief(self, frame: Frame, extras: dict[str, Any]) -> Belief:
         if not self._is_placed[frame.robot]:
             return Belief(np.full(3, np.nan), np.full((3, 3), np.nan), extras)
-        own = _own(frame.robot)
-        pose = Gaussian(self._mean[own], self._covariance[own, own])
+        pose = Gaussian(self._mean[_own(frame.robot)], self._pose_covariance(frame.robot))
         pose = pose.then(self._motions[frame.robot])
         if self.keep_map:
             extras |= {k: v for k, v in self.map.items() if k.startswith("landmark")}
@@ -181,9 +207,15 @@ class EkfSlam:
         are the sensor's, if it gives any.
         """
         n, P, first = self._n_landmarks, self._covariance, 3 * self._n_robots
-        blocks = P[first:, first:].reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n)]
+        every = np.arange(n)
+        blocks = P[first:, first:].reshape(n, 3, n, 3)[every, :, every].reshape(n, 3, 3)
         means = self._landmarks.copy()
-        return self.front_end.map(means, blocks.reshape(n, 3, 3), slice(n))
+        if self.invariant:
+            arm = _quarter_turned(means)
+            mixed = arm[:, :, None] * P[2, first:].reshape(n, 1, 3)
+            blocks = blocks + mixed + mixed.transpose(0, 2, 1)
+            blocks += P[2, 2] * arm[:, :, None] * arm[:, None, :]
+        return self.front_end.map(means, blocks, slice(n))
 
     @property
     def _n_robots(self) -> int:
@@ -208,15 +240,23 @@ class EkfSlam:
         P, own, motion = self._covariance, _own(robot), self._motions[robot]
         mean, by_pose, by_motion = compose(self._mean[own], motion.mean)
         noise = by_motion @ motion.covariance @ by_motion.T
+        self._mean[own], self._motions[robot] = mean, STILL
+        if self.invariant:
+            # a turn of the robot alone is one of the whole map, and of the landmarks back
+            by_noise = np.zeros((len(P), 3))
+            by_noise[:3] = np.eye(3)
+            by_noise[:2, 2] = -_quarter_turned(mean)[:2]
+            by_noise[3:, 2] = -_quarter_turned(self._landmarks).ravel()
+            P += by_noise @ ((noise + noise.T) / 2.0) @ by_noise.T
+            return
         moved = by_pose @ P[own, own] @ by_pose.T + (noise + noise.T) / 2.0
         P[own] = by_pose @ P[own]
         P[:, own] = P[own].T
         P[own, own] = moved
-        self._mean[own] = mean
-        self._motions[robot] = STILL
 
-    def _see(self, robot: int, image: Image) -> dict[str, Any]:
+    def _see(self, frame: Frame, image: Image) -> dict[str, Any]:
         """Take in one image; the extras that it gives."""
+        robot = frame.robot
         extras: dict[str, Any] = {"status": image.status} if image.status else {}
         if len(image.points) > _MOST_OBSERVATIONS:
             image = image.of(np.arange(len(image.points)) < _MOST_OBSERVATIONS)
@@ -226,12 +266,16 @@ class EkfSlam:
             if self.front_end.association == "known"
             else self._associate(robot, image.points, self.front_end.unlikeness(image))
         )
+        if self.front_end.gated and len(slots):
+            passed = self._passed(robot, image, slots)
+            image, slots = image.of(passed), slots[passed]
+        self.front_end.counted(image, frame)
         old = slots >= 0
         fits = old | (np.cumsum(~old) <= _MOST_LANDMARKS - self._n_landmarks)
         if not fits.all():
             image, slots, old = image.of(fits), slots[fits], old[fits]
             extras["status"] = f"map full: landmarks beyond {_MOST_LANDMARKS} rejected"
-        if old.any() and not self._update(robot, slots[old], image.points[old]):
+        if old.any() and not self._revisit(robot, slots[old], image.points[old]):
             extras["status"] = "update rejected: broken covariance, not positive definite"
         if not old.all():
             self._create(robot, image.points[~old])
@@ -251,11 +295,10 @@ class EkfSlam:
         )
         if len(candidates) == 0:
             return slots
-        _, *by = self._camera.predict(self._mean[_own(robot)], self._landmarks[candidates])
+        _, *by = self._predict(robot, self._landmarks[candidates])
         spread = self._predicted_spread(_own(robot), self._rows(candidates), *by)
-        distances = _distances(
-            spread, *self._camera.innovation(predicted[None, candidates], points[:, None])
-        )
+        v, R = self._camera.innovation(predicted[None, candidates], points[:, None])
+        distances = _distances(spread, v, R)
         scores = np.where(distances < self.front_end.d0, distances, np.inf)
         if unlikeness.shape[1] > 0:
             unlike = unlikeness[:, candidates]
@@ -267,71 +310,104 @@ class EkfSlam:
                 scores[:, best] = np.inf
         return slots
 
+    def _passed(self, robot: int, image: Image, slots: Ints) -> NDArray[np.bool_]:
+        """Which observations (K,) of landmarks in these slots, -1 for new ones, pass the gate."""
+        own, old = _own(robot), slots[slots >= 0]
+        predicted, *by = self._predict(robot, self._landmarks[old])
+        v, R = self._camera.innovation(predicted, image.points[slots >= 0])
+        distances = _distances(self._predicted_spread(own, self._rows(old), *by), v, R)
+        return self.front_end.passed(image, slots, distances, self._mean[own])
+
     def _rows(self, slots: Ints) -> Ints:
         """Rows (K, 3) of landmarks in the state."""
         return 3 * (self._n_robots + slots[:, None]) + np.arange(3)
 
-    def _predicted_spread(self, own: slice, at: Ints, of_pose: Array, of_landmark: Array) -> Array:
-        """H P H^T (n, 3, 3) of each of n observations apart; arguments as in `_correct`."""
+    def _predicted_spread(self, own: slice, at: Ints, of_pose: Array, of_other: Array) -> Array:
+        """H P H^T (n, 3, 3) of each of n observations apart; arguments as in `_update`."""
         P = self._covariance
         cross = P[own][:, at].transpose(1, 0, 2)
         theirs = P[at[:, :, None], at[:, None, :]]
-        turned = of_landmark.transpose(0, 2, 1)
+        turned = of_other.transpose(0, 2, 1)
         mixed = of_pose @ cross @ turned
         spread: Array = (
-            of_pose @ P[own, own] @ of_pose.transpose(0, 2, 1) + of_landmark @ theirs @ turned
+            of_pose @ P[own, own] @ of_pose.transpose(0, 2, 1) + of_other @ theirs @ turned
         )
         return spread + mixed + mixed.transpose(0, 2, 1)
 
-    def _update(self, robot: int, slots: Ints, points: Array) -> bool:
-        """Kalman update by points (K, 3) of landmarks in these slots, all at once.
+    def _revisit(self, robot: int, slots: Ints, points: Array) -> bool:
+        """Update by points (K, 3) of landmarks in these slots, as `_update` does."""
+        predicted, of_pose, of_landmark = self._predict(robot, self._landmarks[slots])
+        v, R = self._camera.innovation(predicted, points)
+        return self._update(_own(robot), self._rows(slots), of_pose, of_landmark, v, R)
+
+    def _update(
+        self, own: slice, at: Ints, of_pose: Array, of_other: Array, v: Array, R: Array
+    ) -> bool:
+        """Kalman update by K innovations v (K, 3) with noise R (K, 3, 3), all at once.
 
         Rejected, with False, if rounding has left the innovation without a proper covariance.
-        """
-        own = _own(robot)
-        predicted, of_pose, of_landmark = self._camera.predict(
-            self._mean[own], self._landmarks[slots]
-        )
-        v, R = self._camera.innovation(predicted, points)
-        return self._correct(own, self._rows(slots), of_pose, of_landmark, v, R)
-
-    def _correct(
-        self, own: slice, at: Ints, of_pose: Array, of_landmark: Array, v: Array, R: Array
-    ) -> bool:
-        """Kalman update by K innovations v (K, 3) with noise R (K, 3, 3).
 
         Parameters
         ----------
         own, at
             Rows of the observing robot's pose, and (K, 3) of what it observes.
-        of_pose, of_landmark
+        of_pose, of_other
             (K, 3, 3) derivatives of the predicted points by these.
         """
         P, K, n = self._covariance, len(at), 3 * len(at)
         rows = P[at].reshape(K, 3, -1)
-        HP = (of_pose @ P[own] + of_landmark @ rows).reshape(n, -1)  # H has two blocks a row
+        HP = (of_pose @ P[own] + of_other @ rows).reshape(n, -1)  # H has two blocks a row
         along = HP[:, at].reshape(n, K, 3).transpose(1, 0, 2)
         S = HP[:, own] @ of_pose.reshape(n, 3).T
-        S += (along @ of_landmark.transpose(0, 2, 1)).transpose(1, 0, 2).reshape(n, n)
+        S += (along @ of_other.transpose(0, 2, 1)).transpose(1, 0, 2).reshape(n, n)
         for k in range(K):
             S[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += R[k]
         try:
             factor = cho_factor((S + S.T) / 2.0, lower=True)
         except np.linalg.LinAlgError:
             return False
-        self._mean += HP.T @ cho_solve(factor, v.ravel())
-        for row in range(2, 3 * self._n_robots, 3):
-            self._mean[row] = wrap(float(self._mean[row]))
+        self._correct(HP.T @ cho_solve(factor, v.ravel()))
         half = solve_triangular(factor[0], HP, lower=True)
         P -= half.T @ half  # symmetric to the last bit
         return True
+
+    def _correct(self, by: Array) -> None:
+        """Correct the mean by an error (n,): added, or a motion of the whole map."""
+        if self.invariant:
+            turn = float(by[2])
+            R, V = _exponential(turn)
+            blocks = self._mean.reshape(-1, 3)  # pose and landmarks
+            blocks[:, :2] = blocks[:, :2] @ R.T + by.reshape(-1, 3)[:, :2] @ V.T
+            self._mean[5::3] += by[5::3]
+            self._mean[2] += turn
+        else:
+            self._mean += by
+        for row in range(2, 3 * self._n_robots, 3):
+            self._mean[row] = wrap(float(self._mean[row]))
+
+    def _predict(self, robot: int, landmarks: Array) -> tuple[Array, Array, Array]:
+        """Predicted points of landmarks (K, 3) and their derivatives by the errors."""
+        predicted, of_pose, of_landmark = self._camera.predict(self._mean[_own(robot)], landmarks)
+        if self.invariant:
+            of_pose = of_pose * [1.0, 1.0, 0.0]
+        return predicted, of_pose, of_landmark
+
+    def _pose_covariance(self, robot: int) -> Array:
+        """Covariance (3, 3) of the coordinates of a robot's pose."""
+        P = self._covariance[_own(robot), _own(robot)]
+        if not self.invariant:
+            return P
+        by_error = np.eye(3)
+        by_error[:2, 2] = _quarter_turned(self._mean[:3])[:2]
+        covariance: Array = by_error @ P @ by_error.T
+        return covariance
 
     def _create(self, robot: int, points: Array) -> None:
         """Append landmarks at points (K, 3), gil2008, eqs. (16)-(18), with their correlations."""
         own, before, n = _own(robot), len(self._mean), 3 * len(points)
         pose = self._mean[own]
         placed = self._camera.place(np.tile(pose, (len(points), 1)), points)
-        predicted, of_pose, of_landmark = self._camera.predict(pose, placed)
+        predicted, of_pose, of_landmark = self._predict(robot, placed)
         # p = C (l - t(pose)) and so l = t(pose) + C^T p
         C_T = of_landmark.transpose(0, 2, 1)
         by_pose = -(C_T @ of_pose).reshape(n, 3)
@@ -369,7 +445,7 @@ class EkfSlam:
         rows, columns = _matches(distances, self.sighting_d0)
         if len(rows):
             v, R = sightings.camera.innovation(predicted[columns], points[rows])
-            self._correct(own, at[columns], of_pose[columns], of_other[columns], v, R)
+            self._update(own, at[columns], of_pose[columns], of_other[columns], v, R)
 
     def _place(self, frame: Frame, image: Image | None, frames: Sequence[Frame]) -> None:
         """Give a robot of unknown start its place, if this instant shows it."""
@@ -430,3 +506,16 @@ def _matches(distances: Array, d0: float) -> tuple[Ints, Ints]:
         columns.append(column)
         left[row], left[:, column] = np.inf, np.inf
     return np.array(rows, np.int64), np.array(columns, np.int64)
+
+
+def _quarter_turned(points: Array) -> Array:
+    """Points (..., 3) turned by a quarter about the map's origin, level: d(R(a) x) / da at 0."""
+    x, y = points[..., 0], points[..., 1]
+    return np.stack([-y, x, np.zeros_like(x)], axis=-1)
+
+
+def _exponential(turn_rad: float) -> tuple[Array, Array]:
+    """R and V (2, 2) of exp: positions become R x + V e."""
+    cos, sin = math.cos(turn_rad), math.sin(turn_rad)
+    along, across = np.sinc(turn_rad / math.pi), (1.0 - cos) / turn_rad if turn_rad else 0.0
+    return np.array([[cos, -sin], [sin, cos]]), np.array([[along, -across], [across, along]])

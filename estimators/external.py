@@ -11,8 +11,16 @@ import numpy as np
 import orjson
 
 from estimators.base import Belief, Estimate, Prior
-from estimators.program import Program, ProgramError, map_message, require_limits, words_of
+from estimators.program import (
+    Program,
+    ProgramError,
+    map_message,
+    require_limits,
+    span_text,
+    words_of,
+)
 from sim.arrays import Array
+from sim.formats.trajectory import FARTHEST_M
 from sim.recording import Frame
 from sim.sensors.base import sensor_settings
 
@@ -82,7 +90,12 @@ class External:
                 covariances = self._numbers(answer, "covariances", (n, 3, 3))
             means = self._numbers(answer, "means", (len(stamps), 3))
             if not len(stamps) or (np.diff(stamps) <= 0.0).any():
-                raise self._wrong("stamps must increase, and there must be some")
+                raise self._wrong("must answer with stamps that increase, and some")
+            if stamps[-1] < self._stamps[0] or stamps[0] > self._stamps[-1]:
+                raise self._wrong(
+                    f"must answer with stamps of the Frames, {span_text(self._stamps)}; got "
+                    f"{span_text(stamps)}"
+                )
             found = Estimate(stamps, means, covariances, "revised")
         assert self._program is not None
         self.program_seconds = self._program.close()
@@ -119,7 +132,10 @@ class External:
             raise self._wrong(
                 f"must answer with {key}, {sizes} numbers; got {answer.get(key)!r:.60}"
             )
-        return found.astype(np.float64)
+        numbers = found.astype(np.float64)
+        if np.abs(numbers).max(initial=0.0) > FARTHEST_M:
+            raise self._wrong(f"must answer with {key}, numbers up to {FARTHEST_M:g}")
+        return numbers
 
     def _wrong(self, what: str) -> ProgramError:
         assert self._program is not None

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from estimators import landmarks as ekf
 from estimators.base import Belief, Estimate, Prior
@@ -78,11 +79,19 @@ class FastSLAM:
         As in `estimators.stereo.StereoModel.of`.
     sigma_column_px, sigma_row_px, sigma_disparity_px, sigma_descriptor
         Believed noise; None for that of the prior's camera.
+    gate_probability, repeat_s
+        Of known ids, as in `estimators.slam_frontend.SlamFrontEnd`: misread ones are left out, and
+        a landmark counts once in `repeat_s`.
     maps
         `shared` or `contiguous`, see `estimators.landmarks.LandmarkMaps`: the same bits, at
         different speeds.
     kr, kl
         Believed slip variance per metre of the wheels, m.
+    forward_slip_m
+        Believed variance per metre of what both wheels slip together, m.
+    slip_dof
+        Degrees of freedom of the slip, which is then Student's t: wheels that slip in bursts leave
+        a normal cloud behind. Each particle draws its own scale at each image. None: normal.
     window_s
         |ds| is netted over at least this time.
     keep_map
@@ -124,9 +133,13 @@ class FastSLAM:
         sigma_row_px: float | None = None,
         sigma_disparity_px: float | None = None,
         sigma_descriptor: float | None = None,
+        gate_probability: float | None = None,
+        repeat_s: float = 0.0,
         maps: Maps = "shared",
         kr: float = 5e-5,
         kl: float = 5e-5,
+        forward_slip_m: float = 0.0,
+        slip_dof: float | None = None,
         window_s: float = 0.05,
         keep_map: bool = False,
         stereo: str = "stereo",
@@ -140,8 +153,10 @@ class FastSLAM:
         )
         require_non_negative(ess_share=ess_share)
         require_positive(p0=p0, sighting_d0=sighting_d0)
+        if slip_dof is not None:
+            require_positive(slip_dof=slip_dof)
         self._noise = noise_model, noise_at
-        self.wheels = WheelPrediction(kr, kl, window_s)
+        self.wheels = WheelPrediction(kr, kl, window_s, forward_slip_m=forward_slip_m)
         self.front_end = SlamFrontEnd(
             "fastslam",
             stereo,
@@ -149,12 +164,15 @@ class FastSLAM:
             d0,
             noise_model,
             noise_at,
+            gate_probability,
+            repeat_s,
             sigma_column_px=sigma_column_px,
             sigma_row_px=sigma_row_px,
             sigma_disparity_px=sigma_disparity_px,
             sigma_descriptor=sigma_descriptor,
         )
         self.n_particles, self.proposal, self.resampling = n_particles, proposal, resampling
+        self.slip_dof = slip_dof
         self.ess_share, self.p0, self.maps, self.keep_map = ess_share, p0, maps, keep_map
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
@@ -175,12 +193,12 @@ class FastSLAM:
         self._rng = rng
         n = self.n_particles
         self._maps = LandmarkMaps(n, self.maps, births=self.front_end.association != "known")
-        mount = self.front_end.camera.mount
+        mount, n_blocks = self.front_end.camera.mount, self._maps.n_blocks
         self._paths = []
         for start, wheels in zip(starts, dead_reckoning(self.wheels, priors), strict=True):
             if start is None:
                 raise InputError("fastslam needs the starts of all robots; ekf_slam does not")
-            self._paths.append(_Path(wheels, start, mount, n, self._maps.n_blocks, rng))
+            self._paths.append(_Path(wheels, self.slip_dof, start, mount, n, n_blocks, rng))
         self._log_weights, self._accumulated = np.zeros(n), np.zeros(n)
         for path in self._paths:
             path.settle()
@@ -197,9 +215,9 @@ class FastSLAM:
         for frame in frames:
             self._paths[frame.robot].roll(frame)
         for frame, found in zip(frames, extras, strict=True):
-            path, seen = self._paths[frame.robot], frame.readings.get(self.stereo)
-            if seen is not None:
-                self._see(path, self.front_end.read(seen), found)
+            path = self._paths[frame.robot]
+            if self.stereo in frame.readings:
+                self._see(path, frame, found)
                 informed |= bool(np.any(found["associations"] >= 0))
             elif path.rolled.covariance[2, 2] > _MOST_DRIFT_RAD**2:
                 path.draw(self._rng)
@@ -208,14 +226,14 @@ class FastSLAM:
             for frame in frames:
                 informed |= self._sight(self._sightings, frame, frames)
         poor = self.ess_share >= 1.0 or self._ess < self.ess_share * self.n_particles
-        beliefs = [self._told(*each) for each in zip(frames, extras, strict=True)]
+        beliefs = [self._belief(*each) for each in zip(frames, extras, strict=True)]
         if poor and informed:
             self._resample()
             for belief in beliefs:
                 belief.extras["resampled"] = True
         return beliefs
 
-    def _told(self, frame: Frame, extras: dict[str, Any]) -> Belief:
+    def _belief(self, frame: Frame, extras: dict[str, Any]) -> Belief:
         """Belief of a Frame's robot; the Frame is noted for `finish`."""
         path = self._paths[frame.robot]
         belief = path.belief.then(path.rolled)
@@ -230,8 +248,9 @@ class FastSLAM:
         path.note(frame.stamp)
         return Belief(belief.mean, belief.covariance, extras)
 
-    def _see(self, path: _Path, image: Image, extras: dict[str, Any]) -> None:
+    def _see(self, path: _Path, frame: Frame, extras: dict[str, Any]) -> None:
         """Take in one image of a robot."""
+        image = self.front_end.read(frame)
         if image.status:
             extras["status"] = image.status
         points, normals = image.points, path.normals(self._rng)
@@ -239,7 +258,11 @@ class FastSLAM:
         known = self.front_end.association == "known"
         if known:
             slots = self.front_end.known(image)
+            if self.front_end.gated and len(slots):
+                passed = self._passed(path, image, slots)
+                image, slots, points = image.of(passed), slots[passed], points[passed]
             self._maps.touch(slots[slots >= 0])
+        self.front_end.counted(image, frame)
         by_motion = self.proposal == "motion" or len(points) == 0
         poses = path.moved(normals if by_motion else np.zeros_like(normals))
         if not known:
@@ -281,14 +304,15 @@ class FastSLAM:
             return False
         others = {f.robot for f in frames} - {frame.robot}
         camera, path = sightings.camera.packed, self._paths[frame.robot]
-        state, used = ekf.new_state(self._maps.n_blocks), False
+        mount, state = _packed(sightings.camera.mount), ekf.new_state(self._maps.n_blocks)
+        used = False
         for point, number in zip(points, numbers.tolist(), strict=True):
             if number not in others:
                 continue
             for each in (path, self._paths[number]):
                 if each.rolled is not STILL:
                     each.draw(self._rng)
-            path.moved(np.zeros((3, path.poses.shape[1])), sightings.camera.mount, state)
+            path.moved(np.zeros((3, path.poses.shape[1])), mount, state)
             marker = ekf.known_landmark(self._paths[number].poses, sightings.marker_z_m)
             ekf.update(marker, np.zeros(1, np.int64), point[None], state, camera)
             if ekf.distances(state, self.n_particles).min() < self.sighting_d0:
@@ -358,6 +382,19 @@ class FastSLAM:
         )
         return slots
 
+    def _passed(self, path: _Path, image: Image, slots: Ints) -> NDArray[np.bool_]:
+        """Which observations (K,) of landmarks in these slots pass the best particle's gate."""
+        camera, old = self.front_end.camera, slots >= 0
+        moved = Gaussian(path.drawn[self._best], np.zeros((3, 3))).then(path.rolled)
+        means, covariances, _ = self._maps.of_particle(self._best)
+        predicted, of_pose, of_landmark = camera.predict(moved.mean, means[slots[old]])
+        v, R = camera.innovation(predicted, image.points[old])
+        turned = of_landmark.transpose(0, 2, 1)
+        S = of_pose @ moved.covariance @ of_pose.transpose(0, 2, 1) + R
+        S += of_landmark @ covariances[slots[old]] @ turned
+        distances = np.sum(v * np.linalg.solve(S, v[..., None])[..., 0], axis=-1)
+        return self.front_end.passed(image, slots, distances, moved.mean)
+
     def _seen_spread(self, path: _Path) -> Array:
         """Covariance of the motion not yet drawn, in axes of the camera after it."""
         angle = -float(path.rolled.mean[2] + self.front_end.camera.mount[2])
@@ -376,10 +413,12 @@ class FastSLAM:
         start, owed = np.zeros_like(normals), np.empty((2, normals.shape[1]))
         if len(rows):
             inform(maps, rows[:_PLACING], points[:_PLACING], state, camera)
-            ekf.propose(path.poses, path.root, state, np.zeros_like(normals), start, owed)
+            ekf.propose(
+                path.poses, path.root, path.stretch, state, np.zeros_like(normals), start, owed
+            )
             path.moved(start)
         inform(maps, rows, points, state, camera)
-        ekf.propose(path.poses, path.root, state, start, normals, owed)
+        ekf.propose(path.poses, path.root, path.stretch, state, start, normals, owed)
         log_owed: Array = 0.5 * owed[0] - np.log(owed[1])
         return log_owed[: self.n_particles]
 
@@ -449,7 +488,9 @@ class _Path:
     drawn
         (M, 3) the same, as of the last draw.
     rolled, root
-        Motion not yet drawn, and the root (3, 2) of its covariance.
+        Motion not yet drawn, and the root (3, K) of its covariance.
+    stretch
+        (lanes,) by which slip of Student's t is wider than normal slip.
     state
         Of `estimators.landmarks`, for the robot's camera.
     belief
@@ -459,13 +500,15 @@ class _Path:
     def __init__(
         self,
         wheels: WheelPrediction,
+        slip_dof: float | None,
         start: Gaussian,
         mount: Array,
         n_particles: int,
         n_blocks: int,
         rng: np.random.Generator,
     ) -> None:
-        self._wheels, self._mount, self._n = wheels, mount, n_particles
+        self._wheels, self._slip_dof, self._n = wheels, slip_dof, n_particles
+        self._mount = _packed(mount)
         self.state = ekf.new_state(n_blocks)
         turned = rotated(start.covariance, -float(start.mean[2]))
         normals = rng.standard_normal((3, n_blocks * ekf.LANES))
@@ -475,6 +518,7 @@ class _Path:
         self.poses = np.stack([*drawn.T, np.cos(headings), np.sin(headings)])
         self._lineages = Lineages(n_particles)
         self.rolled, self.root, self.belief = STILL, np.zeros((3, 2)), start
+        self.stretch = np.ones(self.poses.shape[1])
         # of each Frame: its stamp, the draw it follows, and the motion since
         self._frames: list[tuple[float, int, Array]] = []
 
@@ -482,7 +526,7 @@ class _Path:
         """Add the Frame's arc to the motion that is not yet drawn."""
         motion, root_ = self._wheels.predict_with_root(frame)
         if self.rolled is STILL:
-            self.rolled, self.root = motion, root_
+            self.rolled, self.root = motion, root_ if root_.shape[1] < 3 else np.zeros((3, 0))
         else:
             self.rolled, self.root = self.rolled.then(motion), np.zeros((3, 0))
 
@@ -493,6 +537,9 @@ class _Path:
         rolled[:, :rank] = self.root if rank < 3 else root((covariance + covariance.T) / 2.0)
         normals = np.zeros((3, self.poses.shape[1]))
         rng.standard_normal(out=normals[:rank])
+        if self._slip_dof is not None:  # Student's t: a normal over the root of its own chi-square
+            squares = rng.chisquare(self._slip_dof, len(self.stretch)) / self._slip_dof
+            self.stretch = 1.0 / np.sqrt(squares)
         self.root = rolled
         return normals
 
@@ -500,10 +547,10 @@ class _Path:
         self, normals: Array, mount: Array | None = None, state: Array | None = None
     ) -> Array:
         """Poses (5, lanes) after the motion; writes the state of a camera, by default the own."""
-        x, y, yaw = self._mount if mount is None else mount
-        camera = np.array([x, y, math.cos(yaw), math.sin(yaw)])
+        mount = self._mount if mount is None else mount
         state = self.state if state is None else state
-        return ekf.move(self.poses, self.rolled.mean, self.root, normals, camera, state)
+        noise = self.stretch * normals
+        return ekf.move(self.poses, self.rolled.mean, self.root, noise, mount, state)
 
     def draw(self, rng: np.random.Generator) -> None:
         """Draw the motion by the wheels alone."""
@@ -545,3 +592,9 @@ class _Path:
             kind="revised",
             map=made,
         )
+
+
+def _packed(mount: Array) -> Array:
+    """(4,) x, y, and cosine and sine of the yaw of a mount (3,)."""
+    x, y, yaw = mount
+    return np.array([x, y, math.cos(yaw), math.sin(yaw)])

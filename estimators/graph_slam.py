@@ -77,6 +77,9 @@ class GraphSlam:
     ----------
     metric, covariance, sigma_range_m
         As in `estimators.scan_matching.ScanMatcher`.
+    most_gap_m
+        Leave out a line of which no three points in a row lie this near each other: door posts
+        far behind one another are no wall. None to keep all lines.
     keyframe_distance_m, keyframe_turn_rad
         How far the robot goes before it takes a new key frame.
     kr, kl
@@ -120,6 +123,7 @@ class GraphSlam:
         metric: Metric = "point_to_line",
         covariance: Covariance = "censi",
         sigma_range_m: float | None = None,
+        most_gap_m: float | None = 1.5,
         keyframe_distance_m: float = 0.5,
         keyframe_turn_rad: float = 0.35,
         kr: float = 1e-4,
@@ -139,7 +143,8 @@ class GraphSlam:
         laser: str = "laser",
     ) -> None:
         self.laser = laser
-        self._matcher = ScanMatcher(metric, covariance, sigma_range_m)
+        most_m = math.inf if most_gap_m is None else most_gap_m
+        self._matcher = ScanMatcher(metric, covariance, sigma_range_m, most_gap_m=most_m)
         self.wheels = WheelPrediction(
             kr, kl, window_s, lateral_slip_m=lateral_slip_m, encoder_tick_m=encoder_tick_m
         )
@@ -150,6 +155,8 @@ class GraphSlam:
             revisions=revisions,
         )
         require_positive(loop_reach_m=loop_reach_m, robust_sigma=robust_sigma)
+        if most_gap_m is not None:
+            require_positive(most_gap_m=most_gap_m)
         require_shares(shared_noise=shared_noise, loop_gate_probability=loop_gate_probability)
         require(
             shared_noise < 1.0 and loop_gate_probability > 0.0,

@@ -34,9 +34,6 @@ _NO_GAIN = 1e-4  # fall of the cost, in squared standard deviations, that is wor
 _GRAZING = 0.001  # squared sine below which a beam along a wall is not trusted further
 # Tuning constants, in standard deviations; without a kernel every match within the gate counts
 _WIDTHS = {"tukey": 6.0, "huber": 1.345, "none": math.inf}
-# Points of a plane, with its own. With 10 and more, corners bend the planes, and registrations of
-# successive scans (721 beams, 1 cm, tuning seeds) jump by decimetres now and then.
-_NEIGHBOURS = 6
 _LEAST_MEMBERS = 3  # points on a line before it holds a direction
 _AGREEMENT = 6.0  # range standard deviations from a line of the other scan
 LEAST_POINTS = 3  # of a scan that can be registered
@@ -61,16 +58,23 @@ class Rules:
     stop_error_m
         Root mean square of the distances at which the pose is good enough (decristoforis2020, sec.
         II-C); 0: iterations end when the pose rests.
+    neighbours
+        Points of a plane, with its own (point to plane only); the paper gives no number. With 10
+        and more, corners bend the planes, and registrations of successive scans (721 beams, 1 cm,
+        tuning seeds) jump by decimetres now and then.
     """
 
     trim: float = 0.0
     kernel: Kernel = "tukey"
     max_iterations: int = 100
     stop_error_m: float = 0.0
+    neighbours: int = 6
 
     def __post_init__(self) -> None:
         require_choices(kernel=(self.kernel, Kernel))
         require_counts(max_iterations=self.max_iterations)
+        require_counts(100, neighbours=self.neighbours)
+        require(self.neighbours > 1, f"estimator.neighbours must be above 1, got {self.neighbours}")
         require_non_negative(trim=self.trim, stop_error_m=self.stop_error_m)
         require(self.trim < 1.0, f"estimator.trim must be below 1, got {self.trim}")
 
@@ -721,7 +725,7 @@ def register(
     Point to line minimises sum w (n.(R p + t) - d)^2 over the lines of the target (Chen and
     Medioni); w is one over the variance that the range noise has along the normal, so beams
     that graze a wall, which feel its distance most finely, count most. Point to plane minimises
-    the same over the planes of the nearest points, each that of six nearest neighbours,
+    the same over the planes of the nearest points, each that of its nearest neighbours,
     with one variance for all (decristoforis2020, sec. II-C). Point to point minimises
     sum w |R p + t - q|^2 over the nearest points (Besl and McKay). The last two have the same
     points, stages and end of iterations.
@@ -784,7 +788,7 @@ def register(
     surface = target.segments if whole_lines else _as_segments(target)
     planes = surface
     if metric == "point_to_plane":
-        normals, offsets = _planes(target.points, _NEIGHBOURS)
+        normals, offsets = _planes(target.points, rules.neighbours)
         planes = surface._replace(normals=normals, distances_m=offsets)
     pair = _Pair(
         source, target, whole_lines, metric != "point_to_point", surface, planes,

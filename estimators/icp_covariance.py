@@ -151,6 +151,7 @@ def censi(
     *,
     scans: Scans = "both",
     matches: Matches = "held",
+    everywhere: bool = False,
 ) -> Array:
     """Closed-form covariance (3, 3): A^-1 B R B^T A^-1 with A = d2J/dx2, B = d2J/dz dx.
 
@@ -166,6 +167,9 @@ def censi(
         has no lever about the sensor, so the heading looks known far too well, and sliding
         along a wall looks resisted. `sliding`: matches change as the pose does, so that only
         the part of each residual along the normal of the target's wall counts.
+    everywhere
+        The formula as it stands in all directions, also in those that the scans do not hold: there
+        it takes for information what the noise of the normals makes up.
     """
     if registration.status in ("empty", "poor_overlap"):
         return _unknown()
@@ -182,7 +186,7 @@ def censi(
     if scans == "both":
         noise = target.noise_m if sigma_range_m is None else sigma_range_m
         middle += noise**2 * by_target
-    return _sandwich(A, middle, registration)
+    return _sandwich(A, middle, registration, everywhere=everywhere)
 
 
 def hessian(registration: Registration) -> Array:
@@ -287,9 +291,11 @@ def split_directions(registration: Registration) -> tuple[Array, Array]:
     return unit[:, None] * directions[:, ~loose], unit[:, None] * directions[:, loose]
 
 
-def _sandwich(A: Array, middle: Array, registration: Registration) -> Array:
-    """A^-1 middle A^-1 within the directions that the scans hold; the rest is unknown."""
-    if registration.status == "degenerate":
+def _sandwich(
+    A: Array, middle: Array, registration: Registration, *, everywhere: bool = False
+) -> Array:
+    """A^-1 middle A^-1 within the directions that the scans hold; the rest, else, is unknown."""
+    if registration.status == "degenerate" and not everywhere:
         held, loose = split_directions(registration)
         gain = held @ np.linalg.solve(held.T @ A @ held, held.T)
         covariance: Array = gain @ middle @ gain.T + loose @ loose.T

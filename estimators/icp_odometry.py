@@ -46,7 +46,7 @@ class IcpOdometry:
     ----------
     metric, covariance, sigma_range_m
         As in `estimators.scan_matching.ScanMatcher`.
-    trim, kernel, max_iterations, stop_error_m
+    trim, kernel, max_iterations, stop_error_m, neighbours
         As in `estimators.icp.Rules`.
     reference
         What a scan is registered against: the `previous` scan (decristoforis2020, eq. (5)), or a
@@ -92,9 +92,10 @@ class IcpOdometry:
         kernel: Kernel = "tukey",
         max_iterations: int = 100,
         stop_error_m: float = 0.0,
+        neighbours: int = 6,
     ) -> None:
         self.laser = laser
-        rules = Rules(trim, kernel, max_iterations, stop_error_m)
+        rules = Rules(trim, kernel, max_iterations, stop_error_m, neighbours)
         self._matcher = ScanMatcher(metric, covariance, sigma_range_m, rules)
         self.wheels = WheelPrediction(kr, kl, window_s)
         require_choices(reference=(reference, Reference))

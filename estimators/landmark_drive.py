@@ -108,16 +108,16 @@ class LandmarkDrive:
             robust_sigma=robust_sigma,
             max_iterations=max_iterations,
         )
-        return self._estimate(rows, solution, solution.poses, solution.covariance, ids)
+        return self._estimate(solution, solution.poses, solution.covariance, ids)
 
     def _estimate(
-        self, rows: list[int], solution: Solution, poses: Array, covariance: Array, ids: Ints
+        self, solution: Solution, poses: Array, joint_covariance: Array, ids: Ints
     ) -> Estimate:
-        """Estimate of solved poses (P, 3) of this drive, and their covariance (3 P, 3 P)."""
-        means, covariances = self._filled_in(rows, poses, covariance)
+        """Estimate of this drive's solved poses; arguments as in `filled_in`."""
+        means, covariances = self.filled_in(poses, joint_covariance)
         status = "ok" if solution.converged else "not_converged"
         return Estimate(
-            stamps=np.array(self._stamps),
+            stamps=self.stamps,
             means=means,
             covariances=covariances,
             kind="revised",
@@ -167,19 +167,33 @@ class LandmarkDrive:
         )
         return problem, ids
 
-    def _filled_in(self, rows: list[int], poses: Array, covariance: Array) -> tuple[Array, Array]:
-        """Means (T, 3) and covariances (T, 3, 3) of every Frame, between the solved ones too."""
+    def filled_in(self, poses: Array, joint_covariance: Array) -> tuple[Array, Array]:
+        """Means (T, 3) and covariances (T, 3, 3) of every Frame, between the solved ones too.
+
+        Parameters
+        ----------
+        poses
+            (N, 3) of the problem, solved.
+        joint_covariance
+            (3 N, 3 N); only that of neighbours is read.
+        """
+        rows = self._rows()
         n, n_poses = len(self._stamps), len(rows)
         means, covariances = np.empty((n, 3)), np.empty((n, 3, 3))
         means[rows], each = poses, range(n_poses)
-        covariances[rows] = covariance.reshape(n_poses, 3, n_poses, 3)[each, :, each]
+        covariances[rows] = joint_covariance.reshape(n_poses, 3, n_poses, 3)[each, :, each]
         for pose, (a, b) in enumerate(itertools.pairwise(rows)):
             block = slice(3 * pose, 3 * pose + 6)
-            joint, ends = covariance[block, block], poses[pose : pose + 2]
+            joint, ends = joint_covariance[block, block], poses[pose : pose + 2]
             between = _between(self._motions[a + 1 : b + 1], ends, joint)
             for row, belief in enumerate(between, start=a + 1):
                 means[row], covariances[row] = belief.mean, belief.covariance
         return means, covariances
+
+    @property
+    def stamps(self) -> Array:
+        """(T,) s of all Frames so far."""
+        return np.array(self._stamps)
 
 
 def revised_team(
@@ -244,10 +258,9 @@ def revised_team(
         max_iterations=max_iterations,
     )
     estimates = []
-    for drive, each, low in zip(drives, rows, begins, strict=True):
-        high = low + len(each)
+    for drive, low, high in zip(drives, begins, ends[1:], strict=True):
         covariance = solution.covariance[3 * low : 3 * high, 3 * low : 3 * high]
-        estimates.append(drive._estimate(each, solution, solution.poses[low:high], covariance, ids))
+        estimates.append(drive._estimate(solution, solution.poses[low:high], covariance, ids))
     return estimates
 
 

@@ -456,21 +456,28 @@ def moments(poses: Array, weights: Array) -> tuple[Array, Array]:
 
 
 @njit(forceinline=True, **_FLOATS)
-def _column(root: Array, k: int, cos: float, sin: float) -> _Vector:
+def _column(root: Array, k: int, cos: float, sin: float, stretch: float) -> _Vector:
     """Column k of B, in `propose`."""
-    x, y = root[0, k], root[1, k]
-    return cos * x - sin * y, sin * x + cos * y, root[2, k]
+    x, y, turn = stretch * root[0, k], stretch * root[1, k], stretch * root[2, k]
+    return cos * x - sin * y, sin * x + cos * y, turn
 
 
 @njit(**_FLOATS)
 def propose(
-    poses: Array, root: Array, state: Array, start: Array, normals: Array, owed: Array
+    poses: Array,
+    root: Array,
+    stretch: Array,
+    state: Array,
+    start: Array,
+    normals: Array,
+    owed: Array,
 ) -> None:
     """Turn standard normal draws (3, lanes) into draws of the motion's noise given the image.
 
-    With the motion's noise `root` x, x ~ N(0, 1), and the state's information I and i on the pose,
-    taken at x0 = `start` (3, lanes), x given the image is N(m, P): P^-1 = 1 + B^T I B,
-    m = P (B^T i + B^T I B x0), B = dpose/dx. A draw's importance weight, p(x) / q(x), is
+    With the motion's noise `stretch` `root` x, a stretch (lanes,) each, x ~ N(0, 1), and the
+    state's information I and i on the pose, taken at x0 = `start` (3, lanes), x given the image is
+    N(m, P): P^-1 = 1 + B^T I B, m = P (B^T i + B^T I B x0), B = dpose/dx. A draw's importance
+    weight, p(x) / q(x), is
     exp(owed[0] / 2) / owed[1], `owed` (2, lanes).
     """
     for block in range(len(state)):
@@ -478,8 +485,9 @@ def propose(
         for j in range(LANES):
             lane = first + j
             cos, sin = poses[3, lane], poses[4, lane]
-            b0, b1 = _column(root, 0, cos, sin), _column(root, 1, cos, sin)
-            b2 = _column(root, 2, cos, sin)
+            wide = stretch[lane]
+            b0, b1 = _column(root, 0, cos, sin, wide), _column(root, 1, cos, sin, wide)
+            b2 = _column(root, 2, cos, sin, wide)
             info = S[_IXX + j], S[_IXY + j], S[_IXT + j], S[_IYY + j], S[_IYT + j], S[_ITT + j]
             i0, i1, i2 = _times(info, b0), _times(info, b1), _times(info, b2)
             f, g, h = start[0, lane], start[1, lane], start[2, lane]

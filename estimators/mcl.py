@@ -1,18 +1,25 @@
 """Monte Carlo localization in a known map by a laser (the starting point of maximo2024, sec. 2.1).
 
 Particles roll by the wheels, are weighted by a likelihood field, and are resampled. Their number
-follows the spread of the belief (KLD sampling). When scans fit worse than their long-term average,
-particles are injected over all the floor (augmented MCL), drawn by the scan (sensor resetting).
+follows the spread of the belief (KLD sampling).
+
+The filter may be lost, and two ways back are offered. `average`: when scans fit worse than their
+long-term average, particles are injected over all the floor (augmented MCL), drawn by the scan
+(sensor resetting). `rivals`: a set of particles drawn by a scan over all the floor, and as many
+drawn from the belief, follow the same wheels and scans for a while; if the best path of the rivals
+explains them better than the best of the defenders by a margin, the rivals become the belief.
+People before the laser and what the map lacks count against both alike, which an average over time
+mistakes for being lost.
 """
 
 import math
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from estimators.base import Belief, Prior
 from estimators.gaussian import STILL, Gaussian, root
-from estimators.likelihood_field import beam_ends, likelihood_field
+from estimators.likelihood_field import LikelihoodField, beam_ends, likelihood_field
 from estimators.options import (
     require_choices,
     require_counts,
@@ -36,6 +43,9 @@ from sim.grid import OccupancyGrid
 from sim.recording import Frame
 from sim.world import World
 
+Recovery = Literal["none", "average", "rivals"]
+
+_OFF_WALLS = 2.0  # what a beam of a contest loses, in log likelihood, by ending off the walls
 _BISECTIONS = 12
 _MOST_PARTICLES, _MOST_TRIES = 10_000_000, 100_000_000  # 0.2 and 2 GB of poses
 _MOST_BINS = 250_000_000  # 2 GB
@@ -72,10 +82,19 @@ class Mcl:
         Scheme, and share of the particles that the effective sample size must fall below.
     jitter_m, jitter_rad
         Spread added to each particle drawn, so that copies differ.
+    recovery
+        `none`, `average` or `rivals`, as above.
     alpha_slow, alpha_fast
-        Rates of the long and the short average of a beam's likelihood; 0 for no recovery.
+        Of `average`: rates of the long and the short average of a beam's likelihood; 0 for no
+        recovery.
     recovery_ratio
-        Particles are injected when the short average falls below this share of the long one.
+        Of `average`: particles are injected when the short average falls below this share of the
+        long one.
+    n_rivals, rival_scans
+        Of `rivals`: their number, and the scans after which they are judged.
+    rival_margin
+        Of `rivals`: how much greater the mean log likelihood of a beam must be along their best
+        path.
     kr, kl
         Believed slip variance per metre of the wheels, m; `amcl_alphas` converts them for AMCL.
     window_s
@@ -95,7 +114,7 @@ class Mcl:
     covariance is that of all particles about it, so it shows whether there are others. Extras, of
     the last scan used: `particles` (M, 3), `log_weights` (M,), `ess`, `hypothesis_weight`,
     `fit`, the likelihood of a beam at the best particle, and `injected`, the number of particles
-    injected; `status` when a scan saw nothing.
+    injected, those of rivals that became the belief included; `status` when a scan saw nothing.
     """
 
     needs = frozenset({"laser", "map"})
@@ -124,9 +143,13 @@ class Mcl:
         ess_share: float = 0.5,
         jitter_m: float = 0.01,
         jitter_rad: float = 0.005,
+        recovery: Recovery = "average",
         alpha_slow: float = 0.01,
         alpha_fast: float = 0.2,
         recovery_ratio: float = 0.9,
+        n_rivals: int = 2000,
+        rival_scans: int = 15,
+        rival_margin: float = 0.2,
         kr: float = 1e-4,
         kl: float = 1e-4,
         window_s: float = 0.05,
@@ -134,14 +157,20 @@ class Mcl:
     ) -> None:
         self.laser = laser
         self.wheels = WheelPrediction(kr, kl, window_s)
-        require_counts(n_least=n_least, n_beams=n_beams, tries=tries)
+        require_counts(
+            n_least=n_least,
+            n_beams=n_beams,
+            tries=tries,
+            n_rivals=n_rivals,
+            rival_scans=rival_scans,
+        )
         require_counts(_MOST_PARTICLES, n_most=n_most)
         require(
-            n_most * tries <= _MOST_TRIES,
-            f"estimator.n_most={n_most} and tries={tries} draw {n_most * tries} poses at once; "
-            f"at most {_MOST_TRIES} are drawn",
+            max(n_most, n_rivals) * tries <= _MOST_TRIES,
+            f"estimator.n_most={n_most}, n_rivals={n_rivals} and tries={tries} draw "
+            f"{max(n_most, n_rivals) * tries} poses at once; at most {_MOST_TRIES} are drawn",
         )
-        require_choices(resampling=(resampling, Scheme))
+        require_choices(resampling=(resampling, Scheme), recovery=(recovery, Recovery))
         require_positive(
             kld_error=kld_error,
             bin_m=bin_m,
@@ -163,6 +192,7 @@ class Mcl:
             alpha_slow=alpha_slow,
             alpha_fast=alpha_fast,
             recovery_ratio=recovery_ratio,
+            rival_margin=rival_margin,
         )
         require(n_least <= n_most, f"estimator.n_least={n_least} is above n_most={n_most}")
         require(
@@ -178,7 +208,8 @@ class Mcl:
         self.resampling, self.ess_share = resampling, ess_share
         self.jitter_m, self.jitter_rad = jitter_m, jitter_rad
         self.alpha_slow, self.alpha_fast = alpha_slow, alpha_fast
-        self.recovery_ratio = recovery_ratio
+        self.recovery, self.recovery_ratio = recovery, recovery_ratio
+        self.n_rivals, self.rival_scans, self.rival_margin = n_rivals, rival_scans, rival_margin
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Draw particles from the prior's pose, or from all the floor if there is none."""
@@ -196,6 +227,18 @@ class Mcl:
             z_hit=self.z_hit,
             z_rand=self.z_rand,
         )
+        if self.recovery == "rivals":
+            # off the walls every end is as unlikely: else beams that end short, at people, outweigh
+            # all others, and beams that end in the unknown are better than those
+            off_walls = math.exp(-_OFF_WALLS) * self._laser.max_range_m
+            self._bounded = likelihood_field(
+                prior.map,
+                self._laser,
+                cell_m=self.cell_m,
+                sigma_m=self.sigma_m,
+                z_hit=1.0,
+                z_rand=off_walls / (self.sigma_m * math.sqrt(2.0 * math.pi)),
+            )
         self._shape = self._shape_of_bins()
         self._off_map = prior.mean is not None and not self._field.holds(prior.mean)
         self._everywhere = prior.mean is None or prior.covariance is None
@@ -206,6 +249,7 @@ class Mcl:
             self._poses = prior.mean + normals @ root(prior.covariance).T
             self._poses[:, 2] = se2.wrap(self._poses[:, 2])
         self._log_weights = np.zeros(len(self._poses))
+        self._contest: Array | None = None  # (2, n_rivals, 3) poses of defenders and rivals
         self._motion = STILL  # since the last scan used
         # A beam errs along itself by the laser's noise, and by half a cell either way
         variance = self._laser.sigma_range_m**2 + self.cell_m**2 / 6.0
@@ -243,18 +287,24 @@ class Mcl:
         """Draw the motion since the last scan used, for each particle."""
         normals = self._rng.standard_normal(self._poses.shape)
         self._poses = self._poses.copy()  # the last Belief keeps its own
-        _move(self._poses, self._motion.mean, root(self._motion.covariance), normals)
+        by_normals = root(self._motion.covariance)
+        _move(self._poses, self._motion.mean, by_normals, normals)
+        for poses in () if self._contest is None else self._contest:
+            _move(poses, self._motion.mean, by_normals, self._rng.standard_normal(poses.shape))
         self._motion = STILL
 
     def _weigh(self, ends: Floats) -> None:
         """Weight by one scan, sum up the belief, and resample if that is due."""
         if self._everywhere:
-            self._poses, self._everywhere = self._drawn_by_scan(self.n_most, ends), False
+            self._poses = self._drawn_by_scan(self.n_most, ends, self._field)
+            self._everywhere = False
             self._belief = self._summed_up()
             return
         of_scan = self._field.log_likelihood(self._poses, ends)
         self._log_weights = self._weighed(of_scan)
         self._belief = self._summed_up()
+        if self.recovery == "rivals" and self._yielded(ends):
+            return
         share = self._injected_share(of_scan, ends.shape[1])
         if share > 0.0 or self._extras["ess"] < self.ess_share * len(self._poses):
             self._draw(share, ends)
@@ -281,18 +331,55 @@ class Mcl:
         The fit is the geometric mean likelihood of a beam at the particle that fits best: the mean
         over the particles, as in augmented MCL, is poor for any belief that is still spread.
         """
-        if self.alpha_slow == 0.0:
-            return 0.0
         fit = math.exp(float(np.max(of_scan)) / n_beams)
+        self._extras["fit"] = fit
+        if self.recovery != "average" or self.alpha_slow == 0.0:
+            return 0.0
         self._slow += self.alpha_slow * (fit - self._slow)
         self._fast += self.alpha_fast * (fit - self._fast)
-        self._extras["fit"] = fit
         return max(0.0, 1.0 - self._fast / (self.recovery_ratio * self._slow))
 
-    def _drawn_by_scan(self, n: int, ends: Floats) -> Array:
+    def _yielded(self, ends: Floats) -> bool:
+        """Let rivals and defenders see the scan too; whether the belief has given way.
+
+        Both are as many, and are resampled alike at every scan: a wide cloud explains a scan worse
+        than a narrow one at the same place. The scan that draws them does not count.
+        """
+        n = self.n_rivals
+        if self._contest is None:
+            defenders = self._poses[resample(self._log_weights, n, self._rng, self.resampling)]
+            rivals = self._drawn_by_scan(n, ends, self._bounded)
+            self._contest = np.stack([self._jittered(defenders), rivals])
+            self._explained, self._n_explained, self._n_contested = np.zeros((2, n)), 0, 0
+            return False
+        for side in (0, 1):
+            of_scan = self._bounded.log_likelihood(self._contest[side], ends)
+            drawn = resample(self.beam_power * of_scan, n, self._rng, self.resampling)
+            self._explained[side] = (self._explained[side] + of_scan)[drawn]
+            self._contest[side] = self._jittered(self._contest[side][drawn])
+        self._n_explained += ends.shape[1]
+        self._n_contested += 1
+        if self._n_contested < self.rival_scans:
+            return False
+        defended, gained = self._explained.max(axis=1) / self._n_explained
+        rivals, self._contest = self._contest[1], None
+        if gained - defended <= self.rival_margin:
+            return False
+        self._poses, self._log_weights = rivals, np.zeros(n)
+        self._belief = self._summed_up()
+        self._extras["injected"] = n
+        return True
+
+    def _jittered(self, poses: Array) -> Array:
+        """Poses (M, 3), each moved a little, so that copies differ."""
+        jitter = self._rng.standard_normal(poses.shape)
+        moved: Array = poses + jitter * [self.jitter_m, self.jitter_m, self.jitter_rad]
+        return moved
+
+    def _drawn_by_scan(self, n: int, ends: Floats, field: LikelihoodField) -> Array:
         """Poses (n, 3) over all the floor, drawn by how well the scan fits there."""
-        tries = self._field.draw(n * self.tries, self._rng)
-        log_weights = self.beam_power * self._field.log_likelihood(tries, ends)
+        tries = field.draw(n * self.tries, self._rng)
+        log_weights = self.beam_power * field.log_likelihood(tries, ends)
         return tries[resample(log_weights, n, self._rng, self.resampling)]
 
     def _draw(self, injected_share: float, ends: Floats) -> None:
@@ -305,11 +392,9 @@ class Mcl:
             drawn = resample(self._log_weights, n - n_injected, self._rng, self.resampling)
             poses = self._poses[drawn]
             if n_injected > 0:
-                poses = np.concatenate([poses, self._drawn_by_scan(n_injected, ends)])
+                poses = np.concatenate([poses, self._drawn_by_scan(n_injected, ends, self._field)])
             needed = min(max(self._kld_number(poses), self.n_least), self.n_most)
-        jitter = self._rng.standard_normal(poses.shape)
-        self._poses = poses + jitter * [self.jitter_m, self.jitter_m, self.jitter_rad]
-        self._log_weights = np.zeros(n)
+        self._poses, self._log_weights = self._jittered(poses), np.zeros(n)
         self._extras["injected"] = n_injected
 
     def _kld_number(self, poses: Array) -> int:

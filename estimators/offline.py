@@ -14,7 +14,14 @@ import orjson
 
 from estimators.base import Belief, Estimate, Prior
 from estimators.options import require_choices
-from estimators.program import Program, ProgramError, map_message, require_limits, words_of
+from estimators.program import (
+    Program,
+    ProgramError,
+    map_message,
+    require_limits,
+    span_text,
+    words_of,
+)
 from sim import se2
 from sim.errors import InputError, require, required
 from sim.files import write_text
@@ -107,6 +114,12 @@ class Offline:
             except InputError as error:
                 text = str(error).replace(str(out), "{out}")
                 raise ProgramError(f"{program.name} wrote no trajectory: {text}") from error
+        first, last = self._frames[0].stamp, self._frames[-1].stamp
+        if track.stamps[-1] < first or track.stamps[0] > last:
+            raise ProgramError(
+                f"{program.name} wrote no trajectory of this log: {{out}} is from "
+                f"{span_text(track.stamps)}, the Frames from {span_text([first, last])}"
+            )
         return Estimate(track.stamps, track.means, track.covariances, self.kind)
 
     def _written(self, folder: Path) -> dict[str, str]:

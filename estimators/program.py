@@ -20,10 +20,12 @@ from typing import Any
 
 import numpy as np
 
+from sim.arrays import Array
 from sim.errors import InputError, printable, require
 from sim.grid import OccupancyGrid
 from sim.world import World
 
+PEERS_PROGRAM = "build/peers/mrpt"  # of the estimators mrpt_*
 _TAIL = 2000  # bytes of its messages that are kept
 _CHUNK = 1 << 16
 _PATIENCE_S = 2.0  # to end by itself once its input is closed
@@ -52,9 +54,10 @@ def words_of(command: Any) -> list[str]:
         f"estimator.command must be a program and its arguments, such as [python3, mine.py], got "
         f"{command!r}",
     )
+    remedy = "`make peers` compiles it" if words[0] == PEERS_PROGRAM else "give its path"
     require(
         shutil.which(words[0]),
-        f"estimator.command: no program {words[0]} that can be run; give its path",
+        f"estimator.command: no program {words[0]} that can be run; {remedy}",
     )
     return list(words)
 
@@ -133,7 +136,7 @@ class Program:
                     self._selector.unregister(self._stdin)
         answer, _, rest = bytes(self._said).partition(b"\n")
         if rest:
-            raise self._error(f"wrote {_quoted(rest)} after its answer")
+            raise self._error(f"wrote {_quoted(rest)} after its answer {_quoted(answer)}")
         self._said.clear()
         return answer
 
@@ -259,3 +262,8 @@ def map_message(known_map: Any) -> dict[str, Any] | None:
         f"a program takes a world or a grid as its map, got a {type(known_map).__name__}; set "
         "prior.map=none, world or GRID.yaml"
     )
+
+
+def span_text(stamps: Sequence[float] | Array) -> str:
+    """First and last stamp, as messages tell them."""
+    return f"{stamps[0]:.9g} to {stamps[-1]:.9g} s"

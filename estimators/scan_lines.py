@@ -136,6 +136,30 @@ def prepare(
     return _prepare(ranges, bearings, float(most_m), full)
 
 
+def without_sparse_lines(scan: PreparedScan, most_gap_m: float) -> PreparedScan:
+    """The scan without lines of which no three points in a row lie this near each other.
+
+    Edges far behind one another, as of doors in a row, may lie on one line by chance. Seen along
+    it their noise hardly moves them off it, so it would hold the heading better than all walls.
+    """
+    on = np.flatnonzero(scan.line_of_point >= 0)
+    line = scan.line_of_point[on]
+    gaps_m = np.hypot(*np.diff(scan.points[on], axis=0).T)
+    near = (line[1:] == line[:-1]) & (gaps_m <= most_gap_m)
+    dense = np.zeros(len(scan.lines), dtype=bool)
+    dense[line[1:-1][near[1:] & near[:-1]]] = True
+    if dense.all():
+        return scan
+    number = np.append(np.where(dense, np.cumsum(dense) - 1, -1), -1)  # the last of no line
+    return scan._replace(
+        line_of_point=number[scan.line_of_point],
+        lines=scan.lines[dense],
+        line_information=scan.line_information[dense],
+        line_ends=scan.line_ends[dense],
+        segments=Segments(*(part[dense] for part in scan.segments)),
+    )
+
+
 @njit()
 def ranked(values: Array, rank: int) -> float:
     """The value at a place of the sorted values, without sorting them.

@@ -24,6 +24,7 @@ from estimators.icp import (
     register,
 )
 from estimators.options import require_choices, require_non_negative
+from estimators.scan_lines import without_sparse_lines
 from sim import se2
 from sim.arrays import Array
 from sim.sensors import Laser
@@ -109,12 +110,15 @@ class ScanMatcher:
         Believed range noise; None for that of the prior's laser.
     rules
         Which matches count, and when iterations end.
+    most_gap_m
+        Lines of which no three points in a row lie this near each other are left out.
     """
 
     metric: Metric
     covariance: Covariance
     sigma_range_m: float | None
     rules: Rules = dataclasses.field(default_factory=Rules)
+    most_gap_m: float = math.inf
 
     def __post_init__(self) -> None:
         require_choices(
@@ -127,6 +131,8 @@ class ScanMatcher:
     def prepare(self, ranges_m: ArrayLike, laser: Laser) -> PreparedScan | None:
         """Prepare a scan of this laser; None if it shows too little to be registered."""
         scan = prepare(ranges_m, laser.bearings_rad, laser.max_range_m)
+        if self.most_gap_m < math.inf:
+            scan = without_sparse_lines(scan, self.most_gap_m)
         return scan if len(scan.points) >= LEAST_POINTS else None
 
     def match(

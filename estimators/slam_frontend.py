@@ -7,11 +7,13 @@ distance themselves. `screened` also serves `estimators.landmark_drive`.
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from estimators.base import Prior
 from estimators.gaussian import Gaussian
@@ -25,7 +27,7 @@ from estimators.options import (
 from estimators.stereo import NoiseAt, NoiseModel, StereoModel
 from sim.arrays import Array, Floats, Ints
 from sim.errors import require
-from sim.sensors import Reading
+from sim.recording import Frame
 
 Association = Literal["known", "mahalanobis", "descriptor"]
 
@@ -110,6 +112,14 @@ class SlamFrontEnd:
         Threshold of the squared Mahalanobis distance.
     noise_model, noise_at
         As in `estimators.stereo.StereoModel.of`.
+    gate_probability
+        Under known association, an observation less probable than this is left out, and a landmark
+        enters the map only when two sightings in a row agree: a misread id is neither an update nor
+        a landmark. None: every id is believed.
+    repeat_s
+        Under known association, a landmark counts at most once in this time for each robot: errors
+        of a sensor that last longer than an image would count again as if they were independent. 0:
+        always.
     sigmas
         Believed noise, by the camera's attribute; None for the prior's camera's own.
 
@@ -131,6 +141,8 @@ class SlamFrontEnd:
         d0: float,
         noise_model: NoiseModel,
         noise_at: NoiseAt,
+        gate_probability: float | None = None,
+        repeat_s: float = 0.0,
         **sigmas: float | None,
     ) -> None:
         require_choices(
@@ -141,6 +153,18 @@ class SlamFrontEnd:
         self._sigmas = {name: sigma for name, sigma in sigmas.items() if sigma is not None}
         require_non_negative(**self._sigmas)
         require_positive(d0=d0)
+        require_non_negative(repeat_s=repeat_s)
+        require(
+            gate_probability is None or 0.0 < gate_probability < 1.0,
+            f"estimator.gate_probability must lie between 0 and 1, or be null: {gate_probability}",
+        )
+        require(
+            association == "known" or (gate_probability is None and repeat_s == 0.0),
+            "estimator.gate_probability and repeat_s are of ids; leave them at null and 0 under "
+            f"association={association}, which has the gate d0",
+        )
+        self.gated, self._repeat_s = gate_probability is not None, repeat_s
+        self._gate = math.inf if gate_probability is None else float(chi2.isf(gate_probability, 3))
         self.association, self.d0 = association, d0
         self._stereo, self._estimator = stereo, estimator
         self._noise_model, self._noise_at = noise_model, noise_at
@@ -169,10 +193,13 @@ class SlamFrontEnd:
         self._landmark_of_id: dict[int, int] = {}
         self._descriptors = np.zeros((0, 0), np.float32)  # of each landmark's first observation
         self._n_observations, self._n_blind = 0, 0
+        self._tentative: dict[int, Array] = {}  # by id, where a first sighting places it in map
+        self._last_s: dict[tuple[int, int], float] = {}  # by robot and id, when it counted last
         return start
 
-    def read(self, seen: Reading) -> Image:
-        """Return the observations of an image that can be used; of duplicate ids the first."""
+    def read(self, frame: Frame) -> Image:
+        """Observations of a Frame's image that can be used; of duplicate ids the first."""
+        seen = frame.readings[self._stereo]
         all_points, all_ids = seen["points_in_camera"], seen.get("ids")
         known = self.association == "known"
         used, status = screened(self.camera, all_points, all_ids if known else None)
@@ -188,12 +215,49 @@ class SlamFrontEnd:
         self._n_observations += len(used)
         ids = None if all_ids is None else all_ids[used]
         points = np.ascontiguousarray(all_points[used])
-        return Image(points, numbers, ids, seen["descriptors"][used], used, status)
+        image = Image(points, numbers, ids, seen["descriptors"][used], used, status)
+        return self._without_repeats(image, frame) if self._repeat_s > 0.0 else image
+
+    def _without_repeats(self, image: Image, frame: Frame) -> Image:
+        """Leave out landmarks that the robot counted less than `repeat_s` ago."""
+        last = [self._last_s.get((frame.robot, i), -math.inf) for i in _listed(image)]
+        return image.of(frame.stamp - np.array(last) >= self._repeat_s)
+
+    def counted(self, image: Image, frame: Frame) -> None:
+        """Note when the landmarks of a Frame's image counted."""
+        if self._repeat_s > 0.0:
+            self._last_s |= {(frame.robot, i): frame.stamp for i in _listed(image)}
+
+    def passed(
+        self, image: Image, landmarks: Ints, distances: Array, pose: Array
+    ) -> NDArray[np.bool_]:
+        """Which observations (K,) pass the gate.
+
+        Parameters
+        ----------
+        landmarks
+            (K,), -1 for those of new ids. These pass if the last sighting placed them, within the
+            noise of both, where this one does.
+        distances
+            Squared Mahalanobis distance of each observation that has a landmark.
+        pose
+            (3,) believed pose of base_link in map.
+        """
+        kept = np.ones(len(landmarks), bool)
+        kept[landmarks >= 0] = distances < self._gate
+        for k in np.flatnonzero(landmarks < 0):
+            point, name = image.points[k], _listed(image)[k]
+            before = self._tentative.get(name)
+            self._tentative[name] = self.camera.place(pose, point)
+            kept[k] = False
+            if before is not None:
+                v, R = self.camera.innovation(self.camera.predict(pose, before)[0], point)
+                kept[k] = v @ np.linalg.solve(2.0 * R, v) < self._gate
+        return kept
 
     def known(self, image: Image) -> Ints:
         """Landmark (K,) of each id, -1 for new ones."""
-        ids = [] if image.ids is None else image.ids.tolist()
-        return np.array([self._landmark_of_id.get(i, -1) for i in ids], np.int64)
+        return np.array([self._landmark_of_id.get(i, -1) for i in _listed(image)], np.int64)
 
     def unlikeness(self, image: Image) -> Array:
         """-2 log of the likelihood ratio (K, N): same landmark against another, by descriptor.
@@ -248,3 +312,9 @@ class SlamFrontEnd:
         if self.association == "known":
             made["ids"] = np.array(list(self._landmark_of_id), dtype=np.int64)
         return made
+
+
+def _listed(image: Image) -> list[int]:
+    """Ids of an image's observations."""
+    ids: list[int] = [] if image.ids is None else image.ids.tolist()
+    return ids

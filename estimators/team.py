@@ -20,7 +20,7 @@ from sim.recording import Frame
 from sim.team import Team
 
 Kind = Literal["always", "range", "delayed", "never"]
-Told = tuple[float, Belief, float]  # stamp, belief, seconds of the step
+Step = tuple[float, Belief, float]  # stamp, belief, seconds of the step
 Answer = tuple[Estimate, Estimate | None]  # of one robot: online and revised
 
 
@@ -108,21 +108,21 @@ def run_team(
         return _run_in_contact(make, team, priors, rng, near)
     estimator = make()
     estimator.reset_team(priors, rng(0))
-    told: list[list[Told]] = [[] for _ in priors]
+    steps: list[list[Step]] = [[] for _ in priors]
     for frames in team.instants():
         for robot, each in _stepped(estimator, frames).items():
-            told[robot].append(each)
+            steps[robot].append(each)
     if communication is not None and communication.delay_s is not None:
         late = dead_reckoning(estimator.wheels, priors)
         return [
             (_estimate(_late(*each, communication.delay_s)), None)
-            for each in zip(told, team.robots, priors, late, strict=True)
+            for each in zip(steps, team.robots, priors, late, strict=True)
         ]
     revised = _revised(estimator, len(priors))
-    return [(_estimate(each), path) for each, path in zip(told, revised, strict=True)]
+    return [(_estimate(each), path) for each, path in zip(steps, revised, strict=True)]
 
 
-def _stepped(estimator: TeamEstimator, frames: Sequence[Frame]) -> dict[int, Told]:
+def _stepped(estimator: TeamEstimator, frames: Sequence[Frame]) -> dict[int, Step]:
     """Beliefs by robot after one instant; the time is shared out evenly."""
     begun = time.perf_counter()
     beliefs = estimator.step_team(frames)
@@ -137,8 +137,8 @@ def _run_alone(
     estimator: TeamEstimator, frames: Iterator[Frame], prior: Prior, rng: np.random.Generator
 ) -> Answer:
     estimator.reset_team((prior,), rng)
-    told = [_stepped(estimator, (frame,))[0] for frame in frames]
-    return _estimate(told), _revised(estimator, 1)[0]
+    steps = [_stepped(estimator, (frame,))[0] for frame in frames]
+    return _estimate(steps), _revised(estimator, 1)[0]
 
 
 def _run_in_contact(
@@ -155,7 +155,7 @@ def _run_in_contact(
         each.reset_team(priors, rng(number))
     logs: list[list[Frame]] = [[] for _ in range(n)]
     known, taken = np.zeros((2, n, n), np.int64)  # of each robot, how many Frames of each other
-    told: list[list[Told]] = [[] for _ in range(n)]
+    steps: list[list[Step]] = [[] for _ in range(n)]
     for frames, near in zip(team.instants(), contacts, strict=True):
         for frame in frames:
             logs[frame.robot].append(frame)
@@ -173,16 +173,16 @@ def _run_in_contact(
             news.sort(key=lambda one: (one.stamp, one.robot))
             for _, instant in itertools.groupby(news, key=lambda one: one.stamp):
                 beliefs = _stepped(filters[robot], tuple(instant))
-            told[robot].append(beliefs[robot])
+            steps[robot].append(beliefs[robot])
     return [
         (_estimate(each), _revised(one, n)[number])
-        for number, (each, one) in enumerate(zip(told, filters, strict=True))
+        for number, (each, one) in enumerate(zip(steps, filters, strict=True))
     ]
 
 
 def _late(
-    told: list[Told], recording: Any, prior: Prior, wheels: Any, delay_s: float
-) -> list[Told]:
+    steps: list[Step], recording: Any, prior: Prior, wheels: Any, delay_s: float
+) -> list[Step]:
     """Beliefs that answers so late leave: the last answer, carried on by the wheels."""
     frames = list(recording.frames())
     motions = [wheels.predict(frame) for frame in frames]
@@ -191,13 +191,13 @@ def _late(
     start = Gaussian(*((prior.mean, prior.covariance) if known else nowhere))
     answered, found = -1, []
     for row, frame in enumerate(frames):
-        while answered + 1 < row and told[answered + 1][0] <= frame.stamp - delay_s + 1e-9:
+        while answered + 1 < row and steps[answered + 1][0] <= frame.stamp - delay_s + 1e-9:
             answered += 1
-        last = told[answered][1] if answered >= 0 else None
+        last = steps[answered][1] if answered >= 0 else None
         belief = start if last is None else Gaussian(last.mean, last.covariance)
         for motion in motions[answered + 1 : row + 1]:
             belief = belief.then(motion)
-        found.append((frame.stamp, Belief(belief.mean, belief.covariance), told[row][2]))
+        found.append((frame.stamp, Belief(belief.mean, belief.covariance), steps[row][2]))
     return found
 
 
@@ -207,10 +207,10 @@ def _revised(estimator: TeamEstimator, n_robots: int) -> Sequence[Estimate | Non
     return paths
 
 
-def _estimate(told: Sequence[Told]) -> Estimate:
+def _estimate(steps: Sequence[Step]) -> Estimate:
     return Estimate(
-        stamps=np.array([stamp for stamp, _, _ in told]),
-        means=np.array([belief.mean for _, belief, _ in told]),
-        covariances=np.array([belief.covariance for _, belief, _ in told]),
-        step_seconds=np.array([seconds for _, _, seconds in told]),
+        stamps=np.array([stamp for stamp, _, _ in steps]),
+        means=np.array([belief.mean for _, belief, _ in steps]),
+        covariances=np.array([belief.covariance for _, belief, _ in steps]),
+        step_seconds=np.array([seconds for _, _, seconds in steps]),
     )

@@ -1,5 +1,7 @@
 """The motion of a Frame as its wheel encoders predict it."""
 
+import math
+
 import numpy as np
 
 from estimators.gaussian import Gaussian, wheel_motion
@@ -17,9 +19,10 @@ class WheelPrediction:
     (puzzlebot2024, eq. (5); decristoforis2020, eq. (2)) and reaches the pose by G = df/dds
     (puzzlebot2024, eq. (6), for the exact arc):
 
-        Q = G diag(kr |ds_r| + q_r, kl |ds_l| + q_l) G^T + diag(0, s (|ds_r| + |ds_l|) / 2, 0)
+        Q = G (diag(kr |ds_r| + q_r, kl |ds_l| + q_l) + f |ds| 1 1^T) G^T + diag(0, s |ds|, 0)
 
-    where q is tick^2 / 6 for a wheel that moved, else 0, and s is `lateral_slip_m`.
+    where q is tick^2 / 6 for a wheel that moved, else 0, |ds| is the mean of both wheels', f is
+    `forward_slip_m` and s is `lateral_slip_m`.
     `Gaussian.then` composes the motion with a belief: H Sigma H^T + G Q G^T (puzzlebot2024,
     eqs. (2) and (5)).
 
@@ -32,6 +35,9 @@ class WheelPrediction:
         noise does not inflate it (`sim.robot.TravelWindow`).
     lateral_slip_m
         Variance per metre of sideways slip, m.
+    forward_slip_m
+        Variance per metre of what both wheels slip together, m: it moves the robot without turning
+        it. Velocities that lag behind their stamps make such errors.
     encoder_tick_m
         Travel of a wheel per encoder tick, m. Ticks do not add up over Frames, so q overstates
         their variance over many.
@@ -44,6 +50,7 @@ class WheelPrediction:
         window_s: float = 0.05,
         *,
         lateral_slip_m: float = 0.0,
+        forward_slip_m: float = 0.0,
         encoder_tick_m: float = 0.0,
     ) -> None:
         require_non_negative(
@@ -51,10 +58,12 @@ class WheelPrediction:
             kl=kl,
             window_s=window_s,
             lateral_slip_m=lateral_slip_m,
+            forward_slip_m=forward_slip_m,
             encoder_tick_m=encoder_tick_m,
         )
         self.kr, self.kl, self.window_s = kr, kl, window_s
         self.lateral_slip_m, self.encoder_tick_m = lateral_slip_m, encoder_tick_m
+        self.forward_slip_m = forward_slip_m
 
     def reset(self, track_m: float) -> None:
         """Forget the travel so far; the wheels are believed to be this far apart."""
@@ -77,9 +86,14 @@ class WheelPrediction:
         return self.predict_with_root(frame)[0]
 
     def predict_with_root(self, frame: Frame) -> tuple[Gaussian, Array]:
-        """Motion over the Frame, and the root (3, 2) of what the wheels add to its covariance."""
+        """Motion over the Frame, and the root (3, K) of what the wheels add to its covariance."""
         travel_m, variances = self.slip(frame)
         motion, by_wheels = wheel_motion(frame.wheel_increments_m, variances, self.track_m)
         if self.lateral_slip_m:
             motion.covariance[1, 1] += self.lateral_slip_m * float(travel_m.mean())
-        return motion, by_wheels * np.sqrt(variances)
+        root = by_wheels * np.sqrt(variances)
+        if self.forward_slip_m:
+            together = by_wheels.sum(axis=1) * math.sqrt(self.forward_slip_m * travel_m.mean())
+            motion.covariance[:] += np.outer(together, together)
+            root = np.column_stack([root, together])
+        return motion, root

@@ -96,7 +96,7 @@ def run(
 
     Examples
     --------
-      estima run
+      estima run (a first look: study=first_run)
 
       estima run estimator=odometry world=office seed=3
 
@@ -124,11 +124,32 @@ def run(
     if many and "--hydra-help" not in arguments:
         from experiments.sweeps.launch import sweep_arguments
 
-        sweep_arguments([a for a in arguments if a not in many])
+        _show_sweep(*sweep_arguments([a for a in arguments if a not in many]))
         return
+    if not arguments:
+        arguments = ["study=first_run"]
+        print("estima run study=first_run (estima options lists what else there is)")
     from experiments.runs.run import application
 
     application(arguments, _draw_run, out)
+
+
+_FEW_RUNS, _FEW_LINES = 2000, 30
+
+
+def _show_sweep(folder: Path, n_runs: int) -> None:
+    """Print a sweep's small table, and what can be done next."""
+    from experiments.report.table import as_lines, notes
+    from experiments.sweeps.collect import collect
+    from experiments.sweeps.summary import ERROR, summary
+
+    if n_runs <= _FEW_RUNS:
+        rows = collect(str(folder))
+        found = summary(rows, metrics=[ERROR] if "ate_rmse_m" in rows else [])
+        if len(found) <= _FEW_LINES:
+            show(as_lines(found, notes(found, None)))
+    print(f"\nNext: estima table {folder.name} --against ESTIMATOR -o table.tex")
+    print(f"      estima report {folder.name}")
 
 
 def _draw_run(
@@ -173,15 +194,30 @@ def record(
 def info(
     log: Annotated[list[Path], typer.Argument(help="A recording (.npz) or a log of any format.")],
     robot: Annotated[int, typer.Option(help="Which robot of an MRCLAM set.")] = 1,
+    check: Annotated[
+        bool,
+        typer.Option(
+            "--check", help="Warn of odd clocks, and of sensors that do not agree with the motion."
+        ),
+    ] = False,
 ) -> None:
     """Check a recording or a log and say what it holds.
 
-    Formats of several files take them all; docs/formats.md gives their order.
+    Formats of several files take them all; docs/formats.md gives their order. With --check it also
+    warns, a line each, of gaps, repeated and coarse stamps, delays between wheels and sensors,
+    gains, and ranges of a wrong scale.
     """
     from experiments.viewing.describe import describe
     from sim.formats.detect import read_any
 
-    show(describe(read_any(log, robot)))
+    recording = read_any(log, robot)
+    show(describe(recording))
+    if check:
+        from experiments.calibration.log_check import check_log
+
+        warnings = check_log(recording)
+        for warning in warnings or ["nothing odd found"]:
+            show(f"check       {warning}")
 
 
 @app.command()
@@ -589,7 +625,8 @@ def calibrate(
         list[str] | None,
         typer.Argument(
             metavar="RECORDINGS...",
-            help="Recordings with truth, .npz. With --sheet: overrides of the robot.",
+            help="Recordings with truth, .npz. With -o: one log of any format. With --sheet: "
+            "overrides of the robot.",
         ),
     ] = None,
     sheet: Annotated[
@@ -605,6 +642,19 @@ def calibrate(
             help="wheel-truth, or end-poses (only commands and final poses) [wheel-truth]."
         ),
     ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            "-o",
+            help="Of a real log: YAML file to write, for `estima run calibration=`; a picture of "
+            "the residuals goes beside it.",
+        ),
+    ] = None,
+    robot: Annotated[int | None, typer.Option(help="Which robot of an MRCLAM set.")] = None,
+    until_s: Annotated[
+        float | None, typer.Option("--until", help="Of a real log: its first seconds only.")
+    ] = None,
     joint: Annotated[
         bool, typer.Option("--joint", help="Estimate wheel gains and the track too.")
     ] = False,
@@ -613,6 +663,9 @@ def calibrate(
 ) -> None:
     """Estimate kr, kl (and wheel gains, track) with 95 % intervals.
 
+    With -o, of a real log: its wheels are compared with its truth, else its scans, else its
+    landmarks, and the delay of the wheels, the mount of the sensor and its noise are found too.
+
     The geometry of a sheet's robot is its nominal one: that which its controller uses.
 
     Examples
@@ -620,6 +673,8 @@ def calibrate(
       estima calibrate run1.npz run2.npz --joint
 
       estima calibrate --sheet runs.csv robot=puzzlebot --joint
+
+      estima calibrate intel.log.gz -o intel.yaml (a real log)
     """
     import numpy as np
 
@@ -627,6 +682,14 @@ def calibrate(
     from experiments.calibration.sheet import calibrate_sheet
     from sim.recording import load
 
+    if out is not None:
+        others = {"--sheet": sheet, "--method": method, "--config-dir": config_dir}
+        given = {**others, "--joint": joint or None, "--json": as_json or None}
+        for option in (name for name, value in given.items() if value is not None):
+            raise InputError(f"{option} is not of a real log; leave it or -o out")
+        _calibrate_log([Path(path) for path in what or []], out, robot or 1, until_s)
+        return
+    require(robot is None and until_s is None, "--robot and --until are of a real log; give -o too")
     if method not in (None, "wheel-truth", "end-poses"):
         raise InputError(f"--method must be wheel-truth or end-poses, got {method!r}")
     if sheet is not None:
@@ -647,8 +710,24 @@ def calibrate(
         kind: Any = (method or "wheel-truth").replace("-", "_")
         result = calibrate_recordings(loaded, kind, geometry=joint)
     print(result.as_json() if as_json else result.as_text())
-    if not as_json:
-        print("  (puzzlebot2024's own gradient descent would return 0.5, whatever the data)")
+
+
+def _calibrate_log(log: list[Path], out: Path, robot: int, until_s: float | None) -> None:
+    """Calibrate a real log, and write its YAML file and its picture."""
+    from experiments.calibration.from_log import calibrate_log
+    from experiments.calibration.residual_figure import residual_figure
+    from experiments.runs.calibration import write_calibration
+    from experiments.viewing.style import save_figure
+    from sim.formats.detect import read_any
+
+    require(log, "no log to calibrate; name one")
+    require(out.suffix in (".yaml", ".yml"), f"-o {out}: a calibration is a .yaml file")
+    found = calibrate_log(read_any(log, robot), until_s)
+    show(found.as_text())
+    intervals = {name: [x.low, x.high] for name, x in found.intervals.items()}
+    write_calibration(out, found.calibration, intervals)
+    save_figure(residual_figure(found.residuals), out.with_suffix(".png"))
+    show(f"{out}, {out.with_suffix('.png')}")
 
 
 def _robot_of(overrides: list[str], config_dir: Path | None) -> DifferentialDrive:
@@ -662,6 +741,53 @@ def _robot_of(overrides: list[str], config_dir: Path | None) -> DifferentialDriv
                 "robot.track_m=0.19"
             )
     return Experiment.compose([*searched(config_dir), *overrides]).robot()
+
+
+@app.command()
+def tune(
+    study: Annotated[
+        str,
+        typer.Argument(
+            help="A study of conf/study that has a tune.", autocompletion=completion.studies
+        ),
+    ],
+    only: Annotated[list[str] | None, typer.Option(help="Only this estimator; repeat it.")] = None,
+    jobs: Annotated[int, typer.Option("--jobs", "-j", help="Processes.")] = 1,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="Folder of the YAMLs [results/tuned/estimator]."),
+    ] = None,
+    config_dir: ConfigDir = None,
+) -> None:
+    """Tune a study's estimators on seeds below 100, with one budget, and judge them on its own.
+
+    The trials are kept, so that the command goes on where it was interrupted. It writes
+    ESTIMATOR_tuned.yaml, tables of trials and gains, and their figure.
+
+    Examples
+    --------
+      estima tune peers --jobs 2
+
+      estima run --config-dir results/tuned estimator=ekf_icp_tuned sensors=hokuyo
+    """
+    from experiments.sweeps import tune as tuning
+    from experiments.viewing.style import save_figure
+
+    folder = str(config_dir) if config_dir else None
+    plan, place = tuning.tuning_of(study, folder), paths.results()
+    found, written = [], []
+    with progress(f"tune {study}", 1.0) as on_progress:
+        for tuned in tuning.tune(
+            study, only or (), jobs=jobs, config_dir=folder, on_progress=on_progress
+        ):
+            found.append(tuned)
+            written.append(tuning.write(tuned, study, plan, out or place / "tuned" / "estimator"))
+    trials, gains = tuning.trials_table(found), tuning.gains_table(found)
+    write_frame(trials, place / "tables" / f"{study}_trials_tuning.csv", digits=6)
+    write_frame(gains, place / "tables" / f"{study}_tuning.csv", digits=6)
+    save_figure(tuning.curves(trials, gains), place / "figures" / f"{study}_tuning.png")
+    show(gains.to_string(index=False, float_format=lambda v: f"{v:.4g}"))
+    print("\n".join(map(paths.short, written)))
 
 
 @app.command()
@@ -803,41 +929,68 @@ def table(
         ),
     ],
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="File to write, .csv or .parquet.")
+        Path | None,
+        typer.Option("--out", "-o", help="File to write: .tex, .md, .html, .csv, .parquet."),
     ] = None,
     against: Annotated[
         str | None,
         typer.Option(
-            help="Give errors relative to this estimator's, too.",
+            help="Compare with this estimator: relative errors, and paired tests.",
             autocompletion=completion.estimators,
+        ),
+    ] = None,
+    metric: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Result to show instead of the main ones; repeat it.",
+            autocompletion=completion.metrics,
         ),
     ] = None,
     all_versions: Annotated[
         bool, typer.Option("--all-versions", help="Keep rows of other versions of the code.")
     ] = False,
     times: Annotated[bool, typer.Option("--times", help="Keep computing times.")] = False,
-    means: Annotated[
-        bool, typer.Option("--means", help="With -o: write the means that are shown without it.")
+    every: Annotated[
+        bool, typer.Option("--rows", help="With -o: write every row, with all its columns.")
     ] = False,
     only: Where = None,
 ) -> None:
-    """Show the means of a sweep's errors, or with -o write all its rows.
+    """Show a sweep's mean errors with 95 % intervals, or write them for a paper.
 
-    The means are those of the best answers: of the revised path of a method that has one.
+    Errors are those of the best answers: of the revised path of a method that has one. The best on
+    the same recordings is bold. A .tex file goes into a LaTeX article by `input` as it is.
 
-    Example: estima table leaderboard --against smoother
+    Examples
+    --------
+      estima table leaderboard --against smoother
+
+      estima table slip --metric answer_ate_rmse_m --metric answer_nees_mean -o slip.tex
+
+      estima table slip --rows -o slip.csv
     """
-    from experiments.sweeps.collect import collect, summary, where
+    from experiments.report.table import as_lines, check_name, notes, statuses, write_table
+    from experiments.sweeps.collect import collect, where
+    from experiments.sweeps.summary import summary
 
-    rows = where(collect(name, all_versions=all_versions, times=times), only or [])
-    if out is None or means:
-        rows = summary(rows, against)
-    if out is None:
-        shown = rows.rename(columns=lambda column: columns.title(column, short=True))
-        show(shown.to_string(index=False, na_rep="-", float_format=lambda v: f"{v:.4g}"))
+    if out is not None:
+        check_name(out)
+    require(not every or out is not None, "--rows: name the file to write, such as -o rows.csv")
+    timed = times or any(column.endswith("_time_us") for column in metric or [])
+    rows = where(collect(name, all_versions=all_versions, times=timed), only or [])
+    if every and out is not None:
+        require(out.suffix in (".csv", ".parquet"), f"-o {out}: with --rows it is .csv or .parquet")
+        write_frame(rows, out)
+        print(f"{out}: {len(rows)} rows, {len(rows.columns)} columns")
         return
-    write_frame(rows, out)
-    print(f"{out}: {len(rows)} rows, {len(rows.columns)} columns")
+    found = summary(rows, against, metric or [])
+    note = notes(found, against)
+    if out is None:
+        show(as_lines(found, note))
+        if (rows["status"] != Outcome.OK).any():
+            show("\n" + "\n".join(f"{count} {words}" for words, count in statuses(rows)))
+        return
+    write_table(found, note, out, Path(name).name)
+    print(f"{out}: {len(found)} rows")
 
 
 @app.command()
@@ -857,12 +1010,28 @@ def plot(
         typer.Option(help="Result (estima options metrics).", autocompletion=completion.metrics),
     ] = "answer_ate_rmse_m",
     by: Annotated[
-        str | None,
-        typer.Option(help="One line a value of this.", autocompletion=completion.settings),
+        list[str] | None,
+        typer.Option(
+            help="One line a value of this; repeat it for combinations.",
+            autocompletion=completion.settings,
+        ),
     ] = None,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Picture to write.")] = Path("plot.png"),
+    row: Annotated[
+        str | None,
+        typer.Option(help="One row of panels a value.", autocompletion=completion.settings),
+    ] = None,
+    col: Annotated[
+        str | None,
+        typer.Option(help="One column of panels a value.", autocompletion=completion.settings),
+    ] = None,
+    size: Annotated[
+        str, typer.Option(help="screen, or column or page of a paper (3.5 in, 7.16 in).")
+    ] = "screen",
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="Picture to write: .png, .pdf, .svg.")
+    ] = Path("plot.png"),
     pool: Annotated[
-        bool, typer.Option("--pool", help="Average over worlds, estimators and logs too.")
+        bool, typer.Option("--pool", help="Average over other settings that differ too.")
     ] = False,
     only: Where = None,
 ) -> None:
@@ -871,18 +1040,25 @@ def plot(
     By default it is the position error of the best answers: of the revised path of a method that
     has one, else of the online one.
 
-    Example: estima plot slip --x robot.kr --y heading_rmse_rad --by choice.estimator
+    Examples
+    --------
+      estima plot slip --x robot.kr --y heading_rmse_rad --by choice.estimator
+
+      estima plot slip --x robot.kr --by choice.estimator --col choice.world --size page -o a.pdf
     """
-    from experiments.report.plot import sweep_figure
+    from experiments.report.plot import Size, sweep_figure
     from experiments.sweeps.collect import collect, where
     from experiments.viewing.style import save_figure
 
+    if size not in list(Size):
+        raise InputError(f"--size must be {', '.join(Size)}, got {size}")
     rows = where(collect(name, times=True), only or [])
     failed = rows["status"] == Outcome.FAILED
     if failed.any():
         print(f"{failed.sum()} of {len(rows)} runs failed; they are left out", file=sys.stderr)
         rows = rows[~failed]
-    save_figure(sweep_figure(rows, x, y, by, pool=pool), out)
+    page = sweep_figure(rows, x, y, by, row=row, col=col, size=size, pool=pool)
+    save_figure(page, out)
     print(out)
 
 
@@ -914,11 +1090,43 @@ def reproduce(
 
 
 @app.command()
-def report() -> None:
-    """Write results/report.html from what the studies have written to results/.
+def report(
+    name: Annotated[
+        str | None,
+        typer.Argument(
+            help="A sweep's name, or a folder or file of rows; else all studies of the papers.",
+            autocompletion=completion.sweeps,
+        ),
+    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="File to write, .html.")] = None,
+    only: Where = None,
+) -> None:
+    """Write one page to open in a browser: of a sweep, or of the papers' studies in results/.
 
-    Example: estima report
+    A sweep's page has a chart whose axes, colours, panels and filters can be chosen, its means, its
+    best and worst runs, and its command. It needs no network.
+
+    Examples
+    --------
+      estima report
+
+      estima report slip
+
+      estima report slip --where choice.world=office -o office.html
     """
+    if out is not None and (name is None or out.suffix != ".html"):
+        raise InputError(f"-o {out}: give the name of a sweep, and a file that ends in .html")
+    if name is not None:
+        from experiments.report.sweep_page import write_sweep_page
+        from experiments.sweeps.collect import collect, folder_of, where
+
+        folder, called = folder_of(name), Path(name).name
+        written = out or folder.parent / f"{called}.html"
+        rows = where(collect(name, times=True), only or [])
+        write_sweep_page(rows, called, folder, written)
+        print(paths.short(written))
+        return
+    require(not only, "--where: name the sweep whose runs to keep")
     if not any((paths.results() / name).exists() for name in ("claims.csv", "figures", "tables")):
         raise InputError(
             f"{paths.short(paths.results())}: no claims, figures or tables to report; "

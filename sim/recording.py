@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import math
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -343,8 +344,13 @@ class Recording:
                 robot=robot,
             )
 
-    def truth_at(self, stamps: Array) -> Array:
+    def truth_at(self, stamps: Array, longest_gap_s: float = math.inf) -> Array:
         """True poses (N, 3) at stamps (N,), interpolated; NaN outside the truth's time span.
+
+        Parameters
+        ----------
+        longest_gap_s
+            NaN, too, between true poses that are farther apart in time than this.
 
         Raises
         ------
@@ -355,7 +361,13 @@ class Recording:
         heading = np.unwrap(poses[:, 2])
         columns = (poses[:, 0], poses[:, 1], heading)
         x, y, angle = (np.interp(stamps, times, c, left=np.nan, right=np.nan) for c in columns)
-        return np.stack([x, y, np.arctan2(np.sin(angle), np.cos(angle))], axis=1)
+        found = np.stack([x, y, np.arctan2(np.sin(angle), np.cos(angle))], axis=1)
+        after = np.clip(np.searchsorted(times, stamps), 1, max(len(times) - 1, 1))
+        if len(times) > 1:
+            wide = times[after] - times[after - 1] > longest_gap_s
+            exact = (times[after] == stamps) | (times[after - 1] == stamps)
+            found[wide & ~exact] = np.nan
+        return found
 
     @property
     def checksum(self) -> str:

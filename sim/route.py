@@ -244,6 +244,7 @@ class Pursuit(_Controller):
     def _project(self, pose: Array) -> None:
         """Advance the progress along the path to the nearest point not far ahead."""
         low = int(np.searchsorted(self._along_m, self._done_m, side="right")) - 1
+        low = min(low, len(self._path) - 2)  # past the goal, the last leg is still the nearest
         ahead_m = self._done_m + 2.0 * self._tour.look_ahead_m
         high = min(int(np.searchsorted(self._along_m, ahead_m)) + 1, len(self._path))
         best = math.inf

@@ -50,8 +50,9 @@ from experiments.runs import cache, store
 from experiments.runs.console import end, show
 from experiments.runs.experiment import Experiment, searched
 from experiments.runs.row import write_rows
-from experiments.sweeps.collect import collect, summary
+from experiments.sweeps.collect import collect
 from experiments.sweeps.launch import sweep
+from experiments.sweeps.summary import summary
 from experiments.trajectories.odometry import read_odometry_csv, write_odometry_csv
 from experiments.viewing.describe import describe
 from sim import recording as recordings
@@ -196,7 +197,7 @@ def use(path):
 
 def attack_recordings(attack, folder, rng):
     sound = sound_recording()
-    arrays, meta = recordings._arrays(sound), recordings.described(sound)
+    arrays, meta = recordings.arrays_of(sound), recordings.described(sound)
     with contextlib.redirect_stdout(io.StringIO()):
         right = use(forged(folder / "sound.npz", arrays, meta))
     for name, values in arrays.items():

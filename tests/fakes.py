@@ -6,13 +6,17 @@ geometry here, so they also stand beside the simulator's as a second opinion.
 
 import dataclasses
 import sys
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from estimators.base import Estimate, Prior
+from estimators.peers import MissingPackageError
 from experiments.papers.maximo2024.places import UMH, place_world
 from sim import se2
+from sim.errors import InputError
 from sim.recording import Frame, Log, Recording, Truth, WheelLog
 from sim.robot import RobotGeometry
 from sim.sensors import Encoder, Laser, Mount, StereoCamera
@@ -28,6 +32,17 @@ PROGRAMS = {
     "external": [f"estimator.command=['{sys.executable}','{EXAMPLES}/external_odometry.py']"],
     "offline": [f"estimator.command='sh {EXAMPLES}/offline_odometry.sh {{log}} {{start}} {{out}}'"],
 }
+
+
+@contextmanager
+def peers_may_be_missing():
+    """Skip the test, with the reason, where a peer's package or program is not installed."""
+    try:
+        yield
+    except InputError as error:
+        if isinstance(error, MissingPackageError) or "no program build/peers/" in str(error):
+            pytest.skip(str(error))
+        raise
 
 
 def square_room(n_landmarks=40, seed=0):

@@ -97,6 +97,13 @@ def words_of(pid):
         return ""
 
 
+def writes(pid):
+    """Whether it has a file of rows open."""
+    with contextlib.suppress(OSError):  # it has ended, or is ending
+        return any("/rows-" in os.readlink(file) for file in Path(f"/proc/{pid}/fd").iterdir())
+    return False
+
+
 def kill(pids):
     for pid in pids:
         with contextlib.suppress(ProcessLookupError):
@@ -130,12 +137,13 @@ def disturb(sweep, n_kills, rng):
         workers, everyone = sweep.workers(), [sweep.process.pid, *below(sweep.process.pid)]
         if kind == "worker" and not workers:
             continue  # none of them at work yet
-        before = sweep.done()
+        before, at_work = sweep.done(), list(filter(writes, workers))
         kill({"planner": everyone[:1], "worker": workers[:1], "all": everyone}[kind])
         counts[kind] += 1
         if kind != "worker":
             sweep.process.wait()
-            wait_until(lambda pids=workers: not any(map(words_of, pids)), 60, "workers ended")
+            wait_until(lambda pids=at_work: not any(map(words_of, pids)), 60, "workers ended")
+            kill(workers)  # joblib's that had no job yet would wait for one, five minutes long
         progress.append(len(sweep.done()))
         assert before <= sweep.done(), f"rows were lost when {kind} was killed"
     if sweep.is_running():

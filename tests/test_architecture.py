@@ -121,16 +121,19 @@ def is_method(path):
     return False
 
 
-METHODS = {p.stem for p in (ROOT / "estimators").glob("*.py") if is_method(p)}
+METHODS = {
+    ".".join(p.relative_to(ROOT).with_suffix("").parts): p
+    for p in (ROOT / "estimators").rglob("*.py")
+    if is_method(p)
+}
 
 
 def test_no_method_imports_another():
-    assert {"odometry", "ekf_icp", "mcl", "smoother"} <= METHODS
-    for stem in METHODS:
-        for name in imports(ROOT / "estimators" / f"{stem}.py"):
-            parts = name.split(".")
-            other = parts[1] if parts[0] == "estimators" and len(parts) > 1 else None
-            assert other not in METHODS - {stem}, f"{stem}.py imports {name}"
+    assert {"estimators.mcl", "estimators.smoother", "estimators.peers.kiss_icp"} <= set(METHODS)
+    for method, path in METHODS.items():
+        others = set(METHODS) - {method}
+        for name in imports(path):
+            assert name not in others, f"{method} imports {name}"
 
 
 def test_no_addresses_or_machine_paths_in_tracked_text():

@@ -110,7 +110,7 @@ def test_every_run_of_a_study_has_its_name(study, names):
         unknown = run.config["estimator"].get("association") == "mahalanobis"
         assert unknown == ("unknown" in name)
         wider = run.config["estimator"].get("sigma_disparity_px") is not None
-        assert wider == ("wider noise" in name)
+        assert wider == ("wider noise" in name or "bursts" in name)
     if study.startswith("mrclam"):
         noise = runs["FastSLAM, known, wider noise"].config["estimator"]
         assert noise["sigma_disparity_px"] == 4.0 * CAMERA.sigma_disparity_px

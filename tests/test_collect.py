@@ -4,11 +4,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments.report.plot import sweep_figure
+from experiments.report.plot import _by_factors, sweep_figure
 from experiments.runs.columns import COLUMNS, ORIGIN, REPEAT, STATUS, is_setting, title
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
-from experiments.sweeps.collect import collect, measured, summary, swept, telling, where
+from experiments.sweeps.collect import collect, measured, swept, telling, where
+from experiments.sweeps.summary import summary
 from sim.errors import InputError
 
 
@@ -89,10 +90,12 @@ def test_a_method_stands_where_its_best_answer_is():
     table["revised_ate_rmse_m"] = np.where(batch, 0.25 * table["ate_rmse_m"], np.nan)
     found = summary(table, against="a").set_index("choice.estimator")
     assert found["answer"].to_dict() == {"a": "online", "b": "revised"}
-    means = table.groupby("choice.estimator")[["ate_rmse_m", "revised_ate_rmse_m"]].mean()
-    assert found["answer_ate_rmse_m"]["a"].mean() == pytest.approx(means["ate_rmse_m"]["a"])
-    assert found["answer_ate_rmse_m"]["b"].mean() == pytest.approx(means["revised_ate_rmse_m"]["b"])
-    assert (found["cpu_time_us"] == 2.0).all()
+    paths = table[["ate_rmse_m", "revised_ate_rmse_m"]]
+    logs = np.log(paths).groupby([table["choice.estimator"], table["robot.kr"]]).mean()
+    of_a, of_b = (found["answer_ate_rmse_m"][name].to_numpy() for name in "ab")
+    np.testing.assert_allclose(of_a, np.exp(logs["ate_rmse_m"]["a"]))
+    np.testing.assert_allclose(of_b, np.exp(logs["revised_ate_rmse_m"]["b"]))
+    np.testing.assert_allclose(found["cpu_time_us"], 2.0)
     page = sweep_figure(table, "choice.estimator", "answer_ate_rmse_m", pool=True)
     words = [label.get_text() for label in page.axes[0].get_xticklabels()]
     assert words == ["a", "b (revised)"]
@@ -131,18 +134,19 @@ def test_plots_name_a_missing_column_and_average_recordings():
     lines = page.axes[0].get_lines()
     assert page.axes[0].get_xscale() == "log"
     table = rows()
-    expected = table[(table["choice.estimator"] == "a")].groupby("robot.kr")["ate_rmse_m"].mean()
+    one = table[table["choice.estimator"] == "a"]
+    expected = np.exp(np.log(one["ate_rmse_m"]).groupby(one["robot.kr"]).mean())
     np.testing.assert_allclose(lines[0].get_ydata(), expected)
-    assert "estimator" not in page.axes[0].get_title()
+    assert page.get_suptitle().startswith("Geometric mean over recordings")
+    assert "estimator" not in page.get_suptitle()
     with pytest.raises(InputError, match=r"different values of choice\.estimator \(a, b\).*--pool"):
         sweep_figure(rows(), "robot.kr", "ate_rmse_m")
     pooled = sweep_figure(rows(), "robot.kr", "ate_rmse_m", pool=True)
-    assert "estimator" in pooled.axes[0].get_title()
+    assert "estimator" in pooled.get_suptitle()
     table = table.assign(ate_rmse_m=np.tile(np.repeat([1e-4, 1.0, 10.0], 2), 2))
     page = sweep_figure(table, "robot.kr", "ate_rmse_m", pool=True)
     geometric = np.exp(np.log(table["ate_rmse_m"]).groupby(table["robot.kr"]).mean())
     np.testing.assert_allclose(page.axes[0].get_lines()[0].get_ydata(), geometric)
-    assert page.axes[0].get_yscale() == "log"
     with pytest.raises(InputError, match="no run has both"):
         sweep_figure(table.assign(**{"robot.kr": None}), "robot.kr", "ate_rmse_m")
     with pytest.raises(
@@ -153,6 +157,71 @@ def test_plots_name_a_missing_column_and_average_recordings():
         sweep_figure(rows(), "nosuch", "ate_rmse_m")
     with pytest.raises(InputError, match="no numbers"):
         sweep_figure(rows(), "robot.kr", "status")
+
+
+def many(n_series=12):
+    """Rows of many series over numbers that grow by factors, in two worlds."""
+    return pd.DataFrame(
+        {
+            "choice.estimator": f"m{series:02d}",
+            "choice.world": world,
+            "estimator.n_particles": n,
+            "seed": seed,
+            "repeat": 0,
+            "recording_checksum": f"{world}{seed}",
+            "status": "ok",
+            "ate_rmse_m": 0.1 * (series + 1) * n * (1.0 + 0.1 * seed),
+        }
+        for series in range(n_series)
+        for world in ("w", "v")
+        for n in (1, 2, 4)
+        for seed in range(3)
+    )
+
+
+def test_plots_have_panels_and_twelve_series_that_differ():
+    x, y, by = "estimator.n_particles", "ate_rmse_m", "choice.estimator"
+    with pytest.raises(InputError, match=r"choice\.world \(v, w\).*--col choice\.world"):
+        sweep_figure(many(), x, y, by)
+    page = sweep_figure(many(), x, y, by, col="choice.world", size="page")
+    assert [ax.get_title() for ax in page.axes] == ["v", "w"]
+    assert page.get_figwidth() == 7.16
+    assert page.axes[0].get_xscale() == page.axes[0].get_yscale() == "log"
+    styles = {(h.lines[0].get_color(), h.lines[0].get_marker()) for h in page.axes[0].containers}
+    assert len(styles) == len({color for color, _ in styles}) == 12
+    page.draw_without_rendering()
+    legend, width = page.legends[0].get_window_extent(), page.bbox.width
+    assert 0.0 <= legend.x0 < legend.x1 <= width
+    with pytest.raises(InputError, match="13 lines; at most 12"):
+        sweep_figure(many(13), x, y, by, col="choice.world")
+    both = sweep_figure(many(3), x, y, [by, "choice.world"])
+    assert "m00, v" in [text.get_text() for text in both.legends[0].get_texts()]
+
+
+def test_lines_are_named_at_their_ends_where_that_fits():
+    few = many(3).query("`choice.world` == 'w'")
+    page = sweep_figure(few, "estimator.n_particles", "ate_rmse_m", "choice.estimator")
+    assert [text.get_text() for text in page.axes[0].texts] == ["m00", "m01", "m02"]
+    assert not page.legends
+    few["ate_rmse_m"] = 1.0  # all ends in one place
+    page = sweep_figure(few, "estimator.n_particles", "ate_rmse_m", "choice.estimator")
+    assert len(page.legends) == 1
+
+
+@pytest.mark.parametrize(
+    ("values", "factors"),
+    [
+        ([1e-5, 1e-4], True),
+        ([1, 2, 4, 8], True),
+        ([10, 20, 50, 100], True),
+        ([1, 2], False),
+        ([1, 2, 3, 4, 5], False),
+        (list(range(1, 100)), False),
+        ([0.0, 1.0, 100.0], False),
+    ],
+)
+def test_values_that_grow_by_factors_have_a_logarithmic_axis(values, factors):
+    assert _by_factors(values) is factors
 
 
 def test_every_column_of_a_row_is_in_the_schema():
@@ -176,7 +245,7 @@ def test_columns_say_their_unit():
     assert title("ate_rmse_m", short=True) == "ATE, m"
     page = sweep_figure(rows(), "robot.kr", "ate_rmse_m", pool=True)
     assert page.axes[0].get_ylabel() == "position RMSE, m"
-    assert page.axes[0].get_xlabel() == "robot.kr"
+    assert page.axes[0].get_xlabel() == "kr (robot), m"
 
 
 def test_runs_of_equal_settings_and_different_keys_are_refused(tmp_path):
@@ -206,3 +275,9 @@ def test_runs_of_equal_settings_and_different_keys_are_refused(tmp_path):
     for changed in ({"ate_rmse_m": 9.0}, {"recording_checksum": "other"}):
         with pytest.raises(InputError, match=f"{len(once)} rows"):
             kept(once.assign(**logged), again.assign(**logged, **changed))
+
+
+def test_a_message_names_the_nearest_columns_and_counts_the_rest(monkeypatch):
+    monkeypatch.setattr("experiments.report.plot._NAMED", 2)
+    with pytest.raises(InputError, match=r"nosuch; there are [\w.]+, [\w.]+ and \d+ more$"):
+        sweep_figure(rows(), "nosuch", "ate_rmse_m")

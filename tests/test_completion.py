@@ -38,7 +38,7 @@ def complete(line, **environment):
         ("estima run world=o", {"world=office"}),
         (
             "estima run world=office estimator=ekf_i",
-            {"estimator=ekf_icp", "estimator=ekf_icp_paper"},
+            {"estimator=ekf_icp", "estimator=ekf_icp_paper", "estimator=ekf_icp_tuned"},
         ),
         ("estima options me", {"metrics"}),
         ("estima table sl", {"slip"}),

@@ -263,6 +263,7 @@ def test_the_sensors_can_be_chosen():
 
 
 OPTIONS = sorted(path.stem for path in (CONF / "estimator").glob("*.yaml"))
+OPTIONS = [name for name in OPTIONS if not name.endswith("_tuned")]  # other values only
 FEWER = {
     "mcl": ["estimator.n_most=1000", "estimator.n_least=300"],  # particles; else 20 s
     **fakes.PROGRAMS,
@@ -271,5 +272,6 @@ FEWER = {
 
 @pytest.mark.parametrize("name", OPTIONS)
 def test_every_option_conforms(name):
-    results = conform_target(name, FEWER.get(name, []))
+    with fakes.peers_may_be_missing():
+        results = conform_target(name, FEWER.get(name, []))
     assert [f"{r.name}: {r.message}" for r in results if not r.passed] == []

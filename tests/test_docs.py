@@ -14,6 +14,7 @@ from experiments.papers.puzzlebot2024 import study as puzzlebot2024
 # studies of questions of ours, beyond the parts of the papers
 NOT_OF_A_PART = {
     "decristoforis2020_beliefs",
+    "decristoforis2020_office",
     "decristoforis2020_ordering",
     "gil2008_bound",
     "puzzlebot2024_engine",

@@ -146,6 +146,101 @@ def test_errors_are_within_their_covariances():
     assert 0.6 < np.median(of_landmarks) / 3.0 < 1.5
 
 
+@pytest.mark.parametrize("errors", ["coordinates", "invariant"])
+def test_little_noise_makes_all_errors_alike(errors):
+    """With a known heading both forms of the error are the same filter to first order."""
+    recording = circle(4, n_frames=60, kr=1e-6, kl=1e-6)
+    prior = tracking_prior(recording, sigma=(0.01, 0.01, 0.002))
+    plain_one, other = EkfSlam(kr=1e-6, kl=1e-6), EkfSlam(kr=1e-6, kl=1e-6, errors=errors)
+    first, second = follow(plain_one, recording, prior), follow(other, recording, prior)
+    np.testing.assert_allclose(second.means, first.means, atol=3e-3)
+    sigma = [np.sqrt(np.diagonal(e.covariances, axis1=1, axis2=2)) for e in (first, second)]
+    np.testing.assert_allclose(sigma[1], sigma[0], rtol=0.1)
+    np.testing.assert_allclose(
+        other.map["landmark_covariances"],
+        plain_one.map["landmark_covariances"],
+        rtol=0.2,
+        atol=3e-5,
+    )
+
+
+def test_seeing_landmarks_again_does_not_tell_where_north_is():
+    """No update may lower the uncertainty of the whole map's heading, given at the start."""
+    spread = 0.3
+    least = {}
+    for errors in ("coordinates", "invariant"):
+        sigmas = []
+        for seed in range(3):
+            recording = circle(seed, n_frames=200, kr=1e-3, kl=1e-3)
+            prior = tracking_prior(recording, sigma=(0.02, 0.02, spread))
+            turned = prior.mean + np.array([0.0, 0.0, spread])
+            filtered = EkfSlam(kr=1e-3, kl=1e-3, errors=errors)
+            online = follow(filtered, recording, dataclasses.replace(prior, mean=turned))
+            sigmas.append(np.sqrt(online.covariances[:, 2, 2].min()))
+        least[errors] = min(sigmas)
+    assert least["invariant"] > 0.999 * spread
+    assert least["coordinates"] < 0.9 * spread
+
+
+def misread(recording, share, seed=0):
+    """The recording with this share of its ids replaced by those of any landmark."""
+    rng = np.random.default_rng(seed)
+    ids = recording.log("stereo")["ids"].copy()
+    wrong = rng.random(len(ids)) < share
+    ids[wrong] = rng.integers(len(recording.truth.world.landmarks), size=int(wrong.sum()))
+    return with_field(recording, "stereo", ids=ids)
+
+
+def test_the_gate_leaves_misread_ids_out():
+    off = {}
+    for seed in range(3):
+        recording = misread(circle(seed, n_frames=100, kr=K_M, kl=K_M), 0.02, seed)
+        for gate in (None, 1e-6):
+            filtered = EkfSlam(**WHEELS, gate_probability=gate)
+            online = follow(filtered, recording)
+            off.setdefault(gate, []).append(
+                np.hypot(*(online.means - recording.truth.poses)[:, :2].T).max()
+            )
+    assert max(off[1e-6]) < 0.1
+    assert min(off[None]) > 2.0 * max(off[1e-6])
+
+
+def test_a_misread_id_starts_no_landmark():
+    recording = circle(0, n_frames=20)
+    log = recording.log("stereo")
+    ids = log["ids"].copy()
+    ids[0] = 999  # seen once
+    filtered = EkfSlam(**WHEELS, gate_probability=1e-6)
+    online = follow(filtered, with_field(recording, "stereo", ids=ids))
+    assert joined(online)[0] == -1
+    assert 999 not in filtered.map["ids"]
+    assert len(filtered.map["ids"]) > 5
+
+
+def test_errors_that_last_are_counted_once():
+    """An error that stays for half a second is one measurement, not three."""
+    values = {0.0: [], 0.5: []}
+    for seed in range(12):
+        recording = circle(seed, n_frames=100, kr=K_M, kl=K_M)
+        log, camera = recording.log("stereo"), recording.sensors["stereo"]
+        rows = np.repeat(np.arange(len(log.stamps)), np.diff(log.splits))
+        poses, landmarks = recording.truth.poses[::2], recording.truth.world.landmarks
+        clean = np.array(
+            [
+                points_in_camera(camera, poses[row], landmarks[None, i])[0]
+                for row, i in zip(rows, true_ids(recording), strict=True)
+            ]
+        )
+        noise = np.random.default_rng([seed, 2]).standard_normal((50, len(landmarks), 3))
+        lasting = noise[rows // 3, true_ids(recording)] * np.array([0.02, 0.02, 0.05])
+        held = with_field(recording, "stereo", points_in_camera=clean + lasting)
+        for repeat_s, squares in values.items():
+            filtered = EkfSlam(**WHEELS, sigma_disparity_px=0.35, repeat_s=repeat_s)
+            online = follow(filtered, held)
+            squares.append(nees(recording.truth.poses, online.means, online.covariances)[20:])
+    assert np.mean(values[0.5]) < 0.7 * np.mean(values[0.0])
+
+
 def described(recording, seed=0, sigma=0.05):
     """The recording with a descriptor of each observation, unlike each other's."""
     rng = np.random.default_rng(seed)
@@ -255,6 +350,10 @@ def test_wrong_input_is_named():
     for options, word in (
         ({"association": "nearest"}, "mahalanobis"),
         ({"d0": 0.0}, "d0"),
+        ({"errors": "twists"}, "invariant"),
+        ({"gate_probability": 1.0}, "gate_probability"),
+        ({"repeat_s": -1.0}, "repeat_s"),
+        ({"repeat_s": 0.5, "association": "mahalanobis"}, "repeat_s are of ids"),
         ({"kr": -1.0}, "kr"),
         ({"sigma_row_px": np.nan}, "sigma_row_px"),
         ({"noise_model": "flat"}, "diagonal"),

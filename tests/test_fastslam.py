@@ -41,6 +41,38 @@ def error_m(recording, estimate):
     return rms(position_errors_m(recording.truth_at(estimate.stamps), estimate.means))
 
 
+def test_the_gate_leaves_misread_ids_out(recording):
+    rng = np.random.default_rng(0)
+    ids = recording.log("stereo")["ids"].copy()
+    wrong = rng.random(len(ids)) < 0.02
+    ids[wrong] = rng.integers(len(recording.truth.world.landmarks), size=int(wrong.sum()))
+    misread = with_field(recording, "stereo", ids=ids)
+    off = {
+        gate: error_m(misread, walked(misread, gate_probability=gate)[0]) for gate in (None, 1e-6)
+    }
+    assert off[1e-6] < 0.2
+    assert off[None] > 2.0 * off[1e-6]
+
+
+def test_slip_in_bursts_is_followed():
+    """A wheel that jumps by far more than is believed leaves a normal cloud behind."""
+    sound = circle(seed=2, n_frames=120, kr=1e-5, kl=1e-5)
+    position = sound.wheels.position_m.copy()
+    for row in (40, 80):
+        position[row:, 0] += 0.06
+    jumped = dataclasses.replace(
+        sound, wheels=dataclasses.replace(sound.wheels, position_m=position)
+    )
+    off = {}
+    for dof in (None, 2.0):
+        done = [
+            walked(jumped, seed, kr=1e-4, kl=1e-4, slip_dof=dof, proposal="motion")[0]
+            for seed in range(3)
+        ]
+        off[dof] = np.mean([error_m(jumped, d) for d in done])
+    assert off[2.0] < 0.8 * off[None]
+
+
 @pytest.mark.parametrize("proposal", ["motion", "optimal"])
 def test_mends_what_the_wheels_spoil(recording, proposal):
     done, estimator = walked(recording, proposal=proposal, keep=("ess", "resampled"))

@@ -66,6 +66,20 @@ def test_scans_of_another_size_are_left_out():
 
 
 @pytest.mark.parametrize(
+    ("written", "reason"),
+    [(b"0", "missing \\(all 0\\)"), (b"1.13486e+09", "too coarse, such as 1.13486e\\+09")],
+)
+def test_stamps_that_are_no_clock_are_refused(written, reason):
+    """A program that prints stamps with six digits, or none at all, leaves one scan of hundreds."""
+    lines = []
+    for i in range(8):
+        lines.append(f"ODOM {0.1 * i} 0 0 0 0 0 ".encode() + written + b" host 0")
+        lines.append(f"FLASER 4 1 2 3 4 0 0 0 {0.1 * i} 0 0 ".encode() + written + b" host 0")
+    with pytest.raises(InputError, match=reason):
+        carmen(b"\n".join(lines))
+
+
+@pytest.mark.parametrize(
     ("line", "reason"),
     [
         (b"FLASER 1000000000000 1 2 3", "number of beams"),

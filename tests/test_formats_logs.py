@@ -84,8 +84,8 @@ def test_mrclam(tmp_path):
     np.testing.assert_allclose(log.stamps, [0.2, 0.6])
     np.testing.assert_array_equal(log.splits, [0, 1, 2])
     np.testing.assert_array_equal(log["ids"], [0, 1])
-    x, y, z = log["points_in_camera"][0]  # range 2, bearing 0.1 to the left
-    assert math.hypot(x, z) == pytest.approx(2.0)
+    x, y, z = log["points_in_camera"][0]  # depth 2, bearing 0.1 to the left
+    assert z == pytest.approx(2.0)
     assert math.atan2(-x, z) == pytest.approx(0.1)
     assert y == 0.0
     notes = recording.config["notes"]
@@ -214,8 +214,43 @@ def test_real_mrclam():
     known = np.isfinite(error)
     # bearings within the few degrees that the data set's text tells of
     assert np.quantile(np.abs(error[known]), 0.9) < math.radians(4.0)
-    short = np.hypot(points[:, 0], points[:, 2]) - np.hypot(*off.T)
-    assert abs(np.nanmedian(short)) < 0.05
+    # and depths too long by the few per cent that belong to each robot
+    longer = points[:, 2] / (np.hypot(*off.T) * np.cos(bearing))
+    assert 1.02 < np.nanmedian(longer) < 1.06
+
+
+@needs_data
+def test_the_range_of_mrclam_is_a_depth():
+    """Relative errors are the same at all bearings, which they are not read as a range."""
+    recording = mrclam.read_mrclam(DATA / "mrclam6/MRCLAM_Dataset6.tar.xz", 2)
+    log = recording.log("stereo")
+    seen = recording.truth_at(log.stamps)[
+        np.repeat(np.arange(len(log.stamps)), np.diff(log.splits))
+    ]
+    off = recording.truth.world.landmarks[true_ids(recording), :2] - seen[:, :2]
+    depth = log["points_in_camera"][:, 2]
+    bearing = np.abs(np.arctan2(log["points_in_camera"][:, 0], depth))
+
+    def spread(expected, shown):
+        parts = [(bearing >= low) & (bearing < low + 0.1) for low in (0.0, 0.1, 0.2, 0.3, 0.4)]
+        return np.ptp([np.nanmedian(shown[part] / expected[part]) for part in parts])
+
+    away = np.hypot(*off.T)
+    ahead = off[:, 0] * np.cos(seen[:, 2]) + off[:, 1] * np.sin(seen[:, 2])
+    assert spread(ahead, depth) < 0.02
+    assert spread(away, depth) > 0.05
+
+
+@pytest.mark.parametrize("n_beams", [180, 181, 360, 361])
+def test_intel_scans_of_a_whole_half_turn(tmp_path, n_beams):
+    """181 beams are a degree apart, from -90 to 90 degrees; 180 end a degree before."""
+    scan = {"range": [2.0] * n_beams, "x": 0.0, "y": 0.0, "theta": 0.0}
+    entries = {"1.0": scan, "2.0": {**scan, "x": 0.1}}
+    path = write(tmp_path / "raw.json", json.dumps({"map": entries}).encode())
+    laser = intel.read_intel(path).sensors["laser"]
+    bearings = np.degrees(laser.bearings_rad + laser.mount.yaw_rad)
+    step = 1.0 if n_beams < 200 else 0.5
+    np.testing.assert_allclose(bearings, np.arange(n_beams) * step - 90.0, atol=1e-9)
 
 
 @needs_data

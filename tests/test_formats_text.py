@@ -21,6 +21,13 @@ def test_numbers_are_read_exactly(numbers):
         assert found.is_number.all()
 
 
+@pytest.mark.parametrize("text", ["1 2\n", "# a comment\n1 2\n", "ODOM 1 2\n", ""])
+def test_a_byte_order_mark_is_passed_over(text):
+    plain, marked = split_words(text.encode(), "f"), split_words(text.encode("utf-8-sig"), "f")
+    np.testing.assert_array_equal(marked.values, plain.values)
+    assert marked.lines_by_keyword == plain.lines_by_keyword
+
+
 @settings(max_examples=500, deadline=None)
 @given(st.text("0123456789.eE+-infaINF#,; \n\txX", max_size=60))
 def test_words_are_numbers_where_python_says_so(text):

@@ -14,7 +14,6 @@ from experiments.evaluation.verdict import Profile, Role, Verdict, conclude
 from experiments.gate.conform import walk
 from experiments.papers.gil2008 import claims as judge
 from experiments.papers.gil2008 import recordings, scores, settings, study
-from experiments.papers.results import Results
 from experiments.runs.experiment import Experiment
 from experiments.sweeps.plan import planned
 from tests.fakes import circle, tracking_prior, true_ids
@@ -299,22 +298,6 @@ def test_dead_reckoning_fails_gi1():
     assert headlines(short)[1] == "undecided"
     own = next(c for c in short if c.statistic.startswith("error of odometry"))
     assert (own.verdict, own.role) == ("not_reproduced", "beside")
-
-
-def test_gi1_of_a_table_without_laps_waits_for_the_next_run():
-    old = sweep("n_particles", PARTICLES, lambda m: 0.5, filter="paper")
-    claims = list(judge.gi1(old, None))
-    assert headlines(claims) == ["reproduced", "undecided"]
-    assert "next full run" in conclusion("GI1", judge.gi1_sentence, claims).sentence
-
-
-def test_sentences_of_former_tables_name_their_filter(tmp_path):
-    old = sweep("n_particles", PARTICLES, lambda m: 0.5, filter="paper")
-    made = Results(tmp_path, "gil2008")
-    for table, is_old in ((old, True), (old.assign(noise_at="measured"), False)):
-        made.write_tables(particles=table)
-        (said,) = judge.conclusions(made, list(judge.gi1(table, laps())))
-        assert ("R was taken at the predicted point" in said.sentence) is is_old
 
 
 def test_gi2_and_gi3_tell_a_trend_from_none():

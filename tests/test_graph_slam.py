@@ -3,6 +3,7 @@
 import dataclasses
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from estimators import least_squares
@@ -14,10 +15,14 @@ from estimators.least_squares import Problem, solve
 from estimators.loop_closing import LoopSearch, look_alike, signature
 from estimators.odometry import Odometry
 from estimators.pose_graph import Edge, PoseGraph
+from estimators.scan_lines import without_sparse_lines
 from estimators.scan_matching import ScanMatcher
+from experiments.bench import graph_robustness
 from experiments.gate.conform import check_estimator
+from experiments.papers.real_logs import building
 from sim import se2
 from sim.errors import InputError
+from sim.formats.relations import Relations
 from sim.sensors import Laser
 from tests.fakes import circle, room_ranges_m, tracking_prior
 
@@ -195,6 +200,46 @@ def test_scans_look_alike_from_any_heading():
     assert look_alike(marks[0], marks).tolist() == [True, True, True, False]
 
 
+def test_edges_far_behind_one_another_are_no_wall():
+    """Posts of doors in a row, one beam on each, 6 m apart on one line; and a wall."""
+    posts = np.array([[6.0, 1.2], [12.0, 1.2], [18.0, 1.2], [24.0, 1.2]])
+    wall = np.column_stack([np.full(30, 3.0), np.linspace(-2.0, -0.2, 30)])
+    points = np.concatenate([wall, posts[::-1]])
+    bearings = np.arctan2(points[:, 1], points[:, 0])
+    order = np.argsort(bearings)
+    scan = prepare(np.hypot(*points.T)[order], bearings[order])
+    assert len(scan.lines) == 2
+    kept = without_sparse_lines(scan, 1.5)
+    assert len(kept.lines) == len(kept.segments.normals) == len(kept.line_ends) == 1
+    assert np.count_nonzero(kept.line_of_point == 0) == 30
+    np.testing.assert_allclose(kept.lines[0], [1.0 / 3.0, 0.0], atol=1e-9)
+    assert without_sparse_lines(scan, 10.0) is scan
+
+
+def test_planted_drives_are_summed_by_share_and_threshold():
+    names = ["share", "support", "closures", "false", "planted", "revisits", "closed"]
+    drives = pd.DataFrame(
+        [
+            [0.0, 3, 10, 0, 0, 8, 8, 0.1],
+            [0.5, 3, 6, 1, 9, 8, 4, 0.1],
+            [0.5, 3, 4, 1, 9, 2, 1, 0.9],
+            [0.5, 5, 0, 0, 9, 5, 0, 0.2],
+        ],
+        columns=[*names, "revised_worst_m"],
+    )
+    sums = graph_robustness.table(drives)
+    assert sums.precision.tolist() == [1.0, 0.8, 1.0]
+    assert sums.recall.tolist() == [1.0, 0.5, 0.0]
+    assert sums.bent.tolist() == [0, 1, 0]
+
+
+def test_relations_of_unknown_stamps_and_of_a_scan_with_itself_judge_nothing():
+    stamps = np.array([[0.0, 10.0], [0.0, 0.02], [0.0, 20.0], [10.0, 20.0]])
+    relations = Relations(stamps, np.arange(12.0).reshape(4, 3))
+    known, others = np.array([0.01, 10.0, 19.0]), np.array([0.0, 0.02, 10.04, 20.0])
+    assert building._shared(relations, known, others).stamps.tolist() == [[0.0, 10.0]]
+
+
 # --- the estimator -------------------------------------------------------------------------------
 
 
@@ -291,6 +336,8 @@ def test_frames_without_scans_and_before_the_first():
 def test_bad_options_and_no_frames_are_refused():
     with pytest.raises(InputError, match="loop_support"):
         GraphSlam(loop_support=0)
+    with pytest.raises(InputError, match="most_gap_m"):
+        GraphSlam(most_gap_m=0.0)
     with pytest.raises(InputError, match="shared_noise"):
         GraphSlam(shared_noise=1.0)
     estimator = GraphSlam()

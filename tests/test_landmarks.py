@@ -140,11 +140,12 @@ def test_proposal_is_the_motion_given_the_image(noise_model, noise_at):
     drawn, middle = noise.copy(), np.zeros((3, n_lanes))
     owed, at_middle = np.empty((2, n_lanes)), np.empty((2, n_lanes))
     start = 0.1 * np.random.default_rng(4).standard_normal((3, n_lanes))
-    ekf.propose(batch.lanes, root, batch.state, start, drawn, owed)
-    ekf.propose(batch.lanes, root, batch.state, start, middle, at_middle)
+    stretch = np.random.default_rng(5).uniform(0.5, 3.0, n_lanes)
+    ekf.propose(batch.lanes, root, stretch, batch.state, start, drawn, owed)
+    ekf.propose(batch.lanes, root, stretch, batch.state, start, middle, at_middle)
     for m in range(N_PARTICLES):
         cos, sin = batch.lanes[3:, m]
-        B = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]]) @ root
+        B = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]]) @ root * stretch[m]
         inverse, rhs = np.eye(3), np.zeros(3)
         for slot in range(len(batch.points)):
             v, S, H, _, _, _ = innovation(batch, m, slot)

@@ -83,23 +83,42 @@ def test_finds_the_robot_anywhere():
     assert found >= 5
 
 
-@pytest.mark.parametrize("recovery", [True, False])
+@pytest.mark.parametrize("recovery", ["average", "rivals", "none"])
 def test_carried_off(recovery):
     """Set down elsewhere at frame 40: found again with recovery on, lost for good without."""
     poses, frames = drive(ROOM, 40, wheel_noise_m=NOISE_M)
     after, more = drive(ROOM, 100, start=[3.8, 3.0, START[2] + math.pi], wheel_noise_m=NOISE_M)
     poses = np.concatenate([poses, after[1:]])
     frames += [dataclasses.replace(frame, stamp=frame.stamp + 4.0) for frame in more[1:]]
-    estimator = Mcl(n_most=4000, alpha_slow=0.01 if recovery else 0.0, **WHEELS)
+    estimator = Mcl(n_most=4000, recovery=recovery, rival_scans=5, **WHEELS)
     beliefs = follow(estimator, frames, prior())
     off_m = errors(beliefs, poses)[0]
     assert off_m[:40].max() < 0.15
-    if recovery:
+    if recovery != "none":
         assert off_m[-30:].max() < 0.2
         assert max(b.extras["injected"] for b in beliefs[40:]) > 0
         assert max(b.extras["injected"] for b in beliefs[:40]) == 0
     else:
         assert off_m[40:].min() > 0.5
+
+
+def test_people_before_the_laser_are_not_being_lost():
+    """Half the beams end short for three metres: the average calls that lost, rivals do not."""
+    poses, frames = drive(ROOM, 120, wheel_noise_m=NOISE_M)
+    rng = np.random.default_rng(1)
+    for i in range(40, 100):
+        ranges = frames[i].readings["laser"]["ranges_m"].copy()
+        short = rng.random(len(ranges)) < 0.5
+        ranges[short] *= rng.uniform(0.2, 0.9, int(short.sum()))
+        frames[i] = with_scan(frames[i], ranges)
+    injected = {}
+    for recovery in ("average", "rivals"):
+        beliefs = follow(Mcl(n_most=4000, recovery=recovery, **WHEELS), frames, prior())
+        injected[recovery] = max(b.extras["injected"] for b in beliefs)
+        if recovery == "rivals":
+            assert errors(beliefs, poses)[0].max() < 0.2
+    assert injected["average"] > 0
+    assert injected["rivals"] == 0
 
 
 def test_number_of_particles_follows_fox():

@@ -227,9 +227,33 @@ def test_stamps_outside_the_truth_are_left_out():
     assert set(without) == {"duration_s", "step_time_us"}
 
 
+def test_frames_in_a_gap_of_the_truth_are_not_scored():
+    """As in a thinned log: between true poses far apart the robot did not drive straight."""
+    import dataclasses
+
+    recording = fakes.circle()  # 100 frames, 0.1 s apart
+    truth = recording.truth
+    rows = np.array([*range(20), *range(60, 100)])  # 4.1 s are missing
+    holed = dataclasses.replace(
+        recording,
+        truth=dataclasses.replace(truth, stamps=truth.stamps[rows], poses=truth.poses[rows]),
+    )
+    estimate = fakes.estimate(recording)
+    row = metrics.score(holed, estimate)
+    assert (row["stamps_scored"], row["stamps_left_out"]) == (60, 40)
+    assert row["ate_rmse_m"] == pytest.approx(0.0, abs=1e-9)
+    drawn_across = metrics.score(holed, estimate, longest_gap_s=10.0)
+    assert drawn_across["stamps_left_out"] == 0
+    assert drawn_across["ate_rmse_m"] > 0.05
+    sparse = dataclasses.replace(truth, stamps=truth.stamps[::9] + 0.01, poses=truth.poses[::9])
+    with pytest.raises(InputError, match=r"scoring\.longest_gap_s"):
+        metrics.score(dataclasses.replace(recording, truth=sparse), estimate)
+
+
 def test_every_score_says_its_unit():
     recording = fakes.circle(n_frames=400)
     pure = {"nees_mean", "nees_counted_share", "final_in_ellipse"}
+    pure |= {"stamps_scored", "stamps_left_out"}
     keys = set(metrics.score(recording, fakes.estimate(recording)))
     assert {
         *("ate_rmse_m", "ate_aligned_rmse_m", "heading_rmse_rad", "heading_aligned_rmse_rad"),

@@ -151,6 +151,8 @@ BAD = {
     ),
     "error": ("print('{\"error\": \"no scan\"}', flush=True)", "the error no scan"),
     "two_lines": (f"print('{_BELIEF}\\n{_BELIEF}', flush=True)", "after its answer|being asked"),
+    "greeting": ("print('hello\\n{}', flush=True)", "after its answer 'hello'|being asked"),
+    "far": ("print('{\"mean\": [1e300, 0, 0]}', flush=True)", r"mean, numbers up to 1e\+12"),
     "half_line": ("print('{\"mean\"', end='', flush=True); time.sleep(60)", "no answer within"),
     "endless_line": ("while True: sys.stdout.write('x' * 65536)", "more than 1048576 bytes"),
     "binary": ("sys.stdout.buffer.write(b'\\xff\\xfe\\n'); sys.stdout.flush()", "no JSON object"),
@@ -234,6 +236,24 @@ def test_a_revised_trajectory_comes_at_the_end(recording, tmp_path):
     assert not revised.covariances.any()
 
 
+def test_revised_stamps_of_another_time_are_refused(recording, tmp_path):
+    answer = '{"stamps": [1000, 1001], "means": [[0, 0, 0], [1, 0, 0]]}'
+    command = child(tmp_path, f"print('{answer}' if m['type'] == 'finish' else '{_BELIEF}')\n"
+                    "sys.stdout.flush()")  # fmt: skip
+    with pytest.raises(ProgramError, match="must answer with stamps of the Frames, 0 to"):
+        run(External(command), recording)
+
+
+def test_a_revised_path_of_one_pose_gets_a_remark(tmp_path):
+    answer = '{"stamps": [0], "means": [[0, 0, 0]]}'
+    command = child(tmp_path, f"print('{answer}' if m['type'] == 'finish' else '{_BELIEF}')\n"
+                    "sys.stdout.flush()")  # fmt: skip
+    settings = ["simulation.physics=kinematic", "route=linear_1", "estimator=external"]
+    experiment = Experiment.compose(settings).with_estimator(command=command)
+    (row,) = evaluate(experiment)
+    assert (row["status"], row["status_code"]) == (Outcome.REMARK, "gap")
+
+
 def test_a_failing_program_is_a_status_of_its_row(tmp_path):
     command = child(tmp_path, "if m['type'] == 'frame': sys.exit(7)\nprint('{}', flush=True)")
     settings = ["simulation.physics=kinematic", "route=linear_1", "estimator=external"]
@@ -250,6 +270,7 @@ def test_a_failing_program_is_a_status_of_its_row(tmp_path):
         ({"command": []}, "must be a program"),
         ({"command": [1, 2]}, "must be a program"),
         ({"command": "no_such_program_here --fast"}, "no program no_such_program_here"),
+        ({"command": "build/peers/mrpt icp"}, "`make peers` compiles it"),
         ({"command": "python3 'open"}, "No closing quotation"),
         ({"command": PYTHON, "step_s": 0}, "step_s must be a positive number"),
         ({"command": PYTHON, "start_s": True}, "start_s must be a positive number"),
@@ -280,6 +301,7 @@ OFFLINE_BAD = {
     "nothing": ("exit 0", r"ended without writing \{out\}"),
     "garbage": ('echo hello > "$1"', r"wrote no trajectory: \{out\}:1"),
     "empty": (': > "$1"', "holds no pose"),
+    "elsewhere": ('echo 1000 1 2 0 0 0 0 1 > "$1"', "is from 1000 to 1000 s, the Frames from 0 to"),
     "slow": ("sleep 60", r"did not end within 0\.5 s"),
     "child": ("sleep 60 & wait", r"did not end within 0\.5 s"),
     "talk": ("while :; do echo much too much; done", r"did not end within 0\.5 s"),

@@ -137,6 +137,20 @@ def test_truth_is_interpolated_the_short_way_round():
     assert np.isnan(outside).all()
 
 
+def test_truth_is_not_interpolated_over_gaps():
+    stamps = np.array([0.0, 0.1, 2.0, 2.1])
+    truth = Truth(stamps, np.column_stack([stamps, stamps, np.zeros(4)]))
+    recording = dataclasses.replace(small_recording(), truth=truth)
+    asked = np.array([-0.1, 0.0, 0.05, 0.1, 1.0, 2.0, 2.05, 2.1, 2.2])
+    known = np.isfinite(recording.truth_at(asked, longest_gap_s=0.5)).all(axis=1)
+    assert known.tolist() == [False, True, True, True, False, True, True, True, False]
+    assert np.isfinite(recording.truth_at(asked)).all(axis=1).tolist() == [
+        False,
+        *[True] * 7,
+        False,
+    ]
+
+
 def test_what_is_missing_is_named():
     blind = dataclasses.replace(small_recording().without("laser").without("stereo"), truth=None)
     assert blind.world is None

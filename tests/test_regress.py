@@ -359,7 +359,7 @@ def test_suite_of_the_check_is_sound():
     for entry in suite.estimators:
         assert entry.repeats[0] >= entry.repeats[1]
     estimators = {entry.estimator for entry in suite.estimators}
-    assert {"ekf_icp_paper", "fastslam_paper", "fixed_lag"} <= estimators
+    assert {"ekf_icp_paper", "fastslam_paper", "fixed_lag", "graph_slam"} <= estimators
     by_engine = [
         e for e in suite.estimators if "simulation.physics=bullet" in suite.overrides[e.recordings]
     ]

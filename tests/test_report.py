@@ -161,6 +161,21 @@ def test_a_figure_without_a_caption_still_shows(text):
     assert "Not made yet: puzzlebot2024_ideal_and_real" in page.all("main")[0]["text"]
 
 
+def test_a_picture_of_a_table_is_shown_as_the_table():
+    tables = {"a": {"name": "a"}}
+    assert contents.shown_as_table(tables, {"table": "a"}) == {"table": {"name": "a"}}
+    assert contents.shown_as_table(tables, {"table": "gone"}) == {"table": None}
+    assert contents.shown_as_table(tables, {}) == {"table": None}
+
+
+def test_spreads_and_bounds_share_the_cell_of_their_value():
+    columns = ("x_mean_m", "x_sd_m", "k_m", "k_low_m", "k_high_m", "y_mean_m")
+    frame = pd.DataFrame([[1.0, 0.25, 1e-5, 0.5e-5, 2e-5, 3.0]], columns=columns)
+    found = contents.with_spread(frame).to_dict("list")
+    expected = {"x_m": ["1.00 ± 0.25"], "k_m": ["1e-05 [5e-06, 2e-05]"], "y_mean_m": [3.0]}
+    assert found == expected
+
+
 def test_small_tables_whole_and_large_ones_begun(text):
     bodies = {e.get("aria-label"): e["text"] for e in Outline(text).all("div")}
     assert "a<b1e-05c" in bodies["puzzlebot2024_small"]
@@ -249,7 +264,7 @@ def test_findings_are_complete(paper):
     assert set(about) == {"title", "about", "claims", "figures"}
     for name, figure in about["figures"].items():
         assert name.startswith(f"{paper}_")
-        assert set(figure) == {"title", "alt", "paper", "claims"}
+        assert set(figure) - {"table"} == {"title", "alt", "paper", "claims"}
         assert set(figure["claims"]) <= set(about["claims"])
         assert len(figure["alt"]) > 40
 
@@ -282,6 +297,52 @@ def test_the_keyboard_skips_to_the_claims_and_opens_details(tab):
     assert tab.js("getComputedStyle(document.activeElement).outlineStyle") == "solid"
     tab.press("Enter", text="\r")
     assert tab.becomes("document.querySelector('#claim-PB1 details').open")
+
+
+def test_figures_open_enlarged_by_key_and_close_again(tab):
+    tab.js("document.querySelector('figure .enlarge').focus()")
+    tab.press("Enter", text="\r")
+    assert tab.becomes("document.querySelector('dialog').open")
+    assert tab.js("document.querySelector('dialog img').getBoundingClientRect().width") >= 600
+    tab.js("document.querySelector('dialog').click()")
+    assert tab.becomes("!document.querySelector('dialog').open")
+
+
+def test_tables_can_be_sorted(tab):
+    table = "document.querySelector('table.sortable')"
+    tab.js(f"{table}.closest('details').open = true")
+    tab.js(f"{table}.querySelector('th:last-child button').click()")
+    assert tab.js(f"{table}.querySelector('th:last-child').ariaSort") == "ascending"
+
+
+def test_the_first_screen_names_the_best_of_the_leaderboard(tmp_path):
+    path = tmp_path / "leaderboard_means.csv"
+    assert contents.best_of_worlds(path) == []
+    rows = {"choice.world": ["v", "v", "w"], "choice.estimator": ["a", "b", "b"]}
+    write_frame(pd.DataFrame({**rows, "answer_ate_rmse_m": [0.2, 0.1234, 0.3]}), path)
+    assert contents.best_of_worlds(path) == [("v", "b", "0.12"), ("w", "b", "0.3")]
+    write_frame(pd.DataFrame(rows), path)
+    assert contents.best_of_worlds(path) == []
+
+
+def test_the_first_screen_names_the_paper_that_holds_best():
+    good, bad, open_ = Verdict.REPRODUCED, Verdict.NOT_REPRODUCED, Verdict.UNDECIDED
+    tallies = {"a": [(good, 3), (bad, 1)], "b": [(good, 6), (bad, 2)], "c": [(open_, 6)], "d": []}
+    assert contents.holding_best(tallies) == [("a", 3, 4), ("b", 6, 8)]
+    assert contents.holding_best({"c": [(open_, 6)], "d": []}) == []
+
+
+def test_the_first_screen_names_the_best_on_lasers(tmp_path):
+    path = tmp_path / "peers_methods.csv"
+    assert contents.best_on_lasers(path) == {}
+    rows = {"sensor": ["wheels", "laser", "laser"], "estimator": ["w", "theirs", "ours"]}
+    rows |= {"project": ["Estima", "other 1.0", "Estima"], "runs": 15}
+    write_frame(pd.DataFrame({**rows, "ate_rmse_m": [0.001, 0.0321, 0.0123]}), path)
+    found = contents.best_on_lasers(path)
+    assert (found["estimator"], found["error"], found["methods"]) == ("ours", "0.012", 2)
+    assert found["others"] == "theirs, 0.032 m"
+    write_frame(pd.DataFrame({**rows, "sensor": "wheels", "ate_rmse_m": 0.1}), path)
+    assert contents.best_on_lasers(path) == {}
 
 
 def test_what_scrolls_sideways_can_be_reached_by_keyboard(tab):

@@ -143,3 +143,16 @@ def test_a_point_never_reached_leaves_the_route_incomplete():
     assert driver.trouble is None
     driver.command(6 * 300 * 60, start)
     assert driver.trouble == "incomplete"
+
+
+def test_a_robot_that_rolls_past_its_goal_comes_to_rest():
+    world = World("open", np.zeros((0, 4)), np.zeros((0, 2)))
+    tour = Tour(waypoints=((0.0, 0.0), (0.6, 0.0), (1.2, 0.0)), tolerance_m=1.0)
+    pose, driver = tour.start(world, ROBOT)
+    for tick in range(0, 300, 6):
+        driver.command(tick, pose)  # at full speed
+    pose[0] = 1.5
+    commands = [driver.command(tick, pose) for tick in range(300, 1800, 6)]
+    assert commands[0] is not None
+    assert commands[-1] is None
+    assert driver.trouble is None

@@ -164,7 +164,7 @@ def test_a_row_is_an_ordinary_one(files, tmp_path, monkeypatch, capsys):
     assert "revised path, not aligned" in out
     code, out, err = run(monkeypatch, capsys, "table", "score", "--times")
     assert code == 0, err
-    assert [line.split()[:3] for line in out.splitlines()[1:]] == [
+    assert [line.split()[:3] for line in out.splitlines()[3:]] == [
         ["batch", "1", "revised"],
         ["est", "1", "online"],
     ]
@@ -173,6 +173,20 @@ def test_a_row_is_an_ordinary_one(files, tmp_path, monkeypatch, capsys):
         monkeypatch, capsys, "plot", "score", "--x", "choice.estimator", "-o", picture
     )
     assert (code, picture.exists()) == (0, True), err
+
+
+def test_a_trajectory_that_leaves_out_much_gets_a_remark(files, tmp_path, monkeypatch, capsys):
+    folder, _ = files
+    monkeypatch.setenv("ESTIMA_RESULTS", str(tmp_path))
+    one = tmp_path / "one.tum"
+    one.write_text((folder / "est.tum").read_text().splitlines()[0] + "\n")
+    found = {}
+    for path in (one, folder / "est.tum"):
+        code, out, err = run(monkeypatch, capsys, "score", folder / "run.npz", path, "--json")
+        assert code == 0, err
+        (row,) = json.loads(out)
+        found[path.stem] = (row["status"], row["status_code"])
+    assert found == {"one": ("remark", "gap"), "est": ("ok", "")}
 
 
 def test_trajectories_are_compared(files, tmp_path, monkeypatch, capsys):
@@ -225,6 +239,7 @@ MALFORMED = {
     "stamp.tum": b"nan 1 2 0 0 0 0 1\n",
     "quaternion.tum": b"0 1 2 0 0 0 0 0\n",
     "long.tum": b"0 1 2 0 9 0 0 1\n",
+    "far.tum": b"0 1e300 2 0 0 0 0 1\n",
     "huge.tum": b"1e300 1e300 2 0 0 0 0 1\n",
     "backwards.tum": (_LINE.format(1) + _LINE.format(0)).encode(),
     "twice.tum": (_LINE.format(1) * 2).encode(),
@@ -232,6 +247,7 @@ MALFORMED = {
     "elsewhere.tum": _LINE.format(1e6).encode(),
     "binary.tum": bytes(range(256)),
     "utf16.tum": _LINE.format(0).encode("utf-16"),
+    "mark.tum": "\ufeff".encode(),
     "cut.tum": (_LINE.format(0) + "0.1 1 2").encode(),
     "empty.csv": b"",
     "header.csv": _CSV.encode(),

@@ -357,6 +357,25 @@ def test_robots_of_a_team_carry_the_same_sensors():
         EkfSlam(**SEEING).reset_team([dataclasses.replace(priors[0], sensors=bare)], None)
 
 
+def test_invariant_errors_are_of_one_robot():
+    team = fake_team(0, n_frames=5)
+    with pytest.raises(InputError, match=r"set estimator\.errors=coordinates"):
+        answers(lambda: EkfSlam(errors="invariant", **WHEELS), team, priors_of(team))
+
+
+def test_repeats_are_counted_for_each_robot():
+    """What another robot saw is news, however lately."""
+    team = fake_team(0, n_robots=1, n_frames=2)
+    [prior], frames = priors_of(team), [*team.robots[0].frames()]
+    filter_ = EkfSlam(repeat_s=1e3, **WHEELS)
+    filter_.reset_team([prior, prior], np.random.default_rng(0))
+    used = []
+    for frame in (frames[0], dataclasses.replace(frames[0], robot=1), frames[0]):
+        [belief] = filter_.step_team([frame])
+        used.append(np.count_nonzero(belief.extras["associations"] >= 0))
+    assert used[0] == used[1] > 0 == used[2]
+
+
 def test_in_range():
     team = fake_team(0, n_frames=10)
     near = in_range(team, 3.0)

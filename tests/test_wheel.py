@@ -133,7 +133,7 @@ def test_a_sweep_by_the_command_and_by_the_api(installed):
     code, said = estima("run", "-m", *QUICK, "name=sweep", "seed=range(0,3)")
     assert code == 0, said
     assert len(list((folder / "results" / "runs" / "sweep").glob("*.parquet"))) == 3
-    code, said = estima("table", "sweep", "-o", "sweep.csv")
+    code, said = estima("table", "sweep", "--rows", "-o", "sweep.csv")
     assert code == 0, said
     script = f"import estima; print(len(estima.sweep(*{QUICK}, 'seed=range(0,3)', name='sweep')))"
     done = subprocess.run(

@@ -29,6 +29,17 @@ def test_covariance_is_slip_ticks_and_sideways_slip(travel_m):
     np.testing.assert_allclose(motion.covariance, root @ root.T + sideways, atol=1e-18)
 
 
+def test_what_both_wheels_slip_together_does_not_turn():
+    wheels = WheelPrediction(1e-4, 1e-4, forward_slip_m=5e-3)
+    wheels.reset(TRACK_M)
+    motion, root = wheels.predict_with_root(frame(0.1, 0.1))
+    alone = WheelPrediction(1e-4, 1e-4)
+    alone.reset(TRACK_M)
+    more = motion.covariance - alone.predict(frame(0.1, 0.1)).covariance
+    np.testing.assert_allclose(more, np.diag([5e-3 * 0.1, 0.0, 0.0]), atol=1e-18)
+    np.testing.assert_allclose(root @ root.T, motion.covariance, atol=1e-18)
+
+
 def test_travel_is_netted_over_the_window_and_forgotten_at_reset():
     wheels = WheelPrediction(1e-4, 1e-4, window_s=0.2)
     wheels.reset(TRACK_M)
@@ -40,7 +51,9 @@ def test_travel_is_netted_over_the_window_and_forgotten_at_reset():
     assert wheels.slip(frame(-0.01, -0.01))[0].tolist() == [0.01, 0.01]
 
 
-@pytest.mark.parametrize("name", ["kr", "kl", "window_s", "lateral_slip_m", "encoder_tick_m"])
+@pytest.mark.parametrize(
+    "name", ["kr", "kl", "window_s", "lateral_slip_m", "encoder_tick_m", "forward_slip_m"]
+)
 def test_wrong_options_are_named(name):
     with pytest.raises(InputError, match=rf"^estimator\.{name} must be"):
         WheelPrediction(**{"kr": 1e-4, "kl": 1e-4, name: -1.0})

@@ -17,7 +17,7 @@ SUITES = {
     "mcl": ("mcl",),
     "formats": ("formats",),
     "smoothing": ("smoothing",),
-    "graph_slam": ("graph_slam",),
+    "graph_slam": ("graph_slam", "graph_growth"),
     "compile": ("compile",),
     "growth": ("growth",),
     "external": ("external",),

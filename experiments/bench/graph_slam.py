@@ -18,8 +18,8 @@ from estimators.base import Estimate
 from estimators.base import run as run_estimator
 from estimators.gaussian import Gaussian
 from estimators.graph_slam import GraphSlam
-from estimators.pose_graph import Edge, PoseGraph
-from experiments.bench.measure import Measurement, time_s
+from estimators.pose_graph import Edge
+from experiments.bench.measure import Measurement
 from experiments.evaluation.metrics import nees
 from experiments.runs.evaluate import limited_blas
 from experiments.runs.experiment import Experiment
@@ -33,8 +33,6 @@ _NEAR_M, _NEAR_RAD, _APART_M = 2.0, 0.8, 10.0  # of a revisit: to an old key fra
 _TWIN_M = 0.5  # along x in map
 _ROOMS = (
     "world=rooms",
-    "world.n_x=7",
-    "world.n_y=6",
     "world.objects_per_room=0",
     "robot=robocom",
     "sensors=lms291",
@@ -46,7 +44,7 @@ _ROOMS = (
     "prior.sigma_position_m=1e-3",
     "prior.sigma_heading_rad=1e-4",
 )
-_JUDGED = range(1000, 1020)
+_JUDGED = range(1100, 1120)  # seeds 1000 to 1012 have been looked at
 
 
 class Planted(GraphSlam):
@@ -84,8 +82,8 @@ class RoomRun:
         Closures believed by the end, those of them that are false, and false ones planted.
     revisits, closed
         Key frames near an old one, and those of them within 5 m of travel of a closure.
-    end_m, revised_end_m, worst_m
-        Errors of position at the end and the greatest one, online but for the second.
+    end_m, revised_end_m, worst_m, revised_worst_m
+        Errors of position at the end and the greatest ones, online and revised.
     nees, revised_nees
         Mean NEES / 3.
     realtime_factor
@@ -102,6 +100,7 @@ class RoomRun:
     end_m: float
     revised_end_m: float
     worst_m: float
+    revised_worst_m: float
     nees: float
     revised_nees: float
     realtime_factor: float
@@ -109,14 +108,19 @@ class RoomRun:
 
 
 def run_rooms(
-    seed: int, planted: float = 0.0, distance_m: float = 300.0, **options: Any
+    seed: int,
+    planted: float = 0.0,
+    distance_m: float = 300.0,
+    rooms: tuple[int, int] = (7, 6),
+    **options: Any,
 ) -> RoomRun:
-    """Drive through look-alike rooms, with this share of false candidates.
+    """Drive through rows and columns of look-alike rooms, with this share of false candidates.
 
     `options` are those of `estimators.graph_slam.GraphSlam`.
     """
-    experiment = Experiment.compose([*_ROOMS, f"seed={seed}", f"route.distance_m={distance_m}"])
-    recording, robot = experiment.simulate(), experiment.robot()
+    size = [f"world.n_x={rooms[0]}", f"world.n_y={rooms[1]}", f"route.distance_m={distance_m}"]
+    experiment = Experiment.compose([*_ROOMS, *size, f"seed={seed}"])
+    recording, robot = experiment.recording(), experiment.robot()
     estimator = Planted(planted, stream(seed, "bench"), kr=robot.kr, kl=robot.kl, **options)
     with limited_blas():
         begun = time.process_time()
@@ -133,6 +137,7 @@ def run_rooms(
         end_m=float(errors_m[-1]),
         revised_end_m=float(revised_m[-1]),
         worst_m=float(errors_m.max()),
+        revised_worst_m=float(revised_m.max()),
         nees=_nees(recording, online),
         revised_nees=_nees(recording, revised),
         realtime_factor=float(duration_s / (stepped - begun)),
@@ -174,41 +179,8 @@ def _nees(recording: Recording, estimate: Estimate) -> float:
     return float(np.nanmean(nees(truth, estimate.means, estimate.covariances)) / 3.0)
 
 
-def growth(lengths_m: tuple[float, ...] = (500.0, 1500.0, 5000.0)) -> Iterator[Measurement]:
-    """Time of a key frame and of a solution after laps of 100 m, a key frame each 0.5 m.
-
-    The graph alone, without scans: what grows with the length of the path. Every third key frame
-    closes the lap.
-    """
-    rng, noise, lap = stream(0, "bench"), np.diag([1e-5, 1e-5, 1e-6]), 200
-    step = np.array([0.5, 0.0, 2.0 * np.pi / lap])
-    graph = PoseGraph(Gaussian(np.zeros(3), 1e-6 * np.eye(3)), robust_sigma=5.0)
-    draws = rng.standard_normal((int(max(lengths_m) / 0.5), 3)) * np.sqrt(np.diag(noise))
-    for length_m in lengths_m:
-        begun, before = time.process_time(), len(graph)
-        while len(graph) < length_m / 0.5:
-            motion = step + draws[len(graph)]
-            graph.add(motion, [Gaussian(motion, noise)])
-            graph.newest_from(np.arange(len(graph) - 1), exact=False)
-        spent_s = (time.process_time() - begun) / (len(graph) - before)
-        closures = [
-            Edge(second - lap, second, Gaussian(np.zeros(3), noise))
-            for second in range(max(before, lap), len(graph), 3)
-        ]
-        graph.close(closures)
-        last = len(graph) - 1
-        extra = Edge(last - lap, last, Gaussian(np.zeros(3), noise))
-        solve_s = time_s(graph.close, [extra], 1e-4, clock=time.process_time)
-        note = f"{len(graph)} key frames, {len(graph.closures)} closures"
-        name = f"graph_slam.at_{length_m:.0f}_m"
-        yield Measurement(f"{name}.key_frame_ms", 1e3 * spent_s, "ms", note=note)
-        yield Measurement(f"{name}.closure_ms", 1e3 * solve_s, "ms", note="and its solution")
-
-
 def run() -> Iterator[Measurement]:
-    """Growth; twenty judged drives of 300 m, five of them again with planted closures."""
-    with limited_blas():
-        yield from growth()
+    """Twenty judged drives of 300 m, five of them again with planted closures."""
     runs = [run_rooms(seed) for seed in _JUDGED]
     note = "20 drives of 300 m through look-alike rooms"
     n_revisits = sum(r.revisits for r in runs)
@@ -224,7 +196,7 @@ def run() -> Iterator[Measurement]:
     yield Measurement("graph_slam.revised_nees_3", mean, "", 1.5)
     factor = min(r.realtime_factor for r in runs)
     yield Measurement("graph_slam.realtime_factor_10hz", factor, "", 10, "higher", "the least")
-    for share in (0.1, 0.3, 0.5):
+    for share in (0.1, 0.25, 0.5):
         found = [run_rooms(seed, share) for seed in _JUDGED[:5]]
         note = f"of {sum(r.planted for r in found)}; false candidates are {share:.0%} of all"
         bent = sum(r.false for r in found)

@@ -94,7 +94,7 @@ def driven(name: str) -> tuple[list[float], list[float]]:
     step_us, memory_mib = [], []
     for _, steps in _minutes(name):
         step_us.append(1e6 * statistics.fmean(seconds for seconds, _ in steps))
-        memory_mib.append(_memory_mib())
+        memory_mib.append(resident_mib())
     return step_us, memory_mib
 
 
@@ -130,7 +130,7 @@ def _experiment(name: str) -> Experiment:
     return Experiment.compose([*drive, length, f"estimator={name}", *known])
 
 
-def _memory_mib() -> float:
+def resident_mib() -> float:
     """Memory that the process needs now, without what it has freed."""
     gc.collect()
     ctypes.CDLL(None).malloc_trim(0)

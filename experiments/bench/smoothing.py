@@ -15,7 +15,7 @@ from experiments.runs.evaluate import limited_blas
 from experiments.runs.experiment import Experiment
 from experiments.runs.seeds import stream
 
-_DRIVE = (
+DRIVE = (
     "world=rooms",
     "sensors=laser_stereo",
     "robot=robocom",
@@ -26,7 +26,7 @@ _DRIVE = (
 
 def run() -> Iterator[Measurement]:
     """Processor times over the drive, with one BLAS thread."""
-    experiment = Experiment.compose([*_DRIVE, "estimator=smoother"])
+    experiment = Experiment.compose([*DRIVE, "estimator=smoother"])
     recording = experiment.simulate()
     prior = experiment.prior(recording)
     batch = Smoother(kr=experiment.robot().kr, kl=experiment.robot().kl)
@@ -43,7 +43,7 @@ def run() -> Iterator[Measurement]:
     yield Measurement("smoother.solve_s", solved, "s", 0.15, note=note)
     yield Measurement("smoother.covariances_s", whole, "s", 0.3, note=f"{note}, and every Frame")
     for name, goal in (("ekf_slam", 0.35), ("fixed_lag", 0.3)):
-        online = Experiment.compose([*_DRIVE, f"estimator={name}"]).estimator()
+        online = Experiment.compose([*DRIVE, f"estimator={name}"]).estimator()
 
         def steps(online: Estimator = online) -> None:
             run_estimator(online, recording, prior, stream(0, "bench"))

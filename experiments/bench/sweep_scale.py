@@ -23,8 +23,9 @@ from experiments.runs.columns import COLUMNS
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row, Status
 from experiments.sweeps import launch
-from experiments.sweeps.collect import collect, summary
+from experiments.sweeps.collect import collect
 from experiments.sweeps.plan import Family, packed, plan_of
+from experiments.sweeps.summary import summary
 
 T = TypeVar("T")
 _NAME = "bench_sweep_scale"

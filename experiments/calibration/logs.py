@@ -180,13 +180,13 @@ def slip_of_turns(
     require(n >= 10, f"only {n} blocks of {block} intervals; use shorter blocks")
     square, path = np.concatenate(squares), np.concatenate(paths)
     picks = rng.integers(n, size=(n_resamples, n))
-    spread = np.array([_law(square[pick], path[pick]) for pick in picks])
-    bounds = [_law(square, path), *np.quantile(spread, [0.025, 0.975], axis=0)]
+    spread = np.array([slip_law(square[pick], path[pick]) for pick in picks])
+    bounds = [slip_law(square, path), *np.quantile(spread, [0.025, 0.975], axis=0)]
     kr, kl = (Interval(*map(float, column)) for column in np.transpose(bounds))
     return SlipOfTurns(kr, kl, n)
 
 
-def _law(square: Array, path: Array) -> Array:
+def slip_law(square: Array, path: Array) -> Array:
     """(kr, kl) >= 0 that make Gaussian sums of variance path @ k most likely."""
     k = np.full(2, float(square.sum() / path.sum()))
     for _ in range(10):  # iteratively reweighted: the score equations of the likelihood

@@ -11,13 +11,20 @@ from numpy.typing import NDArray
 from estimators.base import Estimate
 from sim import se2
 from sim.arrays import Array
-from sim.errors import require
+from sim.errors import InputError, require
 from sim.recording import Recording
 
 CHI2_95_2DOF = 5.991464547107979  # 95 % quantile of chi-square with two degrees of freedom
 _SINGULAR = 1e-10  # least eigenvalue of a correlation matrix that can be trusted
 RPE_DISTANCES_M = (1.0, 10.0)
+LONGEST_GAP_S = 0.25  # of the truth, over which it is interpolated
 SCORED_EXTRAS = ("dispersion_m",)  # Belief extras that `score` reads, of estimators that have them
+
+
+def longest_pause_s(stamps: Array, start: float, end: float) -> float:
+    """Longest time from start to end without a stamp, s; the stamps increase."""
+    inside = stamps[(stamps > start) & (stamps < end)]
+    return float(np.diff([start, *inside, end]).max(initial=0.0))
 
 
 def position_errors_m(truth: Array, means: Array) -> Array:
@@ -128,17 +135,25 @@ def nees_at_distances(truth: Array, means: Array, covariances: Array, distances_
     return np.where(rows >= 0, nees(truth, means, covariances)[rows], np.nan)
 
 
-def score(recording: Recording, estimate: Estimate) -> dict[str, float]:
+def score(
+    recording: Recording,
+    estimate: Estimate,
+    longest_gap_s: float = LONGEST_GAP_S,
+    after_s: float = 0.0,
+) -> dict[str, float]:
     """Score an estimate against its recording's truth; units are in the keys.
 
-    Stamps outside the truth's span are left out. A score that does not apply has no key: all but
-    the times without a truth, the error over 10 m of a shorter run, the NEES without a usable
-    covariance. NaN means that the estimate itself is not finite.
+    Stamps outside the truth's span are left out, and so are those in a gap of the truth longer than
+    `longest_gap_s`: they have no true pose. Those of the first `after_s` of the recording do not
+    count either: something may have been calibrated on them. `stamps_scored` and `stamps_left_out`
+    count both kinds. A score that does not apply has no key: all but the times without a truth, the
+    error over 10 m of a shorter run, the NEES without a usable covariance. NaN means that the
+    estimate itself is not finite.
 
     Raises
     ------
     InputError
-        If no stamp of the estimate lies within the truth's span.
+        If no stamp of the estimate has a true pose.
     """
     row = {"duration_s": float(np.ptp(estimate.stamps)) if len(estimate.stamps) else 0.0}
     if len(estimate.step_seconds):
@@ -150,9 +165,20 @@ def score(recording: Recording, estimate: Estimate) -> dict[str, float]:
         row["dispersion_final_m"] = float(dispersions[-1])
     if recording.truth is None:
         return row
-    truth = recording.truth_at(estimate.stamps)
-    known = np.isfinite(truth).all(axis=1)
-    require(known.any(), "no estimate lies within the truth's time span; are the clocks the same?")
+    truth = recording.truth_at(estimate.stamps, longest_gap_s)
+    late = estimate.stamps >= recording.frame_stamps[0] + after_s
+    require(late.any(), f"scoring.after_s={after_s:g} is beyond the end of the recording")
+    known = np.isfinite(truth).all(axis=1) & late
+    if not known.any():
+        spanned = np.isfinite(recording.truth_at(estimate.stamps)).any()
+        complaint = "no estimate lies within the truth's time span; are the clocks the same?"
+        if spanned:
+            complaint = (
+                f"no estimate lies within {longest_gap_s:g} s between two true poses; raise "
+                "scoring.longest_gap_s"
+            )
+        raise InputError(complaint)
+    row |= {"stamps_scored": float(known.sum()), "stamps_left_out": float((~known).sum())}
     covariances = estimate.covariances[known]
     return row | path_scores(truth[known], estimate.means[known], covariances)
 

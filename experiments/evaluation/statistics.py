@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -80,6 +80,27 @@ def log_ratio_interval(first: ArrayLike, second: ArrayLike, level: float = 0.95)
 def wilcoxon_p(first: ArrayLike, second: ArrayLike) -> float:
     """P of the one-sided signed-rank test that first is below second in paired logs."""
     return float(stats.wilcoxon(_log_ratios(first, second), alternative="less").pvalue)
+
+
+def paired_p(differences: ArrayLike) -> float:
+    """P of the two-sided t test that paired differences (N,) have mean zero; NaN below two."""
+    sample = np.asarray(differences, float)
+    if len(sample) < 2 or not np.isfinite(sample).all():
+        return math.nan
+    if np.ptp(sample) <= 1e-12 * np.abs(sample).max():  # no spread: the same, or surely different
+        return float(sample[0] == 0.0)
+    return float(stats.ttest_1samp(sample, 0.0).pvalue)
+
+
+def holm(p_values: Sequence[float], alpha: float) -> list[bool]:
+    """Which null hypotheses to reject, with a family-wise error rate of alpha (Holm 1979)."""
+    order = sorted(range(len(p_values)), key=lambda i: p_values[i])
+    rejected = [False] * len(p_values)
+    for rank, i in enumerate(order):
+        if p_values[i] > alpha / (len(p_values) - rank):
+            break
+        rejected[i] = True
+    return rejected
 
 
 def page_trend_p(rows: ArrayLike) -> float:

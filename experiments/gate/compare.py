@@ -25,7 +25,7 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from experiments.evaluation.statistics import mean_interval
+from experiments.evaluation.statistics import holm, mean_interval
 from experiments.gate.suite import ERRORS
 from experiments.runs.seeds import stream
 from sim.arrays import Array
@@ -144,17 +144,6 @@ def general_p(differences: Array) -> tuple[float, float]:
         return (0.0 if mean > 0.0 else 1.0), (0.0 if mean < 0.0 else 1.0)
     above = float(stats.t.sf(mean / spread, n - 1))
     return above, 1.0 - above
-
-
-def holm(p_values: Sequence[float], alpha: float) -> list[bool]:
-    """Which null hypotheses to reject, with a family-wise error rate of alpha (Holm 1979)."""
-    order = sorted(range(len(p_values)), key=lambda i: p_values[i])
-    rejected = [False] * len(p_values)
-    for rank, i in enumerate(order):
-        if p_values[i] > alpha / (len(p_values) - rank):
-            break
-        rejected[i] = True
-    return rejected
 
 
 def examine(

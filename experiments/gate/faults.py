@@ -265,6 +265,11 @@ FAULTS: dict[str, dict[str, tuple[Fault, float]]] = {
         "lost": (lost_landmarks, 0.2),
         "noise": (inflated_camera, 2.0),
     },
+    "graph_slam": {
+        "derivative": (wrong_mount, 0.005),
+        "lost": (lost("laser"), 0.2),
+        "noise": (noisy_ranges, 0.005),
+    },
     "mcl": {
         "derivative": (wrong_wheels, 0.5),
         "lost": (lost("laser"), 0.3),

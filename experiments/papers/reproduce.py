@@ -30,7 +30,11 @@ from sim.errors import InputError
 PAPERS = ("puzzlebot2024", "decristoforis2020", "maximo2024", "gil2008")
 LOGS = ("real_logs",)  # run only where the logs are
 NAMED = ("teams",)  # judged, run when named
-OWN = ("mcl_office", "fastslam_consistency")  # our own, which judge no claim: run when named
+OWN = (
+    "mcl_office",
+    "fastslam_consistency",
+    "peers",
+)  # our own, which judge no claim: run when named
 _APART = "_tuning"  # the table on other seeds from which parameters were chosen
 
 

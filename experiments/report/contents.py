@@ -1,6 +1,7 @@
 """What the report shows, read from results/ into plain data."""
 
 import base64
+import math
 import struct
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -11,7 +12,7 @@ import pandas as pd
 
 from experiments.evaluation.verdict import Profile, Role, Verdict, headline_verdict
 from experiments.report.claims import read_claims, read_provenance, read_verdicts, this_code
-from experiments.report.export import as_text, numeric
+from experiments.report.export import as_text, folded, numeric, plain
 from experiments.runs.paths import CONF, SOURCE
 from experiments.runs.row import read_rows
 from sim.errors import InputError
@@ -26,8 +27,13 @@ OWN = {
         "estima run -m study=leaderboard",
         "estima plot leaderboard --x choice.estimator --by choice.world "
         "-o results/figures/leaderboard_errors.png",
-        "estima table leaderboard --against smoother --times --means "
+        "estima table leaderboard --against smoother --times "
         "-o results/tables/leaderboard_means.csv",
+    ],
+    "peers": [
+        "pip install 'estima[peers,tune]' && make peers",
+        "estima reproduce --paper peers --full",
+        "estima tune peers -o conf/estimator",
     ],
     "all_estimators": ["estima run -m study=all_estimators"],
     "mcl_office": ["estima reproduce --paper mcl_office --full"],
@@ -65,6 +71,9 @@ def contents(results: Path, on_progress: Callable[[float], None]) -> dict[str, A
     origins = made | {"this page": this_code()}
     return {
         "claims": claims,
+        "best": best_of_worlds(results / "tables" / "leaderboard_means.csv"),
+        "holds_best": holding_best({name: studies[name]["tally"] for name in PAPERS}),
+        "on_lasers": best_on_lasers(results / "tables" / "peers_methods.csv"),
         "n_statistics": len(table),
         "n_judged": table["id"].nunique(),
         "tally": tally(claims.values()),
@@ -83,6 +92,57 @@ def contents(results: Path, on_progress: Callable[[float], None]) -> dict[str, A
         "origins": origins,
         "details": list(dict.fromkeys(key for how in origins.values() for key in how)),
         "unknown": [paper for paper in papers if paper not in made],
+    }
+
+
+def best_of_worlds(path: Path) -> list[tuple[str, str, str]]:
+    """The estimator of the least position error in each world, and that error, of the leaderboard.
+
+    Empty if there is no such table.
+    """
+    columns = ["choice.world", "choice.estimator"]
+    found = read_rows(path) if path.exists() else pd.DataFrame()
+    error = next((c for c in ("answer_ate_rmse_m", "ate_rmse_m") if c in found), "")
+    if not error or not {*columns} <= {*found}:
+        return []
+    least = found.loc[found.groupby("choice.world")[error].idxmin()]
+    return [(str(w), str(e), plain(v, 2)) for w, e, v in least[[*columns, error]].to_numpy()]
+
+
+def holding_best(
+    tallies: Mapping[str, Sequence[tuple[Verdict, int]]],
+) -> list[tuple[str, int, int]]:
+    """The papers of the greatest share of reproduced claims, with their number and that of all."""
+    found = [
+        (name, dict(counts).get(Verdict.REPRODUCED, 0), sum(n for _, n in counts))
+        for name, counts in tallies.items()
+        if counts
+    ]
+    best = max((held / of for _, held, of in found), default=0.0)
+    return [entry for entry in found if best and entry[1] / entry[2] == best]
+
+
+def best_on_lasers(path: Path) -> dict[str, Any]:
+    """The laser's method of the least position error beside other projects', of the peers' table.
+
+    Empty if there is no such table.
+    """
+    found = read_rows(path) if path.exists() else pd.DataFrame()
+    if not {"sensor", "estimator", "project", "runs", "ate_rmse_m"} <= {*found}:
+        return {}
+    laser = found[found["sensor"] == "laser"].dropna(subset="ate_rmse_m").sort_values("ate_rmse_m")
+    if laser.empty:
+        return {}
+    first = laser.iloc[0]
+    others = laser[laser["project"] != first["project"]].head(1)
+    return {
+        "estimator": str(first["estimator"]),
+        "error": plain(float(first["ate_rmse_m"]), 2),
+        "methods": len(laser),
+        "runs": int(first["runs"]),
+        "others": "".join(
+            f"{row.estimator}, {plain(float(row.ate_rmse_m), 2)} m" for row in others.itertuples()
+        ),
     }
 
 
@@ -144,21 +204,30 @@ def study(results: Path, name: str, about: Entry, claims: Mapping[str, Entry]) -
     there = {path.stem: path for path in sorted((results / "figures").glob(f"{name}_*.png"))}
     described = [figure for figure in about["figures"] if figure in there]
     settings = [*sorted((CONF / "study").glob(f"{name}*.yaml")), _FOLDER / name / "settings.py"]
+    tables = {path.stem: table(path) for path in sorted((results / "tables").glob(f"{name}_*.csv"))}
     return {
         "name": name,
         "about": about,
         "figures": [
-            picture(there[figure], about["figures"].get(figure, {}), claims)
+            {
+                **picture(there[figure], about["figures"].get(figure, {}), claims),
+                **shown_as_table(tables, about["figures"].get(figure, {})),
+            }
             for figure in dict.fromkeys([*described, *there])
         ],
         "missing": [figure for figure in about["figures"] if figure not in there],
-        "tables": [table(path) for path in sorted((results / "tables").glob(f"{name}_*.csv"))],
+        "tables": list(tables.values()),
         "settings": {
             "/".join(path.parts[-3:]): path.read_text(encoding="utf-8").strip()
             for path in settings
             if path.exists()
         },
     }
+
+
+def shown_as_table(tables: Mapping[str, Entry], about: Entry) -> Entry:
+    """The table that stands in the page for a picture of it, as its finding says; none if gone."""
+    return {"table": tables.get(about.get("table", ""))}
 
 
 def picture(path: Path, about: Entry, claims: Mapping[str, Entry]) -> Entry:
@@ -193,9 +262,37 @@ def picture(path: Path, about: Entry, claims: Mapping[str, Entry]) -> Entry:
     }
 
 
+def with_spread(frame: pd.DataFrame) -> pd.DataFrame:
+    """Put means and their standard deviations, and values and their bounds, into one cell each."""
+    shown = frame.copy()
+    for name in frame:
+        spread = name.replace("_mean_", "_sd_")
+        stem, _, unit = name.rpartition("_")
+        bounds = [f"{stem}_{end}_{unit}" for end in ("low", "high")]
+        if spread != name and spread in frame:
+            pairs = zip(frame[name], frame[spread], strict=True)
+            shown[name] = [_beside_spread(a, b) for a, b in pairs]
+            shown = shown.drop(columns=spread).rename(columns={name: name.replace("_mean_", "_")})
+        elif {*bounds} <= {*frame}:
+            triples = zip(frame[name], *(frame[end] for end in bounds), strict=True)
+            shown[name] = [f"{plain(a, 3)} [{plain(b, 3)}, {plain(c, 3)}]" for a, b, c in triples]
+            shown = shown.drop(columns=bounds)
+    return shown
+
+
+def _beside_spread(mean: float, deviation: float) -> str:
+    """Write a mean to the digits that its standard deviation leaves: two of the latter's."""
+    if not math.isfinite(mean) or not math.isfinite(deviation) or deviation <= 0.0:
+        return f"{plain(mean, 3)} ± {plain(deviation, 2)}"
+    digits = max(0, 1 - math.floor(math.log10(deviation)))
+    return f"{mean:z.{digits}f} ± {deviation:.{digits}f}"
+
+
 def table(path: Path) -> Entry:
     """Read a table: whole if it is small, else its first rows."""
-    frame = read_rows(path)
+    read = folded(read_rows(path))
+    frame = with_spread(read)
+    joined = [c for c in frame if c not in read or frame[c].dtype != read[c].dtype]
     small = len(frame) <= SMALL_ROWS and frame.shape[1] <= SMALL_COLUMNS
     shown = as_text(frame if small else frame.head(FIRST_ROWS))
     note = "" if small else f"; the first {len(shown)}, the rest in the file"
@@ -207,6 +304,6 @@ def table(path: Path) -> Entry:
         "size": f"{len(frame)} rows, {frame.shape[1]} columns",
         "note": note,
         "head": list(shown.columns),
-        "numeric": numeric(frame),
+        "numeric": [n or c in joined for n, c in zip(numeric(frame), frame, strict=True)],
         "cells": shown.to_numpy().tolist(),
     }

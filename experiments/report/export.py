@@ -3,12 +3,14 @@
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 import pandas as pd
 
 from experiments.runs.columns import title
 from experiments.runs.row import read_rows
+from experiments.sweeps.summary import MARKS, SUFFIXES
 from sim.errors import InputError, printable
 from sim.files import write_whole
 
@@ -20,7 +22,7 @@ _LATEX = str.maketrans(
         **{character: f"\\{character}" for character in "&%$#_{}"},
     }
 )
-_MARKDOWN = str.maketrans({character: f"\\{character}" for character in "\\|<[]!`"})
+_MARKDOWN = str.maketrans({character: f"\\{character}" for character in "\\|<[]!`*"})
 
 
 def read_table(path: Path) -> pd.DataFrame:
@@ -64,16 +66,75 @@ def plain(value: Any, digits: int = 4) -> str:
     return f"{value:.{digits}g}" if isinstance(value, float) else str(value)
 
 
+def significant(value: float, digits: int) -> str:
+    """A number with so many significant digits; zeros at its end are some of them."""
+    if not 1e-3 <= abs(value) < 1e6:
+        return plain(value, digits)
+    text = np.format_float_positional(value, digits, unique=False, fractional=False)
+    return text.removesuffix(".")
+
+
+class Mean(NamedTuple):
+    """A cell: a mean with the bounds of its interval, and how it is marked."""
+
+    value: float
+    low: float
+    high: float
+    best: bool
+    differs: bool
+
+
+def folded(frame: pd.DataFrame) -> pd.DataFrame:
+    """Put a mean, its bounds and its marks, columns of `sweeps.summary`, into one cell."""
+    cells = {}
+    for name in frame:
+        parts = [f"{name}{suffix}" for suffix in SUFFIXES]
+        if set(parts) <= set(frame):
+            marks = [frame.get(f"{name}_{mark}", [False] * len(frame)) for mark in MARKS]
+            columns = zip(frame[name], *(frame[part] for part in parts), *marks, strict=True)
+            cells[name] = pd.Series([Mean(*cell) for cell in columns], frame.index, object)
+    gone = {f"{name}{end}" for name in cells for end in (*SUFFIXES, *(f"_{m}" for m in MARKS))}
+    return frame.assign(**cells).drop(columns=[name for name in frame if name in gone])
+
+
+class Form(NamedTuple):
+    """How a kind of file writes text, the best of several means, and one that differs."""
+
+    escape: Callable[[str], str]
+    best: str
+    differs: str
+
+
+def written(frame: pd.DataFrame, form: Form, digits: int) -> pd.DataFrame:
+    """Every cell as text, under headings with units."""
+
+    def text(value: Any) -> str:
+        if not isinstance(value, Mean):
+            return form.escape(printable(" ".join(plain(value, digits).split())))
+        number, low, high = (form.escape(significant(part, digits)) for part in value[:3])
+        if value.best:
+            number = form.best.format(number)
+        bounds = f" [{low}, {high}]" if low and value.low < value.high else ""
+        return number + (form.differs if value.differs else "") + bounds
+
+    long = not any(isinstance(cell, Mean) for cell in frame.head(1).to_numpy().ravel())
+    heads = [" ".join(title(str(name), short=not long).split()) for name in frame]
+    return (
+        frame.set_axis([form.escape(printable(h)) for h in heads], axis=1).astype(object).map(text)
+    )
+
+
 def as_text(frame: pd.DataFrame, digits: int = 4) -> pd.DataFrame:
     """Every cell as `plain` writes it, under headings with units."""
-    heads = [printable(" ".join(title(str(name)).split())) for name in frame]
-    cells = frame.set_axis(heads, axis=1).astype(object)
-    return cells.map(lambda value: printable(" ".join(plain(value, digits).split())))
+    return written(frame, Form(str, "{}", "*"), digits)
 
 
 def numeric(frame: pd.DataFrame) -> list[bool]:
     """Whether each column holds numbers."""
-    return [dtype.kind in "iuf" for dtype in frame.dtypes]
+    return [
+        column.dtype.kind in "iuf" or column.map(lambda cell: isinstance(cell, Mean)).any()
+        for _, column in frame.items()
+    ]
 
 
 def escaped(text: str) -> str:
@@ -83,8 +144,7 @@ def escaped(text: str) -> str:
 
 def to_markdown(frame: pd.DataFrame, digits: int = 4) -> str:
     """Pipe table; columns of numbers are aligned to the right."""
-    cells = as_text(frame, digits).map(escaped)
-    table: str = cells.rename(columns=escaped).to_markdown(
+    table: str = written(frame, Form(escaped, "**{}**", r"\*"), digits).to_markdown(
         index=False,
         tablefmt="pipe",
         disable_numparse=True,
@@ -95,13 +155,14 @@ def to_markdown(frame: pd.DataFrame, digits: int = 4) -> str:
 
 def to_latex(frame: pd.DataFrame, digits: int = 4) -> str:
     """A `tabular` that needs `booktabs`; numbers such as 1e-05 become powers of ten."""
-    cells = as_text(frame, digits).map(_latex).rename(columns=_latex)
+    cells = written(frame, Form(latex, r"\textbf{{\boldmath {}}}", "$^{*}$"), digits)
     columns = "".join("r" if number else "l" for number in numeric(frame))
     table: str = cells.style.hide(axis="index").to_latex(column_format=columns, hrules=True)
     return re.sub(r"(?m)^(?=[*\[])", "{}", table)  # else \\ takes it as its argument
 
 
-def _latex(text: str) -> str:
+def latex(text: str) -> str:
+    """Text in which LaTeX finds nothing of its own; numbers become mathematics."""
     power = re.fullmatch(r"(-?[\d.]+)e([+-]\d+)", text)
     if power:
         return rf"${power[1]} \times 10^{{{int(power[2])}}}$"
@@ -127,7 +188,7 @@ def export(paths: Sequence[Path], form: str, out: Path | None, digits: int) -> N
     as_form, suffix = FORMATS[form]
     if out is None:
         for path in paths:
-            text = as_form(read_table(path), digits)
+            text = as_form(folded(read_table(path)), digits)
             try:
                 print(text)
             except UnicodeEncodeError as error:
@@ -144,5 +205,5 @@ def export(paths: Sequence[Path], form: str, out: Path | None, digits: int) -> N
         sources[target] = path
     for target, path in sources.items():
         with write_whole(target) as part:
-            part.write_text(as_form(read_table(path), digits), encoding="utf-8")
+            part.write_text(as_form(folded(read_table(path)), digits), encoding="utf-8")
     print(f"{out}: {len(paths)} tables")

@@ -3,6 +3,8 @@
 It is made only from what the studies left in results/, and is a single file.
 """
 
+import base64
+import hashlib
 import math
 import sys
 from collections.abc import Callable, Mapping
@@ -17,6 +19,8 @@ from experiments.report.contents import contents
 from experiments.report.export import plain
 from sim.errors import printable
 from sim.files import write_whole
+
+_TEMPLATES = Path(__file__).parent / "templates"
 
 
 def write_report(results: Path, on_progress: Callable[[float], None] = lambda _: None) -> Path:
@@ -36,6 +40,14 @@ def write_report(results: Path, on_progress: Callable[[float], None] = lambda _:
             "of the paper have one; `git checkout results/claims.csv` or `estima reproduce`",
             file=sys.stderr,
         )
+    path = results / "report.html"
+    with write_whole(path) as part:
+        part.write_text(render("page.html", **found), encoding="utf-8")
+    return path
+
+
+def render(template: str, **found: Any) -> str:
+    """Fill a template of a page; texts are escaped, and only the page's own scripts may run."""
     environment = Environment(
         loader=PackageLoader("experiments.report"),
         autoescape=True,
@@ -45,10 +57,15 @@ def write_report(results: Path, on_progress: Callable[[float], None] = lambda _:
         lstrip_blocks=True,
     )
     environment.filters |= {"plain": plain, "interval": interval, "verdict": verdict}
-    path = results / "report.html"
-    with write_whole(path) as part:
-        part.write_text(environment.get_template("page.html").render(found), encoding="utf-8")
-    return path
+    environment.globals |= {"script": _script}
+    return environment.get_template(template).render(found)
+
+
+def _script(name: str) -> Mapping[str, str]:
+    """Text of a script of the page, and the hash by which the page's policy allows it."""
+    text = (_TEMPLATES / name).read_text(encoding="utf-8")
+    digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+    return {"text": Markup(text), "allowed": f"'sha256-{digest}'"}
 
 
 def _printable(value: Any) -> Any:

@@ -2,112 +2,264 @@
 
 from __future__ import annotations
 
-import math
+import itertools
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
+from enum import StrEnum
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from experiments.evaluation.statistics import mean_interval
-from experiments.runs.columns import ANSWER, COLUMNS, PATH, REPEAT, title
-from experiments.sweeps.collect import measured, telling, with_answers
-from experiments.viewing.style import CYCLE, subplots
+from experiments.runs.columns import ANSWER, COLUMNS, PATH, title
+from experiments.sweeps.averages import averages, rule, unit_of
+from experiments.sweeps.collect import DRAWN, measured, telling, with_answers
+from experiments.viewing.plotting import plain_log, plain_ticks
+from experiments.viewing.style import SERIES, figure
 from sim.errors import InputError
 
-_WIDE_X, _WIDE_Y = 20.0, 30.0  # an axis that spans more than this factor is logarithmic
-_KINDS = ("choice.world", "choice.estimator", "recording")  # not averaged over unless asked
+_NAMED = 12  # columns that a message names, the nearest first
+_FEW = 8  # values that are ticks of their own
+_DECADES = 100.0  # factor below which a logarithmic axis has plain numbers
+_WIDE = 10.0  # an axis whose values span this factor, or grow by factors, is logarithmic
+_LEAST = 3.0  # factor below which no axis is
 # How far the bars of several lines are moved, so that none hides another
 _BESIDE = 0.006  # share of the axis
 _BESIDE_WORD = 0.08  # among words, which are 1 apart
+_MOST_DIRECT = 6  # lines that are named at their ends rather than in a legend
+
+
+class Size(StrEnum):
+    """For what a figure is made; widths of IEEE's two-column papers."""
+
+    SCREEN = "screen"
+    COLUMN = "column"
+    PAGE = "page"
+
+
+_WIDTH_IN = {Size.SCREEN: 6.5, Size.COLUMN: 3.5, Size.PAGE: 7.16}
+_FONT = {Size.SCREEN: 9.0, Size.COLUMN: 7.0, Size.PAGE: 8.0}  # points
 
 
 def sweep_figure(
-    table: pd.DataFrame, x: str, y: str, by: str | None = None, *, pool: bool = False
+    table: pd.DataFrame,
+    x: str,
+    y: str,
+    by: str | Sequence[str] | None = None,
+    *,
+    row: str | None = None,
+    col: str | None = None,
+    size: Size | str = Size.SCREEN,
+    pool: bool = False,
 ) -> Figure:
     """Mean of `y` over the recordings, with 95 % intervals, against `x`; one line per `by`.
 
     A y such as `answer_ate_rmse_m` is that of the best answer, the revised path where there is one;
-    what gives revised paths is marked so.
-
-    Repeats over one recording are averaged first: the recording is the unit of inference. Where no
-    point has more than one recording, the intervals are over its repeats. On a logarithmic axis
-    means and intervals are those of the logarithm.
+    what gives revised paths is marked so. Means follow the rule of `sweeps.averages`, as those of
+    tables do.
 
     Parameters
     ----------
+    by
+        One line, of its own colour and marker, for each combination of these columns; at most 12.
+    row, col
+        A row, a column of panels for each value; they share their axes.
+    size
+        For the screen, or for a column or the page of a paper.
     pool
-        Average over different worlds, estimators and logs too, rather than refuse it.
+        Average over settings that differ within a point too, rather than refuse it.
 
     Raises
     ------
     InputError
         If a column is not in the table, y has no numbers, no run has both x and y, or a point
-        would pool what differs in kind.
+        would pool what differs in more than its seeds.
     """
+    by = [by] if isinstance(by, str) else list(by or [])
+    facets = [name for name in (row, col) if name is not None]
     if y.startswith(ANSWER):
-        table = _marked(with_answers(table, [y]), [c for c in (x, by) if c is not None])
-    for column in filter(None, (x, y, by)):
+        table = _marked(with_answers(table, [y]), [x, *by, *facets])
+    _check(table, x, y, [*by, *facets], pool=pool)
+    table = table[table[[x, y]].notna().all(axis=1)]
+    groups = [*by, *facets, x]
+    unit = unit_of(table, groups)
+    means = averages(table, groups, unit, y).reset_index()
+    lines = _labels(means, by)
+    if len(lines) > len(SERIES):
+        raise InputError(
+            f"--by gives {len(lines)} lines; at most {len(SERIES)} differ in colour: keep some "
+            "with --where, or give panels their own with --row or --col"
+        )
+    across, down = (_values(means, name) for name in (col, row))
+    chosen = Size(size)
+    page, axes = _panels(chosen, len(down), len(across))
+    names = sorted(means[x].unique())
+    numeric = means[x].dtype.kind in "fi"
+    wide = numeric and _by_factors(names)
+    for (i, above), (j, left) in itertools.product(enumerate(down), enumerate(across)):
+        ax = axes[i, j]
+        panel = _within(_within(means, row, above), col, left)
+        for k, (label, line) in enumerate(lines.items()):
+            points = panel[(panel[by] == list(line)).all(axis=1)] if by else panel
+            if points.empty:
+                continue
+            at = np.array([v if numeric else names.index(v) for v in points[x]], float)
+            beside = k - (len(lines) - 1) / 2
+            if wide:
+                at *= (names[-1] / names[0]) ** (_BESIDE * beside)
+            else:
+                at += beside * (_BESIDE * (names[-1] - names[0]) if numeric else _BESIDE_WORD)
+            value, low, high = points[["value", "low", "high"]].to_numpy(float).T
+            colour, marker = SERIES[k]
+            ax.errorbar(
+                at, value, yerr=(value - low, high - value), color=colour, marker=marker, ms=4,
+                capsize=2, lw=1.2, ls="-" if numeric else "none", label=label,
+            )  # fmt: skip
+        words = [_named(name, value) for name, value in ((row, above), (col, left)) if name]
+        ax.set_title("; ".join(words), fontsize="medium")
+    _scale(axes, names, means, wide=wide, numeric=numeric, log=_is_log(y, means["value"]))
+    for ax in axes[-1]:
+        ax.set_xlabel(title(x))
+    for ax in axes[:, 0]:
+        ax.set_ylabel(title(y))
+    pooled = [c for c in telling(table) if c not in (*groups, *DRAWN)]
+    note = rule(unit, [y]) + (f"; over {', '.join(map(title, pooled))} too" if pooled else "")
+    characters = int(_WIDTH_IN[chosen] * 115 / _FONT[chosen])
+    page.suptitle(textwrap.fill(note, characters), fontsize=0.85 * _FONT[chosen], color="#555555")
+    if by:
+        _name_lines(page, axes, title(by[0]) if len(by) == 1 else "", chosen, direct=numeric)
+    return page
+
+
+def _check(table: pd.DataFrame, x: str, y: str, others: Sequence[str], *, pool: bool) -> None:
+    """Check that the columns are there and that no point pools what differs in kind."""
+    for column in (x, y, *others):
         if column not in table:
-            raise InputError(
-                f"the sweep has no column {column}; there are {', '.join(_columns(table, column))}"
-            )
+            near = _metrics(table, y) if column == y else _columns(table, column)
+            more = f" and {len(near) - _NAMED} more" if len(near) > _NAMED else ""
+            there = ", ".join(near[:_NAMED])
+            raise InputError(f"the sweep has no column {column}; there are {there}{more}")
     if table[y].dtype.kind not in "fi":
         raise InputError(f"column {y} holds no numbers; there are {', '.join(measured(table))}")
     if table[[x, y]].dropna().empty:
         raise InputError(f"no run has both {x} and {y}")
-    points = table.groupby([x] if by is None else [x, by])
-    for column in () if pool else [kind for kind in _KINDS if kind in table]:
+    points = table.groupby([x, *others], dropna=False)
+    for column in () if pool else [c for c in telling(table) if c not in DRAWN]:
         if points[column].nunique().max() > 1:
             there = ", ".join(map(str, sorted(table[column].dropna().unique())[:8]))
             raise InputError(
                 f"a point would pool different values of {column} ({there}); draw a line for each "
-                f"with --by {column}, keep one with --where {column}=..., or average with --pool"
+                f"with --by {column} or a panel with --col {column}, keep one with "
+                f"--where {column}=..., or average with --pool"
             )
-    one_each = points["recording_checksum"].nunique().max() == 1
-    repeated = one_each and REPEAT in table and table[REPEAT].nunique() > 1
-    unit = REPEAT if repeated else "recording_checksum"
-    page, ax = subplots(6.5, 4.0)
-    scale = COLUMNS[y].scale if y in COLUMNS else "log"
-    logarithmic = scale == "log" and _spans(table[y], _WIDE_Y)
-    numeric = table[x].dtype.kind in "fi"
-    names = sorted(table[x].dropna().unique())
-    wide = numeric and _spans(table[x], _WIDE_X)
-    groups = [("", table)] if by is None else list(table.groupby(by))
-    for i, (label, rows) in enumerate(groups):
-        recordings = rows.groupby([x, unit])[y].mean().dropna().groupby(level=0)
-        points = {name: _interval(values, logarithmic) for name, values in recordings}
-        value, low, high = np.array(list(points.values())).reshape(-1, 3).T
-        at = np.array([name if numeric else names.index(name) for name in points], float)
-        beside = i - (len(groups) - 1) / 2
-        if wide:
-            at *= (names[-1] / names[0]) ** (_BESIDE * beside)
-        else:
-            at += beside * (_BESIDE * (names[-1] - names[0]) if numeric else _BESIDE_WORD)
-        ax.errorbar(
-            at, value, yerr=[value - low, high - value],
-            marker="osD^v"[i // len(CYCLE) % 5], ms=4, capsize=2,
-            ls="-" if numeric else "none", color=CYCLE[i % len(CYCLE)],
-            label=f"{label:g}" if isinstance(label, float) else str(label),
-        )  # fmt: skip
-    ax.set(
-        xlabel=title(x),
-        ylabel=title(y),
-        xscale="log" if wide else "linear",
-        yscale="log" if logarithmic else "linear",
-    )
+
+
+def _values(means: pd.DataFrame, name: str | None) -> list[Any]:
+    return [None] if name is None else sorted(means[name].dropna().unique())
+
+
+def _within(means: pd.DataFrame, name: str | None, value: Any) -> pd.DataFrame:
+    return means if name is None else means[means[name] == value]
+
+
+def _named(name: str, value: Any) -> str:
+    """A value of a setting in words; a number with its setting."""
+    if isinstance(value, str):
+        return value
+    words, _, unit = title(name).partition(", ")
+    return f"{words} = {value:g}" + (f" {unit}" if unit else "")
+
+
+def _labels(means: pd.DataFrame, by: Sequence[str]) -> dict[str, tuple[Any, ...]]:
+    """The lines by what they are called; the legend's title names a single setting."""
+    if not by:
+        return {"": ()}
+    lines = means[list(by)].drop_duplicates().sort_values(list(by))
+    if len(by) == 1:
+        values = lines[by[0]]
+        return {f"{v:g}" if isinstance(v, float) else str(v): (v,) for v in values}
+    each = lines.itertuples(index=False, name=None)
+    return {", ".join(map(_named, by, line)): line for line in each}
+
+
+def _panels(size: Size, n_rows: int, n_cols: int) -> tuple[Figure, Any]:
+    """A page with panels that share their axes."""
+    width_in = _WIDTH_IN[size] if size is not Size.SCREEN else max(6.5, 2.6 * n_cols)
+    height_in = min(0.8 * width_in, 4.4)
+    if n_rows * n_cols > 1:
+        height_in = 0.8 + n_rows * min(0.85 * width_in / n_cols, 2.6)
+    page = figure(width_in, height_in, font_pt=_FONT[size])
+    return page, page.subplots(n_rows, n_cols, sharex=True, sharey=True, squeeze=False)
+
+
+def _scale(
+    axes: Any, names: Sequence[Any], means: pd.DataFrame, *, wide: bool, numeric: bool, log: bool
+) -> None:
+    """Choose the axes' scales and ticks; all panels share them."""
+    ax = axes[0, 0]
+    ax.margins(x=0.08)
+    if wide:
+        ax.set_xscale("log")
+        if len(names) <= _FEW:
+            plain_ticks(ax, names)
     if not numeric:
-        ax.set_xticks(range(len(names)), [str(n) for n in names], rotation=20, ha="right")
-    pooled = [c for c in telling(table) if c not in (x, by, "seed", "world_seed")]
-    over = "repeats" if repeated else "recordings"
-    over = ", ".join([over, *(c.removeprefix("choice.") for c in pooled)])
-    kind = "geometric mean" if logarithmic else "mean"
-    ax.set_title(textwrap.fill(f"{kind} over {over}; 95 % intervals", 62), fontsize="small")
-    if by is not None:
-        page.legend(title=title(by), loc="outside right upper")
-    return page
+        for each in axes[-1]:
+            each.set_xticks(range(len(names)), list(map(str, names)), rotation=25, ha="right")
+            each.set_xlim(-0.6, len(names) - 0.4)
+    if log:
+        ax.set_yscale("log")
+        low, high = means["low"].fillna(means["value"]), means["high"].fillna(means["value"])
+        positive = low[low > 0.0]
+        if len(positive) and high.max() < _DECADES * positive.min():
+            plain_log(ax.yaxis)
+
+
+def _name_lines(page: Figure, axes: Any, heading: str, size: Size, *, direct: bool) -> None:
+    """Name the lines: at their ends where that fits, else in a legend."""
+    found = [ax.get_legend_handles_labels() for ax in axes.flat]
+    handles = {label: handle for pair in found for handle, label in zip(*pair, strict=True)}
+    if direct and axes.size == 1 and len(handles) <= _MOST_DIRECT and _fits(page, handles):
+        for label, handle in handles.items():
+            line = handle.lines[0]
+            axes[0, 0].annotate(
+                label, (line.get_xdata()[-1], line.get_ydata()[-1]), xytext=(8, 0),
+                textcoords="offset points", va="center", color=line.get_color(),
+            )  # fmt: skip
+        return
+    widest = max(map(len, handles)) + 6
+    columns = max(1, int(page.get_figwidth() * 105 / _FONT[size] / widest))
+    page.legend(
+        handles.values(), handles, title=heading, loc="outside lower center",
+        ncols=min(columns, len(handles)), fontsize="small", title_fontsize="small",
+    )  # fmt: skip
+
+
+def _fits(page: Figure, handles: Mapping[str, Any]) -> bool:
+    """Whether the ends of the lines are a line of text apart, and all at the right."""
+    page.draw_without_rendering()
+    lines = [handle.lines[0] for handle in handles.values()]
+    ends = np.array([line.axes.transData.transform(line.get_xydata()[-1]) for line in lines])
+    apart = np.diff(np.sort(ends[:, 1])) * 72.0 / page.dpi
+    wide = np.ptp(ends[:, 0]) < 0.1 * lines[0].axes.bbox.width
+    return bool(wide and (apart > 1.2 * lines[0].axes.xaxis.label.get_size()).all())
+
+
+def _is_log(y: str, values: pd.Series[float]) -> bool:
+    """Whether a metric is drawn on a logarithmic axis."""
+    scale = COLUMNS[y].scale if y in COLUMNS else "log"
+    return scale == "log" and values.min() > 0.0 and values.max() >= _WIDE * values.min()
+
+
+def _by_factors(values: Sequence[float]) -> bool:
+    """Whether ordered numbers differ by factors rather than by steps."""
+    if len(values) < 2 or values[0] <= 0.0 or values[-1] < _LEAST * values[0]:
+        return False
+    steps, factors = np.diff(values), np.diff(np.log(values))
+    if len(values) == 2:
+        return bool(values[-1] >= _WIDE * values[0])
+    return bool(np.std(factors) / np.mean(factors) < np.std(steps) / np.mean(steps))
 
 
 def _marked(table: pd.DataFrame, columns: Sequence[str]) -> pd.DataFrame:
@@ -121,19 +273,17 @@ def _marked(table: pd.DataFrame, columns: Sequence[str]) -> pd.DataFrame:
     return table
 
 
+def _metrics(table: pd.DataFrame, wanted: str) -> list[str]:
+    """Results of a table: those like a wanted one, the best answers, and all others."""
+    found = measured(table)
+    answers = [f"{ANSWER}{name}" for name in found if f"{ANSWER}{name}" in COLUMNS]
+    near = [name for name in (*answers, *found) if wanted.lower() in name]
+    near += get_close_matches(wanted, [*answers, *found], n=5)
+    return list(dict.fromkeys([*near, *found]))
+
+
 def _columns(table: pd.DataFrame, wanted: str) -> list[str]:
     """Columns of a table: those most like a wanted one, swept settings, results, and all others."""
     near = get_close_matches(wanted, map(str, table), n=len(table.columns))
     near += [name for name in table if wanted.rpartition(".")[2] in name]
     return list(dict.fromkeys([*near, *telling(table), *measured(table), *table]))
-
-
-def _spans(values: pd.Series[float], factor: float) -> bool:
-    """Whether positive values differ by more than a factor."""
-    return bool(values.min() > 0.0 and values.max() > factor * values.min())
-
-
-def _interval(values: pd.Series[float], logarithmic: bool) -> tuple[float, ...]:
-    """Mean and the bounds of its interval; those of the logarithm on a logarithmic axis."""
-    found = vars(mean_interval(np.log(values) if logarithmic else values)).values()
-    return tuple(map(math.exp, found)) if logarithmic else tuple(found)

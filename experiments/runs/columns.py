@@ -5,7 +5,16 @@ This is the one schema of rows: by its name, a column is a setting, a metric, a 
 
 import dataclasses
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Literal
+
+
+class Average(StrEnum):
+    """How runs are averaged; `sweeps.averages` does it."""
+
+    ERROR = "error"  # repeats by their squares, recordings geometrically
+    FACTOR = "factor"  # repeats arithmetically, recordings geometrically
+    PLAIN = "plain"  # both arithmetically
 
 
 @dataclass(frozen=True)
@@ -24,6 +33,8 @@ class Column:
         Axis on which it is drawn when it spans decades.
     better
         Which direction is better; None where neither is.
+    average
+        How runs are averaged.
     """
 
     label: str
@@ -31,19 +42,24 @@ class Column:
     unit: str = ""
     scale: Literal["linear", "log"] = "log"
     better: Literal["lower", "higher"] | None = "lower"
+    average: Average = Average.ERROR
 
 
 OF_THE_RUN = {
-    "duration_s": Column("duration", "t", "s", "linear", None),
-    "distance_m": Column("distance travelled", "d", "m", "linear", None),
-    "cpu_time_us": Column("processor time per Frame", "cpu", "us"),
-    "stamps_scored": Column("stamps scored", "scored", "", "linear", None),
-    "stamps_left_out": Column("stamps without a true pose", "left out", "", "linear"),
-    "longest_gap_s": Column("longest time without a pose", "gap", "s", "linear"),
+    "duration_s": Column("duration", "t", "s", "linear", None, Average.PLAIN),
+    "distance_m": Column("distance travelled", "d", "m", "linear", None, Average.PLAIN),
+    "cpu_time_us": Column("processor time per Frame", "cpu", "us", average=Average.FACTOR),
+    "stamps_scored": Column("stamps scored", "scored", "", "linear", None, Average.PLAIN),
+    "stamps_left_out": Column(
+        "stamps without a true pose", "left out", "", "linear", average=Average.PLAIN
+    ),
+    "longest_gap_s": Column(
+        "longest time without a pose", "gap", "s", "linear", average=Average.PLAIN
+    ),
     "dispersion_final_m": Column("final dispersion of the particles", "dispersion", "m"),
 }
 _OF_THE_PATH = {
-    "step_time_us": Column("time per step", "step", "us"),
+    "step_time_us": Column("time per step", "step", "us", average=Average.FACTOR),
     "ate_rmse_m": Column("position RMSE", "ATE", "m"),
     "ate_mean_m": Column("mean position error", "mean error", "m"),
     "ate_aligned_rmse_m": Column("position RMSE after alignment", "ATE aligned", "m"),
@@ -52,22 +68,34 @@ _OF_THE_PATH = {
     "final_position_error_m": Column("final position error", "final ATE", "m"),
     "final_heading_error_rad": Column("final heading error", "final heading", "rad"),
     "nees_counted_share": Column(
-        "share of stamps with a usable covariance", "NEES counted", "", "linear", "higher"
+        "share of stamps with a usable covariance",
+        "NEES counted",
+        "",
+        "linear",
+        "higher",
+        Average.PLAIN,
     ),
     "ellipse_area_final_m2": Column(
-        "area of the final 95 % ellipse", "ellipse", "m^2", better=None
+        "area of the final 95 % ellipse", "ellipse", "m^2", better=None, average=Average.FACTOR
     ),
     "final_in_ellipse": Column(
-        "share of final positions in the 95 % ellipse", "in ellipse", "", "linear", None
+        "share of final positions in the 95 % ellipse",
+        "in ellipse",
+        "",
+        "linear",
+        None,
+        Average.PLAIN,
     ),
-    "nees_mean": Column("mean NEES (3 when consistent)", "NEES", better=None),
+    "nees_mean": Column(
+        "mean NEES (3 when consistent)", "NEES", better=None, average=Average.PLAIN
+    ),
     "rpe_1m_rmse_m": Column("position RMSE over 1 m", "RPE 1 m", "m"),
     "rpe_1m_heading_rmse_rad": Column("heading RMSE over 1 m", "RPE heading 1 m", "rad"),
     "rpe_10m_rmse_m": Column("position RMSE over 10 m", "RPE 10 m", "m"),
     "rpe_10m_heading_rmse_rad": Column("heading RMSE over 10 m", "RPE heading 10 m", "rad"),
 }
 _OF_THE_MAP = {
-    "n_landmarks": Column("landmarks in the map", "N", "", "linear", None),
+    "n_landmarks": Column("landmarks in the map", "N", "", "linear", None, Average.PLAIN),
     "map_rmse_m": Column("RMSE of the map's landmarks", "map", "m"),
     "map_aligned_rmse_m": Column("RMSE of the map's landmarks after alignment", "map aligned", "m"),
 }
@@ -84,6 +112,7 @@ def _of(prefix: str, label: str, symbol: str) -> dict[str, Column]:
 
 
 REVISED, ANSWER = "revised_", "answer_"
+RELATIVE = "ate_rmse_over_"  # and an estimator: of position errors, on the same recordings
 PATH = "answer"  # which path the answer is: online or revised
 # The answer of a method is its revised path if it has one, else the online one. Its columns are not
 # in the files: tables and plots derive them (`sweeps.collect`).
@@ -92,12 +121,12 @@ COLUMNS = {
     **_OF_THE_PATH,
     **_OF_THE_MAP,
     **_of(REVISED, ", revised path", " revised"),
-    **_of(ANSWER, ", best answer", " best"),
+    **_of(ANSWER, ", best answer", ""),
 }
 STATUS = ("status", "status_code", "status_detail")
 REPEAT = "repeat"  # counts the runs of an estimator over one recording
 ORIGIN = ("run_key", "code_version", "recording_checksum")
-_SETTINGS = ("seed", "world_seed", "repeats", "recording", "name")
+_SETTINGS = ("seed", "world_seed", "repeats", "recording", "calibration", "name")
 
 
 def is_setting(name: str) -> bool:
@@ -105,13 +134,45 @@ def is_setting(name: str) -> bool:
     return "." in name or name in _SETTINGS
 
 
+_UNITS = ("m", "rad", "deg", "s", "us", "hz", "mps", "radps", "m2", "gib")
+_SPELT = {"hz": "Hz", "mps": "m/s", "radps": "rad/s", "m2": "m^2", "gib": "GiB"}
+_IN_METRES = ("kr", "kl")  # of settings, whose names do not say it
+
+
 def title(name: str, *, short: bool = False) -> str:
-    """Label (or symbol) and unit of a metric; any other column's own name."""
-    if name not in COLUMNS:
+    """Label (or symbol) and unit of a metric or of a dotted setting; else the column's own name.
+
+    Examples
+    --------
+    >>> title("ate_rmse_m"), title("choice.world"), title("sensors.stereo.max_distance_m")
+    ('position RMSE, m', 'world', 'max distance (stereo), m')
+    """
+    if name in COLUMNS:
+        column = COLUMNS[name]
+        words, unit = column.symbol if short else column.label, column.unit
+    elif name.startswith(RELATIVE):
+        words, unit = f"ATE / that of {name.removeprefix(RELATIVE)}", ""
+    elif "." in name:
+        words, unit = _setting(name)
+    else:
         return name
-    column = COLUMNS[name]
-    words = column.symbol if short else column.label
-    return f"{words}, {column.unit}" if column.unit else words
+    return f"{words}, {unit}" if unit else words
+
+
+def _setting(name: str) -> tuple[str, str]:
+    """Words and unit of a dotted setting."""
+    *_, group, last = name.split(".")
+    words, _, unit = last.rpartition("_")
+    if not words or unit not in _UNITS:
+        words, unit = last, "m" if last in _IN_METRES else ""
+    words = words.strip("_").replace("_", " ")
+    words = f"number of {words[2:]}" if words.startswith("n ") else words
+    return (words if group == "choice" else f"{words} ({group})"), _SPELT.get(unit, unit)
+
+
+def average_of(name: str) -> Average:
+    """How a column is averaged; one that is in no schema, arithmetically."""
+    return COLUMNS[name].average if name in COLUMNS else Average.PLAIN
 
 
 def as_text() -> str:

@@ -48,6 +48,11 @@ def estimators(incomplete: str) -> list[str]:
     return [name for name in options("estimator") if name.startswith(incomplete)]
 
 
+def studies(incomplete: str) -> list[str]:
+    """Options of conf/study."""
+    return [name for name in options("study") if name.startswith(incomplete)]
+
+
 def groups(incomplete: str) -> list[str]:
     """What `estima options` lists."""
     return [name for name in (*GROUPS, "metrics") if name.startswith(incomplete)]
@@ -84,4 +89,5 @@ def _keys(path: Path) -> list[str]:
     for indent, name in _KEY.findall(path.read_text(encoding="utf-8")):
         places[len(indent) // 2 :] = [name]
         found.append(".".join(places))
-    return [name for name in found if name.partition(".")[0] not in ("defaults", "hydra", "sweeps")]
+    passed = ("defaults", "hydra", "sweeps", "tune")
+    return [name for name in found if name.partition(".")[0] not in passed]

@@ -12,13 +12,21 @@ from threadpoolctl import ThreadpoolController
 
 from estimators.base import Estimate, Estimator, Prior, run
 from experiments.evaluation.map_quality import landmark_errors
-from experiments.evaluation.metrics import SCORED_EXTRAS, score
+from experiments.evaluation.metrics import (
+    LONGEST_GAP_S,
+    SCORED_EXTRAS,
+    longest_pause_s,
+    score,
+)
 from experiments.runs.columns import OF_THE_RUN
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome, Row, Status
 from experiments.runs.seeds import stream
+from sim.arrays import Array
 from sim.errors import InputError, require
 from sim.recording import Recording
+
+REMARKED_PAUSE_S = 1.0  # without a pose
 
 Streams = Callable[[int], np.random.Generator]
 Planted = Callable[[Estimator, int], AbstractContextManager[object]]
@@ -87,8 +95,8 @@ def evaluate(
             ):
                 keep = (*SCORED_EXTRAS, *experiment.keep)
                 online, revised = estimates(estimator, recording, prior, rng, keep, on_step)
-            status = status_of(recording, online)
-            scores = scored(recording, online, revised)
+            status = status_of(recording, online, revised)
+            scores = scored(recording, online, revised, **experiment.scoring)
         except InputError:
             raise
         except (Exception, SystemExit) as error:
@@ -148,17 +156,26 @@ def _blas() -> ThreadpoolController:
     return ThreadpoolController()
 
 
-def scored(recording: Recording, online: Estimate, revised: Estimate | None) -> Row:
+def scored(
+    recording: Recording,
+    online: Estimate,
+    revised: Estimate | None,
+    longest_gap_s: float = LONGEST_GAP_S,
+    after_s: float = 0.0,
+) -> Row:
     """Scores of a run as columns; those of the revised path begin with `revised_`."""
     made = online.map if revised is None else revised.map
-    scores: Row = {**score(recording, online), **landmark_errors(recording, made)}
+    scores: Row = {
+        **score(recording, online, longest_gap_s, after_s),
+        **landmark_errors(recording, made),
+    }
     if revised is not None:
-        found = score(recording, revised)
+        found = score(recording, revised, longest_gap_s, after_s)
         scores |= {f"revised_{k}": found[k] for k in found if k not in OF_THE_RUN}
     return scores
 
 
-def status_of(recording: Recording, online: Estimate) -> Status:
+def status_of(recording: Recording, online: Estimate, revised: Estimate | None = None) -> Status:
     """How a run ended that no exception did."""
     if recording.status != "ok":
         return Status(Outcome.FAILED, "recording", recording.status)
@@ -169,4 +186,22 @@ def status_of(recording: Recording, online: Estimate) -> Status:
     if not sound.all():
         when = online.stamps[np.argmin(sound)]
         return Status(Outcome.FAILED, "not_finite", f"not finite at {when:.2f} s")
-    return Status()
+    paths = (online.stamps, *([] if revised is None else [revised.stamps]))
+    return max((status_of_pauses(recording, stamps) for stamps in paths), key=lambda s: s.code)
+
+
+def status_of_pauses(recording: Recording, stamps: Array) -> Status:
+    """Remark on a path that leaves out much: whoever chooses its poses chooses what is scored.
+
+    It counts what can be scored: the time between the first and the last Frame with a truth.
+    """
+    frames = recording.frame_stamps
+    start, end, own_s = frames[0], frames[-1], float(np.diff(frames).max(initial=0.0))
+    if recording.truth is not None:
+        known = recording.truth.stamps
+        start, end = max(start, known[0]), min(end, known[-1])
+        own_s = max(own_s, float(np.diff(known).max(initial=0.0)))
+    pause_s = longest_pause_s(stamps, start, end)
+    if pause_s <= max(REMARKED_PAUSE_S, own_s):
+        return Status()
+    return Status(Outcome.REMARK, "gap", f"no pose for {pause_s:.3g} s of the recording")

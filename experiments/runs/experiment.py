@@ -22,6 +22,7 @@ from omegaconf.errors import InterpolationKeyError
 from estimators.base import Estimator, Prior
 from experiments.runs import paths
 from experiments.runs.cache import cached, key_of
+from experiments.runs.calibration import read_calibration
 from experiments.runs.row import Row
 from experiments.runs.seeds import stream
 from experiments.runs.targets import checked, make, targets
@@ -40,14 +41,15 @@ from sim.yaml_file import read_yaml
 
 Config = dict[str, Any]
 GROUPS = ("world", "robot", "sensors", "route", "estimator")
-_MAPPINGS = (*GROUPS, "simulation", "prior")
+_MAPPINGS = (*GROUPS, "simulation", "prior", "scoring")
 SIMULATED_KEYS = ("world", "robot", "sensors", "route", "simulation", "seed", "world_seed")
 _KEYS = (
     *_MAPPINGS,
-    *("seed", "world_seed", "repeats", "recording", "name", "picture", "keep"),
+    *("seed", "world_seed", "repeats", "recording", "calibration", "name", "picture", "keep"),
     *("simulation.physics", "simulation.rays"),
     *("prior.start", "prior.sigma_position_m", "prior.sigma_heading_rad"),
     *("prior.wheel_radius_m", "prior.track_m", "prior.map"),
+    *("scoring.longest_gap_s", "scoring.after_s"),
 )
 _NOT_IN_KEY = ("name", "picture", "recording")
 _READ_OF_HYDRA = ("hydra/launcher", "hydra.launcher", "hydra.searchpath")
@@ -88,6 +90,7 @@ class Experiment:
         InputError
             If a key is missing, or is no mapping where it must be one.
         """
+        _believe(cfg)
         try:
             config: Config = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
         except InterpolationKeyError as error:
@@ -95,7 +98,8 @@ class Experiment:
                 f"{error.full_key} follows a key that is missing: {str(error).splitlines()[0]}; "
                 f"keep that key, or set {error.full_key} too"
             ) from error
-        config.pop("sweeps", None)
+        for of_sweeps in ("sweeps", "tune"):
+            config.pop(of_sweeps, None)
         _check_shape(config)
         simulation = config["simulation"]
         if simulation["rays"] is None:
@@ -122,6 +126,11 @@ class Experiment:
 
     def over(self, recording: Recording) -> Experiment:
         """Return the experiment over a recording in memory, identified by its checksum."""
+        require(
+            self.config["calibration"] is None,
+            "calibration is for recording=FILE; of a recording in memory take "
+            "read_calibration(FILE).applied(recording)",
+        )
         self._compare_slip(recording)
         return self.replaced(recording={"checksum": recording.checksum})
 
@@ -159,6 +168,11 @@ class Experiment:
         return list(self.config["keep"])
 
     @property
+    def scoring(self) -> dict[str, float]:
+        """Options of `experiments.evaluation.metrics.score`."""
+        return {name: float(value) for name, value in self.config["scoring"].items()}
+
+    @property
     def picture(self) -> bool:
         """Whether a single run is drawn."""
         return bool(self.config["picture"])
@@ -184,6 +198,7 @@ class Experiment:
         settings = {key: value for key, value in self.config.items() if key not in _NOT_IN_KEY}
         files = files_digest(self.config["prior"].get("map"))
         files |= files_of_options(self.config["estimator"])
+        files |= files_digest(self.config.get("calibration"))
         total = leaf_digest((), [self._recording_sources(), files, self._code_version()])
         total += sum(leaf_digest(leaf, value) for leaf, value in _leaves(settings))
         return f"{total % 2**64:016x}"
@@ -250,6 +265,7 @@ class Experiment:
         stream(config["world_seed"], "world", key="world_seed")
         self._check_simulation()
         self._check_prior()
+        self._check_scoring()
         self._check_needs()
         self._check_map()
 
@@ -282,6 +298,14 @@ class Experiment:
                 "prior.map must be none, world, a grid's .yaml file or a mapping with _target_, "
                 f"got {known_map!r}"
             )
+
+    def _check_scoring(self) -> None:
+        for key, value in self.config["scoring"].items():
+            number = isinstance(value, (int, float)) and not isinstance(value, bool)
+            if not (number and value >= 0.0):
+                raise InputError(
+                    f"scoring.{key} must be zero or a positive number of seconds, got {value!r}"
+                )
 
     def _check_needs(self) -> None:
         """Check that the estimator gets the sensors and the map that it needs."""
@@ -421,14 +445,19 @@ class Experiment:
                     f"recording: {wanted['_target_']} must return a Recording, "
                     f"got {type(made).__name__}"
                 )
-            return made
+            return self._calibrated(made)
         if wanted is not None:
             recording = load(Path(wanted))
             self._compare_slip(recording)
-            return self._with_classes(recording)
+            return self._calibrated(self._with_classes(recording))
         recording = cached(self.recording_key, lambda: self.simulate(on_progress))
         # a file does not choose what code runs, but the configuration does
         return dataclasses.replace(recording, sensors=self.sensors())
+
+    def _calibrated(self, recording: Recording) -> Recording:
+        """Return the recording as the calibration has it."""
+        path = self.config["calibration"]
+        return recording if path is None else read_calibration(Path(path)).applied(recording)
 
     def _with_classes(self, recording: Recording) -> Recording:
         """Return the recording with the classes of its sensors that the configuration names too."""
@@ -524,6 +553,23 @@ class Experiment:
         return recording.world
 
 
+def _believe(cfg: DictConfig) -> None:
+    """Put the slip of a calibration in the place of a simulated robot's."""
+    path = cfg.get("calibration")
+    if path is None:
+        return
+    require(isinstance(path, str) and path, f"calibration must be a path or null, got {path!r}")
+    require(
+        cfg.get("recording") is not None,
+        "calibration is of a real log: set recording too, made by `estima convert LOG -o FILE.npz`",
+    )
+    slip = read_calibration(Path(path)).slip
+    for key in ("kr", "kl"):
+        OmegaConf.update(cfg, f"robot.{key}", getattr(slip, key))
+    if cfg.estimator.get("forward_slip_m") == 0.0:
+        OmegaConf.update(cfg, "estimator.forward_slip_m", slip.forward_slip_m)
+
+
 def _true_start(recording: Recording) -> Array:
     """True pose (3,) at the first Frame."""
     begin_s = float(recording.frame_stamps[0])
@@ -556,7 +602,7 @@ def _check_shape(config: Config) -> None:
             raise InputError(f"{key} is missing; {remedy}")
         if key in _MAPPINGS and not isinstance(config[key], dict):
             raise InputError(f"{key} must hold keys, got {config[key]!r}")
-    for place in ("simulation", "prior"):
+    for place in ("simulation", "prior", "scoring"):
         for name in config[place]:
             _check_known(f"{place}.{name}")
     wanted = config["recording"]
@@ -637,7 +683,15 @@ def check_added(hydra: Any) -> None:
         Naming the key, and the known ones.
     """
     groups = {choice.partition("@")[0] for choice in hydra.runtime.choices}
-    for override in OverridesParser.create().parse_overrides(list(hydra.overrides.task)):
+    overrides = OverridesParser.create().parse_overrides(list(hydra.overrides.task))
+    calibrated = any(o.key_or_group == "calibration" and o.value() is not None for o in overrides)
+    for override in overrides:
+        if override.key_or_group in ("robot.kr", "robot.kl") and calibrated:
+            key = override.key_or_group.removeprefix("robot.")
+            raise InputError(
+                f"{override.input_line}: the calibration has its own {key}; set estimator.{key} to "
+                "believe another, or leave calibration out"
+            )
         added = override.is_add() or override.is_force_add()
         if added and override.key_or_group not in groups:
             _check_known(override.key_or_group.partition(".")[0])

@@ -1,5 +1,7 @@
 """The Hydra application: a configuration's rows, in results/runs/NAME/KEY.DIGEST.parquet."""
 
+import math
+import shlex
 import sys
 import traceback
 from collections.abc import Callable, Sequence
@@ -7,13 +9,14 @@ from pathlib import Path
 from statistics import fmean
 
 import hydra
+import numpy as np
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from estimators.base import Estimate
 from estimators.program import ProgramError
 from experiments.runs import paths
-from experiments.runs.columns import COLUMNS
+from experiments.runs.columns import COLUMNS, REVISED
 from experiments.runs.console import RunFailedError, end, progress, show
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import (
@@ -50,8 +53,16 @@ def run_once(experiment: Experiment, draw: Draw, out: Path | None = None) -> lis
     folder, name = experiment.rows_folder / experiment.key, experiment.estimator_name
 
     def fetch() -> Recording:
-        with progress("simulated seconds") as on_progress:
-            return experiment.recording(on_progress)
+        with progress("simulated seconds", _expected_s(experiment)) as on_progress:
+            recording = experiment.recording(on_progress)
+        slip = experiment.believed_slip
+        if "source" in recording.config and experiment.config["calibration"] is None and slip:
+            show(
+                f"believed of this real robot: kr={slip[0]:g} and kl={slip[1]:g} m, and the "
+                "geometry that the log's reader assumes; to find its own: "
+                "estima calibrate LOG -o cal.yaml, then calibration=cal.yaml"
+            )
+        return recording
 
     def keep(recording: Recording, repeat: int, online: Estimate, revised: Estimate | None) -> None:
         answer = online if revised is None else revised
@@ -76,6 +87,20 @@ def run_once(experiment: Experiment, draw: Draw, out: Path | None = None) -> lis
     return rows
 
 
+def _expected_s(experiment: Experiment) -> float | None:
+    """About how long the simulated drive will be; None if that is not known before."""
+    route = experiment.config["route"] if experiment.config["recording"] is None else {}
+    if "segments" in route:
+        return sum(float(segment[2]) for segment in route["segments"]) + float(route["rest_s"])
+    if "look_ahead_m" not in route:
+        return None
+    way_m = route["distance_m"]
+    if way_m is None:
+        points = experiment.world().waypoints if route["waypoints"] is None else route["waypoints"]
+        way_m = np.hypot(*np.diff(np.asarray(points, float), axis=0).T).sum()
+    return float(way_m) / float(route["speed_mps"])
+
+
 def _trace(error: Exception | SystemExit) -> None:
     """Print where an error came from, unless it is a program's, whose own message says so."""
     if not isinstance(error, ProgramError):
@@ -95,7 +120,17 @@ def application(arguments: Sequence[str], draw: Draw, out: Path | None = None) -
                 raise InputError(
                     f"study={study} sweeps values; add -m: estima run -m study={study}"
                 )
-            run_once(Experiment.resolved(cfg, choices), draw, out)
+            experiment = Experiment.resolved(cfg, choices)
+            run_once(experiment, draw, out)
+            said = shlex.join(["estima", "run", *overrides, *options])
+            if experiment.config["recording"] is None:
+                show(f"Next: intervals over ten drives: {said} -m 'seed=range(0,10)'")
+                drive = shlex.join(["estima", "record", "-o", "run.npz", *overrides, *options])
+                if "command" not in experiment.config["estimator"]:  # `view` cannot be told it
+                    play = shlex.join(
+                        ["estima", "view", "run.npz", "-e", experiment.estimator_name]
+                    )
+                    show(f"      as it moves, in a window: {drive} && {play}")
         except Exception as error:
             end(error)  # here, since Hydra would add a line of its own
 
@@ -143,10 +178,21 @@ _SHOWN = (
 )
 
 
+_CONSISTENT = (1.5, 6.0)  # mean NEES of a run, half and twice the expected
+_DOF = 3
+
+
 def _print(rows: Sequence[Row], files: Sequence[Path]) -> None:
     first = rows[0]
     where = first.get("choice.world") or first.get("recording") or "a recording"
-    show(f"{first['choice.estimator']} on {where}, seed {first['seed']}: {first['status']}")
+    ended = {Outcome.OK: "", Outcome.REMARK: ", with a remark", Outcome.FAILED: ": failed"}
+    status = ended[Outcome(str(first["status"]))]
+    show(f"{first['choice.estimator']} on {where}, seed {first['seed']}{status}")
+    if words := in_words(rows):
+        show(f"  {words}")
+    if first.get("stamps_left_out"):
+        scored, left_out = first["stamps_scored"], first["stamps_left_out"]
+        show(f"  scored at {scored:.0f} frames; {left_out:.0f} others have no true pose")
     for name in _SHOWN:
         values = [float(v) for row in rows if isinstance(v := row.get(name), (int, float))]
         if values:
@@ -154,3 +200,29 @@ def _print(rows: Sequence[Row], files: Sequence[Path]) -> None:
             show(f"  {column.label:<30} {mean:10.4g} {column.unit}")
     for path in files:
         show(f"  {paths.short(path)}")
+    if first["status"] == Outcome.REMARK:
+        show(f"  remark: {first['status_detail']}")
+
+
+def in_words(rows: Sequence[Row]) -> str:
+    """What came out, in a sentence; errors over repeats are pooled by squares."""
+
+    def mean(name: str, power: int = 1) -> float:
+        every = [row.get(f"{REVISED}{name}", row.get(name)) for row in rows]
+        powers = [float(v) ** power for v in every if isinstance(v, (int, float))]
+        return float(fmean(powers) ** (1.0 / power)) if powers else math.nan
+
+    error_m = mean("ate_rmse_m", power=2)
+    distance_m, nees = mean("distance_m"), mean("nees_mean")
+    if not math.isfinite(error_m):
+        return ""
+    words = f"position RMSE {error_m:.3g} m"
+    if distance_m > 0.0:
+        words += f", {100.0 * error_m / distance_m:.2g} % of {distance_m:.3g} m"
+    if math.isfinite(nees):
+        low, high = _CONSISTENT
+        kind = (
+            "too sure of itself" if nees > high else "too cautious" if nees < low else "consistent"
+        )
+        words += f"; {kind} (NEES {nees:.2g} of {_DOF})"
+    return words

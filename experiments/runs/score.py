@@ -16,6 +16,7 @@ from experiments.evaluation.metrics import (
     RPE_DISTANCES_M,
     alignment,
     heading_errors_rad,
+    longest_pause_s,
     pairs_by_distance,
     path_scores,
     position_errors_m,
@@ -24,8 +25,9 @@ from experiments.evaluation.metrics import (
 )
 from experiments.evaluation.time_sync import Rows, nearest
 from experiments.runs.columns import OF_THE_RUN, REVISED
+from experiments.runs.evaluate import status_of_pauses
 from experiments.runs.experiment import files_digest, rows_folder
-from experiments.runs.row import Row, Status
+from experiments.runs.row import Row
 from experiments.runs.store import write_run
 from experiments.runs.version import code_version
 from experiments.trajectories.read import read_trajectory
@@ -149,9 +151,9 @@ def scored_against(recording: Recording, given: Estimate, how: Scoring) -> Score
     cos, sin = math.cos(T[2]), math.sin(T[2])
     turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
     moved = Estimate(stamps[rows], se2.compose(T, means), turn @ covariances @ turn.T)
-    instants = np.array([start, *stamps[rows][(stamps[rows] > start) & (stamps[rows] < end)], end])
+    pause_s = longest_pause_s(stamps[rows], start, end)
     left_out = len(stamps) - len(np.unique(rows))
-    return Scored(moved, truth, T, len(stamps), left_out, float(np.diff(instants).max(initial=0.0)))
+    return Scored(moved, truth, T, len(stamps), left_out, pause_s)
 
 
 def _associated(stamps: Array, true_stamps: Array, tolerance_s: float) -> tuple[Rows, Rows]:
@@ -233,10 +235,10 @@ def row_of(
         "run_key": key,
         "code_version": code_version(),
         "recording_checksum": checksum,
-        **Status().columns(),
+        **status_of_pauses(recording, scored.estimate.stamps).columns(),
         "duration_s": float(np.ptp(scored.estimate.stamps)),
-        "stamps_scored": len(scored.truth),
-        "stamps_left_out": scored.n_left_out,
+        "stamps_scored": float(len(scored.truth)),
+        "stamps_left_out": float(scored.n_left_out),
         "longest_gap_s": scored.longest_gap_s,
     }
     if how.cpu_seconds is not None:

@@ -11,26 +11,14 @@ import pandas as pd
 
 from experiments.runs.columns import ANSWER, ORIGIN, PATH, REPEAT, REVISED, STATUS, is_setting
 from experiments.runs.paths import results
-from experiments.runs.row import Outcome
 from experiments.runs.store import read_runs
 from experiments.runs.version import code_version, version_with
 from sim.errors import InputError
 
 _TIMES = ["step_time_us", "cpu_time_us"]  # they differ from run to run
 _COMMAND = "estimator.command"
-_DRAWN = ["seed", "world_seed"]  # what `summary` averages over
-_MAIN = (
-    "answer_ate_rmse_m",
-    "answer_ate_mean_m",
-    "answer_ate_aligned_rmse_m",
-    "answer_heading_rmse_rad",
-    "answer_heading_aligned_rmse_rad",
-    "answer_nees_mean",
-    "dispersion_final_m",
-    "step_time_us",
-    "cpu_time_us",
-)
-_COUNTED = {"failed": Outcome.FAILED, "with_remarks": Outcome.REMARK}
+COMMAND = "command.txt"  # beside the rows: the commands that made them
+DRAWN = ("seed", "world_seed")  # settings that only draw other samples
 
 
 def collect(name: str, *, all_versions: bool = False, times: bool = False) -> pd.DataFrame:
@@ -51,12 +39,8 @@ def collect(name: str, *, all_versions: bool = False, times: bool = False) -> pd
         If there are no rows, or none of this version of the code; or if runs of different keys
         have equal settings, because a file was edited between them, say.
     """
-    runs = results() / "runs"
-    path = next((p for p in (runs / name, Path(name)) if p.exists()), None)
-    if path is None:
-        there = sorted(p.name for p in runs.glob("*") if p.is_dir())
-        raise InputError(f"no sweep named {name}; there are: {', '.join(there) or 'none'}")
-    table = read_runs(path)
+    path = folder_of(name)
+    table = read_runs(path).copy()  # in one piece; else pandas warns
     for column in ("status", REPEAT, *ORIGIN):
         if column not in table:
             raise InputError(f"{path}: not rows of runs, column {column} is missing")
@@ -68,7 +52,7 @@ def collect(name: str, *, all_versions: bool = False, times: bool = False) -> pd
         if not mine.any():
             raise InputError(
                 f"{path}: all {len(table)} rows are of other versions of the code; run the sweep "
-                "again, or see them with --all-versions"
+                f"again, or see them by `estima table {name} --all-versions`"
             )
         if not mine.all():
             print(f"left out {(~mine).sum()} rows of other code versions", file=sys.stderr)
@@ -78,6 +62,22 @@ def collect(name: str, *, all_versions: bool = False, times: bool = False) -> pd
     if not times:
         table = table.drop(columns=_TIMES, errors="ignore")
     return table.sort_values([*settings, "run_key", REPEAT], kind="stable", ignore_index=True)
+
+
+def folder_of(name: str) -> Path:
+    """Path of a sweep's rows, by its name or path.
+
+    Raises
+    ------
+    InputError
+        If there is none.
+    """
+    runs = results() / "runs"
+    path = next((p for p in (runs / name, Path(name)) if p.exists()), None)
+    if path is None:
+        there = sorted(p.name for p in runs.glob("*") if p.is_dir())
+        raise InputError(f"no sweep named {name}; there are: {', '.join(there) or 'none'}")
+    return path
 
 
 def _check_distinct(table: pd.DataFrame, settings: list[str], path: Path) -> None:
@@ -197,47 +197,3 @@ def with_answers(table: pd.DataFrame, names: Sequence[str]) -> pd.DataFrame:
             ]
             added[name] = np.where(has, *parts)
     return table.assign(**added)
-
-
-def summary(table: pd.DataFrame, against: str | None = None) -> pd.DataFrame:
-    """Mean of the main errors for each combination of the swept settings except the seeds.
-
-    Errors are those of the best answers; column `answer` says which path that is.
-
-    Parameters
-    ----------
-    against
-        An estimator's name: errors are also given relative to that estimator's, on the same
-        recordings.
-    """
-    table = with_answers(table, _MAIN)
-    by = telling(table.drop(columns=_DRAWN, errors="ignore"))
-    shown = [c for c in _MAIN if c in table and table[c].notna().any()]
-    for column in shown:
-        if not pd.api.types.is_numeric_dtype(table[column]):
-            raise InputError(f"column {column} holds no numbers in some rows; see --where")
-    if against is not None:
-        column = f"ate_rmse_over_{against}"
-        table = table.assign(**{column: np.log(_error_ratio(table, against))})
-        shown.append(column)
-    groups = table.groupby(by, dropna=False) if by else table.groupby(lambda _: "all runs")
-    found = groups[shown].mean()
-    if against is not None:
-        found[column] = np.exp(found[column])
-    found.insert(0, "runs", groups.size())
-    found.insert(1, PATH, groups[PATH].agg(lambda s: "/".join(sorted(set(s)))))
-    for place, (name, outcome) in enumerate(_COUNTED.items(), start=2):
-        found.insert(place, name, groups["status"].agg(lambda s, o=outcome: (s == o).sum()))
-    return found.reset_index(drop=not by)
-
-
-def _error_ratio(table: pd.DataFrame, against: str) -> pd.Series[float]:
-    """Ratio of position error, of the best answers, to an estimator's mean one on a recording."""
-    one = table[table["choice.estimator"] == against]
-    if one.empty:
-        raise InputError(f"no rows of estimator {against}")
-    if own := [c for c in telling(one) if c.startswith("estimator.")]:
-        print(f"{against} is the mean over its {', '.join(own)}", file=sys.stderr)
-    error = table["answer_ate_rmse_m"]
-    reference = error[one.index].groupby(one["recording_checksum"]).mean()
-    return error / table["recording_checksum"].map(reference)

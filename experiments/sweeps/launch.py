@@ -11,6 +11,7 @@ import os
 import platform
 import re
 import secrets
+import shlex
 import shutil
 import signal
 import sys
@@ -31,7 +32,9 @@ from experiments.runs.console import RunFailedError, progress
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment, check_hydra
 from experiments.runs.row import Outcome, Row, Status, check_row
+from experiments.sweeps.collect import COMMAND
 from experiments.sweeps.plan import Family, Numbers, Plan, packed, plan_of
+from sim.compiled import announce_once_in
 from sim.errors import InputError
 from sim.files import require_file, write_whole
 from sim.recording import Recording
@@ -41,7 +44,7 @@ _JOBS_PER_CORE = 4  # enough to keep all busy to the end, few enough to cost lit
 _DIED = {"UncompletedJobError", "WorkerCrashedError", "NodeDiedError", "OutOfMemoryError"}
 
 
-def sweep_arguments(arguments: Sequence[str]) -> None:
+def sweep_arguments(arguments: Sequence[str]) -> tuple[Path, int]:
     """Sweep by a command line's arguments: overrides, and `--config-dir` with its folder."""
     overrides, config_dir = [], None
     rest = iter(arguments)
@@ -56,10 +59,10 @@ def sweep_arguments(arguments: Sequence[str]) -> None:
         else:
             overrides.append(argument)
     signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGINT))  # end as by Ctrl-C
-    sweep(overrides, config_dir)
+    return sweep(overrides, config_dir)
 
 
-def sweep(arguments: Sequence[str], config_dir: str | None = None) -> None:
+def sweep(arguments: Sequence[str], config_dir: str | None = None) -> tuple[Path, int]:
     """Run all combinations of the swept values, except those already done.
 
     Parameters
@@ -71,6 +74,11 @@ def sweep(arguments: Sequence[str], config_dir: str | None = None) -> None:
         that the runs are packed into.
     config_dir
         A further folder of options.
+
+    Returns
+    -------
+    folder, n_runs
+        Where the rows are, and how many runs the sweep has.
 
     Raises
     ------
@@ -96,20 +104,27 @@ def sweep(arguments: Sequence[str], config_dir: str | None = None) -> None:
     done = np.isin(keys, store.ended(folder, damaged=_drop).done)
     runs = np.sort(first[~done])
     check(plan, runs)
+    _note_command(folder, arguments, config_dir)
     print(
         f"{len(keys)} run{'s' if len(keys) > 1 else ''}, {done.sum()} of them done "
         f"before: {paths.short(folder)}",
         file=sys.stderr,
     )
     if not len(runs):
-        return
-    _launch_all(plan, runs, Jobs(folder, n_jobs), launching)
+        return folder, len(keys)
+    try:
+        _launch_all(plan, runs, Jobs(folder, n_jobs), launching)
+    except KeyboardInterrupt:
+        n_kept = np.isin(keys, store.ended(folder).done).sum()
+        print(f"{n_kept} of {len(keys)} runs are kept; run it again to go on", file=sys.stderr)
+        raise
     _tidy(folder)
     found = store.ended(folder)
     bad = runs[~np.isin(plan.keys[runs], found.done)]
     if len(bad):
         why = found.failed.get(int(plan.keys[bad[0]]), "no row was written")
         raise RunFailedError(f"{len(bad)} of {len(keys)} runs; first: {why}")
+    return folder, len(keys)
 
 
 def _name(plan: Plan, own: Sequence[str], config_dir: str | None) -> str | None:
@@ -123,6 +138,18 @@ def _name(plan: Plan, own: Sequence[str], config_dir: str | None) -> str | None:
     last = {argument.partition("=")[0]: argument for argument in own}  # that one is swept
     text = json.dumps([sorted(last.values()), config_dir and str(Path(config_dir).resolve())])
     return f"sweep_{hashlib.sha256(text.encode()).hexdigest()[:8]}"
+
+
+def _note_command(folder: Path, arguments: Sequence[str], config_dir: str | None) -> None:
+    """Keep the command beside the rows, for pages that show them."""
+    path = folder / COMMAND
+    require_file(path)
+    given = [*(["--config-dir", config_dir] if config_dir else []), *arguments]
+    command = " ".join(shlex.join(["estima", "run", "-m", *given]).splitlines())
+    noted = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+    if command not in noted:
+        with write_whole(path) as part:
+            part.write_text("\n".join([*noted, command]) + "\n", encoding="utf-8")
 
 
 def check(plan: Plan, runs: Numbers) -> None:
@@ -361,6 +388,7 @@ def job_application(cfg: DictConfig) -> None:
     if os.getpid() != share["planner"][1]:  # joblib's workers stay, as they were, for later sweeps
         folder, os.environ["ESTIMA_RESULTS"] = share["places"]
         os.chdir(folder)
+        announce_once_in(share_of(cfg.plan, cfg.job).parent / "compiling")
     run_share(share)
 
 

@@ -475,7 +475,10 @@ def _decides_more(leaf: Leaf, values: Sequence[Any]) -> bool:
     if leaf[0] == "estimator" or leaf[:2] == ("route", "feedback"):
         options = [] if isinstance(values, range) else list(values)
         return leaf[-1] == "_target_" or bool(files_of_options(options))
-    files = leaf[0] == "recording" or leaf[:2] in (("prior", "map"), ("world", "path"))
+    files = leaf[0] in ("recording", "calibration") or leaf[:2] in (
+        ("prior", "map"),
+        ("world", "path"),
+    )
     return files or leaf[0] == "simulation" or leaf[-1] in ("_target_", "path")
 
 

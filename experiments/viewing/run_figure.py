@@ -7,11 +7,16 @@ from matplotlib.figure import Figure
 
 from estimators.base import Estimate
 from experiments.viewing.plotting import draw_ellipses, plan_axes
-from experiments.viewing.style import ESTIMATE, TRUTH, figure
+from experiments.viewing.style import ESTIMATE, GREEN, ORANGE, TRUTH, figure
 from experiments.viewing.world import draw_world, sees_landmarks
 from sim import se2
 from sim.arrays import Array
 from sim.recording import Recording
+
+_N_ELLIPSES = 8
+_N_READINGS = 30
+_MOST_POINTS = 4000
+_AROUND_M = 3.0  # of the path that is shown
 
 
 def run_figure(recording: Recording, estimate: Estimate, name: str) -> Figure:
@@ -26,12 +31,48 @@ def run_figure(recording: Recording, estimate: Estimate, name: str) -> Figure:
         map_axes.plot(*truth[:, :2].T, color=TRUTH, lw=1.6, label="truth")
         _draw_errors(halves[1].subplots(3, 1, sharex=True), estimate, truth)
     means = estimate.means
+    shown = truth[:, :2] if recording.truth is not None else means[:, :2]
+    low, high = shown.min(axis=0) - _AROUND_M, shown.max(axis=0) + _AROUND_M
+    for name_of, color in zip(_seen(recording), (ORANGE, GREEN), strict=False):
+        points = _points(recording, estimate, name_of)
+        map_axes.plot(*points.T, ".", color=color, ms=1.5, alpha=0.6, label=f"{name_of} as placed")
     map_axes.plot(*means[:, :2].T, color=ESTIMATE, lw=1.2, ls="--", label=name)
-    some = np.linspace(0, len(means) - 1, 12).astype(int)[1:]
-    draw_ellipses(map_axes, means[some], estimate.covariances[some], ec=ESTIMATE, fc="none", lw=0.8)
-    plan_axes(map_axes)
-    map_axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2)
+    some = _spread(means, _N_ELLIPSES)
+    draw_ellipses(
+        map_axes, means[some], estimate.covariances[some], "95 % ellipse",
+        ec=ESTIMATE, fc=ESTIMATE, alpha=0.35, lw=0.8, zorder=3,
+    )  # fmt: skip
+    plan_axes(map_axes, xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+    map_axes.legend(
+        loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, fontsize="small", markerscale=3.0
+    )
     return page
+
+
+def _spread(means: Array, count: int) -> Array:
+    """Rows that are spread evenly along a path, without its first."""
+    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(means[:, :2], axis=0).T))])
+    rows = np.searchsorted(along, np.linspace(0.0, along[-1], count + 1)[1:])
+    return np.unique(np.minimum(rows, len(means) - 1))
+
+
+def _seen(recording: Recording) -> list[str]:
+    """The sensor to draw: a laser, else what sees landmarks; none if nothing can be drawn."""
+    drawn = [n for n in recording.logs if hasattr(recording.sensors[n], "points_in_base")]
+    flat = [n for n in drawn if "ranges_m" in recording.logs[n].values]
+    return (flat or drawn)[:1]
+
+
+def _points(recording: Recording, estimate: Estimate, name: str) -> Array:
+    """Points (N, 2) in map of some readings of a sensor, placed by the estimate."""
+    log, sensor = recording.logs[name], recording.sensors[name]
+    points = [np.zeros((0, 2))]
+    for row in np.unique(np.linspace(0, len(log.stamps) - 1, _N_READINGS).astype(int)):
+        at = int(np.searchsorted(estimate.stamps, log.stamps[row]))
+        seen: Any = getattr(sensor, "points_in_base")(log.reading(row))  # noqa: B009
+        pose = estimate.means[min(at, len(estimate.means) - 1)]
+        points.append(se2.transform(pose, seen[:, :2]))
+    return np.concatenate(points)[:: max(1, sum(map(len, points)) // _MOST_POINTS)]
 
 
 def _draw_errors(axes: Array, estimate: Estimate, truth: Array) -> None:

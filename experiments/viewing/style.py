@@ -5,8 +5,10 @@ from typing import Any
 
 import matplotlib as mpl
 from cycler import cycler
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from sim.errors import require
 from sim.files import write_whole
@@ -15,21 +17,25 @@ from sim.files import write_whole
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
 YELLOW, BLUE, RED, PURPLE = "#F0E442", "#0072B2", "#D55E00", "#CC79A7"
 CYCLE = (BLUE, ORANGE, GREEN, PURPLE, RED, SKY, BLACK)
+# Twelve series that differ in colour and in marker; the first seven are CYCLE
+_MORE = ("#882255", "#999933", "#332288", "#777777", "#661100")
+SERIES = tuple(zip((*CYCLE, *_MORE), "osD^vPX<>p*h", strict=True))
 TRUTH, ESTIMATE, ODOMETRY, WALL = BLACK, BLUE, ORANGE, "#555555"
 
 _SETTINGS: dict[str, Any] = {
-    "font.size": 9.0,
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.prop_cycle": cycler(color=CYCLE),
     "legend.frameon": False,
     "svg.hashsalt": "estima",
+    "svg.fonttype": "none",  # text stays text
+    "pdf.fonttype": 42,  # IEEE refuses type 3
 }
 
 
-def figure(width_in: float, height_in: float) -> Figure:
+def figure(width_in: float, height_in: float, font_pt: float = 9.0) -> Figure:
     """Empty page with the house style and a layout in which nothing overlaps."""
-    mpl.rcParams.update(_SETTINGS)  # type: ignore[arg-type]
+    mpl.rcParams.update(_SETTINGS | {"font.size": font_pt})  # type: ignore[arg-type]
     page = Figure(figsize=(width_in, height_in), layout="constrained")
     FigureCanvasAgg(page)
     return page
@@ -41,6 +47,14 @@ def subplots(
     """Page in the house style and its axes, as `matplotlib.pyplot.subplots` gives them."""
     page = figure(width_in, height_in)
     return page, page.subplots(n_rows, n_cols, **options)
+
+
+def plain_log_ticks(*axes: Axis) -> None:
+    """Label logarithmic axes at 1, 2 and 5 of each decade, as plain numbers that do not collide."""
+    for axis in axes:
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_formatter(NullFormatter())
 
 
 def save_figure(page: Figure, path: Path) -> None:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from sim import se2
 from sim.arrays import Array
-from sim.errors import require
+from sim.errors import InputError, require
 from sim.recording import WheelLog
 from sim.robot import arc_increment
 
@@ -56,6 +56,25 @@ def in_order(stamps: Array, name: str, notes: Notes) -> Rows:
     if len(rows) > 1:
         notes[f"{name}_longest_gap_s"] = round(float(np.max(np.diff(stamps[rows]))), 6)
     return rows
+
+
+def require_clock(stamps: Array, where: str, what: str) -> None:
+    """Refuse readings (N,) most of whose stamps are those of others: they have no usable clock.
+
+    Raises
+    ------
+    InputError
+        If less than half of them have a stamp of their own.
+    """
+    different = len(np.unique(stamps))
+    if 2 * different >= len(stamps):
+        return
+    zero = different == 1 and stamps[0] == 0.0
+    how = "are missing (all 0)" if zero else "are too coarse, such as 1.13486e+09 for every one"
+    raise InputError(
+        f"{where}: {len(stamps)} {what} have {different} different stamps: the stamps {how}; write "
+        "them in seconds with at least three decimals"
+    )
 
 
 def wheels_from_poses(stamps: Array, poses: Array, track_m: float, notes: Notes) -> WheelLog:

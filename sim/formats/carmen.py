@@ -110,6 +110,7 @@ def parse_carmen(words: Words) -> CarmenLog:
     """The log in a file's words."""
     notes: assemble.Notes = {}
     odometry = words.finite(words.lines_of(_ODOM), 1, 7, "ODOM")
+    assemble.require_clock(odometry[:, 6], words.where, "ODOM lines")
     odometry = odometry[assemble.in_order(odometry[:, 6], "odometry", notes)]
     flaser, robotlaser = words.lines_of(_FLASER), words.lines_of(_ROBOTLASER)
     lines, count_column = (robotlaser, 8) if len(robotlaser) >= len(flaser) else (flaser, 1)
@@ -139,7 +140,8 @@ def parse_carmen(words: Words) -> CarmenLog:
         tail = words.finite(lines, after, 7, "poses and stamp of FLASER")
         stamps, laser_poses, poses = tail[:, 6], tail[:, :3], tail[:, 3:6]
         start_angle, max_range = -math.pi / 2.0, _FLASER_MAX_RANGE_M
-        resolution = math.pi / (n_beams - n_beams % 2) if n_beams > 1 else math.pi
+        resolution = half_turn_step_rad(n_beams)
+    assemble.require_clock(stamps, words.where, "scans")
     rows = assemble.in_order(stamps, "scans", notes)
     return CarmenLog(
         odometry_stamps=odometry[:, 6].copy(),
@@ -234,6 +236,14 @@ def scan_recording(
 def seen_ranges(raw_m: Array, max_range_m: float) -> NDArray[np.float32]:
     """Ranges with +inf where nothing was seen: at the maximum or beyond, zero, or no number."""
     return np.where((raw_m > 0.0) & (raw_m < max_range_m), raw_m, np.inf).astype(np.float32)
+
+
+def half_turn_step_rad(n_beams: int) -> float:
+    """Angle between the beams of a half turn: 180 / n degrees, or 180 / (n - 1) for an odd n.
+
+    A scanner with a beam at either end of the half turn has an odd number of them, such as 181.
+    """
+    return math.pi / (n_beams - n_beams % 2) if n_beams > 1 else math.pi
 
 
 def _mount(poses: Array, laser_poses: Array) -> Array:

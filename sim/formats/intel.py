@@ -13,7 +13,13 @@ import numpy as np
 from sim.arrays import Array
 from sim.errors import InputError, require
 from sim.formats import assemble
-from sim.formats.carmen import NOMINAL_RADIUS_M, NOMINAL_TRACK_M, scan_recording, seen_ranges
+from sim.formats.carmen import (
+    NOMINAL_RADIUS_M,
+    NOMINAL_TRACK_M,
+    half_turn_step_rad,
+    scan_recording,
+    seen_ranges,
+)
 from sim.formats.text import json_number, read_bytes, read_words
 from sim.recording import Recording, Truth
 from sim.sensors import Laser, Mount
@@ -68,7 +74,7 @@ def read_intel(
 ) -> Recording:
     """A Recording of the raw file; the corrected file's poses, if given, are its truth.
 
-    Beams are one degree apart (180 / n) from -90 degrees on.
+    Beams start at -90 degrees and are `half_turn_step_rad` apart: a degree for 180 or 181 of them.
     """
     where = str(raw)
     stamps, poses, ranges = parse_intel(read_bytes(raw), where)
@@ -165,12 +171,12 @@ def read_thinned_intel(
 
 
 def _scanner(rate_hz: float, n_beams: int, max_range_m: float) -> Laser:
-    """A laser whose beams are 180 / n degrees apart, from -90 degrees on."""
-    step = math.pi / n_beams
+    """A laser whose beams start at -90 degrees, `half_turn_step_rad` apart."""
+    step = half_turn_step_rad(n_beams)
     return Laser(
         rate_hz=rate_hz,
         n_beams=n_beams,
         fov_rad=step * (n_beams - 1),
         max_range_m=max_range_m,
-        mount=Mount(yaw_rad=-step / 2.0),
+        mount=Mount(yaw_rad=(step * (n_beams - 1) - math.pi) / 2.0),
     )

@@ -51,6 +51,7 @@ def parse_motors(words: Words) -> TickLog:
     assemble.require_readings(len(lines), 2, words.where, "M lines")
     values = words.finite(lines, 1, 6, "an M line")
     stamps = values[:, 0] / 1000.0
+    assemble.require_clock(stamps, words.where, "M lines")
     rows = assemble.in_order(stamps, "motors", {})
     assemble.require_readings(len(rows), 2, words.where, "M lines with different stamps")
     return TickLog(stamps[rows], values[rows][:, [5, 1]])
@@ -64,6 +65,7 @@ def parse_scans(words: Words) -> tuple[Array, NDArray[np.float32]]:
     words.refuse(counts != counts[0], lines, "a scan of another size than the first")
     stamps = words.finite(lines, 1, 1, "an S line")[:, 0] / 1000.0
     ranges = words.numbers(lines, 3, int(counts[0]), "ranges") / 1000.0
+    assemble.require_clock(stamps, words.where, "S lines")
     rows = assemble.in_order(stamps, "scans", {})
     return stamps[rows], seen_ranges(ranges, _MAX_RANGE_M)[rows]
 

@@ -115,6 +115,7 @@ def read_rawseeds(
     """
     notes: assemble.Notes = {}
     stamps, ticks, poses = _odometry(read_words(odometry))
+    assemble.require_clock(stamps, str(odometry), "odometry readings")
     rows = assemble.in_order(stamps, "odometry", notes)
     assemble.require_readings(len(rows), 2, str(odometry), "odometry readings")
     if m_per_tick is None:
@@ -126,6 +127,7 @@ def read_rawseeds(
         )
         wheels = WheelLog(stamps[rows], m_per_tick * np.cumsum(ticks, axis=0)[rows])
     times, ranges, start, step = parse_sick(read_words(scans), resolution_deg)
+    assemble.require_clock(times, str(scans), "scans")
     rows = assemble.in_order(times, "scans", notes)
     times, ranges = times[rows], ranges[rows]
     fov = max(step * (ranges.shape[1] - 1), 1e-9)

@@ -4,6 +4,7 @@ Whatever the file holds, the memory is bounded by its size: nothing is ever allo
 header promises it.
 """
 
+import codecs
 import io
 import lzma
 import math
@@ -203,13 +204,15 @@ class Words:
 def split_words(data: bytes, where: str) -> Words:
     """Split text at white space, commas and semicolons; `#` begins a comment.
 
-    Numbers are read exactly, as Python's `float` reads them, except that underscores are refused.
+    A byte order mark of UTF-8 at its beginning is passed over. Numbers are read exactly, as
+    Python's `float` reads them, except that underscores are refused.
 
     Raises
     ------
     InputError
         If the file is binary (holds a zero byte).
     """
+    data = data.removeprefix(codecs.BOM_UTF8)
     zero = data.find(b"\x00")
     if zero >= 0:
         line_number = data.count(b"\n", 0, zero) + 1

@@ -9,6 +9,7 @@ from sim.files import require_file
 from sim.formats.rosbag import Track
 from sim.formats.tum import read_tum
 
+FARTHEST_M = 1e12  # of a position that can be scored; far beyond, squares overflow
 _BAGS = (".mcap", ".bag", ".db3")
 _MAGIC = (b"#ROSBAG", b"\x89MCAP", b"SQLite format 3")
 _OTHERS = ("odom", "ground_truth")  # topics that are no estimate unless they are asked for
@@ -39,7 +40,7 @@ def read_track(path: Path, topic: str | None = None) -> Track:
 
 
 def check_track(track: Track, path: Path) -> None:
-    """Check that a file's trajectory has poses, finite ones, at stamps that increase.
+    """Check that a file's trajectory has poses, finite and not too far, at stamps that increase.
 
     Raises
     ------
@@ -49,6 +50,11 @@ def check_track(track: Track, path: Path) -> None:
     require(len(track.stamps), f"{path}: holds no pose")
     sound = np.isfinite(track.stamps) & np.isfinite(track.means).all(axis=1)
     require(sound.all(), f"{path}: pose {int(np.argmin(sound)) + 1} is not finite")
+    near = np.abs(track.means[:, :2]).max(axis=1) <= FARTHEST_M
+    require(
+        near.all(),
+        f"{path}: pose {int(np.argmin(near)) + 1} is farther away than {FARTHEST_M:g} m",
+    )
     rising = np.diff(track.stamps) > 0.0
     if not rising.all():
         row = int(np.argmin(rising))

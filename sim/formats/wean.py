@@ -86,6 +86,7 @@ def parse_wean(
     rows = assemble.in_order(all_stamps, "poses", notes)
     assemble.require_readings(len(rows), 2, words.where, "poses at different stamps")
     wheels = assemble.wheels_from_poses(all_stamps[rows], poses[rows], track_m, notes)
+    assemble.require_clock(stamps, words.where, "scans")
     order = assemble.in_order(stamps, "scans", notes)
     of_laser = head[:, 3:] / np.array([100.0, 100.0, 1.0])
     mount = np.median(se2.between(poses[len(odometry) :], of_laser), axis=0)

@@ -1,13 +1,17 @@
 """Registration from scan to scan: the errors of its steps, and the shape of its ellipses."""
 
 import functools
+import itertools
 import math
 
 import numpy as np
 import pandas as pd
 
+from estimators import icp_covariance
 from estimators.base import Estimate
 from estimators.gaussian import STILL, Gaussian
+from estimators.icp import Metric, Rules, prepare, register
+from estimators.scan_matching import FAILED
 from experiments.evaluation.metrics import travelled_m
 from experiments.evaluation.scan_bound import fisher_bound
 from experiments.papers.decristoforis2020.settings import HELD_M, WINDOWS_S
@@ -79,22 +83,43 @@ def _accumulated(steps: dict[int, Gaussian], truth: Array, n: int) -> float:
     return float(np.mean(values)) if values else math.nan
 
 
-def ellipse_path(recording: Recording, world: World, estimate: Estimate) -> pd.DataFrame:
-    """Ellipse of each registration, in the axes of the map, along the true path.
+def ellipse_path(
+    recording: Recording,
+    world: World,
+    metric: Metric,
+    scans: icp_covariance.Scans,
+    neighbours: int = Rules.neighbours,
+) -> pd.DataFrame:
+    """Ellipse of each registration of successive scans, in the axes of the map, along the path.
+
+    Covariances are those of eqs. (6)-(8) as they stand: also along a direction that the scans hold
+    badly or not at all, where an estimator would take the wheels' instead. Registrations start
+    from the true motion, so that they differ in nothing but the scans.
 
     Returns
     -------
     DataFrame
         One row per registration: `distance_m` driven, `place`, true pose; covariance `xx_m2`,
         `xy_m2`, `yy_m2`; standard deviations along the axes `long_m`, `short_m`, and the
-        `direction_rad` of the long one.
+        `direction_rad` of the long one; `degenerate`: whether the scans hold too little.
     """
-    truth = recording.truth_at(recording.frame_stamps)
-    found = estimate.extras["registration_covariance"]
-    use = np.array([i for i, C in enumerate(found) if C is not None])
+    laser, log = recording.sensor("laser", Laser), recording.logs["laser"]
+    truth = recording.truth_at(log.stamps)
+    mount, sigma_m = laser.mount.pose, laser.sigma_range_m
+    motions = se2.between(*(se2.compose(poses, mount) for poses in (truth[:-1], truth[1:])))
+    prepared = [prepare(r, laser.bearings_rad, laser.max_range_m) for r in log["ranges_m"]]
+    rules, rows = Rules(neighbours=neighbours), []
+    for i, (target, source) in enumerate(itertools.pairwise(prepared), 1):
+        found = register(source, target, motions[i - 1], metric=metric, rules=rules)
+        if found.status in FAILED:
+            continue
+        R = icp_covariance.censi(found, source, target, sigma_m, scans=scans, everywhere=True)
+        step, _ = Gaussian(found.T_target_source, R).seen_from(se2.inverse(mount))
+        rows.append((i, found.status == "degenerate", step.covariance[:2, :2]))
+    use, degenerate, in_base = (np.array(column) for column in zip(*rows, strict=True))
     cos, sin = np.cos(truth[use - 1, 2]), np.sin(truth[use - 1, 2])
     R = np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], -2)
-    in_map = R @ np.array([found[i][:2, :2] for i in use]) @ R.transpose(0, 2, 1)
+    in_map = R @ in_base @ R.transpose(0, 2, 1)
     values, vectors = np.linalg.eigh(in_map)
     return pd.DataFrame(
         {
@@ -109,6 +134,7 @@ def ellipse_path(recording: Recording, world: World, estimate: Estimate) -> pd.D
             "long_m": np.sqrt(values[:, 1]),
             "short_m": np.sqrt(values[:, 0]),
             "direction_rad": np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1]),
+            "degenerate": degenerate,
         }
     )
 
@@ -125,6 +151,7 @@ def ellipse_summary(path: pd.DataFrame) -> Row:
         "tilt_bare_deg": float(np.degrees(tilt.median())),
         "long_bare_m": float(bare["long_m"].median()),
         "long_objects_m": float(objects["long_m"].median()),
+        "degenerate_bare": float(bare["degenerate"].mean()),
     }
     for bend, legs in (("curve", ("leg_2", "leg_3")), ("corner", ("leg_1", "leg_2"))):
         inside, before, after = (path[path["place"] == place] for place in (bend, *legs))

@@ -17,6 +17,7 @@ from matplotlib.cbook import boxplot_stats
 
 from estimators.base import Estimate
 from estimators.icp import prepare, register
+from estimators.icp_covariance import Scans
 from experiments.bench.icp import BEARINGS_RAD, pair
 from experiments.evaluation.map_quality import map_points, mean_map_entropy, wall_distances_m
 from experiments.evaluation.metrics import (
@@ -249,7 +250,7 @@ def _drawn_office(group: Sequence[Experiment], out: Results) -> Tables:
         arrays[f"{row['method']}_points"] = points.astype(np.float32)
         row["map_distance_m"] = float(wall_distances_m(points, world).mean())
         if row["method"] == "icp":
-            path = ellipse_path(recording, world, estimate)
+            path = ellipse_path(recording, world, "point_to_plane", "last")
             inside = [_within(path, area, 2.0).assign(area=name) for name, area in areas.items()]
     out.write_arrays("office", **arrays)
     return {"drawn": pd.DataFrame(rows), "areas": pd.concat(inside)}
@@ -294,7 +295,9 @@ def _closeup(group: Sequence[Experiment], out: Results | None = None) -> Tables:
     recording, world = group[0].recording(), group[0].world()
     rows, tables = [], {}
     for experiment in group:
-        path = ellipse_path(recording, world, _run(experiment, recording, {})[1])
+        believed = experiment.config["estimator"]
+        scans: Scans = "last" if believed["covariance"] == "censi_last" else "both"
+        path = ellipse_path(recording, world, believed["metric"], scans, believed["neighbours"])
         origin = {"seed": experiment.seed, "method": experiment.config["method"]}
         rows.append(origin | ellipse_summary(path))
         if out is not None and origin["method"] == "printed":

@@ -42,8 +42,6 @@ from experiments.papers.maximo2024.settings import (
 )
 from experiments.papers.results import Results
 
-# Tables without `n_nearest` have queries off the route, and other parameters for each method
-_EARLIER = "to be judged at the next full run, with queries between nodes and shared parameters"
 _LEAST_M = 1e-3  # added to dispersions that may be zero, before a logarithm
 
 
@@ -109,7 +107,7 @@ def mx1(
         for compare in (_m3_error, _m2_error):
             claim = compare(name, errors)
             if claim is not None:
-                claim = remarked(_as_amended(claim, weighting), _where(compare, quality, name))
+                claim = remarked(claim, _where(compare, quality, name))
                 yield beside(claim, name not in decisive)
     if runs is not None:
         errors = runs.pivot_table(index="run", columns="method", values="error_m")
@@ -139,8 +137,6 @@ def _m2_error(name: str, errors: pd.DataFrame) -> Claim:
 def mx1_sentence(rows: Sequence[Claim]) -> str:
     """Say which weighting errs least, and where M3 fails."""
     judged_rows = list(filter(_is_headline, rows))
-    if _is_earlier(judged_rows):
-        return f"{_EARLIER.capitalize()}."
     below = [row for row in judged_rows if row.statistic.startswith("error of M2 over M1")]
     parts = [f"{plain(row.found.value, 3)} on {_place(row)} ({_p(row)})" for row in below]
     fails = pick(judged_rows, "5 times M2")
@@ -165,7 +161,7 @@ def mx3(dispersion: pd.DataFrame, quality: pd.DataFrame) -> Iterator[Claim]:
     for compare in (_m2_dispersion, _m3_dispersion):
         for name in geometries(at_10):
             worlds = _by_world(at_10[at_10["geometry"] == name], "dispersion_m")
-            claim = _as_amended(compare(name, worlds), dispersion)
+            claim = compare(name, worlds)
             where = _where(compare, quality, name)
             yield beside(remarked(claim, where), name not in decisive)
 
@@ -186,25 +182,12 @@ def _less_dispersed(method: str, name: str, worlds: pd.DataFrame) -> Claim:
 def mx3_sentence(rows: Sequence[Claim]) -> str:
     """Say how far particles have concentrated after ten steps, by the weighting."""
     judged_rows = list(filter(_is_headline, rows))
-    if _is_earlier(judged_rows):
-        return f"{_EARLIER.capitalize()}."
     parts = [
         f"{row.statistic.removeprefix('dispersion of ').split(' at ')[0]} on {_place(row)} "
         f"{plain(row.found.value)} ({_p(row)})"
         for row in judged_rows
     ]
     return f"Ratios of the dispersions after ten steps: {'; '.join(parts)}."
-
-
-def _as_amended(claim: Claim, table: pd.DataFrame) -> Claim:
-    """Leave a claim undecided if the table is of a study before the amendments."""
-    if "n_nearest" in table:
-        return claim
-    return remarked(replace(claim, verdict=Verdict.UNDECIDED, more=0), _EARLIER)
-
-
-def _is_earlier(rows: Sequence[Claim]) -> bool:
-    return any(_EARLIER in row.reason for row in rows)
 
 
 def _is_headline(row: Claim) -> bool:
@@ -233,14 +216,12 @@ COMPARISONS: dict[Compare, str] = {
 def judged_map(quality: pd.DataFrame, name: str, compare: Compare) -> pd.DataFrame:
     """Value and verdict of a comparison at each noise weight and B of a geometry.
 
-    At B = 1, which tables of former studies have, the weightings are the same filter.
-
     Returns
     -------
     DataFrame
         Columns noise_weight, n_nearest, statistic, value, verdict.
     """
-    part = quality[(quality["geometry"] == name) & (quality["n_nearest"] > 1)]
+    part = quality[quality["geometry"] == name]
     rows = []
     for key, cell in part.groupby(["noise_weight", "n_nearest"]):
         claim = compare(name, _by_world(cell, COMPARISONS[compare]))

@@ -389,7 +389,8 @@ def _route(
     geometry = GEOMETRIES[name]
     if noise_weight is not None:
         geometry = dataclasses.replace(geometry, noise_weight=noise_weight)
-    nodes = None if positions is None else oxford_positions(Path(positions), run)
+    real = name == "oxford" and positions is not None
+    nodes = oxford_positions(Path(str(positions)), run) if real else None
     return place_world(geometry, config["world_seed"], nodes, offsets)
 
 

@@ -9,10 +9,17 @@ import pandas as pd
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from experiments.papers.real_logs.settings import GMAPPING, INTEL_DRAWN, MRCLAM_DRAWN
+from experiments.papers.real_logs.settings import (
+    GMAPPING,
+    INTEL_DRAWN,
+    MRCLAM_DRAWN,
+    RESOLUTION_M,
+)
 from experiments.papers.results import Results
+from experiments.viewing.grid import draw_grid
 from experiments.viewing.plotting import plan_axes
 from experiments.viewing.style import BLACK, CYCLE, subplots
+from sim.grid import OccupancyGrid
 
 Arrays = Mapping[str, NDArray[Any]]
 
@@ -21,6 +28,7 @@ def draw(made: Results) -> dict[str, Figure]:
     """Draw all figures of the study, by file name."""
     return {
         "real_logs_intel": intel(made.table("relations"), made.arrays("intel")),
+        "real_logs_building": building(made.arrays("building")),
         "real_logs_mrclam": mrclam(made.table("mrclam"), made.arrays("mrclam")),
         "real_logs_wheels": wheels(made.table("wheels")),
         "real_logs_wean": wean(made.table("wean"), made.arrays("wean")),
@@ -53,6 +61,19 @@ def intel(relations: pd.DataFrame, paths: Arrays) -> Figure:
     return page
 
 
+def building(grids: Arrays) -> Figure:
+    """Grid maps of the Intel building, before and after its loops are closed."""
+    page, axes = subplots(11.0, 5.6, 1, 2)
+    titles = {"before": "by its edges alone", "after": "with its loops closed"}
+    for ax, (name, title) in zip(axes, titles.items(), strict=True):
+        grid = OccupancyGrid(grids[name], RESOLUTION_M, grids[f"{name}_origin"])
+        draw_grid(ax, grid)
+        low, high = grid.corners_m.min(axis=0), grid.corners_m.max(axis=0)
+        ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+        ax.set_title(f"Intel Research Lab, {title}")
+    return page
+
+
 def mrclam(errors: pd.DataFrame, paths: Arrays) -> Figure:
     """Errors and NEES of each robot, and the paths of robot 4."""
     page, (left, middle, right) = subplots(11.0, 4.6, 1, 3, width_ratios=[1.0, 1.0, 1.1])
@@ -64,7 +85,12 @@ def mrclam(errors: pd.DataFrame, paths: Arrays) -> Figure:
         left.plot(at, rows.ate_rmse_m.mean(), "o", ms=4, color=color, label=method)
         middle.plot(at, rows.nees_mean.median(), "o", ms=4, color=color)
     ticks = {"xticks": range(len(robots)), "xticklabels": [f"R{robot}" for robot in robots]}
-    left.set(ylabel="ATE from the true start, m", ylim=(0.0, None), title="MRCLAM 6", **ticks)
+    left.set(
+        ylabel="ATE after 300 s, from the true start, m",
+        ylim=(0.0, None),
+        title="MRCLAM 6",
+        **ticks,
+    )
     middle.set(yscale="log", ylabel="mean NEES (3 is consistent)", **ticks)
     middle.axhline(3.0, color=BLACK, lw=0.7, ls=":")
     drawn = ("motion capture", *MRCLAM_DRAWN)

@@ -8,6 +8,7 @@ import numpy as np
 from estimators.base import Estimate, Estimator, Prior
 from estimators.base import run as run_estimator
 from estimators.icp_odometry import IcpOdometry
+from experiments.calibration.from_log import calibrate_log
 from experiments.calibration.logs import calibrate_wheels
 from experiments.papers.real_logs.settings import CALIBRATED_S, DATA, TUNED_SHARE
 from sim import se2
@@ -27,12 +28,23 @@ def intel(version: Literal["sparse", "logged", "calibrated"]) -> Recording:
         return intel_lab.read_intel(
             folder / "intel_raw_910.json.gz", folder / "intel_gmapping_910.json.gz"
         )
-    logged, _ = intel_lab.read_thinned_intel(
+    logged, _ = _thinned_intel()
+    return calibrated_by_scans(logged, tuned_until_s(logged)) if version == "calibrated" else logged
+
+
+def intel_known_stamps(recording: Recording) -> Array:
+    """Stamps (N,) s of those scans of the log with all its scans whose stamps are not guessed."""
+    stamps: Array = recording.log("laser").stamps[_thinned_intel()[1].astype(np.int64)]
+    return stamps
+
+
+def _thinned_intel() -> tuple[Recording, Array]:
+    folder = DATA / "intel_lab"
+    return intel_lab.read_thinned_intel(
         folder / "intel_mrpt_scans_converted.txt.gz",
         folder / "intel_mrpt_ODO.txt.gz",
         folder / "intel_mrpt_reference_matches.csv.gz",
     )
-    return calibrated_by_scans(logged, tuned_until_s(logged)) if version == "calibrated" else logged
 
 
 def freiburg() -> Recording:
@@ -95,25 +107,16 @@ def calibrated_by_scans(recording: Recording, until_s: float) -> Recording:
 
 
 def calibrated_by_truth(recording: Recording) -> Recording:
-    """The recording with wheel gains and track fitted to the truth of its first `CALIBRATED_S`."""
-    truth, wheels = recording.known_truth, recording.wheels
-    begin = max(truth.stamps[0], wheels.stamps[0])
-    times = np.arange(begin, min(begin + CALIBRATED_S, truth.stamps[-1]), 0.02)
-    heading = np.interp(times, truth.stamps, np.unwrap(truth.poses[:, 2]))
-    x, y = (np.interp(times, truth.stamps, truth.poses[:, i]) for i in (0, 1))
-    along = np.cos(heading[:-1]) * np.diff(x) + np.sin(heading[:-1]) * np.diff(y)
-    forward = np.concatenate([[0.0], np.cumsum(along)])
-    travel, every = _wheels_at(wheels, times), 200  # 4 s
-    rolled, turn, advance = (np.diff(v[::every], axis=0) for v in (travel, heading, forward))
-    # turn = (a_r W_r - a_l W_l) / track, advance = (a_r W_r + a_l W_l) / 2
-    per_track = np.linalg.lstsq(rolled * np.array([1.0, -1.0]), turn, rcond=None)[0]
-    mean = rolled @ per_track / 2.0
-    track_m = float(mean @ advance / (mean @ mean))
-    return dataclasses.replace(
-        recording,
-        wheels=WheelLog(wheels.stamps.copy(), wheels.position_m * (per_track * track_m)),
-        robot=RobotGeometry(recording.robot.wheel_radius_m, track_m),
-    )
+    """The recording calibrated on its first `CALIBRATED_S`, with the noise that its log believes.
+
+    What is believed of the noise was chosen on the robots that do not judge.
+    """
+    found = calibrate_log(recording, CALIBRATED_S).calibration
+    sensors = {
+        name: dataclasses.replace(belief, sigma_column_px=None, sigma_disparity_px=None)
+        for name, belief in found.sensors.items()
+    }
+    return dataclasses.replace(found, sensors=sensors).applied(recording)
 
 
 def _wheels_at(wheels: WheelLog, stamps: Array) -> Array:

@@ -56,12 +56,18 @@ MRCLAM = (
     "FastSLAM, known",
     "FastSLAM, known, wider noise",
     "FastSLAM, unknown, wider noise",
+    "FastSLAM, known, slip in bursts",
     "EKF-SLAM, known",
     "EKF-SLAM, known, wider noise",
     "EKF-SLAM, unknown, wider noise",
+    "EKF-SLAM, known, gated",
+    "EKF-SLAM, known, repeats once",
+    "EKF-SLAM, known, invariant",
 )
+MRCLAM_CHOSEN = ("slip in bursts", "invariant", "unknown, wider noise")  # the headlines of RL3
 MRCLAM_DRAWN = (MRCLAM[1], MRCLAM[3])
 
+RESOLUTION_M = 0.05  # of the grid maps
 TUNED_SHARE = 0.4  # of the Intel log, on which options were chosen; the rest judges
 TUNED_ROBOTS = (1, 2)  # of MRCLAM; robots 3 to 5 judge
 CALIBRATED_S = 300.0  # from the start of a log of MRCLAM

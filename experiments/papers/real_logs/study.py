@@ -25,9 +25,11 @@ from experiments.evaluation.relations import relation_errors
 from experiments.evaluation.time_sync import aligned_ate_m
 from experiments.evaluation.verdict import Profile
 from experiments.papers.jobs import in_parallel
+from experiments.papers.real_logs.building import closed_loops
 from experiments.papers.real_logs.grid_match import beam_points, best_fit
 from experiments.papers.real_logs.logs import tracked, tuned_until_s
 from experiments.papers.real_logs.settings import (
+    CALIBRATED_S,
     DATA,
     DRAWN_ROBOT,
     FASTSLAM_SEEDS,
@@ -89,6 +91,9 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
     ]
     out.write_tables(relations=pd.DataFrame([*errors, *freiburg_relations(), *printed]))
     out.write_arrays("intel", **paths)
+    found, grids = closed_loops()
+    out.write_tables(building=found)
+    out.write_arrays("building", **grids)
     on_progress(0.3)
     slam, paths = landmark_slam(profile, lambda share: on_progress(0.3 + 0.5 * share))
     out.write_arrays("mrclam", **paths)
@@ -250,7 +255,7 @@ def _landmark_job(
 ) -> tuple[Row, NDArray[np.float32]]:
     log = run.recording()
     estimate = tracked(run.estimator(), log, seed, log.truth_at(log.frame_stamps[:1])[0])
-    found = score(log, estimate)
+    found = score(log, estimate, after_s=CALIBRATED_S)
     row: Row = {"robot": robot, "method": method, "seed": seed, "judged": robot not in TUNED_ROBOTS}
     row |= {key: found.get(key, math.nan) for key in _SCORES}
     return row, _path(estimate.means[::5])

@@ -1,0 +1,152 @@
+"""Odometry by small_gicp: each scan registered against the last one, or against a key frame.
+
+Koide, small_gicp: efficient and parallel algorithms for point cloud registration, JOSS 9(100),
+2024. It works in three dimensions. A scan alone is flat, and the normals of all its
+neighbourhoods point up, so it is given three times: a voxel below, at and above the laser.
+"""
+
+from typing import Any, Literal
+
+import numpy as np
+
+from estimators.base import Belief, Prior
+from estimators.gaussian import STILL
+from estimators.options import (
+    require_choices,
+    require_counts,
+    require_laser,
+    require_non_negative,
+    require_positive,
+    start_pose,
+)
+from estimators.peers import package
+from estimators.peers.planar import matrix_of, pose_of, scan_of
+from sim import se2
+from sim.arrays import Array
+from sim.recording import Frame
+from sim.robot import arc_increment
+
+Kind = Literal["GICP", "PLANE_ICP", "ICP"]
+Reference = Literal["previous", "keyframe"]
+
+_LEAST_POINTS = 10
+
+
+class SmallGicp:
+    """Compose registrations of scans by small_gicp, on one thread.
+
+    Parameters
+    ----------
+    laser
+        The sensor that it reads.
+    registration
+        small_gicp's `registration_type`.
+    reference
+        What a scan is registered against: the `previous` scan, or a `keyframe`, kept until the
+        robot has left it by more than the thresholds.
+    keyframe_distance_m, keyframe_turn_rad
+        How far the robot goes before it takes a new key frame.
+    use_odometry_guess
+        Start registrations from the wheels; else from the last motion.
+    downsampling_m, neighbors, max_correspondence_m, max_iterations
+        small_gicp's own options, with its defaults.
+
+    Notes
+    -----
+    It gives no covariance. A registration that does not converge is replaced by its guess, and
+    `extras["status"]` says so.
+    """
+
+    needs = frozenset({"laser"})
+
+    def __init__(
+        self,
+        laser: str = "laser",
+        registration: Kind = "GICP",
+        reference: Reference = "previous",
+        keyframe_distance_m: float = 0.5,
+        keyframe_turn_rad: float = 0.35,
+        use_odometry_guess: bool = True,
+        downsampling_m: float = 0.25,
+        neighbors: int = 10,
+        max_correspondence_m: float = 1.0,
+        max_iterations: int = 20,
+    ) -> None:
+        self._small_gicp = package("small_gicp", "peers")
+        require_choices(registration=(registration, Kind), reference=(reference, Reference))
+        require_non_negative(
+            keyframe_distance_m=keyframe_distance_m, keyframe_turn_rad=keyframe_turn_rad
+        )
+        require_positive(downsampling_m=downsampling_m, max_correspondence_m=max_correspondence_m)
+        require_counts(neighbors=neighbors, max_iterations=max_iterations)
+        self.laser, self.registration, self.reference = laser, registration, reference
+        self.keyframe_distance_m, self.keyframe_turn_rad = keyframe_distance_m, keyframe_turn_rad
+        self.use_odometry_guess, self.downsampling_m = use_odometry_guess, downsampling_m
+        self.neighbors, self.max_correspondence_m = neighbors, max_correspondence_m
+        self.max_iterations = max_iterations
+
+    def reset(self, prior: Prior, rng: np.random.Generator) -> None:
+        """Start from the prior's pose; the first scan becomes the reference."""
+        self._laser = require_laser(prior, self.laser, "small_gicp")
+        self._track_m = prior.robot.track_m
+        self._pose = start_pose(prior, "small_gicp").mean  # at the last scan
+        self._rolled = STILL.mean.copy()  # since then, by the wheels
+        self._motion = STILL.mean.copy()  # between the last two scans
+        self._key_pose = self._pose
+        self._key: tuple[Any, Any] | None = None
+
+    def step(self, frame: Frame) -> Belief:
+        """Register the Frame's scan, if it has one, and compose."""
+        rolled = arc_increment(frame.wheel_increments_m, self._track_m)
+        self._rolled = se2.compose(self._rolled, rolled)
+        points = scan_of(frame, self.laser, self._laser)
+        guess = self._rolled if self.use_odometry_guess else self._motion
+        if points is None:
+            between = se2.compose(self._pose, self._rolled) if self.use_odometry_guess else None
+            return _belief(self._pose if between is None else between)
+        predicted = se2.compose(self._pose, guess)
+        if len(points) < _LEAST_POINTS:
+            return self._moved(predicted, "empty")
+        cloud = self._prepared(points)
+        if self._key is None:
+            self._key, self._key_pose = cloud, se2.compose(self._pose, self._rolled)
+            return self._moved(self._key_pose, "")
+        target, tree = self._key
+        found = self._small_gicp.align(
+            target,
+            cloud[0],
+            tree,
+            matrix_of(se2.between(self._key_pose, predicted)),
+            registration_type=self.registration,
+            max_correspondence_distance=self.max_correspondence_m,
+            num_threads=1,
+            max_iterations=self.max_iterations,
+        )
+        motion = pose_of(found.T_target_source)
+        status = "" if found.converged and np.isfinite(motion).all() else "not_converged"
+        pose = predicted if status else se2.compose(self._key_pose, motion)
+        if status or self.reference == "previous" or self._left_key(pose):
+            self._key, self._key_pose = cloud, pose
+        return self._moved(pose, status)
+
+    def _prepared(self, points: Array) -> tuple[Any, Any]:
+        """Cloud and search tree of points (N, 2)."""
+        layers = [-self.downsampling_m, 0.0, self.downsampling_m]
+        cloud = np.concatenate([np.column_stack([points, np.full(len(points), z)]) for z in layers])
+        prepared: tuple[Any, Any] = self._small_gicp.preprocess_points(
+            cloud, self.downsampling_m, self.neighbors, 1
+        )
+        return prepared
+
+    def _left_key(self, pose: Array) -> bool:
+        x, y, turn = se2.between(self._key_pose, pose)
+        return bool(np.hypot(x, y) > self.keyframe_distance_m or abs(turn) > self.keyframe_turn_rad)
+
+    def _moved(self, pose: Array, status: str) -> Belief:
+        self._motion = se2.between(self._pose, pose)
+        self._pose, self._rolled = pose, STILL.mean.copy()
+        return _belief(pose, status)
+
+
+def _belief(pose: Array, status: str = "") -> Belief:
+    return Belief(pose.copy(), np.zeros((3, 3)), {"status": status} if status else {})

@@ -1,0 +1,1 @@
+"""Methods of other projects beside ours, on the same recordings."""

@@ -1,0 +1,66 @@
+"""Figures of the study of peers: errors and processor times."""
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from experiments.papers.peers.settings import LASER, STEREO, TUNED
+from experiments.papers.results import Results
+from experiments.viewing.style import BLUE, ORANGE, WALL, plain_log_ticks, subplots
+
+_WORLDS = {"room": "s", "rooms": "^", "office": "D"}
+
+
+def draw(made: Results) -> dict[str, Figure]:
+    """Draw the study's figure."""
+    return {"peers_errors": errors(made.table("methods"))}
+
+
+def errors(methods: pd.DataFrame) -> Figure:
+    """Draw the error of each method, the best on top, with its processor time beside it."""
+    parts = {sensor: methods[methods["sensor"] == sensor] for sensor in (LASER, STEREO)}
+    heights = [len(part) for part in parts.values()]
+    page, rows = subplots(
+        9.5, 1.6 + 0.3 * sum(heights), 2, 2, gridspec_kw={"height_ratios": heights}, squeeze=False
+    )
+    for (sensor, part), (left, right) in zip(parts.items(), rows, strict=True):
+        names = list(part["estimator"])
+        places = np.arange(len(names))[::-1]
+        for place, (_, method) in zip(places, part.iterrows(), strict=True):
+            color = BLUE if method["project"] == "Estima" else ORANGE
+            filled = color if method["tuned"] else "white"
+            mark = {"color": color, "mfc": filled, "ls": "", "zorder": 3}
+            for world, shape in _WORLDS.items():
+                left.plot(method[f"ate_rmse_m_{world}"], place, shape, ms=3.5, color=WALL, zorder=2)
+            left.plot(method["ate_rmse_m"], place, "o", ms=8, **mark)
+            right.plot(method["cpu_time_us"], place, "o", ms=8, **mark)
+        for axes, label in ((left, "position error, RMS m"), (right, "processor time a Frame, us")):
+            axes.set(xscale="log", xlabel=label, ylim=(-0.7, len(names) - 0.3))
+            axes.grid(axis="y", color="0.92")
+        right.tick_params(axis="y", length=0)
+        plain_log_ticks(left.xaxis, right.xaxis)
+        left.set_yticks(places, [name.replace(TUNED, " (tuned)") for name in names])
+        right.set_yticks(places, [""] * len(names))
+        left.set_title(f"{sensor} and wheels", fontsize=9, loc="left")
+    page.legend(handles=_legend(), loc="outside lower center", ncols=4, fontsize=8)
+    return page
+
+
+def _legend() -> list[Line2D]:
+    """One entry a colour, a filling and a world."""
+    kinds = [
+        ("ours", BLUE, BLUE),
+        ("of another project", ORANGE, ORANGE),
+        ("default", "black", "white"),
+        ("tuned", "black", "black"),
+    ]
+    marks = [
+        Line2D([], [], color=color, mfc=filled, ls="", marker="o", ms=7, label=label)
+        for label, color, filled in kinds
+    ]
+    worlds = [
+        Line2D([], [], color=WALL, ls="", marker=shape, ms=4, label=world)
+        for world, shape in _WORLDS.items()
+    ]
+    return [*marks, *worlds]

@@ -1,0 +1,109 @@
+"""The table of a sweep, shown and written: text, Markdown, LaTeX, HTML, CSV, Parquet."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pandas as pd
+from markupsafe import Markup, escape
+
+from experiments.report.export import (
+    Form,
+    escaped,
+    folded,
+    latex,
+    numeric,
+    to_latex,
+    to_markdown,
+    written,
+)
+from experiments.report.page import render
+from experiments.runs.columns import PATH
+from experiments.runs.row import Outcome, write_frame
+from experiments.sweeps.summary import COUNTS, MARKS
+from sim.errors import require
+from sim.files import write_whole
+
+DIGITS = 3
+FORMATS = (".tex", ".md", ".html", ".csv", ".parquet")
+HTML = Form(lambda text: str(escape(text)), "<b>{}</b>", "<sup>*</sup>")
+
+
+WORDS = {
+    Outcome.OK: "ran to the end",
+    Outcome.REMARK: "ran, with a remark",
+    Outcome.FAILED: "failed",
+}
+_MOST_REMARKS = 12
+
+
+def check_name(path: Path) -> None:
+    """Check that a table's file has an ending that names its format."""
+    require(path.suffix in FORMATS, f"-o {path}: a table is {', '.join(FORMATS)}")
+
+
+def notes(found: pd.DataFrame, against: str | None) -> str:
+    """How the numbers of a summary came about and what the marks mean, in a line."""
+    best, differs = (found.filter(regex=f"_{mark}$").to_numpy(bool).any() for mark in MARKS)
+    parts = [
+        f"{found.attrs['rule']}.",
+        "Bold: the best on the same recordings." if best else "",
+        f"*: differs from {against} (paired t tests over recordings; 5 % for the table, Holm)."
+        if differs
+        else f"Nothing differs from {against} by paired tests."
+        if against
+        else "",
+    ]
+    return " ".join(filter(None, parts))
+
+
+def shown(found: pd.DataFrame) -> pd.DataFrame:
+    """A summary with a cell a mean, and without columns that say nothing."""
+    silent = [name for name in COUNTS if not found[name].any()]
+    silent += [PATH] if (found[PATH] == "online").all() else []
+    return folded(found.drop(columns=silent))
+
+
+def as_lines(found: pd.DataFrame, note: str) -> str:
+    """The table for a terminal, where `>` stands for bold."""
+    cells = written(shown(found), Form(str, ">{}", "*"), DIGITS)
+    return f"{note.replace('Bold:', '>:')}\n\n{cells.to_string(index=False)}"
+
+
+def write_table(found: pd.DataFrame, note: str, path: Path, name: str) -> None:
+    """Write a summary in the format of the path's ending, with its note where the format has text.
+
+    LaTeX is a `tabular` and a line of small print, for a float of one's own; it needs `booktabs`.
+    """
+    if path.suffix in (".csv", ".parquet"):
+        write_frame(found, path)
+        return
+    frame = shown(found)
+    if path.suffix == ".tex":
+        small = f"\\par\\smallskip\\parbox{{\\linewidth}}{{\\footnotesize {latex(note)}}}\n"
+        text = f"% needs \\usepackage{{booktabs}}\n{to_latex(frame, DIGITS)}{small}"
+    elif path.suffix == ".md":
+        text = f"{escaped(note)}\n\n{to_markdown(frame, DIGITS)}"
+    else:
+        cells = written(frame, HTML, DIGITS)
+        text = render(
+            "table.html",
+            name=name,
+            note=note,
+            head=[Markup(head) for head in cells],
+            numeric=numeric(frame),
+            rows=[[Markup(cell) for cell in row] for row in cells.to_numpy()],
+        )
+    with write_whole(path) as part:
+        part.write_text(text, encoding="utf-8")
+
+
+def statuses(table: pd.DataFrame) -> list[tuple[str, int]]:
+    """How the runs ended, in words, with how often; numbers in details count as the same."""
+    detail = table["status_detail"].fillna("") if "status_detail" in table else ""
+    words = table["status"].map(lambda status: WORDS[Outcome(status)])
+    same = pd.Series(detail, table.index).str.replace(r"\d+(\.\d+)?", "...", regex=True)
+    counts = (words + same.map(lambda text: f": {text}" if text else "")).value_counts()
+    rest = counts[_MOST_REMARKS:].sum()
+    found = list(counts[:_MOST_REMARKS].items())
+    return [*found, ("ended in other ways", int(rest))] if rest else found

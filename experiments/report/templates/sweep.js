@@ -1,0 +1,207 @@
+// The chart of a sweep: each run as a dot, means over recordings with 95 % intervals as lines.
+"use strict";
+const data = JSON.parse(document.getElementById("data").textContent);
+const columns = new Map([...data.settings, ...data.metrics].map((c) => [c.name, c]));
+const byId = (id) => document.getElementById(id);
+const COLOURS = ["#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9", "#8c8c8c",
+  "#AA3377", "#999933", "#7766dd", "#b0724a", "#44aa99"];
+const MARKERS = ["circle", "square", "diamond", "triangle-up", "triangle-down", "cross", "x",
+  "triangle-left", "triangle-right", "star", "hexagon", "pentagon"];
+const kept = new Map(); // values to keep, by the setting
+
+function fill(select, options, chosen) {
+  for (const [value, text] of options) select.append(new Option(text, value));
+  select.value = chosen;
+  select.addEventListener("change", draw);
+}
+
+function distinct(name) {
+  const values = [...new Set(columns.get(name).values.filter((v) => v !== null))];
+  return values.sort((a, b) => (typeof a === "number" ? a - b : String(a).localeCompare(b)));
+}
+
+function setUp() {
+  const settings = data.settings.map((c) => [c.name, c.title]);
+  const few = [["", "none"], ...settings.filter(([name]) => distinct(name).length <= 12)];
+  fill(byId("x"), settings, data.start.x);
+  fill(byId("y"), data.metrics.map((c) => [c.name, c.title]), data.start.y);
+  fill(byId("colour"), few, data.start.colour);
+  fill(byId("panels"), few, data.start.panels);
+  byId("each").addEventListener("change", draw);
+  for (const [name, title] of settings) {
+    const values = distinct(name);
+    if (values.length < 2 || values.length > 24) continue;
+    kept.set(name, new Set(values));
+    const box = document.createElement("details");
+    const summary = document.createElement("summary");
+    summary.textContent = `only some of ${title}`;
+    box.append(summary);
+    for (const value of values) {
+      const label = document.createElement("label");
+      const input = document.createElement("input");
+      input.type = "checkbox";
+      input.checked = true;
+      input.addEventListener("change", () => {
+        kept.get(name)[input.checked ? "add" : "delete"](value);
+        draw();
+      });
+      label.append(input, ` ${value}`);
+      box.append(label);
+    }
+    byId("filters").append(box);
+  }
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
+  addEventListener("resize", draw);
+  draw();
+}
+
+// Rows in groups by a key, in the order of the rows.
+function grouped(rows, key) {
+  const groups = new Map();
+  for (const row of rows) {
+    const name = key(row);
+    if (!groups.has(name)) groups.set(name, []);
+    groups.get(name).push(row);
+  }
+  return groups;
+}
+
+const mean = (values) => values.reduce((sum, v) => sum + v, 0) / values.length;
+
+// Mean with its 95 % interval: the rule of tables and plots.
+function average(rows, metric, unit) {
+  const units = [...grouped(rows, (row) => unit[row]).values()].map((same) => {
+    const values = same.map((row) => metric.values[row]);
+    return metric.average === "error" ? Math.sqrt(mean(values.map((v) => v * v))) : mean(values);
+  });
+  const logs = metric.average !== "plain";
+  const values = logs ? units.map(Math.log) : units;
+  const middle = mean(values);
+  const n = values.length;
+  const spread = Math.sqrt(values.reduce((sum, v) => sum + (v - middle) ** 2, 0) / (n - 1));
+  const t = data.t975[Math.min(n - 1, data.t975.length) - 1];
+  const half = n > 1 ? (t * spread) / Math.sqrt(n) : NaN;
+  const back = logs ? Math.exp : (v) => v;
+  return { value: back(middle), low: back(middle - half), high: back(middle + half), n };
+}
+
+// Numbers that grow by factors rather than by steps.
+function byFactors(values) {
+  const numbers = values.filter((v) => typeof v === "number");
+  if (numbers.length < 2 || numbers.length < values.length || numbers[0] <= 0) return false;
+  const [low, high] = [numbers[0], numbers[numbers.length - 1]];
+  if (numbers.length === 2) return high >= 10 * low;
+  const even = (list) => {
+    const steps = list.slice(1).map((v, i) => v - list[i]);
+    const middle = mean(steps);
+    return mean(steps.map((v) => (v - middle) ** 2)) / middle ** 2;
+  };
+  return high >= 3 * low && even(numbers.map(Math.log)) < even(numbers);
+}
+
+function draw() {
+  const [x, y, colour, panels] = ["x", "y", "colour", "panels"].map((id) => byId(id).value);
+  const [xs, metric] = [columns.get(x), columns.get(y)];
+  const rows = data.failed.map((_, row) => row).filter((row) =>
+    !data.failed[row] && metric.values[row] !== null && xs.values[row] !== null &&
+    [...kept].every(([name, some]) => {
+      const value = columns.get(name).values[row];
+      return value === null || some.has(value);
+    }));
+  const style = getComputedStyle(document.documentElement);
+  const ink = style.getPropertyValue("--text").trim();
+  const line = style.getPropertyValue("--line").trim();
+  const order = distinct(x);
+  const numeric = order.every((v) => typeof v === "number");
+  const of = (name, row) => (name ? columns.get(name).values[row] : "");
+  const panelNames = panels ? distinct(panels).filter((v) => rows.some((r) => of(panels, r) === v)) : [""];
+  const colours = colour ? distinct(colour) : [""];
+  const groups = grouped(rows, (row) => [of(panels, row), of(colour, row), of(x, row)].join("\u0000"));
+  const alone = [...groups.values()].every((g) => new Set(g.map((r) => data.recording[r])).size === 1);
+  const repeated = alone && [...groups.values()].some((g) => new Set(g.map((r) => data.repeat[r])).size > 1);
+  const unit = repeated ? data.repeat : data.recording;
+  const across = Math.min(panelNames.length, innerWidth < 700 ? 1 : 3);
+  const down = Math.ceil(panelNames.length / across);
+  const traces = [];
+  const found = [];
+  const annotations = [];
+  panelNames.forEach((panel, p) => {
+    const axis = p ? String(p + 1) : "";
+    const inPanel = rows.filter((row) => !panels || of(panels, row) === panel);
+    if (panels) {
+      annotations.push({ text: `${columns.get(panels).title}: ${panel}`.replaceAll("<", "&lt;"),
+        showarrow: false, xref: `x${axis} domain`, yref: `y${axis} domain`, x: 0.5, y: 1.02,
+        yanchor: "bottom" });
+    }
+    colours.forEach((name, c) => {
+      const mine = inPanel.filter((row) => !colour || of(colour, row) === name);
+      if (!mine.length) return;
+      const label = String(name).replaceAll("<", "&lt;");
+      const shared = { xaxis: `x${axis}`, yaxis: `y${axis}`, legendgroup: label, name: label };
+      const paint = COLOURS[c % COLOURS.length];
+      if (byId("each").checked) {
+        traces.push({ ...shared, type: "scatter", mode: "markers", showlegend: false,
+          x: mine.map((row) => of(x, row)), y: mine.map((row) => metric.values[row]),
+          marker: { color: paint, size: 5, opacity: 0.35 },
+          text: mine.map((row) => data.settings.filter((s) => s.values[row] !== null)
+            .map((s) => `${s.title}: ${s.values[row]}`).join("<br>")
+            .concat(`<br>${data.status[row]}`).replaceAll(/<(?!br>)/g, "&lt;")),
+          hovertemplate: "%{y:.4g}<br>%{text}<extra></extra>" });
+      }
+      const points = order.map((v) => [v, mine.filter((row) => of(x, row) === v)])
+        .filter(([, some]) => some.length).map(([v, some]) => ({ at: v, ...average(some, metric, unit) }));
+      found.push(...points);
+      traces.push({ ...shared, type: "scatter", mode: numeric ? "lines+markers" : "markers",
+        showlegend: Boolean(colour) && !traces.some((t) => t.name === label && t.showlegend),
+        x: points.map((point) => point.at), y: points.map((point) => point.value),
+        marker: { color: paint, symbol: MARKERS[c % MARKERS.length], size: 9 },
+        line: { color: paint, width: 2 },
+        error_y: { type: "data", symmetric: false, color: paint, thickness: 1.5,
+          array: points.map((point) => point.high - point.value || 0),
+          arrayminus: points.map((point) => point.value - point.low || 0) },
+        customdata: points.map((point) => [point.low, point.high, point.n]),
+        hovertemplate: "<b>%{y:.4g}</b> [%{customdata[0]:.3g}, %{customdata[1]:.3g}], "
+          + "mean of %{customdata[2]}<extra>%{fullData.name}</extra>" });
+    });
+  });
+  const means = found.map((point) => point.value).sort((a, b) => a - b);
+  const log = metric.log && means[0] > 0 && means[means.length - 1] >= 10 * means[0];
+  const decades = means[means.length - 1] / means[0];
+  const height = Math.max(420, 330 * down) + (innerWidth < 700 ? 25 * colours.length : 0);
+  const layout = {
+    height, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
+    font: { color: ink, family: "system-ui, sans-serif", size: 13 }, annotations,
+    margin: { l: 70, r: 15, t: 50, b: 60 }, hovermode: "closest",
+    modebar: { bgcolor: "rgba(0,0,0,0)", color: ink, activecolor: ink },
+    legend: innerWidth < 700 ? { orientation: "h", y: -0.25 } : { title: { text: colour ? columns.get(colour).title : "" } },
+    grid: { rows: down, columns: across, pattern: "independent", xgap: 0.12, ygap: 0.3 },
+  };
+  panelNames.forEach((_, p) => {
+    const axis = p ? String(p + 1) : "";
+    const lines = { gridcolor: line, linecolor: line, zerolinecolor: line, automargin: true };
+    layout[`xaxis${axis}`] = { ...lines, title: { text: p >= panelNames.length - across ? xs.title : "" },
+      ...(numeric ? { type: byFactors(order) ? "log" : "linear",
+        ...(order.length <= 8 ? { tickvals: order, ticktext: order.map(String) } : {}) }
+        : { type: "category", categoryorder: "array", categoryarray: order }),
+      ...(p ? { matches: "x" } : {}) };
+    layout[`yaxis${axis}`] = { ...lines, title: { text: p % across ? "" : metric.title },
+      type: log ? "log" : "linear", ...(log && decades >= 100 ? { dtick: 1 } : {}),
+      exponentformat: "power", ...(p ? { matches: "y" } : {}) };
+  });
+  Plotly.react("chart", traces, layout,
+    { responsive: true, displaylogo: false, modeBarButtons: [["toImage", "zoom2d", "pan2d", "resetScale2d"]] });
+  say(rows, x, colour, panels, metric, repeated);
+}
+
+// Say how the means came about, and what else differs within a point.
+function say(rows, x, colour, panels, metric, repeated) {
+  const over = repeated ? "repeats" : "recordings";
+  const kind = metric.average === "plain" ? "Arithmetic" : "Geometric";
+  const pooledBy = metric.average === "error" && !repeated ? ", repeats pooled by squares" : "";
+  const others = data.settings.filter((s) => ![x, colour, panels, "repeat", ...data.drawn].includes(s.name) &&
+    new Set(rows.map((row) => s.values[row])).size > 1).map((s) => s.title);
+  byId("said").textContent = `${rows.length} runs. ${kind} means over ${over}${pooledBy}, with 95 % intervals.` +
+    (others.length ? ` Each point also averages over ${others.join("; ")}: choose a colour, panels, or only some.` : "");
+}
+
+setUp();

@@ -1,0 +1,81 @@
+"""The one rule by which tables, plots and pages average runs.
+
+The recording is the unit of inference. Repeats over one recording are averaged first: errors by
+their squares, all else arithmetically. Recordings are averaged geometrically, with the t interval
+of the logs, where a metric is spread by factors, else arithmetically: `runs.columns.Average`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pandas as pd
+from scipy import stats
+
+from experiments.evaluation.statistics import paired_p
+from experiments.runs.columns import REPEAT, Average, average_of
+
+RECORDING = "recording_checksum"
+
+
+def rule(unit: str, names: Sequence[str]) -> str:
+    """How columns are averaged over recordings or repeats, in words."""
+    over = "repeats" if unit == REPEAT else "recordings"
+    kinds = {average_of(name) for name in names}
+    if kinds == {Average.PLAIN}:
+        return f"Arithmetic mean over {over} [95 % interval]"
+    pooled_first = f", repeats pooled by squares{'' if unit == REPEAT else ' first'}"
+    words = f"Geometric mean over {over}{pooled_first if Average.ERROR in kinds else ''}"
+    rest = "; NEES, shares and counts: arithmetic" if Average.PLAIN in kinds else ""
+    return f"{words} [95 % interval]{rest}"
+
+
+def unit_of(table: pd.DataFrame, by: Sequence[str]) -> str:
+    """Column of the unit of inference: the recording, or the repeat.
+
+    It is the repeat where no group has more than one recording, but some have several repeats.
+    """
+    groups = table.groupby(list(by) or (lambda _: 0), dropna=False)
+    alone = groups[RECORDING].nunique().max() == 1
+    return REPEAT if alone and groups[REPEAT].nunique().max() > 1 else RECORDING
+
+
+def pooled(table: pd.DataFrame, by: Sequence[str], name: str) -> pd.Series[float]:
+    """One value of a column for each group, over all rows that have one; `by` holds the unit."""
+    known = table[table[name].notna()].astype({name: float})
+    if average_of(name) is not Average.ERROR:
+        return known.groupby(list(by), dropna=False)[name].mean()
+    squares = known.assign(**{name: known[name] ** 2})
+    return np.sqrt(squares.groupby(list(by), dropna=False)[name].mean())
+
+
+def averages(table: pd.DataFrame, by: Sequence[str], unit: str, name: str) -> pd.DataFrame:
+    """Mean of a column over the units of each group, with its 95 % interval.
+
+    A geometric mean over a zero is zero, without bounds; so is any mean below two units.
+
+    Returns
+    -------
+    DataFrame
+        Columns `value`, `low` and `high`; one row a group that has a value.
+    """
+    values = pooled(table, [*by, unit], name)
+    geometric = average_of(name) is not Average.PLAIN
+    with np.errstate(divide="ignore", invalid="ignore"):
+        groups = (np.log(values) if geometric else values).groupby(level=list(range(len(by))))
+        mean, n = groups.mean(), groups.size()
+        half = stats.t.ppf(0.975, n - 1) * groups.std() / np.sqrt(n)
+    found = pd.DataFrame({"value": mean, "low": mean - half, "high": mean + half})
+    return np.exp(found) if geometric else found
+
+
+def difference_p(ours: pd.Series[float], theirs: pd.Series[float], name: str) -> float:
+    """P that a column differs between two arms: the paired t test over their common units.
+
+    Of geometric means the logs are compared. NaN where fewer than two units are common.
+    """
+    both = pd.concat([ours, theirs], axis=1, join="inner").to_numpy()
+    if average_of(name) is not Average.PLAIN:
+        both = np.log(both[(both > 0.0).all(axis=1)])
+    return paired_p(both[:, 0] - both[:, 1])

@@ -1,0 +1,142 @@
+"""The table of a sweep: means with intervals, the best, and what differs from a reference."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+import pandas as pd
+
+from experiments.evaluation.statistics import holm
+from experiments.runs.columns import COLUMNS, PATH, RELATIVE
+from experiments.runs.row import Outcome
+from experiments.sweeps.averages import RECORDING, averages, difference_p, pooled, rule, unit_of
+from experiments.sweeps.collect import DRAWN, measured, telling, with_answers
+from sim.errors import InputError
+
+ERROR = "answer_ate_rmse_m"
+_MAIN = (
+    ERROR,
+    "answer_ate_aligned_rmse_m",
+    "answer_heading_rmse_rad",
+    "answer_nees_mean",
+    "dispersion_final_m",
+    "step_time_us",
+    "cpu_time_us",
+)
+COUNTS = {"failed": Outcome.FAILED, "with_remarks": Outcome.REMARK}
+_LEVEL = 0.05  # of all tests of a table
+_GROUP = "group"  # numbers the rows of a table
+SUFFIXES = ("_low", "_high")  # of the bounds of an interval
+MARKS = ("best", "differs")
+
+
+def summary(
+    table: pd.DataFrame, against: str | None = None, metrics: Sequence[str] = ()
+) -> pd.DataFrame:
+    """Average runs for each combination of the swept settings except the seeds.
+
+    Each metric has three columns: its mean, and the bounds of its 95 % interval (`_low`, `_high`),
+    by the rule of `sweeps.averages`. Column `_best` says whether it is the best among rows over the
+    same recordings; a row with failed runs is never the best, since it leaves out what was hard.
+    Errors are those of the best answers; column `answer` says which path that is.
+
+    Parameters
+    ----------
+    against
+        An estimator's name: errors are also given relative to that estimator's, on the same
+        recordings, and column `_differs` of each metric says whether it differs from its own:
+        paired tests over the recordings, 5 % for the whole table (Holm 1979).
+    metrics
+        Which to give; by default the main ones that there are.
+
+    Raises
+    ------
+    InputError
+        If a metric is not in the table, or the estimator is not.
+    """
+    table = with_answers(table, metrics or _MAIN)
+    by = telling(table.drop(columns=list(DRAWN), errors="ignore"))
+    shown = list(metrics) or [c for c in _MAIN if c in table and table[c].notna().any()]
+    for column in shown:
+        if column not in table:
+            there = ", ".join(measured(table))
+            raise InputError(f"the sweep has no column {column}; there are {there}")
+        if not pd.api.types.is_numeric_dtype(table[column]):
+            raise InputError(f"column {column} holds no numbers in some rows; see --where")
+    groups = table.groupby(by or (lambda _: "all runs"), dropna=False)
+    table = table.assign(**{_GROUP: groups.ngroup()})
+    unit = unit_of(table, [_GROUP])
+    found = _counted(table)
+    sound = table[table["status"] != Outcome.FAILED]
+    on = table.groupby(_GROUP)[RECORDING].agg(lambda s: "+".join(sorted(set(map(str, s)))))
+    for name in shown:
+        _add(found, name, averages(sound, [_GROUP], unit, name))
+        found[f"{name}_best"] = _best(found[name].where(found["failed"] == 0), name, on)
+    if against is not None:
+        _compare(found, sound, shown, against, _rows_of(against, sound))
+    found.attrs["rule"] = rule(unit, shown)
+    return found.set_axis(groups.size().index).reset_index(drop=not by)
+
+
+def _counted(table: pd.DataFrame) -> pd.DataFrame:
+    """How many runs a group has, which path answers, and how many failed or had a remark."""
+    groups = table.groupby(_GROUP)
+    found = {
+        "runs": groups.size(),
+        PATH: groups[PATH].agg(lambda s: "/".join(sorted(set(map(str, s))))),
+    }
+    for name, outcome in COUNTS.items():
+        found[name] = (table["status"] == outcome).groupby(table[_GROUP]).sum()
+    return pd.DataFrame(found)
+
+
+def _add(found: pd.DataFrame, name: str, means: pd.DataFrame) -> None:
+    """Add the columns of means with their intervals, by groups."""
+    for suffix, column in zip(("", *SUFFIXES), means, strict=True):
+        found[name + suffix] = means[column]
+
+
+def _best(values: pd.Series[float], name: str, on: pd.Series[str]) -> pd.Series[bool]:
+    """Which values are the best of several over the same recordings."""
+    better = COLUMNS[name].better if name in COLUMNS else None
+    blocks = values.groupby(on)
+    if better is None:
+        return pd.Series(False, values.index)
+    best = blocks.transform("min" if better == "lower" else "max")
+    return (values == best) & (blocks.transform("size") > 1)
+
+
+def _rows_of(estimator: str, table: pd.DataFrame) -> pd.DataFrame:
+    """Rows of the estimator that others are compared with."""
+    one = table[table["choice.estimator"] == estimator]
+    if one.empty:
+        raise InputError(f"no rows of estimator {estimator}")
+    if own := [c for c in telling(one) if c.startswith("estimator.")]:
+        print(f"{estimator} is the mean over its {', '.join(own)}", file=sys.stderr)
+    return one
+
+
+def _compare(
+    found: pd.DataFrame,
+    table: pd.DataFrame,
+    names: Sequence[str],
+    against: str,
+    reference: pd.DataFrame,
+) -> None:
+    """Add which means differ from the reference's, and the ratio of the position errors."""
+    p: dict[tuple[int, str], float] = {}
+    for name in names:
+        theirs = pooled(reference, [RECORDING], name)
+        for group, ours in pooled(table, [_GROUP, RECORDING], name).groupby(level=0):
+            p[group, name] = difference_p(ours.droplevel(0), theirs, name)
+    tested = [pair for pair, value in p.items() if value < 1.0]  # not NaN, nor with itself
+    real = holm([p[pair] for pair in tested], _LEVEL)
+    differs = {pair for pair, is_real in zip(tested, real, strict=True) if is_real}
+    for name in names:
+        found[f"{name}_differs"] = [(group, name) in differs for group in found.index]
+    if ERROR in names:
+        each = pooled(table, [_GROUP, RECORDING], ERROR)
+        ratio = each / each.index.get_level_values(1).map(pooled(reference, [RECORDING], ERROR))
+        table = ratio.rename(ERROR).reset_index()
+        _add(found, RELATIVE + against, averages(table, [_GROUP], RECORDING, ERROR))

@@ -1,0 +1,179 @@
+"""How runs are averaged, what the table of a sweep marks, and the files that it becomes."""
+
+import re
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy import stats
+from typer.testing import CliRunner
+
+from experiments.cli import app
+from experiments.evaluation.statistics import holm, mean_interval, paired_p
+from experiments.report.table import notes, statuses, write_table
+from experiments.runs.columns import COLUMNS, Average
+from experiments.sweeps.averages import averages, unit_of
+from experiments.sweeps.summary import summary
+from sim.errors import InputError
+
+
+def runs(n=12, repeats=2, ratio=2.0):
+    """Estimators `a` and `b` over n recordings; b has `ratio` times the error of a."""
+    rng = np.random.default_rng(0)
+    of_recording = np.exp(rng.normal(size=n))
+    rows = [
+        {
+            "choice.estimator": name,
+            "choice.world": "w_1",
+            "seed": recording,
+            "repeat": repeat,
+            "run_key": f"{name}{recording}",
+            "code_version": "v",
+            "recording_checksum": f"r{recording:02d}",
+            "status": "ok",
+            "ate_rmse_m": error * factor * np.exp(0.1 * rng.normal()),
+            "nees_mean": 3.0 + rng.normal(),
+        }
+        for recording, error in enumerate(of_recording)
+        for name, factor in (("a", 1.0), ("b", ratio))
+        for repeat in range(repeats)
+    ]
+    return pd.DataFrame(rows)
+
+
+def test_errors_pool_repeats_by_squares_and_recordings_geometrically():
+    table = runs().query("`choice.estimator` == 'a'")
+    (found,) = averages(table, ["choice.world"], "recording_checksum", "ate_rmse_m").itertuples()
+    each = table["ate_rmse_m"].to_numpy().reshape(12, 2)
+    logs = np.log(np.sqrt((each**2).mean(axis=1)))
+    expected = np.exp(list(vars(mean_interval(logs)).values()))
+    np.testing.assert_allclose(found[1:], expected)
+    (nees,) = averages(table, ["choice.world"], "recording_checksum", "nees_mean").itertuples()
+    each = table["nees_mean"].to_numpy().reshape(12, 2).mean(axis=1)
+    np.testing.assert_allclose(nees[1:], list(vars(mean_interval(each)).values()))
+
+
+def test_one_recording_gives_intervals_over_its_repeats_and_one_run_none():
+    one = runs(n=1, repeats=5)
+    assert unit_of(one, ["choice.estimator"]) == "repeat"
+    assert unit_of(runs(), ["choice.estimator"]) == "recording_checksum"
+    found = averages(one, ["choice.estimator"], "repeat", "ate_rmse_m")
+    assert (found["low"] < found["value"]).all()
+    alone = averages(one[:1], ["choice.estimator"], "recording_checksum", "ate_rmse_m")
+    assert alone[["low", "high"]].isna().all(axis=None)
+    zero = averages(one.assign(ate_rmse_m=0.0), ["choice.estimator"], "repeat", "ate_rmse_m")
+    assert (zero["value"] == 0.0).all()
+
+
+def test_every_metric_says_how_it_is_averaged():
+    assert {c.unit for c in COLUMNS.values() if c.average is Average.ERROR} == {"m", "rad"}
+    assert all(c.average is Average.PLAIN for c in COLUMNS.values() if not c.unit)
+
+
+def test_the_best_is_that_of_the_same_recordings_and_has_no_failures():
+    table = runs()
+    other = runs().assign(**{"choice.world": "w_2"})
+    other["recording_checksum"] = "s" + other["recording_checksum"]
+    other["ate_rmse_m"] *= 0.01
+    both = pd.concat([table, other], ignore_index=True)
+    best = summary(both).set_index(["choice.estimator", "choice.world"])["answer_ate_rmse_m_best"]
+    assert best["a"].all()
+    assert not best["b"].any()
+    table.loc[0, "status"] = "failed"
+    best = summary(table).set_index("choice.estimator")["answer_ate_rmse_m_best"]
+    assert best.to_dict() == {"a": False, "b": True}  # a leaves out what was hard
+
+
+@pytest.mark.parametrize(("ratio", "differs"), [(2.0, True), (1.0, False)])
+def test_differences_are_marked_by_paired_tests(ratio, differs):
+    table = runs(ratio=ratio)
+    compared = summary(table, against="a")
+    found = compared.set_index("choice.estimator")
+    assert found["answer_ate_rmse_m_differs"].to_dict() == {"a": False, "b": differs}
+    assert not found["answer_nees_mean_differs"].any()
+    assert found["ate_rmse_over_a_low"]["b"] < ratio < found["ate_rmse_over_a_high"]["b"]
+    assert ("*: differs from a" in notes(compared, "a")) is differs
+
+
+def test_p_of_pairs_is_scipys_and_equal_arms_never_differ():
+    rng = np.random.default_rng(1)
+    first, second = rng.normal(size=(2, 9))
+    assert paired_p(first - second) == pytest.approx(stats.ttest_rel(first, second).pvalue)
+    assert paired_p(np.zeros(5)) == 1.0
+    assert paired_p(np.ones(5)) == 0.0
+    assert np.isnan(paired_p([1.0]))
+    assert holm([0.01, 0.04, 0.03], 0.05) == [True, False, False]
+
+
+def test_metrics_are_chosen_and_unknown_ones_refused():
+    found = summary(runs(), metrics=["nees_mean"])
+    assert [c for c in found if c in COLUMNS] == ["nees_mean"]
+    with pytest.raises(InputError, match="no column nees; there are ate_rmse_m"):
+        summary(runs(), metrics=["nees"])
+
+
+def check_latex(text):
+    """Braces, environments, mathematics and cells are whole; nothing is left unescaped."""
+    text = re.sub(r"(?m)^%.*\n", "", text)
+    bare = re.sub(r"\\[\\{}%&#_$]", "", text)
+    assert bare.count("{") == bare.count("}")
+    assert bare.count("$") % 2 == 0
+    outside = re.sub(r"\$[^$]*\$", "", bare)
+    assert not re.search(r"[_^#%~]", outside)
+    begun, ended = (re.findall(rf"\\{word}{{(\w+)}}", text) for word in ("begin", "end"))
+    assert begun == ended == ["tabular"]
+    columns = len(re.search(r"\\begin{tabular}{([lr]+)}", text)[1])
+    inside = text.partition(r"\toprule")[2].partition(r"\bottomrule")[0]
+    rows = [row for row in inside.replace(r"\midrule", "").split(r"\\") if row.strip()]
+    assert {len(re.findall(r"(?<!\\)&", row)) + 1 for row in rows} == {columns}
+    return len(rows) - 1
+
+
+def test_tables_are_written_for_papers_and_pages(tmp_path):
+    table = runs().replace({"b": "<b>&%_#^w"})
+    table["ate_rmse_m"] *= 1e-4
+    found = summary(table, against="a")
+    note = notes(found, "a")
+    for name in ("t.tex", "t.md", "t.html", "t.csv"):
+        write_table(found, note, tmp_path / name, "sweep <i>")
+    texts = {path.suffix: path.read_text() for path in tmp_path.iterdir()}
+    assert check_latex(texts[".tex"]) == 2
+    assert r"\textbf{" in texts[".tex"]
+    assert r"\times 10^{-5}" in texts[".tex"]
+    assert "ATE, m" in texts[".tex"]
+    assert len(re.findall(r"\*\*[\d.e-]+\*\* \[", texts[".md"])) == 1
+    assert r"\<b>&%_#^w" in texts[".md"]
+    assert len(re.findall(r"<td class=.number.><b>[\d.e-]+</b> \[", texts[".html"])) == 1
+    assert "&lt;b&gt;&amp;%_#^w" in texts[".html"]
+    assert "sweep &lt;i&gt;" in texts[".html"]
+    assert "script-src &" not in texts[".html"]
+    again = pd.read_csv(tmp_path / "t.csv")
+    assert again["answer_ate_rmse_m_low"].tolist() == pytest.approx(
+        found["answer_ate_rmse_m_low"].tolist()
+    )
+
+
+def test_a_table_that_latex_would_refuse_is_found():
+    good = r"\begin{tabular}{lr}\toprule a & b\\ \midrule 1 & 2\\ \bottomrule\end{tabular}"
+    assert check_latex(good) == 1
+    for bad in (good.replace("1 & 2", "1 & 2 & 3"), good.replace("a &", "a_b &"), good + "}"):
+        with pytest.raises(AssertionError):
+            check_latex(bad)
+
+
+def test_statuses_are_words_with_counts():
+    table = runs(n=3, repeats=1).assign(status_detail="")
+    table.loc[:2, "status"] = "remark"
+    table.loc[:2, "status_detail"] = ["gated at 1.5 s", "gated at 20 s", "lost"]
+    assert statuses(table) == [
+        ("ran to the end", 3),
+        ("ran, with a remark: gated at ... s", 2),
+        ("ran, with a remark: lost", 1),
+    ]
+
+
+def test_the_command_refuses_other_endings_before_it_reads(tmp_path):
+    for arguments in (["-o", "x.xlsx"], ["--rows"], ["--rows", "-o", "x.tex"]):
+        done = CliRunner().invoke(app, ["table", str(tmp_path / "none"), *arguments])
+        assert isinstance(done.exception, InputError)
+        assert re.search(r"a table is \.tex|name the file|no sweep", str(done.exception))

@@ -1,0 +1,61 @@
+"""What a run and a sweep say in plain words."""
+
+import numpy as np
+import pytest
+
+from experiments.runs.experiment import Experiment
+from experiments.runs.run import _expected_s, in_words
+from experiments.viewing.run_figure import run_figure
+from tests.test_cli import QUICK, estima
+
+
+def a_row(**changed):
+    return {"ate_rmse_m": 0.3, "distance_m": 38.0, "nees_mean": 3.2, **changed}
+
+
+def test_errors_are_said_with_their_share_of_the_way_and_consistency():
+    assert in_words([a_row()]) == (
+        "position RMSE 0.3 m, 0.79 % of 38 m; consistent (NEES 3.2 of 3)"
+    )
+    assert in_words([a_row(), a_row(ate_rmse_m=0.4)]).startswith("position RMSE 0.354 m")
+    assert "too sure of itself (NEES 9 of 3)" in in_words([a_row(nees_mean=9.0)])
+    assert "too cautious" in in_words([a_row(nees_mean=0.5)])
+    assert in_words([a_row(revised_ate_rmse_m=0.1)]).startswith("position RMSE 0.1 m")
+    assert in_words([{"distance_m": 3.0}]) == ""
+    assert in_words([{"ate_rmse_m": 0.3, "distance_m": 0.0}]) == "position RMSE 0.3 m"
+
+
+@pytest.mark.parametrize(
+    ("overrides", "expected_s"),
+    [(["route=linear_1"], 2.2), (["route.distance_m=8"], 16.0), (["route=square"], None)],
+)
+def test_progress_knows_about_how_long_a_drive_is(overrides, expected_s):
+    assert _expected_s(Experiment.compose(overrides)) == (expected_s and pytest.approx(expected_s))
+    assert _expected_s(Experiment.compose(["world=room"])) > 10.0
+
+
+def test_the_picture_shows_the_path_and_few_ellipses_however_large():
+    experiment = Experiment.compose(
+        ["study=first_run", "simulation.physics=kinematic", "route.distance_m=6"]
+    )
+    recording = experiment.simulate()
+    from experiments.runs.evaluate import estimates
+
+    prior = experiment.prior(recording)
+    estimate, _ = estimates(experiment.estimator(), recording, prior, np.random.default_rng(0))
+    page = run_figure(recording, estimate, "ekf_slam")
+    plan = page.axes[0]
+    assert len(plan.patches) <= 8
+    assert {"truth", "ekf_slam", "95 % ellipse"} <= set(plan.get_legend_handles_labels()[1])
+    assert np.ptp(plan.get_xlim()) < 6.0 + 2 * 3.0 + 1.0
+
+
+def test_a_sweep_shows_its_small_table_and_what_comes_next(tmp_path):
+    overrides = ["route=linear_1", "seed=0,1", "name=small", "hydra/launcher=basic"]
+    done = estima("run", "-m", *QUICK, *overrides, ESTIMA_RESULTS=str(tmp_path))
+    assert done.returncode == 0, done.stderr
+    assert "ATE, m" in done.stdout
+    assert "estima report small" in done.stdout
+    command = (tmp_path / "runs" / "small" / "command.txt").read_text()
+    assert command.startswith("estima run -m ")
+    assert "seed=0,1" in command

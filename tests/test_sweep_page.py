@@ -1,0 +1,129 @@
+"""The page of a sweep: what it holds, and how it does in a real browser."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+from experiments.report import sweep_page
+from experiments.report.sweep_page import write_sweep_page
+from experiments.sweeps.averages import averages
+from experiments.sweeps.collect import with_answers
+from sim.errors import InputError
+from tests import browser
+from tests.test_collect import many
+
+EVIL = "</script><img src=x onerror=alert(1)>"
+
+
+def rows():
+    """A sweep of three series, one of a hostile name; one run failed, one has a remark."""
+    table = many(3).replace({"m01": EVIL})
+    table["run_key"] = [f"{i:016x}" for i in range(len(table))]
+    table["code_version"] = "v"
+    table["status_detail"] = ""
+    table.loc[3, ["status", "status_detail"]] = "remark", "gated at 12.5 s"
+    table.loc[4, ["status", "status_detail"]] = "remark", "gated at 99.9 s"
+    table.loc[0, ["status", "status_detail"]] = "failed", f"bad {EVIL}"
+    table["simulation.physics"] = "kinematic"
+    return table
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("sweep")
+    (folder / "command.txt").write_text(f"estima run -m world={EVIL}\n")
+    write_sweep_page(rows(), f"mine {EVIL}", folder, folder / "page.html")
+    return folder / "page.html"
+
+
+def test_the_page_is_one_small_file_in_which_nothing_from_files_is_code(path):
+    text = path.read_text()
+    assert len(text) < 2_000_000
+    assert "<img" not in text
+    held = re.search(r'id="data">(.*?)</script>', text)[1]
+    assert EVIL in json.loads(held)["settings"][0]["values"]
+    for words in ("2 ran, with a remark: gated at ... s", "1 failed: bad", "estima run -m world="):
+        assert words in text
+
+
+def test_a_page_too_large_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(sweep_page, "MOST_RUNS", 10)
+    with pytest.raises(InputError, match=r"54 runs; a page holds 10.*--where"):
+        write_sweep_page(rows(), "mine", tmp_path, tmp_path / "page.html")
+    assert not (tmp_path / "page.html").exists()
+
+
+@pytest.fixture(scope="module")
+def tab(path):
+    if browser.find() is None:
+        pytest.skip("no Chromium on this machine")
+    with browser.page() as tab:
+        tab.shape(1400, 900)
+        tab.open(path.as_uri())
+        yield tab
+
+
+def choose(tab, name, value):
+    tab.js(
+        f"(() => {{ const s = document.getElementById('{name}'); s.value = '{value}';"
+        "s.dispatchEvent(new Event('change')); })()"
+    )
+
+
+def test_the_chart_draws_the_means_of_tables_and_plots(tab):
+    assert tab.complaints() == []
+    table = with_answers(rows(), ["answer_ate_rmse_m"])
+    table = table[table["status"] != "failed"]
+    by = ["choice.estimator", "choice.world", "estimator.n_particles"]
+    expected = averages(table, by, "recording_checksum", "answer_ate_rmse_m")
+    drawn = tab.js(
+        "document.getElementById('chart').data.filter(t => t.error_y)"
+        ".flatMap(t => Array.from(t.y, (y, i) => [y, ...t.customdata[i]]))"
+    )
+    found = np.array(sorted(drawn))[:, :3].astype(float)
+    order = expected.sort_values("value").to_numpy()
+    np.testing.assert_allclose(found, order, rtol=1e-3)
+    assert tab.js("document.getElementById('chart').layout.xaxis.type") == "log"
+    assert "with 95 % intervals" in tab.js("document.getElementById('said').textContent")
+
+
+def test_what_is_chosen_is_drawn_and_what_is_pooled_is_said(tab):
+    choose(tab, "panels", "")
+    assert "also averages over world" in tab.js("document.getElementById('said').textContent")
+    choose(tab, "panels", "choice.world")
+    assert tab.js("Object.keys(document.getElementById('chart').layout).includes('xaxis2')")
+    n = "document.getElementById('said').textContent.split(' ')[0]"
+    assert tab.js(n) == "53"
+    tab.js("document.querySelector('#filters input').click()")
+    assert int(tab.js(n)) < 53
+    tab.js("document.querySelector('#filters input').click()")
+    assert tab.js(n) == "53"
+
+
+def test_tables_are_sorted_by_keyboard(tab):
+    head = "document.querySelectorAll('table.sortable th button')"
+    assert tab.js(f"{head}.length") > 4
+    at = tab.js(f"[...{head}].findIndex(b => b.textContent.startsWith('ATE'))")
+    tab.js(f"{head}[{at}].focus()")
+    rows_of = "[...document.querySelectorAll('.sortable tbody tr')]"
+    cells = f"{rows_of}.map(r => parseFloat(r.cells[{at}].textContent))"
+    tab.press("Enter", text="\r")
+    assert tab.becomes(f"{head}[{at}].parentElement.ariaSort == 'ascending'")
+    assert tab.js(cells) == sorted(tab.js(cells))
+    tab.press("Enter", text="\r")
+    assert tab.becomes(f"{head}[{at}].parentElement.ariaSort == 'descending'")
+    assert tab.js(cells) == sorted(tab.js(cells), reverse=True)
+
+
+@pytest.mark.parametrize("dark", [False, True])
+def test_phones_and_dark_mode(tab, dark):
+    tab.shape(390, 800, dark=dark)
+    assert tab.becomes("document.getElementById('chart').getBoundingClientRect().width <= 390")
+    assert tab.becomes("document.documentElement.scrollWidth <= 390")
+    ink = tab.js("getComputedStyle(document.body).color")
+    assert tab.becomes(
+        f"getComputedStyle(document.querySelector('#chart .xtick text')).fill == '{ink}'"
+    )
+    assert tab.complaints() == []

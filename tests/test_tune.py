@@ -1,0 +1,173 @@
+"""Tuning on a problem whose answer is known, what it refuses, and that it goes on."""
+
+import json
+import math
+import sys
+
+import numpy as np
+import pytest
+import yaml
+
+import experiments.sweeps.tune as tuning
+from experiments.runs.experiment import Experiment
+from experiments.sweeps.ranges import Range, Tuning
+from sim.errors import InputError
+
+STUDY = """# @package _global_
+defaults:
+  - override /estimator: odometry
+route:
+  distance_m: 4.0
+simulation:
+  physics: kinematic
+tune:
+  trials: {trials}
+  seeds: [0, 1, 2, 3, 4, 5]
+  estimators:
+    odometry:
+      window_s: {{ interval: [0.01, 1.0], log: true }}
+      integration: {{ choice: [arc, midpoint, euler] }}
+hydra:
+  sweeper:
+    params:
+      seed: range({judged},{end})
+"""
+
+
+@pytest.fixture
+def study(tmp_path, monkeypatch):
+    """A study whose error is least, and known, at window_s=0.3 by the arc; and the runs made."""
+    pytest.importorskip("optuna")
+    monkeypatch.setenv("ESTIMA_RESULTS", str(tmp_path / "results"))
+    calls = []
+
+    def error_m(experiment):
+        settings = experiment.config["estimator"]
+        calls.append((experiment.seed, settings["window_s"], settings["integration"]))
+        off = math.log(settings["window_s"] / 0.3) ** 2 + 2.0 * (settings["integration"] != "arc")
+        return math.exp(off + 0.01 * experiment.seed % 7)
+
+    monkeypatch.setattr(tuning, "error_m", error_m)
+    (tmp_path / "study").mkdir()
+
+    def write(trials=12, judged=1000):
+        text = STUDY.format(trials=trials, judged=judged, end=judged + 4)
+        (tmp_path / "study" / "toy.yaml").write_text(text)
+        return str(tmp_path)
+
+    return write, calls
+
+
+def test_it_finds_what_is_better_and_judges_it_elsewhere(study, tmp_path):
+    write, calls = study
+    folder = write()
+    (tuned,) = tuning.tune("toy", config_dir=folder)
+    assert tuned.trials["state"].isin(["complete", "pruned"]).all()
+    assert len(tuned.trials) == 12
+    assert list(tuned.trials["trial"]) == [*range(1, 13)]
+    assert tuned.trials["mean_log_error"].notna().equals(tuned.trials["state"] == "complete")
+    best = tuned.trials.loc[tuned.trials["mean_log_error"].idxmin()]
+    assert best["best_so_far_m"] == tuned.trials["best_so_far_m"].iloc[-1]
+    assert tuned.values.items() <= json.loads(best["options"]).items()
+    assert tuned.gain.value < 0.2
+    assert tuned.gain.value == pytest.approx(tuned.tuned_m / tuned.default_m)
+    assert tuned.n_judged == 4
+    assert (np.diff(tuned.trials["best_so_far_m"]) <= 0.0).all()
+    assert {seed for seed, *_ in calls} == {*range(6), *range(1000, 1004)}
+    assert "pruned" in set(tuned.trials["state"])
+    plan = tuning.tuning_of("toy", folder)
+    path = tuning.write(tuned, "toy", plan, tmp_path / "estimator")
+    assert set(yaml.safe_load(path.read_text())) == {"defaults", *tuned.values}
+    with_folder = [f"hydra.searchpath=[file://{tmp_path}]", "estimator=odometry_tuned"]
+    settings = Experiment.compose(with_folder).config["estimator"]
+    assert settings["window_s"] == tuned.values["window_s"]
+    assert settings["kr"] == Experiment.compose([]).config["estimator"]["kr"]
+    trials, gains = tuning.trials_table([tuned]), tuning.gains_table([tuned])
+    assert json.loads(trials["options"].iloc[0]) == {"window_s": 0.05, "integration": "arc"}
+    assert gains["pruned"].iloc[0] == (trials["state"] == "pruned").sum()
+    assert tuning.curves(trials, gains).axes[0].get_xlabel() == "trials"
+
+
+def test_it_goes_on_where_it_ended(study):
+    write, calls = study
+    list(tuning.tune("toy", config_dir=write(trials=4)))
+    n_first = sum(seed < 100 for seed, *_ in calls)
+    calls.clear()
+    (tuned,) = tuning.tune("toy", config_dir=write(trials=6))
+    assert len(tuned.trials) == 6
+    assert 0 < sum(seed < 100 for seed, *_ in calls) <= 12  # two trials of six recordings
+    calls.clear()
+    (again,) = tuning.tune("toy", config_dir=write(trials=6))
+    assert not calls
+    assert again.gain == tuned.gain
+    assert n_first > 0
+
+
+def test_the_default_wins_where_nothing_is_better(study, monkeypatch):
+    monkeypatch.setattr(
+        tuning, "error_m", lambda e: 1.0 + (e.config["estimator"]["window_s"] != 0.05)
+    )
+    (tuned,) = tuning.tune("toy", config_dir=study[0](trials=5))
+    assert "window_s" not in tuned.values
+    assert tuned.gain.value == 1.0
+
+
+def test_a_failed_run_counts(monkeypatch):
+    rows = [{"status": "failed"}, {"status": "ok", "ate_rmse_m": math.nan}]
+    rows += [{"status": "ok", "ate_rmse_m": 4.0, "revised_ate_rmse_m": 0.5}]
+    assert [tuning._answer_m(row) for row in rows] == [tuning.FAILED_M, tuning.FAILED_M, 0.5]
+
+
+def test_seeds_to_tune_and_to_judge_are_apart(study):
+    with pytest.raises(InputError, match="1000 or more"):
+        list(tuning.tune("toy", config_dir=study[0](judged=20)))
+    with pytest.raises(InputError, match=r"tune\.seeds"):
+        Tuning.of("toy", {"trials": 3, "seeds": [1000], "estimators": {}})
+
+
+@pytest.mark.parametrize(
+    ("settings", "complaint"),
+    [
+        ({"interval": [1, 0]}, "lower first"),
+        ({"interval": [1]}, "lower first"),
+        ({"interval": [0, 1], "log": True}, "above 0"),
+        ({"interval": [0, 1], "log": "yes"}, "true or false"),
+        ({"choice": [1]}, "two plain values"),
+        ({"choice": "ab"}, "two plain values"),
+        ({"choice": [1, 2], "log": True}, "must be"),
+        ({"range": [0, 1]}, "must be"),
+        (3, "must be"),
+    ],
+)
+def test_wrong_ranges_are_told(settings, complaint):
+    with pytest.raises(InputError, match=complaint) as error:
+        Range.of("tune.estimators.mcl.n_most", settings)
+    assert "tune.estimators.mcl.n_most" in str(error.value)
+
+
+@pytest.mark.parametrize("settings", [None, {}, {"trials": 3, "seeds": [0]}, {"trial": 3}])
+def test_a_study_without_a_tune_is_told(settings):
+    with pytest.raises(InputError, match="tune must hold trials, seeds, estimators"):
+        Tuning.of("toy", settings)
+
+
+def test_what_does_not_fit_the_estimator_is_told_before_any_run(study, tmp_path):
+    write, calls = study
+    path = tmp_path / "study" / "toy.yaml"
+    for old, new, complaint in (
+        ("window_s:", "windows:", "no option windows; it has kr"),
+        ("[0.01, 1.0]", "[0.1, 1.0]", "must hold the default, 0.05"),
+    ):
+        folder = write()
+        path.write_text(path.read_text().replace(old, new))
+        with pytest.raises(InputError, match=complaint):
+            list(tuning.tune("toy", config_dir=folder))
+    with pytest.raises(InputError, match="does not tune mcl"):
+        list(tuning.tune("toy", ["mcl"], config_dir=write()))
+    assert not calls
+
+
+def test_without_optuna_it_says_so(monkeypatch):
+    monkeypatch.setitem(sys.modules, "optuna", None)
+    with pytest.raises(InputError, match=r"pip install 'estima\[tune\]'"):
+        list(tuning.tune("peers"))
