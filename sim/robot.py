@@ -339,7 +339,7 @@ class TravelWindow:
             return np.abs([right, left])
         self._recent.append((duration_s, right, left))
         total_s = sum(entry[0] for entry in self._recent)
-        while total_s - self._recent[0][0] >= self.window_s - 1e-9:
+        while len(self._recent) > 1 and total_s - self._recent[0][0] >= self.window_s - 1e-9:
             total_s -= self._recent.popleft()[0]
         net_right = sum(entry[1] for entry in self._recent)
         net_left = sum(entry[2] for entry in self._recent)

@@ -1,18 +1,21 @@
 """The filter of velocities: derivatives, the stream of corrections, failures."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from estimators.ekf_icp_paper import EkfIcpPaper, mean_velocity, observation
+from estimators.gaussian import STILL, Gaussian
 from estimators.odometry import Odometry
 from sim import se2
 from sim.errors import InputError
+from sim.robot import arc_increment
 from tests.fakes import blind, with_scan
 from tests.test_gaussian import numeric
 from tests.test_icp import ROOM
-from tests.test_icp_odometry import TRACK_M, drive, errors, follow, prior
+from tests.test_icp_odometry import P0, START, STEP_M, TRACK_M, drive, errors, follow, prior
 
 
 def test_derivatives():
@@ -43,6 +46,79 @@ def test_wheels_alone_are_dead_reckoning():
     wheels = follow(Odometry(1e-4, 1e-4), scanless)[-1]
     np.testing.assert_allclose(found.mean, wheels.mean, atol=2e-3)
     np.testing.assert_allclose(np.diag(found.covariance), np.diag(wheels.covariance), rtol=0.1)
+
+
+def printed(frames, scans, kr, kl, noise):
+    """The filter written out from decristoforis2020, eqs. (1)-(4) and sec. II-D; means (N, 6)."""
+    x, P, means = np.zeros(6), np.diag([*np.diag(P0), 1.0, 1.0, 1.0]), []
+    x[:3] = START
+    for frame, scan in zip(frames, scans, strict=True):
+        dt = frame.duration_s
+        if dt:
+            P = P + np.diag([0.0, 0.0, 0.0, *(np.square(noise) * dt)])
+            F = np.block([[np.eye(3), dt * np.eye(3)], [np.zeros((3, 3)), np.eye(3)]])
+            x, P = F @ x, F @ P @ F.T
+            right, left = frame.wheel_increments_m
+            u = np.array([(right + left) / 2.0, 0.0, (right - left) / TRACK_M])  # eq. (1)
+            spread = np.diag([kr * abs(right), kl * abs(left)])  # eq. (2)
+            J = np.array([[0.5, 0.5], [0.0, 0.0], [1.0 / TRACK_M, -1.0 / TRACK_M]])  # eq. (4)
+            sightings = [(u / dt, J @ spread @ J.T / dt**2)]  # eq. (3)
+            if scan is not None:
+                sightings.append((scan.mean / dt, scan.covariance / dt**2))
+            for z, R in sightings:
+                c, s = np.cos(x[2]), np.sin(x[2])
+                to_robot = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+                by_heading = np.array([[-s, c, 0.0], [-c, -s, 0.0], [0.0, 0.0, 0.0]]) @ x[3:]
+                H = np.column_stack([np.zeros((3, 2)), by_heading, to_robot])
+                K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
+                x, P = x + K @ (z - to_robot @ x[3:]), (np.eye(6) - K @ H) @ P
+        means.append(x.copy())
+    return np.array(means), P
+
+
+def test_the_printed_equations():
+    """At small turns the filter is that of the paper's equations, written out."""
+    _, frames = drive(ROOM, 40, STEP_M / 200.0, wheel_noise_m=5e-5)
+    rng = np.random.default_rng(1)
+    R = np.diag([2e-8, 3e-8, 1e-8]) + 5e-9
+    truth = arc_increment(STEP_M / 200.0, TRACK_M)
+    scans = [None] + [Gaussian(rng.multivariate_normal(truth, R), R) for _ in frames[1:]]
+    filtered = EkfIcpPaper(kr=1e-4, kl=3e-4, window_s=0.0)
+    filtered._matcher = Replayed(scans)
+    found = follow(filtered, frames)
+    means, last = printed(frames, scans, 1e-4, 3e-4, (1.0, 1.0, 2.0))
+    np.testing.assert_allclose([b.mean for b in found], means[:, :3], atol=1e-5)
+    np.testing.assert_allclose(found[-1].covariance, last[:3, :3], rtol=0.02, atol=1e-8)
+    # an equation that differs is seen
+    for kr, kl in ((3e-4, 1e-4), (1e-4, 1e-4)):
+        other, _ = printed(frames, scans, kr, kl, (1.0, 1.0, 2.0))
+        assert np.abs(other[:, :3] - means[:, :3]).max() > 6e-5
+
+
+class Replayed:
+    """Registrations as given, one a scan."""
+
+    def __init__(self, motions):
+        self.motions = iter(motions)
+
+    def prepare(self, ranges_m, laser):
+        """Take the next one."""
+        return next(self.motions) or STILL
+
+    def match(self, scan, previous, guess, laser, rng):
+        """Give it as a registration that succeeded."""
+        return SimpleNamespace(status="ok", failed=False, motion=scan, held=np.eye(3))
+
+
+def test_default_is_the_printed_covariance():
+    _, frames = drive(ROOM, 2)
+    as_default = follow(EkfIcpPaper(), frames)[-1].extras["registration_covariance"]
+    by_name, both = (
+        follow(EkfIcpPaper(covariance=name), frames)[-1].extras["registration_covariance"]
+        for name in ("censi_last", "censi")
+    )
+    np.testing.assert_array_equal(as_default, by_name)
+    assert np.linalg.det(both) > 2.0 * np.linalg.det(by_name)
 
 
 def test_fusion_follows_a_curve():

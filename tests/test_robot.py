@@ -162,6 +162,12 @@ def test_counts_become_metres_by_the_nominal_radius():
     assert (read / (2 * math.pi * 0.06) * 200).tolist() == pytest.approx([300, 50])
 
 
+def test_a_window_of_no_time_nets_nothing():
+    window = TravelWindow(0.0)
+    for travel_m in ([0.1, -0.2], [-0.3, 0.1]):
+        np.testing.assert_array_equal(window.push(0.1, travel_m), np.abs(travel_m))
+
+
 def test_travel_window_does_not_inflate_travel_by_encoder_noise():
     """At k <= 1e-4 m and 75 Hz the sum of |ds| stays within 2 % of the distance, crawling."""
     rng = np.random.default_rng(3)
