@@ -16,7 +16,6 @@ LINKS: dict[str, dict[str, object]] = {
     "delayed, 5 s": {"team.communication.kind": "delayed", "team.communication.delay_s": 5.0},
     "never": {"team.communication.kind": "never"},
 }
-# MRCLAM: the wider noise and the slip of the single robots' study, conf/study/real_logs_mrclam.yaml
-MRCLAM_K_M = 5e-4
-MRCLAM_NOISE = {"sigma_disparity_px": 3.2, "sigma_column_px": 10.4}
+# MRCLAM: as EKF-SLAM with a gate in the single robots' study, conf/study/real_logs_mrclam.yaml
+MRCLAM_OPTIONS = {"gate_probability": 1e-6, "repeat_s": 0.5, "kr": 1e-3, "kl": 1e-3}
 MRCLAM_ARMS = ("alone", "team", "team with sightings")
