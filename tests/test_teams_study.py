@@ -70,7 +70,7 @@ def test_the_sentence_says_the_factors(tmp_path):
     found = claims.judge(made)
     [conclusion] = claims.conclusions(made, found)
     assert conclusion.verdict is Verdict.REPRODUCED
-    assert "with 2 robots" in conclusion.sentence
+    assert "with 2 robots," in conclusion.sentence
     assert "On MRCLAM 6 a team of five errs 0.33 times a robot alone." in conclusion.sentence
     bare = [c for c in found if "MRCLAM" not in c.statistic]
     [conclusion] = claims.conclusions(made, bare)

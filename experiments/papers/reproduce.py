@@ -29,7 +29,7 @@ from sim.errors import InputError
 
 PAPERS = ("puzzlebot2024", "decristoforis2020", "maximo2024", "gil2008")
 LOGS = ("real_logs",)  # run only where the logs are
-NAMED = ("teams",)  # judged, run when named
+NAMED = ("teams", "exploration")  # judged, run when named
 OWN = (
     "mcl_office",
     "fastslam_consistency",

@@ -412,10 +412,10 @@ class Experiment:
             rays=self.config["simulation"]["rays"],
             config={key: self.config[key] for key in SIMULATED_KEYS},
             on_progress=on_progress,
-            onboard=self._onboard,
+            onboard=self.onboard,
         )
 
-    def _onboard(
+    def onboard(
         self, world: World, robot: RobotGeometry, sensors: Sensors, start: Array
     ) -> Callable[[Frame], Array]:
         """Start the estimator that the route's feedback names; it knows the start and the map."""

@@ -110,7 +110,8 @@ class TeamExperiment:
             own = self.of_robot(number)
             streams = {axis: stream(own.seed, axis, number) for axis in ("slip", "sensors")}
             config = {key: own.config[key] for key in SIMULATED_KEYS}
-            members.append(Member(own.robot(), own.sensors(), own.route(), streams, config))
+            what = own.robot(), own.sensors(), own.route(), streams, config, own.onboard
+            members.append(Member(*what))
         simulation = self.experiment.config["simulation"]
         return record_team(
             self.experiment.world(),

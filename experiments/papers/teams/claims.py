@@ -68,7 +68,8 @@ def gi9_sentence(rows: Sequence[Claim]) -> str:
     words = "error with sightings over without"
     sizes = [row for row in rows if words in row.statistic and NAMES["fastslam"] in row.statistic]
     said = ", ".join(
-        f"{plain(row.found.value)} times with {row.statistic.split(', ')[1]}" for row in sizes
+        f"{plain(row.found.value)} times with {row.statistic.split(', ')[1].split(':')[0]}"
+        for row in sizes
     )
     ekf = [row for row in rows if words in row.statistic and NAMES["ekf_slam"] in row.statistic]
     beside_ = ", ".join(plain(row.found.value) for row in ekf)
