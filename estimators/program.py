@@ -266,4 +266,4 @@ def map_message(known_map: Any) -> dict[str, Any] | None:
 
 def span_text(stamps: Sequence[float] | Array) -> str:
     """First and last stamp, as messages tell them."""
-    return f"{stamps[0]:.9g} to {stamps[-1]:.9g} s"
+    return f"{stamps[0]:.13g} to {stamps[-1]:.13g} s"

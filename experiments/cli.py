@@ -149,6 +149,7 @@ def _show_sweep(folder: Path, n_runs: int) -> None:
         if len(found) <= _FEW_LINES:
             show(as_lines(found, notes(found, None)))
     print(f"\nNext: estima table {folder.name} --against ESTIMATOR -o table.tex")
+    print(f"      estima plot {folder.name}")
     print(f"      estima report {folder.name}")
 
 
@@ -912,6 +913,9 @@ def bench(
     print(run_bench(name, as_json=as_json))
 
 
+AllVersions = Annotated[
+    bool, typer.Option("--all-versions", help="Keep rows of other versions of the code.")
+]
 Where = Annotated[
     list[str] | None,
     typer.Option(
@@ -946,9 +950,7 @@ def table(
             autocompletion=completion.metrics,
         ),
     ] = None,
-    all_versions: Annotated[
-        bool, typer.Option("--all-versions", help="Keep rows of other versions of the code.")
-    ] = False,
+    all_versions: AllVersions = False,
     times: Annotated[bool, typer.Option("--times", help="Keep computing times.")] = False,
     every: Annotated[
         bool, typer.Option("--rows", help="With -o: write every row, with all its columns.")
@@ -1002,9 +1004,12 @@ def plot(
         ),
     ],
     x: Annotated[
-        str,
-        typer.Option(help="Swept setting, such as robot.kr.", autocompletion=completion.settings),
-    ],
+        str | None,
+        typer.Option(
+            help="Swept setting, such as robot.kr; without it one is chosen and said.",
+            autocompletion=completion.settings,
+        ),
+    ] = None,
     y: Annotated[
         str,
         typer.Option(help="Result (estima options metrics).", autocompletion=completion.metrics),
@@ -1033,6 +1038,7 @@ def plot(
     pool: Annotated[
         bool, typer.Option("--pool", help="Average over other settings that differ too.")
     ] = False,
+    all_versions: AllVersions = False,
     only: Where = None,
 ) -> None:
     """Draw a column of a sweep against a swept setting, with 95 % intervals.
@@ -1042,23 +1048,35 @@ def plot(
 
     Examples
     --------
+      estima plot slip
+
       estima plot slip --x robot.kr --y heading_rmse_rad --by choice.estimator
 
       estima plot slip --x robot.kr --by choice.estimator --col choice.world --size page -o a.pdf
     """
     from experiments.report.plot import Size, sweep_figure
-    from experiments.sweeps.collect import collect, where
+    from experiments.sweeps.collect import collect, suggested, where
     from experiments.viewing.style import save_figure
 
     if size not in list(Size):
         raise InputError(f"--size must be {', '.join(Size)}, got {size}")
-    rows = where(collect(name, times=True), only or [])
+    rows = where(collect(name, all_versions=all_versions, times=True), only or [])
     failed = rows["status"] == Outcome.FAILED
     if failed.any():
         print(f"{failed.sum()} of {len(rows)} runs failed; they are left out", file=sys.stderr)
         rows = rows[~failed]
+    chosen = ""
+    if x is None:
+        taken = [each for each in (*(by or []), row, col) if each]
+        x, *others = suggested(rows, taken)
+        if not taken:
+            by, col = others[:1], next(iter(others[1:]), None)
+        words = [f"--x {x}", *(f"--by {each}" for each in by or []), f"--col {col}" if col else ""]
+        chosen = f"drawn with {' '.join(filter(None, words))}"
     page = sweep_figure(rows, x, y, by, row=row, col=col, size=size, pool=pool)
     save_figure(page, out)
+    if chosen:
+        print(chosen, file=sys.stderr)
     print(out)
 
 
@@ -1099,6 +1117,7 @@ def report(
         ),
     ] = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="File to write, .html.")] = None,
+    all_versions: AllVersions = False,
     only: Where = None,
 ) -> None:
     """Write one page to open in a browser: of a sweep, or of the papers' studies in results/.
@@ -1122,11 +1141,13 @@ def report(
 
         folder, called = folder_of(name), Path(name).name
         written = out or folder.parent / f"{called}.html"
-        rows = where(collect(name, times=True), only or [])
+        rows = where(collect(name, all_versions=all_versions, times=True), only or [])
         write_sweep_page(rows, called, folder, written)
         print(paths.short(written))
         return
-    require(not only, "--where: name the sweep whose runs to keep")
+    require(
+        not (only or all_versions), "--where, --all-versions: name the sweep of the runs to keep"
+    )
     if not any((paths.results() / name).exists() for name in ("claims.csv", "figures", "tables")):
         raise InputError(
             f"{paths.short(paths.results())}: no claims, figures or tables to report; "
@@ -1184,8 +1205,8 @@ def main() -> None:
     except (Exception, KeyboardInterrupt) as error:
         end(error)
     except SystemExit as ended:
-        if ended.code == _INTERRUPTED:
-            print("estima: interrupted; what was finished is kept", file=sys.stderr)
+        if ended.code == _INTERRUPTED:  # Typer has caught the interrupt, which may hold a message
+            end(ended)
         raise
 
 

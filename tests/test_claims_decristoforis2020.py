@@ -99,7 +99,7 @@ def test_the_order_holds_in_a_cell_only_if_all_intervals_do():
     rows.loc[unsure & (rows["seed"] % 3 == 0), "ate_rmse_m"] = 9.0
     *_, region = claims.dc1(runs(**RIGHT), rows)
     assert region.found.value == 0.5
-    assert region.reason == "at k 1e-06 sigma 0.01"
+    assert region.reason == "where: k 1e-06 sigma 0.01"
 
 
 def ellipses(**changed):

@@ -1,16 +1,20 @@
 """The command line as a user meets it: what it prints, what it leaves, and how it refuses."""
 
+import contextlib
+import io
 import json
 import os
 import subprocess
 import sys
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pandas as pd
 import pytest
 
 from estimators.base import Belief
+from experiments import cli
 from experiments.bench import SUITES
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
@@ -32,6 +36,19 @@ def estima(*arguments, cwd=ROOT, **environment):
         env={**os.environ, "PYTHONPATH": str(ROOT), **environment},
         timeout=120,
     )
+
+
+def called(*arguments):
+    """As `estima`, in this process: for what neither runs nor leaves anything."""
+    out, err = io.StringIO(), io.StringIO()
+    with (
+        mock.patch.object(sys, "argv", ["estima", *arguments]),
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+        pytest.raises(SystemExit) as ended,
+    ):
+        cli.main()
+    return subprocess.CompletedProcess(arguments, ended.value.code, out.getvalue(), err.getvalue())
 
 
 def refused(done, *words):
@@ -112,7 +129,7 @@ def test_a_run_prints_its_errors_and_leaves_a_row(tmp_path):
 )
 def test_bad_input_is_one_line_and_code_2(arguments, words):
     given = [a for a in QUICK if a.split("=")[0] not in {b.split("=")[0] for b in arguments}]
-    refused(estima("run", *given, *arguments), *words)
+    refused(called("run", *given, *arguments), *words)
 
 
 @pytest.mark.parametrize(
@@ -155,7 +172,7 @@ def test_a_bad_configuration_names_its_key(override, words):
 
 @pytest.mark.parametrize("argument", ["robot.kq=1,2", "robot.kq=1"])
 def test_an_unknown_key_of_a_sweep_names_the_known_ones(argument):
-    refused(estima("run", "-m", *QUICK, argument), "unknown key robot.kq", "robot.kr")
+    refused(called("run", "-m", *QUICK, argument), "unknown key robot.kq", "robot.kr")
 
 
 def test_a_sweep_with_a_bad_value_runs_nothing(tmp_path):
@@ -196,7 +213,7 @@ def test_where_lists_the_columns():
     "arguments", [["--results", "", "cache"], ["cache", "--results="], ["cache", "--results", ""]]
 )
 def test_results_need_a_folder(arguments):
-    refused(estima(*arguments), "--results must name a folder")
+    refused(called(*arguments), "--results must name a folder")
 
 
 def test_a_malformed_option_names_its_file(tmp_path):
@@ -220,15 +237,15 @@ def test_damaged_recordings_are_refused(tmp_path):
     believed = estima("run", *QUICK, f"recording={path}", *other)
     assert "was made with robot.kr=1e-05" in believed.stderr
     path.write_bytes(path.read_bytes()[:-100])
-    refused(estima("info", str(path)), "r.npz", "record again")
-    refused(estima("run", f"recording={path}"), "r.npz", "record again")
+    refused(called("info", str(path)), "r.npz", "record again")
+    refused(called("run", f"recording={path}"), "r.npz", "record again")
     log = tmp_path / "a.log"
     log.write_text("ODOM 0 0 0 0 0 0 0 nohost 0\n")
-    refused(estima("run", f"recording={log}"), "a.log", "estima convert")
-    refused(estima("record", "-o", "."), ".npz")
-    refused(estima("convert", str(path), "-o", "."), "name the file")
+    refused(called("run", f"recording={log}"), "a.log", "estima convert")
+    refused(called("record", "-o", "."), ".npz")
+    refused(called("convert", str(path), "-o", "."), "name the file")
     before = path.read_bytes()
-    refused(estima("convert", str(path), "-o", str(path)), "the log itself", "another name")
+    refused(called("convert", str(path), "-o", str(path)), "the log itself", "another name")
     assert path.read_bytes() == before
 
 
@@ -244,8 +261,8 @@ def test_calibration_from_recordings(tmp_path):
     found = json.loads(done.stdout)
     assert found["kr"]["low"] < 1e-4 < found["kr"]["high"]
     assert found["kl"]["low"] < 5e-5 < found["kl"]["high"]
-    refused(estima("calibrate", *paths, "--method", "guess"), "--method")
-    refused(estima("calibrate", paths[0], paths[1], paths[0]), "same recording")
+    refused(called("calibrate", *paths, "--method", "guess"), "--method")
+    refused(called("calibrate", paths[0], paths[1], paths[0]), "same recording")
 
 
 def test_calibration_from_a_sheet():
@@ -255,8 +272,8 @@ def test_calibration_from_a_sheet():
     found = json.loads(done.stdout)
     assert found["method"] == "sampled"
     assert found["track_m"]["low"] < 0.19 < found["track_m"]["high"]
-    refused(estima("calibrate", "--sheet", sheet, "world=room"), "world=room", "robot")
-    refused(estima("calibrate", "--sheet", sheet, "--method", "wheel-truth"), "--method")
+    refused(called("calibrate", "--sheet", sheet, "world=room"), "world=room", "robot")
+    refused(called("calibrate", "--sheet", sheet, "--method", "wheel-truth"), "--method")
 
 
 def test_view_draws_a_world(tmp_path):

@@ -5,7 +5,7 @@ import pytest
 from experiments.runs import cache
 from experiments.runs.version import code_version
 from sim.errors import InputError
-from tests.test_cli import QUICK, estima, refused
+from tests.test_cli import QUICK, called, estima, refused
 
 
 @pytest.fixture
@@ -33,7 +33,7 @@ def test_the_command_shows_and_clears(folder, tmp_path):
     cleared = estima("cache", "--clear", f"--results={tmp_path}")
     assert "3 recordings deleted" in cleared.stdout
     assert list(folder.glob("*.npz")) == []
-    refused(estima("cache", "--results"), "--results must name a folder")
+    refused(called("cache", "--results"), "--results must name a folder")
     refused(estima("cache", ESTIMA_CACHE_GIB="much"), "ESTIMA_CACHE_GIB", "'much'")
 
 

@@ -3,12 +3,14 @@
 import numpy as np
 import pandas as pd
 import pytest
+from typer.testing import CliRunner
 
+from experiments.cli import app
 from experiments.report.plot import _by_factors, sweep_figure
 from experiments.runs.columns import COLUMNS, ORIGIN, REPEAT, STATUS, is_setting, title
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
-from experiments.sweeps.collect import collect, measured, swept, telling, where
+from experiments.sweeps.collect import collect, measured, suggested, swept, telling, where
 from experiments.sweeps.summary import summary
 from sim.errors import InputError
 
@@ -40,7 +42,7 @@ def test_tables_know_settings_from_findings_and_compare_on_the_same_recordings()
     np.testing.assert_allclose(found.loc["a", "ate_rmse_over_a"], 1.0)
     np.testing.assert_allclose(found.loc["b", "ate_rmse_over_a"], 2.0)
     assert (found["runs"] == 3).all()
-    with pytest.raises(InputError, match="no rows of estimator c"):
+    with pytest.raises(InputError, match="no rows of estimator c; there are a, b"):
         summary(table, against="c")
 
 
@@ -147,7 +149,7 @@ def test_plots_name_a_missing_column_and_average_recordings():
     page = sweep_figure(table, "robot.kr", "ate_rmse_m", pool=True)
     geometric = np.exp(np.log(table["ate_rmse_m"]).groupby(table["robot.kr"]).mean())
     np.testing.assert_allclose(page.axes[0].get_lines()[0].get_ydata(), geometric)
-    with pytest.raises(InputError, match="no run has both"):
+    with pytest.raises(InputError, match=r"no run has all of robot\.kr, ate_rmse_m"):
         sweep_figure(table.assign(**{"robot.kr": None}), "robot.kr", "ate_rmse_m")
     with pytest.raises(
         InputError, match=r"no column robot\.krr; there are robot\.kr, .*ate_rmse_m"
@@ -157,6 +159,70 @@ def test_plots_name_a_missing_column_and_average_recordings():
         sweep_figure(rows(), "nosuch", "ate_rmse_m")
     with pytest.raises(InputError, match="no numbers"):
         sweep_figure(rows(), "robot.kr", "status")
+
+
+def test_a_mean_of_two_is_drawn_with_both_and_without_an_interval():
+    two = rows(4).query("`choice.estimator` == 'a'")
+    page = sweep_figure(two, "robot.kr", "ate_rmse_m")
+    mean, *_, dots = page.axes[0].get_lines()
+    assert not [bar for bar in page.axes[0].collections if np.isfinite(bar.get_segments()).any()]
+    np.testing.assert_allclose(np.sort(dots.get_ydata()), np.sort(two["ate_rmse_m"]))
+    assert len(mean.get_ydata()) == 2
+    note = page.get_suptitle().replace("\n", " ")
+    assert note.endswith("pooled by squares first; small dots: both of two")
+    three = sweep_figure(rows(), "robot.kr", "ate_rmse_m", "choice.estimator")
+    assert "[95 % interval]" in three.get_suptitle()
+    assert "dots" not in three.get_suptitle()
+
+
+def test_runs_without_a_finite_value_are_left_out_and_counted(recwarn):
+    table = rows().query("`choice.estimator` == 'a'").assign(mixed=[0.1, 0.2, np.inf, np.nan, 1, 2])
+    page = sweep_figure(table, "mixed", "ate_rmse_m", pool=True)
+    assert len(page.axes[0].get_lines()[0].get_xdata()) == 4
+    assert "2 of 6 runs left out: no finite mixed" in page.get_suptitle().replace("\n", " ")
+    assert not recwarn
+
+
+def test_there_is_no_half_a_seed():
+    table = rows().query("`choice.estimator` == 'a'").assign(**{"robot.kr": 1e-5})
+    page = sweep_figure(table, "seed", "ate_rmse_m")
+    page.draw_without_rendering()
+    low, high = page.axes[0].get_xlim()
+    assert [t for t in page.axes[0].get_xticks() if low <= t <= high] == [0.0, 1.0, 2.0]
+
+
+def test_what_a_plot_is_drawn_by_is_chosen_where_it_is_not_given():
+    assert suggested(rows()) == ["robot.kr", "choice.estimator"]
+    assert suggested(rows(), ["robot.kr"]) == ["choice.estimator"]
+    assert suggested(rows(), ["robot.kr", "choice.estimator"]) == ["seed"]
+    assert suggested(rows()[:1]) == ["repeat"]
+    some = rows().assign(**{"choice.world": ["v", "w"] * 6})  # follows from the estimator
+    some["estimator.n"] = some["robot.kr"].where(some["choice.estimator"] == "b")
+    assert suggested(some.drop(columns="robot.kr")) == ["choice.estimator", "estimator.n"]
+    twice = sweep_figure(rows(), "choice.estimator", "ate_rmse_m", "choice.estimator", pool=True)
+    assert len(twice.axes[0].containers) == 2
+    with pytest.raises(InputError, match="against itself"):
+        sweep_figure(rows(), "ate_rmse_m", "ate_rmse_m")
+
+
+def test_the_same_remedy_shows_rows_of_other_code_in_all_three(tmp_path):
+    rows().to_parquet(tmp_path / "x.parquet")
+    for arguments in (["table"], ["plot", "-o", "p.png"], ["report", "-o", "p.html"]):
+        command, *out = [str(tmp_path / a) if a.startswith("p.") else a for a in arguments]
+        refused = CliRunner().invoke(app, [command, str(tmp_path), *out])
+        assert "with --all-versions" in str(refused.exception)
+        done = CliRunner().invoke(app, [command, str(tmp_path), *out, "--all-versions"])
+        assert done.exit_code == 0
+        if command == "plot":
+            assert "drawn with --x robot.kr --by choice.estimator\n" in done.stderr
+
+
+def test_versions_of_the_code_are_told_apart():
+    both = pd.concat([rows(), rows().assign(code_version="w")], ignore_index=True)
+    assert telling(both)[-1] == "code_version"
+    assert len(summary(both)) == 2 * len(summary(rows()))
+    with pytest.raises(InputError, match=r"code_version \(v, w\).*--by code_version"):
+        sweep_figure(both, "robot.kr", "ate_rmse_m", "choice.estimator")
 
 
 def many(n_series=12):

@@ -29,7 +29,7 @@ from sim.grid_mapping import _between, map_scans
 from sim.recording import save
 from sim.sensors import Laser
 from tests.fakes import HALF_ROOM_M, circle, square_room
-from tests.test_cli import estima, refused
+from tests.test_cli import called, refused
 
 MAP = Path(__file__).resolve().parent.parent / "docs" / "maps" / "lab.yaml"
 LASER = Laser(n_beams=90, max_range_m=30.0)
@@ -562,7 +562,7 @@ def test_what_the_command_line_refuses(tmp_path):
     log = tmp_path / "run.npz"
     save(dataclasses.replace(circle(n_frames=10, n_beams=61), truth=None), log)
     out = str(tmp_path / "map.yaml")
-    refused(estima("map", str(log), "-o", out), "no truth", "-e")
+    refused(called("map", str(log), "-o", out), "no truth", "-e")
     for words, said in (
         (["map", str(log), "-o", "map.pgm"], "a .yaml file"),
         (["map", "seed=3", "-o", out], "name a recording"),

@@ -23,6 +23,7 @@ from experiments.report.claims import (
 )
 from experiments.report.export import to_latex, to_markdown
 from experiments.runs.row import write_frame
+from experiments.viewing.style import save_figure, subplots
 from sim.errors import InputError
 from tests import browser
 
@@ -306,6 +307,33 @@ def test_figures_open_enlarged_by_key_and_close_again(tab):
     assert tab.js("document.querySelector('dialog img').getBoundingClientRect().width") >= 600
     tab.js("document.querySelector('dialog').click()")
     assert tab.becomes("!document.querySelector('dialog').open")
+
+
+@pytest.mark.skipif(browser.find() is None, reason="no Chromium on this machine")
+def test_panels_stand_below_each_other_on_a_phone(tmp_path):
+    page, axes = subplots(9.0, 3.0, 1, 2)
+    for ax in axes:
+        ax.plot([0, 1])
+        ax.set(xlabel="x, m", ylabel="y, m")
+    (tmp_path / "figures").mkdir()
+    save_figure(page, tmp_path / "figures" / "leaderboard_errors.png")
+    places = "e => e.getBoundingClientRect().toJSON()"
+    with browser.page() as tab:
+        tab.open(report.write_report(tmp_path).as_uri())
+        for width in (1400, 390):
+            tab.shape(width, 800)
+            shown = tab.js(
+                f"[...document.querySelectorAll('main figure .panels > span')].map({places})"
+            )
+            assert len(shown) == 2
+            assert all((box["width"] > 0) == (width == 390) for box in shown)
+        first, second = shown
+        assert first["bottom"] <= second["top"]
+        assert first["right"] <= 390
+        assert tab.js("document.documentElement.scrollWidth") == 390
+        best = tab.js(f"[document.querySelector('header figure img')].map({places})[0]")
+        assert best["bottom"] <= 844  # on the first screen
+        assert tab.complaints() == []
 
 
 def test_tables_can_be_sorted(tab):

@@ -264,6 +264,8 @@ def plain(value: float, digits: int = 2) -> str:
     if not math.isfinite(value):
         return "unknown"
     short = f"{value:.{digits}g}"
+    if short.lstrip("-").isdigit() and abs(value) < 10 and value != round(value):
+        short += ".0"  # 0.998 is no 1
     return f"{float(short):,.0f}" if abs(value) >= 10**digits else short
 
 

@@ -13,6 +13,7 @@ import pandas as pd
 from experiments.evaluation.verdict import Profile, Role, Verdict, headline_verdict
 from experiments.report.claims import read_claims, read_provenance, read_verdicts, this_code
 from experiments.report.export import as_text, folded, numeric, plain
+from experiments.report.panels import panels
 from experiments.runs.paths import CONF, SOURCE
 from experiments.runs.row import read_rows
 from sim.errors import InputError
@@ -39,6 +40,10 @@ OWN = {
     "mcl_office": ["estima reproduce --paper mcl_office --full"],
     "fastslam_consistency": ["estima reproduce --paper fastslam_consistency --full"],
 }
+FIRST = (
+    "real_logs_building",
+    "leaderboard_errors",
+)  # pictures for the first screen, the best first
 SMALL_ROWS, SMALL_COLUMNS = 60, 20  # a table up to here is shown whole
 FIRST_ROWS = 5  # of a larger one
 _FOLDER = SOURCE / "experiments" / "papers"
@@ -66,12 +71,14 @@ def contents(results: Path, on_progress: Callable[[float], None]) -> dict[str, A
             "tally": tally(judged),
         }
         on_progress(done / len(about))
+    pictures = {figure["name"]: figure for found in studies.values() for figure in found["figures"]}
     known = tuple(f"{name}_" for name in about)
     files = [*(results / "figures").glob("*.png"), *(results / "tables").glob("*.csv")]
     origins = made | {"this page": this_code()}
     return {
         "claims": claims,
         "best": best_of_worlds(results / "tables" / "leaderboard_means.csv"),
+        "first": next((pictures[name] for name in FIRST if name in pictures), None),
         "holds_best": holding_best({name: studies[name]["tally"] for name in PAPERS}),
         "on_lasers": best_on_lasers(results / "tables" / "peers_methods.csv"),
         "n_statistics": len(table),
@@ -258,6 +265,7 @@ def picture(path: Path, about: Entry, claims: Mapping[str, Entry]) -> Entry:
         "claims": [claims[key] for key in about.get("claims", [])],
         "width": width,
         "height": height,
+        "panels": panels(data),
         "png": base64.b64encode(data).decode(),
     }
 

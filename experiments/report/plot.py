@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from experiments.runs.columns import ANSWER, COLUMNS, PATH, title
-from experiments.sweeps.averages import averages, rule, unit_of
+from experiments.sweeps.averages import averages, pooled, rule, unit_of
 from experiments.sweeps.collect import DRAWN, measured, telling, with_answers
 from experiments.viewing.plotting import plain_log, plain_ticks
 from experiments.viewing.style import SERIES, figure
@@ -56,6 +57,9 @@ def sweep_figure(
 ) -> Figure:
     """Mean of `y` over the recordings, with 95 % intervals, against `x`; one line per `by`.
 
+    A mean of two has no interval; both are dots. The note above the panels counts the runs that are
+    left out because they have no finite value in a column.
+
     A y such as `answer_ate_rmse_m` is that of the best answer, the revised path where there is one;
     what gives revised paths is marked so. Means follow the rule of `sweeps.averages`, as those of
     tables do.
@@ -74,18 +78,22 @@ def sweep_figure(
     Raises
     ------
     InputError
-        If a column is not in the table, y has no numbers, no run has both x and y, or a point
-        would pool what differs in more than its seeds.
+        If a column is not in the table, y has no numbers, no run has all columns, or a point would
+        pool what differs in more than its seeds.
     """
     by = [by] if isinstance(by, str) else list(by or [])
     facets = [name for name in (row, col) if name is not None]
     if y.startswith(ANSWER):
         table = _marked(with_answers(table, [y]), [x, *by, *facets])
-    _check(table, x, y, [*by, *facets], pool=pool)
-    table = table[table[[x, y]].notna().all(axis=1)]
-    groups = [*by, *facets, x]
+    groups = list(dict.fromkeys([*by, *facets, x]))
+    _check(table, y, groups)
+    table, left_out = _complete(table, y, groups)
+    if not pool:
+        _check_points(table, groups)
     unit = unit_of(table, groups)
     means = averages(table, groups, unit, y).reset_index()
+    unbounded = means.loc[means["low"].isna(), groups]
+    dots = pooled(table, [*groups, unit], y).reset_index().merge(unbounded, on=groups)
     lines = _labels(means, by)
     if len(lines) > len(SERIES):
         raise InputError(
@@ -102,21 +110,20 @@ def sweep_figure(
         ax = axes[i, j]
         panel = _within(_within(means, row, above), col, left)
         for k, (label, line) in enumerate(lines.items()):
-            points = panel[(panel[by] == list(line)).all(axis=1)] if by else panel
+            points = _on_line(panel, by, line)
             if points.empty:
                 continue
-            at = np.array([v if numeric else names.index(v) for v in points[x]], float)
             beside = k - (len(lines) - 1) / 2
-            if wide:
-                at *= (names[-1] / names[0]) ** (_BESIDE * beside)
-            else:
-                at += beside * (_BESIDE * (names[-1] - names[0]) if numeric else _BESIDE_WORD)
+            at = _places(points[x], names, beside, wide=wide, numeric=numeric)
             value, low, high = points[["value", "low", "high"]].to_numpy(float).T
             colour, marker = SERIES[k]
             ax.errorbar(
                 at, value, yerr=(value - low, high - value), color=colour, marker=marker, ms=4,
                 capsize=2, lw=1.2, ls="-" if numeric else "none", label=label,
             )  # fmt: skip
+            alone = _on_line(_within(_within(dots, row, above), col, left), by, line)
+            at = _places(alone[x], names, beside, wide=wide, numeric=numeric)
+            ax.plot(at, alone[y], ".", color=colour, ms=4, alpha=0.5)
         words = [_named(name, value) for name, value in ((row, above), (col, left)) if name]
         ax.set_title("; ".join(words), fontsize="medium")
     _scale(axes, names, means, wide=wide, numeric=numeric, log=_is_log(y, means["value"]))
@@ -124,8 +131,14 @@ def sweep_figure(
         ax.set_xlabel(title(x))
     for ax in axes[:, 0]:
         ax.set_ylabel(title(y))
-    pooled = [c for c in telling(table) if c not in (*groups, *DRAWN)]
-    note = rule(unit, [y]) + (f"; over {', '.join(map(title, pooled))} too" if pooled else "")
+    over = [c for c in telling(table) if c not in (*groups, *DRAWN)]
+    parts = [
+        rule(unit, [y], means["low"].notna()),
+        f"over {', '.join(map(title, over))} too" if over else "",
+        "small dots: both of two" if (dots.groupby(groups).size() > 1).any() else "",
+        left_out,
+    ]
+    note = "; ".join(filter(None, parts))
     characters = int(_WIDTH_IN[chosen] * 115 / _FONT[chosen])
     page.suptitle(textwrap.fill(note, characters), fontsize=0.85 * _FONT[chosen], color="#555555")
     if by:
@@ -133,9 +146,11 @@ def sweep_figure(
     return page
 
 
-def _check(table: pd.DataFrame, x: str, y: str, others: Sequence[str], *, pool: bool) -> None:
-    """Check that the columns are there and that no point pools what differs in kind."""
-    for column in (x, y, *others):
+def _check(table: pd.DataFrame, y: str, groups: Sequence[str]) -> None:
+    """Check that the columns are there and that y has numbers."""
+    if y in groups:
+        raise InputError(f"{y} is drawn against itself; estima options metrics lists the results")
+    for column in (y, *groups):
         if column not in table:
             near = _metrics(table, y) if column == y else _columns(table, column)
             more = f" and {len(near) - _NAMED} more" if len(near) > _NAMED else ""
@@ -143,10 +158,25 @@ def _check(table: pd.DataFrame, x: str, y: str, others: Sequence[str], *, pool: 
             raise InputError(f"the sweep has no column {column}; there are {there}{more}")
     if table[y].dtype.kind not in "fi":
         raise InputError(f"column {y} holds no numbers; there are {', '.join(measured(table))}")
-    if table[[x, y]].dropna().empty:
-        raise InputError(f"no run has both {x} and {y}")
-    points = table.groupby([x, *others], dropna=False)
-    for column in () if pool else [c for c in telling(table) if c not in DRAWN]:
+
+
+def _complete(table: pd.DataFrame, y: str, groups: Sequence[str]) -> tuple[pd.DataFrame, str]:
+    """Runs with a y that have finite values in all columns, and words on how many have not."""
+    with_y = table[table[y].notna()]
+    columns = with_y[[y, *groups]]
+    lacking = columns.isna() | columns.isin([np.inf, -np.inf])
+    out = lacking.any(axis=1)
+    if out.all():
+        raise InputError(f"no run has all of {', '.join([*groups, y])}")
+    without = " or ".join(title(str(name)) for name in columns.columns[lacking.any()])
+    words = f"{out.sum()} of {len(out)} runs left out: no finite {without}" if out.any() else ""
+    return with_y[~out], words
+
+
+def _check_points(table: pd.DataFrame, groups: Sequence[str]) -> None:
+    """Check that no point pools what differs in kind."""
+    points = table.groupby(list(groups))
+    for column in [c for c in telling(table) if c not in DRAWN]:
         if points[column].nunique().max() > 1:
             there = ", ".join(map(str, sorted(table[column].dropna().unique())[:8]))
             raise InputError(
@@ -158,6 +188,20 @@ def _check(table: pd.DataFrame, x: str, y: str, others: Sequence[str], *, pool: 
 
 def _values(means: pd.DataFrame, name: str | None) -> list[Any]:
     return [None] if name is None else sorted(means[name].dropna().unique())
+
+
+def _on_line(means: pd.DataFrame, by: Sequence[str], line: tuple[Any, ...]) -> pd.DataFrame:
+    return means[(means[list(by)] == list(line)).all(axis=1)] if by else means
+
+
+def _places(
+    values: pd.Series[Any], names: Sequence[Any], beside: float, *, wide: bool, numeric: bool
+) -> Any:
+    """Where values stand on the x axis, moved a little so that no line's bars hide another's."""
+    at = np.array([v if numeric else names.index(v) for v in values], float)
+    if wide:
+        return at * (names[-1] / names[0]) ** (_BESIDE * beside)
+    return at + beside * (_BESIDE * (names[-1] - names[0]) if numeric else _BESIDE_WORD)
 
 
 def _within(means: pd.DataFrame, name: str | None, value: Any) -> pd.DataFrame:
@@ -204,6 +248,8 @@ def _scale(
         ax.set_xscale("log")
         if len(names) <= _FEW:
             plain_ticks(ax, names)
+    elif numeric and all(float(name).is_integer() for name in names):
+        ax.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))  # no half a seed
     if not numeric:
         for each in axes[-1]:
             each.set_xticks(range(len(names)), list(map(str, names)), rotation=25, ha="right")

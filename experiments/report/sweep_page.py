@@ -23,7 +23,7 @@ from experiments.runs.columns import title as titled
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome
 from experiments.sweeps.averages import RECORDING
-from experiments.sweeps.collect import COMMAND, DRAWN, measured, telling, with_answers
+from experiments.sweeps.collect import COMMAND, DRAWN, measured, suggested, telling, with_answers
 from experiments.sweeps.summary import ERROR, summary
 from sim.errors import InputError, printable, require
 from sim.files import write_whole
@@ -31,7 +31,6 @@ from sim.files import write_whole
 MOST_RUNS = 10_000  # with 1.2 MB of the charting library the page stays below 5 MB
 _DIGITS = 5  # of the numbers behind the chart
 _SHOWN_RUNS = 3  # best, and worst
-_FEW = 12  # colours, and panels
 
 
 def write_sweep_page(table: pd.DataFrame, name: str, folder: Path, out: Path) -> None:
@@ -81,11 +80,7 @@ def write_sweep_page(table: pd.DataFrame, name: str, folder: Path, out: Path) ->
 def _data(table: pd.DataFrame, settings: list[str], metrics: list[str]) -> Markup:
     """All that the chart draws, as JSON that no HTML can end."""
     first = next((m for m in (ERROR, "ate_rmse_m") if m in metrics), metrics[0])
-    numbers = [s for s in settings if s not in DRAWN and table[s].dtype.kind in "fi"]
-    words = [s for s in settings if s not in DRAWN and s not in numbers]
-    x = next(iter([*numbers, *words, *settings]), REPEAT)
-    words.sort(key=lambda word: word != "choice.estimator")
-    rest = [*(w for w in words if w != x and table[w].nunique() <= _FEW), "", ""]
+    x, colour, panels, *_ = [*suggested(table), "", ""]
     columns = [*settings, *([REPEAT] if REPEAT not in settings else [])]
     found = {
         "settings": [{"name": c, "title": titled(c), "values": _cells(table[c])} for c in columns],
@@ -104,7 +99,7 @@ def _data(table: pd.DataFrame, settings: list[str], metrics: list[str]) -> Marku
         "failed": (table["status"] == Outcome.FAILED).tolist(),
         "status": [WORDS[Outcome(s)] for s in table["status"]],
         "drawn": list(DRAWN),
-        "start": {"x": x, "y": first, "colour": rest[0], "panels": rest[1]},
+        "start": {"x": x, "y": first, "colour": colour, "panels": panels},
         "t975": [round(float(stats.t.ppf(0.975, n)), 4) for n in range(1, 200)],
     }
     text = json.dumps(found, allow_nan=False)

@@ -2,6 +2,7 @@
 
 import importlib
 import re
+import signal
 import sys
 import textwrap
 import time
@@ -95,6 +96,8 @@ def _state(
 def end(error: BaseException) -> NoReturn:
     """End the program with one line for what the user can fix: code 2 for input, 1 for failures.
 
+    So it ends after an interrupt, with that one's message and code 130.
+
     An internal error ends with its traceback and code 3.
     """
     chain: list[BaseException] = [error]
@@ -106,7 +109,9 @@ def end(error: BaseException) -> NoReturn:
         if isinstance(link, RunFailedError):
             _say(f"the run failed: {link}", 1)
         if isinstance(link, KeyboardInterrupt):
-            _say("interrupted; what was finished is kept", 130)
+            for again in (signal.SIGINT, signal.SIGTERM):  # what is said is said whole
+                signal.signal(again, signal.SIG_IGN)
+            _say(str(link) or "interrupted; what was finished is kept", 130)
         if isinstance(link, _configuration_errors()):
             if refusal := _refusal(link):
                 _say(refusal, 2)

@@ -139,8 +139,8 @@ def scored_against(recording: Recording, given: Estimate, how: Scoring) -> Score
     true_start, true_end = recording.known_truth.stamps[[0, -1]]
     require(
         len(rows),
-        f"no pose meets a true one: the trajectory is from {stamps[0]:.9g} to {stamps[-1]:.9g} s, "
-        f"the truth from {true_start:.9g} to {true_end:.9g} s; set --offset",
+        f"no pose meets a true one: the trajectory is from {stamps[0]:.13g} to "
+        f"{stamps[-1]:.13g} s, the truth from {true_start:.13g} to {true_end:.13g} s; set --offset",
     )
     means, covariances = given.means[rows], given.covariances[rows]
     T = np.zeros(3)
@@ -317,8 +317,8 @@ def described(scored: Scored, how: Scoring) -> str:
         moved += f": moved by ({x:.6g} m, {y:.6g} m, {heading:.6g} rad)"
     offset = f", {how.offset_s:+g} s on the stamps" if how.offset_s else ""
     return (
-        f"  {scored.n_given} poses, {len(scored.truth)} scored from {stamps[0]:.9g} to "
-        f"{stamps[-1]:.9g} s, {scored.n_left_out} left out; {matching}{offset}\n"
+        f"  {scored.n_given} poses, {len(scored.truth)} scored from {stamps[0]:.13g} to "
+        f"{stamps[-1]:.13g} s, {scored.n_left_out} left out; {matching}{offset}\n"
         f"  longest time without a pose: {scored.longest_gap_s:.3g} s\n"
         f"  {'revised' if how.revised else 'online'} path, {moved}"
     )

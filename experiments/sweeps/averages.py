@@ -17,18 +17,29 @@ from experiments.evaluation.statistics import paired_p
 from experiments.runs.columns import REPEAT, Average, average_of
 
 RECORDING = "recording_checksum"
+LEAST = 3  # units of an interval: of two, Student's t makes it 13 standard errors
 
 
-def rule(unit: str, names: Sequence[str]) -> str:
-    """How columns are averaged over recordings or repeats, in words."""
+def rule(unit: str, names: Sequence[str], bounded: Sequence[bool]) -> str:
+    """How columns are averaged over recordings or repeats, in words.
+
+    Parameters
+    ----------
+    bounded
+        Which of the means have an interval.
+    """
     over = "repeats" if unit == REPEAT else "recordings"
+    if all(bounded):
+        interval = " [95 % interval]"
+    else:
+        interval = f" [95 % interval of {LEAST} or more]" if any(bounded) else ""
     kinds = {average_of(name) for name in names}
     if kinds == {Average.PLAIN}:
-        return f"Arithmetic mean over {over} [95 % interval]"
+        return f"Arithmetic mean over {over}{interval}"
     pooled_first = f", repeats pooled by squares{'' if unit == REPEAT else ' first'}"
     words = f"Geometric mean over {over}{pooled_first if Average.ERROR in kinds else ''}"
     rest = "; NEES, shares and counts: arithmetic" if Average.PLAIN in kinds else ""
-    return f"{words} [95 % interval]{rest}"
+    return f"{words}{interval}{rest}"
 
 
 def unit_of(table: pd.DataFrame, by: Sequence[str]) -> str:
@@ -53,7 +64,7 @@ def pooled(table: pd.DataFrame, by: Sequence[str], name: str) -> pd.Series[float
 def averages(table: pd.DataFrame, by: Sequence[str], unit: str, name: str) -> pd.DataFrame:
     """Mean of a column over the units of each group, with its 95 % interval.
 
-    A geometric mean over a zero is zero, without bounds; so is any mean below two units.
+    A geometric mean over a zero is zero, without bounds; a mean of fewer than three units has none.
 
     Returns
     -------
@@ -65,7 +76,7 @@ def averages(table: pd.DataFrame, by: Sequence[str], unit: str, name: str) -> pd
     with np.errstate(divide="ignore", invalid="ignore"):
         groups = (np.log(values) if geometric else values).groupby(level=list(range(len(by))))
         mean, n = groups.mean(), groups.size()
-        half = stats.t.ppf(0.975, n - 1) * groups.std() / np.sqrt(n)
+        half = stats.t.ppf(0.975, n - 1) * groups.std() / np.sqrt(n.where(n >= LEAST))
     found = pd.DataFrame({"value": mean, "low": mean - half, "high": mean + half})
     return np.exp(found) if geometric else found
 

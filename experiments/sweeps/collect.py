@@ -15,6 +15,7 @@ from experiments.runs.store import read_runs
 from experiments.runs.version import code_version, version_with
 from sim.errors import InputError
 
+FEW = 12  # colours, and panels
 _TIMES = ["step_time_us", "cpu_time_us"]  # they differ from run to run
 _COMMAND = "estimator.command"
 COMMAND = "command.txt"  # beside the rows: the commands that made them
@@ -52,7 +53,7 @@ def collect(name: str, *, all_versions: bool = False, times: bool = False) -> pd
         if not mine.any():
             raise InputError(
                 f"{path}: all {len(table)} rows are of other versions of the code; run the sweep "
-                f"again, or see them by `estima table {name} --all-versions`"
+                "again, or see them as they are with --all-versions"
             )
         if not mine.all():
             print(f"left out {(~mine).sum()} rows of other code versions", file=sys.stderr)
@@ -159,15 +160,33 @@ def swept(table: pd.DataFrame) -> list[str]:
 
 
 def telling(table: pd.DataFrame) -> list[str]:
-    """Swept settings without those that follow from earlier ones, as kl may from kr."""
+    """Swept settings without those that follow from earlier ones, as kl may from kr.
+
+    Of rows of several versions of the code, the version is one.
+    """
     kept: list[str] = []
     n_groups = 1
-    for column in swept(table):
+    for column in [*swept(table), *({"code_version"} & {*table})]:
         finer = table.groupby([*kept, column], dropna=False).ngroups
         if finer > n_groups:
             kept.append(column)
             n_groups = finer
     return kept
+
+
+def suggested(table: pd.DataFrame, taken: Sequence[str] = ()) -> list[str]:
+    """Settings to draw a sweep by, one at least: for the x axis, then for colours and panels.
+
+    First come numbers that all runs have, then the estimator and other words; none that is taken.
+    """
+    settings = [name for name in telling(table) if name not in taken]
+    kinds = [name for name in settings if name not in DRAWN]
+    numbers = [n for n in kinds if table[n].dtype.kind in "fi" and table[n].notna().all()]
+    words = sorted(
+        set(kinds) - set(numbers), key=lambda n: (n != "choice.estimator", kinds.index(n))
+    )
+    x = next(iter([*numbers, *words, *settings]), REPEAT)
+    return [x, *(n for n in [*words, *numbers] if n != x and table[n].nunique() <= FEW)]
 
 
 def measured(table: pd.DataFrame) -> list[str]:

@@ -116,8 +116,9 @@ def sweep(arguments: Sequence[str], config_dir: str | None = None) -> tuple[Path
         _launch_all(plan, runs, Jobs(folder, n_jobs), launching)
     except KeyboardInterrupt:
         n_kept = np.isin(keys, store.ended(folder).done).sum()
-        print(f"{n_kept} of {len(keys)} runs are kept; run it again to go on", file=sys.stderr)
-        raise
+        raise KeyboardInterrupt(
+            f"interrupted; {n_kept} of {len(keys)} runs are kept: run it again to go on"
+        ) from None
     _tidy(folder)
     found = store.ended(folder)
     bad = runs[~np.isin(plan.keys[runs], found.done)]

@@ -75,7 +75,8 @@ def summary(
         found[f"{name}_best"] = _best(found[name].where(found["failed"] == 0), name, on)
     if against is not None:
         _compare(found, sound, shown, against, _rows_of(against, sound))
-    found.attrs["rule"] = rule(unit, shown)
+    bounded = [found.loc[found[name].notna(), f"{name}_low"].notna() for name in shown]
+    found.attrs["rule"] = rule(unit, shown, [each for some in bounded for each in some])
     return found.set_axis(groups.size().index).reset_index(drop=not by)
 
 
@@ -111,7 +112,8 @@ def _rows_of(estimator: str, table: pd.DataFrame) -> pd.DataFrame:
     """Rows of the estimator that others are compared with."""
     one = table[table["choice.estimator"] == estimator]
     if one.empty:
-        raise InputError(f"no rows of estimator {estimator}")
+        there = ", ".join(sorted(table["choice.estimator"].unique()))
+        raise InputError(f"no rows of estimator {estimator}; there are {there}")
     if own := [c for c in telling(one) if c.startswith("estimator.")]:
         print(f"{estimator} is the mean over its {', '.join(own)}", file=sys.stderr)
     return one

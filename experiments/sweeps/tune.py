@@ -35,7 +35,8 @@ from experiments.runs.experiment import Experiment, composed, searched
 from experiments.runs.row import Outcome, Row
 from experiments.sweeps.plan import planned
 from experiments.sweeps.ranges import FIRST_JUDGED_SEED, Range, Tuning
-from experiments.viewing.style import CYCLE, plain_log_ticks, subplots
+from experiments.viewing.plotting import plain_log
+from experiments.viewing.style import CYCLE, subplots
 from sim.errors import InputError, require
 from sim.files import write_text
 
@@ -187,7 +188,8 @@ def curves(trials: pd.DataFrame, gains: pd.DataFrame) -> Figure:
     right.axvline(1.0, color="0.6", lw=0.8, ls="--")
     right.set(xlabel="error of the tuned over that of the default, judged seeds", xscale="log")
     right.set_yticks(places, names)
-    plain_log_ticks(left.yaxis, right.xaxis)
+    plain_log(left.yaxis)
+    plain_log(right.xaxis)
     return page
 
 

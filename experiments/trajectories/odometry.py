@@ -143,7 +143,15 @@ def read_odometry_csv(path: Path) -> Estimate:
     require_file(path)
     try:
         with path.open(newline="") as file:
-            for number, row in enumerate(csv.DictReader(file), start=2):
+            table = csv.DictReader(file)
+            missing = [name for name in _READ if name not in (table.fieldnames or [])]
+            require(
+                not missing,
+                f"{path}:1: no column {', '.join(missing[:5])}; a CSV has header.stamp, "
+                "pose.position.x and .y, pose.orientation.z and .w, and pose.covariance.0 to .35; "
+                "write poses alone as TUM",
+            )
+            for number, row in enumerate(table, start=2):
                 try:
                     rows.append([float(row[name]) for name in _READ])
                 except (KeyError, TypeError, ValueError) as error:

@@ -45,12 +45,12 @@ def compare_files(
         require(len(given) >= 2, "one trajectory alone: add others, or --recording for the truth")
         reference = next(iter(given))
         recording = reference_of(given.pop(reference))
-    found = {}
+    found, paths = {}, dict(zip(short, trajectories, strict=True))
     for name, estimate in given.items():
         try:
             found[name] = scored_against(recording, estimate, how)
         except InputError as error:
-            raise InputError(f"{name}: {error}") from error
+            raise InputError(f"{paths[name]}: {error}") from error
     save_figure(compare_figure(recording, found, reference), out)
     return compare_table(found)
 

@@ -5,10 +5,8 @@ from typing import Any
 
 import matplotlib as mpl
 from cycler import cycler
-from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullFormatter
 
 from sim.errors import require
 from sim.files import write_whole
@@ -47,14 +45,6 @@ def subplots(
     """Page in the house style and its axes, as `matplotlib.pyplot.subplots` gives them."""
     page = figure(width_in, height_in)
     return page, page.subplots(n_rows, n_cols, **options)
-
-
-def plain_log_ticks(*axes: Axis) -> None:
-    """Label logarithmic axes at 1, 2 and 5 of each decade, as plain numbers that do not collide."""
-    for axis in axes:
-        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        axis.set_major_formatter("{x:g}")
-        axis.set_minor_formatter(NullFormatter())
 
 
 def save_figure(page: Figure, path: Path) -> None:

@@ -60,8 +60,8 @@ def check_track(track: Track, path: Path) -> None:
         row = int(np.argmin(rising))
         before, after = track.stamps[row : row + 2]
         raise InputError(
-            f"{path}: stamps must increase; pose {row + 2} at {after:.9g} s follows one at "
-            f"{before:.9g} s"
+            f"{path}: stamps must increase; pose {row + 2} at {after:.13g} s follows one at "
+            f"{before:.13g} s"
         )
 
 

@@ -16,7 +16,13 @@ from experiments.evaluation.statistics import log_ratio_interval
 from experiments.papers.decristoforis2020.claims import judged_runs, nees_intervals
 from experiments.papers.decristoforis2020.settings import CONSISTENT, PAPERS_OWN, PLACES
 from experiments.papers.results import Results
-from experiments.viewing.plotting import draw_ellipses, plain_ticks, plan_axes, with_legend
+from experiments.viewing.plotting import (
+    draw_ellipses,
+    plain_log,
+    plain_ticks,
+    plan_axes,
+    with_legend,
+)
 from experiments.viewing.style import (
     BLUE,
     GREEN,
@@ -110,6 +116,7 @@ def ellipses(office: Arrays, areas: pd.DataFrame, path: pd.DataFrame) -> Figure:
     for name, color in (("long", BLUE), ("short", ORANGE)):
         sigma_mm = 1e3 * path[f"{name}_m"]
         ax.semilogy(path["distance_m"], sigma_mm, color=color, lw=1.0, label=f"{name} axis")
+    plain_log(ax.yaxis)
     low, high = ax.get_ylim()
     for place, color, name in (
         ("corridor_bare", ORANGE, "bare"),
@@ -356,7 +363,7 @@ def _grid(ax: Axes, found: pd.DataFrame) -> Any:
         color = "white" if abs(value) > 2.0 else "black"
         ends = low.iat[i, j], high.iat[i, j]
         clear = "bold" if ends[0] > 1.0 or ends[1] < 1.0 else "normal"
-        text = f"{ratio.iat[i, j]:.2g}\n{ends[0]:.2g}-{ends[1]:.2g}"
+        text = f"{_short(ratio.iat[i, j])}\n{_short(ends[0])}-{_short(ends[1])}"
         ax.text(j, i, text, ha="center", va="center", size=6, color=color, weight=clear)
     below = logs < 0.0  # the boundary runs along the edges of cells
     for i, j in np.argwhere(below[:, 1:] != below[:, :-1]):
@@ -366,6 +373,11 @@ def _grid(ax: Axes, found: pd.DataFrame) -> Any:
     ax.set_xticks(range(logs.shape[1]), [f"{k:g}" for k in ratio.columns], fontsize=7)
     ax.set_yticks(range(logs.shape[0]), [f"{s:g}" for s in ratio.index], fontsize=7)
     return drawn
+
+
+def _short(ratio: float) -> str:
+    """Write a ratio in few characters."""
+    return f"{ratio:.0f}" if ratio >= 10.0 else f"{ratio:.{1 if ratio < 0.1 else 2}g}"
 
 
 def steps(table: pd.DataFrame) -> Figure:

@@ -7,7 +7,8 @@ from matplotlib.lines import Line2D
 
 from experiments.papers.peers.settings import LASER, STEREO, TUNED
 from experiments.papers.results import Results
-from experiments.viewing.style import BLUE, ORANGE, WALL, plain_log_ticks, subplots
+from experiments.viewing.plotting import plain_log
+from experiments.viewing.style import BLUE, ORANGE, WALL, subplots
 
 _WORLDS = {"room": "s", "rooms": "^", "office": "D"}
 
@@ -39,7 +40,8 @@ def errors(methods: pd.DataFrame) -> Figure:
             axes.set(xscale="log", xlabel=label, ylim=(-0.7, len(names) - 0.3))
             axes.grid(axis="y", color="0.92")
         right.tick_params(axis="y", length=0)
-        plain_log_ticks(left.xaxis, right.xaxis)
+        plain_log(left.xaxis)
+        plain_log(right.xaxis)
         left.set_yticks(places, [name.replace(TUNED, " (tuned)") for name in names])
         right.set_yticks(places, [""] * len(names))
         left.set_title(f"{sensor} and wheels", fontsize=9, loc="left")

@@ -66,9 +66,13 @@ function grouped(rows, key) {
   return groups;
 }
 
+// Numbers as plots have them, and those of a logarithmic axis that spans little.
+const written = (v) => (v && Math.abs(v) < 1e-3 ? v.toExponential() : String(v));
+const NUMBERS = Array.from({ length: 36 }, (_, i) => [1, 2, 5].map((m) => Number(`${m}e${i - 18}`))).flat();
+
 const mean = (values) => values.reduce((sum, v) => sum + v, 0) / values.length;
 
-// Mean with its 95 % interval: the rule of tables and plots.
+// Mean with its 95 % interval, if it is of three or more: the rule of tables and plots.
 function average(rows, metric, unit) {
   const units = [...grouped(rows, (row) => unit[row]).values()].map((same) => {
     const values = same.map((row) => metric.values[row]);
@@ -80,7 +84,7 @@ function average(rows, metric, unit) {
   const n = values.length;
   const spread = Math.sqrt(values.reduce((sum, v) => sum + (v - middle) ** 2, 0) / (n - 1));
   const t = data.t975[Math.min(n - 1, data.t975.length) - 1];
-  const half = n > 1 ? (t * spread) / Math.sqrt(n) : NaN;
+  const half = n > 2 ? (t * spread) / Math.sqrt(n) : NaN;
   const back = logs ? Math.exp : (v) => v;
   return { value: back(middle), low: back(middle - half), high: back(middle + half), n };
 }
@@ -160,8 +164,9 @@ function draw() {
           array: points.map((point) => point.high - point.value || 0),
           arrayminus: points.map((point) => point.value - point.low || 0) },
         customdata: points.map((point) => [point.low, point.high, point.n]),
-        hovertemplate: "<b>%{y:.4g}</b> [%{customdata[0]:.3g}, %{customdata[1]:.3g}], "
-          + "mean of %{customdata[2]}<extra>%{fullData.name}</extra>" });
+        hovertemplate: points.map((point) => "<b>%{y:.4g}</b>"
+          + (point.n > 2 ? " [%{customdata[0]:.3g}, %{customdata[1]:.3g}]" : "")
+          + ", mean of %{customdata[2]}<extra>%{fullData.name}</extra>") });
     });
   });
   const means = found.map((point) => point.value).sort((a, b) => a - b);
@@ -181,26 +186,29 @@ function draw() {
     const lines = { gridcolor: line, linecolor: line, zerolinecolor: line, automargin: true };
     layout[`xaxis${axis}`] = { ...lines, title: { text: p >= panelNames.length - across ? xs.title : "" },
       ...(numeric ? { type: byFactors(order) ? "log" : "linear",
-        ...(order.length <= 8 ? { tickvals: order, ticktext: order.map(String) } : {}) }
+        ...(order.length <= 8 ? { tickvals: order, ticktext: order.map(written) } : {}) }
         : { type: "category", categoryorder: "array", categoryarray: order }),
       ...(p ? { matches: "x" } : {}) };
     layout[`yaxis${axis}`] = { ...lines, title: { text: p % across ? "" : metric.title },
       type: log ? "log" : "linear", ...(log && decades >= 100 ? { dtick: 1 } : {}),
+      ...(log && decades < 100 ? { tickvals: NUMBERS, ticktext: NUMBERS.map(written) } : {}),
       exponentformat: "power", ...(p ? { matches: "y" } : {}) };
   });
   Plotly.react("chart", traces, layout,
     { responsive: true, displaylogo: false, modeBarButtons: [["toImage", "zoom2d", "pan2d", "resetScale2d"]] });
-  say(rows, x, colour, panels, metric, repeated);
+  say(rows, x, colour, panels, metric, repeated, found.map((point) => point.n > 2));
 }
 
 // Say how the means came about, and what else differs within a point.
-function say(rows, x, colour, panels, metric, repeated) {
+function say(rows, x, colour, panels, metric, repeated, bounded) {
   const over = repeated ? "repeats" : "recordings";
   const kind = metric.average === "plain" ? "Arithmetic" : "Geometric";
   const pooledBy = metric.average === "error" && !repeated ? ", repeats pooled by squares" : "";
+  const intervals = bounded.every(Boolean) ? ", with 95 % intervals"
+    : bounded.some(Boolean) ? ", with 95 % intervals of three or more" : "";
   const others = data.settings.filter((s) => ![x, colour, panels, "repeat", ...data.drawn].includes(s.name) &&
     new Set(rows.map((row) => s.values[row])).size > 1).map((s) => s.title);
-  byId("said").textContent = `${rows.length} runs. ${kind} means over ${over}${pooledBy}, with 95 % intervals.` +
+  byId("said").textContent = `${rows.length} runs. ${kind} means over ${over}${pooledBy}${intervals}.` +
     (others.length ? ` Each point also averages over ${others.join("; ")}: choose a colour, panels, or only some.` : "");
 }
 

@@ -1,0 +1,85 @@
+"""A figure's panels, found by the white between them."""
+
+from io import BytesIO
+
+import numpy as np
+import pytest
+
+from experiments.report.panels import panels
+from experiments.viewing.plotting import with_legend
+from experiments.viewing.style import subplots
+
+
+def parts(page):
+    """Parts of a page as the report finds them, and the axes that each holds."""
+    file = BytesIO()
+    page.savefig(file, dpi=130, format="png")
+    height = page.bbox.height * 130 / page.dpi
+    scale = 130 / page.dpi
+    found = panels(file.getvalue())
+    held = []
+    for left, top, right, bottom in found:
+        middles = [(ax.bbox.p0 + ax.bbox.p1) / 2 * scale for ax in page.axes]
+        held.append(
+            [
+                i
+                for i, (x, y) in enumerate(middles)
+                if left < x < right and top < height - y < bottom
+            ]
+        )
+    return found, held
+
+
+def drawn(n_rows, n_cols, **shared):
+    page, axes = subplots(8.0, 2.5 * n_rows, n_rows, n_cols, squeeze=False, **shared)
+    for i, ax in enumerate(axes.flat):
+        ax.plot([0, 1, 2], [0.3, 1.0, 2.0 + i], label="a method with a long name")
+        ax.plot([0, 1, 2], [0.3, 0.5, 0.2], label="another method with a long name")
+        ax.set(xlabel="distance, m", ylabel="error, m", title=f"panel {i}")
+    return page, axes
+
+
+def test_panels_stand_alone_as_they_are_read():
+    page, _ = drawn(2, 2)
+    found, held = parts(page)
+    assert held == [[0], [1], [2], [3]]
+    boxes = np.array(found)
+    assert (boxes[:, 2:] > boxes[:, :2]).all()
+    assert boxes.min() >= 0
+
+
+def test_a_legend_of_several_panels_is_parts_of_its_own():
+    page, _ = drawn(1, 2)
+    found, held = parts(with_legend(page, ncols=2))
+    assert held == [[0], [1], [], []]
+    assert all(bottom - top < 50 for _, top, _, bottom in found[2:])
+
+
+@pytest.mark.parametrize(
+    ("shape", "shared", "expected"),
+    [
+        ((1, 2), {"sharey": True}, []),  # the second has no labels of its own
+        ((2, 2), {"sharex": True}, [[0, 2], [1, 3]]),
+        ((1, 1), {}, []),
+    ],
+)
+def test_panels_that_share_an_axis_stay_together(shape, shared, expected):
+    page, axes = drawn(*shape, **shared)
+    for ax in axes[:-1].flat:
+        ax.set(xlabel="")
+    for ax in axes[:, 1:].flat if "sharey" in shared else ():
+        ax.set(ylabel="")
+    assert parts(page)[1] == expected
+
+
+def test_a_colour_bar_stays_with_its_panel():
+    page, axes = drawn(1, 2)
+    image = axes[0, 0].imshow(np.eye(4), aspect="auto")
+    page.colorbar(image, ax=axes[0, 0], label="share")
+    assert parts(page)[1] == [[0, 2], [1]]
+
+
+def test_a_picture_without_axes_is_whole():
+    page, axes = drawn(1, 1)
+    axes[0, 0].remove()
+    assert parts(page)[0] == []
