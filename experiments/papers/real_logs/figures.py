@@ -13,6 +13,7 @@ from experiments.papers.real_logs.settings import (
     GMAPPING,
     INTEL_DRAWN,
     MRCLAM_DRAWN,
+    MRCLAM_SHOWN,
     RESOLUTION_M,
 )
 from experiments.papers.results import Results
@@ -77,11 +78,11 @@ def building(grids: Arrays) -> Figure:
 def mrclam(errors: pd.DataFrame, paths: Arrays) -> Figure:
     """Errors and NEES of each robot, and the paths of robot 4."""
     page, (left, middle, right) = subplots(11.0, 4.6, 1, 3, width_ratios=[1.0, 1.0, 1.1])
-    robots, by_method = sorted(errors.robot.unique()), errors.groupby("method", sort=False)
-    colors = (BLACK, *CYCLE[:-1], "#999999")
-    for i, ((method, part), color) in enumerate(zip(by_method, colors, strict=False)):
-        rows = part.groupby("robot")
-        at = np.searchsorted(robots, list(rows.groups)) + (i - len(by_method) / 2.0) * 0.09
+    robots, by_method = sorted(errors.robot.unique()), dict(list(errors.groupby("method")))
+    shown = [method for method in MRCLAM_SHOWN if method in by_method]
+    for i, (method, color) in enumerate(zip(shown, (BLACK, *CYCLE[:-1], "#999999"), strict=False)):
+        rows = by_method[method].groupby("robot")
+        at = np.searchsorted(robots, list(rows.groups)) + (i - len(shown) / 2.0) * 0.09
         left.plot(at, rows.ate_rmse_m.mean(), "o", ms=4, color=color, label=method)
         middle.plot(at, rows.nees_mean.median(), "o", ms=4, color=color)
     ticks = {"xticks": range(len(robots)), "xticklabels": [f"R{robot}" for robot in robots]}

@@ -65,7 +65,8 @@ MRCLAM = (
     "EKF-SLAM, known, invariant",
 )
 MRCLAM_CHOSEN = ("slip in bursts", "invariant", "unknown, wider noise")  # the headlines of RL3
-MRCLAM_DRAWN = (MRCLAM[1], MRCLAM[3])
+MRCLAM_DRAWN = (MRCLAM[1], MRCLAM[5])
+MRCLAM_SHOWN = (*MRCLAM[:3], *MRCLAM[4:7], MRCLAM[8], MRCLAM[11])  # as many as there are colours
 
 RESOLUTION_M = 0.05  # of the grid maps
 TUNED_SHARE = 0.4  # of the Intel log, on which options were chosen; the rest judges
