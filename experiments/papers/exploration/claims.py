@@ -75,9 +75,11 @@ def gi10(runs: pd.DataFrame) -> Iterator[Claim]:
 def gi10_sentence(rows: Sequence[Claim]) -> str:
     """Say how much more coordinated robots see, and what it does to the map."""
     area = pick(rows, "area seen", NAMES[BASE]).found
+    gain = pick(rows, "area seen", NAMES["information_gain"]).found
     chart = pick(rows, "error of FastSLAM's map").found
     return (
         f"After {AFTER_M:g} m a robot, coordinated robots have seen {plain(1.0 / area.value, 3)} "
         f"times the area that robots at their nearest frontiers have; the error of FastSLAM's map "
-        f"is {plain(chart.value)} times theirs."
+        f"is {plain(chart.value)} times theirs. Robots that weigh what frontiers show, but do not "
+        f"share them out, have seen {plain(gain.value, 3)} times the area of the coordinated ones."
     )
