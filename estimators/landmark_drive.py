@@ -10,12 +10,14 @@ from __future__ import annotations
 import functools
 import itertools
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
 from estimators.base import Estimate
 from estimators.gaussian import Gaussian, compose, wrap
-from estimators.least_squares import Problem, Robust, solve
+from estimators.least_squares import PoseSightings, Problem, Robust, Solution, solve
+from estimators.sightings import Sightings
 from estimators.slam_frontend import screened
 from estimators.stereo import StereoModel
 from sim.arrays import Array, Ints
@@ -24,6 +26,8 @@ from sim.recording import Frame
 
 # What a motion and a start pose are uncertain by at least, so that both can be inverted
 _LEAST_SIGMA_M, _LEAST_SIGMA_RAD = 1e-5, 1e-5
+# Robot and row of the Frame that sees, those that are seen, and the point (3,) in the camera
+Sighted = tuple[tuple[int, int], tuple[int, int], Array]
 FLOOR = np.diag(np.square([_LEAST_SIGMA_M, _LEAST_SIGMA_M, _LEAST_SIGMA_RAD]))
 
 
@@ -46,6 +50,7 @@ class LandmarkDrive:
         self._motions: list[Gaussian] = []  # of each Frame since the one before
         self._images: list[tuple[int, Array, Ints]] = []
         self._ties: list[tuple[int, int, Gaussian]] = []
+        self._pinned: set[int] = set()
 
     def add(
         self, stamp: float, motion: Gaussian, guess: Array, seen: tuple[Array, Ints] | None
@@ -66,6 +71,12 @@ class LandmarkDrive:
         self._stamps.append(stamp)
         self._guesses.append(guess)
         self._motions.append(motion)
+
+    def pin(self) -> int:
+        """Make the last Frame a pose of the problem; return its row."""
+        row = len(self._stamps) - 1
+        self._pinned.add(row)
+        return row
 
     def tie(self, motion: Gaussian) -> None:
         """Add another measurement of the motion between the last two images."""
@@ -97,7 +108,13 @@ class LandmarkDrive:
             robust_sigma=robust_sigma,
             max_iterations=max_iterations,
         )
-        means, covariances = self.filled_in(solution.poses, solution.covariance)
+        return self._estimate(solution, solution.poses, solution.covariance, ids)
+
+    def _estimate(
+        self, solution: Solution, poses: Array, joint_covariance: Array, ids: Ints
+    ) -> Estimate:
+        """Estimate of this drive's solved poses; arguments as in `filled_in`."""
+        means, covariances = self.filled_in(poses, joint_covariance)
         status = "ok" if solution.converged else "not_converged"
         return Estimate(
             stamps=self.stamps,
@@ -119,7 +136,8 @@ class LandmarkDrive:
 
     def _rows(self) -> list[int]:
         """Frames that are poses of the problem."""
-        return sorted({0, *(row for row, _, _ in self._images), len(self._stamps) - 1})
+        seeing = (row for row, _, _ in self._images)
+        return sorted({0, *seeing, *self._pinned, len(self._stamps) - 1})
 
     def _guessed(self, rows: list[int]) -> Array:
         return np.array([self._guesses[row] for row in rows])
@@ -176,6 +194,74 @@ class LandmarkDrive:
     def stamps(self) -> Array:
         """(T,) s of all Frames so far."""
         return np.array(self._stamps)
+
+
+def revised_team(
+    drives: Sequence[LandmarkDrive],
+    camera: Sightings | None,
+    sighted: Sequence[Sighted],
+    robust: Robust,
+    robust_sigma: float,
+    max_iterations: int,
+) -> list[Estimate]:
+    """Least squares over the drives of a team in one map: the estimate of each robot.
+
+    `camera` is what sees the robots; the Frames of `sighted` are pinned. Other arguments and errors
+    are those of `LandmarkDrive.revised`.
+    """
+    if len(drives) == 1:
+        return [drives[0].revised(robust, robust_sigma, max_iterations)]
+    rows = [drive._rows() for drive in drives]
+    parts, ids_of = zip(*map(LandmarkDrive._problem, drives, rows), strict=True)
+    seen = [ids[part.landmark_rows] for part, ids in zip(parts, ids_of, strict=True)]
+    ids, landmark_rows = np.unique(np.concatenate(seen), return_inverse=True)
+    # pose 0 is the origin of the map, to which the starts are tied
+    ends = 1 + np.cumsum([0, *map(len, rows)])
+    begins, own = ends[:-1], list(zip(parts, ends, strict=False))
+    pose_of = {
+        (robot, row): begins[robot] + pose
+        for robot, each in enumerate(rows)
+        for pose, row in enumerate(each)
+    }
+    sightings = None
+    if camera is not None and sighted:
+        sightings = PoseSightings(
+            camera.camera,
+            camera.marker_z_m,
+            np.array([pose_of[seeing] for seeing, _, _ in sighted], np.int64),
+            np.array([pose_of[seen_] for _, seen_, _ in sighted], np.int64),
+            np.array([point for _, _, point in sighted]),
+        )
+    starts = [np.array([part.prior_mean for part in parts])]
+    start_covariances = [np.array([part.prior_covariance for part in parts])]
+    problem = Problem(
+        prior_mean=np.zeros(3),
+        prior_covariance=FLOOR,
+        first=np.concatenate([0 * begins, *(part.first + at for part, at in own)]),
+        second=np.concatenate([begins, *(part.second + at for part, at in own)]),
+        motions=np.concatenate(starts + [part.motions for part in parts]),
+        motion_covariances=np.concatenate(
+            start_covariances + [part.motion_covariances for part in parts]
+        ),
+        camera=parts[0].camera,
+        pose_rows=np.concatenate([part.pose_rows + at for part, at in own]),
+        landmark_rows=landmark_rows.astype(np.int64),
+        points_in_camera=np.concatenate([part.points_in_camera for part in parts]),
+        sightings=sightings,
+    )
+    guesses = [drive._guessed(each) for drive, each in zip(drives, rows, strict=True)]
+    solution = solve(
+        problem,
+        np.concatenate([np.zeros((1, 3)), *guesses]),
+        robust=robust,
+        robust_sigma=robust_sigma,
+        max_iterations=max_iterations,
+    )
+    estimates = []
+    for drive, low, high in zip(drives, begins, ends[1:], strict=True):
+        covariance = solution.covariance[3 * low : 3 * high, 3 * low : 3 * high]
+        estimates.append(drive._estimate(solution, solution.poses[low:high], covariance, ids))
+    return estimates
 
 
 def observed(

@@ -179,6 +179,19 @@ def new_state(n_blocks: int) -> Array:
     return np.zeros((n_blocks, _FIELDS * LANES))
 
 
+def known_landmark(poses: Array, z_m: float) -> Array:
+    """Maps (1, blocks, 9 * LANES) of a landmark that stands where poses (5, lanes) are."""
+    data = np.zeros((1, poses.shape[1] // LANES, _NUMBERS, LANES))
+    data[0, :, 0], data[0, :, 1] = poses[:2].reshape(2, -1, LANES)
+    data[0, :, 2] = z_m
+    return data.reshape(1, -1, _NUMBERS * LANES)
+
+
+def distances(state: Array, n_particles: int) -> Array:
+    """Sums (M,) of squared Mahalanobis distances of a group of observations."""
+    return state[:, _DISTANCE : _DISTANCE + LANES].reshape(-1)[:n_particles]
+
+
 def summed(state: Array, n_particles: int) -> Array:
     """Log weights (M,) that a group of observations gave, eq. (13), but for `log_scale`."""
     distances, determinants, depths = (

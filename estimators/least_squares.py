@@ -36,6 +36,43 @@ _AT_ONCE = 50  # poses whose columns of a covariance are solved for together
 
 
 @dataclass(frozen=True)
+class PoseSightings:
+    """Poses seen from poses: robots of a team that see one another's markers.
+
+    Attributes
+    ----------
+    camera
+        What is believed of it.
+    marker_z_m
+        Height of the markers.
+    seeing_rows, seen_rows
+        (K,) who sees whom.
+    points_in_camera
+        (K, 3) m.
+    """
+
+    camera: StereoModel
+    marker_z_m: float
+    seeing_rows: Ints
+    seen_rows: Ints
+    points_in_camera: Array
+
+    def residuals(self, poses: Array, in_image: bool) -> tuple[Array, Array, Array]:
+        """Whitened residuals (K, 3), and derivatives (K, 3, 3) by the seeing and seen pose."""
+        seeing, seen = poses[self.seeing_rows], poses[self.seen_rows]
+        markers = np.column_stack([seen[:, :2], np.full(len(seen), self.marker_z_m)])
+        points = self.points_in_camera
+        off, by_seeing, by_marker = residuals_of(self.camera, seeing, markers, points, in_image)
+        whitening = (
+            camera_whitening(self.camera, seeing, markers)
+            if in_image
+            else whitening_of(self.camera.covariance(points))
+        )
+        by_seen = by_marker * np.array([1.0, 1.0, 0.0])  # its heading is not seen
+        return times(whitening, off), whitening @ by_seeing, whitening @ by_seen
+
+
+@dataclass(frozen=True)
 class Problem:
     """A first pose, relative poses, and stereo observations of landmarks.
 
@@ -57,6 +94,8 @@ class Problem:
     doubtful
         (F,) relative poses that may be wrong, such as closures of loops: they are under the
         robust loss, as all observations are. None: no relative pose is.
+    sightings
+        Poses seen from poses; under the robust loss too.
     """
 
     prior_mean: Array
@@ -70,6 +109,7 @@ class Problem:
     landmark_rows: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
     points_in_camera: Array = field(default_factory=lambda: np.zeros((0, 3)))
     doubtful: NDArray[np.bool_] | None = None
+    sightings: PoseSightings | None = None
 
 
 @dataclass(frozen=True)
@@ -357,6 +397,9 @@ class _Residuals:
         start, motion = self._of_motions(poses)
         seen = times(whitening, self._of_image(poses, landmarks, in_image)[0])
         loss, _ = self._loss(np.sum(seen**2, axis=1))
+        if self.problem.sightings is not None:
+            sighted = self.problem.sightings.residuals(poses, in_image)[0]
+            loss = np.append(loss, self._loss(np.sum(sighted**2, axis=1))[0])
         return self._cost(start, motion, loss)
 
     def _cost(self, start: Array, motion: Array, loss: Array) -> float:
@@ -399,6 +442,16 @@ class _Residuals:
         of_pose, of_landmark = transposed(by_pose), transposed(by_landmark)
         blocks.add(p.pose_rows, p.pose_rows, of_pose @ by_pose)
         np.add.at(g, p.pose_rows, times(of_pose, seen))
+        if p.sightings is not None:
+            sighted, *sides = p.sightings.residuals(poses, in_image)
+            lost, weight = self._loss(np.sum(sighted**2, axis=1))
+            loss = np.append(loss, lost)
+            both = list(zip((p.sightings.seeing_rows, p.sightings.seen_rows), sides, strict=True))
+            for rows, by_side in both:
+                pulled = weight[:, None, None] * transposed(by_side)
+                np.add.at(g, rows, times(pulled, sighted))
+                for columns, by_other in both:
+                    blocks.add(rows, columns, pulled @ by_other)
         V = np.tile(LEAST_INFORMATION * np.eye(3), (n_landmarks, 1, 1))
         h = np.zeros((n_landmarks, 3))
         np.add.at(V, p.landmark_rows, of_landmark @ by_landmark)

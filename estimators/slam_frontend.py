@@ -27,7 +27,7 @@ from estimators.options import (
 from estimators.stereo import NoiseAt, NoiseModel, StereoModel
 from sim.arrays import Array, Floats, Ints
 from sim.errors import require
-from sim.sensors import Reading
+from sim.recording import Frame
 
 Association = Literal["known", "mahalanobis", "descriptor"]
 
@@ -117,8 +117,9 @@ class SlamFrontEnd:
         enters the map only when two sightings in a row agree: a misread id is neither an update nor
         a landmark. None: every id is believed.
     repeat_s
-        Under known association, a landmark counts at most once in this time: errors of the sensor
-        that last longer than an image would count again as if they were independent. 0: always.
+        Under known association, a landmark counts at most once in this time for each robot: errors
+        of a sensor that last longer than an image would count again as if they were independent. 0:
+        always.
     sigmas
         Believed noise, by the camera's attribute; None for the prior's camera's own.
 
@@ -193,11 +194,12 @@ class SlamFrontEnd:
         self._descriptors = np.zeros((0, 0), np.float32)  # of each landmark's first observation
         self._n_observations, self._n_blind = 0, 0
         self._tentative: dict[int, Array] = {}  # by id, where a first sighting places it in map
-        self._last_s: dict[int, float] = {}  # by id, when it counted last
+        self._last_s: dict[tuple[int, int], float] = {}  # by robot and id, when it counted last
         return start
 
-    def read(self, seen: Reading, stamp_s: float) -> Image:
-        """Return the observations of an image that can be used; of duplicate ids the first."""
+    def read(self, frame: Frame) -> Image:
+        """Observations of a Frame's image that can be used; of duplicate ids the first."""
+        seen = frame.readings[self._stereo]
         all_points, all_ids = seen["points_in_camera"], seen.get("ids")
         known = self.association == "known"
         used, status = screened(self.camera, all_points, all_ids if known else None)
@@ -214,17 +216,17 @@ class SlamFrontEnd:
         ids = None if all_ids is None else all_ids[used]
         points = np.ascontiguousarray(all_points[used])
         image = Image(points, numbers, ids, seen["descriptors"][used], used, status)
-        return self._without_repeats(image, stamp_s) if self._repeat_s > 0.0 else image
+        return self._without_repeats(image, frame) if self._repeat_s > 0.0 else image
 
-    def _without_repeats(self, image: Image, stamp_s: float) -> Image:
-        """Leave out landmarks that counted less than `repeat_s` ago."""
-        last = np.array([self._last_s.get(i, -math.inf) for i in _listed(image)])
-        return image.of(stamp_s - last >= self._repeat_s)
+    def _without_repeats(self, image: Image, frame: Frame) -> Image:
+        """Leave out landmarks that the robot counted less than `repeat_s` ago."""
+        last = [self._last_s.get((frame.robot, i), -math.inf) for i in _listed(image)]
+        return image.of(frame.stamp - np.array(last) >= self._repeat_s)
 
-    def counted(self, image: Image, stamp_s: float) -> None:
-        """Note when the landmarks of an image counted."""
+    def counted(self, image: Image, frame: Frame) -> None:
+        """Note when the landmarks of a Frame's image counted."""
         if self._repeat_s > 0.0:
-            self._last_s |= dict.fromkeys(_listed(image), stamp_s)
+            self._last_s |= {(frame.robot, i): frame.stamp for i in _listed(image)}
 
     def passed(
         self, image: Image, landmarks: Ints, distances: Array, pose: Array

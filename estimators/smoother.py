@@ -4,10 +4,18 @@ Poses, odometry increments and stereo landmarks with known ids make one non-line
 problem, which `estimators.least_squares` solves.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from estimators.base import Belief, Estimate, Prior
-from estimators.landmark_drive import LandmarkDrive, loosened, observed
+from estimators.landmark_drive import (
+    LandmarkDrive,
+    Sighted,
+    loosened,
+    observed,
+    revised_team,
+)
 from estimators.least_squares import Problem, Robust
 from estimators.options import (
     require_choices,
@@ -16,9 +24,11 @@ from estimators.options import (
     require_stereo,
     start_pose,
 )
+from estimators.sightings import Sightings, dead_reckoning
 from estimators.stereo import StereoModel
 from estimators.wheels import WheelPrediction
 from sim.arrays import Array
+from sim.errors import require
 from sim.recording import Frame
 
 
@@ -38,6 +48,9 @@ class Smoother:
         Most steps of each of the two stages.
     window_s
         |ds| is netted over at least this time.
+    robots
+        Name of the sensor that sees the other robots of a team, with ids; None: sightings are not
+        used.
 
     Notes
     -----
@@ -64,8 +77,9 @@ class Smoother:
         max_iterations: int = 100,
         window_s: float = 0.05,
         stereo: str = "stereo",
+        robots: str | None = None,
     ) -> None:
-        self.stereo = stereo
+        self.stereo, self.robots = stereo, robots
         self.wheels = WheelPrediction(kr, kl, window_s)
         require_choices(robust=(robust, Robust))
         require_positive(robust_sigma=robust_sigma)
@@ -74,24 +88,56 @@ class Smoother:
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Start from the prior's pose, with nothing seen."""
-        self._camera = StereoModel.of(require_stereo(prior, self.stereo, "smoother"))
-        self._belief = start_pose(prior, "smoother")
-        self.wheels.reset(prior.robot.track_m)
-        self._drive = LandmarkDrive(self._camera, self._belief)
+        self.reset_team((prior,), rng)
+
+    def reset_team(self, priors: Sequence[Prior], rng: np.random.Generator) -> None:
+        """Start a team from the priors of its robots, whose starts are known."""
+        self._camera = StereoModel.of(require_stereo(priors[0], self.stereo, "smoother"))
+        self._sightings = Sightings.of(priors, self.robots, "camera", "predicted", "smoother")
+        self._beliefs = [start_pose(prior, "smoother") for prior in priors]
+        self._wheels = dead_reckoning(self.wheels, priors)
+        self._drives = [LandmarkDrive(self._camera, start) for start in self._beliefs]
+        self._sighted: list[Sighted] = []
 
     def step(self, frame: Frame) -> Belief:
         """Keep what the Frame shows; the belief is dead reckoning alone."""
-        motion = self.wheels.predict(frame)
-        self._belief = self._belief.then(motion)
-        seen, status = observed(frame, self.stereo, self._camera, "smoother")
-        self._drive.add(frame.stamp, loosened(motion), self._belief.mean, seen)
-        extras = {"status": status} if status else {}
-        return Belief(self._belief.mean.copy(), self._belief.covariance.copy(), extras)
+        return self.step_team((frame,))[0]
+
+    def step_team(self, frames: Sequence[Frame]) -> list[Belief]:
+        """Keep what the Frames of an instant show; the beliefs are dead reckoning alone."""
+        beliefs = []
+        for frame in frames:
+            robot, motion = frame.robot, self._wheels[frame.robot].predict(frame)
+            belief = self._beliefs[robot] = self._beliefs[robot].then(motion)
+            seen, status = observed(frame, self.stereo, self._camera, "smoother")
+            self._drives[robot].add(frame.stamp, loosened(motion), belief.mean, seen)
+            extras = {"status": status} if status else {}
+            beliefs.append(Belief(belief.mean.copy(), belief.covariance.copy(), extras))
+        if self._sightings is not None:
+            for frame in frames:
+                self._sight(self._sightings, frame, {f.robot for f in frames} - {frame.robot})
+        return beliefs
+
+    def _sight(self, sightings: Sightings, frame: Frame, others: set[int]) -> None:
+        points, numbers = sightings.read(frame)
+        complaint = "smoother: sightings without ids; set sensors.robots.identifies=true"
+        require(numbers is not None or len(points) == 0, complaint)
+        for point, number in zip(points, () if numbers is None else numbers.tolist(), strict=False):
+            if number in others:
+                seeing, seen = (
+                    (robot, self._drives[robot].pin()) for robot in (frame.robot, number)
+                )
+                self._sighted.append((seeing, seen, point))
 
     def finish(self) -> Estimate:
         """Least squares over all Frames so far: `LandmarkDrive.revised`."""
-        return self._drive.revised(self.robust, self.robust_sigma, self.max_iterations)
+        return self.finish_team()[0]
+
+    def finish_team(self) -> list[Estimate]:
+        """Least squares over all Frames of a team: the path of each robot."""
+        options = self.robust, self.robust_sigma, self.max_iterations
+        return revised_team(self._drives, self._sightings, self._sighted, *options)
 
     def problem(self) -> tuple[Problem, Array]:
         """The least-squares problem over all Frames so far, and poses (T, 3) to start from."""
-        return self._drive.problem()
+        return self._drives[0].problem()

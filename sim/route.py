@@ -151,17 +151,46 @@ class Tour:
 
     def start(self, world: World, robot: DifferentialDrive) -> tuple[Array, Pursuit]:
         """Start pose (3,) on the first way-point, facing the second, and the driver."""
+        path = _lengthened(self._given(world), self.distance_m)
+        return facing_second(path), Pursuit(self, robot, path)
+
+    def _given(self, world: World) -> Array:
+        """Way-points (P, 2) to follow."""
         given = world.waypoints if self.waypoints is None else np.array(self.waypoints, float)
         require(
             given.ndim == 2 and given.shape[1] == 2 and len(given) >= 2,
             f"route: world {world.name} has no tour of at least two way-points; give "
             "route.waypoints=[[x, y], ...]",
         )
-        path = _lengthened(given, self.distance_m)
-        return facing_second(path), Pursuit(self, robot, path)
+        return given
 
 
-class _Controller:
+@dataclass(frozen=True)
+class TourFrom(Tour):
+    """A Tour that goes round, from any of its way-points on: of a team, each robot has its own.
+
+    Attributes
+    ----------
+    first
+        Way-point to begin at, counted from 0 and, beyond the last, from 0 again. A tour that does
+        not end where it begins is closed by a way back.
+    backwards
+        Whether it is driven against its direction.
+    """
+
+    first: int = 0
+    backwards: bool = False
+
+    def _given(self, world: World) -> Array:
+        path = super()._given(world)
+        if np.hypot(*(path[0] - path[-1])) < 1e-6:
+            path = path[:-1]
+        path = np.roll(path, -self.first, axis=0)
+        path = np.concatenate([path, path[:1]])
+        return path[::-1] if self.backwards else path
+
+
+class Controller:
     """Driver that steers 50 times a second with limited acceleration, and rests at its goal."""
 
     def __init__(self, robot: DifferentialDrive, last_s: float) -> None:
@@ -171,6 +200,7 @@ class _Controller:
         self._velocity = np.zeros(2)
         self._rest_ticks: int | None = None
         self._last_tick, self._late = round(last_s / TICK_S), False
+        self._tick = 0
 
     def command(self, tick: int, pose: Array) -> Array | None:
         """Velocity (2,) of the tick; None when the robot has rested at its goal."""
@@ -179,7 +209,7 @@ class _Controller:
             return None if self._rest_ticks < 0 else np.zeros(2)
         if tick % CONTROL_TICKS:
             return self._velocity
-        self._late = tick >= self._last_tick
+        self._tick, self._late = tick, tick >= self._last_tick
         wanted = self._wanted(pose)
         if wanted is None:
             self._rest_ticks = 60
@@ -197,8 +227,30 @@ class _Controller:
         """Velocity (2,) to go for; None at the goal."""
         raise NotImplementedError
 
+    def _pursued(
+        self,
+        goal: Array,
+        pose: Array,
+        speed_mps: float,
+        look_ahead_m: float,
+        limit: float,
+        left_m: float,
+    ) -> Array:
+        """Velocity (2,) on the arc to a point (2,) of a path of which `left_m` are left.
 
-class Pursuit(_Controller):
+        `limit` is that of the turn rate, rad/s.
+        """
+        bearing = _bearing(goal - pose[:2], pose)
+        distance = max(float(np.hypot(*(goal - pose[:2]))), 1e-3)
+        brake = math.sqrt(2.0 * 0.8 * self._most[0] * max(left_m, 0.0))
+        if abs(bearing) > 0.6:  # too sharp for an arc: slow down and turn on the spot
+            return np.array([0.0, math.copysign(limit, bearing)])
+        v = min(speed_mps * math.cos(bearing) ** 4, brake)
+        omega = 2.0 * v * math.sin(bearing) / max(distance, 0.5 * look_ahead_m)
+        return np.array([max(v, 0.01), min(max(omega, -limit), limit)])
+
+
+class Pursuit(Controller):
     """Driver of a Tour: pure pursuit."""
 
     def __init__(self, tour: Tour, robot: DifferentialDrive, path: Array) -> None:
@@ -241,15 +293,9 @@ class Pursuit(_Controller):
         tour = self._tour
         goal_m = self._done_m + tour.look_ahead_m
         goal = np.array([np.interp(goal_m, self._along_m, way) for way in self._path.T])
-        bearing = _bearing(goal - pose[:2], pose)
-        distance = max(float(np.hypot(*(goal - pose[:2]))), 1e-3)
-        brake = math.sqrt(2.0 * 0.8 * self._most[0] * max(left_m, 0.0))
-        if abs(bearing) > 0.6:  # too sharp for an arc: slow down and turn on the spot
-            return np.array([0.0, math.copysign(tour.turn_rate_radps, bearing)])
-        v = min(tour.speed_mps * math.cos(bearing) ** 4, brake)
-        omega = 2.0 * v * math.sin(bearing) / max(distance, 0.5 * tour.look_ahead_m)
-        limit = tour.turn_rate_radps
-        return np.array([max(v, 0.01), min(max(omega, -limit), limit)])
+        return self._pursued(
+            goal, pose, tour.speed_mps, tour.look_ahead_m, tour.turn_rate_radps, left_m
+        )
 
 
 @dataclass(frozen=True)
@@ -312,7 +358,7 @@ class GoToPoints:
         return world.start_pose, GoToPoint(self, robot, transform(world.start_pose, path))
 
 
-class GoToPoint(_Controller):
+class GoToPoint(Controller):
     """Driver of GoToPoints."""
 
     def __init__(self, route: GoToPoints, robot: DifferentialDrive, path: Array) -> None:

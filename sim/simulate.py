@@ -55,7 +55,12 @@ class Body(Protocol):
 
 
 class Driver(Protocol):
-    """What commands a run, tick by tick."""
+    """What commands a run, tick by tick.
+
+    It may also have `begin(sensors, drivers)`, called once with what the robot carries and the
+    drivers of all robots of its team, and `see(pose, readings)`, called after each Frame with the
+    pose (3,) that is believed then.
+    """
 
     def command(self, tick: int, pose: Array) -> Array | None:
         """Body velocity (2,) m/s, rad/s for the tick, or None when the route is done.
@@ -172,6 +177,9 @@ def record_team(
             f"the robot overlaps a wall of world {world.name} at its start "
             f"({pose[0]:.2f}, {pose[1]:.2f}); move the start pose or the wall",
         )
+    for member, (_, driver) in zip(members, starts, strict=True):
+        if hasattr(driver, "begin"):
+            driver.begin(member.sensors, [other for _, other in starts])
     # a sensor looks at them, and must not change them
     for values in (*(pose for pose, _ in starts), *vars(world).values()):
         if isinstance(values, np.ndarray):
@@ -342,6 +350,8 @@ def _drive(
             for name, reading in shown.items():
                 logs[name].append((tick, reading))
             feedback.see(tick / TICKS_PER_S, encoder, shown)
+            if hasattr(driver, "see"):
+                driver.see(feedback.pose(tick, pose, encoder), shown)
         if wanted is None or tick % _CHECK_EVERY == 0:
             trouble = (find_trouble() if wanted is not None else None) or driver.trouble
             if trouble is not None:

@@ -23,6 +23,7 @@ from sim.recording import (
     described,
     write_arrays,
 )
+from sim.sensors import RobotCamera
 
 MOST_ROBOTS = 100
 
@@ -72,6 +73,14 @@ class Team:
                 for recording, stamps in zip(recordings, clock, strict=True)
             )
         )
+
+    def first(self, size: int) -> Team:
+        """Team of the first robots alone, without sightings of the others.
+
+        It is what they would have recorded alone if the others' bodies hid nothing from them.
+        """
+        require(1 <= size <= len(self), f"a team of {len(self)} has no first {size} robots")
+        return Team.on_one_clock([_among(recording, size) for recording in self.robots[:size]])
 
     def instants(self) -> Iterator[tuple[Frame, ...]]:
         """Walk through the instants in order: the Frames of the robots that have one then."""
@@ -128,6 +137,24 @@ def load(path: Path) -> Team:
         others = len(stored) - sum(map(len, own))
         require(others == 0, f"{others} arrays are of no robot of its team")
         return Team(tuple(map(assembled, own, parts)))
+
+
+def _among(recording: Recording, size: int) -> Recording:
+    """Recording without sightings of robots from this number on."""
+    for name, sensor in recording.sensors.items():
+        if isinstance(sensor, RobotCamera):
+            log, truth = recording.log(name), recording.known_truth
+            hidden = truth.readings[name]
+            kept = hidden["true_ids"] < size
+            log = dataclasses.replace(
+                log,
+                values={key: values[kept] for key, values in log.values.items()},
+                splits=np.concatenate([[0], np.cumsum(kept)])[log.known_splits],
+            )
+            hidden = {key: values[kept] for key, values in hidden.items()}
+            truth = dataclasses.replace(truth, readings={**truth.readings, name: hidden})
+            recording = dataclasses.replace(recording.with_log(name, log), truth=truth)
+    return recording
 
 
 def _on_one_clock(recordings: Sequence[Recording]) -> list[Array]:

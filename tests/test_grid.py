@@ -12,7 +12,6 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from estimators.base import Prior, run
-from estimators.grid_mapping import _between, map_scans
 from estimators.likelihood_field import likelihood_field
 from estimators.mcl import Mcl
 from experiments.cli import app
@@ -26,6 +25,7 @@ from sim.builders import from_grid
 from sim.errors import InputError
 from sim.grid import OccupancyGrid, of_world, rasterized
 from sim.grid_file import image_of, read_grid, write_grid
+from sim.grid_mapping import _between, map_scans
 from sim.recording import save
 from sim.sensors import Laser
 from tests.fakes import HALF_ROOM_M, circle, square_room

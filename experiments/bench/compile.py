@@ -64,10 +64,10 @@ def _others() -> None:
     """Casting, landmarks, particles, maps, calibration."""
     import numpy as np
 
-    from estimators.grid_mapping import map_scans
     from experiments.calibration.end_pose_model import EndPoseModel
     from experiments.runs.evaluate import estimates
     from experiments.runs.experiment import Experiment
+    from sim.grid_mapping import map_scans
     from sim.kinematic import run_batch
     from sim.robot import DifferentialDrive
     from sim.route import TABLE_1

@@ -13,7 +13,7 @@ from sim.files import write_text
 from sim.formats.assemble import frame_stamps
 from sim.recording import Log, Recording, WheelLog
 from sim.robot import RobotGeometry
-from sim.sensors import Laser, StereoCamera
+from sim.sensors import Laser, RobotCamera, StereoCamera
 from sim.sensors.base import Sensor
 from sim.settings import build, check_numbers
 from sim.yaml_file import read_yaml
@@ -134,7 +134,7 @@ class Calibration:
 def _believed(name: str, sensor: Sensor, belief: SensorBelief) -> Sensor:
     """Return the sensor with another mount and noise."""
     require(
-        isinstance(sensor, (Laser, StereoCamera)),
+        isinstance(sensor, (Laser, StereoCamera, RobotCamera)),
         f"calibration: {name} is a {type(sensor).__name__}; only a Laser or a StereoCamera has one",
     )
     placed = {key: getattr(belief, key) for key in ("x_m", "y_m", "yaw_rad")}

@@ -74,6 +74,11 @@ def evaluate(
         If the configuration or the recording does not fit together.
     """
     experiment.check()
+    require(
+        "team" not in experiment.config,
+        "team: a run is of one robot; `estima reproduce --paper teams` runs teams, and "
+        "experiments.runs.team from Python",
+    )
     recording = fetch() if fetch else experiment.recording()
     prior = experiment.prior(recording)
     labels = experiment.labels(recording.checksum)

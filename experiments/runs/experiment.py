@@ -413,10 +413,10 @@ class Experiment:
             rays=self.config["simulation"]["rays"],
             config={key: self.config[key] for key in SIMULATED_KEYS},
             on_progress=on_progress,
-            onboard=self._onboard,
+            onboard=self.onboard,
         )
 
-    def _onboard(
+    def onboard(
         self, world: World, robot: RobotGeometry, sensors: Sensors, start: Array
     ) -> Callable[[Frame], Array]:
         """Start the estimator that the route's feedback names; it knows the start and the map."""
@@ -519,8 +519,8 @@ class Experiment:
             sources["code"] = code_version()
         return sources
 
-    def prior(self, recording: Recording) -> Prior:
-        """Return what the estimator knows at the start.
+    def prior(self, recording: Recording, number: int = 0) -> Prior:
+        """Return what the estimator knows at the start of the robot of this number.
 
         Raises
         ------
@@ -539,7 +539,7 @@ class Experiment:
         start = np.zeros(3)
         if recording.truth is not None:
             start = _true_start(recording)
-        offset = sigma * stream(self.config["seed"], "prior").standard_normal(3)
+        offset = sigma * stream(self.config["seed"], "prior", number).standard_normal(3)
         return Prior(robot, recording.sensors, start + offset, np.diag(np.square(sigma)), known_map)
 
     def _map(self, recording: Recording) -> Any:

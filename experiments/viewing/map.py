@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 
 from estimators.base import Estimate
-from estimators.grid_mapping import map_scans
 from experiments.evaluation.time_sync import interpolate
 from experiments.runs.evaluate import estimates
 from experiments.runs.seeds import stream
@@ -16,6 +15,7 @@ from experiments.viewing.view import experiment_over, is_file_of_estimate, read_
 from sim.arrays import Array, Floats
 from sim.errors import InputError, require, required
 from sim.grid import OccupancyGrid
+from sim.grid_mapping import map_scans
 from sim.recording import Recording
 from sim.sensors import Laser
 

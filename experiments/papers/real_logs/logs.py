@@ -11,6 +11,7 @@ from estimators.icp_odometry import IcpOdometry
 from experiments.calibration.from_log import calibrate_log
 from experiments.calibration.logs import calibrate_wheels
 from experiments.papers.real_logs.settings import CALIBRATED_S, DATA, TUNED_SHARE
+from experiments.runs.calibration import Calibration
 from sim import se2
 from sim.arrays import Array
 from sim.formats import carmen, mrclam, wean
@@ -107,7 +108,12 @@ def calibrated_by_scans(recording: Recording, until_s: float) -> Recording:
 
 
 def calibrated_by_truth(recording: Recording) -> Recording:
-    """The recording calibrated on its first `CALIBRATED_S`, with the noise that its log believes.
+    """The recording with `calibration_by_truth` applied."""
+    return calibration_by_truth(recording).applied(recording)
+
+
+def calibration_by_truth(recording: Recording) -> Calibration:
+    """Calibration on the first `CALIBRATED_S`, with the noise that the log believes.
 
     What is believed of the noise was chosen on the robots that do not judge.
     """
@@ -116,7 +122,7 @@ def calibrated_by_truth(recording: Recording) -> Recording:
         name: dataclasses.replace(belief, sigma_column_px=None, sigma_disparity_px=None)
         for name, belief in found.sensors.items()
     }
-    return dataclasses.replace(found, sensors=sensors).applied(recording)
+    return dataclasses.replace(found, sensors=sensors)
 
 
 def _wheels_at(wheels: WheelLog, stamps: Array) -> Array:

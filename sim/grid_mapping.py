@@ -25,8 +25,9 @@ from sim.arrays import Array, Floats, Ints
 from sim.compiled import njit
 from sim.errors import require
 from sim.grid import OccupancyGrid, check_size
-from sim.sensors import Laser
+from sim.sensors.laser import Laser
 
+P_HIT, P_MISS = 0.8, 0.4
 _AT_ONCE = 50  # scans
 
 
@@ -37,8 +38,8 @@ def map_scans(
     *,
     resolution_m: float,
     max_range_m: float | None = None,
-    p_hit: float = 0.8,
-    p_miss: float = 0.4,
+    p_hit: float = P_HIT,
+    p_miss: float = P_MISS,
     on_progress: Callable[[int], None] | None = None,
 ) -> OccupancyGrid:
     """Build a grid from scans.
@@ -81,21 +82,101 @@ def map_scans(
     check_size(
         rows, columns, "the map", "check that the estimate has not diverged, or take larger cells"
     )
-    log_odds = np.zeros((int(rows), int(columns)), np.float32)
-    last_scan = np.zeros(log_odds.shape, np.int32)
-    hit, miss = math.log(p_hit / (1.0 - p_hit)), math.log(p_miss / (1.0 - p_miss))
-    eyes = np.column_stack([lasers[:, :2] / resolution_m - corner, lasers[:, 2]])
-    for begin in range(0, len(eyes), _AT_ONCE):
+    grid = ScanGrid(corner, (int(rows), int(columns)), resolution_m, p_hit, p_miss)
+    for begin in range(0, len(lasers), _AT_ONCE):
         part = slice(begin, begin + _AT_ONCE)
-        _add_scans(
-            log_odds, last_scan, eyes[part], ranges[part], bearings, resolution_m, most_m,
-            hit, miss, begin,
-        )  # fmt: skip
+        grid.add(lasers[part], ranges[part], bearings, most_m)
         if on_progress is not None:
-            on_progress(min(begin + _AT_ONCE, len(eyes)))
-    probability = np.where(last_scan > 0, expit(log_odds), np.float32(np.nan))
-    origin = np.array([*(corner * resolution_m), 0.0])
-    return OccupancyGrid(probability.astype(np.float32), resolution_m, origin)
+            on_progress(grid.n_scans)
+    return grid.occupancy()
+
+
+class ScanGrid:
+    """A grid to which scans are added.
+
+    Parameters
+    ----------
+    corner
+        (2,) x, y of cell (0, 0), in whole cells from the origin of map.
+    shape
+        Rows and columns.
+    resolution_m
+        Side of a cell.
+    p_hit, p_miss
+        As in `map_scans`.
+
+    Attributes
+    ----------
+    log_odds
+        (rows, columns) that a cell is occupied.
+    last_scan
+        (rows, columns) number of the last scan that touched each cell, from 1; 0 for none.
+    n_scans
+        Scans so far.
+    """
+
+    def __init__(
+        self,
+        corner: Array,
+        shape: tuple[int, int],
+        resolution_m: float,
+        p_hit: float = P_HIT,
+        p_miss: float = P_MISS,
+    ) -> None:
+        self.log_odds = np.zeros(shape, np.float32)
+        self.last_scan = np.zeros(shape, np.int32)
+        self.resolution_m, self.n_scans = resolution_m, 0
+        self._corner = corner
+        self._hit, self._miss = math.log(p_hit / (1.0 - p_hit)), math.log(p_miss / (1.0 - p_miss))
+
+    @classmethod
+    def over(cls, low: Array, high: Array, resolution_m: float) -> ScanGrid:
+        """Grid over a rectangle with the corners (2,), (2,) m.
+
+        Raises
+        ------
+        InputError
+            If it would be too large.
+        """
+        corner = np.floor(low / resolution_m)
+        columns, rows = np.ceil(high / resolution_m) - corner
+        check_size(rows, columns, "the grid", "take larger cells")
+        return cls(corner, (int(rows), int(columns)), resolution_m)
+
+    def add(self, lasers: Array, ranges_m: Floats, bearings: Array, most_m: float) -> None:
+        """Add scans; all that they touch must lie on the grid.
+
+        Parameters
+        ----------
+        lasers
+            (N, 3) poses in map.
+        ranges_m
+            (N, beams) float32; 0 for a beam that says nothing. Those beyond `most_m` clear the
+            cells up to there.
+        bearings
+            (beams,) rad.
+        """
+        eyes = np.column_stack([lasers[:, :2] / self.resolution_m - self._corner, lasers[:, 2]])
+        _add_scans(
+            self.log_odds, self.last_scan, eyes, ranges_m, bearings, self.resolution_m, most_m,
+            self._hit, self._miss, self.n_scans,
+        )  # fmt: skip
+        self.n_scans += len(eyes)
+
+    def cells(self, points: Array) -> Ints:
+        """Cells (N, 2) of points (N, 2 or more) m, by row and column."""
+        at: Ints = np.floor(points[:, 1::-1] / self.resolution_m - self._corner[::-1]).astype(int)
+        return at
+
+    def middles_m(self, cells: Ints) -> Array:
+        """Middles (N, 2) m of cells (N, 2)."""
+        return np.asarray((cells[:, ::-1] + 0.5 + self._corner) * self.resolution_m)
+
+    def occupancy(self) -> OccupancyGrid:
+        """The grid as a map; what no beam has touched is unknown."""
+        probability = np.where(self.last_scan > 0, expit(self.log_odds), np.float32(np.nan))
+        origin = np.array([*(self._corner * self.resolution_m), 0.0])
+        return OccupancyGrid(probability.astype(np.float32), self.resolution_m, origin)
 
 
 @njit()

@@ -1,0 +1,93 @@
+"""Figures of the study of teams."""
+
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+
+from experiments.evaluation.statistics import log_ratio_interval
+from experiments.papers.results import Results
+from experiments.papers.teams.claims import NAMES
+from experiments.papers.teams.settings import ALWAYS
+from experiments.viewing.plotting import plain_log, plan_axes, with_legend
+from experiments.viewing.style import BLACK, BLUE, GREEN, ORANGE, PURPLE, RED, SKY, subplots
+from experiments.viewing.world import draw_walls
+
+_COLOURS = (BLUE, ORANGE, GREEN, RED, PURPLE)
+_FILTERS = {"fastslam": (BLUE, "s"), "ekf_slam": (BLACK, "o"), "smoother": (PURPLE, "^")}
+
+
+def draw(made: Results) -> dict[str, Figure]:
+    """Draw every figure, by file name."""
+    errors = made.table("errors")
+    return {
+        "teams_drive": drive(made.arrays("drive")),
+        "teams_errors": by_size(errors),
+        "teams_links": by_link(errors),
+    }
+
+
+def drive(run: dict[str, Any]) -> Figure:
+    """Paths of the robots in one world, and lines from who sees to who is seen."""
+    page, ax = subplots(7.0, 6.5)
+    draw_walls(ax, run["walls"], run["wall_z_m"])
+    numbers = sorted(int(name.removeprefix("truth_")) for name in run if name.startswith("truth_"))
+    for number, colour in zip(numbers, _COLOURS, strict=False):
+        path = run[f"truth_{number}"]
+        ax.plot(*path.T, color=colour, lw=1.8, label=f"robot {number + 1}")
+        ax.plot(*path[0], "o", color=colour, ms=6)
+        lines = run[f"sightings_{number}"].reshape(-1, 2, 2)
+        ax.add_collection(LineCollection(list(lines), colors=colour, lw=0.5, alpha=0.5))
+    plan_axes(ax)
+    return with_legend(page, ncols=5)
+
+
+def by_size(errors: pd.DataFrame) -> Figure:
+    """Error by the number of robots with and without sightings; and the ratio of the two."""
+    page, (left, right) = subplots(11.0, 4.6, 1, 2)
+    linked = errors[errors["link"] == ALWAYS]
+    for k, (name, part) in enumerate(linked.groupby("filter", sort=False)):
+        colour, marker = _FILTERS[name]
+        wide = part.pivot_table(index=["size", "seed"], columns="sightings", values="ate_rmse_m")
+        medians = wide.groupby("size").median()
+        for seen, line, words in ((False, "--", "without"), (True, "-", "with sightings")):
+            label = f"{NAMES[name]}, {words}"
+            _line(left, medians.index, medians[seen], label, colour, marker, line)
+        ratios = {size: log_ratio_interval(w[True], w[False]) for size, w in wide.groupby("size")}
+        found = np.array([[r.value, r.low, r.high] for r in ratios.values()]).T
+        at = np.array(list(ratios)) + 0.06 * (k - 1)
+        right.plot(at, found[0], marker, color=colour, ms=6)
+        right.vlines(at, found[1], found[2], color=colour, lw=1.4)
+    right.axhline(1.0, color=SKY, lw=1.0)
+    left.set(ylabel="RMS position error of the team, m, median", yscale="log")
+    right.set(ylabel="error with sightings over without (95 %)", yscale="log")
+    for ax in (left, right):
+        ax.set_xlabel("robots in the team")
+        ax.set_xticks(sorted(errors["size"].unique()))
+        plain_log(ax.yaxis)
+    return with_legend(page, ncols=3)
+
+
+def by_link(errors: pd.DataFrame) -> Figure:
+    """Error of EKF-SLAM with sightings by the kind of communication, a dot a world."""
+    own = errors[(errors["filter"] == "ekf_slam") & errors["sightings"]]
+    size = own.loc[own["link"] != ALWAYS, "size"].iloc[0]
+    own = own[own["size"] == size]
+    page, ax = subplots(7.0, 4.2)
+    for at, (link, part) in enumerate(own.groupby("link", sort=False)):
+        values = part["ate_rmse_m"].to_numpy()
+        ax.plot(np.full(len(values), at), values, ".", color=SKY, ms=6)
+        ax.plot(at, np.median(values), "_", color=BLACK, ms=24, mew=2.0)
+        ax.annotate(str(link), (at, 0.0), (0, -8), ha="center", va="top",
+                    xycoords=("data", "axes fraction"), textcoords="offset points")  # fmt: skip
+    ax.set(ylabel=f"RMS position error of {size} robots, m", yscale="log", xlim=(-0.5, at + 0.5))
+    ax.set_xticks([])
+    plain_log(ax.yaxis)
+    return page
+
+
+def _line(ax: Axes, x: Any, y: Any, label: str, colour: str, marker: str, line: str) -> None:
+    ax.plot(x, y, line, marker=marker, color=colour, ms=4.5, lw=1.4, label=label)
