@@ -152,7 +152,7 @@ def test_an_estimator_on_board_steers_by_what_it_makes_of_the_recording():
     believed = []
 
     def spied(*arguments):
-        step = experiment._onboard(*arguments)
+        step = experiment.onboard(*arguments)
         return lambda frame: believed.append(step(frame)) or believed[-1]
 
     recording = record(
@@ -167,7 +167,7 @@ def test_an_estimator_on_board_steers_by_what_it_makes_of_the_recording():
     )
     assert recording.status == "ok"
     truth = recording.truth
-    step = experiment._onboard(truth.world, recording.robot, recording.sensors, truth.poses[0])
+    step = experiment.onboard(truth.world, recording.robot, recording.sensors, truth.poses[0])
     again = [step(frame) for frame in recording.frames()]
     np.testing.assert_array_equal(again[: len(believed)], believed)
     assert np.hypot(*(again - truth.poses)[:, :2].T).max() < 0.02

@@ -275,7 +275,7 @@ def test_gi1_holds_slam_against_odometry():
     assert headlines(judge.gi1(good, ours)) == ["reproduced", "reproduced"]
     said = conclusion("GI1", judge.gi1_sentence, judge.gi1(good, laps()))
     assert said.verdict == "reproduced"
-    assert "its error is 1 times that at the first visit, and odometry's 1.9" in said.sentence
+    assert "its error is 1.0 times that at the first visit, and odometry's 1.9" in said.sentence
 
 
 @pytest.mark.parametrize("seed", [0, 1])

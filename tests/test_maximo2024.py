@@ -59,7 +59,7 @@ def test_mx1_follows_the_errors():
     found = conclusion("MX1", claims.mx1_sentence, said)
     assert found.verdict == "reproduced"
     assert "M3 is worse than 5 times M2 in 100 % of worlds on Oxford" in found.sentence
-    assert "Of the numbers B tried there, that holds at B = 5, 10" in found.sentence
+    assert "Of the numbers B tried, that on Oxford holds at B = 5, 10" in found.sentence
     said = list(claims.mx1(weighting(10.0, 10.2, 11.0), quality(fails_from=99)))
     assert [c.verdict for c in said] == ["not_reproduced", "not_reproduced"]
     assert said[0].reason == "holds at no B of 2, 5, 10"
@@ -216,7 +216,7 @@ def test_our_own_claims_follow_their_tables():
     )
     assert [c.verdict for c in claims.mx8(trials)] == ["reproduced", "reproduced"]
     found = conclusion("MX8", claims.mx8_sentence, claims.mx8(trials))
-    assert "at least 100 % of kidnapped robots are found again" in found.sentence
+    assert "With injection 100 % of kidnapped robots are found again" in found.sentence
     quick = trials.assign(settled_at=4.0)  # found again even without injection
     assert [c.verdict for c in claims.mx8(quick)] == ["not_reproduced", "reproduced"]
     slow = trials.assign(settled_at=25.0)

@@ -24,11 +24,12 @@ from experiments.evaluation.verdict import (
     plain,
     shown,
 )
-from experiments.papers.reproduce import LOGS, PAPERS, _judgement
+from experiments.papers.reproduce import LOGS, NAMED, PAPERS, _judgement
 from experiments.papers.results import Results
 from experiments.report.claims import (
     VERDICT_COLUMNS,
     read_claims,
+    read_provenance,
     read_verdicts,
     write_claims,
     write_verdicts,
@@ -151,7 +152,7 @@ def test_damaged_verdicts_are_refused_in_one_line(tmp_path, row, wrong):
     assert "\n" not in str(refused.value)
 
 
-@pytest.fixture(scope="module", params=[*PAPERS, *LOGS])
+@pytest.fixture(scope="module", params=[*PAPERS, *LOGS, *NAMED])
 def tracked(request):
     """A paper's statistics and conclusions by the tracked tables."""
     return request.param, *_judgement(Results(RESULTS, request.param))
@@ -159,7 +160,10 @@ def tracked(request):
 
 def test_the_tracked_verdicts_are_those_of_the_tracked_tables(tracked, tmp_path):
     paper, claims, conclusions = tracked
-    origin = {"paper": paper, "profile": Profile.FULL}
+    made = read_provenance(RESULTS)
+    assert all(made[name]["profile"] == Profile.FULL for name in PAPERS)
+    profile = Profile(made.get(paper, {}).get("profile", Profile.QUICK))
+    origin = {"paper": paper, "profile": profile}
     write_claims(claims, tmp_path / "claims.csv", command="c", **origin)
     says = findings(paper)["claims"]
     write_verdicts(conclusions, tmp_path / "verdicts.csv", says=says, **origin)
