@@ -104,7 +104,7 @@ class Twin:
         return dataclasses.replace(made, sensors=self.sensors)
 
     def _log_sigma(self, name: str) -> float:
-        """Standard deviation of the logarithm of what was found of the slip."""
+        """Standard deviation of the logarithm of a slip coefficient, from its interval."""
         found = self.found.intervals[f"slip.{name}"]
         return math.log(found.high / found.low) / _SIGMAS if found.low > 0.0 else 0.0
 

@@ -31,8 +31,8 @@ class RealCamera(StereoCamera):
         Share of both variances that belongs to errors which one landmark keeps for a while, and
         the time in which these fall by a factor of e.
     detection_share, detection_s
-        Share of the landmarks in view that are seen, and the mean time until it is settled anew
-        whether one is.
+        Share of the landmarks in view that are seen, and the mean time until it is drawn
+        again whether one is.
     misread_share
         Share of those seen that are taken for another.
     min_distance_m
@@ -106,10 +106,10 @@ class DetectingEye:
         return world.descriptors if len(world.descriptors) else np.zeros((n, 0), np.float32)
 
     def _advance(self, lapse_s: float) -> None:
-        """Let time pass: first-order Gauss-Markov errors, and detections settled anew."""
+        """Let time pass: first-order Gauss-Markov errors, and detections drawn again."""
         camera, rng, n = self._camera, self._rng, len(self._found)
-        anew = rng.random(n) >= math.exp(-lapse_s / camera.detection_s)
-        self._found = np.where(anew, rng.random(n) < camera.detection_share, self._found)
+        redrawn = rng.random(n) >= math.exp(-lapse_s / camera.detection_s)
+        self._found = np.where(redrawn, rng.random(n) < camera.detection_share, self._found)
         kept = math.exp(-lapse_s / camera.lasting_s)
         fresh = rng.standard_normal((n, 2))
         self._lasting = kept * self._lasting + math.sqrt(1.0 - kept**2) * fresh
