@@ -59,6 +59,8 @@ class DifferentialDrive:
         Encoder travel of one such event, m.
     forward_slip_m
         Variance per metre of what both wheels slip together, m: their encoders gain the same error.
+    forward_slip_length_m
+        Travel over which slip of both wheels together is forgotten, m; 0: at once.
     body_length_m, body_width_m, body_height_m, mass_kg
         The body, centred over the axle.
     max_acceleration_mps2
@@ -79,6 +81,7 @@ class DifferentialDrive:
     unmodelled_slip: float = 0.0
     unmodelled_slip_m: float = 0.02
     forward_slip_m: float = 0.0
+    forward_slip_length_m: float = 0.0
     body_length_m: float = 0.18
     body_width_m: float = 0.14
     body_height_m: float = 0.10
@@ -107,6 +110,7 @@ class DifferentialDrive:
                 "unmodelled_slip",
                 "unmodelled_slip_m",
                 "forward_slip_m",
+                "forward_slip_length_m",
             ),
         )
         for name in ("nominal_wheel_radius_m", "nominal_track_m"):
@@ -129,6 +133,10 @@ class DifferentialDrive:
             not self.encoder_pulses_per_turn or not self.encoder_tick_m,
             "robot.encoder_pulses_per_turn and robot.encoder_tick_m both set the encoder's "
             "quantum; set one of them to 0",
+        )
+        require(
+            not self.forward_slip_length_m or self.forward_slip_m,
+            "robot.forward_slip_length_m has no effect without such slip; set robot.forward_slip_m",
         )
         require(
             self.gear_ratio == 1.0 or self.encoder_pulses_per_turn,

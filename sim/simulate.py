@@ -442,17 +442,30 @@ class _SlipEvents:
 
 
 class _ForwardSlip:
-    """Slip that both wheels share."""
+    """Slip that both wheels share: white over the way, or a share of the travel that lasts.
+
+    That share is an Ornstein-Uhlenbeck process of length l over the travel s, with the variance
+    q / 2l. So its error over s has the variance q (s - l (1 - exp(-s / l))): q per metre in the
+    long run.
+    """
 
     def __init__(self, robot: DifferentialDrive, rng: np.random.Generator) -> None:
-        self._variance_per_m = robot.forward_slip_m
+        self._variance_per_m, self._length_m = robot.forward_slip_m, robot.forward_slip_length_m
         self._normals = _normals(rng.spawn(1)[0])
+        if self._length_m:
+            self._spread = math.sqrt(self._variance_per_m / (2.0 * self._length_m))
+            self._share = self._spread * next(self._normals)[0]
 
     def error(self, rolling_m: tuple[float, float]) -> float:
         """Error of both encoders, m, of this tick."""
         if self._variance_per_m == 0.0:
             return 0.0
         travel_m = (abs(rolling_m[0]) + abs(rolling_m[1])) / 2.0
+        if self._length_m:
+            kept = math.exp(-travel_m / self._length_m)
+            news = self._spread * math.sqrt(1.0 - kept * kept) * next(self._normals)[0]
+            self._share = kept * self._share + news
+            return self._share * travel_m
         return float(scaled_error(travel_m, self._variance_per_m, next(self._normals)[0]))
 
 

@@ -4,11 +4,12 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy import signal
 from typer.testing import CliRunner
 
 from estimators.base import Prior
 from estimators.odometry import Odometry
-from experiments.calibration.from_log import Source, calibrate_log
+from experiments.calibration.from_log import BLOCK_S, Source, _slip, calibrate_log
 from experiments.cli import app
 from experiments.evaluation.metrics import position_errors_m
 from experiments.runs.calibration import read_calibration, write_calibration
@@ -145,6 +146,31 @@ def test_the_laser_is_calibrated_by_its_scans():
     assert wheels.delay_s == pytest.approx(DELAY_S, abs=0.04)
     assert (laser.x_m, laser.y_m) == pytest.approx((0.1, 0.0), abs=0.02)
     assert laser.sigma_range_m == pytest.approx(0.02, rel=0.3)
+
+
+@pytest.mark.parametrize("length_m", [0.0, 0.1, 0.3])
+def test_how_long_forward_slip_lasts_is_found(length_m):
+    """Of 400 blocks of 0.26 m. White slip has no length; slip that lasts is more than they say."""
+    rng, n, fine = np.random.default_rng(3), 400, 100
+    step_m = 0.26 / fine
+    errors = np.sqrt(5e-3 * step_m) * rng.standard_normal(n * fine)
+    if length_m:
+        kept = np.exp(-step_m / length_m)
+        errors = signal.lfilter([(1.0 - kept)], [1.0, -kept], errors)
+    forward = errors.reshape(n, fine).sum(axis=1)
+    path = rng.uniform(0.2, 0.32, (n, 2))
+    off = np.sqrt(3e-4 * path.sum(axis=1)) * rng.standard_normal(n)
+    forward += np.sqrt(3e-4 * 0.52) / 2.0 * rng.standard_normal(n)
+    slip, _ = _slip(BLOCK_S * np.arange(n), off, forward, path, rng)
+    assert slip.kr == slip.kl == pytest.approx(3e-4, rel=0.2)
+    assert slip.forward_slip_m == pytest.approx(5e-3, rel=0.3)
+    if length_m:
+        assert slip.forward_slip_length_m == pytest.approx(length_m, rel=0.4)
+        assert np.mean(forward**2) < 0.9 * slip.forward_slip_m * 0.26
+    else:
+        assert slip.forward_slip_length_m == 0.0
+    gaps = 2.0 * BLOCK_S * np.arange(n)  # no block follows another
+    assert _slip(gaps, off, forward, path, rng)[0].forward_slip_length_m == 0.0
 
 
 def test_file_round_trip_and_its_errors(tmp_path, found):

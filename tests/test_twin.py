@@ -244,6 +244,24 @@ def test_forward_slip_moves_both_encoders_alike():
     assert np.mean(off[:, 0] ** 2) / np.mean(path) == pytest.approx(1e-3, rel=0.4)
 
 
+@pytest.mark.parametrize("seed", [0, 1])
+def test_forward_slip_that_lasts_has_the_variance_of_its_formula(seed):
+    """The variance q (s - l (1 - exp(-s / l))) of the error over s, and white slip's is far off."""
+    drive = "world=empty sensors=encoder sensors.encoder.rate_hz=20 simulation.physics=kinematic"
+    slip = "robot.kr=0 robot.kl=0 robot.forward_slip_m=1e-3 robot.forward_slip_length_m=0.5"
+    route = f"route=open_loop route.segments=[[0.5,0.0,1500.0]] seed={seed}"
+    made = Experiment.compose([*drive.split(), *slip.split(), *route.split()]).simulate()
+    error = made.wheels.position_m[:, 0] - made.truth.wheel_travel_m[:, 0]
+    for steps in (4, 20, 80):
+        path = 0.025 * steps
+        law = 1e-3 * (path - 0.5 * (1.0 - np.exp(-path / 0.5)))
+        found = np.mean((error[steps:] - error[:-steps]) ** 2)
+        assert found == pytest.approx(law, rel=0.25)
+        assert found < 0.9 * 1e-3 * path
+    with pytest.raises(InputError, match=r"set robot\.forward_slip_m"):
+        DifferentialDrive(0.05, 0.2, forward_slip_length_m=0.1)
+
+
 def test_the_walls_of_a_laser_log_are_driven_through_nowhere(tmp_path):
     """A twin of scans in a room: the error of its dead reckoning is of the log's size."""
     drive = (

@@ -37,6 +37,7 @@ LARGEST_DELAY_S, _DELAY_STEP_S = 1.0, 0.01
 _N_PARTS = 8  # of the log, for the spread of a delay
 _FEWEST_BLOCKS = 10
 _RESAMPLES = 200
+_MOST_LASTING = 10.0  # blocks; slip that lasts longer is a gain
 _NO_SLIP_M = 1e-12  # kr or kl that is at its bound of zero
 _OUTLIER = 6.0  # in robust standard deviations
 _LONGEST_GAP_S = 1.0  # of the truth
@@ -156,7 +157,7 @@ def calibrate_against(reference: Reference, part: Recording) -> Found:
     rolled = blocks.rolled_m * geometry[:2]
     turn = blocks.turn_rad - (rolled[:, 0] - rolled[:, 1]) / geometry[2]
     forward = blocks.forward_m - rolled.mean(axis=1)
-    slip, slip_intervals = _slip(turn * geometry[2], forward, path, rng)
+    slip, slip_intervals = _slip(blocks.stamps, turn * geometry[2], forward, path, rng)
     intervals = {
         "wheels.gain_right": right,
         "wheels.gain_left": left_one,
@@ -423,36 +424,70 @@ def _robust_fit(rows: Array, values: Array) -> Array:
 
 
 def _slip(
-    off_m: Array, forward_m: Array, path_m: Array, rng: np.random.Generator
+    stamps: Array, off_m: Array, forward_m: Array, path_m: Array, rng: np.random.Generator
 ) -> tuple[Slip, dict[str, Interval]]:
     """kr, kl by the turns of blocks, times the track, and the forward slip that they leave.
 
     Both get what they have in common unless the log tells them apart: blocks in which both wheels
-    roll alike say nothing of either, and a kr of zero would be believed.
+    roll alike say nothing of either, and a kr of zero would be believed. Forward slip lasts if the
+    errors of a block and the next are alike.
     """
+    travel_m = path_m.mean(axis=1)
+    joined = np.append(np.diff(stamps) < 1.5 * BLOCK_S, False)
+    product = np.where(joined, forward_m * np.roll(forward_m, -1), 0.0)
 
     def law(rows: Ints, together: bool = False) -> Array:
         kr, kl = slip_law(off_m[rows] ** 2, path_m[rows])
         if together:
             kr = kl = np.sum(off_m[rows] ** 2) / np.sum(path_m[rows])
-        explained = path_m[rows] @ [kr, kl] / 4.0
-        more = np.sum(forward_m[rows] ** 2 - explained) / np.sum(path_m[rows].mean(axis=1))
-        return np.array([kr, kl, max(more, 0.0)])
+        more = forward_m[rows] ** 2 - path_m[rows] @ [kr, kl] / 4.0
+        variance = max(float(np.mean(more)), 0.0)
+        follows = rows[joined[rows]]
+        alike = np.mean(product[follows]) / variance if variance and len(follows) else 0.0
+        return np.array([kr, kl, variance / np.mean(travel_m[rows]), alike])
 
     n = len(path_m)
+    every = np.arange(n)
     picks = rng.integers(n, size=(_RESAMPLES, n))
     apart = np.array([law(pick) for pick in picks])
     difference = np.quantile(apart[:, 0] - apart[:, 1], [0.025, 0.975])
-    none_at_zero = float(law(np.arange(n))[:2].min()) > _NO_SLIP_M
+    none_at_zero = float(law(every)[:2].min()) > _NO_SLIP_M
     together = bool(difference[0] <= 0.0 <= difference[1]) or not none_at_zero
     spread = np.array([law(pick, True) for pick in picks]) if together else apart
-    low, high = np.quantile(spread, [0.025, 0.975], axis=0)
-    values = law(np.arange(n), together)
+    lasts = float(np.quantile(spread[:, 3], 0.025)) > 0.0
+    block_m = float(np.mean(travel_m))
+
+    def named(values: Array) -> Array:
+        """kr, kl, forward slip per metre in the long run, and its length, m."""
+        lengths = lasting_blocks(values[3]) if lasts else 0.0
+        share = 1.0 - lengths * (1.0 - math.exp(-1.0 / lengths)) if lengths else 1.0
+        return np.array([*values[:2], values[2] / share, lengths * block_m])
+
+    low, high = np.quantile([named(values) for values in spread], [0.025, 0.975], axis=0)
+    values = named(law(every, together))
+    names = ("kr", "kl", "forward_slip_m", "forward_slip_length_m")
     found = {
         f"slip.{name}": Interval(float(v), float(a), float(b))
-        for name, v, a, b in zip(("kr", "kl", "forward_slip_m"), values, low, high, strict=True)
+        for name, v, a, b in zip(names, values, low, high, strict=True)
     }
     return Slip(*map(float, values)), found
+
+
+def lasting_blocks(alike: float) -> float:
+    """Length, in blocks, of an Ornstein-Uhlenbeck process from its integrals over blocks.
+
+    Integrals over a block and the next correlate by (1 - e)^2 / (2 (a - 1 + e)), with e = exp(-a)
+    and the length 1 / a blocks. At most `_MOST_LASTING` blocks.
+    """
+
+    def off(a: float) -> float:
+        e = math.exp(-a)
+        return (1.0 - e) ** 2 / (2.0 * (a - 1.0 + e)) - alike
+
+    least, most = 1.0 / _MOST_LASTING, 1e3
+    if off(most) >= 0.0:
+        return 0.0
+    return 1.0 / float(optimize.brentq(off, least, most)) if off(least) > 0.0 else _MOST_LASTING
 
 
 def _camera(

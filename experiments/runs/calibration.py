@@ -47,14 +47,15 @@ class Wheels:
 
 @dataclass(frozen=True)
 class Slip:
-    """Variance per metre of each wheel, m, and of what both wheels slip together."""
+    """Variance per metre of each wheel, m, and of what both slip together, which may last, m."""
 
     kr: float
     kl: float
     forward_slip_m: float
+    forward_slip_length_m: float = 0.0
 
     def __post_init__(self) -> None:
-        check_numbers("slip", self, (), ("kr", "kl", "forward_slip_m"))
+        check_numbers("slip", self, (), ("kr", "kl", "forward_slip_m", "forward_slip_length_m"))
 
 
 @dataclass(frozen=True)

@@ -157,6 +157,7 @@ def make_twin(log: Recording, split_s: float | None = None) -> Twin:
         kr=calibration.slip.kr,
         kl=calibration.slip.kl,
         forward_slip_m=calibration.slip.forward_slip_m,
+        forward_slip_length_m=calibration.slip.forward_slip_length_m,
     )
     landmarks, grid = np.zeros((0, 3)), None
     if isinstance(sensor, Laser):
