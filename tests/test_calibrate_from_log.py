@@ -148,6 +148,20 @@ def test_the_laser_is_calibrated_by_its_scans():
     assert laser.sigma_range_m == pytest.approx(0.02, rel=0.3)
 
 
+def test_wheels_are_calibrated_by_landmarks_of_unknown_places():
+    """In the camera's metres, which are too long by its scale; online answers add some per cent."""
+    found = calibrate_log(log_of(100.0, 2, "stereo", with_truth=False))
+    wheels = found.calibration.wheels
+    assert found.source is Source.LANDMARKS
+    gains = np.array([wheels.gain_right, wheels.gain_left])
+    assert gains == pytest.approx(SCALE * GAINS, rel=0.07)
+    assert gains[0] / gains[1] == pytest.approx(GAINS[0] / GAINS[1], rel=0.01)
+    assert wheels.track_m == pytest.approx(SCALE * TRACK_M, rel=0.07)
+    assert wheels.delay_s == pytest.approx(DELAY_S, abs=0.06)
+    assert found.calibration.slip.kr == pytest.approx(K_M, rel=0.6)
+    assert not found.calibration.sensors
+
+
 @pytest.mark.parametrize("length_m", [0.0, 0.1, 0.3])
 def test_how_long_forward_slip_lasts_is_found(length_m):
     """Of 400 blocks of 0.26 m. White slip has no length; slip that lasts is more than they say."""

@@ -1,8 +1,8 @@
 """A real robot's calibration from one of its logs: wheels, delays, slip, and the sensor's noise.
 
 The wheels are compared with a reference of the robot's motion: the log's truth if it has one, else
-the registrations of its scans, else the landmarks that it saw (least squares over all of them, with
-wheels that count for little). What is found against scans or landmarks is in their metres.
+the registrations of its scans, else the landmarks that it saw (EKF-SLAM, with wheels that count for
+little). What is found against scans or landmarks is in their metres.
 """
 
 import dataclasses
@@ -18,9 +18,9 @@ from scipy import optimize
 
 from estimators.base import Prior
 from estimators.base import run as run_estimator
+from estimators.ekf_slam import EkfSlam
 from estimators.icp_odometry import IcpOdometry
 from estimators.scan_matching import FAILED
-from estimators.smoother import Smoother
 from experiments.calibration.logs import calibrate_wheels, slip_law
 from experiments.evaluation.statistics import Interval, mean_interval, share_interval
 from experiments.runs.calibration import Calibration, SensorBelief, Slip, Wheels
@@ -255,9 +255,9 @@ def reference_of(recording: Recording) -> Reference:
     )
     name, _ = _of_kind(recording, StereoCamera)
     prior = Prior(recording.robot, recording.sensors, np.zeros(3), _START)
-    batch = Smoother(kr=1e-2, kl=1e-2, robust="cauchy", stereo=name)
-    run_estimator(batch, recording, prior, np.random.default_rng(0))
-    found = batch.finish()
+    # online, and gated: a batch that starts from wrong wheels and misread landmarks ends anywhere
+    mapper = EkfSlam(kr=3e-3, kl=3e-3, errors="invariant", gate_probability=1e-6, stereo=name)
+    found = run_estimator(mapper, recording, prior, np.random.default_rng(0))
     rows = np.flatnonzero(np.isin(found.stamps, recording.log(name).stamps))
     stamps = found.stamps[rows]
     return Reference(
