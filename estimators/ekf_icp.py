@@ -67,6 +67,10 @@ class EkfIcp:
     gate_probability
         Reject a registration if only this share of all should have a larger innovation; None to
         use all. The default rejects only what must be a wrong match.
+    slip_burst_m
+        What a wheel may slip at once, as a standard deviation: then a registration outside the gate
+        that did not fail is explained by slip since the last scan, which neither kr nor kl
+        describes. 0: it is left out.
     shared_noise
         Share of a registration's covariance that comes from the scans' own errors, half from
         each; 0: registrations are independent. Registrations before and after a key frame then
@@ -82,7 +86,8 @@ class EkfIcp:
     are left to the wheels.
 
     Belief extras: `registration_covariance` (3, 3) of T_reference_base, `registration_status`,
-    `nis` (normalised innovation squared) with `nis_dof`, and `status` if a scan was not used.
+    `nis` (normalised innovation squared) with `nis_dof`, `slip_burst` if one was assumed, and
+    `status` if a scan was not used.
     """
 
     needs = frozenset({"laser"})
@@ -101,6 +106,7 @@ class EkfIcp:
         lateral_slip_m: float = 1e-7,
         encoder_tick_m: float = 0.0,
         gate_probability: float | None = 1e-9,
+        slip_burst_m: float = 0.0,
         shared_noise: float = 0.75,
         window_s: float = 0.05,
         laser: str = "laser",
@@ -119,6 +125,7 @@ class EkfIcp:
         require_non_negative(
             keyframe_distance_m=keyframe_distance_m,
             keyframe_turn_rad=keyframe_turn_rad,
+            slip_burst_m=slip_burst_m,
             register_distance_m=register_distance_m,
             register_turn_rad=register_turn_rad,
         )
@@ -133,6 +140,12 @@ class EkfIcp:
             "estimator.gate_probability must lie between 0 and 1 or be null, "
             f"got {gate_probability}",
         )
+        require(
+            not slip_burst_m or gate_probability is not None,
+            "estimator.slip_burst_m is for registrations outside the gate; "
+            "set estimator.gate_probability",
+        )
+        self.slip_burst_m = slip_burst_m
         self.keyframe_distance_m, self.keyframe_turn_rad = keyframe_distance_m, keyframe_turn_rad
         self.register_distance_m, self.register_turn_rad = register_distance_m, register_turn_rad
         self.gate_probability, self.shared_noise = gate_probability, shared_noise
@@ -197,6 +210,7 @@ class EkfIcp:
         references = [(_KEY, self._key)]
         if self._last is not self._key:
             references.append((_LAST, self._last))
+        outside: tuple[Match, slice, PreparedScan] | None = None
         for place, reference in references:
             found = self._matcher.match(
                 scan, reference, self._expected(place)[0], self._laser, self._rng
@@ -207,19 +221,28 @@ class EkfIcp:
             if place is _KEY:
                 found = self._as_before(found)
             if self._take_in(found, place, extras):
-                self._failures = 0
-                left_key = moved_beyond(
-                    found.motion.mean, self.keyframe_distance_m, self.keyframe_turn_rad
-                )
-                key, source = (scan, _NEW) if left_key else (reference, place)
-                self._keep(key, scan, (source, _NEW))
+                self._go_on(scan, found, place, reference)
                 return
             extras["registration_status"] = "gated"
+            outside = found, place, reference
+        if outside is not None and self._take_in_after_burst(*outside[:2], extras):
+            extras["registration_status"] = outside[0].status
+            self._go_on(scan, *outside)
+            return
         extras["status"] = extras["registration_status"]
         self._insert(self._own_noise(scan))
         self._failures += 1
         lost = self._failures >= _PATIENCE
         self._keep(scan if lost else self._key, scan, (_NEW if lost else _KEY, _NEW))
+
+    def _go_on(
+        self, scan: PreparedScan, found: Match, place: slice, reference: PreparedScan
+    ) -> None:
+        """Keep the reference as key frame, or take the scan, which was registered, for it."""
+        self._failures = 0
+        left_key = moved_beyond(found.motion.mean, self.keyframe_distance_m, self.keyframe_turn_rad)
+        key, source = (scan, _NEW) if left_key else (reference, place)
+        self._keep(key, scan, (source, _NEW))
 
     def _expected(self, place: slice) -> tuple[Gaussian, Array]:
         """Pose relative to a clone's, with its covariance; its derivative (3, 3) by the twists.
@@ -259,6 +282,21 @@ class EkfIcp:
         for part in (_KEY, _LAST, _POSE, _NEW):
             self._mean[part] = _moved(self._mean[part], twists[part])
         return True
+
+    def _take_in_after_burst(self, found: Match, place: slice, extras: dict[str, Any]) -> bool:
+        """Take a registration in as `_take_in` does, if the wheels slipped since the last scan."""
+        if not self.slip_burst_m or found.status != "ok":
+            return False
+        turn_rad = 2.0 * self.slip_burst_m / self.wheels.track_m
+        burst = np.diag(np.square([self.slip_burst_m, self.slip_burst_m, turn_rad]))
+        to_twist, before = _from_twist(-self._mean[_POSE]), self._covariance
+        self._covariance = before.copy()
+        self._covariance[_POSE, _POSE] += to_twist @ burst @ to_twist.T
+        if self._take_in(found, place, extras):
+            extras["slip_burst"] = True
+            return True
+        self._covariance = before
+        return False
 
     def _as_before(self, found: Match) -> Match:
         """Give a degenerate match the directions of the key frame's first such match.

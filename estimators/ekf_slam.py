@@ -19,6 +19,7 @@ from estimators.options import require_choices, require_positive
 from estimators.sightings import Sightings, dead_reckoning, pose_by_points, team_starts
 from estimators.slam_frontend import Association, Image, SlamFrontEnd
 from estimators.stereo import LEAST_DEPTH_M, NoiseAt, NoiseModel
+from estimators.wheel_gains import NO_MOTION, GainBelief, gained_motion
 from estimators.wheels import WheelPrediction
 from sim.arrays import Array, Ints
 from sim.errors import require
@@ -69,6 +70,9 @@ class EkfSlam:
         Believed slip variance per metre of the wheels, m.
     forward_slip_m
         Believed variance per metre of what both wheels slip together, m.
+    gain_sigma, gain_wander_m
+        The wheels' gains and the track are states too, of this deviation at the start, a share of
+        them, and this variance per metre of the way (`estimators.wheel_gains`). 0: they are known.
     window_s
         |ds| is netted over at least this time.
     keep_map
@@ -82,8 +86,8 @@ class EkfSlam:
     -----
     Extras: `associations` (K,): for each observation, counted from 0 over the whole run, the one
     that started its landmark, itself if it is the first, -1 if it was rejected; with `keep_map`
-    also `landmarks` (N, 3) and `landmark_covariances` (N, 3, 3); `status` when an image was not
-    used.
+    also `landmarks` (N, 3) and `landmark_covariances` (N, 3, 3); `wheel_gains` (3,), g_r, g_l and
+    g_b, where they are states; `status` when an image was not used.
 
     A step costs O(K N^2): the whole covariance is touched. So the map holds at most 4000 landmarks;
     `status` says when it is full, and when an image has more than 1000 observations.
@@ -107,6 +111,8 @@ class EkfSlam:
         kr: float = 5e-5,
         kl: float = 5e-5,
         forward_slip_m: float = 0.0,
+        gain_sigma: float = 0.0,
+        gain_wander_m: float = 0.0,
         window_s: float = 0.05,
         keep_map: bool = False,
         stereo: str = "stereo",
@@ -118,6 +124,11 @@ class EkfSlam:
         self.stereo, self.robots, self.sighting_d0 = stereo, robots, sighting_d0
         self.invariant = errors == "invariant"
         self.wheels = WheelPrediction(kr, kl, window_s, forward_slip_m=forward_slip_m)
+        self._gain_belief = GainBelief(gain_sigma, gain_wander_m)
+        require(
+            not (gain_sigma and self.invariant),
+            "ekf_slam: errors=invariant knows the gains; set estimator.gain_sigma=0",
+        )
         self.front_end = SlamFrontEnd(
             "ekf_slam",
             stereo,
@@ -152,13 +163,23 @@ class EkfSlam:
             len(priors) == 1 or not self.invariant,
             "ekf_slam: errors=invariant is of one robot; set estimator.errors=coordinates",
         )
+        require(
+            len(priors) == 1 or not self._gain_belief.sigma,
+            "ekf_slam: gains of wheels are of one robot; set estimator.gain_sigma=0",
+        )
         starts = team_starts(priors, self.front_end, "ekf_slam")
         self._sightings = Sightings.of(priors, self.robots, *self._noise, "ekf_slam")
         self._camera = self.front_end.camera
         self._wheels = dead_reckoning(self.wheels, priors)
         n = len(priors)
         self._is_placed = [start is not None for start in starts]
-        self._mean, self._room = np.zeros(3 * n), np.zeros((3 * n, 3 * n))
+        self._gains = slice(3 * n, 3 * n + 3) if self._gain_belief.sigma else None
+        self._first_landmark = 3 * n + (3 if self._gains else 0)
+        self._mean = np.zeros(self._first_landmark)
+        self._room = np.zeros((self._first_landmark, self._first_landmark))
+        if self._gains:
+            self._room[self._gains, self._gains] = self._gain_belief.covariance
+            self._gained, self._nominal_track_m = NO_MOTION, priors[0].robot.track_m
         for robot, start in enumerate(starts):
             if start is not None:
                 self._mean[_own(robot)] = start.mean
@@ -175,8 +196,7 @@ class EkfSlam:
         That of a robot whose place in the map is not known yet is NaN.
         """
         for frame in frames:
-            motion = self._wheels[frame.robot].predict(frame)
-            self._motions[frame.robot] = self._motions[frame.robot].then(motion)
+            self._roll(frame)
         extras: list[dict[str, Any]] = [{} for _ in frames]
         for frame, found in zip(frames, extras, strict=True):
             image = self.front_end.read(frame) if self.stereo in frame.readings else None
@@ -190,11 +210,29 @@ class EkfSlam:
                 self._sight(self._sightings, frame, frames)
         return [self._belief(*each) for each in zip(frames, extras, strict=True)]
 
+    def _roll(self, frame: Frame) -> None:
+        """Add a Frame to a robot's motion since its last image."""
+        robot, wheels = frame.robot, self._wheels[frame.robot]
+        if self._gains:
+            by_gains = gained_motion(wheels, frame, self._mean[self._gains], self._nominal_track_m)
+            self._gained = self._gained.then(by_gains)
+            self._motions[robot] = self._gained.motion
+        else:
+            self._motions[robot] = self._motions[robot].then(wheels.predict(frame))
+
     def _belief(self, frame: Frame, extras: dict[str, Any]) -> Belief:
         if not self._is_placed[frame.robot]:
             return Belief(np.full(3, np.nan), np.full((3, 3), np.nan), extras)
-        pose = Gaussian(self._mean[_own(frame.robot)], self._pose_covariance(frame.robot))
-        pose = pose.then(self._motions[frame.robot])
+        own = _own(frame.robot)
+        pose = Gaussian(self._mean[own], self._pose_covariance(frame.robot))
+        if self._gains:
+            both = slice(own.start, self._gains.stop)  # of one robot: its pose and the gains
+            P = self._covariance[both, both].copy()
+            mean = self._gained.applied(pose.mean, P, slice(0, 3), slice(3, 6))
+            pose = Gaussian(mean, P[:3, :3])
+            extras["wheel_gains"] = self._mean[self._gains].copy()
+        else:
+            pose = pose.then(self._motions[frame.robot])
         if self.keep_map:
             extras |= {k: v for k, v in self.map.items() if k.startswith("landmark")}
         return Belief(pose.mean.copy(), (pose.covariance + pose.covariance.T) / 2.0, extras)
@@ -206,7 +244,7 @@ class EkfSlam:
         `origins` (N,) are the observations, counted over the run, that started them; `ids` (N,)
         are the sensor's, if it gives any.
         """
-        n, P, first = self._n_landmarks, self._covariance, 3 * self._n_robots
+        n, P, first = self._n_landmarks, self._covariance, self._first_landmark
         every = np.arange(n)
         blocks = P[first:, first:].reshape(n, 3, n, 3)[every, :, every].reshape(n, 3, 3)
         means = self._landmarks.copy()
@@ -223,11 +261,11 @@ class EkfSlam:
 
     @property
     def _n_landmarks(self) -> int:
-        return len(self._mean) // 3 - self._n_robots
+        return (len(self._mean) - self._first_landmark) // 3
 
     @property
     def _landmarks(self) -> Array:
-        return self._mean[3 * self._n_robots :].reshape(-1, 3)
+        return self._mean[self._first_landmark :].reshape(-1, 3)
 
     @property
     def _covariance(self) -> Array:
@@ -238,6 +276,12 @@ class EkfSlam:
     def _move(self, robot: int) -> None:
         """Apply a robot's motion since its last image to its pose and to its correlations."""
         P, own, motion = self._covariance, _own(robot), self._motions[robot]
+        if self._gains:
+            walked = self._gain_belief.wander_m * self._gained.travel_m
+            self._mean[own] = self._gained.applied(self._mean[own], P, own, self._gains)
+            P[self._gains, self._gains] += walked * np.eye(3)
+            self._motions[robot], self._gained = STILL, NO_MOTION
+            return
         mean, by_pose, by_motion = compose(self._mean[own], motion.mean)
         noise = by_motion @ motion.covariance @ by_motion.T
         self._mean[own], self._motions[robot] = mean, STILL
@@ -320,7 +364,7 @@ class EkfSlam:
 
     def _rows(self, slots: Ints) -> Ints:
         """Rows (K, 3) of landmarks in the state."""
-        return 3 * (self._n_robots + slots[:, None]) + np.arange(3)
+        return self._first_landmark + 3 * slots[:, None] + np.arange(3)
 
     def _predicted_spread(self, own: slice, at: Ints, of_pose: Array, of_other: Array) -> Array:
         """H P H^T (n, 3, 3) of each of n observations apart; arguments as in `_update`."""
@@ -414,7 +458,7 @@ class EkfSlam:
         R = self._camera.innovation(predicted, points)[1]
         after = before + n
         if after > len(self._room):
-            wanted = min(after + after // 2, 3 * (self._n_robots + _MOST_LANDMARKS))
+            wanted = min(after + after // 2, self._first_landmark + 3 * _MOST_LANDMARKS)
             self._room = np.pad(self._covariance, (0, wanted - before))
         P = self._room[:after, :after]
         P[before:, :before] = by_pose @ P[own, :before]

@@ -87,6 +87,15 @@ class WheelPrediction:
 
     def predict_with_root(self, frame: Frame) -> tuple[Gaussian, Array]:
         """Motion over the Frame, and the root (3, K) of what the wheels add to its covariance."""
+        motion, _, root = self._predict(frame)
+        return motion, root
+
+    def predict_with_derivative(self, frame: Frame) -> tuple[Gaussian, Array]:
+        """Motion over the Frame, and its derivative (3, 2) by the increments."""
+        motion, by_wheels, _ = self._predict(frame)
+        return motion, by_wheels
+
+    def _predict(self, frame: Frame) -> tuple[Gaussian, Array, Array]:
         travel_m, variances = self.slip(frame)
         motion, by_wheels = wheel_motion(frame.wheel_increments_m, variances, self.track_m)
         if self.lateral_slip_m:
@@ -96,4 +105,4 @@ class WheelPrediction:
             together = by_wheels.sum(axis=1) * math.sqrt(self.forward_slip_m * travel_m.mean())
             motion.covariance[:] += np.outer(together, together)
             root = np.column_stack([root, together])
-        return motion, root
+        return motion, by_wheels, root

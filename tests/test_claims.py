@@ -297,12 +297,12 @@ def test_verdicts_are_whole_words():
 def test_rl2_judges_after_the_tuned_part_and_shows_the_whole():
     methods = ("odometry, as logged", "odometry, calibrated", "ICP alone", "ICP from the wheels")
     rows = [
-        ("intel", method, part, mean, 0.9 * mean, 1.1 * mean)
+        ("intel", method, part, mean, fused - mean, fused - mean - 0.1, fused - mean + 0.1, 10)
         for part, fused in (("judged", 0.1), ("all", 9.0))
         for method, mean in (*((m, 1.0) for m in methods), ("EKF of wheels and ICP", fused))
     ]
-    names = ("mean", "low", "high")
-    columns = ["log", "method", "part", *(f"translation_{name}_m" for name in names)]
+    differences = [f"difference_{name}_m" for name in ("mean", "low", "high")]
+    columns = ["log", "method", "part", "translation_mean_m", *differences, "difference_minutes"]
     said = list(real_logs.rl2(pd.DataFrame(rows, columns=columns)))
     assert [c.verdict for c in said] == ["reproduced"] * 4 + ["shown"] * 4
     assert said[0].reason == "fusion 0.100 m, the other 1.000 m"
@@ -310,7 +310,7 @@ def test_rl2_judges_after_the_tuned_part_and_shows_the_whole():
     assert all("the whole log" in c.statistic for c in said[4:])
 
 
-def test_rl2_judges_the_paired_difference_where_the_table_has_it():
+def test_rl2_judges_the_paired_difference():
     def judged(low, high):
         table = pd.DataFrame(
             {

@@ -217,13 +217,13 @@ def test_edges_far_behind_one_another_are_no_wall():
 
 
 def test_planted_drives_are_summed_by_share_and_threshold():
-    names = ["share", "support", "closures", "false", "planted", "revisits", "closed"]
+    names = ["share", "support", "gate", "closures", "false", "planted", "revisits", "closed"]
     drives = pd.DataFrame(
         [
-            [0.0, 3, 10, 0, 0, 8, 8, 0.1],
-            [0.5, 3, 6, 1, 9, 8, 4, 0.1],
-            [0.5, 3, 4, 1, 9, 2, 1, 0.9],
-            [0.5, 5, 0, 0, 9, 5, 0, 0.2],
+            [0.0, 3, 1e-3, 10, 0, 0, 8, 8, 0.1],
+            [0.5, 3, 1e-3, 6, 1, 9, 8, 4, 0.1],
+            [0.5, 3, 1e-3, 4, 1, 9, 2, 1, 0.9],
+            [0.5, 5, 1e-3, 0, 0, 9, 5, 0, 0.2],
         ],
         columns=[*names, "revised_worst_m"],
     )

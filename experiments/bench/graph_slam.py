@@ -112,14 +112,15 @@ def run_rooms(
     planted: float = 0.0,
     distance_m: float = 300.0,
     rooms: tuple[int, int] = (7, 6),
+    overrides: tuple[str, ...] = (),
     **options: Any,
 ) -> RoomRun:
     """Drive through rows and columns of look-alike rooms, with this share of false candidates.
 
-    `options` are those of `estimators.graph_slam.GraphSlam`.
+    `overrides` are of the configuration; `options` those of `estimators.graph_slam.GraphSlam`.
     """
     size = [f"world.n_x={rooms[0]}", f"world.n_y={rooms[1]}", f"route.distance_m={distance_m}"]
-    experiment = Experiment.compose([*_ROOMS, *size, f"seed={seed}"])
+    experiment = Experiment.compose([*_ROOMS, *size, *overrides, f"seed={seed}"])
     recording, robot = experiment.recording(), experiment.robot()
     estimator = Planted(planted, stream(seed, "bench"), kr=robot.kr, kl=robot.kl, **options)
     with limited_blas():

@@ -67,19 +67,14 @@ def rl1_sentence(rows: Sequence[Claim]) -> str:
 def rl2(relations: pd.DataFrame) -> Iterator[Claim]:
     """RL2: on the Intel log, fusion beats odometry and ICP in the relations metric.
 
-    Judged after the part that the filter's noise was tuned on, over the same relations; a table
-    without these differences is judged by the intervals of both means. Odometry as logged and the
-    whole log stand beside.
+    Judged after the part that the filter's noise was tuned on, over the same relations. Odometry as
+    logged and the whole log stand beside.
     """
     intel = relations[relations.log == "intel"]
     for part, where in (("judged", "after the tuned part"), ("all", "the whole log")):
         rows = intel[intel.part == part].set_index("method")
         for other in (name for name in INTEL[1:] if name != FUSION):
-            claim = (
-                _difference(rows.loc[FUSION], rows.loc[other], f"{other}, Intel, {where}")
-                if "difference_mean_m" in rows and np.isfinite(rows.loc[other].difference_mean_m)
-                else _apart(rows.loc[FUSION], rows.loc[other], f"{other}, Intel, {where}")
-            )
+            claim = _difference(rows.loc[FUSION], rows.loc[other], f"{other}, Intel, {where}")
             if part == "all":
                 reason = f"the tuned part is in it; {claim.reason}"
                 yield shown("RL2", claim.statistic, claim.found, reason)
@@ -94,17 +89,6 @@ def _difference(fused: pd.Series[float], rival: pd.Series[float], where: str) ->
     minutes = int(rival["difference_minutes"])
     claim = banded("RL2", label, found, at_most=0.0, criterion="below 0", n=minutes)
     return remarked(claim, _means(fused, rival))
-
-
-def _apart(fused: pd.Series[float], rival: pd.Series[float], where: str) -> Claim:
-    """Judge by whether the intervals of both means are apart."""
-    found = Interval(*(float(fused[f"translation_{end}_m"]) for end in ("mean", "low", "high")))
-    verdict = Verdict.UNDECIDED
-    if found.high < rival.translation_low_m or found.low > rival.translation_high_m:
-        verdict = holds(found.high < rival.translation_low_m)
-    label = f"mean translational error of {FUSION}, m, beside {where}"
-    criterion = "intervals apart, fusion below"
-    return Claim("RL2", label, found, criterion, verdict, _means(fused, rival))
 
 
 def _means(fused: pd.Series[float], rival: pd.Series[float]) -> str:
