@@ -124,7 +124,7 @@ def run(
     if many and "--hydra-help" not in arguments:
         from experiments.sweeps.launch import sweep_arguments
 
-        _show_sweep(*sweep_arguments([a for a in arguments if a not in many]))
+        sweep_arguments([a for a in arguments if a not in many], _show_sweep)
         return
     if not arguments:
         arguments = ["study=first_run"]
@@ -178,12 +178,13 @@ def record(
     Example: estima record -o office.npz world=office sensors=lms291 seed=3
     """
     from experiments.runs.experiment import Experiment, searched
+    from experiments.runs.run import expected_s
     from sim.recording import save
 
     if out.suffix != ".npz":
         raise InputError(f"-o {out}: a recording is an .npz file")
     experiment = Experiment.compose([*searched(config_dir), *(overrides or [])])
-    with progress("simulated seconds") as on_progress:
+    with progress("simulated seconds", expected_s(experiment)) as on_progress:
         recording = experiment.simulate(on_progress)
     checksum = save(recording, out)
     print(f"{out}: {recording.status}, {recording.duration_s:.1f} s, checksum {checksum}")

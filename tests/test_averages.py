@@ -167,8 +167,12 @@ def test_p_of_pairs_is_scipys_and_equal_arms_never_differ():
 def test_metrics_are_chosen_and_unknown_ones_refused():
     found = summary(runs(), metrics=["nees_mean"])
     assert [c for c in found if c in COLUMNS] == ["nees_mean"]
-    with pytest.raises(InputError, match="no column nees; there are ate_rmse_m"):
+    with pytest.raises(
+        InputError, match=r"no column nees; did you mean answer_nees_mean\? there are"
+    ):
         summary(runs(), metrics=["nees"])
+    with pytest.raises(InputError, match=r"no column xyzzy; there are answer_ate_rmse_m, "):
+        summary(runs(), metrics=["xyzzy"])
 
 
 def check_latex(text):
@@ -210,7 +214,12 @@ def test_tables_are_written_for_papers_and_pages(tmp_path):
     assert r"\textless{}b\textgreater{}\&\%\_\#\textasciicircum{}w" in texts[".tex"]
     assert len(re.findall(r"\*\*[\d.e-]+\*\* \[", texts[".md"])) == 1
     assert r"\<b>\&%\_#^w" in texts[".md"]
-    assert len(re.findall(r"<td class=.number.><b>[\d.e-]+</b> \[", texts[".html"])) == 1
+    assert (
+        len(
+            re.findall(r"<td class=.number.><b>[\d.e-]+</b> <span class=.whole.>\[", texts[".html"])
+        )
+        == 1
+    )
     assert "&lt;b&gt;&amp;%_#^w" in texts[".html"]
     assert "sweep &lt;i&gt;" in texts[".html"]
     assert "script-src &" not in texts[".html"]

@@ -29,7 +29,12 @@ DIGITS = 3
 FORMATS = (".tex", ".md", ".html", ".csv", ".parquet")
 # Of the text of LaTeX's article, and of IEEE's two-column papers
 WIDTHS_PT = {"text": TEXT_PT, "column": 252.0, "page": 516.0}
-HTML = Form(lambda text: str(escape(text)), "<b>{}</b>", "<sup>*</sup>", " [{},&nbsp;{}]")
+HTML = Form(
+    lambda text: str(escape(text)),
+    "<b>{}</b>",
+    "<sup>*</sup>",
+    ' <span class="whole">[{}, {}]</span>',
+)
 
 
 WORDS = {

@@ -11,7 +11,7 @@ from experiments.evaluation.statistics import holm
 from experiments.runs.columns import COLUMNS, PATH, RELATIVE
 from experiments.runs.row import GAP, Outcome
 from experiments.sweeps.averages import RECORDING, averages, difference_p, pooled, rule, unit_of
-from experiments.sweeps.collect import DRAWN, measured, telling, with_answers
+from experiments.sweeps.collect import DRAWN, no_column, telling, with_answers
 from sim.errors import InputError
 
 ERROR = "answer_ate_rmse_m"
@@ -61,8 +61,7 @@ def summary(
     shown = list(metrics) or [c for c in _MAIN if c in table and table[c].notna().any()]
     for column in shown:
         if column not in table:
-            there = ", ".join(measured(table))
-            raise InputError(f"the sweep has no column {column}; there are {there}")
+            raise no_column(table, column, metric=True)
         if not pd.api.types.is_numeric_dtype(table[column]):
             raise InputError(f"column {column} holds no numbers in some rows; see --where")
     groups = table.groupby(by or (lambda _: "all runs"), dropna=False)
