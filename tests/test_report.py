@@ -413,10 +413,10 @@ TABLE = pd.DataFrame(
 
 def test_markdown():
     assert to_markdown(TABLE).splitlines() == [
-        r"| case_name    |   k_m |   n | ok   |",
-        r"|:-------------|------:|----:|:-----|",
-        r"| a\|b         | 1e-05 |   3 | yes  |",
-        r"| 50 % & {x}\\ |       |   4 | no   |",
+        r"| case_name     |   k_m |   n | ok   |",
+        r"|:--------------|------:|----:|:-----|",
+        r"| a\|b          | 1e-05 |   3 | yes  |",
+        r"| 50 % \& {x}\\ |       |   4 | no   |",
     ]
 
 
@@ -424,7 +424,7 @@ def test_latex():
     lines = to_latex(TABLE).splitlines()
     assert lines[0] == r"\begin{tabular}{lrrl}"
     assert lines[2] == r"case\_name & k\_m & n & ok \\"
-    assert lines[4] == r"a|b & $1 \times 10^{-5}$ & 3 & yes \\"
+    assert lines[4] == r"a\textbar{}b & $1 \times 10^{-5}$ & 3 & yes \\"
     assert lines[5] == r"50 \% \& \{x\}\textbackslash{} &  & 4 & no \\"
     assert "$-1.5$" in to_latex(pd.DataFrame({"x": [-1.5]}))
     assert lines[-1] == r"\end{tabular}"
