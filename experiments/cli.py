@@ -124,7 +124,7 @@ def run(
     if many and "--hydra-help" not in arguments:
         from experiments.sweeps.launch import sweep_arguments
 
-        _show_sweep(*sweep_arguments([a for a in arguments if a not in many]))
+        sweep_arguments([a for a in arguments if a not in many], _show_sweep)
         return
     if not arguments:
         arguments = ["study=first_run"]
@@ -178,12 +178,13 @@ def record(
     Example: estima record -o office.npz world=office sensors=lms291 seed=3
     """
     from experiments.runs.experiment import Experiment, searched
+    from experiments.runs.run import expected_s
     from sim.recording import save
 
     if out.suffix != ".npz":
         raise InputError(f"-o {out}: a recording is an .npz file")
     experiment = Experiment.compose([*searched(config_dir), *(overrides or [])])
-    with progress("simulated seconds") as on_progress:
+    with progress("simulated seconds", expected_s(experiment)) as on_progress:
         recording = experiment.simulate(on_progress)
     checksum = save(recording, out)
     print(f"{out}: {recording.status}, {recording.duration_s:.1f} s, checksum {checksum}")
@@ -998,12 +999,20 @@ def table(
     every: Annotated[
         bool, typer.Option("--rows", help="With -o: write every row, with all its columns.")
     ] = False,
+    size: Annotated[
+        str | None,
+        typer.Option(
+            help="Of a .tex: column or page of an IEEE paper (252, 516 pt), or text of an article "
+            "(345 pt) [text]."
+        ),
+    ] = None,
     only: Where = None,
 ) -> None:
     """Show a sweep's mean errors with 95 % intervals, or write them for a paper.
 
     Errors are those of the best answers: of the revised path of a method that has one. The best on
-    the same recordings is bold. A .tex file goes into a LaTeX article by `input` as it is.
+    the same recordings is bold. A .tex file goes into a LaTeX article by `input` as it is; what is
+    too wide for one table becomes several.
 
     Examples
     --------
@@ -1017,8 +1026,7 @@ def table(
     from experiments.sweeps.collect import collect, where
     from experiments.sweeps.summary import summary
 
-    if out is not None:
-        check_name(out)
+    check_name(out, size)
     require(not every or out is not None, "--rows: name the file to write, such as -o rows.csv")
     timed = times or any(column.endswith("_time_us") for column in metric or [])
     rows = where(collect(name, all_versions=all_versions, times=timed), only or [])
@@ -1034,7 +1042,7 @@ def table(
         if (rows["status"] != Outcome.OK).any():
             show("\n" + "\n".join(f"{count} {words}" for words, count in statuses(rows)))
         return
-    write_table(found, note, out, Path(name).name)
+    write_table(found, note, out, Path(name).name, size)
     print(f"{out}: {len(found)} rows")
 
 

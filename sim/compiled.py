@@ -1,5 +1,6 @@
 """Numba's decorator for the hot loops: compiled once, cached on disk, announced when it happens."""
 
+import multiprocessing
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +13,10 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 class _Announcer(event.Listener):
-    """Announces, once, that code is being compiled; code read from the cache makes no event."""
+    """Announces, once, that code is being compiled; code read from the cache makes no event.
+
+    A process that another started is silent, unless it was told where the processes agree.
+    """
 
     _announced = False
     once_in: Path | None = None  # file by which processes that work together announce it once
@@ -20,6 +24,8 @@ class _Announcer(event.Listener):
     def on_start(self, event: Any) -> None:
         if not self._announced:
             self._announced = True
+            if self.once_in is None and multiprocessing.parent_process() is not None:
+                return
             if self.once_in is not None:
                 try:
                     self.once_in.open("x").close()

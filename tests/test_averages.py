@@ -1,6 +1,8 @@
 """How runs are averaged, what the table of a sweep marks, and the files that it becomes."""
 
 import re
+import shutil
+import subprocess
 
 import numpy as np
 import pandas as pd
@@ -10,7 +12,7 @@ from typer.testing import CliRunner
 
 from experiments.cli import app
 from experiments.evaluation.statistics import holm, mean_interval, paired_p
-from experiments.report.table import notes, statuses, write_table
+from experiments.report.table import WIDTHS_PT, notes, statuses, write_table
 from experiments.runs.columns import COLUMNS, Average
 from experiments.sweeps.averages import averages, unit_of
 from experiments.sweeps.summary import summary
@@ -84,6 +86,63 @@ def test_the_best_is_that_of_the_same_recordings_and_has_no_failures():
     assert best.to_dict() == {"a": False, "b": True}  # a leaves out what was hard
 
 
+@pytest.mark.parametrize(("code", "incomplete"), [("gap", 2), ("estimator", 0)])
+def test_what_gives_no_pose_for_some_of_the_drive_is_never_the_best(tmp_path, code, incomplete):
+    table = runs(repeats=1).assign(status_code="", status_detail="")
+    table.loc[[0, 2], ["status", "status_code", "status_detail"]] = (
+        "remark",
+        code,
+        "no pose for 9 s",
+    )
+    found = summary(table)
+    best = found.set_index("choice.estimator")["answer_ate_rmse_m_best"]
+    assert best.to_dict() == {"a": not incomplete, "b": bool(incomplete)}
+    assert found["incomplete"].tolist() == [incomplete, 0]
+    assert found["with_remarks"].tolist() == [2, 0]
+    for name in ("t.tex", "t.md", "t.html", "t.csv"):
+        write_table(found, notes(found, None), tmp_path / name, "mine")
+        text = (tmp_path / name).read_text()
+        if name != "t.csv":
+            assert ("incomplete" in text) is bool(incomplete)
+            assert ("runs without a pose for some of the drive" in text) is bool(incomplete)
+
+
+def wide():
+    """The summary of a sweep of long names and many results."""
+    table = runs().replace({"b": "a_very_long_name_of_many_words_and_letters"})
+    rng = np.random.default_rng(0)
+    for name in ("ate_aligned_rmse_m", "heading_rmse_rad", "step_time_us", "cpu_time_us"):
+        table[name] = rng.lognormal(size=len(table))
+    table.insert(
+        2, "sensors.stereo.max_distance_m", np.where(table["choice.estimator"] == "a", 5, 9)
+    )
+    return summary(table, against="a")
+
+
+def test_a_table_too_wide_for_the_text_becomes_several_of_the_same_rows(tmp_path):
+    write_table(wide(), "note", tmp_path / "t.tex", "mine")
+    text = (tmp_path / "t.tex").read_text()
+    assert check_latex(text) == [3, 3, 3]  # the name has two lines
+    assert text.count("ATE, m") == text.count("step, us") == 1
+    assert len(re.findall(r"(?m)^a & ", text)) == 3
+    write_table(wide(), "note", tmp_path / "page.tex", "mine", "page")
+    assert check_latex((tmp_path / "page.tex").read_text()) == [3, 3]
+
+
+@pytest.mark.skipif(shutil.which("pdflatex") is None, reason="needs pdfLaTeX")
+@pytest.mark.parametrize("size", list(WIDTHS_PT))
+def test_tables_go_straight_into_an_article_and_fit(tmp_path, size):
+    write_table(wide(), r"note <>_&%$#~^\{}|", tmp_path / "t.tex", "mine", size)
+    (tmp_path / "paper.tex").write_text(
+        rf"\documentclass{{article}}\usepackage{{booktabs}}\textwidth={WIDTHS_PT[size]}pt"
+        r"\begin{document}\begin{table}\input{t}\end{table}\end{document}"
+    )
+    command = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "paper.tex"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout
+    assert "Overfull" not in done.stdout
+
+
 @pytest.mark.parametrize(("ratio", "differs"), [(2.0, True), (1.0, False)])
 def test_differences_are_marked_by_paired_tests(ratio, differs):
     table = runs(ratio=ratio)
@@ -108,25 +167,36 @@ def test_p_of_pairs_is_scipys_and_equal_arms_never_differ():
 def test_metrics_are_chosen_and_unknown_ones_refused():
     found = summary(runs(), metrics=["nees_mean"])
     assert [c for c in found if c in COLUMNS] == ["nees_mean"]
-    with pytest.raises(InputError, match="no column nees; there are ate_rmse_m"):
+    with pytest.raises(
+        InputError, match=r"no column nees; did you mean answer_nees_mean\? there are"
+    ):
         summary(runs(), metrics=["nees"])
+    with pytest.raises(InputError, match=r"no column xyzzy; there are answer_ate_rmse_m, "):
+        summary(runs(), metrics=["xyzzy"])
 
 
 def check_latex(text):
-    """Braces, environments, mathematics and cells are whole; nothing is left unescaped."""
+    """Braces, environments, mathematics and cells are whole; nothing is left unescaped.
+
+    Gives the lines of each tabular, below its headings, that begin with a word.
+    """
     text = re.sub(r"(?m)^%.*\n", "", text)
     bare = re.sub(r"\\[\\{}%&#_$]", "", text)
     assert bare.count("{") == bare.count("}")
     assert bare.count("$") % 2 == 0
     outside = re.sub(r"\$[^$]*\$", "", bare)
-    assert not re.search(r"[_^#%~]", outside)
+    assert not re.search(r"[_^#%~<>|\"`]|--", outside)
     begun, ended = (re.findall(rf"\\{word}{{(\w+)}}", text) for word in ("begin", "end"))
-    assert begun == ended == ["tabular"]
-    columns = len(re.search(r"\\begin{tabular}{([lr]+)}", text)[1])
-    inside = text.partition(r"\toprule")[2].partition(r"\bottomrule")[0]
-    rows = [row for row in inside.replace(r"\midrule", "").split(r"\\") if row.strip()]
-    assert {len(re.findall(r"(?<!\\)&", row)) + 1 for row in rows} == {columns}
-    return len(rows) - 1
+    assert begun == ended == ["tabular"] * len(begun)
+    counts = []
+    for columns, inside in re.findall(
+        r"(?s)\\begin{tabular}{([lr]+)}\s*\\toprule(.*?)\\bottomrule", text
+    ):
+        head, body = inside.replace(r"\addlinespace", "").split(r"\midrule")
+        rows = [row for part in (head, body) for row in part.split(r"\\") if row.strip()]
+        assert {len(re.findall(r"(?<!\\)&", row)) + 1 for row in rows} == {len(columns)}
+        counts.append(sum(not row.lstrip("\n").startswith(" &") for row in body.split(r"\\")[:-1]))
+    return counts
 
 
 def test_tables_are_written_for_papers_and_pages(tmp_path):
@@ -137,13 +207,19 @@ def test_tables_are_written_for_papers_and_pages(tmp_path):
     for name in ("t.tex", "t.md", "t.html", "t.csv"):
         write_table(found, note, tmp_path / name, "sweep <i>")
     texts = {path.suffix: path.read_text() for path in tmp_path.iterdir()}
-    assert check_latex(texts[".tex"]) == 2
+    assert check_latex(texts[".tex"]) == [2]
     assert r"\textbf{" in texts[".tex"]
     assert r"\times 10^{-5}" in texts[".tex"]
     assert "ATE, m" in texts[".tex"]
+    assert r"\textless{}b\textgreater{}\&\%\_\#\textasciicircum{}w" in texts[".tex"]
     assert len(re.findall(r"\*\*[\d.e-]+\*\* \[", texts[".md"])) == 1
-    assert r"\<b>&%_#^w" in texts[".md"]
-    assert len(re.findall(r"<td class=.number.><b>[\d.e-]+</b> \[", texts[".html"])) == 1
+    assert r"\<b>\&%\_#^w" in texts[".md"]
+    assert (
+        len(
+            re.findall(r"<td class=.number.><b>[\d.e-]+</b> <span class=.whole.>\[", texts[".html"])
+        )
+        == 1
+    )
     assert "&lt;b&gt;&amp;%_#^w" in texts[".html"]
     assert "sweep &lt;i&gt;" in texts[".html"]
     assert "script-src &" not in texts[".html"]
@@ -155,8 +231,9 @@ def test_tables_are_written_for_papers_and_pages(tmp_path):
 
 def test_a_table_that_latex_would_refuse_is_found():
     good = r"\begin{tabular}{lr}\toprule a & b\\ \midrule 1 & 2\\ \bottomrule\end{tabular}"
-    assert check_latex(good) == 1
-    for bad in (good.replace("1 & 2", "1 & 2 & 3"), good.replace("a &", "a_b &"), good + "}"):
+    assert check_latex(good) == [1]
+    bads = [("1 & 2", "1 & 2 & 3"), ("a &", "a_b &"), ("a &", "a<b &"), ("tabular}", "tabular}}")]
+    for bad in [good.replace(*bad) for bad in bads]:
         with pytest.raises(AssertionError):
             check_latex(bad)
 
@@ -173,7 +250,8 @@ def test_statuses_are_words_with_counts():
 
 
 def test_the_command_refuses_other_endings_before_it_reads(tmp_path):
-    for arguments in (["-o", "x.xlsx"], ["--rows"], ["--rows", "-o", "x.tex"]):
+    sized = (["--size", "page"], ["--size", "huge", "-o", "x.tex"])
+    for arguments in (["-o", "x.xlsx"], ["--rows"], ["--rows", "-o", "x.tex"], *sized):
         done = CliRunner().invoke(app, ["table", str(tmp_path / "none"), *arguments])
         assert isinstance(done.exception, InputError)
-        assert re.search(r"a table is \.tex|name the file|no sweep", str(done.exception))
+        assert re.search(r"a table is \.tex|name the file|no sweep|--size", str(done.exception))

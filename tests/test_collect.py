@@ -152,7 +152,7 @@ def test_plots_name_a_missing_column_and_average_recordings():
     with pytest.raises(InputError, match=r"no run has all of robot\.kr, ate_rmse_m"):
         sweep_figure(table.assign(**{"robot.kr": None}), "robot.kr", "ate_rmse_m")
     with pytest.raises(
-        InputError, match=r"no column robot\.krr; there are robot\.kr, .*ate_rmse_m"
+        InputError, match=r"no column robot\.krr; did you mean robot\.kr\? there are .*ate_rmse_m"
     ):
         sweep_figure(rows(), "robot.krr", "ate_rmse_m")
     with pytest.raises(InputError, match=r"no column nosuch; there are .*robot\.kr"):
@@ -344,6 +344,6 @@ def test_runs_of_equal_settings_and_different_keys_are_refused(tmp_path):
 
 
 def test_a_message_names_the_nearest_columns_and_counts_the_rest(monkeypatch):
-    monkeypatch.setattr("experiments.report.plot._NAMED", 2)
+    monkeypatch.setattr("experiments.sweeps.collect._NAMED", 2)
     with pytest.raises(InputError, match=r"nosuch; there are [\w.]+, [\w.]+ and \d+ more$"):
         sweep_figure(rows(), "nosuch", "ate_rmse_m")

@@ -11,14 +11,14 @@ from experiments.viewing.style import subplots
 
 
 def parts(page):
-    """Parts of a page as the report finds them, and the axes that each holds."""
+    """Boxes of a page's parts as the report finds them, and the axes that each part holds."""
     file = BytesIO()
     page.savefig(file, dpi=130, format="png")
     height = page.bbox.height * 130 / page.dpi
     scale = 130 / page.dpi
     found = panels(file.getvalue())
     held = []
-    for left, top, right, bottom in found:
+    for *_, (left, top, right, bottom) in found:
         middles = [(ax.bbox.p0 + ax.bbox.p1) / 2 * scale for ax in page.axes]
         held.append(
             [
@@ -43,7 +43,7 @@ def test_panels_stand_alone_as_they_are_read():
     page, _ = drawn(2, 2)
     found, held = parts(page)
     assert held == [[0], [1], [2], [3]]
-    boxes = np.array(found)
+    boxes = np.array([box for (box,) in found])
     assert (boxes[:, 2:] > boxes[:, :2]).all()
     assert boxes.min() >= 0
 
@@ -52,24 +52,38 @@ def test_a_legend_of_several_panels_is_parts_of_its_own():
     page, _ = drawn(1, 2)
     found, held = parts(with_legend(page, ncols=2))
     assert held == [[0], [1], [], []]
-    assert all(bottom - top < 50 for _, top, _, bottom in found[2:])
+    assert all(bottom - top < 50 for ((_, top, _, bottom),) in found[2:])
 
 
 @pytest.mark.parametrize(
     ("shape", "shared", "expected"),
     [
-        ((1, 2), {"sharey": True}, []),  # the second has no labels of its own
         ((2, 2), {"sharex": True}, [[0, 2], [1, 3]]),
         ((1, 1), {}, []),
     ],
 )
-def test_panels_that_share_an_axis_stay_together(shape, shared, expected):
+def test_panels_that_share_a_horizontal_axis_stay_together(shape, shared, expected):
     page, axes = drawn(*shape, **shared)
     for ax in axes[:-1].flat:
         ax.set(xlabel="")
-    for ax in axes[:, 1:].flat if "sharey" in shared else ():
-        ax.set(ylabel="")
     assert parts(page)[1] == expected
+
+
+def test_panels_that_share_a_vertical_axis_come_with_its_labels():
+    page, axes = drawn(1, 3, sharey=True)
+    for ax in axes.flat[1:]:
+        ax.set(ylabel="")
+    found, held = parts(page)
+    assert held == [[0], [1], [2]]
+    (first,), (of_second, second), (of_third, third) = found
+    assert of_second == of_third
+    left, top, right, bottom = of_second
+    axis = axes.flat[0].bbox.x0 * 130 / page.dpi
+    assert first[0] <= left < right <= axis  # all that stands to the left of the first axis
+    assert axis - right < 15
+    assert first[1] <= top < bottom <= first[3]
+    assert second[0] > axis
+    assert third[0] > second[0]
 
 
 def test_a_colour_bar_stays_with_its_panel():

@@ -134,12 +134,12 @@ def test_structure_that_readers_and_their_aids_rely_on(text):
 def test_each_claim_is_one_row_with_its_statistics_below(text):
     page = Outline(text)
     rows = {e["id"]: e["text"] for e in page.all("tbody") if "id" in e}
-    assert "0.5 [0.4, 0.6]" in rows["claim-PB1"]
+    assert "0.500 [0.400, 0.600]" in rows["claim-PB1"]
     head, folded = rows["claim-PB4"].split("PB4: statistics (3)")
     assert "The ellipse holds <b>61 %</b> at 1e-3 m." in head
     assert head.strip().endswith("not reproduced (quick)")
     assert folded.index("the unfavourable") < folded.index("of our own")  # headlines first
-    assert "0.25 [0.4, 0.6]" in folded
+    assert "0.250 [0.400, 0.600]" in folded
     assert "follows from its headline statistics" in page.all("caption")[0]["text"]
     assert "3 claims, by 5 statistics" in page.all("header")[0]["text"]
     (tile,) = (e["text"] for e in page.all("li") if "Covariance of dead" in e["text"])
@@ -348,7 +348,7 @@ def test_the_first_screen_names_the_best_of_the_leaderboard(tmp_path):
     assert contents.best_of_worlds(path) == []
     rows = {"choice.world": ["v", "v", "w"], "choice.estimator": ["a", "b", "b"]}
     write_frame(pd.DataFrame({**rows, "answer_ate_rmse_m": [0.2, 0.1234, 0.3]}), path)
-    assert contents.best_of_worlds(path) == [("v", "b", "0.12"), ("w", "b", "0.3")]
+    assert contents.best_of_worlds(path) == [("v", "b", "0.12"), ("w", "b", "0.30")]
     write_frame(pd.DataFrame(rows), path)
     assert contents.best_of_worlds(path) == []
 
@@ -413,10 +413,10 @@ TABLE = pd.DataFrame(
 
 def test_markdown():
     assert to_markdown(TABLE).splitlines() == [
-        r"| case_name    |   k_m |   n | ok   |",
-        r"|:-------------|------:|----:|:-----|",
-        r"| a\|b         | 1e-05 |   3 | yes  |",
-        r"| 50 % & {x}\\ |       |   4 | no   |",
+        r"| case_name     |   k_m |   n | ok   |",
+        r"|:--------------|------:|----:|:-----|",
+        r"| a\|b          | 1e-05 |   3 | yes  |",
+        r"| 50 % \& {x}\\ |       |   4 | no   |",
     ]
 
 
@@ -424,7 +424,7 @@ def test_latex():
     lines = to_latex(TABLE).splitlines()
     assert lines[0] == r"\begin{tabular}{lrrl}"
     assert lines[2] == r"case\_name & k\_m & n & ok \\"
-    assert lines[4] == r"a|b & $1 \times 10^{-5}$ & 3 & yes \\"
+    assert lines[4] == r"a\textbar{}b & $1 \times 10^{-5}$ & 3 & yes \\"
     assert lines[5] == r"50 \% \& \{x\}\textbackslash{} &  & 4 & no \\"
     assert "$-1.5$" in to_latex(pd.DataFrame({"x": [-1.5]}))
     assert lines[-1] == r"\end{tabular}"

@@ -1,11 +1,21 @@
 """What a run and a sweep say in plain words."""
 
+import contextlib
+import io
+import multiprocessing
+from concurrent.futures import ProcessPoolExecutor
+
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from experiments.cli import app
+from experiments.runs import console
 from experiments.runs.experiment import Experiment
-from experiments.runs.run import _expected_s, in_words
+from experiments.runs.run import expected_s, in_words
 from experiments.viewing.run_figure import run_figure
+from sim import compiled
+from sim.formats.tum import write_tum
 from tests.test_cli import QUICK, estima
 
 
@@ -26,12 +36,39 @@ def test_errors_are_said_with_their_share_of_the_way_and_consistency():
 
 
 @pytest.mark.parametrize(
-    ("overrides", "expected_s"),
+    ("overrides", "seconds"),
     [(["route=linear_1"], 2.2), (["route.distance_m=8"], 16.0), (["route=square"], None)],
 )
-def test_progress_knows_about_how_long_a_drive_is(overrides, expected_s):
-    assert _expected_s(Experiment.compose(overrides)) == (expected_s and pytest.approx(expected_s))
-    assert _expected_s(Experiment.compose(["world=room"])) > 10.0
+def test_progress_knows_about_how_long_a_drive_is(overrides, seconds):
+    assert expected_s(Experiment.compose(overrides)) == (seconds and pytest.approx(seconds))
+    assert expected_s(Experiment.compose(["world=room"])) > 10.0
+
+
+def test_a_timetable_takes_as_long_as_its_trajectory(tmp_path):
+    write_tum(tmp_path / "way.tum", np.array([5.0, 6.0, 9.0]), np.zeros((3, 3)))
+    way = ["route=timetable", f"route.path={tmp_path / 'way.tum'}"]
+    assert expected_s(Experiment.compose(way)) == 4.0
+
+
+def test_recording_says_how_much_there_is_to_simulate(tmp_path, monkeypatch):
+    monkeypatch.setattr(console, "_QUIET_S", 0.0)
+    arguments = ["record", "-o", str(tmp_path / "r.npz"), "route=linear_1"]
+    done = CliRunner().invoke(app, [*arguments, "simulation.physics=kinematic"])
+    assert done.exit_code == 0, done.output
+    assert "seconds: 0 of 2.2 after 0 s" in done.stderr
+
+
+def announced(_):
+    """What a process says when it compiles."""
+    with contextlib.redirect_stderr(io.StringIO()) as said:
+        compiled._Announcer().on_start(None)
+    return said.getvalue()
+
+
+def test_only_the_process_that_began_says_that_it_compiles():
+    assert "compiling numerical code" in announced(0)
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        assert list(pool.map(announced, [0])) == [""]
 
 
 def test_the_picture_shows_the_path_and_few_ellipses_however_large():

@@ -216,6 +216,9 @@ def test_failed_runs_leave_rows_and_the_rest_goes_on(name, tmp_path):
     assert done.returncode == 1, done.stderr
     assert "2 of 4 runs" in done.stderr
     assert "a planted fault" in done.stderr
+    _, *table = done.stdout.split("\n\n")[1].splitlines()
+    assert [line.split()[:3] for line in table] == [["1e-05", "2", "0"], ["0.001", "2", "2"]]
+    assert "Next: estima table" in done.stdout
     rows = table_of(name)
     assert len(rows) == 4
     assert sorted(rows["status"] == "ok") == [False, False, True, True]

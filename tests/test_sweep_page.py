@@ -14,7 +14,7 @@ from sim.errors import InputError
 from tests import browser
 from tests.test_collect import many
 
-EVIL = "</script><img src=x onerror=alert(1)>"
+EVIL = "</script><img src=x onerror=alert(1)><b>&lt;</b>"
 
 
 def rows():
@@ -94,12 +94,41 @@ def test_what_is_chosen_is_drawn_and_what_is_pooled_is_said(tab):
     assert "also averages over world" in tab.js("document.getElementById('said').textContent")
     choose(tab, "panels", "choice.world")
     assert tab.js("Object.keys(document.getElementById('chart').layout).includes('xaxis2')")
-    n = "document.getElementById('said').textContent.split(' ')[0]"
-    assert tab.js(n) == "53"
+    said = "document.getElementById('said').textContent"
+    n = f"{said}.split(' ')[0]"
+    assert tab.js(said).startswith("53 runs. Not drawn: 1 failed. ")
     tab.js("document.querySelector('#filters input').click()")
     assert int(tab.js(n)) < 53
     tab.js("document.querySelector('#filters input').click()")
     assert tab.js(n) == "53"
+    tab.js("[0, 1, 2].forEach((row) => { columns.get(byId('y').value).values[row] = null; })")
+    choose(tab, "panels", "")
+    assert tab.js(said).startswith("51 runs. Not drawn: 1 failed, 2 have no finite value. ")
+    tab.open(tab.js("location.href"))
+
+
+def test_names_are_no_markup_for_the_chart(tab):
+    legend = "[...document.querySelectorAll('#chart .legendtext')].map(t => t.textContent)"
+    assert EVIL in tab.js(legend)
+    choose(tab, "x", "choice.estimator")
+    ticks = "[...document.querySelectorAll('#chart .xtick text')].map(t => t.textContent)"
+    assert EVIL in tab.js(ticks)
+    choose(tab, "panels", "choice.estimator")
+    assert f"estimator: {EVIL}" in tab.js(
+        "[...document.querySelectorAll('#chart .annotation')].map(t => t.textContent)"
+    )
+    tab.open(tab.js("location.href"))
+
+
+def test_a_wide_table_scrolls_in_its_own_box(tab):
+    tab.js("document.querySelector('.sortable').style.width = '3000px'")
+    box = "document.querySelector('.scroll')"
+    assert tab.js(f"{box}.scrollWidth > {box}.clientWidth")
+    assert tab.js("document.documentElement.scrollWidth <= innerWidth")
+    tab.js(f"{box}.scrollTo(400, 0)")
+    first = "document.querySelector('.sortable td').getBoundingClientRect().left"
+    assert tab.js(f"{first} == {box}.getBoundingClientRect().left")  # names stay in sight
+    tab.js("document.querySelector('.sortable').style.width = ''")
 
 
 def test_tables_are_sorted_by_keyboard(tab):

@@ -12,7 +12,7 @@ import pandas as pd
 
 from experiments.evaluation.verdict import Profile, Role, Verdict, headline_verdict
 from experiments.report.claims import read_claims, read_provenance, read_verdicts, this_code
-from experiments.report.export import as_text, folded, numeric, plain
+from experiments.report.export import as_text, folded, numeric, plain, significant
 from experiments.report.panels import panels
 from experiments.runs.paths import CONF, SOURCE
 from experiments.runs.row import read_rows
@@ -113,7 +113,7 @@ def best_of_worlds(path: Path) -> list[tuple[str, str, str]]:
     if not error or not {*columns} <= {*found}:
         return []
     least = found.loc[found.groupby("choice.world")[error].idxmin()]
-    return [(str(w), str(e), plain(v, 2)) for w, e, v in least[[*columns, error]].to_numpy()]
+    return [(str(w), str(e), significant(v, 2)) for w, e, v in least[[*columns, error]].to_numpy()]
 
 
 def holding_best(
@@ -144,11 +144,12 @@ def best_on_lasers(path: Path) -> dict[str, Any]:
     others = laser[laser["project"] != first["project"]].head(1)
     return {
         "estimator": str(first["estimator"]),
-        "error": plain(float(first["ate_rmse_m"]), 2),
+        "error": significant(float(first["ate_rmse_m"]), 2),
         "methods": len(laser),
         "runs": int(first["runs"]),
         "others": "".join(
-            f"{row.estimator}, {plain(float(row.ate_rmse_m), 2)} m" for row in others.itertuples()
+            f"{row.estimator}, {significant(float(row.ate_rmse_m), 2)} m"
+            for row in others.itertuples()
         ),
     }
 

@@ -1,11 +1,12 @@
 """Tables for papers and pages: LaTeX (booktabs) and Markdown."""
 
 import re
+import textwrap
 from collections.abc import Callable, Sequence
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 import pandas as pd
 
 from experiments.runs.columns import title
@@ -19,10 +20,19 @@ _LATEX = str.maketrans(
         "\\": r"\textbackslash{}",
         "~": r"\textasciitilde{}",
         "^": r"\textasciicircum{}",
+        "<": r"\textless{}",
+        ">": r"\textgreater{}",
+        "|": r"\textbar{}",
+        "`": r"\textasciigrave{}",
+        '"': r"\textquotedbl{}",
         **{character: f"\\{character}" for character in "&%$#_{}"},
     }
 )
-_MARKDOWN = str.maketrans({character: f"\\{character}" for character in "\\|<[]!`*"})
+_MARKDOWN = re.compile(r"[\\|<\[\]!`*~&$]|(?<![^\W_])_|_(?![^\W_])")
+TEXT_PT = 345.0  # width of the text of LaTeX's article
+_LETTER_PT, _SMALL_LETTER_PT = 5.0, 4.4  # width of a letter, of \footnotesize
+_GAP_PT, _SMALL_GAP_PT = 12.0, 6.0  # between columns
+_TEXT_LETTERS, _HEAD_LETTERS = 24, 12  # of a line in a cell, in a heading, of a wide table
 
 
 def read_table(path: Path) -> pd.DataFrame:
@@ -68,10 +78,10 @@ def plain(value: Any, digits: int = 4) -> str:
 
 def significant(value: float, digits: int) -> str:
     """A number with so many significant digits; zeros at its end are some of them."""
-    if not 1e-3 <= abs(value) < 1e6:
+    if not 0.0 < abs(value) < 1e6:
         return plain(value, digits)
-    text = np.format_float_positional(value, digits, unique=False, fractional=False)
-    return text.removesuffix(".")
+    rounded = float(f"{value:.{digits - 1}e}")
+    return f"{rounded:.0f}" if abs(rounded) >= 10 ** (digits - 1) else f"{rounded:#.{digits}g}"
 
 
 class Mean(NamedTuple):
@@ -98,11 +108,12 @@ def folded(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 class Form(NamedTuple):
-    """How a kind of file writes text, the best of several means, and one that differs."""
+    """How a kind of file writes text, the best mean, one that differs, and an interval."""
 
     escape: Callable[[str], str]
     best: str
     differs: str
+    interval: str = " [{}, {}]"
 
 
 def written(frame: pd.DataFrame, form: Form, digits: int) -> pd.DataFrame:
@@ -114,7 +125,7 @@ def written(frame: pd.DataFrame, form: Form, digits: int) -> pd.DataFrame:
         number, low, high = (form.escape(significant(part, digits)) for part in value[:3])
         if value.best:
             number = form.best.format(number)
-        bounds = f" [{low}, {high}]" if low and value.low < value.high else ""
+        bounds = form.interval.format(low, high) if low and value.low < value.high else ""
         return number + (form.differs if value.differs else "") + bounds
 
     long = not any(isinstance(cell, Mean) for cell in frame.head(1).to_numpy().ravel())
@@ -139,7 +150,7 @@ def numeric(frame: pd.DataFrame) -> list[bool]:
 
 def escaped(text: str) -> str:
     """Text in which Markdown and HTML find nothing of theirs."""
-    return text.translate(_MARKDOWN)
+    return _MARKDOWN.sub(r"\\\g<0>", text)
 
 
 def to_markdown(frame: pd.DataFrame, digits: int = 4) -> str:
@@ -153,12 +164,72 @@ def to_markdown(frame: pd.DataFrame, digits: int = 4) -> str:
     return table + "\n"
 
 
-def to_latex(frame: pd.DataFrame, digits: int = 4) -> str:
-    """A `tabular` that needs `booktabs`; numbers such as 1e-05 become powers of ten."""
-    cells = written(frame, Form(latex, r"\textbf{{\boldmath {}}}", "$^{*}$"), digits)
+def to_latex(frame: pd.DataFrame, digits: int = 4, width_pt: float = TEXT_PT) -> str:
+    """A `tabular` that needs `booktabs`; numbers such as 1e-05 become powers of ten.
+
+    What is wider than `width_pt` becomes small, with intervals below their means and long texts in
+    lines; if that does not do, several tabulars, each with the columns that tell the rows apart.
+    """
+    best, differs = r"\textbf{{\boldmath {}}}", "$^{*}$"
+    cells = written(frame, Form(latex, best, differs), digits)
     columns = "".join("r" if number else "l" for number in numeric(frame))
-    table: str = cells.style.hide(axis="index").to_latex(column_format=columns, hrules=True)
-    return re.sub(r"(?m)^(?=[*\[])", "{}", table)  # else \\ takes it as its argument
+    if sum(_widths(cells, _LETTER_PT, _GAP_PT)) <= width_pt:
+        return _tabular(cells, columns)
+    small = Form(lambda text: _in_lines(text, _TEXT_LETTERS), best, differs, "\n[{}, {}]")
+    narrow = small._replace(escape=lambda text: _in_lines(text, _HEAD_LETTERS))
+    heads = written(frame, narrow, digits).columns
+    cells = written(frame, small, digits).set_axis(heads, axis=1)
+    widths, n_keys = _widths(cells, _SMALL_LETTER_PT, _SMALL_GAP_PT), _n_keys(frame)
+    parts = [[*range(n_keys)]]
+    for column in range(n_keys, len(widths)):
+        if len(parts[-1]) > n_keys and sum(widths[i] for i in [*parts[-1], column]) > width_pt:
+            parts.append([*range(n_keys)])
+        parts[-1].append(column)
+    tabulars = [_tabular(cells.iloc[:, part], "".join(columns[i] for i in part)) for part in parts]
+    small_print = r"{\footnotesize\setlength{\tabcolsep}{3pt}"
+    return f"{small_print}\n" + "\\par\\medskip\\noindent\n".join(tabulars) + "\\par}\n"
+
+
+def _in_lines(text: str, most: int) -> str:
+    return "\n".join(map(latex, textwrap.wrap(text, most)))
+
+
+def _widths(cells: pd.DataFrame, letter_pt: float, gap_pt: float) -> list[float]:
+    """About how wide the columns will be, points."""
+
+    def letters(text: str) -> int:
+        seen = re.sub(r"\\[a-z]+\{\}", "x", text)  # what remains of commands is not seen
+        return max(len(re.sub(r"\\[a-z]+|[\\{}$]", "", line)) for line in seen.split("\n"))
+
+    return [
+        gap_pt + letter_pt * max(map(letters, [str(head), *cells.iloc[:, i]]))
+        for i, head in enumerate(cells)
+    ]
+
+
+def _n_keys(frame: pd.DataFrame) -> int:
+    """How many of the first columns tell the rows apart; one if none do."""
+    counts = range(1, frame.shape[1])
+    return next((n for n in counts if not frame.iloc[:, :n].duplicated().any()), 1)
+
+
+def _tabular(cells: pd.DataFrame, columns: str) -> str:
+    """Cells of one or several lines as the rows of a `tabular`; headings stand at the bottom."""
+    heads = [str(head).split("\n") for head in cells]
+    most = max(map(len, heads))
+    lines = [*_lines([[*[""] * (most - len(head)), *head] for head in heads]), r"\midrule"]
+    rows = [_lines([cell.split("\n") for cell in row]) for row in cells.to_numpy().tolist()]
+    apart = [r"\addlinespace"] if max(map(len, rows), default=1) > 1 else []
+    for i, row in enumerate(rows):
+        lines += [*(apart if i else []), *row]
+    begin, end = rf"\begin{{tabular}}{{{columns}}}", r"\end{tabular}"
+    return "\n".join([begin, r"\toprule", *lines, r"\bottomrule", end, ""])
+
+
+def _lines(cells: list[list[str]]) -> list[str]:
+    """Lines of a row; one that begins with * or [ would be an argument of the row before."""
+    lines = [" & ".join(line) for line in zip_longest(*cells, fillvalue="")]
+    return ["{}" * line.startswith(("*", "[")) + line + r" \\" for line in lines]
 
 
 def latex(text: str) -> str:
@@ -166,7 +237,9 @@ def latex(text: str) -> str:
     power = re.fullmatch(r"(-?[\d.]+)e([+-]\d+)", text)
     if power:
         return rf"${power[1]} \times 10^{{{int(power[2])}}}$"
-    return f"${text}$" if re.fullmatch(r"-[\d.]+", text) else text.translate(_LATEX)
+    if re.fullmatch(r"-[\d.]+", text):
+        return f"${text}$"
+    return re.sub("-(?=-)", "-{}", text.translate(_LATEX))  # else -- becomes a dash
 
 
 FORMATS: dict[str, tuple[Callable[[pd.DataFrame, int], str], str]] = {

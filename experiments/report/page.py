@@ -16,7 +16,7 @@ from markupsafe import Markup
 
 from experiments.evaluation.verdict import Profile
 from experiments.report.contents import contents
-from experiments.report.export import plain
+from experiments.report.export import plain, significant
 from sim.errors import printable
 from sim.files import write_whole
 
@@ -79,8 +79,13 @@ def interval(row: Mapping[str, Any]) -> str:
     """A value and its interval; the value alone where nothing is random; empty if unknown."""
     if math.isnan(row["value"]):
         return ""
-    value, low, high = (plain(row[name]) for name in ("value", "low", "high"))
+    value, low, high = (_number(row[name]) for name in ("value", "low", "high"))
     return value if row["low"] == row["high"] == row["value"] else f"{value} [{low}, {high}]"
+
+
+def _number(value: float) -> str:
+    """A whole number as it is, any other with three significant digits."""
+    return plain(value) if value % 1 == 0 else significant(value, 3)
 
 
 def verdict(row: Mapping[str, Any]) -> str:

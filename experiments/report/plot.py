@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import textwrap
 from collections.abc import Mapping, Sequence
-from difflib import get_close_matches
 from enum import StrEnum
 from typing import Any
 
@@ -16,12 +15,11 @@ from matplotlib.ticker import MaxNLocator
 
 from experiments.runs.columns import ANSWER, COLUMNS, PATH, title
 from experiments.sweeps.averages import averages, pooled, rule, unit_of
-from experiments.sweeps.collect import DRAWN, measured, telling, with_answers
+from experiments.sweeps.collect import DRAWN, measured, no_column, telling, with_answers
 from experiments.viewing.plotting import plain_log, plain_ticks
 from experiments.viewing.style import SERIES, figure
 from sim.errors import InputError
 
-_NAMED = 12  # columns that a message names, the nearest first
 _FEW = 8  # values that are ticks of their own
 _DECADES = 100.0  # factor below which a logarithmic axis has plain numbers
 _WIDE = 10.0  # an axis whose values span this factor, or grow by factors, is logarithmic
@@ -161,10 +159,7 @@ def _check(table: pd.DataFrame, y: str, groups: Sequence[str]) -> None:
         raise InputError(f"{y} is drawn against itself; estima options metrics lists the results")
     for column in (y, *groups):
         if column not in table:
-            near = _metrics(table, y) if column == y else _columns(table, column)
-            more = f" and {len(near) - _NAMED} more" if len(near) > _NAMED else ""
-            there = ", ".join(near[:_NAMED])
-            raise InputError(f"the sweep has no column {column}; there are {there}{more}")
+            raise no_column(table, column, metric=column == y)
     if table[y].dtype.kind not in "fi":
         raise InputError(f"column {y} holds no numbers; there are {', '.join(measured(table))}")
 
@@ -326,19 +321,3 @@ def _marked(table: pd.DataFrame, columns: Sequence[str]) -> pd.DataFrame:
             words = table[column].where(~all_of, table[column].astype(str) + " (revised)")
             table = table.assign(**{column: words})
     return table
-
-
-def _metrics(table: pd.DataFrame, wanted: str) -> list[str]:
-    """Results of a table: those like a wanted one, the best answers, and all others."""
-    found = measured(table)
-    answers = [f"{ANSWER}{name}" for name in found if f"{ANSWER}{name}" in COLUMNS]
-    near = [name for name in (*answers, *found) if wanted.lower() in name]
-    near += get_close_matches(wanted, [*answers, *found], n=5)
-    return list(dict.fromkeys([*near, *found]))
-
-
-def _columns(table: pd.DataFrame, wanted: str) -> list[str]:
-    """Columns of a table: those most like a wanted one, swept settings, results, and all others."""
-    near = get_close_matches(wanted, map(str, table), n=len(table.columns))
-    near += [name for name in table if wanted.rpartition(".")[2] in name]
-    return list(dict.fromkeys([*near, *telling(table), *measured(table), *table]))

@@ -8,6 +8,7 @@ import pandas as pd
 from markupsafe import Markup, escape
 
 from experiments.report.export import (
+    TEXT_PT,
     Form,
     escaped,
     folded,
@@ -26,7 +27,14 @@ from sim.files import write_whole
 
 DIGITS = 3
 FORMATS = (".tex", ".md", ".html", ".csv", ".parquet")
-HTML = Form(lambda text: str(escape(text)), "<b>{}</b>", "<sup>*</sup>")
+# Of the text of LaTeX's article, and of IEEE's two-column papers
+WIDTHS_PT = {"text": TEXT_PT, "column": 252.0, "page": 516.0}
+HTML = Form(
+    lambda text: str(escape(text)),
+    "<b>{}</b>",
+    "<sup>*</sup>",
+    ' <span class="whole">[{}, {}]</span>',
+)
 
 
 WORDS = {
@@ -37,9 +45,13 @@ WORDS = {
 _MOST_REMARKS = 12
 
 
-def check_name(path: Path) -> None:
-    """Check that a table's file has an ending that names its format."""
-    require(path.suffix in FORMATS, f"-o {path}: a table is {', '.join(FORMATS)}")
+def check_name(path: Path | None, size: str | None) -> None:
+    """Check that a table's file has an ending that names its format, and a LaTeX one's size."""
+    if path is not None:
+        require(path.suffix in FORMATS, f"-o {path}: a table is {', '.join(FORMATS)}")
+    if size is not None:
+        require(size in WIDTHS_PT, f"--size must be {', '.join(WIDTHS_PT)}, got {size}")
+        require(path is not None and path.suffix == ".tex", f"--size {size} is for -o x.tex")
 
 
 _TESTED = 6  # runs below which a paired test finds next to nothing
@@ -48,25 +60,28 @@ _TESTED = 6  # runs below which a paired test finds next to nothing
 def notes(found: pd.DataFrame, against: str | None) -> str:
     """How the numbers of a summary came about and what the marks mean, in a line."""
     best, differs = (found.filter(regex=f"_{mark}$").to_numpy(bool).any() for mark in MARKS)
-    parts = [
-        f"{found.attrs['rule']}.",
-        "Bold: the best on the same recordings." if best else "",
-        f"*: differs from {against} (paired t tests over recordings; 5 % for the table, Holm)."
-        if differs
-        else f"Too few recordings to test what differs from {against}."
-        if found["runs"].max() < _TESTED
-        else f"Nothing differs from {against} by paired tests."
-        if against
-        else "",
-    ]
-    return " ".join(filter(None, parts))
+    parts = [f"{found.attrs['rule']}."]
+    if best:
+        parts.append("Bold: the best on the same recordings.")
+    if found["incomplete"].any():
+        parts.append("incomplete: runs without a pose for some of the drive, never the best.")
+    if differs:
+        parts.append(
+            f"*: differs from {against} (paired t tests over recordings; 5 % for the table, Holm)."
+        )
+    elif against and found["runs"].max() < _TESTED:
+        parts.append(f"Too few recordings to test what differs from {against}.")
+    elif against:
+        parts.append(f"Nothing differs from {against} by paired tests.")
+    return " ".join(parts)
 
 
 def shown(found: pd.DataFrame) -> pd.DataFrame:
     """A summary with a cell a mean, and without columns that say nothing."""
     silent = [name for name in COUNTS if not found[name].any()]
     silent += [PATH] if (found[PATH] == "online").all() else []
-    return folded(found.drop(columns=silent))
+    words = {name: name.replace("_", " ") for name in COUNTS}
+    return folded(found.drop(columns=silent)).rename(columns=words)
 
 
 def as_lines(found: pd.DataFrame, note: str) -> str:
@@ -75,18 +90,25 @@ def as_lines(found: pd.DataFrame, note: str) -> str:
     return f"{note.replace('Bold:', '>:')}\n\n{cells.to_string(index=False)}"
 
 
-def write_table(found: pd.DataFrame, note: str, path: Path, name: str) -> None:
+def write_table(
+    found: pd.DataFrame, note: str, path: Path, name: str, size: str | None = None
+) -> None:
     """Write a summary in the format of the path's ending, with its note where the format has text.
 
     LaTeX is a `tabular` and a line of small print, for a float of one's own; it needs `booktabs`.
+    One wider than its `size` (of `WIDTHS_PT`, `text` by default) becomes several.
     """
     if path.suffix in (".csv", ".parquet"):
         write_frame(found, path)
         return
     frame = shown(found)
     if path.suffix == ".tex":
-        small = f"\\par\\smallskip\\parbox{{\\linewidth}}{{\\footnotesize {latex(note)}}}\n"
-        text = f"% needs \\usepackage{{booktabs}}\n{to_latex(frame, DIGITS)}{small}"
+        small = (
+            f"\\par\\smallskip\\noindent\\parbox{{\\linewidth}}{{\\footnotesize {latex(note)}}}\n"
+        )
+        table = to_latex(frame, DIGITS, WIDTHS_PT[size or "text"])
+        engine = "" if table.isascii() else ", and LuaLaTeX if pdfLaTeX lacks a letter"
+        text = f"% needs \\usepackage{{booktabs}}{engine}\n{table}{small}"
     elif path.suffix == ".md":
         text = f"{escaped(note)}\n\n{to_markdown(frame, DIGITS)}"
     else:

@@ -20,7 +20,7 @@ from experiments.evaluation.metrics import (
 )
 from experiments.runs.columns import OF_THE_RUN
 from experiments.runs.experiment import Experiment
-from experiments.runs.row import Outcome, Row, Status
+from experiments.runs.row import GAP, Outcome, Row, Status
 from experiments.runs.seeds import stream
 from sim.arrays import Array
 from sim.errors import InputError, require
@@ -181,13 +181,15 @@ def status_of(recording: Recording, online: Estimate, revised: Estimate | None =
         return Status(Outcome.FAILED, "recording", recording.status)
     sound = np.isfinite(online.means).all(axis=1)
     sound &= np.isfinite(online.covariances).all(axis=(1, 2))
-    if online.status != "ok":
-        return Status(Outcome.REMARK, "estimator", online.status)
-    if not sound.all():
+    if online.status == "ok" and not sound.all():
         when = online.stamps[np.argmin(sound)]
         return Status(Outcome.FAILED, "not_finite", f"not finite at {when:.2f} s")
     paths = (online.stamps, *([] if revised is None else [revised.stamps]))
-    return max((status_of_pauses(recording, stamps) for stamps in paths), key=lambda s: s.code)
+    found = max((status_of_pauses(recording, stamps) for stamps in paths), key=lambda s: s.code)
+    if online.status == "ok":
+        return found
+    detail = "; ".join(filter(None, [found.detail, online.status]))
+    return Status(Outcome.REMARK, found.code or "estimator", detail)
 
 
 def status_of_pauses(recording: Recording, stamps: Array) -> Status:
@@ -204,4 +206,4 @@ def status_of_pauses(recording: Recording, stamps: Array) -> Status:
     pause_s = longest_pause_s(stamps, start, end)
     if pause_s <= max(REMARKED_PAUSE_S, own_s):
         return Status()
-    return Status(Outcome.REMARK, "gap", f"no pose for {pause_s:.3g} s of the recording")
+    return Status(Outcome.REMARK, GAP, f"no pose for {pause_s:.3g} s of the recording")

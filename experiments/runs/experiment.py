@@ -597,7 +597,7 @@ def rows_folder(name: Any) -> Path:
 
 
 def _check_shape(config: Config) -> None:
-    """Check that every key is there, and holds keys or a path where it must."""
+    """Check that every key is there, holds keys or a path where it must, and nowhere NaN."""
     for key in _KEYS:
         parent, _, leaf = key.rpartition(".")
         if leaf not in (config[parent] if parent else config):
@@ -612,6 +612,17 @@ def _check_shape(config: Config) -> None:
     if not (wanted is None or isinstance(wanted, dict) or (isinstance(wanted, str) and wanted)):
         got = "nothing" if wanted == "" else repr(wanted)
         raise InputError(f"recording must be a path, null, or a mapping with _target_, got {got}")
+    for place, value in _leaves(config):
+        require(not _holds_nan(value), f"{'.'.join(map(str, place))} holds NaN; give a number")
+
+
+def _holds_nan(value: Any) -> bool:
+    """Whether a value is NaN, or a list or mapping that has one."""
+    if isinstance(value, dict):
+        return any(map(_holds_nan, value.values()))
+    if isinstance(value, (list, tuple)):
+        return any(map(_holds_nan, value))
+    return isinstance(value, float) and math.isnan(value)
 
 
 def _presets_with(names: Sequence[str]) -> list[str]:

@@ -25,6 +25,7 @@ Row = dict[str, str | int | float | bool | None]
 _TEXTS = (*STATUS, *ORIGIN)
 WITH_DIGEST = re.compile(r".+\.([0-9a-f]{16})\.parquet")
 _NONE = type(None)
+GAP = "gap"  # the code of a run that gave no pose for some of the drive
 
 
 class Outcome(StrEnum):

@@ -54,7 +54,7 @@ def run_once(experiment: Experiment, draw: Draw, out: Path | None = None) -> lis
     folder, name = experiment.rows_folder / experiment.key, experiment.estimator_name
 
     def fetch() -> Recording:
-        with progress("simulated seconds", _expected_s(experiment)) as on_progress:
+        with progress("simulated seconds", expected_s(experiment)) as on_progress:
             recording = experiment.recording(on_progress)
         slip = experiment.believed_slip
         if "source" in recording.config and experiment.config["calibration"] is None and slip:
@@ -88,11 +88,14 @@ def run_once(experiment: Experiment, draw: Draw, out: Path | None = None) -> lis
     return rows
 
 
-def _expected_s(experiment: Experiment) -> float | None:
+def expected_s(experiment: Experiment) -> float | None:
     """About how long the simulated drive will be; None if that is not known before."""
     route = experiment.config["route"] if experiment.config["recording"] is None else {}
     if "segments" in route:
         return sum(float(segment[2]) for segment in route["segments"]) + float(route["rest_s"])
+    if route.get("_target_") == "sim.timetable.Timetable":
+        stamps, _ = experiment.route().way
+        return float(stamps[-1] - stamps[0])
     if "look_ahead_m" not in route:
         return None
     way_m = route["distance_m"]

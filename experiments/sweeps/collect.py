@@ -4,12 +4,22 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from difflib import get_close_matches
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
-from experiments.runs.columns import ANSWER, ORIGIN, PATH, REPEAT, REVISED, STATUS, is_setting
+from experiments.runs.columns import (
+    ANSWER,
+    COLUMNS,
+    ORIGIN,
+    PATH,
+    REPEAT,
+    REVISED,
+    STATUS,
+    is_setting,
+)
 from experiments.runs.paths import results
 from experiments.runs.store import read_runs
 from experiments.runs.version import code_version, version_with
@@ -20,6 +30,7 @@ _TIMES = ["step_time_us", "cpu_time_us"]  # they differ from run to run
 _COMMAND = "estimator.command"
 COMMAND = "command.txt"  # beside the rows: the commands that made them
 DRAWN = ("seed", "world_seed")  # settings that only draw other samples
+_NAMED = 12  # columns that a message names
 
 
 def collect(name: str, *, all_versions: bool = False, times: bool = False) -> pd.DataFrame:
@@ -193,6 +204,20 @@ def measured(table: pd.DataFrame) -> list[str]:
     """Results of the runs: columns of numbers that are neither settings nor origin."""
     numbers = table.select_dtypes(["integer", "floating"])
     return [c for c in numbers if not is_setting(c) and c not in (REPEAT, *ORIGIN)]
+
+
+def no_column(table: pd.DataFrame, wanted: str, *, metric: bool) -> InputError:
+    """Say that a column, or a result, is not there, and which are, those like it first."""
+    found = measured(table)
+    answers = [f"{ANSWER}{name}" for name in found if f"{ANSWER}{name}" in COLUMNS]
+    known = [*answers, *found] if metric else [*telling(table), *found, *table]
+    near = [name for name in known if wanted.rpartition(".")[2].lower() in name]
+    near += get_close_matches(wanted, known, n=5)
+    names = list(dict.fromkeys([*near, *known]))
+    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    meant = f"did you mean {near[0]}? " if near else ""
+    there = ", ".join(names[:_NAMED])
+    return InputError(f"the sweep has no column {wanted}; {meant}there are {there}{more}")
 
 
 def with_answers(table: pd.DataFrame, names: Sequence[str]) -> pd.DataFrame:

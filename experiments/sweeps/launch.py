@@ -17,7 +17,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -42,9 +42,10 @@ from sim.recording import Recording
 _JOBS_PER_CORE = 4  # enough to keep all busy to the end, few enough to cost little
 # What launchers raise when a process of theirs has died; Ray and submitit are extras
 _DIED = {"UncompletedJobError", "WorkerCrashedError", "NodeDiedError", "OutOfMemoryError"}
+OnDone = Callable[[Path, int], None]
 
 
-def sweep_arguments(arguments: Sequence[str]) -> tuple[Path, int]:
+def sweep_arguments(arguments: Sequence[str], on_done: OnDone) -> None:
     """Sweep by a command line's arguments: overrides, and `--config-dir` with its folder."""
     overrides, config_dir = [], None
     rest = iter(arguments)
@@ -59,10 +60,12 @@ def sweep_arguments(arguments: Sequence[str]) -> tuple[Path, int]:
         else:
             overrides.append(argument)
     signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGINT))  # end as by Ctrl-C
-    return sweep(overrides, config_dir)
+    sweep(overrides, config_dir, on_done)
 
 
-def sweep(arguments: Sequence[str], config_dir: str | None = None) -> tuple[Path, int]:
+def sweep(
+    arguments: Sequence[str], config_dir: str | None = None, on_done: OnDone = lambda *_: None
+) -> None:
     """Run all combinations of the swept values, except those already done.
 
     Parameters
@@ -74,11 +77,9 @@ def sweep(arguments: Sequence[str], config_dir: str | None = None) -> tuple[Path
         that the runs are packed into.
     config_dir
         A further folder of options.
-
-    Returns
-    -------
-    folder, n_runs
-        Where the rows are, and how many runs the sweep has.
+    on_done
+        Called when all runs have ended, also if some failed, with the folder of the rows and the
+        number of runs.
 
     Raises
     ------
@@ -111,7 +112,8 @@ def sweep(arguments: Sequence[str], config_dir: str | None = None) -> tuple[Path
         file=sys.stderr,
     )
     if not len(runs):
-        return folder, len(keys)
+        on_done(folder, len(keys))
+        return
     try:
         _launch_all(plan, runs, Jobs(folder, n_jobs), launching)
     except KeyboardInterrupt:
@@ -121,11 +123,11 @@ def sweep(arguments: Sequence[str], config_dir: str | None = None) -> tuple[Path
         ) from None
     _tidy(folder)
     found = store.ended(folder)
+    on_done(folder, len(keys))
     bad = runs[~np.isin(plan.keys[runs], found.done)]
     if len(bad):
         why = found.failed.get(int(plan.keys[bad[0]]), "no row was written")
         raise RunFailedError(f"{len(bad)} of {len(keys)} runs; first: {why}")
-    return folder, len(keys)
 
 
 def _name(plan: Plan, own: Sequence[str], config_dir: str | None) -> str | None:

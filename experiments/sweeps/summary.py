@@ -9,9 +9,9 @@ import pandas as pd
 
 from experiments.evaluation.statistics import holm
 from experiments.runs.columns import COLUMNS, PATH, RELATIVE
-from experiments.runs.row import Outcome
+from experiments.runs.row import GAP, Outcome
 from experiments.sweeps.averages import RECORDING, averages, difference_p, pooled, rule, unit_of
-from experiments.sweeps.collect import DRAWN, measured, telling, with_answers
+from experiments.sweeps.collect import DRAWN, no_column, telling, with_answers
 from sim.errors import InputError
 
 ERROR = "answer_ate_rmse_m"
@@ -24,7 +24,7 @@ _MAIN = (
     "step_time_us",
     "cpu_time_us",
 )
-COUNTS = {"failed": Outcome.FAILED, "with_remarks": Outcome.REMARK}
+COUNTS = ("failed", "with_remarks", "incomplete")  # runs; the last are some of those with remarks
 _LEVEL = 0.05  # of all tests of a table
 _GROUP = "group"  # numbers the rows of a table
 SUFFIXES = ("_low", "_high")  # of the bounds of an interval
@@ -38,8 +38,9 @@ def summary(
 
     Each metric has three columns: its mean, and the bounds of its 95 % interval (`_low`, `_high`),
     by the rule of `sweeps.averages`. Column `_best` says whether it is the best among rows over the
-    same recordings; a row with failed runs is never the best, since it leaves out what was hard.
-    Errors are those of the best answers; column `answer` says which path that is.
+    same recordings; a row with failed runs, or with some that gave no pose for a part of the drive
+    (`incomplete`), is never the best, since it leaves out what was hard. Errors are those of the
+    best answers; column `answer` says which path that is.
 
     Parameters
     ----------
@@ -60,8 +61,7 @@ def summary(
     shown = list(metrics) or [c for c in _MAIN if c in table and table[c].notna().any()]
     for column in shown:
         if column not in table:
-            there = ", ".join(measured(table))
-            raise InputError(f"the sweep has no column {column}; there are {there}")
+            raise no_column(table, column, metric=True)
         if not pd.api.types.is_numeric_dtype(table[column]):
             raise InputError(f"column {column} holds no numbers in some rows; see --where")
     groups = table.groupby(by or (lambda _: "all runs"), dropna=False)
@@ -69,10 +69,11 @@ def summary(
     unit = unit_of(table, [_GROUP])
     found = _counted(table)
     sound = table[table["status"] != Outcome.FAILED]
+    whole = (found["failed"] == 0) & (found["incomplete"] == 0)
     on = table.groupby(_GROUP)[RECORDING].agg(lambda s: "+".join(sorted(set(map(str, s)))))
     for name in shown:
         _add(found, name, averages(sound, [_GROUP], unit, name))
-        found[f"{name}_best"] = _best(found[name].where(found["failed"] == 0), name, on)
+        found[f"{name}_best"] = _best(found[name].where(whole), name, on)
     if against is not None:
         _compare(found, sound, shown, against, _rows_of(against, sound))
     bounded = [found.loc[found[name].notna(), f"{name}_low"].notna() for name in shown]
@@ -81,14 +82,17 @@ def summary(
 
 
 def _counted(table: pd.DataFrame) -> pd.DataFrame:
-    """How many runs a group has, which path answers, and how many failed or had a remark."""
+    """How many runs a group has, which path answers, and how many of each kind of `COUNTS`."""
     groups = table.groupby(_GROUP)
     found = {
         "runs": groups.size(),
         PATH: groups[PATH].agg(lambda s: "/".join(sorted(set(map(str, s))))),
     }
-    for name, outcome in COUNTS.items():
-        found[name] = (table["status"] == outcome).groupby(table[_GROUP]).sum()
+    remarked = table["status"] == Outcome.REMARK
+    gap = table["status_code"] == GAP if "status_code" in table else remarked & False
+    kinds = (table["status"] == Outcome.FAILED, remarked, remarked & gap)
+    for name, is_so in zip(COUNTS, kinds, strict=True):
+        found[name] = is_so.groupby(table[_GROUP]).sum()
     return pd.DataFrame(found)
 
 

@@ -48,8 +48,10 @@ def plain_log(axis: Axis, multiples: Sequence[float] = (1.0, 2.0, 5.0)) -> None:
     axis.set_minor_formatter("")
 
 
-def with_legend(page: Figure, ncols: int, loc: str = "outside lower center") -> Figure:
+def with_legend(
+    page: Figure, ncols: int, loc: str = "outside lower center", markerscale: float = 1.0
+) -> Figure:
     """Add one legend for all axes, of what the first of them shows; return the page."""
     handles, labels = page.axes[0].get_legend_handles_labels()
-    page.legend(handles, labels, loc=loc, ncols=ncols)  # type: ignore[call-overload]
+    page.legend(handles, labels, loc=loc, ncols=ncols, markerscale=markerscale)  # type: ignore[call-overload]
     return page

@@ -84,7 +84,7 @@ def draw(made: Results) -> dict[str, Figure]:
 
 def route(office: Arrays) -> Figure:
     """Figure 1: the route, with areas like the paper's A (a curve) and B (corridor, objects)."""
-    page, ax = subplots(9.0, 6.4)
+    page, ax = subplots(6.2, 4.5)
     draw_walls(ax, office["walls"], office["wall_z_m"])
     ax.plot(*office["truth"].T, color=BLUE, lw=1.2, label="route")
     ax.plot(*office["truth"][0], "o", color=BLUE, ms=5, label="start")
@@ -104,14 +104,14 @@ def ellipses(office: Arrays, areas: pd.DataFrame, path: pd.DataFrame) -> Figure:
 
     The axes are those along a corridor of the judged ones, with bare legs, objects and bends.
     """
-    page = figure(9.0, 6.6)
+    page = figure(6.2, 6.0)
     top, bottom = page.subfigures(2, 1, height_ratios=(1.5, 1.0))  # type: ignore[misc]
     scale = 0.6 / (2.45 * areas["long_m"].quantile(0.9))
     for ax, name, what in zip(
         top.subplots(1, 2), "AB", ("a curve", "a corridor with objects"), strict=True
     ):
         rows = areas[areas["area"] == name]
-        _enlarged_ellipses(ax, office, rows, scale, f"{name}: {what} (ellipses times {scale:.0f})")
+        _enlarged_ellipses(ax, office, rows, scale, f"{name}: {what}\n(ellipses times {scale:.0f})")
     ax = bottom.subplots()
     for name, color in (("long", BLUE), ("short", ORANGE)):
         sigma_mm = 1e3 * path[f"{name}_m"]
@@ -157,7 +157,7 @@ def _enlarged_ellipses(
 
 def trajectories(office: Arrays, drawn: pd.DataFrame) -> Figure:
     """Figure 3: trajectories of the three methods and the truth; errors against time below."""
-    page = figure(9.0, 8.4)
+    page = figure(6.2, 6.8)
     top, bottom = page.subfigures(2, 1, height_ratios=(2.2, 1.0))  # type: ignore[misc]
     ax, below = top.subplots(), bottom.subplots()
     draw_walls(ax, office["walls"], office["wall_z_m"])

@@ -54,7 +54,7 @@ def _paths(ax: Axes, run: dict[str, Any]) -> None:
 
 def by_distance(coverage: pd.DataFrame) -> Figure:
     """Area seen by the distance driven: median and quartiles over worlds."""
-    page, ax = subplots(7.5, 4.8)
+    page, ax = subplots(6.2, 4.4)
     longest_m = coverage.groupby(["strategy", "seed"])["driven_m"].max().median()
     for strategy, (colour, line) in _STRATEGIES.items():
         part = coverage[coverage["strategy"] == strategy]

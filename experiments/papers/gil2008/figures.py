@@ -170,8 +170,10 @@ def _draw_3d(ax: Any, run: Arrays, name: str) -> None:
         xlabel="x, m",
         ylabel="y, m",
         zlabel="z, m",
+        zticks=range(4),
     )
     ax.set_box_aspect((2.0 * reach, 2.0 * reach, 3.0), zoom=1.0)
+    ax.zaxis.labelpad = 0.0
 
 
 def path(run: Arrays) -> Figure:

@@ -103,7 +103,7 @@ def map_and_route(drawn: dict[str, Arrays]) -> Figure:
         ax.plot(*place["queries_m"].T, ".", color=RED, ms=2, label="queries")
         ax.plot(*place["nodes_m"].T, ".", color=BLUE, ms=2, label="nodes of the map")
         plan_axes(ax, title=NAMES[name])
-    return with_legend(page, ncols=2)
+    return with_legend(page, ncols=2, markerscale=4.0)
 
 
 def dispersion(table: pd.DataFrame) -> Figure:
@@ -241,7 +241,7 @@ def quality(table: pd.DataFrame) -> Figure:
 
 def oxford_runs(table: pd.DataFrame) -> Figure:
     """Error of each method on the positions of each Oxford run."""
-    page, ax = subplots(8.0, 4.0)
+    page, ax = subplots(6.2, 4.0)
     errors = table.groupby(["run", "method"])["error_m"].mean().unstack()
     for i, method in enumerate(METHODS):
         at = np.arange(len(errors)) + 0.15 * (i - 1)

@@ -148,13 +148,13 @@ def calibration(table: pd.DataFrame) -> Figure:
                 _estimates(ax, part, len(rows) - 1 - i, CYCLE[i // 2])
             ax.axvline(1.0, color=BLACK, lw=0.8)
             arm = "gain and track joint" if joint else "nominal geometry"
-            ax.set_title(f"k = {k:g} m, {arm}", fontsize="small")
+            ax.set_title(f"k = {k:g} m\n{arm}", fontsize="small")
     labels = [f"{_METHODS[method]}, {_PARAMETERS[name]}" for method, name in rows]
     ticks = {"yticks": range(len(rows)), "yticklabels": labels[::-1]}
     axes[0, 0].set(xscale="log", xlim=(0.55, 6.5), **ticks)
     plain_ticks(axes[0, 0], [0.7, 1.0, 1.5, 2.0, 3.0, 4.0])
     page.supxlabel(
-        "estimate over the truth: histogram, its mean (dot), mean 95 % interval (bar); "
+        "estimate over the truth: histogram, its mean (dot), mean 95 % interval (bar);\n"
         "at the right, the share of intervals that cover",
         fontsize="medium",
     )

@@ -80,7 +80,8 @@ def mrclam(errors: pd.DataFrame, paths: Arrays) -> Figure:
     page, (left, middle, right) = subplots(11.0, 4.6, 1, 3, width_ratios=[1.0, 1.0, 1.1])
     robots, by_method = sorted(errors.robot.unique()), dict(list(errors.groupby("method")))
     shown = [method for method in MRCLAM_SHOWN if method in by_method]
-    for i, (method, color) in enumerate(zip(shown, (BLACK, *CYCLE[:-1], "#999999"), strict=False)):
+    color_of = dict(zip(shown, (BLACK, *CYCLE[:-1], "#999999"), strict=False))
+    for i, (method, color) in enumerate(color_of.items()):
         rows = by_method[method].groupby("robot")
         at = np.searchsorted(robots, list(rows.groups)) + (i - len(shown) / 2.0) * 0.09
         left.plot(at, rows.ate_rmse_m.mean(), "o", ms=4, color=color, label=method)
@@ -94,9 +95,8 @@ def mrclam(errors: pd.DataFrame, paths: Arrays) -> Figure:
     )
     middle.set(yscale="log", ylabel="mean NEES (3 is consistent)", **ticks)
     middle.axhline(3.0, color=BLACK, lw=0.7, ls=":")
-    drawn = ("motion capture", *MRCLAM_DRAWN)
-    for name, color in zip(drawn, (BLACK, CYCLE[1], CYCLE[0]), strict=True):
-        right.plot(*paths[name].T, color=color, lw=0.8, label=name)
+    for name in ("motion capture", *MRCLAM_DRAWN):
+        right.plot(*paths[name].T, color=color_of.get(name, BLACK), lw=0.8, label=name)
     plan_axes(right, title="robot 4")
     page.legend(*left.get_legend_handles_labels(), loc="outside lower left", ncols=4, fontsize=7)
     page.legend(*right.get_legend_handles_labels(), loc="outside lower right", fontsize=7)

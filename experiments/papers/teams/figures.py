@@ -32,7 +32,7 @@ def draw(made: Results) -> dict[str, Figure]:
 
 def drive(run: dict[str, Any]) -> Figure:
     """Paths of the robots in one world, and lines from who sees to who is seen."""
-    page, ax = subplots(7.0, 6.5)
+    page, ax = subplots(6.2, 6.0)
     draw_walls(ax, run["walls"], run["wall_z_m"])
     numbers = sorted(int(name.removeprefix("truth_")) for name in run if name.startswith("truth_"))
     for number, colour in zip(numbers, _COLOURS, strict=False):
@@ -76,7 +76,7 @@ def by_link(errors: pd.DataFrame) -> Figure:
     own = errors[(errors["filter"] == "ekf_slam") & errors["sightings"]]
     size = own.loc[own["link"] != ALWAYS, "size"].iloc[0]
     own = own[own["size"] == size]
-    page, ax = subplots(7.0, 4.2)
+    page, ax = subplots(6.2, 3.8)
     for at, (link, part) in enumerate(own.groupby("link", sort=False)):
         values = part["ate_rmse_m"].to_numpy()
         ax.plot(np.full(len(values), at), values, ".", color=SKY, ms=6)
@@ -85,6 +85,7 @@ def by_link(errors: pd.DataFrame) -> Figure:
                     xycoords=("data", "axes fraction"), textcoords="offset points")  # fmt: skip
     ax.set(ylabel=f"RMS position error of {size} robots, m", yscale="log", xlim=(-0.5, at + 0.5))
     ax.set_xticks([])
+    ax.set_xlabel("communication", labelpad=20)
     plain_log(ax.yaxis)
     return page
 

@@ -6,19 +6,30 @@ for (const picture of document.querySelectorAll("img[data-panels]")) {
   parts.className = "panels";
   parts.setAttribute("role", "img");
   parts.setAttribute("aria-label", picture.alt);
-  for (const box of picture.dataset.panels.split(" ")) {
-    const [left, top, right, bottom] = box.split(",").map(Number);
-    const [across, down] = [right - left, bottom - top];
+  for (const text of picture.dataset.panels.split(" ")) {
+    // a panel; before it the labels of its axis, which are another panel's
+    const boxes = text.split("+").map((box) => box.split(",").map(Number));
+    const [, top, , bottom] = boxes[boxes.length - 1];
+    const down = bottom - top;
+    const across = boxes.reduce((sum, [left, , right]) => sum + right - left, 0);
     const part = document.createElement("span");
-    // half its size at least, where its letters are eight pixels high, and twelve at most
-    part.style.cssText = `width: clamp(${0.5 * across}px, 100%, ${0.75 * across}px);
+    // 0.4 of its size at least, where its letters are seven pixels high, and twelve at most
+    part.style.cssText = `width: clamp(${0.4 * across}px, 100%, ${0.75 * across}px);
       aspect-ratio: ${across} / ${down}`;
-    const whole = new Image();
-    whole.alt = "";
-    whole.src = picture.src;
-    whole.style.cssText = `width: ${(100 * width) / across}%; height: ${(100 * height) / down}%;
-      left: ${(-100 * left) / across}%; top: ${(-100 * top) / down}%`;
-    part.append(whole);
+    let at = 0;
+    for (const [left, first, right, last] of boxes) {
+      const pane = document.createElement("span");
+      pane.style.cssText = `left: ${(100 * at) / across}%; width: ${(100 * (right - left)) / across}%;
+        clip-path: inset(${(100 * (first - top)) / down}% 0 ${(100 * (bottom - last)) / down}% 0)`;
+      const whole = new Image();
+      whole.alt = "";
+      whole.src = picture.src;
+      whole.style.cssText = `width: ${(100 * width) / (right - left)}%; height: ${(100 * height) / down}%;
+        left: ${(-100 * left) / (right - left)}%; top: ${(-100 * top) / down}%`;
+      pane.append(whole);
+      part.append(pane);
+      at += right - left;
+    }
     parts.append(part);
   }
   picture.after(parts);

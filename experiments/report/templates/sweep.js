@@ -70,6 +70,9 @@ function grouped(rows, key) {
 const written = (v) => (v && Math.abs(v) < 1e-3 ? v.toExponential() : String(v));
 const NUMBERS = Array.from({ length: 36 }, (_, i) => [1, 2, 5].map((m) => Number(`${m}e${i - 18}`))).flat();
 
+// A text of a file as Plotly's labels show it, which read some of HTML.
+const safe = (text) => String(text).replaceAll("&", "&amp;").replaceAll("<", "&lt;").replaceAll(">", "&gt;");
+
 const mean = (values) => values.reduce((sum, v) => sum + v, 0) / values.length;
 
 // Mean with its 95 % interval, if it is of three or more: the rule of tables and plots.
@@ -106,18 +109,20 @@ function byFactors(values) {
 function draw() {
   const [x, y, colour, panels] = ["x", "y", "colour", "panels"].map((id) => byId(id).value);
   const [xs, metric] = [columns.get(x), columns.get(y)];
-  const rows = data.failed.map((_, row) => row).filter((row) =>
-    !data.failed[row] && metric.values[row] !== null && xs.values[row] !== null &&
+  const chosen = data.failed.map((_, row) => row).filter((row) =>
     [...kept].every(([name, some]) => {
       const value = columns.get(name).values[row];
       return value === null || some.has(value);
     }));
+  const ended = chosen.filter((row) => !data.failed[row]);
+  const rows = ended.filter((row) => metric.values[row] !== null && xs.values[row] !== null);
   const style = getComputedStyle(document.documentElement);
   const ink = style.getPropertyValue("--text").trim();
   const line = style.getPropertyValue("--line").trim();
   const order = distinct(x);
   const numeric = order.every((v) => typeof v === "number");
   const of = (name, row) => (name ? columns.get(name).values[row] : "");
+  const at = (value) => (numeric ? value : safe(value));
   const panelNames = panels ? distinct(panels).filter((v) => rows.some((r) => of(panels, r) === v)) : [""];
   const colours = colour ? distinct(colour) : [""];
   const groups = grouped(rows, (row) => [of(panels, row), of(colour, row), of(x, row)].join("\u0000"));
@@ -133,27 +138,26 @@ function draw() {
     const axis = p ? String(p + 1) : "";
     const inPanel = rows.filter((row) => !panels || of(panels, row) === panel);
     if (panels) {
-      annotations.push({ text: `${columns.get(panels).title}: ${panel}`.replaceAll("<", "&lt;"),
+      annotations.push({ text: safe(`${columns.get(panels).title}: ${panel}`),
         showarrow: false, xref: `x${axis} domain`, yref: `y${axis} domain`, x: 0.5, y: 1.02,
         yanchor: "bottom" });
     }
     colours.forEach((name, c) => {
       const mine = inPanel.filter((row) => !colour || of(colour, row) === name);
       if (!mine.length) return;
-      const label = String(name).replaceAll("<", "&lt;");
+      const label = safe(name);
       const shared = { xaxis: `x${axis}`, yaxis: `y${axis}`, legendgroup: label, name: label };
       const paint = COLOURS[c % COLOURS.length];
       if (byId("each").checked) {
         traces.push({ ...shared, type: "scatter", mode: "markers", showlegend: false,
-          x: mine.map((row) => of(x, row)), y: mine.map((row) => metric.values[row]),
+          x: mine.map((row) => at(of(x, row))), y: mine.map((row) => metric.values[row]),
           marker: { color: paint, size: 5, opacity: 0.35 },
           text: mine.map((row) => data.settings.filter((s) => s.values[row] !== null)
-            .map((s) => `${s.title}: ${s.values[row]}`).join("<br>")
-            .concat(`<br>${data.status[row]}`).replaceAll(/<(?!br>)/g, "&lt;")),
+            .map((s) => `${s.title}: ${s.values[row]}`).concat(data.status[row]).map(safe).join("<br>")),
           hovertemplate: "%{y:.4g}<br>%{text}<extra></extra>" });
       }
       const points = order.map((v) => [v, mine.filter((row) => of(x, row) === v)])
-        .filter(([, some]) => some.length).map(([v, some]) => ({ at: v, ...average(some, metric, unit) }));
+        .filter(([, some]) => some.length).map(([v, some]) => ({ at: at(v), ...average(some, metric, unit) }));
       found.push(...points);
       traces.push({ ...shared, type: "scatter", mode: numeric ? "lines+markers" : "markers",
         showlegend: Boolean(colour) && !traces.some((t) => t.name === label && t.showlegend),
@@ -172,35 +176,39 @@ function draw() {
   const means = found.map((point) => point.value).sort((a, b) => a - b);
   const log = metric.log && means[0] > 0 && means[means.length - 1] >= 10 * means[0];
   const decades = means[means.length - 1] / means[0];
-  const height = Math.max(420, 330 * down) + (innerWidth < 700 ? 25 * colours.length : 0);
+  const legend = 25 * colours.length;
+  const height = innerWidth < 700 ? Math.max(420, 330 * down) + legend
+    : Math.max(420, 330 * down, 180 + legend);
   const layout = {
     height, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
     font: { color: ink, family: "system-ui, sans-serif", size: 13 }, annotations,
     margin: { l: 70, r: 15, t: 50, b: 60 }, hovermode: "closest",
     modebar: { bgcolor: "rgba(0,0,0,0)", color: ink, activecolor: ink },
-    legend: innerWidth < 700 ? { orientation: "h", y: -0.25 } : { title: { text: colour ? columns.get(colour).title : "" } },
+    hoverlabel: { namelength: -1 },
+    legend: innerWidth < 700 ? { orientation: "h", y: -0.25 } : { title: { text: colour ? safe(columns.get(colour).title) : "" } },
     grid: { rows: down, columns: across, pattern: "independent", xgap: 0.12, ygap: 0.3 },
   };
   panelNames.forEach((_, p) => {
     const axis = p ? String(p + 1) : "";
     const lines = { gridcolor: line, linecolor: line, zerolinecolor: line, automargin: true };
-    layout[`xaxis${axis}`] = { ...lines, title: { text: p >= panelNames.length - across ? xs.title : "" },
+    layout[`xaxis${axis}`] = { ...lines, title: { text: p >= panelNames.length - across ? safe(xs.title) : "" },
       ...(numeric ? { type: byFactors(order) ? "log" : "linear",
         ...(order.length <= 8 ? { tickvals: order, ticktext: order.map(written) } : {}) }
-        : { type: "category", categoryorder: "array", categoryarray: order }),
+        : { type: "category", categoryorder: "array", categoryarray: order.map(safe) }),
       ...(p ? { matches: "x" } : {}) };
-    layout[`yaxis${axis}`] = { ...lines, title: { text: p % across ? "" : metric.title },
+    layout[`yaxis${axis}`] = { ...lines, title: { text: p % across ? "" : safe(metric.title) },
       type: log ? "log" : "linear", ...(log && decades >= 100 ? { dtick: 1 } : {}),
       ...(log && decades < 100 ? { tickvals: NUMBERS, ticktext: NUMBERS.map(written) } : {}),
       exponentformat: "power", ...(p ? { matches: "y" } : {}) };
   });
   Plotly.react("chart", traces, layout,
     { responsive: true, displaylogo: false, modeBarButtons: [["toImage", "zoom2d", "pan2d", "resetScale2d"]] });
-  say(rows, x, colour, panels, metric, repeated, found.map((point) => point.n > 2));
+  say(rows, x, colour, panels, metric, repeated, found.map((point) => point.n > 2),
+    [[chosen.length - ended.length, "failed"], [ended.length - rows.length, "have no finite value"]]);
 }
 
-// Say how the means came about, and what else differs within a point.
-function say(rows, x, colour, panels, metric, repeated, bounded) {
+// Say how the means came about, what is not drawn, and what else differs within a point.
+function say(rows, x, colour, panels, metric, repeated, bounded, missing) {
   const over = repeated ? "repeats" : "recordings";
   const kind = metric.average === "plain" ? "Arithmetic" : "Geometric";
   const pooledBy = metric.average === "error" && !repeated ? ", repeats pooled by squares" : "";
@@ -208,7 +216,9 @@ function say(rows, x, colour, panels, metric, repeated, bounded) {
     : bounded.some(Boolean) ? ", with 95 % intervals of three or more" : "";
   const others = data.settings.filter((s) => ![x, colour, panels, "repeat", ...data.drawn].includes(s.name) &&
     new Set(rows.map((row) => s.values[row])).size > 1).map((s) => s.title);
-  byId("said").textContent = `${rows.length} runs. ${kind} means over ${over}${pooledBy}${intervals}.` +
+  const left = missing.filter(([n]) => n).map(([n, why]) => `${n} ${n === 1 ? why.replace("have", "has") : why}`);
+  const not = left.length ? ` Not drawn: ${left.join(", ")}.` : "";
+  byId("said").textContent = `${rows.length} runs.${not} ${kind} means over ${over}${pooledBy}${intervals}.` +
     (others.length ? ` Each point also averages over ${others.join("; ")}: choose a colour, panels, or only some.` : "");
 }
 
