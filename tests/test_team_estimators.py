@@ -16,7 +16,6 @@ from estimators.smoother import Smoother
 from estimators.stereo import StereoModel
 from estimators.team import Communication, run_team
 from experiments.evaluation.metrics import nees
-from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from experiments.runs.team import TeamExperiment, in_range
 from sim import se2
@@ -397,12 +396,7 @@ def test_in_range():
 )
 def test_wrong_teams_are_refused(overrides, complaint):
     with pytest.raises(InputError, match=complaint):
-        TeamExperiment(Experiment.compose(["study=teams", *overrides]))
-
-
-def test_a_run_of_one_robot_refuses_a_team():
-    with pytest.raises(InputError, match="team: a run is of one robot"):
-        evaluate(Experiment.compose(["study=teams"]))
+        Experiment.compose(["study=teams", *overrides]).check()
 
 
 def test_first_robots_of_a_simulated_team():
@@ -412,7 +406,7 @@ def test_first_robots_of_a_simulated_team():
     two = team.first(2)
     assert len(two) == 2
     assert set(np.concatenate([r.logs["robots"]["ids"] for r in two.robots])) <= {0, 1}
-    alone = Experiment.compose([*short, *wide]).simulate()
+    alone = Experiment.compose([*short, *wide]).of_robot(0).simulate()
     one = team.first(1).robots[0]
     assert np.array_equal(one.truth.poses, alone.truth.poses)
     assert np.array_equal(one.wheels.position_m, alone.wheels.position_m)
