@@ -8,6 +8,8 @@ import pytest
 from estima import run as run_once
 from estima import simulate
 from experiments.evaluation.metrics import position_errors_m, rms
+from experiments.gate.candidate import write_recordings
+from experiments.gate.suite import draw_run, read_suite, run_suite
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome, Status
@@ -217,3 +219,26 @@ def test_pictures_of_a_team(tmp_path):
     seeing = team_view.with_estimates(shown, team, "ekf_slam", [], lambda _: None)
     assert [own.name for own in seeing.robots] == ["ekf_slam", "ekf_slam"]
     assert not np.array_equal(bare[-1], list(team_view.pictures(seeing))[-1])
+
+
+def test_a_suite_may_hold_a_team(tmp_path):
+    path = tmp_path / "mine.yaml"
+    lines = ["study=teams", "team.size=2", "route.distance_m=2"]
+    path.write_text(
+        f"first_seed: 3\nrecordings: {{team: {{count: 2, overrides: {lines}}}}}\nestimators:\n"
+        "  ekf_slam: {recordings: team, repeats: [1, 1]}\n"
+        "  fastslam: {recordings: team, repeats: [2, 2], overrides: [estimator.n_particles=10]}\n"
+    )
+    suite = read_suite(path)
+    rows = run_suite(suite, {"ekf_slam": 1, "fastslam": 2}, n_jobs=1)
+    assert set(rows["status"]) == {"ok"}
+    assert len(rows) == 6
+    particles = rows[rows["estimator"] == "fastslam"]
+    assert particles["ate_rmse_m"].nunique() == 4  # each repeat has a stream of its own
+    again = run_suite(suite, {"fastslam": 2}, n_jobs=1)
+    assert again["ate_rmse_m"].tolist() == particles["ate_rmse_m"].tolist()
+    other = run_suite(suite, {"fastslam": 2}, n_jobs=1, reseed=1)
+    assert not set(other["ate_rmse_m"]) & set(again["ate_rmse_m"])
+    assert other["fingerprint"].tolist() == again["fingerprint"].tolist()
+    assert draw_run(suite, "ekf_slam", 3, tmp_path / "run.png")
+    assert write_recordings(suite, tmp_path) == 0
