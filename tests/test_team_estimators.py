@@ -304,6 +304,28 @@ def test_what_comes_back_by_way_of_others_is_not_counted_twice():
         assert sorted(listener.heard) == every
 
 
+def test_a_robot_gains_nothing_from_itself():
+    """What it told another, who saw nothing, comes back: its belief is that of the robot alone."""
+    team = fake_team(8, n_frames=30)
+    own, other = team.robots
+    unseen = own.without("robots"), other.without("stereo").without("robots")
+    pair = Team(tuple(dataclasses.replace(each, sensors=own.sensors) for each in unseen))
+    priors = priors_of(team)
+    contacts = np.ones((len(own.frame_stamps), 2, 2), bool)
+    talk = Communication("range", range_m=9.0)
+    [(found, _), _] = answers(lambda: EkfSlam(**SEEING), pair, priors, talk, contacts)
+    alone = run(EkfSlam(**WHEELS), own, priors[0], np.random.default_rng(0))
+    np.testing.assert_allclose(found.covariances, alone.covariances, rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(found.means, alone.means, atol=1e-9)
+    twice = EkfSlam(**SEEING)  # that the same images counted twice would show
+    twice.reset_team([priors[0]], np.random.default_rng(0))
+    for frame in own.without("robots").frames():
+        again = dataclasses.replace(frame, wheel_increments_m=np.zeros(2), duration_s=0.0)
+        beliefs = [twice.step_team([each])[0] for each in (frame, again)]
+    determinants = [np.linalg.det(c) for c in (beliefs[-1].covariance, alone.covariances[-1])]
+    assert determinants[0] < 0.95 * determinants[1]
+
+
 def test_kinds_of_communication():
     team = fake_team(7, n_frames=30)
     priors, n = priors_of(team), len(team.robots[0].frame_stamps)
