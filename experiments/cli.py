@@ -707,7 +707,7 @@ def calibrate(
             "the residuals goes beside it.",
         ),
     ] = None,
-    robot: Annotated[int | None, typer.Option(help="Which robot of an MRCLAM set.")] = None,
+    robot: WhichRobot = None,
     until_s: Annotated[
         float | None, typer.Option("--until", help="Of a real log: its first seconds only.")
     ] = None,
@@ -743,7 +743,7 @@ def calibrate(
         given = {**others, "--joint": joint or None, "--json": as_json or None}
         for option in (name for name, value in given.items() if value is not None):
             raise InputError(f"{option} is not of a real log; leave it or -o out")
-        _calibrate_log([Path(path) for path in what or []], out, robot or 1, until_s)
+        _calibrate_log([Path(path) for path in what or []], out, robot, until_s)
         return
     require(robot is None and until_s is None, "--robot and --until are of a real log; give -o too")
     if method not in (None, "wheel-truth", "end-poses"):
@@ -768,7 +768,7 @@ def calibrate(
     print(result.as_json() if as_json else result.as_text())
 
 
-def _calibrate_log(log: list[Path], out: Path, robot: int, until_s: float | None) -> None:
+def _calibrate_log(log: list[Path], out: Path, robot: int | None, until_s: float | None) -> None:
     """Calibrate a real log, and write its YAML file and its picture."""
     from experiments.calibration.from_log import calibrate_log
     from experiments.calibration.residual_figure import residual_figure

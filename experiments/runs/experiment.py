@@ -359,6 +359,9 @@ class Experiment:
             not inspect.isclass(kind) or hasattr(kind, "step_team"),
             f"estimator={self.estimator_name} is of one robot; a team takes {_OF_TEAMS}",
         )
+        settings = self.config["estimator"]
+        if settings.get("robots") is not None and self.config["recording"] is None:
+            self._check_sensors(f"estimator={self.estimator_name}", ["robots"], settings)
         for number in range(team.size):
             own = self.of_robot(number)
             try:
