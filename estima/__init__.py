@@ -133,7 +133,7 @@ def simulate(*overrides: str) -> Recording:
     return _experiment(overrides).simulate()
 
 
-def load(*paths: str | Path, robot: int = 1) -> Recording:
+def load(*paths: str | Path, robot: int | None = None) -> Recording:
     """Read a recording, or a log of any format that `docs/formats.md` lists.
 
     Parameters
@@ -141,7 +141,7 @@ def load(*paths: str | Path, robot: int = 1) -> Recording:
     paths
         The log; the formats of several files take them in the order that `docs/formats.md` gives.
     robot
-        Which robot of an MRCLAM set.
+        Which robot of an MRCLAM set, by default 1; or of a team's file, from 0 on.
 
     Raises
     ------
@@ -204,6 +204,8 @@ def run(*given: Any, estimator: str | Estimator | None = None) -> Run:
     overrides = given if recording is None else given[1:]
     named = [f"estimator={estimator}"] if isinstance(estimator, str) else []
     experiment = _experiment((*named, *overrides))
+    if experiment.team is not None:
+        raise InputError("team: estima.run is of one robot; estima.sweep runs teams")
     if experiment.repeats != 1:
         raise InputError(
             f"estima.run makes one run; use estima.sweep for repeats={experiment.repeats}"

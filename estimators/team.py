@@ -78,6 +78,7 @@ def run_team(
     rng: Callable[[int], np.random.Generator],
     communication: Communication | None = None,
     contacts: NDArray[np.bool_] | None = None,
+    on_step: Callable[[int], None] | None = None,
 ) -> list[Answer]:
     """Run estimators over a team's recordings, instant by instant.
 
@@ -91,6 +92,8 @@ def run_team(
         By default always.
     contacts
         (T, R, R), for the kind `range`: which robots are in range at each instant.
+    on_step
+        Called with the number of Frames done.
 
     Returns
     -------
@@ -98,28 +101,41 @@ def run_team(
         Of each robot, the online estimate at its Frames, and the revised one or None.
     """
     kind = (communication or Communication()).kind
+    counted = _counter(on_step or (lambda _: None))
     if kind == "never":
         return [
-            _run_alone(make(), recording.frames(), prior, rng(number))
+            _run_alone(make(), map(counted, recording.frames()), prior, rng(number))
             for number, (recording, prior) in enumerate(zip(team.robots, priors, strict=True))
         ]
+    instants = (tuple(map(counted, frames)) for frames in team.instants())
     if kind == "range":
         near = required(contacts, "communication by range needs the contacts of the robots")
-        return _run_in_contact(make, team, priors, rng, near)
+        return _run_in_contact(make, instants, priors, rng, near)
     estimator = make()
     estimator.reset_team(priors, rng(0))
     steps: list[list[Step]] = [[] for _ in priors]
-    for frames in team.instants():
+    for frames in instants:
         for robot, each in _stepped(estimator, frames).items():
             steps[robot].append(each)
     if communication is not None and communication.delay_s is not None:
         late = dead_reckoning(estimator.wheels, priors)
         return [
-            (_estimate(_late(*each, communication.delay_s)), None)
+            (_estimate(_late(*each, communication.delay_s), estimator), None)
             for each in zip(steps, team.robots, priors, late, strict=True)
         ]
     revised = _revised(estimator, len(priors))
-    return [(_estimate(each), path) for each, path in zip(steps, revised, strict=True)]
+    return [(_estimate(each, estimator), path) for each, path in zip(steps, revised, strict=True)]
+
+
+def _counter(on_step: Callable[[int], None]) -> Callable[[Frame], Frame]:
+    """Function that passes Frames on, and tells how many."""
+    numbers = itertools.count(1)
+
+    def counted(frame: Frame) -> Frame:
+        on_step(next(numbers))
+        return frame
+
+    return counted
 
 
 def _stepped(estimator: TeamEstimator, frames: Sequence[Frame]) -> dict[int, Step]:
@@ -138,25 +154,25 @@ def _run_alone(
 ) -> Answer:
     estimator.reset_team((prior,), rng)
     steps = [_stepped(estimator, (frame,))[0] for frame in frames]
-    return _estimate(steps), _revised(estimator, 1)[0]
+    return _estimate(steps, estimator), _revised(estimator, 1)[0]
 
 
 def _run_in_contact(
     make: Callable[[], TeamEstimator],
-    team: Team,
+    instants: Iterator[tuple[Frame, ...]],
     priors: Sequence[Prior],
     rng: Callable[[int], np.random.Generator],
     contacts: NDArray[np.bool_],
 ) -> list[Answer]:
     """Each robot with a filter of the team, which takes in each Frame that reaches it once."""
-    n = len(team)
+    n = len(priors)
     filters = [make() for _ in range(n)]
     for number, each in enumerate(filters):
         each.reset_team(priors, rng(number))
     logs: list[list[Frame]] = [[] for _ in range(n)]
     known, taken = np.zeros((2, n, n), np.int64)  # of each robot, how many Frames of each other
     steps: list[list[Step]] = [[] for _ in range(n)]
-    for frames, near in zip(team.instants(), contacts, strict=True):
+    for frames, near in zip(instants, contacts, strict=True):
         for frame in frames:
             logs[frame.robot].append(frame)
             known[frame.robot, frame.robot] += 1
@@ -175,7 +191,7 @@ def _run_in_contact(
                 beliefs = _stepped(filters[robot], tuple(instant))
             steps[robot].append(beliefs[robot])
     return [
-        (_estimate(each), _revised(one, n)[number])
+        (_estimate(each, one), _revised(one, n)[number])
         for number, (each, one) in enumerate(zip(steps, filters, strict=True))
     ]
 
@@ -207,10 +223,17 @@ def _revised(estimator: TeamEstimator, n_robots: int) -> Sequence[Estimate | Non
     return paths
 
 
-def _estimate(steps: Sequence[Step]) -> Estimate:
+def _estimate(steps: Sequence[Step], estimator: TeamEstimator) -> Estimate:
+    odd = (
+        f"{belief.extras['status']} at {stamp:.2f} s"
+        for stamp, belief, _ in steps
+        if belief.extras.get("status", "ok") != "ok"
+    )
     return Estimate(
         stamps=np.array([stamp for stamp, _, _ in steps]),
         means=np.array([belief.mean for _, belief, _ in steps]),
         covariances=np.array([belief.covariance for _, belief, _ in steps]),
         step_seconds=np.array([seconds for _, _, seconds in steps]),
+        map=getattr(estimator, "map", None),
+        status=next(odd, "ok"),
     )

@@ -16,6 +16,8 @@ from experiments.runs.version import code_version
 from sim.errors import InputError, require
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from estimators.base import Estimate
     from experiments.runs.experiment import Experiment
     from sim.recording import Recording
@@ -44,6 +46,13 @@ Overrides = Annotated[
 ]
 ConfigDir = Annotated[
     Path | None, typer.Option("--config-dir", "-cd", help="Folder with options of your own.")
+]
+
+WhichRobot = Annotated[
+    int | None,
+    typer.Option(
+        help="Which robot of an MRCLAM set (from 1 on [1]), or of a team's file (from 0)."
+    ),
 ]
 
 
@@ -154,17 +163,18 @@ def _show_sweep(folder: Path, n_runs: int) -> None:
 
 
 def _draw_run(
-    recording: Recording, estimate: Estimate, experiment: Experiment, folder: Path
+    found: Sequence[tuple[Recording, Estimate]], experiment: Experiment, folder: Path
 ) -> None:
-    """Write the picture and the trajectory of a single run."""
+    """Write the picture of a single run, and the trajectory of each of its robots."""
     from experiments.trajectories.convert import write_estimate
-    from experiments.viewing.run_figure import run_figure
+    from experiments.viewing.run_figure import figure_of
     from experiments.viewing.style import save_figure
 
-    write_estimate(folder / "estimate.csv", estimate, recording, slip=experiment.believed_slip)
-    revised = " (revised)" if estimate.kind == "revised" else ""
-    name = f"{experiment.estimator_name}{revised}"
-    save_figure(run_figure(recording, estimate, name), folder / "run.png")
+    for number, (recording, estimate) in enumerate(found):
+        name = "estimate.csv" if len(found) == 1 else f"estimate_{number}.csv"
+        write_estimate(folder / name, estimate, recording, slip=experiment.believed_slip)
+    revised = " (revised)" if found[0][1].kind == "revised" else ""
+    save_figure(figure_of(found, f"{experiment.estimator_name}{revised}"), folder / "run.png")
 
 
 @app.command()
@@ -179,23 +189,30 @@ def record(
     """
     from experiments.runs.experiment import Experiment, searched
     from experiments.runs.run import expected_s
-    from sim.recording import save
+    from experiments.runs.team import TeamExperiment
+    from sim import recording, team
 
     if out.suffix != ".npz":
         raise InputError(f"-o {out}: a recording is an .npz file")
     experiment = Experiment.compose([*searched(config_dir), *(overrides or [])])
     with progress("simulated seconds", expected_s(experiment)) as on_progress:
-        recording = experiment.simulate(on_progress)
-    checksum = save(recording, out)
-    print(f"{out}: {recording.status}, {recording.duration_s:.1f} s, checksum {checksum}")
-    if recording.status != "ok":
+        if experiment.team is None:
+            made = experiment.simulate(on_progress)
+            robots, checksum = {"": made}, recording.save(made, out)
+        else:
+            several = TeamExperiment(experiment).record(on_progress)
+            robots = {f"robot {n}: ": robot for n, robot in enumerate(several.robots)}
+            checksum = team.save(several, out)
+    said = [f"{whose}{robot.status}, {robot.duration_s:.1f} s" for whose, robot in robots.items()]
+    print(f"{out}: {'; '.join(said)}, checksum {checksum}")
+    if any(robot.status != "ok" for robot in robots.values()):
         raise typer.Exit(1)
 
 
 @app.command()
 def info(
     log: Annotated[list[Path], typer.Argument(help="A recording (.npz) or a log of any format.")],
-    robot: Annotated[int, typer.Option(help="Which robot of an MRCLAM set.")] = 1,
+    robot: WhichRobot = None,
     check: Annotated[
         bool,
         typer.Option(
@@ -210,9 +227,15 @@ def info(
     gains, and ranges of a wrong scale.
     """
     from experiments.viewing.describe import describe
-    from sim.formats.detect import read_any
+    from sim.formats.detect import read_all
+    from sim.team import Team
 
-    recording = read_any(log, robot)
+    recording = read_all(log, robot)
+    if isinstance(recording, Team):
+        require(not check, "--check is of one robot; name it by --robot")
+        for number, own in enumerate(recording.robots):
+            show(f"robot {number}\n{describe(own)}\n")
+        return
     show(describe(recording))
     if check:
         from experiments.calibration.log_check import check_log
@@ -231,7 +254,10 @@ def convert(
             "--out", "-o", help="File to write: .npz, .mcap, .bag, .db3, .log (CARMEN), .tum."
         ),
     ],
-    robot: Annotated[int, typer.Option(help="Which robot of an MRCLAM set.")] = 1,
+    robot: WhichRobot = None,
+    whole: Annotated[
+        bool, typer.Option("--team", help="All robots of an MRCLAM set, in one .npz.")
+    ] = False,
     topic: Annotated[
         str | None, typer.Option(help="Of a bag, the nav_msgs/Odometry to convert alone.")
     ] = None,
@@ -250,10 +276,14 @@ def convert(
 
       estima convert MRCLAM_Dataset6.tar.xz --robot 3 -o robot3.npz
 
+      estima convert MRCLAM_Dataset6.tar.xz --team -o team.npz
+
       estima convert estimate.csv -o estimate.tum
     """
     from experiments.trajectories.convert import is_estimate, write_estimate, write_recording
-    from sim.formats.detect import read_any
+    from sim.formats.detect import kind_of, read_any
+    from sim.formats.mrclam import read_team
+    from sim.team import save
 
     if not out.name:
         raise InputError(f"-o {out}: name the file to write, such as run.mcap")
@@ -268,6 +298,16 @@ def convert(
         print(
             f"{out}: {len(estimate.stamps)} poses, {estimate.stamps[-1] - estimate.stamps[0]:.1f} s"
         )
+        return
+    if whole:
+        require(robot is None, "--team takes all robots; leave out --robot")
+        require(out.suffix == ".npz", f"-o {out}: a team is an .npz file")
+        require(
+            len(log) == 1 and kind_of(log[0]) == "mrclam",
+            f"{log[0]}: --team is of MRCLAM sets; `estima record study=teams` simulates a team",
+        )
+        team = read_team(log[0])
+        print(f"{out}: a team of {len(team)} robots, {team.duration_s:.1f} s, {save(team, out)}")
         return
     recording = read_any(log, robot)
     write_recording(out, recording)
@@ -410,34 +450,49 @@ def _show_run(
 ) -> None:
     from dataclasses import replace
 
-    from experiments.viewing import live, view
-    from sim.formats.detect import read_any
+    from experiments.viewing import live, team_view, view
+    from sim.formats.detect import read_all
     from sim.grid_file import read_grid
+    from sim.team import Team
 
     if out is None and grid is not None:
         raise InputError("--map is drawn in files only; add -o run.html, run.gif or run.mp4")
-    if out is None:
-        live.check_display()
-    else:
+    if out is not None:
         view.check_output(out)
     known = None if grid is None else read_grid(grid)
-    recording = read_any([log])
-    drive_s = recording.duration_s
+    read = read_all([log])
+    if isinstance(read, Team):
+        require(out is not None, f"{log}: a team is drawn in files; add -o team.html, .gif or .mp4")
+    elif out is None:
+        live.check_display()
+    drive_s = read.duration_s
     length_s = seconds or (drive_s if out is None else min(drive_s, view.SECONDS))
-    rows = view.shown_rows(recording, int(length_s * (live.FPS if out is None else view.FPS)))
-    shown = view.Playback(recording, rows)
-    if source is not None:
-        with progress(source, len(recording.frame_stamps)) as on_step:
-            found = view.estimate_of(recording, source, overrides, rows, on_step)
-        shown = view.Playback(recording, rows, *found)
-    if out is None:
-        live.watch(shown, seconds)
-        return
-    shown = replace(shown, grid=known, seconds=length_s)
+    n_shown = int(length_s * (live.FPS if out is None else view.FPS))
+    if isinstance(read, Team):
+        several = team_view.TeamPlayback.of(read, n_shown)
+        if source is not None:
+            with progress(source, sum(len(r.frame_stamps) for r in read.robots)) as on_step:
+                several = team_view.with_estimates(several, read, source, overrides, on_step)
+        several = replace(several, grid=known, seconds=length_s)
+        run: view.Played = several
+        images = team_view.pictures(several)
+    else:
+        rows = view.shown_rows(read, n_shown)
+        shown = view.Playback(read, rows)
+        if source is not None:
+            with progress(source, len(read.frame_stamps)) as on_step:
+                found = view.estimate_of(read, source, overrides, rows, on_step)
+            shown = view.Playback(read, rows, *found)
+        if out is None:
+            live.watch(shown, seconds)
+            return
+        run = shown = replace(shown, grid=known, seconds=length_s)
+        images = view.pictures(shown)
+    assert out is not None
     with progress(f"drawing {out.name}", 1.0) as on_progress:
-        view.save(shown, out, on_progress)
+        view.save(run, images, out, on_progress)
     speed = "real time" if length_s == drive_s else f"{drive_s / length_s:.3g} times real time"
-    print(f"{out}: {len(rows)} pictures, {length_s:.1f} s, {speed}")
+    print(f"{out}: {len(run.stamps)} pictures, {length_s:.1f} s, {speed}")
 
 
 @app.command("map")
@@ -653,7 +708,7 @@ def calibrate(
             "the residuals goes beside it.",
         ),
     ] = None,
-    robot: Annotated[int | None, typer.Option(help="Which robot of an MRCLAM set.")] = None,
+    robot: WhichRobot = None,
     until_s: Annotated[
         float | None, typer.Option("--until", help="Of a real log: its first seconds only.")
     ] = None,
@@ -689,7 +744,7 @@ def calibrate(
         given = {**others, "--joint": joint or None, "--json": as_json or None}
         for option in (name for name, value in given.items() if value is not None):
             raise InputError(f"{option} is not of a real log; leave it or -o out")
-        _calibrate_log([Path(path) for path in what or []], out, robot or 1, until_s)
+        _calibrate_log([Path(path) for path in what or []], out, robot, until_s)
         return
     require(robot is None and until_s is None, "--robot and --until are of a real log; give -o too")
     if method not in (None, "wheel-truth", "end-poses"):
@@ -714,7 +769,7 @@ def calibrate(
     print(result.as_json() if as_json else result.as_text())
 
 
-def _calibrate_log(log: list[Path], out: Path, robot: int, until_s: float | None) -> None:
+def _calibrate_log(log: list[Path], out: Path, robot: int | None, until_s: float | None) -> None:
     """Calibrate a real log, and write its YAML file and its picture."""
     from experiments.calibration.from_log import calibrate_log
     from experiments.calibration.residual_figure import residual_figure
@@ -741,7 +796,7 @@ def twin(
             "--out", "-o", help="Study to write, .yaml; its world, way and log go beside it."
         ),
     ],
-    robot: Annotated[int, typer.Option(help="Which robot of an MRCLAM set.")] = 1,
+    robot: WhichRobot = None,
     split_s: Annotated[
         float | None,
         typer.Option("--split", help="Seconds of the log that it is calibrated on [half of it]."),
@@ -943,7 +998,7 @@ def bench(
         str,
         typer.Argument(
             help="compile, external, fastslam, formats, graph_slam, growth, icp, mcl, sim, "
-            "smoothing, sweep, sweep_scale, topological, or all."
+            "smoothing, sweep, sweep_scale, teams, topological, or all."
         ),
     ] = "all",
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,

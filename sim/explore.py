@@ -39,12 +39,15 @@ from sim.sensors.laser import Laser
 from sim.settings import check_numbers
 from sim.world import World
 
-Strategy = Literal["random", "nearest_frontier", "information_gain", "coordinated"]
+Strategy = Literal[
+    "random", "nearest_frontier", "shared_frontiers", "information_gain", "coordinated"
+]
 
 _LEAST_FRONTIER_M = 0.6  # shorter ones lead nowhere that a robot fits in
 _ROBOT_M = 0.6  # from a robot's middle, within which an echo is that robot
 _APART_M = 1.0  # at which a robot waits behind another
 _ARRIVED_M, _GIVEN_UP_M = 0.4, 1.0
+_SHARED_OUT = ("shared_frontiers", "coordinated")
 _MOST_SEEN = 0.95  # of a goal's worth that goes to another; a robot is never left without one
 
 
@@ -60,7 +63,7 @@ class Explore:
         unknown area A in sight of it and the way L (Gonzalez-Banos and Latombe 2002).
         `coordinated`: the same, but the robots choose one after another, best choice first, and
         what a frontier is worth falls by the chance that it is seen from one already chosen
-        (Burgard et al. 2005).
+        (Burgard et al. 2005). `shared_frontiers`: so shared out, but by the way alone (A = 1).
     distance_m
         Where a robot ends, by its own reckoning, if the team sees no frontier any more before.
     draw
@@ -302,10 +305,12 @@ class Crew:
         elif strategy == "nearest_frontier":
             score = -cost_m
         else:
-            areas = [unknown_in_sight(occupied, unknown, goal, reach) for goal in goals]
-            score = np.log(np.maximum(areas, 1.0)) - cost_m / self._route.decay_m
+            score = -cost_m / self._route.decay_m
+            if strategy != "shared_frontiers":
+                areas = [unknown_in_sight(occupied, unknown, goal, reach) for goal in goals]
+                score += np.log(np.maximum(areas, 1.0))
         score[~np.isfinite(cost_m)] = -np.inf
-        if strategy == "coordinated":
+        if strategy in _SHARED_OUT:
             for robot in robots:
                 if robot.goal is not None:
                     score += np.log(_left(occupied, robot.goal, goals, reach))
@@ -317,7 +322,7 @@ class Crew:
             if not math.isfinite(best[number, goal]):
                 return
             taken[number], robots[number].goal = True, goals[goal]
-            if strategy == "coordinated":
+            if strategy in _SHARED_OUT:
                 score += np.log(_left(occupied, goals[goal], goals, reach))
 
 

@@ -372,7 +372,7 @@ class Recording:
     @property
     def checksum(self) -> str:
         """SHA-256 over all the recording holds, as hex."""
-        return _digest(arrays_of(self), described(self))
+        return digest_of(arrays_of(self), described(self))
 
     def cut(self, n_frames: int) -> Recording:
         """The same recording, ended after `n_frames` Frames (the logs keep their tails)."""
@@ -401,7 +401,7 @@ def write_arrays(
     path: Path, arrays: dict[str, NDArray[Any]], meta: dict[str, Any], *, durable: bool = True
 ) -> str:
     """Write arrays and plain values that describe them, whole; return their checksum."""
-    checksum = _digest(arrays, meta)
+    checksum = digest_of(arrays, meta)
     meta_bytes = np.frombuffer(json.dumps({**meta, "checksum": checksum}).encode(), np.uint8)
     with write_whole(path, durable=durable) as part, part.open("wb") as file:
         np.savez(file, allow_pickle=False, meta=meta_bytes, **arrays)
@@ -424,7 +424,12 @@ def load(path: Path) -> Recording:
         )
     with blamed(path, REMEDY):
         stored, meta = checked_arrays(path)
-        require("team" not in meta, "it holds a team of robots, which `sim.team.load` reads")
+    require(
+        "team" not in meta,
+        f"{path}: it holds a team; run all of its robots by study=teams, or take one by "
+        f"`estima convert {path} --robot 0 -o robot_0.npz`",
+    )
+    with blamed(path, REMEDY):
         if meta["format"] == 1:
             stored, meta = upgraded(stored, meta)
         return assembled(stored, meta)
@@ -453,7 +458,7 @@ def checked_arrays(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]
         version in (1, FORMAT_VERSION),
         f"recording format {version}, this version reads up to {FORMAT_VERSION}",
     )
-    require(_digest(stored, meta) == checksum, "the data do not match their checksum")
+    require(digest_of(stored, meta) == checksum, "the data do not match their checksum")
     return stored, meta
 
 
@@ -512,7 +517,8 @@ def described(recording: Recording) -> dict[str, Any]:
     }
 
 
-def _digest(arrays: dict[str, NDArray[Any]], meta: dict[str, Any]) -> str:
+def digest_of(arrays: dict[str, NDArray[Any]], meta: dict[str, Any]) -> str:
+    """SHA-256 of arrays and plain values that describe them, as hex."""
     digest = hashlib.sha256(json.dumps(meta, sort_keys=True).encode())
     for name in sorted(arrays):
         array = np.ascontiguousarray(arrays[name])

@@ -185,6 +185,10 @@ class TourFrom(Tour):
         path = super()._given(world)
         if np.hypot(*(path[0] - path[-1])) < 1e-6:
             path = path[:-1]
+        require(
+            0 <= self.first < len(path),
+            f"route.first must be a way-point of the tour, 0 to {len(path) - 1}, got {self.first}",
+        )
         path = np.roll(path, -self.first, axis=0)
         path = np.concatenate([path, path[:1]])
         return path[::-1] if self.backwards else path

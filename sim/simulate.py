@@ -171,12 +171,7 @@ def record_team(
     )
     periods = [_periods(member.sensors) for member in members]
     starts = [member.route.start(world, member.robot) for member in members]
-    for member, (pose, _) in zip(members, starts, strict=True):
-        require(
-            not overlaps(world, member.robot, pose),
-            f"the robot overlaps a wall of world {world.name} at its start "
-            f"({pose[0]:.2f}, {pose[1]:.2f}); move the start pose or the wall",
-        )
+    _check_starts(world, members, [pose for pose, _ in starts])
     for member, (_, driver) in zip(members, starts, strict=True):
         if hasattr(driver, "begin"):
             driver.begin(member.sensors, [other for _, other in starts])
@@ -221,6 +216,25 @@ def record_team(
             for number, member in enumerate(members)
         ]
     )
+
+
+def _check_starts(world: World, members: Sequence[Member], poses: Sequence[Array]) -> None:
+    """Check that no robot starts in a wall or in another robot."""
+    for number, (member, pose) in enumerate(zip(members, poses, strict=True)):
+        whose = f"robot {number}" if len(members) > 1 else "the robot"
+        require(
+            not overlaps(world, member.robot, pose),
+            f"{whose} overlaps a wall of world {world.name} at its start "
+            f"({pose[0]:.2f}, {pose[1]:.2f}); move the start pose or the wall",
+        )
+    radii_m = [float(_half_footprint_m(member.robot).min()) for member in members]
+    for one, other in itertools.combinations(range(len(members)), 2):
+        apart_m = math.hypot(*(poses[one] - poses[other])[:2])
+        require(
+            apart_m >= radii_m[one] + radii_m[other],
+            f"robots {one} and {other} start within each other, {apart_m:.2f} m apart; give one "
+            "another start by its route in team.robots",
+        )
 
 
 def _bodied(

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import zipfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sim.arrays import Array
 from sim.errors import InputError, require
@@ -21,6 +24,7 @@ from sim.recording import (
     blamed,
     checked_arrays,
     described,
+    digest_of,
     write_arrays,
 )
 from sim.sensors import RobotCamera
@@ -59,6 +63,17 @@ class Team:
                 same = np.array_equal(first.walls, own.walls)
                 same &= np.array_equal(first.landmarks, own.landmarks)
             require(same, f"the world of robot {number} is not that of robot 0")
+
+    @property
+    def duration_s(self) -> float:
+        """Time from the first Frame of any robot to the last, s."""
+        stamps = [robot.frame_stamps for robot in self.robots]
+        return float(max(own[-1] for own in stamps) - min(own[0] for own in stamps))
+
+    @property
+    def checksum(self) -> str:
+        """SHA-256 over all the team holds, as hex."""
+        return digest_of(*_parts(self))
 
     def __len__(self) -> int:
         return len(self.robots)
@@ -104,13 +119,26 @@ def save(team: Team, path: Path) -> str:
     InputError
         If it cannot be written.
     """
+    return write_arrays(path, *_parts(team))
+
+
+def _parts(team: Team) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+    """Every array of a team under the name it is saved by, and plain values."""
     arrays = {
         f"{number}.{name}": values
         for number, recording in enumerate(team.robots)
         for name, values in arrays_of(recording).items()
     }
-    meta = {"format": FORMAT_VERSION, "team": [described(robot) for robot in team.robots]}
-    return write_arrays(path, arrays, meta)
+    return arrays, {"format": FORMAT_VERSION, "team": [described(robot) for robot in team.robots]}
+
+
+def is_team(path: Path) -> bool:
+    """Whether a file is a team's, by the names of its arrays."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return "0.frame_stamps.npy" in archive.namelist()
+    except (OSError, zipfile.BadZipFile):
+        return False
 
 
 def load(path: Path) -> Team:
@@ -123,9 +151,10 @@ def load(path: Path) -> Team:
     """
     with blamed(path, REMEDY):
         stored, meta = checked_arrays(path)
-        parts = meta.get("team")
-        if not isinstance(parts, list):
-            raise InputError("it holds one robot, and no team")
+    parts = meta.get("team")
+    if not isinstance(parts, list):
+        raise InputError(f"{path}: it holds one robot, and no team; leave out study and team")
+    with blamed(path, REMEDY):
         own = [
             {
                 name.removeprefix(f"{number}."): values

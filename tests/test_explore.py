@@ -128,7 +128,8 @@ def visited(team):
 
 
 @pytest.mark.parametrize(
-    "strategy", ["random", "nearest_frontier", "information_gain", "coordinated"]
+    "strategy",
+    ["random", "nearest_frontier", "shared_frontiers", "information_gain", "coordinated"],
 )
 def test_robots_explore_and_hit_nothing(strategy):
     team = explored(strategy, distance_m=8.0)

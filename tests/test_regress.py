@@ -27,6 +27,7 @@ from experiments.gate.suite import (
 )
 from experiments.runs.experiment import Experiment
 from experiments.runs.paths import results
+from experiments.runs.team import recorded, robots_of
 from sim import se2
 from sim.errors import InputError
 from sim.formats import assemble, carmen
@@ -360,6 +361,7 @@ def test_suite_of_the_check_is_sound():
         assert entry.repeats[0] >= entry.repeats[1]
     estimators = {entry.estimator for entry in suite.estimators}
     assert {"ekf_icp_paper", "fastslam_paper", "fixed_lag", "graph_slam"} <= estimators
+    assert any("study=teams" in suite.overrides[e.recordings] for e in suite.estimators)
     by_engine = [
         e for e in suite.estimators if "simulation.physics=bullet" in suite.overrides[e.recordings]
     ]
@@ -457,10 +459,11 @@ def test_recordings_of_the_check_turn():
     suite = read_suite(suite_path("check"))
     for group, overrides in suite.overrides.items():
         seed = suite.first_seed
-        recording = Experiment.compose(overrides).replaced(seed=seed, world_seed=seed).recording()
-        assert recording.status == "ok"
-        turned = np.abs(np.diff(np.unwrap(recording.truth.poses[:, 2]))).sum()
-        assert turned > 1.0, group
+        read = recorded(Experiment.compose(overrides).replaced(seed=seed, world_seed=seed))
+        for recording in robots_of(read):
+            assert recording.status == "ok"
+            turned = np.abs(np.diff(np.unwrap(recording.truth.poses[:, 2]))).sum()
+            assert turned > 1.0, group
 
 
 @pytest.mark.parametrize(

@@ -46,8 +46,6 @@ def test_each_study_fits_together(name, tmp_path):
 def test_each_study_runs(name, tmp_path):
     if name == "decristoforis2020_rawseeds":
         pytest.skip("needs a log of Rawseeds")
-    if name in ("teams", "exploration"):
-        pytest.skip("its runs are of several robots")
     if name.startswith(("real_logs", "decristoforis2020_log")) and (why := missing()):
         pytest.skip(why)
     for experiment in runs_of(name, tmp_path):

@@ -133,7 +133,7 @@ def test_files_of_teams(tmp_path):
     teams.save(team, path)
     again = teams.load(path)
     assert [r.checksum for r in again.robots] == [r.checksum for r in team.robots]
-    with pytest.raises(InputError, match=r"team.npz: it holds a team of robots"):
+    with pytest.raises(InputError, match=r"team.npz: it holds a team; run all"):
         recordings.load(path)
     recordings.save(team.robots[0], path)
     with pytest.raises(InputError, match=r"team.npz: it holds one robot, and no team"):

@@ -16,7 +16,6 @@ from estimators.smoother import Smoother
 from estimators.stereo import StereoModel
 from estimators.team import Communication, run_team
 from experiments.evaluation.metrics import nees
-from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from experiments.runs.team import TeamExperiment, in_range
 from sim import se2
@@ -305,6 +304,28 @@ def test_what_comes_back_by_way_of_others_is_not_counted_twice():
         assert sorted(listener.heard) == every
 
 
+def test_a_robot_gains_nothing_from_itself():
+    """What it told another, who saw nothing, comes back: its belief is that of the robot alone."""
+    team = fake_team(8, n_frames=30)
+    own, other = team.robots
+    unseen = own.without("robots"), other.without("stereo").without("robots")
+    pair = Team(tuple(dataclasses.replace(each, sensors=own.sensors) for each in unseen))
+    priors = priors_of(team)
+    contacts = np.ones((len(own.frame_stamps), 2, 2), bool)
+    talk = Communication("range", range_m=9.0)
+    [(found, _), _] = answers(lambda: EkfSlam(**SEEING), pair, priors, talk, contacts)
+    alone = run(EkfSlam(**WHEELS), own, priors[0], np.random.default_rng(0))
+    np.testing.assert_allclose(found.covariances, alone.covariances, rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(found.means, alone.means, atol=1e-9)
+    twice = EkfSlam(**SEEING)  # that the same images counted twice would show
+    twice.reset_team([priors[0]], np.random.default_rng(0))
+    for frame in own.without("robots").frames():
+        again = dataclasses.replace(frame, wheel_increments_m=np.zeros(2), duration_s=0.0)
+        beliefs = [twice.step_team([each])[0] for each in (frame, again)]
+    determinants = [np.linalg.det(c) for c in (beliefs[-1].covariance, alone.covariances[-1])]
+    assert determinants[0] < 0.95 * determinants[1]
+
+
 def test_kinds_of_communication():
     team = fake_team(7, n_frames=30)
     priors, n = priors_of(team), len(team.robots[0].frame_stamps)
@@ -397,12 +418,7 @@ def test_in_range():
 )
 def test_wrong_teams_are_refused(overrides, complaint):
     with pytest.raises(InputError, match=complaint):
-        TeamExperiment(Experiment.compose(["study=teams", *overrides]))
-
-
-def test_a_run_of_one_robot_refuses_a_team():
-    with pytest.raises(InputError, match="team: a run is of one robot"):
-        evaluate(Experiment.compose(["study=teams"]))
+        Experiment.compose(["study=teams", *overrides]).check()
 
 
 def test_first_robots_of_a_simulated_team():
@@ -412,7 +428,7 @@ def test_first_robots_of_a_simulated_team():
     two = team.first(2)
     assert len(two) == 2
     assert set(np.concatenate([r.logs["robots"]["ids"] for r in two.robots])) <= {0, 1}
-    alone = Experiment.compose([*short, *wide]).simulate()
+    alone = Experiment.compose([*short, *wide]).of_robot(0).simulate()
     one = team.first(1).robots[0]
     assert np.array_equal(one.truth.poses, alone.truth.poses)
     assert np.array_equal(one.wheels.position_m, alone.wheels.position_m)

@@ -157,7 +157,7 @@ def test_a_robot_given_by_its_number(recording):
 
 def test_gif(run, tmp_path):
     shares = []
-    view.save(run, tmp_path / "run.gif", shares.append)
+    view.save(run, view.pictures(run), tmp_path / "run.gif", shares.append)
     assert shares[-1] == 1.0
     with Image.open(tmp_path / "run.gif") as image:
         assert image.n_frames == len(run.rows)
@@ -170,7 +170,7 @@ def test_gif(run, tmp_path):
 @pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="no ffmpeg on this machine")
 def test_mp4(run, tmp_path):
     path = tmp_path / "run.mp4"
-    view.save(run, path, silent)
+    view.save(run, view.pictures(run), path, silent)
     played = subprocess.run(
         ["ffmpeg", "-i", str(path), "-f", "null", "-"], capture_output=True, text=True
     )
@@ -186,7 +186,7 @@ def test_without_ffmpeg_the_remedy_is_named(monkeypatch):
 
 @pytest.mark.skipif(browser.find() is None, reason="no Chromium on this machine")
 def test_html_plays_in_a_browser(run, tmp_path):
-    view.save(run, tmp_path / "run.html", silent)
+    view.save(run, view.pictures(run), tmp_path / "run.html", silent)
     assert "://" not in (tmp_path / "run.html").read_text()
     with browser.page() as tab:
         tab.open((tmp_path / "run.html").as_uri())

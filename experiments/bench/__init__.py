@@ -13,6 +13,7 @@ SUITES = {
     "sweep_scale": ("sweep_scale",),
     "icp": ("icp", "ekf_icp"),
     "fastslam": ("fastslam",),
+    "teams": ("teams",),
     "topological": ("topological",),
     "mcl": ("mcl",),
     "formats": ("formats",),

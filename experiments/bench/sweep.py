@@ -14,6 +14,7 @@ from experiments.runs.experiment import Experiment
 from experiments.runs.seeds import stream
 from experiments.sweeps.launch import run_and_record
 from sim.recording import Recording
+from sim.team import Team
 
 _NAME = "bench_sweep"
 _SHORT = ["simulation.physics=kinematic", "simulation.rays=exact", "route=linear_1"]
@@ -93,7 +94,7 @@ def _cheapest_run_ms() -> float:
     return 1e3 * _packed_s(runs[20:], {}) / len(runs[20:])
 
 
-def _packed_s(runs: Sequence[Experiment], held: dict[str, Recording]) -> float:
+def _packed_s(runs: Sequence[Experiment], held: dict[str, Recording | Team]) -> float:
     """Processor time of runs in one job, their rows included."""
     begun = time.process_time()
     with store.journal(runs[0].rows_folder / f"bench{store.JOURNAL}") as journal:

@@ -29,8 +29,10 @@ def write_recordings(
 
     GROUP_SEED.mcap (where rosbags is installed), GROUP_SEED.log (CARMEN, of a laser) and
     GROUP_SEED.start.txt, which holds the first belief: `x y heading`, and its covariance.
+    Teams are left out.
     """
-    groups = {entry.recordings for entry in suite.estimators}
+    named = {entry.recordings for entry in suite.estimators}
+    groups = [g for g in named if Experiment.compose(suite.overrides[g]).team is None]
     total = sum(suite.counts[group] for group in groups)
     bags = importlib.util.find_spec("rosbags") is not None
     done = 0

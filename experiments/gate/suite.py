@@ -25,10 +25,12 @@ from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome
 from experiments.runs.seeds import stream
-from experiments.viewing.run_figure import run_figure
+from experiments.runs.team import recorded, robots_of
+from experiments.viewing.run_figure import figure_of
 from experiments.viewing.style import save_figure
 from sim.errors import InputError, printable, require
 from sim.recording import Recording
+from sim.team import Team
 from sim.yaml_file import read_yaml
 
 ERRORS = ("ate_rmse_m", "ate_aligned_rmse_m", "heading_rmse_rad")
@@ -263,15 +265,18 @@ def draw_run(suite: Suite, estimator: str, recording: int, path: Path) -> bool:
     """Draw the first run of an estimator over a recording of a suite; False if it fails."""
     (entry,) = suite.of([estimator]).estimators
 
-    def draw(made: Recording, _: int, online: Estimate, revised: Estimate | None) -> None:
-        judged = revised if entry.revised and revised is not None else online
-        save_figure(run_figure(made, judged, estimator), path)
+    found: list[tuple[Recording, Estimate]] = []
+
+    def keep(made: Recording, _: int, online: Estimate, revised: Estimate | None) -> None:
+        found.append((made, revised if entry.revised and revised is not None else online))
 
     rows = evaluate(
         _experiment(suite, entry, {estimator: 1}).replaced(seed=recording, world_seed=recording),
         streams=partial(_stream, f"estimator/{estimator}", recording, 0),
-        on_estimate=draw,
+        on_estimate=keep,
     )
+    if found:
+        save_figure(figure_of(found, estimator), path)
     return rows[0]["status"] != Outcome.FAILED
 
 
@@ -303,7 +308,7 @@ def _run_recording(
 ) -> list[dict[str, Any]]:
     """Rows of all runs over one recording."""
     rows = []
-    recording = runs[0][1].replaced(seed=seed, world_seed=seed).recording()
+    recording = recorded(runs[0][1].replaced(seed=seed, world_seed=seed))
     origin = {"checksum": recording.checksum[:12], "fingerprint": fingerprint(recording)}
     for entry, experiment, planted in runs:
         for row in evaluate(
@@ -336,12 +341,18 @@ def _plant(
     return lambda estimator, repeat: planted(estimator, _stream("fault", seed, reseed, repeat))
 
 
-def fingerprint(recording: Recording) -> float:
+def fingerprint(read: Recording | Team) -> float:
     """Sum of weighted means over each sensor's first field, and over the true positions.
+
+    That of a team is the sum of its robots'.
 
     Machines that differ in the last bits make recordings with different checksums, but with
     fingerprints that agree to a millionth; those of different recordings do not.
     """
+    return sum(map(_fingerprint, robots_of(read)))
+
+
+def _fingerprint(recording: Recording) -> float:
     first = [next(iter(log.values.values())) for log in recording.logs.values()]
     logs = [recording.wheels.position_m, *first]
     if recording.truth is not None:

@@ -57,6 +57,8 @@ OF_THE_RUN = {
         "longest time without a pose", "gap", "s", "linear", average=Average.PLAIN
     ),
     "dispersion_final_m": Column("final dispersion of the particles", "dispersion", "m"),
+    "worst_robot_rmse_m": Column("position RMSE of a team's worst robot", "worst robot", "m"),
+    "n_sightings": Column("sightings of robots", "sightings", "", "linear", None, Average.PLAIN),
 }
 _OF_THE_PATH = {
     "step_time_us": Column("time per step", "step", "us", average=Average.FACTOR),

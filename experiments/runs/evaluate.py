@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import os
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from contextlib import AbstractContextManager, nullcontext
 
 import numpy as np
@@ -22,20 +22,30 @@ from experiments.runs.columns import OF_THE_RUN
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import GAP, Outcome, Row, Status
 from experiments.runs.seeds import stream
+from experiments.runs.team import (
+    TeamExperiment,
+    recorded,
+    robots_of,
+    scores_of_team,
+    status_of_team,
+)
 from sim.arrays import Array
 from sim.errors import InputError, require
 from sim.recording import Recording
+from sim.team import Team
 
 REMARKED_PAUSE_S = 1.0  # without a pose
 
 Streams = Callable[[int], np.random.Generator]
 Planted = Callable[[Estimator, int], AbstractContextManager[object]]
-Shown = Callable[[Recording], AbstractContextManager[Callable[[int], None]]]
+Shown = Callable[[Recording | Team], AbstractContextManager[Callable[[int], None]]]
+OnStep = Callable[[int], None] | None
+Answers = list[tuple[Estimate, Estimate | None]]  # of each robot: online and revised
 
 
 def evaluate(
     experiment: Experiment,
-    fetch: Callable[[], Recording] | None = None,
+    fetch: Callable[[], Recording | Team] | None = None,
     *,
     streams: Streams | None = None,
     planted: Planted | None = None,
@@ -48,17 +58,19 @@ def evaluate(
     Parameters
     ----------
     fetch
-        Gives the recording, once the configuration is known to fit together; by default the
-        experiment's own.
+        Gives the recording, or those of a team, once the configuration is known to fit together; by
+        default the experiment's own.
     streams
-        The estimator's generator of each repeat; by default that of the axis `estimator/NAME`.
+        The estimator's generator of each repeat, or a team's (see `TeamExperiment.run`); by default
+        that of the axis `estimator/NAME`.
     planted
-        Gives a context in which the estimator is faulty, for each repeat.
+        Gives a context in which the estimator is faulty, for each repeat; not of a team.
     shown
         Shows the progress over a recording: gives a function of the number of Frames done, as a
         context around each repeat.
     on_estimate
-        Called with the recording, the repeat, its online estimate and the revised one (or None).
+        Called for each robot, with its recording, the repeat, its online estimate and the revised
+        one (or None).
     on_error
         Called with the exception that ended a run, which becomes its row's status.
 
@@ -74,38 +86,75 @@ def evaluate(
         If the configuration or the recording does not fit together.
     """
     experiment.check()
-    require(
-        "team" not in experiment.config,
-        "team: a run is of one robot; `estima reproduce --paper teams` runs teams, and "
-        "experiments.runs.team from Python",
-    )
-    recording = fetch() if fetch else experiment.recording()
-    prior = experiment.prior(recording)
-    labels = experiment.labels(recording.checksum)
-    axis = f"estimator/{experiment.estimator_name}"
+    read = fetch() if fetch else recorded(experiment)
+    answers_of = _runner(experiment, read, streams)
+    require(planted is None or not isinstance(read, Team), "faults are planted in one robot's runs")
+    robots = robots_of(read)
+    labels = experiment.labels(read.checksum)
     rows = []
     for repeat in range(experiment.repeats):
         estimator = experiment.estimator()
-        rng = streams(repeat) if streams else stream(experiment.seed, axis, repeat)
         scores: Row = {}
         try:
             with (
                 planted(estimator, repeat) if planted else nullcontext(),
-                shown(recording) if shown else nullcontext() as on_step,
+                shown(read) if shown else nullcontext() as on_step,
             ):
-                keep = (*SCORED_EXTRAS, *experiment.keep)
-                online, revised = estimates(estimator, recording, prior, rng, keep, on_step)
-            status = status_of(recording, online, revised)
-            scores = scored(recording, online, revised, **experiment.scoring)
+                answers = answers_of(estimator, repeat, on_step)
+            status, scores = _scored_run(read, answers, experiment.scoring)
         except InputError:
             raise
         except (Exception, SystemExit) as error:
             status = Status.of_error(error)
             on_error(error)
         else:
-            on_estimate(recording, repeat, online, revised)
+            for recording, answer in zip(robots, answers, strict=True):
+                on_estimate(recording, repeat, *answer)
         rows.append({**labels, "repeat": repeat, **status.columns(), **scores})
     return rows
+
+
+def _runner(
+    experiment: Experiment, read: Recording | Team, streams: Streams | None
+) -> Callable[[Estimator, int, OnStep], Answers]:
+    """Function that runs an estimator of one robot, or of a team, over what was read."""
+    require(
+        isinstance(read, Team) == (experiment.team is not None),
+        "team: the recording is of one robot, and the experiment of several"
+        if experiment.team is not None
+        else "the recording is of a team; choose study=teams",
+    )
+    if isinstance(read, Team):
+        team, several = read, TeamExperiment(experiment)
+
+        def run_several(
+            _: Estimator, repeat: int, on_step: Callable[[int], None] | None
+        ) -> Answers:
+            with limited_blas():
+                return several.run(team, repeat, streams, on_step)
+
+        return run_several
+    recording, prior = read, experiment.prior(read)
+    own = streams or functools.partial(
+        stream, experiment.seed, f"estimator/{experiment.estimator_name}"
+    )
+    keep = (*SCORED_EXTRAS, *experiment.keep)
+    return lambda estimator, repeat, on_step: [
+        estimates(estimator, recording, prior, own(repeat), keep, on_step)
+    ]
+
+
+def _scored_run(
+    read: Recording | Team, answers: Answers, scoring: Mapping[str, float]
+) -> tuple[Status, Row]:
+    """How a run ended, and its scores."""
+    statuses, scores = [], []
+    for recording, (online, revised) in zip(robots_of(read), answers, strict=True):
+        statuses.append(status_of(recording, online, revised))
+        scores.append(scored(recording, online, revised, **scoring))
+    if isinstance(read, Team):
+        return status_of_team(statuses), scores_of_team(read, scores)
+    return statuses[0], scores[0]
 
 
 def estimates(

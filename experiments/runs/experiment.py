@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import inspect
 import json
 import math
 import re
@@ -11,7 +12,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from hydra import compose, initialize_config_dir
@@ -20,23 +21,25 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationKeyError
 
 from estimators.base import Estimator, Prior
+from estimators.team import TeamEstimator
 from experiments.runs import paths
 from experiments.runs.cache import cached, key_of
 from experiments.runs.calibration import read_calibration
 from experiments.runs.row import Row
 from experiments.runs.seeds import stream
 from experiments.runs.targets import checked, make, targets
+from experiments.runs.team_settings import TeamSettings, own_config, team_settings
 from experiments.runs.version import code_version, source_digest, version_with
 from sim import grid_file
 from sim.arrays import Array
-from sim.errors import InputError, blaming, require
+from sim.errors import InputError, blaming, require, required
 from sim.files import write_text
 from sim.grid import OccupancyGrid
 from sim.recording import Frame, Recording, load
 from sim.robot import DifferentialDrive, RobotGeometry
 from sim.sensors import Sensor, Sensors, sensors_from_config
 from sim.sensors.base import RecordedSensor, sensor_settings
-from sim.settings import build
+from sim.settings import build, find
 from sim.world import World
 from sim.yaml_file import read_yaml
 
@@ -44,6 +47,7 @@ Config = dict[str, Any]
 GROUPS = ("world", "robot", "sensors", "route", "estimator")
 _MAPPINGS = (*GROUPS, "simulation", "prior", "scoring")
 SIMULATED_KEYS = ("world", "robot", "sensors", "route", "simulation", "seed", "world_seed")
+_TEAM_KEYS = ("size", "robots")  # of the key `team`, those that decide what is read
 _KEYS = (
     *_MAPPINGS,
     *("seed", "world_seed", "repeats", "recording", "calibration", "name", "picture", "keep"),
@@ -54,6 +58,7 @@ _KEYS = (
 )
 _NOT_IN_KEY = ("name", "picture", "recording")
 _READ_OF_HYDRA = ("hydra/launcher", "hydra.launcher", "hydra.searchpath")
+_OF_TEAMS = "ekf_slam, fastslam or smoother"
 _PHYSICS = ("bullet", "kinematic")
 _RAYS = ("bullet", "exact")
 
@@ -267,6 +272,7 @@ class Experiment:
         self._check_simulation()
         self._check_prior()
         self._check_scoring()
+        self._check_team()
         self._check_needs()
         self._check_map()
 
@@ -343,6 +349,33 @@ class Experiment:
                 "occupancy grid"
             )
 
+    def _check_team(self) -> None:
+        """Check each robot of a team, and what is of one robot only."""
+        team = self.team
+        if team is None:
+            return
+        kind = find(self.config["estimator"].get("_target_"), "estimator")
+        require(
+            not inspect.isclass(kind) or hasattr(kind, "step_team"),
+            f"estimator={self.estimator_name} is of one robot; a team takes {_OF_TEAMS}",
+        )
+        settings = self.config["estimator"]
+        if settings.get("robots") is not None and self.config["recording"] is None:
+            self._check_sensors(f"estimator={self.estimator_name}", ["robots"], settings)
+        for number in range(team.size):
+            own = self.of_robot(number)
+            try:
+                own.robot(), own.sensors(), own.route()
+            except InputError as error:
+                raise InputError(f"team.robots[{number}]: {error}") from error
+        require(
+            self.config["prior"]["start"] == "tracking",
+            "prior.start=global: the start of robot 0 must be known to a team; those of the "
+            "others may be unknown (team.starts)",
+        )
+        for key in ("keep", "calibration"):
+            require(not self.config[key], f"{key} is of one robot; leave it out for a team")
+
     def _check_sensors(self, who: str, needs: Iterable[str], settings: Config) -> None:
         """Check that the robot has the sensors that an estimator needs."""
         has = {name for name, sensor in self.config["sensors"].items() if sensor is not None}
@@ -382,6 +415,26 @@ class Experiment:
                 )
         return estimator
 
+    def team_estimator(self) -> TeamEstimator:
+        """Make the estimator of a team: anything with `reset_team` and `step_team`."""
+        estimator: Any = self.estimator()
+        require(
+            hasattr(estimator, "reset_team") and hasattr(estimator, "step_team"),
+            f"estimator={self.estimator_name} is of one robot; a team takes {_OF_TEAMS}",
+        )
+        return cast(TeamEstimator, estimator)
+
+    @property
+    def team(self) -> TeamSettings | None:
+        """The key `team` of a study of several robots; None of one robot."""
+        given = self.config.get("team")
+        return None if given is None else team_settings(given)
+
+    def of_robot(self, number: int) -> Experiment:
+        """The experiment of one robot of the team, alone, with what it has of its own."""
+        team = required(self.team, "team: this experiment is of one robot")
+        return dataclasses.replace(self, config=own_config(self.config, team, number))
+
     def route(self) -> Any:
         """Make the route: anything with `start`, as in `sim.simulate.Route`."""
         return make(self.config["route"], "route")
@@ -402,6 +455,7 @@ class Experiment:
         """
         from sim.simulate import record
 
+        self._check_one_robot()
         self._check_simulation()
         return record(
             self.world(),
@@ -438,6 +492,7 @@ class Experiment:
 
         A mapping in place of a path names a function that makes one.
         """
+        self._check_one_robot()
         wanted = self.config["recording"]
         if isinstance(wanted, dict):
             made = make(wanted, "recording", config=self.config)
@@ -454,6 +509,12 @@ class Experiment:
         recording = cached(self.recording_key, lambda: self.simulate(on_progress))
         # a file does not choose what code runs, but the configuration does
         return dataclasses.replace(recording, sensors=self.sensors())
+
+    def _check_one_robot(self) -> None:
+        require(
+            self.team is None,
+            "team: a recording is of one robot; `estima record` and `estima run` take teams",
+        )
 
     def _calibrated(self, recording: Recording) -> Recording:
         """Return the recording as the calibration has it."""
@@ -493,6 +554,8 @@ class Experiment:
     def _recording_settings(self) -> Config:
         """What decides the recording."""
         made = {} if isinstance(self.config["recording"], str) else self._simulated()
+        if (team := self.config.get("team")) is not None:
+            made["team"] = {key: team.get(key) for key in _TEAM_KEYS}
         return {**made, **self._recording_sources()}
 
     def _recording_sources(self) -> Config:
@@ -836,6 +899,12 @@ def _digest(path: Path) -> str:
         return hashlib.sha256(path.read_bytes()).hexdigest()
     except OSError as error:
         raise InputError(f"{path}: cannot read it ({error.strerror})") from error
+
+
+def decides_recording(leaf: tuple[str, ...], *, from_file: bool) -> bool:
+    """Whether a leaf of the configuration decides which recording is read."""
+    of_team = leaf[0] == "team" and leaf[1] in _TEAM_KEYS
+    return of_team or (leaf[0] in SIMULATED_KEYS and not from_file)
 
 
 def leaf_digest(leaf: tuple[str, ...], value: Any) -> int:

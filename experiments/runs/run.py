@@ -29,11 +29,14 @@ from experiments.runs.experiment import (
 )
 from experiments.runs.row import Outcome, Row
 from experiments.runs.store import write_run
+from experiments.runs.team import recorded, robots_of
 from experiments.trajectories.convert import write_estimate
-from sim.errors import InputError
+from sim.errors import InputError, require
 from sim.recording import Recording
+from sim.team import Team
 
-Draw = Callable[[Recording, Estimate, Experiment, Path], None]
+# Of each robot: its recording and its estimate
+Draw = Callable[[Sequence[tuple[Recording, Estimate]], Experiment, Path], None]
 
 
 def run_once(experiment: Experiment, draw: Draw, out: Path | None = None) -> list[Row]:
@@ -42,9 +45,10 @@ def run_once(experiment: Experiment, draw: Draw, out: Path | None = None) -> lis
     Parameters
     ----------
     draw
-        Draws a recording and an estimate of an experiment into a folder.
+        Draws the recordings and estimates of an experiment into a folder.
     out
         File of the first repeat's estimate, the revised one if there is one; None for no file.
+        It is of one robot.
 
     Raises
     ------
@@ -52,11 +56,18 @@ def run_once(experiment: Experiment, draw: Draw, out: Path | None = None) -> lis
         If a run failed; its row says how.
     """
     folder, name = experiment.rows_folder / experiment.key, experiment.estimator_name
+    require(
+        out is None or experiment.team is None,
+        f"-o {out}: one file is of one robot; those of a team are in the folder of its run",
+    )
+    found: list[tuple[Recording, Estimate]] = []
 
-    def fetch() -> Recording:
+    def fetch() -> Recording | Team:
         with progress("simulated seconds", expected_s(experiment)) as on_progress:
-            recording = experiment.recording(on_progress)
+            recording = recorded(experiment, on_progress)
         slip = experiment.believed_slip
+        if isinstance(recording, Team):
+            return recording
         if "source" in recording.config and experiment.config["calibration"] is None and slip:
             show(
                 f"believed of this real robot: kr={slip[0]:g} and kl={slip[1]:g} m, and the "
@@ -66,19 +77,20 @@ def run_once(experiment: Experiment, draw: Draw, out: Path | None = None) -> lis
         return recording
 
     def keep(recording: Recording, repeat: int, online: Estimate, revised: Estimate | None) -> None:
-        answer = online if revised is None else revised
-        if repeat == 0 and experiment.picture:
-            draw(recording, answer, experiment, folder)
-        if repeat == 0 and out is not None:
-            write_estimate(out, answer)
+        if repeat == 0:
+            found.append((recording, online if revised is None else revised))
 
     rows = evaluate(
         experiment,
         fetch,
-        shown=lambda recording: progress(name, len(recording.frame_stamps)),
+        shown=lambda read: progress(name, sum(len(r.frame_stamps) for r in robots_of(read))),
         on_estimate=keep,
         on_error=_trace,
     )
+    if found and experiment.picture:
+        draw(found, experiment, folder)
+    if found and out is not None:
+        write_estimate(out, found[0][1])
     path = write_run(rows, folder.parent)
     written = (path, folder / "run.png", *([out] if out is not None else []))
     _print(rows, [file for file in written if file.exists()])
@@ -131,10 +143,11 @@ def application(arguments: Sequence[str], draw: Draw, out: Path | None = None) -
                 show(f"Next: intervals over ten drives: {said} -m 'seed=range(0,10)'")
                 drive = shlex.join(["estima", "record", "-o", "run.npz", *given, *options])
                 if "command" not in experiment.config["estimator"]:  # `view` cannot be told it
-                    play = shlex.join(
-                        ["estima", "view", "run.npz", "-e", experiment.estimator_name]
-                    )
-                    show(f"      as it moves, in a window: {drive} && {play}")
+                    view = ["estima", "view", "run.npz", "-e", experiment.estimator_name]
+                    place = "in a window"
+                    if experiment.team is not None:
+                        view, place = [*view, "-o", "run.html"], "in a file"
+                    show(f"      as it moves, {place}: {drive} && {shlex.join(view)}")
         except Exception as error:
             end(error)  # here, since Hydra would add a line of its own
 
@@ -190,6 +203,7 @@ _DOF = 3
 def _print(rows: Sequence[Row], files: Sequence[Path]) -> None:
     first = rows[0]
     where = first.get("choice.world") or first.get("recording") or "a recording"
+    where = f"{where}, {first['team.size']} robots" if "team.size" in first else where
     ended = {Outcome.OK: "", Outcome.REMARK: ", with a remark", Outcome.FAILED: ": failed"}
     status = ended[Outcome(str(first["status"]))]
     show(f"{first['choice.estimator']} on {where}, seed {first['seed']}{status}")

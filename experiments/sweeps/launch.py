@@ -32,12 +32,14 @@ from experiments.runs.console import RunFailedError, progress
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment, check_hydra
 from experiments.runs.row import Outcome, Row, Status, check_row
+from experiments.runs.team import recorded
 from experiments.sweeps.collect import COMMAND
 from experiments.sweeps.plan import Family, Numbers, Plan, packed, plan_of
 from sim.compiled import announce_once_in
 from sim.errors import InputError
 from sim.files import require_file, write_whole
 from sim.recording import Recording
+from sim.team import Team
 
 _JOBS_PER_CORE = 4  # enough to keep all busy to the end, few enough to cost little
 # What launchers raise when a process of theirs has died; Ray and submitit are extras
@@ -400,7 +402,7 @@ def run_share(share: Mapping[str, Any]) -> None:
 
     A run that fails leaves its row, and the next follows.
     """
-    held: dict[str, Recording] = {}
+    held: dict[str, Recording | Team] = {}
     path = Path(share["journal"])
     over = store.ended(path.parent, f"{path.stem}.")  # something if the launcher tries it again
     keys = {*over.done.tolist(), *over.failed}
@@ -431,7 +433,7 @@ def _end_with(node: str, planner: int) -> None:
 
 
 def run_and_record(
-    experiment: Experiment, held: dict[str, Recording], journal: store.Journal
+    experiment: Experiment, held: dict[str, Recording | Team], journal: store.Journal
 ) -> None:
     """Run one experiment; what goes wrong becomes the status of its row.
 
@@ -452,11 +454,11 @@ def run_and_record(
     journal.append(rows)
 
 
-def _held(experiment: Experiment, held: dict[str, Recording]) -> Recording:
+def _held(experiment: Experiment, held: dict[str, Recording | Team]) -> Recording | Team:
     key = experiment.recording_key
     if key not in held:
         held.clear()
-        held[key] = experiment.recording()
+        held[key] = recorded(experiment)
     return held[key]
 
 

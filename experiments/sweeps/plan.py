@@ -11,7 +11,7 @@ import itertools
 import json
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -26,11 +26,11 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from experiments.runs import paths
 from experiments.runs.console import unknown_key
 from experiments.runs.experiment import (
-    SIMULATED_KEYS,
     Config,
     Experiment,
     check_overrides,
     composed,
+    decides_recording,
     files_of_options,
     leaf_digests,
     searched,
@@ -61,15 +61,15 @@ class Axis:
     leaves: tuple[Leaf, ...]
     values: Sequence[Any]
 
-    def digests(self, tops: frozenset[str] | None = None) -> Digests:
+    def digests(self, counts: Callable[[Leaf], bool] = lambda _: True) -> Digests:
         """What each value adds to a run's digest, beyond the first one; see `Experiment.key`.
 
         Parameters
         ----------
-        tops
-            Top-level keys of the leaves that count; by default all.
+        counts
+            Whether a leaf counts; by default all do.
         """
-        counted = [tops is None or leaf[0] in tops for leaf in self.leaves]
+        counted = [counts(leaf) for leaf in self.leaves]
         found: Digests = self._each[counted].sum(axis=0, dtype=np.uint64)
         return found - found[:1]
 
@@ -117,9 +117,9 @@ class Family:
     def recordings(self) -> Digests:
         """A digest for each run that is the same for runs of the same recording."""
         from_file = isinstance(self.config["recording"], str)
-        tops = frozenset() if from_file else frozenset(SIMULATED_KEYS)
+        counts = functools.partial(decides_recording, from_file=from_file)
         first = self.experiment(0).recording_key[:16]
-        return _sums(first, [axis.digests(tops) for axis in self.axes])
+        return _sums(first, [axis.digests(counts) for axis in self.axes])
 
     def spread(self, most: int = _MOST_CHECKED) -> list[int]:
         """All runs of a small family; of a large one, runs along each axis, its ends included."""

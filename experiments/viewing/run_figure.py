@@ -1,5 +1,6 @@
 """One run at a glance: truth and estimate in the world, and the errors with their 2-sigma bands."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -8,6 +9,7 @@ from matplotlib.figure import Figure
 from estimators.base import Estimate
 from experiments.viewing.plotting import draw_ellipses, plan_axes
 from experiments.viewing.style import ESTIMATE, GREEN, ORANGE, TRUTH, figure
+from experiments.viewing.team_figure import team_figure
 from experiments.viewing.world import draw_world, sees_landmarks
 from sim import se2
 from sim.arrays import Array
@@ -17,6 +19,11 @@ _N_ELLIPSES = 8
 _N_READINGS = 30
 _MOST_POINTS = 4000
 _AROUND_M = 3.0  # of the path that is shown
+
+
+def figure_of(found: Sequence[tuple[Recording, Estimate]], name: str) -> Figure:
+    """Picture of a run: the recording and the estimate of its robot, or of each of a team."""
+    return run_figure(*found[0], name) if len(found) == 1 else team_figure(found, name)
 
 
 def run_figure(recording: Recording, estimate: Estimate, name: str) -> Figure:

@@ -9,10 +9,10 @@ import io
 import itertools
 import shutil
 import subprocess
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -47,9 +47,11 @@ from sim.errors import InputError, require
 from sim.files import write_whole
 from sim.grid import OccupancyGrid
 from sim.recording import Frame, Recording
+from sim.world import World
 
 Picture = NDArray[np.uint8]
-_Layer = tuple[bool, str, str, str, dict[str, Any]]  # whether drawn, marker, colour, label, style
+Layer = tuple[str, str, str, dict[str, Any]]  # style, colour, label, further settings
+_Layer = tuple[bool, str, str, str, dict[str, Any]]  # whether drawn, and the Layer
 SUFFIXES = (".mp4", ".gif", ".html")
 FPS = 10
 SECONDS = 20.0
@@ -94,6 +96,11 @@ class Playback:
     def fps(self) -> float:
         """Pictures a second."""
         return len(self.rows) / (self.seconds or max(float(np.ptp(self.stamps)), 1.0 / FPS))
+
+    def clock(self, stamp: float) -> str:
+        """Time since the start, and the whole time."""
+        stamps = self.recording.frame_stamps
+        return f"{stamp - stamps[0]:.1f} of {stamps[-1] - stamps[0]:.1f}"
 
     def belief_row(self, stamp: float) -> int:
         """Row of the last belief up to a time; -1 before the first, or without an estimate."""
@@ -175,6 +182,10 @@ def read_estimate(recording: Recording, path: Path) -> Estimate:
         If it cannot be read, is not finite, or belongs to another recording.
     """
     if path.is_dir():
+        require(
+            not (path / "estimate_0.csv").exists(),
+            f"{path}: the run of a team; its robots' estimates are {path}/estimate_0.csv and on",
+        )
         path /= "estimate.csv"
     stamps = recording.frame_stamps
     estimate = read_odometry_csv(path) if path.suffix == ".csv" else read_trajectory(path)
@@ -248,23 +259,48 @@ def ellipse_outlines(means: Array, covariances: Array) -> Array:
 
 
 def pictures(run: Playback) -> Iterator[Picture]:
-    """The run as pictures (H, W, 3) with even sides, one for each row shown.
-
-    What never moves is drawn once.
-    """
+    """The run as pictures (H, W, 3) with even sides, one for each row shown."""
     recording = run.recording
     truth = None if recording.truth is None else recording.truth_at(recording.frame_stamps)
-    x1, y1, x2, y2 = bounds(run, truth)
+    around = bounds(run, truth)
+    glyph_m = max(recording.robot.track_m / 2.0, 0.012 * (around[2] - around[0]))
+    layers = _layers(run, truth is not None)
+    instants = (_instant(run, int(row), truth, glyph_m) for row in run.rows)
+    landmarks = sees_landmarks(recording)
+    yield from animated(around, recording.world, run.grid, layers, instants, landmarks)
+
+
+def animated(
+    around: tuple[float, float, float, float],
+    world: World | None,
+    grid: OccupancyGrid | None,
+    layers: Mapping[str, Layer],
+    instants: Iterable[tuple[dict[str, Array], str]],
+    landmarks: bool = True,
+) -> Iterator[Picture]:
+    """Pictures (H, W, 3) with even sides of what moves on a map; what never moves is drawn once.
+
+    Parameters
+    ----------
+    around
+        What the map shows: x and y of its lower left and of its upper right corner, m.
+    layers
+        What moves, from the lowest up.
+    instants
+        Of each picture: points (N, 2) of the layers, and the title.
+    landmarks
+        Whether those of the world are drawn.
+    """
+    x1, y1, x2, y2 = around
     page, ax = subplots(8.0, float(np.clip(7.0 * (y2 - y1) / (x2 - x1), 2.0, 8.0)) + 1.2)
     page.set_dpi(_DPI)
-    if run.grid is not None:
-        draw_grid(ax, run.grid)
-    if recording.world is not None:
-        draw_world(ax, recording.world, landmarks=sees_landmarks(recording))
-    glyph = max(recording.robot.track_m / 2.0, 0.012 * (x2 - x1))  # visible on any map
+    if grid is not None:
+        draw_grid(ax, grid)
+    if world is not None:
+        draw_world(ax, world, landmarks=landmarks)
     moving = {
         key: ax.plot([], [], style, color=color, label=label, animated=True, **more)[0]
-        for key, (style, color, label, more) in _layers(run, truth is not None).items()
+        for key, (style, color, label, more) in layers.items()
     }
     title = ax.text(0.0, 1.01, "", transform=ax.transAxes, animated=True)
     plan_axes(ax, xlim=(x1, x2), ylim=(y1, y2))
@@ -275,9 +311,8 @@ def pictures(run: Playback) -> Iterator[Picture]:
     canvas.draw()
     page.set_layout_engine("none")
     background = canvas.copy_from_bbox(page.bbox)
-    for row in run.rows:
+    for points, words in instants:
         canvas.restore_region(background)
-        points, words = _instant(run, int(row), truth, glyph)
         for key, line in moving.items():
             line.set_data(*points.get(key, np.zeros((0, 2))).T)
             ax.draw_artist(line)
@@ -287,7 +322,7 @@ def pictures(run: Playback) -> Iterator[Picture]:
         yield image[: image.shape[0] // 2 * 2, : image.shape[1] // 2 * 2].copy()
 
 
-def _layers(run: Playback, known: bool) -> dict[str, tuple[str, str, str, dict[str, Any]]]:
+def _layers(run: Playback, known: bool) -> dict[str, Layer]:
     """Moving layers from the lowest up: style, colour, label, further settings."""
     recording = run.recording
     extras = {} if run.estimate is None else run.estimate.extras
@@ -326,7 +361,7 @@ def _instant(
     stamps = run.recording.frame_stamps
     stamp = float(stamps[frame])
     points = {name: seen_points(run, name, stamp) for name in _sensor_layers(run.recording)}
-    words = f"{_clock(run, stamp)} s"
+    words = f"{run.clock(stamp)} s"
     if truth is not None:
         points["truth"] = truth[: frame + 1, :2]
         points["truth robot"] = robot_outline(truth[frame], glyph_m)
@@ -348,12 +383,6 @@ def _instant(
     if truth is not None and np.isfinite(truth[frame]).all():
         words += f", position error {np.hypot(*(mean - truth[frame])[:2]):.3f} m"
     return points, words
-
-
-def _clock(run: Playback, stamp: float) -> str:
-    """Time since the start, and the whole time."""
-    stamps = run.recording.frame_stamps
-    return f"{stamp - stamps[0]:.1f} of {stamps[-1] - stamps[0]:.1f}"
 
 
 def robot_outline(pose: Array, radius_m: float) -> Array:
@@ -399,8 +428,25 @@ def check_output(path: Path) -> None:
         raise InputError(f"{path}: MP4 needs ffmpeg, which is not installed; take .gif or .html")
 
 
-def save(run: Playback, path: Path, on_progress: Callable[[float], None]) -> None:
-    """Write the run as `.mp4` (needs ffmpeg), `.gif` or `.html`, whole or not at all.
+class Played(Protocol):
+    """What plays: a robot's run, or a team's."""
+
+    @property
+    def stamps(self) -> Array:
+        """Stamps (n,) of the pictures, s."""
+
+    @property
+    def fps(self) -> float:
+        """Pictures a second."""
+
+    def clock(self, stamp: float) -> str:
+        """Time since the start, and the whole time."""
+
+
+def save(
+    run: Played, images: Iterator[Picture], path: Path, on_progress: Callable[[float], None]
+) -> None:
+    """Write a run's pictures as `.mp4` (needs ffmpeg), `.gif` or `.html`, whole or not at all.
 
     Parameters
     ----------
@@ -410,16 +456,16 @@ def save(run: Playback, path: Path, on_progress: Callable[[float], None]) -> Non
     check_output(path)
 
     def counted() -> Iterator[Picture]:
-        for done, picture in enumerate(pictures(run), start=1):
+        for done, picture in enumerate(images, start=1):
             yield picture
-            on_progress(done / len(run.rows))
+            on_progress(done / len(run.stamps))
 
     write = {".mp4": _write_mp4, ".gif": _write_gif, ".html": _write_html}[path.suffix]
     with write_whole(path) as part:
         write(run, counted(), part)
 
 
-def _write_mp4(run: Playback, images: Iterator[Picture], path: Path) -> None:
+def _write_mp4(run: Played, images: Iterator[Picture], path: Path) -> None:
     first = next(images)
     size = f"{first.shape[1]}x{first.shape[0]}"
     raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", f"{run.fps:.4f}", "-i", "-"]
@@ -448,13 +494,13 @@ def _reduced(image: Picture) -> Any:
     return Image.fromarray(image).quantize(96, method=Image.Quantize.FASTOCTREE)
 
 
-def _write_gif(run: Playback, images: Iterator[Picture], path: Path) -> None:
+def _write_gif(run: Played, images: Iterator[Picture], path: Path) -> None:
     first, *rest = (_reduced(image) for image in images)
     duration_ms = round(1000.0 / run.fps)
     first.save(path, "GIF", save_all=True, append_images=rest, duration=duration_ms, loop=0)
 
 
-def _write_html(run: Playback, images: Iterator[Picture], path: Path) -> None:
+def _write_html(run: Played, images: Iterator[Picture], path: Path) -> None:
     frames: list[str] = []
     for image in images:
         data = io.BytesIO()
@@ -465,7 +511,7 @@ def _write_html(run: Playback, images: Iterator[Picture], path: Path) -> None:
         "height": image.shape[0],
         "last": len(frames) - 1,
         "fps": f"{run.fps:.4f}",
-        "times": ", ".join(f'"{_clock(run, float(stamp))} s"' for stamp in run.stamps),
+        "times": ", ".join(f'"{run.clock(float(stamp))} s"' for stamp in run.stamps),
         "first": frames[0],
         "frames": ",\n".join(f'"{frame}"' for frame in frames),
     }

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from sim.errors import InputError
+from sim.errors import InputError, require
 from sim.files import require_file
 from sim.formats import carmen, khepera
 from sim.formats.intel import read_intel
@@ -15,6 +15,8 @@ from sim.formats.text import read_bytes, read_members
 from sim.formats.wean import read_wean
 from sim.recording import Recording, load
 from sim.recording_check import check_recording
+from sim.team import Team, is_team
+from sim.team import load as load_team
 
 KINDS = ("recording", "rosbag", "mrclam", "carmen", "intel", "khepera", "lego", "rawseeds", "wean")
 _HEAD_BYTES = 1 << 16
@@ -76,7 +78,15 @@ def _kind_of_text(head: bytes, path: Path) -> str:
     )
 
 
-def read_any(paths: Sequence[Path], robot: int = 1, member: str | None = None) -> Recording:
+def read_all(paths: Sequence[Path], robot: int | None = None) -> Recording | Team:
+    """A Recording of one log as `read_any` reads it, or the team of a file that holds one."""
+    several = robot is None and paths[0].is_file() and is_team(paths[0])
+    return load_team(paths[0]) if several else read_any(paths, robot)
+
+
+def read_any(
+    paths: Sequence[Path], robot: int | None = None, member: str | None = None
+) -> Recording:
     """A Recording of one log.
 
     Parameters
@@ -85,7 +95,7 @@ def read_any(paths: Sequence[Path], robot: int = 1, member: str | None = None) -
         The log. Some formats come in several files, in this order: Intel (raw, corrected);
         Rawseeds (odometry, scans, ground truth); Lego (motors, scans, reference, cylinders).
     robot
-        Which robot of an MRCLAM set.
+        Which robot of an MRCLAM set, by default 1; or of a team's file, from 0 on.
     member
         Which file of an archive of Khepera tuples.
 
@@ -104,14 +114,20 @@ def read_any(paths: Sequence[Path], robot: int = 1, member: str | None = None) -
     return recording
 
 
-def _read(paths: Sequence[Path], kind: str, robot: int, member: str | None) -> Recording:
+def _read(paths: Sequence[Path], kind: str, robot: int | None, member: str | None) -> Recording:
     first, rest = paths[0], paths[1:]
     least, most = {"intel": (1, 2), "rawseeds": (2, 3), "lego": (2, 4)}.get(kind, (1, 1))
     if not least <= len(paths) <= most:
         wanted = f"{least} to {most} files" if most > 1 else "one file"
         raise InputError(f"{first}: a {kind} log is {wanted}, got {len(paths)}")
     if kind == "mrclam":
-        return read_mrclam(first, robot)
+        return read_mrclam(first, 1 if robot is None else robot)
+    if kind == "recording" and robot is not None and is_team(first):
+        team = load_team(first)
+        require(
+            0 <= robot < len(team), f"{first}: its robots are 0 to {len(team) - 1}, got {robot}"
+        )
+        return team.robots[robot]
     if kind == "carmen":
         return carmen.to_recording(carmen.read_carmen(first))
     if kind == "khepera":

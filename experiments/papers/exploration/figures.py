@@ -3,20 +3,19 @@
 from typing import Any
 
 import pandas as pd
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from experiments.papers.exploration.claims import NAMES
 from experiments.papers.exploration.settings import AFTER_M, BASE, JUDGED
 from experiments.papers.results import Results
-from experiments.viewing.plotting import plan_axes, with_legend
-from experiments.viewing.style import BLACK, BLUE, GREEN, ORANGE, PURPLE, subplots
-from experiments.viewing.world import draw_walls
+from experiments.viewing.plotting import with_legend
+from experiments.viewing.style import BLACK, BLUE, GREEN, ORANGE, PURPLE, RED, subplots
+from experiments.viewing.team_figure import draw_paths
 
-_ROBOTS = (BLUE, ORANGE, GREEN)
 _STRATEGIES = {
     "random": (PURPLE, ":"),
     "nearest_frontier": (BLUE, "--"),
+    "shared_frontiers": (RED, (0, (5, 1, 1, 1, 1, 1))),
     "information_gain": (GREEN, "-."),
     "coordinated": (ORANGE, "-"),
 }
@@ -36,20 +35,11 @@ def drives(runs: dict[str, dict[str, Any]]) -> Figure:
     """Paths of the robots in one world, a panel a strategy."""
     page, panels = subplots(10.0, 5.6, 1, 2)
     for ax, (strategy, run) in zip(panels, runs.items(), strict=True):
-        _paths(ax, run)
+        draw_paths(ax, run)
         ax.set_title(f"{NAMES[strategy]}, {AFTER_M:g} m a robot")
     handles, labels = panels[0].get_legend_handles_labels()
     page.legend(handles, labels, loc="outside lower center", ncols=3)
     return page
-
-
-def _paths(ax: Axes, run: dict[str, Any]) -> None:
-    draw_walls(ax, run["walls"], run["wall_z_m"])
-    for number, colour in enumerate(_ROBOTS):
-        path = run[f"truth_{number}"]
-        ax.plot(*path.T, color=colour, lw=1.8, label=f"robot {number + 1}")
-        ax.plot(*path[0], "o", color=colour, ms=6)
-    plan_axes(ax)
 
 
 def by_distance(coverage: pd.DataFrame) -> Figure:
@@ -61,10 +51,10 @@ def by_distance(coverage: pd.DataFrame) -> Figure:
         wide = part.pivot_table(index="driven_m", columns="seed", values="area_m2").ffill()
         wide = wide[wide.index <= longest_m]
         low, middle, high = (wide.quantile(q, axis=1) for q in (0.25, 0.5, 0.75))
-        ax.plot(middle.index, middle, line, color=colour, lw=1.8, label=NAMES[strategy])
+        ax.plot(middle.index, middle, ls=line, color=colour, lw=1.8, label=NAMES[strategy])
         ax.fill_between(middle.index, low, high, color=colour, alpha=0.15, lw=0)
     ax.axvline(AFTER_M, color=BLACK, lw=0.8)
     ax.annotate("judged", (AFTER_M, 0.02), (4, 0), xycoords=("data", "axes fraction"),
                 textcoords="offset points", fontsize="small")  # fmt: skip
     ax.set(xlabel="distance driven a robot, m", ylabel="floor seen by the team, m²")
-    return with_legend(page, ncols=4)
+    return with_legend(page, ncols=3)

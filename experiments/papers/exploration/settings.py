@@ -2,13 +2,11 @@
 
 from experiments.evaluation.verdict import Profile
 
-STRATEGIES = ("random", "nearest_frontier", "information_gain", "coordinated")
 BASE, JUDGED = "nearest_frontier", "coordinated"
+SHARED, GAIN = "shared_frontiers", "information_gain"  # each with one half of what is judged
+STRATEGIES = ("random", BASE, SHARED, GAIN, JUDGED)
 FIRST_SEED = 1000  # of the judged worlds
-WORLDS = {  # by strategy; the claim is of two of them
-    Profile.FULL: {BASE: 30, JUDGED: 30, "information_gain": 4, "random": 4},
-    Profile.QUICK: dict.fromkeys(STRATEGIES, 2),
-}
+WORLDS = {Profile.FULL: 30, Profile.QUICK: 2}
 AFTER_M = 15.0  # driven a robot, after which the area is judged
 RESOLUTION_M = 0.2  # of the area
 N_ROBOTS = 3

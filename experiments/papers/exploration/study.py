@@ -44,8 +44,8 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
     """
     jobs = [
         (settings.FIRST_SEED + i, strategy)
-        for strategy, n_worlds in settings.WORLDS[profile].items()
-        for i in range(n_worlds)
+        for strategy in settings.STRATEGIES
+        for i in range(settings.WORLDS[profile])
     ]
     parts = [*in_parallel(row_of, jobs, on_progress)]
     out.write_tables(
@@ -62,7 +62,7 @@ def row_of(seed: int, strategy: str) -> tuple[Row, pd.DataFrame]:
     The map is that of the paper's method, run over the drive.
     """
     experiment = composed(seed, strategy)
-    team = experiment.record()
+    team = experiment.recording()
     driven_m, area_m2 = coverage(team, settings.RESOLUTION_M)
     labels: Row = {"seed": seed, "strategy": strategy}
     online, revised = experiment.run(team)[0]
@@ -123,7 +123,7 @@ def _driven_m(robot: Recording, stamps: Array) -> Array:
 
 def paths(experiment: TeamExperiment) -> dict[str, Any]:
     """True paths of a team up to where its area is judged, and the walls, for the figure."""
-    team = experiment.record()
+    team = experiment.recording()
     world = team.robots[0].known_world
     arrays: dict[str, Any] = {"walls": world.walls, "wall_z_m": world.wall_z_m}
     for number, robot in enumerate(team.robots):

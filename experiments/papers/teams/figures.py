@@ -5,18 +5,16 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from experiments.evaluation.statistics import log_ratio_interval
 from experiments.papers.results import Results
 from experiments.papers.teams.claims import NAMES
 from experiments.papers.teams.settings import ALWAYS
-from experiments.viewing.plotting import plain_log, plan_axes, with_legend
-from experiments.viewing.style import BLACK, BLUE, GREEN, ORANGE, PURPLE, RED, SKY, subplots
-from experiments.viewing.world import draw_walls
+from experiments.viewing.plotting import plain_log, with_legend
+from experiments.viewing.style import BLACK, BLUE, PURPLE, SKY, subplots
+from experiments.viewing.team_figure import draw_paths, draw_sightings
 
-_COLOURS = (BLUE, ORANGE, GREEN, RED, PURPLE)
 _FILTERS = {"fastslam": (BLUE, "s"), "ekf_slam": (BLACK, "o"), "smoother": (PURPLE, "^")}
 
 
@@ -33,15 +31,9 @@ def draw(made: Results) -> dict[str, Figure]:
 def drive(run: dict[str, Any]) -> Figure:
     """Paths of the robots in one world, and lines from who sees to who is seen."""
     page, ax = subplots(6.2, 6.0)
-    draw_walls(ax, run["walls"], run["wall_z_m"])
-    numbers = sorted(int(name.removeprefix("truth_")) for name in run if name.startswith("truth_"))
-    for number, colour in zip(numbers, _COLOURS, strict=False):
-        path = run[f"truth_{number}"]
-        ax.plot(*path.T, color=colour, lw=1.8, label=f"robot {number + 1}")
-        ax.plot(*path[0], "o", color=colour, ms=6)
-        lines = run[f"sightings_{number}"].reshape(-1, 2, 2)
-        ax.add_collection(LineCollection(list(lines), colors=colour, lw=0.5, alpha=0.5))
-    plan_axes(ax)
+    draw_paths(ax, run)
+    for number in range(sum(name.startswith("truth_") for name in run)):
+        draw_sightings(ax, run[f"sightings_{number}"].reshape(-1, 2, 2), number)
     return with_legend(page, ncols=5)
 
 

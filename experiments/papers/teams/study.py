@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,23 +18,36 @@ from numpy.typing import NDArray
 
 from estimators.base import Estimate, Prior
 from estimators.ekf_slam import EkfSlam
-from estimators.team import Answer, Communication, Kind, run_team
-from experiments.evaluation.map_quality import landmark_errors
-from experiments.evaluation.metrics import nees, position_errors_m, rms
+from estimators.team import Communication, Kind, run_team
+from experiments.evaluation.metrics import position_errors_m, rms
 from experiments.evaluation.verdict import Profile
 from experiments.papers.jobs import in_parallel
 from experiments.papers.real_logs.logs import calibration_by_truth
 from experiments.papers.real_logs.settings import CALIBRATED_S, DATA
 from experiments.papers.results import Results
 from experiments.papers.teams import settings
+from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
 from experiments.runs.team import TeamExperiment
+from experiments.sweeps.collect import with_answers
+from experiments.viewing.team_figure import sightings
 from sim.arrays import Array
 from sim.formats import mrclam
 from sim.recording import Recording
 from sim.sensors import Mount
 from sim.team import Team
+
+_KEPT = {  # columns of a run's row, and what the study's table calls them
+    "answer_ate_rmse_m": "ate_rmse_m",
+    "worst_robot_rmse_m": "worst_robot_m",
+    "answer_nees_mean": "answer_nees",
+    "n_sightings": "n_sightings",
+    "step_time_us": "step_us",
+    "n_landmarks": "n_landmarks",
+    "map_rmse_m": "map_rmse_m",
+    "map_aligned_rmse_m": "map_aligned_rmse_m",
+}
 
 
 def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) -> None:
@@ -64,56 +77,35 @@ def team_jobs(profile: Profile) -> Iterator[tuple[int, str]]:
 
 def rows_of(seed: int, option: str) -> list[Row]:
     """Rows of an estimator's runs in one world, for each size of the team."""
-    whole = _composed(seed, {}).record()
+    whole = TeamExperiment(_composed(seed, {})).recording()
     rows = []
     for size in settings.SIZES:
-        team = whole.first(size)
         for overrides, labels in _arms(size, option):
-            answers = _composed(seed, overrides).run(team)
+            made = pd.DataFrame(
+                evaluate(_composed(seed, overrides), functools.partial(whole.first, size))
+            )
+            found = with_answers(made, list(_KEPT)).iloc[0]
             labels = {"seed": seed, "size": size, "filter": option, **labels}
-            rows.append({**labels, **team_scores(team, answers)})
+            rows.append({**labels, **{_KEPT[name]: found[name] for name in _KEPT if name in found}})
     return rows
 
 
 def _arms(size: int, option: str) -> Iterator[tuple[dict[str, Any], Row]]:
     """Overrides of each run of a team of this size, and its labels."""
-    for sightings in (False, True):
-        seen = "robots" if sightings else "null"
+    for used in (False, True):
+        seen = "robots" if used else "null"
         base = {"team.size": size, "estimator": option, "estimator.robots": seen}
         if option == "fastslam":
             base["estimator.n_particles"] = settings.N_PARTICLES
-        yield base, {"sightings": sightings, "link": settings.ALWAYS}
+        yield base, {"sightings": used, "link": settings.ALWAYS}
     if option == "ekf_slam" and size == settings.LINKED:
         for kind, link in settings.LINKS.items():
             yield base | link, {"sightings": True, "link": kind}
 
 
-def _composed(seed: int, overrides: Mapping[str, Any]) -> TeamExperiment:
+def _composed(seed: int, overrides: Mapping[str, Any]) -> Experiment:
     given = [f"{key}={value}" for key, value in overrides.items()]
-    return TeamExperiment(Experiment.compose(["study=teams", f"seed={seed}", *given]))
-
-
-def team_scores(team: Team, answers: Sequence[Answer]) -> Row:
-    """Errors of a team: squares are pooled over all robots' Frames."""
-    off, by_robot, consistent = [], [], []
-    for recording, (online, revised) in zip(team.robots, answers, strict=True):
-        found = revised or online
-        truth, known = _known(recording.truth_at(found.stamps), found)
-        errors_m = position_errors_m(truth, found.means[known])
-        off.append(errors_m)
-        by_robot.append(rms(errors_m))
-        values = nees(truth, found.means[known], found.covariances[known])
-        consistent.append(values[np.isfinite(values)])
-    seen = [len(recording.log("robots")["points_in_camera"]) for recording in team.robots]
-    first = answers[0][1] or answers[0][0]
-    return {
-        "ate_rmse_m": rms(np.concatenate(off)),
-        "worst_robot_m": max(by_robot),
-        "answer_nees": float(np.mean(np.concatenate(consistent))),
-        "n_sightings": sum(seen),
-        "step_us": 1e6 * sum(float(online.step_seconds.mean()) for online, _ in answers),
-        **landmark_errors(team.robots[0], first.map),
-    }
+    return Experiment.compose(["study=teams", f"seed={seed}", *given])
 
 
 def _known(truth: Array, found: Estimate) -> tuple[Array, NDArray[np.bool_]]:
@@ -124,20 +116,12 @@ def _known(truth: Array, found: Estimate) -> tuple[Array, NDArray[np.bool_]]:
 
 def drive(seed: int) -> dict[str, Array]:
     """True paths of a team, and its sightings as lines, for the figure."""
-    team = _composed(seed, {}).record()
-    world = team.robots[0].known_world
+    robots = TeamExperiment(_composed(seed, {})).recording().robots
+    world = robots[0].known_world
     arrays: dict[str, Array] = {"walls": world.walls, "wall_z_m": world.wall_z_m}
-    for number, recording in enumerate(team.robots):
+    for number, recording in enumerate(robots):
         arrays[f"truth_{number}"] = recording.known_truth.poses[:, :2]
-        log = recording.log("robots")
-        numbers = recording.known_truth.readings["robots"]["true_ids"]
-        stamps = np.repeat(log.stamps, np.diff(log.known_splits))
-        seen = [
-            team.robots[j].truth_at(np.array([s]))[0] for s, j in zip(stamps, numbers, strict=True)
-        ]
-        ends = np.array(seen).reshape(-1, 3)[:, :2]
-        lines = np.hstack([recording.truth_at(stamps)[:, :2], ends])
-        arrays[f"sightings_{number}"] = lines[np.isfinite(lines).all(axis=1)]
+        arrays[f"sightings_{number}"] = sightings(robots, number)[1].reshape(-1, 4)
     return arrays
 
 

@@ -1,0 +1,110 @@
+"""A team at a glance: paths and sightings in the world, and each robot's error."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from numpy.typing import NDArray
+
+from estimators.base import Estimate
+from experiments.evaluation.metrics import position_errors_m
+from experiments.viewing.plotting import plan_axes
+from experiments.viewing.style import BLACK, PURPLE, SERIES, TRUTH, subplots
+from experiments.viewing.world import draw_walls, draw_world
+from sim.arrays import Array
+from sim.recording import Recording
+from sim.sensors import RobotCamera
+
+_COLOURS = [colour for colour, _ in SERIES if colour not in (PURPLE, BLACK)]  # of landmarks, text
+
+
+def colour_of(number: int) -> str:
+    """Colour of a robot of a team."""
+    return _COLOURS[number % len(_COLOURS)]
+
+
+def sightings(robots: Sequence[Recording], number: int) -> tuple[Array, NDArray[np.float64]]:
+    """Stamps (S,) s of a robot's sightings, and true lines (S, 2, 2) m, in map.
+
+    A line goes from the robot to the one that it sees. Robots without truth have none.
+    """
+    own = robots[number]
+    stamps, lines = [np.zeros(0)], [np.zeros((0, 2, 2))]
+    for name, sensor in own.sensors.items():
+        hidden = own.truth.readings.get(name) if own.truth else None
+        if isinstance(sensor, RobotCamera) and hidden is not None and name in own.logs:
+            log = own.logs[name]
+            at = np.repeat(log.stamps, np.diff(log.known_splits))
+            ends = np.full((len(at), 2), np.nan)
+            for other, robot in enumerate(robots):
+                seen = hidden["true_ids"] == other
+                if robot.truth is not None:
+                    ends[seen] = robot.truth_at(at[seen])[:, :2]
+            stamps.append(at)
+            lines.append(np.stack([own.truth_at(at)[:, :2], ends], axis=1))
+    when, where = np.concatenate(stamps), np.concatenate(lines)
+    known = np.isfinite(where).all(axis=(1, 2))
+    return when[known], where[known]
+
+
+def draw_sightings(ax: Axes, lines: Array, number: int) -> None:
+    """Draw a robot's sightings (S, 2, 2), m, in map."""
+    ax.add_collection(LineCollection(list(lines), colors=colour_of(number), lw=0.5, alpha=0.4))
+
+
+def draw_paths(ax: Axes, run: Mapping[str, Array]) -> None:
+    """Draw a world's walls, and the true paths of a team.
+
+    Parameters
+    ----------
+    run
+        Arrays: `walls`, `wall_z_m`, and of each robot `truth_N` (T, 2) m, in map.
+    """
+    draw_walls(ax, run["walls"], run["wall_z_m"])
+    for number in range(sum(name.startswith("truth_") for name in run)):
+        path, colour = run[f"truth_{number}"], colour_of(number)
+        ax.plot(*path.T, color=colour, lw=1.8, label=f"robot {number}")
+        ax.plot(*path[0], "o", color=colour, ms=6)
+    plan_axes(ax)
+
+
+def team_figure(found: Sequence[tuple[Recording, Estimate]], name: str) -> Figure:
+    """Map with all paths and sightings; position errors against time.
+
+    Parameters
+    ----------
+    found
+        Of each robot: its recording and its estimate.
+    """
+    page, (plan, errors) = subplots(10.0, 4.8, 1, 2, width_ratios=(1.0, 1.0))
+    robots = [recording for recording, _ in found]
+    if robots[0].world is not None:
+        draw_world(plan, robots[0].world)
+    for number, (recording, estimate) in enumerate(found):
+        colour: Any = {"color": colour_of(number)}
+        if recording.truth is not None:
+            truth = recording.truth_at(estimate.stamps)
+            plan.plot(*recording.truth.poses[:, :2].T, lw=1.6, **colour)
+            draw_sightings(plan, sightings(robots, number)[1], number)
+            off_m = position_errors_m(truth, estimate.means)
+            errors.plot(estimate.stamps, off_m, lw=1.2, label=f"robot {number}", **colour)
+        plan.plot(*estimate.means[:, :2].T, "--", color=TRUTH, lw=0.8)
+        plan.plot(*estimate.means[:1, :2].T, "o", ms=5, **colour)
+    plan_axes(plan)
+    plan.autoscale_view()
+    errors.set(xlabel="time, s", ylabel="position error, m")
+    errors.set_ylim(bottom=0.0)
+    errors.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=5, fontsize="small")
+    lines = [
+        Line2D([], [], color=TRUTH, lw=1.6, label="truth, a colour a robot"),
+        Line2D([], [], color=TRUTH, lw=0.8, ls="--", label=name),
+        Line2D([], [], color=TRUTH, lw=0.5, alpha=0.6, label="sightings"),
+    ]
+    plan.legend(
+        handles=lines, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, fontsize="small"
+    )
+    return page
