@@ -52,7 +52,7 @@ lock: setup
 
 # MRPT's libraries are Debian's libmrpt-slam-dev; estimator=mrpt_icp and mrpt_rbpf run the program.
 MRPT_INCLUDES := $(addprefix -isystem ,$(wildcard /usr/include/mrpt/*/include)) -isystem /usr/include/eigen3
-MRPT_LIBRARIES := slam maps obs poses math tfest bayes random config rtti io serialization system core
+MRPT_LIBRARIES := slam containers maps obs poses math tfest bayes random config rtti io serialization system core
 peers: build/peers/mrpt
 build/peers/mrpt: tools/peers/mrpt.cpp
 	@test -d /usr/include/mrpt/slam || { echo "MRPT is not here: apt-get install libmrpt-slam-dev"; exit 1; }
