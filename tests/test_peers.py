@@ -118,9 +118,9 @@ def test_kiss_icp_follows_a_circle():
 def test_mrpt_follows_exact_wheels_and_ranges(option, most_m):
     """With a turned laser off the centre.
 
-    Without its mount's turn `mrpt_icp` misses by 2.3 m, without its place by 0.15 m, with a field of
-    view that is one beam too wide by 0.022 m. What is left is MRPT's own: it takes the wheels to
-    err by a centimetre between scans.
+    Without its mount's turn `mrpt_icp` misses by 2.3 m, without its place by 0.15 m, with a field
+    of view that is one beam too wide by 0.022 m. What is left is MRPT's own: it takes the wheels
+    to err by a centimetre between scans.
     """
     settings = ["world=room", "sensors=hokuyo", "sensors.laser.n_beams=361"]
     settings += ["sensors.laser.mount.x_m=0.3", "sensors.laser.mount.yaw_rad=0.7"]
