@@ -23,7 +23,7 @@ from estimators.program import (
     words_of,
 )
 from sim import se2
-from sim.errors import InputError, require, required
+from sim.errors import InputError, require
 from sim.files import write_text
 from sim.formats.carmen import write_carmen
 from sim.formats.rosbag_out import write_bag
@@ -37,6 +37,7 @@ from sim.world import World
 Output = Literal["tum", "mcap", "bag"]
 Kind = Literal["revised", "online"]
 _PLACES = ("log", "mcap", "npz", "map", "grid", "start", "seed", "out")
+_NEEDED_BY = {"laser": ("log", "grid"), "map": ("map", "grid")}
 _CELL_M = 0.05  # of a world's {grid}
 
 
@@ -81,12 +82,22 @@ class Offline:
                 f"{', '.join(f'{{{place}}}' for place in _PLACES)}",
             )
         require("out" in self._used, "estimator.command must have {out}, the file it writes")
+        used = set(self._used)
+        self.needs = frozenset(
+            need for need, places in _NEEDED_BY.items() if not used.isdisjoint(places)
+        )
         self.limit_s, self.output, self.kind = limit_s, output, kind
         self.global_or_grid = global_or_grid
         self.program_seconds = 0.0
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Keep what is known at the start."""
+        if "laser" in self.needs:
+            self._laser = require_laser(prior, "laser", "estimator.command")
+        require(
+            "map" not in self.needs or isinstance(prior.map, (World, OccupancyGrid)),
+            "estimator.command names {map} or {grid}; set prior.map=world or GRID.yaml",
+        )
         self._prior, self._seed = prior, int(rng.integers(2**32))
         self._frames = list[Frame]()
         self._pose = np.zeros(3) if prior.mean is None else prior.mean.copy()
@@ -142,12 +153,7 @@ class Offline:
         """The known map as free, occupied and unknown cells, which every map server reads."""
         known_map = self._prior.map
         if isinstance(known_map, World):
-            laser = require_laser(self._prior, "laser", "estimator.command with {grid}")
-            return rasterized(known_map, _CELL_M, laser.mount.z_m)
-        require(
-            isinstance(known_map, OccupancyGrid),
-            "estimator.command names {grid}; set prior.map=world or GRID.yaml",
-        )
+            return rasterized(known_map, _CELL_M, self._laser.mount.z_m)
         return cast(OccupancyGrid, known_map)
 
     def _map_file(self) -> tuple[str, Callable[[Path], object]]:
@@ -156,8 +162,7 @@ class Offline:
             return "map.yaml", lambda path: write_grid(known_map, path, "raw")
 
         def write(path: Path) -> None:
-            complaint = "estimator.command names {map}; set prior.map=world or a grid"
-            message = required(map_message(known_map), complaint)
+            message = map_message(known_map)
             text = orjson.dumps(message, option=orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_INDENT_2)
             write_text(path, text.decode())
 

@@ -314,10 +314,25 @@ def test_a_program_gets_a_grid_of_the_map(recording, tmp_path, known):
     assert found.origin == pytest.approx(expected.origin)
 
 
-def test_a_grid_of_no_map_is_told(recording):
+@pytest.mark.parametrize(
+    ("lacking", "message"),
+    [
+        ("prior.map=none", "needs a map; set prior.map=world"),
+        ("sensors.laser=null", "sensor laser"),
+    ],
+)
+def test_what_an_offline_program_needs_is_told_before_anything_is_simulated(lacking, message):
+    settings = ["sensors=laser_stereo", "prior.map=world", "estimator=offline"]
+    settings += ["estimator.command=[sh,'{grid}','{out}']"]
+    Experiment.compose(settings).check()
+    with pytest.raises(InputError, match=message):
+        Experiment.compose([*settings, lacking]).check()
+
+
+def test_an_offline_program_without_a_map_is_told(recording):
     prior = fakes.tracking_prior(recording, with_map=False)
-    with pytest.raises(InputError, match=r"names \{grid\}; set prior\.map=world"):
-        run(Offline("sh {grid} {out}"), recording, prior)
+    with pytest.raises(InputError, match=r"set prior\.map=world"):
+        run(Offline("sh {map} {out}"), recording, prior)
 
 
 OFFLINE_BAD = {
