@@ -12,7 +12,7 @@ PACKAGES = {
     "mrpt_mcl": "mrpt",
     "mrpt_rbpf": "mrpt",
 }
-LASER, MAP, STEREO, WHEELS = "laser", "laser and known map", "landmarks", "wheels"
+LASER, MAP, STEREO, WHEELS = "laser", "laser, known map", "landmarks", "wheels"
 # What a method reads beside the wheels, where that is not the laser alone.
 READS = {
     "odometry": WHEELS,
