@@ -50,9 +50,9 @@ lock: setup
 	@.uv/bin/uv pip compile pyproject.toml --extra dev --extra docs --generate-hashes --no-emit-index-url \
 	  --no-header --no-annotate --universal --python-version 3.11 --quiet --output-file requirements.lock
 
-# MRPT's libraries are Debian's libmrpt-slam-dev; estimator=mrpt_icp and mrpt_rbpf run the program.
+# MRPT's libraries are Debian's libmrpt-slam-dev; the estimators mrpt_* run the program.
 MRPT_INCLUDES := $(addprefix -isystem ,$(wildcard /usr/include/mrpt/*/include)) -isystem /usr/include/eigen3
-MRPT_LIBRARIES := slam maps obs poses math tfest bayes random config rtti io serialization system core
+MRPT_LIBRARIES := slam containers maps obs poses math tfest bayes random config rtti io serialization system core
 peers: build/peers/mrpt
 build/peers/mrpt: tools/peers/mrpt.cpp
 	@test -d /usr/include/mrpt/slam || { echo "MRPT is not here: apt-get install libmrpt-slam-dev"; exit 1; }

@@ -14,9 +14,9 @@ from estimators.base import Belief, Estimate, Prior
 from estimators.program import (
     Program,
     ProgramError,
+    apart,
     map_message,
     require_limits,
-    span_text,
     words_of,
 )
 from sim.arrays import Array
@@ -91,11 +91,8 @@ class External:
             means = self._numbers(answer, "means", (len(stamps), 3))
             if not len(stamps) or (np.diff(stamps) <= 0.0).any():
                 raise self._wrong("must answer with stamps that increase, and some")
-            if stamps[-1] < self._stamps[0] or stamps[0] > self._stamps[-1]:
-                raise self._wrong(
-                    f"must answer with stamps of the Frames, {span_text(self._stamps)}; got "
-                    f"{span_text(stamps)}"
-                )
+            if why := apart(stamps, self._stamps):
+                raise self._wrong(f"must answer with stamps of the Frames; its path {why}")
             found = Estimate(stamps, means, covariances, "revised")
         assert self._program is not None
         self.program_seconds = self._program.close()

@@ -7,35 +7,38 @@ import re
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 import orjson
 
 from estimators.base import Belief, Estimate, Prior
-from estimators.options import require_choices
+from estimators.options import require_choices, require_laser
 from estimators.program import (
     Program,
     ProgramError,
+    apart,
     map_message,
     require_limits,
-    span_text,
     words_of,
 )
 from sim import se2
-from sim.errors import InputError, require, required
+from sim.errors import InputError, require
 from sim.files import write_text
 from sim.formats.carmen import write_carmen
 from sim.formats.rosbag_out import write_bag
 from sim.formats.trajectory import read_track
-from sim.grid import OccupancyGrid
+from sim.grid import OccupancyGrid, rasterized
 from sim.grid_file import write_grid
 from sim.recording import Frame, Recording, WheelLog, joined, save
 from sim.robot import arc_increment
+from sim.world import World
 
 Output = Literal["tum", "mcap", "bag"]
 Kind = Literal["revised", "online"]
-_PLACES = ("log", "mcap", "npz", "map", "start", "seed", "out")
+_PLACES = ("log", "mcap", "npz", "map", "grid", "start", "seed", "out")
+_NEEDED_BY = {"laser": ("log", "grid"), "map": ("map", "grid")}
+_CELL_M = 0.05  # of a world's {grid}
 
 
 class Offline:
@@ -47,7 +50,7 @@ class Offline:
     ----------
     command
         The program and its arguments, a list or a line, with {log} (CARMEN), {mcap}, {npz}, {map},
-        {start}, {seed} and {out} in place of the files' names.
+        {grid}, {start}, {seed} and {out} in place of the files' names.
     limit_s
         Longest time that it may take, s.
     output
@@ -79,12 +82,22 @@ class Offline:
                 f"{', '.join(f'{{{place}}}' for place in _PLACES)}",
             )
         require("out" in self._used, "estimator.command must have {out}, the file it writes")
+        used = set(self._used)
+        self.needs = frozenset(
+            need for need, places in _NEEDED_BY.items() if not used.isdisjoint(places)
+        )
         self.limit_s, self.output, self.kind = limit_s, output, kind
         self.global_or_grid = global_or_grid
         self.program_seconds = 0.0
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Keep what is known at the start."""
+        if "laser" in self.needs:
+            self._laser = require_laser(prior, "laser", "estimator.command")
+        require(
+            "map" not in self.needs or isinstance(prior.map, (World, OccupancyGrid)),
+            "estimator.command names {map} or {grid}; set prior.map=world or GRID.yaml",
+        )
         self._prior, self._seed = prior, int(rng.integers(2**32))
         self._frames = list[Frame]()
         self._pose = np.zeros(3) if prior.mean is None else prior.mean.copy()
@@ -114,12 +127,8 @@ class Offline:
             except InputError as error:
                 text = str(error).replace(str(out), "{out}")
                 raise ProgramError(f"{program.name} wrote no trajectory: {text}") from error
-        first, last = self._frames[0].stamp, self._frames[-1].stamp
-        if track.stamps[-1] < first or track.stamps[0] > last:
-            raise ProgramError(
-                f"{program.name} wrote no trajectory of this log: {{out}} is from "
-                f"{span_text(track.stamps)}, the Frames from {span_text([first, last])}"
-            )
+        if why := apart(track.stamps, [frame.stamp for frame in self._frames]):
+            raise ProgramError(f"{program.name} wrote no trajectory of this log: {{out}} {why}")
         return Estimate(track.stamps, track.means, track.covariances, self.kind)
 
     def _written(self, folder: Path) -> dict[str, str]:
@@ -130,6 +139,7 @@ class Offline:
             "mcap": ("log.mcap", lambda path: write_bag(path, recording)),
             "npz": ("log.npz", lambda path: save(recording, path)),
             "map": self._map_file(),
+            "grid": ("grid.yaml", lambda path: write_grid(self._grid(), path)),
             "start": ("start.txt", lambda path: write_text(path, start_text(self._prior))),
         }
         places = {"seed": str(self._seed), "out": str(folder / f"out.{self.output}")}
@@ -139,14 +149,20 @@ class Offline:
             places[key] = str(folder / name)
         return places
 
+    def _grid(self) -> OccupancyGrid:
+        """The known map as free, occupied and unknown cells, which every map server reads."""
+        known_map = self._prior.map
+        if isinstance(known_map, World):
+            return rasterized(known_map, _CELL_M, self._laser.mount.z_m)
+        return cast(OccupancyGrid, known_map)
+
     def _map_file(self) -> tuple[str, Callable[[Path], object]]:
         known_map = self._prior.map
         if isinstance(known_map, OccupancyGrid):
             return "map.yaml", lambda path: write_grid(known_map, path, "raw")
 
         def write(path: Path) -> None:
-            complaint = "estimator.command names {map}; set prior.map=world or a grid"
-            message = required(map_message(known_map), complaint)
+            message = map_message(known_map)
             text = orjson.dumps(message, option=orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_INDENT_2)
             write_text(path, text.decode())
 

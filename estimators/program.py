@@ -264,6 +264,10 @@ def map_message(known_map: Any) -> dict[str, Any] | None:
     )
 
 
-def span_text(stamps: Sequence[float] | Array) -> str:
-    """First and last stamp, as messages tell them."""
-    return f"{stamps[0]:.13g} to {stamps[-1]:.13g} s"
+def apart(stamps: Array, frame_stamps: Sequence[float]) -> str:
+    """Why an answer's stamps are not those of the Frames; empty if they overlap."""
+    first, last = frame_stamps[0], frame_stamps[-1]
+    if stamps[0] <= last and stamps[-1] >= first:
+        return ""
+    spans = (f"{a:.13g} to {b:.13g} s" for a, b in ((stamps[0], stamps[-1]), (first, last)))
+    return "is from {}, the Frames from {}".format(*spans)

@@ -882,9 +882,14 @@ def tune(
         ):
             found.append(tuned)
             written.append(tuning.write(tuned, study, plan, out or place / "tuned" / "estimator"))
-    trials, gains = tuning.trials_table(found), tuning.gains_table(found)
-    write_frame(trials, place / "tables" / f"{study}_trials_tuning.csv", digits=6)
-    write_frame(gains, place / "tables" / f"{study}_tuning.csv", digits=6)
+    tables = place / "tables"
+    trials, gains = (
+        tuning.written_beside(table, tables / f"{study}_{name}.csv", plan)
+        for table, name in (
+            (tuning.trials_table(found), "trials_tuning"),
+            (tuning.gains_table(found), "tuning"),
+        )
+    )
     save_figure(tuning.curves(trials, gains), place / "figures" / f"{study}_tuning.png")
     show(gains.to_string(index=False, float_format=lambda v: f"{v:.4g}"))
     print("\n".join(map(paths.short, written)))

@@ -24,6 +24,7 @@ from experiments.runs.row import Outcome
 from experiments.runs.version import version_with
 from sim.errors import InputError
 from sim.grid import rasterized
+from sim.grid_file import read_grid
 from sim.recording import load, save
 from tests import fakes
 
@@ -240,7 +241,7 @@ def test_revised_stamps_of_another_time_are_refused(recording, tmp_path):
     answer = '{"stamps": [1000, 1001], "means": [[0, 0, 0], [1, 0, 0]]}'
     command = child(tmp_path, f"print('{answer}' if m['type'] == 'finish' else '{_BELIEF}')\n"
                     "sys.stdout.flush()")  # fmt: skip
-    with pytest.raises(ProgramError, match="must answer with stamps of the Frames, 0 to"):
+    with pytest.raises(ProgramError, match="stamps of the Frames; its path is from"):
         run(External(command), recording)
 
 
@@ -276,7 +277,8 @@ def test_a_failing_program_is_a_status_of_its_row(tmp_path):
         ({"command": PYTHON, "start_s": True}, "start_s must be a positive number"),
     ],
 )
-def test_wrong_settings_are_named(settings, message):
+def test_wrong_settings_are_named(settings, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # where no peer is compiled
     with pytest.raises(InputError, match=message):
         External(**settings)
 
@@ -294,6 +296,43 @@ def test_wrong_settings_are_named(settings, message):
 def test_wrong_settings_of_offline_programs_are_named(settings, message):
     with pytest.raises(InputError, match=message):
         Offline(**settings)
+
+
+@pytest.mark.parametrize("known", ["world", "grid"])
+def test_a_program_gets_a_grid_of_the_map(recording, tmp_path, known):
+    """Of a world that at the laser's height, in the form that every map server reads."""
+    prior, kept = fakes.tracking_prior(recording), tmp_path / "kept"
+    expected = rasterized(prior.map, 0.05, recording.sensors["laser"].mount.z_m)
+    if known == "grid":
+        prior = dataclasses.replace(prior, map=expected)
+    copied = f"cp -r $(dirname {{grid}}) {kept} && echo 0 0 0 0 0 0 0 1 > {{out}}"
+    run(Offline(["sh", "-c", copied]), recording, prior)
+    found = read_grid(kept / "grid.yaml")
+    assert "mode: trinary" in (kept / "grid.yaml").read_text()
+    np.testing.assert_array_equal(found.occupied, expected.occupied)
+    np.testing.assert_array_equal(found.free, expected.free)
+    assert found.origin == pytest.approx(expected.origin)
+
+
+@pytest.mark.parametrize(
+    ("lacking", "message"),
+    [
+        ("prior.map=none", "needs a map; set prior.map=world"),
+        ("sensors.laser=null", "sensor laser"),
+    ],
+)
+def test_what_an_offline_program_needs_is_told_before_anything_is_simulated(lacking, message):
+    settings = ["sensors=laser_stereo", "prior.map=world", "estimator=offline"]
+    settings += ["estimator.command=[sh,'{grid}','{out}']"]
+    Experiment.compose(settings).check()
+    with pytest.raises(InputError, match=message):
+        Experiment.compose([*settings, lacking]).check()
+
+
+def test_an_offline_program_without_a_map_is_told(recording):
+    prior = fakes.tracking_prior(recording, with_map=False)
+    with pytest.raises(InputError, match=r"set prior\.map=world"):
+        run(Offline("sh {map} {out}"), recording, prior)
 
 
 OFFLINE_BAD = {

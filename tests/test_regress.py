@@ -445,6 +445,39 @@ def test_trajectories_made_elsewhere_are_judged(elsewhere, tmp_path, capsys):
     assert "3 of 12 runs fail" in capsys.readouterr().out
 
 
+def test_what_is_no_trajectory_of_the_suite_is_told(elsewhere, tmp_path, capsys):
+    """Whatever lies in the folder is a run that failed, or is named, or is passed over."""
+    inputs, folder = tmp_path / "in", tmp_path / "out"
+    suite = read_suite(elsewhere).made(elsewhere=True)
+    write_recordings(suite, inputs)
+    trajectories(inputs, folder)
+    for name, content in (
+        ("room_5.0.tum", b""),
+        ("room_6.0.tum", bytes(range(256)) * 9),
+        ("room_7.0.tum", None),
+        ("room_8.0.mcap", b"\x89MCAP0\r\n no more"),
+        ("room_99.0.tum", b"0 0 0 0 0 0 0 1\n"),
+        ("room_9.7.tum", b""),
+        ("room_9.0.csv", b"second choice"),
+        ("map.txt", b"of a run's own"),
+        ("readme.md", b"# Mine"),
+        ("plots", None),
+    ):
+        (folder / name).unlink(missing_ok=True)
+        if content is None:
+            (folder / name).mkdir()
+        else:
+            (folder / name).write_bytes(content)
+    (folder / "room_8.0.tum").unlink()
+    rows = candidate_rows(suite, folder, {"mine": 2}).set_index(["recording", "repeat"])["status"]
+    assert (rows == "ok").sum() == 8
+    for seed in (5, 6, 7, 8):
+        assert rows[seed, 0].startswith("unreadable")
+        assert "\n" not in rows[seed, 0]
+    told = capsys.readouterr().err
+    assert "of no run, left out: map.txt, room_9.0.csv, room_9.7.tum, room_99.0.tum\n" in told
+
+
 def test_what_is_made_elsewhere_needs_its_trajectories(elsewhere, small, tmp_path):
     with pytest.raises(InputError, match="no trajectories here"):
         baseline.accept(str(elsewhere), "why", candidate=tmp_path / "none")

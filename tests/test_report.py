@@ -369,6 +369,9 @@ def test_the_first_screen_names_the_best_on_lasers(tmp_path):
     found = contents.best_on_lasers(path)
     assert (found["estimator"], found["error"], found["methods"]) == ("ours", "0.012", 2)
     assert found["others"] == "theirs, 0.032 m"
+    revised = pd.DataFrame({**rows, "ate_rmse_m": [0.001, 0.0321, 0.0123], "answer": "revised"})
+    write_frame(revised, path)
+    assert contents.best_on_lasers(path)["estimator"] == "ours (revised)"
     write_frame(pd.DataFrame({**rows, "sensor": "wheels", "ate_rmse_m": 0.1}), path)
     assert contents.best_on_lasers(path) == {}
 

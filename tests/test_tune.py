@@ -2,9 +2,14 @@
 
 import json
 import math
+import os
+import signal
+import subprocess
 import sys
+import time
 
 import numpy as np
+import pandas as pd
 import pytest
 import yaml
 
@@ -171,3 +176,65 @@ def test_without_optuna_it_says_so(monkeypatch):
     monkeypatch.setitem(sys.modules, "optuna", None)
     with pytest.raises(InputError, match=r"pip install 'estima\[tune\]'"):
         list(tuning.tune("peers"))
+
+
+def test_one_that_was_interrupted_keeps_its_trials(study, monkeypatch):
+    write, calls = study
+    folder, error_m = write(trials=5), tuning.error_m
+
+    def interrupted(experiment):
+        if len(calls) == 15:  # in the third trial or a later one
+            raise KeyboardInterrupt
+        return error_m(experiment)
+
+    monkeypatch.setattr(tuning, "error_m", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        list(tuning.tune("toy", config_dir=folder))
+    monkeypatch.setattr(tuning, "error_m", error_m)
+    (tuned,) = tuning.tune("toy", config_dir=folder)
+    assert len(tuned.trials) == 5
+    assert json.loads(tuned.trials["options"].iloc[0]) == {"window_s": 0.05, "integration": "arc"}
+    n_runs = sum(seed < 100 for seed, *_ in calls)
+    assert n_runs <= 5 * 6 + 5  # at most one trial is begun twice
+
+
+@pytest.mark.slow
+def test_two_processes_that_are_killed_go_on_to_the_same_budget(tmp_path):
+    pytest.importorskip("optuna")
+    (tmp_path / "study").mkdir()
+    (tmp_path / "study" / "toy.yaml").write_text(STUDY.format(trials=7, judged=1000, end=1002))
+    results = tmp_path / "results"
+    journal = results / "tune" / "toy" / "odometry.journal"
+    command = [sys.executable, "-m", "experiments.cli", "tune", "toy", "--jobs", "2"]
+    command += ["--config-dir", str(tmp_path)]
+    environment = {**os.environ, "ESTIMA_RESULTS": str(results)}
+    first = subprocess.Popen(command, env=environment, start_new_session=True)
+    deadline = time.monotonic() + 120.0
+    while not (journal.exists() and journal.read_bytes().count(b'"state":1') >= 2):
+        assert first.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    os.killpg(first.pid, signal.SIGKILL)
+    first.wait()
+    before = journal.read_bytes()
+    subprocess.run(command, env=environment, check=True, timeout=300)
+    assert journal.read_bytes().startswith(before[: before.rfind(b"\n") + 1])
+    trials = pd.read_csv(results / "tables" / "toy_trials_tuning.csv")
+    assert list(trials["trial"]) == [*range(1, 8)]
+    assert (results / "tuned" / "estimator" / "odometry_tuned.yaml").exists()
+
+
+def test_the_tables_keep_what_was_not_tuned_now(tmp_path):
+    path = tmp_path / "t.csv"
+    names = {"a": {}, "b": {}, "c": {}}
+    study = Tuning(2, (0,), names)
+
+    def write(estimators, value):
+        table = pd.DataFrame({"estimator": estimators, "gain": value + 0.5})
+        return tuning.written_beside(table, path, study)
+
+    write(["c", "a"], 1.0)
+    assert list(write(["b"], 2.0)["estimator"]) == ["a", "b", "c"]
+    found = write(["a"], 3.0)
+    assert list(found["gain"]) == [3.5, 2.5, 1.5]
+    pd.testing.assert_frame_equal(pd.read_csv(path), found)

@@ -1,6 +1,7 @@
 """Trajectories made elsewhere over the recordings of a suite, as rows that a check compares."""
 
 import importlib.util
+import sys
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -61,7 +62,8 @@ def candidate_rows(
 
     The files are GROUP_SEED.tum (or .csv, .mcap, .bag), of several repeats GROUP_SEED.0.tum and so
     on; in a folder of its own, called by the entry, for each of several entries. A trajectory that
-    is missing, cannot be read, or has a gap of more than a second is a run that failed.
+    is missing, cannot be read, or has a gap of more than a second is a run that failed. Files of
+    trajectories that are of no run are left out, and named.
 
     Raises
     ------
@@ -77,14 +79,27 @@ def candidate_rows(
             f"{own}: no trajectories here; name them {group}_{suite.first_seed}.tum, and of "
             f"several repeats {group}_{suite.first_seed}.0.tum",
         )
+        read = set[Path | None]()
         for i, (seed, _, recording) in enumerate(_recordings(suite, group)):
             origin = {"checksum": recording.checksum[:12], "fingerprint": fingerprint(recording)}
             for repeat in range(repeats[entry.name]):
                 which = {"estimator": entry.name, "recording": seed, "repeat": repeat}
-                errors, status = _errors(own, entry, seed, repeat, recording)
+                path = trajectory_path(own, entry, seed, repeat)
+                read.add(path)
+                errors, status = _errors(path, entry, seed, repeat, recording)
                 rows.append({**which, **origin, **errors, "status": status})
             on_progress((place + (i + 1) / count) / len(suite.estimators))
+        _tell_of_others(own, read)
     return pd.DataFrame(rows)
+
+
+def _tell_of_others(folder: Path, read: set[Path | None]) -> None:
+    """Name the trajectories of a folder that are of no run."""
+    others = sorted(p.name for p in folder.iterdir() if p.suffix in SUFFIXES and p not in read)
+    if others:
+        more = f" and {len(others) - 5} more" if len(others) > 5 else ""
+        shown = printable(", ".join(others[:5]))
+        print(f"{folder}: of no run, left out: {shown}{more}", file=sys.stderr)
 
 
 def trajectory_path(folder: Path, entry: Entry, seed: int, repeat: int) -> Path | None:
@@ -96,10 +111,9 @@ def trajectory_path(folder: Path, entry: Entry, seed: int, repeat: int) -> Path 
 
 
 def _errors(
-    folder: Path, entry: Entry, seed: int, repeat: int, recording: Recording
+    path: Path | None, entry: Entry, seed: int, repeat: int, recording: Recording
 ) -> tuple[dict[str, float], str]:
     nothing = dict.fromkeys(ERRORS, float("nan"))
-    path = trajectory_path(folder, entry, seed, repeat)
     if path is None:
         return nothing, f"missing: no trajectory {entry.recordings}_{seed}, repeat {repeat}"
     try:

@@ -319,7 +319,7 @@ class Experiment:
         settings = self.config["estimator"]
         estimator = self.own_estimator or checked(settings, "estimator")
         if str(settings.get("_target_")).startswith("estimators."):
-            self.estimator()  # its values too; one from elsewhere may take long to make
+            estimator = self.estimator()  # its values too; one from elsewhere may take long to make
         needs = frozenset(getattr(estimator, "needs", ()))
         if self.config["recording"] is None:
             self._check_sensors(f"estimator={self.estimator_name}", needs - {"map"}, settings)

@@ -32,7 +32,7 @@ from experiments.runs import paths
 from experiments.runs.columns import REVISED
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment, composed, searched
-from experiments.runs.row import Outcome, Row
+from experiments.runs.row import Outcome, Row, read_rows, write_frame
 from experiments.sweeps.plan import planned
 from experiments.sweeps.ranges import FIRST_JUDGED_SEED, Range, Tuning
 from experiments.viewing.plotting import plain_log
@@ -169,6 +169,25 @@ def gains_table(results: Sequence[Tuned]) -> pd.DataFrame:
     )
 
 
+def written_beside(table: pd.DataFrame, path: Path, tuning: Tuning) -> pd.DataFrame:
+    """Write the rows of the estimators just tuned, and keep those of the study's others.
+
+    Returns
+    -------
+    pandas.DataFrame
+        All rows, by the study's order of estimators.
+    """
+    parts = [table]
+    if path.exists():
+        kept = read_rows(path)
+        parts.append(kept[~kept["estimator"].isin(set(table["estimator"]))])
+    both = pd.concat(parts, ignore_index=True)
+    order = [name for name in tuning.estimators if name in set(both["estimator"])]
+    found = pd.concat([both[both["estimator"] == name] for name in order], ignore_index=True)
+    write_frame(found, path, digits=6)
+    return found
+
+
 def curves(trials: pd.DataFrame, gains: pd.DataFrame) -> Figure:
     """Draw the best value against the trials, and the gains that were judged."""
     names = list(gains["estimator"])
@@ -244,7 +263,8 @@ def _tuned(
         opened.enqueue_trial(default)
     arguments = (str(journal), label, tuning.trials, ranges, drives)
     Parallel(n_jobs=jobs)(delayed(_work)(*arguments, worker) for worker in range(jobs))
-    finished = [t for t in _opened(journal, label).trials if t.state.is_finished()]
+    done = _opened(journal, label).get_trials(states=_done())
+    finished = sorted(done, key=lambda t: t.number)[: tuning.trials]  # two processes may make more
     complete = [t for t in finished if t.state == optuna.trial.TrialState.COMPLETE]
     best = min(complete, key=lambda t: t.value)
     values = {k: v for k, v in best.params.items() if v != default[k]}
@@ -278,11 +298,15 @@ def _work(
     """Run trials until there are enough of them."""
     optuna = _optuna()
     study = _opened(Path(journal), label, seed=len(drives) + worker)
-    states = (optuna.trial.TrialState.COMPLETE, optuna.trial.TrialState.PRUNED)
-    n_done = len(study.get_trials(deepcopy=False, states=states))
-    if n_done < trials:
-        enough = optuna.study.MaxTrialsCallback(trials, states=states)
+    if len(study.get_trials(deepcopy=False, states=_done())) < trials:
+        enough = optuna.study.MaxTrialsCallback(trials, states=_done())
         study.optimize(lambda trial: _mean_log_error(trial, ranges, drives), callbacks=[enough])
+
+
+def _done() -> tuple[Any, Any]:
+    """States of trials that count; one that was interrupted is made anew."""
+    states = _optuna().trial.TrialState
+    return states.COMPLETE, states.PRUNED
 
 
 def _mean_log_error(trial: Any, ranges: Mapping[str, Range], drives: Sequence[Experiment]) -> float:
@@ -318,12 +342,12 @@ def _answer_m(row: Row) -> float:
 
 
 def _trials(finished: Sequence[Any]) -> pd.DataFrame:
-    """Trials in the order in which they began; a pruned one has no value.
+    """A row a trial; a pruned one has no value.
 
     Optuna gives that the value of its last recording.
     """
     rows = []
-    for number, trial in enumerate(sorted(finished, key=lambda t: t.number), start=1):
+    for number, trial in enumerate(finished, start=1):
         state = trial.state.name.lower()
         value = trial.value if state == "complete" else math.nan
         options = json.dumps(trial.params)

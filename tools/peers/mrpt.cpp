@@ -1,26 +1,30 @@
-// MRPT's scan matching and its Rao-Blackwellized SLAM over a CARMEN log, for estimator=offline.
+// MRPT's scan matching, particle localization and Rao-Blackwellized SLAM over a CARMEN log, for
+// estimator=offline.
 //
 //   make peers                                  # needs libmrpt-slam-dev (Debian)
 //   build/peers/mrpt icp|rbpf LOG START OUT SEED [KEY=VALUE ...]
+//   build/peers/mrpt mcl LOG START OUT SEED GRID [KEY=VALUE ...]
 //   build/peers/mrpt version
 //
-// LOG has ROBOTLASER1 lines (laser pose and robot pose by odometry), START the first pose, OUT gets TUM
-// lines at the stamps of the scans. `icp` registers each scan against a key frame from the wheels'
-// guess; its keys are members of CICP's options, and key_m and key_rad. `rbpf` has the settings of
-// MRPT's grid mapping by optimal sampling; its keys are particles and resolution_m.
+// LOG has ROBOTLASER1 lines (laser pose and robot pose by odometry), START the first pose and its
+// covariance, GRID is a map of ROS's map server, OUT gets TUM lines at the stamps of the scans.
+// The settings are those of the examples that MRPT publishes for its own programs (share/mrpt/
+// config_files), named below; KEY=VALUE changes one of them.
 
+#include <mrpt/bayes/CParticleFilter.h>
 #include <mrpt/config/CConfigFileMemory.h>
+#include <mrpt/containers/yaml.h>
 #include <mrpt/maps/CMultiMetricMap.h>
 #include <mrpt/maps/COccupancyGridMap2D.h>
-#include <mrpt/maps/CSimplePointsMap.h>
 #include <mrpt/obs/CActionCollection.h>
 #include <mrpt/obs/CActionRobotMovement2D.h>
 #include <mrpt/obs/CObservation2DRangeScan.h>
 #include <mrpt/obs/CSensoryFrame.h>
 #include <mrpt/poses/CPosePDFGaussian.h>
 #include <mrpt/random.h>
-#include <mrpt/slam/CICP.h>
+#include <mrpt/slam/CMetricMapBuilderICP.h>
 #include <mrpt/slam/CMetricMapBuilderRBPF.h>
+#include <mrpt/slam/CMonteCarloLocalization2D.h>
 #include <mrpt/version.h>
 
 #include <cmath>
@@ -28,12 +32,12 @@
 #include <cstdlib>
 #include <fstream>
 #include <iostream>
-#include <map>
 #include <sstream>
 #include <string>
 #include <vector>
 
 using mrpt::poses::CPose2D;
+using mrpt::poses::CPosePDFGaussian;
 
 struct Scan {
   double stamp;
@@ -89,6 +93,18 @@ std::vector<Scan> read_log(const std::string& path) {
   return scans;
 }
 
+// Whether the file holds a start: x y heading, and the rows of its covariance.
+bool read_start(const std::string& path, CPosePDFGaussian& start) {
+  std::ifstream file(path);
+  double x, y, heading;
+  if (!(file >> x >> y >> heading)) return false;
+  start.mean = CPose2D(x, y, heading);
+  for (int row = 0; row < 3; ++row)
+    for (int column = 0; column < 3; ++column)
+      if (!(file >> start.cov(row, column))) fail(path + ": the covariance is cut short");
+  return true;
+}
+
 void write_pose(std::ofstream& out, double stamp, const CPose2D& pose) {
   char line[200];
   std::snprintf(line, sizeof line, "%.9f %.17g %.17g 0 0 0 %.17g %.17g\n", stamp, pose.x(), pose.y(),
@@ -96,90 +112,140 @@ void write_pose(std::ofstream& out, double stamp, const CPose2D& pose) {
   out << line;
 }
 
-double take(std::map<std::string, double>& options, const std::string& key, double otherwise) {
-  const auto found = options.find(key);
-  if (found == options.end()) return otherwise;
-  const double value = found->second;
-  options.erase(found);
-  return value;
-}
+// icp-slam/icp-slam_demo_classic.ini
+const char* const ICP = R"(
+[ICP]
+maxIterations=80
+minAbsStep_trans=1e-6
+minAbsStep_rot=1e-6
+thresholdDist=0.3
+thresholdAng_DEG=5
+ALFA=0.8
+smallestThresholdDist=0.05
+onlyUniqueRobust=true
+ICP_algorithm=icpClassic
+corresponding_points_decimation=5
+[S]
+localizationLinDistance=0.2
+localizationAngDistance=5
+insertionLinDistance=1.2
+insertionAngDistance=45
+minICPgoodnessToAccept=0.40
+matchAgainstTheGrid=0
+occupancyGrid_count=0
+pointsMap_count=1
+likelihoodMapSelection=-1
+[S_pointsMap_00_insertOpts]
+minDistBetweenLaserPoints=0.05
+fuseWithExisting=false
+isPlanarMap=1
+)";
 
-void check_all_taken(const std::map<std::string, double>& options) {
-  if (!options.empty()) fail("unknown option " + options.begin()->first);
-}
+// pf-localization/localization_demo.ini. Odometry's noise is the default of CActionRobotMovement2D, as
+// in the other methods: with the example's [DummyOdometryParams] of 0.10 m and 2 degrees, once a scan,
+// the error was twice as large and took 25 times as long (30 m drives, seed 0).
+const char* const MCL = R"(
+[PF]
+PF_algorithm=0
+resamplingMethod=0
+adaptiveSampleSize=1
+BETA=0.5
+sampleSize=1
+[KLD]
+KLD_binSize_PHI_deg=10
+KLD_binSize_XY=0.10
+KLD_delta=0.01
+KLD_epsilon=0.01
+KLD_maxSampleSize=40000
+KLD_minSampleSize=150
+KLD_minSamplesPerBin=0
+[Filter]
+particles_count=40000
+minStdXY=0.01
+minStdPHI=0.2
+[Likelihood]
+likelihoodMethod=4
+LF_decimation=10
+LF_stdHit=0.40
+LF_maxCorrsDistance=0.30
+LF_zHit=0.95
+LF_zRandom=0.05
+LF_maxRange=80
+LF_alternateAverageMethod=0
+)";
 
-void run_icp(const std::vector<Scan>& scans, const CPose2D& start, std::ofstream& out,
-             std::map<std::string, double> options) {
-  mrpt::slam::CICP icp;
-  auto& o = icp.options;
-  o.skip_cov_calculation = true;
-  o.maxIterations = static_cast<unsigned>(take(options, "maxIterations", o.maxIterations));
-  o.thresholdDist = take(options, "thresholdDist", o.thresholdDist);
-  o.thresholdAng = take(options, "thresholdAng", o.thresholdAng);
-  o.smallestThresholdDist = take(options, "smallestThresholdDist", o.smallestThresholdDist);
-  o.corresponding_points_decimation = static_cast<std::uint32_t>(
-      take(options, "corresponding_points_decimation", o.corresponding_points_decimation));
-  const double key_m = take(options, "key_m", 0.5), key_rad = take(options, "key_rad", 0.35);
-  check_all_taken(options);
-  const auto map_of = [](const Scan& scan) {
-    mrpt::maps::CSimplePointsMap map;
-    map.insertionOptions.minDistBetweenLaserPoints = 0.0f;
-    map.insertObservation(*scan.observation);
-    return map;
-  };
-  CPose2D pose = start, key = start;
-  mrpt::maps::CSimplePointsMap reference = map_of(scans.front());
-  write_pose(out, scans.front().stamp, pose);
-  for (std::size_t i = 1; i < scans.size(); ++i) {
-    const CPose2D predicted = pose + (scans[i].odometry - scans[i - 1].odometry);
-    const mrpt::maps::CSimplePointsMap now = map_of(scans[i]);
-    const auto found = icp.Align(&reference, &now, predicted - key);
-    const CPose2D moved = found->getMeanVal();
-    pose = std::isfinite(moved.x()) ? key + moved : predicted;
-    const CPose2D since = pose - key;
-    if (std::hypot(since.x(), since.y()) > key_m || std::abs(since.phi()) > key_rad) {
-      key = pose;
-      reference = now;
-    }
-    write_pose(out, scans[i].stamp, pose);
+// rbpf-slam/gridmapping_optimal_sampling.ini; the localize distances are the builder's defaults
+const char* const RBPF = R"(
+[S]
+insertionLinDistance=1.0
+insertionAngDistance_deg=40
+localizeLinDistance=0.4
+localizeAngDistance_deg=10
+verbosity_level=ERROR
+PF_algorithm=3
+adaptiveSampleSize=0
+resamplingMethod=0
+sampleSize=25
+BETA=0.50
+powFactor=0.01
+pfAuxFilterOptimal_MaximumSearchSamples=400
+pfOptimalProposal_mapSelection=0
+occupancyGrid_count=1
+pointsMap_count=0
+likelihoodMapSelection=-1
+[S_occupancyGrid_00_creationOpts]
+resolution=0.07
+[S_occupancyGrid_00_insertOpts]
+maxDistanceInsertion=35
+maxOccupancyUpdateCertainty=0.60
+considerInvalidRangesAsFreeSpace=1
+minLaserScanNoiseStd=0.001
+wideningBeamsWithDistance=0
+[S_occupancyGrid_00_likelihoodOpts]
+likelihoodMethod=4
+LF_decimation=5
+LF_stdHit=0.20
+LF_maxCorrsDistance=0.30
+LF_zHit=0.999
+LF_zRandom=0.001
+LF_maxRange=30
+LF_alternateAverageMethod=0
+enableLikelihoodCache=1
+)";
+
+using mrpt::config::CConfigFileMemory;
+
+void change(CConfigFileMemory& settings, const std::string& word) {
+  const std::size_t equals = word.find('=');
+  if (equals == std::string::npos) fail(word + ": give KEY=VALUE");
+  const std::string key = word.substr(0, equals);
+  std::vector<std::string> sections;
+  settings.getAllSections(sections);
+  for (const auto& section : sections) {
+    if (!settings.keyExists(section, key)) continue;
+    settings.write(section, key, word.substr(equals + 1));
+    return;
   }
+  fail("unknown option " + key);
 }
 
-void run_rbpf(const std::vector<Scan>& scans, const CPose2D& start, std::ofstream& out,
-              std::map<std::string, double> options) {
-  std::ostringstream text;
-  text << "[S]\nPF_algorithm=pfOptimalProposal\nresamplingMethod=prMultinomial\nBETA=0.5\n"
-          "adaptiveSampleSize=false\nsampleSize="
-       << static_cast<int>(take(options, "particles", 15))
-       << "\npfAuxFilterOptimal_MaximumSearchSamples=250\n"
-          "insertionLinDistance=0.5\ninsertionAngDistance_deg=30\n"
-          "localizeLinDistance=0.2\nlocalizeAngDistance_deg=10\n"
-          "verbosity_level=ERROR\npfOptimalProposal_mapSelection=0\n"
-          "ICPGlobalAlign_MinQuality=0.70\nupdate_gridMapLikelihoodOptions=1\n"
-          "occupancyGrid_count=1\npointsMap_count=0\nlikelihoodMapSelection=0\n"
-          "[S_occupancyGrid_00_creationOpts]\nresolution="
-       << take(options, "resolution_m", 0.06)
-       << "\n[S_occupancyGrid_00_insertOpts]\nmaxDistanceInsertion=15\n"
-          "maxOccupancyUpdateCertainty=0.55\nconsiderInvalidRangesAsFreeSpace=false\n"
-          "[S_occupancyGrid_00_likelihoodOpts]\nlikelihoodMethod=4\nLF_decimation=5\n"
-          "LF_stdHit=0.20\nLF_maxCorrsDistance=0.30\nLF_zHit=0.999\nLF_zRandom=0.001\n"
-          "LF_maxRange=80\nLF_alternateAverageMethod=false\nenableLikelihoodCache=true\n";
-  check_all_taken(options);
-  mrpt::config::CConfigFileMemory config(text.str());
-  mrpt::slam::CMetricMapBuilderRBPF::TConstructionOptions settings;
-  settings.loadFromConfigFile(config, "S");
-  settings.verbosity_level = mrpt::system::LVL_ERROR;
-  mrpt::slam::CMetricMapBuilderRBPF builder(settings);
+mrpt::obs::CActionCollection moved_between(
+    const Scan& before, const Scan& now,
+    const mrpt::obs::CActionRobotMovement2D::TMotionModelOptions& noise) {
+  mrpt::obs::CActionRobotMovement2D moved;
+  moved.computeFromOdometry(now.odometry - before.odometry, noise);
+  moved.timestamp = now.observation->timestamp;
+  mrpt::obs::CActionCollection actions;
+  actions.insert(moved);
+  return actions;
+}
+
+template <class Builder>
+void build_map(Builder& builder, const std::vector<Scan>& scans, const CPose2D& start,
+               std::ofstream& out) {
   builder.setVerbosityLevel(mrpt::system::LVL_ERROR);
-  const mrpt::obs::CActionRobotMovement2D::TMotionModelOptions motion_model;
   for (std::size_t i = 0; i < scans.size(); ++i) {
-    const CPose2D step =
-        i ? scans[i].odometry - scans[i - 1].odometry : CPose2D(0.0, 0.0, 0.0);
-    mrpt::obs::CActionRobotMovement2D moved;
-    moved.computeFromOdometry(step, motion_model);
-    moved.timestamp = scans[i].observation->timestamp;
-    mrpt::obs::CActionCollection actions;
-    actions.insert(moved);
+    auto actions = moved_between(scans[i ? i - 1 : 0], scans[i], {});
     mrpt::obs::CSensoryFrame frame;
     frame.insert(scans[i].observation);
     builder.processActionObservation(actions, frame);
@@ -188,35 +254,80 @@ void run_rbpf(const std::vector<Scan>& scans, const CPose2D& start, std::ofstrea
   }
 }
 
+void run_icp(const std::vector<Scan>& scans, const CPose2D& start, std::ofstream& out,
+             const CConfigFileMemory& settings) {
+  mrpt::slam::CMetricMapBuilderICP builder;
+  builder.ICP_options.loadFromConfigFile(settings, "S");
+  builder.ICP_params.loadFromConfigFile(settings, "ICP");
+  builder.initialize();
+  build_map(builder, scans, start, out);
+}
+
+void run_rbpf(const std::vector<Scan>& scans, const CPose2D& start, std::ofstream& out,
+              const CConfigFileMemory& settings) {
+  mrpt::slam::CMetricMapBuilderRBPF::TConstructionOptions options;
+  options.loadFromConfigFile(settings, "S");
+  mrpt::slam::CMetricMapBuilderRBPF builder(options);
+  build_map(builder, scans, start, out);
+}
+
+void run_mcl(const std::vector<Scan>& scans, const CPosePDFGaussian* start, std::ofstream& out,
+             const CConfigFileMemory& settings, const std::string& grid_path) {
+  const auto origin = mrpt::containers::yaml::FromFile(grid_path)["origin"].toStdVector<double>();
+  if (origin.size() > 2 && origin[2] != 0.0) fail(grid_path + ": MRPT has no turned grids");
+  const auto grid = mrpt::maps::COccupancyGridMap2D::Create();
+  if (!grid->loadFromROSMapServerYAML(grid_path)) fail(grid_path + ": cannot read it");
+  grid->likelihoodOptions.loadFromConfigFile(settings, "Likelihood");
+  mrpt::bayes::CParticleFilter filter;
+  filter.m_options.loadFromConfigFile(settings, "PF");
+  const int count = settings.read_int("Filter", "particles_count", 0, true);
+  mrpt::slam::CMonteCarloLocalization2D particles(count);
+  particles.options.KLD_params.loadFromConfigFile(settings, "KLD");
+  particles.options.metricMap = grid;
+  if (start) {
+    for (auto& particle : particles.m_particles) {
+      CPose2D drawn;
+      start->drawSingleSample(drawn);
+      particle.d = drawn.asTPose();
+    }
+  } else {
+    particles.resetUniformFreeSpace(grid.get(), 0.7, count);
+  }
+  mrpt::obs::CActionRobotMovement2D::TMotionModelOptions noise;
+  noise.gaussianModel.minStdXY = settings.read_double("Filter", "minStdXY", 0.0, true);
+  noise.gaussianModel.minStdPHI =
+      mrpt::DEG2RAD(settings.read_double("Filter", "minStdPHI", 0.0, true));
+  for (std::size_t i = 0; i < scans.size(); ++i) {
+    const auto actions = moved_between(scans[i ? i - 1 : 0], scans[i], noise);
+    mrpt::obs::CSensoryFrame frame;
+    frame.insert(scans[i].observation);
+    if (i > 0 || !start) filter.executeOn(particles, &actions, &frame);
+    write_pose(out, scans[i].stamp, particles.getMeanVal());
+  }
+}
+
 int main(int argc, char** argv) {
   if (argc == 2 && std::string(argv[1]) == "version") {
     std::cout << MRPT_version_str << "\n";
     return 0;
   }
-  if (argc < 6) fail("usage: mrpt icp|rbpf LOG START OUT SEED [KEY=VALUE ...]");
-  const std::string mode = argv[1];
+  const std::string mode = argc > 1 ? argv[1] : "";
+  const bool icp = mode == "icp", mcl = mode == "mcl", rbpf = mode == "rbpf";
+  if (!icp && !mcl && !rbpf) fail("the methods are icp, mcl and rbpf");
+  const int first_option = mcl ? 7 : 6;
+  if (argc < first_option) fail("usage: mrpt icp|mcl|rbpf LOG START OUT SEED [GRID] [KEY=VALUE ...]");
   const std::vector<Scan> scans = read_log(argv[2]);
-  std::ifstream start_file(argv[3]);
-  double x = 0.0, y = 0.0, heading = 0.0;
-  if (!(start_file >> x >> y >> heading)) fail("the start is not known; set prior.start=tracking");
+  CPosePDFGaussian start;
+  const bool known = read_start(argv[3], start);
+  if (!known && !mcl) fail("the start is not known; set prior.start=tracking");
   std::ofstream out(argv[4]);
   mrpt::random::getRandomGenerator().randomize(
       static_cast<std::uint32_t>(std::strtoull(argv[5], nullptr, 10)));
-  std::map<std::string, double> options;
-  for (int i = 6; i < argc; ++i) {
-    const std::string word = argv[i];
-    const std::size_t equals = word.find('=');
-    if (equals == std::string::npos) fail(word + ": give KEY=VALUE");
-    options[word.substr(0, equals)] = std::atof(word.c_str() + equals + 1);
-  }
-  const CPose2D start(x, y, heading);
-  if (mode == "icp") {
-    run_icp(scans, start, out, options);
-  } else if (mode == "rbpf") {
-    run_rbpf(scans, start, out, options);
-  } else {
-    fail(mode + ": the methods are icp and rbpf");
-  }
+  CConfigFileMemory settings{std::string(icp ? ICP : mcl ? MCL : RBPF)};
+  for (int i = first_option; i < argc; ++i) change(settings, argv[i]);
+  if (icp) run_icp(scans, start.mean, out, settings);
+  if (mcl) run_mcl(scans, known ? &start : nullptr, out, settings, argv[6]);
+  if (rbpf) run_rbpf(scans, start.mean, out, settings);
   out.close();
   if (!out) fail(std::string(argv[4]) + ": cannot write it");
   return 0;

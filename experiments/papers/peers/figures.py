@@ -5,7 +5,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from experiments.papers.peers.settings import LASER, STEREO, TUNED
+from experiments.papers.peers.settings import LASER, MAP, STEREO, TUNED
 from experiments.papers.results import Results
 from experiments.viewing.plotting import plain_log
 from experiments.viewing.style import BLUE, ORANGE, WALL, subplots
@@ -20,10 +20,16 @@ def draw(made: Results) -> dict[str, Figure]:
 
 def errors(methods: pd.DataFrame) -> Figure:
     """Draw the error of each method, the best on top, with its processor time beside it."""
-    parts = {sensor: methods[methods["sensor"] == sensor] for sensor in (LASER, STEREO)}
+    groups = [sensor for sensor in (LASER, MAP, STEREO) if (methods["sensor"] == sensor).any()]
+    parts = {sensor: methods[methods["sensor"] == sensor] for sensor in groups}
     heights = [len(part) for part in parts.values()]
     page, rows = subplots(
-        9.5, 1.6 + 0.3 * sum(heights), 2, 2, gridspec_kw={"height_ratios": heights}, squeeze=False
+        9.5,
+        0.7 + 0.5 * len(parts) + 0.3 * sum(heights),
+        len(parts),
+        2,
+        gridspec_kw={"height_ratios": heights},
+        squeeze=False,
     )
     for (sensor, part), (left, right) in zip(parts.items(), rows, strict=True):
         names = list(part["estimator"])
@@ -42,11 +48,18 @@ def errors(methods: pd.DataFrame) -> Figure:
         right.tick_params(axis="y", length=0)
         plain_log(left.xaxis)
         plain_log(right.xaxis)
-        left.set_yticks(places, [name.replace(TUNED, " (tuned)") for name in names])
+        left.set_yticks(places, list(map(_label, names, part["answer"])))
         right.set_yticks(places, [""] * len(names))
         left.set_title(f"{sensor} and wheels", fontsize=9, loc="left")
     page.legend(handles=_legend(), loc="outside lower center", ncols=4, fontsize=8)
     return page
+
+
+def _label(name: str, answer: str) -> str:
+    """A method's name with what is said of it: whether it is tuned, and revised."""
+    said = {"tuned": name.endswith(TUNED), "revised": answer == "revised"}
+    marks = ", ".join(mark for mark, holds in said.items() if holds)
+    return name.removesuffix(TUNED) + (f" ({marks})" if marks else "")
 
 
 def _legend() -> list[Line2D]:

@@ -9,8 +9,13 @@ PACKAGES = {
     "gtsam_isam2": "gtsam",
     "gtsam_batch": "gtsam",
     "mrpt_icp": "mrpt",
+    "mrpt_mcl": "mrpt",
     "mrpt_rbpf": "mrpt",
 }
-# Methods that read landmarks; the others, but for odometry, read the laser.
-LANDMARKS = ("ekf_slam", "fixed_lag", "smoother", "gtsam_isam2", "gtsam_batch")
-LASER, STEREO, WHEELS = "laser", "landmarks", "wheels"
+LASER, MAP, STEREO, WHEELS = "laser", "laser, known map", "landmarks", "wheels"
+# What a method reads beside the wheels, where that is not the laser alone.
+READS = {
+    "odometry": WHEELS,
+    **dict.fromkeys(("mcl", "mrpt_mcl"), MAP),
+    **dict.fromkeys(("ekf_slam", "fixed_lag", "smoother", "gtsam_isam2", "gtsam_batch"), STEREO),
+}

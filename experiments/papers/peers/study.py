@@ -14,7 +14,7 @@ from estimators.peers import MissingPackageError
 from experiments.evaluation.statistics import log_ratio_interval
 from experiments.evaluation.verdict import Profile
 from experiments.papers.jobs import grouped, in_parallel
-from experiments.papers.peers.settings import LANDMARKS, LASER, PACKAGES, STEREO, TUNED, WHEELS
+from experiments.papers.peers.settings import LASER, PACKAGES, READS, TUNED
 from experiments.papers.results import Results
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
@@ -125,8 +125,7 @@ def methods(table: pd.DataFrame) -> pd.DataFrame:
 
 def sensor_of(name: str) -> str:
     """What a method reads beside the wheels."""
-    plain = name.removesuffix(TUNED)
-    return WHEELS if plain == "odometry" else STEREO if plain in LANDMARKS else LASER
+    return READS.get(name.removesuffix(TUNED), LASER)
 
 
 def is_ours(name: str) -> bool:
