@@ -1,6 +1,5 @@
 """Exploration: frontiers, what is seen from them, ways to them, and robots that drive to them."""
 
-import dataclasses
 import math
 
 import numpy as np
@@ -161,9 +160,13 @@ def test_what_makes_no_sense_is_refused():
     with pytest.raises(InputError, match=r"route\.laser: no sensor named lidar"):
         explored("random", laser="lidar")
     mixed = [
-        Member(ROBOT, SENSORS, dataclasses.replace(Explore("random", 5.0), strategy=strategy),
-               {k: np.random.default_rng(0) for k in ("slip", "sensors")})
-        for strategy in ("random", "coordinated")
-    ]  # fmt: skip
+        Member(
+            ROBOT,
+            SENSORS,
+            Explore(strategy, 5.0, start_offset_m=(offset_m, 0.0)),
+            {k: np.random.default_rng(0) for k in ("slip", "sensors")},
+        )
+        for strategy, offset_m in (("random", 0.0), ("coordinated", 0.6))
+    ]
     with pytest.raises(InputError, match="differ in start_offset_m and feedback alone"):
         record_team(world(), mixed, physics="kinematic", rays="exact")

@@ -458,7 +458,7 @@ def test_a_schema_that_does_not_fit_the_file(recording, tmp_path, field, words):
     meta = json.loads(arrays.pop("meta").tobytes())
     del meta["checksum"]
     meta["schemas"]["beacons"]["ranges_m"] |= field
-    meta["checksum"] = module._digest(arrays, meta)
+    meta["checksum"] = module.digest_of(arrays, meta)
     arrays["meta"] = np.frombuffer(json.dumps(meta).encode(), np.uint8)
     np.savez(tmp_path / "b.npz", **arrays)
     with pytest.raises(InputError, match=words) as caught:

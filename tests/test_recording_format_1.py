@@ -9,7 +9,7 @@ import pytest
 from sim.errors import InputError
 from sim.formats.rosbag import ABOUT, STRING, nanoseconds
 from sim.formats.rosbag_in import read_bag
-from sim.recording import _digest, load, save
+from sim.recording import digest_of, load, save
 from sim.sensors import Encoder, Laser, Lidar3D, Mount, PlaceDescriptor, StereoCamera
 from sim.sensors.base import sensor_settings
 
@@ -83,7 +83,7 @@ def description(**sensors):
 
 
 def write(path, stored, meta):
-    stamped = {**meta, "checksum": _digest(stored, meta)}
+    stamped = {**meta, "checksum": digest_of(stored, meta)}
     whole = np.frombuffer(json.dumps(stamped).encode(), np.uint8)
     np.savez(path, meta=whole, **stored)
     return path

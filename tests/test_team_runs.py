@@ -113,7 +113,9 @@ def test_sweeps_of_teams():
     keys = [int(plan.experiment(i).key, 16) for i in range(len(plan.keys))]
     assert keys == plan.keys.tolist()
     assert len(set(plan.recordings.tolist())) == 4  # by size and seed
-    folder, n_runs = sweep([*lines, "hydra/launcher=basic", "name=small"])
+    done = []
+    sweep([*lines, "hydra/launcher=basic", "name=small"], on_done=lambda *found: done.append(found))
+    ((folder, n_runs),) = done
     table = collect(str(folder))
     assert n_runs == len(table) == 8
     assert set(table["status"]) == {"ok"}
@@ -143,7 +145,7 @@ def test_sweeps_of_teams():
         (["team.robots=[{},{route: {first: 9}}]"], r"route\.first must be a way-point .* got 9"),
         (["team.robots=[{},{robot: {kr: -1}}]"], r"team\.robots\[1\]: robot\.kr"),
         (["team.communication.kind=range", "team.communication.range_m=-1"], "positive number"),
-        (["team.communication.kind=range", "team.communication.range_m=nan"], "positive number"),
+        (["team.communication.kind=range", "team.communication.range_m=nan"], "holds NaN"),
         (["team.communication.kind=shouting"], "kind"),
         (["estimator=odometry"], r"estimator=odometry is of one robot; a team takes ekf_slam"),
         (["keep=[ess]"], "keep is of one robot"),
