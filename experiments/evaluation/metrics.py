@@ -112,10 +112,13 @@ def ellipse_area_m2(covariances: Array) -> Array:
 def in_ellipse(truth: Array, mean: Array, covariance: Array) -> bool:
     """Whether a true position lies in the 95 % ellipse of a pose's (3,) covariance (3, 3).
 
-    puzzlebot2024 asks it of the real robot and the ideal one's ellipse.
+    puzzlebot2024 asks it of the real robot and the ideal one's ellipse. That of a singular
+    covariance, as of particles that are all alike, is a line or a point, and holds nothing.
     """
-    off = truth[:2] - mean[:2]
-    return bool(off @ np.linalg.solve(covariance[:2, :2], off) <= CHI2_95_2DOF)
+    off, block = truth[:2] - mean[:2], covariance[:2, :2]
+    if np.linalg.matrix_rank(block, hermitian=True) < 2:
+        return False
+    return bool(off @ np.linalg.solve(block, off) <= CHI2_95_2DOF)
 
 
 def travelled_m(path: Array) -> Array:
