@@ -286,10 +286,11 @@ def test_a_position_lies_in_the_ellipse_or_not():
 
 
 def test_the_ellipse_of_a_singular_covariance_holds_nothing():
-    pose = np.array([1.0, 2.0, 0.3])
+    pose, near, far = np.zeros(3), np.array([0.1, 0.0, 0.0]), np.array([0.3, 0.0, 0.0])
     for block in (np.zeros((2, 2)), np.ones((2, 2))):
         covariance = np.diag([0.0, 0.0, 1e-6])
         covariance[:2, :2] = block
-        assert not metrics.in_ellipse(pose, pose + [0.1, 0.0, 0.0], covariance)
-    assert metrics.in_ellipse(pose, pose + [0.1, 0.0, 0.0], np.diag([0.01, 0.01, 1e-6]))
-    assert not metrics.in_ellipse(pose, pose + [0.3, 0.0, 0.0], np.diag([0.01, 0.01, 1e-6]))
+        assert not metrics.in_ellipse(pose, near, covariance)
+    covariance = np.diag([0.01, 0.01, 1e-6])
+    assert metrics.in_ellipse(pose, near, covariance)
+    assert not metrics.in_ellipse(pose, far, covariance)
