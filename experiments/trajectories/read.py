@@ -25,8 +25,8 @@ def read_trajectory(path: Path, topic: str | None = None) -> Estimate:
         If the file cannot be read, holds no pose, one that is not finite, or stamps that do not
         increase.
     """
-    require(path.exists(), f"{path}: no such trajectory; known: {', '.join(SUFFIXES)}")
-    if path.suffix == ".csv" and topic is None:
+    require(path.exists(), f"{path}: no such file")
+    if path.suffix == ".csv" and topic is None and not path.is_dir():
         found = read_odometry_csv(path)
         check_track(Track(found.stamps, found.means, found.covariances), path)
         return found
