@@ -218,6 +218,24 @@ def test_a_trajectory_that_leaves_out_much_gets_a_remark(files, tmp_path, monkey
     assert found == {"three": ("remark", "gap"), "est": ("ok", "")}
 
 
+@pytest.mark.parametrize("left", [False, True])
+def test_what_is_not_planar_is_said(files, tmp_path, monkeypatch, capsys, left):
+    folder, _ = files
+    monkeypatch.setenv("ESTIMA_RESULTS", str(tmp_path))
+    lines = (folder / "est.tum").read_text().splitlines()
+    height = (i * 3.0 / (len(lines) - 1) if left else 3.0 for i in range(len(lines)))
+    turn = "0 0.7071 0 0.7071" if left else "0 0 0 1"
+    steep = [" ".join([*a.split()[:3], f"{z}", turn]) for a, z in zip(lines, height, strict=True)]
+    path = tmp_path / "steep.tum"
+    path.write_text("\n".join(steep) + "\n")
+    code, out, err = run(monkeypatch, capsys, "score", folder / "run.npz", path)
+    assert code == 0, err
+    said = "roll and pitch up to 90 degrees and 3 m of height are left out: scores are planar"
+    assert (said in out) == left  # a constant height is none
+    code, out, _ = run(monkeypatch, capsys, "score", folder / "run.npz", path, "--json")
+    assert json.loads(out)[0]["status_code"] == ("planar" if left else "")
+
+
 def test_trajectories_are_compared(files, tmp_path, monkeypatch, capsys):
     folder, _ = files
     monkeypatch.chdir(tmp_path)

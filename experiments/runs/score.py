@@ -27,7 +27,7 @@ from experiments.evaluation.time_sync import Rows, nearest
 from experiments.runs.columns import OF_THE_RUN, REVISED
 from experiments.runs.evaluate import status_of_pauses
 from experiments.runs.experiment import files_digest, rows_folder
-from experiments.runs.row import Row
+from experiments.runs.row import Outcome, Row, Status
 from experiments.runs.store import write_run
 from experiments.runs.version import code_version
 from experiments.trajectories.read import read_trajectory
@@ -153,7 +153,12 @@ def scored_against(recording: Recording, given: Estimate, how: Scoring) -> Score
         T = alignment(truth, means)
     cos, sin = math.cos(T[2]), math.sin(T[2])
     turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
-    moved = Estimate(stamps[rows], se2.compose(T, means), turn @ covariances @ turn.T)
+    moved = Estimate(
+        stamps[rows],
+        se2.compose(T, means),
+        turn @ covariances @ turn.T,
+        left_out=given.left_out,
+    )
     pause_s = longest_pause_s(stamps[rows], start, end)
     left_out = len(stamps) - len(np.unique(rows))
     return Scored(moved, truth, T, len(stamps), left_out, pause_s)
@@ -238,7 +243,7 @@ def row_of(
         "run_key": key,
         "code_version": code_version(),
         "recording_checksum": checksum,
-        **status_of_pauses(recording, scored.estimate.stamps).columns(),
+        **_status(recording, scored).columns(),
         "duration_s": float(np.ptp(scored.estimate.stamps)),
         "stamps_scored": float(len(scored.truth)),
         "stamps_left_out": float(scored.n_left_out),
@@ -249,6 +254,14 @@ def row_of(
     scores = path_scores(scored.truth, scored.estimate.means, scored.estimate.covariances)
     prefix = REVISED if how.revised else ""
     return row | {k if k in OF_THE_RUN else f"{prefix}{k}": v for k, v in scores.items()}
+
+
+def _status(recording: Recording, scored: Scored) -> Status:
+    """Remark on what is not scored: long pauses, or all that is not planar."""
+    status = status_of_pauses(recording, scored.estimate.stamps)
+    if status.outcome is Outcome.OK and scored.estimate.left_out:
+        return Status(Outcome.REMARK, "planar", scored.estimate.left_out)
+    return status
 
 
 def score_files(
@@ -321,11 +334,12 @@ def described(scored: Scored, how: Scoring) -> str:
     offset = f", {how.offset_s:+g} s on the stamps" if how.offset_s else ""
     n_again = len(scored.truth) + scored.n_left_out - scored.n_given
     again = f" ({n_again} of them again, with another true stamp)" if n_again else ""
+    remark = f"\n  {scored.estimate.left_out}" if scored.estimate.left_out else ""
     return (
         f"  {scored.n_given} poses, {len(scored.truth)} scored{again} from {stamps[0]:.13g} to "
         f"{stamps[-1]:.13g} s, {scored.n_left_out} left out; {matching}{offset}\n"
         f"  longest time without a pose: {scored.longest_gap_s:.3g} s\n"
-        f"  {'revised' if how.revised else 'online'} path, {moved}"
+        f"  {'revised' if how.revised else 'online'} path, {moved}{remark}"
     )
 
 

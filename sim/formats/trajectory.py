@@ -1,5 +1,6 @@
 """Trajectories of other programs: TUM files, and nav_msgs/Odometry in bags and MCAP files."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,8 @@ from sim.arrays import Array
 from sim.errors import InputError, require
 from sim.files import require_file
 from sim.formats.rosbag import Track
-from sim.formats.tum import read_tum
+from sim.formats.text import read_bytes
+from sim.formats.tum import parse_spatial_tum
 
 FARTHEST_M = 1e12  # of a position that can be scored; far beyond, squares overflow
 _ROUNDING = 1e-3  # of a covariance, relative; programs write few digits
@@ -39,8 +41,11 @@ def read_track(path: Path, topic: str | None = None) -> Track:
         track = _of_bag(path, topic)
     else:
         require(topic is None, f"{path}: a topic is of a bag, and this is none")
-        stamps, means = read_tum(path)
-        track = Track(stamps, means, np.zeros((len(stamps), 3, 3)))
+        stamps, means, heights_m, tilts_rad = parse_spatial_tum(read_bytes(path), str(path))
+        require(len(stamps), f"{path}: holds no pose")
+        tilt_rad, height_m = float(tilts_rad.max()), float(np.ptp(heights_m))
+        zeros = np.zeros((len(stamps), 3, 3))
+        track = Track(stamps, means, zeros, tilt_rad=tilt_rad, height_m=height_m)
     check_track(track, path)
     return track
 
@@ -120,4 +125,4 @@ def _of_bag(path: Path, topic: str | None) -> Track:
     covariances = track.covariances.copy()
     unknown = (np.diagonal(covariances, axis1=1, axis2=2) == -1.0).any(axis=1)
     covariances[unknown] = 0.0  # ROS marks by -1 what is not known
-    return Track(track.stamps, track.means, covariances)
+    return dataclasses.replace(track, covariances=covariances)
