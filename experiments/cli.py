@@ -697,7 +697,7 @@ def calibrate(
     method: Annotated[
         str | None,
         typer.Option(
-            help="wheel-truth, or end-poses (only commands and final poses) [wheel-truth]."
+            help="wheel-truth, or end-poses (only commands and final poses) (default: wheel-truth)."
         ),
     ] = None,
     out: Annotated[

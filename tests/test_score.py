@@ -15,6 +15,7 @@ from experiments.trajectories.read import read_trajectory
 from experiments.viewing.compare import reference_of
 from sim import se2
 from sim.errors import InputError
+from sim.formats.trajectory import sound_covariances
 from sim.recording import save
 from tests import fakes
 
@@ -336,6 +337,45 @@ def test_malformed_trajectories_end_in_one_line(files, tmp_path, monkeypatch, ca
     assert err.startswith("estima: ")
     assert name in err
     assert len(err.splitlines()) == 1
+
+
+def test_messages_say_what_is_wrong(tmp_path):
+    (tmp_path / "dir.tum").mkdir()
+    (tmp_path / "cut.csv").write_bytes(MALFORMED["cut.csv"])
+    for name, message in (
+        ("dir.tum", "is a folder"),
+        ("missing.tum", "no such file"),
+        ("cut.csv", r"cut\.csv:3: the line ends before pose\.covariance\.2; is it cut off"),
+    ):
+        with pytest.raises(InputError, match=message):
+            read_trajectory(tmp_path / name)
+
+
+def test_unknown_covariances_of_odometry_are_minus_one(tmp_path):
+    stamps, poses = np.arange(3.0), np.zeros((3, 3))
+    path = tmp_path / "odom.mcap"
+    write_estimate(path, Estimate(stamps, poses, np.tile(-np.eye(3), (3, 1, 1))))
+    assert not read_trajectory(path).covariances.any()
+    write_estimate(path, Estimate(stamps, poses, np.tile(-0.5 * np.eye(3), (3, 1, 1))))
+    with pytest.raises(InputError, match=r"odom\.mcap: the covariance of pose 1 is none"):
+        read_trajectory(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "sound"),
+    [
+        (np.zeros((3, 3)), True),
+        (np.diag([0.0, 0.0, -1e-5]), False),
+        (np.diag([np.nan, 0.0, 0.0]), False),
+        (np.array([[0.0, 1e-6, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]]), True),
+        (np.array([[0.0, 1e-3, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]]), False),
+        (np.array([[0.0, 0.02, 0.0], [0.02, 0.0, 0.0], [0.0, 0.0, 0.0]]), False),
+    ],
+)
+def test_a_covariance_is_sound_up_to_rounding(change, sound):
+    covariance = np.diag([0.01, 0.01, 0.0]) + change
+    assert sound_covariances(covariance[None])[0] == sound
+    assert sound_covariances(np.zeros((1, 3, 3)))[0]
 
 
 def test_options_that_make_no_sense_are_named(files, tmp_path, monkeypatch, capsys):
