@@ -400,6 +400,18 @@ def test_what_a_paper_does_not_claim_is_not_counted_as_its_claim():
     assert [key for key, claim in claims.items() if claim["own"]] == ["MX6", "MX7", "MX8"]
 
 
+def test_the_marks_of_a_table_of_means_are_explained(tmp_path):
+    path = tmp_path / "t.csv"
+    means = {"choice.estimator": ["a", "b"], "with_remarks": [0, 1], "ate_rmse_m": [0.1, 0.2]}
+    means |= {"ate_rmse_m_low": [0.1, 0.15], "ate_rmse_m_high": [0.1, 0.25]}
+    for differs in (True, False):
+        frame = pd.DataFrame({**means, "ate_rmse_m_differs": [False, differs]})
+        write_frame(frame.assign(ate_rmse_over_a=[1.0, 2.0]), path)
+        found = contents.table(path)
+        assert "with remarks" in found["head"]
+        assert ("*: differs from the reference" in found["note"]) == differs
+
+
 def test_backticks_become_code_and_nothing_else_does():
     assert report.code("of `a_b` <i>") == "of <code>a_b</code> &lt;i&gt;"
 

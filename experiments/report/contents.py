@@ -18,6 +18,7 @@ from experiments.report.export import as_text, folded, numeric, plain, significa
 from experiments.report.panels import panels
 from experiments.runs.paths import CONF, SOURCE
 from experiments.runs.row import read_rows
+from experiments.sweeps.summary import COUNT_WORDS
 from sim.errors import InputError
 from sim.files import require_file
 from sim.yaml_file import read_yaml
@@ -146,8 +147,10 @@ def best_on_lasers(path: Path) -> dict[str, Any]:
     found = read_rows(path) if path.exists() else pd.DataFrame()
     if not {"sensor", "estimator", "project", "runs", "ate_rmse_m"} <= {*found}:
         return {}
-    laser = found[found["sensor"] == "laser"].dropna(subset="ate_rmse_m").sort_values(
-        "ate_rmse_m", kind="stable"
+    laser = (
+        found[found["sensor"] == "laser"]
+        .dropna(subset="ate_rmse_m")
+        .sort_values("ate_rmse_m", kind="stable")
     )
     if laser.empty:
         return {}
@@ -325,7 +328,8 @@ def _beside_spread(mean: float, deviation: float) -> str:
 
 def table(path: Path) -> Entry:
     """Read a table: whole if it is small, else its first rows."""
-    read = folded(read_rows(path))
+    written = read_rows(path)
+    read = folded(written).rename(columns=COUNT_WORDS)
     frame = with_spread(read)
     joined = [c for c in frame if c not in read or frame[c].dtype != read[c].dtype]
     small = len(frame) <= SMALL_ROWS and frame.shape[1] <= SMALL_COLUMNS
@@ -334,6 +338,8 @@ def table(path: Path) -> Entry:
     if "seed" in frame and len(frame):
         low, high = frame["seed"].min(), frame["seed"].max()
         note += f"; seed {low}" if low == high else f"; seeds {low} to {high}"
+    if written.filter(regex="_differs$").to_numpy(bool).any():
+        note += "; *: differs from the reference of the last column, by paired tests"
     return {
         "name": path.stem,
         "size": f"{len(frame)} rows, {frame.shape[1]} columns",
