@@ -88,6 +88,8 @@ class Estimate:
         Each recorded key to its values, one a Frame.
     status
         `ok`, or what went wrong.
+    left_out
+        One line on what its poses leave out of the file that they were read from; or empty.
     """
 
     stamps: Array
@@ -99,6 +101,7 @@ class Estimate:
     map: Any = None
     extras: dict[str, list[Any]] = field(default_factory=dict)
     status: str = "ok"
+    left_out: str = ""
 
 
 class Estimator(Protocol):

@@ -20,7 +20,7 @@ from estimators.program import (
     words_of,
 )
 from sim.arrays import Array
-from sim.formats.trajectory import FARTHEST_M
+from sim.formats.trajectory import FARTHEST_M, sound_covariances
 from sim.recording import Frame
 from sim.sensors.base import sensor_settings
 
@@ -72,7 +72,7 @@ class External:
         mean = self._numbers(answer, "mean", (3,))
         covariance = np.zeros((3, 3))
         if answer.get("covariance") is not None:
-            covariance = self._numbers(answer, "covariance", (3, 3))
+            covariance = self._covariances(answer, "covariance", (3, 3))
         status = answer.get("status")
         return Belief(mean, covariance, {} if status is None else {"status": str(status)[:300]})
 
@@ -87,7 +87,7 @@ class External:
                 stamps = self._numbers(answer, "stamps", (n,))
             covariances = np.zeros((n, 3, 3))
             if answer.get("covariances") is not None:
-                covariances = self._numbers(answer, "covariances", (n, 3, 3))
+                covariances = self._covariances(answer, "covariances", (n, 3, 3))
             means = self._numbers(answer, "means", (len(stamps), 3))
             if not len(stamps) or (np.diff(stamps) <= 0.0).any():
                 raise self._wrong("must answer with stamps that increase, and some")
@@ -133,6 +133,15 @@ class External:
         if np.abs(numbers).max(initial=0.0) > FARTHEST_M:
             raise self._wrong(f"must answer with {key}, numbers up to {FARTHEST_M:g}")
         return numbers
+
+    def _covariances(self, answer: dict[str, Any], key: str, shape: tuple[int, ...]) -> Array:
+        found = self._numbers(answer, key, shape)
+        if not sound_covariances(found.reshape(-1, 3, 3)).all():
+            raise self._wrong(
+                f"must answer with {key}, symmetric and without a negative variance; leave out "
+                "what is not known"
+            )
+        return found
 
     def _wrong(self, what: str) -> ProgramError:
         assert self._program is not None

@@ -525,7 +525,7 @@ def build_map(
         float | None,
         typer.Option(
             "--max-range",
-            help="Beams longer than this only clear cells; metres [the laser's range].",
+            help="Beams longer than this only clear cells; metres (default: the laser's range).",
         ),
     ] = None,
     raw: Annotated[
@@ -576,7 +576,7 @@ def build_map(
 
 
 Topic = Annotated[
-    str | None, typer.Option(help="Of a bag, the nav_msgs/Odometry to read [estimate].")
+    str | None, typer.Option(help="Of a bag, the nav_msgs/Odometry to read (default: estimate).")
 ]
 AlignBy = Annotated[
     str, typer.Option("--align", help="Move it first: none, start (first pose), or se2.")
@@ -613,7 +613,8 @@ def score(
     ] = None,
     topic: Topic = None,
     estimator: Annotated[
-        str | None, typer.Option("--as", help="Name of the estimator in the row [the file's].")
+        str | None,
+        typer.Option("--as", help="Name of the estimator in the row (default: the file's)."),
     ] = None,
     name: Annotated[str, typer.Option(help="Folder of the rows in results/runs.")] = "score",
     as_json: Annotated[bool, typer.Option("--json", help="Print the rows as JSON.")] = False,
@@ -808,7 +809,9 @@ def twin(
     robot: WhichRobot = None,
     split_s: Annotated[
         float | None,
-        typer.Option("--split", help="Seconds of the log that it is calibrated on [half of it]."),
+        typer.Option(
+            "--split", help="Seconds of the log that it is calibrated on (default: half of it)."
+        ),
     ] = None,
 ) -> None:
     """Make a twin of a real log: a simulation of what comes after its first half.

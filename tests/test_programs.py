@@ -150,6 +150,10 @@ BAD = {
         "print('{\"mean\": [0, 0, 0], \"covariance\": [1, 2, 3]}', flush=True)",
         "covariance, 3 x 3 numbers",
     ),
+    "variance": (
+        "print('{\"mean\": [0, 0, 0], \"covariance\": [[1,0,0],[0,-1,0],[0,0,1]]}', flush=True)",
+        "covariance, symmetric and without a negative variance",
+    ),
     "error": ("print('{\"error\": \"no scan\"}', flush=True)", "the error no scan"),
     "two_lines": (f"print('{_BELIEF}\\n{_BELIEF}', flush=True)", "after its answer|being asked"),
     "greeting": ("print('hello\\n{}', flush=True)", "after its answer 'hello'|being asked"),

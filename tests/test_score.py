@@ -9,7 +9,7 @@ from evo.core.trajectory import PoseTrajectory3D
 
 from estimators.base import Estimate
 from experiments import cli
-from experiments.runs.score import Align, Match, Scoring, error_table, scored_against
+from experiments.runs.score import Align, Match, Scoring, described, error_table, scored_against
 from experiments.trajectories.convert import write_estimate
 from experiments.trajectories.read import read_trajectory
 from experiments.viewing.compare import reference_of
@@ -84,6 +84,35 @@ def test_figures_are_those_of_evo(seed):
             assert ours[error] == pytest.approx(values, abs=1e-9, rel=1e-9), (error, align)
 
 
+@pytest.mark.parametrize("n", [99, 100, 101])
+def test_of_equally_many_poses_the_pairs_are_those_of_evo(n):
+    stamps, truth, *_ = drive(0)
+    rng = np.random.default_rng(n)
+    clock = np.sort(stamps[0] + 10.0 * rng.random(n))
+    means = truth[np.searchsorted(stamps, clock)] + 0.1 * rng.standard_normal((n, 3))
+    zeros = np.zeros((100, 3, 3))
+    recording = reference_of(Estimate(stamps[:100], truth[:100], zeros))
+    scored = scored_against(
+        recording, Estimate(clock, means, np.zeros((n, 3, 3))), Scoring(match=Match.NEAREST)
+    )
+    reference, estimate = sync.associate_trajectories(
+        for_evo(stamps[:100], truth[:100]), for_evo(clock, means), max_diff=0.01
+    )
+    assert np.array_equal(scored.estimate.stamps, estimate.timestamps)
+    assert np.array_equal(scored.truth[:, :2], reference.positions_xyz[:, :2])
+
+
+def test_a_pose_that_is_scored_twice_is_counted():
+    stamps, truth, *_ = drive(0)
+    recording = reference_of(Estimate(stamps[:3], truth[:3], np.zeros((3, 3, 3))))
+    clock = stamps[0] + np.array([0.0, 0.3, 0.4, 0.5])
+    given = Estimate(clock, truth[:4], np.zeros((4, 3, 3)))
+    how = Scoring(match=Match.NEAREST, tolerance_s=0.12)
+    said = described(scored_against(recording, given, how), how)
+    assert "4 poses, 3 scored (1 of them again, with another true stamp)" in said
+    assert "2 left out" in said
+
+
 def test_what_was_scored_is_said():
     stamps, truth, _, _ = drive(0)
     recording = reference_of(Estimate(stamps, truth, np.zeros((len(stamps), 3, 3))))
@@ -106,7 +135,7 @@ def test_what_was_scored_is_said():
     )  # fmt: skip
     assert turned.moved_by[2] == pytest.approx(-np.pi / 2)
     assert turned.estimate.covariances[0] == pytest.approx(np.diag([1.0, 4.0, 1.0]))
-    with pytest.raises(InputError, match=r"no pose meets a true one.*set --offset"):
+    with pytest.raises(InputError, match=r"0 of 50 poses meet the truth.*set --offset"):
         scored_against(recording, late, Scoring(offset_s=1e4))
 
 
@@ -178,15 +207,33 @@ def test_a_row_is_an_ordinary_one(files, tmp_path, monkeypatch, capsys):
 def test_a_trajectory_that_leaves_out_much_gets_a_remark(files, tmp_path, monkeypatch, capsys):
     folder, _ = files
     monkeypatch.setenv("ESTIMA_RESULTS", str(tmp_path))
-    one = tmp_path / "one.tum"
-    one.write_text((folder / "est.tum").read_text().splitlines()[0] + "\n")
+    three = tmp_path / "three.tum"
+    three.write_text("\n".join((folder / "est.tum").read_text().splitlines()[:3]) + "\n")
     found = {}
-    for path in (one, folder / "est.tum"):
+    for path in (three, folder / "est.tum"):
         code, out, err = run(monkeypatch, capsys, "score", folder / "run.npz", path, "--json")
         assert code == 0, err
         (row,) = json.loads(out)
         found[path.stem] = (row["status"], row["status_code"])
-    assert found == {"one": ("remark", "gap"), "est": ("ok", "")}
+    assert found == {"three": ("remark", "gap"), "est": ("ok", "")}
+
+
+@pytest.mark.parametrize("left", [False, True])
+def test_what_is_not_planar_is_said(files, tmp_path, monkeypatch, capsys, left):
+    folder, _ = files
+    monkeypatch.setenv("ESTIMA_RESULTS", str(tmp_path))
+    lines = (folder / "est.tum").read_text().splitlines()
+    height = (i * 3.0 / (len(lines) - 1) if left else 3.0 for i in range(len(lines)))
+    turn = "0 0.7071 0 0.7071" if left else "0 0 0 1"
+    steep = [" ".join([*a.split()[:3], f"{z}", turn]) for a, z in zip(lines, height, strict=True)]
+    path = tmp_path / "steep.tum"
+    path.write_text("\n".join(steep) + "\n")
+    code, out, err = run(monkeypatch, capsys, "score", folder / "run.npz", path)
+    assert code == 0, err
+    said = "roll and pitch up to 90 degrees and 3 m of height are left out: scores are planar"
+    assert (said in out) == left  # a constant height is none
+    code, out, _ = run(monkeypatch, capsys, "score", folder / "run.npz", path, "--json")
+    assert json.loads(out)[0]["status_code"] == ("planar" if left else "")
 
 
 def test_trajectories_are_compared(files, tmp_path, monkeypatch, capsys):
@@ -259,6 +306,13 @@ MALFORMED = {
     "backwards.csv": (_CSV + _ROW.format(1) + _ROW.format(0)).encode(),
     "binary.csv": b"\xff\xfe\x00header.stamp",
     "nul.csv": (_CSV + _ROW.format(0)).encode() + b"\x00\x00\n",
+    "one.tum": _LINE.format(0.5).encode(),
+    "meets_once.tum": "".join(_LINE.format(i * 100_000_000) for i in range(9)).encode(),
+    "negated.csv": (_CSV + "".join(_ROW.format(0.1 * i - 0.8) for i in range(9))).encode(),
+    "variance.csv": (_CSV + _ROW.format(0).replace(",0,1,0", ",0,1,-1e-4", 1)).encode(),
+    "nan_covariance.csv": (_CSV + _ROW.format(0).replace(",0,1,0", ",0,1,nan", 1)).encode(),
+    "asymmetric.csv": (_CSV + _ROW.format(0).replace(",0,1,0,0", ",0,1,1,0.5", 1)).encode(),
+    "cut.csv": (_CSV + _ROW.format(0) + "0.1,1,2,0,1,0,0").encode(),
     "empty.mcap": b"",
     "magic.mcap": b"\x89MCAP0\r\n",
     "noise.mcap": b"\x89MCAP0\r\n" + bytes(range(256)) * 4,

@@ -27,7 +27,7 @@ from experiments.evaluation.time_sync import Rows, nearest
 from experiments.runs.columns import OF_THE_RUN, REVISED
 from experiments.runs.evaluate import status_of_pauses
 from experiments.runs.experiment import files_digest, rows_folder
-from experiments.runs.row import Row
+from experiments.runs.row import Outcome, Row, Status
 from experiments.runs.store import write_run
 from experiments.runs.version import code_version
 from experiments.trajectories.read import read_trajectory
@@ -36,6 +36,8 @@ from sim.arrays import Array
 from sim.errors import InputError, require
 from sim.formats.detect import read_any
 from sim.recording import Recording
+
+_FEWEST_POSES = 3  # of fewer, figures say nothing, and stamps of another unit may meet by chance
 
 
 class Align(StrEnum):
@@ -123,7 +125,7 @@ def scored_against(recording: Recording, given: Estimate, how: Scoring) -> Score
     Raises
     ------
     InputError
-        If the recording has no truth, or no pose meets a true one.
+        If the recording has no truth, or fewer than three poses meet it.
     """
     require(recording.truth is not None, "this recording has no truth to score against")
     stamps = given.stamps + how.offset_s
@@ -138,9 +140,10 @@ def scored_against(recording: Recording, given: Estimate, how: Scoring) -> Score
     start, end = recording.frame_stamps[[0, -1]]
     true_start, true_end = recording.known_truth.stamps[[0, -1]]
     require(
-        len(rows),
-        f"no pose meets a true one: the trajectory is from {stamps[0]:.13g} to "
-        f"{stamps[-1]:.13g} s, the truth from {true_start:.13g} to {true_end:.13g} s; set --offset",
+        len(rows) >= _FEWEST_POSES,
+        f"{len(np.unique(rows))} of {len(stamps)} poses meet the truth, at least {_FEWEST_POSES} "
+        f"must: the trajectory is from {stamps[0]:.13g} to {stamps[-1]:.13g} s, the truth from "
+        f"{true_start:.13g} to {true_end:.13g} s; write stamps in seconds, or set --offset",
     )
     means, covariances = given.means[rows], given.covariances[rows]
     T = np.zeros(3)
@@ -150,7 +153,12 @@ def scored_against(recording: Recording, given: Estimate, how: Scoring) -> Score
         T = alignment(truth, means)
     cos, sin = math.cos(T[2]), math.sin(T[2])
     turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
-    moved = Estimate(stamps[rows], se2.compose(T, means), turn @ covariances @ turn.T)
+    moved = Estimate(
+        stamps[rows],
+        se2.compose(T, means),
+        turn @ covariances @ turn.T,
+        left_out=given.left_out,
+    )
     pause_s = longest_pause_s(stamps[rows], start, end)
     left_out = len(stamps) - len(np.unique(rows))
     return Scored(moved, truth, T, len(stamps), left_out, pause_s)
@@ -158,12 +166,12 @@ def scored_against(recording: Recording, given: Estimate, how: Scoring) -> Score
 
 def _associated(stamps: Array, true_stamps: Array, tolerance_s: float) -> tuple[Rows, Rows]:
     """Rows of both that belong together, as evo finds them: nearest stamps of the shorter one."""
-    longer = len(true_stamps) > len(stamps)
-    short, long = (stamps, true_stamps) if longer else (true_stamps, stamps)
+    longer = len(stamps) > len(true_stamps)  # of equally many, those of the trajectory are sought
+    short, long = (true_stamps, stamps) if longer else (stamps, true_stamps)
     rows = nearest(long, short)
     near = np.abs(long[rows] - short) <= tolerance_s
     pair: tuple[Rows, Rows] = np.flatnonzero(near), rows[near]
-    return pair if longer else (pair[1], pair[0])
+    return (pair[1], pair[0]) if longer else pair
 
 
 def statistics(errors: Array) -> dict[str, float]:
@@ -235,7 +243,7 @@ def row_of(
         "run_key": key,
         "code_version": code_version(),
         "recording_checksum": checksum,
-        **status_of_pauses(recording, scored.estimate.stamps).columns(),
+        **_status(recording, scored).columns(),
         "duration_s": float(np.ptp(scored.estimate.stamps)),
         "stamps_scored": float(len(scored.truth)),
         "stamps_left_out": float(scored.n_left_out),
@@ -246,6 +254,14 @@ def row_of(
     scores = path_scores(scored.truth, scored.estimate.means, scored.estimate.covariances)
     prefix = REVISED if how.revised else ""
     return row | {k if k in OF_THE_RUN else f"{prefix}{k}": v for k, v in scores.items()}
+
+
+def _status(recording: Recording, scored: Scored) -> Status:
+    """Remark on what is not scored: long pauses, or all that is not planar."""
+    status = status_of_pauses(recording, scored.estimate.stamps)
+    if status.outcome is Outcome.OK and scored.estimate.left_out:
+        return Status(Outcome.REMARK, "planar", scored.estimate.left_out)
+    return status
 
 
 def score_files(
@@ -316,11 +332,14 @@ def described(scored: Scored, how: Scoring) -> str:
     if how.align is not Align.NONE:
         moved += f": moved by ({x:.6g} m, {y:.6g} m, {heading:.6g} rad)"
     offset = f", {how.offset_s:+g} s on the stamps" if how.offset_s else ""
+    n_again = len(scored.truth) + scored.n_left_out - scored.n_given
+    again = f" ({n_again} of them again, with another true stamp)" if n_again else ""
+    remark = f"\n  {scored.estimate.left_out}" if scored.estimate.left_out else ""
     return (
-        f"  {scored.n_given} poses, {len(scored.truth)} scored from {stamps[0]:.13g} to "
+        f"  {scored.n_given} poses, {len(scored.truth)} scored{again} from {stamps[0]:.13g} to "
         f"{stamps[-1]:.13g} s, {scored.n_left_out} left out; {matching}{offset}\n"
         f"  longest time without a pose: {scored.longest_gap_s:.3g} s\n"
-        f"  {'revised' if how.revised else 'online'} path, {moved}"
+        f"  {'revised' if how.revised else 'online'} path, {moved}{remark}"
     )
 
 

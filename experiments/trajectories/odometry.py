@@ -152,6 +152,8 @@ def read_odometry_csv(path: Path) -> Estimate:
                 "write poses alone as TUM",
             )
             for number, row in enumerate(table, start=2):
+                cut = next((name for name in _READ if row[name] is None), None)
+                require(cut is None, f"{path}:{number}: the line ends before {cut}; is it cut off?")
                 try:
                     rows.append([float(row[name]) for name in _READ])
                 except (KeyError, TypeError, ValueError) as error:

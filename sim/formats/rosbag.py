@@ -59,7 +59,8 @@ class Track:
     """A trajectory with covariances: stamps (T,) s, means (T, 3), covariances (T, 3, 3).
 
     `landmarks` (N, 3) m is the map that came with it, or empty. `twist_covariances` (T, 3, 3) are
-    those of its mean velocities, or None where they are unknown.
+    those of its mean velocities, or None where they are unknown. `tilt_rad` and `height_m` are the
+    greatest tilt of the upright axis and the span of the heights that the planar means leave out.
     """
 
     stamps: Array
@@ -67,6 +68,8 @@ class Track:
     covariances: Array
     landmarks: Array = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
     twist_covariances: Array | None = None
+    tilt_rad: float = 0.0
+    height_m: float = 0.0
 
 
 def library() -> None:

@@ -141,7 +141,16 @@ def _track(path: Path, topics: dict[str, _Topic], name: str) -> Track:
     if f"{name}/map" in topics and topics[f"{name}/map"].kind == CLOUD:
         points = point_cloud.columns(topics[f"{name}/map"].messages[-1])
         landmarks = np.stack([points[c] for c in "xyz"], axis=1).astype(np.float64)
-    return Track(stamps[rows], poses[rows], covariance[(slice(None), *PLANAR)][rows], landmarks)
+    spatial = [m.pose.pose for m in topic.messages]
+    turns = ((p.orientation.x, p.orientation.y, p.orientation.z, p.orientation.w) for p in spatial)
+    return Track(
+        stamps[rows],
+        poses[rows],
+        covariance[(slice(None), *PLANAR)][rows],
+        landmarks,
+        tilt_rad=max(2.0 * math.atan2(math.hypot(x, y), math.hypot(z, w)) for x, y, z, w in turns),
+        height_m=float(np.ptp([p.position.z for p in spatial])),
+    )
 
 
 def _recording(

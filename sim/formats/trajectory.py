@@ -1,15 +1,19 @@
 """Trajectories of other programs: TUM files, and nav_msgs/Odometry in bags and MCAP files."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
 
+from sim.arrays import Array
 from sim.errors import InputError, require
 from sim.files import require_file
 from sim.formats.rosbag import Track
-from sim.formats.tum import read_tum
+from sim.formats.text import read_bytes
+from sim.formats.tum import parse_spatial_tum
 
 FARTHEST_M = 1e12  # of a position that can be scored; far beyond, squares overflow
+_ROUNDING = 1e-3  # of a covariance, relative; programs write few digits
 _BAGS = (".mcap", ".bag", ".db3")
 _MAGIC = (b"#ROSBAG", b"\x89MCAP", b"SQLite format 3")
 _OTHERS = ("odom", "ground_truth")  # topics that are no estimate unless they are asked for
@@ -29,18 +33,25 @@ def read_track(path: Path, topic: str | None = None) -> Track:
     InputError
         If the file cannot be read, or `check_track` refuses what it holds.
     """
+    require(
+        not path.is_dir() or (path / "metadata.yaml").exists(),
+        f"{path}: is a folder, and not that of a ROS 2 bag; name a file",
+    )
     if path.is_dir() or path.suffix in _BAGS or _head(path).startswith(_MAGIC):
         track = _of_bag(path, topic)
     else:
         require(topic is None, f"{path}: a topic is of a bag, and this is none")
-        stamps, means = read_tum(path)
-        track = Track(stamps, means, np.zeros((len(stamps), 3, 3)))
+        stamps, means, heights_m, tilts_rad = parse_spatial_tum(read_bytes(path), str(path))
+        require(len(stamps), f"{path}: holds no pose")
+        tilt_rad, height_m = float(tilts_rad.max()), float(np.ptp(heights_m))
+        zeros = np.zeros((len(stamps), 3, 3))
+        track = Track(stamps, means, zeros, tilt_rad=tilt_rad, height_m=height_m)
     check_track(track, path)
     return track
 
 
 def check_track(track: Track, path: Path) -> None:
-    """Check that a file's trajectory has poses, finite and not too far, at stamps that increase.
+    """Check a file's trajectory: poses, finite and not too far, covariances, stamps that increase.
 
     Raises
     ------
@@ -55,6 +66,12 @@ def check_track(track: Track, path: Path) -> None:
         near.all(),
         f"{path}: pose {int(np.argmin(near)) + 1} is farther away than {FARTHEST_M:g} m",
     )
+    fit = sound_covariances(track.covariances)
+    require(
+        fit.all(),
+        f"{path}: the covariance of pose {int(np.argmin(fit)) + 1} is none: it must be finite and "
+        "symmetric, without a negative variance; write zeros where it is not known",
+    )
     rising = np.diff(track.stamps) > 0.0
     if not rising.all():
         row = int(np.argmin(rising))
@@ -63,6 +80,24 @@ def check_track(track: Track, path: Path) -> None:
             f"{path}: stamps must increase; pose {row + 2} at {after:.13g} s follows one at "
             f"{before:.13g} s"
         )
+
+
+def sound_covariances(covariances: Array) -> Array:
+    """Which of covariances (T, 3, 3) are finite, symmetric and without a negative variance.
+
+    Rounding is let pass: 1e-3 of the two standard deviations, or of the greatest variance.
+    """
+    sound = np.isfinite(covariances).all(axis=(1, 2))
+    sound &= np.abs(covariances).max(axis=(1, 2)) <= FARTHEST_M
+    known = np.where(sound[:, None, None], covariances, 0.0)
+    variances = np.diagonal(known, axis1=1, axis2=2)
+    sound &= (variances >= 0.0).all(axis=1)
+    sigma = np.sqrt(np.abs(variances))
+    slack = _ROUNDING * sigma[:, :, None] * sigma[:, None, :] + 1e-12
+    sound &= (np.abs(known - known.transpose(0, 2, 1)) <= slack).all(axis=(1, 2))
+    lowest, _, highest = np.linalg.eigvalsh((known + known.transpose(0, 2, 1)) / 2.0).T
+    found: Array = sound & (lowest >= -_ROUNDING * highest - 1e-12)
+    return found
 
 
 def _head(path: Path) -> bytes:
@@ -88,6 +123,6 @@ def _of_bag(path: Path, topic: str | None) -> Track:
             "name one with --topic"
         )
     covariances = track.covariances.copy()
-    unknown = np.diagonal(covariances, axis1=1, axis2=2).min(axis=1, initial=0.0) < 0.0
+    unknown = (np.diagonal(covariances, axis1=1, axis2=2) == -1.0).any(axis=1)
     covariances[unknown] = 0.0  # ROS marks by -1 what is not known
-    return Track(track.stamps, track.means, covariances)
+    return dataclasses.replace(track, covariances=covariances)

@@ -32,6 +32,11 @@ def read_tum(path: Path) -> tuple[Array, Array]:
 
 def parse_tum(data: bytes, where: str) -> tuple[Array, Array]:
     """As `read_tum`, of a file's contents."""
+    return parse_spatial_tum(data, where)[:2]
+
+
+def parse_spatial_tum(data: bytes, where: str) -> tuple[Array, Array, Array, Array]:
+    """As `parse_tum`, with what it drops: heights (T,) m, tilts (T,) rad of its upright axis."""
     columns = "timestamp tx ty tz qx qy qz qw"
     words = split_words(data, where)
     words.refuse(words.counts != 8, words.lines, f"a line must be {columns}")
@@ -42,4 +47,5 @@ def parse_tum(data: bytes, where: str) -> tuple[Array, Array]:
     sound = np.isfinite(table[:, :3]).all(axis=1) & (norm > 0.5) & (norm < 1.5)
     words.refuse(~sound, words.lines, "numbers must be finite, the quaternion of length 1")
     yaw = np.arctan2(2.0 * (qw * qz + qx * qy), norm - 2.0 * (qy * qy + qz * qz))
-    return table[:, 0].copy(), np.stack([x, y, yaw], axis=1)
+    tilt = 2.0 * np.arctan2(np.hypot(qx, qy), np.hypot(qz, qw))
+    return table[:, 0].copy(), np.stack([x, y, yaw], axis=1), table[:, 3], tilt
