@@ -92,6 +92,10 @@ class Smoother:
 
     def reset_team(self, priors: Sequence[Prior], rng: np.random.Generator) -> None:
         """Start a team from the priors of its robots, whose starts are known."""
+        require(
+            len(priors) == 1 or all(prior.mean is not None for prior in priors),
+            "smoother: the starts of a team must be known; set team.starts=known",
+        )
         self._camera = StereoModel.of(require_stereo(priors[0], self.stereo, "smoother"))
         self._sightings = Sightings.of(priors, self.robots, "camera", "predicted", "smoother")
         self._beliefs = [start_pose(prior, "smoother") for prior in priors]

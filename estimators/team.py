@@ -58,16 +58,19 @@ class Communication:
     delay_s: float | None = None
 
     def __post_init__(self) -> None:
-        require_choices(kind=(self.kind, Kind))
+        require_choices("team.communication.", kind=(self.kind, Kind))
         for kind, name in (("range", "range_m"), ("delayed", "delay_s")):
             value = getattr(self, name)
             if self.kind == kind:
                 number = isinstance(value, (int, float)) and not isinstance(value, bool)
                 sound = number and 0.0 < value < np.inf
-                require(sound, f"communication.{name} must be a positive number, got {value!r}")
+                require(
+                    sound, f"team.communication.{name} must be a positive number, got {value!r}"
+                )
             else:
                 require(
-                    value is None, f"communication.{name} has no effect on kind={self.kind}; null"
+                    value is None,
+                    f"team.communication.{name} has no effect on kind={self.kind}; set it to null",
                 )
 
 

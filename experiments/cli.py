@@ -148,16 +148,25 @@ _FEW_RUNS, _FEW_LINES = 2000, 30
 
 def _show_sweep(folder: Path, n_runs: int) -> None:
     """Print a sweep's small table, and what can be done next."""
-    from experiments.report.table import as_lines, notes
+    from experiments.report.table import as_lines, notes, statuses
     from experiments.sweeps.collect import collect
     from experiments.sweeps.summary import ERROR, summary
 
+    against = ""
     if n_runs <= _FEW_RUNS:
         rows = collect(str(folder))
+        if (rows["status"] == Outcome.FAILED).all():
+            (why, count), *_ = statuses(rows)
+            reason = why.removeprefix("failed: ")
+            show(f"All {len(rows)} runs failed, most often ({count}) so: {reason}")
+            print(f"\nNext: estima table {folder.name} --rows -o rows.csv  (how each run ended)")
+            return
         found = summary(rows, metrics=[ERROR] if "ate_rmse_m" in rows else [])
         if len(found) <= _FEW_LINES:
             show(as_lines(found, notes(found, None)))
-    print(f"\nNext: estima table {folder.name} --against ESTIMATOR -o table.tex")
+        estimators = rows["choice.estimator"].unique()
+        against = f" --against {estimators[0]}" if len(estimators) > 1 else ""
+    print(f"\nNext: estima table {folder.name}{against} -o table.tex")
     print(f"      estima plot {folder.name}")
     print(f"      estima report {folder.name}")
 
@@ -337,7 +346,7 @@ def options(
     """
     groups = completion.GROUPS
     if group == "metrics":
-        print(columns.as_text())
+        show(columns.as_text())
         return
     if config_dir is not None and not config_dir.is_dir():
         raise InputError(f"--config-dir must name a folder, got {config_dir}")
@@ -1176,6 +1185,8 @@ def plot(
         raise InputError(f"--size must be {', '.join(Size)}, got {size}")
     rows = where(collect(name, all_versions=all_versions, times=True), only or [])
     failed = rows["status"] == Outcome.FAILED
+    if failed.all():
+        raise InputError(f"{name}: all {len(rows)} runs failed; `estima table {name}` says how")
     if failed.any():
         print(f"{failed.sum()} of {len(rows)} runs failed; they are left out", file=sys.stderr)
         rows = rows[~failed]

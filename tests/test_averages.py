@@ -123,7 +123,7 @@ def test_a_table_too_wide_for_the_text_becomes_several_of_the_same_rows(tmp_path
     write_table(wide(), "note", tmp_path / "t.tex", "mine")
     text = (tmp_path / "t.tex").read_text()
     assert check_latex(text) == [3, 3, 3]  # the name has two lines
-    assert text.count("ATE, m") == text.count("step, us") == 1
+    assert text.count("ATE, m") == text.count(r"step, $\mu$s") == 1
     assert len(re.findall(r"(?m)^a & ", text)) == 3
     write_table(wide(), "note", tmp_path / "page.tex", "mine", "page")
     assert check_latex((tmp_path / "page.tex").read_text()) == [3, 3]

@@ -372,8 +372,48 @@ def test_the_first_screen_names_the_best_on_lasers(tmp_path):
     revised = pd.DataFrame({**rows, "ate_rmse_m": [0.001, 0.0321, 0.0123], "answer": "revised"})
     write_frame(revised, path)
     assert contents.best_on_lasers(path)["estimator"] == "ours (revised)"
+    assert contents.best_on_lasers(path)["level"] == []
     write_frame(pd.DataFrame({**rows, "sensor": "wheels", "ate_rmse_m": 0.1}), path)
     assert contents.best_on_lasers(path) == {}
+
+
+def test_a_tuned_method_is_no_second_one_and_ties_are_said(tmp_path):
+    path = tmp_path / "peers_methods.csv"
+    rows = {"sensor": "laser", "estimator": ["a", "a_tuned", "b", "b_tuned", "c"], "runs": 15}
+    rows |= {"project": "Estima", "ate_rmse_m": [0.01, 0.01, 0.011, 0.011, 0.02]}
+    rows |= {"over_best_ours": [1, 1, 1.1, 1.1, 2.0], "answer": "online"}
+    rows |= {"low": [1, 1, 0.9, 0.9, 1.5], "high": [1, 1, 1.3, 1.3, 3.0]}
+    write_frame(pd.DataFrame(rows), path)
+    found = contents.best_on_lasers(path)
+    assert found["methods"] == 3
+    assert found["level"] == [("b", "1.1", "0.90", "1.3")]
+    write_frame(pd.DataFrame(rows | {"low": [1, 1, 1.05, 1.05, 1.5]}), path)
+    assert contents.best_on_lasers(path)["level"] == []
+
+
+def test_what_a_paper_does_not_claim_is_not_counted_as_its_claim():
+    rows = [{"role": "headline", "verdict": v, "profile": "full", "paper": "maximo2024"} for v in
+            ("not_reproduced", "reproduced")]  # fmt: skip
+    table = pd.DataFrame(rows).assign(id=["MX1", "MX6"])
+    about = {"maximo2024": contents.findings("maximo2024")}
+    claims = contents.judged_claims(table, about, {})
+    assert [key for key, claim in claims.items() if claim["own"]] == ["MX6", "MX7", "MX8"]
+
+
+def test_the_marks_of_a_table_of_means_are_explained(tmp_path):
+    path = tmp_path / "t.csv"
+    means = {"choice.estimator": ["a", "b"], "with_remarks": [0, 1], "ate_rmse_m": [0.1, 0.2]}
+    means |= {"ate_rmse_m_low": [0.1, 0.15], "ate_rmse_m_high": [0.1, 0.25]}
+    for differs in (True, False):
+        frame = pd.DataFrame({**means, "ate_rmse_m_differs": [False, differs]})
+        write_frame(frame.assign(ate_rmse_over_a=[1.0, 2.0]), path)
+        found = contents.table(path)
+        assert "with remarks" in found["head"]
+        assert ("*: differs from the reference" in found["note"]) == differs
+
+
+def test_backticks_become_code_and_nothing_else_does():
+    assert report.code("of `a_b` <i>") == "of <code>a_b</code> &lt;i&gt;"
 
 
 def test_what_scrolls_sideways_can_be_reached_by_keyboard(tab):

@@ -30,7 +30,7 @@ def test_errors_are_said_with_their_share_of_the_way_and_consistency():
     assert in_words([a_row(), a_row(ate_rmse_m=0.4)]).startswith("position RMSE 0.354 m")
     assert "too sure of itself (NEES 9 of 3)" in in_words([a_row(nees_mean=9.0)])
     assert "too cautious" in in_words([a_row(nees_mean=0.5)])
-    assert in_words([a_row(revised_ate_rmse_m=0.1)]).startswith("position RMSE 0.1 m")
+    assert in_words([a_row(revised_ate_rmse_m=0.1)]).startswith("revised path: position RMSE 0.1 m")
     assert in_words([{"distance_m": 3.0}]) == ""
     assert in_words([{"ate_rmse_m": 0.3, "distance_m": 0.0}]) == "position RMSE 0.3 m"
 

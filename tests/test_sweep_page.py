@@ -6,6 +6,7 @@ import re
 import numpy as np
 import pytest
 
+from experiments import cli
 from experiments.report import sweep_page
 from experiments.report.sweep_page import write_sweep_page
 from experiments.sweeps.averages import averages
@@ -46,6 +47,29 @@ def test_the_page_is_one_small_file_in_which_nothing_from_files_is_code(path):
     assert EVIL in json.loads(held)["settings"][0]["values"]
     for words in ("2 ran, with a remark: gated at ... s", "1 failed: bad", "estima run -m world="):
         assert words in text
+
+
+def test_a_sweep_without_a_sound_run_says_why_and_proposes_what_works(
+    tmp_path, monkeypatch, capsys
+):
+    table = rows()
+    monkeypatch.setattr("experiments.sweeps.collect.collect", lambda *_args, **_options: table)
+    cli._show_sweep(tmp_path / "mine", len(table))
+    assert "estima table mine --against m00 -o" in capsys.readouterr().out
+    alone = table[table["choice.estimator"] == "m00"]
+    monkeypatch.setattr("experiments.sweeps.collect.collect", lambda *_args, **_options: alone)
+    cli._show_sweep(tmp_path / "mine", len(alone))
+    assert "estima table mine -o" in capsys.readouterr().out
+    table[["status", "status_detail"]] = "failed", "odd"
+    table.loc[3:, "status_detail"] = [f"late at {i}.5 s" for i in range(len(table) - 3)]
+    monkeypatch.setattr("experiments.sweeps.collect.collect", lambda *_args, **_options: table)
+    cli._show_sweep(tmp_path / "mine", len(table))
+    said = capsys.readouterr().out
+    assert f"{len(table)} runs failed, most often ({len(table) - 3}) so: late at ... s" in said
+    assert "estima table mine --rows" in said
+    assert "plot" not in said
+    with pytest.raises(InputError, match=f"all {len(table)} runs failed; `estima table mine`"):
+        cli.plot("mine")
 
 
 def test_a_page_too_large_is_refused(tmp_path, monkeypatch):

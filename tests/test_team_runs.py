@@ -94,7 +94,7 @@ def test_a_robot_of_unknown_start_is_scored_from_where_it_is_placed():
     assert row["stamps_scored"] < whole["stamps_scored"]
     [never] = evaluate(composed("team.starts=unknown", APART, "route.distance_m=0.5"))
     assert (never["status"], never["status_code"]) == ("failed", "not_finite")
-    assert never["status_detail"].startswith("robot 1: not finite")
+    assert never["status_detail"].startswith("robot 1: no pose at any time")
 
 
 def test_a_team_is_simulated_once_and_a_smaller_one_is_another():

@@ -60,6 +60,13 @@ def test_errors_outside_and_intervals_too_wide_fail():
     assert wide[1].found.value == 1.0
 
 
+def test_the_interval_of_tau_stays_within_its_range():
+    pairs = study.predicted(runs())
+    pairs.loc[pairs.log == JUDGED[0], "error_m"] = ERRORS_M[::-1]
+    found = claims.tw2(pairs)[0].found
+    assert -1.0 <= found.low < found.value < found.high == 1.0
+
+
 def test_another_order_fails():
     _, said = verdicts(runs(errors=ERRORS_M[::-1]))
     assert said["TW2"] is Verdict.NOT_REPRODUCED

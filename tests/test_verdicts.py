@@ -70,6 +70,8 @@ def test_an_undecided_sentence_says_how_many_more_recordings_settle_it():
     assert verdict_of(GOOD, OPEN).sentence == (
         "There are 2 rows. About 57 more recordings would settle it."
     )
+    one = dataclasses.replace(OPEN, more=1)
+    assert verdict_of(one).sentence.endswith("About 1 more recording would settle it.")
     assert verdict_of(GOOD).sentence == "There are 1 rows."
     unknown = dataclasses.replace(OPEN, more=0)
     assert verdict_of(unknown).sentence == "There are 1 rows."

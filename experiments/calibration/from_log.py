@@ -457,14 +457,18 @@ def _slip(
     lasts = float(np.quantile(spread[:, 3], 0.025)) > 0.0
     block_m = float(np.mean(travel_m))
 
-    def named(values: Array) -> Array:
+    def named(values: Array, blocks: float) -> Array:
         """kr, kl, forward slip per metre in the long run, and its length, m."""
-        lengths = lasting_blocks(values[3]) if lasts else 0.0
-        share = 1.0 - lengths * (1.0 - math.exp(-1.0 / lengths)) if lengths else 1.0
-        return np.array([*values[:2], values[2] / share, lengths * block_m])
+        share = 1.0 - blocks * (1.0 - math.exp(-1.0 / blocks)) if blocks else 1.0
+        return np.array([*values[:2], values[2] / share, blocks * block_m])
 
-    low, high = np.quantile([named(values) for values in spread], [0.025, 0.975], axis=0)
-    values = named(law(every, together))
+    lengths = [lasting_blocks(values[3]) for values in spread]
+    found_of = [named(v, a if lasts else 0.0) for v, a in zip(spread, lengths, strict=True)]
+    low, high = np.quantile(found_of, [0.025, 0.975], axis=0)
+    if not lasts:
+        high[3] = np.quantile(lengths, 0.975) * block_m
+    whole = law(every, together)
+    values = named(whole, lasting_blocks(whole[3]) if lasts else 0.0)
     names = ("kr", "kl", "forward_slip_m", "forward_slip_length_m")
     found = {
         f"slip.{name}": Interval(float(v), float(a), float(b))
@@ -565,8 +569,12 @@ def _camera(
         for key, v, h in zip(names, fit.x, half, strict=True)
     }
     intervals[f"sensors.{name}.delay_s"] = Interval(delay_s, delay_s - 0.02, delay_s + 0.02)
-    intervals[f"{name}: depth error, share"] = Interval.exact(float(spread[0]))
-    intervals[f"{name}: bearing error, rad"] = Interval.exact(float(spread[1]))
+    for label, value, errors_near in zip(
+        ("depth error, share", "bearing error, rad"), spread, found[:, near], strict=True
+    ):
+        parts = [MAD * np.median(np.abs(part)) for part in np.array_split(errors_near, _N_PARTS)]
+        known = mean_interval(parts)
+        intervals[f"{name}: {label}"] = Interval(float(value), known.low, known.high)
     intervals[f"{name}: outliers"] = share_interval(n_out, int(finite.sum()))
     left = [depth[near], found[0, near] * depth[near], bearing[near], found[1, near]]
     return belief, intervals, left

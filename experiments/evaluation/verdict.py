@@ -282,7 +282,8 @@ def _with_debt(sentence: str, verdict: Verdict, rows: Sequence[Claim], unit: str
     if not more:
         return sentence
     what = "it" if all(row.more for row in open_ones) else "what is open"
-    return f"{sentence} About {_rounded(more)} more {unit} would settle {what}."
+    units = unit.removesuffix("s") if more == 1 else unit
+    return f"{sentence} About {_rounded(more)} more {units} would settle {what}."
 
 
 def _rounded(number: int) -> int:

@@ -1,5 +1,7 @@
 """What the report shows, read from results/ into plain data."""
 
+from __future__ import annotations
+
 import base64
 import math
 import struct
@@ -16,12 +18,14 @@ from experiments.report.export import as_text, folded, numeric, plain, significa
 from experiments.report.panels import panels
 from experiments.runs.paths import CONF, SOURCE
 from experiments.runs.row import read_rows
+from experiments.sweeps.summary import COUNT_WORDS
 from sim.errors import InputError
 from sim.files import require_file
 from sim.yaml_file import read_yaml
 
 Entry = Mapping[str, Any]
 PAPERS = ("puzzlebot2024", "decristoforis2020", "gil2008", "maximo2024")
+OUR_CLAIM = "(Our own"  # begins, in a paper's findings, what we ask and the paper does not claim
 # What belongs to no paper, by the prefix of its files' names, and the commands that make it.
 OWN = {
     "leaderboard": [
@@ -68,7 +72,9 @@ def contents(results: Path, on_progress: Callable[[float], None]) -> dict[str, A
             **study(results, name, page, claims),
             "commands": commands[name],
             "claims": judged,
-            "tally": tally(judged),
+            "is_paper": name in PAPERS,
+            "tally": tally(claim for claim in judged if not claim["own"]),
+            "own_tally": tally(claim for claim in judged if claim["own"]),
         }
         on_progress(done / len(about))
     pictures = {figure["name"]: figure for found in studies.values() for figure in found["figures"]}
@@ -113,7 +119,10 @@ def best_of_worlds(path: Path) -> list[tuple[str, str, str]]:
     if not error or not {*columns} <= {*found}:
         return []
     least = found.loc[found.groupby("choice.world")[error].idxmin()]
-    return [(str(w), str(e), significant(v, 2)) for w, e, v in least[[*columns, error]].to_numpy()]
+    return [
+        (str(row["choice.world"]), _with_path(row, "choice.estimator"), significant(row[error], 2))
+        for _, row in least.iterrows()
+    ]
 
 
 def holding_best(
@@ -132,27 +141,45 @@ def holding_best(
 def best_on_lasers(path: Path) -> dict[str, Any]:
     """The laser's method of the least position error beside other projects', of the peers' table.
 
-    Empty if there is no such table.
+    A method and its tuned variant are one. Level with the first is whose ratio of errors to it has
+    an interval that holds 1. Empty if there is no such table.
     """
     found = read_rows(path) if path.exists() else pd.DataFrame()
     if not {"sensor", "estimator", "project", "runs", "ate_rmse_m"} <= {*found}:
         return {}
-    laser = found[found["sensor"] == "laser"].dropna(subset="ate_rmse_m").sort_values("ate_rmse_m")
+    laser = (
+        found[found["sensor"] == "laser"]
+        .dropna(subset="ate_rmse_m")
+        .sort_values("ate_rmse_m", kind="stable")
+    )
     if laser.empty:
         return {}
     first = laser.iloc[0]
-    revised = " (revised)" if first.get("answer") == "revised" else ""
+    methods = laser["estimator"].str.removesuffix("_tuned")
+    level = laser[methods.ne(methods.iloc[0]) & ~methods.duplicated()]
+    # the table's ratios are to the best of ours: they say nothing beside another that leads
+    known = {"over_best_ours", "low", "high"} <= {*laser} and first.get("over_best_ours") == 1.0
+    level = level[(level["low"] <= 1.0) & (level["high"] >= 1.0)] if known else level.head(0)
     others = laser[laser["project"] != first["project"]].head(1)
     return {
-        "estimator": f"{first['estimator']}{revised}",
+        "estimator": _with_path(first),
         "error": significant(float(first["ate_rmse_m"]), 2),
-        "methods": len(laser),
+        "level": [
+            (_with_path(row), *(significant(row[c], 2) for c in ("over_best_ours", "low", "high")))
+            for _, row in level.iterrows()
+        ],
+        "methods": methods.nunique(),
         "runs": int(first["runs"]),
         "others": "".join(
             f"{row.estimator}, {significant(float(row.ate_rmse_m), 2)} m"
             for row in others.itertuples()
         ),
     }
+
+
+def _with_path(row: pd.Series[Any], column: str = "estimator") -> str:
+    """A method's name, and whether its answer is the revised path."""
+    return f"{row[column]}{' (revised)' if row.get('answer') == 'revised' else ''}"
 
 
 def tally(claims: Iterable[Entry]) -> list[tuple[Verdict, int]]:
@@ -173,9 +200,9 @@ def judged_claims(
 ) -> Mapping[str, Entry]:
     """Every claim by its id: those of the papers' findings in their order, then the others.
 
-    Each has what the paper `says`; its `statistics`, the rows of the table, headlines first; its
-    `ruling`, the verdict that follows from the headlines, also in words (`verdict`) with a `style`;
-    and the `sentence` on what came out.
+    Each has what the paper `says`, and whether that is our `own`; its `statistics`, the rows of the
+    table, headlines first; its `ruling`, the verdict that follows from the headlines, also in words
+    (`verdict`) with a `style`; and the `sentence` on what came out.
     """
     says = {key: text for page in about.values() for key, text in page["claims"].items()}
     rows: dict[str, list[Entry]] = {key: [] for key in says}
@@ -188,6 +215,7 @@ def judged_claims(
         key: {
             "id": key,
             "says": says.get(key, ""),
+            "own": says.get(key, "").startswith(OUR_CLAIM),
             "sentence": sentences.get(key, ""),
             "paper": statistics[0]["paper"] if statistics else "",
             "statistics": statistics,
@@ -300,7 +328,8 @@ def _beside_spread(mean: float, deviation: float) -> str:
 
 def table(path: Path) -> Entry:
     """Read a table: whole if it is small, else its first rows."""
-    read = folded(read_rows(path))
+    written = read_rows(path)
+    read = folded(written).rename(columns=COUNT_WORDS)
     frame = with_spread(read)
     joined = [c for c in frame if c not in read or frame[c].dtype != read[c].dtype]
     small = len(frame) <= SMALL_ROWS and frame.shape[1] <= SMALL_COLUMNS
@@ -309,6 +338,8 @@ def table(path: Path) -> Entry:
     if "seed" in frame and len(frame):
         low, high = frame["seed"].min(), frame["seed"].max()
         note += f"; seed {low}" if low == high else f"; seeds {low} to {high}"
+    if written.filter(regex="_differs$").to_numpy(bool).any():
+        note += "; *: differs from the reference of the last column, by paired tests"
     return {
         "name": path.stem,
         "size": f"{len(frame)} rows, {frame.shape[1]} columns",

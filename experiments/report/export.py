@@ -25,6 +25,8 @@ _LATEX = str.maketrans(
         "|": r"\textbar{}",
         "`": r"\textasciigrave{}",
         '"': r"\textquotedbl{}",
+        "µ": r"$\mu$",
+        "²": r"$^{2}$",
         **{character: f"\\{character}" for character in "&%$#_{}"},
     }
 )

@@ -6,13 +6,14 @@ It is made only from what the studies left in results/, and is a single file.
 import base64
 import hashlib
 import math
+import re
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from experiments.evaluation.verdict import Profile
 from experiments.report.contents import contents
@@ -56,7 +57,7 @@ def render(template: str, **found: Any) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"plain": plain, "interval": interval, "verdict": verdict}
+    environment.filters |= {"plain": plain, "interval": interval, "verdict": verdict, "code": code}
     environment.globals |= {"script": _script}
     return environment.get_template(template).render(found)
 
@@ -73,6 +74,11 @@ def _printable(value: Any) -> Any:
     if not isinstance(value, str) or isinstance(value, Markup):
         return value
     return "\n".join(map(printable, value.split("\n")))
+
+
+def code(text: str) -> Markup:
+    """Text with what stands between backticks as code."""
+    return Markup(re.sub("`([^`]+)`", r"<code>\1</code>", str(escape(printable(text)))))
 
 
 def interval(row: Mapping[str, Any]) -> str:

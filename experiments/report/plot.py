@@ -161,7 +161,9 @@ def _check(table: pd.DataFrame, y: str, groups: Sequence[str]) -> None:
         if column not in table:
             raise no_column(table, column, metric=column == y)
     if table[y].dtype.kind not in "fi":
-        raise InputError(f"column {y} holds no numbers; there are {', '.join(measured(table))}")
+        raise InputError(
+            f"column {y} holds no numbers; there are {', '.join(measured(table)) or 'none'}"
+        )
 
 
 def _complete(table: pd.DataFrame, y: str, groups: Sequence[str]) -> tuple[pd.DataFrame, str]:

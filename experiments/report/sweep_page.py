@@ -54,7 +54,7 @@ def write_sweep_page(table: pd.DataFrame, name: str, folder: Path, out: Path) ->
     metrics = [c for c in COLUMNS if c in measured(every) and every[c].notna().any()]
     if not metrics:
         raise InputError(
-            f"{name}: no run has a result to show; estima table {name} --rows -o x.csv"
+            f"{name}: no run has a result to show; `estima table {name}` says how they ended"
         )
     settings = telling(table)
     found = summary(table)

@@ -21,7 +21,7 @@ from experiments.report.export import (
 from experiments.report.page import render
 from experiments.runs.columns import PATH
 from experiments.runs.row import Outcome, write_frame
-from experiments.sweeps.summary import COUNTS, MARKS
+from experiments.sweeps.summary import COUNT_WORDS, COUNTS, MARKS
 from sim.errors import require
 from sim.files import write_whole
 
@@ -80,8 +80,7 @@ def shown(found: pd.DataFrame) -> pd.DataFrame:
     """A summary with a cell a mean, and without columns that say nothing."""
     silent = [name for name in COUNTS if not found[name].any()]
     silent += [PATH] if (found[PATH] == "online").all() else []
-    words = {name: name.replace("_", " ") for name in COUNTS}
-    return folded(found.drop(columns=silent)).rename(columns=words)
+    return folded(found.drop(columns=silent)).rename(columns=COUNT_WORDS)
 
 
 def as_lines(found: pd.DataFrame, note: str) -> str:

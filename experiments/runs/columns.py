@@ -48,7 +48,7 @@ class Column:
 OF_THE_RUN = {
     "duration_s": Column("duration", "t", "s", "linear", None, Average.PLAIN),
     "distance_m": Column("distance travelled", "d", "m", "linear", None, Average.PLAIN),
-    "cpu_time_us": Column("processor time per Frame", "cpu", "us", average=Average.FACTOR),
+    "cpu_time_us": Column("processor time per Frame", "cpu", "µs", average=Average.FACTOR),
     "stamps_scored": Column("stamps scored", "scored", "", "linear", None, Average.PLAIN),
     "stamps_left_out": Column(
         "stamps without a true pose", "left out", "", "linear", average=Average.PLAIN
@@ -61,7 +61,7 @@ OF_THE_RUN = {
     "n_sightings": Column("sightings of robots", "sightings", "", "linear", None, Average.PLAIN),
 }
 _OF_THE_PATH = {
-    "step_time_us": Column("time per step", "step", "us", average=Average.FACTOR),
+    "step_time_us": Column("time per step", "step", "µs", average=Average.FACTOR),
     "ate_rmse_m": Column("position RMSE", "ATE", "m"),
     "ate_mean_m": Column("mean position error", "mean error", "m"),
     "ate_aligned_rmse_m": Column("position RMSE after alignment", "ATE aligned", "m"),
@@ -78,7 +78,7 @@ _OF_THE_PATH = {
         Average.PLAIN,
     ),
     "ellipse_area_final_m2": Column(
-        "area of the final 95 % ellipse", "ellipse", "m^2", better=None, average=Average.FACTOR
+        "area of the final 95 % ellipse", "ellipse", "m²", better=None, average=Average.FACTOR
     ),
     "final_in_ellipse": Column(
         "share of final positions in the 95 % ellipse",
@@ -137,7 +137,7 @@ def is_setting(name: str) -> bool:
 
 
 _UNITS = ("m", "rad", "deg", "s", "us", "hz", "mps", "radps", "m2", "gib")
-_SPELT = {"hz": "Hz", "mps": "m/s", "radps": "rad/s", "m2": "m^2", "gib": "GiB"}
+_SPELT = {"us": "µs", "hz": "Hz", "mps": "m/s", "radps": "rad/s", "m2": "m²", "gib": "GiB"}
 _IN_METRES = ("kr", "kl")  # of settings, whose names do not say it
 
 

@@ -230,6 +230,8 @@ def status_of(recording: Recording, online: Estimate, revised: Estimate | None =
         return Status(Outcome.FAILED, "recording", recording.status)
     sound = np.isfinite(online.means).all(axis=1)
     sound &= np.isfinite(online.covariances).all(axis=(1, 2))
+    if online.status == "ok" and not sound.any():
+        return Status(Outcome.FAILED, "not_finite", "no pose at any time: it was never placed")
     if online.status == "ok" and not sound.all():
         when = online.stamps[np.argmin(sound)]
         return Status(Outcome.FAILED, "not_finite", f"not finite at {when:.2f} s")

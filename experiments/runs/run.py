@@ -236,6 +236,8 @@ def in_words(rows: Sequence[Row]) -> str:
     if not math.isfinite(error_m):
         return ""
     words = f"position RMSE {error_m:.3g} m"
+    if any(f"{REVISED}ate_rmse_m" in row for row in rows):
+        words = f"revised path: {words}"
     if distance_m > 0.0:
         words += f", {100.0 * error_m / distance_m:.2g} % of {distance_m:.3g} m"
     if math.isfinite(nees):

@@ -25,6 +25,7 @@ _MAIN = (
     "cpu_time_us",
 )
 COUNTS = ("failed", "with_remarks", "incomplete")  # runs; the last are some of those with remarks
+COUNT_WORDS = {name: name.replace("_", " ") for name in COUNTS}
 _LEVEL = 0.05  # of all tests of a table
 _GROUP = "group"  # numbers the rows of a table
 SUFFIXES = ("_low", "_high")  # of the bounds of an interval

@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from experiments.evaluation.metrics import rms
 from experiments.papers.gil2008.claims import pooled
@@ -140,6 +141,17 @@ def world_3d(run: Arrays) -> Figure:
         ax: Any = page.add_subplot(1, 2, i + 1, projection="3d")
         _draw_3d(ax, run, name)
         ax.set_title(_FILTERS[name][2], loc="left")
+    handles = [
+        Line2D([], [], color=BLACK, label="estimated path"),
+        Line2D([], [], color=WALL, label="walls"),
+        Line2D([], [], color=SKY, label="sight of a landmark in the image"),
+        Line2D([], [], color=GREEN, label="95 % ellipsoid of such a landmark"),
+        *(
+            Line2D([], [], color=colour, marker=".", ls="", label=f"landmarks, {words}")
+            for colour, _, words in map(_FILTERS.__getitem__, _SHOWN)
+        ),
+    ]
+    page.legend(handles=handles, loc="outside lower center", ncols=3)
     return page
 
 
