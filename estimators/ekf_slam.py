@@ -216,7 +216,6 @@ class EkfSlam:
         if self._gains:
             by_gains = gained_motion(wheels, frame, self._mean[self._gains], self._nominal_track_m)
             self._gained = self._gained.then(by_gains)
-            self._motions[robot] = self._gained.motion
         else:
             self._motions[robot] = self._motions[robot].then(wheels.predict(frame))
 
@@ -280,7 +279,7 @@ class EkfSlam:
             walked = self._gain_belief.wander_m * self._gained.travel_m
             self._mean[own] = self._gained.applied(self._mean[own], P, own, self._gains)
             P[self._gains, self._gains] += walked * np.eye(3)
-            self._motions[robot], self._gained = STILL, NO_MOTION
+            self._gained = NO_MOTION
             return
         mean, by_pose, by_motion = compose(self._mean[own], motion.mean)
         noise = by_motion @ motion.covariance @ by_motion.T

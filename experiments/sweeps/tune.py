@@ -304,7 +304,7 @@ def _work(
 
 
 def _done() -> tuple[Any, Any]:
-    """States of trials that count; one that was interrupted is made anew."""
+    """States of trials that count; one that was interrupted is run again."""
     states = _optuna().trial.TrialState
     return states.COMPLETE, states.PRUNED
 
