@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from experiments.evaluation.statistics import Interval
 from experiments.evaluation.verdict import Claim, Conclusion, Profile, Verdict, beside
-from experiments.report import contents
+from experiments.report import contents, leaderboard
 from experiments.report import page as report
 from experiments.report.claims import (
     note_provenance,
@@ -137,7 +137,9 @@ def test_each_claim_is_one_row_with_its_statistics_below(text):
     assert "0.500 [0.400, 0.600]" in rows["claim-PB1"]
     head, folded = rows["claim-PB4"].split("PB4: statistics (3)")
     assert "The ellipse holds <b>61 %</b> at 1e-3 m." in head
-    assert head.strip().endswith("not reproduced (quick)")
+    verdict, figures = head.strip().split("Figures: ")
+    assert verdict.endswith("not reproduced (quick)")
+    assert figures == "How often the true end lies in the ellipse"
     assert folded.index("the unfavourable") < folded.index("of our own")  # headlines first
     assert "0.250 [0.400, 0.600]" in folded
     assert "follows from its headline statistics" in page.all("caption")[0]["text"]
@@ -158,7 +160,7 @@ def test_a_figure_without_a_caption_still_shows(text):
     page = Outline(text)
     figures = {e["id"]: e["text"] for e in page.all("figure")}
     assert figures["puzzlebot2024_surprise"].strip() == "surprise"
-    assert "PB4: not reproduced (quick). The ellipse holds" in figures["puzzlebot2024_coverage"]
+    assert "Here:\nPB4 not reproduced (quick)." in figures["puzzlebot2024_coverage"]
     assert "Not made yet: puzzlebot2024_ideal_and_real" in page.all("main")[0]["text"]
 
 
@@ -294,10 +296,17 @@ def test_the_keyboard_skips_to_the_claims_and_opens_details(tab):
     tab.press("Enter", text="\r")
     assert tab.becomes("location.hash == '#leaderboard'")
     tab.press("Tab")
-    assert tab.js("document.activeElement.textContent") == "PB1: statistics (1)"
+    assert tab.js("document.activeElement.textContent") == "How leaderboard was made"
     assert tab.js("getComputedStyle(document.activeElement).outlineStyle") == "solid"
     tab.press("Enter", text="\r")
-    assert tab.becomes("document.querySelector('#claim-PB1 details').open")
+    assert tab.becomes("document.activeElement.parentElement.open")
+
+
+def test_a_link_opens_the_fold_that_hides_its_figure(tab):
+    surprise = "document.getElementById('puzzlebot2024_surprise')"
+    assert not tab.js(f"{surprise}.closest('details').open")
+    tab.js("location.hash = '#puzzlebot2024_surprise'")
+    assert tab.becomes(f"{surprise}.closest('details').open")
 
 
 def test_figures_open_enlarged_by_key_and_close_again(tab):
@@ -343,14 +352,21 @@ def test_tables_can_be_sorted(tab):
     assert tab.js(f"{table}.querySelector('th:last-child').ariaSort") == "ascending"
 
 
-def test_the_first_screen_names_the_best_of_the_leaderboard(tmp_path):
+def test_the_first_screen_has_the_leaderboard_by_world(tmp_path):
     path = tmp_path / "leaderboard_means.csv"
-    assert contents.best_of_worlds(path) == []
-    rows = {"choice.world": ["v", "v", "w"], "choice.estimator": ["a", "b", "b"]}
-    write_frame(pd.DataFrame({**rows, "answer_ate_rmse_m": [0.2, 0.1234, 0.3]}), path)
-    assert contents.best_of_worlds(path) == [("v", "b", "0.12"), ("w", "b", "0.30")]
+    assert leaderboard.by_world(path) == {}
+    rows = {"choice.world": ["v", "v", "v", "w", "w"], "choice.estimator": [*"abcab"]}
+    write_frame(pd.DataFrame({**rows, "answer_ate_rmse_m": [0.2, 0.1234, 0.01, 0.3, 0.4]}), path)
+    assert leaderboard.by_world(path) == {
+        "worlds": ["v", "w"],
+        "rows": [  # c did not run in all worlds
+            ("b", [("0.12", True), ("0.40", False)]),
+            ("a", [("0.20", False), ("0.30", True)]),
+        ],
+        "n_methods": 2,
+    }
     write_frame(pd.DataFrame(rows), path)
-    assert contents.best_of_worlds(path) == []
+    assert leaderboard.by_world(path) == {}
 
 
 def test_the_first_screen_names_the_paper_that_holds_best():
@@ -360,35 +376,42 @@ def test_the_first_screen_names_the_paper_that_holds_best():
     assert contents.holding_best({"c": [(open_, 6)], "d": []}) == []
 
 
-def test_the_first_screen_names_the_best_on_lasers(tmp_path):
+def test_the_first_screen_has_the_leaderboard_on_lasers(tmp_path):
     path = tmp_path / "peers_methods.csv"
-    assert contents.best_on_lasers(path) == {}
+    assert leaderboard.on_lasers(path) == {}
     rows = {"sensor": ["wheels", "laser", "laser"], "estimator": ["w", "theirs", "ours"]}
     rows |= {"project": ["Estima", "other 1.0", "Estima"], "runs": 15}
-    write_frame(pd.DataFrame({**rows, "ate_rmse_m": [0.001, 0.0321, 0.0123]}), path)
-    found = contents.best_on_lasers(path)
-    assert (found["estimator"], found["error"], found["methods"]) == ("ours", "0.012", 2)
-    assert found["others"] == "theirs, 0.032 m"
-    revised = pd.DataFrame({**rows, "ate_rmse_m": [0.001, 0.0321, 0.0123], "answer": "revised"})
-    write_frame(revised, path)
-    assert contents.best_on_lasers(path)["estimator"] == "ours (revised)"
-    assert contents.best_on_lasers(path)["level"] == []
-    write_frame(pd.DataFrame({**rows, "sensor": "wheels", "ate_rmse_m": 0.1}), path)
-    assert contents.best_on_lasers(path) == {}
+    rows |= {"ate_rmse_m": [0.001, 0.0321, 0.0123]}
+    write_frame(pd.DataFrame(rows), path)
+    found = leaderboard.on_lasers(path)
+    assert found["rows"][0] == {
+        "method": "ours",
+        "project": "Estima",
+        "ours": True,
+        "error": "0.012",
+        "level": False,
+        "ratio": "",
+    }
+    assert (found["n_methods"], found["runs"], found["others"]["method"]) == (2, 15, "theirs")
+    write_frame(pd.DataFrame({**rows, "answer": "revised"}), path)
+    assert leaderboard.on_lasers(path)["rows"][0]["method"] == "ours (revised)"
+    write_frame(pd.DataFrame({**rows, "sensor": "wheels"}), path)
+    assert leaderboard.on_lasers(path) == {}
 
 
 def test_a_tuned_method_is_no_second_one_and_ties_are_said(tmp_path):
     path = tmp_path / "peers_methods.csv"
-    rows = {"sensor": "laser", "estimator": ["a", "a_tuned", "b", "b_tuned", "c"], "runs": 15}
+    rows = {"sensor": "laser", "estimator": ["a", "a_tuned", "b_tuned", "b", "c"], "runs": 15}
     rows |= {"project": "Estima", "ate_rmse_m": [0.01, 0.01, 0.011, 0.011, 0.02]}
     rows |= {"over_best_ours": [1, 1, 1.1, 1.1, 2.0], "answer": "online"}
     rows |= {"low": [1, 1, 0.9, 0.9, 1.5], "high": [1, 1, 1.3, 1.3, 3.0]}
     write_frame(pd.DataFrame(rows), path)
-    found = contents.best_on_lasers(path)
-    assert found["methods"] == 3
-    assert found["level"] == [("b", "1.1", "0.90", "1.3")]
+    shown = leaderboard.on_lasers(path)["rows"]
+    assert [row["method"] for row in shown] == ["a", "b (tuned)", "c"]
+    assert [row["ratio"] for row in shown] == ["", "1.1 [0.90, 1.3]", "2.0 [1.5, 3.0]"]
+    assert [row["level"] for row in shown] == [False, True, False]
     write_frame(pd.DataFrame(rows | {"low": [1, 1, 1.05, 1.05, 1.5]}), path)
-    assert contents.best_on_lasers(path)["level"] == []
+    assert not any(row["level"] for row in leaderboard.on_lasers(path)["rows"])
 
 
 def test_what_a_paper_does_not_claim_is_not_counted_as_its_claim():
@@ -456,17 +479,17 @@ TABLE = pd.DataFrame(
 
 def test_markdown():
     assert to_markdown(TABLE).splitlines() == [
-        r"| case_name     |   k_m |   n | ok   |",
-        r"|:--------------|------:|----:|:-----|",
-        r"| a\|b          | 1e-05 |   3 | yes  |",
-        r"| 50 % \& {x}\\ |       |   4 | no   |",
+        r"| case name     |   k, m |   n | ok   |",
+        r"|:--------------|-------:|----:|:-----|",
+        r"| a\|b          |  1e-05 |   3 | yes  |",
+        r"| 50 % \& {x}\\ |        |   4 | no   |",
     ]
 
 
 def test_latex():
     lines = to_latex(TABLE).splitlines()
     assert lines[0] == r"\begin{tabular}{lrrl}"
-    assert lines[2] == r"case\_name & k\_m & n & ok \\"
+    assert lines[2] == r"case name & k, m & n & ok \\"
     assert lines[4] == r"a\textbar{}b & $1 \times 10^{-5}$ & 3 & yes \\"
     assert lines[5] == r"50 \% \& \{x\}\textbackslash{} &  & 4 & no \\"
     assert "$-1.5$" in to_latex(pd.DataFrame({"x": [-1.5]}))

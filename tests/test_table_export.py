@@ -29,7 +29,7 @@ def test_cells_are_shown_as_they_are_written(tmp_path):
 def test_metrics_are_named_with_their_unit():
     frame = pd.DataFrame({"ate_rmse_m": [0.5], "revised_nees_mean": [3.0], "k_m": [1e-5]})
     assert to_markdown(frame).splitlines()[0] == (
-        "|   position RMSE, m |   mean NEES (3 when consistent), revised path |   k_m |"
+        "|   position RMSE, m |   mean NEES (3 when consistent), revised path |   k, m |"
     )
 
 

@@ -14,7 +14,8 @@ import pandas as pd
 
 from experiments.evaluation.verdict import Profile, Role, Verdict, headline_verdict
 from experiments.report.claims import read_claims, read_provenance, read_verdicts, this_code
-from experiments.report.export import as_text, folded, numeric, plain, significant
+from experiments.report.export import as_text, folded, numeric, plain
+from experiments.report.leaderboard import by_world, on_lasers
 from experiments.report.panels import panels
 from experiments.runs.paths import CONF, SOURCE
 from experiments.runs.row import read_rows
@@ -83,10 +84,10 @@ def contents(results: Path, on_progress: Callable[[float], None]) -> dict[str, A
     origins = made | {"this page": this_code()}
     return {
         "claims": claims,
-        "best": best_of_worlds(results / "tables" / "leaderboard_means.csv"),
+        "by_world": by_world(results / "tables" / "leaderboard_means.csv"),
         "first": next((pictures[name] for name in FIRST if name in pictures), None),
         "holds_best": holding_best({name: studies[name]["tally"] for name in PAPERS}),
-        "on_lasers": best_on_lasers(results / "tables" / "peers_methods.csv"),
+        "on_lasers": on_lasers(results / "tables" / "peers_methods.csv"),
         "n_statistics": len(table),
         "n_judged": table["id"].nunique(),
         "tally": tally(claims.values()),
@@ -108,23 +109,6 @@ def contents(results: Path, on_progress: Callable[[float], None]) -> dict[str, A
     }
 
 
-def best_of_worlds(path: Path) -> list[tuple[str, str, str]]:
-    """The estimator of the least position error in each world, and that error, of the leaderboard.
-
-    Empty if there is no such table.
-    """
-    columns = ["choice.world", "choice.estimator"]
-    found = read_rows(path) if path.exists() else pd.DataFrame()
-    error = next((c for c in ("answer_ate_rmse_m", "ate_rmse_m") if c in found), "")
-    if not error or not {*columns} <= {*found}:
-        return []
-    least = found.loc[found.groupby("choice.world")[error].idxmin()]
-    return [
-        (str(row["choice.world"]), _with_path(row, "choice.estimator"), significant(row[error], 2))
-        for _, row in least.iterrows()
-    ]
-
-
 def holding_best(
     tallies: Mapping[str, Sequence[tuple[Verdict, int]]],
 ) -> list[tuple[str, int, int]]:
@@ -136,50 +120,6 @@ def holding_best(
     ]
     best = max((held / of for _, held, of in found), default=0.0)
     return [entry for entry in found if best and entry[1] / entry[2] == best]
-
-
-def best_on_lasers(path: Path) -> dict[str, Any]:
-    """The laser's method of the least position error beside other projects', of the peers' table.
-
-    A method and its tuned variant are one. Level with the first is whose ratio of errors to it has
-    an interval that holds 1. Empty if there is no such table.
-    """
-    found = read_rows(path) if path.exists() else pd.DataFrame()
-    if not {"sensor", "estimator", "project", "runs", "ate_rmse_m"} <= {*found}:
-        return {}
-    laser = (
-        found[found["sensor"] == "laser"]
-        .dropna(subset="ate_rmse_m")
-        .sort_values("ate_rmse_m", kind="stable")
-    )
-    if laser.empty:
-        return {}
-    first = laser.iloc[0]
-    methods = laser["estimator"].str.removesuffix("_tuned")
-    level = laser[methods.ne(methods.iloc[0]) & ~methods.duplicated()]
-    # the table's ratios are to the best of ours: they say nothing beside another that leads
-    known = {"over_best_ours", "low", "high"} <= {*laser} and first.get("over_best_ours") == 1.0
-    level = level[(level["low"] <= 1.0) & (level["high"] >= 1.0)] if known else level.head(0)
-    others = laser[laser["project"] != first["project"]].head(1)
-    return {
-        "estimator": _with_path(first),
-        "error": significant(float(first["ate_rmse_m"]), 2),
-        "level": [
-            (_with_path(row), *(significant(row[c], 2) for c in ("over_best_ours", "low", "high")))
-            for _, row in level.iterrows()
-        ],
-        "methods": methods.nunique(),
-        "runs": int(first["runs"]),
-        "others": "".join(
-            f"{row.estimator}, {significant(float(row.ate_rmse_m), 2)} m"
-            for row in others.itertuples()
-        ),
-    }
-
-
-def _with_path(row: pd.Series[Any], column: str = "estimator") -> str:
-    """A method's name, and whether its answer is the revised path."""
-    return f"{row[column]}{' (revised)' if row.get('answer') == 'revised' else ''}"
 
 
 def tally(claims: Iterable[Entry]) -> list[tuple[Verdict, int]]:

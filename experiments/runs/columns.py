@@ -136,18 +136,27 @@ def is_setting(name: str) -> bool:
     return "." in name or name in _SETTINGS
 
 
-_UNITS = ("m", "rad", "deg", "s", "us", "hz", "mps", "radps", "m2", "gib")
-_SPELT = {"us": "µs", "hz": "Hz", "mps": "m/s", "radps": "rad/s", "m2": "m²", "gib": "GiB"}
+_UNITS = (
+    *("m", "rad", "deg", "s", "ms", "us", "hz", "mps", "radps", "m2", "rad2", "px", "gib"),
+    "percent",
+)
+_SPELT = {
+    **{"us": "µs", "hz": "Hz", "mps": "m/s", "radps": "rad/s", "m2": "m²", "rad2": "rad²"},
+    **{"gib": "GiB", "percent": "%"},
+}
+_ACRONYMS = ("ate", "ess", "nees", "rms", "rmse", "sd")
 _IN_METRES = ("kr", "kl")  # of settings, whose names do not say it
 
 
 def title(name: str, *, short: bool = False) -> str:
-    """Label (or symbol) and unit of a metric or of a dotted setting; else the column's own name.
+    """Label (or symbol) and unit of a metric, a setting, or any other column by its own words.
 
     Examples
     --------
     >>> title("ate_rmse_m"), title("choice.world"), title("sensors.stereo.max_distance_m")
     ('position RMSE, m', 'world', 'max distance (stereo), m')
+    >>> title("omega_radps"), title("ate_rmse_m_office"), title("recall_at_1_percent")
+    ('omega, rad/s', 'ATE (office), m', 'recall at 1, %')
     """
     if name in COLUMNS:
         column = COLUMNS[name]
@@ -157,19 +166,30 @@ def title(name: str, *, short: bool = False) -> str:
     elif "." in name:
         words, unit = _setting(name)
     else:
-        return name
+        metric = next((m for m in COLUMNS if name.startswith(f"{m}_")), "")
+        if metric:
+            of = name.removeprefix(f"{metric}_").replace("_", " ")
+            words, unit = f"{COLUMNS[metric].symbol} ({of})", COLUMNS[metric].unit
+        else:
+            words, unit = _worded(name)
     return f"{words}, {unit}" if unit else words
 
 
 def _setting(name: str) -> tuple[str, str]:
     """Words and unit of a dotted setting."""
     *_, group, last = name.split(".")
-    words, _, unit = last.rpartition("_")
-    if not words or unit not in _UNITS:
-        words, unit = last, "m" if last in _IN_METRES else ""
-    words = words.strip("_").replace("_", " ")
+    words, unit = _worded(last)
+    return (words if group == "choice" else f"{words} ({group})"), unit
+
+
+def _worded(name: str) -> tuple[str, str]:
+    """Words of a name, and the unit that it ends with."""
+    words, _, unit = name.rpartition("_")
+    if not words or unit not in _UNITS or (words[-1].isdigit() and unit == "m"):  # beyond_10_m
+        words, unit = name, "m" if name in _IN_METRES else ""
+    words = " ".join(w.upper() if w in _ACRONYMS else w for w in words.strip("_").split("_"))
     words = f"number of {words[2:]}" if words.startswith("n ") else words
-    return (words if group == "choice" else f"{words} ({group})"), _SPELT.get(unit, unit)
+    return words, _SPELT.get(unit, unit)
 
 
 def average_of(name: str) -> Average:

@@ -1,0 +1,101 @@
+"""The leaderboard of the first screen, read from the tables of the studies leaderboard and peers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from experiments.report.export import significant
+from experiments.runs.row import read_rows
+
+MOST = 6  # methods that the first screen names
+_TUNED = "_tuned"
+
+
+def by_world(path: Path) -> dict[str, Any]:
+    """The methods of the least position error over all worlds, with their errors in each.
+
+    Returns
+    -------
+    dict
+        `worlds`; `rows` of the method and a cell (error, whether it is the least) for each world,
+        the best method first, at most `MOST`; `n_methods`. Empty if there is no such table.
+    """
+    columns = ["choice.world", "choice.estimator"]
+    found = read_rows(path) if path.exists() else pd.DataFrame()
+    error = next((c for c in ("answer_ate_rmse_m", "ate_rmse_m") if c in found), "")
+    if not error or not {*columns} <= {*found}:
+        return {}
+    found = found.assign(method=[_with_path(row, "choice.estimator") for _, row in found.iterrows()])
+    errors = found.pivot_table(error, "method", "choice.world", sort=False).dropna()
+    if errors.empty:
+        return {}
+    order = np.log(errors).mean(axis=1).sort_values(kind="stable").index
+    least = errors.min()
+    return {
+        "worlds": list(errors),
+        "rows": [
+            (name, [(significant(errors.at[name, w], 2), errors.at[name, w] == least[w]) for w in errors])
+            for name in order[:MOST]
+        ],
+        "n_methods": len(errors),
+    }
+
+
+def on_lasers(path: Path) -> dict[str, Any]:
+    """The methods of the least position error with a laser, beside other projects'.
+
+    A method and its tuned variant are one, of which the better is shown. Level with the first is
+    whose ratio of errors to it has an interval that holds 1.
+
+    Returns
+    -------
+    dict
+        `rows`, the best method first, at most `MOST`, each with its `method`, `project`, `error`,
+        whether it is `ours` and `level` with the first, and the `ratio` of its error to the first's
+        in words (empty for the first); `n_methods`, `runs` and `others`, the best row of another
+        project (or None). Empty if there is no such table.
+    """
+    found = read_rows(path) if path.exists() else pd.DataFrame()
+    if not {"sensor", "estimator", "project", "runs", "ate_rmse_m"} <= {*found}:
+        return {}
+    laser = found[found["sensor"] == "laser"].dropna(subset="ate_rmse_m")
+    laser = laser.sort_values("ate_rmse_m", kind="stable")
+    laser = laser[~laser["estimator"].str.removesuffix(_TUNED).duplicated()]
+    if laser.empty:
+        return {}
+    # the table's ratios are to the best of ours: they say nothing beside another that leads
+    first = laser.iloc[0]
+    known = {"over_best_ours", "low", "high"} <= {*laser} and first.get("over_best_ours") == 1.0
+    rows = [_of_lasers(row, known and i > 0) for i, (_, row) in enumerate(laser.iterrows())]
+    return {
+        "rows": rows[:MOST],
+        "n_methods": len(rows),
+        "runs": int(first["runs"]),
+        "others": next((row for row in rows if row["project"] != rows[0]["project"]), None),
+    }
+
+
+def _of_lasers(row: pd.Series[Any], compared: bool) -> dict[str, Any]:
+    ratio, low, high = (
+        [significant(row[c], 2) for c in ("over_best_ours", "low", "high")] if compared else [""] * 3
+    )
+    return {
+        "method": _with_path(row, "estimator"),
+        "project": row["project"],
+        "ours": row["project"] == "Estima",
+        "error": significant(float(row["ate_rmse_m"]), 2),
+        "level": compared and row["low"] <= 1.0 <= row["high"],
+        "ratio": f"{ratio} [{low}, {high}]" if compared else "",
+    }
+
+
+def _with_path(row: pd.Series[Any], column: str) -> str:
+    """A method's name, whether it was tuned, and whether its answer is the revised path."""
+    name = str(row[column])
+    marks = ["tuned"] * name.endswith(_TUNED) + ["revised"] * (row.get("answer") == "revised")
+    name = name.removesuffix(_TUNED)
+    return f"{name} ({', '.join(marks)})" if marks else name
