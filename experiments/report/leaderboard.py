@@ -1,4 +1,4 @@
-"""The leaderboard of the first screen, read from the tables of the studies leaderboard and peers."""
+"""The leaderboard of the first screen, read from the tables of leaderboard and peers."""
 
 from __future__ import annotations
 
@@ -29,7 +29,8 @@ def by_world(path: Path) -> dict[str, Any]:
     error = next((c for c in ("answer_ate_rmse_m", "ate_rmse_m") if c in found), "")
     if not error or not {*columns} <= {*found}:
         return {}
-    found = found.assign(method=[_with_path(row, "choice.estimator") for _, row in found.iterrows()])
+    names = [_with_path(row, "choice.estimator") for _, row in found.iterrows()]
+    found = found.assign(method=names)
     errors = found.pivot_table(error, "method", "choice.world", sort=False).dropna()
     if errors.empty:
         return {}
@@ -38,7 +39,7 @@ def by_world(path: Path) -> dict[str, Any]:
     return {
         "worlds": list(errors),
         "rows": [
-            (name, [(significant(errors.at[name, w], 2), errors.at[name, w] == least[w]) for w in errors])
+            (name, [(significant(e, 2), e == least[w]) for w, e in errors.loc[name].items()])
             for name in order[:MOST]
         ],
         "n_methods": len(errors),
@@ -80,16 +81,17 @@ def on_lasers(path: Path) -> dict[str, Any]:
 
 
 def _of_lasers(row: pd.Series[Any], compared: bool) -> dict[str, Any]:
-    ratio, low, high = (
-        [significant(row[c], 2) for c in ("over_best_ours", "low", "high")] if compared else [""] * 3
-    )
+    ratio = ""
+    if compared:
+        value, low, high = (significant(row[c], 2) for c in ("over_best_ours", "low", "high"))
+        ratio = f"{value} [{low}, {high}]"
     return {
         "method": _with_path(row, "estimator"),
         "project": row["project"],
         "ours": row["project"] == "Estima",
         "error": significant(float(row["ate_rmse_m"]), 2),
         "level": compared and row["low"] <= 1.0 <= row["high"],
-        "ratio": f"{ratio} [{low}, {high}]" if compared else "",
+        "ratio": ratio,
     }
 
 
