@@ -417,9 +417,11 @@ def mx7(starts: pd.DataFrame) -> Claim:
 def mx7_sentence(rows: Sequence[Claim]) -> str:
     """Say how far below the spacing registration brings the error."""
     (row,) = rows
+    low = row.found.low
+    bound = f"at least {plain(low)} times" if math.isfinite(low) else "too few worlds for a bound"
     return (
-        f"With registration the RMS error is {plain(row.found.value)} times below the node spacing "
-        f"(at least {plain(row.found.low)})."
+        f"With registration the RMS error is {plain(row.found.value)} times smaller than the node "
+        f"spacing ({bound})."
     )
 
 
