@@ -175,6 +175,7 @@ def test_every_point_of_the_ordering_has_all_methods_over_one_drive():
         assert {run.config["method"] for run in group} >= set(decristoforis2020.CHECKED)
 
 
+@pytest.mark.slow
 def test_metrics_register_the_same_scans(monkeypatch):
     asked = []
 
@@ -228,6 +229,7 @@ def test_bullet_and_kinematic_robots_drive_the_same_routes_with_the_same_noise()
     assert by_physics["bullet"] == by_physics["kinematic"]
 
 
+@pytest.mark.slow
 def test_calibrations_see_the_same_runs(monkeypatch):
     arm = puzzlebot2024.arms("calibration")[0]
     seen = []

@@ -267,6 +267,7 @@ def test_calibration_from_recordings(tmp_path):
     refused(called("calibrate", paths[0], paths[1], paths[0]), "same recording")
 
 
+@pytest.mark.slow
 def test_calibration_from_a_sheet():
     sheet = str(ROOT / "docs" / "examples" / "end_poses.csv")
     done = estima("calibrate", "--sheet", sheet, "robot=puzzlebot_short_turns", "--joint", "--json")

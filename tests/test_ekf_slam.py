@@ -217,6 +217,7 @@ def test_a_misread_id_starts_no_landmark():
     assert len(filtered.map["ids"]) > 5
 
 
+@pytest.mark.slow
 def test_errors_that_last_are_counted_once():
     """An error that stays for half a second is one measurement, not three."""
     values = {0.0: [], 0.5: []}

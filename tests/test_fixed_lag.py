@@ -63,7 +63,9 @@ def test_a_window_beyond_the_run_is_full_least_squares(correlated):
     np.testing.assert_allclose(online.covariances[rows] / scale, covariances / scale, atol=0.01)
 
 
-@pytest.mark.parametrize("lag_images", [1, 3, 8])
+@pytest.mark.parametrize(
+    "lag_images", [1, *(pytest.param(n, marks=pytest.mark.slow) for n in (3, 8))]
+)
 def test_what_leaves_the_window_is_kept(lag_images):
     """With hardly any noise all is linear, and any window gives what full least squares does.
 

@@ -473,6 +473,7 @@ def test_processes_share_one_making(tmp_path, monkeypatch):
 
 @pytest.mark.bullet
 @pytest.mark.parametrize("rays", ["bullet", "exact"])
+@pytest.mark.slow
 def test_two_processes_write_the_same_recording(tmp_path, rays):
     script = f"""
 import sys

@@ -253,7 +253,7 @@ def own_estimator(folder, body):
 
 @pytest.mark.parametrize(
     ("body", "words"),
-    [("self.how == 'bad' and sys.exit(0)", "SystemExit"),
+    [pytest.param("self.how == 'bad' and sys.exit(0)", "SystemExit", marks=pytest.mark.slow),
      ("self.how == 'bad' and os._exit(3)", "process died")],
     ids=["exits", "dies"],
 )  # fmt: skip
@@ -389,6 +389,7 @@ def test_values_that_no_column_holds_fail_alone(name):
         out.unlink(missing_ok=True)
 
 
+@pytest.mark.slow
 def test_a_sweep_without_a_name_has_one_of_its_own(tmp_path):
     place = {"ESTIMA_RESULTS": str(tmp_path)}
     first = estima("run", "-m", *ALONE, "seed=0,1", **place)
@@ -506,6 +507,7 @@ def test_a_missing_value_can_be_given_in_a_sweep(tmp_path):
     assert runs[0].config["recording"]["positions"] == f"{tmp_path}/positions.npy"
 
 
+@pytest.mark.slow
 def test_files_that_are_not_the_runs_rows(name):
     swept_ = ["run", "-m", *ALONE, "seed=0,1,2", f"name={name}"]
     assert estima(*swept_).returncode == 0
@@ -666,6 +668,7 @@ def test_damaged_files_are_made_again(name):
     pd.testing.assert_frame_equal(table_of(name), expected, check_exact=True)
 
 
+@pytest.mark.slow
 def test_nothing_is_left_of_the_plan(name):
     done = estima("run", "-m", *SHORT, "seed=0,1", f"name={name}")
     assert done.returncode == 0, done.stderr

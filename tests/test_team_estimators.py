@@ -164,7 +164,7 @@ def final_nees(make, seeds, which, **options):
     return np.concatenate(found)
 
 
-@pytest.mark.parametrize("known", [None, 1])
+@pytest.mark.parametrize("known", [None, pytest.param(1, marks=pytest.mark.slow)])
 def test_the_team_is_as_sure_as_it_errs(known):
     """NEES of the EKF in its 99.9 % band, with known starts and with unknown ones."""
     found = final_nees(lambda: EkfSlam(**SEEING), range(12), 0, known=known)
@@ -175,6 +175,7 @@ def test_the_team_is_as_sure_as_it_errs(known):
     assert bold.mean() > high  # a filter that believes too little slip is found out
 
 
+@pytest.mark.slow
 def test_the_batch_of_a_team_is_as_sure_as_it_errs():
     found = final_nees(lambda: Smoother(**SEEING), range(6), 1)
     low, high = stats.chi2.ppf([0.0005, 0.9995], 3 * len(found)) / len(found)

@@ -72,6 +72,7 @@ def test_what_was_planted_is_found(twin):
     assert 4e-4 < twin.robot.forward_slip_m < 2.5e-3
 
 
+@pytest.mark.slow
 def test_a_twin_predicts_the_error_and_more_slip_is_out_of_its_reach(twin):
     predicted = [error_m(twin.simulated(seed)) for seed in range(12)]
     low, high = min(predicted), max(predicted)
@@ -245,6 +246,7 @@ def test_forward_slip_moves_both_encoders_alike():
 
 
 @pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.slow
 def test_forward_slip_that_lasts_has_the_variance_of_its_formula(seed):
     """The variance q (s - l (1 - exp(-s / l))) of the error over s, and white slip's is far off."""
     drive = "world=empty sensors=encoder sensors.encoder.rate_hz=20 simulation.physics=kinematic"

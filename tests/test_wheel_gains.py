@@ -89,6 +89,7 @@ def test_wheels_that_are_not_as_stated_are_found_out(recording):
     assert consistency < 3.0 < 30.0 < overconfident
 
 
+@pytest.mark.slow
 def test_states_of_no_deviation_are_none_and_small_ones_change_little():
     recording = Experiment.compose(DRIVE.split()).simulate()
     known, tiny = run_with(recording), run_with(recording, gain_sigma=1e-9)
