@@ -86,6 +86,7 @@ def contents(results: Path, on_progress: Callable[[float], None]) -> dict[str, A
         "claims": claims,
         "by_world": by_world(results / "tables" / "leaderboard_means.csv"),
         "first": next((pictures[name] for name in FIRST if name in pictures), None),
+        "titles": {name: page["title"] for name, page in about.items()},
         "holds_best": holding_best({name: studies[name]["tally"] for name in PAPERS}),
         "on_lasers": on_lasers(results / "tables" / "peers_methods.csv"),
         "n_statistics": len(table),
