@@ -1,6 +1,5 @@
 """What every estimator takes and gives: Prior, Belief, Estimate, and the protocol itself."""
 
-import time
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
@@ -8,6 +7,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 
 from sim.arrays import Array
+from sim.compiled import wall_s
 from sim.errors import InputError, require
 from sim.recording import Frame, Recording
 from sim.robot import RobotGeometry
@@ -82,6 +82,7 @@ class Estimate:
         (T,) computing time of each step; empty for a revised estimate.
     cpu_seconds
         Processor time of the whole run, `finish` and programs included; None where not measured.
+        Neither it nor the time of a step has that of compiling code.
     map
         What the estimator made of the world, or None.
     extras
@@ -158,9 +159,9 @@ def run(
     status = "ok"
     estimator.reset(prior, rng)
     for i, frame in enumerate(recording.frames()):
-        begun = time.perf_counter()
+        begun = wall_s()
         belief = estimator.step(frame)
-        seconds[i] = time.perf_counter() - begun
+        seconds[i] = wall_s() - begun
         if i == 0:
             _check_belief(belief, estimator)
         means[i], covariances[i] = belief.mean, belief.covariance

@@ -13,7 +13,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtri  # scipy.stats takes half a second to import
 
 from estimators.base import Prior
 from estimators.gaussian import Gaussian
@@ -164,7 +164,7 @@ class SlamFrontEnd:
             f"association={association}, which has the gate d0",
         )
         self.gated, self._repeat_s = gate_probability is not None, repeat_s
-        self._gate = math.inf if gate_probability is None else float(chi2.isf(gate_probability, 3))
+        self._gate = math.inf if gate_probability is None else float(chdtri(3, gate_probability))
         self.association, self.d0 = association, d0
         self._stereo, self._estimator = stereo, estimator
         self._noise_model, self._noise_at = noise_model, noise_at

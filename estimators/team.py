@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
@@ -15,6 +14,7 @@ from estimators.base import Belief, Estimate, Prior
 from estimators.gaussian import Gaussian
 from estimators.options import require_choices
 from estimators.sightings import dead_reckoning
+from sim.compiled import wall_s
 from sim.errors import require, required
 from sim.recording import Frame
 from sim.team import Team
@@ -143,9 +143,9 @@ def _counter(on_step: Callable[[int], None]) -> Callable[[Frame], Frame]:
 
 def _stepped(estimator: TeamEstimator, frames: Sequence[Frame]) -> dict[int, Step]:
     """Beliefs by robot after one instant; the time is shared out evenly."""
-    begun = time.perf_counter()
+    begun = wall_s()
     beliefs = estimator.step_team(frames)
-    share_s = (time.perf_counter() - begun) / len(frames)
+    share_s = (wall_s() - begun) / len(frames)
     return {
         frame.robot: (frame.stamp, belief, share_s)
         for frame, belief in zip(frames, beliefs, strict=True)

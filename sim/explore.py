@@ -118,6 +118,10 @@ class Explore:
         pose = se2.compose(world.start_pose, np.array([*self.start_offset_m, 0.0]))
         return pose, Explorer(self, robot, world, pose)
 
+    def about_s(self, world: World, robot: DifferentialDrive) -> float:
+        """About how long the drive takes, s, if frontiers are left all along."""
+        return self.distance_m / self.speed_mps
+
     @property
     def common(self) -> Explore:
         """What the routes of a team have in common."""

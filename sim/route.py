@@ -57,6 +57,10 @@ class OpenLoop:
         """Start pose (3,) of the world, and the driver."""
         return world.start_pose, Replay(self.profile(robot))
 
+    def about_s(self, world: World, robot: DifferentialDrive) -> float:
+        """How long the drive takes, s."""
+        return float(self.edges_s(robot)[-1]) + self.rest_s
+
     def profile(self, robot: DifferentialDrive, dt_s: float = TICK_S) -> Array:
         """Body velocities (N, 2), m/s and rad/s: means over ticks of `dt_s`, rest included.
 
@@ -153,6 +157,15 @@ class Tour:
         """Start pose (3,) on the first way-point, facing the second, and the driver."""
         path = _lengthened(self._given(world), self.distance_m)
         return facing_second(path), Pursuit(self, robot, path)
+
+    def about_s(self, world: World, robot: DifferentialDrive) -> float:
+        """About how long the drive takes, s; at 0.5 m/s a radian of its turns costs some 0.6 s."""
+        path = _lengthened(self._given(world), self.distance_m)
+        x, y = np.diff(path, axis=0).T
+        turns = np.diff(np.unwrap(np.arctan2(y, x)))
+        speeding_s = 2.0 * self.speed_mps / robot.max_acceleration_mps2
+        turning_s = 0.6 * float(np.abs(turns).sum())
+        return round(float(_along_m(path)[-1]) / self.speed_mps + speeding_s + turning_s)
 
     def _given(self, world: World) -> Array:
         """Way-points (P, 2) to follow."""

@@ -77,6 +77,7 @@ class Route(Protocol):
     """A plan that gives a Driver for a robot in a world.
 
     It may have an attribute `feedback`, see `sim.feedback`; without one its driver gets the truth.
+    It may have `about_s(world, robot)`, about how long the drive takes, s.
     """
 
     def start(self, world: World, robot: DifferentialDrive) -> tuple[Array, Driver]:

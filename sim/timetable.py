@@ -63,6 +63,11 @@ class Timetable:
         """First pose (3,), and the driver."""
         return Drive(*self.way, self.tolerance_m).start(world, robot)
 
+    def about_s(self, world: World, robot: DifferentialDrive) -> float:
+        """How long the drive takes, s."""
+        stamps, _ = self.way
+        return float(stamps[-1] - stamps[0])
+
 
 @dataclass(frozen=True)
 class Drive:

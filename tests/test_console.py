@@ -35,6 +35,24 @@ def test_lines_elsewhere_say_amount_rate_failures_and_time_left(clock, capsys):
     assert capsys.readouterr().err == "simulating, s: 12.3 after 3 s\n"
 
 
+def test_the_rate_counts_from_a_restart_on(clock, capsys):
+    with console.progress("", 10, "runs") as on_progress:
+        for clock[0], done in ((40.0, 1), (55.0, 2), (66.0, 4)):
+            on_progress(done, restart=done == 2)
+    assert capsys.readouterr().err.splitlines() == [
+        "1 of 10 runs, 0.025 a second, 6 min left",
+        "2 of 10 runs",
+        "4 of 10 runs, 0.18 a second, 33 s left",
+    ]
+
+
+def test_no_more_is_done_than_there_is(clock, capsys):
+    with console.progress("simulated seconds", 60.0) as on_progress:
+        clock[0] += 3.0
+        on_progress(62.0)
+    assert capsys.readouterr().err == "simulated seconds: 62 of 62 after 3 s\n"
+
+
 def test_what_ends_soon_leaves_at_most_a_summary(clock, capsys):
     for summary in (False, True):
         with console.progress("drawing", 1.0, summary=summary) as on_progress:

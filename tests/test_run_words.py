@@ -36,12 +36,22 @@ def test_errors_are_said_with_their_share_of_the_way_and_consistency():
 
 
 @pytest.mark.parametrize(
-    ("overrides", "seconds"),
-    [(["route=linear_1"], 2.2), (["route.distance_m=8"], 16.0), (["route=square"], None)],
+    ("overrides", "within_s"),
+    [
+        (["route=linear_1"], 0.05),
+        (["study=first_run"], 1.0),
+        (["route.distance_m=8", "world=corridor"], 1.0),
+    ],
 )
-def test_progress_knows_about_how_long_a_drive_is(overrides, seconds):
-    assert expected_s(Experiment.compose(overrides)) == (seconds and pytest.approx(seconds))
-    assert expected_s(Experiment.compose(["world=room"])) > 10.0
+def test_progress_knows_about_how_long_a_drive_is(overrides, within_s):
+    alone = ["simulation.physics=kinematic", "sensors=encoder", "estimator=odometry"]
+    experiment = Experiment.compose([*overrides, *alone])
+    assert expected_s(experiment) == pytest.approx(experiment.simulate().duration_s, abs=within_s)
+
+
+def test_progress_does_not_know_how_long_other_drives_are():
+    assert expected_s(Experiment.compose(["route=square"])) is None
+    assert expected_s(Experiment.compose(["study=teams"])) > 10.0
 
 
 def test_a_timetable_takes_as_long_as_its_trajectory(tmp_path):
@@ -55,7 +65,7 @@ def test_recording_says_how_much_there_is_to_simulate(tmp_path, monkeypatch):
     arguments = ["record", "-o", str(tmp_path / "r.npz"), "route=linear_1"]
     done = CliRunner().invoke(app, [*arguments, "simulation.physics=kinematic"])
     assert done.exit_code == 0, done.output
-    assert "seconds: 0 of 2.2 after" in done.stderr
+    assert "seconds: 0 of 2.7 after" in done.stderr
 
 
 def announced(_):

@@ -1,5 +1,6 @@
 """Sweeps: what is expanded, composed and packed, and what is left after failures and kills."""
 
+import contextlib
 import json
 import os
 import re
@@ -666,6 +667,33 @@ def test_damaged_files_are_made_again(name):
             for line in again.stderr.splitlines()
         )
     pd.testing.assert_frame_equal(table_of(name), expected, check_exact=True)
+
+
+def test_compiling_is_said_once_and_restarts_the_rate(tmp_path, monkeypatch, capsys):
+    jobs, restarts = launch.Jobs(tmp_path, 1), []
+    note = launch._compiling(jobs.plan)
+    note.parent.mkdir()
+    ended = iter([1, 2, 3, 4, 5])  # runs at each look; code is compiled before the second
+
+    def counted(*_):
+        done = next(ended)
+        if done == 1:
+            note.touch()
+        return 0, done, 0
+
+    @contextlib.contextmanager
+    def shown(*_, **__):
+        yield lambda done, failed, *, restart: restarts.append((done, restart))
+
+    monkeypatch.setattr(launch, "progress", shown)
+    monkeypatch.setattr(launch, "_counted", counted)
+    jobs.sizes[tmp_path / "rows-0.jsonl"] = 5
+    with launch._watched(jobs, 5):
+        deadline = time.monotonic() + 20.0
+        while len(restarts) < 4 and time.monotonic() < deadline:
+            time.sleep(0.05)
+    assert restarts[:4] == [(1, False), (2, True), (3, True), (4, True)]
+    assert capsys.readouterr().err.count("compiling numerical code") == 1
 
 
 @pytest.mark.slow

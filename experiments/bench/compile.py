@@ -11,6 +11,8 @@ import time
 from collections.abc import Iterator, Mapping
 
 from experiments.bench.measure import Measurement
+from experiments.runs import paths
+from sim.compiled import note_compiling
 
 _PROCESSES = ("scans", "others")
 _ROOM = (
@@ -79,7 +81,7 @@ def _others() -> None:
     model = EndPoseModel(route.profile(robot), robot, rng, "sampled", n_samples=4)
     model.moments(np.full(2, 1e-5), np.zeros(2), robot.track_m)
     for overrides in (
-        [*_ROOM, "estimator=fastslam"],
+        [*_ROOM, "estimator=fastslam", "estimator.ess_share=1"],
         [*_ROOM, "estimator=fastslam", "estimator.association=mahalanobis"],
         [*_ROOM, "estimator=mcl", "prior.map=world"],
         ["study=maximo2024_umh"],
@@ -95,6 +97,7 @@ def _others() -> None:
 
 if __name__ == "__main__":
     if len(sys.argv) > 1:
+        note_compiling(paths.results() / "compiling")  # who began this says it
         {"scans": _scans, "others": _others}[sys.argv[1]]()
     else:
         fill({})

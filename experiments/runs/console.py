@@ -28,12 +28,12 @@ def progress(
     """Yield a function that takes the amount done, and how much of it failed (by default none).
 
     It draws a bar on a terminal, and prints a line now and then elsewhere. Nothing is shown for
-    the first two seconds.
+    the first two seconds. With `restart` the rate, and so the time left, counts from there on.
 
     Parameters
     ----------
     total
-        The amount when all is done; None if unknown, 1.0 if the amount is a share.
+        The amount when all is done, or about that; None if unknown, 1.0 if the amount is a share.
     unit
         What is counted, such as runs; their rate is then shown too.
     summary
@@ -41,12 +41,16 @@ def progress(
     """
     begun = time.monotonic()
     next_line, line, printed = begun + _QUIET_S, "", ""
+    start, start_s = 0.0, begun
     bar = _bar(total) if sys.stderr.isatty() else None
 
-    def update(done: float, failed: int = 0) -> None:
-        nonlocal next_line, line, printed
+    def update(done: float, failed: int = 0, *, restart: bool = False) -> None:
+        nonlocal next_line, line, printed, start, start_s
         now = time.monotonic()
-        line = _state(label, done, total, unit, failed, now - begun)
+        if restart:
+            start, start_s = done, now
+        rate = (done - start) / max(now - start_s, 1e-9)
+        line = _state(label, done, total, unit, failed, now - begun, rate)
         if now < next_line:
             return
         if bar is not None:
@@ -76,17 +80,23 @@ def _bar(total: float | None) -> Any:
 
 
 def _state(
-    label: str, done: float, total: float | None, unit: str, failed: int, spent_s: float
+    label: str,
+    done: float,
+    total: float | None,
+    unit: str,
+    failed: int,
+    spent_s: float,
+    rate: float,
 ) -> str:
     amount = f"{done:.3g}" if isinstance(done, float) else str(done)
-    of_total = f"{amount} of {total:g}" if total else amount
+    of_total = f"{amount} of {max(total, done):g}" if total else amount
     if total == 1.0 and not unit:
         of_total = f"{100 * done:.0f} %"
-    parts = [f"{of_total} after {spent_s:.0f} s"]
-    if unit:
-        parts = [f"{of_total} {unit}", f"{done / max(spent_s, 1e-9):.2g} a second"]
-    if total and 0 < done < total:
-        left_s = (total - done) * spent_s / done
+    parts = [f"{of_total} {unit}" if unit else f"{of_total} after {spent_s:.0f} s"]
+    if unit and rate:
+        parts.append(f"{rate:.2g} a second")
+    if total and rate and done < total:
+        left_s = (total - done) / rate
         parts.append(f"{left_s / 60:.0f} min left" if left_s > 90 else f"{left_s:.0f} s left")
     if failed:
         parts.append(f"{failed} failed")

@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 import os
-import time
 from collections.abc import Callable, Collection, Mapping
 from contextlib import AbstractContextManager, nullcontext
 
@@ -30,6 +29,7 @@ from experiments.runs.team import (
     status_of_team,
 )
 from sim.arrays import Array
+from sim.compiled import processor_s
 from sim.errors import InputError, require
 from sim.recording import Recording
 from sim.team import Team
@@ -167,17 +167,18 @@ def estimates(
 ) -> tuple[Estimate, Estimate | None]:
     """Online estimate of a run, and the revised one of an estimator that has `finish`.
 
-    The online estimate tells the processor time of all, `finish` included.
+    The online estimate has the processor time of all, `finish` included, but for compiling code
+    and reading compiled code.
 
     BLAS uses one thread, or as many as ESTIMA_BLAS_THREADS says: its threads spin while they wait,
     and the matrices of filters are small.
     """
     with limited_blas():
-        begun = time.process_time()
+        begun = processor_s()
         online = run(estimator, recording, prior, rng, keep, on_step)
         finish = getattr(estimator, "finish", None)
         revised: Estimate | None = None if finish is None else finish()
-        own_s = time.process_time() - begun
+        own_s = processor_s() - begun
         spent_s = getattr(estimator, "program_seconds", own_s)  # without the transport to it
     if revised is not None and revised.kind == "online":
         online, revised = revised, None

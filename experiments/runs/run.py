@@ -9,7 +9,6 @@ from pathlib import Path
 from statistics import fmean
 
 import hydra
-import numpy as np
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
@@ -102,19 +101,11 @@ def run_once(experiment: Experiment, draw: Draw, out: Path | None = None) -> lis
 
 def expected_s(experiment: Experiment) -> float | None:
     """About how long the simulated drive will be; None if that is not known before."""
-    route = experiment.config["route"] if experiment.config["recording"] is None else {}
-    if "segments" in route:
-        return sum(float(segment[2]) for segment in route["segments"]) + float(route["rest_s"])
-    if route.get("_target_") == "sim.timetable.Timetable":
-        stamps, _ = experiment.route().way
-        return float(stamps[-1] - stamps[0])
-    if "look_ahead_m" not in route:
+    if experiment.config["recording"] is not None:
         return None
-    way_m = route["distance_m"]
-    if way_m is None:
-        points = experiment.world().waypoints if route["waypoints"] is None else route["waypoints"]
-        way_m = np.hypot(*np.diff(np.asarray(points, float), axis=0).T).sum()
-    return float(way_m) / float(route["speed_mps"])
+    one = experiment if experiment.team is None else experiment.of_robot(0)
+    about_s = getattr(one.route(), "about_s", None)
+    return None if about_s is None else round(about_s(one.world(), one.robot()), 1)
 
 
 def _trace(error: Exception | SystemExit) -> None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +25,7 @@ from experiments.runs.row import Outcome, Row, Status
 from experiments.runs.seeds import stream
 from experiments.runs.team_settings import TeamSettings
 from sim.arrays import Array
+from sim.compiled import processor_s
 from sim.errors import InputError, required
 from sim.recording import Recording
 from sim.sensors import RobotCamera
@@ -140,7 +140,7 @@ class TeamExperiment:
         contacts = None
         if communication.range_m is not None:
             contacts = in_range(team, communication.range_m)
-        begun = time.process_time()
+        begun = processor_s()
         found = run_team(
             experiment.team_estimator,
             team,
@@ -150,7 +150,7 @@ class TeamExperiment:
             contacts,
             on_step,
         )
-        spent_s = time.process_time() - begun
+        spent_s = processor_s() - begun
         n_frames = sum(len(online.stamps) for online, _ in found)
         answers = []
         for number, (online, revised) in enumerate(found):

@@ -35,7 +35,7 @@ from experiments.runs.row import Outcome, Row, Status, check_row
 from experiments.runs.team import recorded
 from experiments.sweeps.collect import COMMAND
 from experiments.sweeps.plan import Family, Numbers, Plan, packed, plan_of
-from sim.compiled import announce_once_in
+from sim.compiled import ANNOUNCED, note_compiling
 from sim.errors import InputError
 from sim.files import require_file, write_whole
 from sim.recording import Recording
@@ -226,6 +226,11 @@ def share_of(plan: str | Path, job: int) -> Path:
     return Path(f"{plan}.jobs") / f"share-{job}.json"
 
 
+def _compiling(plan: str | Path) -> Path:
+    """File that is touched whenever a job compiles numerical code."""
+    return Path(f"{plan}.jobs") / "compiling"
+
+
 def _plan_of(folder: Path, journal: str) -> Path:
     """The plan that a journal belongs to."""
     return folder / f"plan-{journal.removeprefix('rows-').rpartition('-')[0]}.json"
@@ -253,6 +258,7 @@ def _launch_all(plan: Plan, runs: Numbers, jobs: Jobs, launching: Sequence[str])
                 keys = np.array([*over.done, *over.failed], np.uint64)
                 left = left[~np.isin(plan.keys[left], keys)]
     finally:
+        note_compiling(None)
         _remove(jobs.plan)
 
 
@@ -393,7 +399,7 @@ def job_application(cfg: DictConfig) -> None:
     if os.getpid() != share["planner"][1]:  # joblib's workers stay, as they were, for later sweeps
         folder, os.environ["ESTIMA_RESULTS"] = share["places"]
         os.chdir(folder)
-        announce_once_in(share_of(cfg.plan, cfg.job).parent / "compiling")
+    note_compiling(_compiling(cfg.plan))
     run_share(share)
 
 
@@ -477,23 +483,34 @@ def _record_death(experiment: Experiment, jobs: Jobs) -> None:
 
 @contextmanager
 def _watched(jobs: Jobs, n_runs: int) -> Iterator[None]:
-    """Show how many runs are done and failed, at what rate, and the time that remains."""
+    """Show how many runs are done and failed, at what rate, and the time that remains.
+
+    The rate counts from the second run on that ended after code was last compiled.
+    """
     ended = threading.Event()
 
     def watch() -> None:
         counts: dict[Path, tuple[int, int, int]] = {}
+        compiled_ns, done_then, shown = 0, -2, 0
         with progress("", n_runs, "runs", summary=True) as on_progress:
             over = False
             while not over:
                 over = ended.wait(0.5)
+                noted_ns = _touched_ns(_compiling(jobs.plan))
+                if noted_ns and not compiled_ns:
+                    print(ANNOUNCED, file=sys.stderr, flush=True)
                 for journal in list(jobs.sizes):
                     counts[journal] = _counted(journal, jobs.sizes[journal], counts.get(journal))
                 done, failed = (sum(count[i] for count in counts.values()) for i in (1, 2))
                 if over:
                     found = store.ended(jobs.folder, f"rows-{jobs.name}", lambda *_: None)
                     done, failed = len(found.done) + len(found.failed), len(found.failed)
+                if noted_ns != compiled_ns:
+                    compiled_ns, done_then = noted_ns, done
                 if done:
-                    on_progress(min(done, n_runs), failed)
+                    restart = shown <= done_then + 1
+                    on_progress(min(done, n_runs), failed, restart=restart)
+                    shown = done
 
     thread = threading.Thread(target=watch, daemon=True)
     thread.start()
@@ -502,6 +519,14 @@ def _watched(jobs: Jobs, n_runs: int) -> Iterator[None]:
     finally:
         ended.set()
         thread.join()
+
+
+def _touched_ns(path: Path) -> int:
+    """When a file was last touched; 0 if it is not there."""
+    try:
+        return path.stat().st_mtime_ns
+    except OSError:
+        return 0
 
 
 def _counted(
