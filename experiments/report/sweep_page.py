@@ -18,7 +18,7 @@ from scipy import stats
 from experiments.report.export import numeric, plain, written
 from experiments.report.page import render
 from experiments.report.table import DIGITS, HTML, WORDS, notes, shown, statuses
-from experiments.runs.columns import ANSWER, COLUMNS, REPEAT, average_of, is_setting
+from experiments.runs.columns import ANSWER, COLUMNS, PATH, REPEAT, average_of, is_setting
 from experiments.runs.columns import title as titled
 from experiments.runs.row import Outcome
 from experiments.sweeps.again import short_key
@@ -110,14 +110,17 @@ def _data(
                 "title": titled(c),
                 "average": average_of(c),
                 "log": COLUMNS[c].scale == "log",
-                "values": _cells(table[c]),
+                # the page takes those of the best answers from the paths' own
+                "values": [] if c.startswith(ANSWER) else _cells(table[c]),
             }
             for c in metrics
         ],
+        "revised": (table[PATH] == "revised").astype(int).tolist(),
         "recording": pd.factorize(table[RECORDING])[0].tolist(),
         "repeat": table[REPEAT].tolist(),
-        "failed": (table["status"] == Outcome.FAILED).tolist(),
-        "status": [WORDS[Outcome(s)] for s in table["status"]],
+        "failed": (table["status"] == Outcome.FAILED).astype(int).tolist(),
+        "status": pd.factorize(table["status"])[0].tolist(),
+        "statuses": [WORDS[Outcome(s)] for s in pd.factorize(table["status"])[1]],
         "keys": [short_key(row) for _, row in table[["run_key", REPEAT]].iterrows()],
         "pictures": pictures,
         "name": name,
@@ -125,7 +128,7 @@ def _data(
         "start": {"x": x, "y": first, "colour": colour, "panels": panels},
         "t975": [round(float(stats.t.ppf(0.975, n)), 4) for n in range(1, 200)],
     }
-    text = json.dumps(found, allow_nan=False)
+    text = json.dumps(found, allow_nan=False, separators=(",", ":"))
     return Markup(re.sub("[<>&\u2028\u2029]", lambda c: f"\\u{ord(c[0]):04x}", text))
 
 

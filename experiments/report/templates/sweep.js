@@ -2,6 +2,11 @@
 "use strict";
 const data = JSON.parse(document.getElementById("data").textContent);
 const columns = new Map([...data.settings, ...data.metrics].map((c) => [c.name, c]));
+for (const metric of data.metrics.filter((m) => m.name.startsWith("answer_"))) {
+  const name = metric.name.slice("answer_".length);
+  const [online, revised] = [name, `revised_${name}`].map((path) => columns.get(path)?.values ?? []);
+  metric.values = data.revised.map((is, row) => (is ? revised : online)[row] ?? null);
+}
 const byId = (id) => document.getElementById(id);
 const COLOURS = ["#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9", "#8c8c8c",
   "#AA3377", "#999933", "#7766dd", "#b0724a", "#44aa99"];
@@ -174,7 +179,7 @@ function draw() {
         traces.push({ ...shared, type: "scatter", mode: "markers", showlegend: false,
           x: mine.map((row) => beside(aside)(of(x, row))), y: mine.map((row) => metric.values[row]),
           marker: { color: paint, size: 6, opacity: 0.45 }, customdata: mine,
-          text: mine.map((row) => [...named(row), data.status[row]].map(safe).join("<br>")),
+          text: mine.map((row) => [...named(row), data.statuses[data.status[row]]].map(safe).join("<br>")),
           hovertemplate: "%{y:.4g}<br>%{text}<extra></extra>" });
       }
       const points = order.map((v) => [v, mine.filter((row) => of(x, row) === v)])
