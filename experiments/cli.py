@@ -18,8 +18,11 @@ from sim.errors import InputError, require
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from pandas import DataFrame
+
     from estimators.base import Estimate
     from experiments.runs.experiment import Experiment
+    from experiments.sweeps.again import Again
     from sim.recording import Recording
     from sim.robot import DifferentialDrive
 
@@ -362,7 +365,9 @@ def options(
 def view(
     what: Annotated[
         list[str] | None,
-        typer.Argument(help="A recording or a log of any format, then Hydra overrides."),
+        typer.Argument(
+            help="A recording or a log of any format, then Hydra overrides; or a sweep's NAME/KEY."
+        ),
     ] = None,
     estimate: Annotated[
         str | None,
@@ -395,6 +400,7 @@ def view(
     """Show a run as an animation, in a window or in a file; or draw a world or a map.
 
     It shows robot, scan, particles or landmarks, truth and estimate. Without -o it opens a window.
+    A run of a sweep is called by the first digits of its key, as `estima report NAME` gives them.
 
     Examples
     --------
@@ -408,9 +414,12 @@ def view(
 
       estima view run.npz -e ekf_icp --map map.yaml -o run.html
 
+      estima view slip/1f0c33ab -o run.html (a run of the sweep slip)
+
       estima view --map map.yaml -o map.png
     """
     from experiments.runs.experiment import searched
+    from experiments.sweeps.again import row_of, run_again
 
     if world and grid is not None:
         raise InputError("--world and --map: draw one at a time")
@@ -424,6 +433,13 @@ def view(
         raise InputError("name a recording to view, such as run.npz, or say --world")
     if seconds is not None and not 0.0 < seconds <= 3600.0:
         raise InputError(f"--seconds must lie between 0 and 3600, got {seconds:g}")
+    if not Path(what[0]).exists() and (row := row_of(what[0])) is not None:
+        require(
+            estimate is None and len(what) == 1,
+            f"{what[0]}: a run of a sweep has its estimator and its settings; leave out others",
+        )
+        _show_run(run_again(row, searched(config_dir)), None, [], out, seconds, grid)
+        return
     if estimate is None and len(what) > 1:
         raise InputError(f"{what[1]}: overrides need an estimator; add --estimate NAME")
     overrides = [*searched(config_dir), *what[1:]]
@@ -450,7 +466,7 @@ def _draw_map(path: Path, out: Path) -> None:
 
 
 def _show_run(
-    log: Path,
+    what: Path | Again,
     source: str | None,
     overrides: list[str],
     out: Path | None,
@@ -459,6 +475,7 @@ def _show_run(
 ) -> None:
     from dataclasses import replace
 
+    from experiments.runs.team import TeamExperiment
     from experiments.viewing import live, team_view, view
     from sim.formats.detect import read_all
     from sim.grid_file import read_grid
@@ -469,9 +486,11 @@ def _show_run(
     if out is not None:
         view.check_output(out)
     known = None if grid is None else read_grid(grid)
-    read = read_all([log])
+    again = None if isinstance(what, Path) else what
+    read = read_all([what]) if isinstance(what, Path) else what.recording()
+    name = source if again is None else again.experiment.estimator_name
     if isinstance(read, Team):
-        require(out is not None, f"{log}: a team is drawn in files; add -o team.html, .gif or .mp4")
+        require(out is not None, "a team is drawn in files; add -o team.html, .gif or .mp4")
     elif out is None:
         live.check_display()
     drive_s = read.duration_s
@@ -479,18 +498,27 @@ def _show_run(
     n_shown = int(length_s * (live.FPS if out is None else view.FPS))
     if isinstance(read, Team):
         several = team_view.TeamPlayback.of(read, n_shown)
-        if source is not None:
-            with progress(source, sum(len(r.frame_stamps) for r in read.robots)) as on_step:
-                several = team_view.with_estimates(several, read, source, overrides, on_step)
+        if name is not None:
+            with progress(name, sum(len(r.frame_stamps) for r in read.robots)) as on_step:
+                if again is None:
+                    several = team_view.with_estimates(several, read, name, overrides, on_step)
+                else:
+                    team = TeamExperiment(again.experiment)
+                    answers = team.run(read, again.repeat, on_step=on_step)
+                    several = several.beside([online for online, _ in answers], name)
         several = replace(several, grid=known, seconds=length_s)
         run: view.Played = several
         images = team_view.pictures(several)
     else:
         rows = view.shown_rows(read, n_shown)
         shown = view.Playback(read, rows)
-        if source is not None:
-            with progress(source, len(read.frame_stamps)) as on_step:
-                found = view.estimate_of(read, source, overrides, rows, on_step)
+        if name is not None:
+            with progress(name, len(read.frame_stamps)) as on_step:
+                if again is None:
+                    found = view.estimate_of(read, name, overrides, rows, on_step)
+                else:
+                    experiment, repeat = again.experiment, again.repeat
+                    found = view.estimate_by(experiment, read, rows, on_step, repeat), name
             shown = view.Playback(read, rows, *found)
         if out is None:
             live.watch(shown, seconds)
@@ -501,7 +529,7 @@ def _show_run(
     with progress(f"drawing {out.name}", 1.0) as on_progress:
         view.save(run, images, out, on_progress)
     speed = "real time" if length_s == drive_s else f"{drive_s / length_s:.3g} times real time"
-    print(f"{out}: {len(run.stamps)} pictures, {length_s:.1f} s, {speed}")
+    print(f"{paths.short(out)}: {len(run.stamps)} pictures, {length_s:.1f} s, {speed}")
 
 
 @app.command("map")
@@ -1242,19 +1270,28 @@ def report(
         ),
     ] = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="File to write, .html.")] = None,
+    pictures: Annotated[
+        bool,
+        typer.Option(
+            "--pictures", help="Draw the best and worst run of each estimator as they move."
+        ),
+    ] = False,
     all_versions: AllVersions = False,
     only: Where = None,
 ) -> None:
     """Write one page to open in a browser: of a sweep, or of the papers' studies in results/.
 
     A sweep's page has a chart whose axes, colours, panels and filters can be chosen, its means, its
-    best and worst runs, and its command. It needs no network.
+    best and worst runs, and its command. It needs no network. With --pictures it links the best and
+    the worst run of each estimator as they move, drawn into PAGE/pictures beside it.
 
     Examples
     --------
       estima report
 
       estima report slip
+
+      estima report slip --pictures
 
       estima report slip --where choice.world=office -o office.html
     """
@@ -1269,11 +1306,15 @@ def report(
         folder, called = folder_of(name), Path(name).name
         written = out or folder.parent / f"{called}.html"
         rows = where(collect(name, all_versions=all_versions, times=True), only or [])
-        write_sweep_page(rows, called, folder, written)
+        if pictures:
+            _draw_extremes(rows, written)
+        in_runs = folder.parent == paths.results() / "runs"
+        write_sweep_page(rows, called if in_runs else name, folder, written)
         print(paths.short(written))
         return
     require(
-        not (only or all_versions), "--where, --all-versions: name the sweep of the runs to keep"
+        not (only or all_versions or pictures),
+        "--where, --all-versions, --pictures: name the sweep of the runs",
     )
     if not any((paths.results() / name).exists() for name in ("claims.csv", "figures", "tables")):
         raise InputError(
@@ -1284,6 +1325,23 @@ def report(
 
     with progress("report", 1.0) as on_progress:
         print(write_report(paths.results(), on_progress))
+
+
+def _draw_extremes(rows: DataFrame, page: Path) -> None:
+    """Draw the best and the worst run of each estimator, unless they are there."""
+    from experiments.report.sweep_page import extremes, picture_path
+    from experiments.sweeps.again import run_again
+
+    runs = extremes(rows)
+    for _, row in runs[runs["first"] & (runs["kind"] != "failed")].iterrows():
+        out = picture_path(row, page)
+        if out.exists():
+            continue
+        out.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            _show_run(run_again(row), None, [], out, None, None)
+        except InputError as error:
+            print(f"{out.name} is not drawn: {error}", file=sys.stderr)
 
 
 @app.command()

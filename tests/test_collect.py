@@ -264,6 +264,44 @@ def test_plots_have_panels_and_twelve_series_that_differ():
     assert "m00, v" in [text.get_text() for text in both.legends[0].get_texts()]
 
 
+def test_what_panels_say_the_legend_does_not_repeat():
+    x, y, world = "estimator.n_particles", "ate_rmse_m", "choice.world"
+    few = many(3)
+    page = sweep_figure(few, x, y, [world, "choice.estimator"], col=world)
+    assert [text.get_text() for text in page.legends[0].get_texts()] == ["m00", "m01", "m02"]
+    page = sweep_figure(few, x, y, [world], col=world, row="choice.estimator")
+    assert not page.legends
+
+
+def test_seeds_are_not_joined_by_lines():
+    def styles(x):
+        page = sweep_figure(many(3), x, "ate_rmse_m", "choice.estimator", pool=True)
+        return {bars.lines[0].get_linestyle() for bars in page.axes[0].containers}
+
+    assert styles("estimator.n_particles") == {"-"}
+    assert styles("seed") == {"None"}
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("team.size", "team size"),
+        ("team.communication.range_m", "communication range, m"),
+        ("sensors.stereo.max_distance_m", "stereo max distance, m"),
+        ("sensors.laser.mount.yaw_rad", "laser mount yaw, rad"),
+        ("sensors.laser.n_beams", "number of laser beams"),
+        ("sensors.laser.sigma_range_m", "laser range sigma, m"),
+        ("estimator.sigma_range_m", "believed range sigma, m"),
+        ("estimator.n_particles", "number of particles"),
+        ("estimator.kr", "believed kr, m"),
+        ("robot.max_acceleration_mps2", "robot max acceleration, m/s²"),
+        ("world_seed", "world seed"),
+    ],
+)
+def test_settings_are_called_as_one_would(name, words):
+    assert title(name) == words
+
+
 def test_lines_are_named_at_their_ends_where_that_fits():
     few = many(3).query("`choice.world` == 'w'")
     page = sweep_figure(few, "estimator.n_particles", "ate_rmse_m", "choice.estimator")
@@ -311,7 +349,7 @@ def test_columns_say_their_unit():
     assert title("ate_rmse_m", short=True) == "ATE, m"
     page = sweep_figure(rows(), "robot.kr", "ate_rmse_m", pool=True)
     assert page.axes[0].get_ylabel() == "position RMSE, m"
-    assert page.axes[0].get_xlabel() == "kr (robot), m"
+    assert page.axes[0].get_xlabel() == "true kr, m"
 
 
 def test_runs_of_equal_settings_and_different_keys_are_refused(tmp_path):

@@ -8,7 +8,7 @@ import pytest
 
 from experiments import cli
 from experiments.report import sweep_page
-from experiments.report.sweep_page import write_sweep_page
+from experiments.report.sweep_page import extremes, picture_path, write_sweep_page
 from experiments.sweeps.averages import averages
 from experiments.sweeps.collect import with_answers
 from sim.errors import InputError
@@ -21,7 +21,7 @@ EVIL = "</script><img src=x onerror=alert(1)><b>&lt;</b>"
 def rows():
     """A sweep of three series, one of a hostile name; one run failed, one has a remark."""
     table = many(3).replace({"m01": EVIL})
-    table["run_key"] = [f"{i:016x}" for i in range(len(table))]
+    table["run_key"] = [f"{i:04x}{0:012x}" for i in range(len(table))]
     table["code_version"] = "v"
     table["status_detail"] = ""
     table.loc[3, ["status", "status_detail"]] = "remark", "gated at 12.5 s"
@@ -142,6 +142,77 @@ def test_names_are_no_markup_for_the_chart(tab):
         "[...document.querySelectorAll('#chart .annotation')].map(t => t.textContent)"
     )
     tab.open(tab.js("location.href"))
+
+
+def test_colours_stand_beside_each_other_over_the_name_of_their_word(tab):
+    choose(tab, "x", "choice.world")
+    choose(tab, "colour", "choice.estimator")
+    choose(tab, "panels", "")
+    chart = "document.getElementById('chart')"
+    first = tab.js(f"{chart}.data.filter(t => t.error_y).map(t => t.x[0])")
+    assert len(set(first)) == 3
+    np.testing.assert_allclose(np.mean(first), 0.0, atol=1e-12)
+    assert tab.js(f"{chart}.layout.xaxis.tickvals") == [0, 1]
+    assert tab.js(f"{chart}.layout.xaxis.ticktext") == ["v", "w"]
+    choose(tab, "panels", "choice.estimator")
+    low, high = tab.js(f"{chart}._fullLayout.yaxis.range")
+    drawn = np.array(tab.js(f"{chart}.data.flatMap(t => t.y)"))
+    if tab.js(f"{chart}.layout.yaxis.type") == "log":
+        drawn = np.log10(drawn)
+    assert low < drawn.min() < drawn.max() < high
+    assert high - low < 2.0 * np.ptp(drawn)  # not Plotly's range of no data
+    tab.open(tab.js("location.href"))
+
+
+def test_seeds_are_not_joined(tab):
+    modes = "document.getElementById('chart').data.filter(t => t.error_y).map(t => t.mode)"
+    assert set(tab.js(modes)) == {"lines+markers"}
+    choose(tab, "x", "seed")
+    assert set(tab.js(modes)) == {"markers"}
+    tab.open(tab.js("location.href"))
+
+
+def test_of_each_estimator_the_best_and_the_worst_run_are_shown_and_more_of_one(tab):
+    shown = "[...document.querySelectorAll('#extremes tbody tr:not([hidden])')]"
+    kinds = f"{shown}.map(r => [r.cells[0].textContent, r.cells[1].textContent])"
+    assert tab.js(kinds) == [
+        *([EVIL, kind] for kind in ("best", "worst")),
+        *(["m00", kind] for kind in ("best", "worst", "failed")),
+        *(["m02", kind] for kind in ("best", "worst")),
+    ]
+    choose(tab, "of", "m02")
+    assert tab.js(kinds) == [["m02", kind] for kind in ["best"] * 3 + ["worst"] * 3]
+    errors = tab.js(f"{shown}.map(r => parseFloat(r.cells[2].textContent))")
+    assert errors[:3] == sorted(errors[:3])
+    assert errors[3:] == sorted(errors[3:], reverse=True)
+    assert errors[2] <= errors[5]
+    choose(tab, "of", "")
+
+
+def test_a_click_on_a_run_gives_its_command_or_its_picture(tab, path):
+    click = "document.getElementById('chart').emit('plotly_click', {points: [{customdata: %s}]})"
+    picked = "document.getElementById('picked')"
+    tab.js(click % 5)
+    key = rows()["run_key"][5]
+    assert f"/{key[:10]} -o run.html" in tab.js(f"{picked}.textContent")
+    before = tab.js(f"{picked}.textContent")
+    tab.js(click % "[1, 2, 3, null]")  # a mean of several runs
+    assert tab.js(f"{picked}.textContent") == before
+    tab.js("document.querySelector('#picked .copy').click()")
+    assert tab.becomes("document.querySelector('#picked .copy').textContent != 'copy'")
+    assert tab.complaints() == []
+
+
+def test_pictures_that_are_there_are_linked(tmp_path):
+    table = rows()
+    page = tmp_path / "my page.html"
+    runs = extremes(table)
+    best = runs[runs["first"] & (runs["kind"] == "best")].iloc[0]
+    picture_path(best, page).parent.mkdir(parents=True)
+    picture_path(best, page).write_text("x")
+    write_sweep_page(table, "mine", tmp_path, page)
+    links = re.findall(r'<a href="([^"#]+)">watch', page.read_text())
+    assert links == [f"my%20page/pictures/{best['run_key'][:10]}.html"]
 
 
 def test_a_wide_table_scrolls_in_its_own_box(tab):

@@ -13,7 +13,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from experiments.runs.columns import ANSWER, COLUMNS, PATH, title
+from experiments.runs.columns import ANSWER, COLUMNS, PATH, REPEAT, title
 from experiments.sweeps.averages import averages, pooled, rule, unit_of
 from experiments.sweeps.collect import DRAWN, measured, no_column, telling, with_answers
 from experiments.viewing.plotting import plain_log, plain_ticks
@@ -26,7 +26,8 @@ _WIDE = 10.0  # an axis whose values span this factor, or grow by factors, is lo
 _LEAST = 3.0  # factor below which no axis is
 # How far the bars of several lines are moved, so that none hides another
 _BESIDE = 0.006  # share of the axis
-_BESIDE_WORD = 0.08  # among words, which are 1 apart
+_BESIDE_WORD = 0.12  # among words and seeds: share of what is between two of them
+_MOST_BESIDE = 0.7  # the same, of all lines together
 _MOST_DIRECT = 6  # lines that are named at their ends rather than in a legend
 
 
@@ -79,8 +80,8 @@ def sweep_figure(
         If a column is not in the table, y has no numbers, no run has all columns, or a point would
         pool what differs in more than its seeds.
     """
-    by = [by] if isinstance(by, str) else list(by or [])
     facets = [name for name in (row, col) if name is not None]
+    by = [name for name in ([by] if isinstance(by, str) else by or []) if name not in facets]
     if y.startswith(ANSWER):
         table = _marked(with_answers(table, [y]), [x, *by, *facets])
     groups = list(dict.fromkeys([*by, *facets, x]))
@@ -103,7 +104,8 @@ def sweep_figure(
     page, axes = _panels(chosen, len(down), len(across))
     names = sorted(means[x].unique())
     numeric = means[x].dtype.kind in "fi"
-    wide = numeric and _by_factors(names)
+    joined = numeric and x not in (*DRAWN, REPEAT)  # seeds have no order
+    wide = joined and _by_factors(names)
     for (i, above), (j, left) in itertools.product(enumerate(down), enumerate(across)):
         ax = axes[i, j]
         panel = _within(_within(means, row, above), col, left)
@@ -111,16 +113,16 @@ def sweep_figure(
             points = _on_line(panel, by, line)
             if points.empty:
                 continue
-            beside = k - (len(lines) - 1) / 2
-            at = _places(points[x], names, beside, wide=wide, numeric=numeric)
+            line_of = (k, len(lines))
+            at = _places(points[x], names, line_of, wide=wide, numeric=numeric, joined=joined)
             value, low, high = points[["value", "low", "high"]].to_numpy(float).T
             colour, marker = SERIES[k]
             ax.errorbar(
                 at, value, yerr=(value - low, high - value), color=colour, marker=marker, ms=4,
-                capsize=2, lw=1.2, ls="-" if numeric else "none", label=label,
+                capsize=2, lw=1.2, ls="-" if joined else "none", label=label,
             )  # fmt: skip
             alone = _on_line(_within(_within(dots, row, above), col, left), by, line)
-            at = _places(alone[x], names, beside, wide=wide, numeric=numeric)
+            at = _places(alone[x], names, line_of, wide=wide, numeric=numeric, joined=joined)
             ax.plot(at, alone[y], ".", color=colour, ms=4, alpha=0.5)
         words = [_named(name, value) for name, value in ((row, above), (col, left)) if name]
         ax.set_title("; ".join(words), fontsize="medium")
@@ -149,7 +151,7 @@ def sweep_figure(
     characters = int(_WIDTH_IN[chosen] * 115 / _FONT[chosen])
     page.suptitle(textwrap.fill(note, characters), fontsize=0.85 * _FONT[chosen], color="#555555")
     if by:
-        _name_lines(page, axes, title(by[0]) if len(by) == 1 else "", chosen, direct=numeric)
+        _name_lines(page, axes, title(by[0]) if len(by) == 1 else "", chosen, direct=joined)
     return page
 
 
@@ -201,13 +203,27 @@ def _on_line(means: pd.DataFrame, by: Sequence[str], line: tuple[Any, ...]) -> p
 
 
 def _places(
-    values: pd.Series[Any], names: Sequence[Any], beside: float, *, wide: bool, numeric: bool
+    values: pd.Series[Any],
+    names: Sequence[Any],
+    line_of: tuple[int, int],
+    *,
+    wide: bool,
+    numeric: bool,
+    joined: bool,
 ) -> Any:
-    """Where values stand on the x axis, moved a little so that no line's bars hide another's."""
+    """Where values stand on the x axis, moved a little so that no line's bars hide another's.
+
+    `line_of` is which line it is, and of how many.
+    """
     at = np.array([v if numeric else names.index(v) for v in values], float)
+    line, n_lines = line_of
+    beside = line - (n_lines - 1) / 2
     if wide:
         return at * (names[-1] / names[0]) ** (_BESIDE * beside)
-    return at + beside * (_BESIDE * (names[-1] - names[0]) if numeric else _BESIDE_WORD)
+    if joined:
+        return at + beside * _BESIDE * (names[-1] - names[0])
+    apart = np.diff(names).min(initial=names[-1] - names[0]) if numeric else 1.0
+    return at + beside * apart * min(_BESIDE_WORD, _MOST_BESIDE / n_lines)
 
 
 def _within(means: pd.DataFrame, name: str | None, value: Any) -> pd.DataFrame:

@@ -5,23 +5,23 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
+import numpy as np
 import pandas as pd
-from hydra.errors import HydraException
 from markupsafe import Markup
 from scipy import stats
 
 from experiments.report.export import numeric, plain, written
 from experiments.report.page import render
 from experiments.report.table import DIGITS, HTML, WORDS, notes, shown, statuses
-from experiments.runs import completion, paths
-from experiments.runs.columns import ANSWER, COLUMNS, ORIGIN, REPEAT, average_of, is_setting
+from experiments.runs.columns import ANSWER, COLUMNS, PATH, REPEAT, average_of, is_setting
 from experiments.runs.columns import title as titled
-from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome
+from experiments.sweeps.again import short_key
 from experiments.sweeps.averages import RECORDING
 from experiments.sweeps.collect import COMMAND, DRAWN, measured, suggested, telling, with_answers
 from experiments.sweeps.summary import ERROR, summary
@@ -30,14 +30,18 @@ from sim.files import write_whole
 
 MOST_RUNS = 10_000  # with 1.2 MB of the charting library the page stays below 5 MB
 _DIGITS = 5  # of the numbers behind the chart
-_SHOWN_RUNS = 3  # best, and worst
+_SHOWN_RUNS = 3  # of an estimator, best, worst and failed
 
 
 def write_sweep_page(table: pd.DataFrame, name: str, folder: Path, out: Path) -> None:
     """Write the page of a sweep's rows, as `collect` gives them with their times.
 
+    It links the pictures of runs that are at their `picture_path`.
+
     Parameters
     ----------
+    name
+        Of the sweep, as `estima view NAME/KEY` finds it.
     folder
         Where the rows lie, for the command that made them.
 
@@ -57,19 +61,29 @@ def write_sweep_page(table: pd.DataFrame, name: str, folder: Path, out: Path) ->
             f"{name}: no run has a result to show; `estima table {name}` says how they ended"
         )
     settings = telling(table)
+    named = [c for c in settings if c != "choice.estimator"]
+    pictures = {
+        path.stem: quote(path.relative_to(out.parent).as_posix())
+        for path in _pictures(out).glob("*.html")
+    }
+    runs = extremes(table)
     found = summary(table)
     means = written(shown(found), HTML, DIGITS)
     text = render(
         "sweep.html",
         name=name,
         n_runs=len(table),
-        data=_data(every, settings, metrics),
+        data=_data(every, name, settings, metrics, pictures),
         statuses=statuses(table),
         note=notes(found, None),
         head=[Markup(cell) for cell in means],
         numeric=numeric(shown(found)),
         rows=[[Markup(cell) for cell in row] for row in means.to_numpy()],
-        extremes=_extremes(every, settings),
+        runs=_shown(runs, named, pictures),
+        run_settings=[titled(c) for c in named],
+        estimators=sorted(runs["choice.estimator"].unique()),
+        remarks=bool((runs.get("status_detail", pd.Series(dtype=str)).fillna("") != "").any()),
+        drawn=bool(pictures),
         commands=_commands(folder),
         constant=_constant(table),
     )
@@ -77,7 +91,13 @@ def write_sweep_page(table: pd.DataFrame, name: str, folder: Path, out: Path) ->
         part.write_text(text, encoding="utf-8")
 
 
-def _data(table: pd.DataFrame, settings: list[str], metrics: list[str]) -> Markup:
+def _data(
+    table: pd.DataFrame,
+    name: str,
+    settings: list[str],
+    metrics: list[str],
+    pictures: Mapping[str, str],
+) -> Markup:
     """All that the chart draws, as JSON that no HTML can end."""
     first = next((m for m in (ERROR, "ate_rmse_m") if m in metrics), metrics[0])
     x, colour, panels, *_ = [*suggested(table), "", ""]
@@ -90,19 +110,25 @@ def _data(table: pd.DataFrame, settings: list[str], metrics: list[str]) -> Marku
                 "title": titled(c),
                 "average": average_of(c),
                 "log": COLUMNS[c].scale == "log",
-                "values": _cells(table[c]),
+                # the page takes those of the best answers from the paths' own
+                "values": [] if c.startswith(ANSWER) else _cells(table[c]),
             }
             for c in metrics
         ],
+        "revised": (table[PATH] == "revised").astype(int).tolist(),
         "recording": pd.factorize(table[RECORDING])[0].tolist(),
         "repeat": table[REPEAT].tolist(),
-        "failed": (table["status"] == Outcome.FAILED).tolist(),
-        "status": [WORDS[Outcome(s)] for s in table["status"]],
+        "failed": (table["status"] == Outcome.FAILED).astype(int).tolist(),
+        "status": pd.factorize(table["status"])[0].tolist(),
+        "statuses": [WORDS[Outcome(s)] for s in pd.factorize(table["status"])[1]],
+        "keys": [short_key(row) for _, row in table[["run_key", REPEAT]].iterrows()],
+        "pictures": pictures,
+        "name": name,
         "drawn": list(DRAWN),
         "start": {"x": x, "y": first, "colour": colour, "panels": panels},
         "t975": [round(float(stats.t.ppf(0.975, n)), 4) for n in range(1, 200)],
     }
-    text = json.dumps(found, allow_nan=False)
+    text = json.dumps(found, allow_nan=False, separators=(",", ":"))
     return Markup(re.sub("[<>&\u2028\u2029]", lambda c: f"\\u{ord(c[0]):04x}", text))
 
 
@@ -114,72 +140,56 @@ def _cells(column: pd.Series[Any]) -> list[Any]:
             for v in column.tolist()]  # fmt: skip
 
 
-def _extremes(table: pd.DataFrame, settings: list[str]) -> list[Mapping[str, Any]]:
-    """The best and worst runs by the position error and the first failed ones, with commands."""
-    failed = table["status"] == Outcome.FAILED
-    groups = {"failed": table[failed].head(_SHOWN_RUNS)}
-    if ERROR in table:
-        ranked = table[~failed & table[ERROR].notna()].sort_values(ERROR, kind="stable")
+def extremes(table: pd.DataFrame) -> pd.DataFrame:
+    """The runs of each estimator that its reader looks at first, one row each.
+
+    Column `kind` says what they are: `best` and `worst` by the position error of the best answers,
+    and `failed`; `first` marks the first of each kind.
+    """
+    table = with_answers(table, [ERROR])
+    table = table if ERROR in table else table.assign(**{ERROR: np.nan})
+    found = []
+    for _, runs in table.groupby("choice.estimator"):
+        failed = runs["status"] == Outcome.FAILED
+        ranked = runs[~failed & runs[ERROR].notna()].sort_values(ERROR, kind="stable")
         n = min(_SHOWN_RUNS, len(ranked) // 2)
-        groups = {"best": ranked.head(n), "worst": ranked.tail(n)[::-1], **groups}
-    bases: dict[str, Mapping[str, Any]] = {}
+        kinds = {
+            "best": ranked.head(max(n, 1)),
+            "worst": ranked.tail(n)[::-1],
+            "failed": runs[failed].head(_SHOWN_RUNS),
+        }
+        found += [
+            some.assign(kind=kind, first=np.arange(len(some)) == 0) for kind, some in kinds.items()
+        ]
+    return pd.concat(found, ignore_index=True)
+
+
+def picture_path(row: pd.Series[Any], page: Path) -> Path:
+    """Where the page of a sweep looks for the picture of a run as it moves."""
+    return _pictures(page) / f"{short_key(row)}.html"
+
+
+def _pictures(page: Path) -> Path:
+    return page.with_suffix("") / "pictures"
+
+
+def _shown(
+    runs: pd.DataFrame, settings: Sequence[str], pictures: Mapping[str, str]
+) -> list[dict[str, Any]]:
+    """What the table of the best and worst runs says of each."""
     return [
         {
-            "kind": kind,
-            "error": plain(row.get(ERROR), DIGITS),
-            "what": _named(row, settings),
-            "status": row.get("status_detail") or "",
-            "commands": _view_commands(row, bases),
+            "estimator": row["choice.estimator"],
+            "kind": row["kind"],
+            "first": row["first"],
+            "error": plain(row[ERROR], DIGITS) if row["kind"] != "failed" else "",
+            "settings": [plain(row[name]) if pd.notna(row[name]) else "" for name in settings],
+            "remark": row.get("status_detail") or "",
+            "key": short_key(row),
+            "picture": pictures.get(short_key(row), ""),
         }
-        for kind, rows in groups.items()
-        for _, row in rows.iterrows()
+        for _, row in runs.iterrows()
     ]
-
-
-def _named(row: pd.Series[Any], settings: list[str]) -> str:
-    """What tells a run from others, in words."""
-    return ", ".join(f"{titled(s)} = {plain(row[s])}" for s in settings if pd.notna(row[s]))
-
-
-def _view_commands(row: pd.Series[Any], bases: dict[str, Mapping[str, Any]]) -> list[str]:
-    """Commands that draw a run as it moves; none if its options are not here."""
-    choices = [
-        f"{group}={row[f'choice.{group}']}"
-        for group in completion.GROUPS
-        if isinstance(row.get(f"choice.{group}"), str) and group != "study"
-    ]
-    key = " ".join(choices)
-    try:
-        base = bases.setdefault(key, Experiment.compose(choices).labels(""))
-    except (InputError, HydraException):  # options of one's own, which are not here
-        return []
-    skipped = ("choice.", "name", *ORIGIN, REPEAT)
-    other = [
-        f"{name}={_override(row[name])}"
-        for name in row.index
-        if is_setting(str(name))
-        and not str(name).startswith(skipped)
-        and not _same(row[name], base.get(str(name)))
-    ]
-    words = " ".join([*choices, *other])
-    if isinstance(recording := row.get("recording"), str):
-        return [f"estima view {recording} -e {row['choice.estimator']} {words} -o run.html"]
-    return [
-        f"estima record -o run.npz {words}",
-        f"estima view run.npz -e {row['choice.estimator']} {words} -o run.html",
-    ]
-
-
-def _same(value: Any, default: Any) -> bool:
-    """Whether a run's setting is the default; one that it has not got is."""
-    return bool(pd.isna(value) or value == default or str(value) == str(default))
-
-
-def _override(value: Any) -> str:
-    """A setting as a word of a command line."""
-    if isinstance(value, str) and not value.startswith("["):
-        return value if re.fullmatch(r"[\w./-]+", value) else f'"{paths.quoted(value)}"'
-    return f'"{value}"' if isinstance(value, str) else str(value)
 
 
 def _commands(folder: Path) -> list[str]:

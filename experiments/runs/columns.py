@@ -136,16 +136,57 @@ def is_setting(name: str) -> bool:
     return "." in name or name in _SETTINGS
 
 
-_UNITS = (
-    *("m", "rad", "deg", "s", "ms", "us", "hz", "mps", "radps", "m2", "rad2", "px", "gib"),
-    "percent",
-)
-_SPELT = {
-    **{"us": "µs", "hz": "Hz", "mps": "m/s", "radps": "rad/s", "m2": "m²", "rad2": "rad²"},
-    **{"gib": "GiB", "percent": "%"},
+_UNITS = {
+    **{unit: unit for unit in ("m", "rad", "deg", "s", "ms", "px", "kg")},
+    **{"us": "µs", "hz": "Hz", "mps": "m/s", "mps2": "m/s²", "radps": "rad/s", "m2": "m²"},
+    **{"rad2": "rad²", "radps_per_sqrt_s": "rad/s/√s", "gib": "GiB", "percent": "%"},
 }
-_ACRONYMS = ("ate", "ess", "nees", "rms", "rmse", "sd")
 _IN_METRES = ("kr", "kl")  # of settings, whose names do not say it
+_WORDS = {  # of names
+    **{"target": "class", "fov": "field of view", "focal": "focal length"},
+    **{"ess": "ESS", "kld": "KLD", "dof": "degrees of freedom"},
+    **{word: word.upper() for word in ("ate", "nees", "rms", "rmse", "sd")},
+}
+_GROUPS = {"choice": "", "simulation": "", "robots": "robot camera", "lidar3d": "3D lidar"}
+_SETTINGS_IN_WORDS = {  # where the rule does not give what one would say
+    "estimator.kr": "believed kr",
+    "estimator.kl": "believed kl",
+    "estimator.encoder_tick_m": "believed encoder tick",
+    "estimator.finish_s": "time limit of finish",
+    "estimator.forward_slip_m": "believed forward slip",
+    "estimator.limit_s": "estimator time limit",
+    "estimator.n_least": "least number of particles",
+    "estimator.n_most": "largest number of particles",
+    "estimator.n_nearest": "number of nearest nodes",
+    "estimator.n_rivals": "number of rival particles",
+    "estimator.repeat_s": "least time between repeated landmarks",
+    "estimator.robots": "sensor of sightings",
+    "robot.bias_left": "left wheel bias",
+    "robot.bias_right": "right wheel bias",
+    "robot.kr": "true kr",
+    "robot.kl": "true kl",
+    "robot.unmodelled_slip": "rate of unmodelled slip",
+    "robot.unmodelled_slip_m": "size of unmodelled slip",
+    "scoring.after_s": "start of scoring",
+    "scoring.longest_gap_s": "longest gap of the truth",
+    "team.communication.kind": "communication",
+    "world.bare_after_m": "length of the second bare stretch",
+    "world.bare_m": "length of the bare stretch",
+    "world.block_m": "block size",
+    "world.corridor_m": "corridor width",
+    "world.door_m": "door width",
+    "world.look_alike_share": "share of look-alike landmarks",
+    "world.n_x": "number of rooms or blocks along x",
+    "world.n_y": "number of rooms or blocks along y",
+    "world.objects_m": "length of the stretch with objects",
+    "world.on_walls_share": "share of landmarks on walls",
+    "world.room_m": "room size",
+    "world.rooms_visited": "number of rooms visited",
+    "world.second_leg_m": "length of the second leg",
+    "world.street_m": "street width",
+    "world.third_leg_m": "length of the third leg",
+    "world.tour_m": "tour length",
+}
 
 
 def title(name: str, *, short: bool = False) -> str:
@@ -154,7 +195,7 @@ def title(name: str, *, short: bool = False) -> str:
     Examples
     --------
     >>> title("ate_rmse_m"), title("choice.world"), title("sensors.stereo.max_distance_m")
-    ('position RMSE, m', 'world', 'max distance (stereo), m')
+    ('position RMSE, m', 'world', 'stereo max distance, m')
     >>> title("omega_radps"), title("ate_rmse_m_office"), title("recall_at_1_percent")
     ('omega, rad/s', 'ATE (office), m', 'recall at 1, %')
     """
@@ -167,29 +208,39 @@ def title(name: str, *, short: bool = False) -> str:
         words, unit = _setting(name)
     else:
         metric = next((m for m in COLUMNS if name.startswith(f"{m}_")), "")
+        own, unit = _parted(name)
+        words = " ".join(["number of", *own[1:]] if own[0] == "n" and own[1:] else own)
         if metric:
             of = name.removeprefix(f"{metric}_").replace("_", " ")
             words, unit = f"{COLUMNS[metric].symbol} ({of})", COLUMNS[metric].unit
-        else:
-            words, unit = _worded(name)
     return f"{words}, {unit}" if unit else words
 
 
 def _setting(name: str) -> tuple[str, str]:
-    """Words and unit of a dotted setting."""
-    *_, group, last = name.split(".")
-    words, unit = _worded(last)
-    return (words if group == "choice" else f"{words} ({group})"), unit
+    """Words and unit of a dotted setting: its group, then its own name."""
+    *_, above, group, last = ["", *name.split(".")]
+    own, unit = _parted(last)
+    if name in _SETTINGS_IN_WORDS:
+        return _SETTINGS_IN_WORDS[name], unit
+    if own[0] == "sigma":
+        own = [*own[1:], "sigma"]
+        group = "believed" if group == "estimator" else group
+    groups = [above, group] if group == "mount" else [group]
+    if ("n" in own[:1] or "per" in own) and above != "sensors":
+        groups = []  # of all of the world or the estimator
+    counted = ["number of"] if own[0] == "n" else []
+    named = [_GROUPS.get(each, each) for each in groups]
+    return " ".join(filter(None, [*counted, *named, *own[len(counted) :]])), unit
 
 
-def _worded(name: str) -> tuple[str, str]:
+def _parted(name: str) -> tuple[list[str], str]:
     """Words of a name, and the unit that it ends with."""
-    words, _, unit = name.rpartition("_")
-    if not words or unit not in _UNITS or (words[-1].isdigit() and unit == "m"):  # beyond_10_m
-        words, unit = name, "m" if name in _IN_METRES else ""
-    words = " ".join(w.upper() if w in _ACRONYMS else w for w in words.strip("_").split("_"))
-    words = f"number of {words[2:]}" if words.startswith("n ") else words
-    return words, _SPELT.get(unit, unit)
+    longest = max((unit for unit in _UNITS if name.endswith(f"_{unit}")), key=len, default="")
+    own = name.removesuffix(f"_{longest}").strip("_").split("_")
+    if own[-1].isdigit() and longest == "m":  # share_beyond_10_m
+        own, longest = [*own, longest], ""
+    unit = _UNITS.get(longest, "m" if name in _IN_METRES else "")
+    return [_WORDS.get(word, word) for word in own], unit
 
 
 def average_of(name: str) -> Average:

@@ -1,11 +1,12 @@
 """A team as an animation: all robots' paths, estimates and sightings on one clock."""
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
+from estimators.base import Estimate
 from estimators.team import run_team
 from experiments.runs.seeds import stream
 from experiments.viewing.style import BLACK
@@ -61,6 +62,12 @@ class TeamPlayback:
         last = max(robot.frame_stamps[-1] for robot in team.robots)
         return cls(robots, np.linspace(first, last, max(n_shown, 2)))
 
+    def beside(self, estimates: Sequence[Estimate], name: str) -> "TeamPlayback":
+        """The team with an estimate of each robot."""
+        robots = zip(self.robots, estimates, strict=True)
+        shown = tuple(replace(own, estimate=estimate, name=name) for own, estimate in robots)
+        return replace(self, robots=shown)
+
     @property
     def fps(self) -> float:
         """Pictures a second."""
@@ -101,11 +108,7 @@ def with_estimates(
             on_step=on_step,
         )
         found = [revised or online for online, revised in answers]
-    robots = tuple(
-        Playback(own.recording, own.rows, estimate, name)
-        for own, estimate in zip(shown.robots, found, strict=True)
-    )
-    return TeamPlayback(robots, shown.stamps, shown.grid, shown.seconds)
+    return shown.beside(found, name)
 
 
 def pictures(run: TeamPlayback) -> Iterator[Picture]:

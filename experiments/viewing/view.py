@@ -160,12 +160,24 @@ def estimate_of(
         if overrides:
             raise InputError(f"{overrides[0]}: overrides are for estimators that are run now")
         return read_estimate(recording, path), "estimate"
-    experiment = experiment_over(recording, source, overrides)
+    return estimate_by(
+        experiment_over(recording, source, overrides), recording, rows, on_step
+    ), source
+
+
+def estimate_by(
+    experiment: Experiment,
+    recording: Recording,
+    rows: NDArray[np.int64],
+    on_step: Callable[[int], None],
+    repeat: int = 0,
+) -> Estimate:
+    """Online estimate of an experiment's estimator, with what is drawn at the shown Frames."""
     if "keep_map" in experiment.config["estimator"]:
         experiment = experiment.with_estimator(keep_map=True)
     sparing = _Sparing(experiment.estimator(), set(rows.tolist()))
-    rng, prior = stream(experiment.seed, f"estimator/{source}", 0), experiment.prior(recording)
-    return run_estimator(sparing, recording, prior, rng, _EXTRAS, on_step), source
+    rng = stream(experiment.seed, f"estimator/{experiment.estimator_name}", repeat)
+    return run_estimator(sparing, recording, experiment.prior(recording), rng, _EXTRAS, on_step)
 
 
 def is_file_of_estimate(path: Path) -> bool:

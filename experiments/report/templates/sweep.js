@@ -2,6 +2,11 @@
 "use strict";
 const data = JSON.parse(document.getElementById("data").textContent);
 const columns = new Map([...data.settings, ...data.metrics].map((c) => [c.name, c]));
+for (const metric of data.metrics.filter((m) => m.name.startsWith("answer_"))) {
+  const name = metric.name.slice("answer_".length);
+  const [online, revised] = [name, `revised_${name}`].map((path) => columns.get(path)?.values ?? []);
+  metric.values = data.revised.map((is, row) => (is ? revised : online)[row] ?? null);
+}
 const byId = (id) => document.getElementById(id);
 const COLOURS = ["#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9", "#8c8c8c",
   "#AA3377", "#999933", "#7766dd", "#b0724a", "#44aa99"];
@@ -19,6 +24,11 @@ function distinct(name) {
   const values = [...new Set(columns.get(name).values.filter((v) => v !== null))];
   return values.sort((a, b) => (typeof a === "number" ? a - b : String(a).localeCompare(b)));
 }
+
+// What tells a run from others.
+const named = (row) => data.settings
+  .filter((s) => s.values[row] !== null && new Set(s.values).size > 1)
+  .map((s) => `${s.title}: ${s.values[row]}`);
 
 function setUp() {
   const settings = data.settings.map((c) => [c.name, c.title]);
@@ -67,8 +77,18 @@ function grouped(rows, key) {
 }
 
 // Numbers as plots have them, and those of a logarithmic axis that spans little.
-const written = (v) => (v && Math.abs(v) < 1e-3 ? v.toExponential() : String(v));
+const written = (v) => (v && Math.abs(v) < 1e-4 ? v.toExponential() : String(v));
 const NUMBERS = Array.from({ length: 36 }, (_, i) => [1, 2, 5].map((m) => Number(`${m}e${i - 18}`))).flat();
+
+// Where values stand on the x axis: each colour a little beside the others, as in plots.
+function placed(order, beside, n, { numeric, joined, wide }) {
+  const [low, high] = [order[0], order[order.length - 1]];
+  if (wide) return (v) => v * (high / low) ** (0.006 * beside);
+  if (joined) return (v) => v + 0.006 * (high - low) * beside;
+  const apart = numeric ? Math.min(high - low, ...order.slice(1).map((v, i) => v - order[i])) : 1;
+  const shift = apart * Math.min(0.12, 0.7 / n) * beside;
+  return (v) => (numeric ? v : order.indexOf(v)) + shift;
+}
 
 // A text of a file as Plotly's labels show it, which read some of HTML.
 const safe = (text) => String(text).replaceAll("&", "&amp;").replaceAll("<", "&lt;").replaceAll(">", "&gt;");
@@ -122,14 +142,18 @@ function draw() {
   const order = distinct(x);
   const numeric = order.every((v) => typeof v === "number");
   const of = (name, row) => (name ? columns.get(name).values[row] : "");
-  const at = (value) => (numeric ? value : safe(value));
+  const joined = numeric && !["repeat", ...data.drawn].includes(x); // seeds have no order
+  const wide = joined && byFactors(order);
   const panelNames = panels ? distinct(panels).filter((v) => rows.some((r) => of(panels, r) === v)) : [""];
   const colours = colour ? distinct(colour) : [""];
   const groups = grouped(rows, (row) => [of(panels, row), of(colour, row), of(x, row)].join("\u0000"));
   const alone = [...groups.values()].every((g) => new Set(g.map((r) => data.recording[r])).size === 1);
   const repeated = alone && [...groups.values()].some((g) => new Set(g.map((r) => data.repeat[r])).size > 1);
   const unit = repeated ? data.repeat : data.recording;
-  const across = Math.min(panelNames.length, innerWidth < 700 ? 1 : 3);
+  const narrow = matchMedia("(max-width: 700px)").matches;
+  // where means have bars, their runs' dots stand to the left of them
+  const aside = numeric || [...groups.values()].every((g) => g.length === 1) ? 0 : -0.4;
+  const across = Math.min(panelNames.length, narrow ? 1 : 3);
   const down = Math.ceil(panelNames.length / across);
   const traces = [];
   const found = [];
@@ -147,19 +171,22 @@ function draw() {
       if (!mine.length) return;
       const label = safe(name);
       const shared = { xaxis: `x${axis}`, yaxis: `y${axis}`, legendgroup: label, name: label };
+      const beside = (shift) =>
+        placed(order, c - (colours.length - 1) / 2 + shift, colours.length, { numeric, joined, wide });
+      const at = beside(0);
       const paint = COLOURS[c % COLOURS.length];
       if (byId("each").checked) {
         traces.push({ ...shared, type: "scatter", mode: "markers", showlegend: false,
-          x: mine.map((row) => at(of(x, row))), y: mine.map((row) => metric.values[row]),
-          marker: { color: paint, size: 5, opacity: 0.35 },
-          text: mine.map((row) => data.settings.filter((s) => s.values[row] !== null)
-            .map((s) => `${s.title}: ${s.values[row]}`).concat(data.status[row]).map(safe).join("<br>")),
+          x: mine.map((row) => beside(aside)(of(x, row))), y: mine.map((row) => metric.values[row]),
+          marker: { color: paint, size: 6, opacity: 0.45 }, customdata: mine,
+          text: mine.map((row) => [...named(row), data.statuses[data.status[row]]].map(safe).join("<br>")),
           hovertemplate: "%{y:.4g}<br>%{text}<extra></extra>" });
       }
       const points = order.map((v) => [v, mine.filter((row) => of(x, row) === v)])
-        .filter(([, some]) => some.length).map(([v, some]) => ({ at: at(v), ...average(some, metric, unit) }));
+        .filter(([, some]) => some.length).map(([v, some]) => ({ at: at(v),
+          row: some.length === 1 ? some[0] : undefined, ...average(some, metric, unit) }));
       found.push(...points);
-      traces.push({ ...shared, type: "scatter", mode: numeric ? "lines+markers" : "markers",
+      traces.push({ ...shared, type: "scatter", mode: joined ? "lines+markers" : "markers",
         showlegend: Boolean(colour) && !traces.some((t) => t.name === label && t.showlegend),
         x: points.map((point) => point.at), y: points.map((point) => point.value),
         marker: { color: paint, symbol: MARKERS[c % MARKERS.length], size: 9 },
@@ -167,34 +194,38 @@ function draw() {
         error_y: { type: "data", symmetric: false, color: paint, thickness: 1.5,
           array: points.map((point) => point.high - point.value || 0),
           arrayminus: points.map((point) => point.value - point.low || 0) },
-        customdata: points.map((point) => [point.low, point.high, point.n]),
+        customdata: points.map((point) => [point.low, point.high, point.n, point.row]),
         hovertemplate: points.map((point) => "<b>%{y:.4g}</b>"
           + (point.n > 2 ? " [%{customdata[0]:.3g}, %{customdata[1]:.3g}]" : "")
-          + ", mean of %{customdata[2]}<extra>%{fullData.name}</extra>") });
+          + (point.n > 1 ? ", mean of %{customdata[2]}" : "") + "<extra>%{fullData.name}</extra>") });
     });
   });
   const means = found.map((point) => point.value).sort((a, b) => a - b);
   const log = metric.log && means[0] > 0 && means[means.length - 1] >= 10 * means[0];
   const decades = means[means.length - 1] / means[0];
   const legend = 25 * colours.length;
-  const height = innerWidth < 700 ? Math.max(420, 330 * down) + legend
+  const height = narrow ? Math.max(420, 330 * down) + legend
     : Math.max(420, 330 * down, 180 + legend);
+  // where a narrow legend begins: below the ticks, whose words are slanted, and the axis' title
+  const below = 70 + (numeric ? 0 : 3.5 * Math.max(...order.map((v) => String(v).length)));
   const layout = {
     height, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
     font: { color: ink, family: "system-ui, sans-serif", size: 13 }, annotations,
     margin: { l: 70, r: 15, t: 50, b: 60 }, hovermode: "closest",
     modebar: { bgcolor: "rgba(0,0,0,0)", color: ink, activecolor: ink },
     hoverlabel: { namelength: -1 },
-    legend: innerWidth < 700 ? { orientation: "h", y: -0.25 } : { title: { text: colour ? safe(columns.get(colour).title) : "" } },
+    legend: narrow ? { orientation: "h", y: -below / (height - 110 - legend), yanchor: "top" }
+      : { title: { text: colour ? safe(columns.get(colour).title) : "" } },
     grid: { rows: down, columns: across, pattern: "independent", xgap: 0.12, ygap: 0.3 },
   };
   panelNames.forEach((_, p) => {
     const axis = p ? String(p + 1) : "";
     const lines = { gridcolor: line, linecolor: line, zerolinecolor: line, automargin: true };
     layout[`xaxis${axis}`] = { ...lines, title: { text: p >= panelNames.length - across ? safe(xs.title) : "" },
-      ...(numeric ? { type: byFactors(order) ? "log" : "linear",
+      ...(numeric ? { type: wide ? "log" : "linear",
         ...(order.length <= 8 ? { tickvals: order, ticktext: order.map(written) } : {}) }
-        : { type: "category", categoryorder: "array", categoryarray: order.map(safe) }),
+        : { type: "linear", tickvals: order.map((_, i) => i), ticktext: order.map(safe),
+          zeroline: false, ticklabeloverflow: "allow", tickangle: narrow ? -30 : "auto" }),
       ...(p ? { matches: "x" } : {}) };
     layout[`yaxis${axis}`] = { ...lines, title: { text: p % across ? "" : safe(metric.title) },
       type: log ? "log" : "linear", ...(log && decades >= 100 ? { dtick: 1 } : {}),
@@ -222,4 +253,45 @@ function say(rows, x, colour, panels, metric, repeated, bounded, missing) {
     (others.length ? ` Each point also averages over ${others.join("; ")}: choose a colour, panels, or only some.` : "");
 }
 
+// What a click on a run's dot offers: its picture, or the command that draws it.
+function pick(event) {
+  const row = event.points.map(({ customdata: c }) => (Array.isArray(c) ? c[3] : c)).find(Number.isInteger);
+  if (row === undefined) return;
+  const key = data.keys[row];
+  const picture = data.pictures[key];
+  const made = document.createElement(picture ? "a" : "code");
+  if (picture) made.href = picture;
+  made.textContent = picture ? "watch" : `estima view ${data.name}/${key} -o run.html`;
+  byId("picked").replaceChildren(`${named(row).join(", ")}. `, made, " ");
+  if (picture) return;
+  const copy = document.createElement("button");
+  copy.className = "copy";
+  copy.textContent = "copy";
+  byId("picked").append(copy);
+}
+
+// A button copies the command before it; where that is not allowed, it selects it.
+async function copied(event) {
+  if (!event.target.matches(".copy")) return;
+  const command = event.target.previousElementSibling;
+  getSelection().selectAllChildren(command);
+  try {
+    await navigator.clipboard.writeText(command.textContent);
+    event.target.textContent = "copied";
+  } catch {
+    event.target.textContent = "selected";
+  }
+}
+
+// Of one estimator some best and worst runs; of all, the first of each.
+function showExtremes() {
+  const of = byId("of").value;
+  for (const row of byId("extremes").tBodies[0].rows) {
+    row.hidden = of ? row.dataset.estimator !== of : !("first" in row.dataset);
+  }
+}
+
 setUp();
+byId("chart").on("plotly_click", pick);
+byId("of").addEventListener("change", showExtremes);
+document.addEventListener("click", copied);
