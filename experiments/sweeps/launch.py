@@ -485,13 +485,14 @@ def _record_death(experiment: Experiment, jobs: Jobs) -> None:
 def _watched(jobs: Jobs, n_runs: int) -> Iterator[None]:
     """Show how many runs are done and failed, at what rate, and the time that remains.
 
-    The rate counts from the second run on that ended after code was last compiled.
+    The rate counts from the second run on, and again from the second that ended after code was
+    compiled: imports and compiling say nothing of the rest.
     """
     ended = threading.Event()
 
     def watch() -> None:
         counts: dict[Path, tuple[int, int, int]] = {}
-        compiled_ns, done_then, shown = 0, -2, 0
+        compiled_ns, done_then, shown = 0, 0, 0
         with progress("", n_runs, "runs", summary=True) as on_progress:
             over = False
             while not over:
