@@ -340,7 +340,7 @@ def plot(
     >>> quick = ("simulation.physics=kinematic", "route=linear_1", "hydra/launcher=basic")
     >>> table = estima.sweep(*quick, "robot.kr=1e-5,1e-4", "seed=range(0,2)")
     >>> estima.plot(table, x="robot.kr", y="ate_rmse_m").axes[0].get_xlabel()
-    'kr (robot), m'
+    'true kr, m'
     """
     from experiments.report.plot import sweep_figure
     from experiments.runs.row import Outcome
