@@ -34,7 +34,10 @@ def runs_of(name, folder):
     return list({run.estimator_name: run for run in reversed(runs)}.values())
 
 
-@pytest.mark.parametrize("name", STUDIES)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=[pytest.mark.slow] * (n == "peers")) for n in STUDIES],
+)
 def test_each_study_fits_together(name, tmp_path):
     for experiment in runs_of(name, tmp_path):
         with peers_may_be_missing():
