@@ -9,6 +9,7 @@ import pytest
 from experiments.papers.decristoforis2020 import figures as decristoforis2020
 from experiments.papers.gil2008 import figures as gil2008
 from experiments.papers.maximo2024 import figures as maximo2024
+from experiments.papers.teams import figures as teams
 
 ERRORS = (
     "revised_ate_rmse_m",
@@ -72,8 +73,8 @@ def runs(errors):
 
 def test_the_drive_drawn_tells_its_errors():
     drawn = runs({"odometry": 1.0, "icp": 0.5, "fusion": 0.1}).query("seed == 0")
-    told = decristoforis2020._of_drawn(drawn.assign(distance_m=300.2), "ate_rmse_m", "RMSE, m")
-    assert told == "seed 0, 300 m: RMSE, m: odometry 1.00, ICP 0.50, fusion 0.10"
+    told = decristoforis2020._of_drawn(drawn.assign(distance_m=300.2), "ate_rmse_m", "RMSE")
+    assert told == "300 m, seed 0; RMSE: odometry 1.00 m, ICP 0.50 m, fusion 0.10 m"
 
 
 def test_the_map_of_the_order_has_intervals_and_its_boundary():
@@ -85,11 +86,11 @@ def test_the_map_of_the_order_has_intervals_and_its_boundary():
     )
     page = decristoforis2020.ordering(table)
     fused, alone, same = page.axes[:3]
-    assert [text.get_text() for text in fused.texts] == ["2\n2-2", "0.5\n0.5-0.5"]
+    assert [text.get_text() for text in fused.texts] == ["2\n2–2", "0.5\n0.5–0.5"]
     (boundary,) = fused.lines
     np.testing.assert_array_equal(boundary.get_xdata(), [0.5, 0.5])
     assert not alone.lines  # better everywhere
-    assert {text.get_text() for text in same.texts} == {"1\n1-1"}
+    assert {text.get_text() for text in same.texts} == {"1\n1–1"}
     assert page.axes[-1]._colorbar.extend == "both"
 
 
@@ -143,3 +144,17 @@ def test_figure_8_shows_both_designs():
         for drawn in ax.containers:
             assert drawn.lines[0].get_ydata() == pytest.approx([mean, mean])
     assert "2 runs each" in page.get_suptitle()
+
+
+def test_robots_that_drive_the_same_way_all_show():
+    way = np.array([[0.0, 0.0], [4.0, 0.0]])
+    run = {"walls": np.array([[0.0, -1.0, 4.0, -1.0]]), "wall_z_m": np.array([[0.0, 2.0]])}
+    run |= {f"truth_{number}": way for number in range(3)}
+    run |= {f"sightings_{number}": np.zeros((0, 4)) for number in range(3)}
+    page = teams.drive(run)
+    paths = [line for line in page.axes[0].lines if line.get_label().startswith("robot")]
+    assert len(paths) == 3
+    assert all(a.get_linewidth() >= b.get_linewidth() + 1.0 for a, b in itertools.pairwise(paths))
+    named = [text.get_text() for text in page.legends[0].get_texts()]
+    assert "start" in named
+    assert any("sighting" in name for name in named)

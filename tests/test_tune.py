@@ -238,3 +238,11 @@ def test_the_tables_keep_what_was_not_tuned_now(tmp_path):
     found = write(["a"], 3.0)
     assert list(found["gain"]) == [3.5, 2.5, 1.5]
     pd.testing.assert_frame_equal(pd.read_csv(path), found)
+
+
+def test_no_two_estimators_are_drawn_alike():
+    names = [f"method_{i}" for i in range(11)]
+    trials = pd.DataFrame({"estimator": names, "trial": 1, "best_so_far_m": 0.1})
+    gains = pd.DataFrame({"estimator": names, "tuned_over_default": 1.0, "low": 0.9, "high": 1.1})
+    lines = tuning.curves(trials, gains).axes[0].lines
+    assert len({(line.get_color(), line.get_marker()) for line in lines}) == len(names)

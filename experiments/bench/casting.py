@@ -28,8 +28,8 @@ def _scans(n_boxes: int) -> list[Measurement]:
     many = median_time_s(caster.cast_many, batches) / _BATCH
     name, faces = f"sim.scan_exact_{n_boxes}", f"721 beams, {len(world.walls)} faces"
     return [
-        Measurement(f"{name}_us", each * 1e6, "us", _GOAL_US[n_boxes], note=f"{faces}, one call"),
-        Measurement(f"{name}_batch_us", many * 1e6, "us", note=f"{faces}, in batches of {_BATCH}"),
+        Measurement(f"{name}_us", each * 1e6, "µs", _GOAL_US[n_boxes], note=f"{faces}, one call"),
+        Measurement(f"{name}_batch_us", many * 1e6, "µs", note=f"{faces}, in batches of {_BATCH}"),
     ]
 
 
@@ -41,8 +41,8 @@ def _other_rays() -> list[Measurement]:
     origins = [(np.append(pose[:2], 0.5),) for pose in poses]
     sight = median_time_s(lambda origin: visible(world, origin, points), origins)
     return [
-        Measurement("sim.cloud_exact_us", cloud * 1e6, "us", note=f"16 x 720 rays, {faces}"),
-        Measurement("sim.visible_exact_us", sight * 1e6, "us", note=f"800 points, {faces}"),
+        Measurement("sim.cloud_exact_us", cloud * 1e6, "µs", note=f"16 x 720 rays, {faces}"),
+        Measurement("sim.visible_exact_us", sight * 1e6, "µs", note=f"800 points, {faces}"),
     ]
 
 

@@ -35,4 +35,4 @@ def run() -> Iterator[Measurement]:
     median_s = median_time_s(estimator.step, [(frame,) for frame in frames])
     estimator.finish()
     note = f"{_N_BEAMS} beams, echo child"
-    yield Measurement("external.roundtrip_us", 1e6 * median_s, "us", _GOAL_US, note=note)
+    yield Measurement("external.roundtrip_us", 1e6 * median_s, "µs", _GOAL_US, note=note)

@@ -68,7 +68,7 @@ def run() -> Iterator[Measurement]:
         yield Measurement(
             f"growth.{name}.step_us",
             late,
-            "us",
+            "µs",
             note=f"at the end; {early:.0f} in minutes 2-4, {middle:.0f} in 7-9",
         )
         yield Measurement(
@@ -90,7 +90,7 @@ def _alone(function: Callable[[str], T], name: str) -> T:
 
 
 def driven(name: str) -> tuple[list[float], list[float]]:
-    """Mean processor time of a step in each minute, us, and memory after it, MiB."""
+    """Mean processor time of a step in each minute, µs, and memory after it, MiB."""
     step_us, memory_mib = [], []
     for _, steps in _minutes(name):
         step_us.append(1e6 * statistics.fmean(seconds for seconds, _ in steps))

@@ -151,7 +151,7 @@ def _covariances(pairs: list[Pair]) -> list[Measurement]:
         Measurement(
             f"icp.covariance.{name}_us",
             1e6 * median_time_s(method, inputs),
-            "us",
+            "µs",
             goals.get(name),
             note=notes.get(name, ""),
         )

@@ -66,6 +66,6 @@ def run() -> list[Measurement]:
         scan_s = median_time_s(lambda pose: scan(laser, pose), [(pose,) for pose in poses])
     return [
         *results,
-        Measurement("sim.scan_bullet_30_us", 1e6 * scan_s, "us", note="the same scan by Bullet"),
+        Measurement("sim.scan_bullet_30_us", 1e6 * scan_s, "µs", note="the same scan by Bullet"),
         Measurement("sim.peak_memory_mib", memory_mib, "MiB", note="of the process so far"),
     ]

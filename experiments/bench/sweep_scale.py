@@ -60,15 +60,15 @@ def run() -> list[Measurement]:
         Measurement(
             "sweep.plan_us_per_run",
             1e6 * plan_s / _N_RUNS,
-            "us",
+            "µs",
             200.0,
             note="with the jobs' files",
         ),
-        Measurement("sweep.resume_us_per_run", 1e6 * resume_s / _N_RUNS, "us", 60.0),
+        Measurement("sweep.resume_us_per_run", 1e6 * resume_s / _N_RUNS, "µs", 60.0),
         Measurement(
             "sweep.table_us_per_row",
             1e6 * table_s / _N_RUNS,
-            "us",
+            "µs",
             25.0,
             note=f"read and averaged; {table_mib:.0f} MiB of memory",
         ),

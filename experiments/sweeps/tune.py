@@ -36,7 +36,7 @@ from experiments.runs.row import Outcome, Row, read_rows, write_frame
 from experiments.sweeps.plan import planned
 from experiments.sweeps.ranges import FIRST_JUDGED_SEED, Range, Tuning
 from experiments.viewing.plotting import plain_log
-from experiments.viewing.style import CYCLE, subplots
+from experiments.viewing.style import SERIES, subplots
 from sim.errors import InputError, require
 from sim.files import write_text
 
@@ -192,20 +192,23 @@ def curves(trials: pd.DataFrame, gains: pd.DataFrame) -> Figure:
     """Draw the best value against the trials, and the gains that were judged."""
     names = list(gains["estimator"])
     page, (left, right) = subplots(10.0, 3.8, 1, 2)
-    styles = ("-", "--", ":")
-    for i, name in enumerate(names):
-        rows = trials[trials["estimator"] == name]
-        style = {"color": CYCLE[i % len(CYCLE)], "ls": styles[i // len(CYCLE) % len(styles)]}
-        best = rows["best_so_far_m"].to_numpy(float)
-        left.step(rows["trial"], best / best[0], where="post", label=name, **style)
-    left.set(xlabel="trials", ylabel="best error over the default's, tuning seeds", yscale="log")
-    page.legend(loc="outside lower center", ncols=4, fontsize=8)
     places = np.arange(len(names))[::-1]
-    at = gains["tuned_over_default"].to_numpy(float)
-    reach = [at - gains["low"].to_numpy(float), gains["high"].to_numpy(float) - at]
-    right.errorbar(at, places, xerr=np.nan_to_num(reach), fmt="o", color=CYCLE[0], capsize=3)
+    judged = gains.set_index("estimator")[["low", "tuned_over_default", "high"]]
+    for i, (name, place) in enumerate(zip(names, places, strict=True)):
+        rows = trials[trials["estimator"] == name]
+        colour, marker = SERIES[i % len(SERIES)]
+        style = {"color": colour, "marker": marker, "ms": 6}
+        best = rows["best_so_far_m"].to_numpy(float)
+        at = [i % len(best)]  # one mark a line, at trials of their own, where lines are the same
+        left.step(rows["trial"], best / best[0], where="post", label=name, markevery=at, **style)
+        low, gain, high = judged.loc[name]
+        right.errorbar(gain, place, xerr=[[gain - low], [high - gain]], capsize=3, **style)
+    left.set(
+        xlabel="trials", ylabel="best error over the default's,\nseeds of tuning", yscale="log"
+    )
+    page.legend(loc="outside lower center", ncols=4, fontsize=8)
     right.axvline(1.0, color="0.6", lw=0.8, ls="--")
-    right.set(xlabel="error of the tuned over that of the default, judged seeds", xscale="log")
+    right.set(xlabel="error over the default's, other seeds, 95 % interval", xscale="log")
     right.set_yticks(places, names)
     plain_log(left.yaxis)
     plain_log(right.xaxis)

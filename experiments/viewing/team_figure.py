@@ -27,6 +27,11 @@ def colour_of(number: int) -> str:
     return _COLOURS[number % len(_COLOURS)]
 
 
+def path_width(number: int, size: int) -> float:
+    """Width of a robot's path, points: each one narrower, so that none hides those below it."""
+    return 1.4 * (size - number)
+
+
 def sightings(robots: Sequence[Recording], number: int) -> tuple[Array, NDArray[np.float64]]:
     """Stamps (S,) s of a robot's sightings, and true lines (S, 2, 2) m, in map.
 
@@ -53,11 +58,12 @@ def sightings(robots: Sequence[Recording], number: int) -> tuple[Array, NDArray[
 
 def draw_sightings(ax: Axes, lines: Array, number: int) -> None:
     """Draw a robot's sightings (S, 2, 2), m, in map."""
-    ax.add_collection(LineCollection(list(lines), colors=colour_of(number), lw=0.5, alpha=0.4))
+    colour = colour_of(number)
+    ax.add_collection(LineCollection(list(lines), colors=colour, lw=0.5, alpha=0.6, zorder=1))
 
 
 def draw_paths(ax: Axes, run: Mapping[str, Array]) -> None:
-    """Draw a world's walls, and the true paths of a team.
+    """Draw a world's walls, and the true paths of a team, which show where they lie on each other.
 
     Parameters
     ----------
@@ -65,10 +71,12 @@ def draw_paths(ax: Axes, run: Mapping[str, Array]) -> None:
         Arrays: `walls`, `wall_z_m`, and of each robot `truth_N` (T, 2) m, in map.
     """
     draw_walls(ax, run["walls"], run["wall_z_m"])
-    for number in range(sum(name.startswith("truth_") for name in run)):
+    size = sum(name.startswith("truth_") for name in run)
+    for number in range(size):
         path, colour = run[f"truth_{number}"], colour_of(number)
-        ax.plot(*path.T, color=colour, lw=1.8, label=f"robot {number}")
-        ax.plot(*path[0], "o", color=colour, ms=6)
+        ax.plot(*path.T, color=colour, lw=path_width(number, size), label=f"robot {number}")
+        ax.plot(*path[0], "o", color=colour, mec=BLACK, ms=8, zorder=3)
+    ax.plot([], [], "o", color="white", mec=BLACK, ms=8, label="start")
     plan_axes(ax)
 
 
@@ -88,7 +96,8 @@ def team_figure(found: Sequence[tuple[Recording, Estimate]], name: str) -> Figur
         colour: Any = {"color": colour_of(number)}
         if recording.truth is not None:
             truth = recording.truth_at(estimate.stamps)
-            plan.plot(*recording.truth.poses[:, :2].T, lw=1.6, **colour)
+            lw = path_width(number, len(found))
+            plan.plot(*recording.truth.poses[:, :2].T, lw=lw, **colour)
             draw_sightings(plan, sightings(robots, number)[1], number)
             off_m = position_errors_m(truth, estimate.means)
             errors.plot(estimate.stamps, off_m, lw=1.2, label=f"robot {number}", **colour)

@@ -56,10 +56,15 @@ NAMES = {
     "fusion_clone": "our fusion",
 }
 _DEG = float(np.degrees(1.0))
-_METHODS = (
-    "censi_last", "hessian_points", "sampling", "censi", "censi_sliding", "hessian",
-    "unscented_censi",
-)  # fmt: skip
+_METHODS = {
+    "censi_last": "Censi, last scan's noise",
+    "hessian_points": "Hessian of points",
+    "sampling": "sampling",
+    "censi": "Censi",
+    "censi_sliding": "Censi, sliding matches",
+    "hessian": "Hessian",
+    "unscented_censi": "unscented Censi",
+}
 
 
 def draw(made: Results) -> dict[str, Figure]:
@@ -167,7 +172,7 @@ def trajectories(office: Arrays, drawn: pd.DataFrame) -> Figure:
         ax.plot(*office[method].T, style, color=COLORS[method], lw=1.2, label=NAMES[method])
         off = np.hypot(*(office[method] - office["truth"]).T)
         below.semilogy(office["stamp_s"], np.maximum(off, 1e-4), color=COLORS[method], lw=1.0)
-    ax.set_title(_of_drawn(drawn, "ate_rmse_m", "position RMSE, m"), size=9)
+    ax.set_title(_of_drawn(drawn, "ate_rmse_m", "position RMSE"), size=9)
     top.legend(*ax.get_legend_handles_labels(), loc="outside upper center", ncols=4)
     below.set(xlabel="time, s", ylabel="position error, m")
     return page
@@ -176,15 +181,17 @@ def trajectories(office: Arrays, drawn: pd.DataFrame) -> Figure:
 def _of_drawn(drawn: pd.DataFrame, column: str, words: str) -> str:
     """Each method's value for the long drive that is drawn."""
     values = drawn.set_index("method")[column]
-    parts = ", ".join(f"{NAMES[method]} {values[method]:.2f}" for method in PAPERS_OWN)
-    return f"seed {drawn['seed'].iloc[0]}, {drawn['distance_m'].iloc[0]:.0f} m: {words}: {parts}"
+    parts = ", ".join(f"{NAMES[method]} {values[method]:.2f} m" for method in PAPERS_OWN)
+    return f"{drawn['distance_m'].iloc[0]:.0f} m, seed {drawn['seed'].iloc[0]}; {words}: {parts}"
 
 
 def boxes(table: pd.DataFrame) -> Figure:
     """Figure 4: absolute errors of position and heading over all recordings."""
     page, axes = subplots(8.0, 3.8, 1, 2)
     _boxes(axes, table)
-    page.suptitle("all recordings; box: quartiles, whiskers: 1.5 times their distance", size=9)
+    page.suptitle(
+        "all recordings; box: quartiles; whiskers: within 1.5 times the interquartile range", size=9
+    )
     return page
 
 
@@ -230,7 +237,7 @@ def maps(office: Arrays, drawn: pd.DataFrame) -> Figure:
         ax.plot(*office[f"{method}_points"].T, ",", color=TRUTH, alpha=0.8)
         ax.set_title(f"by {NAMES[method]}", fontsize="medium")
         ax.label_outer()
-    means = _of_drawn(drawn, "map_distance_m", "mean distance of points to walls, m")
+    means = _of_drawn(drawn, "map_distance_m", "mean distance of points to walls")
     page.suptitle(f"laser points (black) over the true walls (orange)\n{means}", size=9)
     return page
 
@@ -268,10 +275,10 @@ def runs(table: pd.DataFrame) -> Figure:
 
 def covariances(table: pd.DataFrame) -> Figure:
     """NEES of every covariance by metric and place, and its time."""
-    page, (*axes, times_axes) = subplots(11.0, 4.8, 1, 4, width_ratios=(1.0, 1.0, 1.0, 0.8))
+    page, (*axes, times_axes) = subplots(11.5, 4.8, 1, 4)
     nees = nees_intervals(table)
     for ax, metric in zip(axes, METRICS, strict=True):
-        ax.axvspan(*CONSISTENT, color=GREEN, alpha=0.2, lw=0)
+        ax.axvspan(*CONSISTENT, color=GREEN, alpha=0.2, lw=0, label="consistent")
         for j, (place, color) in enumerate(zip(PLACES, (BLUE, RED, ORANGE, GREEN), strict=True)):
             found = pd.DataFrame([nees[metric, place, method] for method in _METHODS])
             heights = np.arange(len(_METHODS)) + 0.16 * (j - 1.5)
@@ -280,23 +287,25 @@ def covariances(table: pd.DataFrame) -> Figure:
                 found["value"], heights, fmt="o", ms=4, color=color, label=place,
                 xerr=[found["value"] - low, found["high"] - found["value"]],
             )  # fmt: skip
-        ax.set(xscale="log", xlabel="NEES / dof", title=metric.replace("_", " "))
+        words = metric.replace("_", " ")
+        ax.set(xscale="log", xlabel="NEES / degrees of freedom", title=words)
     times = table.groupby(["metric", "method"])["time_us"].median().unstack("metric")
     for metric, marker, color in zip(METRICS, "os^", (BLUE, TRUTH, ORANGE), strict=True):
         times_axes.plot(
             times.loc[list(_METHODS), metric], range(len(_METHODS)), marker,
             color=color, mfc="none", label=metric.replace("_", " "),
         )  # fmt: skip
-    times_axes.set(xscale="log", xlabel="time, us", title="time of one")
+    times_axes.set(xscale="log", xlabel="time of one covariance, µs", title="time")
     times_axes.legend(loc="upper right", fontsize=7)
     for ax in (*axes, times_axes):
         ax.set_yticks(range(len(_METHODS)), [])
-        ax.invert_yaxis()
-    axes[0].set(yticklabels=[m.replace("_", " ") for m in _METHODS])
+        ax.set_ylim(len(_METHODS) - 0.5, -0.5)
+    axes[0].set(yticklabels=_METHODS.values())
     for ax in axes[:2]:
         ax.set(xlim=(0.4, max(8.0, *ax.get_xlim())))
-        plain_ticks(ax, [0.5, 1.0, 2.0, 4.0, 8.0])
-    return with_legend(page, ncols=4, loc="outside upper center")
+        low, high = ax.get_xlim()
+        plain_ticks(ax, (2.0**i for i in range(-1, 10) if low <= 2.0**i <= high))
+    return with_legend(page, ncols=5, loc="outside upper center")
 
 
 def beliefs(table: pd.DataFrame) -> Figure:
@@ -315,14 +324,24 @@ def beliefs(table: pd.DataFrame) -> Figure:
     axes[1].axvspan(*CONSISTENT, color=GREEN, alpha=0.2, lw=0)
     axes[0].set(
         xscale="log",
-        xlabel="position RMSE over that of right beliefs",
+        xlabel="position RMSE over that with true values",
         yticks=range(len(by_belief)),
-        yticklabels=list(by_belief.groups),
+        yticklabels=[_belief(str(name)) for name in by_belief.groups],
     )
     axes[0].invert_yaxis()
     axes[1].set(xscale="log", xlabel="NEES / 3")
-    page.suptitle("clone filter; dots: recordings, black: geometric mean with 95 %", size=9)
+    page.suptitle(
+        "our fusion; dot: a recording; green: consistent\nblack: geometric mean, 95 % interval",
+        size=9,
+    )
     return page
+
+
+def _belief(name: str) -> str:
+    """A belief about the noise in words."""
+    return {"right": "true values"}.get(
+        name, name.replace("sigma", "range noise").replace(" x ", " × ")
+    )
 
 
 def ordering(table: pd.DataFrame) -> Figure:
@@ -343,7 +362,7 @@ def ordering(table: pd.DataFrame) -> Figure:
             ax.set_title(f"{what}: {NAMES[better]} over {NAMES[worse]}", fontsize=8)
             ax.set(xlabel="kr = kl, m", ylabel="range noise, m")
             ax.label_outer()
-    label = "log of the mean ratio of RMSE (blue: the first is better)"
+    label = "natural log of the mean ratio of RMSE (blue: the first is better)"
     page.colorbar(drawn, ax=axes, label=label, extend="both")
     page.suptitle(
         "mean ratio of errors, 95 % interval below; line: where the order turns; bold: the "
@@ -363,7 +382,7 @@ def _grid(ax: Axes, found: pd.DataFrame) -> Any:
         color = "white" if abs(value) > 2.0 else "black"
         ends = low.iat[i, j], high.iat[i, j]
         clear = "bold" if ends[0] > 1.0 or ends[1] < 1.0 else "normal"
-        text = f"{_short(ratio.iat[i, j])}\n{_short(ends[0])}-{_short(ends[1])}"
+        text = f"{_short(ratio.iat[i, j])}\n{_short(ends[0])}–{_short(ends[1])}"
         ax.text(j, i, text, ha="center", va="center", size=6, color=color, weight=clear)
     below = logs < 0.0  # the boundary runs along the edges of cells
     for i, j in np.argwhere(below[:, 1:] != below[:, :-1]):
@@ -382,7 +401,7 @@ def _short(ratio: float) -> str:
 
 def steps(table: pd.DataFrame) -> Figure:
     """Registrations from scan to scan: correlation, accumulation, and the least possible error."""
-    page, axes = subplots(9.5, 3.4, 1, 3)
+    page, axes = subplots(9.5, 3.8, 1, 3)
     rows = table[table["rays"] == "exact"].assign(
         position=lambda row: row["step_error_m"] / row["step_bound_m"],
         heading=lambda row: row["step_error_rad"] / row["step_bound_rad"],
@@ -404,7 +423,7 @@ def steps(table: pd.DataFrame) -> Figure:
     axes[1].set(
         ylim=(0.0, None),
         xlabel="composed over",
-        ylabel="squared error over\nits covariance, / 3",
+        ylabel="NEES / 3",
         xticks=range(3),
         xticklabels=["one step", "1 s", "10 s"],
     )
@@ -413,6 +432,11 @@ def steps(table: pd.DataFrame) -> Figure:
         ylabel="RMS error of a step\nover the Fisher bound",
         xlim=(-0.5, 1.5),
         xticks=[0, 1],
-        xticklabels=["x, y", "heading"],
+        xticklabels=["position", "heading"],
+    )
+    page.supxlabel(
+        "dot: median of the recordings; bar: least to greatest\n"
+        "line: uncorrelated, consistent, at the bound",
+        size=9,
     )
     return with_legend(page, ncols=2, loc="outside upper center")

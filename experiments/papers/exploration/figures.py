@@ -9,7 +9,7 @@ from experiments.papers.exploration.claims import NAMES
 from experiments.papers.exploration.settings import AFTER_M, BASE, JUDGED
 from experiments.papers.results import Results
 from experiments.viewing.plotting import with_legend
-from experiments.viewing.style import BLACK, BLUE, GREEN, ORANGE, PURPLE, RED, subplots
+from experiments.viewing.style import BLACK, BLUE, GREEN, ORANGE, PURPLE, RED, WALL, subplots
 from experiments.viewing.team_figure import draw_paths
 
 _STRATEGIES = {
@@ -38,7 +38,7 @@ def drives(runs: dict[str, dict[str, Any]]) -> Figure:
         draw_paths(ax, run)
         ax.set_title(f"{NAMES[strategy]}, {AFTER_M:g} m a robot")
     handles, labels = panels[0].get_legend_handles_labels()
-    page.legend(handles, labels, loc="outside lower center", ncols=3)
+    page.legend(handles, labels, loc="outside lower center", ncols=4)
     return page
 
 
@@ -54,7 +54,9 @@ def by_distance(coverage: pd.DataFrame) -> Figure:
         ax.plot(middle.index, middle, ls=line, color=colour, lw=1.8, label=NAMES[strategy])
         ax.fill_between(middle.index, low, high, color=colour, alpha=0.15, lw=0)
     ax.axvline(AFTER_M, color=BLACK, lw=0.8)
-    ax.annotate("judged", (AFTER_M, 0.02), (4, 0), xycoords=("data", "axes fraction"),
-                textcoords="offset points", fontsize="small")  # fmt: skip
-    ax.set(xlabel="distance driven a robot, m", ylabel="floor seen by the team, m²")
+    ax.fill_between([], [], color=WALL, alpha=0.15, lw=0, label="quartiles of worlds")
+    ax.annotate(f"judged at {AFTER_M:g} m", (AFTER_M, 0.02), (-4, 0), ha="right",
+                xycoords=("data", "axes fraction"), textcoords="offset points",
+                fontsize="small")  # fmt: skip
+    ax.set(xlabel="distance driven a robot, m", ylabel="floor seen by the team, m², median")
     return with_legend(page, ncols=3)

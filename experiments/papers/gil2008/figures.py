@@ -53,6 +53,7 @@ _BATCH = PURPLE
 _NOISE = {"paper": "10 px", "pixel": "1 px"}
 _CHI_95_3D = 2.7955
 _PATH, _MAP = "revised_ate_rmse_m", "map_rmse_m"
+_INTERVALS = "geometric means over worlds, 95 % intervals"
 _BOTH = ((_PATH, "RMS of the path, m"), (_MAP, "RMS of the map, m"))
 
 
@@ -126,12 +127,13 @@ def association_ellipses() -> Figure:
     for name, mean, spread, colour in zip("AB", means, spreads, (BLUE, GREEN), strict=True):
         draw_ellipses(ax, [mean], [spread], fill=False, color=colour, lw=1.5)
         d = (z - mean) @ np.linalg.solve(spread + R, z - mean)
-        ax.plot(*mean, "o", color=colour, label=f"landmark {name}, distance {d:.1f}")
+        ax.plot(
+            *mean, "o", color=colour, label=f"landmark {name}: squared Mahalanobis distance {d:.1f}"
+        )
     draw_ellipses(ax, [z], [R], fill=False, color=RED, lw=1.5, ls="--")
-    ax.plot(*z, "x", color=RED, label="measurement")
-    plan_axes(ax, xlim=(-0.9, 1.9), ylim=(-1.0, 1.9))
-    ax.legend(loc="upper left")
-    return page
+    ax.plot(*z, "x", color=RED, label="measurement (ellipses: 95 %)")
+    plan_axes(ax, xlim=(-0.9, 1.9), ylim=(-1.0, 1.3))
+    return with_legend(page, ncols=1, loc="outside upper center")
 
 
 def world_3d(run: Arrays) -> Figure:
@@ -261,7 +263,8 @@ def by_particles(repeats: pd.DataFrame, bound: pd.DataFrame) -> Figure:
         ax.set_xlabel("particles M")
     n_runs = len(repeats[drawn]) // repeats.groupby(["filter", "n_particles"]).ngroups
     page.suptitle(
-        f"one drive, {n_runs} runs each; odometry errs by {repeats['odometry_rmse_m'][0]:.1f} m"
+        f"one drive, {n_runs} runs each, bars of two standard deviations; "
+        f"RMS error of odometry: {repeats['odometry_rmse_m'][0]:.1f} m"
     )
     return with_legend(page, ncols=4)
 
@@ -292,6 +295,7 @@ def by_particles_over_worlds(particles: pd.DataFrame, bound: pd.DataFrame) -> Fi
         row[0].set_ylabel("RMS error, m")
     for ax in grid[-1]:
         ax.set_xlabel("particles M")
+    page.suptitle(f"by image noise; aligned: fitted to the truth; {_INTERVALS}", size=9)
     # the noise that most filters ran on
     fullest = max(grid[:, 0], key=lambda ax: len(ax.get_legend_handles_labels()[0]))
     page.legend(*fullest.get_legend_handles_labels(), loc="outside lower center", ncols=4)
@@ -321,8 +325,9 @@ def by_distance(distance: pd.DataFrame) -> Figure:
                 band = (middle - bars[0], middle + bars[1])
                 ax.fill_between(middle.index, *band, color=colour, alpha=0.08, lw=0)
         ax.axvline(10.0, color=BLACK, lw=0.6, ls=":")
-        ax.set(xlabel="dmax, m", ylabel=label, yscale="log")
+        ax.set(xlabel="farthest distance of an observation (dmax), m", ylabel=label, yscale="log")
         plain_log(ax.yaxis)
+    page.suptitle(_INTERVALS, size=9)
     return with_legend(page, ncols=1, loc="outside right center")
 
 
@@ -331,16 +336,17 @@ def by_observations(observations: pd.DataFrame) -> Figure:
     page, axes = subplots(9.0, 3.8, 1, 2)
     for ax, (column, label) in zip(axes, _BOTH, strict=True):
         _by_filter(ax, observations, "n_seen", column)
-        ax.set(xscale="log", yscale="log", xlabel="most observations B", ylabel=label)
+        ax.set(xscale="log", yscale="log", xlabel="most observations of an image (B)", ylabel=label)
         plain_ticks(ax, observations["n_seen"], fontsize=8)
         plain_log(ax.yaxis)
+    page.suptitle(_INTERVALS, size=9)
     return with_legend(page, ncols=2)
 
 
 _WAYS = {
     "known": (BLACK, "known"),
-    "descriptor": (GREEN, "descriptors, $\\sigma$ = {sigma:g} ({alone:.0f} % right alone)"),
-    "mahalanobis": (ORANGE, "Mahalanobis, p0 = {p0:g}"),
+    "descriptor": (GREEN, "descriptors, $\\sigma$ = {sigma:g} (right alone: {alone:.0f} %)"),
+    "mahalanobis": (ORANGE, "Mahalanobis, $p_0$ = {p0:g}"),
     "ekf_slam": (RED, "EKF-SLAM, Mahalanobis"),
 }
 
@@ -379,7 +385,7 @@ def by_association(association: pd.DataFrame) -> Figure:
         plain_log(left.xaxis)
         right.set(xlim=(0.0, 1.0))
         right.tick_params(axis="y", left=False, labelleft=False)
-    left.set(xlabel="path error over odometry's (each world; diamonds: RMS)")
+    left.set(xlabel="path error over odometry's (tick: a world;\ndiamond: RMS; dotted: a half)")
     right.set(xlabel="share of right associations")
     return page
 
@@ -387,7 +393,7 @@ def by_association(association: pd.DataFrame) -> Figure:
 def by_settings(resampling: pd.DataFrame, noise: pd.DataFrame) -> Figure:
     """Resampling schemes, and where R is taken, by noise."""
     page, (left, right) = subplots(10.0, 3.8, 1, 2)
-    for j, (share, words) in enumerate(((1.0, "at every image"), (0.5, "ESS < M/2"))):
+    for j, (share, words) in enumerate(((1.0, "at every image"), (0.5, "when ESS < M / 2"))):
         part = resampling[resampling["ess_share"] == share]
         middle, bars = _intervals(part, "resampling", "revised_ate_aligned_rmse_m")
         left.errorbar(
@@ -418,6 +424,7 @@ def by_settings(resampling: pd.DataFrame, noise: pd.DataFrame) -> Figure:
     plain_ticks(right, noise["sigma_px"], fontsize=8)
     plain_log(right.yaxis)
     right.legend()
+    page.suptitle(_INTERVALS, size=9)
     return page
 
 
@@ -425,9 +432,9 @@ def cost(table: pd.DataFrame) -> Figure:
     """Time of a step against the number of landmarks in the map."""
     page, ax = subplots(5.5, 3.8)
     for maps_kind, part in table.groupby("maps", sort=False):
-        colour = BLUE if maps_kind == "shared" else ORANGE
+        colour, words = (BLUE, "shared") if maps_kind == "shared" else (ORANGE, "copied")
         wide = part.groupby("n_landmarks")["step_ms"]
-        ax.plot(wide.median(), "o-", color=colour, label=f"{maps_kind} maps")
+        ax.plot(wide.median(), "o-", color=colour, label=f"{words} maps: median, least to greatest")
         ax.fill_between(list(wide.groups), wide.min(), wide.max(), color=colour, alpha=0.2, lw=0)
     ax.set(xscale="log", yscale="log", xlabel="landmarks N", ylabel="time of a step, ms")
     ax.set_title("M = 1000, B = 20, resampling at every image", loc="left")

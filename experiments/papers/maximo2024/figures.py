@@ -37,6 +37,7 @@ _VERDICT = {
     Verdict.UNDECIDED: "#DDDDDD",
     Verdict.NOT_REPRODUCED: "#F2B48C",
 }
+_DESCRIPTORS = {"scan_context": "Scan Context", "ring_key": "ring key", "m2dp": "M2DP"}
 _RECALL = {"recall_at_1": "recall@1", "recall_at_1_percent": "recall@1 %"}
 
 
@@ -89,7 +90,7 @@ def clusters(drawn: dict[str, Arrays]) -> Figure:
         nodes, colours = place["nodes_m"].T, (rank * 7) % len(order)
         ax.plot(*nodes, color=WALL, lw=0.4)
         ax.scatter(*nodes, c=colours, cmap="nipy_spectral", s=9, zorder=2)
-        kind = f" ({DRAWN_DESCRIPTOR})" if name.startswith("campus") else ""
+        kind = f" ({_DESCRIPTORS[DRAWN_DESCRIPTOR]})" if name.startswith("campus") else ""
         plan_axes(ax, title=NAMES[name] + kind)
     return page
 
@@ -122,6 +123,7 @@ def dispersion(table: pd.DataFrame) -> Figure:
         axes[1].set(xlabel="step")
     columns[0][0][0].set(ylabel="dispersion, m")
     columns[0][0][1].set(ylabel="error, m")
+    page.suptitle("line: median; band: the middle 80 % of the runs", size=9)
     return with_legend(page, ncols=3)
 
 
@@ -177,7 +179,7 @@ def table_1(table: pd.DataFrame, weighting: pd.DataFrame) -> Figure:
                 bar = {"fmt": "D", "color": RED, "ms": 5, "label": "paper" * (i == 0)}
                 ax.errorbar(i + 0.3, row["paper_m"], yerr=row["paper_sd_m"], **bar)
         nearest = float(part["nearest_node_m"].iloc[0])
-        ax.axhline(nearest, color=WALL, ls=":", lw=1, label="nearest node")
+        ax.axhline(nearest, color=WALL, ls=":", lw=1, label="distance to the nearest node")
         ax.set(title=NAMES[name], xticks=range(3), xticklabels=METHODS, xlim=(-0.5, 2.6))
         _log_scale(ax)
         low, high = ax.get_ylim()
@@ -190,11 +192,12 @@ def table_2(table: pd.DataFrame) -> Figure:
     """Table 2: error and time per node by the number of particles, beside the paper's."""
     table = table[table["geometry"].isin(headlines(table["geometry"]))]
     page, columns = _columns(table, 4.2, 0.6, 5.4, n_rows=2)
-    here, paper = {"fmt": "o-", "color": BLUE}, {"fmt": "D--", "color": RED}
+    here: Any = {"fmt": "o-", "color": BLUE, "label": "here ± deviation of the repeats"}
+    paper: Any = {"fmt": "D--", "color": RED, "label": "paper ± its deviation"}
     for (upper, lower), name, part in columns:
         n = part["particles"]
-        upper.errorbar(n, part["error_m"], part["sd_repeats_m"], label="here", capsize=3, **here)
-        upper.errorbar(n, part["paper_m"], part["paper_sd_m"], label="paper", capsize=3, **paper)
+        upper.errorbar(n, part["error_m"], part["sd_repeats_m"], capsize=3, **here)
+        upper.errorbar(n, part["paper_m"], part["paper_sd_m"], capsize=3, **paper)
         top = 1.6 * float(np.nanmax(part[["error_m", "paper_m"]]))
         upper.set(title=NAMES[name], ylim=(0.0, top))
         lower.errorbar(n, 1e3 * part["time_s"], **here)
@@ -224,7 +227,7 @@ def quality(table: pd.DataFrame) -> Figure:
             for (i, j), value in np.ndenumerate(values):
                 ax.text(j, i, f"{value:.2f}", ha="center", va="center", fontsize=8)
             ax.set(
-                xlabel="B",
+                xlabel="neighbours (B)",
                 xticks=range(values.shape[1]),
                 xticklabels=values.columns,
                 yticks=range(len(values)),
@@ -247,7 +250,8 @@ def oxford_runs(table: pd.DataFrame) -> Figure:
         at = np.arange(len(errors)) + 0.15 * (i - 1)
         ax.plot(at, errors[method], "o", color=_COLOUR[method], ms=4, label=method)
     nearest = table.groupby("run")["nearest_node_m"].mean()
-    ax.plot(np.arange(len(errors)), nearest, "_", color=WALL, ms=14, label="nearest node")
+    label = "distance to the nearest node"
+    ax.plot(np.arange(len(errors)), nearest, "_", color=WALL, ms=14, label=label)
     ax.set_xticks(range(len(errors)), [run[:10] for run in errors.index], rotation=60, ha="right")
     ax.set(ylabel="mean error over the route, m", xlabel="Oxford run", yscale="log")
     plain_log(ax.yaxis)
@@ -262,12 +266,13 @@ def kidnapping(table: pd.DataFrame) -> Figure:
         for injects, trials in part.groupby(part["injection"] > 0.0):
             steps = np.sort(trials["settled_at"].fillna(np.inf))
             shares = np.searchsorted(steps, at, side="right") / len(steps)
-            label = "with injection" if injects else "without"
+            label = "with injection" if injects else "without injection"
             ax.plot(at, shares, color=BLUE if injects else ORANGE, label=label)
-        ax.axvline(RECOVERED_WITHIN, color=WALL, ls=":", lw=1)
+        label = f"judged at {RECOVERED_WITHIN} nodes"
+        ax.axvline(RECOVERED_WITHIN, color=WALL, ls=":", lw=1, label=label)
         ax.set(xlabel="nodes since the kidnapping", title=NAMES[name], ylim=(-0.03, 1.03))
     page.axes[0].set(ylabel="share recovered")
-    return with_legend(page, ncols=2)
+    return with_legend(page, ncols=3)
 
 
 def campus_errors(starts_table: pd.DataFrame, clusters_table: pd.DataFrame) -> Figure:
@@ -282,7 +287,8 @@ def campus_errors(starts_table: pd.DataFrame, clusters_table: pd.DataFrame) -> F
     page.legend(*left.get_legend_handles_labels(), loc="outside lower left", ncols=4, fontsize=8)
     part = clusters_table[clusters_table["geometry"].str.startswith("campus")]
     recall = part.groupby("descriptor")[list(_RECALL)].mean().loc[list(describers.KINDS)]
-    recall.rename(columns=_RECALL).plot.bar(ax=right, color=[BLUE, SKY], width=0.76, rot=0)
+    recall = recall.rename(columns=_RECALL, index=_DESCRIPTORS)
+    recall.plot.bar(ax=right, color=[BLUE, SKY], width=0.76, rot=0)
     for bars in right.containers:
         right.bar_label(bars, fmt="%.3f", fontsize=7)
     right.set(xlabel="", ylim=(0.0, 1.0), ylabel="share of queries")

@@ -21,6 +21,7 @@ def found_by(starts: pd.DataFrame) -> Figure:
     share = np.arange(len(found_m) + 1) / len(starts)
     left.step([0.0, *found_m, WITHIN_M], [*share, share[-1]], where="post", color=BLUE)
     left.axhline(0.9, color=WALL, lw=0.8, ls="--")
+    left.annotate("0.9", (29.5, 0.89), ha="right", va="top")
     left.set(
         xlabel="travel, m", ylabel="share of starts localised", ylim=(0, 1.02), xlim=(-0.5, 30)
     )
@@ -31,7 +32,7 @@ def found_by(starts: pd.DataFrame) -> Figure:
         right.plot(found, np.full(len(found), i), "|", color=BLUE, ms=9)
         right.plot(missed, np.full(len(missed), i), "x", color=RED, ms=5)
     right.set(
-        xlabel="travel until localised, m (x: not within 30 m)",
+        xlabel="travel until localised, m (×: not within 30 m)",
         ylabel="office, by seed",
         xlim=(-0.5, 32),
         yticks=range(len(offices)),

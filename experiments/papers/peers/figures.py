@@ -37,12 +37,13 @@ def errors(methods: pd.DataFrame) -> Figure:
         for place, (_, method) in zip(places, part.iterrows(), strict=True):
             color = BLUE if method["project"] == "Estima" else ORANGE
             filled = color if method["tuned"] else "white"
-            mark = {"color": color, "mfc": filled, "ls": "", "zorder": 3}
+            mark = {"color": color, "mfc": filled, "ls": "", "zorder": 2}
             for world, shape in _WORLDS.items():
-                left.plot(method[f"ate_rmse_m_{world}"], place, shape, ms=3.5, color=WALL, zorder=2)
+                error_m = method[f"ate_rmse_m_{world}"]
+                left.plot(error_m, place, shape, ms=5, color=WALL, mec="white", mew=0.5, zorder=3)
             left.plot(method["ate_rmse_m"], place, "o", ms=8, **mark)
             right.plot(method["cpu_time_us"], place, "o", ms=8, **mark)
-        for axes, label in ((left, "position error, RMS m"), (right, "processor time a Frame, us")):
+        for axes, label in ((left, "RMS position error, m"), (right, "processor time a Frame, µs")):
             axes.set(xscale="log", xlabel=label, ylim=(-0.7, len(names) - 0.3))
             axes.grid(axis="y", color="0.92")
         right.tick_params(axis="y", length=0)

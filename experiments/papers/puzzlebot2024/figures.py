@@ -65,8 +65,10 @@ def ideal_and_real(square: Arrays) -> Figure:
     parts = (square[name] for name in ("kr_kl_m", "real_m", "covariances_m2"))
     for ax, (kr, kl), real, covariances in zip(axes, *parts, strict=True):
         ax.plot(*real[1:].T, color=ORANGE, lw=0.4, alpha=0.35)
-        ax.plot(*real[0].T, color=ORANGE, lw=1.2, label=f"real robot ({len(real)} runs)")
-        ax.plot(*real[:, -1].T, ".", color=ORANGE, ms=3)
+        ax.plot(
+            *real[0].T, color=ORANGE, lw=1.2, label=f"real robot, ends as dots ({len(real)} runs)"
+        )
+        ax.plot(*real[:, -1].T, ".", color=ORANGE, ms=5)
         ax.plot(*means.T, color=BLUE, lw=1.4, label="ideal robot")
         draw_ellipses(
             ax, means[some], covariances[some], "95 % ellipse", fill=False, color=BLUE, lw=0.9
@@ -82,17 +84,17 @@ def square_feedback(table: pd.DataFrame, paths: Arrays) -> Figure:
         for ax, (feedback, steered) in zip(line, _FEEDBACKS.items(), strict=True):
             chosen = table["robot"].eq(robot) & table["feedback"].eq(feedback)
             rows = np.flatnonzero(chosen)
-            ax.plot(*paths["wanted_m"].T, color=BLACK, lw=3.0, alpha=0.25, label="wanted square")
+            ax.plot(*paths["wanted_m"].T, color=BLACK, lw=3.0, alpha=0.25, label="target square")
             for name, color, label in (
                 ("true_m", ORANGE, "true path"),
                 ("believed_m", BLUE, "path by odometry"),
             ):
                 ways = paths[name][rows]
                 ax.plot(*ways[1:].T, color=color, lw=0.4, alpha=0.5)
-                ax.plot(*ways[0].T, color=color, lw=1.2, label=label)
+                ax.plot(*ways[0].T, color=color, lw=1.2, label=f"{label}, ends as dots")
                 ax.plot(*ways[:, -1].T, ".", color=color, ms=5)
             end_m = table.loc[chosen, "true_end_m"].median()
-            title = f"{its}, {steered}\nmedian end {end_m:.2f} m from the corner wanted"
+            title = f"{its}, {steered}\nmedian end {end_m:.2f} m from the target"
             ax.set_title(title, fontsize="medium")
             ax.set(xlabel="x, m", ylabel="y, m", aspect="equal")
     return with_legend(page, ncols=3)
@@ -120,8 +122,8 @@ def ellipse_area(areas: pd.DataFrame, crossover: pd.DataFrame, straight: Arrays)
 def _crossover(ax: Axes, crossover: pd.DataFrame, straight: Arrays) -> None:
     """Draw the two spreads along a straight; they cross at track sqrt(3) / 2."""
     distance, spread = (1000.0 * straight[name] for name in ("distance_m", "sigma_m"))
-    ax.plot(distance, spread[:, 0], color=BLUE, label="along the way: borne by translation")
-    ax.plot(distance, spread[:, 1], color=ORANGE, label="across: borne by heading")
+    ax.plot(distance, spread[:, 0], color=BLUE, label="along the way, by translation")
+    ax.plot(distance, spread[:, 1], color=ORANGE, label="across, by heading")
     theory, found = 1000 * NOMINAL.track_m * np.sqrt(3.0) / 2.0, 1000 * crossover["crossover_m"]
     ax.axvline(theory, color=BLACK, lw=0.8, ls=":")
     ax.annotate(
@@ -131,7 +133,7 @@ def _crossover(ax: Axes, crossover: pd.DataFrame, straight: Arrays) -> None:
         textcoords="offset points",
         va="top",
     )
-    ax.set(xlabel="distance rolled, mm", ylabel="standard deviation, mm (k = 1e-5 m)")
+    ax.set(xlabel="distance rolled, mm", ylabel="standard deviation, mm\n(k = 1e-5 m)")
     ax.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0))
 
 
@@ -147,7 +149,7 @@ def calibration(table: pd.DataFrame) -> Figure:
                 part = table[chosen & table["joint"].eq(joint) & table["k_m"].eq(k)]
                 _estimates(ax, part, len(rows) - 1 - i, CYCLE[i // 2])
             ax.axvline(1.0, color=BLACK, lw=0.8)
-            arm = "gain and track joint" if joint else "nominal geometry"
+            arm = "gains and track estimated too" if joint else "nominal geometry"
             ax.set_title(f"k = {k:g} m\n{arm}", fontsize="small")
     labels = [f"{_METHODS[method]}, {_PARAMETERS[name]}" for method, name in rows]
     ticks = {"yticks": range(len(rows)), "yticklabels": labels[::-1]}
@@ -155,7 +157,7 @@ def calibration(table: pd.DataFrame) -> Figure:
     plain_ticks(axes[0, 0], [0.7, 1.0, 1.5, 2.0, 3.0, 4.0])
     page.supxlabel(
         "estimate over the truth: histogram, its mean (dot), mean 95 % interval (bar);\n"
-        "at the right, the share of intervals that cover",
+        "right: share of the intervals that hold the truth",
         fontsize="medium",
     )
     return page

@@ -107,13 +107,19 @@ def wheels(found: pd.DataFrame) -> Figure:
     """Khepera: kr and kl by the length of the blocks that residuals are summed over."""
     page, ax = subplots(5.5, 3.6)
     slip = found[found.block > 0].groupby(["log", "quantity"], sort=False)
-    for color, ((log, quantity), rows) in zip(CYCLE, slip, strict=False):
+    for i, (color, ((log, quantity), rows)) in enumerate(zip(CYCLE, slip, strict=False)):
         spread = np.abs(rows[["low", "high"]].to_numpy().T - rows.value.to_numpy())
+        at = rows.block * 1.03 ** (i - 1.5)  # beside one another
         ax.errorbar(
-            rows.block, rows.value, spread, color=color, marker="o", ms=3, capsize=2,
-            label=f"${quantity[0]}_{quantity[1]}$, {log}",
+            at, rows.value, spread, color=color, marker="o", ms=3, capsize=2,
+            label=f"${quantity[0]}_{quantity[1]}$, run {log}",
         )  # fmt: skip
-    ax.set(xscale="log", yscale="log", xlabel="intervals of 0.8 s in a block", ylabel="k, m")
+    ax.set(
+        xscale="log",
+        yscale="log",
+        xlabel="intervals of 0.8 s in a block",
+        ylabel="$k_r$ and $k_l$ with 95 % intervals, m",
+    )
     ax.set_xticks([1, 2, 4, 8, 16], ["1", "2", "4", "8", "16"])
     ax.legend()
     return page

@@ -12,7 +12,7 @@ from experiments.papers.results import Results
 from experiments.papers.teams.claims import NAMES
 from experiments.papers.teams.settings import ALWAYS
 from experiments.viewing.plotting import plain_log, with_legend
-from experiments.viewing.style import BLACK, BLUE, PURPLE, SKY, subplots
+from experiments.viewing.style import BLACK, BLUE, PURPLE, SKY, WALL, subplots
 from experiments.viewing.team_figure import draw_paths, draw_sightings
 
 _FILTERS = {"fastslam": (BLUE, "s"), "ekf_slam": (BLACK, "o"), "smoother": (PURPLE, "^")}
@@ -34,7 +34,8 @@ def drive(run: dict[str, Any]) -> Figure:
     draw_paths(ax, run)
     for number in range(sum(name.startswith("truth_") for name in run)):
         draw_sightings(ax, run[f"sightings_{number}"].reshape(-1, 2, 2), number)
-    return with_legend(page, ncols=5)
+    ax.plot([], [], color=WALL, lw=0.5, label="sighting (colour: who sees)")
+    return with_legend(page, ncols=4)
 
 
 def by_size(errors: pd.DataFrame) -> Figure:
@@ -45,7 +46,10 @@ def by_size(errors: pd.DataFrame) -> Figure:
         colour, marker = _FILTERS[name]
         wide = part.pivot_table(index=["size", "seed"], columns="sightings", values="ate_rmse_m")
         medians = wide.groupby("size").median()
-        for seen, line, words in ((False, "--", "without"), (True, "-", "with sightings")):
+        for seen, line, words in (
+            (False, "--", "without sightings"),
+            (True, "-", "with sightings"),
+        ):
             label = f"{NAMES[name]}, {words}"
             _line(left, medians.index, medians[seen], label, colour, marker, line)
         ratios = {size: log_ratio_interval(w[True], w[False]) for size, w in wide.groupby("size")}
@@ -53,9 +57,9 @@ def by_size(errors: pd.DataFrame) -> Figure:
         at = np.array(list(ratios)) + 0.06 * (k - 1)
         right.plot(at, found[0], marker, color=colour, ms=6)
         right.vlines(at, found[1], found[2], color=colour, lw=1.4)
-    right.axhline(1.0, color=SKY, lw=1.0)
-    left.set(ylabel="RMS position error of the team, m, median", yscale="log")
-    right.set(ylabel="error with sightings over without (95 %)", yscale="log")
+    right.axhline(1.0, color=WALL, lw=0.8)
+    left.set(ylabel="median RMS position error of the team, m", yscale="log")
+    right.set(ylabel="error with sightings over without, 95 % interval", yscale="log")
     for ax in (left, right):
         ax.set_xlabel("robots in the team")
         ax.set_xticks(sorted(errors["size"].unique()))
@@ -77,7 +81,7 @@ def by_link(errors: pd.DataFrame) -> Figure:
                     xycoords=("data", "axes fraction"), textcoords="offset points")  # fmt: skip
     ax.set(ylabel=f"RMS position error of {size} robots, m", yscale="log", xlim=(-0.5, at + 0.5))
     ax.set_xticks([])
-    ax.set_xlabel("communication", labelpad=20)
+    ax.set_xlabel("communication (dot: a world; bar: median)", labelpad=20)
     plain_log(ax.yaxis)
     return page
 

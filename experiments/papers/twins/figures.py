@@ -5,8 +5,8 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from experiments.papers.results import Results
-from experiments.viewing.plotting import plain_log
-from experiments.viewing.style import BLUE, RED, subplots
+from experiments.viewing.plotting import plain_log, with_legend
+from experiments.viewing.style import BLACK, RED, SKY, subplots
 
 
 def draw(made: Results) -> dict[str, Figure]:
@@ -23,20 +23,16 @@ def errors(pairs: pd.DataFrame) -> Figure:
     for ax, log in zip(axes.flat, logs, strict=False):
         chosen = pairs[pairs.log == log]
         at = np.arange(len(chosen))[::-1]
-        ax.hlines(at, chosen.low_m, chosen.high_m, color=BLUE, lw=4, alpha=0.4, label="95 %")
-        ax.plot(chosen.median_m, at, "|", color=BLUE, ms=9, label="median of the twin")
-        ax.plot(chosen.error_m, at, "D", color=RED, ms=4, label="on the log")
+        predicted = "predicted by the twin: median, 95 %"
+        ax.hlines(at, chosen.low_m, chosen.high_m, color=SKY, lw=4, alpha=0.6, label=predicted)
+        ax.plot(chosen.error_m, at, "D", color=RED, ms=5, label="on the log")
+        ax.plot(chosen.median_m, at, "|", color=BLACK, ms=11)
         ax.set(
             xscale="log", title=log, yticks=at, yticklabels=chosen.method, ylim=(-0.6, at[0] + 0.6)
         )
-        ax.set_xlabel("position error, RMS, m")
+        ax.set_xlabel("RMS position error, m")
         ax.tick_params(axis="y", labelsize=7)
         plain_log(ax.xaxis, (1.0,))
     for ax in list(axes.flat)[len(logs) :]:
         ax.set_axis_off()
-    handles, labels = axes.flat[0].get_legend_handles_labels()
-    if len(logs) < axes.size:
-        axes.flat[-1].legend(handles, labels, loc="center", frameon=False)
-    else:
-        axes.flat[0].legend(fontsize=6)
-    return page
+    return with_legend(page, ncols=2, loc="outside upper center")
