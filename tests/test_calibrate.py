@@ -76,6 +76,7 @@ def test_wheel_truth_on_the_engines_recordings():
     assert found.track_m.value == pytest.approx(0.19, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_gain_and_track_errors_are_found_jointly():
     robot = slipping(1e-4, geometry=True)
     for result in calibrate_once(Arm(3, robot, TABLE_1))[:2]:

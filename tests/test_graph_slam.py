@@ -277,6 +277,7 @@ def test_loops_close_and_bound_the_error(laps):
     assert nees.mean() / 3.0 < 3.0
 
 
+@pytest.mark.slow
 def test_false_closures_are_not_believed(laps, monkeypatch):
     """As many false candidates as right ones, each within what its own pose allows."""
     rng = np.random.default_rng(1)

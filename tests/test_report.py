@@ -139,7 +139,7 @@ def test_each_claim_is_one_row_with_its_statistics_below(text):
     assert "The ellipse holds <b>61 %</b> at 1e-3 m." in head
     verdict, figures = head.strip().split("Figures: ")
     assert verdict.endswith("not reproduced (quick)")
-    assert figures == "How often the true end lies in the ellipse"
+    assert figures == "Coverage of the 95 % ellipse"
     assert folded.index("the unfavourable") < folded.index("of our own")  # headlines first
     assert "0.250 [0.400, 0.600]" in folded
     assert "follows from its headline statistics" in page.all("caption")[0]["text"]

@@ -222,7 +222,9 @@ def test_leaving_the_route_is_reported():
 
 
 @pytest.mark.bullet
-@pytest.mark.parametrize("name", ["rooms", "corridor", "room"])
+@pytest.mark.parametrize(
+    "name", ["room", *(pytest.param(n, marks=pytest.mark.slow) for n in ("rooms", "corridor"))]
+)
 @pytest.mark.parametrize("robot", ["puzzlebot", "robocom"])
 def test_tours_are_driven_to_their_end(name, robot):
     experiment = Experiment.compose([f"world={name}", f"robot={robot}", "seed=2", "robot.kr=1e-4"])

@@ -369,6 +369,7 @@ def test_wrong_sweeps_end_in_one_line(arguments, words):
         assert not (results() / never).exists()
 
 
+@pytest.mark.slow
 def test_values_that_no_column_holds_fail_alone(name):
     done = estima("run", "-m", *ALONE, "seed=1,2,99999999999999999999999", f"name={name}",
                   "world.n_objects=6,many")  # fmt: skip
