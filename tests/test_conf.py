@@ -86,3 +86,12 @@ def test_every_option_says_what_it_is():
     for path in CONF.rglob("*.yaml"):
         assert path.read_text().startswith("#"), f"{path.name} has no opening comment"
         yaml.safe_load(path.read_text())
+
+
+@pytest.mark.parametrize(
+    "override", ["route.distance_m=far", "estimator.kr=small", "world.n_objects=many"]
+)
+def test_a_word_for_a_number_is_named(override):
+    key, _, word = override.partition("=")
+    with pytest.raises(InputError, match=f"{key} must be a number, got '{word}'"):
+        Experiment.compose(["world=room", override]).check()

@@ -322,6 +322,8 @@ def test_accept_check_worsen_accept(small, monkeypatch, capsys):
     capsys.readouterr()
     assert not regress_report.run_check(str(small), "longer wheels")
     shown = capsys.readouterr().out
+    assert "accepted: " in shown
+    assert "copied" not in shown
     assert "odometry, position error worse by" in shown
     assert f'estima check --suite {small} --only odometry --accept "REASON" --release' in shown
     assert {f.baseline for f in baseline.check(str(small)) if f.alarms} == {"release"}

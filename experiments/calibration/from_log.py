@@ -41,6 +41,7 @@ _MOST_LASTING = 10.0  # blocks; slip that lasts longer is a gain
 _NO_SLIP_M = 1e-12  # kr or kl that is at its bound of zero
 _OUTLIER = 6.0  # in robust standard deviations
 _LONGEST_GAP_S = 1.0  # of the truth
+_VAGUE = 5.0  # factor between the ends of an interval, from which on it says little
 _START = np.diag([1e-6] * 3)  # covariance of a known start
 S = TypeVar("S")
 MAD = 1.4826  # standard deviation of a normal over its median absolute deviation
@@ -113,7 +114,9 @@ class Found:
         lines = [f"against the {self.source} of the log"]
         for name, found in self.intervals.items():
             bounds = f"[{found.low:.4g}, {found.high:.4g}]"
-            lines.append(f"  {name:<28} {found.value:12.5g} {bounds:>26}")
+            vague = 0.0 < _VAGUE * found.low < found.high
+            remark = "  hardly known from these motions" if vague else ""
+            lines.append(f"  {name:<28} {found.value:12.5g} {bounds:>26}{remark}")
         return "\n".join(lines)
 
 
@@ -526,7 +529,7 @@ def _camera(
         error = se2.wrap(bearing - np.arctan2(y, x))
         return float(np.nanmedian(np.abs(error - np.nanmedian(error))))
 
-    delays = np.arange(-0.5, 0.5 + 1e-9, 0.02)
+    delays = 0.02 * np.arange(-25, 26)  # 0 is one of them
     delay_s = float(delays[int(np.argmin([off(d) for d in delays]))])
     seen = ahead(delay_s)
     finite = np.isfinite(seen).all(axis=1)

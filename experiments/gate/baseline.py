@@ -29,12 +29,15 @@ class Accepted:
     Attributes
     ----------
     written
-        Files.
+        Files of the new baseline.
+    copied
+        Files of the old one that came with the package and now stand beside it, unchanged.
     findings
         How it compares with the baselines that were there.
     """
 
     written: list[Path]
+    copied: list[Path]
     findings: list[Finding]
 
 
@@ -222,16 +225,15 @@ def accept(
             "baseline of failures guards nothing"
         )
     findings = [f for key in old for f in _compared({key: old[key].rows}, rows)]
-    written = []
+    written, copied = [], []
     for key, path in baseline_paths(suite_name, own=True).items():
         if key == "accepted" or release or key not in old:
             write_baseline(renewed(old.get(key), rows, names, reason, known), path)
+            written.append(path)
         elif path != paths[key]:  # the package's comes along
             write_baseline(old[key], path)
-        else:
-            continue
-        written.append(path)
-    return Accepted(written, findings)
+            copied.append(path)
+    return Accepted(written, copied, findings)
 
 
 def _rows(

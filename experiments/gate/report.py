@@ -48,6 +48,8 @@ def run_check(
         show(as_text(accepted.findings, hint=""))
         for path in accepted.written:
             print(f"accepted: {short(path)}")
+        for path in accepted.copied:
+            print(f"copied, unchanged: {short(path)}")
         left = [f for f in accepted.findings if f.alarms and f.baseline == "release"]
         if left and not release:
             again = _options(suite, left)

@@ -36,6 +36,12 @@ def make(settings: Mapping[str, Any], where: str, **injected: Any) -> Any:
         ) from error
 
 
+def _is_number(annotation: Any) -> bool:
+    """Whether a parameter takes a number or nothing."""
+    name = annotation if isinstance(annotation, str) else getattr(annotation, "__name__", "")
+    return name.removesuffix(" | None") in ("int", "float")
+
+
 def checked(
     settings: Mapping[str, Any], where: str, injected: Collection[str] = ()
 ) -> Callable[..., Any]:
@@ -44,14 +50,16 @@ def checked(
     Raises
     ------
     InputError
-        If the target cannot be found, or a key is unknown or missing.
+        If the target cannot be found, a key is unknown or missing, or a word stands for a number.
     """
     function = find(settings.get("_target_"), where)
     target = settings["_target_"]
     known = inspect.signature(function).parameters
     variadic = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
     open_ended = any(p.kind is inspect.Parameter.VAR_KEYWORD for p in known.values())
-    for key in settings:
+    for key, value in settings.items():
+        if key in known and isinstance(value, str) and _is_number(known[key].annotation):
+            raise InputError(f"{where}.{key} must be a number, got {value!r}")
         if key not in (*known, "_target_") and not open_ended:
             free = ", ".join(k for k in known if k not in injected) or "none"
             raise InputError(f"unknown key {where}.{key} for {target}; known: {free}")

@@ -13,8 +13,10 @@ for (const picture of document.querySelectorAll("img[data-panels]")) {
     const down = bottom - top;
     const across = boxes.reduce((sum, [left, , right]) => sum + right - left, 0);
     const part = document.createElement("span");
+    // a panel has its own line, the entries of a legend share one
+    const block = down > 60 ? "display: block; margin: 0 auto;" : "";
     // 0.4 of its size at least, where its letters are seven pixels high, and twelve at most
-    part.style.cssText = `width: clamp(${0.4 * across}px, 100%, ${0.75 * across}px);
+    part.style.cssText = `${block} width: clamp(${0.4 * across}px, 100%, ${0.75 * across}px);
       aspect-ratio: ${across} / ${down}`;
     let at = 0;
     for (const [left, first, right, last] of boxes) {
