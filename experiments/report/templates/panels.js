@@ -14,7 +14,7 @@ for (const picture of document.querySelectorAll("img[data-panels]")) {
     const across = boxes.reduce((sum, [left, , right]) => sum + right - left, 0);
     const part = document.createElement("span");
     // a panel has its own line, the entries of a legend share one
-    const block = down > 60 ? "display: block; margin: 0 auto;" : "";
+    const block = down > 60 ? "display: block; margin: 0 auto;" : across < 300 ? "margin: 0 5px;" : "";
     // 0.4 of its size at least, where its letters are seven pixels high, and twelve at most
     part.style.cssText = `${block} width: clamp(${0.4 * across}px, 100%, ${0.75 * across}px);
       aspect-ratio: ${across} / ${down}`;
