@@ -788,7 +788,8 @@ def attack_reports(attack, folder, _):
         assert printable(text.replace("\n", "")) == text.replace("\n", ""), "control characters"
         return Tags(text).found
 
-    allowed = report({"tables/puzzlebot2024_b.csv": "a,b\nx,1\n", "tables/x.csv": "a\n1\n"})
+    more = {"tables/puzzlebot2024_b.csv": "a,b\nx,1\n", "tables/x.csv": "a\n1\n"}
+    allowed = report({**more, "figures/puzzlebot2024_b.png": picture.getvalue()})
     assert ("refresh", "") not in allowed
 
     def only_allowed(changes):

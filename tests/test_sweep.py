@@ -372,7 +372,7 @@ def test_wrong_sweeps_end_in_one_line(arguments, words):
 @pytest.mark.slow
 def test_values_that_no_column_holds_fail_alone(name):
     done = estima("run", "-m", *ALONE, "seed=1,2,99999999999999999999999", f"name={name}",
-                  "world.n_objects=6,many")  # fmt: skip
+                  "world.n_objects=6,6.5")  # fmt: skip
     assert done.returncode == 1, done.stderr
     assert "Traceback" not in done.stderr
     assert "3 of 6 runs" in done.stderr
