@@ -15,7 +15,7 @@ import pandas as pd
 from markupsafe import Markup
 from scipy import stats
 
-from experiments.report.export import numeric, plain, written
+from experiments.report.export import in_words, numeric, plain, written
 from experiments.report.page import render
 from experiments.report.table import DIGITS, HTML, WORDS, notes, shown, statuses
 from experiments.runs.columns import ANSWER, COLUMNS, PATH, REPEAT, average_of, is_setting
@@ -177,18 +177,19 @@ def _shown(
     runs: pd.DataFrame, settings: Sequence[str], pictures: Mapping[str, str]
 ) -> list[dict[str, Any]]:
     """What the table of the best and worst runs says of each."""
+    values = {name: in_words(runs[name]) for name in settings}
     return [
         {
             "estimator": row["choice.estimator"],
             "kind": row["kind"],
             "first": row["first"],
             "error": plain(row[ERROR], DIGITS) if row["kind"] != "failed" else "",
-            "settings": [plain(row[name]) if pd.notna(row[name]) else "" for name in settings],
+            "settings": [values[name][i] for name in settings],
             "remark": row.get("status_detail") or "",
             "key": short_key(row),
             "picture": pictures.get(short_key(row), ""),
         }
-        for _, row in runs.iterrows()
+        for i, (_, row) in enumerate(runs.iterrows())
     ]
 
 
