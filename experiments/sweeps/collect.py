@@ -92,6 +92,12 @@ def folder_of(name: str) -> Path:
     return path
 
 
+def commands(folder: Path) -> list[str]:
+    """Commands that made the rows of a folder, as the sweeps noted them."""
+    path = folder / COMMAND
+    return path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
+
+
 def _check_distinct(table: pd.DataFrame, settings: list[str], path: Path) -> None:
     """Check that rows of equal settings are of one run; `settings` are those that differ.
 
