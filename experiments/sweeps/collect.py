@@ -133,7 +133,8 @@ def where(table: pd.DataFrame, conditions: Sequence[str]) -> pd.DataFrame:
     for condition in conditions:
         column, equals, wanted = condition.partition("=")
         if not equals:
-            raise InputError(f"--where {condition}: give COLUMN=VALUE")
+            there = dozen([*map(str, table)])
+            raise InputError(f"--where {condition}: give COLUMN=VALUE; columns: {there}")
         if column not in table:
             raise InputError(f"--where {condition}: {no_column(table, column, metric=False)}")
         numbers, number = (pd.to_numeric(v, errors="coerce") for v in (table[column], wanted))
