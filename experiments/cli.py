@@ -391,9 +391,7 @@ def view(
     ] = None,
     seconds: Annotated[
         float | None,
-        typer.Option(
-            help="Duration; shorter if there are few Frames [saved: 20, live: real time]."
-        ),
+        typer.Option(help="Duration [real time; saved, of a drive longer than 70 s: 20]."),
     ] = None,
     config_dir: ConfigDir = None,
 ) -> None:
@@ -419,7 +417,8 @@ def view(
       estima view --map map.yaml -o map.png
     """
     from experiments.runs.experiment import searched
-    from experiments.sweeps.again import row_of, run_again
+    from experiments.sweeps.again import noted_config_dir, row_of, run_again
+    from experiments.sweeps.collect import folder_of
 
     if world and grid is not None:
         raise InputError("--world and --map: draw one at a time")
@@ -438,12 +437,13 @@ def view(
             estimate is None and len(what) == 1,
             f"{what[0]}: a run of a sweep has its estimator and its settings; leave out others",
         )
-        _show_run(run_again(row, searched(config_dir)), None, [], out, seconds, grid)
+        noted = noted_config_dir(folder_of(str(Path(what[0]).parent)))
+        _show_run(run_again(row, config_dir, noted), None, [], out, seconds, grid, what[0])
         return
     if estimate is None and len(what) > 1:
         raise InputError(f"{what[1]}: overrides need an estimator; add --estimate NAME")
     overrides = [*searched(config_dir), *what[1:]]
-    _show_run(Path(what[0]), estimate, overrides, out, seconds, grid)
+    _show_run(Path(what[0]), estimate, overrides, out, seconds, grid, Path(what[0]).name)
 
 
 def _draw_world(overrides: list[str], out: Path) -> None:
@@ -472,6 +472,7 @@ def _show_run(
     out: Path | None,
     seconds: float | None,
     grid: Path | None,
+    called: str,
 ) -> None:
     from dataclasses import replace
 
@@ -494,8 +495,11 @@ def _show_run(
     elif out is None:
         live.check_display()
     drive_s = read.duration_s
-    length_s = seconds or (drive_s if out is None else min(drive_s, view.SECONDS))
+    in_real_time = out is None or drive_s <= view.REAL_TIME_S
+    length_s = seconds or (drive_s if in_real_time else view.SECONDS)
     n_shown = int(length_s * (live.FPS if out is None else view.FPS))
+    if out is not None and seconds is None:
+        n_shown = min(n_shown, view.MOST_PICTURES)
     if isinstance(read, Team):
         several = team_view.TeamPlayback.of(read, n_shown)
         if name is not None:
@@ -527,9 +531,10 @@ def _show_run(
         images = view.pictures(shown)
     assert out is not None
     with progress(f"drawing {out.name}", 1.0) as on_progress:
-        view.save(run, images, out, on_progress)
-    speed = "real time" if length_s == drive_s else f"{drive_s / length_s:.3g} times real time"
-    print(f"{paths.short(out)}: {len(run.stamps)} pictures, {length_s:.1f} s, {speed}")
+        title = f"{Path(name).name}: {called}" if name is not None else called
+        view.save(run, images, out, on_progress, title)
+    said = f"{len(run.stamps)} pictures, {length_s:.1f} s, {view.speed(run)}"
+    print(f"{paths.short(out)}: {said}")
 
 
 @app.command("map")
@@ -1278,6 +1283,7 @@ def report(
     ] = False,
     all_versions: AllVersions = False,
     only: Where = None,
+    config_dir: ConfigDir = None,
 ) -> None:
     """Write one page to open in a browser: of a sweep, or of the papers' studies in results/.
 
@@ -1306,15 +1312,15 @@ def report(
         folder, called = folder_of(name), Path(name).name
         written = out or folder.parent / f"{called}.html"
         rows = where(collect(name, all_versions=all_versions, times=True), only or [])
+        called = called if folder.parent == paths.results() / "runs" else name
         if pictures:
-            _draw_extremes(rows, written)
-        in_runs = folder.parent == paths.results() / "runs"
-        write_sweep_page(rows, called if in_runs else name, folder, written)
+            _draw_extremes(rows, called, folder, written, config_dir)
+        write_sweep_page(rows, called, folder, written, config_dir)
         print(paths.short(written))
         return
     require(
-        not (only or all_versions or pictures),
-        "--where, --all-versions, --pictures: name the sweep of the runs",
+        not (only or all_versions or pictures or config_dir),
+        "--where, --all-versions, --pictures, --config-dir: name the sweep of the runs",
     )
     if not any((paths.results() / name).exists() for name in ("claims.csv", "figures", "tables")):
         raise InputError(
@@ -1327,11 +1333,14 @@ def report(
         print(write_report(paths.results(), on_progress))
 
 
-def _draw_extremes(rows: DataFrame, page: Path) -> None:
+def _draw_extremes(
+    rows: DataFrame, called: str, folder: Path, page: Path, config_dir: Path | None
+) -> None:
     """Draw the best and the worst run of each estimator, unless they are there."""
     from experiments.report.sweep_page import extremes, picture_path
-    from experiments.sweeps.again import run_again
+    from experiments.sweeps.again import noted_config_dir, run_again, short_key
 
+    noted = noted_config_dir(folder)
     runs = extremes(rows)
     for _, row in runs[runs["first"] & (runs["kind"] != "failed")].iterrows():
         out = picture_path(row, page)
@@ -1339,7 +1348,8 @@ def _draw_extremes(rows: DataFrame, page: Path) -> None:
             continue
         out.parent.mkdir(parents=True, exist_ok=True)
         try:
-            _show_run(run_again(row), None, [], out, None, None)
+            again = run_again(row, config_dir, noted)
+            _show_run(again, None, [], out, None, None, f"{called}/{short_key(row)}")
         except InputError as error:
             print(f"{out.name} is not drawn: {error}", file=sys.stderr)
 

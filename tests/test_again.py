@@ -8,6 +8,7 @@ from typer.testing import CliRunner
 from experiments.cli import app
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
+from experiments.runs.paths import CONF
 from experiments.runs.store import write_run
 from experiments.sweeps.again import row_of, run_again, short_key
 from experiments.viewing.view import estimate_by, shown_rows
@@ -60,12 +61,22 @@ def test_another_run_than_the_rows_is_refused(results):
         run_again(pd.concat([row.drop("code_version"), pd.Series({"code_version": "other"})]))
     gone = row.copy()
     gone["choice.estimator"] = "nosuch"
-    with pytest.raises(InputError, match=r"nosuch.*--config-dir"):
-        run_again(gone)
+    with pytest.raises(InputError, match=r"^estimator/nosuch is no .*--config-dir.*own\)"):
+        run_again(gone, noted="own")
     changed = row.copy()
     changed["recording_checksum"] = "other"
     with pytest.raises(InputError, match="not what it was"):
         run_again(changed).recording()
+
+
+def test_own_options_are_found_where_the_sweep_found_them(results, tmp_path):
+    row = row_of(f"mine/{Experiment.compose([*DRIVE, *RUNS[0]]).key}").copy()
+    row["choice.estimator"] = "my_odometry"
+    (tmp_path / "estimator").mkdir()
+    option = CONF / "estimator" / "odometry.yaml"
+    (tmp_path / "estimator" / "my_odometry.yaml").write_text(option.read_text())
+    for given in ({"noted": str(tmp_path)}, {"config_dir": tmp_path, "noted": "gone"}):
+        assert run_again(row, **given).experiment.estimator_name == "my_odometry"
 
 
 def test_view_and_report_draw_runs_of_a_sweep(results, tmp_path):

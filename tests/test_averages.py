@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 
 from experiments.cli import app
 from experiments.evaluation.statistics import holm, mean_interval, paired_p
+from experiments.report.plot import sweep_figure
 from experiments.report.table import WIDTHS_PT, notes, statuses, write_table
 from experiments.runs.columns import COLUMNS, Average
 from experiments.sweeps.averages import averages, unit_of
@@ -53,6 +54,20 @@ def test_errors_pool_repeats_by_squares_and_recordings_geometrically():
     (nees,) = averages(table, ["choice.world"], "recording_checksum", "nees_mean").itertuples()
     each = table["nees_mean"].to_numpy().reshape(12, 2).mean(axis=1)
     np.testing.assert_allclose(nees[1:], list(vars(mean_interval(each)).values()))
+
+
+def test_settings_are_no_repeats():
+    """Errors of 1 and 100 of two estimators over each recording are 10, not 71."""
+    table = runs().assign(ate_rmse_m=np.tile([1.0, 1.0, 100.0, 100.0], 12))
+    unit, by = "recording_checksum", ["choice.world"]
+    (found,) = averages(table, by, unit, "ate_rmse_m", ["choice.estimator"])["value"]
+    assert found == pytest.approx(10.0)
+    page = sweep_figure(table, "choice.world", "ate_rmse_m", pool=True)
+    assert page.axes[0].get_lines()[0].get_ydata() == pytest.approx([10.0])
+    assert "over recordings and estimator" in page.get_suptitle().replace("\n", " ")
+    table["estimator.n"] = table["ate_rmse_m"]
+    against = summary(table.assign(**{"choice.estimator": "a"}), against="a")
+    assert against["ate_rmse_over_a"].tolist() == pytest.approx([0.1, 10.0])
 
 
 def test_one_recording_gives_intervals_over_its_repeats_and_one_run_none():

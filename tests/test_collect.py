@@ -3,9 +3,11 @@
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib.cbook import is_math_text
 from typer.testing import CliRunner
 
 from experiments.cli import app
+from experiments.report.export import as_text
 from experiments.report.plot import _by_factors, sweep_figure
 from experiments.runs.columns import COLUMNS, ORIGIN, REPEAT, STATUS, is_setting, title
 from experiments.runs.evaluate import evaluate
@@ -198,6 +200,7 @@ def test_what_a_plot_is_drawn_by_is_chosen_where_it_is_not_given():
     assert suggested(rows()[:1]) == ["repeat"]
     some = rows().assign(**{"choice.world": ["v", "w"] * 6})  # follows from the estimator
     some["estimator.n"] = some["robot.kr"].where(some["choice.estimator"] == "b")
+    assert suggested(many(13))[0] == "choice.estimator"  # more than there are colours
     assert suggested(some.drop(columns="robot.kr")) == ["choice.estimator", "estimator.n"]
     twice = sweep_figure(rows(), "choice.estimator", "ate_rmse_m", "choice.estimator", pool=True)
     assert len(twice.axes[0].containers) == 2
@@ -385,3 +388,42 @@ def test_a_message_names_the_nearest_columns_and_counts_the_rest(monkeypatch):
     monkeypatch.setattr("experiments.sweeps.collect._NAMED", 2)
     with pytest.raises(InputError, match=r"nosuch; there are [\w.]+, [\w.]+ and \d+ more$"):
         sweep_figure(rows(), "nosuch", "ate_rmse_m")
+    with pytest.raises(InputError, match=r"--where nosuch=1: .*, [\w.]+ and \d+ more$"):
+        where(rows(), ["nosuch=1"])
+    with pytest.raises(InputError, match=r"run_key holds no numbers; there are ate_rmse_m, step_t"):
+        sweep_figure(rows(), "robot.kr", "run_key")
+
+
+def test_long_names_leave_the_axes_their_height_and_fit_a_column():
+    table = many(5).assign(
+        **{"choice.estimator": lambda t: t["choice.estimator"] + "_of_a_rather_long_name"}
+    )
+    by = ["choice.estimator", "choice.world"]
+    page = sweep_figure(table, "estimator.n_particles", "ate_rmse_m", by, size="column")
+    page.draw_without_rendering()
+    (ax,), (legend,) = page.axes, page.legends
+    assert ax.bbox.height / page.dpi > 1.4
+    assert 0.0 <= legend.get_window_extent().x0 < legend.get_window_extent().x1 <= page.bbox.width
+    short = sweep_figure(many(5), "estimator.n_particles", "ate_rmse_m", by, size="column")
+    assert short.legends[0]._ncols > 1
+
+
+def test_a_panel_is_of_one_setting_and_names_are_no_mathematics():
+    with pytest.raises(InputError, match=r"--row and --col are both choice\.world"):
+        sweep_figure(
+            many(2), "seed", "ate_rmse_m", row="choice.world", col="choice.world", pool=True
+        )
+    odd = many(2).replace({"m00": "it's $x$"})
+    x, by = "estimator.n_particles", "choice.estimator"
+    page = sweep_figure(odd, x, "ate_rmse_m", by, row="choice.world")
+    (legend,) = page.legends
+    assert [is_math_text(text.get_text()) for text in legend.get_texts()] == [False, False]
+
+
+def test_a_setting_is_written_in_one_way():
+    page = sweep_figure(
+        rows().replace({"robot.kr": {1e-3: 1e-4}}), "robot.kr", "ate_rmse_m", "choice.estimator"
+    )
+    assert [tick.get_text() for tick in page.axes[0].get_xticklabels()] == ["1e-5", "1e-4"]
+    cells = as_text(pd.DataFrame({"robot.kr": [1e-5, 1e-4], "x": [1e-5, 1e-4]}))
+    assert cells.to_numpy().T.tolist() == [["1e-5", "1e-4"], ["1e-05", "0.0001"]]

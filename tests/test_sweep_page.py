@@ -1,5 +1,6 @@
 """The page of a sweep: what it holds, and how it does in a real browser."""
 
+import html
 import json
 import re
 
@@ -9,6 +10,7 @@ import pytest
 from experiments import cli
 from experiments.report import sweep_page
 from experiments.report.sweep_page import extremes, picture_path, write_sweep_page
+from experiments.sweeps.again import noted_config_dir
 from experiments.sweeps.averages import averages
 from experiments.sweeps.collect import with_answers
 from sim.errors import InputError
@@ -129,6 +131,80 @@ def test_what_is_chosen_is_drawn_and_what_is_pooled_is_said(tab):
     choose(tab, "panels", "")
     assert tab.js(said).startswith("51 runs. Not drawn: 1 failed, 2 have no finite value. ")
     tab.open(tab.js("location.href"))
+
+
+def test_without_a_run_there_are_no_axes(tab):
+    said = "document.getElementById('said').textContent"
+    boxes = "[...document.querySelector('#filters details').querySelectorAll('input')]"
+    tab.js(f"{boxes}.forEach((box) => box.click())")
+    assert tab.js(said) == "Nothing is chosen."
+    assert tab.js("document.getElementById('chart').hidden")
+    tab.js(f"{boxes}[0].click()")
+    assert "Geometric means" in tab.js(said)
+    assert not tab.js("document.getElementById('chart').hidden")
+    tab.open(tab.js("location.href"))
+
+
+def test_settings_that_are_not_drawn_are_no_repeats(tab):
+    """As in plots: runs of three estimators over one recording are averaged geometrically."""
+    choose(tab, "colour", "")
+    choose(tab, "panels", "")
+    said = tab.js("document.getElementById('said').textContent")
+    assert "also averages over estimator; world, geometrically" in said
+    table = with_answers(rows(), ["answer_ate_rmse_m"])
+    table = table[table["status"] != "failed"]
+    by, others = ["estimator.n_particles"], ["choice.world", "choice.estimator"]
+    expected = averages(table, by, "recording_checksum", "answer_ate_rmse_m", others)
+    drawn = tab.js("Array.from(document.getElementById('chart').data.find(t => t.error_y).y)")
+    np.testing.assert_allclose(drawn, expected["value"], rtol=1e-4)
+    tab.open(tab.js("location.href"))
+
+
+def test_an_estimator_that_always_failed_has_no_tick(tab):
+    column = "columns.get('choice.estimator').values"
+    tab.js(f"{column}.forEach((v, row) => {{ if (v === 'm00') data.failed[row] = 1; }})")
+    choose(tab, "x", "choice.estimator")
+    ticks = tab.js("document.getElementById('chart').layout.xaxis.ticktext")
+    assert len(ticks) == 2
+    assert "m00" not in ticks
+    tab.open(tab.js("location.href"))
+
+
+def test_a_page_of_one_run(tmp_path, tab):
+    home = tab.js("location.href")
+    one = rows().query("status == 'ok'")[:1].assign(ate_rmse_m=0.006152)
+    one["robot.kr"] = 1e-5
+    write_sweep_page(one, "one", tmp_path, tmp_path / "one.html")
+    tab.open((tmp_path / "one.html").as_uri())
+    assert tab.js("document.getElementById('said').textContent").startswith("1 run. ")
+    assert tab.js("document.title") == "one: 1 run"
+    ticks = tab.js("[...document.querySelectorAll('#chart .ytick text')].map(t => t.textContent)")
+    assert max(map(len, ticks)) < 8
+    assert tab.js("document.getElementById('chart').data.every(t => t.y[0] === 0.006152)")
+    tab.open(home)
+
+
+def test_a_setting_is_written_in_one_way(tmp_path, tab):
+    home = tab.js("location.href")
+    table = rows().replace({"estimator.n_particles": {1: 1e-5, 2: 1e-4, 4: 1e-3}})
+    write_sweep_page(table, "mine", tmp_path, tmp_path / "page.html")
+    tab.open((tmp_path / "page.html").as_uri())
+    written = ["1e-5", "1e-4", "1e-3"]
+    assert tab.js("document.getElementById('chart').layout.xaxis.ticktext") == written
+    choose(tab, "colour", "estimator.n_particles")
+    legend = "[...document.querySelectorAll('#chart .legendtext')].map(t => t.textContent)"
+    assert tab.js(legend) == written
+    assert ">1e-4</td>" in (tmp_path / "page.html").read_text()
+    tab.open(home)
+
+
+def test_commands_name_the_folder_of_own_options(tmp_path):
+    (tmp_path / "command.txt").write_text("estima run -m --config-dir 'my own' estimator=a\n")
+    write_sweep_page(rows(), "mine", tmp_path, tmp_path / "page.html")
+    text = html.unescape((tmp_path / "page.html").read_text())
+    assert re.search(r"estima view mine/\w+ --config-dir 'my own' -o run\.html", text)
+    (tmp_path / "command.txt").write_text("estima run -m estimator=a\n")
+    assert noted_config_dir(tmp_path) is None
 
 
 def test_names_are_no_markup_for_the_chart(tab):

@@ -8,6 +8,7 @@ import sys
 import time
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -186,11 +187,14 @@ def test_without_ffmpeg_the_remedy_is_named(monkeypatch):
 
 @pytest.mark.skipif(browser.find() is None, reason="no Chromium on this machine")
 def test_html_plays_in_a_browser(run, tmp_path):
-    view.save(run, view.pictures(run), tmp_path / "run.html", silent)
+    view.save(run, view.pictures(run), tmp_path / "run.html", silent, "<mcl>: run.npz")
     assert "://" not in (tmp_path / "run.html").read_text()
     with browser.page() as tab:
         tab.open((tmp_path / "run.html").as_uri())
         assert tab.js("document.images[0].naturalWidth") == 800
+        assert tab.js("document.title") == "<mcl>: run.npz"
+        assert tab.js("document.querySelector('h1').textContent") == "<mcl>: run.npz"
+        assert "real time" in tab.js("document.querySelector('form').textContent")
         last = len(run.rows) - 1
         for _ in range(400):
             if tab.js("+document.querySelector('input').value") == last:
@@ -202,6 +206,15 @@ def test_html_plays_in_a_browser(run, tmp_path):
         tab.press("Enter", text="\r")  # again from the start, by keyboard
         assert tab.js("document.querySelector('button').textContent") == "Pause"
         assert tab.complaints() == []
+
+
+@pytest.mark.parametrize(
+    ("drive_s", "seconds", "words"),
+    [(62.0, 62.0, "real time"), (62.0, 20.0, "3.1 times real time"), (9.0, 20.0, "0.45 times")],
+)
+def test_how_fast_it_plays_is_said(drive_s, seconds, words):
+    stamps = np.linspace(0.0, drive_s, 200)
+    assert view.speed(SimpleNamespace(stamps=stamps, fps=200 / seconds)).startswith(words)
 
 
 def test_from_the_command_line(recording, tmp_path, monkeypatch):

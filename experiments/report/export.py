@@ -1,5 +1,7 @@
 """Tables for papers and pages: LaTeX (booktabs) and Markdown."""
 
+from __future__ import annotations
+
 import re
 import textwrap
 from collections.abc import Callable, Sequence
@@ -9,7 +11,7 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
-from experiments.runs.columns import title
+from experiments.runs.columns import alike, is_setting, title
 from experiments.runs.row import read_rows
 from experiments.sweeps.summary import MARKS, SUFFIXES
 from sim.errors import InputError, printable
@@ -78,6 +80,14 @@ def plain(value: Any, digits: int = 4) -> str:
     return f"{value:.{digits}g}" if isinstance(value, float) else str(value)
 
 
+def in_words(column: pd.Series[Any], digits: int = 4) -> list[str]:
+    """The values of a setting as `plain` texts, its numbers all in one way."""
+    if column.dtype.kind != "f":
+        return [plain(value) for value in column]
+    texts = alike(column, digits)
+    return ["" if text == "nan" else text for text in texts]
+
+
 def significant(value: float, digits: int) -> str:
     """A number with so many significant digits; zeros at its end are some of them."""
     if not 0.0 < abs(value) < 1e6:
@@ -132,8 +142,13 @@ def written(frame: pd.DataFrame, form: Form, digits: int) -> pd.DataFrame:
 
     long = not any(isinstance(cell, Mean) for cell in frame.head(1).to_numpy().ravel())
     heads = [" ".join(title(str(name), short=not long).split()) for name in frame]
+    numbers = [c for c in frame if is_setting(str(c)) and frame[c].dtype.kind == "f"]
+    alike_in = {name: in_words(frame[name], digits) for name in numbers}
     return (
-        frame.set_axis([form.escape(printable(h)) for h in heads], axis=1).astype(object).map(text)
+        frame.assign(**alike_in)
+        .set_axis([form.escape(printable(h)) for h in heads], axis=1)
+        .astype(object)
+        .map(text)
     )
 
 
@@ -236,7 +251,7 @@ def _lines(cells: list[list[str]]) -> list[str]:
 
 def latex(text: str) -> str:
     """Text in which LaTeX finds nothing of its own; numbers become mathematics."""
-    power = re.fullmatch(r"(-?[\d.]+)e([+-]\d+)", text)
+    power = re.fullmatch(r"(-?[\d.]+)e([+-]?\d+)", text)
     if power:
         return rf"${power[1]} \times 10^{{{int(power[2])}}}$"
     if re.fullmatch(r"-[\d.]+", text):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import textwrap
 from collections.abc import Mapping, Sequence
 from enum import StrEnum
@@ -13,10 +14,11 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from experiments.runs.columns import ANSWER, COLUMNS, PATH, REPEAT, title
+from experiments.report.export import in_words
+from experiments.runs.columns import ANSWER, COLUMNS, PATH, REPEAT, alike, title
 from experiments.sweeps.averages import averages, pooled, rule, unit_of
-from experiments.sweeps.collect import DRAWN, measured, no_column, telling, with_answers
-from experiments.viewing.plotting import plain_log, plain_ticks
+from experiments.sweeps.collect import DRAWN, dozen, measured, no_column, telling, with_answers
+from experiments.viewing.plotting import literal, plain_log
 from experiments.viewing.style import SERIES, figure
 from sim.errors import InputError
 
@@ -29,6 +31,10 @@ _BESIDE = 0.006  # share of the axis
 _BESIDE_WORD = 0.12  # among words and seeds: share of what is between two of them
 _MOST_BESIDE = 0.7  # the same, of all lines together
 _MOST_DIRECT = 6  # lines that are named at their ends rather than in a legend
+_DIRECT_SHARE = 0.25  # of the page's width, for those names
+_AXES_SHARE = 0.55  # of the height, at least for the axes; a page with a long legend is higher
+_MOST_COLUMNS = 6  # of a legend
+_LETTER = 0.55  # width of a letter, em
 
 
 class Size(StrEnum):
@@ -80,6 +86,8 @@ def sweep_figure(
         If a column is not in the table, y has no numbers, no run has all columns, or a point would
         pool what differs in more than its seeds.
     """
+    if row is not None and row == col:
+        raise InputError(f"--row and --col are both {row}; one panel a value needs one of them")
     facets = [name for name in (row, col) if name is not None]
     by = [name for name in ([by] if isinstance(by, str) else by or []) if name not in facets]
     if y.startswith(ANSWER):
@@ -89,11 +97,14 @@ def sweep_figure(
     table, left_out = _complete(table, y, groups)
     if not pool:
         _check_points(table, groups)
+    table = table.assign(**{c: table[c].map(literal) for c in groups if _holds_words(table[c])})
     unit = unit_of(table, groups)
-    means = averages(table, groups, unit, y).reset_index()
+    over = [c for c in telling(table) if c not in (*groups, *DRAWN)]
+    means = averages(table, groups, unit, y, over).reset_index()
     unbounded = means.loc[means["low"].isna(), groups]
-    dots = pooled(table, [*groups, unit], y).reset_index().merge(unbounded, on=groups)
-    lines = _labels(means, by)
+    dots = pooled(table, [*groups, unit], y, over).reset_index().merge(unbounded, on=groups)
+    texts = {name: _texts(means[name]) for name in groups}
+    lines = _labels(means, by, texts)
     if len(lines) > len(SERIES):
         raise InputError(
             f"--by gives {len(lines)} lines; at most {len(SERIES)} differ in colour: keep some "
@@ -124,34 +135,39 @@ def sweep_figure(
             alone = _on_line(_within(_within(dots, row, above), col, left), by, line)
             at = _places(alone[x], names, line_of, wide=wide, numeric=numeric, joined=joined)
             ax.plot(at, alone[y], ".", color=colour, ms=4, alpha=0.5)
-        words = [_named(name, value) for name, value in ((row, above), (col, left)) if name]
+        words = [
+            _named(name, value, texts[name]) for name, value in ((row, above), (col, left)) if name
+        ]
         ax.set_title("; ".join(words), fontsize="medium")
     _scale(
         axes,
-        names,
+        texts[x],
         means,
         wide=wide,
         numeric=numeric,
         log=_is_log(y, means[["value", "low", "high"]].stack()),
     )
     for ax in axes[-1]:
-        ax.set_xlabel(title(x))
+        ax.set_xlabel(literal(title(x)))
+    least_in = _AXES_SHARE * page.get_figheight()
+    whole = "\u00a0".join(literal(title(y)).rsplit(" ", 1))  # a unit is no line of its own
+    of_y = textwrap.fill(whole, _characters(1.2 * least_in, _FONT[chosen])).replace("\u00a0", " ")
     if len(down) > 1:  # one label beside all, as one each would collide on a column's width
-        page.supylabel(title(y), fontsize=_FONT[chosen])
+        page.supylabel(of_y, fontsize=_FONT[chosen])
     else:
-        axes[0, 0].set_ylabel(title(y))
-    over = [c for c in telling(table) if c not in (*groups, *DRAWN)]
+        axes[0, 0].set_ylabel(of_y)
     parts = [
-        rule(unit, [y], means["low"].notna()),
-        f"over {', '.join(map(title, over))} too" if over else "",
+        rule(unit, [y], means["low"].notna(), over),
         "small dots: both of two" if (dots.groupby(groups).size() > 1).any() else "",
         left_out,
     ]
-    note = "; ".join(filter(None, parts))
+    note = literal("; ".join(filter(None, parts)))
     characters = int(_WIDTH_IN[chosen] * 115 / _FONT[chosen])
     page.suptitle(textwrap.fill(note, characters), fontsize=0.85 * _FONT[chosen], color="#555555")
     if by:
-        _name_lines(page, axes, title(by[0]) if len(by) == 1 else "", chosen, direct=joined)
+        heading = literal(title(by[0])) if len(by) == 1 else ""
+        _name_lines(page, axes, heading, chosen, direct=joined)
+    _grow(page, axes, least_in)
     return page
 
 
@@ -164,7 +180,7 @@ def _check(table: pd.DataFrame, y: str, groups: Sequence[str]) -> None:
             raise no_column(table, column, metric=column == y)
     if table[y].dtype.kind not in "fi":
         raise InputError(
-            f"column {y} holds no numbers; there are {', '.join(measured(table)) or 'none'}"
+            f"column {y} holds no numbers; there are {dozen(measured(table)) or 'none'}"
         )
 
 
@@ -230,24 +246,36 @@ def _within(means: pd.DataFrame, name: str | None, value: Any) -> pd.DataFrame:
     return means if name is None else means[means[name] == value]
 
 
-def _named(name: str, value: Any) -> str:
+def _holds_words(column: pd.Series[Any]) -> bool:
+    return all(isinstance(value, str) for value in column)
+
+
+def _texts(column: pd.Series[Any]) -> dict[Any, str]:
+    """What the values of a setting are called, in their order."""
+    values = column.drop_duplicates().sort_values()
+    return dict(zip(values, in_words(values, 6), strict=True))
+
+
+def _named(name: str, value: Any, texts: Mapping[Any, str]) -> str:
     """A value of a setting in words; a number with its setting."""
     if isinstance(value, str):
         return value
-    words, _, unit = title(name).partition(", ")
-    return f"{words} = {value:g}" + (f" {unit}" if unit else "")
+    words, _, unit = literal(title(name)).partition(", ")
+    return f"{words} = {texts[value]}" + (f" {unit}" if unit else "")
 
 
-def _labels(means: pd.DataFrame, by: Sequence[str]) -> dict[str, tuple[Any, ...]]:
+def _labels(
+    means: pd.DataFrame, by: Sequence[str], texts: Mapping[str, Mapping[Any, str]]
+) -> dict[str, tuple[Any, ...]]:
     """The lines by what they are called; the legend's title names a single setting."""
     if not by:
         return {"": ()}
     lines = means[list(by)].drop_duplicates().sort_values(list(by))
     if len(by) == 1:
-        values = lines[by[0]]
-        return {f"{v:g}" if isinstance(v, float) else str(v): (v,) for v in values}
+        return {texts[by[0]][value]: (value,) for value in lines[by[0]]}
     each = lines.itertuples(index=False, name=None)
-    return {", ".join(map(_named, by, line)): line for line in each}
+    own = [texts[name] for name in by]
+    return {", ".join(map(_named, by, line, own)): line for line in each}
 
 
 def _panels(size: Size, n_rows: int, n_cols: int) -> tuple[Figure, Any]:
@@ -261,20 +289,27 @@ def _panels(size: Size, n_rows: int, n_cols: int) -> tuple[Figure, Any]:
 
 
 def _scale(
-    axes: Any, names: Sequence[Any], means: pd.DataFrame, *, wide: bool, numeric: bool, log: bool
+    axes: Any,
+    names: Mapping[Any, str],
+    means: pd.DataFrame,
+    *,
+    wide: bool,
+    numeric: bool,
+    log: bool,
 ) -> None:
-    """Choose the axes' scales and ticks; all panels share them."""
+    """Choose the axes' scales and ticks; all panels share them. `names` are the values' texts."""
     ax = axes[0, 0]
     ax.margins(x=0.08)
     if wide:
         ax.set_xscale("log")
         if len(names) <= _FEW:
-            plain_ticks(ax, names)
+            ax.set_xticks(list(names), list(names.values()))
+            ax.minorticks_off()
     elif numeric and all(float(name).is_integer() for name in names):
         ax.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))  # no half a seed
     if not numeric:
         for each in axes[-1]:
-            each.set_xticks(range(len(names)), list(map(str, names)), rotation=25, ha="right")
+            each.set_xticks(range(len(names)), list(names.values()), rotation=25, ha="right")
             each.set_xlim(-0.6, len(names) - 0.4)
     if log:
         ax.set_yscale("log")
@@ -282,13 +317,17 @@ def _scale(
         positive = low[low > 0.0]
         if len(positive) and high.max() < _DECADES * positive.min():
             plain_log(ax.yaxis)
+            least = float(positive.min())
+            ax.yaxis.set_major_formatter(lambda value, _: alike([value, least])[0])
 
 
 def _name_lines(page: Figure, axes: Any, heading: str, size: Size, *, direct: bool) -> None:
     """Name the lines: at their ends where that fits, else in a legend."""
     found = [ax.get_legend_handles_labels() for ax in axes.flat]
     handles = {label: handle for pair in found for handle, label in zip(*pair, strict=True)}
-    if direct and axes.size == 1 and len(handles) <= _MOST_DIRECT and _fits(page, handles):
+    few = axes.size == 1 and len(handles) <= _MOST_DIRECT
+    beside = _characters(_DIRECT_SHARE * page.get_figwidth(), _FONT[size])
+    if direct and few and max(map(len, handles)) <= beside and _fits(page, handles):
         for label, handle in handles.items():
             line = handle.lines[0]
             axes[0, 0].annotate(
@@ -296,12 +335,30 @@ def _name_lines(page: Figure, axes: Any, heading: str, size: Size, *, direct: bo
                 textcoords="offset points", va="center", color=line.get_color(),
             )  # fmt: skip
         return
-    widest = max(map(len, handles)) + 6
-    columns = max(1, int(page.get_figwidth() * 105 / _FONT[size] / widest))
-    page.legend(
-        handles.values(), handles, title=heading, loc="outside lower center",
-        ncols=min(columns, len(handles)), fontsize="small", title_fontsize="small",
-    )  # fmt: skip
+    most = _characters(0.9 * page.get_figwidth(), _FONT[size])  # of a line
+    labels = [textwrap.fill(label, most) for label in handles]
+    for columns in range(min(len(handles), _MOST_COLUMNS), 0, -1):
+        legend = page.legend(
+            handles.values(), labels, title=heading, loc="outside lower center", ncols=columns,
+            fontsize="small", title_fontsize="small", handlelength=1.5, columnspacing=1.2,
+        )  # fmt: skip
+        if columns == 1 or legend.get_window_extent().width <= 0.92 * page.bbox.width:
+            return
+        legend.remove()
+
+
+def _characters(width_in: float, font_pt: float) -> int:
+    """How many letters are about so wide."""
+    return int(width_in * 72.0 / (_LETTER * font_pt))
+
+
+def _grow(page: Figure, axes: Any, least_in: float) -> None:
+    """Make the page higher until its axes, which share it with long names, are high enough."""
+    page.draw_without_rendering()
+    n_rows = axes.shape[0]
+    lacking_in = least_in - n_rows * axes[0, 0].bbox.height / page.dpi
+    if lacking_in > 0.0:
+        page.set_figheight(page.get_figheight() + math.ceil(20.0 * lacking_in) / 20.0)
 
 
 def _fits(page: Figure, handles: Mapping[str, Any]) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,15 +16,15 @@ import pandas as pd
 from markupsafe import Markup
 from scipy import stats
 
-from experiments.report.export import numeric, plain, written
+from experiments.report.export import in_words, numeric, plain, written
 from experiments.report.page import render
 from experiments.report.table import DIGITS, HTML, WORDS, notes, shown, statuses
 from experiments.runs.columns import ANSWER, COLUMNS, PATH, REPEAT, average_of, is_setting
 from experiments.runs.columns import title as titled
 from experiments.runs.row import Outcome
-from experiments.sweeps.again import short_key
+from experiments.sweeps.again import noted_config_dir, short_key
 from experiments.sweeps.averages import RECORDING
-from experiments.sweeps.collect import COMMAND, DRAWN, measured, suggested, telling, with_answers
+from experiments.sweeps.collect import DRAWN, commands, measured, suggested, telling, with_answers
 from experiments.sweeps.summary import ERROR, summary
 from sim.errors import InputError, printable, require
 from sim.files import write_whole
@@ -33,7 +34,9 @@ _DIGITS = 5  # of the numbers behind the chart
 _SHOWN_RUNS = 3  # of an estimator, best, worst and failed
 
 
-def write_sweep_page(table: pd.DataFrame, name: str, folder: Path, out: Path) -> None:
+def write_sweep_page(
+    table: pd.DataFrame, name: str, folder: Path, out: Path, config_dir: Path | None = None
+) -> None:
     """Write the page of a sweep's rows, as `collect` gives them with their times.
 
     It links the pictures of runs that are at their `picture_path`.
@@ -44,6 +47,8 @@ def write_sweep_page(table: pd.DataFrame, name: str, folder: Path, out: Path) ->
         Of the sweep, as `estima view NAME/KEY` finds it.
     folder
         Where the rows lie, for the command that made them.
+    config_dir
+        Folder of options of one's own, for the commands that draw runs; by default the sweep's.
 
     Raises
     ------
@@ -66,6 +71,8 @@ def write_sweep_page(table: pd.DataFrame, name: str, folder: Path, out: Path) ->
         path.stem: quote(path.relative_to(out.parent).as_posix())
         for path in _pictures(out).glob("*.html")
     }
+    own = config_dir or noted_config_dir(folder)
+    options = f" --config-dir {shlex.quote(str(own))}" if own else ""
     runs = extremes(table)
     found = summary(table)
     means = written(shown(found), HTML, DIGITS)
@@ -73,7 +80,7 @@ def write_sweep_page(table: pd.DataFrame, name: str, folder: Path, out: Path) ->
         "sweep.html",
         name=name,
         n_runs=len(table),
-        data=_data(every, name, settings, metrics, pictures),
+        data=_data(every, (name, options), settings, metrics, pictures),
         statuses=statuses(table),
         note=notes(found, None),
         head=[Markup(cell) for cell in means],
@@ -84,7 +91,8 @@ def write_sweep_page(table: pd.DataFrame, name: str, folder: Path, out: Path) ->
         estimators=sorted(runs["choice.estimator"].unique()),
         remarks=bool((runs.get("status_detail", pd.Series(dtype=str)).fillna("") != "").any()),
         drawn=bool(pictures),
-        commands=_commands(folder),
+        commands=commands(folder),
+        options=options,
         constant=_constant(table),
     )
     with write_whole(out) as part:
@@ -93,7 +101,7 @@ def write_sweep_page(table: pd.DataFrame, name: str, folder: Path, out: Path) ->
 
 def _data(
     table: pd.DataFrame,
-    name: str,
+    called: tuple[str, str],
     settings: list[str],
     metrics: list[str],
     pictures: Mapping[str, str],
@@ -123,7 +131,8 @@ def _data(
         "statuses": [WORDS[Outcome(s)] for s in pd.factorize(table["status"])[1]],
         "keys": [short_key(row) for _, row in table[["run_key", REPEAT]].iterrows()],
         "pictures": pictures,
-        "name": name,
+        "name": called[0],
+        "options": called[1],
         "drawn": list(DRAWN),
         "start": {"x": x, "y": first, "colour": colour, "panels": panels},
         "t975": [round(float(stats.t.ppf(0.975, n)), 4) for n in range(1, 200)],
@@ -177,25 +186,20 @@ def _shown(
     runs: pd.DataFrame, settings: Sequence[str], pictures: Mapping[str, str]
 ) -> list[dict[str, Any]]:
     """What the table of the best and worst runs says of each."""
+    values = {name: in_words(runs[name]) for name in settings}
     return [
         {
             "estimator": row["choice.estimator"],
             "kind": row["kind"],
             "first": row["first"],
             "error": plain(row[ERROR], DIGITS) if row["kind"] != "failed" else "",
-            "settings": [plain(row[name]) if pd.notna(row[name]) else "" for name in settings],
+            "settings": [values[name][i] for name in settings],
             "remark": row.get("status_detail") or "",
             "key": short_key(row),
             "picture": pictures.get(short_key(row), ""),
         }
-        for _, row in runs.iterrows()
+        for i, (_, row) in enumerate(runs.iterrows())
     ]
-
-
-def _commands(folder: Path) -> list[str]:
-    """Commands that made the rows, as the sweeps noted them."""
-    path = folder / COMMAND
-    return path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
 
 
 def _constant(table: pd.DataFrame) -> list[tuple[str, str]]:

@@ -4,6 +4,7 @@ This is the one schema of rows: by its name, a column is a setting, a metric, a 
 """
 
 import dataclasses
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Literal
@@ -241,6 +242,25 @@ def _parted(name: str) -> tuple[list[str], str]:
         own, longest = [*own, longest], ""
     unit = _UNITS.get(longest, "m" if name in _IN_METRES else "")
     return [_WORDS.get(word, word) for word in own], unit
+
+
+def alike(values: Iterable[float], digits: int = 4) -> list[str]:
+    """Numbers of one setting as texts: all with powers of ten if one of them needs it.
+
+    Examples
+    --------
+    >>> alike([1e-5, 1e-4, 0.0]), alike([1e-4, 0.25, 2000.0])
+    (['1e-5', '1e-4', '0'], ['0.0001', '0.25', '2000'])
+    """
+    rounded = [float(f"{value:.{digits}g}") for value in values]
+    texts = [f"{value:.{max(digits, 6)}g}" for value in rounded]
+    if not any("e" in text for text in texts):
+        return texts
+    parts = [f"{value:.{digits - 1}e}".partition("e") for value in rounded]
+    return [
+        f"{mantissa.rstrip('0').rstrip('.')}e{int(exponent)}" if value and exponent else text
+        for text, value, (mantissa, _, exponent) in zip(texts, rounded, parts, strict=True)
+    ]
 
 
 def average_of(name: str) -> Average:

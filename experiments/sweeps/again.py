@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import json
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
-from hydra.errors import HydraException
+from hydra.errors import HydraException, MissingConfigException
 
 from experiments.runs.columns import REPEAT, is_setting
-from experiments.runs.experiment import Config, Experiment
+from experiments.runs.experiment import Config, Experiment, searched
 from experiments.runs.store import read_runs
 from experiments.runs.team import recorded
-from experiments.sweeps.collect import folder_of
+from experiments.sweeps.collect import commands, folder_of
 from sim.errors import InputError, require
 from sim.recording import Recording
 from sim.team import Team
@@ -73,13 +74,29 @@ def row_of(word: str) -> pd.Series[Any] | None:
     return found.iloc[0]
 
 
-def run_again(row: pd.Series[Any], options: list[str] | None = None) -> Again:
+def noted_config_dir(folder: Path) -> str | None:
+    """The folder of options that the last sweep into a folder of rows named, if any did."""
+    for command in reversed(commands(folder)):
+        try:
+            words = shlex.split(command)
+        except ValueError:  # edited by hand
+            continue
+        if "--config-dir" in words[:-1]:
+            return words[words.index("--config-dir") + 1]
+    return None
+
+
+def run_again(
+    row: pd.Series[Any], config_dir: str | Path | None = None, noted: str | None = None
+) -> Again:
     """The experiment that left a row.
 
     Parameters
     ----------
-    options
-        Hydra's overrides by which options of one's own are found, if any.
+    config_dir
+        A folder of further options.
+    noted
+        That of the sweep; it is taken where none is given, if it is there.
 
     Raises
     ------
@@ -89,10 +106,17 @@ def run_again(row: pd.Series[Any], options: list[str] | None = None) -> Again:
     settings = {str(c): row[c] for c in row.index if is_setting(str(c)) and str(c) != "name"}
     chosen = {c.partition(".")[2]: v for c, v in settings.items() if c.startswith("choice.")}
     choices = [f"{group}={name}" for group, name in chosen.items() if isinstance(name, str)]
+    if config_dir is None and noted is not None and Path(noted).is_dir():
+        config_dir = noted
     try:
-        base = Experiment.compose([*(options or []), *choices])
+        base = Experiment.compose([*searched(config_dir), *choices])
+    except MissingConfigException as error:
+        was = f" (the sweep's was {noted})" if noted is not None else ""
+        raise InputError(
+            f"{error.missing_cfg_file} is no option here; add --config-dir with its folder{was}"
+        ) from error
     except HydraException as error:
-        raise InputError(f"{', '.join(choices)}: not options here; add --config-dir") from error
+        raise InputError(f"{', '.join(choices)}: {str(error).splitlines()[0]}") from error
     config: Config = json.loads(json.dumps(base.config))
     defaults = base.labels("")
     for name in [*(n for n in defaults if n in settings), *settings]:

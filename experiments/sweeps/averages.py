@@ -1,8 +1,9 @@
 """The one rule by which tables, plots and pages average runs.
 
 The recording is the unit of inference. Repeats over one recording are averaged first: errors by
-their squares, all else arithmetically. Recordings are averaged geometrically, with the t interval
-of the logs, where a metric is spread by factors, else arithmetically: `runs.columns.Average`.
+their squares, all else arithmetically. Runs of other settings over one recording are no repeats;
+they, then recordings, are averaged geometrically, with the t interval of the logs, where a metric
+is spread by factors, else arithmetically: `runs.columns.Average`.
 """
 
 from __future__ import annotations
@@ -14,21 +15,27 @@ import pandas as pd
 from scipy import stats
 
 from experiments.evaluation.statistics import paired_p
-from experiments.runs.columns import REPEAT, Average, average_of
+from experiments.runs.columns import REPEAT, Average, average_of, title
 
 RECORDING = "recording_checksum"
 LEAST = 3  # units of an interval: of two, Student's t makes it 13 standard errors
 
 
-def rule(unit: str, names: Sequence[str], bounded: Sequence[bool]) -> str:
+def rule(
+    unit: str, names: Sequence[str], bounded: Sequence[bool], settings: Sequence[str] = ()
+) -> str:
     """How columns are averaged over recordings or repeats, in words.
 
     Parameters
     ----------
     bounded
         Which of the means have an interval.
+    settings
+        Which are averaged over too.
     """
     over = "repeats" if unit == REPEAT else "recordings"
+    if settings:
+        over = f"{over} and {', '.join(map(title, settings))}"
     if all(bounded):
         interval = " [95 % interval]"
     else:
@@ -52,26 +59,46 @@ def unit_of(table: pd.DataFrame, by: Sequence[str]) -> str:
     return REPEAT if alone and groups[REPEAT].nunique().max() > 1 else RECORDING
 
 
-def pooled(table: pd.DataFrame, by: Sequence[str], name: str) -> pd.Series[float]:
-    """One value of a column for each group, over all rows that have one; `by` holds the unit."""
+def pooled(
+    table: pd.DataFrame, by: Sequence[str], name: str, settings: Sequence[str] = ()
+) -> pd.Series[float]:
+    """One value of a column for each group, over all rows that have one; `by` holds the unit.
+
+    Repeats are rows that are equal in `settings` too.
+    """
     known = table[table[name].notna()].astype({name: float})
-    if average_of(name) is not Average.ERROR:
-        return known.groupby(list(by), dropna=False)[name].mean()
-    squares = known.assign(**{name: known[name] ** 2})
-    return np.sqrt(squares.groupby(list(by), dropna=False)[name].mean())
+    kind, levels = average_of(name), list(range(len(by)))
+    if kind is Average.ERROR:
+        squares = known.assign(**{name: known[name] ** 2})
+        values = np.sqrt(squares.groupby([*by, *settings], dropna=False)[name].mean())
+    else:
+        values = known.groupby([*by, *settings], dropna=False)[name].mean()
+    if not settings:
+        return values
+    if kind is Average.PLAIN:
+        return values.groupby(level=levels, dropna=False).mean()
+    with np.errstate(divide="ignore"):
+        return np.exp(np.log(values).groupby(level=levels, dropna=False).mean())
 
 
-def averages(table: pd.DataFrame, by: Sequence[str], unit: str, name: str) -> pd.DataFrame:
+def averages(
+    table: pd.DataFrame, by: Sequence[str], unit: str, name: str, settings: Sequence[str] = ()
+) -> pd.DataFrame:
     """Mean of a column over the units of each group, with its 95 % interval.
 
     A geometric mean over a zero is zero, without bounds; a mean of fewer than three units has none.
+
+    Parameters
+    ----------
+    settings
+        Those that differ within a group, the seeds left out.
 
     Returns
     -------
     DataFrame
         Columns `value`, `low` and `high`; one row a group that has a value.
     """
-    values = pooled(table, [*by, unit], name)
+    values = pooled(table, [*by, unit], name, settings)
     geometric = average_of(name) is not Average.PLAIN
     with np.errstate(divide="ignore", invalid="ignore"):
         groups = (np.log(values) if geometric else values).groupby(level=list(range(len(by))))

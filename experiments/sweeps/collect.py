@@ -92,6 +92,12 @@ def folder_of(name: str) -> Path:
     return path
 
 
+def commands(folder: Path) -> list[str]:
+    """Commands that made the rows of a folder, as the sweeps noted them."""
+    path = folder / COMMAND
+    return path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
+
+
 def _check_distinct(table: pd.DataFrame, settings: list[str], path: Path) -> None:
     """Check that rows of equal settings are of one run; `settings` are those that differ.
 
@@ -126,10 +132,11 @@ def where(table: pd.DataFrame, conditions: Sequence[str]) -> pd.DataFrame:
     """
     for condition in conditions:
         column, equals, wanted = condition.partition("=")
-        if not equals or column not in table:
-            raise InputError(
-                f"--where {condition}: give COLUMN=VALUE; columns: {', '.join(map(str, table))}"
-            )
+        if not equals:
+            there = dozen([*map(str, table)])
+            raise InputError(f"--where {condition}: give COLUMN=VALUE; columns: {there}")
+        if column not in table:
+            raise InputError(f"--where {condition}: {no_column(table, column, metric=False)}")
         numbers, number = (pd.to_numeric(v, errors="coerce") for v in (table[column], wanted))
         meets = (table[column].astype(str) == wanted) | (numbers == number)
         if not meets.any():
@@ -189,6 +196,7 @@ def suggested(table: pd.DataFrame, taken: Sequence[str] = ()) -> list[str]:
     """Settings to draw a sweep by, one at least: for the x axis, then for colours and panels.
 
     First come numbers that all runs have, then the estimator and other words; none that is taken.
+    Words of more values than there are colours come before all.
     """
     settings = [name for name in telling(table) if name not in taken]
     kinds = [name for name in settings if name not in DRAWN]
@@ -196,7 +204,8 @@ def suggested(table: pd.DataFrame, taken: Sequence[str] = ()) -> list[str]:
     words = sorted(
         set(kinds) - set(numbers), key=lambda n: (n != "choice.estimator", kinds.index(n))
     )
-    x = next(iter([*numbers, *words, *settings]), REPEAT)
+    crowds = [name for name in words if table[name].nunique() > FEW]
+    x = next(iter([*crowds, *numbers, *words, *settings]), REPEAT)
     return [x, *(n for n in [*words, *numbers] if n != x and table[n].nunique() <= FEW)]
 
 
@@ -213,11 +222,15 @@ def no_column(table: pd.DataFrame, wanted: str, *, metric: bool) -> InputError:
     known = [*answers, *found] if metric else [*telling(table), *found, *table]
     near = [name for name in known if wanted.rpartition(".")[2].lower() in name]
     near += get_close_matches(wanted, known, n=5)
-    names = list(dict.fromkeys([*near, *known]))
-    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
     meant = f"did you mean {near[0]}? " if near else ""
-    there = ", ".join(names[:_NAMED])
-    return InputError(f"the sweep has no column {wanted}; {meant}there are {there}{more}")
+    there = dozen(list(dict.fromkeys([*near, *known])))
+    return InputError(f"the sweep has no column {wanted}; {meant}there are {there}")
+
+
+def dozen(names: Sequence[str]) -> str:
+    """The first dozen names, and how many more there are."""
+    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    return ", ".join(names[:_NAMED]) + more
 
 
 def with_answers(table: pd.DataFrame, names: Sequence[str]) -> pd.DataFrame:

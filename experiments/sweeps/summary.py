@@ -133,8 +133,9 @@ def _compare(
 ) -> None:
     """Add which means differ from the reference's, and the ratio of the position errors."""
     p: dict[tuple[int, str], float] = {}
+    own = [c for c in telling(reference) if c not in DRAWN]
     for name in names:
-        theirs = pooled(reference, [RECORDING], name)
+        theirs = pooled(reference, [RECORDING], name, own)
         for group, ours in pooled(table, [_GROUP, RECORDING], name).groupby(level=0):
             p[group, name] = difference_p(ours.droplevel(0), theirs, name)
     tested = [pair for pair, value in p.items() if value < 1.0]  # not NaN, nor with itself
@@ -144,6 +145,7 @@ def _compare(
         found[f"{name}_differs"] = [(group, name) in differs for group in found.index]
     if ERROR in names:
         each = pooled(table, [_GROUP, RECORDING], ERROR)
-        ratio = each / each.index.get_level_values(1).map(pooled(reference, [RECORDING], ERROR))
+        theirs = pooled(reference, [RECORDING], ERROR, own)
+        ratio = each / each.index.get_level_values(1).map(theirs)
         table = ratio.rename(ERROR).reset_index()
         _add(found, RELATIVE + against, averages(table, [_GROUP], RECORDING, ERROR))

@@ -34,6 +34,11 @@ def draw_ellipses(
         label = ""
 
 
+def literal(text: str) -> str:
+    """A text of a file as Matplotlib shows it, which reads what is between two $ as mathematics."""
+    return text.replace("$", r"\$")
+
+
 def plain_ticks(ax: Axes, values: Iterable[float], **text: Any) -> None:
     """Put the ticks of a logarithmic x axis at the values; both axes lose their minor ticks."""
     ticks = sorted(set(values))

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from estimators.base import Estimate
-from experiments.viewing.plotting import draw_ellipses, plan_axes
+from experiments.viewing.plotting import draw_ellipses, literal, plan_axes
 from experiments.viewing.style import ESTIMATE, GREEN, ORANGE, TRUTH, figure
 from experiments.viewing.team_figure import team_figure
 from experiments.viewing.world import draw_world, sees_landmarks
@@ -43,7 +43,7 @@ def run_figure(recording: Recording, estimate: Estimate, name: str) -> Figure:
     for name_of, color in zip(_seen(recording), (ORANGE, GREEN), strict=False):
         points = _points(recording, estimate, name_of)
         map_axes.plot(*points.T, ".", color=color, ms=1.5, alpha=0.6, label=f"{name_of} as placed")
-    map_axes.plot(*means[:, :2].T, color=ESTIMATE, lw=1.2, ls="--", label=name)
+    map_axes.plot(*means[:, :2].T, color=ESTIMATE, lw=1.2, ls="--", label=literal(name))
     some = _spread(means, _N_ELLIPSES)
     draw_ellipses(
         map_axes, means[some], estimate.covariances[some], "95 % ellipse",

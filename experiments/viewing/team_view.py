@@ -9,6 +9,7 @@ import numpy as np
 from estimators.base import Estimate
 from estimators.team import run_team
 from experiments.runs.seeds import stream
+from experiments.viewing.plotting import literal
 from experiments.viewing.style import BLACK
 from experiments.viewing.team_figure import colour_of, sightings
 from experiments.viewing.view import (
@@ -124,7 +125,7 @@ def pictures(run: TeamPlayback) -> Iterator[Picture]:
         layers[f"truth {number}"] = ("-", colour, label, {"lw": 1.6})
         layers[f"robot {number}"] = ("-", colour, "", {"lw": 1.4})
         if own.estimate is not None:
-            label = f"{own.name} and 95 % ellipse" if number == 0 else ""
+            label = f"{literal(own.name)} and 95 % ellipse" if number == 0 else ""
             layers[f"estimate {number}"] = ("--", BLACK, label, {"lw": 1.0})
             layers[f"ellipse {number}"] = ("-", BLACK, "", {"lw": 0.8})
 

@@ -5,6 +5,7 @@ The same `Playback` is drawn to a file here (MP4, GIF, HTML), and in a window by
 
 import base64
 import dataclasses
+import html
 import io
 import itertools
 import shutil
@@ -27,7 +28,7 @@ from experiments.trajectories.odometry import read_odometry_csv
 from experiments.trajectories.read import SUFFIXES as TRAJECTORIES
 from experiments.trajectories.read import read_trajectory
 from experiments.viewing.grid import draw_grid
-from experiments.viewing.plotting import plan_axes
+from experiments.viewing.plotting import literal, plan_axes
 from experiments.viewing.style import (
     BLUE,
     ESTIMATE,
@@ -54,7 +55,9 @@ Layer = tuple[str, str, str, dict[str, Any]]  # style, colour, label, further se
 _Layer = tuple[bool, str, str, str, dict[str, Any]]  # whether drawn, and the Layer
 SUFFIXES = (".mp4", ".gif", ".html")
 FPS = 10
-SECONDS = 20.0
+MOST_PICTURES = 200  # a page of some 6 MB
+REAL_TIME_S = 70.0  # longest drive of which so many show three instants a second
+SECONDS = 20.0  # how long a longer drive plays
 _EXTRAS = ("particles", "landmarks", "landmark_covariances")
 _MOST_PARTICLES = 1000  # drawn, of any number
 _DPI = 100
@@ -349,7 +352,7 @@ def _layers(run: Playback, known: bool) -> dict[str, Layer]:
         "landmarks": (mapped, "-", GREEN, "landmarks, 95 %", {"lw": 0.8}),
         "truth": (known, "-", TRUTH, "truth", {"lw": 1.6}),
         "truth robot": (known, "-", TRUTH, "", {"lw": 1.4}),
-        "estimate": (estimated, "--", ESTIMATE, run.name, {"lw": 1.3}),
+        "estimate": (estimated, "--", ESTIMATE, literal(run.name), {"lw": 1.3}),
         "estimate robot": (estimated, "-", ESTIMATE, "", {"lw": 1.4}),
         "ellipse": (estimated, "-", ESTIMATE, "its 95 % ellipse", {"lw": 0.9}),
     }
@@ -455,8 +458,18 @@ class Played(Protocol):
         """Time since the start, and the whole time."""
 
 
+def speed(run: Played) -> str:
+    """How fast a run plays, in words."""
+    factor = float(f"{np.ptp(run.stamps) * run.fps / len(run.stamps):.2g}")
+    return "real time" if factor == 1.0 else f"{factor:g} times real time"
+
+
 def save(
-    run: Played, images: Iterator[Picture], path: Path, on_progress: Callable[[float], None]
+    run: Played,
+    images: Iterator[Picture],
+    path: Path,
+    on_progress: Callable[[float], None],
+    title: str = "A run",
 ) -> None:
     """Write a run's pictures as `.mp4` (needs ffmpeg), `.gif` or `.html`, whole or not at all.
 
@@ -464,6 +477,8 @@ def save(
     ----------
     on_progress
         Called with the share done.
+    title
+        Of an `.html`.
     """
     check_output(path)
 
@@ -472,9 +487,11 @@ def save(
             yield picture
             on_progress(done / len(run.stamps))
 
-    write = {".mp4": _write_mp4, ".gif": _write_gif, ".html": _write_html}[path.suffix]
     with write_whole(path) as part:
-        write(run, counted(), part)
+        if path.suffix == ".html":
+            _write_html(run, counted(), part, title)
+        else:
+            {".mp4": _write_mp4, ".gif": _write_gif}[path.suffix](run, counted(), part)
 
 
 def _write_mp4(run: Played, images: Iterator[Picture], path: Path) -> None:
@@ -512,7 +529,7 @@ def _write_gif(run: Played, images: Iterator[Picture], path: Path) -> None:
     first.save(path, "GIF", save_all=True, append_images=rest, duration=duration_ms, loop=0)
 
 
-def _write_html(run: Played, images: Iterator[Picture], path: Path) -> None:
+def _write_html(run: Played, images: Iterator[Picture], path: Path, title: str) -> None:
     frames: list[str] = []
     for image in images:
         data = io.BytesIO()
@@ -522,10 +539,12 @@ def _write_html(run: Played, images: Iterator[Picture], path: Path) -> None:
         "width": image.shape[1],
         "height": image.shape[0],
         "last": len(frames) - 1,
+        "speed": speed(run),
         "fps": f"{run.fps:.4f}",
         "times": ", ".join(f'"{run.clock(float(stamp))} s"' for stamp in run.stamps),
         "first": frames[0],
         "frames": ",\n".join(f'"{frame}"' for frame in frames),
+        "title": html.escape(title),
     }
     page = (Path(__file__).parent / "player.html").read_text(encoding="utf-8")
     for name, value in values.items():

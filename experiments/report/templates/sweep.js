@@ -20,15 +20,26 @@ function fill(select, options, chosen) {
   select.addEventListener("change", draw);
 }
 
-function distinct(name) {
-  const values = [...new Set(columns.get(name).values.filter((v) => v !== null))];
+const ALL = data.failed.map((_, row) => row);
+
+function distinct(name, rows = ALL) {
+  const column = columns.get(name).values;
+  const values = [...new Set(rows.map((row) => column[row]).filter((v) => v !== null))];
   return values.sort((a, b) => (typeof a === "number" ? a - b : String(a).localeCompare(b)));
 }
+
+// Numbers of a column as plots have them: all with powers of ten if one needs it.
+function writer(values) {
+  const powers = values.some((v) => typeof v === "number" && v && (Math.abs(v) < 1e-4 || Math.abs(v) >= 1e6));
+  return (v) => (powers && typeof v === "number" && v ? v.toExponential().replace("e+", "e") : String(v));
+}
+const writers = new Map(data.settings.map((s) => [s.name, writer(s.values)]));
+const word = (name, value) => writers.get(name)(value);
 
 // What tells a run from others.
 const named = (row) => data.settings
   .filter((s) => s.values[row] !== null && new Set(s.values).size > 1)
-  .map((s) => `${s.title}: ${s.values[row]}`);
+  .map((s) => `${s.title}: ${word(s.name, s.values[row])}`);
 
 function setUp() {
   const settings = data.settings.map((c) => [c.name, c.title]);
@@ -55,7 +66,7 @@ function setUp() {
         kept.get(name)[input.checked ? "add" : "delete"](value);
         draw();
       });
-      label.append(input, ` ${value}`);
+      label.append(input, ` ${word(name, value)}`);
       box.append(label);
     }
     byId("filters").append(box);
@@ -76,8 +87,7 @@ function grouped(rows, key) {
   return groups;
 }
 
-// Numbers as plots have them, and those of a logarithmic axis that spans little.
-const written = (v) => (v && Math.abs(v) < 1e-4 ? v.toExponential() : String(v));
+// Ticks of a logarithmic axis that spans little.
 const NUMBERS = Array.from({ length: 36 }, (_, i) => [1, 2, 5].map((m) => Number(`${m}e${i - 18}`))).flat();
 
 // Where values stand on the x axis: each colour a little beside the others, as in plots.
@@ -96,20 +106,26 @@ const safe = (text) => String(text).replaceAll("&", "&amp;").replaceAll("<", "&l
 const mean = (values) => values.reduce((sum, v) => sum + v, 0) / values.length;
 
 // Mean with its 95 % interval, if it is of three or more: the rule of tables and plots.
-function average(rows, metric, unit) {
-  const units = [...grouped(rows, (row) => unit[row]).values()].map((same) => {
-    const values = same.map((row) => metric.values[row]);
-    return metric.average === "error" ? Math.sqrt(mean(values.map((v) => v * v))) : mean(values);
-  });
+// Repeats are runs of one recording that are equal in the `others`.
+function average(rows, metric, unit, others) {
   const logs = metric.average !== "plain";
-  const values = logs ? units.map(Math.log) : units;
+  const [into, back] = logs ? [Math.log, Math.exp] : [(v) => v, (v) => v];
+  const of = (repeats) => {
+    const values = repeats.map((row) => metric.values[row]);
+    return metric.average === "error" ? Math.sqrt(mean(values.map((v) => v * v))) : mean(values);
+  };
+  const setting = (row) => others.map((s) => s.values[row]).join("\u0000");
+  const values = [...grouped(rows, (row) => unit[row]).values()].map((same) =>
+    mean([...grouped(same, setting).values()].map((repeats) => into(of(repeats)))));
   const middle = mean(values);
   const n = values.length;
   const spread = Math.sqrt(values.reduce((sum, v) => sum + (v - middle) ** 2, 0) / (n - 1));
   const t = data.t975[Math.min(n - 1, data.t975.length) - 1];
   const half = n > 2 ? (t * spread) / Math.sqrt(n) : NaN;
-  const back = logs ? Math.exp : (v) => v;
-  return { value: back(middle), low: back(middle - half), high: back(middle + half), n };
+  const least = metric.values.every((v) => v === null || v >= 0) ? 0 : -Infinity;
+  const round = (v) => Number(v.toPrecision(6)); // else a mean of one is not quite its run
+  return { value: round(back(middle)), low: round(Math.max(least, back(middle - half))),
+    high: round(back(middle + half)), n };
 }
 
 // Numbers that grow by factors rather than by steps.
@@ -129,27 +145,40 @@ function byFactors(values) {
 function draw() {
   const [x, y, colour, panels] = ["x", "y", "colour", "panels"].map((id) => byId(id).value);
   const [xs, metric] = [columns.get(x), columns.get(y)];
-  const chosen = data.failed.map((_, row) => row).filter((row) =>
+  const chosen = ALL.filter((row) =>
     [...kept].every(([name, some]) => {
       const value = columns.get(name).values[row];
       return value === null || some.has(value);
     }));
   const ended = chosen.filter((row) => !data.failed[row]);
   const rows = ended.filter((row) => metric.values[row] !== null && xs.values[row] !== null);
+  const missing = [[chosen.length - ended.length, "failed"], [ended.length - rows.length, "have no finite value"]];
+  const left = missing.filter(([n]) => n).map(([n, why]) => `${n} ${n === 1 ? why.replace("have", "has") : why}`);
+  const not = left.length ? ` Not drawn: ${left.join(", ")}.` : "";
+  byId("chart").hidden = !rows.length;
+  if (!rows.length) {
+    const none = { visible: false };
+    Plotly.react("chart", [], { height: 60, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
+      margin: { t: 0, b: 0 }, xaxis: none, yaxis: none }, { displayModeBar: false });
+    byId("said").textContent = chosen.length ? `0 runs.${not}` : "Nothing is chosen.";
+    return;
+  }
   const style = getComputedStyle(document.documentElement);
   const ink = style.getPropertyValue("--text").trim();
   const line = style.getPropertyValue("--line").trim();
-  const order = distinct(x);
+  const order = distinct(x, rows);
   const numeric = order.every((v) => typeof v === "number");
   const of = (name, row) => (name ? columns.get(name).values[row] : "");
   const joined = numeric && !["repeat", ...data.drawn].includes(x); // seeds have no order
   const wide = joined && byFactors(order);
-  const panelNames = panels ? distinct(panels).filter((v) => rows.some((r) => of(panels, r) === v)) : [""];
+  const panelNames = panels ? distinct(panels, rows) : [""];
   const colours = colour ? distinct(colour) : [""];
   const groups = grouped(rows, (row) => [of(panels, row), of(colour, row), of(x, row)].join("\u0000"));
   const alone = [...groups.values()].every((g) => new Set(g.map((r) => data.recording[r])).size === 1);
   const repeated = alone && [...groups.values()].some((g) => new Set(g.map((r) => data.repeat[r])).size > 1);
   const unit = repeated ? data.repeat : data.recording;
+  const others = data.settings.filter((s) => ![x, colour, panels, "repeat", ...data.drawn].includes(s.name) &&
+    distinct(s.name, rows).length > 1);
   const narrow = matchMedia("(max-width: 700px)").matches;
   // where means have bars, their runs' dots stand to the left of them
   const aside = numeric || [...groups.values()].every((g) => g.length === 1) ? 0 : -0.4;
@@ -162,14 +191,14 @@ function draw() {
     const axis = p ? String(p + 1) : "";
     const inPanel = rows.filter((row) => !panels || of(panels, row) === panel);
     if (panels) {
-      annotations.push({ text: safe(`${columns.get(panels).title}: ${panel}`),
+      annotations.push({ text: safe(`${columns.get(panels).title}: ${word(panels, panel)}`),
         showarrow: false, xref: `x${axis} domain`, yref: `y${axis} domain`, x: 0.5, y: 1.02,
         yanchor: "bottom" });
     }
     colours.forEach((name, c) => {
       const mine = inPanel.filter((row) => !colour || of(colour, row) === name);
       if (!mine.length) return;
-      const label = safe(name);
+      const label = colour ? safe(word(colour, name)) : "";
       const shared = { xaxis: `x${axis}`, yaxis: `y${axis}`, legendgroup: label, name: label };
       const beside = (shift) =>
         placed(order, c - (colours.length - 1) / 2 + shift, colours.length, { numeric, joined, wide });
@@ -184,7 +213,7 @@ function draw() {
       }
       const points = order.map((v) => [v, mine.filter((row) => of(x, row) === v)])
         .filter(([, some]) => some.length).map(([v, some]) => ({ at: at(v),
-          row: some.length === 1 ? some[0] : undefined, ...average(some, metric, unit) }));
+          row: some.length === 1 ? some[0] : undefined, ...average(some, metric, unit, others) }));
       found.push(...points);
       traces.push({ ...shared, type: "scatter", mode: joined ? "lines+markers" : "markers",
         showlegend: Boolean(colour) && !traces.some((t) => t.name === label && t.showlegend),
@@ -202,12 +231,14 @@ function draw() {
   });
   const means = found.map((point) => point.value).sort((a, b) => a - b);
   const log = metric.log && means[0] > 0 && means[means.length - 1] >= 10 * means[0];
+  const shown = rows.map((row) => metric.values[row]);
+  const level = shown.every((v) => v === shown[0]);
   const decades = means[means.length - 1] / means[0];
   const legend = 25 * colours.length;
   const height = narrow ? Math.max(420, 330 * down) + legend
     : Math.max(420, 330 * down, 180 + legend);
   // where a narrow legend begins: below the ticks, whose words are slanted, and the axis' title
-  const below = 70 + (numeric ? 0 : 3.5 * Math.max(...order.map((v) => String(v).length)));
+  const below = 70 + (numeric ? 0 : 3.5 * Math.max(...order.map((v) => word(x, v).length)));
   const layout = {
     height, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
     font: { color: ink, family: "system-ui, sans-serif", size: 13 }, annotations,
@@ -223,34 +254,32 @@ function draw() {
     const lines = { gridcolor: line, linecolor: line, zerolinecolor: line, automargin: true };
     layout[`xaxis${axis}`] = { ...lines, title: { text: p >= panelNames.length - across ? safe(xs.title) : "" },
       ...(numeric ? { type: wide ? "log" : "linear",
-        ...(order.length <= 8 ? { tickvals: order, ticktext: order.map(written) } : {}) }
-        : { type: "linear", tickvals: order.map((_, i) => i), ticktext: order.map(safe),
+        ...(order.length <= 8 ? { tickvals: order, ticktext: order.map((v) => word(x, v)) } : {}) }
+        : { type: "linear", tickvals: order.map((_, i) => i), ticktext: order.map((v) => safe(word(x, v))),
           zeroline: false, ticklabeloverflow: "allow", tickangle: narrow ? -30 : "auto" }),
       ...(p ? { matches: "x" } : {}) };
     layout[`yaxis${axis}`] = { ...lines, title: { text: p % across ? "" : safe(metric.title) },
       type: log ? "log" : "linear", ...(log && decades >= 100 ? { dtick: 1 } : {}),
-      ...(log && decades < 100 ? { tickvals: NUMBERS, ticktext: NUMBERS.map(written) } : {}),
-      exponentformat: "power", ...(p ? { matches: "y" } : {}) };
+      ...(log && decades < 100 ? { tickvals: NUMBERS, ticktext: NUMBERS.map(writer(means)) } : {}),
+      exponentformat: "power", rangemode: level ? "tozero" : "normal", ...(p ? { matches: "y" } : {}) };
   });
   Plotly.react("chart", traces, layout,
     { responsive: true, displaylogo: false, modeBarButtons: [["toImage", "zoom2d", "pan2d", "resetScale2d"]] });
-  say(rows, x, colour, panels, metric, repeated, found.map((point) => point.n > 2),
-    [[chosen.length - ended.length, "failed"], [ended.length - rows.length, "have no finite value"]]);
+  say(rows, not, metric, repeated, found.map((point) => point.n > 2), others);
 }
 
 // Say how the means came about, what is not drawn, and what else differs within a point.
-function say(rows, x, colour, panels, metric, repeated, bounded, missing) {
+function say(rows, not, metric, repeated, bounded, others) {
   const over = repeated ? "repeats" : "recordings";
   const kind = metric.average === "plain" ? "Arithmetic" : "Geometric";
   const pooledBy = metric.average === "error" && !repeated ? ", repeats pooled by squares" : "";
   const intervals = bounded.every(Boolean) ? ", with 95 % intervals"
     : bounded.some(Boolean) ? ", with 95 % intervals of three or more" : "";
-  const others = data.settings.filter((s) => ![x, colour, panels, "repeat", ...data.drawn].includes(s.name) &&
-    new Set(rows.map((row) => s.values[row])).size > 1).map((s) => s.title);
-  const left = missing.filter(([n]) => n).map(([n, why]) => `${n} ${n === 1 ? why.replace("have", "has") : why}`);
-  const not = left.length ? ` Not drawn: ${left.join(", ")}.` : "";
-  byId("said").textContent = `${rows.length} runs.${not} ${kind} means over ${over}${pooledBy}${intervals}.` +
-    (others.length ? ` Each point also averages over ${others.join("; ")}: choose a colour, panels, or only some.` : "");
+  const runs = rows.length === 1 ? "1 run" : `${rows.length} runs`;
+  const also = others.map((s) => s.title).join("; ");
+  byId("said").textContent = `${runs}.${not} ${kind} means over ${over}${pooledBy}${intervals}.` +
+    (also ? ` Each point also averages over ${also}, ${metric.average === "plain" ? "arithmetically" : "geometrically"}: ` +
+      "choose a colour, panels, or only some." : "");
 }
 
 // What a click on a run's dot offers: its picture, or the command that draws it.
@@ -261,7 +290,7 @@ function pick(event) {
   const picture = data.pictures[key];
   const made = document.createElement(picture ? "a" : "code");
   if (picture) made.href = picture;
-  made.textContent = picture ? "watch" : `estima view ${data.name}/${key} -o run.html`;
+  made.textContent = picture ? "watch" : `estima view ${data.name}/${key}${data.options} -o run.html`;
   byId("picked").replaceChildren(`${named(row).join(", ")}. `, made, " ");
   if (picture) return;
   const copy = document.createElement("button");
