@@ -4,7 +4,8 @@ import math
 import shlex
 import sys
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from statistics import fmean
 
@@ -26,6 +27,7 @@ from experiments.runs.experiment import (
     searched,
     with_study_file,
 )
+from experiments.runs.interrupts import held_interrupts
 from experiments.runs.row import Outcome, Row
 from experiments.runs.store import write_run
 from experiments.runs.team import recorded, robots_of
@@ -62,7 +64,7 @@ def run_once(experiment: Experiment, draw: Draw, out: Path | None = None) -> lis
     found: list[tuple[Recording, Estimate]] = []
 
     def fetch() -> Recording | Team:
-        with progress("simulated seconds", expected_s(experiment)) as on_progress:
+        with shown("simulated seconds", expected_s(experiment)) as on_progress:
             recording = recorded(experiment, on_progress)
         slip = experiment.believed_slip
         if isinstance(recording, Team):
@@ -79,13 +81,25 @@ def run_once(experiment: Experiment, draw: Draw, out: Path | None = None) -> lis
         if repeat == 0:
             found.append((recording, online if revised is None else revised))
 
-    rows = evaluate(
-        experiment,
-        fetch,
-        shown=lambda read: progress(name, sum(len(r.frame_stamps) for r in robots_of(read))),
-        on_estimate=keep,
-        on_error=_trace,
-    )
+    with held_interrupts() as interrupt:
+
+        @contextmanager
+        def shown(label: str, total: float | None) -> Iterator[Callable[[float], None]]:
+            with progress(label, total) as on_progress:
+
+                def update(done: float) -> None:
+                    interrupt()
+                    on_progress(done)
+
+                yield update
+
+        rows = evaluate(
+            experiment,
+            fetch,
+            shown=lambda read: shown(name, sum(len(r.frame_stamps) for r in robots_of(read))),
+            on_estimate=keep,
+            on_error=_trace,
+        )
     if found and experiment.picture:
         draw(found, experiment, folder)
     if found and out is not None:

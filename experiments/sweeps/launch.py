@@ -18,7 +18,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,7 @@ from experiments.runs import paths, store
 from experiments.runs.console import RunFailedError, progress
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment, check_hydra
+from experiments.runs.interrupts import held_interrupts
 from experiments.runs.row import Outcome, Row, Status, check_row
 from experiments.runs.team import recorded
 from experiments.sweeps.collect import COMMAND
@@ -421,7 +422,7 @@ def run_share(share: Mapping[str, Any]) -> None:
 
 
 def _end_with(node: str, planner: int) -> None:
-    """End this process when the planner is killed, if the planner started it."""
+    """End this process when the planner ends, if the planner started it, and not by Ctrl-C."""
     if platform.node() != node or os.getpid() == planner:
         return
     if os.getppid() != planner:  # started by a launcher's own processes, or left behind just now
@@ -434,6 +435,7 @@ def _end_with(node: str, planner: int) -> None:
             time.sleep(0.5)
         os._exit(1)
 
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the terminal sends it to all; the planner acts
     if "planner" not in {thread.name for thread in threading.enumerate()}:
         threading.Thread(target=watch, name="planner", daemon=True).start()
 
@@ -451,20 +453,27 @@ def run_and_record(
         Takes the rows.
     """
     journal.begin(experiment.key)
-    try:
-        rows = evaluate(experiment, lambda: _held(experiment, held))
-        for row in rows:
-            check_row(row)
-    except (Exception, SystemExit) as error:
-        rows = [_failure(experiment, Status.of_error(error))]
+    with held_interrupts() as on_step:  # what one causes is no result
+        try:
+            rows = evaluate(
+                experiment,
+                lambda: _held(experiment, held, on_step),
+                shown=lambda _: nullcontext(on_step),
+            )
+            for row in rows:
+                check_row(row)
+        except (Exception, SystemExit) as error:
+            rows = [_failure(experiment, Status.of_error(error))]
     journal.append(rows)
 
 
-def _held(experiment: Experiment, held: dict[str, Recording | Team]) -> Recording | Team:
+def _held(
+    experiment: Experiment, held: dict[str, Recording | Team], on_progress: Callable[..., None]
+) -> Recording | Team:
     key = experiment.recording_key
     if key not in held:
         held.clear()
-        held[key] = recorded(experiment)
+        held[key] = recorded(experiment, on_progress)
     return held[key]
 
 
