@@ -184,6 +184,11 @@ def _configuration_errors() -> tuple[type[Exception], ...]:
     return (hydra.HydraException, omegaconf.OmegaConfBaseException, malformed)
 
 
+def counted(n: int, what: str) -> str:
+    """A number of things, such as 1 run or 2 runs."""
+    return f"{n} {what}" if n == 1 else f"{n} {what}s"
+
+
 def show(text: str) -> None:
     """Print text that may come from a file, with ? for what the terminal cannot or must not show.
 

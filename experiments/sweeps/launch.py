@@ -28,13 +28,13 @@ import numpy as np
 from omegaconf import DictConfig
 
 from experiments.runs import paths, store
-from experiments.runs.console import RunFailedError, progress
+from experiments.runs.console import RunFailedError, counted, progress
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment, check_hydra
 from experiments.runs.interrupts import held_interrupts
 from experiments.runs.row import Outcome, Row, Status, check_row
 from experiments.runs.team import recorded
-from experiments.sweeps.collect import COMMAND
+from experiments.sweeps.collect import COMMAND, UNFINISHED
 from experiments.sweeps.plan import Family, Numbers, Plan, packed, plan_of
 from sim.compiled import ANNOUNCED, note_compiling
 from sim.errors import InputError
@@ -108,15 +108,18 @@ def sweep(
     done = np.isin(keys, store.ended(folder, damaged=_drop).done)
     runs = np.sort(first[~done])
     check(plan, runs)
-    _note_command(folder, arguments, config_dir)
+    command = _note_command(folder, arguments, config_dir)
+    unfinished = folder / UNFINISHED.format(hashlib.sha256(command.encode()).hexdigest()[:8])
     print(
-        f"{len(keys)} run{'s' if len(keys) > 1 else ''}, {done.sum()} of them done "
-        f"before: {paths.short(folder)}",
+        f"{counted(len(keys), 'run')}, {done.sum()} of them done before: {paths.short(folder)}",
         file=sys.stderr,
     )
     if not len(runs):
+        unfinished.unlink(missing_ok=True)
         on_done(folder, len(keys))
         return
+    with write_whole(unfinished) as part:
+        part.write_text(f"{len(keys)} {command}\n", encoding="utf-8")
     try:
         _launch_all(plan, runs, Jobs(folder, n_jobs), launching)
     except KeyboardInterrupt:
@@ -124,6 +127,7 @@ def sweep(
         raise KeyboardInterrupt(
             f"interrupted; {n_kept} of {len(keys)} runs are kept: run it again to go on"
         ) from None
+    unfinished.unlink(missing_ok=True)
     _tidy(folder)
     found = store.ended(folder)
     on_done(folder, len(keys))
@@ -146,8 +150,8 @@ def _name(plan: Plan, own: Sequence[str], config_dir: str | None) -> str | None:
     return f"sweep_{hashlib.sha256(text.encode()).hexdigest()[:8]}"
 
 
-def _note_command(folder: Path, arguments: Sequence[str], config_dir: str | None) -> None:
-    """Keep the command beside the rows, for pages that show them."""
+def _note_command(folder: Path, arguments: Sequence[str], config_dir: str | None) -> str:
+    """Keep the command beside the rows, for pages that show them, and return it."""
     path = folder / COMMAND
     require_file(path)
     given = [*(["--config-dir", config_dir] if config_dir else []), *arguments]
@@ -156,6 +160,7 @@ def _note_command(folder: Path, arguments: Sequence[str], config_dir: str | None
     if command not in noted:
         with write_whole(path) as part:
             part.write_text("\n".join([*noted, command]) + "\n", encoding="utf-8")
+    return command
 
 
 def check(plan: Plan, runs: Numbers) -> None:
