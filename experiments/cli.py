@@ -1219,7 +1219,7 @@ def plot(
         every = f"all {len(rows)} runs" if len(rows) > 1 else "the run"
         raise InputError(f"{name}: {every} failed; `estima table {name}` says how")
     if failed.any():
-        print(f"left out {failed.sum()} of {len(rows)} runs, which failed", file=sys.stderr)
+        print(f"{failed.sum()} of {len(rows)} runs failed; left out", file=sys.stderr)
         rows = rows[~failed]
     chosen = ""
     if x is None:
