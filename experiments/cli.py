@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from experiments.runs import columns, completion, paths
-from experiments.runs.console import end, progress, show
+from experiments.runs.console import counted, end, progress, show
 from experiments.runs.row import Outcome, write_frame
 from experiments.runs.version import code_version
 from sim.errors import InputError, require
@@ -54,7 +54,7 @@ ConfigDir = Annotated[
 WhichRobot = Annotated[
     int | None,
     typer.Option(
-        help="Which robot of an MRCLAM set (from 1 on [1]), or of a team's file (from 0)."
+        help="Which robot of an MRCLAM set (from 1; default: 1), or of a team's file (from 0)."
     ),
 ]
 
@@ -161,13 +161,15 @@ def _show_sweep(folder: Path, n_runs: int) -> None:
         if (rows["status"] == Outcome.FAILED).all():
             (why, count), *_ = statuses(rows)
             reason = why.removeprefix("failed: ")
-            show(f"All {len(rows)} runs failed, most often ({count}) so: {reason}")
+            often = f"All {len(rows)} runs failed, most often ({count}) so"
+            show(f"{often if len(rows) > 1 else 'The run failed'}: {reason}")
             print(f"\nNext: estima table {folder.name} --rows -o rows.csv  (how each run ended)")
             return
         found = summary(rows, metrics=[ERROR] if "ate_rmse_m" in rows else [])
         if len(found) <= _FEW_LINES:
             show(as_lines(found, notes(found, None)))
-        estimators = rows["choice.estimator"].unique()
+        sound = rows[rows["status"] != Outcome.FAILED]
+        estimators = sound["choice.estimator"].unique()
         against = f" --against {estimators[0]}" if len(estimators) > 1 else ""
     print(f"\nNext: estima table {folder.name}{against} -o table.tex")
     print(f"      estima plot {folder.name}")
@@ -391,7 +393,7 @@ def view(
     ] = None,
     seconds: Annotated[
         float | None,
-        typer.Option(help="Duration [real time; saved, of a drive longer than 70 s: 20]."),
+        typer.Option(help="Duration (default: real time; of a drive over 70 s in a file, 20)."),
     ] = None,
     config_dir: ConfigDir = None,
 ) -> None:
@@ -900,7 +902,7 @@ def tune(
     jobs: Annotated[int, typer.Option("--jobs", "-j", help="Processes.")] = 1,
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", help="Folder of the YAMLs [results/tuned/estimator]."),
+        typer.Option("--out", "-o", help="Folder of the YAMLs (default: results/tuned/estimator)."),
     ] = None,
     config_dir: ConfigDir = None,
 ) -> None:
@@ -1108,7 +1110,7 @@ def table(
         str | None,
         typer.Option(
             help="Of a .tex: column or page of an IEEE paper (252, 516 pt), or text of an article "
-            "(345 pt) [text]."
+            "(345 pt), the default."
         ),
     ] = None,
     only: Where = None,
@@ -1138,7 +1140,7 @@ def table(
     if every and out is not None:
         require(out.suffix in (".csv", ".parquet"), f"-o {out}: with --rows it is .csv or .parquet")
         write_frame(rows, out)
-        print(f"{out}: {len(rows)} rows, {len(rows.columns)} columns")
+        print(f"{out}: {counted(len(rows), 'row')}, {len(rows.columns)} columns")
         return
     found = summary(rows, against, metric or [])
     note = notes(found, against)
@@ -1148,7 +1150,7 @@ def table(
             show("\n" + "\n".join(f"{count} {words}" for words, count in statuses(rows)))
         return
     write_table(found, note, out, Path(name).name, size)
-    print(f"{out}: {len(found)} rows")
+    print(f"{out}: {counted(len(found), 'row')}")
 
 
 @app.command()
@@ -1219,9 +1221,10 @@ def plot(
     rows = where(collect(name, all_versions=all_versions, times=True), only or [])
     failed = rows["status"] == Outcome.FAILED
     if failed.all():
-        raise InputError(f"{name}: all {len(rows)} runs failed; `estima table {name}` says how")
+        every = f"all {len(rows)} runs" if len(rows) > 1 else "the run"
+        raise InputError(f"{name}: {every} failed; `estima table {name}` says how")
     if failed.any():
-        print(f"{failed.sum()} of {len(rows)} runs failed; they are left out", file=sys.stderr)
+        print(f"{failed.sum()} of {len(rows)} runs failed; left out", file=sys.stderr)
         rows = rows[~failed]
     chosen = ""
     if x is None:

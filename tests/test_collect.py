@@ -46,6 +46,9 @@ def test_tables_know_settings_from_findings_and_compare_on_the_same_recordings()
     assert (found["runs"] == 3).all()
     with pytest.raises(InputError, match="no rows of estimator c; there are a, b"):
         summary(table, against="c")
+    table.loc[table["choice.estimator"] == "a", "status"] = "failed"
+    with pytest.raises(InputError, match="all runs of a failed; there are b"):
+        summary(table, against="a")
 
 
 def test_settings_that_follow_from_others_are_not_named():
@@ -70,7 +73,18 @@ def test_rows_of_other_code_are_left_out(tmp_path, capsys):
     table.loc[:4, "code_version"] = code_version()
     table.to_parquet(tmp_path / "x.parquet")
     assert len(collect(str(tmp_path))) == 5
-    assert "left out 7 rows" in capsys.readouterr().err
+    assert (
+        "left out 7 rows of other versions of the code; --all-versions" in capsys.readouterr().err
+    )
+
+
+@pytest.mark.parametrize("columns", [[], list(rows())])
+def test_a_file_of_no_rows_is_named(tmp_path, columns):
+    rows().to_parquet(tmp_path / "a.parquet")
+    rows().reindex(columns=columns).iloc[:0].to_parquet(tmp_path / "b.parquet")
+    for path in (tmp_path, tmp_path / "b.parquet"):
+        with pytest.raises(InputError, match=r"b.parquet: a table of no rows; delete it"):
+            collect(str(path), all_versions=True)
 
 
 def test_settings_of_some_estimators_only_are_settings(tmp_path):

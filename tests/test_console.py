@@ -26,7 +26,7 @@ def test_lines_elsewhere_say_amount_rate_failures_and_time_left(clock, capsys):
         for clock[0], done in ((1.0, 20), (4.0, 80), (5.0, 100), (15.0, 300)):
             on_progress(done, failed=done // 100)
     assert capsys.readouterr().err.splitlines() == [
-        "80 of 400 runs, 20 a second, 16 s left",
+        "80 of 400 runs, 20 a second",
         "300 of 400 runs, 20 a second, 5 s left, 3 failed",
     ]
     with console.progress("simulating, s") as on_progress:
@@ -43,6 +43,27 @@ def test_the_rate_counts_from_a_restart_on(clock, capsys):
         "1 of 10 runs, 0.025 a second, 6 min left",
         "2 of 10 runs",
         "4 of 10 runs, 0.18 a second, 33 s left",
+    ]
+
+
+def test_a_time_left_is_given_once_there_is_a_rate_to_judge_it_by(clock, capsys):
+    with console.progress("checking", 1.0) as on_progress:
+        for clock[0], done in ((7.0, 0.2), (17.0, 0.04), (28.0, 0.5)):
+            on_progress(done)
+    assert capsys.readouterr().err.splitlines() == [
+        "checking: 20 % after 7 s",
+        "checking: 4 % after 17 s",
+        "checking: 50 % after 28 s, 28 s left",
+    ]
+
+
+def test_what_is_counted_is_not_said_twice(clock, capsys):
+    with console.progress("", 60, "runs") as on_progress:
+        for clock[0] in range(3, 90):
+            on_progress(2 if clock[0] < 80 else 3, restart=clock[0] < 80)
+    assert capsys.readouterr().err.splitlines() == [
+        "2 of 60 runs",
+        "3 of 60 runs, 1 a second",
     ]
 
 

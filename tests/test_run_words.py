@@ -3,16 +3,18 @@
 import contextlib
 import io
 import multiprocessing
+import re
 from concurrent.futures import ProcessPoolExecutor
 
 import numpy as np
 import pytest
+import typer
 from typer.testing import CliRunner
 
 from experiments.cli import app
 from experiments.runs import console
 from experiments.runs.experiment import Experiment
-from experiments.runs.run import expected_s, in_words
+from experiments.runs.run import _print, expected_s, in_words
 from experiments.viewing.run_figure import run_figure
 from sim import compiled
 from sim.formats.tum import write_tum
@@ -106,3 +108,26 @@ def test_a_sweep_shows_its_small_table_and_what_comes_next(tmp_path):
     command = (tmp_path / "runs" / "small" / "command.txt").read_text()
     assert command.startswith("estima run -m ")
     assert "seed=0,1" in command
+
+
+def test_a_run_that_failed_says_why_and_no_metrics(capsys):
+    bad = {"status": "failed", "status_code": "not_finite", "status_detail": "not finite at 1.00 s"}
+    of = {"choice.estimator": "mine", "choice.world": "rooms", "seed": 3}
+    _print([{**of, **bad, **a_row(ate_rmse_m=float("nan"))}], [])
+    assert capsys.readouterr().out == "mine on rooms, seed 3: failed, not finite at 1.00 s\n"
+    _print([{**of, **bad, **a_row()}, {**of, "status": "ok", **a_row()}], [])
+    said = capsys.readouterr().out
+    assert "seed 3: 1 of 2 repeats failed, not finite at 1.00 s\n  position RMSE 0.3 m," in said
+
+
+def test_the_next_command_has_each_key_once(tmp_path):
+    done = estima("run", *QUICK, "route=linear_1", "seed=3", ESTIMA_RESULTS=str(tmp_path))
+    assert "route=linear_1 -m 'seed=range(0,10)'\n" in done.stdout
+    assert "seed=3" in done.stdout  # of the drive to view
+
+
+def test_no_help_is_taken_for_markup():
+    """Typer's leaves out words in brackets."""
+    for command in typer.main.get_command(app).commands.values():
+        for option in command.params:
+            assert not re.search(r"\[[a-z#/@]", getattr(option, "help", None) or ""), option.name

@@ -5,6 +5,7 @@ import json
 import os
 import re
 import shlex
+import signal
 import subprocess
 import sys
 import time
@@ -16,6 +17,7 @@ import pytest
 
 from experiments.runs import cache, store
 from experiments.runs.experiment import Experiment, files_digest, searched
+from experiments.runs.interrupts import held_interrupts
 from experiments.runs.paths import quoted, results
 from experiments.runs.row import Status, read_rows
 from experiments.runs.store import read_runs
@@ -137,11 +139,11 @@ def test_keys_depend_on_what_decides_the_rows(tmp_path, monkeypatch):
         ("mine_for_key.Mine", "mine_for_key.py", "helper_of_mine.py"),
         ("package.part.Mine", "package/part.py", "package/other.py"),  # without an __init__
     ):
-        (tmp_path / source).write_text("class Mine: pass\n")
+        (tmp_path / source).write_text("import helper_of_mine\nclass Mine: pass\n")
         own = experiment.replaced(estimator={"_target_": target})
         keys = [own.key]
         for file in (source, beside):
-            (tmp_path / file).write_text("class Mine: x = 1\n")
+            (tmp_path / file).write_text("import helper_of_mine\nclass Mine: x = 1\n")
             source_digest.cache_clear()
             keys.append(own.key)
         assert len(set(keys)) == 3, target
@@ -295,6 +297,24 @@ def test_rows_of_an_edited_estimator_do_not_mix(name, tmp_path, monkeypatch, cap
     assert len(collect(name, all_versions=True)) == 4
 
 
+def test_only_what_an_estimator_imports_is_of_its_version(tmp_path, monkeypatch):
+    for module, text in (("tidal", "import tidal_a\n"), ("tidal_a", "from tidal_b import x\n"),
+                         ("tidal_b", "x = 1\n"), ("other", "y = 1\n")):  # fmt: skip
+        (tmp_path / f"{module}.py").write_text(text)
+    monkeypatch.syspath_prepend(str(tmp_path))
+
+    def digest():
+        source_digest.cache_clear()
+        return source_digest("tidal.Own")
+
+    first = digest()
+    (tmp_path / "other.py").write_text("y = 2\n")
+    (tmp_path / "more.py").write_text("def broken(\n")
+    assert digest() == first
+    (tmp_path / "tidal_b.py").write_text("x = 2\n")
+    assert digest() != first
+
+
 @pytest.mark.slow
 def test_two_sweeps_of_one_name_at_once(name):
     command = [sys.executable, "-m", "experiments.cli", "run", "-m", *SHORT, f"name={name}",
@@ -332,16 +352,21 @@ def test_workers_end_with_a_killed_sweep(name):
 
 
 @pytest.mark.slow
-def test_a_terminated_sweep_says_so_and_leaves_no_plan(name):
+@pytest.mark.parametrize("sent", [signal.SIGTERM, signal.SIGINT])
+def test_a_stopped_sweep_says_so_and_leaves_no_plan(name, sent):
     process = subprocess.Popen(
         [sys.executable, "-m", "experiments.cli", "run", "-m", *SHORT, f"name={name}",
          "seed=range(0,400)"],
         cwd=ROOT, stderr=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": str(ROOT)},
+        start_new_session=True,
     )  # fmt: skip
     while not list(folder(name).glob("rows-*")):
         assert process.poll() is None
         time.sleep(0.1)
-    process.terminate()
+    if sent == signal.SIGINT:  # a terminal sends it to the workers too
+        os.killpg(process.pid, sent)
+    else:
+        process.send_signal(sent)
     _, errors = process.communicate(timeout=30)
     assert process.returncode == 130
     assert errors.count("interrupted") == errors.count("kept") == 1
@@ -350,6 +375,77 @@ def test_a_terminated_sweep_says_so_and_leaves_no_plan(name):
         r"estima: interrupted; \d+ of 400 runs are kept: run it again to go on", last
     )
     assert not list(folder(name).glob("plan-*"))
+    assert not store.ended(folder(name)).failed
+
+
+@pytest.fixture
+def usual_interrupt():
+    """An interrupt does what it does in a process of its own."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("usual_interrupt")
+def test_an_interrupt_is_no_result_of_a_run(tmp_path, monkeypatch):
+    """Compiled code makes an error of it, as an estimator's own `except` may."""
+
+    def evaluated(*_, **__):
+        signal.raise_signal(signal.SIGINT)
+        raise SystemError("returned a result with an exception set")
+
+    monkeypatch.setattr(launch, "evaluate", evaluated)
+    experiment = Experiment.compose(SHORT)
+    with store.journal(tmp_path / "rows.journal") as journal, pytest.raises(KeyboardInterrupt):
+        launch.run_and_record(experiment, {}, journal)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    ended = store.ended(tmp_path)
+    assert not len(ended.done)
+    assert not ended.failed
+
+
+@pytest.mark.usefixtures("usual_interrupt")
+def test_an_interrupt_waits_for_the_next_step_and_a_second_one_does_not():
+    reached = []
+
+    def work():
+        with held_interrupts() as on_step:
+            on_step(1)
+            signal.raise_signal(signal.SIGINT)
+            for stop in (on_step, lambda: signal.raise_signal(signal.SIGINT)):
+                with pytest.raises(KeyboardInterrupt):
+                    stop()
+                reached.append(stop)
+
+    with pytest.raises(KeyboardInterrupt):
+        work()
+    assert len(reached) == 2
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # as in a worker
+    with held_interrupts():
+        signal.raise_signal(signal.SIGINT)
+
+
+def test_a_sweep_that_has_not_ended_says_so(name, monkeypatch, capsys):
+    words = [*ALONE, f"name={name}", "seed=0,1,2"]
+
+    def interrupted(experiment, *_):
+        if experiment.seed == 2:
+            raise KeyboardInterrupt
+        return original(experiment, *_)
+
+    original = launch.run_and_record
+    monkeypatch.setattr(launch, "run_and_record", interrupted)
+    with pytest.raises(KeyboardInterrupt, match="2 of 3 runs are kept"):
+        launch.sweep(words)
+    capsys.readouterr()
+    assert len(table_of(name)) == 2
+    said = capsys.readouterr().err
+    assert "2 runs so far: the sweep of 3 is unfinished; to go on: estima run -m" in said
+    monkeypatch.undo()
+    launch.sweep(words)
+    capsys.readouterr()
+    assert len(table_of(name)) == 3
+    assert not capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -58,6 +58,11 @@ def test_a_sweep_without_a_sound_run_says_why_and_proposes_what_works(
     monkeypatch.setattr("experiments.sweeps.collect.collect", lambda *_args, **_options: table)
     cli._show_sweep(tmp_path / "mine", len(table))
     assert "estima table mine --against m00 -o" in capsys.readouterr().out
+    first = table["choice.estimator"] == "m00"
+    bad = table.assign(status=table["status"].mask(first, "failed"))
+    monkeypatch.setattr("experiments.sweeps.collect.collect", lambda *_args, **_options: bad)
+    cli._show_sweep(tmp_path / "mine", len(bad))
+    assert "--against m00" not in capsys.readouterr().out
     alone = table[table["choice.estimator"] == "m00"]
     monkeypatch.setattr("experiments.sweeps.collect.collect", lambda *_args, **_options: alone)
     cli._show_sweep(tmp_path / "mine", len(alone))

@@ -1,6 +1,7 @@
 """Terminal output: progress, and the one line that ends a failed command."""
 
 import importlib
+import math
 import re
 import signal
 import sys
@@ -15,6 +16,8 @@ from sim.errors import InputError, printable
 
 _QUIET_S = 2.0  # what ends sooner shows no progress
 _LINE_EVERY_S = 10.0  # where the output is a file
+# A time left is shown once there is a rate to judge it by
+_RATED_S, _RATED_SHARE, _RATED_UNITS = 10.0, 0.05, 10
 
 
 class RunFailedError(Exception):
@@ -27,8 +30,10 @@ def progress(
 ) -> Iterator[Callable[..., None]]:
     """Yield a function that takes the amount done, and how much of it failed (by default none).
 
-    It draws a bar on a terminal, and prints a line now and then elsewhere. Nothing is shown for
-    the first two seconds. With `restart` the rate, and so the time left, counts from there on.
+    It draws a bar on a terminal, and prints a line now and then elsewhere; of what is counted, only
+    when more is done. Nothing is shown for the first two seconds, and no time left for the first
+    ten, nor before a twentieth is done, or ten of what is counted. With `restart` the rate, and so
+    the time left, counts from there on.
 
     Parameters
     ----------
@@ -41,23 +46,30 @@ def progress(
     """
     begun = time.monotonic()
     next_line, line, printed = begun + _QUIET_S, "", ""
-    start, start_s = 0.0, begun
+    start, start_s, last = 0.0, begun, (0.0, 0)
     bar = _bar(total) if sys.stderr.isatty() else None
 
     def update(done: float, failed: int = 0, *, restart: bool = False) -> None:
-        nonlocal next_line, line, printed, start, start_s
+        nonlocal next_line, line, printed, start, start_s, last
         now = time.monotonic()
         if restart:
             start, start_s = done, now
         rate = (done - start) / max(now - start_s, 1e-9)
-        line = _state(label, done, total, unit, failed, now - begun, rate)
+        line = _state(label, done, total, unit, now - begun, rate)
+        rated = done - start >= min(_RATED_SHARE * (total or math.inf), _RATED_UNITS)
+        if total and done < total and rated and now - start_s >= _RATED_S:
+            line += f", {_time((total - done) / rate)} left"
+        if failed:
+            line += f", {failed} failed"
         if now < next_line:
             return
         if bar is not None:
             bar.start()
             bar.update(bar.task_ids[0], completed=done, description=line)
             return
-        next_line, printed = now + _LINE_EVERY_S, line
+        if unit and last == (done, failed):
+            return
+        next_line, printed, last = now + _LINE_EVERY_S, line, (done, failed)
         print(line, file=sys.stderr, flush=True)
 
     try:
@@ -84,10 +96,10 @@ def _state(
     done: float,
     total: float | None,
     unit: str,
-    failed: int,
     spent_s: float,
     rate: float,
 ) -> str:
+    """The amount done, and after how long or at what rate."""
     amount = f"{done:.3g}" if isinstance(done, float) else str(done)
     of_total = f"{amount} of {max(total, done):g}" if total else amount
     if total == 1.0 and not unit:
@@ -95,12 +107,11 @@ def _state(
     parts = [f"{of_total} {unit}" if unit else f"{of_total} after {spent_s:.0f} s"]
     if unit and rate:
         parts.append(f"{rate:.2g} a second")
-    if total and rate and done < total:
-        left_s = (total - done) / rate
-        parts.append(f"{left_s / 60:.0f} min left" if left_s > 90 else f"{left_s:.0f} s left")
-    if failed:
-        parts.append(f"{failed} failed")
     return ": ".join(filter(None, [label, ", ".join(parts)]))
+
+
+def _time(s: float) -> str:
+    return f"{s / 60:.0f} min" if s > 90 else f"{s:.0f} s"
 
 
 def end(error: BaseException) -> NoReturn:
@@ -171,6 +182,11 @@ def _configuration_errors() -> tuple[type[Exception], ...]:
     hydra, omegaconf = (importlib.import_module(f"{n}.errors") for n in ("hydra", "omegaconf"))
     malformed = importlib.import_module("yaml").YAMLError
     return (hydra.HydraException, omegaconf.OmegaConfBaseException, malformed)
+
+
+def counted(n: int, what: str) -> str:
+    """A number of things, such as 1 run or 2 runs."""
+    return f"{n} {what}" if n == 1 else f"{n} {what}s"
 
 
 def show(text: str) -> None:

@@ -4,7 +4,8 @@ import math
 import shlex
 import sys
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from statistics import fmean
 
@@ -26,6 +27,7 @@ from experiments.runs.experiment import (
     searched,
     with_study_file,
 )
+from experiments.runs.interrupts import held_interrupts
 from experiments.runs.row import Outcome, Row
 from experiments.runs.store import write_run
 from experiments.runs.team import recorded, robots_of
@@ -62,7 +64,7 @@ def run_once(experiment: Experiment, draw: Draw, out: Path | None = None) -> lis
     found: list[tuple[Recording, Estimate]] = []
 
     def fetch() -> Recording | Team:
-        with progress("simulated seconds", expected_s(experiment)) as on_progress:
+        with shown("simulated seconds", expected_s(experiment)) as on_progress:
             recording = recorded(experiment, on_progress)
         slip = experiment.believed_slip
         if isinstance(recording, Team):
@@ -79,13 +81,25 @@ def run_once(experiment: Experiment, draw: Draw, out: Path | None = None) -> lis
         if repeat == 0:
             found.append((recording, online if revised is None else revised))
 
-    rows = evaluate(
-        experiment,
-        fetch,
-        shown=lambda read: progress(name, sum(len(r.frame_stamps) for r in robots_of(read))),
-        on_estimate=keep,
-        on_error=_trace,
-    )
+    with held_interrupts() as interrupt:
+
+        @contextmanager
+        def shown(label: str, total: float | None) -> Iterator[Callable[[float], None]]:
+            with progress(label, total) as on_progress:
+
+                def update(done: float) -> None:
+                    interrupt()
+                    on_progress(done)
+
+                yield update
+
+        rows = evaluate(
+            experiment,
+            fetch,
+            shown=lambda read: shown(name, sum(len(r.frame_stamps) for r in robots_of(read))),
+            on_estimate=keep,
+            on_error=_trace,
+        )
     if found and experiment.picture:
         draw(found, experiment, folder)
     if found and out is not None:
@@ -129,7 +143,8 @@ def application(arguments: Sequence[str], draw: Draw, out: Path | None = None) -
                 )
             experiment = Experiment.resolved(cfg, choices)
             run_once(experiment, draw, out)
-            said = shlex.join(["estima", "run", *given, *options])
+            others = [word for word in given if word.lstrip("+").partition("=")[0] != "seed"]
+            said = shlex.join(["estima", "run", *others, *options])
             if experiment.config["recording"] is None:
                 show(f"Next: intervals over ten drives: {said} -m 'seed=range(0,10)'")
                 drive = shlex.join(["estima", "record", "-o", "run.npz", *given, *options])
@@ -195,16 +210,20 @@ def _print(rows: Sequence[Row], files: Sequence[Path]) -> None:
     first = rows[0]
     where = first.get("choice.world") or first.get("recording") or "a recording"
     where = f"{where}, {first['team.size']} robots" if "team.size" in first else where
-    ended = {Outcome.OK: "", Outcome.REMARK: ", with a remark", Outcome.FAILED: ": failed"}
-    status = ended[Outcome(str(first["status"]))]
+    failed = [row for row in rows if row["status"] == Outcome.FAILED]
+    sound = [row for row in rows if row["status"] != Outcome.FAILED]
+    status = ", with a remark" if first["status"] == Outcome.REMARK else ""
+    if failed:
+        how_many = f"{len(failed)} of {len(rows)} repeats " if len(rows) > 1 else ""
+        status = f": {how_many}failed, {failed[0]['status_detail']}"
     show(f"{first['choice.estimator']} on {where}, seed {first['seed']}{status}")
-    if words := in_words(rows):
+    if words := in_words(sound):
         show(f"  {words}")
     if first.get("stamps_left_out"):
         scored, left_out = first["stamps_scored"], first["stamps_left_out"]
         show(f"  scored at {scored:.0f} frames; {left_out:.0f} others have no true pose")
     for name in _SHOWN:
-        values = [float(v) for row in rows if isinstance(v := row.get(name), (int, float))]
+        values = [float(v) for row in sound if isinstance(v := row.get(name), (int, float))]
         if values:
             column, mean = COLUMNS[name], fmean(values)
             show(f"  {column.label:<30} {mean:10.4g} {column.unit}")

@@ -17,7 +17,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -33,7 +33,7 @@ from experiments.runs.row import (
     read_parquet,
     read_rows,
 )
-from sim.errors import InputError
+from sim.errors import InputError, require
 from sim.files import require_file, write_whole
 
 if TYPE_CHECKING:
@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
     from numpy.typing import NDArray
 
+Table = TypeVar("Table", "pd.DataFrame", "pa.Table")
 JOURNAL = ".journal"
 _BEGUN, _WHOLE, _CHANGES, _FAILED = b"b=+!"
 ENDED = (_WHOLE, _CHANGES, _FAILED)  # kinds of lines of runs that have ended
@@ -135,11 +136,11 @@ def read_runs(path: Path) -> pd.DataFrame:
     Raises
     ------
     InputError
-        If there are none, or a file is damaged.
+        If there are none, or a file is damaged or holds no rows.
     """
     if not path.is_dir():
-        return read_rows(path)
-    tables = [table for file in _files(path) for table in _tables(file)]
+        return _with_rows(read_rows(path), path)
+    tables = [_with_rows(table, file) for file in _files(path) for table in _tables(file)]
     if not tables:
         raise InputError(f"{path}: no results here; run the study first")
     table = joined(tables)
@@ -151,6 +152,12 @@ def read_runs(path: Path) -> pd.DataFrame:
     sound = (table["status"] != Outcome.FAILED).groupby([table["run_key"], source])
     order = np.lexsort((source, sound.transform("all")))
     return table.iloc[order].drop_duplicates(["run_key", REPEAT], keep="last", ignore_index=True)
+
+
+def _with_rows(table: Table, file: Path) -> Table:
+    """The table of a file, which has rows."""
+    require(len(table) > 0, f"{file}: a table of no rows; delete it")
+    return table
 
 
 def ended(folder: Path, prefix: str = "", damaged: Any = None) -> Ended:

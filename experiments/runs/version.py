@@ -1,5 +1,6 @@
 """Digests of the source code, so that results of different versions never mix silently."""
 
+import ast
 import functools
 import hashlib
 import importlib.util
@@ -68,10 +69,10 @@ def command_files(command: Any) -> list[Path]:
 
 @functools.cache
 def source_digest(target: str) -> str:
-    """Digest of the source behind a target such as `mine.Mine`, and of the files beside it.
+    """Digest of the source behind a target such as `mine.Mine`.
 
-    It covers all files of a package; of a single module, also those in its folder, which it may
-    import. Empty for what `code_version` covers, and for what is not found.
+    It covers all files of a package; of a single module, also those in its folder that it imports.
+    Empty for what `code_version` covers, and for what is not found.
     """
     module, top = target.rpartition(".")[0], target.partition(".")[0]
     if top in ("sim", "estimators"):
@@ -85,8 +86,25 @@ def source_digest(target: str) -> str:
             places = map(Path, spec.submodule_search_locations)
             files = [path for place in places for path in sorted(place.rglob("*.py"))]
         else:
-            files = sorted(Path(spec.origin).parent.glob("*.py")) if spec and spec.origin else []
+            files = _with_imports(Path(spec.origin)) if spec and spec.origin else []
     digest = hashlib.sha256()
     for path in filter(Path.is_file, files):
         digest.update(path.name.encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:12] if files else ""
+
+
+def _with_imports(module: Path) -> list[Path]:
+    """A module's file and those in its folder that it imports, itself or through others."""
+    found, left = set[Path](), {module}
+    while left:
+        path = left.pop()
+        found.add(path)
+        try:
+            nodes = list(ast.walk(ast.parse(path.read_bytes())))
+        except (OSError, SyntaxError, ValueError):  # it will not run
+            continue
+        names = [node.module or "" for node in nodes if isinstance(node, ast.ImportFrom)]
+        names += [a.name for node in nodes if isinstance(node, ast.Import) for a in node.names]
+        beside = {module.parent / f"{name.partition('.')[0]}.py" for name in names}
+        left |= {path for path in beside if path.is_file()} - found
+    return sorted(found)

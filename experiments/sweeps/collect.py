@@ -20,15 +20,17 @@ from experiments.runs.columns import (
     STATUS,
     is_setting,
 )
+from experiments.runs.console import counted
 from experiments.runs.paths import results
 from experiments.runs.store import read_runs
 from experiments.runs.version import code_version, version_with
-from sim.errors import InputError
+from sim.errors import InputError, printable
 
 FEW = 12  # colours, and panels
 _TIMES = ["step_time_us", "cpu_time_us"]  # they differ from run to run
 _COMMAND = "estimator.command"
 COMMAND = "command.txt"  # beside the rows: the commands that made them
+UNFINISHED = "unfinished-{}.txt"  # there until its sweep has ended: how many runs, and its command
 DRAWN = ("seed", "world_seed")  # settings that only draw other samples
 _NAMED = 12  # columns that a message names
 
@@ -63,17 +65,31 @@ def collect(name: str, *, all_versions: bool = False, times: bool = False) -> pd
         mine = _of_this_code(table)
         if not mine.any():
             raise InputError(
-                f"{path}: all {len(table)} rows are of other versions of the code; run the sweep "
-                "again, or see them as they are with --all-versions"
+                f"{path}: all rows are of other versions of the code; run the sweep again, or see "
+                "them as they are with --all-versions"
             )
         if not mine.all():
-            print(f"left out {(~mine).sum()} rows of other code versions", file=sys.stderr)
+            left_out = counted((~mine).sum(), "row")
+            print(
+                f"left out {left_out} of other versions of the code; --all-versions keeps them",
+                file=sys.stderr,
+            )
         table = table[mine]
+    _say_unfinished(path, table)
     settings = swept(table)
     _check_distinct(table, settings, path)
     if not times:
         table = table.drop(columns=_TIMES, errors="ignore")
     return table.sort_values([*settings, "run_key", REPEAT], kind="stable", ignore_index=True)
+
+
+def _say_unfinished(folder: Path, table: pd.DataFrame) -> None:
+    """Say which sweeps of a folder have not ended."""
+    for path in sorted(folder.glob(UNFINISHED.format("*"))):
+        n_runs, _, command = path.read_text(encoding="utf-8", errors="replace").partition(" ")
+        here = counted(table["run_key"].nunique(), "run")
+        words = f"{here} so far: the sweep of {n_runs} is unfinished; to go on: {command}"
+        print(printable(words.rstrip()), file=sys.stderr)
 
 
 def folder_of(name: str) -> Path:

@@ -18,7 +18,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -28,12 +28,13 @@ import numpy as np
 from omegaconf import DictConfig
 
 from experiments.runs import paths, store
-from experiments.runs.console import RunFailedError, progress
+from experiments.runs.console import RunFailedError, counted, progress
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment, check_hydra
+from experiments.runs.interrupts import held_interrupts
 from experiments.runs.row import Outcome, Row, Status, check_row
 from experiments.runs.team import recorded
-from experiments.sweeps.collect import COMMAND
+from experiments.sweeps.collect import COMMAND, UNFINISHED
 from experiments.sweeps.plan import Family, Numbers, Plan, packed, plan_of
 from sim.compiled import ANNOUNCED, note_compiling
 from sim.errors import InputError
@@ -107,15 +108,18 @@ def sweep(
     done = np.isin(keys, store.ended(folder, damaged=_drop).done)
     runs = np.sort(first[~done])
     check(plan, runs)
-    _note_command(folder, arguments, config_dir)
+    command = _note_command(folder, arguments, config_dir)
+    unfinished = folder / UNFINISHED.format(hashlib.sha256(command.encode()).hexdigest()[:8])
     print(
-        f"{len(keys)} run{'s' if len(keys) > 1 else ''}, {done.sum()} of them done "
-        f"before: {paths.short(folder)}",
+        f"{counted(len(keys), 'run')}, {done.sum()} of them done before: {paths.short(folder)}",
         file=sys.stderr,
     )
     if not len(runs):
+        unfinished.unlink(missing_ok=True)
         on_done(folder, len(keys))
         return
+    with write_whole(unfinished) as part:
+        part.write_text(f"{len(keys)} {command}\n", encoding="utf-8")
     try:
         _launch_all(plan, runs, Jobs(folder, n_jobs), launching)
     except KeyboardInterrupt:
@@ -123,6 +127,7 @@ def sweep(
         raise KeyboardInterrupt(
             f"interrupted; {n_kept} of {len(keys)} runs are kept: run it again to go on"
         ) from None
+    unfinished.unlink(missing_ok=True)
     _tidy(folder)
     found = store.ended(folder)
     on_done(folder, len(keys))
@@ -145,8 +150,8 @@ def _name(plan: Plan, own: Sequence[str], config_dir: str | None) -> str | None:
     return f"sweep_{hashlib.sha256(text.encode()).hexdigest()[:8]}"
 
 
-def _note_command(folder: Path, arguments: Sequence[str], config_dir: str | None) -> None:
-    """Keep the command beside the rows, for pages that show them."""
+def _note_command(folder: Path, arguments: Sequence[str], config_dir: str | None) -> str:
+    """Keep the command beside the rows, for pages that show them, and return it."""
     path = folder / COMMAND
     require_file(path)
     given = [*(["--config-dir", config_dir] if config_dir else []), *arguments]
@@ -155,6 +160,7 @@ def _note_command(folder: Path, arguments: Sequence[str], config_dir: str | None
     if command not in noted:
         with write_whole(path) as part:
             part.write_text("\n".join([*noted, command]) + "\n", encoding="utf-8")
+    return command
 
 
 def check(plan: Plan, runs: Numbers) -> None:
@@ -421,7 +427,7 @@ def run_share(share: Mapping[str, Any]) -> None:
 
 
 def _end_with(node: str, planner: int) -> None:
-    """End this process when the planner is killed, if the planner started it."""
+    """End this process when the planner ends, if the planner started it, and not by Ctrl-C."""
     if platform.node() != node or os.getpid() == planner:
         return
     if os.getppid() != planner:  # started by a launcher's own processes, or left behind just now
@@ -434,6 +440,7 @@ def _end_with(node: str, planner: int) -> None:
             time.sleep(0.5)
         os._exit(1)
 
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the terminal sends it to all; the planner acts
     if "planner" not in {thread.name for thread in threading.enumerate()}:
         threading.Thread(target=watch, name="planner", daemon=True).start()
 
@@ -451,20 +458,27 @@ def run_and_record(
         Takes the rows.
     """
     journal.begin(experiment.key)
-    try:
-        rows = evaluate(experiment, lambda: _held(experiment, held))
-        for row in rows:
-            check_row(row)
-    except (Exception, SystemExit) as error:
-        rows = [_failure(experiment, Status.of_error(error))]
+    with held_interrupts() as on_step:  # what one causes is no result
+        try:
+            rows = evaluate(
+                experiment,
+                lambda: _held(experiment, held, on_step),
+                shown=lambda _: nullcontext(on_step),
+            )
+            for row in rows:
+                check_row(row)
+        except (Exception, SystemExit) as error:
+            rows = [_failure(experiment, Status.of_error(error))]
     journal.append(rows)
 
 
-def _held(experiment: Experiment, held: dict[str, Recording | Team]) -> Recording | Team:
+def _held(
+    experiment: Experiment, held: dict[str, Recording | Team], on_progress: Callable[..., None]
+) -> Recording | Team:
     key = experiment.recording_key
     if key not in held:
         held.clear()
-        held[key] = recorded(experiment)
+        held[key] = recorded(experiment, on_progress)
     return held[key]
 
 

@@ -76,7 +76,7 @@ def summary(
         _add(found, name, averages(sound, [_GROUP], unit, name))
         found[f"{name}_best"] = _best(found[name].where(whole), name, on)
     if against is not None:
-        _compare(found, sound, shown, against, _rows_of(against, sound))
+        _compare(found, sound, shown, against, _rows_of(against, table))
     bounded = [found.loc[found[name].notna(), f"{name}_low"].notna() for name in shown]
     found.attrs["rule"] = rule(unit, shown, [each for some in bounded for each in some])
     return found.set_axis(groups.size().index).reset_index(drop=not by)
@@ -114,11 +114,14 @@ def _best(values: pd.Series[float], name: str, on: pd.Series[str]) -> pd.Series[
 
 
 def _rows_of(estimator: str, table: pd.DataFrame) -> pd.DataFrame:
-    """Rows of the estimator that others are compared with."""
-    one = table[table["choice.estimator"] == estimator]
+    """Sound rows of the estimator that others are compared with."""
+    sound = table[table["status"] != Outcome.FAILED]
+    one = sound[sound["choice.estimator"] == estimator]
     if one.empty:
-        there = ", ".join(sorted(table["choice.estimator"].unique()))
-        raise InputError(f"no rows of estimator {estimator}; there are {there}")
+        failed = (table["choice.estimator"] == estimator).any()
+        why = f"all runs of {estimator} failed" if failed else f"no rows of estimator {estimator}"
+        there = ", ".join(sorted(sound["choice.estimator"].unique()))
+        raise InputError(f"{why}; there are {there or 'no others'}")
     if own := [c for c in telling(one) if c.startswith("estimator.")]:
         print(f"{estimator} is the mean over its {', '.join(own)}", file=sys.stderr)
     return one

@@ -15,6 +15,7 @@ import json
 import math
 import warnings
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,6 +33,7 @@ from experiments.runs import paths
 from experiments.runs.columns import REVISED
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment, composed, searched
+from experiments.runs.interrupts import held_interrupts
 from experiments.runs.row import Outcome, Row, read_rows, write_frame
 from experiments.sweeps.plan import planned
 from experiments.sweeps.ranges import FIRST_JUDGED_SEED, Range, Tuning
@@ -334,7 +336,9 @@ def _suggested(trial: Any, name: str, allowed: Range) -> Any:
 
 def error_m(experiment: Experiment) -> float:
     """Position error of the best answer, RMS m; the geometric mean over its repeats."""
-    return math.exp(float(np.mean([math.log(_answer_m(row)) for row in evaluate(experiment)])))
+    with held_interrupts() as on_step:  # an interrupted run is none that failed
+        rows = evaluate(experiment, shown=lambda _: nullcontext(on_step))
+    return math.exp(float(np.mean([math.log(_answer_m(row)) for row in rows])))
 
 
 def _answer_m(row: Row) -> float:
