@@ -118,7 +118,7 @@ def test_a_run_prints_its_errors_and_leaves_a_row(tmp_path):
         (["simulation=null"], ["simulation", "must hold keys"]),
         (["name=../../x"], ["name", "one word"]),
         (["world.n_objects=-3"], ["objects", "zero or more"]),
-        (["route.speed_mps="], ["route", "must be real number"]),
+        (["route.speed_mps="], ["route.speed_mps must be a number, got ''"]),
         (["study=leaderboard"], ["-m study=leaderboard"]),
         (["robot.kq=1"], ["unknown key robot.kq", "robot.kr", "robot.track_m"]),
         (["estimator=nosuch"], ["no estimator named nosuch", "fastslam, ", "topological_mcl"]),

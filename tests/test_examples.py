@@ -75,6 +75,7 @@ def test_own_world(example):
     assert names["run"].row["ate_rmse_m"] < 0.05
 
 
+@pytest.mark.slow
 def test_sweep_and_plot(example):
     _, written, names = example("sweep_and_plot")
     assert written == WRITES["sweep_and_plot"]

@@ -418,6 +418,7 @@ def trajectories(inputs, folder, noise_m=0.0, seed=0):
             write_tum(folder / f"{log.stem}.{repeat}.tum", made.wheels.stamps, moved)
 
 
+@pytest.mark.slow
 def test_trajectories_made_elsewhere_are_judged(elsewhere, tmp_path, capsys):
     inputs, then, now, worse = (tmp_path / name for name in ("in", "then", "now", "worse"))
     suite = read_suite(elsewhere).made(elsewhere=True)

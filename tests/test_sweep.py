@@ -220,7 +220,7 @@ def test_failed_runs_leave_rows_and_the_rest_goes_on(name, tmp_path):
     assert "2 of 4 runs" in done.stderr
     assert "a planted fault" in done.stderr
     _, *table = done.stdout.split("\n\n")[1].splitlines()
-    assert [line.split()[:3] for line in table] == [["1e-05", "2", "0"], ["0.001", "2", "2"]]
+    assert [line.split()[:3] for line in table] == [["1e-5", "2", "0"], ["1e-3", "2", "2"]]
     assert "Next: estima table" in done.stdout
     rows = table_of(name)
     assert len(rows) == 4
@@ -276,6 +276,7 @@ def test_an_estimator_that_ends_its_process_costs_its_own_runs(name, tmp_path, b
     assert {path.suffix for path in folder(name).iterdir()} == {".parquet", ".txt"}
 
 
+@pytest.mark.slow
 def test_rows_of_an_edited_estimator_do_not_mix(name, tmp_path, monkeypatch, capsys):
     for body in ("pass", "frame.wheel_increments_m"):
         words = own_estimator(tmp_path, body)
@@ -624,6 +625,7 @@ def test_files_that_are_not_the_runs_rows(name):
     (folder(name) / "rows-fifo.parquet").unlink()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("launcher", ["basic", "submitit_local", "ray"])
 def test_launchers_give_the_same_table(name, launcher):
     plugin = {"submitit_local": "hydra_submitit_launcher", "ray": "hydra_ray_launcher"}

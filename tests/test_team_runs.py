@@ -107,6 +107,7 @@ def test_a_team_is_simulated_once_and_a_smaller_one_is_another():
     )
 
 
+@pytest.mark.slow
 def test_sweeps_of_teams():
     lines = [*SHORT, "team.size=1,2", "seed=5,6", "estimator.robots=null,robots"]
     plan = plan_of([*lines, "estimator.kr=1e-5,5e-5"])
