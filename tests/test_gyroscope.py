@@ -51,7 +51,9 @@ def test_biases_at_the_start_have_their_variance():
     assert np.var(first) == pytest.approx(0.03**2, rel=0.1)
 
 
-@pytest.mark.parametrize(("rate_hz", "seconds"), [(10.0, 4), (100.0, 1)])
+@pytest.mark.parametrize(
+    ("rate_hz", "seconds"), [(10.0, 4), pytest.param(100.0, 1, marks=pytest.mark.slow)]
+)
 def test_the_bias_walks_with_a_variance_that_grows_with_time(rate_hz, seconds):
     """At any rate: the walk is a law of time, not of readings."""
     walk = 0.01

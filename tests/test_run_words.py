@@ -77,6 +77,7 @@ def announced(_):
     return said.getvalue()
 
 
+@pytest.mark.slow
 def test_only_the_process_that_began_says_that_it_compiles():
     assert "compiling numerical code" in announced(0)
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:

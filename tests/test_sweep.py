@@ -741,6 +741,7 @@ def test_a_full_disk_ends_in_a_line_and_a_correct_re_run(name, full, tmp_path):
     pd.testing.assert_frame_equal(collect(str(tmp_path)), table_of(name), check_exact=True)
 
 
+@pytest.mark.slow
 def test_damaged_files_are_made_again(name):
     swept_ = ["run", "-m", *ALONE, "seed=range(90001,90005)", f"name={name}"]
     assert estima(*swept_).returncode == 0
