@@ -63,6 +63,10 @@ def test_another_run_than_the_rows_is_refused(results):
     gone["choice.estimator"] = "nosuch"
     with pytest.raises(InputError, match=r"^estimator/nosuch is no .*--config-dir.*own\)"):
         run_again(gone, noted="own")
+    absent = pd.concat([row, pd.Series({"estimator._target_": "nowhere.Mine"})])
+    absent = absent[~absent.index.duplicated(keep="last")]
+    with pytest.raises(InputError, match="no module nowhere; is its folder on PYTHONPATH"):
+        run_again(absent)
     changed = row.copy()
     changed["recording_checksum"] = "other"
     with pytest.raises(InputError, match="not what it was"):

@@ -6,6 +6,7 @@ import re
 import pytest
 
 from experiments.runs import console
+from sim.errors import InputError
 
 
 class Terminal(io.StringIO):
@@ -90,3 +91,13 @@ def test_a_terminal_gets_a_bar_and_then_the_summary(clock, monkeypatch):
     text = re.sub(r"\x1b\[[\d;?]*[a-zA-Z]", "", console.sys.stderr.getvalue())
     assert "━" in text
     assert text.endswith("1 of 4 runs, 0.005 a second, 10 min left\n")
+
+
+def test_an_interrupt_is_said_whatever_it_caused(capsys, monkeypatch):
+    monkeypatch.setattr(console.signal, "signal", lambda *_: None)
+    error = InputError("half composed")
+    error.__context__ = KeyboardInterrupt("interrupted; 3 of 9 runs are kept")
+    with pytest.raises(SystemExit) as ended:
+        console.end(error)
+    assert ended.value.code == 130
+    assert "3 of 9 runs are kept" in capsys.readouterr().err

@@ -37,6 +37,7 @@ def rows():
 def path(tmp_path_factory):
     folder = tmp_path_factory.mktemp("sweep")
     (folder / "command.txt").write_text(f"estima run -m world={EVIL}\n")
+    (folder / "unfinished-1a.txt").write_text(f"60 estima run -m world={EVIL}\n")
     write_sweep_page(rows(), f"mine {EVIL}", folder, folder / "page.html")
     return folder / "page.html"
 
@@ -47,6 +48,7 @@ def test_the_page_is_one_small_file_in_which_nothing_from_files_is_code(path):
     assert "<img" not in text
     held = re.search(r'id="data">(.*?)</script>', text)[1]
     assert EVIL in json.loads(held)["settings"][0]["values"]
+    assert "The sweep of 60 is unfinished; to go on: <code>estima run -m world=" in text
     for words in ("2 ran, with a remark: gated at ... s", "1 failed: bad", "estima run -m world="):
         assert words in text
 

@@ -294,3 +294,13 @@ def orange(path):
     screen = np.frombuffer(path.read_bytes()[4096:], np.uint8)
     blue, green, red, _ = screen[: len(screen) // 4 * 4].reshape(-1, 4).T.astype(int)
     return bool(((red > 190) & (green > 70) & (green < 120) & (blue < 30)).sum() > 5)
+
+
+def test_a_folder_without_estimates_hides_no_estimator(recording, tmp_path, monkeypatch):
+    (tmp_path / "odometry").mkdir()
+    monkeypatch.chdir(tmp_path)
+    rows = np.arange(3)
+    assert view.estimate_of(recording, "odometry", [], rows, silent)[1] == "odometry"
+    (tmp_path / "runs" / "1").mkdir(parents=True)
+    with pytest.raises(InputError, match="runs/1/estimate.csv"):
+        view.estimate_of(recording, "runs/1", [], rows, silent)

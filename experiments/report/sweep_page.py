@@ -24,7 +24,15 @@ from experiments.runs.columns import title as titled
 from experiments.runs.row import Outcome
 from experiments.sweeps.again import noted_config_dir, short_key
 from experiments.sweeps.averages import RECORDING
-from experiments.sweeps.collect import DRAWN, commands, measured, suggested, telling, with_answers
+from experiments.sweeps.collect import (
+    DRAWN,
+    commands,
+    measured,
+    suggested,
+    telling,
+    unfinished,
+    with_answers,
+)
 from experiments.sweeps.summary import ERROR, summary
 from sim.errors import InputError, printable, require
 from sim.files import write_whole
@@ -80,6 +88,7 @@ def write_sweep_page(
         "sweep.html",
         name=name,
         n_runs=len(table),
+        unfinished=unfinished(folder),
         data=_data(every, (name, options), settings, metrics, pictures),
         statuses=statuses(table),
         note=notes(found, None),

@@ -124,6 +124,7 @@ def end(error: BaseException) -> NoReturn:
     chain: list[BaseException] = [error]
     while (before := chain[-1].__cause__ or chain[-1].__context__) is not None:
         chain.append(before)
+    chain.sort(key=lambda link: not isinstance(link, KeyboardInterrupt))  # it may cause others
     for link in chain:
         if isinstance(link, InputError):
             _say(str(link), 2)

@@ -149,7 +149,7 @@ def application(arguments: Sequence[str], draw: Draw, out: Path | None = None) -
                 show(f"Next: intervals over ten drives: {said} -m 'seed=range(0,10)'")
                 drive = shlex.join(["estima", "record", "-o", "run.npz", *given, *options])
                 if "command" not in experiment.config["estimator"]:  # `view` cannot be told it
-                    view = ["estima", "view", "run.npz", "-e", experiment.estimator_name]
+                    view = ["estima", "view", "run.npz", "-e", experiment.estimator_name, *options]
                     place = "in a window"
                     if experiment.team is not None:
                         view, place = [*view, "-o", "run.html"], "in a file"

@@ -14,6 +14,7 @@ from hydra.errors import HydraException, MissingConfigException
 from experiments.runs.columns import REPEAT, is_setting
 from experiments.runs.experiment import Config, Experiment, searched
 from experiments.runs.store import read_runs
+from experiments.runs.targets import checked
 from experiments.runs.team import recorded
 from experiments.sweeps.collect import commands, folder_of
 from sim.errors import InputError, require
@@ -131,6 +132,7 @@ def run_again(
             str(mine) == str(value) or mine == value or not (_known(mine) or _known(value)),
             f"the run had {name}={value}, and would have {mine} if it was made again",
         )
+    checked(config["estimator"], "estimator")  # without its module its version is another
     require(
         made["code_version"] == row["code_version"],
         f"the run is of another version of the code, {row['code_version']}; run the sweep again",

@@ -83,13 +83,22 @@ def collect(name: str, *, all_versions: bool = False, times: bool = False) -> pd
     return table.sort_values([*settings, "run_key", REPEAT], kind="stable", ignore_index=True)
 
 
+def unfinished(folder: Path) -> list[tuple[str, str]]:
+    """Sweeps of a folder that have not ended: how many runs each has, and its command."""
+    texts = [
+        path.read_text(encoding="utf-8", errors="replace")
+        for path in sorted(folder.glob(UNFINISHED.format("*")))
+    ]
+    parts = [text.partition(" ") for text in texts]
+    return [(n_runs, command.rstrip()) for n_runs, _, command in parts]
+
+
 def _say_unfinished(folder: Path, table: pd.DataFrame) -> None:
     """Say which sweeps of a folder have not ended."""
-    for path in sorted(folder.glob(UNFINISHED.format("*"))):
-        n_runs, _, command = path.read_text(encoding="utf-8", errors="replace").partition(" ")
+    for n_runs, command in unfinished(folder):
         here = counted(table["run_key"].nunique(), "run")
         words = f"{here} so far: the sweep of {n_runs} is unfinished; to go on: {command}"
-        print(printable(words.rstrip()), file=sys.stderr)
+        print(printable(words), file=sys.stderr)
 
 
 def folder_of(name: str) -> Path:

@@ -185,7 +185,8 @@ def estimate_by(
 
 def is_file_of_estimate(path: Path) -> bool:
     """Whether a word is a trajectory's file or a run's folder, and no estimator's name."""
-    return path.suffix in TRAJECTORIES or path.is_dir()
+    of_run = path.is_dir() and (len(path.parts) > 1 or any(path.glob("estimate*.csv")))
+    return path.suffix in TRAJECTORIES or of_run
 
 
 def read_estimate(recording: Recording, path: Path) -> Estimate:

@@ -256,6 +256,7 @@ function draw() {
       ...(numeric ? { type: wide ? "log" : "linear",
         ...(order.length <= 8 ? { tickvals: order, ticktext: order.map((v) => word(x, v)) } : {}) }
         : { type: "linear", tickvals: order.map((_, i) => i), ticktext: order.map((v) => safe(word(x, v))),
+          ...(order.length + panelNames.length === 2 ? { range: [-0.5, 0.5] } : {}),
           zeroline: false, ticklabeloverflow: "allow", tickangle: narrow ? -30 : "auto" }),
       ...(p ? { matches: "x" } : {}) };
     layout[`yaxis${axis}`] = { ...lines, title: { text: p % across ? "" : safe(metric.title) },
