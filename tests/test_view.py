@@ -302,5 +302,5 @@ def test_a_folder_without_estimates_hides_no_estimator(recording, tmp_path, monk
     rows = np.arange(3)
     assert view.estimate_of(recording, "odometry", [], rows, silent)[1] == "odometry"
     (tmp_path / "runs" / "1").mkdir(parents=True)
-    with pytest.raises(InputError, match="runs/1/estimate.csv"):
+    with pytest.raises(InputError, match=r"runs/1/estimate\.csv"):
         view.estimate_of(recording, "runs/1", [], rows, silent)
