@@ -91,7 +91,6 @@ def contents(results: Path, on_progress: Callable[[float], None]) -> dict[str, A
         "on_lasers": on_lasers(results / "tables" / "peers_methods.csv"),
         "n_statistics": len(table),
         "n_judged": table["id"].nunique(),
-        "tally": tally(claims.values()),
         "n_quick": int((table["profile"] == Profile.QUICK).sum()),
         # a table that was cut off lacks these: claims without a verdict in papers that have some
         "missing": [

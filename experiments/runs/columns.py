@@ -207,13 +207,12 @@ def title(name: str, *, short: bool = False) -> str:
         words, unit = f"ATE / that of {name.removeprefix(RELATIVE)}", ""
     elif "." in name:
         words, unit = _setting(name)
+    elif metric := next((m for m in COLUMNS if name.startswith(f"{m}_")), ""):
+        of = name.removeprefix(f"{metric}_").replace("_", " ")
+        words, unit = f"{COLUMNS[metric].symbol} ({of})", COLUMNS[metric].unit
     else:
-        metric = next((m for m in COLUMNS if name.startswith(f"{m}_")), "")
         own, unit = _parted(name)
         words = " ".join(["number of", *own[1:]] if own[0] == "n" and own[1:] else own)
-        if metric:
-            of = name.removeprefix(f"{metric}_").replace("_", " ")
-            words, unit = f"{COLUMNS[metric].symbol} ({of})", COLUMNS[metric].unit
     return f"{words}, {unit}" if unit else words
 
 
