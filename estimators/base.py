@@ -10,7 +10,7 @@ from sim.arrays import Array
 from sim.compiled import wall_s
 from sim.errors import InputError, require
 from sim.recording import Frame, Recording
-from sim.robot import RobotGeometry
+from sim.robot.drive import RobotGeometry
 from sim.sensors import Sensors
 
 

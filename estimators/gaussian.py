@@ -1,7 +1,7 @@
 """Gaussian beliefs of poses and motions, and the update of a Kalman filter.
 
 A filter handles one pose at a time, so these are sums of scalars: for so little, NumPy's calls
-would cost ten times more. The formulas are those of `sim.se2` and `sim.robot`, and the tests
+would cost ten times more. The formulas are those of `sim.se2` and `sim.robot.drive`, and the tests
 hold them against those.
 """
 
@@ -90,7 +90,7 @@ def between(T_w_a: Array, T_w_b: Array) -> tuple[Array, Array, Array]:
 
 
 def wheel_motion(travel_m: Array, variances_m2: Array, track_m: float) -> tuple[Gaussian, Array]:
-    """Motion of base_link by wheel increments (2,) of variances (2,): `sim.robot.arc_increment`.
+    """Motion of base_link by wheel increments (2,) of variances (2,), along an exact arc.
 
     Returns
     -------

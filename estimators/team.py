@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from estimators.base import Belief, Estimate, Prior
 from estimators.gaussian import Gaussian
+from estimators.landmarks.sightings import dead_reckoning
 from estimators.options import require_choices
-from estimators.sightings import dead_reckoning
 from sim.compiled import wall_s
 from sim.errors import require, required
 from sim.recording import Frame

@@ -8,14 +8,14 @@ from estimators.gaussian import Gaussian, wheel_motion
 from estimators.options import require_non_negative
 from sim.arrays import Array
 from sim.recording import Frame
-from sim.robot import TravelWindow, wheel_variances
+from sim.robot.drive import TravelWindow, wheel_variances
 
 
 class WheelPrediction:
     """Relative pose of base_link over a Frame, with the covariance of the wheels' slip.
 
     The increments ds = (right, left) turn evenly over the Frame, so base_link moves along the arc
-    u = f(ds) (`sim.robot.arc_increment`). Slip has a variance proportional to the travel
+    u = f(ds) (`sim.robot.drive.arc_increment`). Slip has a variance proportional to the travel
     (puzzlebot2024, eq. (5); decristoforis2020, eq. (2)) and reaches the pose by G = df/dds
     (puzzlebot2024, eq. (6), for the exact arc):
 
@@ -32,7 +32,7 @@ class WheelPrediction:
         Believed slip variance per metre of the right and left wheel, m.
     window_s
         |ds| is the net travel over at least this time, shared out to the Frame, so that encoder
-        noise does not inflate it (`sim.robot.TravelWindow`).
+        noise does not inflate it (`sim.robot.drive.TravelWindow`).
     lateral_slip_m
         Variance per metre of sideways slip, m.
     forward_slip_m

@@ -26,7 +26,7 @@ from sim.files import write_whole
 from sim.npz import UNREADABLE, read_arrays
 from sim.recording_check import check_recording
 from sim.recording_format_1 import upgraded
-from sim.robot import RobotGeometry
+from sim.robot.drive import RobotGeometry
 from sim.sensors.base import (
     Reading,
     Schema,
@@ -39,7 +39,7 @@ from sim.sensors.base import (
     sensors_from_meta,
 )
 from sim.settings import build
-from sim.world import World
+from sim.worlds.world import World
 
 FORMAT_VERSION = 2
 REMEDY = "delete it and record again"

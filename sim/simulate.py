@@ -22,14 +22,14 @@ from numpy.typing import NDArray
 from sim import se2
 from sim.arrays import Array
 from sim.errors import InputError, blaming, require
-from sim.feedback import Feedback, Onboard, feedback_of
-from sim.kinematic import KinematicBody
-from sim.rays import AmongRobots, BulletRays, ExactRays
 from sim.recording import CommandLog, Log, Recording, Truth, WheelLog, joined
-from sim.robot import DifferentialDrive, scaled_error
+from sim.robot.drive import DifferentialDrive, scaled_error
+from sim.robot.kinematic import KinematicBody
+from sim.routes.feedback import Feedback, Onboard, feedback_of
 from sim.sensors.base import Rays, Reading, Sensor, Sensors, View, parted
+from sim.sensors.rays import AmongRobots, BulletRays, ExactRays
 from sim.team import Team
-from sim.world import World
+from sim.worlds.world import World
 
 Physics = Literal["bullet", "kinematic"]
 RayKind = Literal["bullet", "exact"]
@@ -76,8 +76,8 @@ class Driver(Protocol):
 class Route(Protocol):
     """A plan that gives a Driver for a robot in a world.
 
-    It may have an attribute `feedback`, see `sim.feedback`; without one its driver gets the truth.
-    It may have `about_s(world, robot)`, about how long the drive takes, s.
+    It may have an attribute `feedback`, see `sim.routes.feedback`; without one its driver gets the
+    truth. It may have `about_s(world, robot)`, about how long the drive takes, s.
     """
 
     def start(self, world: World, robot: DifferentialDrive) -> tuple[Array, Driver]:
@@ -128,7 +128,7 @@ def record(
     physics
         `bullet`: rigid-body dynamics. `kinematic`: the same slip law with ideal rolling.
     rays
-        `bullet`, or `exact` for the caster of `sim.casting`; the geometry is the same.
+        `bullet`, or `exact` for the caster of `sim.sensors.casting`; the geometry is the same.
     config
         Kept in the recording: where it came from.
     on_progress
@@ -248,7 +248,7 @@ def _bodied(
 ) -> tuple[Body, Callable[[], str | None], Rays]:
     """Body of a robot, what looks for its troubles, and rays in its world."""
     if physics == "bullet":
-        from sim.bullet import BulletBody
+        from sim.robot.bullet import BulletBody
 
         bullet = stack.enter_context(BulletBody(world, robot, start))
         caster = BulletRays(bullet) if rays == "bullet" else ExactRays(world)

@@ -1,4 +1,4 @@
-"""Batch least squares by GTSAM's Levenberg-Marquardt: the problem of `estimators.smoother`."""
+"""Batch least squares by GTSAM's Levenberg-Marquardt: the problem of `smoother`."""
 
 import itertools
 from typing import Any
@@ -7,11 +7,11 @@ import numpy as np
 
 from estimators.base import Belief, Estimate, Prior
 from estimators.gaussian import STILL, Gaussian
-from estimators.landmark_drive import LandmarkDrive, loosened, observed
+from estimators.graph.landmark_drive import LandmarkDrive, loosened, observed
+from estimators.landmarks.stereo import StereoModel
 from estimators.options import require_counts, require_stereo, start_pose
 from estimators.peers import package
 from estimators.peers.gtsam_model import GtsamModel, Isam2
-from estimators.stereo import StereoModel
 from estimators.wheels import WheelPrediction
 from sim.arrays import Array
 from sim.recording import Frame

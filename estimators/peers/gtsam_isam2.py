@@ -7,11 +7,11 @@ import numpy as np
 
 from estimators.base import Belief, Prior
 from estimators.gaussian import STILL
-from estimators.landmark_drive import loosened, observed
+from estimators.graph.landmark_drive import loosened, observed
+from estimators.landmarks.stereo import StereoModel
 from estimators.options import require_counts, require_positive, require_stereo, start_pose
 from estimators.peers import package
 from estimators.peers.gtsam_model import Isam2
-from estimators.stereo import StereoModel
 from estimators.wheels import WheelPrediction
 from sim.recording import Frame
 

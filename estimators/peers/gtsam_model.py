@@ -1,4 +1,4 @@
-"""The measurement model of `estimators.smoother` as factors of GTSAM, for both of its solvers.
+"""The measurement model of `smoother` as factors of GTSAM, for both of its solvers.
 
 A planar pose is a Pose3 held to the plane, because GTSAM's stereo factor takes one. Noise has the
 covariances of `StereoModel` (column, row and disparity) and of the wheels.
@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from estimators.gaussian import Gaussian, rotated
-from estimators.landmark_drive import FLOOR
+from estimators.graph.landmark_drive import FLOOR
+from estimators.landmarks.stereo import StereoModel
 from estimators.peers import package
 from estimators.peers.planar import matrix_of
-from estimators.stereo import StereoModel
 from sim import se2
 from sim.arrays import Array, Ints
 from sim.errors import require

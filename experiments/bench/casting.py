@@ -6,9 +6,9 @@ import numpy as np
 
 from experiments.bench.measure import Measurement, median_time_s
 from sim.arrays import Array
-from sim.casting import SegmentCaster, cast_lidar, visible
 from sim.sensors import Laser, Lidar3D
-from sim.world import World
+from sim.sensors.casting import SegmentCaster, cast_lidar, visible
+from sim.worlds.world import World
 
 _GOAL_US = {30: 10.0, 300: 40.0}
 _LASER = Laser(n_beams=721, fov_rad=math.pi, max_range_m=80.0)

@@ -48,8 +48,8 @@ def _scans() -> None:
     """Registration of scans by both metrics, and its covariances."""
     import numpy as np
 
-    from estimators import icp_covariance
-    from estimators.icp import prepare, register
+    from estimators.laser import icp_covariance
+    from estimators.laser.icp import prepare, register
     from experiments.bench.icp import BEARINGS_RAD, pair
 
     drawn = pair("room", "small", 0)
@@ -69,11 +69,11 @@ def _others() -> None:
     from experiments.calibration.end_pose_model import EndPoseModel
     from experiments.runs.evaluate import estimates
     from experiments.runs.experiment import Experiment
-    from sim.grid_mapping import map_scans
-    from sim.kinematic import run_batch
-    from sim.robot import DifferentialDrive
-    from sim.route import TABLE_1
+    from sim.robot.drive import DifferentialDrive
+    from sim.robot.kinematic import run_batch
+    from sim.routes.route import TABLE_1
     from sim.sensors import Laser
+    from sim.worlds.grid_mapping import map_scans
 
     robot, route = DifferentialDrive(0.05, 0.19), TABLE_1["linear_1"]
     rng = np.random.default_rng(0)
@@ -84,7 +84,7 @@ def _others() -> None:
         [*_ROOM, "estimator=fastslam", "estimator.ess_share=1"],
         [*_ROOM, "estimator=fastslam", "estimator.association=mahalanobis"],
         [*_ROOM, "estimator=mcl", "prior.map=world"],
-        ["study=maximo2024_umh"],
+        ["study=maximo2024/umh"],
     ):
         experiment = Experiment.compose(overrides)
         recording = experiment.recording()

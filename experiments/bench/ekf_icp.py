@@ -13,7 +13,7 @@ from experiments.runs.seeds import stream
 from sim.recording import Recording
 
 _OFFICE = (
-    "study=decristoforis2020_office",
+    "study=decristoforis2020/office",
     "sensors.laser.rate_hz=75",
     "simulation.physics=kinematic",
     "route.distance_m=20",

@@ -6,10 +6,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from estimators.base import Prior
-from estimators.external import External
+from estimators.programs.external import External
 from experiments.bench.measure import Measurement, median_time_s
 from sim.recording import Frame
-from sim.robot import RobotGeometry
+from sim.robot.drive import RobotGeometry
 
 _N_BEAMS = 721
 _GOAL_US = 500.0

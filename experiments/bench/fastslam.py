@@ -8,16 +8,16 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from estimators import landmarks as ekf
 from estimators.base import Prior
 from estimators.base import run as walk
-from estimators.fastslam import FastSLAM
-from estimators.stereo import StereoModel
+from estimators.landmarks import particle_maps as ekf
+from estimators.landmarks.fastslam import FastSLAM
+from estimators.landmarks.stereo import StereoModel
 from experiments.bench.measure import Measurement, median_time_s, timed_steps
 from experiments.evaluation.statistics import log_log_slope
 from sim.arrays import Array
 from sim.recording import Log, Recording, WheelLog
-from sim.robot import RobotGeometry, wheel_errors
+from sim.robot.drive import RobotGeometry, wheel_errors
 from sim.sensors import StereoCamera
 
 PAPER = StereoCamera(sigma_column_px=10.0, sigma_row_px=10.0, correlated=False)

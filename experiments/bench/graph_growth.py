@@ -18,10 +18,10 @@ from pathlib import Path
 import numpy as np
 
 from estimators.gaussian import Gaussian
-from estimators.icp import PreparedScan, prepare
-from estimators.loop_closing import LoopSearch, look_alike, signature
-from estimators.pose_graph import Edge, PoseGraph
-from estimators.scan_matching import ScanMatcher
+from estimators.graph.loop_closing import LoopSearch, look_alike, signature
+from estimators.graph.pose_graph import Edge, PoseGraph
+from estimators.laser.icp import PreparedScan, prepare
+from estimators.laser.scan_matching import ScanMatcher
 from experiments.bench.growth import resident_mib
 from experiments.bench.measure import Measurement, time_s
 from experiments.runs.evaluate import limited_blas

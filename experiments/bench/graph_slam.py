@@ -17,8 +17,8 @@ import numpy as np
 from estimators.base import Estimate
 from estimators.base import run as run_estimator
 from estimators.gaussian import Gaussian
-from estimators.graph_slam import GraphSlam
-from estimators.pose_graph import Edge
+from estimators.graph.graph_slam import GraphSlam
+from estimators.graph.pose_graph import Edge
 from experiments.bench.measure import Measurement
 from experiments.evaluation.metrics import nees
 from experiments.runs.evaluate import limited_blas
@@ -117,7 +117,8 @@ def run_rooms(
 ) -> RoomRun:
     """Drive through rows and columns of look-alike rooms, with this share of false candidates.
 
-    `overrides` are of the configuration; `options` those of `estimators.graph_slam.GraphSlam`.
+    `overrides` are of the configuration; `options` those of
+    `estimators.graph.graph_slam.GraphSlam`.
     """
     size = [f"world.n_x={rooms[0]}", f"world.n_y={rooms[1]}", f"route.distance_m={distance_m}"]
     experiment = Experiment.compose([*_ROOMS, *size, *overrides, f"seed={seed}"])

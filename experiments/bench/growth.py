@@ -36,7 +36,7 @@ _ROOMS = (
     "prior.sigma_heading_rad=1e-4",
 )
 _CAMPUS = (
-    "study=maximo2024_campus",
+    "study=maximo2024/campus",
     "world.n_x=3",
     "world.n_y=2",
     "simulation.physics=kinematic",

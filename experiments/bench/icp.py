@@ -20,13 +20,13 @@ from typing import get_args
 
 import numpy as np
 
-from estimators import icp_covariance
-from estimators.icp import Metric, PreparedScan, Registration, prepare, register
+from estimators.laser import icp_covariance
+from estimators.laser.icp import Metric, PreparedScan, Registration, prepare, register
 from experiments.bench.measure import Measurement, median_time_s
 from experiments.evaluation.scan_bound import cast, fisher_bound
 from sim import se2
 from sim.arrays import Array
-from sim.world import World
+from sim.worlds.world import World
 
 Matcher = Callable[[Array, Array], Array]  # ranges of the target and of the source -> pose
 

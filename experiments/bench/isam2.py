@@ -1,8 +1,8 @@
 """gtsam's iSAM2 and batch solutions beside `fixed_lag`: ten standard drives, one noise model.
 
 `python -m experiments.bench.isam2` prints a table; it needs the extra `gtsam`. Both solve the
-problem that `estimators.landmark_drive` makes of a drive: the same motions between images with
-their covariances, the same observations. The camera's noise is Gaussian in pixels
+problem that `estimators.graph.landmark_drive` makes of a drive: the same motions between images
+with their covariances, the same observations. The camera's noise is Gaussian in pixels
 (`sensors.stereo.correlated=true`), the only kind for which gtsam has a compiled factor. Its poses
 are held to the plane by motions that hardly let them leave it (`_LIFT`), and its motions err on a
 tangent.
@@ -20,9 +20,9 @@ import numpy as np
 import pandas as pd
 
 from estimators.base import run as run_estimator
-from estimators.fixed_lag import FixedLag
-from estimators.least_squares import Problem, solve
-from estimators.smoother import Smoother
+from estimators.graph.fixed_lag import FixedLag
+from estimators.graph.least_squares import Problem, solve
+from estimators.graph.smoother import Smoother
 from experiments.bench.smoothing import DRIVE
 from experiments.evaluation.metrics import nees
 from experiments.runs.console import progress

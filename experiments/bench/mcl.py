@@ -12,18 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimators.base import Prior
-from estimators.likelihood_field import beam_ends, likelihood_field
-from estimators.mcl import Mcl
+from estimators.on_a_map.likelihood_field import beam_ends, likelihood_field
+from estimators.on_a_map.mcl import Mcl
 from experiments.bench.measure import Measurement, median_time_s, timed_steps
 from experiments.runs.seeds import stream
 from sim import se2
 from sim.arrays import Array
-from sim.builders import office
-from sim.casting import SegmentCaster
 from sim.recording import Frame
-from sim.robot import RobotGeometry, arc_increment
+from sim.robot.drive import RobotGeometry, arc_increment
 from sim.sensors import Laser
-from sim.world import World
+from sim.sensors.casting import SegmentCaster
+from sim.worlds.buildings import office
+from sim.worlds.world import World
 
 _LASER = Laser(n_beams=721, max_range_m=80.0, sigma_range_m=0.01)
 _N_PARTICLES = 10_000

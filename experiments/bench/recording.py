@@ -8,11 +8,11 @@ from experiments.bench.casting import hall
 from experiments.bench.measure import Measurement, median_time_s, time_s
 from experiments.runs.experiment import Experiment
 from experiments.runs.seeds import stream
-from sim.bullet import BulletBody
-from sim.rays import BulletRays
-from sim.robot import DifferentialDrive
-from sim.route import OpenLoop
+from sim.robot.bullet import BulletBody
+from sim.robot.drive import DifferentialDrive
+from sim.routes.route import OpenLoop
 from sim.sensors import Laser
+from sim.sensors.rays import BulletRays
 from sim.simulate import record
 
 _ROBOT = DifferentialDrive(0.05, 0.19, kr=1e-5, kl=1e-5)

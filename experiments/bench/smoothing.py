@@ -8,8 +8,8 @@ import numpy as np
 
 from estimators.base import Estimator
 from estimators.base import run as run_estimator
-from estimators.least_squares import solve
-from estimators.smoother import Smoother
+from estimators.graph.least_squares import solve
+from estimators.graph.smoother import Smoother
 from experiments.bench.measure import Measurement, time_s
 from experiments.runs.evaluate import limited_blas
 from experiments.runs.experiment import Experiment

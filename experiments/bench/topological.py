@@ -10,7 +10,7 @@ import numpy as np
 
 from estimators.base import Estimator, Prior
 from estimators.base import run as run_estimator
-from estimators.topological_mcl import TopologicalMcl
+from estimators.topological.topological_mcl import TopologicalMcl
 from experiments.bench.measure import Measurement
 from experiments.runs.experiment import Experiment
 from sim.recording import Recording
@@ -25,7 +25,7 @@ _GOAL_MS = 0.3
 def run() -> Iterator[Measurement]:
     """Each count with the paper's filter; the largest ones with the defaults too."""
     for name, times_s in PAPER_S.items():
-        experiment = Experiment.compose([f"study=maximo2024_{name}", "seed=1000"])
+        experiment = Experiment.compose([f"study=maximo2024/{name}", "seed=1000"])
         recording = experiment.recording()
         prior = experiment.prior(recording)
         for n_particles, paper_s in times_s.items():

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from sim.arrays import Array
 from sim.compiled import njit
 from sim.errors import require
-from sim.robot import SLIP_TIME_CONSTANT_S, DifferentialDrive
-from sim.route import TICK_S
+from sim.robot.drive import SLIP_TIME_CONSTANT_S, DifferentialDrive
+from sim.routes.route import TICK_S
 
 Ticks = NDArray[np.int64]
 EndPoseMethod = Literal["sampled", "linearised"]
@@ -23,7 +23,7 @@ class EndPoseModel:
 
     The run is cut at two dozen knots. Between two of them a wheel rolls as far as the command and
     the bias make it, less sqrt(k) times the slip's Brownian motion over the travel, delayed by the
-    lag of the wheel's speed loop as in `sim.robot.Slip`; the path is an arc.
+    lag of the wheel's speed loop as in `sim.robot.drive.Slip`; the path is an arc.
 
     Parameters
     ----------
@@ -111,7 +111,7 @@ def _slip_paths(commands_m: Array, knots: Ticks, n_samples: int, rng: np.random.
 
 @njit()
 def _mean_travel(commands_m: Array, knots: Ticks, bias: Array, lag_share: float) -> Array:
-    """Ground travel (S, 2) between knots without noise, through the lag of `sim.robot.Slip`."""
+    """Ground travel (S, 2) between knots without noise, through the lag of the slip law."""
     travel = np.zeros((len(knots) - 1, 2))
     for i in range(2):
         lag = 0.0

@@ -18,9 +18,9 @@ from scipy import optimize
 
 from estimators.base import Prior
 from estimators.base import run as run_estimator
-from estimators.ekf_slam import EkfSlam
-from estimators.icp_odometry import IcpOdometry
-from estimators.scan_matching import FAILED
+from estimators.landmarks.ekf_slam import EkfSlam
+from estimators.laser.icp_odometry import IcpOdometry
+from estimators.laser.scan_matching import FAILED
 from experiments.calibration.logs import calibrate_wheels, slip_law
 from experiments.evaluation.statistics import Interval, mean_interval, share_interval
 from experiments.runs.calibration import Calibration, SensorBelief, Slip, Wheels

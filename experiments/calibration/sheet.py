@@ -17,8 +17,8 @@ from sim.arrays import Array
 from sim.errors import InputError, require
 from sim.files import write_whole
 from sim.formats.text import LARGEST
-from sim.robot import DifferentialDrive
-from sim.route import OpenLoop
+from sim.robot.drive import DifferentialDrive
+from sim.routes.route import OpenLoop
 
 COMMAND = ("v_mps", "omega_radps", "duration_s")
 END_POSE = ("x_m", "y_m", "heading_rad")

@@ -11,7 +11,7 @@ from sim import se2
 from sim.arrays import Array
 from sim.recording import Recording
 from sim.sensors import Laser
-from sim.world import World
+from sim.worlds.world import World
 
 _CHUNK = 2000
 _LEAST_SIGMA_M = 1e-3  # points on one line have no spread across it

@@ -9,13 +9,13 @@ import numpy as np
 import pandas as pd
 from scipy.spatial import KDTree
 
-from estimators import icp_covariance
-from estimators.icp import Metric, PreparedScan, Registration, prepare, register
+from estimators.laser import icp_covariance
+from estimators.laser.icp import Metric, PreparedScan, Registration, prepare, register
 from experiments.evaluation.scan_bound import cast, fisher_bound
 from sim import se2
 from sim.arrays import Array, Ints
 from sim.sensors import Laser
-from sim.world import World
+from sim.worlds.world import World
 
 METRICS: tuple[Metric, ...] = ("point_to_plane", "point_to_line", "point_to_point")
 _GUESS_SIGMA = np.array([0.01, 0.01, math.radians(0.5)])

@@ -8,7 +8,7 @@ from typing import Any
 
 import pandas as pd
 
-from estimators.offline import recording_of, start_text
+from estimators.programs.offline import recording_of, start_text
 from experiments.evaluation.metrics import path_scores
 from experiments.gate.suite import ERRORS, Entry, Suite, fingerprint
 from experiments.runs.experiment import Experiment

@@ -22,7 +22,7 @@ from sim import se2
 from sim.arrays import Array
 from sim.errors import InputError, require
 from sim.recording import Frame, Recording
-from sim.world import World
+from sim.worlds.world import World
 
 Make = Callable[[], Estimator]
 MOTION = np.array([3.0, -2.0, 0.7])  # the rigid motion of the world in the equivariance check
@@ -43,7 +43,7 @@ _ROOM = (
     "prior.map=world",
 )
 _PLACES = (
-    "study=maximo2024_umh",
+    "study=maximo2024/umh",
     "prior.start=tracking",
     "prior.sigma_position_m=0.5",
     "prior.sigma_heading_rad=0.1",

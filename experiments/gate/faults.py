@@ -13,14 +13,15 @@ from unittest import mock
 
 import numpy as np
 
-from estimators import ekf_icp, ekf_icp_paper, odometry, wheels
+from estimators import odometry, wheels
 from estimators.base import Estimator, Prior
 from estimators.gaussian import Gaussian
-from estimators.scan_matching import Match, ScanMatcher
-from estimators.stereo import StereoModel
+from estimators.landmarks.stereo import StereoModel
+from estimators.laser import ekf_icp, ekf_icp_paper
+from estimators.laser.scan_matching import Match, ScanMatcher
 from sim.arrays import Array
 from sim.recording import Frame
-from sim.robot import wheel_errors
+from sim.robot.drive import wheel_errors
 from sim.sensors import Laser, Reading, sensor_of
 
 Planted = Callable[[Estimator, np.random.Generator], AbstractContextManager[object]]

@@ -12,12 +12,13 @@ from typing import Any
 
 import pandas as pd
 
-from experiments.evaluation.verdict import Profile, Role, Verdict, headline_verdict
-from experiments.report.claims import read_claims, read_provenance, read_verdicts, this_code
+from experiments.judging.claims_file import read_claims, read_provenance, read_verdicts, this_code
+from experiments.judging.folders import code_folder
+from experiments.judging.verdict import Profile, Role, Verdict, headline_verdict
 from experiments.report.export import as_text, folded, numeric, plain
 from experiments.report.leaderboard import by_world, on_lasers
 from experiments.report.panels import panels
-from experiments.runs.paths import CONF, SOURCE
+from experiments.runs.paths import CONF
 from experiments.runs.row import read_rows
 from experiments.sweeps.summary import COUNT_WORDS
 from sim.errors import InputError
@@ -51,7 +52,6 @@ FIRST = (
 )  # pictures for the first screen, the best first
 SMALL_ROWS, SMALL_COLUMNS = 60, 20  # a table up to here is shown whole
 FIRST_ROWS = 5  # of a larger one
-_FOLDER = SOURCE / "experiments" / "papers"
 _REMEDY = "restore it by `git checkout`, or delete it and run `estima reproduce`"
 
 
@@ -130,7 +130,7 @@ def tally(claims: Iterable[Entry]) -> list[tuple[Verdict, int]]:
 
 def findings(name: str) -> dict[str, Any]:
     """A paper's findings in our words: `title`, `about`, `claims` by id, `figures` by file name."""
-    path = _FOLDER / name / "findings.yaml"
+    path = code_folder(name) / "findings.yaml"
     found = read_yaml(path) if path.exists() else {}
     return {"title": name, "about": "", "claims": {}, "figures": {}, **found}
 
@@ -180,7 +180,11 @@ def study(results: Path, name: str, about: Entry, claims: Mapping[str, Entry]) -
     """Read a study's figures in the order of its findings, its tables and its settings."""
     there = {path.stem: path for path in sorted((results / "figures").glob(f"{name}_*.png"))}
     described = [figure for figure in about["figures"] if figure in there]
-    settings = [*sorted((CONF / "study").glob(f"{name}*.yaml")), _FOLDER / name / "settings.py"]
+    settings = [
+        *sorted((CONF / "study").glob(f"{name}*.yaml")),
+        *sorted((CONF / "study" / name).glob("*.yaml")),
+        code_folder(name) / "settings.py",
+    ]
     tables = {path.stem: table(path) for path in sorted((results / "tables").glob(f"{name}_*.csv"))}
     return {
         "name": name,

@@ -12,7 +12,7 @@ from sim.errors import InputError, require
 from sim.files import write_text
 from sim.formats.assemble import frame_stamps
 from sim.recording import Log, Recording, WheelLog
-from sim.robot import RobotGeometry
+from sim.robot.drive import RobotGeometry
 from sim.sensors import Laser, RobotCamera, StereoCamera
 from sim.sensors.base import Sensor
 from sim.settings import build, check_numbers

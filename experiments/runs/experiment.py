@@ -30,17 +30,17 @@ from experiments.runs.seeds import stream
 from experiments.runs.targets import checked, make, targets
 from experiments.runs.team_settings import TeamSettings, own_config, team_settings
 from experiments.runs.version import code_version, source_digest, version_with
-from sim import grid_file
 from sim.arrays import Array
 from sim.errors import InputError, blaming, require, required
 from sim.files import write_text
-from sim.grid import OccupancyGrid
 from sim.recording import Frame, Recording, load
-from sim.robot import DifferentialDrive, RobotGeometry
+from sim.robot.drive import DifferentialDrive, RobotGeometry
 from sim.sensors import Sensor, Sensors, sensors_from_config
 from sim.sensors.base import RecordedSensor, sensor_settings
 from sim.settings import build, find
-from sim.world import World
+from sim.worlds import grid_file
+from sim.worlds.grid import OccupancyGrid
+from sim.worlds.world import World
 from sim.yaml_file import read_yaml
 
 Config = dict[str, Any]

@@ -14,7 +14,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from estimators.base import Estimate
-from estimators.program import ProgramError
+from estimators.programs.program import ProgramError
 from experiments.runs import paths
 from experiments.runs.columns import COLUMNS, REVISED
 from experiments.runs.console import RunFailedError, end, progress, show

@@ -17,14 +17,14 @@ from experiments.twin.way import best_poses, observer, way_of
 from experiments.viewing.map import grid_along
 from sim.arrays import Array
 from sim.errors import require
-from sim.grid import OccupancyGrid
-from sim.plan import WALL_HEIGHT_M
 from sim.recording import Recording
-from sim.robot import DifferentialDrive
+from sim.robot.drive import DifferentialDrive
+from sim.routes.timetable import Drive
 from sim.sensors import Encoder, Laser, RealCamera, RealLaser, Sensor
 from sim.simulate import record
-from sim.timetable import Drive
-from sim.world import World
+from sim.worlds.floor_plan import WALL_HEIGHT_M
+from sim.worlds.grid import OccupancyGrid
+from sim.worlds.world import World
 
 CELL_M = 0.05
 _SIGMAS = 2.0 * 1.96  # in a 95 % interval

@@ -12,11 +12,11 @@ from scipy import optimize
 from sim import se2
 from sim.arrays import Array
 from sim.errors import require
-from sim.rays import ExactRays
 from sim.recording import Recording
 from sim.sensors import Laser, RealCamera, RealLaser, StereoCamera
+from sim.sensors.rays import ExactRays
 from sim.sensors.stereo import points_in_camera
-from sim.world import World
+from sim.worlds.world import World
 
 Mask = NDArray[np.bool_]
 

@@ -4,14 +4,14 @@ import numpy as np
 
 from estimators.base import Prior
 from estimators.base import run as run_estimator
-from estimators.graph_slam import GraphSlam
-from estimators.smoother import Smoother
+from estimators.graph.graph_slam import GraphSlam
+from estimators.graph.smoother import Smoother
 from experiments.runs.calibration import Slip
 from sim import se2
 from sim.arrays import Array
 from sim.errors import InputError, require
 from sim.recording import Recording
-from sim.robot import arc_increment
+from sim.robot.drive import arc_increment
 from sim.sensors import Laser, StereoCamera
 
 STEP_S = 0.1  # of a way

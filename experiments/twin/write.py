@@ -11,9 +11,9 @@ from experiments.twin.make import Twin
 from sim.errors import require
 from sim.files import write_text
 from sim.formats.tum import write_tum
-from sim.grid_file import write_grid
 from sim.recording import save
 from sim.sensors.base import sensor_settings
+from sim.worlds.grid_file import write_grid
 
 _HEAD = """# @package _global_
 # A twin, made by `estima twin`: estima run study={file} estimator=NAME

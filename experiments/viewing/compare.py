@@ -18,7 +18,7 @@ from experiments.viewing.world import draw_world
 from sim.errors import InputError, require
 from sim.formats.detect import read_any
 from sim.recording import Recording, Truth, WheelLog
-from sim.robot import RobotGeometry
+from sim.robot.drive import RobotGeometry
 
 _STYLES = ("-", "--", ":", "-.")
 

@@ -11,7 +11,7 @@ from matplotlib.transforms import Affine2D
 from numpy.typing import NDArray
 
 from experiments.viewing.style import figure
-from sim.grid import OccupancyGrid
+from sim.worlds.grid import OccupancyGrid
 
 _OCCUPIED, _FREE, _UNKNOWN = 0, 255, 222  # greys
 UNKNOWN = 3 * (_UNKNOWN / 255,)  # of the axes, off the grid

@@ -16,7 +16,7 @@ import numpy as np
 from experiments.viewing.view import Playback, bounds, seen
 from sim.arrays import Array
 from sim.errors import require
-from sim.world import World
+from sim.worlds.world import World
 
 FPS = 20
 _REMEDY = "save the run instead: add -o run.html, run.gif or run.mp4"
@@ -60,7 +60,7 @@ def _window(run: Playback, seconds: float | None) -> None:
     """Body of the window's process: play once, then wait for the window to be closed."""
     with open(os.devnull, "w") as sink:
         os.dup2(sink.fileno(), 1)  # the engine prints about its threads and OpenGL
-    from sim import bullet
+    from sim.robot import bullet
 
     engine: Any = vars(bullet)["pybullet"]
     client = engine.connect(engine.GUI)

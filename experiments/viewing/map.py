@@ -14,10 +14,10 @@ from experiments.runs.seeds import stream
 from experiments.viewing.view import experiment_over, is_file_of_estimate, read_estimate
 from sim.arrays import Array, Floats
 from sim.errors import InputError, require, required
-from sim.grid import OccupancyGrid
-from sim.grid_mapping import map_scans
 from sim.recording import Recording
 from sim.sensors import Laser
+from sim.worlds.grid import OccupancyGrid
+from sim.worlds.grid_mapping import map_scans
 
 _LONGEST_GAP_S = 3.0  # between poses; scans in longer ones are left out
 

@@ -28,8 +28,8 @@ from experiments.viewing.view import (
 )
 from sim.arrays import Array
 from sim.errors import InputError
-from sim.grid import OccupancyGrid
 from sim.team import Team
+from sim.worlds.grid import OccupancyGrid
 
 _SEEN_S = 1.0  # how long a sighting is shown
 

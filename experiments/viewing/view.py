@@ -46,9 +46,9 @@ from sim import se2
 from sim.arrays import Array
 from sim.errors import InputError, require
 from sim.files import write_whole
-from sim.grid import OccupancyGrid
 from sim.recording import Frame, Recording
-from sim.world import World
+from sim.worlds.grid import OccupancyGrid
+from sim.worlds.world import World
 
 Picture = NDArray[np.uint8]
 Layer = tuple[str, str, str, dict[str, Any]]  # style, colour, label, further settings

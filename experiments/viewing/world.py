@@ -23,7 +23,7 @@ from experiments.viewing.style import (
 )
 from sim.arrays import Array
 from sim.recording import Recording
-from sim.world import World
+from sim.worlds.world import World
 
 _PLACES = {
     "room": SKY,

@@ -27,7 +27,7 @@ from sim.files import write_text
 from sim.formats import assemble
 from sim.formats.text import Rows, Words, read_words
 from sim.recording import Log, Recording, Truth, WheelLog
-from sim.robot import RobotGeometry
+from sim.robot.drive import RobotGeometry
 from sim.sensors import Encoder, Laser, Mount
 
 Poses = Literal["odometry", "reference"]

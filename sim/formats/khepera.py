@@ -17,7 +17,7 @@ from sim.errors import InputError, require
 from sim.formats.assemble import chained
 from sim.formats.text import json_number, read_bytes, read_members
 from sim.recording import Recording, Truth, WheelLog
-from sim.robot import RobotGeometry
+from sim.robot.drive import RobotGeometry
 from sim.sensors import Encoder
 
 # What a rolled radian is taken to be until it is calibrated (the robot's data sheet)

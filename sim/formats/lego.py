@@ -19,7 +19,7 @@ from sim.formats.carmen import scan_recording, seen_ranges
 from sim.formats.text import Words, read_words
 from sim.recording import Recording, Truth, WheelLog
 from sim.sensors import Laser, Mount
-from sim.world import World
+from sim.worlds.world import World
 
 # The lecture's constants: geometric width of the tracks, effective one, length of a tick, the
 # scanner ahead of the axle, and the angles of its beams

@@ -29,10 +29,10 @@ from sim.errors import InputError
 from sim.formats import assemble
 from sim.formats.text import Words, read_members, split_words
 from sim.recording import Log, Recording, Truth
-from sim.robot import RobotGeometry
+from sim.robot.drive import RobotGeometry
 from sim.sensors import Encoder, Mount, RobotCamera, StereoCamera
 from sim.team import Team
-from sim.world import World
+from sim.worlds.world import World
 
 # An iRobot Create
 TRACK_M, WHEEL_RADIUS_M = 0.258, 0.033

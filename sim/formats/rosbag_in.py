@@ -40,7 +40,7 @@ from sim.formats.rosbag import (
 from sim.formats.rosbag_bounds import check_bounds
 from sim.recording import CommandLog, Log, Recording, Truth, WheelLog, joined
 from sim.recording_format_1 import upgraded_sensors
-from sim.robot import RobotGeometry
+from sim.robot.drive import RobotGeometry
 from sim.sensors import (
     Encoder,
     Laser,
@@ -52,7 +52,7 @@ from sim.sensors import (
 )
 from sim.sensors.base import parted, schema_from_meta, sensors_from_meta
 from sim.settings import build
-from sim.world import World
+from sim.worlds.world import World
 
 NOMINAL_TRACK_M, NOMINAL_RADIUS_M = 0.3, 0.1  # of a robot that the bag does not describe
 _BASES = ("base_link", "base_footprint", "base")

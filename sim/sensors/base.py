@@ -26,7 +26,7 @@ from sim import se2
 from sim.arrays import Array
 from sim.errors import InputError, blaming, require
 from sim.settings import build, find
-from sim.world import World
+from sim.worlds.world import World
 
 S = TypeVar("S")
 Reading = Mapping[str, NDArray[Any]]

@@ -12,7 +12,7 @@ from sim.errors import require
 from sim.sensors.base import Reading, View
 from sim.sensors.stereo import StereoCamera, in_field_of_view, points_in_camera
 from sim.settings import check_numbers
-from sim.world import World
+from sim.worlds.world import World
 
 
 @dataclass(frozen=True)

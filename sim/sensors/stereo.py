@@ -14,7 +14,7 @@ from sim.arrays import Array
 from sim.errors import InputError
 from sim.sensors.base import Field, Mount, Reading, Schema, View
 from sim.settings import check_numbers
-from sim.world import World
+from sim.worlds.world import World
 
 Selection = Literal["nearest", "random", "spread"]
 

@@ -4,8 +4,8 @@ import numpy as np
 
 from estimators.base import Belief
 from estimators.gaussian import STILL, Gaussian, update, wrap
+from estimators.laser.scan_matching import ScanMatcher
 from estimators.options import require_laser, start_pose
-from estimators.scan_matching import ScanMatcher
 from estimators.wheels import WheelPrediction
 from sim.sensors import sensor_of
 

@@ -9,7 +9,8 @@ import pandas as pd
 
 from experiments.evaluation.registration_errors import METRICS
 from experiments.evaluation.statistics import Interval, log_ratio_interval, mean_interval
-from experiments.evaluation.verdict import (
+from experiments.judging.results import Results
+from experiments.judging.verdict import (
     Claim,
     Conclusion,
     Verdict,
@@ -23,7 +24,6 @@ from experiments.evaluation.verdict import (
     shown,
 )
 from experiments.papers.decristoforis2020.settings import CONSISTENT, PLACES, RATE_HZ
-from experiments.papers.results import Results
 from sim.arrays import Array
 
 _ERRORS = {"position": "ate_rmse_m", "heading": "heading_rmse_rad"}

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from experiments.evaluation.registration_errors import METRICS
 from experiments.evaluation.statistics import log_ratio_interval
+from experiments.judging.results import Results
 from experiments.papers.decristoforis2020.claims import judged_runs, nees_intervals
 from experiments.papers.decristoforis2020.settings import CONSISTENT, PAPERS_OWN, PLACES
-from experiments.papers.results import Results
 from experiments.viewing.plotting import (
     draw_ellipses,
     plain_log,

@@ -1,9 +1,9 @@
-"""Recordings of real logs that conf/study/decristoforis2020_*.yaml name."""
+"""Recordings of real logs that conf/study/decristoforis2020/*.yaml name."""
 
 import dataclasses
 from pathlib import Path
 
-from experiments.papers.real_logs import logs
+from experiments.studies.real_logs import logs
 from sim.errors import required
 from sim.formats.rawseeds import read_rawseeds
 from sim.recording import Recording

@@ -1,4 +1,4 @@
-"""Constants of the studies; the rest is in conf/study/decristoforis2020_*.yaml."""
+"""Constants of the studies; the rest is in conf/study/decristoforis2020/*.yaml."""
 
 JUDGED_SEED = 1000  # seeds 0-99 are for tuning
 RATE_HZ = 75.0  # of the laser as printed, at which DC1 and DC6 are judged

@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pandas as pd
 
-from estimators import icp_covariance
 from estimators.base import Estimate
 from estimators.gaussian import STILL, Gaussian
-from estimators.icp import Metric, Rules, prepare, register
-from estimators.scan_matching import FAILED
+from estimators.laser import icp_covariance
+from estimators.laser.icp import Metric, Rules, prepare, register
+from estimators.laser.scan_matching import FAILED
 from experiments.evaluation.metrics import travelled_m
 from experiments.evaluation.scan_bound import fisher_bound
 from experiments.papers.decristoforis2020.settings import HELD_M, WINDOWS_S
@@ -20,7 +20,7 @@ from sim import se2
 from sim.arrays import Array
 from sim.recording import Recording
 from sim.sensors import Laser
-from sim.world import World
+from sim.worlds.world import World
 
 
 def step_errors(recording: Recording, world: World, estimate: Estimate) -> Row:

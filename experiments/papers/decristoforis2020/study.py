@@ -16,8 +16,8 @@ import pandas as pd
 from matplotlib.cbook import boxplot_stats
 
 from estimators.base import Estimate
-from estimators.icp import prepare, register
-from estimators.icp_covariance import Scans
+from estimators.laser.icp import prepare, register
+from estimators.laser.icp_covariance import Scans
 from experiments.bench.icp import BEARINGS_RAD, pair
 from experiments.evaluation.map_quality import map_points, mean_map_entropy, wall_distances_m
 from experiments.evaluation.metrics import (
@@ -26,7 +26,9 @@ from experiments.evaluation.metrics import (
     position_errors_m,
 )
 from experiments.evaluation.registration_errors import METRICS, measured, scenes
-from experiments.evaluation.verdict import Profile
+from experiments.judging.jobs import grouped, in_parallel
+from experiments.judging.results import Results
+from experiments.judging.verdict import Profile
 from experiments.papers.decristoforis2020.claims import judged_runs
 from experiments.papers.decristoforis2020.settings import (
     CHECKED,
@@ -40,14 +42,12 @@ from experiments.papers.decristoforis2020.settings import (
     RATE_HZ,
 )
 from experiments.papers.decristoforis2020.steps import ellipse_path, ellipse_summary, step_errors
-from experiments.papers.jobs import grouped, in_parallel
-from experiments.papers.real_logs.settings import DATA
-from experiments.papers.results import Results
 from experiments.runs.console import RunFailedError
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome, Row
 from experiments.runs.seeds import stream
+from experiments.studies.real_logs.settings import DATA
 from experiments.sweeps.plan import planned
 from sim.arrays import Array
 from sim.recording import Recording
@@ -114,10 +114,10 @@ def _jobs(full: bool, out: Results) -> list[Job]:
     (office,) = _planned("methods", 1, "route.distance_m=300.0", *shorter)
     first, *others = _planned("corridor", n)
     adjusted = grouped(
-        planned(["study=decristoforis2020_tuning", *([] if full else ["seed=60", *short])]),
+        planned(["study=decristoforis2020/tuning", *([] if full else ["seed=60", *short])]),
         lambda run: run.recording_key,
     )
-    on_log = list(planned(["study=decristoforis2020_log"])) if DATA.is_dir() else []
+    on_log = list(planned(["study=decristoforis2020/log"])) if DATA.is_dir() else []
     return [
         (drawn, _drawn_office, [_only(PAPERS_OWN, office), out]),
         *((0.5, _drawn_log, [group, out]) for group in ([on_log] if on_log else [])),
@@ -150,9 +150,9 @@ def _jobs(full: bool, out: Results) -> list[Job]:
 
 
 def _planned(study: str, n_seeds: int, *overrides: str) -> list[list[Experiment]]:
-    """Experiments of conf/study/decristoforis2020_*.yaml, grouped by recording."""
+    """Experiments of conf/study/decristoforis2020/*.yaml, grouped by recording."""
     seeds = f"seed=range({JUDGED_SEED},{JUDGED_SEED + n_seeds})"
-    runs = planned([f"study=decristoforis2020_{study}", seeds, *overrides])
+    runs = planned([f"study=decristoforis2020/{study}", seeds, *overrides])
     return grouped(runs, lambda run: run.recording_key)
 
 
@@ -309,7 +309,7 @@ def _closeup(group: Sequence[Experiment], out: Results | None = None) -> Tables:
 def _scenes(seed: int, place: str, n_repeats: int) -> Tables:
     """Many registrations of one pair of poses in a place, and all covariances of them."""
     study, part = PLACES[place]
-    experiment = Experiment.compose([f"study=decristoforis2020_{study}", f"seed={seed}"])
+    experiment = Experiment.compose([f"study=decristoforis2020/{study}", f"seed={seed}"])
     laser = sensor_of(experiment.sensors(), "laser", Laser)
     rng = stream(seed, f"scenes/{place}")
     (scene,) = scenes(experiment.world(), part, laser.mount.pose, rng, 1)

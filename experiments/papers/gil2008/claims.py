@@ -20,7 +20,8 @@ from experiments.evaluation.statistics import (
     mean_interval,
     page_trend_p,
 )
-from experiments.evaluation.verdict import (
+from experiments.judging.results import Results
+from experiments.judging.verdict import (
     Claim,
     Conclusion,
     Role,
@@ -37,7 +38,6 @@ from experiments.evaluation.verdict import (
     shown,
 )
 from experiments.papers.gil2008.settings import P0
-from experiments.papers.results import Results
 from sim.arrays import Array
 
 POSITION = "revised_ate_rmse_m"

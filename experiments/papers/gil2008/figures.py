@@ -11,9 +11,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from experiments.evaluation.metrics import rms
+from experiments.judging.results import Results
 from experiments.papers.gil2008.claims import pooled
 from experiments.papers.gil2008.settings import CELL_M
-from experiments.papers.results import Results
 from experiments.viewing.grid import UNKNOWN, draw_grid
 from experiments.viewing.plotting import (
     draw_ellipses,
@@ -39,7 +39,7 @@ from experiments.viewing.style import (
 from experiments.viewing.world import draw_walls
 from sim import se2
 from sim.arrays import Array
-from sim.grid import OccupancyGrid
+from sim.worlds.grid import OccupancyGrid
 
 Arrays = dict[str, Any]
 

@@ -19,12 +19,12 @@ from experiments.runs.experiment import Config, Experiment
 from experiments.runs.seeds import stream
 from sim.arrays import Array
 from sim.errors import InputError
-from sim.rays import ExactRays
 from sim.recording import Log, Recording, WheelLog, joined
-from sim.robot import wheel_errors
+from sim.robot.drive import wheel_errors
 from sim.sensors import StereoCamera, View, sensor_of, sensors_from_config
 from sim.sensors.base import parted, sensor_settings
-from sim.world import World
+from sim.sensors.rays import ExactRays
+from sim.worlds.world import World
 
 
 @dataclass(frozen=True)

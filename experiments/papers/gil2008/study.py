@@ -16,11 +16,11 @@ from estimators.base import run as walk
 from estimators.odometry import Odometry
 from experiments.bench.fastslam import cost_by_landmarks
 from experiments.evaluation.metrics import position_errors_m, rms, travelled_m
-from experiments.evaluation.verdict import Profile
+from experiments.judging.jobs import grouped, in_parallel
+from experiments.judging.results import Results
+from experiments.judging.verdict import Profile
 from experiments.papers.gil2008 import scores, settings
 from experiments.papers.gil2008.recordings import Scene, landmark_distances_m, thinned, whole
-from experiments.papers.jobs import grouped, in_parallel
-from experiments.papers.results import Results
 from experiments.runs.evaluate import estimates, scored, status_of
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
@@ -30,7 +30,7 @@ from experiments.viewing.map import grid_along
 from sim import se2
 from sim.arrays import Array
 from sim.recording import Recording
-from sim.robot import arc_increment, wheel_errors
+from sim.robot.drive import arc_increment, wheel_errors
 from sim.sensors import StereoCamera
 
 TableRun = tuple[str, Experiment]  # the table its rows go to; its configuration
@@ -81,7 +81,7 @@ def plan(profile: Profile) -> Iterator[TableRun]:
     n_draws, n_repeats = settings.N_DRAWS[profile], settings.N_REPEATS[profile]
     for table in settings.LABELS:
         few = profile is Profile.QUICK and table != "repeats"  # which has one world
-        for one in planned([f"study=gil2008_{table}", *few * [f"seed={settings.QUICK_SEEDS}"]]):
+        for one in planned([f"study=gil2008/{table}", *few * [f"seed={settings.QUICK_SEEDS}"]]):
             drawn = one.config["recording"]
             if drawn["draw"] < n_draws and drawn["image_draw"] <= n_repeats:
                 yield table, one.replaced(repeats=min(one.repeats, n_repeats))
@@ -160,7 +160,7 @@ def one_run(experiment: Experiment, recording: Recording, rng: np.random.Generat
 def write_arrays(out: Results) -> None:
     """Write what the figures draw of one recording, and particles along a motion."""
     path = Experiment.compose(["study=gil2008"])
-    recording, scanned = path.recording(), Experiment.compose(["study=gil2008_scans"]).recording()
+    recording, scanned = path.recording(), Experiment.compose(["study=gil2008/scans"]).recording()
     log, world = recording.log("stereo"), recording.known_world
     along = recording.truth_at(recording.frame_stamps)
     busiest = int(np.argmax(np.diff(log.known_splits)))

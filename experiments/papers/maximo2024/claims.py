@@ -16,7 +16,8 @@ from experiments.evaluation.statistics import (
     mean_interval,
     share_interval,
 )
-from experiments.evaluation.verdict import (
+from experiments.judging.results import Results
+from experiments.judging.verdict import (
     Claim,
     Conclusion,
     Role,
@@ -40,7 +41,6 @@ from experiments.papers.maximo2024.settings import (
     RECOVERED_WITHIN,
     WITHIN,
 )
-from experiments.papers.results import Results
 
 _LEAST_M = 1e-3  # added to dispersions that may be zero, before a logarithm
 

@@ -12,8 +12,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from estimators import descriptors as describers
-from experiments.evaluation.verdict import Verdict
+from estimators.topological import descriptors as describers
+from experiments.judging.results import Results
+from experiments.judging.verdict import Verdict
 from experiments.papers.maximo2024.claims import COMPARISONS, geometries, headlines, judged_map
 from experiments.papers.maximo2024.settings import (
     CONTROLS,
@@ -24,7 +25,6 @@ from experiments.papers.maximo2024.settings import (
     PRINTED_5,
     RECOVERED_WITHIN,
 )
-from experiments.papers.results import Results
 from experiments.viewing.plotting import plain_log, plan_axes, with_legend
 from experiments.viewing.style import BLACK, BLUE, CYCLE, GREEN, ORANGE, RED, SKY, WALL, subplots
 

@@ -18,7 +18,12 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from estimators.topological_map import TopologicalMap, from_arrays, from_recording, read_array
+from estimators.topological.topological_map import (
+    TopologicalMap,
+    from_arrays,
+    from_recording,
+    read_array,
+)
 from experiments.evaluation.metrics import travelled_m
 from experiments.runs.experiment import Experiment
 from experiments.runs.seeds import stream
@@ -27,7 +32,7 @@ from sim import se2
 from sim.arrays import Array, Floats
 from sim.errors import InputError
 from sim.recording import Log, Recording, Truth, WheelLog
-from sim.robot import RobotGeometry, wheel_errors
+from sim.robot.drive import RobotGeometry, wheel_errors
 from sim.sensors import Lidar3D, PlaceDescriptor
 from sim.settings import find
 
@@ -420,8 +425,8 @@ def mapping_run(
     Parameters
     ----------
     descriptor, network
-        What describes its clouds: a name of `estimators.descriptors.KINDS`, or a network as in
-        `described_run`.
+        What describes its clouds: a name of `estimators.topological.descriptors.KINDS`, or a
+        network as in `described_run`.
     """
     made = Experiment(config).replaced(seed=seed, recording=None).recording()
     if network is not None:

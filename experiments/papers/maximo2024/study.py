@@ -13,10 +13,11 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from estimators.topological_map import from_recording
+from estimators.topological.topological_map import from_recording
 from experiments.bench import topological
-from experiments.evaluation.verdict import Profile
-from experiments.papers.jobs import in_parallel
+from experiments.judging.jobs import in_parallel
+from experiments.judging.results import Results
+from experiments.judging.verdict import Profile
 from experiments.papers.maximo2024.claims import headlines
 from experiments.papers.maximo2024.places import oxford_runs, resequenced
 from experiments.papers.maximo2024.settings import (
@@ -61,7 +62,6 @@ from experiments.papers.maximo2024.worlds import (
     starts,
     weighting_rows,
 )
-from experiments.papers.results import Results
 from experiments.runs.seeds import stream
 from sim import se2
 from sim.arrays import Array

@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
 
-from estimators import descriptors as describers
 from estimators.base import Estimate, Prior, run
-from estimators.topological_map import TopologicalMap, from_recording
+from estimators.topological import descriptors as describers
+from estimators.topological.topological_map import TopologicalMap, from_recording
 from experiments.evaluation.metrics import position_errors_m, rms, travelled_m
-from experiments.evaluation.verdict import Profile
+from experiments.judging.verdict import Profile
 from experiments.papers.maximo2024.places import N_STRETCHES, UMH, described, gaps_m, resequenced
 from experiments.papers.maximo2024.settings import (
     CAMPUS_SHIFT_M,
@@ -55,7 +55,7 @@ class Case:
     name, seed
         Geometry, and the seed of its world and noise.
     experiment
-        Composed from conf/study/maximo2024_*.yaml.
+        Composed from conf/study/maximo2024/*.yaml.
     """
 
     name: str
@@ -68,7 +68,7 @@ class Case:
 def case_of(name: str, seed: int, *overrides: str) -> Case:
     """World of a route; `oxford_real` has the real positions, `_plane` queries off the route."""
     route, _, kind = name.partition("_")
-    lines = [f"study=maximo2024_{route}", f"seed={seed}", *overrides]
+    lines = [f"study=maximo2024/{route}", f"seed={seed}", *overrides]
     if kind == "real":
         lines.append(f"positions='{POSITIONS}'")
     if kind == "plane":
@@ -307,7 +307,7 @@ def cluster_row(known_map: TopologicalMap, recording: Recording, descriptor: str
 def campus_runs(seed: int) -> tuple[Experiment, Experiment]:
     """Mapping run and query run through one campus, the queries one lane to the left."""
     mapping = Experiment.compose(
-        ["study=maximo2024_campus", f"seed={seed}", "simulation.physics=kinematic"]
+        ["study=maximo2024/campus", f"seed={seed}", "simulation.physics=kinematic"]
     )
     way = mapping.world().waypoints
     along = np.gradient(way, axis=0)

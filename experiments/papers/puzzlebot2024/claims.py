@@ -10,7 +10,8 @@ import numpy as np
 import pandas as pd
 
 from experiments.evaluation.statistics import Interval, mean_interval, share_interval
-from experiments.evaluation.verdict import (
+from experiments.judging.results import Results
+from experiments.judging.verdict import (
     Claim,
     Conclusion,
     Role,
@@ -28,7 +29,6 @@ from experiments.evaluation.verdict import (
     shown,
 )
 from experiments.papers.puzzlebot2024.settings import NOMINAL, REPORTED_TURN_RATIO
-from experiments.papers.results import Results
 from sim.arrays import Array
 
 # Sigma_1 and Sigma_2 as printed, each with half a unit of its last digit

@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from experiments.judging.results import Results
 from experiments.papers.puzzlebot2024.settings import (
     CALIBRATION_RUNS,
     NOMINAL,
@@ -16,7 +17,6 @@ from experiments.papers.puzzlebot2024.settings import (
     REPORTED_TURN_RATIO,
     TABLE_1_K_M,
 )
-from experiments.papers.results import Results
 from experiments.viewing.plotting import draw_ellipses, plain_ticks, plan_axes, with_legend
 from experiments.viewing.style import BLACK, BLUE, CYCLE, ORANGE, subplots
 

@@ -2,9 +2,9 @@
 
 import math
 
-from experiments.evaluation.verdict import Profile
-from sim.robot import DifferentialDrive
-from sim.route import OpenLoop
+from experiments.judging.verdict import Profile
+from sim.robot.drive import DifferentialDrive
+from sim.routes.route import OpenLoop
 
 NOMINAL = DifferentialDrive(wheel_radius_m=0.05, track_m=0.19)  # conf/robot/puzzlebot, no slip
 CALIBRATIONS = {Profile.QUICK: 5, Profile.FULL: 200}  # of each robot, from its seed on

@@ -23,8 +23,9 @@ from experiments.calibration.end_poses import Manoeuvre, from_end_poses
 from experiments.calibration.result import CalibrationResult
 from experiments.calibration.wheel_truth import from_wheel_truth
 from experiments.evaluation.metrics import ellipse_area_m2, travelled_m
-from experiments.evaluation.verdict import Profile
-from experiments.papers.jobs import in_parallel
+from experiments.judging.jobs import in_parallel
+from experiments.judging.results import Results
+from experiments.judging.verdict import Profile
 from experiments.papers.puzzlebot2024.settings import (
     AREA_K_M,
     CALIBRATION_RUNS,
@@ -40,16 +41,15 @@ from experiments.papers.puzzlebot2024.settings import (
     SQUARE_SAMPLES,
     TABLE_1_K_M,
 )
-from experiments.papers.results import Results
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
 from experiments.runs.seeds import stream
 from experiments.sweeps.plan import planned
 from sim.arrays import Array
-from sim.kinematic import BatchRuns, run_batch
 from sim.recording import Recording, WheelLog
-from sim.robot import DifferentialDrive, RobotGeometry
-from sim.route import OpenLoop
+from sim.robot.drive import DifferentialDrive, RobotGeometry
+from sim.robot.kinematic import BatchRuns, run_batch
+from sim.routes.route import OpenLoop
 
 Routes = Mapping[str, OpenLoop]
 Driven = dict[tuple[str, str, int], Recording]  # keyed by physics, case and seed
@@ -114,7 +114,7 @@ class Arm:
 
 def arms(study: str) -> list[Arm]:
     """All robots of a study, each with all manoeuvres."""
-    runs = planned([f"study=puzzlebot2024_{study}"])
+    runs = planned([f"study=puzzlebot2024/{study}"])
     return [
         Arm(seed, robot, {part.choices["route"]: part.route() for part in parts})
         for (seed, robot), parts in itertools.groupby(runs, lambda run: (run.seed, run.robot()))
@@ -158,7 +158,7 @@ def crossover(*overrides: str) -> pd.DataFrame:
     the heading. The encoders are noisy, so each run gives its own distance.
     """
     rows = []
-    for experiment in planned(["study=puzzlebot2024_crossover", *overrides]):
+    for experiment in planned(["study=puzzlebot2024/crossover", *overrides]):
         robot = experiment.robot()
         batch = run_batch(robot, experiment.route(), 1, stream(experiment.seed, "slip"))
         believed = dead_reckoning(batch, robot.kr, robot.kl)
@@ -191,7 +191,7 @@ def drawn() -> dict[str, NDArray[np.float32]]:
         for arm in robots
     ]
     ellipses = [ideal(route, arm.robot.kr, arm.robot.kl) for arm in robots]
-    straight = Experiment.compose(["study=puzzlebot2024_crossover"])
+    straight = Experiment.compose(["study=puzzlebot2024/crossover"])
     promised = ideal(straight.route(), straight.robot().kr, straight.robot().kl)
     values = {
         "kr_kl_m": [arm.robot.slip_variance_per_m for arm in robots],
@@ -218,7 +218,7 @@ def square_feedback(*overrides: str) -> tuple[pd.DataFrame, dict[str, NDArray[np
     """
     rows: list[Row] = []
     paths: dict[str, list[Array]] = {"true_m": [], "believed_m": []}
-    for experiment in planned(["study=puzzlebot2024_square_feedback", *overrides]):
+    for experiment in planned(["study=puzzlebot2024/square_feedback", *overrides]):
         route, recording = experiment.route(), experiment.simulate()
         prior, rng = experiment.prior(recording), np.random.default_rng(0)
         believed = run_estimator(experiment.estimator(), recording, prior, rng).means[:, :2]
@@ -421,7 +421,7 @@ def engine_recordings(*overrides: str) -> Driven:
     """Drive some manoeuvres by PyBullet's robot and by the kinematic one, with the same noise."""
     driven: Driven = {}
     for physics in ("bullet", "kinematic"):
-        study = ["study=puzzlebot2024_engine", f"simulation.physics={physics}", *overrides]
+        study = ["study=puzzlebot2024/engine", f"simulation.physics={physics}", *overrides]
         cases: dict[str, int] = {}
         for run in planned(study):
             case = run.choices["route"]
@@ -444,7 +444,7 @@ def engine_k(driven: Driven) -> pd.DataFrame:
     """Recover kr and kl from the wheels of PyBullet's robot."""
     runs = [recording for (physics, *_), recording in driven.items() if physics == "bullet"]
     found = calibrate_recordings(runs, geometry=False, interval_s=0.02)
-    robot = Experiment.compose(["study=puzzlebot2024_engine"]).robot()
+    robot = Experiment.compose(["study=puzzlebot2024/engine"]).robot()
     rows = [
         {"k_m": 2.0 * robot.kl, "parameter": name, "truth": getattr(robot, name)}
         | dataclasses.asdict(interval)

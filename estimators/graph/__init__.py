@@ -1,0 +1,1 @@
+"""Methods by sparse least squares over a drive."""

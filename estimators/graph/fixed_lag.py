@@ -1,0 +1,399 @@
+"""Fixed-lag smoothing of stereo landmarks: an online estimate close to full least squares.
+
+The poses x_0 ... x_W of the last W images and the landmarks l seen from them minimise
+
+    |(x_0, l) - m|^2_P + sum_i |between(x_i-1, x_i) - u_i|^2_Q + sum_ij |h(x_i, l_j) - z_ij|^2_R
+
+by Gauss-Newton steps at every image (sibley2010, the sliding window filter). Everything in the
+window is linearised again at every step, which a filter cannot do.
+
+The prior N(m, P) covers x_0 and all landmarks seen before, with all their correlations, so that
+a landmark that comes back after hundreds of images counts. The window needs the part of it on its
+own landmarks, and a part of a covariance is a marginal, so a Gauss-Newton step does not grow with
+the map. When x_0 leaves, the terms that tie x_0 and x_1 and the image of x_1 become part of the
+prior, linearised at the window's estimates x*, l* of that moment:
+
+    e + J_x (x_1 - x_1*) + J_l (l - l*) = noise,    x_1 = x_1* - B^-1 (r + A (x_0 - x_0*) - noise)
+
+with residuals e, r and A, B the derivatives of `between` at x_0*, x_1*. It is an update of
+EKF-SLAM, W images late, and costs as much, O(K N^2). W = 1 is an iterated EKF-SLAM; a W beyond
+the run, full least squares.
+
+Marginalised terms keep their point of linearisation. Those of one landmark differ by what W images
+teach, so the heading gains next to no false information (huang2009). First-estimate Jacobians of
+the landmarks left the errors of ten runs as they were at W = 20. A Bayes tree (kaess2012, iSAM2)
+linearises old poses again too, where they have moved.
+
+With a laser, the scans of consecutive images are registered, and their relative pose is one more
+measurement of u_i, of the covariance that `estimators.laser.scan_matching` gives it.
+
+Sources: Sibley, Matthies and Sukhatme, Sliding window filter with application to planetary landing,
+J. Field Robotics 27, 2010; Huang, Mourikis and Roumeliotis, A first-estimates Jacobian EKF for
+improving SLAM consistency, ISER 2008 (2009); Kaess et al., iSAM2: incremental smoothing and mapping
+using the Bayes tree, IJRR 31, 2012.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
+
+from estimators.base import Belief, Estimate, Prior
+from estimators.gaussian import STILL, Gaussian, between, wrap
+from estimators.graph.landmark_drive import FLOOR, LandmarkDrive, loosened, observed
+from estimators.graph.least_squares import (
+    LEAST_INFORMATION,
+    camera_whitening,
+    inverse,
+    residuals_of,
+    times,
+    transposed,
+    whitening_of,
+)
+from estimators.landmarks.stereo import StereoModel
+from estimators.laser.icp import PreparedScan
+from estimators.laser.scan_matching import ScanMatcher
+from estimators.options import require_counts, require_laser, require_stereo, start_pose
+from estimators.wheels import WheelPrediction
+from sim import se2
+from sim.arrays import Array, Ints
+from sim.recording import Frame
+
+
+@dataclass(frozen=True)
+class _Image:
+    """Motion since the image before, and points (K, 3) in the camera frame of landmarks (K,)."""
+
+    motion: Gaussian
+    landmarks: Ints
+    points: Array
+
+
+class FixedLag:
+    """Least squares over the last images on a Gaussian prior of all older ones.
+
+    Parameters
+    ----------
+    kr, kl
+        Believed slip variance per metre of the right and left wheel, m.
+    lag_images
+        W, the images whose poses are estimated together.
+    iterations
+        Gauss-Newton steps at every image.
+    keep_landmarks
+        Keep landmarks that the window sees no more, so that they count when they come back. If
+        not, time and memory do not grow with the map.
+    window_s
+        |ds| is netted over at least this time.
+    laser
+        Name of a laser whose scans are registered where a Frame has a scan beside its image; None
+        for none.
+    sigma_range_m
+        Believed range noise of it; None for its own.
+
+    Notes
+    -----
+    The camera and the odometry are believed as `estimators.graph.smoother` does. Landmarks are
+    numbered in the order in which they are seen; those of the prior come first. An image without
+    usable observations is no pose of the window.
+
+    Extras: `status` when an observation could not be used, or an image not be solved for; the
+    belief is then the odometry's from the last one.
+    """
+
+    needs = frozenset({"stereo"})
+
+    def __init__(
+        self,
+        kr: float = 1e-4,
+        kl: float = 1e-4,
+        lag_images: int = 20,
+        iterations: int = 1,
+        keep_landmarks: bool = True,
+        window_s: float = 0.05,
+        stereo: str = "stereo",
+        laser: str | None = None,
+        sigma_range_m: float | None = None,
+    ) -> None:
+        self.stereo, self.laser = stereo, laser
+        self._matcher = ScanMatcher("point_to_line", "censi", sigma_range_m)
+        self.wheels = WheelPrediction(kr, kl, window_s)
+        require_counts(lag_images=lag_images, iterations=iterations)
+        self.lag_images, self.iterations = lag_images, iterations
+        self.keep_landmarks = keep_landmarks
+
+    def reset(self, prior: Prior, rng: np.random.Generator) -> None:
+        """Start from the prior's pose, with an empty map."""
+        self._camera = StereoModel.of(require_stereo(prior, self.stereo, "fixed_lag"))
+        self._belief = start_pose(prior, "fixed_lag")
+        self.wheels.reset(prior.robot.track_m)
+        self._drive = LandmarkDrive(self._camera, self._belief)
+        self._laser = None if self.laser is None else require_laser(prior, self.laser, "fixed_lag")
+        self._scan: PreparedScan | None = None  # of the last image
+        self._rng = rng
+        self._mean, self._room = self._belief.mean.copy(), self._belief.covariance + FLOOR
+        self._motion = STILL  # since the last image
+        self._images: list[_Image] = []
+        self._poses = self._belief.mean[None].copy()  # of the prior, then of each image
+        self._landmarks = np.zeros((0, 3))
+        self._landmark_of_id: dict[int, int] = {}
+
+    def step(self, frame: Frame) -> Belief:
+        """Roll by the wheels; at an image, solve the window, and let its oldest pose go."""
+        motion = self.wheels.predict(frame)
+        loose = loosened(motion)
+        self._belief, self._motion = self._belief.then(motion), self._motion.then(loose)
+        seen, rejected = observed(frame, self.stereo, self._camera, "fixed_lag")
+        registered = None if seen is None else self._registered(frame)
+        if registered is not None:
+            self._motion = self._motion.with_measured(registered)
+        status = ("" if seen is None else self._see(*seen)) or rejected
+        self._drive.add(frame.stamp, loose, self._belief.mean, seen)
+        if registered is not None:
+            self._drive.tie(registered)
+        covariance = (self._belief.covariance + self._belief.covariance.T) / 2.0
+        return Belief(self._belief.mean.copy(), covariance, {"status": status} if status else {})
+
+    def finish(self) -> Estimate:
+        """Least squares over all Frames so far, as `estimators.graph.smoother` solves it.
+
+        It starts from the online estimate, and gives what `LandmarkDrive.revised` does.
+        """
+        return self._drive.revised("none", 3.0, 100)
+
+    def _registered(self, frame: Frame) -> Gaussian | None:
+        """Motion since the last image by the scans; None without both, or if that fails."""
+        before, self._scan = self._scan, None
+        reading = None if self.laser is None else frame.readings.get(self.laser)
+        if reading is None or self._laser is None:
+            return None
+        self._scan = self._matcher.prepare(reading["ranges_m"], self._laser)
+        if before is None or self._scan is None:
+            return None
+        found = self._matcher.match(self._scan, before, self._motion, self._laser, self._rng)
+        return None if found.failed else found.motion
+
+    def _see(self, points: Array, ids: Ints) -> str:
+        """Take in points (K, 3) and ids (K,) of an image; what went wrong, or nothing."""
+        order = np.argsort(ids)
+        ids, points = ids[order], points[order]
+        pose = se2.compose(self._poses[-1], self._motion.mean)
+        self._poses = np.vstack([self._poses, pose])
+        number = self._landmark_of_id
+        landmarks = np.array([number.setdefault(i, len(number)) for i in ids.tolist()])
+        new = np.flatnonzero(landmarks >= len(self._landmarks))
+        placed = self._camera.place(np.tile(pose, (len(new), 1)), points[new])
+        self._landmarks = np.concatenate([self._landmarks, placed])
+        self._images.append(_Image(self._motion, landmarks, points))
+        self._motion = STILL
+        sound = all(self._refine() for _ in range(self.iterations))
+        if len(self._images) >= self.lag_images:
+            sound &= self._absorb(self._images.pop(0))
+        return "" if sound else "image not used: broken covariance, not positive definite"
+
+    def _refine(self) -> bool:
+        """One Gauss-Newton step of the window; not taken, with False, if it cannot be solved."""
+        try:
+            active, step, root = self._solved()
+        except np.linalg.LinAlgError:
+            return False
+        if not np.isfinite(step).all():
+            return False
+        n = len(active)
+        self._landmarks[active] += step[:n]
+        self._poses += step[n:]
+        self._poses[:, 2] = se2.wrap(self._poses[:, 2])
+        self._belief = Gaussian(self._poses[-1], root.T @ root)
+        return True
+
+    def _solved(self) -> tuple[Ints, Array, Array]:
+        """Solve the window's normal equations, of its landmarks and then its poses.
+
+        Returns
+        -------
+        tuple
+            Landmarks (N,) that the window sees; their changes and those of the poses, (N + T, 3);
+            a root (3, 3) of the newest pose's covariance.
+        """
+        seen = np.concatenate([image.landmarks for image in self._images])
+        active, columns = np.unique(seen, return_inverse=True)
+        old = active[active < self._n_prior]
+        n_landmarks, n = len(active), len(active) + len(self._poses)
+        H, g = np.zeros((n, 3, n, 3)), np.zeros((n, 3))
+        flat, flat_g = H.reshape(3 * n, 3 * n), g.reshape(3 * n)
+
+        of_prior = np.concatenate([(3 + 3 * old[:, None] + np.arange(3)).ravel(), [0, 1, 2]])
+        rows = np.concatenate([np.arange(3 * len(old)), 3 * n_landmarks + np.arange(3)])
+        factor = cho_factor(self._covariance[np.ix_(of_prior, of_prior)], lower=True)
+        off = np.concatenate([self._landmarks[old].ravel(), self._poses[0]]) - self._mean[of_prior]
+        off[-1] = wrap(off[-1])
+        flat[np.ix_(rows, rows)] = cho_solve(factor, np.eye(len(rows)))
+        flat_g[rows] = cho_solve(factor, off)
+        fresh = np.arange(3 * len(old), 3 * n_landmarks)
+        flat[fresh, fresh] += LEAST_INFORMATION
+
+        ends = self._poses[:-1], self._poses[1:]
+        missed = se2.between(*ends) - np.array([image.motion.mean for image in self._images])
+        missed[:, 2] = se2.wrap(missed[:, 2])
+        whitening = whitening_of(np.array([image.motion.covariance for image in self._images]))
+        by_first, by_second = (whitening @ by for by in se2.between_jacobians(*ends))
+        first = np.arange(n_landmarks, n - 1)
+        _add(H, g, first, first + 1, by_first, by_second, times(whitening, missed))
+
+        counts = [len(image.landmarks) for image in self._images]
+        images = np.repeat(np.arange(1, len(counts) + 1), counts)
+        points = np.concatenate([image.points for image in self._images])
+        e, by_pose, by_landmark = self._whitened(self._poses[images], seen, points)
+        _add(H, g, n_landmarks + images, columns, by_pose, by_landmark, e)
+
+        factor = cho_factor(flat, lower=True)
+        step = -cho_solve(factor, flat_g).reshape(n, 3)
+        # the newest pose is eliminated last, so its corner of the factor is its information's root
+        return active, step, inverse(np.tril(factor[0][-3:, -3:]))
+
+    def _absorb(self, image: _Image) -> bool:
+        """Make the oldest image of the window part of the prior, which moves on to its pose.
+
+        With False if the prior rejects it.
+        """
+        moved = self._move(image.motion)
+        self._poses = self._poses[1:]
+        x_1 = np.tile(self._poses[0], (len(image.points), 1))
+        e, by_pose, by_landmark = self._whitened(x_1, image.landmarks, image.points)
+        e += by_pose @ moved
+        old = image.landmarks < self._n_prior
+        taken = self._update(image.landmarks[old], e[old], by_pose[old], by_landmark[old])
+        new = np.flatnonzero(~old)[np.argsort(image.landmarks[~old])]
+        # until now, e was at the prior's x_1 before the update
+        e[new] += by_pose[new] @ (self._mean[:3] - self._poses[0] - moved)
+        self._create(image.landmarks[new], e[new], by_pose[new], by_landmark[new])
+        self._mean[2] = wrap(float(self._mean[2]))
+        idle = np.ones(self._n_prior, dtype=bool)
+        for other in self._images:
+            idle[other.landmarks[other.landmarks < self._n_prior]] = False
+        if self.keep_landmarks:  # out of the window they go with the prior, by their correlations
+            self._landmarks[: self._n_prior][idle] = self._mean[3:].reshape(-1, 3)[idle]
+        else:
+            self._forget(idle)
+        return taken
+
+    def _move(self, motion: Gaussian) -> Array:
+        """Put x_1 in place of x_0 in the prior; its mean (3,) less the window's x_1*."""
+        P = self._covariance
+        r, A, B = between(self._poses[0], self._poses[1])
+        r -= motion.mean
+        off = self._mean[:3] - self._poses[0]
+        r[2], off[2] = wrap(r[2]), wrap(off[2])
+        by_motion = inverse(B)
+        by_pose = -by_motion @ A
+        moved: Array = by_pose @ off - by_motion @ r
+        P[:3, :3] = by_pose @ P[:3, :3] @ by_pose.T + by_motion @ motion.covariance @ by_motion.T
+        P[:3, 3:] = by_pose @ P[:3, 3:]
+        P[3:, :3] = P[:3, 3:].T
+        self._mean[:3] = self._poses[1] + moved
+        return moved
+
+    def _update(self, landmarks: Ints, e: Array, by_pose: Array, by_landmark: Array) -> bool:
+        """Kalman update of the prior by whitened residuals (K, 3) at its pose and at l*.
+
+        Rejected, with False, if rounding has left the innovation without a proper covariance.
+        """
+        if not len(landmarks):
+            return True
+        P, n = self._covariance, 3 * len(landmarks)
+        at = 3 + 3 * landmarks[:, None] + np.arange(3)
+        e = e + times(by_landmark, self._mean[at] - self._landmarks[landmarks])
+        HP = (by_pose @ P[:3] + by_landmark @ P[at]).reshape(n, -1)  # H has two blocks a row
+        along = HP[:, at].reshape(n, len(landmarks), 3).transpose(1, 0, 2)
+        S = HP[:, :3] @ by_pose.reshape(n, 3).T + np.eye(n)
+        S += (along @ transposed(by_landmark)).transpose(1, 0, 2).reshape(n, n)
+        try:
+            factor = cho_factor((S + S.T) / 2.0, lower=True)
+        except np.linalg.LinAlgError:
+            return False
+        self._mean -= HP.T @ cho_solve(factor, e.ravel())
+        half = solve_triangular(factor[0], HP, lower=True)
+        P -= half.T @ half  # symmetric to the last bit
+        return True
+
+    def _create(self, landmarks: Ints, e: Array, by_pose: Array, by_landmark: Array) -> None:
+        """Append landmarks to the prior, from whitened residuals (K, 3) at its mean pose."""
+        before, n = len(self._mean), 3 * len(landmarks)
+        after = before + n
+        if after > len(self._room):
+            size = after + after // 2
+            room = np.zeros((size, size))
+            room[:before, :before] = self._covariance
+            self._room = room
+        by_residual = -inverse(by_landmark)
+        J = (by_residual @ by_pose).reshape(n, 3)
+        P = self._room[:after, :after]
+        P[before:, :before] = J @ P[:3, :before]
+        P[:before, before:] = P[before:, :before].T
+        own = J @ P[:3, :3] @ J.T
+        for k, block in enumerate(by_residual @ transposed(by_residual)):
+            own[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += block
+        P[before:, before:] = (own + own.T) / 2.0
+        placed = self._landmarks[landmarks] + times(by_residual, e)
+        self._mean = np.concatenate([self._mean, placed.ravel()])
+
+    def _forget(self, gone: NDArray[np.bool_]) -> None:
+        """Drop these (N,) of the prior's landmarks, and number the others without gaps."""
+        of_prior = np.concatenate([np.ones(3, dtype=bool), np.repeat(~gone, 3)])
+        self._room = self._covariance[np.ix_(of_prior, of_prior)]
+        self._mean = self._mean[of_prior]
+        kept = np.ones(len(self._landmarks), dtype=bool)
+        kept[: len(gone)] = ~gone
+        number = np.cumsum(kept) - 1
+        self._landmarks = self._landmarks[kept]
+        self._images = [replace(i, landmarks=number[i.landmarks]) for i in self._images]
+        old = self._landmark_of_id.items()
+        self._landmark_of_id = {i: int(number[n]) for i, n in old if kept[n]}
+
+    def _whitened(self, poses: Array, landmarks: Ints, points: Array) -> tuple[Array, Array, Array]:
+        """Residuals (K, 3) in standard deviations, and derivatives by the pose and landmark."""
+        at = self._landmarks[landmarks]
+        e, by_pose, by_landmark = residuals_of(self._camera, poses, at, points)
+        whitening = camera_whitening(self._camera, poses, at)
+        return times(whitening, e), whitening @ by_pose, whitening @ by_landmark
+
+    @property
+    def _covariance(self) -> Array:
+        """P of the prior's pose and landmarks, a view of the room kept for more."""
+        n = len(self._mean)
+        P: Array = self._room[:n, :n]
+        return P
+
+    @property
+    def _n_prior(self) -> int:
+        """Landmarks that the prior covers."""
+        return len(self._mean) // 3 - 1
+
+
+def _add(
+    H: Array, g: Array, first: Ints, second: Ints, by_first: Array, by_second: Array, e: Array
+) -> None:
+    """Add K squared residuals to normal equations, each of two nodes; no pair comes twice.
+
+    Parameters
+    ----------
+    H, g
+        (N, 3, N, 3) and (N, 3) of the nodes, changed in place.
+    first, second
+        (K,) nodes of each residual.
+    by_first, by_second, e
+        (K, 3, 3), (K, 3, 3), (K, 3): derivatives and whitened residuals.
+    """
+    n, k, node = len(g), np.arange(len(e)), np.arange(len(g))
+    for nodes, by_node in ((first, by_first), (second, by_second)):
+        select = np.zeros((n, len(e)))
+        select[nodes, k] = 1.0
+        of_node = transposed(by_node)
+        H[node, :, node] += (select @ (of_node @ by_node).reshape(-1, 9)).reshape(n, 3, 3)
+        g += select @ times(of_node, e)
+    cross = transposed(by_first) @ by_second
+    H[first, :, second] += cross
+    H[second, :, first] += transposed(cross)

@@ -1,0 +1,370 @@
+"""Graph SLAM with a laser: key frames tied by registrations, and loops that close.
+
+The nodes are key frames, taken by distance and turn (lu1997, grisetti2010). Consecutive ones are
+tied by the wheels and by the registration of their scans, others by closures
+(`estimators.graph.loop_closing`). After each set of closures that is believed, all poses x minimise
+
+    |x_0 - m|^2_P + sum |between(x_i, x_j) - z_ij|^2_R + sum over closures rho(|...|^2_R),
+
+with rho the bounded loss of dynamic covariance scaling (`estimators.graph.least_squares`). `finish`
+registers all key frames that the solved graph shows to be near each other, and solves again.
+
+As in `estimators.laser.ekf_icp` each scan is modelled as seen from an apparent pose, whose error
+enters all its registrations. The nodes are the apparent poses: between them registrations have the
+share 1 - `shared_noise` of their covariance R and are independent, and base_link is off its
+apparent pose by `shared_noise` R / 2. Closures have all of R: from farther apart two scans show
+other walls, and share less of their errors.
+
+Sources: Lu and Milios, Globally consistent range scan alignment for environment mapping, Autonomous
+Robots 4, 1997; Grisetti et al., A tutorial on graph-based SLAM, ITSM 2, 2010.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from estimators.base import Belief, Estimate, Prior
+from estimators.gaussian import STILL, Gaussian
+from estimators.graph.landmark_drive import FLOOR, loosened
+from estimators.graph.loop_closing import (
+    N_QUANTILES,
+    LoopSearch,
+    look_alike,
+    signature,
+    within_gate,
+)
+from estimators.graph.pose_graph import Edge, PoseGraph
+from estimators.laser.icp import Metric, PreparedScan
+from estimators.laser.scan_matching import FAILED, Covariance, Match, ScanMatcher, moved_beyond
+from estimators.options import (
+    require_counts,
+    require_laser,
+    require_non_negative,
+    require_positive,
+    require_shares,
+    start_pose,
+)
+from estimators.wheels import WheelPrediction
+from sim import se2
+from sim.arrays import Array, Ints
+from sim.errors import InputError, require
+from sim.recording import Frame
+
+_PATIENCE = 2  # scans in a row that may fail before the newest becomes a key frame
+_HELD_FRAMES, _MOST_HELD = 15, 15  # how long closures wait for others, in key frames; and how many
+_CONSIDERED = 8  # times the candidates whose uncertainty is looked at closely
+_ONLINE_TOLERANCE = 1e-4  # of a solution that the next closure refines
+
+
+@dataclass(frozen=True)
+class _Placed:
+    """A Frame: its stamp, its key frame, and base_link in the frame of that."""
+
+    stamp: float
+    node: int
+    in_key: Gaussian
+
+
+class GraphSlam:
+    """Key frames, closures, and a sparse least-squares solution whenever a loop closes.
+
+    Parameters
+    ----------
+    metric, covariance, sigma_range_m
+        As in `estimators.laser.scan_matching.ScanMatcher`.
+    most_gap_m
+        Leave out a line of which no three points in a row lie this near each other: door posts
+        far behind one another are no wall. None to keep all lines.
+    keyframe_distance_m, keyframe_turn_rad
+        How far the robot goes before it takes a new key frame.
+    kr, kl
+        Believed slip variance per metre of the right and left wheel, m.
+    lateral_slip_m, encoder_tick_m, window_s
+        As in `estimators.wheels.WheelPrediction`.
+    gate_probability
+        Leave a registration with the key frame out if only this share of all should differ more
+        from what the wheels say; None to use all.
+    shared_noise
+        Share of a registration's covariance that comes from the scans' own errors, half from each.
+    loop_reach_m
+        Two key frames may see the same place if they are no farther apart.
+    loop_gate_probability
+        A closure is refused if only this share of all right ones misses the graph by more.
+    loop_least_gain
+        Information about the relative pose that a closure must add online, nats.
+    loop_candidates
+        Older key frames that a new one is registered with, at most.
+    loop_support
+        Closures of the last 15 key frames that must be consistent before any is believed.
+    robust_sigma
+        Mahalanobis distance from which on a closure counts less.
+    revisions
+        Searches for further closures in `finish`, each followed by a solution.
+
+    Notes
+    -----
+    Where the registration with the key frame fails, the wheels go on; after two such scans in a row
+    the newest becomes a key frame. Directions that the scans do not constrain are left to the
+    wheels.
+
+    Belief extras: `registration_status`, `status` if a scan was not used, `closures`, the number
+    believed so far.
+    """
+
+    needs = frozenset({"laser"})
+
+    def __init__(
+        self,
+        metric: Metric = "point_to_line",
+        covariance: Covariance = "censi",
+        sigma_range_m: float | None = None,
+        most_gap_m: float | None = 1.5,
+        keyframe_distance_m: float = 0.5,
+        keyframe_turn_rad: float = 0.35,
+        kr: float = 1e-4,
+        kl: float = 1e-4,
+        lateral_slip_m: float = 1e-7,
+        encoder_tick_m: float = 0.0,
+        gate_probability: float | None = 1e-9,
+        shared_noise: float = 0.75,
+        loop_reach_m: float = 3.0,
+        loop_gate_probability: float = 1e-3,
+        loop_least_gain: float = 2.0,
+        loop_candidates: int = 5,
+        loop_support: int = 3,
+        robust_sigma: float = 5.0,
+        revisions: int = 2,
+        window_s: float = 0.05,
+        laser: str = "laser",
+    ) -> None:
+        self.laser = laser
+        most_m = math.inf if most_gap_m is None else most_gap_m
+        self._matcher = ScanMatcher(metric, covariance, sigma_range_m, most_gap_m=most_m)
+        self.wheels = WheelPrediction(
+            kr, kl, window_s, lateral_slip_m=lateral_slip_m, encoder_tick_m=encoder_tick_m
+        )
+        require_non_negative(
+            keyframe_distance_m=keyframe_distance_m,
+            keyframe_turn_rad=keyframe_turn_rad,
+            loop_least_gain=loop_least_gain,
+            revisions=revisions,
+        )
+        require_positive(loop_reach_m=loop_reach_m, robust_sigma=robust_sigma)
+        if most_gap_m is not None:
+            require_positive(most_gap_m=most_gap_m)
+        require_shares(shared_noise=shared_noise, loop_gate_probability=loop_gate_probability)
+        require(
+            shared_noise < 1.0 and loop_gate_probability > 0.0,
+            "estimator.shared_noise must be below 1, and loop_gate_probability above 0",
+        )
+        require(
+            gate_probability is None or 0.0 < gate_probability < 1.0,
+            "estimator.gate_probability must lie between 0 and 1 or be null, "
+            f"got {gate_probability}",
+        )
+        require_counts(loop_candidates=loop_candidates, loop_support=loop_support)
+        self.keyframe_distance_m, self.keyframe_turn_rad = keyframe_distance_m, keyframe_turn_rad
+        self.gate_probability = gate_probability
+        self.shared_noise, self.robust_sigma = shared_noise, robust_sigma
+        self.loop_reach_m, self.loop_gate_probability = loop_reach_m, loop_gate_probability
+        self.loop_least_gain, self.loop_candidates = loop_least_gain, loop_candidates
+        self.loop_support, self.revisions = loop_support, int(revisions)
+
+    def reset(self, prior: Prior, rng: np.random.Generator) -> None:
+        """Start from the prior's pose; the first scan becomes a key frame."""
+        self._laser, self._rng = require_laser(prior, self.laser, "graph_slam"), rng
+        self._search = LoopSearch(
+            self._matcher,
+            self._laser,
+            self.loop_reach_m,
+            self.loop_gate_probability,
+            self.loop_least_gain,
+        )
+        start = start_pose(prior, "graph_slam")
+        self.wheels.reset(prior.robot.track_m)
+        self._graph = PoseGraph(Gaussian(start.mean, start.covariance + FLOOR), self.robust_sigma)
+        self._scans: list[PreparedScan | None] = [None]  # node 0 is the start
+        self._signatures = np.full((1, N_QUANTILES), np.inf)
+        self._held: list[Edge] = []  # closures that wait for others
+        self._in_key = self._by_wheels = STILL  # base_link in the newest node's frame
+        self._failures = 0
+        self._path: list[_Placed] = []
+        self._stamps, self._now = [math.nan], math.nan
+
+    @property
+    def graph(self) -> PoseGraph:
+        """Key frames and closures so far."""
+        return self._graph
+
+    @property
+    def node_stamps(self) -> Array:
+        """(N,) s of the graph's nodes; NaN of the start."""
+        return np.array(self._stamps)
+
+    def step(self, frame: Frame) -> Belief:
+        """Move by the wheels; register a scan with the key frame; at a new one look for loops."""
+        motion = loosened(self.wheels.predict(frame))
+        self._in_key, self._by_wheels = self._in_key.then(motion), self._by_wheels.then(motion)
+        self._now = frame.stamp
+        extras: dict[str, Any] = {}
+        reading = frame.readings.get(self.laser)
+        if reading is not None:
+            status = self._see(self._matcher.prepare(reading["ranges_m"], self._laser))
+            extras["registration_status"] = status
+            if status not in ("first", "ok", "degenerate"):
+                extras["status"] = status
+        extras["closures"] = len(self._graph.closures)
+        self._path.append(_Placed(frame.stamp, len(self._graph) - 1, self._in_key))
+        belief = _symmetric(self._graph.newest.then(self._in_key))
+        return Belief(belief.mean, belief.covariance, extras)
+
+    def finish(self) -> Estimate:
+        """All Frames on the graph as the whole drive shows it.
+
+        Raises
+        ------
+        InputError
+            If there is no Frame yet.
+        """
+        if not self._path:
+            raise InputError("the estimator has seen no Frame; step before finish")
+        for _ in range(self.revisions):
+            found = self._revised_closures()
+            if not found:
+                break
+            self._graph.close(found)
+        keys = [
+            Gaussian(*key) for key in zip(self._graph.poses, self._graph.marginals(), strict=True)
+        ]
+        path = [_symmetric(keys[placed.node].then(placed.in_key)) for placed in self._path]
+        return Estimate(
+            stamps=np.array([placed.stamp for placed in self._path]),
+            means=np.array([belief.mean for belief in path]),
+            covariances=np.array([belief.covariance for belief in path]),
+            kind="revised",
+        )
+
+    def _see(self, scan: PreparedScan | None) -> str:
+        """Register a scan with the newest key frame; what came of it."""
+        if scan is None:
+            return "empty"
+        key = self._scans[-1]
+        if key is None:
+            self._add_key_frame(scan, None)
+            return "first"
+        found = self._matcher.match(scan, key, self._in_key, self._laser, self._rng)
+        status = found.status if found.failed or self._explained(found) else "gated"
+        if status in (*FAILED, "gated"):
+            self._failures += 1
+            if self._failures >= _PATIENCE:
+                self._add_key_frame(scan, None)
+            return status
+        self._failures = 0
+        of_base = _scaled(found.motion, 1.0 - self.shared_noise / 2.0)
+        self._in_key = dataclasses.replace(found, motion=of_base).completed(self._in_key)
+        if moved_beyond(found.motion.mean, self.keyframe_distance_m, self.keyframe_turn_rad):
+            own_noise = self.shared_noise / 2.0 * found.known_covariance
+            self._add_key_frame(scan, found.motion)
+            self._in_key = Gaussian(STILL.mean, own_noise)
+        return status
+
+    def _explained(self, found: Match) -> bool:
+        """Whether a registration differs from what was expected by no more than it may."""
+        if self.gate_probability is None or not len(found.held):
+            return True
+        off = found.held @ se2.difference(found.motion.mean, self._in_key.mean)
+        spread = found.held @ (found.motion.covariance + self._in_key.covariance) @ found.held.T
+        return within_gate(off, spread, self.gate_probability)
+
+    def _add_key_frame(self, scan: PreparedScan, registered: Gaussian | None) -> None:
+        """Append a node, tied by the wheels and by its registration, and look for loops."""
+        measured = [Gaussian(self._by_wheels.mean, self._by_wheels.covariance + FLOOR)]
+        if registered is not None:
+            measured.append(_scaled(registered, 1.0 - self.shared_noise))
+        self._graph.add(self._in_key.mean, measured)
+        self._scans.append(scan)
+        self._stamps.append(self._now)
+        self._signatures = np.vstack([self._signatures, signature(scan)])
+        self._in_key = self._by_wheels = STILL
+        self._failures = 0
+        self._close_loops()
+
+    def _close_loops(self) -> None:
+        """Hold the newest key frame's closures; believe those that enough others agree with."""
+        oldest = len(self._graph) - _HELD_FRAMES
+        self._held = [edge for edge in self._held if edge.second >= oldest]
+        found = self.proposed()
+        if not found:
+            return
+        self._held = [*self._held, *found][-_MOST_HELD:]
+        agreed = self._search.consistent(self._graph, self._held)
+        believed = sum(e.second >= oldest for e in self._graph.closures[-self.loop_support :])
+        if agreed and len(agreed) + believed >= self.loop_support:
+            self._held = [edge for edge in self._held if edge not in agreed]
+            self._graph.close(agreed, _ONLINE_TOLERANCE)
+
+    def proposed(self) -> list[Edge]:
+        """Closures of the newest key frame that pass each on its own."""
+        newest = len(self._graph) - 1
+        older = np.arange(newest - 1)
+        motions, covariances = self._graph.newest_from(older, exact=False)
+        nodes = self._candidates(newest, motions, covariances)
+        return self._closures(newest, nodes, *self._graph.newest_from(nodes, exact=True))
+
+    def _revised_closures(self) -> list[Edge]:
+        """More closures between key frames that the graph shows to be near each other."""
+        graph = self._graph
+        known = {(edge.first, edge.second) for edge in graph.closures}
+        graph.marginals()
+        found = []
+        for node in range(2, len(graph)):
+            motions = se2.between(graph.poses[: node - 1], graph.poses[node])
+            nodes = self._candidates(node, motions, np.zeros((len(motions), 3, 3)))
+            nodes = np.array([i for i in nodes.tolist() if (i, node) not in known], np.int64)
+            if len(nodes):
+                found += self._closures(node, nodes, *graph.seen_from(nodes, node))
+        return found
+
+    def _candidates(self, node: int, motions: Array, covariances: Array) -> Ints:
+        """Those of nodes 0 ... K - 1 that may close a loop with another, by its pose in theirs."""
+        alike = look_alike(self._signatures[node], self._signatures[: len(motions)])
+        nodes = self._search.candidates(motions, covariances, alike)
+        return nodes[: _CONSIDERED * self.loop_candidates]
+
+    def _closures(self, node: int, nodes: Ints, motions: Array, covariances: Array) -> list[Edge]:
+        """Register a node with the first few of K others that would teach enough."""
+        typical = self._graph.noise_of(node)
+        worth = [self._search.worthwhile(P, typical) for P in covariances]
+        found = [
+            self._closure(int(nodes[k]), node, Gaussian(motions[k], covariances[k]))
+            for k in np.flatnonzero(worth)[: self.loop_candidates]
+        ]
+        return [edge for edge in found if edge is not None]
+
+    def _closure(self, first: int, second: int, expected: Gaussian) -> Edge | None:
+        """Register two key frames; None if that fails or misses the graph by too much."""
+        scan, other = self._scans[second], self._scans[first]
+        if scan is None or other is None:
+            return None
+        found = self._search.register(scan, other, expected, self._rng)
+        if found is None:
+            return None
+        off = se2.difference(found.mean, expected.mean)
+        spread = expected.covariance + found.covariance
+        explained = within_gate(off, spread, self.loop_gate_probability)
+        if not (explained and self._search.worthwhile(expected.covariance, found.covariance)):
+            return None
+        return Edge(first, second, found)
+
+
+def _scaled(motion: Gaussian, share: float) -> Gaussian:
+    return Gaussian(motion.mean, share * motion.covariance)
+
+
+def _symmetric(belief: Gaussian) -> Gaussian:
+    return Gaussian(belief.mean, (belief.covariance + belief.covariance.T) / 2.0)

@@ -1,0 +1,593 @@
+"""Least squares over poses, relative poses and stereo landmarks, by Levenberg-Marquardt.
+
+Each step eliminates the landmarks (Schur complement), so that only the poses are left to
+factorise: as a dense matrix, or, where most of it is zero, as a sparse one. Shared by
+`estimators.graph.smoother`, `estimators.graph.fixed_lag` and `estimators.graph.pose_graph`.
+
+The loss `dcs` is dynamic covariance scaling (Agarwal et al., Robust map optimization using dynamic
+covariance scaling, ICRA 2013), the switchable constraints of Suenderhauf and Protzel (2012) with
+the switches solved for: it is bounded, so a wrong closure cannot bend the map without end.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve, lapack
+from scipy.sparse import bsr_array, csc_array
+from scipy.sparse.linalg import splu
+
+from estimators.landmarks.stereo import LEAST_DEPTH_M, StereoModel
+from sim import se2
+from sim.arrays import Array, Ints
+
+Robust = Literal["none", "huber", "cauchy", "dcs"]
+
+LEAST_INFORMATION = 1e-6  # wrong ids can send a landmark to infinity; a kilometre is enough
+_LEAST_DAMPING, _MOST_DAMPING = 1e-9, 1e6
+_SPARSE_POSES = 100  # without landmarks, from so many on the matrix is kept sparse
+_AT_ONCE = 50  # poses whose columns of a covariance are solved for together
+
+
+@dataclass(frozen=True)
+class PoseSightings:
+    """Poses seen from poses: robots of a team that see one another's markers.
+
+    Attributes
+    ----------
+    camera
+        What is believed of it.
+    marker_z_m
+        Height of the markers.
+    seeing_rows, seen_rows
+        (K,) who sees whom.
+    points_in_camera
+        (K, 3) m.
+    """
+
+    camera: StereoModel
+    marker_z_m: float
+    seeing_rows: Ints
+    seen_rows: Ints
+    points_in_camera: Array
+
+    def residuals(self, poses: Array, in_image: bool) -> tuple[Array, Array, Array]:
+        """Whitened residuals (K, 3), and derivatives (K, 3, 3) by the seeing and seen pose."""
+        seeing, seen = poses[self.seeing_rows], poses[self.seen_rows]
+        markers = np.column_stack([seen[:, :2], np.full(len(seen), self.marker_z_m)])
+        points = self.points_in_camera
+        off, by_seeing, by_marker = residuals_of(self.camera, seeing, markers, points, in_image)
+        whitening = (
+            camera_whitening(self.camera, seeing, markers)
+            if in_image
+            else whitening_of(self.camera.covariance(points))
+        )
+        by_seen = by_marker * np.array([1.0, 1.0, 0.0])  # its heading is not seen
+        return times(whitening, off), whitening @ by_seeing, whitening @ by_seen
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A first pose, relative poses, and stereo observations of landmarks.
+
+    Attributes
+    ----------
+    prior_mean, prior_covariance
+        (3,) and (3, 3) of pose 0, m, m, rad in map.
+    first, second
+        (F,) rows of the poses that each relative pose ties: T_first_second.
+    motions, motion_covariances
+        (F, 3), (F, 3, 3) in the coordinates of the relative pose; from odometry or from closing
+        a loop.
+    camera
+        What is believed of it; None without landmarks.
+    pose_rows, landmark_rows
+        (K,) who sees which landmark; landmarks are 0, 1, 2 ..., each seen at least once.
+    points_in_camera
+        (K, 3) m: z forward, x right, y down; z positive.
+    doubtful
+        (F,) relative poses that may be wrong, such as closures of loops: they are under the
+        robust loss, as all observations are. None: no relative pose is.
+    sightings
+        Poses seen from poses; under the robust loss too.
+    """
+
+    prior_mean: Array
+    prior_covariance: Array
+    first: Ints
+    second: Ints
+    motions: Array
+    motion_covariances: Array
+    camera: StereoModel | None = None
+    pose_rows: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
+    landmark_rows: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
+    points_in_camera: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    doubtful: NDArray[np.bool_] | None = None
+    sightings: PoseSightings | None = None
+
+
+@dataclass(frozen=True)
+class Solution:
+    """The poses and landmarks of least squares.
+
+    Attributes
+    ----------
+    poses, information
+        (T, 3), and their information with the landmarks marginalised, factorised.
+    landmarks, landmark_covariances
+        (N, 3), (N, 3, 3) m in map, z up.
+    cost
+        Sum of squared whitened residuals (of their robust loss).
+    iterations, converged
+        Steps taken, and whether the last one changed nothing that matters.
+    """
+
+    poses: Array
+    information: Factor
+    landmarks: Array
+    landmark_covariances: Array
+    cost: float
+    iterations: int
+    converged: bool
+
+    @property
+    def covariance(self) -> Array:
+        """(3 T, 3 T) of all poses jointly; `Factor.columns` gives a part of it for less."""
+        return self.information.inverse
+
+
+class Factor:
+    """A symmetric, positive definite matrix, factorised: sparse, or dense.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If it is not positive definite.
+    """
+
+    def __init__(self, matrix: Array | bsr_array) -> None:
+        self.n = matrix.shape[0]
+        if isinstance(matrix, np.ndarray):
+            self._dense = cho_factor(matrix, lower=True, check_finite=False)
+            return
+        self._dense = None
+        try:  # with the pivots on the diagonal L U is L D L'
+            self._sparse = splu(
+                csc_array(matrix),
+                permc_spec="MMD_AT_PLUS_A",
+                diag_pivot_thresh=0.0,
+                options={"SymmetricMode": True},
+            )
+        except RuntimeError as error:
+            raise np.linalg.LinAlgError(str(error)) from None
+        if not (self._sparse.U.diagonal() > 0.0).all():
+            raise np.linalg.LinAlgError("not positive definite")
+
+    def solve(self, right: Array) -> Array:
+        """The matrix's inverse times (n,) or (n, K)."""
+        if self._dense is not None:
+            return np.asarray(cho_solve(self._dense, right), dtype=np.float64)
+        return np.asarray(self._sparse.solve(right), dtype=np.float64)
+
+    def columns(self, poses: Ints) -> Array:
+        """(n, 3 K) columns of the inverse: covariances of all with these K poses."""
+        chosen = (3 * np.asarray(poses)[:, None] + np.arange(3)).ravel()
+        units = np.zeros((self.n, len(chosen)))
+        units[chosen, np.arange(len(chosen))] = 1.0
+        return self.solve(units)
+
+    def joint(self, poses: Ints) -> Array:
+        """(3 K, 3 K) joint covariance of these poses."""
+        chosen = (3 * np.asarray(poses)[:, None] + np.arange(3)).ravel()
+        block: Array = self.columns(poses)[chosen]
+        return (block + block.T) / 2.0
+
+    def marginals(self, poses: Ints) -> Array:
+        """(K, 3, 3) covariance of each of these poses."""
+        found = np.empty((len(poses), 3, 3))
+        for begin in range(0, len(poses), _AT_ONCE):
+            part = np.asarray(poses)[begin : begin + _AT_ONCE]
+            own = self.columns(part).reshape(-1, 3, len(part), 3)[part, :, np.arange(len(part))]
+            found[begin : begin + len(part)] = (own + transposed(own)) / 2.0
+        return found
+
+    @cached_property
+    def inverse(self) -> Array:
+        """(n, n)."""
+        if self._dense is None:
+            return self.columns(np.arange(self.n // 3))
+        lower = np.tril(lapack.dpotri(self._dense[0], lower=1)[0])
+        return np.asarray(lower + np.tril(lower, -1).T, dtype=np.float64)
+
+
+def solve(
+    problem: Problem,
+    poses: Array,
+    *,
+    robust: Robust = "none",
+    robust_sigma: float = 3.0,
+    max_iterations: int = 100,
+    tolerance: float = 1e-9,
+) -> Solution:
+    """Least squares from guessed poses (T, 3), by Levenberg-Marquardt.
+
+    Landmarks start where the observation with the greatest disparity puts them. The first stage
+    fits triangulated points, the second what the camera measures. It ends when a step gains less
+    than the share `tolerance` of the cost.
+    """
+    n_landmarks = int(problem.landmark_rows.max(initial=-1)) + 1
+    order = np.argsort(problem.landmark_rows, kind="stable")
+    problem = dataclasses.replace(
+        problem,
+        pose_rows=problem.pose_rows[order],
+        landmark_rows=problem.landmark_rows[order],
+        points_in_camera=problem.points_in_camera[order],
+    )
+    splits = np.searchsorted(problem.landmark_rows, np.arange(n_landmarks + 1))
+    residuals = _Residuals(problem, splits, robust, robust_sigma)
+
+    by_depth = np.lexsort((problem.points_in_camera[:, 2], problem.landmark_rows))
+    nearest = by_depth[splits[:-1]]
+    landmarks = np.zeros((0, 3))
+    if problem.camera is not None:
+        landmarks = problem.camera.place(
+            poses[problem.pose_rows[nearest]], problem.points_in_camera[nearest]
+        )
+    iterations, converged = 0, True
+    last = (True, tolerance)
+    for in_image, enough in [last] if n_landmarks == 0 else [(False, 1e-4), last]:
+        poses, landmarks, taken = _descend(
+            residuals, poses, landmarks, in_image, enough, max_iterations
+        )
+        iterations, converged = iterations + taken, taken < max_iterations
+    poses = np.column_stack([poses[:, :2], se2.wrap(poses[:, 2])])
+    whitening = residuals.whitening(poses, landmarks, True)
+    system = residuals.linearised(poses, landmarks, whitening, True)
+    information, of_landmarks = system.marginals()
+    return Solution(poses, information, landmarks, of_landmarks, system.cost, iterations, converged)
+
+
+def information_at(
+    problem: Problem, poses: Array, *, robust: Robust = "none", robust_sigma: float = 3.0
+) -> Factor:
+    """Information about poses (T, 3), linearised where they are, of a problem without landmarks."""
+    residuals = _Residuals(problem, np.zeros(1, np.int64), robust, robust_sigma)
+    nothing = np.zeros((0, 3))
+    return residuals.linearised(poses, nothing, nothing[:, None], True).marginals()[0]
+
+
+def _descend(
+    residuals: _Residuals,
+    poses: Array,
+    landmarks: Array,
+    in_image: bool,
+    tolerance: float,
+    max_iterations: int,
+) -> tuple[Array, Array, int]:
+    """Levenberg-Marquardt until a step gains less than this share of the cost.
+
+    The whitening is held during a step, also where it depends on the prediction.
+
+    Returns
+    -------
+    tuple
+        Poses, landmarks, and the number of steps; `max_iterations` if they did not suffice.
+    """
+    damping = _LEAST_DAMPING
+    for taken in range(max_iterations):
+        whitening = residuals.whitening(poses, landmarks, in_image)
+        system = residuals.linearised(poses, landmarks, whitening, in_image)
+        while True:
+            step = system.step(damping)
+            if step is not None:
+                trial = poses + step[0], landmarks + step[1]
+                gain = system.cost - residuals.cost(*trial, whitening, in_image)
+                if gain >= 0.0:
+                    break
+            damping *= 10.0
+            if damping > _MOST_DAMPING:  # nothing leads down: this is as low as it gets
+                return poses, landmarks, taken
+        poses, landmarks = trial
+        damping = max(damping / 10.0, _LEAST_DAMPING)
+        if gain <= tolerance * max(system.cost, 1.0):
+            return poses, landmarks, taken
+    return poses, landmarks, max_iterations
+
+
+@dataclass(frozen=True)
+class _Linearised:
+    """Normal equations of one step: poses, landmarks, and what ties them.
+
+    Attributes
+    ----------
+    H, g
+        (3 T, 3 T) sparse, (T, 3) of the poses.
+    V, h
+        (N, 3, 3), (N, 3) of each landmark.
+    W
+        (K, 3, 3) of each observation, pose by landmark; `splits` (N + 1,) are the first of each
+        landmark.
+    """
+
+    H: bsr_array
+    g: Array
+    V: Array
+    h: Array
+    W: Array
+    problem: Problem
+    splits: Ints
+    cost: float
+
+    def _reduced(self, damping: float) -> tuple[Factor, Array, Array]:
+        """Damped information of the poses without the landmarks, V^-1 and W V^-1."""
+        V = self.V.copy()
+        V[:, range(3), range(3)] *= 1.0 + damping
+        V_inverse = inverse(V)
+        WV = self.W @ V_inverse[self.problem.landmark_rows]
+        if not len(V) and len(self.g) >= _SPARSE_POSES:
+            sparse = csc_array(self.H)
+            sparse.setdiag(sparse.diagonal() * (1.0 + damping))
+            return Factor(sparse), V_inverse, WV
+        S = self.H.toarray()
+        S[np.diag_indices_from(S)] *= 1.0 + damping
+        if len(V):
+            S -= (self._by_landmark(WV).T @ self._by_landmark(self.W)).toarray()
+        return Factor(S), V_inverse, WV
+
+    def _by_landmark(self, blocks: Array) -> bsr_array:
+        """Blocks (K, 3, 3) of the observations as a sparse matrix (3 N, 3 T), transposed."""
+        shape = 3 * len(self.V), self.H.shape[0]
+        return bsr_array((transposed(blocks), self.problem.pose_rows, self.splits), shape=shape)
+
+    def step(self, damping: float) -> tuple[Array, Array] | None:
+        """Changes of the poses (T, 3) and landmarks (N, 3); None if it cannot be solved."""
+        try:
+            factor, V_inverse, WV = self._reduced(damping)
+            rhs = self.g.copy()
+            np.subtract.at(
+                rhs, self.problem.pose_rows, times(WV, self.h[self.problem.landmark_rows])
+            )
+        except np.linalg.LinAlgError:
+            return None
+        solved = factor.solve(rhs.ravel())
+        if not np.isfinite(solved).all():
+            return None
+        of_poses = -solved.reshape(-1, 3)
+        rest = self.h.copy()
+        turned = times(transposed(self.W), of_poses[self.problem.pose_rows])
+        np.add.at(rest, self.problem.landmark_rows, turned)
+        return of_poses, -times(V_inverse, rest)
+
+    def marginals(self) -> tuple[Factor, Array]:
+        """Information of the poses, and covariance (N, 3, 3) of each landmark."""
+        factor, of_landmarks, WV = self._reduced(0.0)
+        rows = 3 * self.problem.pose_rows[:, None] + np.arange(3)
+        for n, (start, stop) in enumerate(itertools.pairwise(self.splits)):
+            seen_from, gain = rows[start:stop].ravel(), WV[start:stop].reshape(-1, 3)
+            of_landmarks[n] += gain.T @ factor.inverse[np.ix_(seen_from, seen_from)] @ gain
+        return factor, of_landmarks
+
+
+@dataclass(frozen=True)
+class _Residuals:
+    """Whitened residuals of a problem, its observations sorted by landmark."""
+
+    problem: Problem
+    splits: Ints
+    robust: Robust
+    robust_sigma: float
+
+    def whitening(self, poses: Array, landmarks: Array, in_image: bool) -> Array:
+        """(K, 3, 3) that makes the residuals of the observations unit white noise."""
+        p = self.problem
+        if p.camera is None:
+            return np.zeros((0, 3, 3))
+        if not in_image:
+            return whitening_of(p.camera.covariance(p.points_in_camera))
+        return camera_whitening(p.camera, poses[p.pose_rows], landmarks[p.landmark_rows])
+
+    def cost(self, poses: Array, landmarks: Array, whitening: Array, in_image: bool) -> float:
+        """Sum of the losses."""
+        start, motion = self._of_motions(poses)
+        seen = times(whitening, self._of_image(poses, landmarks, in_image)[0])
+        loss, _ = self._loss(np.sum(seen**2, axis=1))
+        if self.problem.sightings is not None:
+            sighted = self.problem.sightings.residuals(poses, in_image)[0]
+            loss = np.append(loss, self._loss(np.sum(sighted**2, axis=1))[0])
+        return self._cost(start, motion, loss)
+
+    def _cost(self, start: Array, motion: Array, loss: Array) -> float:
+        """Sum of the losses of the whitened first pose and motions (F, 3), and of the images."""
+        doubtful = self.problem.doubtful
+        if doubtful is not None:
+            loss = np.append(loss, self._loss(np.sum(motion[doubtful] ** 2, axis=1))[0])
+            motion = motion[~doubtful]
+        return float(np.sum(start**2) + np.sum(motion**2) + np.sum(loss))
+
+    def linearised(
+        self, poses: Array, landmarks: Array, whitening: Array, in_image: bool
+    ) -> _Linearised:
+        """Normal equations about these poses and landmarks."""
+        p, n, n_landmarks = self.problem, len(poses), len(landmarks)
+        g = np.zeros((n, 3))
+        start, motion = self._of_motions(poses)
+        by_start = self._start_whitening
+        g[0] += by_start.T @ start
+        weights = np.ones(len(motion))
+        if p.doubtful is not None:
+            weights[p.doubtful] = self._loss(np.sum(motion[p.doubtful] ** 2, axis=1))[1]
+        by_ends = se2.between_jacobians(poses[p.first], poses[p.second])
+        sides = [self._motion_whitening @ side for side in by_ends]
+        ends = list(zip((p.first, p.second), sides, strict=True))
+        blocks = _Blocks(n)
+        blocks.add(np.zeros(1, np.int64), np.zeros(1, np.int64), (by_start.T @ by_start)[None])
+        for rows, by_pose in ends:
+            weighted = weights[:, None, None] * transposed(by_pose)
+            np.add.at(g, rows, times(weighted, motion))
+            for columns, by_other in ends:
+                blocks.add(rows, columns, weighted @ by_other)
+
+        seen, by_pose, by_landmark = self._of_image(poses, landmarks, in_image)
+        seen = times(whitening, seen)
+        loss, weight = self._loss(np.sum(seen**2, axis=1))
+        weighted = whitening * np.sqrt(weight)[:, None, None]
+        seen = seen * np.sqrt(weight)[:, None]
+        by_pose, by_landmark = weighted @ by_pose, weighted @ by_landmark
+        of_pose, of_landmark = transposed(by_pose), transposed(by_landmark)
+        blocks.add(p.pose_rows, p.pose_rows, of_pose @ by_pose)
+        np.add.at(g, p.pose_rows, times(of_pose, seen))
+        if p.sightings is not None:
+            sighted, *sides = p.sightings.residuals(poses, in_image)
+            lost, weight = self._loss(np.sum(sighted**2, axis=1))
+            loss = np.append(loss, lost)
+            both = list(zip((p.sightings.seeing_rows, p.sightings.seen_rows), sides, strict=True))
+            for rows, by_side in both:
+                pulled = weight[:, None, None] * transposed(by_side)
+                np.add.at(g, rows, times(pulled, sighted))
+                for columns, by_other in both:
+                    blocks.add(rows, columns, pulled @ by_other)
+        V = np.tile(LEAST_INFORMATION * np.eye(3), (n_landmarks, 1, 1))
+        h = np.zeros((n_landmarks, 3))
+        np.add.at(V, p.landmark_rows, of_landmark @ by_landmark)
+        np.add.at(h, p.landmark_rows, times(of_landmark, seen))
+        return _Linearised(
+            blocks.matrix(),
+            g,
+            V,
+            h,
+            of_pose @ by_landmark,
+            p,
+            self.splits,
+            self._cost(start, motion, loss),
+        )
+
+    def _of_motions(self, poses: Array) -> tuple[Array, Array]:
+        """Whitened residuals of the first pose (3,) and of the relative poses (F, 3)."""
+        p = self.problem
+        start = poses[0] - p.prior_mean
+        start[2] = se2.wrap(start[2])
+        motion = se2.between(poses[p.first], poses[p.second]) - p.motions
+        motion[:, 2] = se2.wrap(motion[:, 2])
+        return self._start_whitening @ start, times(self._motion_whitening, motion)
+
+    @cached_property
+    def _start_whitening(self) -> Array:
+        return whitening_of(self.problem.prior_covariance)
+
+    @cached_property
+    def _motion_whitening(self) -> Array:
+        return whitening_of(self.problem.motion_covariances)
+
+    def _of_image(
+        self, poses: Array, landmarks: Array, in_image: bool
+    ) -> tuple[Array, Array, Array]:
+        """Residuals of the observations and their derivatives, as `residuals_of` has them."""
+        p = self.problem
+        if p.camera is None:
+            return np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3, 3))
+        poses, landmarks = poses[p.pose_rows], landmarks[p.landmark_rows]
+        return residuals_of(p.camera, poses, landmarks, p.points_in_camera, in_image)
+
+    def _loss(self, squares: Array) -> tuple[Array, Array]:
+        """Loss (K,) of squared Mahalanobis distances, and its derivative by them."""
+        turn = self.robust_sigma**2
+        if self.robust == "huber":
+            beyond = squares > turn
+            root = np.sqrt(np.where(beyond, squares, turn) * turn)
+            return np.where(beyond, 2.0 * root - turn, squares), np.where(beyond, turn / root, 1.0)
+        if self.robust == "cauchy":
+            return turn * np.log1p(squares / turn), 1.0 / (1.0 + squares / turn)
+        if self.robust == "dcs":
+            scale = np.minimum(1.0, 2.0 * turn / (turn + squares))
+            return np.where(scale < 1.0, turn * (3.0 - 2.0 * scale), squares), scale**2
+        return squares, np.ones_like(squares)
+
+
+class _Blocks:
+    """Sum of blocks (3, 3) at rows and columns of n poses, as a sparse matrix."""
+
+    def __init__(self, n: int) -> None:
+        self._n = n
+        self._places: list[Ints] = []
+        self._values: list[Array] = []
+
+    def add(self, rows: Ints, columns: Ints, blocks: Array) -> None:
+        """Add K blocks (K, 3, 3); places may come twice."""
+        self._places.append(rows * self._n + columns)
+        self._values.append(blocks)
+
+    def matrix(self) -> bsr_array:
+        """(3 n, 3 n)."""
+        n = self._n
+        places, row_of = np.unique(np.concatenate(self._places), return_inverse=True)
+        summed = np.zeros((len(places), 3, 3))
+        np.add.at(summed, row_of, np.concatenate(self._values))
+        starts = np.searchsorted(places, n * np.arange(n + 1))
+        return bsr_array((summed, places % n, starts), shape=(3 * n, 3 * n))
+
+
+def residuals_of(
+    camera: StereoModel, poses: Array, landmarks: Array, points: Array, in_image: bool = True
+) -> tuple[Array, Array, Array]:
+    """Residuals of K observations: predicted less measured.
+
+    In pixels of column, row and disparity if the camera's noise is Gaussian there and `in_image`
+    asks for it, else in metres.
+
+    Parameters
+    ----------
+    poses, landmarks, points
+        (K, 3) each: who sees which landmark, and where in the camera frame it was measured.
+
+    Returns
+    -------
+    tuple
+        Residuals (K, 3), and their derivatives (K, 3, 3) by the pose and by the landmark.
+    """
+    predicted, by_pose, by_landmark = camera.predict(poses, landmarks)
+    if not (in_image and camera.in_image):
+        return predicted - points, by_pose, by_landmark
+    # What is guessed to lie behind the camera is pulled before it
+    predicted[:, 2] = np.maximum(predicted[:, 2], LEAST_DEPTH_M)
+    image = camera.to_image(predicted)
+    by_point = -image[:, :, None] * np.array([0.0, 0.0, 1.0])
+    by_point[:, 0, 0] = by_point[:, 1, 1] = camera.focal_px
+    by_point /= predicted[:, 2, None, None]
+    return image - camera.to_image(points), by_point @ by_pose, by_point @ by_landmark
+
+
+def camera_whitening(camera: StereoModel, poses: Array, landmarks: Array) -> Array:
+    """Matrices (K, 3, 3) that make the camera's residuals, `residuals_of`, unit white noise.
+
+    The noise is that at the predicted points where it is not the same everywhere.
+    """
+    if camera.in_image:
+        roots = np.diag(1.0 / np.sqrt(camera.variances_px2))
+        return np.broadcast_to(roots, (len(poses), 3, 3))
+    return whitening_of(camera.covariance(camera.predict(poses, landmarks)[0]))
+
+
+def times(matrices: Array, vectors: Array) -> Array:
+    """Products (K, m) of matrices (K, m, n) and vectors (K, n)."""
+    return (matrices @ vectors[:, :, None])[:, :, 0]
+
+
+def transposed(matrices: Array) -> Array:
+    """Each of the matrices (K, m, n) transposed."""
+    return matrices.transpose(0, 2, 1)
+
+
+def inverse(matrices: Array) -> Array:
+    """Inverses of matrices (K, m, m)."""
+    return np.asarray(np.linalg.inv(matrices), dtype=np.float64)
+
+
+def whitening_of(covariances: Array) -> Array:
+    """Matrices (..., 3, 3) that make residuals of these covariances unit white noise."""
+    return inverse(np.asarray(np.linalg.cholesky(covariances), dtype=np.float64))

@@ -1,0 +1,147 @@
+"""Batch least squares over a whole run: the bound that an online estimate is held against.
+
+Poses, odometry increments and stereo landmarks with known ids make one non-linear least-squares
+problem, which `estimators.graph.least_squares` solves.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from estimators.base import Belief, Estimate, Prior
+from estimators.graph.landmark_drive import (
+    LandmarkDrive,
+    Sighted,
+    loosened,
+    observed,
+    revised_team,
+)
+from estimators.graph.least_squares import Problem, Robust
+from estimators.landmarks.sightings import Sightings, dead_reckoning
+from estimators.landmarks.stereo import StereoModel
+from estimators.options import (
+    require_choices,
+    require_counts,
+    require_positive,
+    require_stereo,
+    start_pose,
+)
+from estimators.wheels import WheelPrediction
+from sim.arrays import Array
+from sim.errors import require
+from sim.recording import Frame
+
+
+class Smoother:
+    """Dead reckoning online; `finish` gives the least-squares trajectory over everything seen.
+
+    Parameters
+    ----------
+    kr, kl
+        Believed slip variance per metre of the right and left wheel, m.
+    robust
+        Loss of each observation of a landmark: `none` (squares), `huber` or `cauchy` from
+        `robust_sigma` standard deviations on, for ids that are sometimes wrong.
+    robust_sigma
+        Mahalanobis distance at which the loss turns.
+    max_iterations
+        Most steps of each of the two stages.
+    window_s
+        |ds| is netted over at least this time.
+    robots
+        Name of the sensor that sees the other robots of a team, with ids; None: sightings are not
+        used.
+
+    Notes
+    -----
+    The camera is believed as `estimators.landmarks.stereo.StereoModel.of` has it: in column, row
+    and disparity where its noise is Gaussian there, else in X, Y and Z with the variances at the
+    predicted point. Dead reckoning may put landmarks behind the camera, so a first stage fits the
+    triangulated points, with covariances as measured.
+
+    Only the Frames with observations (and the first and last) are poses of the problem. Those
+    between are filled in from the odometry on both sides, which loses nothing. The wheels should
+    be read at 10 Hz or more: an arc over 0.4 m misses more of a bend than slip adds.
+
+    Extras: `status` when an observation could not be used.
+    """
+
+    needs = frozenset({"stereo"})
+
+    def __init__(
+        self,
+        kr: float = 1e-4,
+        kl: float = 1e-4,
+        robust: Robust = "none",
+        robust_sigma: float = 3.0,
+        max_iterations: int = 100,
+        window_s: float = 0.05,
+        stereo: str = "stereo",
+        robots: str | None = None,
+    ) -> None:
+        self.stereo, self.robots = stereo, robots
+        self.wheels = WheelPrediction(kr, kl, window_s)
+        require_choices(robust=(robust, Robust))
+        require_positive(robust_sigma=robust_sigma)
+        require_counts(max_iterations=max_iterations)
+        self.robust, self.robust_sigma, self.max_iterations = robust, robust_sigma, max_iterations
+
+    def reset(self, prior: Prior, rng: np.random.Generator) -> None:
+        """Start from the prior's pose, with nothing seen."""
+        self.reset_team((prior,), rng)
+
+    def reset_team(self, priors: Sequence[Prior], rng: np.random.Generator) -> None:
+        """Start a team from the priors of its robots, whose starts are known."""
+        require(
+            len(priors) == 1 or all(prior.mean is not None for prior in priors),
+            "smoother: the starts of a team must be known; set team.starts=known",
+        )
+        self._camera = StereoModel.of(require_stereo(priors[0], self.stereo, "smoother"))
+        self._sightings = Sightings.of(priors, self.robots, "camera", "predicted", "smoother")
+        self._beliefs = [start_pose(prior, "smoother") for prior in priors]
+        self._wheels = dead_reckoning(self.wheels, priors)
+        self._drives = [LandmarkDrive(self._camera, start) for start in self._beliefs]
+        self._sighted: list[Sighted] = []
+
+    def step(self, frame: Frame) -> Belief:
+        """Keep what the Frame shows; the belief is dead reckoning alone."""
+        return self.step_team((frame,))[0]
+
+    def step_team(self, frames: Sequence[Frame]) -> list[Belief]:
+        """Keep what the Frames of an instant show; the beliefs are dead reckoning alone."""
+        beliefs = []
+        for frame in frames:
+            robot, motion = frame.robot, self._wheels[frame.robot].predict(frame)
+            belief = self._beliefs[robot] = self._beliefs[robot].then(motion)
+            seen, status = observed(frame, self.stereo, self._camera, "smoother")
+            self._drives[robot].add(frame.stamp, loosened(motion), belief.mean, seen)
+            extras = {"status": status} if status else {}
+            beliefs.append(Belief(belief.mean.copy(), belief.covariance.copy(), extras))
+        if self._sightings is not None:
+            for frame in frames:
+                self._sight(self._sightings, frame, {f.robot for f in frames} - {frame.robot})
+        return beliefs
+
+    def _sight(self, sightings: Sightings, frame: Frame, others: set[int]) -> None:
+        points, numbers = sightings.read(frame)
+        complaint = "smoother: sightings without ids; set sensors.robots.identifies=true"
+        require(numbers is not None or len(points) == 0, complaint)
+        for point, number in zip(points, () if numbers is None else numbers.tolist(), strict=False):
+            if number in others:
+                seeing, seen = (
+                    (robot, self._drives[robot].pin()) for robot in (frame.robot, number)
+                )
+                self._sighted.append((seeing, seen, point))
+
+    def finish(self) -> Estimate:
+        """Least squares over all Frames so far: `LandmarkDrive.revised`."""
+        return self.finish_team()[0]
+
+    def finish_team(self) -> list[Estimate]:
+        """Least squares over all Frames of a team: the path of each robot."""
+        options = self.robust, self.robust_sigma, self.max_iterations
+        return revised_team(self._drives, self._sightings, self._sighted, *options)
+
+    def problem(self) -> tuple[Problem, Array]:
+        """The least-squares problem over all Frames so far, and poses (T, 3) to start from."""
+        return self._drives[0].problem()

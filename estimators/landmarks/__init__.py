@@ -1,0 +1,1 @@
+"""Methods on landmarks seen by a stereo camera."""

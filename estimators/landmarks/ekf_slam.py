@@ -1,0 +1,565 @@
+"""EKF-SLAM with stereo landmarks, the classical comparison of gil2008 (its refs. 8, 24 to 26).
+
+One Gaussian over the robot's pose and all landmarks, with all their correlations; so there is one
+association for the whole filter, and a wrong one is never taken back. Of a team it holds the poses
+of all robots, and one map.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
+
+from estimators.base import Belief, Prior
+from estimators.gaussian import STILL, Gaussian, compose, wrap
+from estimators.landmarks.sightings import Sightings, dead_reckoning, pose_by_points, team_starts
+from estimators.landmarks.slam_frontend import Association, Image, SlamFrontEnd
+from estimators.landmarks.stereo import LEAST_DEPTH_M, NoiseAt, NoiseModel
+from estimators.landmarks.wheel_gains import NO_MOTION, GainBelief, gained_motion
+from estimators.options import require_choices, require_positive
+from estimators.wheels import WheelPrediction
+from sim.arrays import Array, Ints
+from sim.errors import require
+from sim.recording import Frame
+
+Errors = Literal["coordinates", "invariant"]
+
+# One covariance holds the correlations of all landmarks: 1.2 GB of it
+_MOST_LANDMARKS, _MOST_OBSERVATIONS = 4000, 1000
+# Covariance of a robot that enters the map: wide, against what is measured then
+_ENTERS = np.diag(np.square([10.0, 10.0, 1.0]))
+_REFINEMENTS = 5
+
+
+class EkfSlam:
+    """Extended Kalman filter over pose and landmarks.
+
+    At an image the motion since the last one is applied, the landmarks seen are associated, all of
+    them update the state at once, and those not in the map enter it with their correlations.
+
+    Of a team, a sighting updates the poses of both robots. One of unknown start enters the map at
+    the first instant that shows two points of it a metre apart: landmarks, robots that it sees, or
+    itself as another sees it.
+
+    Parameters
+    ----------
+    association
+        `known`: by the ids that the sensor gives. `mahalanobis`: least distance below `d0`,
+        gil2008, eq. (15). `descriptor`: of those below `d0`, the one that distance and descriptor
+        together favour.
+    d0
+        Threshold of the squared Mahalanobis distance (99.9 % of three degrees of freedom).
+    noise_model, noise_at
+        As in `estimators.landmarks.stereo.StereoModel.of`.
+    sigma_column_px, sigma_row_px, sigma_disparity_px, sigma_descriptor
+        Believed noise; None for that of the prior's camera.
+    errors
+        What the covariance is of. `coordinates`: the differences of headings and positions.
+        `invariant`: the turn and shift of the whole map about the origin of the map frame, and what
+        is left of each landmark: x = R(e_turn) x_hat + e_x for every position x, the robot's too.
+        What is seen does not change with the turn, so no update can make the heading of the whole
+        map look known, which linearising at ever other estimates does (Barrau and Bonnabel, "An
+        EKF-SLAM algorithm with consistency properties", 2015).
+    gate_probability, repeat_s
+        Of known ids, as in `estimators.landmarks.slam_frontend.SlamFrontEnd`: misread ones are
+        left out, and a landmark counts once in `repeat_s`.
+    kr, kl
+        Believed slip variance per metre of the wheels, m.
+    forward_slip_m
+        Believed variance per metre of what both wheels slip together, m.
+    gain_sigma, gain_wander_m
+        The wheels' gains and the track are states too, of this deviation at the start, a share of
+        them, and this variance per metre of the way (`estimators.landmarks.wheel_gains`). 0: they
+        are known.
+    window_s
+        |ds| is netted over at least this time.
+    keep_map
+        Put the map into every Belief.
+    robots
+        Name of the sensor that sees the other robots of a team; None: sightings are not used.
+    sighting_d0
+        Squared Mahalanobis distance from which on a sighting is a misread robot, and rejected.
+
+    Notes
+    -----
+    Extras: `associations` (K,): for each observation, counted from 0 over the whole run, the one
+    that started its landmark, itself if it is the first, -1 if it was rejected; with `keep_map`
+    also `landmarks` (N, 3) and `landmark_covariances` (N, 3, 3); `wheel_gains` (3,), g_r, g_l and
+    g_b, where they are states; `status` when an image was not used.
+
+    A step costs O(K N^2): the whole covariance is touched. So the map holds at most 4000 landmarks;
+    `status` says when it is full, and when an image has more than 1000 observations.
+    """
+
+    needs = frozenset({"stereo"})
+
+    def __init__(
+        self,
+        association: Association = "known",
+        d0: float = 16.27,
+        noise_model: NoiseModel = "camera",
+        noise_at: NoiseAt = "predicted",
+        sigma_column_px: float | None = None,
+        sigma_row_px: float | None = None,
+        sigma_disparity_px: float | None = None,
+        sigma_descriptor: float | None = None,
+        errors: Errors = "coordinates",
+        gate_probability: float | None = None,
+        repeat_s: float = 0.0,
+        kr: float = 5e-5,
+        kl: float = 5e-5,
+        forward_slip_m: float = 0.0,
+        gain_sigma: float = 0.0,
+        gain_wander_m: float = 0.0,
+        window_s: float = 0.05,
+        keep_map: bool = False,
+        stereo: str = "stereo",
+        robots: str | None = None,
+        sighting_d0: float = 16.27,
+    ) -> None:
+        require_positive(sighting_d0=sighting_d0)
+        require_choices(errors=(errors, Errors))
+        self.stereo, self.robots, self.sighting_d0 = stereo, robots, sighting_d0
+        self.invariant = errors == "invariant"
+        self.wheels = WheelPrediction(kr, kl, window_s, forward_slip_m=forward_slip_m)
+        self._gain_belief = GainBelief(gain_sigma, gain_wander_m)
+        require(
+            not (gain_sigma and self.invariant),
+            "ekf_slam: errors=invariant knows the gains; set estimator.gain_sigma=0",
+        )
+        self.front_end = SlamFrontEnd(
+            "ekf_slam",
+            stereo,
+            association,
+            d0,
+            noise_model,
+            noise_at,
+            gate_probability,
+            repeat_s,
+            sigma_column_px=sigma_column_px,
+            sigma_row_px=sigma_row_px,
+            sigma_disparity_px=sigma_disparity_px,
+            sigma_descriptor=sigma_descriptor,
+        )
+        self._noise = noise_model, noise_at
+        self.keep_map = keep_map
+
+    def reset(self, prior: Prior, rng: np.random.Generator) -> None:
+        """Start from the prior's pose, with an empty map."""
+        self.reset_team((prior,), rng)
+
+    def reset_team(self, priors: Sequence[Prior], rng: np.random.Generator) -> None:
+        """Start a team from the priors of its robots; that of robot 0 has a pose.
+
+        Raises
+        ------
+        InputError
+            If the robots do not carry the same sensors, a start is unknown and the camera does not
+            identify landmarks, or the errors are invariant.
+        """
+        require(
+            len(priors) == 1 or not self.invariant,
+            "ekf_slam: errors=invariant is of one robot; set estimator.errors=coordinates",
+        )
+        require(
+            len(priors) == 1 or not self._gain_belief.sigma,
+            "ekf_slam: gains of wheels are of one robot; set estimator.gain_sigma=0",
+        )
+        starts = team_starts(priors, self.front_end, "ekf_slam")
+        self._sightings = Sightings.of(priors, self.robots, *self._noise, "ekf_slam")
+        self._camera = self.front_end.camera
+        self._wheels = dead_reckoning(self.wheels, priors)
+        n = len(priors)
+        self._is_placed = [start is not None for start in starts]
+        self._gains = slice(3 * n, 3 * n + 3) if self._gain_belief.sigma else None
+        self._first_landmark = 3 * n + (3 if self._gains else 0)
+        self._mean = np.zeros(self._first_landmark)
+        self._room = np.zeros((self._first_landmark, self._first_landmark))
+        if self._gains:
+            self._room[self._gains, self._gains] = self._gain_belief.covariance
+            self._gained, self._nominal_track_m = NO_MOTION, priors[0].robot.track_m
+        for robot, start in enumerate(starts):
+            if start is not None:
+                self._mean[_own(robot)] = start.mean
+                self._room[_own(robot), _own(robot)] = start.covariance
+        self._motions = [STILL] * n  # since the last image
+
+    def step(self, frame: Frame) -> Belief:
+        """Roll by the wheels; at an image, associate, update, and add new landmarks."""
+        return self.step_team((frame,))[0]
+
+    def step_team(self, frames: Sequence[Frame]) -> list[Belief]:
+        """Take in the Frames of one instant; the belief of each of their robots.
+
+        That of a robot whose place in the map is not known yet is NaN.
+        """
+        for frame in frames:
+            self._roll(frame)
+        extras: list[dict[str, Any]] = [{} for _ in frames]
+        for frame, found in zip(frames, extras, strict=True):
+            image = self.front_end.read(frame) if self.stereo in frame.readings else None
+            if not self._is_placed[frame.robot]:
+                self._place(frame, image, frames)
+            if image is not None and self._is_placed[frame.robot]:
+                self._move(frame.robot)
+                found |= self._see(frame, image)
+        for frame in frames:
+            if self._sightings is not None and self._is_placed[frame.robot]:
+                self._sight(self._sightings, frame, frames)
+        return [self._belief(*each) for each in zip(frames, extras, strict=True)]
+
+    def _roll(self, frame: Frame) -> None:
+        """Add a Frame to a robot's motion since its last image."""
+        robot, wheels = frame.robot, self._wheels[frame.robot]
+        if self._gains:
+            by_gains = gained_motion(wheels, frame, self._mean[self._gains], self._nominal_track_m)
+            self._gained = self._gained.then(by_gains)
+        else:
+            self._motions[robot] = self._motions[robot].then(wheels.predict(frame))
+
+    def _belief(self, frame: Frame, extras: dict[str, Any]) -> Belief:
+        if not self._is_placed[frame.robot]:
+            return Belief(np.full(3, np.nan), np.full((3, 3), np.nan), extras)
+        own = _own(frame.robot)
+        pose = Gaussian(self._mean[own], self._pose_covariance(frame.robot))
+        if self._gains:
+            both = slice(own.start, self._gains.stop)  # of one robot: its pose and the gains
+            P = self._covariance[both, both].copy()
+            mean = self._gained.applied(pose.mean, P, slice(0, 3), slice(3, 6))
+            pose = Gaussian(mean, P[:3, :3])
+            extras["wheel_gains"] = self._mean[self._gains].copy()
+        else:
+            pose = pose.then(self._motions[frame.robot])
+        if self.keep_map:
+            extras |= {k: v for k, v in self.map.items() if k.startswith("landmark")}
+        return Belief(pose.mean.copy(), (pose.covariance + pose.covariance.T) / 2.0, extras)
+
+    @property
+    def map(self) -> dict[str, Array | Ints]:
+        """`landmarks` (N, 3) and `landmark_covariances` (N, 3, 3), m in map.
+
+        `origins` (N,) are the observations, counted over the run, that started them; `ids` (N,)
+        are the sensor's, if it gives any.
+        """
+        n, P, first = self._n_landmarks, self._covariance, self._first_landmark
+        every = np.arange(n)
+        blocks = P[first:, first:].reshape(n, 3, n, 3)[every, :, every].reshape(n, 3, 3)
+        means = self._landmarks.copy()
+        if self.invariant:
+            arm = _quarter_turned(means)
+            mixed = arm[:, :, None] * P[2, first:].reshape(n, 1, 3)
+            blocks = blocks + mixed + mixed.transpose(0, 2, 1)
+            blocks += P[2, 2] * arm[:, :, None] * arm[:, None, :]
+        return self.front_end.map(means, blocks, slice(n))
+
+    @property
+    def _n_robots(self) -> int:
+        return len(self._motions)
+
+    @property
+    def _n_landmarks(self) -> int:
+        return (len(self._mean) - self._first_landmark) // 3
+
+    @property
+    def _landmarks(self) -> Array:
+        return self._mean[self._first_landmark :].reshape(-1, 3)
+
+    @property
+    def _covariance(self) -> Array:
+        """The part of the allotted room that is in use."""
+        n = len(self._mean)
+        return self._room[:n, :n]
+
+    def _move(self, robot: int) -> None:
+        """Apply a robot's motion since its last image to its pose and to its correlations."""
+        P, own, motion = self._covariance, _own(robot), self._motions[robot]
+        if self._gains:
+            walked = self._gain_belief.wander_m * self._gained.travel_m
+            self._mean[own] = self._gained.applied(self._mean[own], P, own, self._gains)
+            P[self._gains, self._gains] += walked * np.eye(3)
+            self._gained = NO_MOTION
+            return
+        mean, by_pose, by_motion = compose(self._mean[own], motion.mean)
+        noise = by_motion @ motion.covariance @ by_motion.T
+        self._mean[own], self._motions[robot] = mean, STILL
+        if self.invariant:
+            # a turn of the robot alone is one of the whole map, and of the landmarks back
+            by_noise = np.zeros((len(P), 3))
+            by_noise[:3] = np.eye(3)
+            by_noise[:2, 2] = -_quarter_turned(mean)[:2]
+            by_noise[3:, 2] = -_quarter_turned(self._landmarks).ravel()
+            P += by_noise @ ((noise + noise.T) / 2.0) @ by_noise.T
+            return
+        moved = by_pose @ P[own, own] @ by_pose.T + (noise + noise.T) / 2.0
+        P[own] = by_pose @ P[own]
+        P[:, own] = P[own].T
+        P[own, own] = moved
+
+    def _see(self, frame: Frame, image: Image) -> dict[str, Any]:
+        """Take in one image; the extras that it gives."""
+        robot = frame.robot
+        extras: dict[str, Any] = {"status": image.status} if image.status else {}
+        if len(image.points) > _MOST_OBSERVATIONS:
+            image = image.of(np.arange(len(image.points)) < _MOST_OBSERVATIONS)
+            extras["status"] = f"observations beyond {_MOST_OBSERVATIONS} rejected"
+        slots = (
+            self.front_end.known(image)
+            if self.front_end.association == "known"
+            else self._associate(robot, image.points, self.front_end.unlikeness(image))
+        )
+        if self.front_end.gated and len(slots):
+            passed = self._passed(robot, image, slots)
+            image, slots = image.of(passed), slots[passed]
+        self.front_end.counted(image, frame)
+        old = slots >= 0
+        fits = old | (np.cumsum(~old) <= _MOST_LANDMARKS - self._n_landmarks)
+        if not fits.all():
+            image, slots, old = image.of(fits), slots[fits], old[fits]
+            extras["status"] = f"map full: landmarks beyond {_MOST_LANDMARKS} rejected"
+        if old.any() and not self._revisit(robot, slots[old], image.points[old]):
+            extras["status"] = "update rejected: broken covariance, not positive definite"
+        if not old.all():
+            self._create(robot, image.points[~old])
+            self.front_end.start(image, ~old)
+        extras["associations"] = self.front_end.associations(image, slots)
+        return extras
+
+    def _associate(self, robot: int, points: Array, unlikeness: Array) -> Ints:
+        """Slot (K,) of each point, -1 for new ones; a landmark at most once an image."""
+        slots = np.full(len(points), -1)
+        if len(points) == 0 or self._n_landmarks == 0:
+            return slots
+        predicted = self._camera.predict(self._mean[_own(robot)], self._landmarks)[0]
+        near = predicted[:, 2] > LEAST_DEPTH_M
+        candidates = np.flatnonzero(
+            near & (np.linalg.norm(predicted, axis=1) < self.front_end.reach_m)
+        )
+        if len(candidates) == 0:
+            return slots
+        _, *by = self._predict(robot, self._landmarks[candidates])
+        spread = self._predicted_spread(_own(robot), self._rows(candidates), *by)
+        v, R = self._camera.innovation(predicted[None, candidates], points[:, None])
+        distances = _distances(spread, v, R)
+        scores = np.where(distances < self.front_end.d0, distances, np.inf)
+        if unlikeness.shape[1] > 0:
+            unlike = unlikeness[:, candidates]
+            scores = np.where(unlike > 0.0, np.inf, scores + unlike)
+        for k, score in enumerate(scores):
+            best = int(np.argmin(score))
+            if math.isfinite(score[best]):
+                slots[k] = candidates[best]
+                scores[:, best] = np.inf
+        return slots
+
+    def _passed(self, robot: int, image: Image, slots: Ints) -> NDArray[np.bool_]:
+        """Which observations (K,) of landmarks in these slots, -1 for new ones, pass the gate."""
+        own, old = _own(robot), slots[slots >= 0]
+        predicted, *by = self._predict(robot, self._landmarks[old])
+        v, R = self._camera.innovation(predicted, image.points[slots >= 0])
+        distances = _distances(self._predicted_spread(own, self._rows(old), *by), v, R)
+        return self.front_end.passed(image, slots, distances, self._mean[own])
+
+    def _rows(self, slots: Ints) -> Ints:
+        """Rows (K, 3) of landmarks in the state."""
+        return self._first_landmark + 3 * slots[:, None] + np.arange(3)
+
+    def _predicted_spread(self, own: slice, at: Ints, of_pose: Array, of_other: Array) -> Array:
+        """H P H^T (n, 3, 3) of each of n observations apart; arguments as in `_update`."""
+        P = self._covariance
+        cross = P[own][:, at].transpose(1, 0, 2)
+        theirs = P[at[:, :, None], at[:, None, :]]
+        turned = of_other.transpose(0, 2, 1)
+        mixed = of_pose @ cross @ turned
+        spread: Array = (
+            of_pose @ P[own, own] @ of_pose.transpose(0, 2, 1) + of_other @ theirs @ turned
+        )
+        return spread + mixed + mixed.transpose(0, 2, 1)
+
+    def _revisit(self, robot: int, slots: Ints, points: Array) -> bool:
+        """Update by points (K, 3) of landmarks in these slots, as `_update` does."""
+        predicted, of_pose, of_landmark = self._predict(robot, self._landmarks[slots])
+        v, R = self._camera.innovation(predicted, points)
+        return self._update(_own(robot), self._rows(slots), of_pose, of_landmark, v, R)
+
+    def _update(
+        self, own: slice, at: Ints, of_pose: Array, of_other: Array, v: Array, R: Array
+    ) -> bool:
+        """Kalman update by K innovations v (K, 3) with noise R (K, 3, 3), all at once.
+
+        Rejected, with False, if rounding has left the innovation without a proper covariance.
+
+        Parameters
+        ----------
+        own, at
+            Rows of the observing robot's pose, and (K, 3) of what it observes.
+        of_pose, of_other
+            (K, 3, 3) derivatives of the predicted points by these.
+        """
+        P, K, n = self._covariance, len(at), 3 * len(at)
+        rows = P[at].reshape(K, 3, -1)
+        HP = (of_pose @ P[own] + of_other @ rows).reshape(n, -1)  # H has two blocks a row
+        along = HP[:, at].reshape(n, K, 3).transpose(1, 0, 2)
+        S = HP[:, own] @ of_pose.reshape(n, 3).T
+        S += (along @ of_other.transpose(0, 2, 1)).transpose(1, 0, 2).reshape(n, n)
+        for k in range(K):
+            S[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += R[k]
+        try:
+            factor = cho_factor((S + S.T) / 2.0, lower=True)
+        except np.linalg.LinAlgError:
+            return False
+        self._correct(HP.T @ cho_solve(factor, v.ravel()))
+        half = solve_triangular(factor[0], HP, lower=True)
+        P -= half.T @ half  # symmetric to the last bit
+        return True
+
+    def _correct(self, by: Array) -> None:
+        """Correct the mean by an error (n,): added, or a motion of the whole map."""
+        if self.invariant:
+            turn = float(by[2])
+            R, V = _exponential(turn)
+            blocks = self._mean.reshape(-1, 3)  # pose and landmarks
+            blocks[:, :2] = blocks[:, :2] @ R.T + by.reshape(-1, 3)[:, :2] @ V.T
+            self._mean[5::3] += by[5::3]
+            self._mean[2] += turn
+        else:
+            self._mean += by
+        for row in range(2, 3 * self._n_robots, 3):
+            self._mean[row] = wrap(float(self._mean[row]))
+
+    def _predict(self, robot: int, landmarks: Array) -> tuple[Array, Array, Array]:
+        """Predicted points of landmarks (K, 3) and their derivatives by the errors."""
+        predicted, of_pose, of_landmark = self._camera.predict(self._mean[_own(robot)], landmarks)
+        if self.invariant:
+            of_pose = of_pose * [1.0, 1.0, 0.0]
+        return predicted, of_pose, of_landmark
+
+    def _pose_covariance(self, robot: int) -> Array:
+        """Covariance (3, 3) of the coordinates of a robot's pose."""
+        P = self._covariance[_own(robot), _own(robot)]
+        if not self.invariant:
+            return P
+        by_error = np.eye(3)
+        by_error[:2, 2] = _quarter_turned(self._mean[:3])[:2]
+        covariance: Array = by_error @ P @ by_error.T
+        return covariance
+
+    def _create(self, robot: int, points: Array) -> None:
+        """Append landmarks at points (K, 3), gil2008, eqs. (16)-(18), with their correlations."""
+        own, before, n = _own(robot), len(self._mean), 3 * len(points)
+        pose = self._mean[own]
+        placed = self._camera.place(np.tile(pose, (len(points), 1)), points)
+        predicted, of_pose, of_landmark = self._predict(robot, placed)
+        # p = C (l - t(pose)) and so l = t(pose) + C^T p
+        C_T = of_landmark.transpose(0, 2, 1)
+        by_pose = -(C_T @ of_pose).reshape(n, 3)
+        R = self._camera.innovation(predicted, points)[1]
+        after = before + n
+        if after > len(self._room):
+            wanted = min(after + after // 2, self._first_landmark + 3 * _MOST_LANDMARKS)
+            self._room = np.pad(self._covariance, (0, wanted - before))
+        P = self._room[:after, :after]
+        P[before:, :before] = by_pose @ P[own, :before]
+        P[:before, before:] = P[before:, :before].T
+        fresh = by_pose @ P[own, own] @ by_pose.T
+        for k, block in enumerate(C_T @ R @ of_landmark):
+            fresh[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += block
+        P[before:, before:] = (fresh + fresh.T) / 2.0
+        self._mean = np.concatenate([self._mean, placed.ravel()])
+
+    def _sight(self, sightings: Sightings, frame: Frame, frames: Sequence[Frame]) -> None:
+        """Update by a robot's sightings of others that have a Frame at this instant too."""
+        known = [f.robot for f in frames if self._is_placed[f.robot] and f.robot != frame.robot]
+        others = np.array(known, np.int64)
+        points, numbers = sightings.read(frame)
+        if len(points) == 0 or len(others) == 0:
+            return
+        for robot in (frame.robot, *known):
+            self._move(robot)
+        own, at = _own(frame.robot), 3 * others[:, None] + np.arange(3)
+        predicted, of_pose, of_other = sightings.predict(self._mean[own], self._mean[at])
+        spread = self._predicted_spread(own, at, of_pose, of_other)
+        innovations = sightings.camera.innovation(predicted[None], points[:, None])
+        distances = _distances(spread, *innovations)
+        distances[:, predicted[:, 2] < LEAST_DEPTH_M] = np.inf
+        if numbers is not None:
+            distances[numbers[:, None] != others] = np.inf
+        rows, columns = _matches(distances, self.sighting_d0)
+        if len(rows):
+            v, R = sightings.camera.innovation(predicted[columns], points[rows])
+            self._update(own, at[columns], of_pose[columns], of_other[columns], v, R)
+
+    def _place(self, frame: Frame, image: Image | None, frames: Sequence[Frame]) -> None:
+        """Give a robot of unknown start its place, if this instant shows it."""
+        in_base, in_map = [np.zeros((0, 2))], [np.zeros((0, 2))]
+        slots, points = np.zeros(0, np.int64), np.zeros((0, 3))
+        if image is not None:
+            slots = self.front_end.known(image)
+            slots, points = slots[slots >= 0], image.points[slots >= 0]
+            in_base.append(self._camera.place(np.zeros(3), points)[..., :2])
+            in_map.append(self._landmarks[slots, :2])
+        poses = {f.robot: self._pose_now(f.robot) for f in frames if self._is_placed[f.robot]}
+        if self._sightings is not None:
+            for seen in self._sightings.of_robot(frame, frames, poses):
+                in_base.append(seen[0])
+                in_map.append(seen[1])
+        pose = pose_by_points(np.concatenate(in_base), np.concatenate(in_map))
+        if pose is not None:
+            own = _own(frame.robot)
+            if len(slots) >= 2:
+                pose = self._refined(pose, slots, points)
+            self._mean[own], self._covariance[own, own] = pose, _ENTERS
+            self._motions[frame.robot] = STILL
+            self._is_placed[frame.robot] = True
+
+    def _refined(self, pose: Array, slots: Ints, points: Array) -> Array:
+        """Pose that fits points (K, 3) of landmarks best, about which the update linearises."""
+        at = self._rows(slots)
+        spread = self._covariance[at[:, :, None], at[:, None, :]]
+        for _ in range(_REFINEMENTS):
+            predicted, H, of_landmark = self._camera.predict(pose, self._landmarks[slots])
+            v, R = self._camera.innovation(predicted, points)
+            weighted = np.linalg.solve(of_landmark @ spread @ of_landmark.transpose(0, 2, 1) + R, H)
+            information = np.einsum("kji,kjl->il", weighted, H)
+            pose = pose + np.linalg.solve(information, np.einsum("kji,kj->i", weighted, v))
+        return pose
+
+    def _pose_now(self, robot: int) -> Array:
+        return compose(self._mean[_own(robot)], self._motions[robot].mean)[0]
+
+
+def _own(robot: int) -> slice:
+    """Rows of a robot's pose in the state."""
+    return slice(3 * robot, 3 * robot + 3)
+
+
+def _distances(spread: Array, v: Array, R: Array) -> Array:
+    """Squared Mahalanobis distances (K, n) of innovations v (K, n, 3); R may be common to all K."""
+    S = spread + R
+    return np.asarray(np.sum(v * np.linalg.solve(S, v[..., None])[..., 0], axis=-1))
+
+
+def _matches(distances: Array, d0: float) -> tuple[Ints, Ints]:
+    """Rows and columns of the least distances below d0, each row and column once."""
+    left, rows, columns = distances.copy(), [], []
+    while left.size and left.min() < d0:
+        row, column = np.unravel_index(int(np.argmin(left)), left.shape)
+        rows.append(row)
+        columns.append(column)
+        left[row], left[:, column] = np.inf, np.inf
+    return np.array(rows, np.int64), np.array(columns, np.int64)
+
+
+def _quarter_turned(points: Array) -> Array:
+    """Points (..., 3) turned by a quarter about the map's origin, level: d(R(a) x) / da at 0."""
+    x, y = points[..., 0], points[..., 1]
+    return np.stack([-y, x, np.zeros_like(x)], axis=-1)
+
+
+def _exponential(turn_rad: float) -> tuple[Array, Array]:
+    """R and V (2, 2) of exp: positions become R x + V e."""
+    cos, sin = math.cos(turn_rad), math.sin(turn_rad)
+    along, across = np.sinc(turn_rad / math.pi), (1.0 - cos) / turn_rad if turn_rad else 0.0
+    return np.array([[cos, -sin], [sin, cos]]), np.array([[along, -across], [across, along]])

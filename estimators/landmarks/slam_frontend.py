@@ -1,0 +1,320 @@
+"""What landmark SLAM does with an image before any filter: which observations, of which landmarks.
+
+Shared by `estimators.landmarks.ekf_slam` and `estimators.landmarks.fastslam`, whose filters choose
+landmarks by distance themselves. `screened` also serves `estimators.graph.landmark_drive`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtri  # scipy.stats takes half a second to import
+
+from estimators.base import Prior
+from estimators.gaussian import Gaussian
+from estimators.landmarks.stereo import NoiseAt, NoiseModel, StereoModel
+from estimators.options import (
+    require_choices,
+    require_non_negative,
+    require_positive,
+    require_stereo,
+    start_pose,
+)
+from sim.arrays import Array, Floats, Ints
+from sim.errors import require
+from sim.recording import Frame
+
+Association = Literal["known", "mahalanobis", "descriptor"]
+
+_BLIND_IMAGES = 100  # images without a landmark after which the status reports it
+
+
+@dataclass(frozen=True)
+class Image:
+    """The K observations of an image that can be used.
+
+    Attributes
+    ----------
+    points
+        (K, 3) m in the camera frame.
+    numbers
+        (K,) their numbers among all observations of the run, counted from 0.
+    ids
+        (K,); None where the sensor gives none.
+    descriptors
+        (K, D), D = 0 where it gives none.
+    used
+        (A,) which of all the image's observations these are.
+    status
+        What is wrong with the others; empty if nothing is.
+    """
+
+    points: Array
+    numbers: Ints
+    ids: Ints | None
+    descriptors: Floats
+    used: NDArray[np.bool_]
+    status: str
+
+    def of(self, kept: NDArray[np.bool_]) -> Image:
+        """Return the image with these (K,) of its observations only."""
+        used = self.used.copy()
+        used[np.flatnonzero(used)[~kept]] = False
+        ids = None if self.ids is None else self.ids[kept]
+        parts = self.points[kept], self.numbers[kept], ids, self.descriptors[kept]
+        return Image(*parts, used, self.status)
+
+
+def screened(
+    camera: StereoModel, points_in_camera: Array, ids: Ints | None
+) -> tuple[NDArray[np.bool_], str]:
+    """Which observations (A,) of an image can be used, and what is wrong with the others.
+
+    Parameters
+    ----------
+    points_in_camera
+        (A, 3) m.
+    ids
+        (A,), of duplicates only the first is used; None if they do not count.
+    """
+    used = camera.usable(points_in_camera)
+    status = "" if used.all() else "observation without depth rejected"
+    if ids is not None:
+        rows = np.flatnonzero(used)
+        first = np.unique(ids[rows], return_index=True)[1]
+        if len(first) < len(rows):
+            used, status = np.isin(np.arange(len(used)), rows[first]), "duplicate id rejected"
+    return used, status
+
+
+class SlamFrontEnd:
+    """The believed camera, the usable observations, and where each landmark came from.
+
+    Landmarks are numbered in the order in which observations start them. Two unit descriptors of
+    D independent components have a product of N(rho, 1 / D) if they are of one landmark, rho =
+    1 / (1 + sigma_descriptor^2), and of N(0, 1 / D) if not; twice the log of the ratio of these
+    densities is the evidence for the same landmark.
+
+    Parameters
+    ----------
+    estimator
+        Name of the estimator, for error messages.
+    association
+        `known`: by the ids that the sensor gives. `mahalanobis`: the filter takes the landmark of
+        least distance below `d0`. `descriptor`: of those, the one that distance and descriptor
+        together favour.
+    d0
+        Threshold of the squared Mahalanobis distance.
+    noise_model, noise_at
+        As in `estimators.landmarks.stereo.StereoModel.of`.
+    gate_probability
+        Under known association, an observation less probable than this is left out, and a landmark
+        enters the map only when two sightings in a row agree: a misread id is neither an update nor
+        a landmark. None: every id is believed.
+    repeat_s
+        Under known association, a landmark counts at most once in this time for each robot: errors
+        of a sensor that last longer than an image would count again as if they were independent. 0:
+        always.
+    sigmas
+        Believed noise, by the camera's attribute; None for the prior's camera's own.
+
+    Attributes
+    ----------
+    camera
+        What is believed of the camera.
+    reach_m
+        Distance within which a predicted landmark may be one that was seen.
+    origins
+        (N,) number of the observation that started each landmark.
+    """
+
+    def __init__(
+        self,
+        estimator: str,
+        stereo: str,
+        association: Association,
+        d0: float,
+        noise_model: NoiseModel,
+        noise_at: NoiseAt,
+        gate_probability: float | None = None,
+        repeat_s: float = 0.0,
+        **sigmas: float | None,
+    ) -> None:
+        require_choices(
+            association=(association, Association),
+            noise_model=(noise_model, NoiseModel),
+            noise_at=(noise_at, NoiseAt),
+        )
+        self._sigmas = {name: sigma for name, sigma in sigmas.items() if sigma is not None}
+        require_non_negative(**self._sigmas)
+        require_positive(d0=d0)
+        require_non_negative(repeat_s=repeat_s)
+        require(
+            gate_probability is None or 0.0 < gate_probability < 1.0,
+            f"estimator.gate_probability must lie between 0 and 1, or be null: {gate_probability}",
+        )
+        require(
+            association == "known" or (gate_probability is None and repeat_s == 0.0),
+            "estimator.gate_probability and repeat_s are of ids; leave them at null and 0 under "
+            f"association={association}, which has the gate d0",
+        )
+        self.gated, self._repeat_s = gate_probability is not None, repeat_s
+        self._gate = math.inf if gate_probability is None else float(chdtri(3, gate_probability))
+        self.association, self.d0 = association, d0
+        self._stereo, self._estimator = stereo, estimator
+        self._noise_model, self._noise_at = noise_model, noise_at
+
+    def reset(self, prior: Prior) -> Gaussian:
+        """Forget all landmarks; return the prior's pose in map.
+
+        Raises
+        ------
+        InputError
+            If there is no camera, no start pose, or no ids where association needs them.
+        """
+        camera = require_stereo(prior, self._stereo, self._estimator)
+        start = start_pose(prior, self._estimator)
+        require(
+            self.association != "known" or camera.identifies,
+            "the camera does not identify landmarks; set estimator.association=mahalanobis "
+            "or descriptor",
+        )
+        camera = dataclasses.replace(camera, **self._sigmas)  # type: ignore[arg-type]
+        self.camera = StereoModel.of(camera, self._noise_model, self._noise_at)
+        # a landmark may be predicted beyond dmax and still be the one that was seen
+        self.reach_m = 1.5 * camera.max_distance_m + 1.0
+        self._rho = 1.0 / (1.0 + camera.sigma_descriptor**2)
+        self.origins = np.zeros(0, np.int64)
+        self._landmark_of_id: dict[int, int] = {}
+        self._descriptors = np.zeros((0, 0), np.float32)  # of each landmark's first observation
+        self._n_observations, self._n_blind = 0, 0
+        self._tentative: dict[int, Array] = {}  # by id, where a first sighting places it in map
+        self._last_s: dict[tuple[int, int], float] = {}  # by robot and id, when it counted last
+        return start
+
+    def read(self, frame: Frame) -> Image:
+        """Observations of a Frame's image that can be used; of duplicate ids the first."""
+        seen = frame.readings[self._stereo]
+        all_points, all_ids = seen["points_in_camera"], seen.get("ids")
+        known = self.association == "known"
+        used, status = screened(self.camera, all_points, all_ids if known else None)
+        require(
+            not (known and all_ids is None and used.any()),
+            f"{self._estimator}: observations without ids; set "
+            "estimator.association=mahalanobis or descriptor",
+        )
+        self._n_blind = 0 if used.any() else self._n_blind + 1
+        if self._n_blind >= _BLIND_IMAGES:
+            status = f"no landmark in {self._n_blind} images"
+        numbers = self._n_observations + np.flatnonzero(used)
+        self._n_observations += len(used)
+        ids = None if all_ids is None else all_ids[used]
+        points = np.ascontiguousarray(all_points[used])
+        image = Image(points, numbers, ids, seen["descriptors"][used], used, status)
+        return self._without_repeats(image, frame) if self._repeat_s > 0.0 else image
+
+    def _without_repeats(self, image: Image, frame: Frame) -> Image:
+        """Leave out landmarks that the robot counted less than `repeat_s` ago."""
+        last = [self._last_s.get((frame.robot, i), -math.inf) for i in _listed(image)]
+        return image.of(frame.stamp - np.array(last) >= self._repeat_s)
+
+    def counted(self, image: Image, frame: Frame) -> None:
+        """Note when the landmarks of a Frame's image counted."""
+        if self._repeat_s > 0.0:
+            self._last_s |= {(frame.robot, i): frame.stamp for i in _listed(image)}
+
+    def passed(
+        self, image: Image, landmarks: Ints, distances: Array, pose: Array
+    ) -> NDArray[np.bool_]:
+        """Which observations (K,) pass the gate.
+
+        Parameters
+        ----------
+        landmarks
+            (K,), -1 for those of new ids. These pass if the last sighting placed them, within the
+            noise of both, where this one does.
+        distances
+            Squared Mahalanobis distance of each observation that has a landmark.
+        pose
+            (3,) believed pose of base_link in map.
+        """
+        kept = np.ones(len(landmarks), bool)
+        kept[landmarks >= 0] = distances < self._gate
+        for k in np.flatnonzero(landmarks < 0):
+            point, name = image.points[k], _listed(image)[k]
+            before = self._tentative.get(name)
+            self._tentative[name] = self.camera.place(pose, point)
+            kept[k] = False
+            if before is not None:
+                v, R = self.camera.innovation(self.camera.predict(pose, before)[0], point)
+                kept[k] = v @ np.linalg.solve(2.0 * R, v) < self._gate
+        return kept
+
+    def known(self, image: Image) -> Ints:
+        """Landmark (K,) of each id, -1 for new ones."""
+        return np.array([self._landmark_of_id.get(i, -1) for i in _listed(image)], np.int64)
+
+    def unlikeness(self, image: Image) -> Array:
+        """-2 log of the likelihood ratio (K, N): same landmark against another, by descriptor.
+
+        (K, 0) unless association is by descriptor.
+        """
+        if self.association != "descriptor":
+            return np.zeros((len(image.points), 0))
+        require(
+            not (image.descriptors.shape[1] == 0 < len(image.points)),
+            f"{self._estimator}: observations without descriptors; set "
+            "estimator.association=mahalanobis",
+        )
+        if len(self.origins) == 0:
+            return np.zeros((len(image.points), 0))
+        products = (image.descriptors @ self._descriptors.T).astype(np.float64)
+        return np.asarray(image.descriptors.shape[1] * self._rho * (self._rho - 2.0 * products))
+
+    def start(self, image: Image, rows: Ints | NDArray[np.bool_]) -> None:
+        """Number the landmarks that these of the image's observations start."""
+        n = len(self.origins)
+        self.origins = np.concatenate([self.origins, image.numbers[rows]])
+        if self.association == "known" and image.ids is not None:
+            self._landmark_of_id |= {i: n + k for k, i in enumerate(image.ids[rows].tolist())}
+        if self.association == "descriptor":
+            fresh = image.descriptors[rows]
+            self._descriptors = np.concatenate([self._descriptors, fresh]) if n else fresh
+
+    def associations(self, image: Image, landmarks: Ints) -> Ints:
+        """For each observation of an image, used or not, the one that started its landmark.
+
+        `landmarks` (K,) are -1 for observations that start one; rejected observations get -1.
+        """
+        origins = np.full(len(image.used), -1)
+        old = landmarks >= 0
+        origins[image.used] = image.numbers
+        origins[np.flatnonzero(image.used)[old]] = self.origins[landmarks[old]]
+        return origins
+
+    def map(
+        self, means: Array, covariances: Array, landmarks: Ints | slice
+    ) -> dict[str, Array | Ints]:
+        """`landmarks` (N, 3) and `landmark_covariances` (N, 3, 3), with `origins` and `ids` (N,).
+
+        `ids` are the sensor's, and are there under known association only.
+        """
+        made: dict[str, Array | Ints] = {
+            "landmarks": means,
+            "landmark_covariances": covariances,
+            "origins": self.origins[landmarks].copy(),
+        }
+        if self.association == "known":
+            made["ids"] = np.array(list(self._landmark_of_id), dtype=np.int64)
+        return made
+
+
+def _listed(image: Image) -> list[int]:
+    """Ids of an image's observations."""
+    ids: list[int] = [] if image.ids is None else image.ids.tolist()
+    return ids

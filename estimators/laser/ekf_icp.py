@@ -1,0 +1,360 @@
+"""Fusion of wheels and laser in an extended Kalman filter with a clone of the key frame's pose.
+
+decristoforis2020 fuses both as velocities (`estimators.laser.ekf_icp_paper`). Here registrations
+measure what they are: the pose of a scan relative to that of a key frame. The state therefore
+holds the key frame's pose beside the robot's (stochastic cloning; Roumeliotis and Burdick 2002).
+
+Errors are twists in map (an invariant filter; Barrau and Bonnabel 2017): with errors of
+coordinates, registrations would spuriously inform the absolute heading once it is uncertain.
+"""
+
+import dataclasses
+import math
+from typing import Any
+
+import numpy as np
+from scipy.special import chdtri
+
+from estimators.base import Belief, Prior
+from estimators.gaussian import STILL, Gaussian, between, compose, rotated, update, wrap
+from estimators.laser.icp import Kernel, Metric, PreparedScan, Rules
+from estimators.laser.scan_matching import (
+    Covariance,
+    Match,
+    ScanMatcher,
+    moved_beyond,
+)
+from estimators.options import require_laser, require_non_negative, require_shares, start_pose
+from estimators.wheels import WheelPrediction
+from sim.arrays import Array
+from sim.errors import require
+from sim.recording import Frame
+
+_PATIENCE = 2  # scans in a row that may fail before the newest becomes the key frame
+_ORIGIN_STEP_M = 1e4  # the start is taken this near to the origin: twists lose digits far from it
+_TINY = 1e-14  # keeps the update with a noiseless measurement solvable
+# Places in the state: key frame, last scan, robot, and for the time of an update the newest scan
+_KEY, _LAST, _POSE, _NEW = (slice(3 * i, 3 * i + 3) for i in range(4))
+_ROWS = np.arange(12)
+
+
+class EkfIcp:
+    """Predict by the wheels, correct by the scan's pose relative to the key frame.
+
+    Each scan is modelled as seen from an apparent pose, x * d, whose error d enters all its
+    registrations; the rest of the noise is independent from one registration to the next. A
+    registration compares apparent poses, and those of the key frame and of the last scan are in
+    the state. So the noise that all registrations of a key frame share is counted once, and a
+    scan's error cancels when it turns from source to reference.
+
+    Parameters
+    ----------
+    metric, covariance, sigma_range_m
+        As in `estimators.laser.scan_matching.ScanMatcher`; each scan contributes half of the
+        covariance.
+    trim, kernel, max_iterations, stop_error_m, neighbours
+        As in `estimators.laser.icp.Rules`.
+    keyframe_distance_m, keyframe_turn_rad
+        How far the robot goes before it takes a new key frame.
+    register_distance_m, register_turn_rad
+        How far the robot is believed to go before another scan is registered: it must exceed one
+        of them. 0 and 0: every scan is. One cannot be set without the other.
+    kr, kl
+        Believed slip variance per metre of the wheels, m.
+    lateral_slip_m
+        Variance per metre of the sideways slip, m.
+    encoder_tick_m
+        Travel of a wheel per encoder tick, m: see `estimators.wheels.WheelPrediction`.
+    gate_probability
+        Reject a registration if only this share of all should have a larger innovation; None to
+        use all. The default rejects only what must be a wrong match.
+    slip_burst_m
+        What a wheel may slip at once, as a standard deviation: then a registration outside the gate
+        that did not fail is explained by slip since the last scan, which neither kr nor kl
+        describes. 0: it is left out.
+    shared_noise
+        Share of a registration's covariance that comes from the scans' own errors, half from
+        each; 0: registrations are independent. Registrations before and after a key frame then
+        correlate by minus half of it.
+    window_s
+        |ds| is netted over at least this time.
+
+    Notes
+    -----
+    Where the registration with the key frame fails or is gated, the last scan is tried, and
+    becomes the key frame if it succeeds. Where both fail only the wheels are used; after two such
+    scans in a row the newest becomes the key frame. Directions that the scans do not constrain
+    are left to the wheels.
+
+    Belief extras: `registration_covariance` (3, 3) of T_reference_base, `registration_status`,
+    `nis` (normalised innovation squared) with `nis_dof`, `slip_burst` if one was assumed, and
+    `status` if a scan was not used.
+    """
+
+    needs = frozenset({"laser"})
+
+    def __init__(
+        self,
+        metric: Metric = "point_to_line",
+        covariance: Covariance = "censi",
+        sigma_range_m: float | None = None,
+        keyframe_distance_m: float = 0.5,
+        keyframe_turn_rad: float = 0.35,
+        register_distance_m: float = 0.0,
+        register_turn_rad: float = 0.0,
+        kr: float = 1e-4,
+        kl: float = 1e-4,
+        lateral_slip_m: float = 1e-7,
+        encoder_tick_m: float = 0.0,
+        gate_probability: float | None = 1e-9,
+        slip_burst_m: float = 0.0,
+        shared_noise: float = 0.75,
+        window_s: float = 0.05,
+        laser: str = "laser",
+        trim: float = 0.0,
+        kernel: Kernel = "tukey",
+        max_iterations: int = 100,
+        stop_error_m: float = 0.0,
+        neighbours: int = 6,
+    ) -> None:
+        self.laser = laser
+        rules = Rules(trim, kernel, max_iterations, stop_error_m, neighbours)
+        self._matcher = ScanMatcher(metric, covariance, sigma_range_m, rules)
+        self.wheels = WheelPrediction(
+            kr, kl, window_s, lateral_slip_m=lateral_slip_m, encoder_tick_m=encoder_tick_m
+        )
+        require_non_negative(
+            keyframe_distance_m=keyframe_distance_m,
+            keyframe_turn_rad=keyframe_turn_rad,
+            slip_burst_m=slip_burst_m,
+            register_distance_m=register_distance_m,
+            register_turn_rad=register_turn_rad,
+        )
+        require(
+            (register_distance_m > 0.0) == (register_turn_rad > 0.0),
+            "estimator.register_distance_m and register_turn_rad go together, since a scan is "
+            "registered once either is exceeded: set both, or neither",
+        )
+        require_shares(shared_noise=shared_noise)
+        require(
+            gate_probability is None or 0.0 < gate_probability < 1.0,
+            "estimator.gate_probability must lie between 0 and 1 or be null, "
+            f"got {gate_probability}",
+        )
+        require(
+            not slip_burst_m or gate_probability is not None,
+            "estimator.slip_burst_m is for registrations outside the gate; "
+            "set estimator.gate_probability",
+        )
+        self.slip_burst_m = slip_burst_m
+        self.keyframe_distance_m, self.keyframe_turn_rad = keyframe_distance_m, keyframe_turn_rad
+        self.register_distance_m, self.register_turn_rad = register_distance_m, register_turn_rad
+        self.gate_probability, self.shared_noise = gate_probability, shared_noise
+
+    def reset(self, prior: Prior, rng: np.random.Generator) -> None:
+        """Start from the prior's pose; the first scan becomes the key frame."""
+        self._laser, self._rng = require_laser(prior, self.laser, "ekf_icp"), rng
+        start = start_pose(prior, "ekf_icp")
+        self._origin = np.append(np.rint(start.mean[:2] / _ORIGIN_STEP_M) * _ORIGIN_STEP_M, 0.0)
+        start = Gaussian(start.mean - self._origin, start.covariance)
+        self.wheels.reset(prior.robot.track_m)
+        self._key: PreparedScan | None = None
+        self._last: PreparedScan | None = None
+        # of the key frame's first degenerate match, as twists: as in `Match`
+        self._directions: tuple[Array, Array] | None = None
+        # (9,): apparent poses of the key frame and of the last scan, pose of base_link; in map,
+        # less its origin here
+        self._mean = np.tile(start.mean, 3)
+        # of the twists in map that take the means to the true poses
+        to_twist = _from_twist(-start.mean)
+        self._covariance = np.tile(to_twist @ start.covariance @ to_twist.T, (3, 3))
+        self._failures = 0
+        share = self.gate_probability
+        self._gates = [math.inf if share is None else chdtri(d, share) for d in range(4)]
+
+    def step(self, frame: Frame) -> Belief:
+        """Predict by the wheels; correct by the Frame's scan, if it has one."""
+        self._predict(frame)
+        extras: dict[str, Any] = {}
+        scan = frame.readings.get(self.laser)
+        if scan is not None and self._is_due():
+            self._correct(self._matcher.prepare(scan["ranges_m"], self._laser), extras)
+        by_twist = _from_twist(self._mean[_POSE])
+        covariance = by_twist @ self._covariance[_POSE, _POSE] @ by_twist.T
+        mean = self._mean[_POSE] + self._origin
+        return Belief(mean, (covariance + covariance.T) / 2.0, extras)
+
+    def _predict(self, frame: Frame) -> None:
+        """Move the robot's pose by the wheels; the clones stay."""
+        motion = self.wheels.predict(frame)
+        self._mean[_POSE], _, by_motion = compose(self._mean[_POSE], motion.mean)
+        by_motion = _from_twist(-self._mean[_POSE]) @ by_motion
+        self._covariance[_POSE, _POSE] += by_motion @ motion.covariance @ by_motion.T
+
+    def _is_due(self) -> bool:
+        """Whether a scan is to be registered, by the motion since the last one that was."""
+        if self._last is None or not (self.register_distance_m or self.register_turn_rad):
+            return True
+        moved, _, _ = between(self._mean[_LAST], self._mean[_POSE])
+        return moved_beyond(moved, self.register_distance_m, self.register_turn_rad)
+
+    def _correct(self, scan: PreparedScan | None, extras: dict[str, Any]) -> None:
+        """Register the scan against the key frame, or else the last scan, and take it in."""
+        if scan is None:
+            extras["registration_status"] = extras["status"] = "empty"
+            return
+        if self._key is None or self._last is None:
+            extras["registration_status"] = "first"
+            self._insert(self._own_noise(scan))
+            self._keep(scan, scan, (_NEW, _NEW))
+            return
+        references = [(_KEY, self._key)]
+        if self._last is not self._key:
+            references.append((_LAST, self._last))
+        outside: tuple[Match, slice, PreparedScan] | None = None
+        for place, reference in references:
+            found = self._matcher.match(
+                scan, reference, self._expected(place)[0], self._laser, self._rng
+            )
+            extras["registration_status"] = found.status
+            if found.failed:
+                continue
+            if place is _KEY:
+                found = self._as_before(found)
+            if self._take_in(found, place, extras):
+                self._go_on(scan, found, place, reference)
+                return
+            extras["registration_status"] = "gated"
+            outside = found, place, reference
+        if outside is not None and self._take_in_after_burst(*outside[:2], extras):
+            extras["registration_status"] = outside[0].status
+            self._go_on(scan, *outside)
+            return
+        extras["status"] = extras["registration_status"]
+        self._insert(self._own_noise(scan))
+        self._failures += 1
+        lost = self._failures >= _PATIENCE
+        self._keep(scan if lost else self._key, scan, (_NEW if lost else _KEY, _NEW))
+
+    def _go_on(
+        self, scan: PreparedScan, found: Match, place: slice, reference: PreparedScan
+    ) -> None:
+        """Keep the reference as key frame, or take the scan, which was registered, for it."""
+        self._failures = 0
+        left_key = moved_beyond(found.motion.mean, self.keyframe_distance_m, self.keyframe_turn_rad)
+        key, source = (scan, _NEW) if left_key else (reference, place)
+        self._keep(key, scan, (source, _NEW))
+
+    def _expected(self, place: slice) -> tuple[Gaussian, Array]:
+        """Pose relative to a clone's, with its covariance; its derivative (3, 3) by the twists.
+
+        A twist that both poses share changes nothing, so the derivative by the clone's twist is
+        minus that by the robot's: the filter learns nothing that the scans do not measure.
+        """
+        relative, _, by_pose = between(self._mean[place], self._mean[_POSE])
+        by_twist = by_pose @ _from_twist(self._mean[_POSE])
+        P = self._covariance
+        cross = P[place, _POSE]
+        spread = P[place, place] + P[_POSE, _POSE] - cross - cross.T
+        return Gaussian(relative, by_twist @ spread @ by_twist.T), by_twist
+
+    def _take_in(self, found: Match, place: slice, extras: dict[str, Any]) -> bool:
+        """Append the scan's apparent pose to the state, and correct it by the registration.
+
+        Returns False, with the state as before, if the innovation lies outside the gate.
+        """
+        expected, by_twist = self._expected(place)
+        C, R, share = found.held, found.motion.covariance, self.shared_noise
+        off = found.motion.mean - expected.mean
+        off[2] = wrap(off[2])
+        innovation = C @ off
+        extras["registration_covariance"] = R
+        # the clone's half of what is shared is in the state already
+        S = C @ (expected.covariance + (1.0 - share / 2.0) * R) @ C.T
+        nis = float(innovation @ np.linalg.solve(S, innovation)) if len(C) else 0.0
+        extras["nis"], extras["nis_dof"] = nis, len(C)
+        if nis > self._gates[len(C)]:
+            return False
+        self._insert(rotated(share / 2.0 * found.known_covariance, self._mean[place][2]))
+        H = np.zeros((3, 12))
+        H[:, place], H[:, _NEW] = -by_twist, by_twist
+        noise = (1.0 - share) * C @ R @ C.T + _TINY * np.eye(len(C))
+        twists, self._covariance = update(np.zeros(12), self._covariance, innovation, C @ H, noise)
+        for part in (_KEY, _LAST, _POSE, _NEW):
+            self._mean[part] = _moved(self._mean[part], twists[part])
+        return True
+
+    def _take_in_after_burst(self, found: Match, place: slice, extras: dict[str, Any]) -> bool:
+        """Take a registration in as `_take_in` does, if the wheels slipped since the last scan."""
+        if not self.slip_burst_m or found.status != "ok":
+            return False
+        turn_rad = 2.0 * self.slip_burst_m / self.wheels.track_m
+        burst = np.diag(np.square([self.slip_burst_m, self.slip_burst_m, turn_rad]))
+        to_twist, before = _from_twist(-self._mean[_POSE]), self._covariance
+        self._covariance = before.copy()
+        self._covariance[_POSE, _POSE] += to_twist @ burst @ to_twist.T
+        if self._take_in(found, place, extras):
+            extras["slip_burst"] = True
+            return True
+        self._covariance = before
+        return False
+
+    def _as_before(self, found: Match) -> Match:
+        """Give a degenerate match the directions of the key frame's first such match.
+
+        Each registration finds slightly different unconstrained directions, and together they
+        would seem to constrain them. As twists in the key frame the directions are the same
+        wherever the robot is.
+        """
+        if found.status != "degenerate":
+            return found
+        x, y, _ = found.motion.mean.tolist()
+        to_motion = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])
+        to_twist = np.array([[1.0, 0.0, y], [0.0, 1.0, -x], [0.0, 0.0, 1.0]])
+        if self._directions is None or len(self._directions[0]) != len(found.held):
+            self._directions = found.held @ to_motion, to_twist @ found.loose @ to_motion
+        held, loose = self._directions
+        return dataclasses.replace(found, held=held @ to_twist, loose=to_motion @ loose @ to_twist)
+
+    def _insert(self, noise: Array) -> None:
+        """Append the newest scan's apparent pose to the state: that of base_link, and noise.
+
+        The noise (3, 3) is in the coordinates of map.
+        """
+        to_twist = _from_twist(-self._mean[_POSE])
+        self._mean = np.concatenate([self._mean, self._mean[_POSE]])
+        P = np.empty((12, 12))
+        P[:9, :9] = self._covariance
+        P[_NEW, :9] = self._covariance[_POSE]
+        P[:9, _NEW] = self._covariance[:, _POSE]
+        P[_NEW, _NEW] = self._covariance[_POSE, _POSE] + to_twist @ noise @ to_twist.T
+        self._covariance = P
+
+    def _keep(self, key: PreparedScan, last: PreparedScan, places: tuple[slice, slice]) -> None:
+        """Keep two of the apparent poses, and the robot's, and drop the others."""
+        if key is not self._key:
+            self._directions = None
+        self._key, self._last = key, last
+        rows = np.concatenate([_ROWS[place] for place in (*places, _POSE)])
+        self._mean, self._covariance = self._mean[rows], self._covariance[np.ix_(rows, rows)]
+
+    def _own_noise(self, scan: PreparedScan) -> Array:
+        """Shared noise (3, 3) in map of a scan that was not registered: from one against itself."""
+        found = self._matcher.match(scan, scan, STILL, self._laser, self._rng)
+        noise = self.shared_noise / 2.0 * found.known_covariance
+        return np.zeros((3, 3)) if found.failed else rotated(noise, self._mean[8])
+
+
+def _from_twist(pose: Array) -> Array:
+    """Derivative (3, 3) of exp(twist) * pose by the twist, at zero; for -pose its inverse."""
+    x, y, _ = pose.tolist()
+    return np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])
+
+
+def _moved(pose: Array, twist: Array) -> Array:
+    """Pose (3,) after a twist in map: exp(twist) * pose."""
+    u, v, turn = twist.tolist()
+    half = turn / 2.0
+    sinc = 1.0 - half * half / 6.0 if abs(half) < 1e-4 else math.sin(half) / half
+    cos, sin = sinc * math.cos(half), sinc * math.sin(half)
+    return compose(np.array([cos * u - sin * v, sin * u + cos * v, turn]), pose)[0]

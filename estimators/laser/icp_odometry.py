@@ -1,0 +1,191 @@
+"""Odometry by registration of laser scans (decristoforis2020, sec. II-B and III).
+
+Each scan is registered against the previous one, eq. (5), or against a key frame, and its
+covariance is composed along.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from estimators.base import Belief, Prior
+from estimators.gaussian import STILL, Gaussian
+from estimators.laser.icp import Kernel, Metric, PreparedScan, Rules
+from estimators.laser.scan_matching import (
+    FAILED,
+    Covariance,
+    ScanMatcher,
+    moved_beyond,
+)
+from estimators.options import require_choices, require_laser, require_non_negative, start_pose
+from estimators.wheels import WheelPrediction
+from sim import se2
+from sim.recording import Frame
+
+Reference = Literal["previous", "keyframe"]
+
+_HEADING_WINDOW_RAD = math.pi / 6.0  # constant velocity misses the turns: search the headings
+# Constant velocity is not trusted further than to these standard deviations
+_GUESS_FLOOR_M, _GUESS_FLOOR_RAD, _GUESS_SHARE = 0.05, 0.05, 0.5
+
+
+@dataclass(frozen=True)
+class _Anchor:
+    """A scan and the belief in base_link when it was taken; no scan before the first."""
+
+    belief: Gaussian
+    scan: PreparedScan | None
+
+
+class IcpOdometry:
+    """Compose registrations of scans.
+
+    Parameters
+    ----------
+    metric, covariance, sigma_range_m
+        As in `estimators.laser.scan_matching.ScanMatcher`.
+    trim, kernel, max_iterations, stop_error_m, neighbours
+        As in `estimators.laser.icp.Rules`.
+    reference
+        What a scan is registered against: the `previous` scan (decristoforis2020, eq. (5)), or a
+        `keyframe`, kept until the robot has left it by more than the thresholds.
+    keyframe_distance_m, keyframe_turn_rad
+        How far the robot goes before it takes a new key frame.
+    use_odometry_guess
+        Start registrations from the wheel increments. Without it they start from constant
+        velocity, and the wheels are not used at all.
+    kr, kl
+        Believed slip variance per metre of the wheels, m, for the guess.
+    window_s
+        |ds| is netted over at least this time.
+
+    Notes
+    -----
+    When a registration fails (against the reference and against the last scan), the belief moves
+    by the guess with the guess's covariance and `extras["status"]` gives the reason. The next scan
+    is tried against both again; after a second failure the newest scan becomes the reference.
+    Directions that the scans do not constrain keep the guess and its covariance. Frames without a
+    scan move by the wheels with `use_odometry_guess`, else they repeat the last belief.
+
+    Belief extras: `registration_covariance` (3, 3) of T_reference_base, `registration_status`,
+    and `status` if the registration failed.
+    """
+
+    needs = frozenset({"laser"})
+
+    def __init__(
+        self,
+        metric: Metric = "point_to_line",
+        reference: Reference = "keyframe",
+        keyframe_distance_m: float = 0.5,
+        keyframe_turn_rad: float = 0.35,
+        use_odometry_guess: bool = True,
+        covariance: Covariance = "censi",
+        sigma_range_m: float | None = None,
+        kr: float = 1e-4,
+        kl: float = 1e-4,
+        window_s: float = 0.05,
+        laser: str = "laser",
+        trim: float = 0.0,
+        kernel: Kernel = "tukey",
+        max_iterations: int = 100,
+        stop_error_m: float = 0.0,
+        neighbours: int = 6,
+    ) -> None:
+        self.laser = laser
+        rules = Rules(trim, kernel, max_iterations, stop_error_m, neighbours)
+        self._matcher = ScanMatcher(metric, covariance, sigma_range_m, rules)
+        self.wheels = WheelPrediction(kr, kl, window_s)
+        require_choices(reference=(reference, Reference))
+        require_non_negative(
+            keyframe_distance_m=keyframe_distance_m, keyframe_turn_rad=keyframe_turn_rad
+        )
+        self.reference, self.use_odometry_guess = reference, use_odometry_guess
+        self.keyframe_distance_m, self.keyframe_turn_rad = keyframe_distance_m, keyframe_turn_rad
+
+    def reset(self, prior: Prior, rng: np.random.Generator) -> None:
+        """Start from the prior's pose; the first scan becomes the reference."""
+        self._laser, self._rng = require_laser(prior, self.laser, "icp_odometry"), rng
+        self._key = self._last = _Anchor(start_pose(prior, "icp_odometry"), None)
+        self._key_to_last = STILL
+        self._lost = False
+        self.wheels.reset(prior.robot.track_m)
+        self._rolled, self._since_s = STILL, 0.0  # since the last scan, by the wheels
+        self._velocity = np.zeros(3)  # twist between the last two scans, per second
+
+    def step(self, frame: Frame) -> Belief:
+        """Register the Frame's scan, if it has one, and compose."""
+        self._since_s += frame.duration_s
+        if self.use_odometry_guess:
+            self._rolled = self._rolled.then(self.wheels.predict(frame))
+        reading = frame.readings.get(self.laser)
+        if reading is None:
+            return _belief(self._last.belief.then(self._rolled), {})
+        scan = self._matcher.prepare(reading["ranges_m"], self._laser)
+        guess = self._guess()
+        belief = self._last.belief.then(guess)
+        if scan is None:
+            return _belief(belief, {"registration_status": "empty", "status": "empty"})
+        if self._last.scan is None:
+            self._key = self._last = _Anchor(self._last.belief.then(self._rolled), scan)
+            self._rolled, self._since_s = STILL, 0.0
+            return _belief(self._last.belief, {"registration_status": "first"})
+        extras: dict[str, Any] = {}
+        references = [(self._key, self._key_to_last)]
+        if self._key is not self._last:
+            references.append((self._last, STILL))  # tried if the key frame is lost
+        for anchor, so_far in references:
+            assert anchor.scan is not None
+            motion, status = self._matched(scan, anchor.scan, so_far.then(guess))
+            extras["registration_status"] = status
+            if status not in FAILED:
+                extras["registration_covariance"] = motion.covariance
+                belief = anchor.belief.then(motion)
+                self._key, self._key_to_last = anchor, motion
+                break
+        failed = status in FAILED
+        if failed:
+            extras["status"] = status
+            self._key_to_last = self._key_to_last.then(guess)
+        if self._since_s > 0.0:
+            moved = se2.between(self._last.belief.mean, belief.mean)
+            self._velocity = se2.log(moved) / self._since_s
+        self._last = _Anchor(belief, scan)
+        left_key = self.reference == "previous" or moved_beyond(
+            self._key_to_last.mean, self.keyframe_distance_m, self.keyframe_turn_rad
+        )
+        # after a single lost scan the key frame gets another chance: the scan may be at fault
+        if (failed and self._lost) or (not failed and left_key):
+            self._key, self._key_to_last = self._last, STILL
+        self._lost = failed
+        self._rolled, self._since_s = STILL, 0.0
+        return _belief(belief, extras)
+
+    def _guess(self) -> Gaussian:
+        """Motion since the last scan, before this one is looked at."""
+        if self.use_odometry_guess:
+            return self._rolled
+        motion = se2.exp(self._velocity * self._since_s)
+        spread_m = _GUESS_FLOOR_M + _GUESS_SHARE * math.hypot(motion[0], motion[1])
+        spread_rad = _GUESS_FLOOR_RAD + _GUESS_SHARE * abs(float(motion[2]))
+        return Gaussian(motion, np.diag([spread_m**2, spread_m**2, spread_rad**2]))
+
+    def _matched(
+        self, scan: PreparedScan, reference: PreparedScan, guess: Gaussian
+    ) -> tuple[Gaussian, str]:
+        """Motion of base_link from the reference to the scan, and the registration's status."""
+        found = self._matcher.match(
+            scan,
+            reference,
+            guess,
+            self._laser,
+            self._rng,
+            heading_window_rad=0.0 if self.use_odometry_guess else _HEADING_WINDOW_RAD,
+        )
+        return found.completed(guess), found.status
+
+
+def _belief(belief: Gaussian, extras: dict[str, Any]) -> Belief:
+    return Belief(belief.mean.copy(), belief.covariance.copy(), extras)

@@ -1,0 +1,219 @@
+"""Registration of a robot's scans as its estimators use it: motions of base_link, with covariance.
+
+The guess sets how far to look, the chosen method the covariance; directions that the scans do
+not constrain are reported.
+"""
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from estimators.gaussian import Gaussian
+from estimators.laser import icp_covariance
+from estimators.laser.icp import (
+    LEAST_POINTS,
+    Metric,
+    PreparedScan,
+    Registration,
+    Rules,
+    prepare,
+    register,
+)
+from estimators.laser.scan_lines import without_sparse_lines
+from estimators.options import require_choices, require_non_negative
+from sim import se2
+from sim.arrays import Array
+from sim.sensors import Laser
+
+Covariance = Literal["censi", "censi_last", "hessian", "sampling", "unscented_censi"]
+
+FAILED = ("empty", "poor_overlap", "not_converged")
+
+_LEAST_SIGMA_M = 1e-4  # a laser without noise still has rounding
+# Bounds of the error that a guess is assumed to have
+_LEAST_GATE_M, _MOST_GATE_M = 0.5, 2.0
+_LEAST_GATE_RAD, _MOST_GATE_RAD = 0.02, 0.2
+_EVERYTHING, _NOTHING = np.eye(3), np.zeros((3, 3))
+
+
+@dataclass(frozen=True)
+class Match:
+    """The motion of base_link from the reference scan to another, as registered.
+
+    Attributes
+    ----------
+    motion
+        T_reference_base; the guess where the registration failed.
+    status
+        That of the `Registration`.
+    held
+        (D, 3) rows that take a motion to its D coordinates which the scans hold; the identity
+        but for degenerate pairs.
+    loose
+        (3, 3) projection onto the directions that the scans do not hold.
+    overlap
+        Share of the scan's points that agree with the reference.
+    """
+
+    motion: Gaussian
+    status: str
+    held: Array
+    loose: Array
+    overlap: float
+
+    @property
+    def failed(self) -> bool:
+        """Whether the registration is of no use."""
+        return self.status in FAILED
+
+    @property
+    def known_covariance(self) -> Array:
+        """(3, 3) the motion's covariance without the directions that the scans do not hold."""
+        if self.loose is _NOTHING:
+            return self.motion.covariance
+        known = np.eye(3) - self.loose
+        return known @ self.motion.covariance @ known.T
+
+    def completed(self, guess: Gaussian) -> Gaussian:
+        """In the directions that the scans do not hold, the guess and its covariance."""
+        if self.loose is _NOTHING:
+            return self.motion
+        off = self.motion.mean - guess.mean
+        off[2] = math.remainder(off[2], 2.0 * math.pi)
+        unknown = self.motion.covariance - guess.covariance
+        covariance = self.motion.covariance - self.loose @ unknown @ self.loose.T
+        return Gaussian(self.motion.mean - self.loose @ off, (covariance + covariance.T) / 2.0)
+
+
+def moved_beyond(motion: Array, distance_m: float, turn_rad: float) -> bool:
+    """Whether a motion (3,) has left a key frame by more than either threshold."""
+    x, y, turn = motion.tolist()
+    return math.hypot(x, y) > distance_m or abs(turn) > turn_rad
+
+
+@dataclass(frozen=True)
+class ScanMatcher:
+    """How scans are registered, and what is believed of their noise.
+
+    Parameters
+    ----------
+    metric
+        As in `estimators.laser.icp.register`.
+    covariance
+        Method of `estimators.laser.icp_covariance`; `censi_last` counts the noise of the last scan
+        only, as decristoforis2020 prints it. Point to point by `censi` lets matches slide.
+    sigma_range_m
+        Believed range noise; None for that of the prior's laser.
+    rules
+        Which matches count, and when iterations end.
+    most_gap_m
+        Lines of which no three points in a row lie this near each other are left out.
+    """
+
+    metric: Metric
+    covariance: Covariance
+    sigma_range_m: float | None
+    rules: Rules = dataclasses.field(default_factory=Rules)
+    most_gap_m: float = math.inf
+
+    def __post_init__(self) -> None:
+        require_choices(
+            metric=(self.metric, Metric),
+            covariance=(self.covariance, Covariance),
+        )
+        if self.sigma_range_m is not None:
+            require_non_negative(sigma_range_m=self.sigma_range_m)
+
+    def prepare(self, ranges_m: ArrayLike, laser: Laser) -> PreparedScan | None:
+        """Prepare a scan of this laser; None if it shows too little to be registered."""
+        scan = prepare(ranges_m, laser.bearings_rad, laser.max_range_m)
+        if self.most_gap_m < math.inf:
+            scan = without_sparse_lines(scan, self.most_gap_m)
+        return scan if len(scan.points) >= LEAST_POINTS else None
+
+    def match(
+        self,
+        scan: PreparedScan,
+        reference: PreparedScan,
+        guess: Gaussian,
+        laser: Laser,
+        rng: np.random.Generator,
+        heading_window_rad: float = 0.0,
+    ) -> Match:
+        """Register a scan against a reference.
+
+        Parameters
+        ----------
+        guess
+            T_reference_base as known before.
+        laser
+            Where it sits and what it may see.
+        rng
+            For the covariance by sampling.
+        heading_window_rad
+            Half the range of headings to search, where the guess knows nothing of the turn.
+        """
+        mount = laser.mount.pose
+        in_laser, _ = guess.seen_from(mount)
+        (xx, _, _), (_, yy, _), (_, _, turn) = in_laser.covariance.tolist()
+        found = register(
+            scan,
+            reference,
+            in_laser.mean,
+            metric=self.metric,
+            gate_m=min(_LEAST_GATE_M + 4.0 * math.sqrt(max(xx + yy, 0.0)), _MOST_GATE_M),
+            gate_rad=min(_LEAST_GATE_RAD + 4.0 * math.sqrt(max(turn, 0.0)), _MOST_GATE_RAD),
+            heading_window_rad=heading_window_rad,
+            rules=self.rules,
+        )
+        if found.status in FAILED:
+            return Match(guess, found.status, _NOTHING[:0], _EVERYTHING, found.overlap)
+        R = self._covariance_of(
+            found, scan, reference, in_laser.covariance, self.sigma_m(laser), rng
+        )
+        motion, to_base = Gaussian(found.T_target_source, R).seen_from(se2.inverse(mount))
+        if found.status != "degenerate":
+            return Match(motion, found.status, _EVERYTHING, _NOTHING, found.overlap)
+        in_base = [to_base @ part for part in icp_covariance.split_directions(found)]
+        coordinates = np.linalg.inv(np.hstack(in_base))
+        n_held = in_base[0].shape[1]
+        held, loose = coordinates[:n_held], in_base[1] @ coordinates[n_held:]
+        match = Match(motion, found.status, held, loose, found.overlap)
+        # The directions themselves are uncertain: along a loose one that is slightly off, the
+        # error of the registration and of the guess leaks into the held ones.
+        off = coordinates[n_held:] @ (motion.mean - guess.mean)
+        spread = coordinates[n_held:] @ guess.covariance @ coordinates[n_held:].T
+        _, in_laser_loose = icp_covariance.split_directions(found)
+        spurious = in_laser_loose.T @ found.information_noise @ in_laser_loose
+        leak = float(np.trace(spurious @ (np.outer(off, off) + spread)))
+        covariance = motion.covariance + leak * match.known_covariance
+        return dataclasses.replace(match, motion=Gaussian(motion.mean, covariance))
+
+    def sigma_m(self, laser: Laser) -> float:
+        """Believed range noise, m."""
+        sigma = laser.sigma_range_m if self.sigma_range_m is None else self.sigma_range_m
+        return max(sigma, _LEAST_SIGMA_M)
+
+    def _covariance_of(
+        self,
+        found: Registration,
+        source: PreparedScan,
+        target: PreparedScan,
+        of_guess: Array,
+        sigma_m: float,
+        rng: np.random.Generator,
+    ) -> Array:
+        if self.covariance == "hessian":
+            return icp_covariance.hessian(found)
+        if self.covariance == "sampling":
+            return icp_covariance.sampling(found, source, target, rng, sigma_m)
+        if self.covariance == "unscented_censi":
+            return icp_covariance.unscented_censi(
+                found, source, target, of_guess, sigma_m, matches="sliding"
+            )
+        scans: icp_covariance.Scans = "last" if self.covariance == "censi_last" else "both"
+        return icp_covariance.censi(found, source, target, sigma_m, scans=scans, matches="sliding")

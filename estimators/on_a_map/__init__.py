@@ -1,0 +1,1 @@
+"""Localization by a laser in a known map."""

@@ -1,0 +1,291 @@
+"""The likelihood field of a map for a laser: how well each place explains the end of a beam.
+
+A beam that ends at distance d from the nearest wall has the likelihood
+
+    p(d) = z_hit N(d; 0, sigma^2) + z_rand / z_max,
+
+looked up in a table over the floor. The table holds (log p(0) - log p(d)) / step in whole numbers
+of 16 bits, so that it stays in the processor's cache and a scan is a sum of integers.
+
+On an occupancy grid d is the distance to the middle of the nearest occupied cell, and zero in such
+a cell. A beam that ends where nothing is known has at least the likelihood 1 / z_max, since all its
+ranges are equally likely there (Thrun, Burgard, Fox 2005, Probabilistic Robotics, sec. 6.4); off
+the grid nothing is known. Only free cells are floor.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from sim import se2
+from sim.arrays import Array, Floats, Ints
+from sim.compiled import njit
+from sim.errors import require
+from sim.sensors import Laser
+from sim.worlds.grid import FREE_BELOW, OCCUPIED_ABOVE, OccupancyGrid
+from sim.worlds.world import World
+
+_MOST = 65535  # of a table entry
+_CLEARANCE_M = 0.15  # where a robot's centre can be
+_MOST_CELLS = 50_000_000  # 100 MB
+
+
+@dataclass(frozen=True)
+class LikelihoodField:
+    """A table over the floor.
+
+    Attributes
+    ----------
+    table
+        (rows, columns) uint16 of y and x; its rim stands for all that lies outside.
+    origin_m
+        (2,) corner of cell (0, 0) in map.
+    cell_m
+        Side of a cell.
+    step
+        Log likelihood of one count.
+    free_cells
+        Rows and columns (F, 2) of the cells where a robot can be: the largest connected floor off
+        the walls. What is shut in, such as the inside of furniture, does not count, nor does what
+        a grid does not know to be free.
+    """
+
+    table: NDArray[np.uint16]
+    origin_m: Array
+    cell_m: float
+    step: float
+    free_cells: Ints
+
+    def holds(self, pose: Array) -> bool:
+        """Whether a pose (3,) lies on the table, rather than off the map."""
+        column, row = (np.asarray(pose[:2]) - self.origin_m) / self.cell_m
+        rows, columns = self.table.shape
+        return bool(0.0 <= row < rows and 0.0 <= column < columns)
+
+    def draw(self, n: int, rng: np.random.Generator) -> Array:
+        """Poses (n, 3), uniform over the free floor and all headings."""
+        require(len(self.free_cells) > 0, "the map has no floor off its walls to put particles on")
+        cells = self.free_cells[rng.integers(len(self.free_cells), size=n)]
+        places: Array = self.origin_m + (cells[:, ::-1] + rng.random((n, 2))) * self.cell_m
+        return np.column_stack([places, rng.uniform(-math.pi, math.pi, n)])
+
+    def log_likelihood(self, poses: Array, ends: Floats) -> Array:
+        """Log likelihood (M,) of a scan at poses (M, 3), relative to all beams ending at walls.
+
+        Parameters
+        ----------
+        ends
+            (2, B) where the beams end in base_link, m, as from `beam_ends`.
+        """
+        if not np.isfinite(poses).all():  # compiled code would read beyond the table
+            raise FloatingPointError("poses of particles are not finite")
+        counts = np.empty(len(poses), np.int64)
+        rows, columns = self.table.shape
+        _look_up(
+            np.ascontiguousarray(poses), ends, self.table.ravel(), rows, columns,
+            self.origin_m, self.cell_m, counts,
+        )  # fmt: skip
+        return -self.step * counts.astype(np.float64)
+
+
+def likelihood_field(
+    known_map: World | OccupancyGrid,
+    laser: Laser,
+    *,
+    cell_m: float = 0.05,
+    sigma_m: float = 0.1,
+    z_hit: float = 0.9,
+    z_rand: float = 0.1,
+) -> LikelihoodField:
+    """Work out the field of a world's walls at the height of the laser, or of a grid.
+
+    Parameters
+    ----------
+    known_map
+        World or grid. A grid has no heights: it is taken to be of the laser's.
+    sigma_m
+        Spread of beam ends about the walls: range noise, half a cell, and errors of the map.
+    z_hit, z_rand
+        Shares of beams that end at a wall and anywhere; z_max is the laser's greatest range.
+
+    Raises
+    ------
+    InputError
+        If no wall is at that height, or the table would be too large.
+    """
+    walls, extent = _walls(known_map, laser)
+    normal = z_hit / (sigma_m * math.sqrt(2.0 * math.pi))
+    anywhere = z_rand / laser.max_range_m
+    # Beyond this distance beams that hit are a thousandth of those that end anywhere
+    reach_m = sigma_m * math.sqrt(2.0 * math.log(max(1000.0 * normal / anywhere, math.e)))
+    reach_m = max(reach_m, 2.0 * _CLEARANCE_M)
+    with np.errstate(over="ignore", invalid="ignore"):  # counted in floats, which do not wrap
+        origin = np.floor((extent.min(axis=0) - reach_m) / cell_m) * cell_m - cell_m
+        sides = np.ceil((extent.max(axis=0) + reach_m - origin) / cell_m) + 1.0
+        n_cells = float(np.prod(sides))
+    where = "the grid" if isinstance(known_map, OccupancyGrid) else f"world {known_map.name}"
+    require(
+        n_cells <= _MOST_CELLS,
+        f"estimator.cell_m={cell_m} makes {n_cells:.3g} cells of {where}; make it larger",
+    )
+    columns, rows = sides.astype(int).tolist()
+    distances = _distances(walls, origin, cell_m, reach_m, rows, columns)
+    p = normal * np.exp(-0.5 * np.square(distances / sigma_m)) + anywhere
+    floor = distances > _CLEARANCE_M
+    if isinstance(known_map, OccupancyGrid):
+        free, occupied = _states(known_map, origin, cell_m, rows, columns)
+        p[occupied] = normal + anywhere
+        unknown = ~(free | occupied)
+        p[unknown] = np.maximum(p[unknown], min(1.0 / laser.max_range_m, normal + anywhere))
+        floor &= free
+    else:
+        margin = round(reach_m / cell_m) + 1
+        within = np.zeros_like(floor)
+        within[margin:-margin, margin:-margin] = True
+        floor &= within  # the walls' rectangle
+    at_wall, step = math.log(normal + anywhere), math.log1p(normal / anywhere) / _MOST
+    table = np.round((at_wall - np.log(p)) / step).astype(np.uint16)
+    return LikelihoodField(table, origin, cell_m, step, _largest(floor))
+
+
+def _walls(known_map: World | OccupancyGrid, laser: Laser) -> tuple[Array, Array]:
+    """Walls (W, 4) that the laser sees, m, and points (N, 2) that span the map.
+
+    Of a grid the walls are points: the middles of the occupied cells that have others beside them.
+    """
+    if isinstance(known_map, OccupancyGrid):
+        occupied = known_map.occupied
+        middles = known_map.middles_m(np.argwhere(occupied & ~ndimage.binary_erosion(occupied)))
+        require(len(middles) > 0, "the grid of prior.map has no occupied cell")
+        return np.hstack([middles, middles]), known_map.corners_m
+    low, high = known_map.wall_z_m[:, 0], known_map.wall_z_m[:, 1]
+    walls = known_map.walls[(low <= laser.mount.z_m) & (laser.mount.z_m <= high)]
+    require(
+        len(walls) > 0, f"world {known_map.name} has no wall at the laser's {laser.mount.z_m} m"
+    )
+    return walls, walls.reshape(-1, 2)
+
+
+def _states(
+    grid: OccupancyGrid, origin: Array, cell_m: float, rows: int, columns: int
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Whether the middle of each of the table's cells (rows, columns) is free, and is occupied."""
+    probability = np.empty((rows, columns), np.float32)
+    middles = np.empty((columns, 2))
+    middles[:, 0] = origin[0] + (np.arange(columns) + 0.5) * cell_m
+    for row in range(rows):
+        middles[:, 1] = origin[1] + (row + 0.5) * cell_m
+        probability[row] = grid.at(middles)
+    return probability < FREE_BELOW, probability > OCCUPIED_ABOVE
+
+
+def _largest(floor: NDArray[np.bool_]) -> Ints:
+    """Rows and columns (F, 2) of the cells of the largest connected floor."""
+    labels, count = ndimage.label(floor)
+    if count == 0:
+        return np.zeros((0, 2), np.int64)
+    largest = 1 + np.argmax(np.bincount(labels[floor], minlength=count + 1)[1:])
+    return np.argwhere(labels == largest)
+
+
+def beam_ends(ranges_m: Floats, laser: Laser, n_beams: int) -> Floats:
+    """Where beams end in base_link, (2, B) m: `n_beams` evenly spaced ones, less those unseen.
+
+    Beams without a reading (NaN) are not counted; if none of the chosen ones saw anything, they are
+    chosen among those that did.
+    """
+    require(
+        len(ranges_m) == laser.n_beams,
+        f"a scan of {len(ranges_m)} ranges, from a laser of {laser.n_beams} beams",
+    )
+    ranges = np.asarray(ranges_m, float)
+    seen = laser.returned(ranges)
+    chosen = _spread(np.flatnonzero(~np.isnan(ranges)), n_beams)
+    if not seen[chosen].any():
+        chosen = _spread(np.flatnonzero(seen), n_beams)
+    chosen = chosen[seen[chosen]]
+    bearings = laser.bearings_rad[chosen]
+    rays = np.column_stack([np.cos(bearings), np.sin(bearings)])
+    ends = se2.transform(laser.mount.pose, rays * ranges[chosen, None])
+    return np.ascontiguousarray(ends.T, dtype=np.float32)
+
+
+def _spread(places: Ints, n_most: int) -> Ints:
+    """At most `n_most` of the places, evenly spaced."""
+    n = min(n_most, len(places))
+    return places[((np.arange(n) + 0.5) * (len(places) / max(n, 1))).astype(np.int64)]
+
+
+@njit()
+def _distances(
+    walls: Array, origin: Array, cell_m: float, reach_m: float, rows: int, columns: int
+) -> Array:
+    """Distance (rows, columns) of each cell's middle to the nearest wall within reach, else inf."""
+    squares = np.full((rows, columns), np.inf)
+    for w in range(len(walls)):
+        x1, y1 = walls[w, 0] - origin[0], walls[w, 1] - origin[1]
+        dx, dy = walls[w, 2] - walls[w, 0], walls[w, 3] - walls[w, 1]
+        length_square = dx * dx + dy * dy
+        per_square = 1.0 / length_square if length_square > 0.0 else 0.0  # of a point
+        first_row = max(int((min(y1, y1 + dy) - reach_m) / cell_m), 0)
+        last_row = min(int((max(y1, y1 + dy) + reach_m) / cell_m) + 1, rows)
+        first = max(int((min(x1, x1 + dx) - reach_m) / cell_m), 0)
+        last = min(int((max(x1, x1 + dx) + reach_m) / cell_m) + 1, columns)
+        for i in range(first_row, last_row):
+            y = (i + 0.5) * cell_m - y1
+            for j in range(first, last):
+                x = (j + 0.5) * cell_m - x1
+                share = min(max((x * dx + y * dy) * per_square, 0.0), 1.0)
+                square = (x - share * dx) ** 2 + (y - share * dy) ** 2
+                squares[i, j] = min(squares[i, j], square)
+    for i in range(rows):
+        for j in range(columns):
+            d = math.sqrt(squares[i, j])
+            squares[i, j] = d if d < reach_m else np.inf
+    return squares
+
+
+@njit(fastmath=True)
+def _look_up(
+    poses: Array,
+    ends: Floats,
+    table: NDArray[np.uint16],
+    rows: int,
+    columns: int,
+    origin: Array,
+    cell_m: float,
+    counts: Ints,
+) -> None:
+    """Sum the table over the beam ends (2, B), for every pose (M, 3).
+
+    In two passes a particle: the cells, which the compiler turns into vector instructions, then
+    the look-ups. Unsigned indices need no test for counting from the end, and four sums let the
+    processor wait for several look-ups at a time.
+    """
+    n = ends.shape[1]
+    whole = n // 4 * 4
+    x_ends, y_ends = ends[0], ends[1]
+    cells = np.empty(n, np.uint32)
+    zero, x_most, y_most = np.float32(0.0), np.float32(columns - 1), np.float32(rows - 1)
+    stride = np.int32(columns)
+    for m in range(len(poses)):
+        cos = np.float32(math.cos(poses[m, 2]) / cell_m)
+        sin = np.float32(math.sin(poses[m, 2]) / cell_m)
+        x0 = np.float32((poses[m, 0] - origin[0]) / cell_m)
+        y0 = np.float32((poses[m, 1] - origin[1]) / cell_m)
+        for b in range(n):
+            x = min(max(x0 + cos * x_ends[b] - sin * y_ends[b], zero), x_most)
+            y = min(max(y0 + sin * x_ends[b] + cos * y_ends[b], zero), y_most)
+            cells[b] = np.uint32(np.int32(y) * stride + np.int32(x))
+        first = second = third = fourth = np.uint64(0)
+        for b in range(0, whole, 4):
+            first += table[cells[b]]
+            second += table[cells[b + 1]]
+            third += table[cells[b + 2]]
+            fourth += table[cells[b + 3]]
+        for b in range(whole, n):
+            first += table[cells[b]]
+        counts[m] = first + second + third + fourth

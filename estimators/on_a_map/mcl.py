@@ -1,0 +1,500 @@
+"""Monte Carlo localization in a known map by a laser (the starting point of maximo2024, sec. 2.1).
+
+Particles roll by the wheels, are weighted by a likelihood field, and are resampled. Their number
+follows the spread of the belief (KLD sampling).
+
+The filter may be lost, and two ways back are offered. `average`: when scans fit worse than their
+long-term average, particles are injected over all the floor (augmented MCL), drawn by the scan
+(sensor resetting). `rivals`: a set of particles drawn by a scan over all the floor, and as many
+drawn from the belief, follow the same wheels and scans for a while; if the best path of the rivals
+explains them better than the best of the defenders by a margin, the rivals become the belief.
+People before the laser and what the map lacks count against both alike, which an average over time
+mistakes for being lost.
+"""
+
+import math
+from typing import Any, Literal
+
+import numpy as np
+
+from estimators.base import Belief, Prior
+from estimators.gaussian import STILL, Gaussian, root
+from estimators.on_a_map.likelihood_field import LikelihoodField, beam_ends, likelihood_field
+from estimators.options import (
+    require_choices,
+    require_counts,
+    require_laser,
+    require_non_negative,
+    require_positive,
+)
+from estimators.particles import (
+    Scheme,
+    effective_sample_size,
+    normalize,
+    resample,
+    underflowed,
+)
+from estimators.wheels import WheelPrediction
+from sim import se2
+from sim.arrays import Array, Floats, Ints
+from sim.compiled import njit
+from sim.errors import require
+from sim.recording import Frame
+from sim.worlds.grid import OccupancyGrid
+from sim.worlds.world import World
+
+Recovery = Literal["none", "average", "rivals"]
+
+_OFF_WALLS = 2.0  # what a beam of a contest loses, in log likelihood, by ending off the walls
+_BISECTIONS = 12
+_MOST_PARTICLES, _MOST_TRIES = 10_000_000, 100_000_000  # 0.2 and 2 GB of poses
+_MOST_BINS = 250_000_000  # 2 GB
+_FARTHEST_M, _FARTHEST_RAD = 1.0, 0.5  # of what belongs to one hypothesis
+
+
+class Mcl:
+    """Monte Carlo localization with a likelihood field of a world's walls or an occupancy grid.
+
+    Parameters
+    ----------
+    n_least, n_most
+        Bounds of the number of particles; it starts with the greater one.
+    kld_error, kld_quantile
+        KLD sampling: the draw differs from the belief by at most `kld_error`, with the
+        probability that this standard normal quantile has (2.33: 99 %).
+    bin_m, bin_rad
+        Size of the bins that KLD sampling counts.
+    n_beams
+        Beams of each scan that are used, evenly spaced.
+    beam_power
+        Each beam's likelihood is raised to this power, since neighbouring beams err together and
+        particles are few for so sharp a likelihood; 1 for independent beams.
+    least_ess
+        A scan counts for less when it would leave less than this share of the particles; below
+        `ess_share`.
+    tries
+        Poses tried on the floor for each particle injected there by the scan.
+    sigma_m, z_hit, z_rand, cell_m
+        The likelihood field, see `estimators.on_a_map.likelihood_field`.
+    update_distance_m, update_turn_rad
+        How far the robot goes between scans that are used.
+    resampling, ess_share
+        Scheme, and share of the particles that the effective sample size must fall below.
+    jitter_m, jitter_rad
+        Spread added to each particle drawn, so that copies differ.
+    recovery
+        `none`, `average` or `rivals`, as above.
+    alpha_slow, alpha_fast
+        Of `average`: rates of the long and the short average of a beam's likelihood; 0 for no
+        recovery.
+    recovery_ratio
+        Of `average`: particles are injected when the short average falls below this share of the
+        long one.
+    n_rivals, rival_scans
+        Of `rivals`: their number, and the scans after which they are judged.
+    rival_margin
+        Of `rivals`: how much greater the mean log likelihood of a beam must be along their best
+        path.
+    kr, kl
+        Believed slip variance per metre of the wheels, m; `amcl_alphas` converts them for AMCL.
+    window_s
+        |ds| is netted over at least this time.
+
+    Notes
+    -----
+    The defaults are for finding the robot anywhere: blunt likelihoods and a jitter that widens the
+    belief to twice its error or more. A tracker that knows its error wants beam_power=1,
+    least_ess=0, sigma_m of 0.05 to 0.1, and no jitter; it is consistent then.
+
+    Without a start pose the particles are drawn by the first scan, and later ones are injected by
+    the current one: along a corridor, where long beams fix the heading closely, a uniform draw
+    would leave none near the truth.
+
+    The mean is that of the hypothesis (particles within 1 m and 0.5 rad) of greatest weight; the
+    covariance is that of all particles about it, so it shows whether there are others. Extras, of
+    the last scan used: `particles` (M, 3), `log_weights` (M,), `ess`, `hypothesis_weight`,
+    `fit`, the likelihood of a beam at the best particle, and `injected`, the number of particles
+    injected, those of rivals that became the belief included; `status` when a scan saw nothing.
+    """
+
+    needs = frozenset({"laser", "map"})
+    maps = (World, OccupancyGrid)
+    global_or_grid = True
+
+    def __init__(
+        self,
+        n_least: int = 1000,
+        n_most: int = 20_000,
+        kld_error: float = 0.05,
+        kld_quantile: float = 2.33,
+        bin_m: float = 0.5,
+        bin_rad: float = 0.17,
+        n_beams: int = 60,
+        beam_power: float = 0.1,
+        least_ess: float = 0.4,
+        tries: int = 100,
+        sigma_m: float = 0.2,
+        z_hit: float = 0.9,
+        z_rand: float = 0.1,
+        cell_m: float = 0.05,
+        update_distance_m: float = 0.2,
+        update_turn_rad: float = 0.2,
+        resampling: Scheme = "systematic",
+        ess_share: float = 0.5,
+        jitter_m: float = 0.01,
+        jitter_rad: float = 0.005,
+        recovery: Recovery = "average",
+        alpha_slow: float = 0.01,
+        alpha_fast: float = 0.2,
+        recovery_ratio: float = 0.9,
+        n_rivals: int = 2000,
+        rival_scans: int = 15,
+        rival_margin: float = 0.2,
+        kr: float = 1e-4,
+        kl: float = 1e-4,
+        window_s: float = 0.05,
+        laser: str = "laser",
+    ) -> None:
+        self.laser = laser
+        self.wheels = WheelPrediction(kr, kl, window_s)
+        require_counts(
+            n_least=n_least,
+            n_beams=n_beams,
+            tries=tries,
+            n_rivals=n_rivals,
+            rival_scans=rival_scans,
+        )
+        require_counts(_MOST_PARTICLES, n_most=n_most)
+        require(
+            max(n_most, n_rivals) * tries <= _MOST_TRIES,
+            f"estimator.n_most={n_most}, n_rivals={n_rivals} and tries={tries} draw "
+            f"{max(n_most, n_rivals) * tries} poses at once; at most {_MOST_TRIES} are drawn",
+        )
+        require_choices(resampling=(resampling, Scheme), recovery=(recovery, Recovery))
+        require_positive(
+            kld_error=kld_error,
+            bin_m=bin_m,
+            bin_rad=bin_rad,
+            beam_power=beam_power,
+            sigma_m=sigma_m,
+            z_hit=z_hit,
+            z_rand=z_rand,
+            cell_m=cell_m,
+        )
+        require_non_negative(
+            kld_quantile=kld_quantile,
+            least_ess=least_ess,
+            update_distance_m=update_distance_m,
+            update_turn_rad=update_turn_rad,
+            ess_share=ess_share,
+            jitter_m=jitter_m,
+            jitter_rad=jitter_rad,
+            alpha_slow=alpha_slow,
+            alpha_fast=alpha_fast,
+            recovery_ratio=recovery_ratio,
+            rival_margin=rival_margin,
+        )
+        require(n_least <= n_most, f"estimator.n_least={n_least} is above n_most={n_most}")
+        require(
+            least_ess < ess_share,
+            f"estimator.least_ess={least_ess} is not below ess_share={ess_share}",
+        )
+        self.n_least, self.n_most, self.n_beams = n_least, n_most, n_beams
+        self.kld_error, self.kld_quantile = kld_error, kld_quantile
+        self.bin_m, self.bin_rad, self.beam_power = bin_m, bin_rad, beam_power
+        self.least_ess, self.tries = least_ess, tries
+        self.sigma_m, self.z_hit, self.z_rand, self.cell_m = sigma_m, z_hit, z_rand, cell_m
+        self.update_distance_m, self.update_turn_rad = update_distance_m, update_turn_rad
+        self.resampling, self.ess_share = resampling, ess_share
+        self.jitter_m, self.jitter_rad = jitter_m, jitter_rad
+        self.alpha_slow, self.alpha_fast = alpha_slow, alpha_fast
+        self.recovery, self.recovery_ratio = recovery, recovery_ratio
+        self.n_rivals, self.rival_scans, self.rival_margin = n_rivals, rival_scans, rival_margin
+
+    def reset(self, prior: Prior, rng: np.random.Generator) -> None:
+        """Draw particles from the prior's pose, or from all the floor if there is none."""
+        self._laser, self._rng = require_laser(prior, self.laser, "mcl"), rng
+        require(
+            isinstance(prior.map, self.maps),
+            "mcl needs a map of walls; set prior.map=world, or to a grid's .yaml",
+        )
+        self.wheels.reset(prior.robot.track_m)
+        self._field = likelihood_field(
+            prior.map,
+            self._laser,
+            cell_m=self.cell_m,
+            sigma_m=self.sigma_m,
+            z_hit=self.z_hit,
+            z_rand=self.z_rand,
+        )
+        if self.recovery == "rivals":
+            # off the walls every end is as unlikely: else beams that end short, at people, outweigh
+            # all others, and beams that end in the unknown are better than those
+            off_walls = math.exp(-_OFF_WALLS) * self._laser.max_range_m
+            self._bounded = likelihood_field(
+                prior.map,
+                self._laser,
+                cell_m=self.cell_m,
+                sigma_m=self.sigma_m,
+                z_hit=1.0,
+                z_rand=off_walls / (self.sigma_m * math.sqrt(2.0 * math.pi)),
+            )
+        self._shape = self._shape_of_bins()
+        self._off_map = prior.mean is not None and not self._field.holds(prior.mean)
+        self._everywhere = prior.mean is None or prior.covariance is None
+        if prior.mean is None or prior.covariance is None:
+            self._poses = self._field.draw(self.n_most, rng)
+        else:
+            normals = rng.standard_normal((self.n_most, 3))
+            self._poses = prior.mean + normals @ root(prior.covariance).T
+            self._poses[:, 2] = se2.wrap(self._poses[:, 2])
+        self._log_weights = np.zeros(len(self._poses))
+        self._contest: Array | None = None  # (2, n_rivals, 3) poses of defenders and rivals
+        self._motion = STILL  # since the last scan used
+        # A beam errs along itself by the laser's noise, and by half a cell either way
+        variance = self._laser.sigma_range_m**2 + self.cell_m**2 / 6.0
+        self._slow = self._fast = math.exp(-0.5 * variance / self.sigma_m**2)
+        self._seen = False
+        self._extras: dict[str, Any] = {}
+        self._belief = self._summed_up()
+
+    def step(self, frame: Frame) -> Belief:
+        """Roll by the wheels; with a scan from a new place, weight and resample."""
+        self._motion = self._motion.then(self.wheels.predict(frame))
+        extras: dict[str, Any] = {"status": "start off the map"} if self._off_map else {}
+        self._off_map = False
+        scan = frame.readings.get(self.laser)
+        if scan is not None and self._is_due():
+            ends = beam_ends(scan["ranges_m"], self._laser, self.n_beams)
+            self._move()
+            self._seen = True
+            if ends.shape[1] == 0:
+                extras["status"] = "scan without returns"
+                self._belief = self._summed_up()
+            else:
+                self._weigh(ends)
+        now = self._belief.then(self._motion)
+        symmetric = (now.covariance + now.covariance.T) / 2.0
+        return Belief(now.mean.copy(), symmetric, self._extras | extras)
+
+    def _is_due(self) -> bool:
+        """Whether the robot has come far enough since the last scan used."""
+        x, y, turn = self._motion.mean
+        far = math.hypot(x, y) >= self.update_distance_m or abs(turn) >= self.update_turn_rad
+        return far or not self._seen
+
+    def _move(self) -> None:
+        """Draw the motion since the last scan used, for each particle."""
+        normals = self._rng.standard_normal(self._poses.shape)
+        self._poses = self._poses.copy()  # the last Belief keeps its own
+        by_normals = root(self._motion.covariance)
+        _move(self._poses, self._motion.mean, by_normals, normals)
+        for poses in () if self._contest is None else self._contest:
+            _move(poses, self._motion.mean, by_normals, self._rng.standard_normal(poses.shape))
+        self._motion = STILL
+
+    def _weigh(self, ends: Floats) -> None:
+        """Weight by one scan, sum up the belief, and resample if that is due."""
+        if self._everywhere:
+            self._poses = self._drawn_by_scan(self.n_most, ends, self._field)
+            self._everywhere = False
+            self._belief = self._summed_up()
+            return
+        of_scan = self._field.log_likelihood(self._poses, ends)
+        self._log_weights = self._weighed(of_scan)
+        self._belief = self._summed_up()
+        if self.recovery == "rivals" and self._yielded(ends):
+            return
+        share = self._injected_share(of_scan, ends.shape[1])
+        if share > 0.0 or self._extras["ess"] < self.ess_share * len(self._poses):
+            self._draw(share, ends)
+
+    def _weighed(self, of_scan: Array) -> Array:
+        """Log weights (M,) with a scan counted by `beam_power`, or by as much as `least_ess` lets.
+
+        The effective sample size falls as the power grows, so the power is found by bisection.
+        """
+        least = min(self.least_ess * len(of_scan), effective_sample_size(self._log_weights))
+        low, high = 0.0, self.beam_power
+        weights = self._log_weights + high * of_scan
+        if effective_sample_size(weights) < least:
+            for _ in range(_BISECTIONS):
+                middle = (low + high) / 2.0
+                poor = effective_sample_size(self._log_weights + middle * of_scan) < least
+                low, high = (low, middle) if poor else (middle, high)
+            weights = self._log_weights + low * of_scan
+        return np.zeros(len(weights)) if underflowed(weights) else weights - np.max(weights)
+
+    def _injected_share(self, of_scan: Array, n_beams: int) -> float:
+        """Share of particles to inject: the short average of the fit against the long one.
+
+        The fit is the geometric mean likelihood of a beam at the particle that fits best: the mean
+        over the particles, as in augmented MCL, is poor for any belief that is still spread.
+        """
+        fit = math.exp(float(np.max(of_scan)) / n_beams)
+        self._extras["fit"] = fit
+        if self.recovery != "average" or self.alpha_slow == 0.0:
+            return 0.0
+        self._slow += self.alpha_slow * (fit - self._slow)
+        self._fast += self.alpha_fast * (fit - self._fast)
+        return max(0.0, 1.0 - self._fast / (self.recovery_ratio * self._slow))
+
+    def _yielded(self, ends: Floats) -> bool:
+        """Let rivals and defenders see the scan too; whether the belief has given way.
+
+        Both are as many, and are resampled alike at every scan: a wide cloud explains a scan worse
+        than a narrow one at the same place. The scan that draws them does not count.
+        """
+        n = self.n_rivals
+        if self._contest is None:
+            defenders = self._poses[resample(self._log_weights, n, self._rng, self.resampling)]
+            rivals = self._drawn_by_scan(n, ends, self._bounded)
+            self._contest = np.stack([self._jittered(defenders), rivals])
+            self._explained, self._n_explained, self._n_contested = np.zeros((2, n)), 0, 0
+            return False
+        for side in (0, 1):
+            of_scan = self._bounded.log_likelihood(self._contest[side], ends)
+            drawn = resample(self.beam_power * of_scan, n, self._rng, self.resampling)
+            self._explained[side] = (self._explained[side] + of_scan)[drawn]
+            self._contest[side] = self._jittered(self._contest[side][drawn])
+        self._n_explained += ends.shape[1]
+        self._n_contested += 1
+        if self._n_contested < self.rival_scans:
+            return False
+        defended, gained = self._explained.max(axis=1) / self._n_explained
+        rivals, self._contest = self._contest[1], None
+        if gained - defended <= self.rival_margin:
+            return False
+        self._poses, self._log_weights = rivals, np.zeros(n)
+        self._belief = self._summed_up()
+        self._extras["injected"] = n
+        return True
+
+    def _jittered(self, poses: Array) -> Array:
+        """Poses (M, 3), each moved a little, so that copies differ."""
+        jitter = self._rng.standard_normal(poses.shape)
+        moved: Array = poses + jitter * [self.jitter_m, self.jitter_m, self.jitter_rad]
+        return moved
+
+    def _drawn_by_scan(self, n: int, ends: Floats, field: LikelihoodField) -> Array:
+        """Poses (n, 3) over all the floor, drawn by how well the scan fits there."""
+        tries = field.draw(n * self.tries, self._rng)
+        log_weights = self.beam_power * field.log_likelihood(tries, ends)
+        return tries[resample(log_weights, n, self._rng, self.resampling)]
+
+    def _draw(self, injected_share: float, ends: Floats) -> None:
+        """Resample to as many particles as the bins they fall into call for, and inject others."""
+        n, needed = 0, max(self.n_least, min(len(self._poses), self.n_most) // 4)
+        poses, n_injected = self._poses, 0
+        while n < needed:
+            n = needed
+            n_injected = int(self._rng.binomial(n, injected_share))
+            drawn = resample(self._log_weights, n - n_injected, self._rng, self.resampling)
+            poses = self._poses[drawn]
+            if n_injected > 0:
+                poses = np.concatenate([poses, self._drawn_by_scan(n_injected, ends, self._field)])
+            needed = min(max(self._kld_number(poses), self.n_least), self.n_most)
+        self._poses, self._log_weights = self._jittered(poses), np.zeros(n)
+        self._extras["injected"] = n_injected
+
+    def _kld_number(self, poses: Array) -> int:
+        """Particles that the number of bins in use calls for (Fox 2003)."""
+        k = np.count_nonzero(np.bincount(self._bins(poses)))
+        if k < 2:
+            return 1
+        a = 2.0 / (9.0 * (k - 1))
+        cube = (1.0 - a + math.sqrt(a) * self.kld_quantile) ** 3
+        return math.ceil((k - 1) / (2.0 * self.kld_error) * cube)
+
+    def _shape_of_bins(self) -> tuple[int, int, int]:
+        """Numbers of bins along x, along y and in heading."""
+        sides_m = self._field.cell_m * np.array(self._field.table.shape[::-1])
+        with np.errstate(over="ignore"):  # counted in floats, which do not wrap
+            shape = np.ceil(np.array([*sides_m / self.bin_m, 2.0 * math.pi / self.bin_rad]))
+            n_bins = float(np.prod(shape))
+        require(
+            n_bins <= _MOST_BINS,
+            f"estimator.bin_m={self.bin_m} and bin_rad={self.bin_rad} make {n_bins:.3g} bins of "
+            "the map; make them larger",
+        )
+        columns, rows, headings = shape.astype(int).tolist()
+        return columns, rows, headings
+
+    def _bins(self, poses: Array) -> Ints:
+        """Number of the bin (M,) of each pose; what lies off the map counts to its rim."""
+        field, (columns, rows, n_headings) = self._field, self._shape
+        x, y = ((poses[:, i] - field.origin_m[i]) / self.bin_m for i in (0, 1))
+        heading = np.floor((poses[:, 2] + math.pi) / self.bin_rad).astype(np.int64)
+        column = np.clip(x.astype(np.int64), 0, columns - 1)
+        row = np.clip(y.astype(np.int64), 0, rows - 1)
+        return np.asarray((row * columns + column) * n_headings + heading % n_headings)
+
+    def _summed_up(self) -> Gaussian:
+        """Belief of the weighted particles, and its extras."""
+        weights = normalize(self._log_weights)
+        poses = self._poses
+        bins = self._bins(poses)
+        heaviest = bins == np.argmax(np.bincount(bins, weights))
+        mean = weights[heaviest] @ poses[heaviest] / weights[heaviest].sum()
+        for _ in range(2):
+            off = se2.difference(poses, mean)
+            near = np.hypot(off[:, 0], off[:, 1]) < _FARTHEST_M
+            near &= np.abs(off[:, 2]) < _FARTHEST_RAD
+            held = float(weights[near].sum())
+            if held > 0.0:
+                mean = mean + weights[near] @ off[near] / held
+        off = se2.difference(poses, mean)
+        covariance = (off * weights[:, None]).T @ off
+        mean[2] = se2.wrap(mean[2])
+        self._extras = {
+            "particles": poses,
+            "log_weights": self._log_weights,
+            "ess": effective_sample_size(self._log_weights),
+            "hypothesis_weight": held,
+            "injected": 0,
+        }
+        return Gaussian(mean, (covariance + covariance.T) / 2.0)
+
+
+def amcl_alphas(
+    kr: float, kl: float, track_m: float, distance_m: float, turn_rad: float
+) -> tuple[float, float, float, float]:
+    """AMCL's alpha1 to alpha4 (differential model) that have the variances of kr and kl.
+
+    Slip grows with the distance, Var = k |ds|; AMCL's variances grow with its square, Var =
+    alpha ds^2. So they agree at one length of update only, the one given: a straight of
+    `distance_m` (alpha2, alpha3) and a turn on the spot of `turn_rad` (alpha1, alpha4).
+
+    Parameters
+    ----------
+    distance_m, turn_rad
+        AMCL's `update_min_d` and `update_min_a`.
+
+    Returns
+    -------
+    tuple
+        alpha1 (turn by turn), alpha2 (turn by distance, rad^2/m^2), alpha3 (distance by
+        distance), alpha4 (distance by turn, m^2/rad^2).
+    """
+    both = kr + kl
+    return (
+        both / (2.0 * track_m * turn_rad),
+        both / (2.0 * track_m**2 * distance_m),  # two of AMCL's turns share the variance
+        both / (4.0 * distance_m),
+        both * track_m / (8.0 * turn_rad),
+    )
+
+
+@njit()
+def _move(poses: Array, increment: Array, root: Array, normals: Array) -> None:
+    """Compose poses (M, 3) with the increment (3,) + root (3, 3) normals (M, 3), in place."""
+    for m in range(len(poses)):
+        a, b, c = normals[m, 0], normals[m, 1], normals[m, 2]
+        x = increment[0] + root[0, 0] * a + root[0, 1] * b + root[0, 2] * c
+        y = increment[1] + root[1, 0] * a + root[1, 1] * b + root[1, 2] * c
+        turn = increment[2] + root[2, 0] * a + root[2, 1] * b + root[2, 2] * c
+        cos, sin = math.cos(poses[m, 2]), math.sin(poses[m, 2])
+        poses[m, 0] += cos * x - sin * y
+        poses[m, 1] += sin * x + cos * y
+        heading = poses[m, 2] + turn
+        poses[m, 2] = heading - 2.0 * math.pi * math.ceil((heading - math.pi) / (2.0 * math.pi))

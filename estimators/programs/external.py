@@ -1,0 +1,165 @@
+"""A program of any language as an estimator: one JSON line a message, one line each in answer.
+
+docs/programs.md is the protocol. The program never gets the truth: a message holds what a Frame
+does, and the first what the Prior does.
+"""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import orjson
+
+from estimators.base import Belief, Estimate, Prior
+from estimators.programs.program import (
+    Program,
+    ProgramError,
+    apart,
+    map_message,
+    require_limits,
+    words_of,
+)
+from sim.arrays import Array
+from sim.formats.trajectory import FARTHEST_M, sound_covariances
+from sim.recording import Frame
+from sim.sensors.base import sensor_settings
+
+PROTOCOL = 1
+_STEP_BYTES, _FINISH_BYTES = 1 << 20, 1 << 28  # of an answer
+
+
+class External:
+    """Ask a child process for each belief.
+
+    Parameters
+    ----------
+    command
+        The program and its arguments, a list or a line.
+    start_s, step_s, finish_s
+        Longest time for the answer to `reset`, to a Frame and to `finish`, s.
+    global_or_grid
+        Whether `estima conform` compares it in distribution, when the world is moved.
+    """
+
+    def __init__(
+        self,
+        command: Any,
+        start_s: float = 30.0,
+        step_s: float = 10.0,
+        finish_s: float = 600.0,
+        global_or_grid: bool = False,
+    ) -> None:
+        require_limits(start_s=start_s, step_s=step_s, finish_s=finish_s)
+        self._words = words_of(command)
+        self.start_s, self.step_s, self.finish_s = start_s, step_s, finish_s
+        self.global_or_grid = global_or_grid
+        self.program_seconds = 0.0
+        self._program: Program | None = None
+
+    def reset(self, prior: Prior, rng: np.random.Generator) -> None:
+        """Start the program, and tell it what is known."""
+        message = reset_message(prior, int(rng.integers(2**32)))
+        if self._program is not None:
+            self._program.close()
+        self._program, self._stamps = Program(self._words), list[float]()
+        self._ask(message, self.start_s, "reset")
+
+    def step(self, frame: Frame) -> Belief:
+        """Send the Frame, and take the belief that comes back."""
+        message = {"type": "frame", **vars(frame)}
+        answer = self._ask(message, self.step_s, f"the Frame at {frame.stamp:g} s")
+        self._stamps.append(frame.stamp)
+        mean = self._numbers(answer, "mean", (3,))
+        covariance = np.zeros((3, 3))
+        if answer.get("covariance") is not None:
+            covariance = self._covariances(answer, "covariance", (3, 3))
+        status = answer.get("status")
+        return Belief(mean, covariance, {} if status is None else {"status": str(status)[:300]})
+
+    def finish(self) -> Estimate | None:
+        """Ask for a revised trajectory, which there may be, and let the program end."""
+        answer = self._ask({"type": "finish"}, self.finish_s, "finish", _FINISH_BYTES)
+        found = None
+        if answer.get("means") is not None:
+            n = len(answer["means"]) if isinstance(answer["means"], list) else 0
+            stamps = np.array(self._stamps)
+            if answer.get("stamps") is not None:
+                stamps = self._numbers(answer, "stamps", (n,))
+            covariances = np.zeros((n, 3, 3))
+            if answer.get("covariances") is not None:
+                covariances = self._covariances(answer, "covariances", (n, 3, 3))
+            means = self._numbers(answer, "means", (len(stamps), 3))
+            if not len(stamps) or (np.diff(stamps) <= 0.0).any():
+                raise self._wrong("must answer with stamps that increase, and some")
+            if why := apart(stamps, self._stamps):
+                raise self._wrong(f"must answer with stamps of the Frames; its path {why}")
+            found = Estimate(stamps, means, covariances, "revised")
+        assert self._program is not None
+        self.program_seconds = self._program.close()
+        return found
+
+    def _ask(
+        self, message: Any, limit_s: float, what: str, most_bytes: int = _STEP_BYTES
+    ) -> dict[str, Any]:
+        assert self._program is not None
+        line = orjson.dumps(message, option=orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_APPEND_NEWLINE)
+        try:
+            text = self._program.ask(line, limit_s, most_bytes)
+        except ProgramError as error:
+            raise ProgramError(f"{error} (asked: {what})") from error
+        try:
+            answer = orjson.loads(text)
+        except orjson.JSONDecodeError:
+            answer = None
+        if not isinstance(answer, dict):
+            shown = text[:60].decode(errors="replace")
+            raise self._wrong(f"answered {what} with {shown!r}, which is no JSON object")
+        if answer.get("error") is not None:
+            raise self._wrong(f"answered {what} with the error {str(answer['error'])[:300]}")
+        return answer
+
+    def _numbers(self, answer: dict[str, Any], key: str, shape: tuple[int, ...]) -> Array:
+        """Numbers of an answer, of a shape."""
+        try:
+            found = np.array(answer.get(key))
+        except ValueError:  # ragged
+            found = np.zeros(0, object)
+        if found.dtype.kind not in "if" or found.shape != shape:
+            sizes = " x ".join(map(str, shape))
+            raise self._wrong(
+                f"must answer with {key}, {sizes} numbers; got {answer.get(key)!r:.60}"
+            )
+        numbers = found.astype(np.float64)
+        if np.abs(numbers).max(initial=0.0) > FARTHEST_M:
+            raise self._wrong(f"must answer with {key}, numbers up to {FARTHEST_M:g}")
+        return numbers
+
+    def _covariances(self, answer: dict[str, Any], key: str, shape: tuple[int, ...]) -> Array:
+        found = self._numbers(answer, key, shape)
+        if not sound_covariances(found.reshape(-1, 3, 3)).all():
+            raise self._wrong(
+                f"must answer with {key}, symmetric and without a negative variance; leave out "
+                "what is not known"
+            )
+        return found
+
+    def _wrong(self, what: str) -> ProgramError:
+        assert self._program is not None
+        self._program.close(0.0)
+        return ProgramError(f"{self._program.name} {what}")
+
+
+def reset_message(prior: Prior, seed: int) -> dict[str, Any]:
+    """What a program is told before the first Frame."""
+    first = None
+    if prior.mean is not None and prior.covariance is not None:
+        first = {"mean": prior.mean, "covariance": prior.covariance}
+    return {
+        "type": "reset",
+        "protocol": PROTOCOL,
+        "seed": seed,
+        "robot": dataclasses.asdict(prior.robot),
+        "sensors": {name: sensor_settings(sensor) for name, sensor in prior.sensors.items()},
+        "prior": first,
+        "map": map_message(prior.map),
+    }

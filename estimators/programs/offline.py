@@ -1,0 +1,196 @@
+"""A program that reads a whole log as a file, as an estimator; its trajectory is read back.
+
+The log is made of the Frames and the Prior, so it holds neither the truth nor where it came from.
+"""
+
+import re
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Literal, cast
+
+import numpy as np
+import orjson
+
+from estimators.base import Belief, Estimate, Prior
+from estimators.options import require_choices, require_laser
+from estimators.programs.program import (
+    Program,
+    ProgramError,
+    apart,
+    map_message,
+    require_limits,
+    words_of,
+)
+from sim import se2
+from sim.errors import InputError, require
+from sim.files import write_text
+from sim.formats.carmen import write_carmen
+from sim.formats.rosbag_out import write_bag
+from sim.formats.trajectory import read_track
+from sim.recording import Frame, Recording, WheelLog, joined, save
+from sim.robot.drive import arc_increment
+from sim.worlds.grid import OccupancyGrid, rasterized
+from sim.worlds.grid_file import write_grid
+from sim.worlds.world import World
+
+Output = Literal["tum", "mcap", "bag"]
+Kind = Literal["revised", "online"]
+_PLACES = ("log", "mcap", "npz", "map", "grid", "start", "seed", "out")
+_NEEDED_BY = {"laser": ("log", "grid"), "map": ("map", "grid")}
+_CELL_M = 0.05  # of a world's {grid}
+
+
+class Offline:
+    """Run a command over the whole log when the last Frame is there.
+
+    Until then its beliefs are dead reckoning without a covariance.
+
+    Parameters
+    ----------
+    command
+        The program and its arguments, a list or a line, with {log} (CARMEN), {mcap}, {npz}, {map},
+        {grid}, {start}, {seed} and {out} in place of the files' names.
+    limit_s
+        Longest time that it may take, s.
+    output
+        Format of {out}: `tum`, or with covariances `mcap` or `bag` (nav_msgs/Odometry).
+    kind
+        `revised`, or `online` where each pose of its trajectory saw only its past.
+    global_or_grid
+        Whether `estima conform` compares it in distribution, when the world is moved.
+    """
+
+    answers_at_finish = True
+
+    def __init__(
+        self,
+        command: Any,
+        limit_s: float = 600.0,
+        output: Output = "tum",
+        kind: Kind = "revised",
+        global_or_grid: bool = False,
+    ) -> None:
+        require_choices(output=(output, Output), kind=(kind, Kind))
+        require_limits(limit_s=limit_s)
+        self._words = words_of(command)
+        self._used = re.findall(r"\{(\w+)\}", " ".join(self._words))
+        for name in self._used:
+            require(
+                name in _PLACES,
+                f"estimator.command: nothing is called {{{name}}}; known: "
+                f"{', '.join(f'{{{place}}}' for place in _PLACES)}",
+            )
+        require("out" in self._used, "estimator.command must have {out}, the file it writes")
+        used = set(self._used)
+        self.needs = frozenset(
+            need for need, places in _NEEDED_BY.items() if not used.isdisjoint(places)
+        )
+        self.limit_s, self.output, self.kind = limit_s, output, kind
+        self.global_or_grid = global_or_grid
+        self.program_seconds = 0.0
+
+    def reset(self, prior: Prior, rng: np.random.Generator) -> None:
+        """Keep what is known at the start."""
+        if "laser" in self.needs:
+            self._laser = require_laser(prior, "laser", "estimator.command")
+        require(
+            "map" not in self.needs or isinstance(prior.map, (World, OccupancyGrid)),
+            "estimator.command names {map} or {grid}; set prior.map=world or GRID.yaml",
+        )
+        self._prior, self._seed = prior, int(rng.integers(2**32))
+        self._frames = list[Frame]()
+        self._pose = np.zeros(3) if prior.mean is None else prior.mean.copy()
+
+    def step(self, frame: Frame) -> Belief:
+        """Keep the Frame, and follow the wheels."""
+        self._frames.append(frame)
+        increment = arc_increment(frame.wheel_increments_m, self._prior.robot.track_m)
+        self._pose = se2.compose(self._pose, increment)
+        return Belief(self._pose.copy(), np.zeros((3, 3)))
+
+    def finish(self) -> Estimate:
+        """Write the log, run the command, and read its trajectory."""
+        with tempfile.TemporaryDirectory(prefix="estima-") as name:
+            places = self._written(Path(name))
+            words = [_filled(word, places) for word in self._words]
+            program = Program(words)
+            try:
+                program.wait(self.limit_s)
+            finally:
+                self.program_seconds = program.close()
+            out = Path(places["out"])
+            if not out.exists():
+                raise ProgramError(f"{program.name} ended without writing {{out}}")
+            try:
+                track = read_track(out)
+            except InputError as error:
+                text = str(error).replace(str(out), "{out}")
+                raise ProgramError(f"{program.name} wrote no trajectory: {text}") from error
+        if why := apart(track.stamps, [frame.stamp for frame in self._frames]):
+            raise ProgramError(f"{program.name} wrote no trajectory of this log: {{out}} {why}")
+        return Estimate(track.stamps, track.means, track.covariances, self.kind)
+
+    def _written(self, folder: Path) -> dict[str, str]:
+        """Write the files that the command names; return all names."""
+        recording = recording_of(self._frames, self._prior)
+        files: dict[str, tuple[str, Callable[[Path], object]]] = {
+            "log": ("log.log", lambda path: write_carmen(path, recording)),
+            "mcap": ("log.mcap", lambda path: write_bag(path, recording)),
+            "npz": ("log.npz", lambda path: save(recording, path)),
+            "map": self._map_file(),
+            "grid": ("grid.yaml", lambda path: write_grid(self._grid(), path)),
+            "start": ("start.txt", lambda path: write_text(path, start_text(self._prior))),
+        }
+        places = {"seed": str(self._seed), "out": str(folder / f"out.{self.output}")}
+        for key in set(self._used) & set(files):
+            name, write = files[key]
+            write(folder / name)
+            places[key] = str(folder / name)
+        return places
+
+    def _grid(self) -> OccupancyGrid:
+        """The known map as free, occupied and unknown cells, which every map server reads."""
+        known_map = self._prior.map
+        if isinstance(known_map, World):
+            return rasterized(known_map, _CELL_M, self._laser.mount.z_m)
+        return cast(OccupancyGrid, known_map)
+
+    def _map_file(self) -> tuple[str, Callable[[Path], object]]:
+        known_map = self._prior.map
+        if isinstance(known_map, OccupancyGrid):
+            return "map.yaml", lambda path: write_grid(known_map, path, "raw")
+
+        def write(path: Path) -> None:
+            message = map_message(known_map)
+            text = orjson.dumps(message, option=orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_INDENT_2)
+            write_text(path, text.decode())
+
+        return "map.json", write
+
+
+def _filled(word: str, places: dict[str, str]) -> str:
+    return re.sub(r"\{(\w+)\}", lambda found: places[found[1]], word)
+
+
+def start_text(prior: Prior) -> str:
+    """A line `x y heading` and the three rows of its covariance; empty if it is not known."""
+    if prior.mean is None or prior.covariance is None:
+        return ""
+    rows = [prior.mean, *prior.covariance]
+    return "".join(" ".join(f"{value:.17g}" for value in row) + "\n" for row in rows)
+
+
+def recording_of(frames: Sequence[Frame], prior: Prior) -> Recording:
+    """Recording of what Frames show, with the geometry and the sensors that are believed."""
+    stamps = np.array([frame.stamp for frame in frames])
+    travel_m = np.cumsum([frame.wheel_increments_m for frame in frames], axis=0)
+    logs = {}
+    for name, sensor in prior.sensors.items():
+        seen = [frame for frame in frames if name in frame.readings]
+        if seen:
+            readings = [frame.readings[name] for frame in seen]
+            schema = {key: field for key, field in sensor.schema.items() if key in readings[0]}
+            logs[name] = joined(schema, np.array([f.stamp for f in seen]), readings, name)
+    wheels = WheelLog(stamps, travel_m)
+    return Recording(stamps.copy(), wheels, prior.robot, prior.sensors, logs)

@@ -1,0 +1,1 @@
+"""Localization among the places of a topological map."""

@@ -1,0 +1,1 @@
+"""The command `estima`: a file a family of commands."""

@@ -1,0 +1,5 @@
+"""`python -m experiments.cli` is the command `estima`."""
+
+from experiments.cli.main import main
+
+main()

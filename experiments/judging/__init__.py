@@ -1,0 +1,1 @@
+"""What all studies use: results on disk, parallel jobs, claims and verdicts."""

@@ -1,0 +1,62 @@
+"""Figures of the study of exploration."""
+
+from typing import Any
+
+import pandas as pd
+from matplotlib.figure import Figure
+
+from experiments.judging.results import Results
+from experiments.studies.exploration.claims import NAMES
+from experiments.studies.exploration.settings import AFTER_M, BASE, JUDGED
+from experiments.viewing.plotting import with_legend
+from experiments.viewing.style import BLACK, BLUE, GREEN, ORANGE, PURPLE, RED, WALL, subplots
+from experiments.viewing.team_figure import draw_paths
+
+_STRATEGIES = {
+    "random": (PURPLE, ":"),
+    "nearest_frontier": (BLUE, "--"),
+    "shared_frontiers": (RED, (0, (5, 1, 1, 1, 1, 1))),
+    "information_gain": (GREEN, "-."),
+    "coordinated": (ORANGE, "-"),
+}
+
+
+def draw(made: Results) -> dict[str, Figure]:
+    """Draw every figure, by file name."""
+    return {
+        "exploration_drive": drives(
+            {name: made.arrays(f"drive_{name}") for name in (BASE, JUDGED)}
+        ),
+        "exploration_coverage": by_distance(made.table("coverage")),
+    }
+
+
+def drives(runs: dict[str, dict[str, Any]]) -> Figure:
+    """Paths of the robots in one world, a panel a strategy."""
+    page, panels = subplots(10.0, 5.6, 1, 2)
+    for ax, (strategy, run) in zip(panels, runs.items(), strict=True):
+        draw_paths(ax, run)
+        ax.set_title(f"{NAMES[strategy]}, {AFTER_M:g} m a robot")
+    handles, labels = panels[0].get_legend_handles_labels()
+    page.legend(handles, labels, loc="outside lower center", ncols=4)
+    return page
+
+
+def by_distance(coverage: pd.DataFrame) -> Figure:
+    """Area seen by the distance driven: median and quartiles over worlds."""
+    page, ax = subplots(6.2, 4.4)
+    longest_m = coverage.groupby(["strategy", "seed"])["driven_m"].max().median()
+    for strategy, (colour, line) in _STRATEGIES.items():
+        part = coverage[coverage["strategy"] == strategy]
+        wide = part.pivot_table(index="driven_m", columns="seed", values="area_m2").ffill()
+        wide = wide[wide.index <= longest_m]
+        low, middle, high = (wide.quantile(q, axis=1) for q in (0.25, 0.5, 0.75))
+        ax.plot(middle.index, middle, ls=line, color=colour, lw=1.8, label=NAMES[strategy])
+        ax.fill_between(middle.index, low, high, color=colour, alpha=0.15, lw=0)
+    ax.axvline(AFTER_M, color=BLACK, lw=0.8)
+    ax.fill_between([], [], color=WALL, alpha=0.15, lw=0, label="quartiles of worlds")
+    ax.annotate(f"judged at {AFTER_M:g} m", (AFTER_M, 0.02), (-4, 0), ha="right",
+                xycoords=("data", "axes fraction"), textcoords="offset points",
+                fontsize="small")  # fmt: skip
+    ax.set(xlabel="distance driven a robot, m", ylabel="floor seen by the team, m², median")
+    return with_legend(page, ncols=3)

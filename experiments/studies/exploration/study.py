@@ -1,0 +1,133 @@
+"""The study of GI10: what a team sees of a building by the distance that it drives, by strategy.
+
+In a world all strategies have the same robots, slip streams and starts. What is seen is counted by
+the truth: floor that a beam has crossed, from where the robots were.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from experiments.evaluation.map_quality import landmark_errors
+from experiments.judging.jobs import in_parallel
+from experiments.judging.results import Results
+from experiments.judging.verdict import Profile
+from experiments.runs.experiment import Experiment
+from experiments.runs.row import Row
+from experiments.runs.team import TeamExperiment
+from experiments.studies.exploration import settings
+from sim import se2
+from sim.arrays import Array
+from sim.recording import Recording
+from sim.sensors.laser import Laser
+from sim.team import Team
+from sim.worlds.grid import rasterized
+from sim.worlds.grid_mapping import ScanGrid
+
+_EVERY_S = 1.0  # the area is counted
+_EVERY_M = 0.5  # of the curves that are kept
+
+
+def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) -> None:
+    """Run the study; write its tables, and two drives through one world for the figure.
+
+    Parameters
+    ----------
+    profile
+        `quick`: two worlds.
+    on_progress
+        Called with the share of the work done.
+    """
+    jobs = [
+        (settings.FIRST_SEED + i, strategy)
+        for strategy in settings.STRATEGIES
+        for i in range(settings.WORLDS[profile])
+    ]
+    parts = [*in_parallel(row_of, jobs, on_progress)]
+    out.write_tables(
+        runs=pd.DataFrame([row for row, _ in parts]),
+        coverage=pd.concat([curve for _, curve in parts], ignore_index=True),
+    )
+    for strategy in (settings.BASE, settings.JUDGED):
+        out.write_arrays(f"drive_{strategy}", **paths(composed(settings.FIRST_SEED, strategy)))
+
+
+def row_of(seed: int, strategy: str) -> tuple[Row, pd.DataFrame]:
+    """What one exploration came to, and the area seen by the distance driven.
+
+    The map is that of the paper's method, run over the drive.
+    """
+    experiment = composed(seed, strategy)
+    team = experiment.recording()
+    driven_m, area_m2 = coverage(team, settings.RESOLUTION_M)
+    labels: Row = {"seed": seed, "strategy": strategy}
+    online, revised = experiment.run(team)[0]
+    row: Row = {
+        **labels,
+        "area_m2": float(np.interp(settings.AFTER_M, driven_m, area_m2)),
+        "driven_m": float(driven_m[-1]),
+        "stopped": sum(robot.status != "ok" for robot in team.robots),
+        **landmark_errors(team.robots[0], (revised or online).map),
+    }
+    at = np.arange(0.0, driven_m[-1] + _EVERY_M, _EVERY_M)
+    curve = pd.DataFrame({**labels, "driven_m": at, "area_m2": np.interp(at, driven_m, area_m2)})
+    return row, curve
+
+
+def composed(seed: int, strategy: str) -> TeamExperiment:
+    """The experiment of one strategy in one world."""
+    given = [f"seed={seed}", f"route.strategy={strategy}"]
+    return TeamExperiment(Experiment.compose(["study=exploration", *given]))
+
+
+def coverage(team: Team, resolution_m: float) -> tuple[Array, Array]:
+    """Mean distance (T,) m driven a robot, and floor (T,) m^2 that the team has seen by then.
+
+    Floor is what can be reached from the start, and seen what a beam has crossed, by the truth.
+    """
+    world = team.robots[0].known_world
+    laser = team.robots[0].sensor("laser", Laser)
+    ends, reach_m = world.walls.reshape(-1, 2), laser.max_range_m + 1.0
+    low, high = ends.min(axis=0) - reach_m, ends.max(axis=0) + reach_m
+    grid = ScanGrid.over(low, high, resolution_m)
+    every = np.argwhere(grid.last_scan == 0)
+    reached = rasterized(world, resolution_m, laser.mount.z_m).at(grid.middles_m(every))
+    floor = (reached == 0.0).reshape(grid.last_scan.shape)
+    until_s = max(robot.frame_stamps[-1] for robot in team.robots)
+    stamps = np.arange(0.0, until_s + _EVERY_S, _EVERY_S)
+    area_m2 = []
+    for before, now in zip(stamps - _EVERY_S, stamps, strict=True):
+        for robot in team.robots:
+            log = robot.log("laser")
+            rows = slice(*np.searchsorted(log.stamps, [before + 1e-9, now + 1e-9]))
+            if rows.start < rows.stop:
+                ranges_m = log.values["ranges_m"][rows]
+                ranges_m = np.where(laser.returned(ranges_m), ranges_m, 2.0 * laser.max_range_m)
+                poses = se2.compose(robot.truth_at(log.stamps[rows]), laser.mount.pose)
+                grid.add(poses, ranges_m.astype(np.float32), laser.bearings_rad, laser.max_range_m)
+        area_m2.append(resolution_m**2 * np.count_nonzero(floor & (grid.last_scan > 0)))
+    driven_m = np.mean([_driven_m(robot, stamps) for robot in team.robots], axis=0)
+    return driven_m, np.array(area_m2)
+
+
+def _driven_m(robot: Recording, stamps: Array) -> Array:
+    """True length (T,) m of a robot's path up to each stamp."""
+    truth = robot.known_truth
+    steps_m = np.hypot(*np.diff(truth.poses[:, :2], axis=0).T)
+    return np.asarray(np.interp(stamps, truth.stamps, np.append(0.0, np.cumsum(steps_m))))
+
+
+def paths(experiment: TeamExperiment) -> dict[str, Any]:
+    """True paths of a team up to where its area is judged, and the walls, for the figure."""
+    team = experiment.recording()
+    world = team.robots[0].known_world
+    arrays: dict[str, Any] = {"walls": world.walls, "wall_z_m": world.wall_z_m}
+    for number, robot in enumerate(team.robots):
+        truth = robot.known_truth
+        near = _driven_m(robot, truth.stamps) <= settings.AFTER_M
+        arrays[f"truth_{number}"] = truth.poses[near, :2]
+    return arrays

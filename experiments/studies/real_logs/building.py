@@ -1,0 +1,152 @@
+"""Graph SLAM on the Intel building and Freiburg 079, beside the poses published with the logs.
+
+`python -m experiments.studies.real_logs.building` prints errors of relations beside those of the
+FLIRT poses on the very same relations, each between two scans whose stamps are known and lie within
+0.05 s of it. The FLIRT logs hold no wheels: there the log's SEQUENTIAL edges stand in for them. Its
+poses and its LOOP edges are never input. The log of Intel with wheels has no clock but at the scans
+that it shares with others; the rest of its stamps are guessed, and judge nothing.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from estimators.base import Estimate
+from estimators.graph.graph_slam import GraphSlam
+from estimators.odometry import Odometry
+from experiments.evaluation.relations import relation_errors
+from experiments.evaluation.time_sync import nearest
+from experiments.runs.row import Row
+from experiments.studies.real_logs.logs import intel, intel_known_stamps, tracked
+from experiments.studies.real_logs.settings import DATA, KUEMMERLE, RESOLUTION_M
+from experiments.viewing.map import grid_along
+from sim import se2
+from sim.arrays import Array
+from sim.formats import carmen
+from sim.formats.relations import Relations, read_relations
+from sim.recording import Recording
+from sim.sensors import Laser
+
+_TOLERANCE_S = 0.05
+_ORIGIN = np.zeros(3)
+# Walls are no lines and people walk by: what the scans believe is ten times the laser's noise.
+# Chosen when no line was left out yet.
+_OPTIONS: dict[str, Any] = {
+    "sigma_range_m": 0.1,
+    "most_gap_m": None,
+    "gate_probability": 1e-6,
+    "kr": 1e-3,
+    "kl": 1e-3,
+}
+_WHEELED: dict[str, Any] = {
+    "kr": 3e-3,
+    "kl": 3e-3,
+    "lateral_slip_m": 3e-3,
+}  # of the Intel robot, as for `ekf_icp`
+
+
+def intel_by_edges() -> tuple[carmen.CarmenLog, Recording]:
+    """The Intel log with the FLIRT poses, and a Recording whose wheels are its SEQUENTIAL edges."""
+    log = carmen.read_carmen(DATA / "intel_lab/intel-lab.flirt.log.gz")
+    return log, carmen.to_recording(log)
+
+
+def freiburg_by_edges() -> tuple[carmen.CarmenLog, Recording]:
+    """The same of Freiburg 079."""
+    log = carmen.read_carmen(DATA / "fr079_flirt/fr079.flirt.log.gz")
+    return log, carmen.to_recording(log)
+
+
+def scored(
+    name: str,
+    wheels: str,
+    recording: Recording,
+    graph: carmen.CarmenLog,
+    options: dict[str, Any],
+    known_stamps: Array | None = None,
+    T_base_judged: Array = _ORIGIN,
+) -> tuple[list[Row], Estimate]:
+    """Errors of graph SLAM online and revised, and of the FLIRT poses; the revised estimate.
+
+    Parameters
+    ----------
+    name
+        `intel` or `fr079`.
+    wheels
+        What stands for them.
+    options
+        Of `estimators.graph.graph_slam.GraphSlam`, beside those of all logs.
+    known_stamps
+        Of the scans that may be judged; None for all.
+    T_base_judged
+        (3,) the frame that the relations are of, in base_link.
+    """
+    scans = recording.log("laser").stamps
+    folder = {"intel": "intel_lab", "fr079": "fr079_flirt"}[name]
+    relations = read_relations(DATA / folder / f"{name}.relations.gz")
+    known = scans if known_stamps is None else known_stamps
+    judged = _shared(relations, known, graph.scan_stamps)
+    estimator = GraphSlam(**_OPTIONS | options)
+    online = tracked(estimator, recording)
+    revised = estimator.finish()
+    at_scans = np.searchsorted(online.stamps, scans)
+    paths = {
+        "graph_slam, online": (scans, se2.compose(online.means[at_scans], T_base_judged)),
+        "graph_slam, revised": (scans, se2.compose(revised.means[at_scans], T_base_judged)),
+        "FLIRT poses": (graph.scan_stamps, graph.scan_poses),
+    }
+    rows: list[Row] = []
+    for method, path in paths.items():
+        errors = relation_errors(judged, *path)
+        rows.append({"log": name, "wheels": wheels, "method": method, **errors.summary()})
+    mean_m = KUEMMERLE[name]["graph"][0]
+    rows.append({"log": name, "method": "graph (printed)", "translation_mean_m": mean_m})
+    return rows, revised
+
+
+def _shared(relations: Relations, *stamps: Array) -> Relations:
+    """Relations between two different ones of each of these stamps (T,), s, or near them."""
+    kept = np.ones(len(relations.stamps), dtype=bool)
+    for known in stamps:
+        rows = nearest(known, relations.stamps)
+        near = np.abs(known[rows] - relations.stamps) <= _TOLERANCE_S
+        kept &= near.all(axis=1) & (rows[:, 0] != rows[:, 1])
+    return Relations(relations.stamps[kept], relations.motion[kept])
+
+
+def closed_loops() -> tuple[pd.DataFrame, dict[str, NDArray[Any]]]:
+    """Errors on all logs, and grids of Intel by its edges alone and with its loops closed."""
+    graph, recording = intel_by_edges()
+    rows, after = scored("intel", "SEQUENTIAL edges", recording, graph, {})
+    before = tracked(Odometry(_OPTIONS["kr"], _OPTIONS["kl"]), recording)
+    grids = _grids(recording, before=before, after=after)
+    log, recording = freiburg_by_edges()
+    rows += scored("fr079", "SEQUENTIAL edges", recording, log, {})[0]
+    recording, logged = intel("calibrated"), intel("logged")
+    mounts = [one.sensor("laser", Laser).mount.pose for one in (recording, logged)]
+    T_base_logged = se2.compose(mounts[0], se2.inverse(mounts[1]))  # calibration moved base_link
+    known = intel_known_stamps(recording)
+    rows += scored("intel", "wheels, calibrated", recording, graph, _WHEELED, known, T_base_logged)[
+        0
+    ]
+    return pd.DataFrame(rows), grids
+
+
+def _grids(recording: Recording, **paths: Estimate) -> dict[str, NDArray[Any]]:
+    """Occupancy (rows, columns) along each path in cells of `RESOLUTION_M`, and its origin (3,)."""
+    found: dict[str, NDArray[Any]] = {}
+    for name, path in paths.items():
+        grid, _ = grid_along(
+            recording, path.stamps, path.means, resolution_m=RESOLUTION_M, max_range_m=20.0
+        )
+        found |= {name: grid.probability, f"{name}_origin": grid.origin}
+    return found
+
+
+if __name__ == "__main__":
+    shown = ["log", "wheels", "method", "n_relations", "translation_mean_m", "translation_max_m"]
+    print(closed_loops()[0][shown].to_string(index=False))

@@ -1,0 +1,130 @@
+"""Recordings of the real logs that conf/study/real_logs/*.yaml name."""
+
+import dataclasses
+from typing import Literal
+
+import numpy as np
+
+from estimators.base import Estimate, Estimator, Prior
+from estimators.base import run as run_estimator
+from estimators.laser.icp_odometry import IcpOdometry
+from experiments.calibration.from_log import calibrate_log
+from experiments.calibration.logs import calibrate_wheels
+from experiments.runs.calibration import Calibration
+from experiments.studies.real_logs.settings import CALIBRATED_S, DATA, TUNED_SHARE
+from sim import se2
+from sim.arrays import Array
+from sim.formats import carmen, mrclam, wean
+from sim.formats import intel as intel_lab
+from sim.formats.khepera import WheelLaserLog
+from sim.recording import Recording, WheelLog
+from sim.robot.drive import RobotGeometry
+from sim.sensors import Laser, Mount
+
+
+def intel(version: Literal["sparse", "logged", "calibrated"]) -> Recording:
+    """The Intel Research Lab: 910 scans with a mapper's poses, or the log with all its scans."""
+    folder = DATA / "intel_lab"
+    if version == "sparse":
+        return intel_lab.read_intel(
+            folder / "intel_raw_910.json.gz", folder / "intel_gmapping_910.json.gz"
+        )
+    logged, _ = _thinned_intel()
+    return calibrated_by_scans(logged, tuned_until_s(logged)) if version == "calibrated" else logged
+
+
+def intel_known_stamps(recording: Recording) -> Array:
+    """Stamps (N,) s of those scans of the log with all its scans whose stamps are not guessed."""
+    stamps: Array = recording.log("laser").stamps[_thinned_intel()[1].astype(np.int64)]
+    return stamps
+
+
+def _thinned_intel() -> tuple[Recording, Array]:
+    folder = DATA / "intel_lab"
+    return intel_lab.read_thinned_intel(
+        folder / "intel_mrpt_scans_converted.txt.gz",
+        folder / "intel_mrpt_ODO.txt.gz",
+        folder / "intel_mrpt_reference_matches.csv.gz",
+    )
+
+
+def freiburg() -> Recording:
+    """Freiburg 079; its wheels are the edges of a graph that others optimised."""
+    return carmen.to_recording(carmen.read_carmen(DATA / "fr079_flirt" / "fr079.flirt.log.gz"))
+
+
+def landmarks(robot: int, calibrated: bool, identifies: bool) -> Recording:
+    """One robot of MRCLAM 6, with ranges and bearings to landmarks."""
+    logged = mrclam.read_mrclam(DATA / "mrclam6" / "MRCLAM_Dataset6.tar.xz", robot, identifies)
+    return calibrated_by_truth(logged) if calibrated else logged
+
+
+def wean_hall(number: int) -> Recording:
+    """Log 1 or 2 of Wean Hall."""
+    return wean.read_wean(DATA / "wean_hall_mcl" / f"robotdata{number}.log.gz")
+
+
+def tracked(
+    estimator: Estimator, recording: Recording, seed: int = 0, start: Array | None = None
+) -> Estimate:
+    """Estimate from a start pose (3,) known to 1 mm and 1 mrad; the origin by default."""
+    mean, covariance = np.zeros(3) if start is None else start, np.diag([1e-6, 1e-6, 1e-6])
+    prior = Prior(recording.robot, recording.sensors, mean, covariance)
+    rng = np.random.default_rng(seed)
+    return run_estimator(estimator, recording, prior, rng, keep=("registration_status",))
+
+
+def tuned_until_s(logged: Recording) -> float:
+    """End of the part of the Intel log that options were chosen on, s."""
+    return float(np.quantile(logged.log("laser").stamps, TUNED_SHARE))
+
+
+def calibrated_by_scans(recording: Recording, until_s: float) -> Recording:
+    """The recording with wheels, track and laser calibrated by scan matching before `until_s`.
+
+    The wheels of a log of poses are rebuilt with nominal sizes, so the calibration corrects those.
+    """
+    matcher = IcpOdometry(kr=3e-3, kl=3e-3, sigma_range_m=0.03, reference="previous")
+    estimate = tracked(matcher, recording)
+    stamps, wheels = recording.log("laser").stamps, recording.wheels
+    rows = np.searchsorted(estimate.stamps, stamps)
+    poses, travel = estimate.means[rows], _wheels_at(wheels, stamps)
+    status = np.array([str(estimate.extras["registration_status"][i]) for i in rows])
+    trusted = (status[1:] == "ok") & (stamps[1:] < until_s)
+    log = WheelLaserLog(
+        np.diff(stamps)[trusted],
+        2.0 * np.diff(travel, axis=0)[trusted],
+        se2.between(poses[:-1], poses[1:])[trusted],
+    )
+    right, left, axle_m, x, y, yaw = calibrate_wheels(log, 1.0, recording.robot.track_m).values
+    laser = recording.sensor("laser", Laser)
+    mount = Mount(x, y, laser.mount.z_m, laser.mount.yaw_rad + yaw)
+    return dataclasses.replace(
+        recording,
+        wheels=WheelLog(wheels.stamps.copy(), wheels.position_m * np.array([right, left])),
+        robot=RobotGeometry(recording.robot.wheel_radius_m, axle_m),
+        sensors={**recording.sensors, "laser": dataclasses.replace(laser, mount=mount)},
+    )
+
+
+def calibrated_by_truth(recording: Recording) -> Recording:
+    """The recording with `calibration_by_truth` applied."""
+    return calibration_by_truth(recording).applied(recording)
+
+
+def calibration_by_truth(recording: Recording) -> Calibration:
+    """Calibration on the first `CALIBRATED_S`, with the noise that the log believes.
+
+    What is believed of the noise was chosen on the robots that do not judge.
+    """
+    found = calibrate_log(recording, CALIBRATED_S).calibration
+    sensors = {
+        name: dataclasses.replace(belief, sigma_column_px=None, sigma_disparity_px=None)
+        for name, belief in found.sensors.items()
+    }
+    return dataclasses.replace(found, sensors=sensors)
+
+
+def _wheels_at(wheels: WheelLog, stamps: Array) -> Array:
+    """Wheel positions (N, 2) interpolated at stamps (N,), m."""
+    return np.stack([np.interp(stamps, wheels.stamps, p) for p in wheels.position_m.T], axis=1)

@@ -1,0 +1,90 @@
+"""Figures of the study of teams."""
+
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from experiments.evaluation.statistics import log_ratio_interval
+from experiments.judging.results import Results
+from experiments.studies.teams.claims import NAMES
+from experiments.studies.teams.settings import ALWAYS
+from experiments.viewing.plotting import plain_log, with_legend
+from experiments.viewing.style import BLACK, BLUE, PURPLE, SKY, WALL, subplots
+from experiments.viewing.team_figure import draw_paths, draw_sightings
+
+_FILTERS = {"fastslam": (BLUE, "s"), "ekf_slam": (BLACK, "o"), "smoother": (PURPLE, "^")}
+
+
+def draw(made: Results) -> dict[str, Figure]:
+    """Draw every figure, by file name."""
+    errors = made.table("errors")
+    return {
+        "teams_drive": drive(made.arrays("drive")),
+        "teams_errors": by_size(errors),
+        "teams_links": by_link(errors),
+    }
+
+
+def drive(run: dict[str, Any]) -> Figure:
+    """Paths of the robots in one world, and lines from who sees to who is seen."""
+    page, ax = subplots(6.2, 6.0)
+    draw_paths(ax, run)
+    for number in range(sum(name.startswith("truth_") for name in run)):
+        draw_sightings(ax, run[f"sightings_{number}"].reshape(-1, 2, 2), number)
+    ax.plot([], [], color=WALL, lw=0.5, label="sighting (colour: who sees)")
+    return with_legend(page, ncols=4)
+
+
+def by_size(errors: pd.DataFrame) -> Figure:
+    """Error by the number of robots with and without sightings; and the ratio of the two."""
+    page, (left, right) = subplots(11.0, 4.6, 1, 2)
+    linked = errors[errors["link"] == ALWAYS]
+    for k, (name, part) in enumerate(linked.groupby("filter", sort=False)):
+        colour, marker = _FILTERS[name]
+        wide = part.pivot_table(index=["size", "seed"], columns="sightings", values="ate_rmse_m")
+        medians = wide.groupby("size").median()
+        for seen, line, words in (
+            (False, "--", "without sightings"),
+            (True, "-", "with sightings"),
+        ):
+            label = f"{NAMES[name]}, {words}"
+            _line(left, medians.index, medians[seen], label, colour, marker, line)
+        ratios = {size: log_ratio_interval(w[True], w[False]) for size, w in wide.groupby("size")}
+        found = np.array([[r.value, r.low, r.high] for r in ratios.values()]).T
+        at = np.array(list(ratios)) + 0.06 * (k - 1)
+        right.plot(at, found[0], marker, color=colour, ms=6)
+        right.vlines(at, found[1], found[2], color=colour, lw=1.4)
+    right.axhline(1.0, color=WALL, lw=0.8)
+    left.set(ylabel="median RMS position error of the team, m", yscale="log")
+    right.set(ylabel="error with sightings over without, 95 % interval", yscale="log")
+    for ax in (left, right):
+        ax.set_xlabel("robots in the team")
+        ax.set_xticks(sorted(errors["size"].unique()))
+        plain_log(ax.yaxis)
+    return with_legend(page, ncols=3)
+
+
+def by_link(errors: pd.DataFrame) -> Figure:
+    """Error of EKF-SLAM with sightings by the kind of communication, a dot a world."""
+    own = errors[(errors["filter"] == "ekf_slam") & errors["sightings"]]
+    size = own.loc[own["link"] != ALWAYS, "size"].iloc[0]
+    own = own[own["size"] == size]
+    page, ax = subplots(6.2, 3.8)
+    for at, (link, part) in enumerate(own.groupby("link", sort=False)):
+        values = part["ate_rmse_m"].to_numpy()
+        ax.plot(np.full(len(values), at), values, ".", color=SKY, ms=6)
+        ax.plot(at, np.median(values), "_", color=BLACK, ms=24, mew=2.0)
+        ax.annotate(str(link), (at, 0.0), (0, -8), ha="center", va="top",
+                    xycoords=("data", "axes fraction"), textcoords="offset points")  # fmt: skip
+    ax.set(ylabel=f"RMS position error of {size} robots, m", yscale="log", xlim=(-0.5, at + 0.5))
+    ax.set_xticks([])
+    ax.set_xlabel("communication (dot: a world; bar: median)", labelpad=20)
+    plain_log(ax.yaxis)
+    return page
+
+
+def _line(ax: Axes, x: Any, y: Any, label: str, colour: str, marker: str, line: str) -> None:
+    ax.plot(x, y, line, marker=marker, color=colour, ms=4.5, lw=1.4, label=label)

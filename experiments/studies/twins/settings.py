@@ -1,0 +1,37 @@
+"""Constants of the study of twins; the estimators' configuration is in conf/study/twins/*.yaml."""
+
+from experiments.judging.verdict import Profile
+from experiments.studies.real_logs.settings import DATA
+
+MRCLAM = DATA / "mrclam6" / "MRCLAM_Dataset6.tar.xz"
+LOGS = {  # name: files, and the number of the robot in them
+    **{f"MRCLAM 6, robot {robot}": ((MRCLAM,), robot) for robot in range(1, 6)},
+    "fr079": ((DATA / "fr079_flirt" / "fr079.flirt.log.gz",), 1),
+    "Intel": (
+        tuple(DATA / "intel_lab" / f"intel_{part}_910.json.gz" for part in ("raw", "gmapping")),
+        1,
+    ),
+}
+SHOWN = ("MRCLAM 6, robot 1", "MRCLAM 6, robot 2")  # the twin was built on them; others judge
+LANDMARKS, SCANS = "landmarks", "scans"  # kinds of logs
+METHODS = {  # of conf/study/twins/KIND.yaml, in its order
+    LANDMARKS: (
+        "dead reckoning",
+        "EKF-SLAM",
+        "EKF-SLAM, invariant",
+        "FastSLAM",
+        "fixed lag",
+    ),
+    SCANS: (
+        "dead reckoning",
+        "ICP from the wheels",
+        "ICP from the wheels, scan to scan",
+        "ICP alone",
+        "EKF of wheels and ICP",
+    ),
+}
+DEAD_RECKONING = "dead reckoning"
+FIRST_SEED = 1000
+RUNS = {Profile.QUICK: 4, Profile.FULL: 50}
+LEAST_SHARE = 17.0 / 20.0  # of the pairs of log and estimator
+WIDEST, WIDEST_RECKONING = 4.0, 12.0  # ends of an interval, as a ratio

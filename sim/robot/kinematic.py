@@ -1,0 +1,191 @@
+"""The robot with ideal rolling: the same slip law as the Bullet robot, without the engine."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sim.arrays import Array
+from sim.compiled import njit
+from sim.errors import require
+from sim.robot.drive import SLIP_TIME_CONSTANT_S, SMALL_ANGLE_RAD, DifferentialDrive
+from sim.routes.route import TICK_S, OpenLoop
+
+_BLOCK_NORMALS = 2_000_000  # drawn at once, 16 MB; the bits do not depend on it
+
+
+class KinematicBody:
+    """A robot whose wheels roll exactly as driven; the body moves along exact arcs.
+
+    Parameters
+    ----------
+    robot
+        Its track is all that matters here.
+    pose
+        (3,) m, m, rad: base_link at the start.
+    dt_s
+        Length of a tick, s.
+    """
+
+    def __init__(self, robot: DifferentialDrive, pose: ArrayLike, dt_s: float = TICK_S) -> None:
+        self._track_m, self._dt_s = robot.track_m, dt_s
+        self._x, self._y, self._heading = np.array(pose, dtype=np.float64).tolist()
+
+    def step(self, right_mps: float, left_mps: float) -> tuple[float, float]:
+        """Advance one tick at ground speeds of the wheels; return their rolling, m."""
+        right, left = right_mps * self._dt_s, left_mps * self._dt_s
+        x, y, turn = _arc(right, left, self._track_m)
+        cos, sin = math.cos(self._heading), math.sin(self._heading)
+        self._x += cos * x - sin * y
+        self._y += sin * x + cos * y
+        self._heading += turn
+        return right, left
+
+    @property
+    def pose(self) -> Array:
+        """(3,) m, m, rad: base_link in map; the heading is not wrapped."""
+        return np.array([self._x, self._y, self._heading])
+
+
+def _arc(right_m: float, left_m: float, track_m: float) -> tuple[float, float, float]:
+    """`robot.arc_increment` in floats: one robot's tick is too small for NumPy's calls."""
+    turn = (right_m - left_m) / track_m
+    half = turn / 2.0
+    small = abs(half) < SMALL_ANGLE_RAD
+    chord = (right_m + left_m) / 2.0
+    chord *= 1.0 - half**2 / 6.0 if small else math.sin(half) / half
+    return chord * math.cos(half), chord * math.sin(half), turn
+
+
+@dataclass(frozen=True)
+class BatchRuns:
+    """Many runs of one route, sampled at common stamps; row 0 is the start, the last the end.
+
+    Attributes
+    ----------
+    stamps
+        (T,) s.
+    poses
+        (n, T, 3) true poses, m, m, rad; headings unwrapped.
+    encoder_m
+        (n, T, 2) encoder positions, right and left, accumulated metres.
+    ground_m
+        (n, T, 2) rolling of the wheels on the ground, accumulated metres.
+    """
+
+    stamps: Array
+    poses: Array
+    encoder_m: Array
+    ground_m: Array
+
+    @property
+    def end_poses(self) -> Array:
+        """(n, 3) true poses at the end; headings unwrapped."""
+        return self.poses[:, -1]
+
+
+def run_batch(
+    robot: DifferentialDrive,
+    route: OpenLoop,
+    n_runs: int,
+    rng: np.random.Generator,
+    *,
+    start: ArrayLike = (0.0, 0.0, 0.0),
+    sample_s: float = 0.05,
+) -> BatchRuns:
+    """Drive a route many times with independent slip, at 300 ticks a second.
+
+    Parameters
+    ----------
+    robot
+        The true robot. Its unmodelled and forward slip must be off.
+    start
+        (3,) common start pose.
+    sample_s
+        Time between samples, a multiple of the tick; the end is sampled in any case.
+
+    Raises
+    ------
+    InputError
+        If unmodelled or forward slip is asked for, which only the simulator offers.
+    """
+    require(
+        robot.unmodelled_slip == 0.0 and robot.forward_slip_m == 0.0,
+        "batches know the kr/kl law only; set robot.unmodelled_slip=0 and robot.forward_slip_m=0",
+    )
+    require(n_runs >= 1, f"n_runs must be at least 1, got {n_runs}")
+    commands_m = wheel_commands(robot, route)
+    n_ticks = len(commands_m)
+    every = max(1, round(sample_s / TICK_S))
+    sampled = np.append(np.arange(0, n_ticks, every), n_ticks)
+    poses = np.empty((n_runs, len(sampled), 3))
+    encoder_m, ground_m = np.empty((2, n_runs, len(sampled), 2))
+    block = max(1, _BLOCK_NORMALS // (2 * n_ticks))
+    for first in range(0, n_runs, block):
+        rows = slice(first, min(first + block, n_runs))
+        _roll(
+            commands_m,
+            rng.standard_normal((rows.stop - rows.start, n_ticks, 2)),
+            robot.slip_variance_per_m,
+            robot.slip_bias,
+            TICK_S / SLIP_TIME_CONSTANT_S,
+            robot.track_m,
+            every,
+            np.array(start, dtype=np.float64),
+            poses[rows],
+            encoder_m[rows],
+            ground_m[rows],
+        )
+    return BatchRuns(sampled * TICK_S, poses, robot.encoder_reading(encoder_m), ground_m)
+
+
+def wheel_commands(robot: DifferentialDrive, route: OpenLoop) -> Array:
+    """Commanded ground travel (N, 2) of the wheels, right and left, tick by tick, m."""
+    return robot.wheel_speeds(*route.profile(robot).T) * TICK_S
+
+
+@njit()
+def _roll(
+    commands_m: Array,
+    normals: Array,
+    variance_per_m: Array,
+    bias: Array,
+    lag_share: float,
+    track_m: float,
+    every: int,
+    start: Array,
+    poses: Array,
+    encoder_m: Array,
+    ground_m: Array,
+) -> None:
+    """The loop of `robot.Slip` and `KinematicBody` over all runs; samples into the last three."""
+    n_ticks = len(commands_m)
+    for run in range(len(normals)):
+        x, y, heading = start
+        lag, encoder, ground = np.zeros(2), np.zeros(2), np.zeros(2)
+        rolling = np.empty(2)
+        poses[run, 0] = start
+        encoder_m[run, 0] = 0.0
+        ground_m[run, 0] = 0.0
+        row = 1
+        for tick in range(n_ticks):
+            for i in range(2):
+                rolling[i] = commands_m[tick, i] - lag[i]
+                error = bias[i] * rolling[i]
+                error += np.sqrt(variance_per_m[i] * abs(rolling[i])) * normals[run, tick, i]
+                lag[i] += lag_share * (error - lag[i])
+                encoder[i] += rolling[i] + error
+                ground[i] += rolling[i]
+            half = (rolling[0] - rolling[1]) / track_m / 2.0
+            # a tick turns by milliradians, where this series is exact to the last bit
+            chord = (rolling[0] + rolling[1]) / 2.0 * (1.0 - half**2 / 6.0 + half**4 / 120.0)
+            x += chord * np.cos(heading + half)
+            y += chord * np.sin(heading + half)
+            heading += 2.0 * half
+            if (tick + 1) % every == 0 or tick + 1 == n_ticks:
+                poses[run, row, 0], poses[run, row, 1], poses[run, row, 2] = x, y, heading
+                for i in range(2):
+                    encoder_m[run, row, i] = encoder[i]
+                    ground_m[run, row, i] = ground[i]
+                row += 1

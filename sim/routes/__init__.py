@@ -1,0 +1,1 @@
+"""Routes: what the robot is commanded, and by which pose it steers."""

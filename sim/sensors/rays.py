@@ -1,0 +1,123 @@
+"""Rays in a world: by the exact caster, or by the physics engine; the geometry is the same."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.arrays import Array
+from sim.robot.drive import DifferentialDrive
+from sim.se2 import transform
+from sim.sensors.base import Rays
+from sim.worlds.world import World
+
+_SURFACE_M = 0.005  # a landmark this near the face that a ray hits is seen
+
+
+class ExactRays:
+    """The caster of `sim.sensors.casting`, imported only where it is used: it needs a compiler."""
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+        self._casters: dict[Any, Any] = {}
+
+    def scan(self, scanner: Any, pose: Array) -> Array:
+        """Ranges (beams,) m of a scanner on the robot at a pose (3,); inf without a return."""
+        if scanner not in self._casters:
+            from sim.sensors.casting import SegmentCaster
+
+            self._casters[scanner] = SegmentCaster(self._world, scanner)
+        return np.asarray(self._casters[scanner].cast(scanner.mount.in_map(pose)))
+
+    def cloud(self, lidar: Any, pose: Array) -> Array:
+        """Ranges (rings, azimuths) m of a lidar on the robot at a pose (3,)."""
+        from sim.sensors.casting import cast_lidar
+
+        return cast_lidar(self._world, lidar, lidar.mount.in_map(pose))
+
+    def sees(self, origin: Array, points: Array) -> NDArray[np.bool_]:
+        """Whether nothing stands between a point (3,) and each of others (K, 3)."""
+        from sim.sensors.casting import visible
+
+        return visible(self._world, origin, points)
+
+
+class AmongRobots:
+    """Rays in a world in which other robots stand, each a box of the size of its body.
+
+    Parameters
+    ----------
+    rays
+        Those of the world alone.
+    others
+        Gives the other robots and their poses (3,) as they are now.
+    """
+
+    def __init__(
+        self, rays: Rays, others: Callable[[], list[tuple[DifferentialDrive, Array]]]
+    ) -> None:
+        self._rays, self._others = rays, others
+
+    def _boxes(self) -> ExactRays:
+        others = self._others()
+        faces = np.concatenate([np.zeros((0, 4)), *(_faces(*other) for other in others)])
+        heights_m = np.repeat([robot.body_height_m for robot, _ in others], 4)
+        return ExactRays(World("robots", faces, np.stack([0.0 * heights_m, heights_m], axis=1)))
+
+    def scan(self, scanner: Any, pose: Array) -> Array:
+        """Ranges (beams,) m of a scanner on the robot at a pose (3,); inf without a return."""
+        return np.minimum(self._rays.scan(scanner, pose), self._boxes().scan(scanner, pose))
+
+    def cloud(self, lidar: Any, pose: Array) -> Array:
+        """Ranges (rings, azimuths) m of a lidar on the robot at a pose (3,)."""
+        return np.minimum(self._rays.cloud(lidar, pose), self._boxes().cloud(lidar, pose))
+
+    def sees(self, origin: Array, points: Array) -> NDArray[np.bool_]:
+        """Whether nothing stands between a point (3,) and each of others (K, 3)."""
+        return self._rays.sees(origin, points) & self._boxes().sees(origin, points)
+
+
+def _faces(robot: DifferentialDrive, pose: Array) -> Array:
+    """Sides (4, 4) of a robot's body, seen from above, m in map."""
+    x, y = robot.body_length_m / 2, robot.body_width_m / 2
+    corners = transform(pose, np.array([[x, y], [-x, y], [-x, -y], [x, -y]]))
+    return np.hstack([corners, np.roll(corners, -1, axis=0)])
+
+
+class BulletRays:
+    """The physics engine's rays."""
+
+    def __init__(self, bullet: Any) -> None:
+        self._bullet = bullet
+
+    def scan(self, scanner: Any, pose: Array) -> Array:
+        """Ranges (beams,) m of a scanner on the robot at a pose (3,); inf without a return."""
+        planar = scanner.mount.in_map(pose)
+        angles = planar[2] + scanner.bearings_rad
+        starts = np.tile([planar[0], planar[1], scanner.mount.z_m], (len(angles), 1))
+        way = np.stack([np.cos(angles), np.sin(angles), np.zeros_like(angles)], axis=-1)
+        return self._ranges(starts, way, scanner.max_range_m, ground=False)
+
+    def cloud(self, lidar: Any, pose: Array) -> Array:
+        """Ranges (rings, azimuths) m of a lidar on the robot at a pose (3,)."""
+        planar = lidar.mount.in_map(pose)
+        elevation = np.repeat(lidar.elevations_rad, lidar.n_azimuths)
+        azimuth = np.tile(planar[2] + lidar.azimuths_rad, lidar.n_rings)
+        flat = np.cos(elevation)
+        way = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=-1)
+        starts = np.tile([planar[0], planar[1], lidar.mount.z_m], (len(way), 1))
+        ranges = self._ranges(starts, way, lidar.max_range_m, ground=True)
+        return ranges.reshape(lidar.n_rings, lidar.n_azimuths)
+
+    def sees(self, origin: Array, points: Array) -> NDArray[np.bool_]:
+        """Whether nothing stands between a point (3,) and each of others (K, 3)."""
+        if len(points) == 0:
+            return np.zeros(0, bool)
+        distance = np.linalg.norm(points - origin, axis=1)
+        share = self._bullet.cast(np.broadcast_to(origin, points.shape), points)
+        return np.asarray(share * distance >= distance - _SURFACE_M)
+
+    def _ranges(self, starts: Array, way: Array, reach_m: float, *, ground: bool) -> Array:
+        share = self._bullet.cast(starts, starts + reach_m * way, ground=ground)
+        return np.where(share < 1.0, share * reach_m, np.inf)

@@ -1,0 +1,1 @@
+"""Worlds: buildings, floor plans, grids, and their files."""

@@ -1,0 +1,533 @@
+"""Worlds from a few parameters and a random stream.
+
+Each builder is a function `name(*, rng, ...) -> World`; its parameters' defaults are in
+conf/world/<name>.yaml and nowhere else.
+"""
+
+import math
+from collections.abc import Callable
+from itertools import pairwise, product
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from sim.arrays import Array
+from sim.errors import InputError, require, required
+from sim.worlds.floor_plan import WALL_HEIGHT_M, Plan, box_corners, rectangle_corners
+from sim.worlds.grid_file import read_grid
+from sim.worlds.world import World, facing_second
+from sim.worlds.world_file import check_tour, read_world
+
+_MOST_GRID_WALLS = 200_000
+
+
+def empty(*, rng: np.random.Generator, tour_m: float) -> World:
+    """Open floor without a wall; the tour is a square of side `tour_m`."""
+    plan = Plan(tour=[(0, 0), (tour_m, 0), (tour_m, tour_m), (0, tour_m), (0, 0)])
+    return plan.world("empty", rng)
+
+
+def from_file(*, rng: np.random.Generator, path: str) -> World:
+    """Read a user's world; see `sim.worlds.world_file` for the format. Nothing in it is random."""
+    del rng
+    return read_world(Path(path))
+
+
+def from_grid(*, rng: np.random.Generator, path: str | None, waypoints: list[list[float]]) -> World:
+    """Draw a world from an occupancy grid: a wall along each border of its occupied cells.
+
+    Parameters
+    ----------
+    path
+        The grid's YAML file; see `sim.worlds.grid_file`.
+    waypoints
+        [[x, y], ...] m: the tour. A grid has none of its own, so the route needs way-points if
+        these are fewer than two.
+    """
+    del rng
+    path = required(path, "world.path must name a grid's .yaml, such as one `estima map` wrote")
+    walls = read_grid(path).walls()
+    require(
+        len(walls) <= _MOST_GRID_WALLS,
+        f"{path}: {len(walls)} walls, and {_MOST_GRID_WALLS} are the most; clean the grid, or "
+        "make its cells larger",
+    )
+    try:
+        tour = np.array(waypoints, float).reshape(-1, 2)
+    except (TypeError, ValueError):
+        raise InputError(f"world.waypoints must be points [x, y], m, got {waypoints!r}") from None
+    check_tour(tour, walls, Path(path))
+    return World(
+        name=Path(path).stem,
+        walls=walls,
+        wall_z_m=np.tile([0.0, WALL_HEIGHT_M], (len(walls), 1)),
+        start_pose=facing_second(tour) if len(tour) >= 2 else np.zeros(3),
+        waypoints=tour,
+    )
+
+
+def room(
+    *,
+    rng: np.random.Generator,
+    length_m: float,
+    width_m: float,
+    n_objects: int,
+    n_landmarks: int,
+    look_alike_share: float,
+) -> World:
+    """Build one furnished room; the tour goes round it, 1.2 m off the walls."""
+    _positive(length_m=length_m - 3.0, width_m=width_m - 3.0)
+    plan = Plan()
+    plan.rectangle((0, 0), (length_m, width_m))
+    plan.place("room", 0, 0, length_m, width_m)
+    a, b = 1.2, (length_m - 1.2, width_m - 1.2)
+    plan.tour = [(a, a), (b[0], a), (b[0], b[1]), (a, b[1]), (a, a)]
+    plan.furnish(rng, (0, 0), (length_m, width_m), n_objects, size_m=(0.3, 1.0), clearance_m=0.45)
+    return plan.world("room", rng, n_landmarks=n_landmarks, look_alike_share=look_alike_share)
+
+
+def boxes(
+    *,
+    rng: np.random.Generator,
+    n_boxes: int,
+    side_m: float,
+    n_landmarks: int,
+    look_alike_share: float,
+) -> World:
+    """Scatter boxes in a square hall; the tour runs along its walls."""
+    _positive(side_m=side_m - 3.0)
+    plan = Plan()
+    plan.rectangle((0, 0), (side_m, side_m))
+    a, b = 1.2, side_m - 1.2
+    plan.tour = [(a, a), (b, a), (b, b), (a, b), (a, a)]
+    plan.furnish(rng, (0, 0), (side_m, side_m), n_boxes, clearance_m=0.5)
+    return plan.world("boxes", rng, n_landmarks=n_landmarks, look_alike_share=look_alike_share)
+
+
+def rooms(
+    *,
+    rng: np.random.Generator,
+    n_x: int,
+    n_y: int,
+    room_m: float,
+    door_m: float,
+    objects_per_room: int,
+    n_landmarks: int,
+    on_walls_share: float,
+    look_alike_share: float,
+) -> World:
+    """Build n_x by n_y square rooms with a door between all neighbours.
+
+    The tour goes from room to room: round the outer ring, then, where there is one, round the
+    ring inside it, and back.
+    """
+    require(
+        n_x >= 1 and n_y >= 1 and n_x * n_y >= 2,
+        f"world.n_x and n_y must make at least two rooms, got {n_x} x {n_y}",
+    )
+    _positive(room_m=room_m - 2.0, door_m=door_m - 0.7, wall=room_m - door_m)
+    plan = Plan()
+    plan.rectangle((0, 0), (n_x * room_m, n_y * room_m))
+    door = [(room_m / 2, door_m)]
+    corners = [(i * room_m, j * room_m) for i in range(n_x) for j in range(n_y)]
+    for x, y in corners:
+        plan.place("room", x, y, x + room_m, y + room_m)
+        if x < (n_x - 1) * room_m:
+            plan.wall((x + room_m, y), (x + room_m, y + room_m), gaps=door)
+            plan.door((x + room_m, y + room_m / 2), (1, 0))
+        if y < (n_y - 1) * room_m:
+            plan.wall((x, y + room_m), (x + room_m, y + room_m), gaps=door)
+            plan.door((x + room_m / 2, y + room_m), (0, 1))
+    plan.tour = [((i + 0.5) * room_m, (j + 0.5) * room_m) for i, j in _grid_tour(n_x, n_y)]
+    for low in corners:
+        plan.furnish(rng, low, np.add(low, room_m).tolist(), objects_per_room)
+    return plan.world(
+        "rooms",
+        rng,
+        n_landmarks=n_landmarks,
+        on_walls_share=on_walls_share,
+        look_alike_share=look_alike_share,
+    )
+
+
+def corridor(
+    *,
+    rng: np.random.Generator,
+    bare_m: float,
+    objects_m: float,
+    bare_after_m: float,
+    second_leg_m: float,
+    curve_radius_m: float,
+    third_leg_m: float,
+    width_m: float,
+    n_objects: int,
+    n_landmarks: int,
+    look_alike_share: float,
+) -> World:
+    """Build a bare stretch, objects, a bare stretch, a sharp bend, a leg, a round curve, a leg.
+
+    Both turn left. The place `corridor_bare` stops 3 m short of the end wall and of the objects,
+    and so do `leg_1` to `leg_3`, the bare stretches before, between and after the bends, where they
+    are longer than that; the radius is that of the middle of the corridor.
+    """
+    _positive(
+        bare_m=bare_m - 6.0,
+        objects_m=objects_m,
+        second_leg_m=second_leg_m,
+        third_leg_m=third_leg_m - 1.0,
+        width_m=width_m - 1.8,
+        curve_radius_m=curve_radius_m - width_m / 2 - 0.2,
+    )
+    plan, w, r = Plan(), width_m, curve_radius_m
+    x1, x2 = bare_m, bare_m + objects_m + bare_after_m
+    end, top, xc = x1 + objects_m, w + second_leg_m, x2 + w / 2
+    far = xc - r - third_leg_m
+    angle = np.linspace(0.0, math.pi / 2, 13)
+    arc = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    centre = np.array([xc - r, top])
+    outer, inner = centre + (r + w / 2) * arc, centre + (r - w / 2) * arc[::-1]
+    ends = [(far, top + r + w / 2), (far, top + r - w / 2)]
+    plan.enclosure([(0, 0), (x2 + w, 0), *outer, *ends, *inner, (x2, w), (0, w)])
+    plan.place("corridor_bare", 3.0, 0, x1 - 3.0, w)
+    plan.place("corridor_objects", x1, 0, end, w)
+    plan.place("corner", x2, 0, x2 + w, w)
+    legs = (
+        (bare_after_m, (end + 3.0, 0, x2 - 3.0, w)),
+        (second_leg_m, (x2, w + 3.0, x2 + w, top - 3.0)),
+        (third_leg_m, (far + 3.0, top + r - w / 2, xc - r - 3.0, top + r + w / 2)),
+    )
+    for number, (length, area) in enumerate(legs, 1):
+        if length > 6.0:
+            plan.place(f"leg_{number}", *area)
+    plan.place("curve", xc - r, top, x2 + w, top + r + w / 2)
+    middle = [(float(x), float(y)) for x, y in centre + r * arc]
+    plan.tour = [(1.0, w / 2), (xc, w / 2), *middle, (far + 1.0, top + r)]
+    _line_up(plan, rng, (x1, 0), (end, w), n_objects)
+    return plan.world("corridor", rng, n_landmarks=n_landmarks, look_alike_share=look_alike_share)
+
+
+def corridors(*, rng: np.random.Generator, n_objects: list[int], **lengths_m: list[float]) -> World:
+    """Build a corridor whose sizes are drawn, each between the two ends given."""
+    drawn = {name: rng.uniform(ends[0], ends[1]) for name, ends in lengths_m.items()}
+    count = int(rng.integers(n_objects[0], n_objects[1] + 1))
+    return corridor(rng=rng, n_objects=count, n_landmarks=0, look_alike_share=0.0, **drawn)
+
+
+def office(
+    *,
+    rng: np.random.Generator,
+    corridor_m: float,
+    n_landmarks: int,
+    look_alike_share: float,
+    objects_per_room: int,
+    rooms_visited: int,
+) -> World:
+    """Build an office floor of 66 x 42 m: 22 furnished rooms on two corridor loops.
+
+    The corridors are the outer ring but for the rooms along the south side, and a passage from
+    south to north that parts it into two loops. The north corridor is bare for 40 m, without a
+    door; the west and the east one have cabinets. The rooms' widths, doors, niches and furniture
+    are random. The tour goes round the western loop, then round both, into `rooms_visited` rooms.
+    """
+    require(
+        1.8 < corridor_m <= 3.0, f"world.corridor_m must lie between 1.8 and 3 m, got {corridor_m}"
+    )
+    require(0 <= rooms_visited <= 22, f"world.rooms_visited must lie in 0-22, got {rooms_visited}")
+    plan, c = Plan(), corridor_m
+    W, H, south = 66.0, 42.0, 9.0
+    passage = 44.0 + rng.uniform(0.0, 1.0)  # west side of the passage between the loops
+    plan.rectangle((0, 0), (W, H))
+    inner_low, inner_high = south + c, H - c
+    blocks = ((c, passage), (passage + c, W - c))
+    suites: list[Any] = [(((0.0, south), (W, south)), -1, 7, 9.0)]  # the rooms south of the ring
+    row = 8.0
+    for number, (left, right) in enumerate(blocks):
+        court = number == 0  # between its columns; in the other block they stand back to back
+        column = 9.0 if court else 0.5 * (right - left)
+        mouth = inner_low + row
+        suites += [
+            (((left, inner_low), (right, inner_low)), 1, 5 if court else 2, row, "U"),
+            (((left, mouth), (left, inner_high)), -1, 2, column, "_"),
+            (((right, mouth), (right, inner_high)), 1, 2, column, "_" if court else ""),
+        ]
+        plan.wall((left, inner_high), (right, inner_high))
+        if court:
+            plan.close(rectangle_corners((left + column, mouth), (right - column, inner_high)))
+    rooms = [room for suite in suites for room in _suite(plan, rng, *suite)]
+    x0, xm, x1 = c / 2, passage + c / 2, W - c / 2
+    y0, y1 = south + c / 2, H - c / 2
+    plan.place("corridor_bare", c, H - c, passage, H)
+    plan.place("corridor_objects", 0, inner_low, c, inner_high)
+    plan.place("corridor_objects", W - c, inner_low, W, inner_high)
+    for x, y in product((0.0, passage, W - c), (south, H - c)):
+        plan.place("corner", x, y, x + c, y + c)
+    loop = [(x0, y0), (xm, y0), (xm, y1), (x0, y1), (x0, y0)]
+    second = [(x1, y0), (x1, y1), (xm, y1), (xm, y0), (x0, y0)]
+    plan.tour = _with_visits([*loop, *second], rooms, rng, rooms_visited)
+    for low, high in (((0, inner_low), (c, inner_high)), ((W - c, inner_low), (W, inner_high))):
+        doors = [r.door for r in rooms if low[0] - 0.1 <= r.door[0] <= high[0] + 0.1]
+        _line_up(plan, rng, low, high, 7, keep_off=doors)
+    for room in rooms:
+        plan.furnish(rng, room.low, room.high, objects_per_room, size_m=(0.4, 1.6))
+    return plan.world("office", rng, n_landmarks=n_landmarks, look_alike_share=look_alike_share)
+
+
+def streets(
+    *, rng: np.random.Generator, n_x: int, n_y: int, block_m: float, street_m: float
+) -> World:
+    """Build blocks of terraced houses of differing width, height and setback, with few trees."""
+    return _town("streets", rng, n_x, n_y, block_m, street_m, _terrace, trees_per_block=6)
+
+
+def campus(
+    *,
+    rng: np.random.Generator,
+    n_x: int,
+    n_y: int,
+    block_m: float,
+    street_m: float,
+    trees_per_block: int,
+) -> World:
+    """Build blocks with a few turned or L-shaped buildings among lawns and trees."""
+    return _town("campus", rng, n_x, n_y, block_m, street_m, _lawn, trees_per_block)
+
+
+class _Room(NamedTuple):
+    """A room that can be visited: its rectangle, its door, and how to go in."""
+
+    low: Array
+    high: Array
+    door: Array
+    inward: Array
+
+
+def _suite(
+    plan: Plan,
+    rng: np.random.Generator,
+    ends: tuple[tuple[float, float], tuple[float, float]],
+    side: int,
+    count: int,
+    depth_m: float,
+    walls: Literal["", "_", "U"] = "",
+) -> list[_Room]:
+    """Draw a row of rooms behind a corridor's wall, on its left (side 1) or right (-1).
+
+    `walls` says what else is drawn besides the front and the partitions: `_` the back, `U` the
+    back and both ends; the others are walls of something else.
+    """
+    start, end = np.array(ends)
+    length = float(np.hypot(*(end - start)))
+    along = (end - start) / length
+    inward = side * np.array([-along[1], along[0]])
+    share = rng.uniform(0.85, 1.15, count)
+    edges = np.concatenate([[0.0], np.cumsum(share / share.sum() * length)])
+    doors = [
+        (rng.uniform(low + 1.0, high - 1.0), rng.uniform(1.0, 1.2)) for low, high in pairwise(edges)
+    ]
+    plan.wall(start, end, gaps=doors)
+    back = depth_m * inward
+    if walls:
+        plan.wall(start + back, end + back)
+    for corner in (start, end) if walls == "U" else ():
+        plan.wall(corner, corner + back)
+    rooms = []
+    for i, (low, high) in enumerate(pairwise(edges)):
+        near, far = start + low * along, start + high * along
+        if i + 1 < count:
+            plan.wall(far, far + back)
+        _niche(plan, rng, start, (low, high), along, back)
+        corners = np.array([near, far + back])
+        lowest, highest = corners.min(axis=0), corners.max(axis=0)
+        plan.place("room", *lowest, *highest)
+        door = start + doors[i][0] * along
+        plan.door(door, inward)
+        rooms.append(_Room(lowest, highest, door, inward))
+    return rooms
+
+
+def _niche(
+    plan: Plan,
+    rng: np.random.Generator,
+    start: Array,
+    edges: tuple[float, float],
+    along: Array,
+    back: Array,
+) -> None:
+    """Draw a stub of wall from the back or the left side: no two rooms are alike."""
+    low, high = edges
+    if rng.random() < 0.5:
+        foot = start + rng.uniform(low + 1.0, high - 1.0) * along + back
+        end = foot - back * rng.uniform(0.1, 0.22)
+    else:
+        foot = start + low * along + back * rng.uniform(0.55, 0.85)
+        end = foot + along * (high - low) * rng.uniform(0.1, 0.22)
+    plan.wall(foot, end)
+
+
+def _with_visits(
+    path: list[tuple[float, float]], rooms: list[_Room], rng: np.random.Generator, count: int
+) -> list[tuple[float, float]]:
+    """Tour along the path that looks into `count` of the rooms, in and out by the door."""
+    stops: list[list[tuple[float, _Room, Array]]] = [[] for _ in path]
+    for room in (rooms[row] for row in rng.permutation(len(rooms))[:count]):
+        feet = []
+        for start, end in pairwise(np.array(path)):
+            way = end - start
+            share = float(np.clip((room.door - start) @ way / (way @ way), 0.0, 1.0))
+            feet.append((share, start + share * way))
+        # to 1e-9 m, so that of a stretch that is passed twice the first pass counts
+        gaps = [round(float(np.hypot(*(room.door - foot))), 9) for _, foot in feet]
+        leg = int(np.argmin(gaps))
+        stops[leg].append((feet[leg][0], room, feet[leg][1]))
+    tour = []
+    for point, visits in zip(path, stops, strict=True):
+        tour.append(point)
+        for _, room, foot in sorted(visits, key=lambda stop: stop[0]):
+            tour += [(float(x), float(y)) for x, y in (foot, room.door + 2.0 * room.inward, foot)]
+    return tour
+
+
+def _line_up(
+    plan: Plan,
+    rng: np.random.Generator,
+    low: tuple[float, float],
+    high: tuple[float, float],
+    count: int,
+    keep_off: list[Array] | None = None,
+) -> None:
+    """Put cabinets against the long walls of a straight corridor, clear of doors."""
+    long = 0 if high[0] - low[0] > high[1] - low[1] else 1
+    pitch = (high[long] - low[long] - 2.0) / max(count, 1)
+    for i in range(count):
+        depth, width = rng.uniform(0.25, 0.42), rng.uniform(0.4, 0.7) * min(pitch, 1.8)
+        at_high = rng.random() < 0.5
+        across = high[1 - long] - depth / 2 - 0.01 if at_high else low[1 - long] + depth / 2 + 0.01
+        slack = min(0.5, (pitch - width) / 2 - 0.02)
+        position = low[long] + 1.0 + (i + 0.5) * pitch + rng.uniform(-slack, slack)
+        centre = (position, across) if long == 0 else (across, position)
+        size = (width, depth) if long == 0 else (depth, width)
+        if all(abs(door[long] - position) > 0.8 + width / 2 for door in keep_off or []):
+            plan.prism(box_corners(centre, size, 0.0), 0.0, rng.uniform(0.8, 1.9))
+
+
+def _grid_tour(n_x: int, n_y: int) -> list[tuple[int, int]]:
+    """Cells (i, j) to go through, neighbours in turn, ending where it began."""
+    if min(n_x, n_y) == 1:
+        line = [(i, 0) for i in range(n_x)] if n_y == 1 else [(0, j) for j in range(n_y)]
+        return [*line, *line[-2::-1]]
+    tour = _ring(0, 0, n_x - 1, n_y - 1)
+    if min(n_x, n_y) >= 4:
+        tour += [(1, 0), *_ring(1, 1, n_x - 2, n_y - 2), (1, 0), (0, 0)]
+    return tour
+
+
+def _ring(i0: int, j0: int, i1: int, j1: int) -> list[tuple[int, int]]:
+    """Cells round a rectangle of cells, from its corner and back to it, counter-clockwise."""
+    return [
+        *((i, j0) for i in range(i0, i1)),
+        *((i1, j) for j in range(j0, j1)),
+        *((i, j1) for i in range(i1, i0, -1)),
+        *((i0, j) for j in range(j1, j0, -1)),
+        (i0, j0),
+    ]
+
+
+def _town(
+    name: str,
+    rng: np.random.Generator,
+    n_x: int,
+    n_y: int,
+    block_m: float,
+    street_m: float,
+    build: Callable[[Plan, np.random.Generator, Array, float], None],
+    trees_per_block: int,
+) -> World:
+    """Build blocks in a grid of streets; the tour is a closed way along the streets."""
+    require(n_x >= 1 and n_y >= 1, f"world.n_x and n_y must be at least 1, got {n_x} and {n_y}")
+    _positive(block_m=block_m - 30.0, street_m=street_m - 6.0)
+    plan, pitch = Plan(), block_m + street_m
+    corners = [(0, 0), (n_x, 0), (n_x, n_y), (0, n_y), (0, 0)]
+    if n_x >= 3 and n_y >= 2:
+        corners = [(0, 0), (2, 0), (2, 1), (n_x, 1), (n_x, n_y), (1, n_y), (1, 1), (0, 1), (0, 0)]
+    path = [(pitch * i - street_m / 2, pitch * j - street_m / 2) for i, j in corners]
+    plan.tour = _rounded(path, radius_m=0.35 * street_m, spacing_m=4.0)
+    for x, y in path[:-1]:
+        plan.place("corner", *(v + d * street_m / 2 for d in (-1, 1) for v in (x, y)))
+    for cell in product(range(n_x), range(n_y)):
+        low = pitch * np.array(cell)
+        build(plan, rng, low, block_m)
+        _trees(plan, rng, low, block_m, trees_per_block)
+    return plan.world(name, rng)
+
+
+def _terrace(plan: Plan, rng: np.random.Generator, low: Array, block_m: float) -> None:
+    """Houses side by side along the south and the north edge of a block."""
+    for far in (False, True):
+        x = 0.0
+        while x < block_m - 6.0:
+            width = min(rng.uniform(7.0, 16.0), block_m - x)
+            depth, setback = rng.uniform(9.0, 0.38 * block_m), rng.uniform(0.0, 2.5)
+            y = block_m - setback - depth / 2 if far else setback + depth / 2
+            centre = low + np.array([x + width / 2, y])
+            size = (width - 0.02, depth)
+            plan.prism(box_corners(centre.tolist(), size, 0.0), 0.0, rng.uniform(5.0, 16.0))
+            x += width + (rng.uniform(2.5, 6.0) if rng.random() < 0.3 else 0.0)
+
+
+def _lawn(plan: Plan, rng: np.random.Generator, low: Array, block_m: float) -> None:
+    """Two to four buildings, turned at random; some are L-shaped."""
+    for quarter in rng.permutation(4)[: rng.integers(2, 5)]:
+        room = block_m / 2
+        centre = low + room * np.array([quarter % 2 + 0.5, quarter // 2 + 0.5])
+        centre = centre + rng.uniform(-0.06, 0.06, 2) * room
+        size = rng.uniform(0.3, 0.62, 2) * room
+        yaw, top = rng.uniform(-0.5, 0.5), rng.uniform(6.0, 20.0)
+        corners = box_corners(centre.tolist(), size.tolist(), yaw)
+        if rng.random() < 0.5:  # an L: the corner that is cut out lies at a quarter of the box
+            a, b, c, d = corners
+            corners = np.array([a, b, (b + c) / 2, corners.mean(axis=0), (c + d) / 2, d])
+        plan.prism(corners, 0.0, top)
+
+
+def _trees(plan: Plan, rng: np.random.Generator, low: Array, block_m: float, count: int) -> None:
+    """Plant trees along the edges of a block, clear of the buildings."""
+    for _ in range(count):
+        for _ in range(20):
+            along, inset = rng.uniform(2.0, block_m - 2.0), rng.uniform(0.5, 5.0)
+            far = block_m - inset
+            by_edge = ((along, inset), (inset, along), (along, far), (far, along))
+            spot = low + by_edge[rng.integers(4)]
+            crown = rng.uniform(1.0, 2.2)
+            if all(math.dist(spot, d[:2]) > d[2] + crown + 0.3 for d in plan.discs):
+                height = rng.uniform(4.5, 9.0)
+                plan.tree(spot[0], spot[1], rng.uniform(0.12, 0.35), crown, height)
+                break
+
+
+def _rounded(
+    path: list[tuple[float, float]], *, radius_m: float, spacing_m: float
+) -> list[tuple[float, float]]:
+    """Closed way with each corner cut by an arc, and points about `spacing_m` apart."""
+    points = np.array(path[:-1])
+    smooth: list[Array] = []
+    for before, corner, after in zip(
+        np.roll(points, 1, axis=0), points, np.roll(points, -1, axis=0), strict=True
+    ):
+        into = (before - corner) / np.hypot(*(before - corner))
+        out = (after - corner) / np.hypot(*(after - corner))
+        t = np.linspace(0.0, 1.0, 7)[:, None]
+        a, b = corner + radius_m * into, corner + radius_m * out
+        smooth += list((1 - t) ** 2 * a + 2 * t * (1 - t) * corner + t**2 * b)
+    # Begin in the middle of a straight, so that the start does not lie in a bend.
+    ring = np.array([(smooth[-1] + smooth[0]) / 2, *smooth, (smooth[-1] + smooth[0]) / 2])
+    dense = []
+    for a, b in pairwise(ring):
+        n = max(1, round(math.dist(a, b) / spacing_m))
+        dense += [a + share * (b - a) for share in np.arange(n) / n]
+    return [(float(x), float(y)) for x, y in [*dense, ring[-1]]]
+
+
+def _positive(**margins: float) -> None:
+    for name, margin in margins.items():
+        require(margin > 0.0, f"world.{name} is too small for a robot to pass; make it larger")

@@ -1,0 +1,95 @@
+"""The documentation: built without a warning, with the API in it, and nothing from elsewhere."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import estima
+from experiments.papers.puzzlebot2024 import study as puzzlebot2024
+
+# studies of questions of ours, beyond the parts of the papers
+NOT_OF_A_PART = {
+    "decristoforis2020_beliefs",
+    "decristoforis2020_office",
+    "decristoforis2020_ordering",
+    "gil2008_bound",
+    "puzzlebot2024_engine",
+}
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def test_the_papers_page_names_what_there_is():
+    """Every study, option and file on the page exists, and every study of a paper is on it."""
+    page = (ROOT / "docs" / "papers.md").read_text().partition("\n## ")[2]
+    studies = set(re.findall(r"study=(\w+)", page))
+    there = {path.stem for path in (ROOT / "conf" / "study").glob("*.yaml")}
+    assert studies <= there
+    papers = ("puzzlebot2024_", "decristoforis2020_", "maximo2024_", "gil2008")
+    for group, option in re.findall(r" (world|robot|sensors|route|estimator)=(\w+)", page):
+        assert (ROOT / "conf" / group / f"{option}.yaml").exists(), option
+    for name in re.findall(r"`((?:sim|estimators|experiments|conf|docs)/[\w./]+\.\w+)`", page):
+        assert (ROOT / name).exists(), name
+    of_puzzlebot = page.partition("\n## ")[0]
+    for name in re.findall(r"`study\.(\w+)`", of_puzzlebot):
+        assert hasattr(puzzlebot2024, name), name
+    assert {name for name in there if name.startswith(papers)} - studies <= NOT_OF_A_PART
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """The built site, and what the build said."""
+    pytest.importorskip("mkdocs", reason="the extra `docs` is not installed")
+    folder = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "-d", str(folder)]
+    environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
+    done = subprocess.run(
+        command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0, done.stderr
+    return folder, done.stdout + done.stderr
+
+
+def test_it_builds_without_a_warning(site):
+    assert site[1] == ""
+
+
+def test_it_has_a_page_for_every_document(site):
+    folder, _ = site
+    for page in (ROOT / "docs").glob("*.md"):
+        place = folder / ("" if page.stem == "index" else page.stem)
+        assert (place / "index.html").exists(), page.name
+
+
+def test_it_documents_the_api(site):
+    page = (site[0] / "api" / "index.html").read_text()
+    functions = [name for name in estima.__all__ if name[0].islower()]
+    assert len(functions) == 6
+    for name in (*functions, "Run"):
+        assert f'id="estima.{name}"' in page
+    for name in ("Recording", "Frame", "Prior", "Belief", "Estimate", "Experiment"):
+        kind = getattr(estima, name)
+        assert f'id="{kind.__module__}.{name}"' in page
+
+
+def test_its_examples_are_the_scripts(site):
+    pages = [ROOT / "docs" / name for name in ("examples/index.md", "programs.md")]
+    shown = [name for page in pages for name in re.findall(r'--8<-- "(.*?)"', page.read_text())]
+    assert sorted(shown) == sorted(
+        str(path.relative_to(ROOT))
+        for path in (ROOT / "docs" / "examples").rglob("*")
+        if path.suffix in (".py", ".yaml", ".cpp", ".sh", ".yml")
+    )
+    assert "Dead reckoning whose covariance" in (site[0] / "examples" / "index.html").read_text()
+
+
+def test_it_loads_nothing_from_elsewhere(site):
+    for path in site[0].rglob("*.html"):
+        text = path.read_text()
+        loaded = re.findall(r'<(?:script|img|iframe)[^>]* src="?([^">\s]+)', text)
+        loaded += re.findall(r'<link[^>]* rel="?(?:stylesheet|icon|preconnect)[^>]*>', text)
+        assert loaded
+        assert not [address for address in loaded if "//" in address], path

@@ -1,0 +1,77 @@
+"""Each check of an option accepts its bounds, and names the key of what it rejects."""
+
+import math
+from typing import Literal
+
+import numpy as np
+import pytest
+
+from estimators.base import Prior
+from estimators.options import (
+    require_choices,
+    require_counts,
+    require_laser,
+    require_non_negative,
+    require_positive,
+    require_shares,
+    require_stereo,
+    start_pose,
+)
+from sim.errors import InputError
+from sim.robot.drive import RobotGeometry
+from sim.sensors import Encoder, Laser
+
+NUMBERS = {
+    require_non_negative: ([0, 0.0, 1e-300, 2], [-1e-300, math.nan, math.inf, None, "1"]),
+    require_positive: ([1e-300, 2, np.float64(3.0)], [0, 0.0, -0.0, -1.0, math.nan, math.inf]),
+    require_shares: ([0.0, 0.5, 1.0], [-1e-9, 1.0 + 1e-9, math.nan]),
+    require_counts: ([1, 5], [0, -1, 2.0, True, None]),
+}
+
+
+@pytest.mark.parametrize("require", NUMBERS)
+def test_numbers_within_bounds_pass_and_others_are_named(require):
+    allowed, rejected = NUMBERS[require]
+    for number in allowed:
+        require(sound=1, size=number)
+    for number in rejected:
+        with pytest.raises(InputError, match=r"^estimator\.size must be .*, got "):
+            require(sound=1, size=number)
+
+
+def test_choices_are_those_of_the_literal():
+    kind = Literal["tukey", "huber"]
+    require_choices(kernel=("huber", kind))
+    with pytest.raises(InputError, match=r"^estimator\.kernel must be one of tukey, huber, got"):
+        require_choices(kernel=("flat", kind))
+    with pytest.raises(InputError, match=r"^kernel must"):
+        require_choices("", kernel=(None, kind))
+
+
+def test_a_prior_without_what_an_estimator_needs_names_the_estimator():
+    bare = Prior(RobotGeometry(0.05, 0.2), {})
+    with pytest.raises(InputError, match=r"^mcl needs a start pose; "):
+        start_pose(bare, "mcl")
+    for require in (require_laser, require_stereo):
+        with pytest.raises(
+            InputError, match=r"^mcl: no sensor named front .there is none.; choose"
+        ):
+            require(bare, "front", "mcl")
+
+
+def test_a_sensor_is_found_by_its_name_and_must_be_of_its_kind():
+    sensors = {"encoder": Encoder(), "front": Laser(n_beams=3), "rear": Laser(n_beams=5)}
+    prior = Prior(RobotGeometry(0.05, 0.2), sensors)
+    assert require_laser(prior, "rear", "mcl") is sensors["rear"]
+    with pytest.raises(InputError, match=r"laser \(there is encoder, front, rear\); choose"):
+        require_laser(prior, "laser", "mcl")
+    with pytest.raises(InputError, match=r"^fastslam: sensor front is a Laser, not a StereoCamera"):
+        require_stereo(prior, "front", "fastslam")
+
+
+def test_the_start_pose_is_a_copy():
+    prior = Prior(RobotGeometry(0.05, 0.2), {}, np.zeros(3), np.eye(3))
+    start = start_pose(prior, "mcl")
+    start.mean[0], start.covariance[0, 0] = 1.0, 2.0
+    assert prior.mean[0] == 0.0
+    assert prior.covariance[0, 0] == 1.0

@@ -1,0 +1,132 @@
+"""Methods of other projects behind our protocol, and what happens where they are not installed."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from estimators.base import run
+from estimators.graph.fixed_lag import FixedLag
+from estimators.graph.smoother import Smoother
+from estimators.peers import MissingPackageError
+from estimators.peers.gtsam_batch import GtsamBatch
+from estimators.peers.gtsam_isam2 import GtsamIsam2
+from estimators.peers.kiss_icp import KissIcp
+from estimators.peers.planar import matrix_of, pose_of
+from estimators.peers.small_gicp import SmallGicp
+from estimators.programs.program import PEERS_PROGRAM
+from experiments.runs.evaluate import evaluate
+from experiments.runs.experiment import Experiment
+from sim import se2
+from sim.errors import InputError
+from tests.fixtures.fakes import circle, tracking_prior
+
+PACKAGES = {
+    "gtsam": (GtsamBatch, GtsamIsam2),
+    "kiss_icp.config": (KissIcp,),
+    "small_gicp": (SmallGicp,),
+}
+
+
+def driven(estimator, recording):
+    return run(estimator, recording, tracking_prior(recording), np.random.default_rng(0))
+
+
+def off_m(recording, means):
+    return np.hypot(*(means - recording.truth.poses)[:, :2].T)
+
+
+@pytest.mark.parametrize("name", PACKAGES)
+def test_a_missing_package_is_told_in_one_line(name, monkeypatch):
+    monkeypatch.setitem(sys.modules, name, None)
+    for estimator in PACKAGES[name]:
+        with pytest.raises(MissingPackageError, match=r"pip install 'estima\[(peers|gtsam)\]'"):
+            estimator()
+
+
+def test_planar_poses_and_matrices():
+    rng = np.random.default_rng(1)
+    for a, b in rng.normal(size=(20, 2, 3)):
+        assert pose_of(matrix_of(a) @ matrix_of(b)) == pytest.approx(se2.compose(a, b))
+
+
+def test_gtsam_solves_the_problem_of_the_smoother():
+    """Poses of all Frames agree to a part of their own uncertainty, which agrees too."""
+    pytest.importorskip("gtsam")
+    recording = circle(3, n_frames=120, kr=1e-4, kl=1e-4)
+    revised = []
+    for estimator in (Smoother(), GtsamBatch()):
+        driven(estimator, recording)
+        revised.append(estimator.finish())
+    ours, theirs = revised
+    np.testing.assert_array_equal(ours.stamps, theirs.stamps)
+    sigma = np.sqrt(ours.covariances[:, [0, 1, 2], [0, 1, 2]])
+    assert np.abs((ours.means - theirs.means) / sigma).max() < 0.1
+    np.testing.assert_allclose(
+        theirs.covariances[1:], ours.covariances[1:], rtol=0.1, atol=0.05 * ours.covariances.max()
+    )
+
+
+def test_isam2_ends_where_the_smoother_does():
+    pytest.importorskip("gtsam")
+    recording = circle(4, n_frames=120, kr=1e-4, kl=1e-4)
+    batch, isam2 = Smoother(), GtsamIsam2(relinearize_threshold=1e-3, relinearize_skip=1)
+    driven(batch, recording)
+    online, ours = driven(isam2, recording), driven(FixedLag(), recording)
+    last = 118  # the last Frame with an image
+    expected = batch.finish()
+    sigma = np.sqrt(np.diag(expected.covariances[last]))
+    assert np.abs((online.means[last] - expected.means[last]) / sigma).max() < 0.3
+    theirs = np.sqrt(np.diag(online.covariances[last]))
+    assert theirs == pytest.approx(np.sqrt(np.diag(ours.covariances[last])), rel=0.1)
+
+
+def test_a_camera_whose_noise_gtsam_does_not_have_is_refused():
+    pytest.importorskip("gtsam")
+    recording = circle(n_frames=3)
+    object.__setattr__(recording.sensors["stereo"], "correlated", False)
+    with pytest.raises(InputError, match=r"sensors\.stereo\.correlated=true"):
+        driven(GtsamIsam2(), recording)
+
+
+@pytest.mark.parametrize("reference", ["previous", "keyframe"])
+@pytest.mark.parametrize("use_odometry_guess", [True, False])
+def test_small_gicp_follows_a_circle(reference, use_odometry_guess):
+    pytest.importorskip("small_gicp")
+    recording = circle(5)
+    estimator = SmallGicp(
+        reference=reference, use_odometry_guess=use_odometry_guess, downsampling_m=0.1
+    )
+    estimate = driven(estimator, recording)
+    assert off_m(recording, estimate.means).max() < 0.15
+    assert estimate.status == "ok"
+    assert not estimate.covariances.any()
+
+
+def test_kiss_icp_follows_a_circle():
+    pytest.importorskip("kiss_icp")
+    recording = circle(6)
+    estimate = driven(KissIcp(voxel_size_m=0.2), recording)
+    assert off_m(recording, estimate.means).max() < 0.15
+
+
+@pytest.mark.skipif(not Path(PEERS_PROGRAM).exists(), reason="`make peers` compiles it")
+@pytest.mark.parametrize(
+    ("option", "most_m"), [("mrpt_icp", 0.018), ("mrpt_mcl", 0.06), ("mrpt_rbpf", 0.2)]
+)
+def test_mrpt_follows_exact_wheels_and_ranges(option, most_m):
+    """With a turned laser off the centre.
+
+    Without its mount's turn `mrpt_icp` misses by 2.3 m, without its place by 0.15 m, with a field
+    of view that is one beam too wide by 0.022 m. What is left is MRPT's own: it takes the wheels
+    to err by a centimetre between scans.
+    """
+    settings = ["world=room", "sensors=hokuyo", "sensors.laser.n_beams=361"]
+    settings += ["sensors.laser.mount.x_m=0.3", "sensors.laser.mount.yaw_rad=0.7"]
+    settings += ["sensors.laser.max_range_m=20", "sensors.laser.sigma_range_m=1e-4"]
+    settings += ["route=tour", "route.distance_m=6", "robot.kr=0", "robot.kl=0"]
+    settings += ["simulation.physics=kinematic", "prior.map=world", f"estimator={option}"]
+    row = evaluate(Experiment.compose(settings))[0]
+    assert row["status"] == "ok"
+    assert row["ate_rmse_m"] < most_m

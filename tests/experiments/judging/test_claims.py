@@ -1,0 +1,383 @@
+"""Claims: what they read decides the verdict, and a fault in it changes the verdict."""
+
+import dataclasses
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from experiments.evaluation.statistics import Interval
+from experiments.judging.claims_file import COLUMNS, read_claims, write_claims
+from experiments.judging.verdict import Profile, Verdict, conclude, lower, overall
+from experiments.papers.gil2008 import claims as gil2008
+from experiments.papers.maximo2024 import claims as maximo2024
+from experiments.papers.puzzlebot2024 import claims, study
+from experiments.papers.puzzlebot2024.settings import NOMINAL
+from experiments.studies.real_logs import claims as real_logs
+from sim.errors import InputError
+
+
+def test_worked_matrices_come_out_and_the_misprint_does_not():
+    assert claims.pb1()[0].verdict == "reproduced"
+    _, second = claims.worked_matrices()
+    assert second[0, 0] == pytest.approx(0.9998, abs=5e-5)
+    assert abs(second[0, 0] - 0.998) > 1e-3
+
+
+def test_pb1_fails_on_a_wrong_sign(monkeypatch):
+    first, second = claims.worked_matrices()
+    monkeypatch.setattr(claims, "worked_matrices", lambda: (first, second * [1, -1, 1]))
+    assert claims.pb1()[0].verdict == "not_reproduced"
+
+
+def test_areas_grow_on_straights_and_arcs_and_shrink_on_the_way_back():
+    areas, crossover = study.areas(), study.crossover("seed=range(1000,1003)")
+    judged = list(claims.pb2(areas, crossover, NOMINAL.track_m))
+    by_name = {c.statistic.rsplit(", ", 1)[-1]: c for c in judged}
+    assert by_name["straight"].verdict == by_name["arc"].verdict == "reproduced"
+    assert by_name["out and back"].found.value > 0
+    assert judged[-1].verdict == "reproduced"
+    *_, wrong = claims.pb2(areas, crossover, 1.1 * NOMINAL.track_m)
+    assert wrong.verdict == "not_reproduced"
+    shrinking = areas.assign(area_m2=areas["area_m2"].to_numpy()[::-1])
+    assert next(claims.pb2(shrinking, crossover, 0.19)).verdict == "not_reproduced"
+
+
+def calibrated(n, offset=0.0, half=0.1):
+    rng = np.random.default_rng(0)
+    value = 1 + offset + 0.05 * rng.standard_normal(2 * n)
+    return pd.DataFrame(
+        {
+            "k_m": 1e-4,
+            "joint": False,
+            "seed": np.repeat(np.arange(n), 2),
+            "method": "sampled",
+            "parameter": ["kr", "kl"] * n,
+            "truth": 1.0,
+            "value": value,
+            "low": value - half,
+            "high": value + half,
+        }
+    )
+
+
+ENGINE_K = pd.DataFrame(
+    [{"k_m": 1e-4, "parameter": "kr", "truth": 1e-4, "value": 1e-4, "low": 9.8e-5, "high": 1.02e-4}]
+)
+
+
+def pb3(table):
+    return {c.statistic.split(":")[0]: c for c in claims.pb3(table, DESCENT, ENGINE_K)}
+
+
+DESCENT = study.gradient_descent()
+COVERAGE = "coverage of the 95 % intervals of kr and kl"
+BIAS = "relative bias, the worse of kr and kl"
+
+
+def test_pb3_judges_coverage_and_bias():
+    good = pb3(calibrated(200))
+    assert good[COVERAGE].verdict == good[BIAS].verdict == "reproduced"
+    biased = pb3(calibrated(200, offset=0.2))
+    assert biased[COVERAGE].verdict == biased[BIAS].verdict == "not_reproduced"
+    assert pb3(calibrated(200, half=0.02))[COVERAGE].verdict == "not_reproduced"
+    descent = good["the report's gradient descent"]
+    assert (descent.verdict, descent.role) == ("not_reproduced", "beside")
+    sound = DESCENT.assign(k_in_the_end=[1e-5, 2e-5, 3e-5, 4e-5])
+    *_, depends = claims.pb3(calibrated(200), sound, ENGINE_K)
+    assert depends.verdict == "reproduced"
+    off = ENGINE_K.assign(value=1.2e-4, low=1.18e-4, high=1.22e-4)
+    *_, engine, _ = claims.pb3(calibrated(200), DESCENT, off)
+    assert engine.verdict == "not_reproduced"
+
+
+def test_pb3_is_decided_by_wheel_truth_and_the_sampled_likelihood_alone():
+    good, bad = calibrated(200), calibrated(200, offset=0.3).assign(method="linearised")
+    judged = list(claims.pb3(pd.concat([good, bad]), DESCENT, ENGINE_K))
+    assert {c.role for c in judged if "linearised" in c.statistic} == {"beside"}
+    (said,) = conclude(judged, {"PB3": claims.pb3_sentence})
+    assert said.verdict == "reproduced"
+    assert "returns 1/2 whatever the data" in said.sentence
+    worse = calibrated(200, offset=0.3)
+    (said,) = conclude(list(claims.pb3(worse, DESCENT, ENGINE_K)), {"PB3": claims.pb3_sentence})
+    assert said.verdict == "not_reproduced"
+
+
+def test_opposite_biases_of_the_wheels_do_not_cancel():
+    table = calibrated(200)
+    table["value"] += np.where(table["parameter"] == "kr", 0.1, -0.1)
+    judged = pb3(table)[BIAS]
+    assert judged.verdict == "not_reproduced"
+    assert abs(judged.found.value) == pytest.approx(0.1, abs=0.02)
+
+
+def test_pb3_judges_the_gains_and_the_track_of_the_joint_arm_apart():
+    table = calibrated(200).assign(joint=True)
+    geometry = table.assign(parameter="track_m", low=2.0, high=3.0)
+    judged = pb3(pd.concat([table, geometry], ignore_index=True))
+    assert judged[COVERAGE].verdict == "reproduced"
+    assert judged["coverage of the 95 % intervals of gains and track"].verdict == "not_reproduced"
+
+
+def test_pb3_shows_the_short_turns_and_judges_the_track_that_is_found():
+    ends = pd.DataFrame(
+        {
+            "omega_radps": [0.0, 0.5, 0.5, 0.8],
+            "ideal_heading_rad": [0.0, 1.5, 2.5, 2.4],
+            "real_heading_mean_rad": [0.01, 0.66, 1.10, 1.06],
+            "calibrated_heading_mean_rad": [0.01, 1.50, 2.51, 2.39],
+        }
+    )
+    right = pd.DataFrame(
+        {"parameter": ["kr", "track_m"], "truth": [1e-4, 0.19], "value": [1e-4, 0.190],
+         "low": [5e-5, 0.189], "high": [2e-4, 0.191]}
+    )  # fmt: skip
+    came, mended, track = claims.pb3_short_turns(ends, right)
+    assert came.found.value == pytest.approx(0.44, abs=0.002)
+    assert "0.44" in came.reason
+    assert mended.found.value == pytest.approx(1.0, abs=0.01)
+    assert track.verdict == "reproduced"
+    assert {c.role for c in (came, mended, track)} == {"beside"}
+    wrong = right.assign(value=right["value"] * 0.44, low=right["low"] * 0.44)
+    wrong["high"] = wrong["value"] * 1.01
+    *_, track = claims.pb3_short_turns(ends, wrong)
+    assert track.verdict == "not_reproduced"
+
+
+def test_pb4_names_the_k_at_which_the_band_is_left():
+    runs = 4000
+    shares = {1e-5: 0.95, 1e-4: 0.95, 1e-3: 0.80}
+    coverage = pd.DataFrame(
+        [
+            {"case": case, "k_m": k, "runs": runs, "in_ellipse": int(share * runs)}
+            for k, share in shares.items()
+            for case in ("linear_1", "angular_1")
+        ]
+    )
+    engine = ends(0.0)
+    judged = list(claims.pb4(coverage, engine))
+    assert [c.verdict for c in judged[:3]] == ["reproduced", "reproduced", "not_reproduced"]
+    assert [c.role for c in judged[:3]] == ["headline", "headline", "beside"]
+    assert [c.reason.split(";")[0] for c in judged[1:3]] == [
+        "2 of 2 manoeuvres within",
+        "0 of 2 manoeuvres within",
+    ]
+    assert judged[-1].found == Interval.exact(1e-3)
+    cases = pd.DataFrame(
+        {"case": ["linear_1", "angular_1"], "v_mps": [0.5, 0.0], "omega_radps": [0.0, 1.0]}
+    )
+    cases = cases.assign(duration_s=5.0).set_index("case")
+    assert "holds at least 95 %" in claims.pb4_sentence(coverage, cases)
+    early = coverage.assign(k_m=coverage["k_m"] / 10.0)
+    assert overall([c.verdict for c in claims.pb4(early, engine) if c.role == "headline"]) == (
+        "not_reproduced"
+    )
+    assert claims.pb4_sentence(early, cases).startswith("A straight of 2.5 m bends the cloud")
+
+
+def ends(gap_m):
+    """Ends of two cases, the second a hundred times as spread out and a metre further on."""
+    spread = np.tile([-1.0, 0.0, 1.0], 2) * np.repeat([1e-3, 0.1], 3)
+    table = {"case": np.repeat(["angular_1", "linear_1"], 3), "seed": np.tile([1, 2, 3], 2)}
+    for name in ("x_m", "y_m", "heading_rad"):
+        table[f"kinematic_{name}"] = spread + np.repeat([0.0, 1.0], 3)
+        table[f"bullet_{name}"] = table[f"kinematic_{name}"] + np.repeat([gap_m, 0.0], 3)
+    return pd.DataFrame(table)
+
+
+def test_the_engines_gap_is_held_against_the_spread_of_its_own_case():
+    coverage = pd.DataFrame([{"case": "a", "k_m": 1e-4, "runs": 4000, "in_ellipse": 3800}])
+    assert list(claims.pb4(coverage, ends(1e-6)))[1].verdict == "reproduced"
+    assert list(claims.pb4(coverage, ends(2e-4)))[1].verdict == "not_reproduced"
+
+
+def test_coverage_is_95_percent_where_the_first_order_holds():
+    table = study.coverage(study.arms("coverage")[:1], 300)
+    small = table[table["k_m"] == 1e-6]
+    assert small["in_ellipse"].sum() / small["runs"].sum() == pytest.approx(0.95, abs=0.015)
+    assert small["in_ellipsoid"].sum() / small["runs"].sum() == pytest.approx(0.95, abs=0.015)
+
+
+@pytest.mark.bullet
+def test_the_engine_and_the_kinematic_robot_end_together():
+    driven = study.engine_recordings("seed=range(1000,1002)")
+    engine = study.engine_ends(driven)
+    gap = np.hypot(*(engine[f"bullet_{c}_m"] - engine[f"kinematic_{c}_m"] for c in "xy"))
+    assert gap.max() < 3e-4
+    assert np.ptp(engine["kinematic_heading_rad"]) > 1.0
+    k = study.engine_k(driven)
+    assert (k["value"] / k["truth"]).to_numpy() == pytest.approx(1.0, abs=0.2)
+
+
+def write(judged, path, paper="puzzlebot2024"):
+    write_claims(judged, path, paper=paper, profile=Profile.FULL, command="estima reproduce")
+
+
+def test_writing_keeps_other_papers_rows(tmp_path):
+    path = tmp_path / "claims.csv"
+    one = claims.pb1()[0]
+    write([dataclasses.replace(one, id="XX1")], path, "another")
+    write([one], path)
+    write([dataclasses.replace(one, found=Interval.exact(0.5))], path)
+    frame = pd.read_csv(path)
+    assert frame["paper"].tolist() == ["puzzlebot2024", "another"]
+    assert frame["value"].tolist()[0] == 0.5
+    assert tuple(frame.columns) == COLUMNS
+
+
+def test_arms_that_are_equal_or_few_decide_rightly():
+    same = np.linspace(1.0, 2.0, 20)
+    assert lower("", "", same, same).verdict == "not_reproduced"
+    assert lower("", "", same[:1], same[:1]).verdict == "undecided"
+    rng = np.random.default_rng(0)
+    spread = np.exp(0.02 * rng.standard_normal(20))
+    assert lower("", "", 0.8 * same * spread, same).verdict == "reproduced"
+    assert lower("", "", 1.2 * same * spread, same).verdict == "not_reproduced"
+    said = lower("", "", 1.001 * same * spread, same)
+    assert said.found.low < 1.0 < said.found.high
+    assert said.found.low > 0.95  # hardly a gain, but the interval spans the criterion
+    assert said.verdict == "undecided"
+    assert said.more > 0
+
+
+def test_statistics_of_a_claim_stay_in_the_order_given(tmp_path):
+    path = tmp_path / "claims.csv"
+    first = claims.pb1()[0]
+    given = [dataclasses.replace(first, statistic=s) for s in ("the headline", "a detail")]
+    write([dataclasses.replace(first, id="PB2"), *given], path)
+    assert read_claims(path)["statistic"].tolist()[:2] == ["the headline", "a detail"]
+
+
+ROW = "PB1,puzzlebot2024,headline,a statistic,0.5,0.4,0.6,at least 0.4,reproduced,,full,s,c"
+
+
+@pytest.mark.parametrize(
+    ("row", "wrong"),
+    [
+        (ROW[:-20], "the last row is cut off"),
+        ("", "the last row is cut off"),
+        (f"{ROW}\n{ROW}\n", "row 3: a duplicate"),
+        (f'{ROW}\nPB1,puzzlebot2024,"a sta\n', "cannot read the claims"),
+        (ROW.replace("reproduced", "Reproduced") + "\n", "row 2: verdict is 'Reproduced'"),
+        (ROW.replace("reproduced", "reproducedX") + "\n", "row 2: verdict is 'reproducedX'"),
+        (ROW.replace("reproduced", "") + "\n", "row 2: verdict is nan"),
+        (f"{ROW}\n{ROW.replace('0.5', 'abc')}\n", "row 3: value is 'abc', not a number"),
+        (ROW.replace("puzzlebot2024", "") + "\n", "row 2: paper is nan"),
+        (ROW.replace("puzzlebot2024", "../evil paper") + "\n", "row 2: paper is '../evil paper'"),
+        (ROW.replace("puzzlebot2024", "a.b.c") + "\n", "row 2: paper is 'a.b.c'"),
+        (ROW.replace("PB1", "<b>") + "\n", "row 2: id is '<b>'"),
+    ],
+)
+def test_damaged_tables_are_refused_in_one_line(tmp_path, row, wrong):
+    path = tmp_path / "claims.csv"
+    path.write_text(",".join(COLUMNS) + "\n" * bool(row) + row)
+    with pytest.raises(InputError) as refused:
+        read_claims(path)
+    line = str(refused.value)
+    assert str(path) in line
+    assert wrong in line
+    assert "git checkout" in line
+    assert "\n" not in line
+
+
+def test_a_table_without_verdicts_is_refused(tmp_path):
+    table = pd.DataFrame({"id": ["PB1"], "paper": ["p"], "role": ["headline"]})
+    table.to_csv(tmp_path / "claims.csv", index=False)
+    with pytest.raises(InputError, match="no column statistic"):
+        read_claims(tmp_path / "claims.csv")
+
+
+def test_verdicts_are_whole_words():
+    assert Verdict("not_reproduced").label == "not reproduced"
+    for wrong in ("reproducedX", "Reproduced", "not reproduced", "", "reproduced?"):
+        with pytest.raises(ValueError, match="not a valid Verdict"):
+            Verdict(wrong)
+
+
+def test_rl2_judges_after_the_tuned_part_and_shows_the_whole():
+    methods = ("odometry, as logged", "odometry, calibrated", "ICP alone", "ICP from the wheels")
+    rows = [
+        ("intel", method, part, mean, fused - mean, fused - mean - 0.1, fused - mean + 0.1, 10)
+        for part, fused in (("judged", 0.1), ("all", 9.0))
+        for method, mean in (*((m, 1.0) for m in methods), ("EKF of wheels and ICP", fused))
+    ]
+    differences = [f"difference_{name}_m" for name in ("mean", "low", "high")]
+    columns = ["log", "method", "part", "translation_mean_m", *differences, "difference_minutes"]
+    said = list(real_logs.rl2(pd.DataFrame(rows, columns=columns)))
+    assert [c.verdict for c in said] == ["reproduced"] * 4 + ["shown"] * 4
+    assert said[0].reason == "fusion 0.100 m, the other 1.000 m"
+    assert [c.role for c in said[:4]] == ["beside", "headline", "headline", "headline"]
+    assert all("the whole log" in c.statistic for c in said[4:])
+
+
+def test_rl2_judges_the_paired_difference():
+    def judged(low, high):
+        table = pd.DataFrame(
+            {
+                "log": "intel",
+                "method": ["EKF of wheels and ICP", *real_logs.INTEL[1:5]] * 2,
+                "part": np.repeat(["judged", "all"], 5),
+                **dict.fromkeys([f"translation_{e}_m" for e in ("mean", "low", "high")], 1.0),
+                "difference_mean_m": (low + high) / 2.0,
+                "difference_low_m": low,
+                "difference_high_m": high,
+                "difference_minutes": 10,
+            }
+        )
+        return list(real_logs.rl2(table))[:4]
+
+    assert {c.verdict for c in judged(-0.2, -0.1)} == {"reproduced"}
+    assert {c.verdict for c in judged(0.1, 0.2)} == {"not_reproduced"}
+    open_ones = judged(-0.2, 0.1)
+    assert {(c.verdict, c.more) for c in open_ones} == {("undecided", 80)}  # 9 times as long
+    assert open_ones[0].statistic.startswith("translational error of EKF of wheels and ICP less")
+
+
+def test_rl1_rl4_and_rl5_can_fail():
+    ate = pd.DataFrame({"ate_m": [0.1491, 0.2272], "printed_m": ["0.149", "0.227"]})
+    assert real_logs.rl1(ate)[0].verdict == "reproduced"
+    assert real_logs.rl1(ate.assign(ate_m=[0.1496, 0.2272]))[0].verdict == "not_reproduced"
+    wheels = pd.DataFrame({"value": [0.0415, 0.0880], "published": [0.0414, 0.0880]})
+    lego = pd.DataFrame({"case": ["geometric width", "calibrated"], "rms_m": [0.6, 0.04]})
+    assert {c.verdict for c in real_logs.rl4(wheels, lego)} == {"reproduced"}
+    far, late = wheels.assign(value=[0.0420, 0.0880]), lego.assign(rms_m=[0.6, 0.11])
+    assert {c.verdict for c in real_logs.rl4(far, late)} == {"not_reproduced"}
+    wean = pd.DataFrame({"one_means": ["free", "occupied"], "score": [0.5, 0.2]})
+    assert real_logs.rl5(wean)[0].verdict == "reproduced"
+    assert real_logs.rl5(wean.assign(score=[0.5, 0.45]))[0].verdict == "not_reproduced"
+
+
+def test_rl3_wants_every_robot():
+    rows = [(r, "dead reckoning, calibrated", 1.0) for r in (1, 2, 3)]
+    rows += [(r, "good", 0.5) for r in (1, 2, 3)]
+    rows += [(1, "bad", 1.5), (2, "bad", 0.1), (3, "bad", 1.1), (3, "last", 1.1), (2, "last", 0.1)]
+    table = pd.DataFrame(rows, columns=["robot", "method", "ate_rmse_m"]).assign(judged=True)
+    said = {c.statistic.split()[2]: (c.verdict, c.reason) for c in real_logs.rl3(table)}
+    assert said == {
+        "good": ("reproduced", "robots 1, 2, 3"),
+        "bad": ("not_reproduced", "robots 1, 2, 3; not on robots 1, 3"),
+        "last": ("not_reproduced", "robots 2, 3; not on robot 3"),
+    }
+    table["judged"] = table["robot"] < 3  # robots on which the noise was chosen do not count
+    said = {c.statistic.split()[2]: c.verdict for c in real_logs.rl3(table)}
+    assert said == {"good": "reproduced", "bad": "not_reproduced", "last": "reproduced"}
+
+
+def test_intervals_of_two_one_sided_tests_are_named():
+    worlds = pd.DataFrame(
+        [
+            (s, m, d, n, 1.0 + 0.01 * s)
+            for s in range(20)
+            for m in (200, 1000)
+            for d in "ab"
+            for n in (2, 4)
+        ],
+        columns=["seed", "n_particles", "draw", "per_node", "error_m"],
+    ).assign(geometry="umh", noise="paper", filter="fastslam2")
+    for column in gil2008.ERRORS:
+        worlds[column] = worlds["error_m"]
+    no_times = pd.DataFrame({"geometry": [], "particles": [], "time_s": []})
+    said = [*gil2008.gi3(worlds), *maximo2024.mx2(worlds, no_times)]
+    tested = [claim for claim in said if "significance" not in claim.statistic]
+    assert len(tested) == 5
+    assert all("(90 % interval)" in claim.statistic for claim in tested)

@@ -1,0 +1,203 @@
+"""One verdict and one sentence a claim: they follow from its headline statistics."""
+
+import csv
+import dataclasses
+import re
+
+import pandas as pd
+import pytest
+
+from experiments.evaluation.statistics import Interval, mean_interval
+from experiments.judging.claims_file import (
+    VERDICT_COLUMNS,
+    read_claims,
+    read_provenance,
+    read_verdicts,
+    write_claims,
+    write_verdicts,
+)
+from experiments.judging.results import Results
+from experiments.judging.verdict import (
+    Claim,
+    Conclusion,
+    Profile,
+    Role,
+    Verdict,
+    banded,
+    beside,
+    conclude,
+    headline_verdict,
+    more_to_settle,
+    percent,
+    pick,
+    plain,
+    shown,
+)
+from experiments.report.contents import findings
+from experiments.reproduce import LOGS, NAMED, PAPERS, _judgement
+from experiments.runs.paths import SOURCE
+from sim.errors import InputError
+
+RESULTS = SOURCE / "results"
+GOOD = banded("PB1", "a ratio", Interval(1.0, 0.9, 1.1), 0.8, 1.25)
+BAD = banded("PB1", "another", Interval(2.0, 1.9, 2.1), 0.8, 1.25)
+OPEN = banded("PB1", "a third", Interval(1.2, 1.1, 1.3), 0.8, 1.25, n=20)
+
+
+def verdict_of(*claims):
+    (said,) = conclude(claims, {"PB1": lambda rows: f"There are {len(rows)} rows."})
+    return said
+
+
+def test_a_verdict_follows_from_the_headlines_alone():
+    assert verdict_of(GOOD, GOOD).verdict == "reproduced"
+    assert verdict_of(GOOD, OPEN).verdict == "undecided"
+    assert verdict_of(GOOD, OPEN, BAD).verdict == "not_reproduced"
+    assert verdict_of(GOOD, beside(OPEN), beside(BAD)).verdict == "reproduced"
+    assert verdict_of(beside(GOOD), shown("PB1", "only shown", Interval.exact(1.0))).verdict == (
+        "shown"
+    )
+    assert headline_verdict([]) == "shown"
+
+
+def test_what_is_only_shown_stands_beside():
+    claim = shown("PB1", "a share", Interval.exact(0.5), "why")
+    assert (claim.role, claim.verdict, claim.reason) == (Role.BESIDE, Verdict.SHOWN, "why")
+    assert beside(GOOD, False) is GOOD
+
+
+def test_an_undecided_sentence_says_how_many_more_recordings_settle_it():
+    assert verdict_of(GOOD, OPEN).sentence == (
+        "There are 2 rows. About 57 more recordings would settle it."
+    )
+    one = dataclasses.replace(OPEN, more=1)
+    assert verdict_of(one).sentence.endswith("About 1 more recording would settle it.")
+    assert verdict_of(GOOD).sentence == "There are 1 rows."
+    unknown = dataclasses.replace(OPEN, more=0)
+    assert verdict_of(unknown).sentence == "There are 1 rows."
+    assert "would settle what is open." in verdict_of(OPEN, unknown).sentence
+    assert "57 more" in verdict_of(OPEN, dataclasses.replace(beside(OPEN), more=900)).sentence
+
+
+def test_an_interval_shrinks_with_the_square_root_of_the_recordings():
+    wide = Interval(1.0, -1.0, 3.0)
+    assert more_to_settle(wide, 10, at_most=2.0) == 30
+    assert more_to_settle(wide, 10, at_least=0.0, at_most=2.0) == 30
+    outside = Interval(3.0, -1.0, 7.0)  # that it is outside takes the limit beside it alone
+    assert more_to_settle(outside, 10, at_least=-0.5, at_most=1.0) == 30
+    assert more_to_settle(Interval(3.0, 2.5, 3.5), 10, at_most=2.0) == 0
+    assert more_to_settle(wide, 0, at_most=2.0) == 0
+    assert more_to_settle(mean_interval([1.0]), 1, at_most=2.0) == 0
+    ratio = Interval(2.0, 0.5, 8.0)  # in logs, 4 is half of the way to 8
+    assert more_to_settle(ratio, 10, at_most=4.0) == 30
+
+
+def test_as_many_more_recordings_do_settle_it():
+    small = mean_interval([0.1, 0.9] * 5)
+    more = more_to_settle(small, 10, at_most=0.7)
+    assert more > 0
+    large = mean_interval([0.1, 0.9] * ((10 + more) // 2 + 1))
+    assert large.high < 0.7 < small.high
+
+
+def test_numbers_in_sentences():
+    assert [plain(v) for v in (0.0123, 1.25, 190.2, 12345.0, 3e-5)] == [
+        "0.012",
+        "1.2",
+        "190",
+        "12,000",
+        "3e-05",
+    ]
+    assert percent(0.617) == "62 %"
+    assert (plain(float("nan")), percent(float("nan"))) == ("unknown", "an unknown share")
+
+
+def test_a_missing_statistic_is_named():
+    assert pick([GOOD, BAD], "anoth") is BAD
+    with pytest.raises(LookupError, match="no statistic with x and y"):
+        pick([GOOD], "x", "y")
+
+
+def write(conclusions, path, paper="puzzlebot2024", profile=Profile.FULL):
+    says = {"PB1": "What it says.", "RL1": "What it says, too."}
+    write_verdicts(conclusions, path, paper=paper, says=says, profile=profile)
+
+
+def test_verdicts_are_written_one_row_a_claim(tmp_path):
+    path = tmp_path / "verdicts.csv"
+    write([Conclusion("RL1", Verdict.SHOWN, "One.")], path, "real_logs")
+    write([Conclusion("PB1", Verdict.UNDECIDED, "Two.")], path, profile=Profile.QUICK)
+    write([Conclusion("PB1", Verdict.NOT_REPRODUCED, "Three, with a comma.")], path)
+    with path.open() as file:
+        rows = list(csv.DictReader(file))
+    assert tuple(rows[0]) == VERDICT_COLUMNS
+    assert [(row["id"], row["verdict"], row["sentence"]) for row in rows] == [
+        ("PB1", "not_reproduced", "Three, with a comma."),
+        ("RL1", "shown", "One."),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("row", "wrong"),
+    [
+        ("PB1,p,says,undecided,a sentence", "the last row is cut off"),
+        ("PB1,p,says,perhaps,a sentence\n", "row 2: verdict is 'perhaps'"),
+        ("PB1,p,says,undecided,\n", "row 2: sentence is nan"),
+        ("PB1,p,s,shown,a\nPB1,p,s,shown,b\n", "row 3: a duplicate"),
+    ],
+)
+def test_damaged_verdicts_are_refused_in_one_line(tmp_path, row, wrong):
+    path = tmp_path / "verdicts.csv"
+    path.write_text(",".join(VERDICT_COLUMNS) + "\n" + row)
+    with pytest.raises(InputError, match=wrong) as refused:
+        read_verdicts(path)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.fixture(scope="module", params=[*PAPERS, *LOGS, *NAMED])
+def tracked(request):
+    """A paper's statistics and conclusions by the tracked tables."""
+    return request.param, *_judgement(Results(RESULTS, request.param))
+
+
+def test_the_tracked_verdicts_are_those_of_the_tracked_tables(tracked, tmp_path):
+    paper, claims, conclusions = tracked
+    made = read_provenance(RESULTS)
+    assert all(made[name]["profile"] == Profile.FULL for name in PAPERS)
+    profile = Profile(made.get(paper, {}).get("profile", Profile.QUICK))
+    origin = {"paper": paper, "profile": profile}
+    write_claims(claims, tmp_path / "claims.csv", command="c", **origin)
+    says = findings(paper)["claims"]
+    write_verdicts(conclusions, tmp_path / "verdicts.csv", says=says, **origin)
+    for name, read in (("claims.csv", read_claims), ("verdicts.csv", read_verdicts)):
+        old, new = read(RESULTS / name), read(tmp_path / name)
+        old = old[old["paper"] == paper].reset_index(drop=True)
+        if name == "claims.csv":
+            old, new = (table.drop(columns="command") for table in (old, new))
+        pd.testing.assert_frame_equal(old, new, rtol=1e-6)
+
+
+def test_every_claim_has_one_verdict_and_a_plain_sentence(tracked):
+    paper, claims, conclusions = tracked
+    assert {each.id for each in conclusions} == set(findings(paper)["claims"])
+    for each in conclusions:
+        headlines = [c for c in claims if c.id == each.id and c.role is Role.HEADLINE]
+        assert headlines, each.id
+        assert each.sentence.endswith(".")
+        assert "nan" not in each.sentence
+        assert not re.search(r"unknown times|unknown share|\de\+\d", each.sentence)
+        if each.verdict is Verdict.UNDECIDED:
+            assert re.search(r"more \w+( of log)? would|too short", each.sentence)
+
+
+def test_criteria_hold_the_rule_and_nothing_that_came_out(tracked):
+    _, claims, _ = tracked
+    for claim in claims:
+        assert claim.criterion
+        assert "p = " not in claim.criterion
+        if claim.verdict is Verdict.SHOWN:
+            assert claim.role is Role.BESIDE
+
+
+def test_a_claim_says_its_role():
+    assert Claim("PB1", "s", Interval.exact(1.0), "c", Verdict.REPRODUCED).role is Role.HEADLINE

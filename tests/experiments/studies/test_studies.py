@@ -1,0 +1,69 @@
+"""Every study of conf/study composes, fits together, and runs, at the least size."""
+
+import numpy as np
+import pytest
+
+from experiments.runs.evaluate import evaluate
+from experiments.runs.paths import CONF
+from experiments.runs.row import Outcome
+from experiments.studies.real_logs.study import missing
+from experiments.sweeps.plan import planned
+from tests.fixtures.fakes import peers_may_be_missing
+
+STUDIES = sorted(path.stem for path in (CONF / "study").glob("*.yaml"))
+
+
+def shortened(experiment):
+    """The experiment on a few metres, with few particles."""
+    route, estimator = dict(experiment.config["route"]), dict(experiment.config["estimator"])
+    if "distance_m" in route:
+        route["distance_m"] = 4.0
+    for key, most in (("n_particles", 20), ("n_most", 300), ("n_least", 100)):
+        if key in estimator:
+            estimator[key] = min(estimator[key], most)
+    return experiment.replaced(route=route, estimator=estimator, repeats=1)
+
+
+def runs_of(name, folder):
+    """One run of a study for each of its estimators."""
+    given = {
+        "maximo2024_own": f"data={own_places(folder)}",
+        "maximo2024_network": "network._target_=tests.fixtures.fakes.outline",
+    }
+    runs = list(planned([f"study={name}", *([given[name]] if name in given else [])]))
+    return list({run.estimator_name: run for run in reversed(runs)}.values())
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=[pytest.mark.slow] * (n in ("leaderboard", "peers"))) for n in STUDIES],
+)
+def test_each_study_fits_together(name, tmp_path):
+    for experiment in runs_of(name, tmp_path):
+        with peers_may_be_missing():
+            experiment.check()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", STUDIES)
+def test_each_study_runs(name, tmp_path):
+    if name == "decristoforis2020_rawseeds":
+        pytest.skip("needs a log of Rawseeds")
+    if name.startswith(("real_logs", "decristoforis2020_log")) and (why := missing()):
+        pytest.skip(why)
+    for experiment in runs_of(name, tmp_path):
+        with peers_may_be_missing():
+            rows = evaluate(shortened(experiment))
+        assert [row["status_detail"] for row in rows if row["status"] == Outcome.FAILED] == []
+
+
+def own_places(folder):
+    """Files of positions and descriptors along a line."""
+    rng = np.random.default_rng(0)
+    line = np.column_stack([np.arange(30.0), np.zeros(30)])
+    unit = rng.standard_normal((30, 64))
+    unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+    for prefix in ("map_", ""):
+        np.save(folder / f"{prefix}positions.npy", line)
+        np.save(folder / f"{prefix}descriptors.npy", unit)
+    return folder

@@ -1,0 +1,102 @@
+"""The claim GI9: tables that pass and fail it, its sentence and figures."""
+
+import dataclasses
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from experiments.judging.results import Results
+from experiments.judging.verdict import Role, Verdict
+from experiments.studies.teams import claims, figures, settings
+
+
+def table_of(ratio, n_worlds=30, spread=0.4, seed=0):
+    """Errors in worlds where sightings change them by this factor."""
+    rng, rows = np.random.default_rng(seed), []
+    for world in range(n_worlds):
+        for size in settings.SIZES:
+            for name in claims.NAMES:
+                error = np.exp(rng.normal(-2.0, 0.5))
+                links = [*settings.LINKS] if (name, size) == ("ekf_slam", settings.LINKED) else []
+                common = {"seed": world, "size": size, "filter": name}
+                for sightings in (False, True):
+                    factor = ratio * np.exp(rng.normal(0.0, spread)) if sightings else 1.0
+                    for link in [settings.ALWAYS, *(links if sightings else [])]:
+                        slower = 1.0 if link == settings.ALWAYS else 2.0
+                        row = {"sightings": sightings, "link": link}
+                        row["ate_rmse_m"] = error * factor * slower
+                        rows.append(common | row)
+    return pd.DataFrame(rows)
+
+
+def headlines(table):
+    return [claim for claim in claims.gi9(table) if claim.role is Role.HEADLINE]
+
+
+def test_gi9_is_one_statistic_for_each_size_by_the_papers_method():
+    found = headlines(table_of(0.5))
+    assert len(found) == len(settings.SIZES)
+    assert all("FastSLAM" in claim.statistic for claim in found)
+    assert {claim.verdict for claim in found} == {Verdict.REPRODUCED}
+    assert all(0.4 < claim.found.value < 0.6 for claim in found)
+
+
+def test_gi9_can_fail():
+    assert {claim.verdict for claim in headlines(table_of(1.6))} == {Verdict.NOT_REPRODUCED}
+    assert Verdict.REPRODUCED not in {claim.verdict for claim in headlines(table_of(1.0))}
+    assert Verdict.UNDECIDED in {claim.verdict for claim in headlines(table_of(0.8, 6))}
+    mixed = table_of(0.5)
+    worse = (mixed["size"] == 4) & (mixed["filter"] == "fastslam") & mixed["sightings"]
+    mixed.loc[worse, "ate_rmse_m"] *= 6.0
+    [conclusion] = claims.conclusions(None, list(claims.gi9(mixed)))
+    assert conclusion.verdict is Verdict.NOT_REPRODUCED
+
+
+def test_what_communication_costs():
+    costs = [c for c in claims.gi9(table_of(0.5)) if "communication" in c.statistic]
+    assert len(costs) == len(settings.LINKS)
+    assert [c.found.value for c in costs] == pytest.approx([2.0] * len(costs))
+
+
+def test_the_sentence_says_the_factors(tmp_path):
+    made = Results(tmp_path, "teams")
+    log = [
+        {"robot": k, "arm": arm, "ate_rmse_m": 0.4 / (1 + i)}
+        for k in range(5)
+        for i, arm in enumerate(settings.MRCLAM_ARMS)
+    ]
+    made.write_tables(errors=table_of(0.5), mrclam=pd.DataFrame(log))
+    found = claims.judge(made)
+    [conclusion] = claims.conclusions(made, found)
+    assert conclusion.verdict is Verdict.REPRODUCED
+    assert "with 2 robots," in conclusion.sentence
+    assert "On MRCLAM 6 a team of five errs 0.33 times a robot alone." in conclusion.sentence
+    bare = [c for c in found if "MRCLAM" not in c.statistic]
+    [conclusion] = claims.conclusions(made, bare)
+    assert "MRCLAM" not in conclusion.sentence
+
+
+def test_figures_draw(tmp_path):
+    made = Results(tmp_path, "teams")
+    made.write_tables(errors=table_of(0.5, n_worlds=6))
+    square = np.array([[0.0, 0, 4, 0], [4, 0, 4, 4]])
+    paths = {f"truth_{k}": np.cumsum(np.ones((5, 2)), axis=0) + k for k in range(3)}
+    lines = {f"sightings_{k}": np.array([[0.0, 0, 1 + k, 2]]) for k in range(3)}
+    heights = np.tile([0.0, 2.5], (2, 1))
+    made.write_arrays("drive", walls=square, wall_z_m=heights, **paths, **lines)
+    pages = figures.draw(made)
+    assert set(pages) == {"teams_drive", "teams_errors", "teams_links"}
+    for page in pages.values():
+        page.savefig(tmp_path / "page.png")
+
+
+def test_the_arms_of_a_filter_differ_in_sightings_alone():
+    from experiments.studies.teams.study import _arms, _composed
+
+    for option in settings.WORLDS[next(iter(settings.WORLDS))]:
+        arms = [arm for arm, labels in _arms(2, option) if labels["link"] == settings.ALWAYS]
+        first, second = (dataclasses.asdict(_composed(0, arm)) for arm in arms)
+        assert first["config"]["estimator"].pop("robots") is None
+        assert second["config"]["estimator"].pop("robots") == "robots"
+        assert first == second

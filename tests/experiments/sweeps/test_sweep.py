@@ -1,0 +1,804 @@
+"""Sweeps: what is expanded, composed and packed, and what is left after failures and kills."""
+
+import contextlib
+import json
+import os
+import re
+import shlex
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from experiments.runs import cache, store
+from experiments.runs.experiment import Experiment, files_digest, searched
+from experiments.runs.interrupts import held_interrupts
+from experiments.runs.paths import quoted, results
+from experiments.runs.row import Status, read_rows
+from experiments.runs.store import read_runs
+from experiments.runs.version import source_digest
+from experiments.sweeps import launch, plan
+from experiments.sweeps.collect import collect
+from sim.errors import InputError
+from tests.experiments.cli.test_cli import QUICK, ROOT, called, estima, refused
+from tests.fixtures import kill_sweeps
+
+SHORT = [*QUICK, "route=linear_1"]
+ALONE = [*SHORT, "hydra/launcher=basic"]  # no workers, for what does not depend on them
+
+
+def table_of(name):
+    return collect(name)
+
+
+def folder(name):
+    return results() / "runs" / name
+
+
+@pytest.fixture
+def name(request):
+    """Return a sweep's name of its own, cleared before and after."""
+    own = f"test_{request.node.name}".replace("[", "_").replace("]", "")
+    clear(own)
+    yield own
+    clear(own)
+
+
+def clear(name):
+    for path in sorted(folder(name).rglob("*"), reverse=True):
+        path.rmdir() if path.is_dir() else path.unlink()
+    if folder(name).exists():
+        folder(name).rmdir()
+
+
+def test_the_last_values_of_a_key_are_swept():
+    found = plan.swept(["seed=range(0,3)", "robot.kr=1e-5,1e-4", "seed=7,8", "a=b"])
+    assert found == {"seed": [7, 8], "robot.kr": [1e-5, 1e-4], "a": ["a=b"]}
+    assert plan.swept(["seed=range(0,1000000)"])["seed"] == range(1000000)
+    with pytest.raises(InputError, match=r"interval.*lists and ranges"):
+        plan.swept(["robot.kr=interval(0,1)"])
+
+
+def test_a_million_runs_are_planned_as_each_of_them_alone():
+    every = plan.plan_of(["seed=range(0,1000)", "robot.kr=range(1,101,0.1)", "robot.kl=${robot.kr}",
+                          "simulation.physics=kinematic"])  # fmt: skip
+    assert len(every.keys) == len(np.unique(every.keys)) == 10**6
+    assert len(every.families) == 1
+    for i in (0, 1, 500_123, 999_999):
+        run = every.experiment(i)
+        c = run.config
+        alone = Experiment.compose(
+            [f"seed={i // 1000}", f"robot.kr={c['robot']['kr']}", "robot.kl=${robot.kr}",
+             "simulation.physics=kinematic"]
+        )  # fmt: skip
+        assert c == alone.replaced(picture=False).config
+        assert int(alone.key, 16) == every.keys[i]
+
+
+def test_keys_of_a_plan_are_those_of_its_runs(tmp_path):
+    given = ["estimator=ekf_icp,ekf_icp_paper", "seed=2,1", "simulation.physics=kinematic,bullet",
+             "sensors=lms291", "prior.track_m=null,0.2", "world.n_objects=3,6",
+             "estimator.kr=1e-5,1e-4"]  # fmt: skip
+    every = plan.plan_of(given)
+    assert len(every.keys) == len(np.unique(every.keys)) == 64
+    recordings = {}
+    for i, key in enumerate(every.keys):
+        run = every.experiment(i)
+        assert int(run.key, 16) == key
+        recordings.setdefault(run.recording_key, set()).add(every.recordings[i])
+    assert len(recordings) == 8
+    assert all(len(same) == 1 for same in recordings.values())
+    assert [every.experiment(i).seed for i in range(0, 64, 16)] == [2, 1, 2, 1]
+
+
+def test_the_quick_composer_resolves_as_hydra_does():
+    given = ["world=office", "estimator=ekf_icp,odometry", "sensors=lms291", "robot.kr=1e-6,2e-6"]
+    runs = list(plan.planned([*given, "estimator.window_s=0.1", "study=decristoforis2020/office",
+                               "seed=3,4"]))  # fmt: skip
+    assert len(runs) == 2 * 2 * 2
+    for run in runs:
+        c = run.config
+        lines = [
+            "study=decristoforis2020/office", "world=office", "sensors=lms291",
+            f"estimator={run.choices['estimator']}", f"robot.kr={c['robot']['kr']}",
+            f"seed={c['seed']}", "estimator.window_s=0.1", "picture=false",
+        ]  # fmt: skip
+        assert c == Experiment.compose(lines).config
+        assert c["estimator"]["kr"] == c["robot"]["kr"]  # belief follows truth after the change
+    assert len({run.key for run in runs}) == 8
+
+
+def test_a_study_sweeps_its_own_values_unless_others_are_given():
+    runs = list(plan.planned(["study=decristoforis2020/office"]))
+    assert len(runs) == 20 * 4
+    assert {run.config["seed"] for run in runs} == set(range(1000, 1020))
+    runs = list(plan.planned(["study=decristoforis2020/office", "seed=1", "estimator=odometry"]))
+    assert [run.config["seed"] for run in runs] == [1]
+
+
+def test_unknown_keys_and_options_are_refused():
+    with pytest.raises(InputError, match=r"robot\.krr"):
+        list(plan.planned(["robot.krr=1,2"]))
+    refused(called("run", "-m", "robot.krr=1,2"), "robot.krr")
+    refused(called("run", "-m", "world=nowhere,room"), "nowhere")
+    refused(called("run", "-m", "--frob", "seed=1,2"), "--frob")
+
+
+def test_keys_depend_on_what_decides_the_rows(tmp_path, monkeypatch):
+    experiment = Experiment.compose([])
+    assert experiment.replaced(name="other").key == experiment.key
+    assert experiment.replaced(seed=5).key != experiment.key
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (tmp_path / "package").mkdir()
+    for target, source, beside in (
+        ("mine_for_key.Mine", "mine_for_key.py", "helper_of_mine.py"),
+        ("package.part.Mine", "package/part.py", "package/other.py"),  # without an __init__
+    ):
+        (tmp_path / source).write_text("import helper_of_mine\nclass Mine: pass\n")
+        own = experiment.replaced(estimator={"_target_": target})
+        keys = [own.key]
+        for file in (source, beside):
+            (tmp_path / file).write_text("import helper_of_mine\nclass Mine: x = 1\n")
+            source_digest.cache_clear()
+            keys.append(own.key)
+        assert len(set(keys)) == 3, target
+    with pytest.raises(InputError, match=r"nowhere\.npz"):
+        _ = experiment.replaced(recording="nowhere.npz").recording_key
+
+
+def test_keys_know_the_files_that_a_mapping_names(tmp_path):
+    (tmp_path / "a.npy").write_bytes(b"1")
+    named = {
+        "_target_": "experiments.papers.maximo2024.places.recording_from_files",
+        "positions": f"{tmp_path}/a.npy",
+    }
+    experiment = Experiment.compose([])
+    prior = experiment.config["prior"]
+    for changed in (
+        experiment.replaced(recording=named),
+        experiment.replaced(prior={**prior, "map": named}),
+        experiment.replaced(prior={**prior, "map": {"_target_": "x", "f": str(tmp_path)}}),
+    ):
+        (tmp_path / "a.npy").write_bytes(b"1")
+        before = changed.key
+        (tmp_path / "a.npy").write_bytes(b"2")
+        assert changed.key != before
+    assert files_digest({"a": "none", "b": "x" * 5000, "c": ".", "d": "/"}) == {}
+
+
+def test_keys_know_the_files_that_an_estimators_options_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    plain = Experiment.compose(["estimator=topological_mcl"])
+    before_files = plain.key, plain.recording_key
+    for name in ("a.npz", "b.npz", "laser", "stereo", "place", "lidar3d"):  # words are sensors
+        (tmp_path / name).write_bytes(b"1")
+    assert (plain.key, plain.recording_key) == before_files
+    feedback = {"_target_": "estimators.odometry.Odometry", "tables": ["none", "a.npz"]}
+    named = plain.with_estimator(map_path="a.npz")
+    steered = plain.replaced(route={**plain.config["route"], "feedback": feedback})
+    swept = ["estimator=topological_mcl", "estimator.map_path=a.npz,b.npz"]
+    old = named.key, steered.key, steered.recording_key, plan.plan_of(swept).keys[0]
+    (tmp_path / "a.npz").write_bytes(b"2")
+    new = named.key, steered.key, steered.recording_key, plan.plan_of(swept).keys[0]
+    assert all(a != b for a, b in zip(old, new, strict=True))
+    every = plan.plan_of(swept)
+    assert [int(every.experiment(i).key, 16) for i in range(2)] == every.keys.tolist()
+
+
+def test_packing_keeps_recordings_together():
+    every = plan.plan_of(["repeats=1,2", "seed=range(0,6)"])
+    jobs = plan.packed(every.recordings, 3)
+    assert sorted(np.concatenate(jobs)) == list(range(12))
+    assert len(jobs) == 3
+    for job in jobs:
+        assert len({every.experiment(i).seed for i in job}) == 2
+    assert max(len(job) for job in plan.packed(every.recordings, 100)) == 1
+
+
+def test_failed_runs_leave_rows_and_the_rest_goes_on(name, tmp_path):
+    broken = tmp_path / "broken.py"
+    broken.write_text(
+        "from estimators.odometry import Odometry\n"
+        "class Broken(Odometry):\n"
+        "    def step(self, frame):\n"
+        "        if frame.stamp > 1.0 and self.wheels.kr > 1e-4:\n"
+        "            raise ValueError('a planted fault')\n"
+        "        return super().step(frame)\n"
+    )
+    (tmp_path / "conf" / "estimator").mkdir(parents=True)
+    option = tmp_path / "conf" / "estimator" / "broken.yaml"
+    option.write_text("_target_: broken.Broken\nkr: ${robot.kr}\nkl: ${robot.kl}\n")
+    sweep_ = ["run", "-m", "--config-dir", str(tmp_path / "conf"), *ALONE, "estimator=broken",
+              "robot.kr=1e-5,1e-3", "seed=0,1", f"name={name}"]  # fmt: skip
+    done = estima(*sweep_, PYTHONPATH=f"{ROOT}:{tmp_path}")
+    assert done.returncode == 1, done.stderr
+    assert "2 of 4 runs" in done.stderr
+    assert "a planted fault" in done.stderr
+    _, *table = done.stdout.split("\n\n")[1].splitlines()
+    assert [line.split()[:3] for line in table] == [["1e-5", "2", "0"], ["1e-3", "2", "2"]]
+    assert "Next: estima table" in done.stdout
+    rows = table_of(name)
+    assert len(rows) == 4
+    assert sorted(rows["status"] == "ok") == [False, False, True, True]
+    before = set(folder(name).glob("*.parquet"))
+    again = estima(*sweep_, PYTHONPATH=f"{ROOT}:{tmp_path}")
+    assert "2 of them done before" in again.stderr
+    later = set(folder(name).glob("*.parquet")) - before
+    assert sum(len(read_rows(path)) for path in later) == 2  # only what had failed
+    assert len(table_of(name)) == 4
+
+
+def own_estimator(folder, body):
+    """Files of an estimator of one's own, `how` being its option; the words to sweep it by."""
+    (folder / "estuary.py").write_text(
+        "import os, sys\n"
+        "from estimators.odometry import Odometry\n"
+        "class Own(Odometry):\n"
+        "    def __init__(self, how, **rest):\n"
+        "        super().__init__(**rest)\n"
+        "        self.how = how\n"
+        "    def step(self, frame):\n"
+        f"        {body}\n"
+        "        return super().step(frame)\n"
+    )
+    (folder / "conf" / "estimator").mkdir(parents=True, exist_ok=True)
+    (folder / "conf" / "estimator" / "estuary.yaml").write_text(
+        "_target_: estuary.Own\nhow: sound\nkr: ${robot.kr}\nkl: ${robot.kl}\n"
+        "window_s: 0.1\nintegration: arc\n"
+    )
+    return ["run", "-m", "--config-dir", str(folder / "conf"), *SHORT, "estimator=estuary"]
+
+
+@pytest.mark.parametrize(
+    ("body", "words"),
+    [pytest.param("self.how == 'bad' and sys.exit(0)", "SystemExit", marks=pytest.mark.slow),
+     ("self.how == 'bad' and os._exit(3)", "process died")],
+    ids=["exits", "dies"],
+)  # fmt: skip
+def test_an_estimator_that_ends_its_process_costs_its_own_runs(name, tmp_path, body, words):
+    arguments = own_estimator(tmp_path, body)
+    done = estima(*arguments, "estimator.how=sound,bad", "seed=0,1", f"name={name}",
+                  PYTHONPATH=f"{ROOT}:{tmp_path}")  # fmt: skip
+    assert done.returncode == 1, done.stderr
+    assert "Traceback" not in done.stderr
+    assert "2 of 4 runs" in done.stderr
+    rows = table_of(name)
+    assert (rows.loc[rows["estimator.how"] == "sound", "status"] == "ok").all()
+    bad = rows[rows["estimator.how"] == "bad"]
+    assert (bad["status"] == "failed").all()
+    assert (bad["status_code"] + ": " + bad["status_detail"]).str.contains(words).all()
+    assert len(rows) == 4
+    assert {path.suffix for path in folder(name).iterdir()} == {".parquet", ".txt"}
+
+
+@pytest.mark.slow
+def test_rows_of_an_edited_estimator_do_not_mix(name, tmp_path, monkeypatch, capsys):
+    for body in ("pass", "frame.wheel_increments_m"):
+        words = own_estimator(tmp_path, body)
+        done = estima(
+            *words,
+            "hydra/launcher=basic",
+            "seed=0,1",
+            f"name={name}",
+            PYTHONPATH=f"{ROOT}:{tmp_path}",
+        )
+        assert done.returncode == 0, done.stderr
+        assert "0 of them done before" in done.stderr
+    with pytest.raises(InputError, match=r"several versions.*estuary\.Own"):
+        table_of(name)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    source_digest.cache_clear()
+    assert len(table_of(name)) == 2
+    assert "left out 2 rows" in capsys.readouterr().err
+    assert len(collect(name, all_versions=True)) == 4
+
+
+def test_only_what_an_estimator_imports_is_of_its_version(tmp_path, monkeypatch):
+    for module, text in (("tidal", "import tidal_a\n"), ("tidal_a", "from tidal_b import x\n"),
+                         ("tidal_b", "x = 1\n"), ("other", "y = 1\n")):  # fmt: skip
+        (tmp_path / f"{module}.py").write_text(text)
+    monkeypatch.syspath_prepend(str(tmp_path))
+
+    def digest():
+        source_digest.cache_clear()
+        return source_digest("tidal.Own")
+
+    first = digest()
+    (tmp_path / "other.py").write_text("y = 2\n")
+    (tmp_path / "more.py").write_text("def broken(\n")
+    assert digest() == first
+    (tmp_path / "tidal_b.py").write_text("x = 2\n")
+    assert digest() != first
+
+
+@pytest.mark.slow
+def test_two_sweeps_of_one_name_at_once(name):
+    command = [sys.executable, "-m", "experiments.cli", "run", "-m", *SHORT, f"name={name}",
+               "hydra/launcher=basic"]  # fmt: skip
+    both = [
+        subprocess.Popen(
+            [*command, f"seed=range({low},{low + 15})"], cwd=ROOT, stderr=subprocess.PIPE,
+            text=True, env={**os.environ, "PYTHONPATH": str(ROOT)},
+        )
+        for low in (0, 100)
+    ]  # fmt: skip
+    for process in both:
+        _, errors = process.communicate(timeout=120)
+        assert process.returncode == 0, errors
+    assert sorted(table_of(name)["seed"]) == [*range(15), *range(100, 115)]
+    assert {path.suffix for path in folder(name).iterdir()} == {".parquet", ".txt"}
+
+
+@pytest.mark.slow
+def test_workers_end_with_a_killed_sweep(name):
+    process = subprocess.Popen(
+        [sys.executable, "-m", "experiments.cli", "run", "-m", *SHORT, f"name={name}",
+         "seed=range(0,400)"],
+        cwd=ROOT, stderr=subprocess.PIPE, env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+    while len(list(folder(name).glob("rows-*"))) < 2:  # both workers are at work
+        assert process.poll() is None
+        time.sleep(0.1)
+    process.kill()
+    # the pipe ends once nobody holds it any more
+    process.communicate(timeout=30)
+    assert list(folder(name).glob("plan-*"))
+    assert estima("run", "-m", *SHORT, f"name={name}", "seed=range(400,402)").returncode == 0
+    assert not list(folder(name).glob("plan-*"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sent", [signal.SIGTERM, signal.SIGINT])
+def test_a_stopped_sweep_says_so_and_leaves_no_plan(name, sent):
+    process = subprocess.Popen(
+        [sys.executable, "-m", "experiments.cli", "run", "-m", *SHORT, f"name={name}",
+         "seed=range(0,400)"],
+        cwd=ROOT, stderr=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": str(ROOT)},
+        start_new_session=True,
+    )  # fmt: skip
+    while not list(folder(name).glob("rows-*")):
+        assert process.poll() is None
+        time.sleep(0.1)
+    if sent == signal.SIGINT:  # a terminal sends it to the workers too
+        os.killpg(process.pid, sent)
+    else:
+        process.send_signal(sent)
+    _, errors = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert errors.count("interrupted") == errors.count("kept") == 1
+    last = errors.splitlines()[-1]
+    assert re.fullmatch(
+        r"estima: interrupted; \d+ of 400 runs are kept: run it again to go on", last
+    )
+    assert not list(folder(name).glob("plan-*"))
+    assert not store.ended(folder(name)).failed
+
+
+@pytest.fixture
+def usual_interrupt():
+    """An interrupt does what it does in a process of its own."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("usual_interrupt")
+def test_an_interrupt_is_no_result_of_a_run(tmp_path, monkeypatch):
+    """Compiled code makes an error of it, as an estimator's own `except` may."""
+
+    def evaluated(*_, **__):
+        signal.raise_signal(signal.SIGINT)
+        raise SystemError("returned a result with an exception set")
+
+    monkeypatch.setattr(launch, "evaluate", evaluated)
+    experiment = Experiment.compose(SHORT)
+    with store.journal(tmp_path / "rows.journal") as journal, pytest.raises(KeyboardInterrupt):
+        launch.run_and_record(experiment, {}, journal)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    ended = store.ended(tmp_path)
+    assert not len(ended.done)
+    assert not ended.failed
+
+
+@pytest.mark.usefixtures("usual_interrupt")
+def test_an_interrupt_waits_for_the_next_step_and_a_second_one_does_not():
+    reached = []
+
+    def work():
+        with held_interrupts() as on_step:
+            on_step(1)
+            signal.raise_signal(signal.SIGINT)
+            for stop in (on_step, lambda: signal.raise_signal(signal.SIGINT)):
+                with pytest.raises(KeyboardInterrupt):
+                    stop()
+                reached.append(stop)
+
+    with pytest.raises(KeyboardInterrupt):
+        work()
+    assert len(reached) == 2
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # as in a worker
+    with held_interrupts():
+        signal.raise_signal(signal.SIGINT)
+
+
+def test_a_sweep_that_has_not_ended_says_so(name, monkeypatch, capsys):
+    words = [*ALONE, f"name={name}", "seed=0,1,2"]
+
+    def interrupted(experiment, *_):
+        if experiment.seed == 2:
+            raise KeyboardInterrupt
+        return original(experiment, *_)
+
+    original = launch.run_and_record
+    monkeypatch.setattr(launch, "run_and_record", interrupted)
+    with pytest.raises(KeyboardInterrupt, match="2 of 3 runs are kept"):
+        launch.sweep(words)
+    capsys.readouterr()
+    assert len(table_of(name)) == 2
+    said = capsys.readouterr().err
+    assert "2 runs so far: the sweep of 3 is unfinished; to go on: estima run -m" in said
+    monkeypatch.undo()
+    launch.sweep(words)
+    capsys.readouterr()
+    assert len(table_of(name)) == 3
+    assert not capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["name=a,b", "seed=0"], "one, not several"),
+        (["name=2026", "seed=0,1"], "one word"),
+        (["name=../../evil", "seed=0,1"], "one word"),
+        (["name=null", "seed=0,1"], "one word"),
+        (["seed=range(5,0)"], "empty range"),
+        (["study=maximo2024/own", "seed=0,1"], "data"),
+    ],
+)
+def test_wrong_sweeps_end_in_one_line(arguments, words):
+    refused(called("run", "-m", *SHORT[:2], *arguments), words)
+    for never in ("runs/b", "runs/2026", "runs/None", "../evil"):
+        assert not (results() / never).exists()
+
+
+@pytest.mark.slow
+def test_values_that_no_column_holds_fail_alone(name):
+    done = estima("run", "-m", *ALONE, "seed=1,2,99999999999999999999999", f"name={name}",
+                  "world.n_objects=6,6.5")  # fmt: skip
+    assert done.returncode == 1, done.stderr
+    assert "Traceback" not in done.stderr
+    assert "3 of 6 runs" in done.stderr
+    rows = table_of(name)
+    assert len(rows) == 6
+    assert (rows["status"] == "ok").sum() == 3
+    out = folder(name).parent / f"{name}.csv"
+    try:
+        assert estima("table", name, "--rows", "-o", str(out)).returncode == 0
+        assert len(read_rows(out)) == 6
+        plotted = estima("plot", name, "--x", "seed", "-o", str(out.with_suffix(".xyz")))
+        assert plotted.returncode == 2
+        assert "3 of 6 runs failed" in plotted.stderr
+        assert "a picture is .png" in plotted.stderr
+    finally:
+        out.unlink(missing_ok=True)
+
+
+@pytest.mark.slow
+def test_a_sweep_without_a_name_has_one_of_its_own(tmp_path):
+    place = {"ESTIMA_RESULTS": str(tmp_path)}
+    first = estima("run", "-m", *ALONE, "seed=0,1", **place)
+    again = estima("run", "-m", "seed=0,1", *SHORT, "hydra/launcher=joblib", **place)
+    other = estima("run", "-m", *ALONE, "seed=0,1,2", **place)
+    assert "2 runs, 0 of them done before" in first.stderr
+    assert "2 runs, 2 of them done before" in again.stderr
+    assert "3 runs, 0 of them done before" in other.stderr
+    folders = {path.name for path in (tmp_path / "runs").iterdir()}
+    assert len(folders) == 2
+    for own in folders:
+        assert re.fullmatch("sweep_[0-9a-f]{8}", own)
+        assert own in first.stderr + other.stderr
+
+
+def test_the_last_value_of_a_key_decides_a_sweeps_own_name():
+    made = plan.plan_of(["seed=0,1"])
+    orders = (["robot.kr=1e-5", "robot.kr=1e-4"], ["robot.kr=1e-4", "robot.kr=1e-5"])
+    forward, back = (launch._name(made, ["seed=0,1", *order], None) for order in orders)
+    assert forward != back
+    assert forward == launch._name(made, ["robot.kr=1e-4", "seed=0,1"], None)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["-m", "hydra/sweeper=optuna"], ["hydra/sweeper", "every combination"]),
+        (["-m", "hydra.sweep.dir=/tmp/x"], ["hydra.sweep.dir", "set name"]),
+        (["hydra.run.dir=/tmp/x"], ["hydra.run.dir", "--results"]),
+        (["hydra.verbose=true"], ["hydra.verbose", "no log"]),
+        (["-m", "robot.kr=interval(0,1)"], ["interval(0,1)", "range(0,1,0.1)"]),
+        (["-m", "route=glob(nothing*)"], ["empty range or list"]),
+        (["-m", "--info"], ["--info", "leave out -m"]),
+        (["-m", "--cfg", "job"], ["--cfg", "leave out -m"]),
+    ],
+)
+def test_what_hydra_would_ignore_is_refused(arguments, words):
+    refused(called("run", *arguments, *QUICK, "seed=0"), *words)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["seed=range(0,1000000000000)"], "range.0,1000000000000.: .* at most 100,000,000 runs"),
+        (["robot.kr=range(0,1e12,0.1)"], "at most 100,000,000 runs"),
+        (["robot.kr=range(0,inf,0.1)"], "at most 100,000,000 runs"),
+        (["seed=range(0,20000)", "robot.kr=range(0,10000)"], "2e[+]08 runs: a sweep has at most"),
+        (["seed=range(0,5,0)"], "step of a range must not be 0"),
+        (["seed=1,2", "hydra.searchpath=[file:///nope]"], "there is no folder /nope"),
+    ],
+)
+def test_what_cannot_be_planned_is_refused_before_it_is_listed(arguments, words):
+    with pytest.raises(InputError, match=words):
+        plan.plan_of(arguments)
+
+
+@pytest.mark.parametrize("sweeps", ["3", "[3]", "[[seed]]"])
+def test_the_sweeps_of_a_study_are_a_list_of_mappings(tmp_path, sweeps):
+    option(tmp_path, f"sweeps: {sweeps}")
+    with pytest.raises(InputError, match="sweeps must be a list of mappings"):
+        plan.plan_of(["study=own", "seed=0,1"], str(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("text", "is_read"),
+    [
+        ("hydra: {sweeper: {params: {seed: '1,2'}}}", True),
+        ("hydra: {sweep: {dir: zzz}, verbose: true}", False),
+        ("hydra: {sweeper: {max_batch_size: 1}}", False),
+        ("hydra: {launcher: {n_jobs: 1}}", False),
+        ("hydra: 3", False),
+        ("hydra: {sweeper: 3}", False),
+        ("defaults: [{override /hydra/launcher: basic}]", False),
+    ],
+)
+def test_a_studys_settings_of_hydra_that_nothing_reads_are_refused(tmp_path, text, is_read):
+    option(tmp_path, text)
+    if is_read:
+        assert len(plan.plan_of(["study=own"], str(tmp_path)).keys) == 2
+        return
+    with pytest.raises(InputError, match=r"own\.yaml: .*hydra\.sweeper\.params alone"):
+        searched(tmp_path)
+
+
+def option(folder_, text):
+    (folder_ / "study").mkdir()
+    (folder_ / "study" / "own.yaml").write_text(f"# @package _global_\n{text}\n")
+
+
+@pytest.mark.parametrize(
+    ("argument", "words"),
+    [("hydra.launcher.n_jobs=0", "or -1 for all"), ("+hydra.sweeper.params={}", "seed=1,2")],
+)
+def test_a_sweeps_wrong_settings_of_hydra(argument, words):
+    with pytest.raises(InputError, match=words):
+        launch.sweep(["seed=1,2", argument])
+
+
+def test_globs_choose_options():
+    runs = list(plan.planned(["route=glob(linear_*)", "simulation.physics=kinematic"]))
+    assert [run.choices["route"] for run in runs] == [f"linear_{i}" for i in range(1, 5)]
+
+
+@pytest.mark.parametrize(
+    "name", ["a\\'b", "q${seed}x", "a\\${x}\\", "\\\\${x}'", "a b,c=[d]{e}", "ä$"]
+)
+def test_any_path_can_be_a_value(name):
+    experiment = Experiment.compose([f"recording={quoted(name)}"])
+    assert experiment.config["recording"] == name
+
+
+def test_a_missing_value_can_be_given_in_a_sweep(tmp_path):
+    runs = list(plan.planned(["study=maximo2024/own", f"data={tmp_path}", "seed=0,1"]))
+    assert len(runs) == 2
+    assert runs[0].config["recording"]["positions"] == f"{tmp_path}/positions.npy"
+
+
+@pytest.mark.slow
+def test_files_that_are_not_the_runs_rows(name):
+    swept_ = ["run", "-m", *ALONE, "seed=0,1,2", f"name={name}"]
+    assert estima(*swept_).returncode == 0
+    expected = table_of(name)
+    first, second, *_ = sorted(folder(name).glob("*.parquet"))
+    first.write_bytes(second.read_bytes())
+    again = estima(*swept_)
+    assert f"{first} does not match its checksum; its runs are done again" in again.stderr
+    assert again.returncode == 0, again.stderr
+    pd.testing.assert_frame_equal(table_of(name), expected, check_exact=True)
+    expected.to_parquet(folder(name) / "all.parquet")
+    assert len(table_of(name)) == 3  # each row once
+    (folder(name) / "all.parquet").unlink()
+    os.mkfifo(folder(name) / "rows-fifo.parquet")
+    refused(called(*swept_), "not a file of rows; remove it")
+    (folder(name) / "rows-fifo.parquet").unlink()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("launcher", ["basic", "submitit_local", "ray"])
+def test_launchers_give_the_same_table(name, launcher):
+    plugin = {"submitit_local": "hydra_submitit_launcher", "ray": "hydra_ray_launcher"}
+    if launcher in plugin:
+        pytest.importorskip(f"hydra_plugins.{plugin[launcher]}", reason="an extra, not installed")
+    swept_ = [*SHORT, "seed=0,1", "robot.kr=1e-5,1e-4"]
+    first, second = f"{name}_a", f"{name}_b"
+    try:
+        for own, choice in ((first, "joblib"), (second, launcher)):
+            clear(own)
+            done = estima("run", "-m", *swept_, f"name={own}", f"hydra/launcher={choice}")
+            assert done.returncode == 0, done.stderr
+        left, right = (table_of(own).drop(columns="name") for own in (first, second))
+        pd.testing.assert_frame_equal(left, right, check_exact=True)
+    finally:
+        clear(first)
+        clear(second)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("launcher", ["joblib", "ray"])
+def test_a_killed_sweep_comes_to_the_same_table(launcher, tmp_path):
+    if launcher == "ray":
+        pytest.importorskip("hydra_plugins.hydra_ray_launcher", reason="an extra, not installed")
+    (killed, undisturbed), counts, _ = kill_sweeps.run(tmp_path, launcher, n_kills=20, seed=0)
+    assert killed == undisturbed
+    assert sum(counts.values()) == 20
+    assert min(counts.values()) > 0
+
+
+def test_a_job_tried_again_goes_on(tmp_path, monkeypatch):
+    """As Ray and SLURM do it, in the midst of a line."""
+    every = plan.plan_of([*QUICK, "seed=range(0,4)"])
+    jobs = launch.Jobs(tmp_path, 1)
+    jobs.add(every, np.arange(4))
+    share = json.loads(launch.share_of(jobs.plan, 0).read_text())
+    ran = []
+
+    def run(experiment, _, journal):
+        ran.append(experiment.seed)
+        journal.begin(experiment.key)
+        journal.append([{**experiment.labels(""), "seed": experiment.seed, **Status().columns()}])
+        if len(ran) == 2:
+            with journal.path.open("a") as file:
+                file.write('0123abcd b"half a li')
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(launch, "run_and_record", run)
+    with pytest.raises(KeyboardInterrupt):
+        launch.run_share(share)
+    for _ in range(2):
+        launch.run_share(share)
+        assert ran == [0, 1, 2, 3]
+    assert sorted(read_runs(tmp_path)["seed"]) == [0, 1, 2, 3]
+
+
+def test_a_bad_combination_in_a_large_family_fails_alone(tmp_path):
+    """Each of its values is sound with the others' first, so no check finds it before."""
+    every = plan.plan_of(
+        [*SHORT, "sensors=hokuyo", "estimator=mcl", "prior.map=world", "seed=range(0,600)",
+         "estimator.n_least=100,5000", "estimator.n_most=20000,2000"]
+    )  # fmt: skip
+    assert len(every.families) == 1
+    launch.check(every, np.arange(2400))
+    with store.journal(tmp_path / "rows-0.journal") as journal:
+        for i in (1, 3):
+            launch.run_and_record(every.experiment(i), {}, journal)
+    rows = read_runs(tmp_path).set_index("estimator.n_least")
+    assert rows.loc[100, "status"] != "failed"
+    assert rows.loc[5000, "status"] == "failed"
+    assert "n_least" in rows.loc[5000, "status_detail"]
+
+
+def test_the_number_of_jobs():
+    runs = plan.plan_of([*QUICK, "seed=range(0,40)"])
+    assert len(plan.packed(runs.recordings, launch._n_jobs(["jobs=20"]))) == 20
+    assert launch._n_jobs([]) == launch._n_jobs(["jobs=null"]) > 0
+    for wrong in (["jobs=0"], ["jobs=many"], ["jobs=1", "jobs=2"]):
+        with pytest.raises(InputError, match="one whole number"):
+            launch._n_jobs(wrong)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("full", ["cache", "runs/{name}"], ids=["recordings", "rows"])
+def test_a_full_disk_ends_in_a_line_and_a_correct_re_run(name, full, tmp_path):
+    place = results() / full.format(name=name)
+    command = shlex.join(
+        [sys.executable, "-m", "experiments.cli", "run", "-m", *SHORT, "seed=range(0,12)",
+         f"name={name}"]
+    )  # fmt: skip
+    mount = f"mkdir -p {place} && mount -t tmpfs -o size=150k estima {place}"
+    if subprocess.run(["unshare", "-rm", "sh", "-c", mount], cwd=ROOT, check=False).returncode:
+        pytest.skip("a small disk cannot be mounted here")
+    script = (
+        f"{mount}\n{command}\necho code $?\nmount -o remount,size=100m {place}\n"
+        f"{command}\necho code $?\ncp {folder(name)}/*.parquet {tmp_path}"
+    )
+    done = subprocess.run(
+        ["unshare", "-rm", "sh", "-c", script], cwd=ROOT, capture_output=True, text=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT)}, timeout=120, check=False,
+    )  # fmt: skip
+    said = [line for line in done.stdout.splitlines() if line.startswith("code ")]
+    first, second = (int(line.split()[1]) for line in said)
+    assert first in (1, 2), done.stderr
+    assert second == 0, done.stderr
+    lines = [line for line in done.stderr.splitlines() if line.startswith("estima: ")]
+    assert len(lines) == 1
+    assert "No space left on device" in lines[0]
+    assert "free some space" in lines[0]
+    assert "Traceback" not in done.stderr
+    clear(name)
+    assert estima("run", "-m", *SHORT, "seed=range(0,12)", f"name={name}").returncode == 0
+    pd.testing.assert_frame_equal(collect(str(tmp_path)), table_of(name), check_exact=True)
+
+
+@pytest.mark.slow
+def test_damaged_files_are_made_again(name):
+    swept_ = ["run", "-m", *ALONE, "seed=range(90001,90005)", f"name={name}"]
+    assert estima(*swept_).returncode == 0
+    expected = table_of(name)
+    recordings = [
+        cache.folder() / f"{Experiment.compose([*SHORT, f'seed={seed}']).recording_key}.npz"
+        for seed in range(90001, 90005)
+    ]
+    half = recordings[0].read_bytes()[:5000]
+    other = bytearray(recordings[1].read_bytes())
+    other[len(other) // 2] ^= 0x10
+    recordings[0].write_bytes(half)
+    recordings[1].write_bytes(other)
+    recordings[2].write_bytes(b"")
+    for row in folder(name).glob("*.parquet"):
+        row.write_bytes(row.read_bytes()[:-100])
+    again = estima(*swept_)
+    assert again.returncode == 0, again.stderr
+    assert "0 of them done before" in again.stderr
+    for recording in recordings[:3]:
+        assert any(
+            str(recording) in line and "making it again" in line
+            for line in again.stderr.splitlines()
+        )
+    pd.testing.assert_frame_equal(table_of(name), expected, check_exact=True)
+
+
+def test_compiling_is_said_once_and_restarts_the_rate(tmp_path, monkeypatch, capsys):
+    jobs, restarts = launch.Jobs(tmp_path, 1), []
+    note = launch._compiling(jobs.plan)
+    note.parent.mkdir()
+    ended = iter([1, 2, 3, 4, 5])  # runs at each look; code is compiled before the second
+
+    def counted(*_):
+        done = next(ended, 5)
+        if done == 1:
+            note.touch()
+        return 0, done, 0
+
+    @contextlib.contextmanager
+    def shown(*_, **__):
+        yield lambda done, failed, *, restart: restarts.append((done, restart))
+
+    monkeypatch.setattr(launch, "progress", shown)
+    monkeypatch.setattr(launch, "_counted", counted)
+    jobs.sizes[tmp_path / "rows-0.jsonl"] = 5
+    with launch._watched(jobs, 5):
+        deadline = time.monotonic() + 20.0
+        while len(restarts) < 5 and time.monotonic() < deadline:
+            time.sleep(0.05)
+    assert restarts[:5] == [*((n, True) for n in (1, 2, 3, 4)), (5, False)]
+    assert capsys.readouterr().err.count("compiling numerical code") == 1
+
+
+@pytest.mark.slow
+def test_nothing_is_left_of_the_plan(name):
+    done = estima("run", "-m", *SHORT, "seed=0,1", f"name={name}")
+    assert done.returncode == 0, done.stderr
+    assert {path.suffix for path in folder(name).iterdir()} == {".parquet", ".txt"}
+    assert not list(Path.cwd().glob("multirun*"))

@@ -1,0 +1,160 @@
+"""Figures show what they say: equal samples, every curve named, rows at one height."""
+
+import itertools
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from experiments.papers.decristoforis2020 import figures as decristoforis2020
+from experiments.papers.gil2008 import figures as gil2008
+from experiments.papers.maximo2024 import figures as maximo2024
+from experiments.studies.teams import figures as teams
+
+ERRORS = (
+    "revised_ate_rmse_m",
+    "revised_ate_aligned_rmse_m",
+    "map_rmse_m",
+    "map_aligned_rmse_m",
+)
+
+
+def test_figure_8_over_worlds_has_equal_samples_and_names_every_filter():
+    rows = [
+        (seed, m, noise, name, draw, 1.0 if draw == 0 else 50.0)
+        for seed, m, (noise, name) in itertools.product(
+            range(3),
+            (10, 200),
+            [("paper", "paper"), ("paper", "fastslam2"), ("pixel", "fastslam2")],
+        )
+        for draw in range(3 if m == 200 else 1)
+    ]
+    columns = ["seed", "n_particles", "noise", "filter", "draw", "error"]
+    table = pd.DataFrame(rows, columns=columns)
+    table = table.assign(**dict.fromkeys(ERRORS, table["error"]))
+    bound = table[table["draw"] == 0]
+    page = gil2008.by_particles_over_worlds(table, bound)
+    for ax in page.axes:
+        for drawn in ax.containers:
+            assert drawn.lines[0].get_ydata() == pytest.approx([1.0, 1.0])
+    named = {text.get_text() for text in page.legends[0].get_texts()}
+    assert named == {"as printed", "FastSLAM 2.0", "batch bound"}
+
+
+def test_ways_to_associate_stand_at_one_height_left_and_right():
+    ways = [
+        ("fastslam2", "mahalanobis", 1e-3, 0.9),
+        ("fastslam2", "descriptor", 1e-3, 0.9),
+        ("ekf_slam", "mahalanobis", 1e-3, 0.9),
+        ("fastslam2", "known", 1e-3, 0.9),
+    ]
+    columns = ["filter", "association", "p0", "sigma_descriptor"]
+    table = pd.concat(
+        pd.DataFrame(part, columns=columns).assign(noise=noise, seed=seed, noise_at="predicted")
+        for noise, part in (("paper", ways), ("pixel", ways[:2]))
+        for seed in range(2)
+    ).assign(revised_ate_rmse_m=1.0, odometry_rmse_m=2.0, right_share=0.5, matching_precision=0.9)
+    axes = gil2008.by_association(table).axes
+    for left, right, count in ((axes[0], axes[1], 4), (axes[2], axes[3], 2)):
+        assert left.get_ylim() == right.get_ylim()
+        heights = [bar.get_y() + bar.get_height() / 2 for bar in right.patches]
+        assert heights == pytest.approx(range(count))
+    names = [label.get_text() for label in axes[0].get_yticklabels()]
+    assert names[0] == "known"
+    assert names[-1] == "EKF-SLAM, Mahalanobis"
+
+
+def runs(errors):
+    rows = [
+        (seed, method, (seed + 1) * value) for seed in range(3) for method, value in errors.items()
+    ]
+    return pd.DataFrame(rows, columns=["seed", "method", "ate_rmse_m"])
+
+
+def test_the_drive_drawn_tells_its_errors():
+    drawn = runs({"odometry": 1.0, "icp": 0.5, "fusion": 0.1}).query("seed == 0")
+    told = decristoforis2020._of_drawn(drawn.assign(distance_m=300.2), "ate_rmse_m", "RMSE")
+    assert told == "300 m, seed 0; RMSE: odometry 1.00 m, ICP 0.50 m, fusion 0.10 m"
+
+
+def test_the_map_of_the_order_has_intervals_and_its_boundary():
+    table = pd.concat(
+        runs({"odometry": 1e4, "icp": 1.0, "fusion": ratio, "fusion_clone": ratio}).assign(
+            k_m=k, sigma_range_m=0.01, heading_rmse_rad=lambda t: t["ate_rmse_m"]
+        )
+        for k, ratio in ((1e-6, 2.0), (1e-4, 0.5))
+    )
+    page = decristoforis2020.ordering(table)
+    fused, alone, same = page.axes[:3]
+    assert [text.get_text() for text in fused.texts] == ["2\n2–2", "0.5\n0.5–0.5"]
+    (boundary,) = fused.lines
+    np.testing.assert_array_equal(boundary.get_xdata(), [0.5, 0.5])
+    assert not alone.lines  # better everywhere
+    assert {text.get_text() for text in same.texts} == {"1\n1–1"}
+    assert page.axes[-1]._colorbar.extend == "both"
+
+
+def test_shares_end_at_one():
+    starts = pd.DataFrame({"median_m": [0.1, 0.2], "rms_m": [0.2, 0.3], "spacing_m": 6.0})
+    kinds = list(maximo2024.describers.KINDS)
+    clusters = pd.DataFrame(
+        {
+            "geometry": "campus",
+            "descriptor": list(kinds),
+            "recall_at_1": 1.0,
+            "recall_at_1_percent": 1.0,
+        }
+    )
+    right = maximo2024.campus_errors(starts, clusters).axes[1]
+    assert np.array_equal(right.get_ylim(), (0.0, 1.0))
+
+
+def test_figures_1_and_2_of_gil2008_name_both_filters_and_fit_their_grids():
+    run = {}
+    for name in ("truth", "odometry", "paper", "fastslam2"):
+        grid = np.full((300, 300), np.nan, np.float32)
+        grid[100, :] = 0.9
+        run |= {f"{name}_grid": grid, f"{name}_origin": np.zeros(3)}
+    for name in ("paper", "fastslam2"):
+        run |= {
+            f"{name}_landmarks": np.ones((2, 3)),
+            f"{name}_covariances": np.tile(np.eye(3), (2, 1, 1)),
+        }
+    for page in (gil2008.maps(run), gil2008.corrected(run)):
+        titles = [ax.get_title(loc="left") for ax in page.axes]
+        assert "as printed" in titles[1]
+        assert "FastSLAM 2.0" in titles[2]
+        for ax in page.axes:
+            assert ax.get_xlabel() == "x, m"
+            assert np.ptp(ax.get_xlim()) < 40.0
+            assert np.ptp(ax.get_ylim()) < 40.0
+
+
+def test_figure_8_shows_both_designs():
+    rows = [
+        (m, name, draw, 2.0 if draw else 1.0)
+        for m, name in itertools.product((10, 200), ("paper", "fastslam2"))
+        for draw in (0, 0, 1, 2)
+    ]
+    table = pd.DataFrame(rows, columns=["n_particles", "filter", "image_draw", "error"])
+    table = table.assign(**dict.fromkeys(ERRORS, table["error"]))
+    table = table.assign(seed=1000, noise="paper", odometry_rmse_m=3.0)
+    page = gil2008.by_particles(table, table[:1])
+    for ax, mean in zip(page.axes, (2.0, 2.0, 1.0, 1.0), strict=True):
+        for drawn in ax.containers:
+            assert drawn.lines[0].get_ydata() == pytest.approx([mean, mean])
+    assert "2 runs each" in page.get_suptitle()
+
+
+def test_robots_that_drive_the_same_way_all_show():
+    way = np.array([[0.0, 0.0], [4.0, 0.0]])
+    run = {"walls": np.array([[0.0, -1.0, 4.0, -1.0]]), "wall_z_m": np.array([[0.0, 2.0]])}
+    run |= {f"truth_{number}": way for number in range(3)}
+    run |= {f"sightings_{number}": np.zeros((0, 4)) for number in range(3)}
+    page = teams.drive(run)
+    paths = [line for line in page.axes[0].lines if line.get_label().startswith("robot")]
+    assert len(paths) == 3
+    assert all(a.get_linewidth() >= b.get_linewidth() + 1.0 for a, b in itertools.pairwise(paths))
+    named = [text.get_text() for text in page.legends[0].get_texts()]
+    assert "start" in named
+    assert any("sighting" in name for name in named)
