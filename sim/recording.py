@@ -24,6 +24,7 @@ from sim.arrays import Array
 from sim.errors import InputError, require, required
 from sim.files import write_whole
 from sim.npz import UNREADABLE, read_arrays
+from sim.options import build
 from sim.recording_check import check_recording
 from sim.recording_format_1 import upgraded
 from sim.robot.drive import RobotGeometry
@@ -38,7 +39,6 @@ from sim.sensors.base import (
     sensor_settings,
     sensors_from_meta,
 )
-from sim.settings import build
 from sim.worlds.world import World
 
 FORMAT_VERSION = 2

@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 from sim.arrays import Array
 from sim.compiled import njit
 from sim.errors import require
-from sim.robot.drive import SLIP_TIME_CONSTANT_S, DifferentialDrive
-from sim.routes.route import TICK_S
+from sim.robot.base import TICK_S
+from sim.robot.drive import DifferentialDrive
+from sim.robot.slip import SLIP_TIME_CONSTANT_S
 
 Ticks = NDArray[np.int64]
 EndPoseMethod = Literal["sampled", "linearised"]

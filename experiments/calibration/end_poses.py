@@ -17,8 +17,8 @@ from experiments.calibration.result import CalibrationResult
 from experiments.evaluation.statistics import Interval
 from sim.arrays import Array
 from sim.errors import require
+from sim.robot.base import TICK_S
 from sim.robot.drive import DifferentialDrive
-from sim.routes.route import TICK_S
 
 Moments = tuple[Array, Array]
 

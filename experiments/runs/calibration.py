@@ -11,11 +11,12 @@ import yaml
 from sim.errors import InputError, require
 from sim.files import write_text
 from sim.formats.assemble import frame_stamps
+from sim.options import build
 from sim.recording import Log, Recording, WheelLog
 from sim.robot.drive import RobotGeometry
 from sim.sensors import Laser, RobotCamera, StereoCamera
 from sim.sensors.base import Sensor
-from sim.settings import build, check_numbers
+from sim.settings import check_numbers
 from sim.yaml_file import read_yaml
 
 _LONGEST_DELAY_S = 60.0

@@ -33,11 +33,11 @@ from experiments.runs.version import code_version, source_digest, version_with
 from sim.arrays import Array
 from sim.errors import InputError, blaming, require, required
 from sim.files import write_text
+from sim.options import build, find
 from sim.recording import Frame, Recording, load
-from sim.robot.drive import DifferentialDrive, RobotGeometry
+from sim.robot.base import Robot, RobotGeometry, robot_from_config
 from sim.sensors import Sensor, Sensors, sensors_from_config
 from sim.sensors.base import RecordedSensor, sensor_settings
-from sim.settings import build, find
 from sim.worlds import grid_file
 from sim.worlds.grid import OccupancyGrid
 from sim.worlds.world import World
@@ -396,9 +396,9 @@ class Experiment:
         world: World = make(self.config["world"], "world", rng=rng)
         return world
 
-    def robot(self) -> DifferentialDrive:
+    def robot(self) -> Robot:
         """Make the true robot."""
-        return build(DifferentialDrive, self.config["robot"], "robot")
+        return robot_from_config(self.config["robot"])
 
     def sensors(self) -> dict[str, Sensor]:
         """Make the sensors."""
@@ -453,21 +453,24 @@ class Experiment:
         streams
             Generators `slip` and `sensors`, in place of the seed's own.
         """
-        from sim.simulate import record
+        from sim.simulate import Member, record
 
         self._check_one_robot()
         self._check_simulation()
         return record(
             self.world(),
-            self.robot(),
-            self.sensors(),
-            self.route(),
-            streams or {axis: stream(self.config["seed"], axis) for axis in ("slip", "sensors")},
+            Member(
+                self.robot(),
+                self.sensors(),
+                self.route(),
+                streams
+                or {axis: stream(self.config["seed"], axis) for axis in ("slip", "sensors")},
+                config={key: self.config[key] for key in SIMULATED_KEYS},
+                onboard=self.onboard,
+            ),
             physics=self.config["simulation"]["physics"],
             rays=self.config["simulation"]["rays"],
-            config={key: self.config[key] for key in SIMULATED_KEYS},
             on_progress=on_progress,
-            onboard=self.onboard,
         )
 
     def onboard(

@@ -38,6 +38,7 @@ from sim.formats.rosbag import (
     typestore,
 )
 from sim.formats.rosbag_bounds import check_bounds
+from sim.options import build
 from sim.recording import CommandLog, Log, Recording, Truth, WheelLog, joined
 from sim.recording_format_1 import upgraded_sensors
 from sim.robot.drive import RobotGeometry
@@ -51,7 +52,6 @@ from sim.sensors import (
     point_cloud,
 )
 from sim.sensors.base import parted, schema_from_meta, sensors_from_meta
-from sim.settings import build
 from sim.worlds.world import World
 
 NOMINAL_TRACK_M, NOMINAL_RADIUS_M = 0.3, 0.1  # of a robot that the bag does not describe
@@ -344,7 +344,7 @@ def _laser(
         fov_rad=min(fov, 2.0 * math.pi),
         min_range_m=max(lowest, 0.0),
         max_range_m=highest,
-        mount=Mount(x, y, z, math.remainder(yaw, 2.0 * math.pi)),
+        mount=Mount(x_m=x, y_m=y, z_m=z, yaw_rad=math.remainder(yaw, 2.0 * math.pi)),
     )
     return laser, Log.of(laser, stamps[rows], ranges_m=ranges)
 

@@ -18,7 +18,7 @@ import numpy as np
 from sim import se2
 from sim.arrays import Array, Ints
 from sim.errors import InputError, require
-from sim.robot.drive import DifferentialDrive
+from sim.robot.base import TICK_S, Robot
 from sim.routes.feedback import CONTROL_TICKS, check_feedback
 from sim.routes.frontiers import (
     Mask,
@@ -32,7 +32,7 @@ from sim.routes.frontiers import (
     nearest,
     unknown_in_sight,
 )
-from sim.routes.route import TICK_S, Controller
+from sim.routes.route import Controller
 from sim.sensors.base import Reading, Sensors, sensor_of
 from sim.sensors.laser import Laser
 from sim.settings import check_numbers
@@ -113,12 +113,12 @@ class Explore:
             f"route.start_offset_m must be two numbers, got {self.start_offset_m!r}",
         )
 
-    def start(self, world: World, robot: DifferentialDrive) -> tuple[Array, Explorer]:
+    def start(self, world: World, robot: Robot) -> tuple[Array, Explorer]:
         """Start pose (3,) beside the world's, and the driver."""
         pose = se2.compose(world.start_pose, np.array([*self.start_offset_m, 0.0]))
         return pose, Explorer(self, robot, world, pose)
 
-    def about_s(self, world: World, robot: DifferentialDrive) -> float:
+    def about_s(self, world: World, robot: Robot) -> float:
         """About how long the drive takes, s, if frontiers are left all along."""
         return self.distance_m / self.speed_mps
 
@@ -133,7 +133,7 @@ class Explorer(Controller):
 
     _crew: Crew
 
-    def __init__(self, route: Explore, robot: DifferentialDrive, world: World, pose: Array) -> None:
+    def __init__(self, route: Explore, robot: Robot, world: World, pose: Array) -> None:
         super().__init__(robot, 4.0 * route.distance_m / route.speed_mps + 60.0)
         self._route, self._world = route, world
         self._driven_m = 0.0

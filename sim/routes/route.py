@@ -15,15 +15,14 @@ from numpy.typing import ArrayLike
 
 from sim.arrays import Array
 from sim.errors import InputError, require
-from sim.robot.drive import DifferentialDrive, arc_increment
+from sim.robot.arc import arc_increment
+from sim.robot.base import TICK_S, Robot
 from sim.routes.feedback import CONTROL_TICKS, check_feedback
 from sim.se2 import chain, transform
 from sim.settings import check_numbers
 from sim.worlds.world import World, facing_second
 
 Segment = tuple[float, float, float]
-
-TICK_S = 1.0 / 300.0
 
 
 @dataclass(frozen=True)
@@ -53,15 +52,15 @@ class OpenLoop:
         object.__setattr__(self, "segments", tuple(_merged(self.segments)))
         require(self.segments, "route.segments is empty; give at least one [v, omega, duration]")
 
-    def start(self, world: World, robot: DifferentialDrive) -> tuple[Array, Replay]:
+    def start(self, world: World, robot: Robot) -> tuple[Array, Replay]:
         """Start pose (3,) of the world, and the driver."""
         return world.start_pose, Replay(self.profile(robot))
 
-    def about_s(self, world: World, robot: DifferentialDrive) -> float:
+    def about_s(self, world: World, robot: Robot) -> float:
         """How long the drive takes, s."""
         return float(self.edges_s(robot)[-1]) + self.rest_s
 
-    def profile(self, robot: DifferentialDrive, dt_s: float = TICK_S) -> Array:
+    def profile(self, robot: Robot, dt_s: float = TICK_S) -> Array:
         """Body velocities (N, 2), m/s and rad/s: means over ticks of `dt_s`, rest included.
 
         Being means, they add up to the promised distance and angle exactly.
@@ -76,7 +75,7 @@ class OpenLoop:
             velocity[first:] += np.diff(held_s)[:, None] / dt_s * np.array(segment[:2])
         return velocity
 
-    def edges_s(self, robot: DifferentialDrive) -> Array:
+    def edges_s(self, robot: Robot) -> Array:
         """Times (S + 1,) at which the segments begin and the last one ends, s."""
         ramps = [_trapezoid(segment, robot) for segment in self.segments]
         lasts_s = [plateau_s + 2.0 * ramp_s for plateau_s, ramp_s, _ in ramps]
@@ -153,12 +152,12 @@ class Tour:
             wanted = "route.waypoints must be null or at least two points [x, y], m"
             _check_points(self.waypoints, wanted, at_least=2)
 
-    def start(self, world: World, robot: DifferentialDrive) -> tuple[Array, Pursuit]:
+    def start(self, world: World, robot: Robot) -> tuple[Array, Pursuit]:
         """Start pose (3,) on the first way-point, facing the second, and the driver."""
         path = _lengthened(self._given(world), self.distance_m)
         return facing_second(path), Pursuit(self, robot, path)
 
-    def about_s(self, world: World, robot: DifferentialDrive) -> float:
+    def about_s(self, world: World, robot: Robot) -> float:
         """About how long the drive takes, s; at 0.5 m/s a radian of its turns costs some 0.6 s."""
         path = _lengthened(self._given(world), self.distance_m)
         x, y = np.diff(path, axis=0).T
@@ -210,7 +209,7 @@ class TourFrom(Tour):
 class Controller:
     """Driver that steers 50 times a second with limited acceleration, and rests at its goal."""
 
-    def __init__(self, robot: DifferentialDrive, last_s: float) -> None:
+    def __init__(self, robot: Robot, last_s: float) -> None:
         linear = robot.max_acceleration_mps2
         # (2,) of v and omega, m/s^2 and rad/s^2: half of a wheel's acceleration for each
         self._most = np.array([0.5 * linear, linear / robot.nominal.track_m])
@@ -270,7 +269,7 @@ class Controller:
 class Pursuit(Controller):
     """Driver of a Tour: pure pursuit."""
 
-    def __init__(self, tour: Tour, robot: DifferentialDrive, path: Array) -> None:
+    def __init__(self, tour: Tour, robot: Robot, path: Array) -> None:
         self._tour, self._path = tour, path
         self._along_m = _along_m(path)
         self._done_m, self._off_m = 0.0, 0.0
@@ -369,7 +368,7 @@ class GoToPoints:
         )
         _check_points(self.points, "route.points must be at least one point [x, y], m", at_least=1)
 
-    def start(self, world: World, robot: DifferentialDrive) -> tuple[Array, GoToPoint]:
+    def start(self, world: World, robot: Robot) -> tuple[Array, GoToPoint]:
         """Start pose (3,) of the world, and the driver."""
         path = np.array([(0.0, 0.0), *self.points])
         return world.start_pose, GoToPoint(self, robot, transform(world.start_pose, path))
@@ -378,7 +377,7 @@ class GoToPoints:
 class GoToPoint(Controller):
     """Driver of GoToPoints."""
 
-    def __init__(self, route: GoToPoints, robot: DifferentialDrive, path: Array) -> None:
+    def __init__(self, route: GoToPoints, robot: Robot, path: Array) -> None:
         self._route, self._points, self._reached = route, path[1:], 0
         turns_s = math.pi * len(self._points) / route.turn_rate_radps
         super().__init__(robot, 4.0 * (_along_m(path)[-1] / route.speed_mps + turns_s) + 60.0)
@@ -454,7 +453,7 @@ def _merged(segments: Iterable[Iterable[float]]) -> list[Segment]:
     return merged
 
 
-def _trapezoid(segment: Segment, robot: DifferentialDrive) -> tuple[float, float, float]:
+def _trapezoid(segment: Segment, robot: Robot) -> tuple[float, float, float]:
     """Plateau and ramp times, s, and the share of the velocity that the plateau reaches."""
     v, omega, duration_s = segment
     track_m = max(robot.track_m, robot.nominal.track_m)  # neither body nor wheels are hurried
@@ -467,7 +466,7 @@ def _trapezoid(segment: Segment, robot: DifferentialDrive) -> tuple[float, float
     return 0.0, share * ramp_s, share
 
 
-def _held(time_s: Array, segment: Segment, robot: DifferentialDrive) -> Array:
+def _held(time_s: Array, segment: Segment, robot: Robot) -> Array:
     """Integral of the velocity's share from the segment's start to `time_s`, s."""
     plateau_s, ramp_s, share = _trapezoid(segment, robot)
     if ramp_s == 0.0:
@@ -479,15 +478,15 @@ def _held(time_s: Array, segment: Segment, robot: DifferentialDrive) -> Array:
 
 
 TABLE_1: dict[str, OpenLoop] = {
-    "linear_1": OpenLoop(((0.5, 0.0, 2.0),)),
-    "linear_2": OpenLoop(((0.5, 0.0, 5.0),)),
-    "linear_3": OpenLoop(((0.7, 0.0, 2.0),)),
-    "linear_4": OpenLoop(((0.3, 0.0, 2.0),)),
-    "angular_1": OpenLoop(((0.0, 0.5, 3.0),)),
-    "angular_2": OpenLoop(((0.0, 0.5, 5.0),)),
-    "angular_3": OpenLoop(((0.0, 0.5, 10.0),)),
-    "angular_4": OpenLoop(((0.0, 0.8, 3.0),)),
-    "angular_5": OpenLoop(((0.0, 0.2, 5.0),)),
+    "linear_1": OpenLoop(segments=((0.5, 0.0, 2.0),)),
+    "linear_2": OpenLoop(segments=((0.5, 0.0, 5.0),)),
+    "linear_3": OpenLoop(segments=((0.7, 0.0, 2.0),)),
+    "linear_4": OpenLoop(segments=((0.3, 0.0, 2.0),)),
+    "angular_1": OpenLoop(segments=((0.0, 0.5, 3.0),)),
+    "angular_2": OpenLoop(segments=((0.0, 0.5, 5.0),)),
+    "angular_3": OpenLoop(segments=((0.0, 0.5, 10.0),)),
+    "angular_4": OpenLoop(segments=((0.0, 0.8, 3.0),)),
+    "angular_5": OpenLoop(segments=((0.0, 0.2, 5.0),)),
 }
 """The nine manoeuvres of puzzlebot2024, table 1.
 

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from sim import se2
 from sim.arrays import Array
 from sim.errors import InputError, blaming, require
-from sim.settings import build, find
+from sim.options import build, find
 from sim.worlds.world import World
 
 S = TypeVar("S")

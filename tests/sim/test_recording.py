@@ -35,7 +35,7 @@ def small_recording(seed=0):
         frame_stamps=stamps,
         wheels=WheelLog(stamps, np.cumsum(rng.normal(size=(6, 2)), axis=0)),
         robot=RobotGeometry(0.05, 0.19),
-        sensors={"encoder": Encoder(100), "laser": laser, "stereo": camera},
+        sensors={"encoder": Encoder(rate_hz=100), "laser": laser, "stereo": camera},
         logs={
             "laser": Log.of(laser, stamps[::2], ranges_m=rng.random((3, 5))),
             "stereo": Log.of(

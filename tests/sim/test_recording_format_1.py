@@ -68,7 +68,12 @@ def arrays():
 
 
 def description(**sensors):
-    all_of_them = {"encoder": Encoder(None), "laser": LASER, "stereo": CAMERA, "lidar3d": LIDAR}
+    all_of_them = {
+        "encoder": Encoder(rate_hz=None),
+        "laser": LASER,
+        "stereo": CAMERA,
+        "lidar3d": LIDAR,
+    }
     return {
         "format": 1,
         "status": "ok",
@@ -98,7 +103,7 @@ def test_every_log_is_found_under_its_sensor(tmp_path):
     back = load(write(tmp_path / "old.npz", arrays(), description()))
     place = PlaceDescriptor()
     assert back.sensors == {
-        "encoder": Encoder(None),
+        "encoder": Encoder(rate_hz=None),
         "laser": LASER,
         "stereo": CAMERA,
         "lidar3d": LIDAR,
@@ -137,7 +142,7 @@ def test_a_robot_that_lacked_sensors(tmp_path):
     stored["truth.landmark_ids"] = np.zeros(0, np.int64)
     meta = description(laser=None, stereo=None, lidar3d=None)
     back = load(write(tmp_path / "old.npz", stored, meta))
-    assert back.sensors == {"encoder": Encoder(None)}
+    assert back.sensors == {"encoder": Encoder(rate_hz=None)}
     assert back.logs == {}
     assert back.truth.readings == {}
     without_truth = {

@@ -29,11 +29,14 @@ from sim.sensors import (
     sensors_from_config,
 )
 from sim.sensors.base import RecordedSensor, schema_from_meta
-from sim.simulate import record
+from sim.simulate import Member, record
 from tests.fixtures.beacons import Beacons, Compass, Forgetful
 from tests.fixtures.fakes import square_room
 
-FRONT, REAR = Laser(n_beams=31), Laser(5.0, 17, mount=Mount(x_m=-0.1, yaw_rad=np.pi))
+FRONT, REAR = (
+    Laser(n_beams=31),
+    Laser(rate_hz=5.0, n_beams=17, mount=Mount(x_m=-0.1, yaw_rad=np.pi)),
+)
 SENSORS = {"encoder": Encoder(), "beacons": Beacons(), "laser": FRONT}
 COUNTS, ANY_COUNTS = Field("", "i4", (3,)), Field("", "i4", (None,))
 ENDINGS = [".mcap", ".bag", ".db3", ""]
@@ -44,10 +47,12 @@ def drive(sensors, seconds=2.0, seed=0):
     streams = {axis: np.random.default_rng([seed, i]) for i, axis in enumerate(("slip", "sensors"))}
     return record(
         square_room(),
-        DifferentialDrive(0.05, 0.19, kr=1e-4, kl=1e-4),
-        sensors,
-        OpenLoop(((0.2, 0.3, seconds),)),
-        streams,
+        Member(
+            DifferentialDrive(wheel_radius_m=0.05, track_m=0.19, kr=1e-4, kl=1e-4),
+            sensors,
+            OpenLoop(segments=((0.2, 0.3, seconds),)),
+            streams,
+        ),
         physics="kinematic",
         rays="exact",
     )
@@ -137,7 +142,7 @@ def test_bags_hold_it_by_its_schema(recording, tmp_path, ending):
 
 def test_a_sensor_that_never_read_anything(tmp_path):
     pytest.importorskip("rosbags")
-    quiet = drive({"encoder": Encoder(), "gyroscope": Gyroscope(1.0)}, seconds=0.3)
+    quiet = drive({"encoder": Encoder(), "gyroscope": Gyroscope(rate_hz=1.0)}, seconds=0.3)
     assert len(quiet.log("gyroscope").stamps) == 0
     assert quiet.truth.readings["gyroscope"]["bias_radps"].shape == (0,)
     assert save(quiet, tmp_path / "a.npz") == load(tmp_path / "a.npz").checksum
@@ -358,7 +363,7 @@ def test_two_lasers_have_topics_of_their_own(tmp_path, ending):
 
 
 def test_the_noise_of_a_sensor_does_not_depend_on_the_others():
-    one, two = Gyroscope(50.0), Beacons()
+    one, two = Gyroscope(rate_hz=50.0), Beacons()
     alone = drive({"gyro": one})
     for others in (
         {"gyro": one, "beacons": two},

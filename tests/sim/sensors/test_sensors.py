@@ -150,9 +150,9 @@ def test_a_missing_sensor_is_named():
 @pytest.mark.parametrize(
     "sensor",
     [
-        Encoder(None),
+        Encoder(rate_hz=None),
         Gyroscope(),
-        Laser(100),
+        Laser(rate_hz=100),
         Lidar3D(),
         PlaceDescriptor(),
         RobotCamera(),
