@@ -184,6 +184,10 @@ def described(target: Any) -> list[Option]:
         own = vars(base).get("__pydantic_fields__", {})
         fields |= {name: field for name, field in own.items() if field.description}
     found = []
+    try:
+        kinds = get_type_hints(target, include_extras=True)
+    except NameError:  # of a stranger's class, whose types are not all imported at run time
+        kinds = {}
     for name, parameter in inspect.signature(target).parameters.items():
         if parameter.kind in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
             continue
@@ -193,7 +197,7 @@ def described(target: Any) -> list[Option]:
             Option(
                 name,
                 dataclasses.MISSING if bare else parameter.default,
-                accepted(parameter.annotation),
+                accepted(kinds.get(name, parameter.annotation)),
                 meaning,
             )
         )
@@ -208,7 +212,7 @@ def accepted(kind: Any) -> str:
     if get_origin(kind) is Annotated:
         for extra in parts[1:]:
             if isinstance(extra, str):
-                return extra
+                return extra  # says it in words
         bounds: list[tuple[str, float]] = []
         for extra in parts[1:]:
             for limit in getattr(extra, "metadata", [extra]):
@@ -260,7 +264,8 @@ def _complaint(cls: type, where: str, error: ValidationError) -> str:
     known = {option.name: option for option in described(cls)}
     if name not in known:
         return f"unknown key {where}.{name}; known: {', '.join(known)}"
-    if first["type"] == "missing":
+    if first["type"] == "missing" and len(first["loc"]) == 1:
         return f"{where}.{name} is missing"
     wanted = known[name].accepts
-    return f"{where}.{name} must be {wanted or first['msg']}, got {first['input']!r}"
+    row = "".join(f"[{place}]" for place in first["loc"][1:2])  # of a list
+    return f"{where}.{name}{row} must be {wanted or first['msg']}, got {first['input']!r}"

@@ -7,11 +7,10 @@ from __future__ import annotations
 
 import math
 from functools import cached_property
-from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import Field
+from pydantic import NonNegativeInt
 
 from sim.arrays import Array
 from sim.errors import require
@@ -41,7 +40,7 @@ class DifferentialDrive(SlipOptions):
     the true one turns by 0.44 of what it is commanded."""
     encoder_tick_m: NonNegative = 0.0
     """Quantum of the encoder counts, in metres that the encoder reports; 0 for no quantisation."""
-    encoder_pulses_per_turn: Annotated[int, Field(ge=0)] = 0
+    encoder_pulses_per_turn: NonNegativeInt = 0
     """Pulses per turn of the encoder's shaft, in place of `encoder_tick_m`; 0 for none."""
     gear_ratio: Positive = 1.0
     """Turns of the encoder's shaft for one turn of the wheel."""
