@@ -892,7 +892,8 @@ def _robot_of(overrides: list[str], config_dir: Path | None) -> DifferentialDriv
                 f"{override}: with --sheet give the robot alone, such as robot=puzzlebot or "
                 "robot.track_m=0.19"
             )
-    return Experiment.compose([*searched(config_dir), *overrides]).robot()
+    robot: DifferentialDrive = Experiment.compose([*searched(config_dir), *overrides]).robot()
+    return robot
 
 
 @app.command()

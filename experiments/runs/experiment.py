@@ -35,7 +35,7 @@ from sim.errors import InputError, blaming, require, required
 from sim.files import write_text
 from sim.options import build, find
 from sim.recording import Frame, Recording, load
-from sim.robot.base import Robot, RobotGeometry, robot_from_config
+from sim.robot.base import RobotGeometry, robot_from_config
 from sim.sensors import Sensor, Sensors, sensors_from_config
 from sim.sensors.base import RecordedSensor, sensor_settings
 from sim.worlds import grid_file
@@ -396,8 +396,8 @@ class Experiment:
         world: World = make(self.config["world"], "world", rng=rng)
         return world
 
-    def robot(self) -> Robot:
-        """Make the true robot."""
+    def robot(self) -> Any:
+        """Make the true robot: a `sim.robot.base.Robot` with options of its own."""
         return robot_from_config(self.config["robot"])
 
     def sensors(self) -> dict[str, Sensor]:

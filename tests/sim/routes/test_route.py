@@ -87,7 +87,7 @@ def test_tick_length_does_not_change_the_promise():
         ((), "empty"),
         (((0.5, 0.0),), r"segments\[0\]"),
         (((0.5, 0.0, -1.0),), "positive duration"),
-        (((0.5, float("nan"), 1.0),), "finite"),
+        (((0.5, float("nan"), 1.0),), r"segments\[0\] must be a list of"),
         ((0.5, 0.0, 1.0), r"segments\[0\]"),
     ],
 )
