@@ -1,4 +1,4 @@
-"""A robot of another kind and another law of slip, each a class of its own that `_target_` names."""
+"""A robot of another kind and another law of slip, each a class that `_target_` names."""
 
 import numpy as np
 import pytest
