@@ -24,7 +24,7 @@ class EndPoseModel:
 
     The run is cut at two dozen knots. Between two of them a wheel rolls as far as the command and
     the bias make it, less sqrt(k) times the slip's Brownian motion over the travel, delayed by the
-    lag of the wheel's speed loop as in `sim.robot.drive.Slip`; the path is an arc.
+    lag of the wheel's speed loop as in `sim.robot.slip.slip_increment`; the path is an arc.
 
     Parameters
     ----------

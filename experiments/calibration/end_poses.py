@@ -22,7 +22,7 @@ from sim.robot.drive import DifferentialDrive
 
 Moments = tuple[Array, Array]
 
-# both biases, as `sim.robot.drive` bounds them, and a track within a factor of ten
+# both biases, as `sim.robot.slip` bounds them, and a track within a factor of ten
 _GEOMETRY = ((-0.67, -0.67, -math.log(10.0)), (2.0, 2.0, math.log(10.0)))
 
 
