@@ -35,7 +35,7 @@ class RealLaser(Laser):
 
     def __post_init__(self) -> None:
         increasing = self.stamps is None or bool((np.diff(self.stamps) > 0.0).all())
-        require(increasing, "sensors.laser.stamps must increase")
+        require(increasing, "sensors.laser.stamps must be numbers of seconds that increase")
 
     def start(self, rng: np.random.Generator) -> Probe:
         """Probe that casts the beams, and spoils some."""
