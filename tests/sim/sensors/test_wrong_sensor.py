@@ -60,7 +60,7 @@ def test_a_reading_is_copied_when_it_is_taken():
 @pytest.mark.parametrize(
     ("does", "message"),
     [
-        ("write", r"sensors\.odd raised ValueError: .*read-only.*\(test_own_sensor\.py:\d+\)"),
+        ("write", r"sensors\.odd raised ValueError: .*read-only.*\(test_wrong_sensor\.py:\d+\)"),
         ("divide", r"sensors\.odd raised ZeroDivisionError"),
         ("exit", r"sensors\.odd raised SystemExit"),
         ("no probe", r"sensors\.odd: start must return a function"),
