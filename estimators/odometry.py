@@ -12,7 +12,7 @@ from estimators.wheels import WheelPrediction
 from sim import se2
 from sim.arrays import Array
 from sim.recording import Frame
-from sim.robot.drive import arc_increment, arc_increment_jacobian
+from sim.robot.arc import arc_increment, arc_increment_jacobian
 
 Integration = Literal["arc", "midpoint", "euler"]
 

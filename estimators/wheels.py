@@ -8,7 +8,8 @@ from estimators.gaussian import Gaussian, wheel_motion
 from estimators.options import require_non_negative
 from sim.arrays import Array
 from sim.recording import Frame
-from sim.robot.drive import TravelWindow, wheel_variances
+from sim.robot.arc import TravelWindow
+from sim.robot.slip import wheel_variances
 
 
 class WheelPrediction:

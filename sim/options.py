@@ -10,21 +10,36 @@ below the field its meaning, with unit and source::
 
 The constructor, the configuration and `estima options` read the same fields. A method inherits its
 options, `class Mcl(MclOptions)`: its options stay frozen, and it may keep a state of its own.
-Options that several methods share stand in a class that theirs inherit.
+Options that several methods share stand in a class that theirs inherit. `build` makes such a class,
+or a plain dataclass, from a mapping of a configuration.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
+import importlib
 import inspect
-from collections.abc import Callable
-from typing import Annotated, Any, Literal, TypeVar, cast, dataclass_transform, get_args, get_origin
+import math
+from collections.abc import Callable, Mapping
+from types import UnionType
+from typing import (
+    Annotated,
+    Any,
+    Literal,
+    TypeVar,
+    Union,
+    cast,
+    dataclass_transform,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
-from pydantic import ConfigDict, Field, ValidationError
+from pydantic import ConfigDict, Field, Strict, ValidationError
 from pydantic.dataclasses import dataclass as checked_dataclass
 
-from sim.errors import InputError
+from sim.errors import InputError, require
 
 T = TypeVar("T")
 
@@ -32,6 +47,10 @@ Positive = Annotated[float, Field(gt=0.0)]
 NonNegative = Annotated[float, Field(ge=0.0)]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Count = Annotated[int, Field(ge=1)]
+Acute = Annotated[float, Field(gt=0.0, lt=math.pi)]
+# Of a YAML's lists; a text in an Annotated says what the type accepts
+Point = Annotated[tuple[float, float], Strict(False), "a point [x, y]"]
+Points = Annotated[tuple[Point, ...], Strict(False), "points [x, y], m"]
 
 _CONFIG = ConfigDict(
     extra="forbid",
@@ -90,9 +109,72 @@ def options(where: str) -> Callable[[type[T]], type[T]]:
                 raise InputError(_complaint(type(self), where, error)) from None
 
         made.__init__ = checked
+        made._place = where
         return cast("type[T]", made)
 
     return decorate
+
+
+def build(cls: type[T], settings: Mapping[str, Any], where: str) -> T:
+    """Make a dataclass, checked or plain, from a mapping.
+
+    Parameters
+    ----------
+    cls
+        Its fields are the allowed keys; a field may be a dataclass too.
+    settings
+        The mapping. A whole number such as 3.0 may stand for an integer.
+    where
+        Its place in the configuration, for messages.
+
+    Raises
+    ------
+    InputError
+        For an unknown or missing key, or a value of the wrong type.
+    """
+    require(
+        isinstance(settings, Mapping),
+        f"{where} must be a mapping of keys to values, got {settings!r}",
+    )
+    fields = {f.name: f for f in dataclasses.fields(cls)}  # type: ignore[arg-type]
+    kinds = get_type_hints(cls)
+    own: str | None = getattr(cls, "_place", None)
+    values: dict[str, Any] = {}
+    for key, value in settings.items():
+        place = f"{where}.{key}"
+        require(key in fields, f"unknown key {place}; known: {', '.join(fields)}")
+        values[key] = _fitted(value, kinds[key], place, check=own is None)
+    for name, f in fields.items():
+        bare = f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING
+        require(not bare or name in values, f"{where}.{name} is missing")
+    try:
+        return cls(**values)
+    except InputError as error:
+        raise InputError(str(error).replace(f"{own or where}.", f"{where}.")) from None
+
+
+def find(target: Any, where: str) -> Callable[..., Any]:
+    """Import the class or function that a `_target_` names.
+
+    Raises
+    ------
+    InputError
+        If there is none.
+    """
+    require(
+        isinstance(target, str) and "." in target,
+        f"{where}._target_ must name a class or function, such as mine.Mine",
+    )
+    module_name, _, name = target.rpartition(".")
+    try:
+        module = importlib.import_module(module_name)
+    except ModuleNotFoundError as error:
+        raise InputError(
+            f"{where}._target_={target}: no module {error.name}; is its folder on PYTHONPATH?"
+        ) from error
+    found: Any = getattr(module, name, None)
+    require(callable(found), f"{where}._target_={target}: {module_name} has no class {name}")
+    return found  # type: ignore[no-any-return]
 
 
 def described(target: Any) -> list[Option]:
@@ -102,6 +184,10 @@ def described(target: Any) -> list[Option]:
         own = vars(base).get("__pydantic_fields__", {})
         fields |= {name: field for name, field in own.items() if field.description}
     found = []
+    try:
+        kinds = get_type_hints(target, include_extras=True)
+    except NameError:  # of a stranger's class, whose types are not all imported at run time
+        kinds = {}
     for name, parameter in inspect.signature(target).parameters.items():
         if parameter.kind in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
             continue
@@ -111,7 +197,7 @@ def described(target: Any) -> list[Option]:
             Option(
                 name,
                 dataclasses.MISSING if bare else parameter.default,
-                accepted(parameter.annotation),
+                accepted(kinds.get(name, parameter.annotation)),
                 meaning,
             )
         )
@@ -124,6 +210,9 @@ def accepted(kind: Any) -> str:
         return ""
     parts = get_args(kind)
     if get_origin(kind) is Annotated:
+        for extra in parts[1:]:
+            if isinstance(extra, str):
+                return extra  # says it in words
         bounds: list[tuple[str, float]] = []
         for extra in parts[1:]:
             for limit in getattr(extra, "metadata", [extra]):
@@ -146,6 +235,28 @@ def accepted(kind: Any) -> str:
     return plain.get(kind, "")
 
 
+def _fitted(value: Any, kind: Any, where: str, *, check: bool) -> Any:
+    """Value with the type of its field where a YAML has another; `check` that it is so."""
+    kinds = get_args(kind) if get_origin(kind) in (Union, UnionType) else (kind,)
+    part = next((k for k in kinds if isinstance(k, type) and dataclasses.is_dataclass(k)), None)
+    if part is not None and not (isinstance(value, part) or (value is None and part is not kind)):
+        return build(part, value, where)
+    number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if number and float in kinds:
+        return float(value)
+    if number and int in kinds and float(value).is_integer():
+        return int(value)
+    scalar = next((k for k in (float, int, bool) if k in kinds), None)
+    if check and scalar is not None and not isinstance(value, tuple(_classes(kinds))):
+        raise InputError(f"{where} must be {accepted(scalar)}, got {value!r}")
+    return value
+
+
+def _classes(kinds: tuple[Any, ...]) -> list[type]:
+    """Classes of which a checked value may be; True is an int, and yet no number."""
+    return [k for k in kinds if isinstance(k, type) and k not in (float, int)]
+
+
 def _complaint(cls: type, where: str, error: ValidationError) -> str:
     """One line about the first field that is wrong."""
     first = error.errors(include_url=False)[0]
@@ -153,7 +264,8 @@ def _complaint(cls: type, where: str, error: ValidationError) -> str:
     known = {option.name: option for option in described(cls)}
     if name not in known:
         return f"unknown key {where}.{name}; known: {', '.join(known)}"
-    if first["type"] == "missing":
+    if first["type"] == "missing" and len(first["loc"]) == 1:
         return f"{where}.{name} is missing"
     wanted = known[name].accepts
-    return f"{where}.{name} must be {wanted or first['msg']}, got {first['input']!r}"
+    row = "".join(f"[{place}]" for place in first["loc"][1:2])  # of a list
+    return f"{where}.{name}{row} must be {wanted or first['msg']}, got {first['input']!r}"

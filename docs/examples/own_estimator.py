@@ -8,7 +8,7 @@ import numpy as np
 
 import estima
 from sim import se2
-from sim.robot.drive import arc_increment
+from sim.robot.arc import arc_increment
 
 
 class Simple:

@@ -24,7 +24,7 @@ from estimators.peers.planar import matrix_of, pose_of, scan_of
 from sim import se2
 from sim.arrays import Array
 from sim.recording import Frame
-from sim.robot.drive import arc_increment
+from sim.robot.arc import arc_increment
 
 Kind = Literal["GICP", "PLANE_ICP", "ICP"]
 Reference = Literal["previous", "keyframe"]

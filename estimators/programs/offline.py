@@ -29,7 +29,7 @@ from sim.formats.carmen import write_carmen
 from sim.formats.rosbag_out import write_bag
 from sim.formats.trajectory import read_track
 from sim.recording import Frame, Recording, WheelLog, joined, save
-from sim.robot.drive import arc_increment
+from sim.robot.arc import arc_increment
 from sim.worlds.grid import OccupancyGrid, rasterized
 from sim.worlds.grid_file import write_grid
 from sim.worlds.world import World

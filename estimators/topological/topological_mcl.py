@@ -25,7 +25,7 @@ from sim import se2
 from sim.arrays import Array, Floats, Ints
 from sim.errors import InputError, require
 from sim.recording import Frame
-from sim.robot.drive import arc_increment
+from sim.robot.arc import arc_increment
 from sim.sensors import Lidar3D, sensor_of
 
 Weighting = Literal["M1", "M2", "M3"]

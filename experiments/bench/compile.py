@@ -75,7 +75,7 @@ def _others() -> None:
     from sim.sensors import Laser
     from sim.worlds.grid_mapping import map_scans
 
-    robot, route = DifferentialDrive(0.05, 0.19), TABLE_1["linear_1"]
+    robot, route = DifferentialDrive(wheel_radius_m=0.05, track_m=0.19), TABLE_1["linear_1"]
     rng = np.random.default_rng(0)
     run_batch(robot, route, 1, rng)
     model = EndPoseModel(route.profile(robot), robot, rng, "sampled", n_samples=4)

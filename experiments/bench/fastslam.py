@@ -17,7 +17,8 @@ from experiments.bench.measure import Measurement, median_time_s, timed_steps
 from experiments.evaluation.statistics import log_log_slope
 from sim.arrays import Array
 from sim.recording import Log, Recording, WheelLog
-from sim.robot.drive import RobotGeometry, wheel_errors
+from sim.robot.drive import RobotGeometry
+from sim.robot.slip import wheel_errors
 from sim.sensors import StereoCamera
 
 PAPER = StereoCamera(sigma_column_px=10.0, sigma_row_px=10.0, correlated=False)

@@ -19,7 +19,8 @@ from experiments.runs.seeds import stream
 from sim import se2
 from sim.arrays import Array
 from sim.recording import Frame
-from sim.robot.drive import RobotGeometry, arc_increment
+from sim.robot.arc import arc_increment
+from sim.robot.drive import RobotGeometry
 from sim.sensors import Laser
 from sim.sensors.casting import SegmentCaster
 from sim.worlds.buildings import office

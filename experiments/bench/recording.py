@@ -13,10 +13,10 @@ from sim.robot.drive import DifferentialDrive
 from sim.routes.route import OpenLoop
 from sim.sensors import Laser
 from sim.sensors.rays import BulletRays
-from sim.simulate import record
+from sim.simulate import Member, record
 
-_ROBOT = DifferentialDrive(0.05, 0.19, kr=1e-5, kl=1e-5)
-_CIRCLE = OpenLoop(((0.1, 0.2, 59.6),))  # for a minute; a metre across, clear of walls
+_ROBOT = DifferentialDrive(wheel_radius_m=0.05, track_m=0.19, kr=1e-5, kl=1e-5)
+_CIRCLE = OpenLoop(segments=((0.1, 0.2, 59.6),))  # for a minute; a metre across, clear of walls
 _FAST = ("world=rooms", "sensors=lms291", "robot=robocom", "route.distance_m=20")
 
 
@@ -28,7 +28,7 @@ def run() -> list[Measurement]:
     for repeat in range(3):
         streams = {axis: stream(repeat, axis) for axis in ("slip", "sensors")}
         begun = time.perf_counter()
-        recording = record(world, _ROBOT, sensors, _CIRCLE, streams)
+        recording = record(world, Member(_ROBOT, sensors, _CIRCLE, streams))
         factors.append(recording.duration_s / (time.perf_counter() - begun))
         assert recording.status == "ok", recording.status
     results = [

@@ -16,8 +16,8 @@ from sim import se2
 from sim.arrays import Array
 from sim.errors import InputError, require
 from sim.recording import Recording
+from sim.robot.base import TICK_S
 from sim.robot.drive import DifferentialDrive
-from sim.routes.route import TICK_S
 
 
 def calibrate_recordings(

@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 from sim.arrays import Array
 from sim.compiled import njit
 from sim.errors import require
-from sim.robot.drive import SLIP_TIME_CONSTANT_S, DifferentialDrive
-from sim.routes.route import TICK_S
+from sim.robot.base import TICK_S
+from sim.robot.drive import DifferentialDrive
+from sim.robot.slip import SLIP_TIME_CONSTANT_S
 
 Ticks = NDArray[np.int64]
 EndPoseMethod = Literal["sampled", "linearised"]
@@ -23,7 +24,7 @@ class EndPoseModel:
 
     The run is cut at two dozen knots. Between two of them a wheel rolls as far as the command and
     the bias make it, less sqrt(k) times the slip's Brownian motion over the travel, delayed by the
-    lag of the wheel's speed loop as in `sim.robot.drive.Slip`; the path is an arc.
+    lag of the wheel's speed loop as in `sim.robot.slip.slip_increment`; the path is an arc.
 
     Parameters
     ----------

@@ -17,12 +17,12 @@ from experiments.calibration.result import CalibrationResult
 from experiments.evaluation.statistics import Interval
 from sim.arrays import Array
 from sim.errors import require
+from sim.robot.base import TICK_S
 from sim.robot.drive import DifferentialDrive
-from sim.routes.route import TICK_S
 
 Moments = tuple[Array, Array]
 
-# both biases, as `sim.robot.drive` bounds them, and a track within a factor of ten
+# both biases, as `sim.robot.slip` bounds them, and a track within a factor of ten
 _GEOMETRY = ((-0.67, -0.67, -math.log(10.0)), (2.0, 2.0, math.log(10.0)))
 
 

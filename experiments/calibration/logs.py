@@ -20,7 +20,7 @@ from sim.errors import require
 from sim.formats.assemble import chained
 from sim.formats.khepera import WheelLaserLog
 from sim.formats.lego import GEOMETRIC_TRACK_M, SCANNER_AHEAD_M, TICK_M, TickLog
-from sim.robot.drive import arc_increment
+from sim.robot.arc import arc_increment
 
 Mask = NDArray[np.bool_]
 

@@ -45,13 +45,13 @@ def calibrate_sheet(
         Naming the file, and the line that is wrong.
     """
     nominal = DifferentialDrive(
-        robot.nominal.wheel_radius_m,
-        robot.nominal.track_m,
+        wheel_radius_m=robot.nominal.wheel_radius_m,
+        track_m=robot.nominal.track_m,
         max_acceleration_mps2=robot.max_acceleration_mps2,
     )
     commands, ends = read_sheet(path)
     manoeuvres = [
-        Manoeuvre(OpenLoop((command,)).profile(nominal), ends[case])
+        Manoeuvre(OpenLoop(segments=(command,)).profile(nominal), ends[case])
         for case, command in commands.items()
     ]
     try:

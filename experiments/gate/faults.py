@@ -21,7 +21,7 @@ from estimators.laser import ekf_icp, ekf_icp_paper
 from estimators.laser.scan_matching import Match, ScanMatcher
 from sim.arrays import Array
 from sim.recording import Frame
-from sim.robot.drive import wheel_errors
+from sim.robot.slip import wheel_errors
 from sim.sensors import Laser, Reading, sensor_of
 
 Planted = Callable[[Estimator, np.random.Generator], AbstractContextManager[object]]

@@ -1,6 +1,7 @@
 """What is believed of a real robot: the YAML file of `estima calibrate LOG`, and its use."""
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,14 +12,27 @@ import yaml
 from sim.errors import InputError, require
 from sim.files import write_text
 from sim.formats.assemble import frame_stamps
+from sim.options import build
 from sim.recording import Log, Recording, WheelLog
 from sim.robot.drive import RobotGeometry
 from sim.sensors import Laser, RobotCamera, StereoCamera
 from sim.sensors.base import Sensor
-from sim.settings import build, check_numbers
 from sim.yaml_file import read_yaml
 
 _LONGEST_DELAY_S = 60.0
+
+
+def _check_numbers(
+    where: str, settings: object, positive: tuple[str, ...] = (), not_negative: tuple[str, ...] = ()
+) -> None:
+    """Check that attributes are finite and positive, or at least not negative."""
+    for name in (*positive, *not_negative):
+        value = getattr(settings, name)
+        wanted = "a positive number" if name in positive else "zero or a positive number"
+        require(
+            math.isfinite(value) and (value > 0.0 or (value == 0.0 and name in not_negative)),
+            f"{where}.{name} must be {wanted}, got {value}",
+        )
 
 
 @dataclass(frozen=True)
@@ -41,7 +55,7 @@ class Wheels:
     delay_s: float
 
     def __post_init__(self) -> None:
-        check_numbers("wheels", self, ("gain_right", "gain_left", "track_m"))
+        _check_numbers("wheels", self, ("gain_right", "gain_left", "track_m"))
         require(abs(self.delay_s) < _LONGEST_DELAY_S, "wheels.delay_s must be below a minute")
 
 
@@ -55,7 +69,7 @@ class Slip:
     forward_slip_length_m: float = 0.0
 
     def __post_init__(self) -> None:
-        check_numbers("slip", self, (), ("kr", "kl", "forward_slip_m", "forward_slip_length_m"))
+        _check_numbers("slip", self, (), ("kr", "kl", "forward_slip_m", "forward_slip_length_m"))
 
 
 @dataclass(frozen=True)
@@ -86,7 +100,7 @@ class SensorBelief:
     sigma_disparity_px: float | None = None
 
     def __post_init__(self) -> None:
-        check_numbers("sensors", self, ("scale",))
+        _check_numbers("sensors", self, ("scale",))
         require(abs(self.delay_s) < _LONGEST_DELAY_S, "sensors.delay_s must be below a minute")
 
 

@@ -5,7 +5,7 @@ from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 from sim.errors import InputError
-from sim.settings import find
+from sim.options import find
 
 
 def make(settings: Mapping[str, Any], where: str, **injected: Any) -> Any:

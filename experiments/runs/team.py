@@ -20,8 +20,9 @@ from estimators.base import Estimate, Prior
 from estimators.team import Answer, run_team
 from experiments.runs.cache import cached
 from experiments.runs.columns import REVISED, Average, average_of
-from experiments.runs.experiment import SIMULATED_KEYS, Experiment
+from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome, Row, Status
+from experiments.runs.schema import SIMULATED_KEYS
 from experiments.runs.seeds import stream
 from experiments.runs.team_settings import TeamSettings
 from sim.arrays import Array
@@ -71,7 +72,9 @@ class TeamExperiment:
         if isinstance(wanted, str):
             team = load(Path(wanted))
             if size > len(team):
-                raise InputError(f"{wanted}: a team of {len(team)} robots; set team.size")
+                held = f"a team of {len(team)} robots; set team.size"
+                alone = "it holds one robot, and no team; leave out study and team"
+                raise InputError(f"{wanted}: {held if len(team) > 1 else alone}")
             return team if size == len(team) else team.first(size)
         if wanted is not None:
             raise InputError("recording: a team is simulated, or read from a file")

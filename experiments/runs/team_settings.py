@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from estimators.team import Communication
 from sim.errors import require
-from sim.settings import build
+from sim.options import build
 
 OWN = ("robot", "sensors", "route")  # groups in which a robot of a team may differ
 

@@ -14,7 +14,7 @@ from sim.arrays import Array
 from sim.errors import InputError, require
 from sim.files import require_file, write_text, write_whole
 from sim.recording import Recording
-from sim.robot.drive import twist_covariances as wheel_covariances
+from sim.robot.slip import twist_covariances as wheel_covariances
 
 # Entries of x, y, heading in row-major 6x6 covariances in order x, y, z, rotX, rotY, rotZ.
 PLANAR = (slice(None), [[0], [1], [5]], [0, 1, 5])

@@ -21,7 +21,7 @@ from sim.recording import Recording
 from sim.robot.drive import DifferentialDrive
 from sim.routes.timetable import Drive
 from sim.sensors import Encoder, Laser, RealCamera, RealLaser, Sensor
-from sim.simulate import record
+from sim.simulate import Member, record
 from sim.worlds.floor_plan import WALL_HEIGHT_M
 from sim.worlds.grid import OccupancyGrid
 from sim.worlds.world import World
@@ -100,7 +100,9 @@ class Twin:
         robot, sensors = self.drawn(stream(seed, "twin"))
         streams = {axis: stream(seed, axis) for axis in ("slip", "sensors")}
         drive = Drive(self.stamps, self.way)
-        made = record(self.world, robot, sensors, drive, streams, physics="kinematic", rays="exact")
+        made = record(
+            self.world, Member(robot, sensors, drive, streams), physics="kinematic", rays="exact"
+        )
         return dataclasses.replace(made, sensors=self.sensors)
 
     def _log_sigma(self, name: str) -> float:

@@ -187,7 +187,7 @@ def real_laser(
         short_beams=short_beams,
         missing_share=missing_share,
         missing_beams=missing_beams,
-        stamps=[round(float(s), 4) for s in scheduled],
+        stamps=tuple(round(float(s), 4) for s in scheduled),
     )
 
 

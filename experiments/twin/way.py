@@ -11,7 +11,7 @@ from sim import se2
 from sim.arrays import Array
 from sim.errors import InputError, require
 from sim.recording import Recording
-from sim.robot.drive import arc_increment
+from sim.robot.arc import arc_increment
 from sim.sensors import Laser, StereoCamera
 
 STEP_S = 0.1  # of a way

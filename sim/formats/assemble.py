@@ -22,7 +22,7 @@ from sim import se2
 from sim.arrays import Array
 from sim.errors import InputError, require
 from sim.recording import WheelLog
-from sim.robot.drive import arc_increment
+from sim.robot.arc import arc_increment
 
 Rows = NDArray[np.int64]
 Notes = dict[str, Any]

@@ -91,7 +91,7 @@ class CarmenLog:
             n_beams=n_beams,
             fov_rad=min(fov, 2.0 * math.pi),
             max_range_m=self.max_range_m,
-            mount=Mount(x, y, yaw_rad=float(se2.wrap(yaw + middle))),
+            mount=Mount(x_m=x, y_m=y, yaw_rad=float(se2.wrap(yaw + middle))),
         )
 
 

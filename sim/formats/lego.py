@@ -110,7 +110,8 @@ def read_lego(
         fov_rad=min(max(_BEAM_STEP_RAD * (n_beams - 1), 1e-9), 2.0 * math.pi),
         max_range_m=_MAX_RANGE_M,
         mount=Mount(
-            SCANNER_AHEAD_M, yaw_rad=math.remainder(middle * _BEAM_STEP_RAD + _BEAM_OFFSET_RAD, 7.0)
+            x_m=SCANNER_AHEAD_M,
+            yaw_rad=math.remainder(middle * _BEAM_STEP_RAD + _BEAM_OFFSET_RAD, 7.0),
         ),
     )
     truth = None

@@ -21,8 +21,8 @@ from sim.recording import Recording, Truth, WheelLog
 from sim.sensors import Laser, Mount
 
 TRACK_M, WHEEL_RADIUS_M = 0.48, 0.095  # of the Robocom the sets were recorded with, nominal
-FRONT_SICK = Mount(0.08, 0.0, 0.45)
-REAR_SICK = Mount(-0.463, 0.001, 0.454, math.pi)
+FRONT_SICK = Mount(x_m=0.08, y_m=0.0, z_m=0.45)
+REAR_SICK = Mount(x_m=-0.463, y_m=0.001, z_m=0.454, yaw_rad=math.pi)
 _MAX_RANGE_M = 80.0
 _MOST_BEAMS = 3601
 
@@ -137,7 +137,9 @@ def read_rawseeds(
         n_beams=ranges.shape[1],
         fov_rad=fov,
         max_range_m=_MAX_RANGE_M,
-        mount=Mount(mount.x_m, mount.y_m, mount.z_m, math.remainder(yaw, 2.0 * math.pi)),
+        mount=Mount(
+            x_m=mount.x_m, y_m=mount.y_m, z_m=mount.z_m, yaw_rad=math.remainder(yaw, 2.0 * math.pi)
+        ),
     )
     reference = None
     if truth is not None:

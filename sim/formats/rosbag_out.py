@@ -38,7 +38,7 @@ from sim.formats.rosbag import (
     typestore,
 )
 from sim.recording import Log, Recording, Truth, described
-from sim.robot.drive import twist_covariances
+from sim.robot.slip import twist_covariances
 from sim.sensors import Mount, point_cloud
 from sim.sensors.base import is_ours
 

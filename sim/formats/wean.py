@@ -96,7 +96,7 @@ def parse_wean(
         n_beams=_N_BEAMS,
         fov_rad=step * (_N_BEAMS - 1),
         max_range_m=_NO_RETURN_M,
-        mount=Mount(float(mount[0]), float(mount[1]), yaw_rad=float(mount[2]) - step / 2.0),
+        mount=Mount(x_m=float(mount[0]), y_m=float(mount[1]), yaw_rad=float(mount[2]) - step / 2.0),
     )
     return scan_recording(
         wheels,

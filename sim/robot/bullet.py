@@ -17,7 +17,7 @@ import numpy as np
 
 from sim.arrays import Array
 from sim.errors import InputError, require
-from sim.robot.drive import DifferentialDrive
+from sim.robot.base import TICK_S, Robot
 from sim.worlds.world import World
 
 
@@ -41,8 +41,6 @@ def _quiet() -> Iterator[None]:
 with _quiet():
     import pybullet
 
-
-DT_S = 1.0 / 300.0
 MAX_RAYS = 16_000  # a batch of 16384 rays loses its last one
 _SOLVER_ITERATIONS = 80  # 50 leave 0.08 mm of side slip in a straight 2 m, 80 leave 0.03 mm
 _SETTLE_TICKS = 60
@@ -63,7 +61,7 @@ class BulletBody(contextlib.AbstractContextManager["BulletBody"]):
         that would change the bits of all that follows.
     """
 
-    def __init__(self, world: World, robot: DifferentialDrive, pose: Array) -> None:
+    def __init__(self, world: World, robot: Robot, pose: Array) -> None:
         self._radius_m = robot.wheel_radius_m
         self._client = pybullet.connect(pybullet.DIRECT)
         if self._client < 0:
@@ -71,7 +69,7 @@ class BulletBody(contextlib.AbstractContextManager["BulletBody"]):
         c = self._client
         pybullet.setGravity(0, 0, -9.81, physicsClientId=c)
         pybullet.setPhysicsEngineParameter(
-            fixedTimeStep=DT_S,
+            fixedTimeStep=TICK_S,
             numSolverIterations=_SOLVER_ITERATIONS,
             solverResidualThreshold=0,
             deterministicOverlappingPairs=1,
@@ -194,7 +192,7 @@ class BulletBody(contextlib.AbstractContextManager["BulletBody"]):
         self._surface(walls, -1, 0.5, _WALLS, _ROBOT | _RAYS)
         return walls
 
-    def _build_robot(self, robot: DifferentialDrive, pose: Array) -> int:
+    def _build_robot(self, robot: Robot, pose: Array) -> int:
         c, r = self._client, robot.wheel_radius_m
         caster_r = 0.4 * r
         bottom, top = 0.4 * r - r, max(robot.body_height_m, r) - r  # of the body, from the axle

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -9,9 +10,14 @@ from numpy.typing import ArrayLike
 from sim.arrays import Array
 from sim.compiled import njit
 from sim.errors import require
-from sim.robot.drive import SLIP_TIME_CONSTANT_S, SMALL_ANGLE_RAD, DifferentialDrive
-from sim.routes.route import TICK_S, OpenLoop
+from sim.robot.arc import SMALL_ANGLE_RAD
+from sim.robot.base import TICK_S, Robot
+from sim.robot.drive import DifferentialDrive
+from sim.robot.slip import SLIP_TIME_CONSTANT_S, forward_increment, slip_increment
+from sim.routes.route import OpenLoop
 
+_slipped = njit()(slip_increment)
+_slipped_together = njit()(forward_increment)
 _BLOCK_NORMALS = 2_000_000  # drawn at once, 16 MB; the bits do not depend on it
 
 
@@ -28,7 +34,7 @@ class KinematicBody:
         Length of a tick, s.
     """
 
-    def __init__(self, robot: DifferentialDrive, pose: ArrayLike, dt_s: float = TICK_S) -> None:
+    def __init__(self, robot: Robot, pose: ArrayLike, dt_s: float = TICK_S) -> None:
         self._track_m, self._dt_s = robot.track_m, dt_s
         self._x, self._y, self._heading = np.array(pose, dtype=np.float64).tolist()
 
@@ -99,7 +105,8 @@ def run_batch(
     Parameters
     ----------
     robot
-        The true robot. Its unmodelled and forward slip must be off.
+        The true robot. Slip events, which depend on when a wheel turns back, are the simulator's
+        alone.
     start
         (3,) common start pose.
     sample_s
@@ -108,11 +115,11 @@ def run_batch(
     Raises
     ------
     InputError
-        If unmodelled or forward slip is asked for, which only the simulator offers.
+        If the robot has slip events.
     """
     require(
-        robot.unmodelled_slip == 0.0 and robot.forward_slip_m == 0.0,
-        "batches know the kr/kl law only; set robot.unmodelled_slip=0 and robot.forward_slip_m=0",
+        robot.unmodelled_slip == 0.0,
+        "slip events are the simulator's alone; set robot.unmodelled_slip=0",
     )
     require(n_runs >= 1, f"n_runs must be at least 1, got {n_runs}")
     commands_m = wheel_commands(robot, route)
@@ -121,22 +128,25 @@ def run_batch(
     sampled = np.append(np.arange(0, n_ticks, every), n_ticks)
     poses = np.empty((n_runs, len(sampled), 3))
     encoder_m, ground_m = np.empty((2, n_runs, len(sampled), 2))
+    law = _Law(
+        (robot.kr, robot.bias_right),
+        (robot.kl, robot.bias_left),
+        (robot.forward_slip_m, robot.forward_slip_length_m),
+        TICK_S / SLIP_TIME_CONSTANT_S,
+        robot.track_m,
+    )
+    of_both = rng.spawn(1)[0] if robot.forward_slip_m else None
     block = max(1, _BLOCK_NORMALS // (2 * n_ticks))
     for first in range(0, n_runs, block):
         rows = slice(first, min(first + block, n_runs))
-        _roll(
-            commands_m,
-            rng.standard_normal((rows.stop - rows.start, n_ticks, 2)),
-            robot.slip_variance_per_m,
-            robot.slip_bias,
-            TICK_S / SLIP_TIME_CONSTANT_S,
-            robot.track_m,
-            every,
-            np.array(start, dtype=np.float64),
-            poses[rows],
-            encoder_m[rows],
-            ground_m[rows],
-        )
+        n_rows = rows.stop - rows.start
+        normals = rng.standard_normal((n_rows, n_ticks, 2))
+        # the first of each run is for the share at its start
+        shared = np.zeros((n_rows, 1))
+        if of_both is not None:
+            shared = of_both.standard_normal((n_rows, 1 + n_ticks))
+        samples = poses[rows], encoder_m[rows], ground_m[rows]
+        _roll(commands_m, normals, shared, law, np.array(start, dtype=np.float64), every, samples)
     return BatchRuns(sampled * TICK_S, poses, robot.encoder_reading(encoder_m), ground_m)
 
 
@@ -145,26 +155,37 @@ def wheel_commands(robot: DifferentialDrive, route: OpenLoop) -> Array:
     return robot.wheel_speeds(*route.profile(robot).T) * TICK_S
 
 
+class _Law(NamedTuple):
+    """Slip of the right wheel, the left one (k, bias) and of both (q, length); lag; track, m."""
+
+    right: tuple[float, float]
+    left: tuple[float, float]
+    both: tuple[float, float]
+    lag_share: float
+    track_m: float
+
+
 @njit()
 def _roll(
     commands_m: Array,
     normals: Array,
-    variance_per_m: Array,
-    bias: Array,
-    lag_share: float,
-    track_m: float,
-    every: int,
+    shared: Array,
+    law: _Law,
     start: Array,
-    poses: Array,
-    encoder_m: Array,
-    ground_m: Array,
+    every: int,
+    samples: tuple[Array, Array, Array],
 ) -> None:
-    """The loop of `robot.Slip` and `KinematicBody` over all runs; samples into the last three."""
+    """The loop of `WheelSlip` and `KinematicBody` over all runs, sampled into the last three."""
     n_ticks = len(commands_m)
+    poses, encoder_m, ground_m = samples
+    laws, (q_m, length_m) = (law.right, law.left), law.both
     for run in range(len(normals)):
         x, y, heading = start
         lag, encoder, ground = np.zeros(2), np.zeros(2), np.zeros(2)
         rolling = np.empty(2)
+        both, share = 0.0, 0.0
+        if length_m > 0.0:
+            share = np.sqrt(q_m / (2.0 * length_m)) * shared[run, 0]
         poses[run, 0] = start
         encoder_m[run, 0] = 0.0
         ground_m[run, 0] = 0.0
@@ -172,12 +193,18 @@ def _roll(
         for tick in range(n_ticks):
             for i in range(2):
                 rolling[i] = commands_m[tick, i] - lag[i]
-                error = bias[i] * rolling[i]
-                error += np.sqrt(variance_per_m[i] * abs(rolling[i])) * normals[run, tick, i]
-                lag[i] += lag_share * (error - lag[i])
-                encoder[i] += rolling[i] + error
+            if q_m > 0.0:
+                travel_m = (abs(rolling[0]) + abs(rolling[1])) / 2.0
+                both, share = _slipped_together(
+                    travel_m, share, q_m, length_m, shared[run, 1 + tick]
+                )
+            for i in range(2):
+                read_m, lag[i] = _slipped(
+                    rolling[i], lag[i], laws[i], normals[run, tick, i], both, law.lag_share
+                )
+                encoder[i] += read_m
                 ground[i] += rolling[i]
-            half = (rolling[0] - rolling[1]) / track_m / 2.0
+            half = (rolling[0] - rolling[1]) / law.track_m / 2.0
             # a tick turns by milliradians, where this series is exact to the last bit
             chord = (rolling[0] + rolling[1]) / 2.0 * (1.0 - half**2 / 6.0 + half**4 / 120.0)
             x += chord * np.cos(heading + half)

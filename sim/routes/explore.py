@@ -10,16 +10,17 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Literal
 
 import numpy as np
+from pydantic import NonNegativeInt
 
 from sim import se2
 from sim.arrays import Array, Ints
 from sim.errors import InputError, require
-from sim.robot.drive import DifferentialDrive
-from sim.routes.feedback import CONTROL_TICKS, check_feedback
+from sim.options import Point, Positive, options
+from sim.robot.base import TICK_S, Robot
+from sim.routes.feedback import CONTROL_TICKS
 from sim.routes.frontiers import (
     Mask,
     Ways,
@@ -32,10 +33,9 @@ from sim.routes.frontiers import (
     nearest,
     unknown_in_sight,
 )
-from sim.routes.route import TICK_S, Controller
+from sim.routes.route import Controller, PursuitOptions
 from sim.sensors.base import Reading, Sensors, sensor_of
 from sim.sensors.laser import Laser
-from sim.settings import check_numbers
 from sim.worlds.grid_mapping import ScanGrid
 from sim.worlds.world import World
 
@@ -51,74 +51,40 @@ _SHARED_OUT = ("shared_frontiers", "coordinated")
 _MOST_SEEN = 0.95  # of a goal's worth that goes to another; a robot is never left without one
 
 
-@dataclass(frozen=True)
-class Explore:
-    """Drive to frontiers of the map that the robots of a team make as they go.
-
-    Parameters
-    ----------
-    strategy
-        Which frontier a robot goes to. `random`: any. `nearest_frontier`: that of the shortest way
-        (Yamauchi 1998). `information_gain`: that of the greatest A exp(-L / `decay_m`), with the
-        unknown area A in sight of it and the way L (Gonzalez-Banos and Latombe 2002).
-        `coordinated`: the same, but the robots choose one after another, best choice first, and
-        what a frontier is worth falls by the chance that it is seen from one already chosen
-        (Burgard et al. 2005). `shared_frontiers`: so shared out, but by the way alone (A = 1).
-    distance_m
-        Where a robot ends, by its own reckoning, if the team sees no frontier any more before.
-    draw
-        Seed of the random strategy.
-    decay_m
-        See `strategy`.
-    laser
-        Name of the sensor that the grid is made with.
-    resolution_m
-        Side of a cell.
-    clearance_m
-        Least distance of a way from anything that the grid holds occupied.
-    replan_s
-        How often goals and ways are looked at.
-    start_offset_m
-        (2,) of the start from the world's start pose, in its axes.
-    speed_mps, look_ahead_m, turn_rate_radps, feedback
-        As of `sim.routes.route.Tour`.
-    """
+@options("route")
+class Explore(PursuitOptions):
+    """Drive to frontiers of the map that the robots of a team make as they go."""
 
     strategy: Strategy
-    distance_m: float
-    draw: int = 0
-    decay_m: float = 5.0
+    """Which frontier a robot goes to. `random`: any. `nearest_frontier`: that of the shortest way
+    (Yamauchi 1998). `information_gain`: that of the greatest A exp(-L / `decay_m`), with the
+    unknown area A in sight of it and the way L (Gonzalez-Banos and Latombe 2002). `coordinated`:
+    the same, but the robots choose one after another, best choice first, and what a frontier is
+    worth falls by the chance that it is seen from one already chosen (Burgard et al. 2005).
+    `shared_frontiers`: so shared out, but by the way alone (A = 1)."""
+    distance_m: Positive
+    """Where a robot ends, by its own reckoning, if the team sees no frontier any more before."""
+    draw: NonNegativeInt = 0
+    """Seed of the random strategy."""
+    decay_m: Positive = 5.0
+    """Way over which a frontier's worth falls by e: all strategies but the first two."""
     laser: str = "laser"
-    resolution_m: float = 0.2
-    clearance_m: float = 0.55
-    replan_s: float = 1.0
-    start_offset_m: tuple[float, float] = (0.0, 0.0)
-    speed_mps: float = 0.5
-    look_ahead_m: float = 0.35
-    turn_rate_radps: float = 1.0
-    feedback: str | Mapping[str, Any] = "truth"
+    """Name of the sensor that the grid is made with."""
+    resolution_m: Positive = 0.2
+    """Side of a cell."""
+    clearance_m: Positive = 0.55
+    """Least distance of a way from anything that the grid holds occupied."""
+    replan_s: Positive = 1.0
+    """How often goals and ways are looked at."""
+    start_offset_m: Point = (0.0, 0.0)
+    """Of the start from the world's start pose, in its axes."""
 
-    def __post_init__(self) -> None:
-        check_feedback(self.feedback)
-        known = get_args(Strategy)
-        require(
-            self.strategy in known,
-            f"route.strategy must be one of {', '.join(known)}, got {self.strategy!r}",
-        )
-        check_numbers("route", self, ("distance_m", "decay_m", "resolution_m", "clearance_m",
-                      "replan_s", "speed_mps", "look_ahead_m", "turn_rate_radps"))  # fmt: skip
-        offset = np.array(self.start_offset_m, float)
-        require(
-            offset.shape == (2,) and np.isfinite(offset).all(),
-            f"route.start_offset_m must be two numbers, got {self.start_offset_m!r}",
-        )
-
-    def start(self, world: World, robot: DifferentialDrive) -> tuple[Array, Explorer]:
+    def start(self, world: World, robot: Robot) -> tuple[Array, Explorer]:
         """Start pose (3,) beside the world's, and the driver."""
         pose = se2.compose(world.start_pose, np.array([*self.start_offset_m, 0.0]))
         return pose, Explorer(self, robot, world, pose)
 
-    def about_s(self, world: World, robot: DifferentialDrive) -> float:
+    def about_s(self, world: World, robot: Robot) -> float:
         """About how long the drive takes, s, if frontiers are left all along."""
         return self.distance_m / self.speed_mps
 
@@ -133,7 +99,7 @@ class Explorer(Controller):
 
     _crew: Crew
 
-    def __init__(self, route: Explore, robot: DifferentialDrive, world: World, pose: Array) -> None:
+    def __init__(self, route: Explore, robot: Robot, world: World, pose: Array) -> None:
         super().__init__(robot, 4.0 * route.distance_m / route.speed_mps + 60.0)
         self._route, self._world = route, world
         self._driven_m = 0.0

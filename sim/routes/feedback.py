@@ -13,7 +13,8 @@ from sim import se2
 from sim.arrays import Array
 from sim.errors import InputError, blaming, require
 from sim.recording import Frame
-from sim.robot.drive import DifferentialDrive, RobotGeometry, arc_increment
+from sim.robot.arc import arc_increment
+from sim.robot.base import Robot, RobotGeometry
 from sim.sensors.base import Reading, Schema, Sensors, parted
 from sim.worlds.world import World
 
@@ -64,7 +65,7 @@ class OdometryFeedback:
         (3,) m, m, rad: where the reckoning starts.
     """
 
-    def __init__(self, robot: DifferentialDrive, start: Array) -> None:
+    def __init__(self, robot: Robot, start: Array) -> None:
         self._robot = robot
         self._pose, self._reading_m = np.array(start, float), np.zeros(2)
 
@@ -98,7 +99,7 @@ class EstimatorFeedback:
 
     def __init__(
         self,
-        robot: DifferentialDrive,
+        robot: Robot,
         start: Array,
         step: Callable[[Frame], Array],
         schemas: Mapping[str, Schema],
@@ -156,7 +157,7 @@ def check_feedback(wanted: object) -> None:
 
 def feedback_of(
     route: object,
-    robot: DifferentialDrive,
+    robot: Robot,
     start: Array,
     sensors: Sensors,
     world: World,

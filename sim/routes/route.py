@@ -8,25 +8,30 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydantic import Strict
 
 from sim.arrays import Array
-from sim.errors import InputError, require
-from sim.robot.drive import DifferentialDrive, arc_increment
+from sim.errors import require
+from sim.options import NonNegative, Points, Positive, options
+from sim.robot.arc import arc_increment
+from sim.robot.base import TICK_S, Robot
 from sim.routes.feedback import CONTROL_TICKS, check_feedback
 from sim.se2 import chain, transform
-from sim.settings import check_numbers
 from sim.worlds.world import World, facing_second
 
 Segment = tuple[float, float, float]
+Segments = Annotated[
+    tuple[Annotated[Segment, Strict(False)], ...],
+    Strict(False),
+    "a list of [v, omega, duration]",
+]
 
-TICK_S = 1.0 / 300.0
 
-
-@dataclass(frozen=True)
+@options("route")
 class OpenLoop:
     """Commands given by the clock, blind to where the robot is (puzzlebot2024, table 1).
 
@@ -37,31 +42,26 @@ class OpenLoop:
     segment too short to reach its velocity becomes a triangle of the same area. The robot rests
     between two segments, unless their velocities are the same.
 
-    Attributes
-    ----------
-    segments
-        (v m/s, omega rad/s, T s) each; both velocities zero for a pause.
-    rest_s
-        Rest after the last segment, s.
     """
 
-    segments: tuple[Segment, ...]
-    rest_s: float = 0.2
+    segments: Segments
+    """[v m/s, omega rad/s, duration s] each; both velocities zero for a pause."""
+    rest_s: NonNegative = 0.2
+    """Rest after the last segment, s."""
 
     def __post_init__(self) -> None:
-        check_numbers("route", self, not_negative=("rest_s",))
         object.__setattr__(self, "segments", tuple(_merged(self.segments)))
         require(self.segments, "route.segments is empty; give at least one [v, omega, duration]")
 
-    def start(self, world: World, robot: DifferentialDrive) -> tuple[Array, Replay]:
+    def start(self, world: World, robot: Robot) -> tuple[Array, Replay]:
         """Start pose (3,) of the world, and the driver."""
         return world.start_pose, Replay(self.profile(robot))
 
-    def about_s(self, world: World, robot: DifferentialDrive) -> float:
+    def about_s(self, world: World, robot: Robot) -> float:
         """How long the drive takes, s."""
         return float(self.edges_s(robot)[-1]) + self.rest_s
 
-    def profile(self, robot: DifferentialDrive, dt_s: float = TICK_S) -> Array:
+    def profile(self, robot: Robot, dt_s: float = TICK_S) -> Array:
         """Body velocities (N, 2), m/s and rad/s: means over ticks of `dt_s`, rest included.
 
         Being means, they add up to the promised distance and angle exactly.
@@ -76,7 +76,7 @@ class OpenLoop:
             velocity[first:] += np.diff(held_s)[:, None] / dt_s * np.array(segment[:2])
         return velocity
 
-    def edges_s(self, robot: DifferentialDrive) -> Array:
+    def edges_s(self, robot: Robot) -> Array:
         """Times (S + 1,) at which the segments begin and the last one ends, s."""
         ramps = [_trapezoid(segment, robot) for segment in self.segments]
         lasts_s = [plateau_s + 2.0 * ramp_s for plateau_s, ramp_s, _ in ramps]
@@ -105,60 +105,57 @@ class Replay:
         return None
 
 
-@dataclass(frozen=True)
-class Tour:
+@options("route")
+class SteeredOptions:
+    """What routes have in common that a controller steers along by a pose."""
+
+    speed_mps: Positive = 0.5
+    """Cruising speed."""
+    turn_rate_radps: Positive = 1.0
+    """Limit of the turn rate."""
+    feedback: str | Mapping[str, Any] = "truth"
+    """The pose that is followed: `truth`, `odometry`, or a mapping with the `_target_` of an
+    estimator; see `sim.routes.feedback`."""
+
+    def __post_init__(self) -> None:
+        check_feedback(self.feedback)
+
+
+@options("route")
+class PursuitOptions(SteeredOptions):
+    """What routes have in common that are followed by pure pursuit."""
+
+    look_ahead_m: Positive = 0.35
+    """Distance of the point pursued."""
+
+
+@options("route")
+class Tour(PursuitOptions):
     """Way-point following by pure pursuit.
 
     Guided by its true pose, as if someone drove it, the robot keeps its route, and slip makes only
     the odometry err. Guided by its odometry, it leaves the route without noticing.
-
-    Attributes
-    ----------
-    speed_mps
-        Cruising speed.
-    waypoints
-        (P, 2) m; None for the world's own tour.
-    distance_m
-        Where to end, counted along the tour; None for all of it. A longer distance than the tour
-        has goes round again if the tour is closed, else back and forth.
-    look_ahead_m
-        Distance of the point pursued.
-    tolerance_m
-        Distance from the tour at which the robot counts as off its route.
-    turn_rate_radps
-        Limit of the turn rate.
-    feedback
-        The pose that is followed: `truth`, `odometry`, or a mapping with the `_target_` of an
-        estimator; see `sim.routes.feedback`.
     """
 
-    speed_mps: float = 0.5
-    waypoints: tuple[tuple[float, float], ...] | None = None
-    distance_m: float | None = None
-    look_ahead_m: float = 0.35
-    tolerance_m: float = 0.5
-    turn_rate_radps: float = 1.0
-    feedback: str | Mapping[str, Any] = "truth"
+    waypoints: Points | None = None
+    """[[x, y], ...], at least two; null for the world's own tour."""
+    distance_m: Positive | None = None
+    """Where to end, counted along the tour; null for all of it. A longer distance than the tour
+    has goes round again if the tour is closed, else back and forth."""
+    tolerance_m: Positive = 0.5
+    """Distance from the tour at which the robot counts as off its route."""
 
     def __post_init__(self) -> None:
-        check_feedback(self.feedback)
-        check_numbers(
-            "route", self, ("speed_mps", "look_ahead_m", "tolerance_m", "turn_rate_radps")
-        )
-        require(
-            self.distance_m is None or 0.0 < self.distance_m < math.inf,
-            f"route.distance_m must be positive, got {self.distance_m}",
-        )
-        if self.waypoints is not None:
-            wanted = "route.waypoints must be null or at least two points [x, y], m"
-            _check_points(self.waypoints, wanted, at_least=2)
+        super().__post_init__()
+        enough = self.waypoints is None or len(self.waypoints) >= 2
+        require(enough, "route.waypoints must be null or at least two points [x, y], m")
 
-    def start(self, world: World, robot: DifferentialDrive) -> tuple[Array, Pursuit]:
+    def start(self, world: World, robot: Robot) -> tuple[Array, Pursuit]:
         """Start pose (3,) on the first way-point, facing the second, and the driver."""
         path = _lengthened(self._given(world), self.distance_m)
         return facing_second(path), Pursuit(self, robot, path)
 
-    def about_s(self, world: World, robot: DifferentialDrive) -> float:
+    def about_s(self, world: World, robot: Robot) -> float:
         """About how long the drive takes, s; at 0.5 m/s a radian of its turns costs some 0.6 s."""
         path = _lengthened(self._given(world), self.distance_m)
         x, y = np.diff(path, axis=0).T
@@ -178,21 +175,14 @@ class Tour:
         return given
 
 
-@dataclass(frozen=True)
+@options("route")
 class TourFrom(Tour):
-    """A Tour that goes round, from any of its way-points on: of a team, each robot has its own.
-
-    Attributes
-    ----------
-    first
-        Way-point to begin at, counted from 0 and, beyond the last, from 0 again. A tour that does
-        not end where it begins is closed by a way back.
-    backwards
-        Whether it is driven against its direction.
-    """
+    """A Tour that goes round, from any of its way-points on: of a team, each robot has its own."""
 
     first: int = 0
+    """Way-point to begin at. A tour that does not end where it begins is closed by a way back."""
     backwards: bool = False
+    """Whether it is driven against its direction."""
 
     def _given(self, world: World) -> Array:
         path = super()._given(world)
@@ -210,7 +200,7 @@ class TourFrom(Tour):
 class Controller:
     """Driver that steers 50 times a second with limited acceleration, and rests at its goal."""
 
-    def __init__(self, robot: DifferentialDrive, last_s: float) -> None:
+    def __init__(self, robot: Robot, last_s: float) -> None:
         linear = robot.max_acceleration_mps2
         # (2,) of v and omega, m/s^2 and rad/s^2: half of a wheel's acceleration for each
         self._most = np.array([0.5 * linear, linear / robot.nominal.track_m])
@@ -270,7 +260,7 @@ class Controller:
 class Pursuit(Controller):
     """Driver of a Tour: pure pursuit."""
 
-    def __init__(self, tour: Tour, robot: DifferentialDrive, path: Array) -> None:
+    def __init__(self, tour: Tour, robot: Robot, path: Array) -> None:
         self._tour, self._path = tour, path
         self._along_m = _along_m(path)
         self._done_m, self._off_m = 0.0, 0.0
@@ -315,8 +305,8 @@ class Pursuit(Controller):
         )
 
 
-@dataclass(frozen=True)
-class GoToPoints:
+@options("route")
+class GoToPoints(SteeredOptions):
     """One point after another: turn on the spot towards it, then drive to it.
 
     The closed loop of puzzlebot2024: a ControlNode that steers by the pose on `/odom` (section
@@ -325,51 +315,25 @@ class GoToPoints:
     (section "Problemas encontrados"). The law here is the proportional one that is usual for such
     nodes: with the point at distance rho and bearing alpha from the believed pose, omega =
     gain_bearing alpha, and v = gain_distance rho, or 0 while abs(alpha) is above `turn_above_rad`.
-    Both are limited, as are their accelerations. The numbers in `conf/route/square.yaml` are ours.
-
-    Attributes
-    ----------
-    points
-        (P, 2) m, in the frame of the start pose.
-    speed_mps, turn_rate_radps
-        Limits of v and omega.
-    gain_distance, gain_bearing
-        Gains, 1/s.
-    turn_above_rad
-        Bearing above which the robot turns on the spot.
-    tolerance_m
-        Believed distance at which a point counts as reached.
-    feedback
-        The pose that is steered by: `truth`, `odometry`, or a mapping with the `_target_` of an
-        estimator; see `sim.routes.feedback`.
+    Both are limited, as are their accelerations. The numbers are ours.
     """
 
-    points: tuple[tuple[float, float], ...]
-    speed_mps: float
-    turn_rate_radps: float
-    gain_distance: float
-    gain_bearing: float
-    turn_above_rad: float
-    tolerance_m: float
-    feedback: str | Mapping[str, Any] = "truth"
+    points: Points
+    """[[x, y], ...], m, in the frame of the start pose."""
+    gain_distance: Positive
+    """Gain of v, 1/s."""
+    gain_bearing: Positive
+    """Gain of omega, 1/s."""
+    turn_above_rad: Positive
+    """Bearing above which the robot turns on the spot."""
+    tolerance_m: Positive
+    """Believed distance at which a point counts as reached."""
 
     def __post_init__(self) -> None:
-        check_feedback(self.feedback)
-        check_numbers(
-            "route",
-            self,
-            (
-                "speed_mps",
-                "turn_rate_radps",
-                "gain_distance",
-                "gain_bearing",
-                "turn_above_rad",
-                "tolerance_m",
-            ),
-        )
-        _check_points(self.points, "route.points must be at least one point [x, y], m", at_least=1)
+        super().__post_init__()
+        require(self.points, "route.points must be at least one point [x, y], m")
 
-    def start(self, world: World, robot: DifferentialDrive) -> tuple[Array, GoToPoint]:
+    def start(self, world: World, robot: Robot) -> tuple[Array, GoToPoint]:
         """Start pose (3,) of the world, and the driver."""
         path = np.array([(0.0, 0.0), *self.points])
         return world.start_pose, GoToPoint(self, robot, transform(world.start_pose, path))
@@ -378,7 +342,7 @@ class GoToPoints:
 class GoToPoint(Controller):
     """Driver of GoToPoints."""
 
-    def __init__(self, route: GoToPoints, robot: DifferentialDrive, path: Array) -> None:
+    def __init__(self, route: GoToPoints, robot: Robot, path: Array) -> None:
         self._route, self._points, self._reached = route, path[1:], 0
         turns_s = math.pi * len(self._points) / route.turn_rate_radps
         super().__init__(robot, 4.0 * (_along_m(path)[-1] / route.speed_mps + turns_s) + 60.0)
@@ -403,16 +367,6 @@ def _bearing(offset: Array, pose: Array) -> float:
     return math.atan2(math.sin(bearing), math.cos(bearing))
 
 
-def _check_points(given: ArrayLike, wanted: str, at_least: int) -> None:
-    """Refuse what is not (P, 2) finite numbers, with a line that says what is wanted."""
-    try:
-        points = np.array(given, float)
-    except (TypeError, ValueError):
-        raise InputError(f"{wanted}, got {given!r}") from None
-    shaped = points.ndim == 2 and points.shape[1] == 2 and len(points) >= at_least
-    require(shaped and np.isfinite(points).all(), f"{wanted}, got {given!r}")
-
-
 def _lengthened(path: Array, distance_m: float | None) -> Array:
     """Path (P, 2) cut or repeated to the wanted length, without points that coincide."""
     path = path[np.concatenate([[True], np.hypot(*np.diff(path, axis=0).T) > 1e-6])]
@@ -435,18 +389,14 @@ def _along_m(path: Array) -> Array:
     return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
 
 
-def _merged(segments: Iterable[Iterable[float]]) -> list[Segment]:
+def _merged(segments: Iterable[Segment]) -> list[Segment]:
     """Check the segments; join neighbours of the same velocity."""
     merged: list[Segment] = []
     for i, segment in enumerate(segments):
-        where = f"route.segments[{i}]"
-        try:
-            v, omega, duration_s = (float(value) for value in segment)
-        except (TypeError, ValueError):
-            raise InputError(f"{where} must be [v, omega, duration], got {segment!r}") from None
+        v, omega, duration_s = segment
         require(
-            all(map(math.isfinite, (v, omega, duration_s))) and duration_s > 0.0,
-            f"{where} must be finite with a positive duration, got {segment!r}",
+            duration_s > 0.0,
+            f"route.segments[{i}] must have a positive duration, got {segment!r}",
         )
         if merged and merged[-1][:2] == (v, omega):
             duration_s += merged.pop()[2]
@@ -454,7 +404,7 @@ def _merged(segments: Iterable[Iterable[float]]) -> list[Segment]:
     return merged
 
 
-def _trapezoid(segment: Segment, robot: DifferentialDrive) -> tuple[float, float, float]:
+def _trapezoid(segment: Segment, robot: Robot) -> tuple[float, float, float]:
     """Plateau and ramp times, s, and the share of the velocity that the plateau reaches."""
     v, omega, duration_s = segment
     track_m = max(robot.track_m, robot.nominal.track_m)  # neither body nor wheels are hurried
@@ -467,7 +417,7 @@ def _trapezoid(segment: Segment, robot: DifferentialDrive) -> tuple[float, float
     return 0.0, share * ramp_s, share
 
 
-def _held(time_s: Array, segment: Segment, robot: DifferentialDrive) -> Array:
+def _held(time_s: Array, segment: Segment, robot: Robot) -> Array:
     """Integral of the velocity's share from the segment's start to `time_s`, s."""
     plateau_s, ramp_s, share = _trapezoid(segment, robot)
     if ramp_s == 0.0:
@@ -479,15 +429,15 @@ def _held(time_s: Array, segment: Segment, robot: DifferentialDrive) -> Array:
 
 
 TABLE_1: dict[str, OpenLoop] = {
-    "linear_1": OpenLoop(((0.5, 0.0, 2.0),)),
-    "linear_2": OpenLoop(((0.5, 0.0, 5.0),)),
-    "linear_3": OpenLoop(((0.7, 0.0, 2.0),)),
-    "linear_4": OpenLoop(((0.3, 0.0, 2.0),)),
-    "angular_1": OpenLoop(((0.0, 0.5, 3.0),)),
-    "angular_2": OpenLoop(((0.0, 0.5, 5.0),)),
-    "angular_3": OpenLoop(((0.0, 0.5, 10.0),)),
-    "angular_4": OpenLoop(((0.0, 0.8, 3.0),)),
-    "angular_5": OpenLoop(((0.0, 0.2, 5.0),)),
+    "linear_1": OpenLoop(segments=((0.5, 0.0, 2.0),)),
+    "linear_2": OpenLoop(segments=((0.5, 0.0, 5.0),)),
+    "linear_3": OpenLoop(segments=((0.7, 0.0, 2.0),)),
+    "linear_4": OpenLoop(segments=((0.3, 0.0, 2.0),)),
+    "angular_1": OpenLoop(segments=((0.0, 0.5, 3.0),)),
+    "angular_2": OpenLoop(segments=((0.0, 0.5, 5.0),)),
+    "angular_3": OpenLoop(segments=((0.0, 0.5, 10.0),)),
+    "angular_4": OpenLoop(segments=((0.0, 0.8, 3.0),)),
+    "angular_5": OpenLoop(segments=((0.0, 0.2, 5.0),)),
 }
 """The nine manoeuvres of puzzlebot2024, table 1.
 

@@ -13,32 +13,28 @@ from sim.errors import require
 from sim.formats.rosbag import Track
 from sim.formats.trajectory import check_track
 from sim.formats.tum import read_tum
-from sim.robot.drive import DifferentialDrive
+from sim.options import Positive, options
+from sim.robot.base import TICK_S, Robot
 from sim.routes.feedback import CONTROL_TICKS
-from sim.routes.route import TICK_S
 from sim.worlds.world import World
 
 _GAIN_PER_S = 2.0  # an error of place or heading falls by a factor of e in half a second
 _AHEAD_M = 0.3  # where the robot heads back to its way
 
 
-@dataclass(frozen=True)
+@options("route")
 class Timetable:
     """Be at each pose of a trajectory at its time, led by the true pose.
 
     Between two poses the robot drives an arc. Slip moves it off its way, and it comes back as if
     someone drove it, so that only its odometry errs, as on a `Tour`.
 
-    Attributes
-    ----------
-    path
-        A TUM file: stamps, s, of which the first is the start, and poses of base_link in map.
-    tolerance_m
-        Distance from the place of the moment at which the robot counts as off its route.
     """
 
     path: str | None
-    tolerance_m: float = 1.0
+    """A TUM file: stamps, s, of which the first is the start, and poses of base_link in map."""
+    tolerance_m: Positive = 1.0
+    """Distance from the place of the moment at which the robot counts as off its route."""
 
     @cached_property
     def way(self) -> tuple[Array, Array]:
@@ -59,11 +55,11 @@ class Timetable:
         require(len(stamps) >= 2, f"{path}: a route needs two poses or more")
         return stamps, poses
 
-    def start(self, world: World, robot: DifferentialDrive) -> tuple[Array, "Follower"]:
+    def start(self, world: World, robot: Robot) -> tuple[Array, "Follower"]:
         """First pose (3,), and the driver."""
         return Drive(*self.way, self.tolerance_m).start(world, robot)
 
-    def about_s(self, world: World, robot: DifferentialDrive) -> float:
+    def about_s(self, world: World, robot: Robot) -> float:
         """How long the drive takes, s."""
         stamps, _ = self.way
         return float(stamps[-1] - stamps[0])
@@ -77,7 +73,7 @@ class Drive:
     poses: Array
     tolerance_m: float = 1.0
 
-    def start(self, world: World, robot: DifferentialDrive) -> tuple[Array, "Follower"]:
+    def start(self, world: World, robot: Robot) -> tuple[Array, "Follower"]:
         """First pose (3,), and the driver."""
         stamps = self.stamps - self.stamps[0]
         return self.poses[0].copy(), Follower(stamps, self.poses, self.tolerance_m)

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from sim import se2
 from sim.arrays import Array
 from sim.errors import InputError, blaming, require
-from sim.settings import build, find
+from sim.options import build, find, options
 from sim.worlds.world import World
 
 S = TypeVar("S")
@@ -233,7 +233,7 @@ class Sensor(Protocol):
 Sensors = Mapping[str, Sensor]
 
 
-@dataclass(frozen=True)
+@options("sensors.mount")
 class Mount:
     """Pose of a sensor in base_link: x forward, y left, z up (m), yaw (rad)."""
 
@@ -241,11 +241,6 @@ class Mount:
     y_m: float = 0.0
     z_m: float = 0.2
     yaw_rad: float = 0.0
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not math.isfinite(value):
-                raise InputError(f"sensors.mount.{name} must be a finite number, got {value}")
 
     @property
     def pose(self) -> Array:

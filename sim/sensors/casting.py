@@ -204,7 +204,8 @@ def _cast(
             end = end + turn if end < begin else end
             edge_on = c * c <= _EDGE_ON_M * _EDGE_ON_M * (nx * nx + ny * ny)
             if edge_on or end - begin > 0.75 * turn:
-                _draw_edge_on(ax, ay, bx, by, heading, phase, step_rad, directions, nearness)
+                aim = heading, phase, step_rad
+                _draw_edge_on(ax, ay, bx, by, aim, directions, nearness)
                 continue
             begin -= _END_TOLERANCE
             end += _END_TOLERANCE
@@ -270,13 +271,12 @@ def _draw_edge_on(
     ay: float,
     bx: float,
     by: float,
-    heading: float,
-    phase: float,
-    step_rad: float,
+    aim: tuple[float, float, float],
     directions: Array,
     nearness: Array,
 ) -> None:
     """Draw a face that is seen along its plane, or touched, with its range kept on the face."""
+    heading, phase, step_rad = aim
     turn = 2.0 * math.pi / step_rad
     last = nearness.size - 1
     begin, end, gx, gy, least, most = _face(ax, ay, bx, by, heading, phase, step_rad)

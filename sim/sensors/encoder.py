@@ -1,25 +1,20 @@
 """The wheel encoders."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
+from sim.options import Positive, options
 from sim.sensors.base import Probe, Schema
-from sim.settings import check_numbers
 
 
-@dataclass(frozen=True)
+@options("sensors.encoder")
 class Encoder:
-    """Wheel encoders; read at every Frame, and at `rate_hz` on their own if it is not None.
+    """Wheel encoders, read at every Frame.
 
     Their readings are the wheel increments that every Frame has.
     """
 
-    rate_hz: float | None = 20.0
-
-    def __post_init__(self) -> None:
-        if self.rate_hz is not None:
-            check_numbers("sensors.encoder", self, ("rate_hz",))
+    rate_hz: Positive | None = 20.0
+    """Readings per second of their own; null: read whenever another sensor fires."""
 
     @property
     def schema(self) -> Schema:

@@ -1,47 +1,30 @@
 """A gyroscope about the vertical axis."""
 
 import math
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 
+from sim.options import NonNegative, Positive, options
 from sim.sensors.base import Field, Probe, Reading, Schema, View
-from sim.settings import check_numbers
 
 
-@dataclass(frozen=True)
+@options("sensors.gyroscope")
 class Gyroscope:
-    """Mean yaw rate since its last reading, with white noise and a bias that walks.
-
-    Parameters
-    ----------
-    rate_hz
-        Readings per second.
-    sigma_rate_radps
-        Standard deviation of the white noise of a reading.
-    sigma_bias_radps
-        Standard deviation of the bias at the start.
-    bias_walk_radps_per_sqrt_s
-        Standard deviation by which the bias has walked after one second; it grows with the square
-        root of the time.
-    """
+    """Mean yaw rate since its last reading, with white noise and a bias that walks."""
 
     ros_message: ClassVar = "sensor_msgs/msg/Imu"
     ros_topic: ClassVar = "/imu"
 
-    rate_hz: float = 100.0
-    sigma_rate_radps: float = 0.005
-    sigma_bias_radps: float = 0.01
-    bias_walk_radps_per_sqrt_s: float = 1e-4
-
-    def __post_init__(self) -> None:
-        check_numbers(
-            "sensors.gyroscope",
-            self,
-            ("rate_hz",),
-            ("sigma_rate_radps", "sigma_bias_radps", "bias_walk_radps_per_sqrt_s"),
-        )
+    rate_hz: Positive = 100.0
+    """Readings per second."""
+    sigma_rate_radps: NonNegative = 0.005
+    """Standard deviation of the white noise of a reading."""
+    sigma_bias_radps: NonNegative = 0.01
+    """Standard deviation of the bias at the start."""
+    bias_walk_radps_per_sqrt_s: NonNegative = 1e-4
+    """Standard deviation by which the bias has walked after one second; it grows with the square
+    root of the time."""
 
     @property
     def schema(self) -> Schema:

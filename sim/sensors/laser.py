@@ -1,60 +1,39 @@
 """A planar laser scanner. Ranges that see nothing are +inf, as REP-117 asks."""
 
 import math
-from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import Field as Bound
 
 from sim.arrays import Array
-from sim.errors import InputError
+from sim.options import NonNegative, Positive, options
 from sim.sensors.base import Field, Mount, Probe, Reading, Schema
-from sim.settings import check_numbers
 
-MOST_BEAMS = 1_000_000  # of one scan; more would be a mistake, and no memory holds them
+Beams = Annotated[int, Bound(ge=1, le=1_000_000)]  # of one scan: no memory holds more
 
 
-@dataclass(frozen=True)
+@options("sensors.laser")
 class Laser:
-    """A planar laser scanner; beams run counter-clockwise from -fov/2 to +fov/2.
-
-    Parameters
-    ----------
-    rate_hz
-        Scans per second; a scan is taken at one instant.
-    n_beams, fov_rad
-        Beams and the angle between the first and the last one.
-    min_range_m, max_range_m
-        Returns outside are +inf.
-    sigma_range_m
-        Standard deviation of the Gaussian range noise.
-    mount
-        Where it sits on the robot.
-    """
+    """A planar laser scanner; beams run counter-clockwise from -fov/2 to +fov/2."""
 
     ros_message: ClassVar = "sensor_msgs/msg/LaserScan"
     ros_topic: ClassVar = "/scan"
 
-    rate_hz: float = 10.0
-    n_beams: int = 721
-    fov_rad: float = math.pi
-    min_range_m: float = 0.02
-    max_range_m: float = 80.0
-    sigma_range_m: float = 0.01
-    mount: Mount = field(default_factory=Mount)
-
-    def __post_init__(self) -> None:
-        check_numbers(
-            "sensors.laser", self, ("rate_hz", "max_range_m"), ("min_range_m", "sigma_range_m")
-        )
-        if not 1 <= self.n_beams <= MOST_BEAMS:
-            raise InputError(
-                f"sensors.laser.n_beams must be at least 1, at most {MOST_BEAMS}, "
-                f"got {self.n_beams}"
-            )
-        if not 0.0 < self.fov_rad <= 2.0 * math.pi:
-            raise InputError(f"sensors.laser.fov_rad must lie in (0, 2 pi], got {self.fov_rad}")
+    rate_hz: Positive = 10.0
+    """Scans per second; a scan is taken at one instant."""
+    n_beams: Beams = 721
+    fov_rad: Annotated[float, Bound(gt=0.0, le=2.0 * math.pi)] = math.pi
+    """Angle between the first and the last beam."""
+    min_range_m: NonNegative = 0.02
+    """Returns below are +inf."""
+    max_range_m: Positive = 80.0
+    """Returns beyond are +inf."""
+    sigma_range_m: NonNegative = 0.01
+    """Standard deviation of the Gaussian range noise."""
+    mount: Mount = Mount()
+    """Where it sits on the robot."""
 
     @property
     def bearings_rad(self) -> Array:

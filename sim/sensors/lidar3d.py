@@ -1,7 +1,6 @@
 """A spinning 3D lidar."""
 
 import math
-from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
@@ -9,47 +8,40 @@ from numpy.typing import ArrayLike, NDArray
 
 import sim.sensors.point_cloud as point_cloud
 from sim.arrays import Array
-from sim.errors import InputError
+from sim.errors import require
+from sim.options import NonNegative, Positive, options
 from sim.sensors.base import Field, Mount, Probe, Reading, Schema
-from sim.sensors.laser import MOST_BEAMS, noisy_ranges
-from sim.settings import check_numbers
+from sim.sensors.laser import Beams, noisy_ranges
 
 _GROUND_M = 0.3  # points below are not drawn
 
 
-@dataclass(frozen=True)
+@options("sensors.lidar3d")
 class Lidar3D:
     """A spinning lidar: `n_rings` elevations by `n_azimuths` bearings, taken at one instant."""
 
     ros_message: ClassVar = point_cloud.MESSAGE
     ros_topic: ClassVar = "/points"
 
-    rate_hz: float = 1.0
-    n_rings: int = 16
-    n_azimuths: int = 720
+    rate_hz: Positive = 1.0
+    """Turns per second."""
+    n_rings: Beams = 16
+    n_azimuths: Beams = 720
     elevation_min_rad: float = math.radians(-15.0)
     elevation_max_rad: float = math.radians(15.0)
-    min_range_m: float = 0.4
-    max_range_m: float = 100.0
-    sigma_range_m: float = 0.03
-    mount: Mount = field(default_factory=lambda: Mount(z_m=1.5))
+    min_range_m: NonNegative = 0.4
+    max_range_m: Positive = 100.0
+    sigma_range_m: NonNegative = 0.03
+    """Standard deviation of the Gaussian range noise."""
+    mount: Mount = Mount(z_m=1.5)
 
     def __post_init__(self) -> None:
-        check_numbers(
-            "sensors.lidar3d", self, ("rate_hz", "max_range_m"), ("min_range_m", "sigma_range_m")
-        )
-        for name in ("n_rings", "n_azimuths"):
-            if not 1 <= getattr(self, name) <= MOST_BEAMS:
-                raise InputError(
-                    f"sensors.lidar3d.{name} must be at least 1, at most {MOST_BEAMS}, "
-                    f"got {getattr(self, name)}"
-                )
         low, high = self.elevation_min_rad, self.elevation_max_rad
-        if not -math.pi / 2 < low <= high < math.pi / 2:
-            raise InputError(
-                "sensors.lidar3d.elevation_min_rad and elevation_max_rad must be in order and "
-                f"inside (-pi/2, pi/2), got {low} and {high}"
-            )
+        require(
+            -math.pi / 2 < low <= high < math.pi / 2,
+            "sensors.lidar3d.elevation_min_rad and elevation_max_rad must be in order and "
+            f"inside (-pi/2, pi/2), got {low} and {high}",
+        )
 
     @property
     def elevations_rad(self) -> Array:

@@ -1,23 +1,23 @@
 """Global descriptors of places, from a network or from whole clouds."""
 
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 
 import sim.sensors.point_cloud as point_cloud
 from sim.errors import InputError
+from sim.options import Positive, options
 from sim.sensors.base import Field, Probe, Reading, Schema
 
 
-@dataclass(frozen=True)
+@options("sensors.place")
 class PlaceDescriptor:
     """One vector a place, made from other readings; it is recorded, not simulated."""
 
     ros_message: ClassVar = point_cloud.MESSAGE
     ros_topic: ClassVar = "/places"
 
-    rate_hz: float | None = None
+    rate_hz: Positive | None = None
 
     @property
     def schema(self) -> Schema:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.arrays import Array
-from sim.robot.drive import DifferentialDrive
+from sim.robot.base import Robot
 from sim.se2 import transform
 from sim.sensors.base import Rays
 from sim.worlds.world import World
@@ -54,9 +54,7 @@ class AmongRobots:
         Gives the other robots and their poses (3,) as they are now.
     """
 
-    def __init__(
-        self, rays: Rays, others: Callable[[], list[tuple[DifferentialDrive, Array]]]
-    ) -> None:
+    def __init__(self, rays: Rays, others: Callable[[], list[tuple[Robot, Array]]]) -> None:
         self._rays, self._others = rays, others
 
     def _boxes(self) -> ExactRays:
@@ -78,7 +76,7 @@ class AmongRobots:
         return self._rays.sees(origin, points) & self._boxes().sees(origin, points)
 
 
-def _faces(robot: DifferentialDrive, pose: Array) -> Array:
+def _faces(robot: Robot, pose: Array) -> Array:
     """Sides (4, 4) of a robot's body, seen from above, m in map."""
     x, y = robot.body_length_m / 2, robot.body_width_m / 2
     corners = transform(pose, np.array([[x, y], [-x, y], [-x, -y], [x, -y]]))

@@ -1,65 +1,40 @@
 """A camera of landmarks as real detectors are: it misses, misreads, and errs alike for a while."""
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sim.arrays import Array, Ints
-from sim.errors import require
+from sim.options import NonNegative, Positive, Share, options
 from sim.sensors.base import Reading, View
 from sim.sensors.stereo import StereoCamera, in_field_of_view, points_in_camera
-from sim.settings import check_numbers
 from sim.worlds.world import World
 
 
-@dataclass(frozen=True)
+@options("sensors.stereo")
 class RealCamera(StereoCamera):
-    """A camera that errs in depth and bearing. What is believed of it are the noises in pixels.
+    """A camera that errs in depth and bearing. What is believed of it are the noises in pixels."""
 
-    Parameters
-    ----------
-    scale
-        Mean of the observed depth over the true one.
-    sigma_depth
-        Standard deviation of the depth's error, as a share of the depth.
-    sigma_bearing_rad
-        That of the bearing's.
-    lasting_share, lasting_s
-        Share of both variances that belongs to errors which one landmark keeps for a while, and
-        the time in which these fall by a factor of e.
-    detection_share, detection_s
-        Share of the landmarks in view that are seen, and the mean time until it is drawn
-        again whether one is.
-    misread_share
-        Share of those seen that are taken for another.
-    min_distance_m
-        Landmarks that are nearer are not seen.
-    """
-
-    scale: float = 1.0
-    sigma_depth: float = 0.0
-    sigma_bearing_rad: float = 0.0
-    lasting_share: float = 0.0
-    lasting_s: float = 1.0
-    detection_share: float = 1.0
-    detection_s: float = 1.0
-    misread_share: float = 0.0
-    min_distance_m: float = 0.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_numbers(
-            "sensors.stereo",
-            self,
-            ("scale", "lasting_s", "detection_s"),
-            ("sigma_depth", "sigma_bearing_rad", "min_distance_m"),
-        )
-        for name in ("lasting_share", "detection_share", "misread_share"):
-            share = getattr(self, name)
-            require(0.0 <= share <= 1.0, f"sensors.stereo.{name} must lie in [0, 1], got {share}")
+    scale: Positive = 1.0
+    """Mean of the observed depth over the true one."""
+    sigma_depth: NonNegative = 0.0
+    """Standard deviation of the depth's error, as a share of the depth."""
+    sigma_bearing_rad: NonNegative = 0.0
+    """That of the bearing's."""
+    lasting_share: Share = 0.0
+    """Share of both variances that belongs to errors which one landmark keeps for a while."""
+    lasting_s: Positive = 1.0
+    """Time in which these fall by a factor of e."""
+    detection_share: Share = 1.0
+    """Share of the landmarks in view that are seen."""
+    detection_s: Positive = 1.0
+    """Mean time until it is drawn again whether a landmark is seen."""
+    misread_share: Share = 0.0
+    """Share of those seen that are taken for another."""
+    min_distance_m: NonNegative = 0.0
+    """Landmarks that are nearer are not seen."""
 
     def start(self, rng: np.random.Generator) -> "DetectingEye":  # type: ignore[override]
         """Probe that looks for the world's landmarks."""

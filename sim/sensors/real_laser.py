@@ -1,56 +1,41 @@
 """A laser with what real ones show beside noise: short readings, none at all, and scans dropped."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, Strict
 
 from sim.arrays import Array, Ints
 from sim.errors import require
+from sim.options import Share, options
 from sim.sensors.base import Probe, Reading, View
 from sim.sensors.laser import Laser
 
+Neighbours = Annotated[float, Field(ge=1.0)]
+Stamps = Annotated[tuple[float, ...], Strict(False), "numbers of seconds that increase"]
 
-@dataclass(frozen=True)
+
+@options("sensors.laser")
 class RealLaser(Laser):
-    """A laser whose beams may end before the wall, or not come back.
+    """A laser whose beams may end before the wall, or not come back."""
 
-    Parameters
-    ----------
-    short_share, short_beams
-        Of the beams that would hit a wall, the share that end anywhere before it, such as on
-        someone who walks by (Thrun, Burgard, Fox 2005, sec. 6.3); and over how many neighbours it
-        is settled whether they do.
-    missing_share, missing_beams
-        Of the others, the share that do not come back, and over how many neighbours.
-    stamps
-        When it scans, s from the start: at the first firing from each of them on. None: at every
-        firing.
-    """
-
-    short_share: float = 0.0
-    short_beams: float = 1.0
-    missing_share: float = 0.0
-    missing_beams: float = 1.0
-    stamps: Sequence[float] | None = None
+    short_share: Share = 0.0
+    """Of the beams that would hit a wall, the share that end anywhere before it, such as on someone
+    who walks by (Thrun, Burgard, Fox 2005, sec. 6.3)."""
+    short_beams: Neighbours = 1.0
+    """Over how many neighbours it is settled whether they do."""
+    missing_share: Share = 0.0
+    """Of the others, the share that do not come back."""
+    missing_beams: Neighbours = 1.0
+    """Over how many neighbours it is settled whether they do."""
+    stamps: Stamps | None = None
+    """When it scans, s from the start: at the first firing from each of them on; null: at every
+    firing."""
 
     def __post_init__(self) -> None:
-        super().__post_init__()
-        for name in ("short_share", "missing_share"):
-            share = getattr(self, name)
-            require(0.0 <= share <= 1.0, f"sensors.laser.{name} must lie in [0, 1], got {share}")
-        for name in ("short_beams", "missing_beams"):
-            beams = getattr(self, name)
-            require(1.0 <= beams < np.inf, f"sensors.laser.{name} must be at least 1, got {beams}")
-        if self.stamps is not None:
-            numbers = all(isinstance(s, (int, float)) for s in self.stamps)
-            stamps = tuple(map(float, self.stamps)) if numbers else (np.nan,)
-            require(
-                bool(np.isfinite(stamps).all()) and bool((np.diff(stamps) > 0.0).all()),
-                "sensors.laser.stamps must be numbers of seconds that increase, or null",
-            )
-            object.__setattr__(self, "stamps", stamps)
+        increasing = self.stamps is None or bool((np.diff(self.stamps) > 0.0).all())
+        require(increasing, "sensors.laser.stamps must be numbers of seconds that increase")
 
     def start(self, rng: np.random.Generator) -> Probe:
         """Probe that casts the beams, and spoils some."""

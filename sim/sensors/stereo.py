@@ -3,106 +3,68 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import NonNegativeInt
 
 import sim.sensors.point_cloud as point_cloud
 from sim.arrays import Array
-from sim.errors import InputError
+from sim.options import Acute, NonNegative, Positive, options
 from sim.sensors.base import Field, Mount, Reading, Schema, View
-from sim.settings import check_numbers
 from sim.worlds.world import World
 
-Selection = Literal["nearest", "random", "spread"]
+
+@options("sensors.stereo")
+class LensOptions:
+    """The lenses of a rectified stereo pair and the noise of its detector."""
+
+    rate_hz: Positive = 5.0
+    """Images per second."""
+    focal_px: Positive = 381.0
+    baseline_m: Positive = 0.12
+    """Distance between the cameras."""
+    fov_horizontal_rad: Acute = math.radians(80.0)
+    fov_vertical_rad: Acute = math.radians(60.0)
+    max_distance_m: Positive = 10.0
+    """dmax: what is farther away is not observed."""
+    sigma_column_px: NonNegative = 1.0
+    """Noise of the detector (presets `paper`: 10, 10, 0.5; `pixel`: 1, 1, 0.5)."""
+    sigma_row_px: NonNegative = 1.0
+    sigma_disparity_px: NonNegative = 0.5
+    identifies: bool = True
+    """Whether observations come with the landmark's id, or the robot's number (known data
+    association)."""
+    mount: Mount = Mount(z_m=0.5)
+    """Pose of the left camera; its optical axis is the robot's x axis turned by the yaw."""
 
 
-@dataclass(frozen=True)
-class StereoCamera:
+@options("sensors.stereo")
+class StereoCamera(LensOptions):
     """A rectified stereo pair that observes point landmarks (gil2008, sec. IV-B).
 
     Observations are points in the camera frame (z forward, x right, y down), m, made from a
     noisy column, row and disparity by gil2008, eq. (9).
-
-    Parameters
-    ----------
-    rate_hz
-        Images per second.
-    focal_px, baseline_m
-        Focal length and distance between the cameras.
-    fov_horizontal_rad, fov_vertical_rad
-        Field of view.
-    max_distance_m
-        dmax: landmarks farther away are not observed.
-    max_observations
-        B: most observations of one image; 0 for all that are visible.
-    selection
-        Which B: the nearest, random ones, or the ones spread best over the image.
-    sigma_column_px, sigma_row_px, sigma_disparity_px
-        Noise of the detector (presets `paper`: 10, 10, 0.5; `pixel`: 1, 1, 0.5).
-    correlated
-        Noise the image coordinates, so that X, Y and Z share the disparity's error (the truth of
-        a stereo pair). False draws X, Y, Z apart with the variances of eqs. (10)-(12), which is
-        the diagonal R of the paper.
-    identifies
-        Whether observations come with the landmark's id (known data association).
-    sigma_descriptor, sigma_view_descriptor
-        Noise of each descriptor component: white, and growing with the change of viewing angle
-        (per radian from the direction of its first appearance in the world frame).
-    mount
-        Pose of the left camera; its optical axis is the robot's x axis turned by the yaw.
     """
 
     ros_message: ClassVar = point_cloud.MESSAGE
     ros_topic: ClassVar = "/landmarks"
     ros_optical: ClassVar = True  # the frame of its messages: z forward, x right, y down
 
-    rate_hz: float = 5.0
-    focal_px: float = 381.0
-    baseline_m: float = 0.12
-    fov_horizontal_rad: float = math.radians(80.0)
-    fov_vertical_rad: float = math.radians(60.0)
-    max_distance_m: float = 10.0
-    max_observations: int = 0
-    selection: Selection = "random"
-    sigma_column_px: float = 1.0
-    sigma_row_px: float = 1.0
-    sigma_disparity_px: float = 0.5
+    max_observations: NonNegativeInt = 0
+    """B: most observations of one image; 0 for all that are visible."""
+    selection: Literal["nearest", "random", "spread"] = "random"
+    """Which B: the nearest, random ones, or the ones spread best over the image."""
     correlated: bool = True
-    identifies: bool = True
-    sigma_descriptor: float = 0.05
-    sigma_view_descriptor: float = 0.05
-    mount: Mount = field(default_factory=lambda: Mount(z_m=0.5))
-
-    def __post_init__(self) -> None:
-        check_numbers(
-            "sensors.stereo",
-            self,
-            ("rate_hz", "focal_px", "baseline_m", "max_distance_m"),
-            (
-                "sigma_column_px",
-                "sigma_row_px",
-                "sigma_disparity_px",
-                "sigma_descriptor",
-                "sigma_view_descriptor",
-            ),
-        )
-        for name in ("fov_horizontal_rad", "fov_vertical_rad"):
-            if not 0.0 < getattr(self, name) < math.pi:
-                value = getattr(self, name)
-                raise InputError(f"sensors.stereo.{name} must lie in (0, pi), got {value}")
-        if self.max_observations < 0:
-            raise InputError(
-                "sensors.stereo.max_observations must be 0 (all) or more, "
-                f"got {self.max_observations}"
-            )
-        if self.selection not in ("nearest", "random", "spread"):
-            raise InputError(
-                "sensors.stereo.selection must be nearest, random or spread, "
-                f"got {self.selection!r}"
-            )
+    """Noise the image coordinates, so that X, Y and Z share the disparity's error (the truth of a
+    stereo pair). False draws X, Y, Z apart with the variances of eqs. (10)-(12), which is the
+    diagonal R of the paper."""
+    sigma_descriptor: NonNegative = 0.05
+    """White noise of each descriptor component."""
+    sigma_view_descriptor: NonNegative = 0.05
+    """Noise of each component that grows with the change of viewing angle, per radian from the
+    direction of the landmark's first appearance in the world frame."""
 
     @property
     def schema(self) -> Schema:

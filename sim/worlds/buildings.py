@@ -1,11 +1,11 @@
 """Worlds from a few parameters and a random stream.
 
-Each builder is a function `name(*, rng, ...) -> World`; its parameters' defaults are in
-conf/world/<name>.yaml and nowhere else.
+Each builder is a function `name(*, rng, ...) -> World`; its parameters are the options of a world,
+and their defaults stand here.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Sequence
 from itertools import pairwise, product
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -14,15 +14,16 @@ import numpy as np
 
 from sim.arrays import Array
 from sim.errors import InputError, require, required
-from sim.worlds.floor_plan import WALL_HEIGHT_M, Plan, box_corners, rectangle_corners
+from sim.worlds.floor_plan import WALL_HEIGHT_M, Plan, box_corners, check_margins, rectangle_corners
 from sim.worlds.grid_file import read_grid
+from sim.worlds.town import lawn, terrace, town
 from sim.worlds.world import World, facing_second
 from sim.worlds.world_file import check_tour, read_world
 
 _MOST_GRID_WALLS = 200_000
 
 
-def empty(*, rng: np.random.Generator, tour_m: float) -> World:
+def empty(*, rng: np.random.Generator, tour_m: float = 10.0) -> World:
     """Open floor without a wall; the tour is a square of side `tour_m`."""
     plan = Plan(tour=[(0, 0), (tour_m, 0), (tour_m, tour_m), (0, tour_m), (0, 0)])
     return plan.world("empty", rng)
@@ -34,7 +35,9 @@ def from_file(*, rng: np.random.Generator, path: str) -> World:
     return read_world(Path(path))
 
 
-def from_grid(*, rng: np.random.Generator, path: str | None, waypoints: list[list[float]]) -> World:
+def from_grid(
+    *, rng: np.random.Generator, path: str | None = None, waypoints: Sequence[list[float]] = ()
+) -> World:
     """Draw a world from an occupancy grid: a wall along each border of its occupied cells.
 
     Parameters
@@ -70,14 +73,14 @@ def from_grid(*, rng: np.random.Generator, path: str | None, waypoints: list[lis
 def room(
     *,
     rng: np.random.Generator,
-    length_m: float,
-    width_m: float,
-    n_objects: int,
-    n_landmarks: int,
-    look_alike_share: float,
+    length_m: float = 8.0,
+    width_m: float = 6.0,
+    n_objects: int = 6,
+    n_landmarks: int = 60,
+    look_alike_share: float = 0.0,
 ) -> World:
     """Build one furnished room; the tour goes round it, 1.2 m off the walls."""
-    _positive(length_m=length_m - 3.0, width_m=width_m - 3.0)
+    check_margins(length_m=length_m - 3.0, width_m=width_m - 3.0)
     plan = Plan()
     plan.rectangle((0, 0), (length_m, width_m))
     plan.place("room", 0, 0, length_m, width_m)
@@ -90,13 +93,13 @@ def room(
 def boxes(
     *,
     rng: np.random.Generator,
-    n_boxes: int,
-    side_m: float,
-    n_landmarks: int,
-    look_alike_share: float,
+    n_boxes: int = 12,
+    side_m: float = 20.0,
+    n_landmarks: int = 0,
+    look_alike_share: float = 0.0,
 ) -> World:
     """Scatter boxes in a square hall; the tour runs along its walls."""
-    _positive(side_m=side_m - 3.0)
+    check_margins(side_m=side_m - 3.0)
     plan = Plan()
     plan.rectangle((0, 0), (side_m, side_m))
     a, b = 1.2, side_m - 1.2
@@ -108,14 +111,14 @@ def boxes(
 def rooms(
     *,
     rng: np.random.Generator,
-    n_x: int,
-    n_y: int,
-    room_m: float,
-    door_m: float,
-    objects_per_room: int,
-    n_landmarks: int,
-    on_walls_share: float,
-    look_alike_share: float,
+    n_x: int = 3,
+    n_y: int = 2,
+    room_m: float = 6.0,
+    door_m: float = 1.2,
+    objects_per_room: int = 3,
+    n_landmarks: int = 200,
+    on_walls_share: float = 0.7,
+    look_alike_share: float = 0.0,
 ) -> World:
     """Build n_x by n_y square rooms with a door between all neighbours.
 
@@ -126,7 +129,7 @@ def rooms(
         n_x >= 1 and n_y >= 1 and n_x * n_y >= 2,
         f"world.n_x and n_y must make at least two rooms, got {n_x} x {n_y}",
     )
-    _positive(room_m=room_m - 2.0, door_m=door_m - 0.7, wall=room_m - door_m)
+    check_margins(room_m=room_m - 2.0, door_m=door_m - 0.7, wall=room_m - door_m)
     plan = Plan()
     plan.rectangle((0, 0), (n_x * room_m, n_y * room_m))
     door = [(room_m / 2, door_m)]
@@ -154,16 +157,16 @@ def rooms(
 def corridor(
     *,
     rng: np.random.Generator,
-    bare_m: float,
-    objects_m: float,
-    bare_after_m: float,
-    second_leg_m: float,
-    curve_radius_m: float,
-    third_leg_m: float,
-    width_m: float,
-    n_objects: int,
-    n_landmarks: int,
-    look_alike_share: float,
+    bare_m: float = 30.0,
+    objects_m: float = 15.0,
+    bare_after_m: float = 0.0,
+    second_leg_m: float = 12.0,
+    curve_radius_m: float = 4.0,
+    third_leg_m: float = 10.0,
+    width_m: float = 2.2,
+    n_objects: int = 8,
+    n_landmarks: int = 80,
+    look_alike_share: float = 0.0,
 ) -> World:
     """Build a bare stretch, objects, a bare stretch, a sharp bend, a leg, a round curve, a leg.
 
@@ -171,7 +174,7 @@ def corridor(
     and so do `leg_1` to `leg_3`, the bare stretches before, between and after the bends, where they
     are longer than that; the radius is that of the middle of the corridor.
     """
-    _positive(
+    check_margins(
         bare_m=bare_m - 6.0,
         objects_m=objects_m,
         second_leg_m=second_leg_m,
@@ -217,11 +220,11 @@ def corridors(*, rng: np.random.Generator, n_objects: list[int], **lengths_m: li
 def office(
     *,
     rng: np.random.Generator,
-    corridor_m: float,
-    n_landmarks: int,
-    look_alike_share: float,
-    objects_per_room: int,
-    rooms_visited: int,
+    corridor_m: float = 2.2,
+    n_landmarks: int = 600,
+    look_alike_share: float = 0.1,
+    objects_per_room: int = 5,
+    rooms_visited: int = 8,
 ) -> World:
     """Build an office floor of 66 x 42 m: 22 furnished rooms on two corridor loops.
 
@@ -274,23 +277,28 @@ def office(
 
 
 def streets(
-    *, rng: np.random.Generator, n_x: int, n_y: int, block_m: float, street_m: float
+    *,
+    rng: np.random.Generator,
+    n_x: int = 3,
+    n_y: int = 2,
+    block_m: float = 80.0,
+    street_m: float = 14.0,
 ) -> World:
     """Build blocks of terraced houses of differing width, height and setback, with few trees."""
-    return _town("streets", rng, n_x, n_y, block_m, street_m, _terrace, trees_per_block=6)
+    return town("streets", rng, n_x, n_y, block_m, street_m, terrace, trees_per_block=6)
 
 
 def campus(
     *,
     rng: np.random.Generator,
-    n_x: int,
-    n_y: int,
-    block_m: float,
-    street_m: float,
-    trees_per_block: int,
+    n_x: int = 3,
+    n_y: int = 2,
+    block_m: float = 80.0,
+    street_m: float = 16.0,
+    trees_per_block: int = 14,
 ) -> World:
     """Build blocks with a few turned or L-shaped buildings among lawns and trees."""
-    return _town("campus", rng, n_x, n_y, block_m, street_m, _lawn, trees_per_block)
+    return town("campus", rng, n_x, n_y, block_m, street_m, lawn, trees_per_block)
 
 
 class _Room(NamedTuple):
@@ -431,103 +439,3 @@ def _ring(i0: int, j0: int, i1: int, j1: int) -> list[tuple[int, int]]:
         *((i0, j) for j in range(j1, j0, -1)),
         (i0, j0),
     ]
-
-
-def _town(
-    name: str,
-    rng: np.random.Generator,
-    n_x: int,
-    n_y: int,
-    block_m: float,
-    street_m: float,
-    build: Callable[[Plan, np.random.Generator, Array, float], None],
-    trees_per_block: int,
-) -> World:
-    """Build blocks in a grid of streets; the tour is a closed way along the streets."""
-    require(n_x >= 1 and n_y >= 1, f"world.n_x and n_y must be at least 1, got {n_x} and {n_y}")
-    _positive(block_m=block_m - 30.0, street_m=street_m - 6.0)
-    plan, pitch = Plan(), block_m + street_m
-    corners = [(0, 0), (n_x, 0), (n_x, n_y), (0, n_y), (0, 0)]
-    if n_x >= 3 and n_y >= 2:
-        corners = [(0, 0), (2, 0), (2, 1), (n_x, 1), (n_x, n_y), (1, n_y), (1, 1), (0, 1), (0, 0)]
-    path = [(pitch * i - street_m / 2, pitch * j - street_m / 2) for i, j in corners]
-    plan.tour = _rounded(path, radius_m=0.35 * street_m, spacing_m=4.0)
-    for x, y in path[:-1]:
-        plan.place("corner", *(v + d * street_m / 2 for d in (-1, 1) for v in (x, y)))
-    for cell in product(range(n_x), range(n_y)):
-        low = pitch * np.array(cell)
-        build(plan, rng, low, block_m)
-        _trees(plan, rng, low, block_m, trees_per_block)
-    return plan.world(name, rng)
-
-
-def _terrace(plan: Plan, rng: np.random.Generator, low: Array, block_m: float) -> None:
-    """Houses side by side along the south and the north edge of a block."""
-    for far in (False, True):
-        x = 0.0
-        while x < block_m - 6.0:
-            width = min(rng.uniform(7.0, 16.0), block_m - x)
-            depth, setback = rng.uniform(9.0, 0.38 * block_m), rng.uniform(0.0, 2.5)
-            y = block_m - setback - depth / 2 if far else setback + depth / 2
-            centre = low + np.array([x + width / 2, y])
-            size = (width - 0.02, depth)
-            plan.prism(box_corners(centre.tolist(), size, 0.0), 0.0, rng.uniform(5.0, 16.0))
-            x += width + (rng.uniform(2.5, 6.0) if rng.random() < 0.3 else 0.0)
-
-
-def _lawn(plan: Plan, rng: np.random.Generator, low: Array, block_m: float) -> None:
-    """Two to four buildings, turned at random; some are L-shaped."""
-    for quarter in rng.permutation(4)[: rng.integers(2, 5)]:
-        room = block_m / 2
-        centre = low + room * np.array([quarter % 2 + 0.5, quarter // 2 + 0.5])
-        centre = centre + rng.uniform(-0.06, 0.06, 2) * room
-        size = rng.uniform(0.3, 0.62, 2) * room
-        yaw, top = rng.uniform(-0.5, 0.5), rng.uniform(6.0, 20.0)
-        corners = box_corners(centre.tolist(), size.tolist(), yaw)
-        if rng.random() < 0.5:  # an L: the corner that is cut out lies at a quarter of the box
-            a, b, c, d = corners
-            corners = np.array([a, b, (b + c) / 2, corners.mean(axis=0), (c + d) / 2, d])
-        plan.prism(corners, 0.0, top)
-
-
-def _trees(plan: Plan, rng: np.random.Generator, low: Array, block_m: float, count: int) -> None:
-    """Plant trees along the edges of a block, clear of the buildings."""
-    for _ in range(count):
-        for _ in range(20):
-            along, inset = rng.uniform(2.0, block_m - 2.0), rng.uniform(0.5, 5.0)
-            far = block_m - inset
-            by_edge = ((along, inset), (inset, along), (along, far), (far, along))
-            spot = low + by_edge[rng.integers(4)]
-            crown = rng.uniform(1.0, 2.2)
-            if all(math.dist(spot, d[:2]) > d[2] + crown + 0.3 for d in plan.discs):
-                height = rng.uniform(4.5, 9.0)
-                plan.tree(spot[0], spot[1], rng.uniform(0.12, 0.35), crown, height)
-                break
-
-
-def _rounded(
-    path: list[tuple[float, float]], *, radius_m: float, spacing_m: float
-) -> list[tuple[float, float]]:
-    """Closed way with each corner cut by an arc, and points about `spacing_m` apart."""
-    points = np.array(path[:-1])
-    smooth: list[Array] = []
-    for before, corner, after in zip(
-        np.roll(points, 1, axis=0), points, np.roll(points, -1, axis=0), strict=True
-    ):
-        into = (before - corner) / np.hypot(*(before - corner))
-        out = (after - corner) / np.hypot(*(after - corner))
-        t = np.linspace(0.0, 1.0, 7)[:, None]
-        a, b = corner + radius_m * into, corner + radius_m * out
-        smooth += list((1 - t) ** 2 * a + 2 * t * (1 - t) * corner + t**2 * b)
-    # Begin in the middle of a straight, so that the start does not lie in a bend.
-    ring = np.array([(smooth[-1] + smooth[0]) / 2, *smooth, (smooth[-1] + smooth[0]) / 2])
-    dense = []
-    for a, b in pairwise(ring):
-        n = max(1, round(math.dist(a, b) / spacing_m))
-        dense += [a + share * (b - a) for share in np.arange(n) / n]
-    return [(float(x), float(y)) for x, y in [*dense, ring[-1]]]
-
-
-def _positive(**margins: float) -> None:
-    for name, margin in margins.items():
-        require(margin > 0.0, f"world.{name} is too small for a robot to pass; make it larger")

@@ -351,3 +351,9 @@ def make_descriptors(
             raw[rows[-1]] = raw[rows[0]]
     unit = raw / np.linalg.norm(raw, axis=1, keepdims=True) if count else raw
     return unit.astype(np.float32), alike
+
+
+def check_margins(**margins: float) -> None:
+    """Check that what is left over of lengths, m, is positive: InputError names the length."""
+    for name, margin in margins.items():
+        require(margin > 0.0, f"world.{name} is too small for a robot to pass; make it larger")

@@ -158,8 +158,8 @@ class ScanGrid:
         """
         eyes = np.column_stack([lasers[:, :2] / self.resolution_m - self._corner, lasers[:, 2]])
         _add_scans(
-            self.log_odds, self.last_scan, eyes, ranges_m, bearings, self.resolution_m, most_m,
-            self._hit, self._miss, self.n_scans,
+            self.log_odds, self.last_scan, eyes, ranges_m, bearings, (self.resolution_m, most_m),
+            (self._hit, self._miss), self.n_scans,
         )  # fmt: skip
         self.n_scans += len(eyes)
 
@@ -230,10 +230,8 @@ def _add_scans(
     eyes: Array,
     ranges: Floats,
     bearings: Array,
-    cell_m: float,
-    most_m: float,
-    hit: float,
-    miss: float,
+    lengths_m: tuple[float, float],
+    odds: tuple[float, float],
     begun: int,
 ) -> None:
     """Add scans to the grid (rows, columns), in place.
@@ -246,11 +244,14 @@ def _add_scans(
         (N, 3): where the lasers are, in cells from the grid's corner, and their headings.
     ranges
         (N, beams) m; 0 for a beam that says nothing.
-    hit, miss
-        Log odds that they add.
+    lengths_m
+        Side of a cell, and the greatest range.
+    odds
+        Log odds that a cell gains where a beam ends, and where one passes.
     begun
         Number of scans already there.
     """
+    (cell_m, most_m), (hit, miss) = lengths_m, odds
     ends = np.empty((len(bearings), 2))
     cells = np.empty((log_odds.shape[0] + log_odds.shape[1] + 2, 2), np.int64)
     for s in range(len(eyes)):

@@ -3,7 +3,7 @@
 import numpy as np
 
 from sim import se2
-from sim.robot.drive import arc_increment
+from sim.robot.arc import arc_increment
 from sim.sensors.casting import SegmentCaster
 from sim.sensors.stereo import points_in_camera
 from tests.fixtures import fakes

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from estimators.gaussian import Gaussian, between, compose, update, wheel_motion, wrap
 from sim import se2
-from sim.robot.drive import arc_increment, arc_increment_jacobian
+from sim.robot.arc import arc_increment, arc_increment_jacobian
 
 COORDINATE = st.floats(-50.0, 50.0)
 POSE = st.tuples(COORDINATE, COORDINATE, st.floats(-3.1, 3.1)).map(np.array)

@@ -10,7 +10,8 @@ from estimators.odometry import Odometry, relative_motion
 from sim import se2
 from sim.errors import InputError
 from sim.recording import Frame
-from sim.robot.drive import RobotGeometry, arc_increment
+from sim.robot.arc import arc_increment
+from sim.robot.drive import RobotGeometry
 
 TRACK_M = 0.19
 

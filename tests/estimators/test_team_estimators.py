@@ -129,7 +129,7 @@ def test_a_team_of_one_is_the_robot_alone(make):
 
 
 def test_derivatives_of_sightings():
-    eye = dataclasses.replace(EYE, mount=Mount(0.2, -0.1, 0.4, 0.3))
+    eye = dataclasses.replace(EYE, mount=Mount(x_m=0.2, y_m=-0.1, z_m=0.4, yaw_rad=0.3))
     sightings = Sightings.of(
         [Prior(None, {"robots": eye})], "robots", "camera", "predicted", "test"
     )

@@ -6,7 +6,7 @@ import pytest
 from estimators.wheels import WheelPrediction
 from sim.errors import InputError
 from sim.recording import Frame
-from sim.robot.drive import arc_increment, arc_increment_jacobian
+from sim.robot.arc import arc_increment, arc_increment_jacobian
 
 TRACK_M = 0.3
 

@@ -22,7 +22,9 @@ from sim.worlds.world import World
 from tests.fixtures import log_samples as samples
 from tests.fixtures.fakes import circle
 
-ROBOT = DifferentialDrive(0.1, 0.4, body_length_m=0.4, body_width_m=0.3, body_height_m=0.3)
+ROBOT = DifferentialDrive(
+    wheel_radius_m=0.1, track_m=0.4, body_length_m=0.4, body_width_m=0.3, body_height_m=0.3
+)
 STILL = ((0.0, 0.0, 2.0),)
 TURNING = ((0.0, 0.5, 4.0),)
 EYES = {"robots": RobotCamera(rate_hz=10.0)}
@@ -36,7 +38,7 @@ class From:
     segments: tuple = STILL
 
     def start(self, world, robot):
-        _, driver = OpenLoop(self.segments).start(world, robot)
+        _, driver = OpenLoop(segments=self.segments).start(world, robot)
         return np.array(self.pose, float), driver
 
 
@@ -65,11 +67,11 @@ def seen_by(team, number):
 def test_a_team_of_one_is_the_robot_alone():
     robot = dataclasses.replace(ROBOT, kr=1e-4, kl=1e-4)
     world = world_of([3, -3, 3, 3], landmarks=[[2.9, 0.5, 0.4]])
-    sensors = {"laser": Laser(10.0), "stereo": StereoCamera(), **EYES}
+    sensors = {"laser": Laser(rate_hz=10.0), "stereo": StereoCamera(), **EYES}
     team = team_of(From((0, 0, 0), TURNING), world=world, sensors=sensors, robot=robot)
     streams = {axis: stream(0, axis) for axis in ("slip", "sensors")}
     route = From((0, 0, 0), TURNING)
-    alone = record(world, robot, sensors, route, streams, physics="kinematic", rays="exact")
+    alone = record(world, Member(robot, sensors, route, streams), physics="kinematic", rays="exact")
     assert alone.checksum == team.robots[0].checksum
     assert len(alone.logs["robots"]["ids"]) == 0
 
@@ -82,20 +84,20 @@ def test_robots_see_those_before_them_within_reach():
 def test_walls_hide_robots_and_bodies_hide_what_is_low():
     wall = world_of([2, -1, 2, 1])
     assert seen_by(team_of(From((0, 0, 0)), From((4, 0, 0)), world=wall), 0) == set()
-    low = {"robots": RobotCamera(10.0, marker_z_m=0.35, mount=Mount(z_m=0.2))}
+    low = {"robots": RobotCamera(rate_hz=10.0, marker_z_m=0.35, mount=Mount(z_m=0.2))}
     row = [From((0, 0, 0)), From((3, 0, 0)), From((6, 0, 0))]
     assert seen_by(team_of(*row, sensors=low), 0) == {1}  # at 3 m the sight line is below its top
     assert seen_by(team_of(*row), 0) == {1, 2}
-    hidden = {"robots": RobotCamera(10.0, marker_z_m=0.25)}
+    hidden = {"robots": RobotCamera(rate_hz=10.0, marker_z_m=0.25)}
     assert seen_by(team_of(*row, sensors=hidden), 0) == set()  # by its own body
     behind = world_of(landmarks=[[6, 0, 0.1], [6, 1.5, 0.1]])
-    eye = {"stereo": StereoCamera(10.0, mount=Mount(z_m=0.2))}
+    eye = {"stereo": StereoCamera(rate_hz=10.0, mount=Mount(z_m=0.2))}
     both = team_of(From((0, 0, 0)), From((3, 0, 0)), world=behind, sensors=eye)
     assert set(both.robots[0].logs["stereo"]["ids"]) == {1}
 
 
 def test_a_laser_ranges_the_body_of_another_robot():
-    laser = Laser(10.0, n_beams=3, fov_rad=0.2, sigma_range_m=0.0, mount=Mount(z_m=0.2))
+    laser = Laser(rate_hz=10.0, n_beams=3, fov_rad=0.2, sigma_range_m=0.0, mount=Mount(z_m=0.2))
     team = team_of(From((0, 0, 0)), From((3, 0, 0)), sensors={"laser": laser})
     ahead = team.robots[0].logs["laser"]["ranges_m"][:, 1]
     np.testing.assert_allclose(ahead, 3.0 - ROBOT.body_length_m / 2, atol=1e-5)
@@ -136,8 +138,10 @@ def test_files_of_teams(tmp_path):
     with pytest.raises(InputError, match=r"team.npz: it holds a team; run all"):
         recordings.load(path)
     recordings.save(team.robots[0], path)
-    with pytest.raises(InputError, match=r"team.npz: it holds one robot, and no team"):
-        teams.load(path)
+    alone = teams.load(path)
+    assert alone.only.checksum == alone.checksum == team.robots[0].checksum
+    with pytest.raises(InputError, match="it holds a team; run all of its robots by study=teams"):
+        assert again.only
 
 
 @pytest.mark.parametrize(

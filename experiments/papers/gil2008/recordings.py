@@ -15,12 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from experiments.papers.gil2008.settings import FARTHEST_M
-from experiments.runs.experiment import Config, Experiment
+from experiments.runs.experiment import Experiment
+from experiments.runs.schema import Config
 from experiments.runs.seeds import stream
 from sim.arrays import Array
 from sim.errors import InputError
 from sim.recording import Log, Recording, WheelLog, joined
-from sim.robot.drive import wheel_errors
+from sim.robot.slip import wheel_errors
 from sim.sensors import StereoCamera, View, sensor_of, sensors_from_config
 from sim.sensors.base import parted, sensor_settings
 from sim.sensors.rays import ExactRays

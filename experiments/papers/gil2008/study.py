@@ -30,7 +30,8 @@ from experiments.viewing.map import grid_along
 from sim import se2
 from sim.arrays import Array
 from sim.recording import Recording
-from sim.robot.drive import arc_increment, wheel_errors
+from sim.robot.arc import arc_increment
+from sim.robot.slip import wheel_errors
 from sim.sensors import StereoCamera
 
 TableRun = tuple[str, Experiment]  # the table its rows go to; its configuration

@@ -31,10 +31,11 @@ from experiments.runs.targets import make
 from sim import se2
 from sim.arrays import Array, Floats
 from sim.errors import InputError
+from sim.options import find
 from sim.recording import Log, Recording, Truth, WheelLog
-from sim.robot.drive import RobotGeometry, wheel_errors
+from sim.robot.drive import RobotGeometry
+from sim.robot.slip import wheel_errors
 from sim.sensors import Lidar3D, PlaceDescriptor
-from sim.settings import find
 
 # Noisy unit descriptors (K, 512) at points (K, 2) m
 Describe = Callable[[Array, np.random.Generator], NDArray[np.float32]]

@@ -18,10 +18,10 @@ SQUARE_SAMPLES = 200  # of each path that is drawn
 TABLE_1_K_M = 1e-4
 AREA_K_M = (1e-5, 1e-4)
 LOOPS = {
-    "straight": OpenLoop(((0.5, 0.0, 6.0),)),
-    "arc": OpenLoop(((0.5, 0.4, 6.0),)),
-    "arc of one turn and a half": OpenLoop(((0.5, 1.5 * math.pi / 3.0, 6.0),)),
-    "out and back": OpenLoop(((0.5, 0.0, 3.0), (-0.5, 0.0, 3.0))),
+    "straight": OpenLoop(segments=((0.5, 0.0, 6.0),)),
+    "arc": OpenLoop(segments=((0.5, 0.4, 6.0),)),
+    "arc of one turn and a half": OpenLoop(segments=((0.5, 1.5 * math.pi / 3.0, 6.0),)),
+    "out and back": OpenLoop(segments=((0.5, 0.0, 3.0), (-0.5, 0.0, 3.0))),
 }
 # The report's two examples and two of ours: ideal and real end, m or rad, and time, s
 DESCENTS = {

@@ -329,7 +329,9 @@ def short_turns(arm: Arm) -> tuple[pd.DataFrame, pd.DataFrame]:
         truth and with what the controller took.
     """
     rng, robot = stream(arm.seed, "slip"), arm.robot
-    nominal = DifferentialDrive(robot.nominal.wheel_radius_m, robot.nominal.track_m)
+    nominal = DifferentialDrive(
+        wheel_radius_m=robot.nominal.wheel_radius_m, track_m=robot.nominal.track_m
+    )
     before = {
         name: run_batch(robot, route, CALIBRATION_RUNS, rng).end_poses
         for name, route in arm.routes.items()

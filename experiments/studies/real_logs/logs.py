@@ -98,7 +98,7 @@ def calibrated_by_scans(recording: Recording, until_s: float) -> Recording:
     )
     right, left, axle_m, x, y, yaw = calibrate_wheels(log, 1.0, recording.robot.track_m).values
     laser = recording.sensor("laser", Laser)
-    mount = Mount(x, y, laser.mount.z_m, laser.mount.yaw_rad + yaw)
+    mount = Mount(x_m=x, y_m=y, z_m=laser.mount.z_m, yaw_rad=laser.mount.yaw_rad + yaw)
     return dataclasses.replace(
         recording,
         wheels=WheelLog(wheels.stamps.copy(), wheels.position_m * np.array([right, left])),

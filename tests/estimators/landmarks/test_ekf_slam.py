@@ -12,7 +12,7 @@ from experiments.evaluation.metrics import nees
 from experiments.gate.conform import check_estimator
 from sim import se2
 from sim.errors import InputError
-from sim.robot.drive import TravelWindow, arc_increment
+from sim.robot.arc import TravelWindow, arc_increment
 from sim.sensors import Mount
 from sim.sensors.stereo import points_in_camera
 from tests.fixtures.fakes import circle, tracking_prior, true_ids, with_descriptors, with_field

@@ -13,7 +13,7 @@ from estimators.odometry import Odometry
 from experiments.evaluation.scan_bound import cast
 from sim import se2
 from sim.errors import InputError
-from sim.robot.drive import arc_increment
+from sim.robot.arc import arc_increment
 from sim.sensors import Laser
 from tests.estimators.laser.test_icp import BARE, ROOM, circle
 from tests.estimators.laser.test_icp_odometry import (

@@ -11,7 +11,7 @@ from estimators.laser.ekf_icp_paper import EkfIcpPaper, mean_velocity, observati
 from estimators.odometry import Odometry
 from sim import se2
 from sim.errors import InputError
-from sim.robot.drive import arc_increment
+from sim.robot.arc import arc_increment
 from tests.estimators.laser.test_icp import ROOM
 from tests.estimators.laser.test_icp_odometry import (
     P0,

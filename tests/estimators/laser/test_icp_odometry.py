@@ -10,7 +10,8 @@ from estimators.laser.icp_odometry import IcpOdometry
 from experiments.evaluation.scan_bound import cast
 from sim import se2
 from sim.errors import InputError
-from sim.robot.drive import RobotGeometry, arc_increment
+from sim.robot.arc import arc_increment
+from sim.robot.drive import RobotGeometry
 from sim.sensors import Laser, Mount
 from tests.estimators.laser.test_icp import BARE, ROOM
 from tests.fixtures.fakes import blind, scan_frame, with_scan

@@ -14,7 +14,8 @@ from experiments.evaluation.metrics import nees
 from experiments.gate.conform import check_estimator
 from sim import se2
 from sim.errors import InputError
-from sim.robot.drive import RobotGeometry, wheel_variances
+from sim.robot.drive import RobotGeometry
+from sim.robot.slip import wheel_variances
 from sim.worlds.world import World
 from tests.estimators.laser.test_icp import ROOM
 from tests.estimators.laser.test_icp_odometry import LASER, P0, START, TRACK_M, drive

@@ -23,7 +23,7 @@ from sim.errors import InputError
 from sim.robot.kinematic import run_batch
 from sim.routes.route import TABLE_1, OpenLoop
 from sim.sensors import Encoder
-from sim.simulate import record
+from sim.simulate import Member, record
 from sim.worlds.world import World
 
 
@@ -45,10 +45,12 @@ def recordings(robot, n, route, physics="kinematic", rate_hz=20.0, first_seed=0)
     return [
         record(
             OPEN,
-            robot,
-            {"encoder": Encoder(rate_hz)},
-            route,
-            {axis: stream(seed, axis) for axis in ("slip", "sensors")},
+            Member(
+                robot,
+                {"encoder": Encoder(rate_hz=rate_hz)},
+                route,
+                {axis: stream(seed, axis) for axis in ("slip", "sensors")},
+            ),
             physics=physics,
             rays="exact",
         )
@@ -59,7 +61,7 @@ def recordings(robot, n, route, physics="kinematic", rate_hz=20.0, first_seed=0)
 @pytest.mark.parametrize("k", [1e-5, 1e-4, 1e-3])
 def test_wheel_truth_finds_both_wheels_at_any_k(k):
     robot = dataclasses.replace(NOMINAL, kr=k, kl=3 * k)
-    batch = run_batch(robot, OpenLoop(((0.5, 0.3, 8.0),)), 100, np.random.default_rng(0))
+    batch = run_batch(robot, OpenLoop(segments=((0.5, 0.3, 8.0),)), 100, np.random.default_rng(0))
     encoder, ground = (np.diff(a, axis=1).reshape(-1, 2) for a in (batch.encoder_m, batch.ground_m))
     found = from_wheel_truth(encoder, ground, interval_s=0.05, geometry=False)
     assert found.kr.value == pytest.approx(k, rel=0.05)
@@ -70,7 +72,9 @@ def test_wheel_truth_finds_both_wheels_at_any_k(k):
 @pytest.mark.bullet
 def test_wheel_truth_on_the_engines_recordings():
     robot = slipping(1e-4)
-    found = calibrate_recordings(recordings(robot, 3, OpenLoop(((0.5, 0.2, 15.0),)), "bullet"))
+    found = calibrate_recordings(
+        recordings(robot, 3, OpenLoop(segments=((0.5, 0.2, 15.0),)), "bullet")
+    )
     assert found.kr.low <= robot.kr <= found.kr.high
     assert found.kl.low <= robot.kl <= found.kl.high
     assert found.track_m.value == pytest.approx(0.19, rel=1e-3)
@@ -101,7 +105,7 @@ def test_ignoring_a_gain_error_spoils_k():
 @pytest.mark.parametrize("name", ["linear_2", "linear_4", "angular_3", "square"])
 def test_the_models_end_poses_are_those_of_the_tick_by_tick_robot(name):
     """Two dozen knots stand for 300 ticks a second, biases and lag included."""
-    square = OpenLoop(((0.5, 0.0, 1.0), (0.0, 0.8, 2.0)) * 3)
+    square = OpenLoop(segments=((0.5, 0.0, 1.0), (0.0, 0.8, 2.0)) * 3)
     route, robot = {**TABLE_1, "square": square}[name], slipping(1e-3, geometry=True)
     rng = np.random.default_rng(4)
     runs = run_batch(robot, route, 4000, rng)
@@ -114,7 +118,7 @@ def test_the_models_end_poses_are_those_of_the_tick_by_tick_robot(name):
     np.testing.assert_allclose(ratio, 1.0, atol=0.1)
 
 
-@pytest.mark.parametrize("route", [TABLE_1["linear_2"], OpenLoop(((0.4, 0.6, 5.0),))])
+@pytest.mark.parametrize("route", [TABLE_1["linear_2"], OpenLoop(segments=((0.4, 0.6, 5.0),))])
 def test_the_analytic_covariance_is_that_of_the_odometry_filter(route):
     robot = slipping(1e-4)
     profile = route.profile(NOMINAL)
@@ -131,7 +135,7 @@ def test_the_analytic_covariance_is_that_of_the_odometry_filter(route):
 @pytest.mark.parametrize("method", ["sampled", "linearised"])
 def test_gain_errors_scale_the_spread_of_the_end_poses(method):
     """On the ground the variance is k |ds| / (1 + bias)^2; a small k keeps the model linear."""
-    route, robot = OpenLoop(((0.4, 0.6, 5.0),)), slipping(1e-6, geometry=True)
+    route, robot = OpenLoop(segments=((0.4, 0.6, 5.0),)), slipping(1e-6, geometry=True)
     robot = dataclasses.replace(robot, bias_right=0.5, bias_left=0.5)
     rng = np.random.default_rng(6)
     runs = run_batch(robot, route, 4000, rng)

@@ -17,7 +17,8 @@ from experiments.runs.experiment import Experiment
 from sim import se2
 from sim.errors import InputError
 from sim.recording import Log, Recording, Truth, WheelLog, save
-from sim.robot.drive import RobotGeometry, arc_increment
+from sim.robot.arc import arc_increment
+from sim.robot.drive import RobotGeometry
 from sim.sensors import Laser, Mount, StereoCamera
 from sim.sensors.stereo import points_in_camera
 from tests.estimators.landmarks.test_ekf_slam import follow
@@ -50,7 +51,9 @@ def log_of(seconds=400.0, seed=0, sensor="stereo", with_truth=True):
     world = square_room(20)
     if sensor == "stereo":
         camera = StereoCamera(rate_hz=5.0, mount=Mount())
-        true = dataclasses.replace(camera, mount=Mount(CAMERA_X_M, 0.0, 0.0, CAMERA_YAW))
+        true = dataclasses.replace(
+            camera, mount=Mount(x_m=CAMERA_X_M, y_m=0.0, z_m=0.0, yaw_rad=CAMERA_YAW)
+        )
         ids, points, splits = [], [], [0]
         for row in rows:
             seen = points_in_camera(true, poses[row], world.landmarks)
@@ -70,7 +73,7 @@ def log_of(seconds=400.0, seed=0, sensor="stereo", with_truth=True):
         truth_of = {"stereo": {"true_ids": ids}}
         sensors, logs = {"stereo": camera}, {"stereo": log}
     else:
-        laser = Laser(2.5, 121, sigma_range_m=0.02, mount=Mount())
+        laser = Laser(rate_hz=2.5, n_beams=121, sigma_range_m=0.02, mount=Mount())
         placed = se2.compose(poses[rows], np.array([0.1, 0.0, 0.0]))
         ranges = laser.measure(room_ranges_m(laser, placed), rng)
         sensors, truth_of = {"laser": laser}, {}

@@ -16,7 +16,13 @@ from sim.routes.route import TABLE_1
 
 EXAMPLE = Path(__file__).resolve().parents[3] / "docs" / "examples" / "end_poses.csv"
 TRUE = DifferentialDrive(
-    0.05, 0.19, kr=1.5e-4, kl=5e-5, bias_right=0.05, bias_left=-0.03, nominal_track_m=0.0836
+    wheel_radius_m=0.05,
+    track_m=0.19,
+    kr=1.5e-4,
+    kl=5e-5,
+    bias_right=0.05,
+    bias_left=-0.03,
+    nominal_track_m=0.0836,
 )
 HEAD = "case,v_mps,omega_radps,duration_s,x_m,y_m,heading_rad\n"
 COMMANDS = {name: route.segments[0] for name, route in TABLE_1.items()}
@@ -65,7 +71,7 @@ def test_a_robot_that_turns_three_times_too_far_is_found(tmp_path):
 
 def test_the_sheets_robot_brings_its_nominal_geometry_alone(tmp_path, ends):
     write_sheet(tmp_path / "sheet.csv", COMMANDS, ends)
-    other = DifferentialDrive(0.05, 0.0836, kr=1.0, bias_left=0.5)
+    other = DifferentialDrive(wheel_radius_m=0.05, track_m=0.0836, kr=1.0, bias_left=0.5)
     results = [
         calibrate_sheet(tmp_path / "sheet.csv", robot, rng(), geometry=True)
         for robot in (TRUE, other)
@@ -114,7 +120,7 @@ def test_what_is_wrong_is_named_with_its_line(tmp_path):
 
 
 def test_the_example_is_calibrated():
-    robot = DifferentialDrive(0.05, 0.19, nominal_track_m=0.0836)
+    robot = DifferentialDrive(wheel_radius_m=0.05, track_m=0.19, nominal_track_m=0.0836)
     found = calibrate_sheet(EXAMPLE, robot, rng(), geometry=True)
     assert found.track_m.low < 0.19 < found.track_m.high
     assert found.kr.low < 1.5e-4 < found.kr.high

@@ -15,8 +15,9 @@ from experiments.trajectories.odometry import (
     write_odometry_json,
 )
 from sim.errors import InputError
-from sim.robot.drive import DifferentialDrive, twist_covariances
+from sim.robot.drive import DifferentialDrive
 from sim.robot.kinematic import run_batch
+from sim.robot.slip import twist_covariances
 from sim.routes.route import OpenLoop
 from tests.experiments.report.test_table import an_estimate
 from tests.fixtures import fakes
@@ -52,8 +53,8 @@ def test_twist_is_the_body_velocity():
 
 def test_twist_covariance_is_that_of_the_wheels_error():
     """Sampled: velocity by the encoders less that of the wheels on the ground."""
-    robot = DifferentialDrive(0.05, 0.19, kr=1.5e-4, kl=5e-5)
-    runs = run_batch(robot, OpenLoop(((0.4, 0.8, 2.0),)), 4000, np.random.default_rng(2))
+    robot = DifferentialDrive(wheel_radius_m=0.05, track_m=0.19, kr=1.5e-4, kl=5e-5)
+    runs = run_batch(robot, OpenLoop(segments=((0.4, 0.8, 2.0),)), 4000, np.random.default_rng(2))
     lapse = np.diff(runs.stamps)
     J = np.array([[0.5, 0.5], [0.0, 0.0], [1.0 / 0.19, -1.0 / 0.19]])
     travel = np.diff(runs.encoder_m, axis=1)

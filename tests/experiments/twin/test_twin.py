@@ -17,11 +17,11 @@ from sim import se2
 from sim.errors import InputError
 from sim.formats.tum import write_tum
 from sim.recording import Truth, save
+from sim.robot.base import TICK_S
 from sim.robot.drive import DifferentialDrive
 from sim.robot.kinematic import KinematicBody
 from sim.routes.timetable import Drive, Timetable
 from sim.sensors import Mount, RealCamera, RealLaser, View
-from sim.simulate import DT_S
 from tests.estimators.landmarks.test_ekf_slam import follow
 from tests.fixtures.fakes import square_room
 
@@ -120,7 +120,9 @@ def test_bad_input_is_named(tmp_path, log):
     with pytest.raises(InputError, match="a twin needs a laser or a camera"):
         make_twin(log.without("stereo"))
     with pytest.raises(InputError, match=r"must name a \.tum file"):
-        Timetable(None).start(square_room(), DifferentialDrive(0.05, 0.2))
+        Timetable(path=None).start(
+            square_room(), DifferentialDrive(wheel_radius_m=0.05, track_m=0.2)
+        )
     with pytest.raises(InputError, match="no such file"):
         Experiment.compose(["study=nowhere.yaml"])
     with pytest.raises(InputError, match="short_share"):
@@ -145,14 +147,14 @@ def test_a_way_goes_through_the_known_poses(log):
 def test_a_follower_comes_back_to_its_way():
     stamps = np.arange(0.0, 20.0, 0.5)
     way = np.stack([0.3 * stamps, np.sin(0.3 * stamps), np.arctan(np.cos(0.3 * stamps))], axis=1)
-    world, robot = square_room(), DifferentialDrive(0.05, 0.2)
+    world, robot = square_room(), DifferentialDrive(wheel_radius_m=0.05, track_m=0.2)
     _, driver = Drive(stamps, way).start(world, robot)
     body = KinematicBody(robot, way[0] + [0.0, 0.2, 0.3])
     tick = 0
     while (wanted := driver.command(tick, body.pose)) is not None:
         body.step(*robot.wheel_speeds(*wanted))
         tick += 1
-    assert tick * DT_S == pytest.approx(stamps[-1], abs=0.03)
+    assert tick * TICK_S == pytest.approx(stamps[-1], abs=0.03)
     assert np.hypot(*(body.pose - way[-1])[:2]) < 0.02
     assert driver.trouble is None
     driver.command(0, way[0] + [3.0, 0.0, 0.0])
@@ -162,7 +164,7 @@ def test_a_follower_comes_back_to_its_way():
 def test_a_backward_way_is_followed_too():
     stamps = np.arange(0.0, 10.0, 0.5)
     way = np.stack([-0.3 * stamps, 0.0 * stamps, 0.0 * stamps], axis=1)
-    robot = DifferentialDrive(0.05, 0.2)
+    robot = DifferentialDrive(wheel_radius_m=0.05, track_m=0.2)
     _, driver = Drive(stamps, way).start(square_room(), robot)
     body = KinematicBody(robot, [0.0, 0.1, 0.0])
     for tick in range(2000):
@@ -202,7 +204,7 @@ def test_a_real_cameras_errors_have_their_spread_and_last():
     camera = RealCamera(
         rate_hz=4.0, sigma_depth=0.02, sigma_bearing_rad=0.01, lasting_share=0.6, lasting_s=1.0,
         detection_share=0.5, detection_s=0.5, fov_vertical_rad=2.5, scale=1.05,
-        mount=Mount(0.0, 0.0, 0.5),
+        mount=Mount(x_m=0.0, y_m=0.0, z_m=0.5),
     )  # fmt: skip
     exact = RealCamera(fov_vertical_rad=2.5, mount=camera.mount)
     blank = View(0.0, np.zeros(3), world, Sees(), 0.0, np.zeros(3))
@@ -261,7 +263,7 @@ def test_forward_slip_that_lasts_has_the_variance_of_its_formula(seed):
         assert found == pytest.approx(law, rel=0.25)
         assert found < 0.9 * 1e-3 * path
     with pytest.raises(InputError, match=r"set robot\.forward_slip_m"):
-        DifferentialDrive(0.05, 0.2, forward_slip_length_m=0.1)
+        DifferentialDrive(wheel_radius_m=0.05, track_m=0.2, forward_slip_length_m=0.1)
 
 
 def test_the_walls_of_a_laser_log_are_driven_through_nowhere(tmp_path):

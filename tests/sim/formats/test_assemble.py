@@ -4,7 +4,7 @@ from hypothesis import strategies as st
 
 from sim import se2
 from sim.formats import assemble
-from sim.robot.drive import arc_increment
+from sim.robot.arc import arc_increment
 
 
 def drive(wheels, track_m):

@@ -7,7 +7,7 @@ from sim import se2
 from sim.errors import InputError
 from sim.formats.carmen import parse_carmen, read_carmen, to_recording, write_carmen
 from sim.formats.text import split_words
-from sim.robot.drive import arc_increment
+from sim.robot.arc import arc_increment
 from tests.fixtures import fakes
 from tests.fixtures.log_samples import ARC, DATA, RANGES, flaser_log, robotlaser_log
 

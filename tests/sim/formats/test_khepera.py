@@ -8,7 +8,7 @@ from experiments.calibration.logs import calibrate_wheels, slip_of_turns
 from sim import se2
 from sim.errors import InputError
 from sim.formats.khepera import parse_khepera, read_khepera, to_recording
-from sim.robot.drive import arc_increment
+from sim.robot.arc import arc_increment
 
 DATA = Path(__file__).resolve().parents[4] / "shared/data/censi_khepera_calib"
 ARCHIVE = DATA / "khepera_l90_lmov.tar.xz"

@@ -6,13 +6,15 @@ import numpy as np
 import pytest
 
 from sim.errors import InputError
+from sim.robot.base import TICK_S
 from sim.robot.drive import DifferentialDrive
 from sim.robot.kinematic import KinematicBody, run_batch, wheel_commands
-from sim.routes.route import TABLE_1, TICK_S, OpenLoop
+from sim.robot.slip import SLIP_TIME_CONSTANT_S, slip_increment
+from sim.routes.route import TABLE_1, OpenLoop
 
 IDEAL = DifferentialDrive(wheel_radius_m=0.05, track_m=0.18)
 NOISY = dataclasses.replace(IDEAL, kr=2e-4, kl=1e-4, bias_right=0.05, bias_left=-0.03)
-ROUTE = OpenLoop(((0.5, 0.0, 1.0), (0.2, 0.9, 1.5), (0.0, -0.6, 1.0)))
+ROUTE = OpenLoop(segments=((0.5, 0.0, 1.0), (0.2, 0.9, 1.5), (0.0, -0.6, 1.0)))
 
 
 def test_body_rolls_along_exact_arcs():
@@ -44,19 +46,25 @@ def test_without_slip_the_promise_is_kept(name):
     np.testing.assert_array_equal(runs.encoder_m, runs.ground_m)
 
 
+def laws(robot):
+    return (robot.kr, robot.bias_right), (robot.kl, robot.bias_left)
+
+
 def test_batch_is_the_slip_law_tick_by_tick():
     runs = run_batch(NOISY, ROUTE, 2, np.random.default_rng(3), sample_s=0.1)
     rng = np.random.default_rng(3)
     profile = ROUTE.profile(NOISY)
     normals = rng.standard_normal((2, len(profile), 2))
     for run in range(2):
-        body, (right, left) = KinematicBody(NOISY, np.zeros(3)), NOISY.slips(TICK_S)
+        body, lag, law = KinematicBody(NOISY, np.zeros(3)), np.zeros(2), laws(NOISY)
         encoder, ground = np.zeros(2), np.zeros(2)
         encoders = [encoder.copy()]
         for tick, velocity in enumerate(profile):
-            speeds = NOISY.wheel_speeds(*velocity) - [right.correction_mps, left.correction_mps]
-            rolled, (z_right, z_left) = body.step(*speeds.tolist()), normals[run, tick].tolist()
-            encoder += right.advance(rolled[0], z_right), left.advance(rolled[1], z_left)
+            rolled = body.step(*(NOISY.wheel_speeds(*velocity) - lag / TICK_S).tolist())
+            for i in (0, 1):
+                of_wheel = rolled[i], lag[i], law[i], normals[run, tick, i], 0.0
+                read, lag[i] = slip_increment(*of_wheel, TICK_S / SLIP_TIME_CONSTANT_S)
+                encoder[i] += read
             ground += rolled
             if (tick + 1) % 30 == 0:
                 encoders.append(encoder.copy())
@@ -110,6 +118,18 @@ def test_batch_reads_the_encoders_by_the_nominal_radius():
     runs = run_batch(robot, TABLE_1["linear_1"], 1, np.random.default_rng(0))
     assert runs.encoder_m[0, -1] == pytest.approx([1.0, 1.0])  # as commanded
     assert runs.ground_m[0, -1] == pytest.approx([1.25, 1.25])  # by the true radius
+
+
+@pytest.mark.parametrize("length_m", [0.0, 0.5])
+def test_slip_of_both_wheels_together(length_m):
+    """Its variance is that of the simulator's: q per metre, less what has not been forgotten."""
+    q, travelled = 1e-4, 1.0
+    robot = dataclasses.replace(IDEAL, forward_slip_m=q, forward_slip_length_m=length_m)
+    runs = run_batch(robot, TABLE_1["linear_1"], 3000, np.random.default_rng(5))
+    error = (runs.encoder_m - runs.ground_m)[:, -1]
+    lasting = length_m * (1.0 - np.exp(-travelled / length_m)) if length_m else 0.0
+    assert np.var(error[:, 0]) == pytest.approx(q * (travelled - lasting), rel=0.1)
+    np.testing.assert_allclose(error[:, 0], error[:, 1], atol=1e-12)
 
 
 def test_unmodelled_slip_is_refused():

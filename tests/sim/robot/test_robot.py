@@ -6,18 +6,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sim.errors import InputError
-from sim.robot.drive import (
-    DifferentialDrive,
-    RobotGeometry,
-    TravelWindow,
-    arc_increment,
-    arc_increment_jacobian,
-    wheel_errors,
-    wheel_variances,
-)
+from sim.robot.arc import TravelWindow, arc_increment, arc_increment_jacobian
+from sim.robot.drive import DifferentialDrive, RobotGeometry
+from sim.robot.kinematic import run_batch
+from sim.robot.slip import wheel_errors, wheel_variances
+from sim.routes.route import OpenLoop
 
 DT_S = 1 / 300
 travel = st.tuples(st.floats(-2.0, 2.0), st.floats(-2.0, 2.0)).map(np.array)
+
+
+def drive(**options):
+    return DifferentialDrive(**{"wheel_radius_m": 0.05, "track_m": 0.19, **options})
 
 
 @given(travel)
@@ -40,21 +40,6 @@ def test_arc_jacobian_matches_finite_differences(wheels):
         assert np.allclose(numeric, exact[:, i], atol=1e-7)
 
 
-class Wheels:
-    """Both wheels' slip, of one robot or a batch, in arrays (..., 2)."""
-
-    def __init__(self, robot, dt_s):
-        self.slips = robot.slips(dt_s)
-
-    @property
-    def correction_mps(self):
-        return np.stack([slip.correction_mps for slip in self.slips], axis=-1)
-
-    def advance(self, rolling, normals):
-        parts = [s.advance(rolling[..., i], normals[..., i]) for i, s in enumerate(self.slips)]
-        return np.stack(parts, axis=-1)
-
-
 def test_right_wheel_turns_counter_clockwise():
     assert arc_increment([0.1, 0.0], 0.2)[2] > 0
     assert arc_increment_jacobian([0.1, 0.1], 0.2)[2].tolist() == pytest.approx([5.0, -5.0])
@@ -62,21 +47,13 @@ def test_right_wheel_turns_counter_clockwise():
 
 def test_slip_law_over_a_batch():
     """Var(encoder - ground) = k |ds|, white, uncorrelated between wheels, at any interval."""
-    robot = DifferentialDrive(0.05, 0.19, kr=1e-4, kl=3e-4)
-    rng = np.random.default_rng(1)
-    n_runs, n_ticks = 400, 600
-    slip = Wheels(robot, DT_S)
-    ground, encoder = np.zeros((n_runs, 2)), np.zeros((n_runs, 2))
-    grounds, encoders = [], []
-    for _ in range(n_ticks):
-        rolling = np.broadcast_to(0.5 - slip.correction_mps, (n_runs, 2)) * DT_S
-        encoder = encoder + slip.advance(rolling, rng.standard_normal((n_runs, 2)))
-        ground = ground + rolling
-        grounds.append(ground)
-        encoders.append(encoder)
+    robot = drive(kr=1e-4, kl=3e-4)
+    route = OpenLoop(segments=((0.5, 0.0, 2.0),))
+    runs = run_batch(robot, route, 400, np.random.default_rng(1), sample_s=DT_S)
+    grounds, encoders = np.moveaxis(runs.ground_m, 1, 0), np.moveaxis(runs.encoder_m, 1, 0)
     for every in (1, 15):
-        g = np.diff(np.array(grounds)[::every], axis=0)
-        e = np.diff(np.array(encoders)[::every], axis=0) - g
+        g = np.diff(grounds[::every], axis=0)
+        e = np.diff(encoders[::every], axis=0) - g
         k = np.sum(e**2, axis=(0, 1)) / np.sum(np.abs(g), axis=(0, 1))
         assert k == pytest.approx([1e-4, 3e-4], rel=0.03)
         flat = e.reshape(-1, 2)
@@ -99,22 +76,24 @@ def test_wheel_errors_have_variance_k_ds():
 
 
 def test_slip_and_wheel_errors_are_one_law():
-    """From rest, before the lag answers, a tick's encoder error is that of `wheel_errors`."""
-    robot = DifferentialDrive(0.05, 0.19, kr=1e-4, kl=3e-4)
-    rolling = np.array([0.002, -0.001])
-    normals = np.random.default_rng(4).standard_normal(2)
-    read = Wheels(robot, DT_S).advance(rolling, normals)
-    errors = wheel_errors(rolling, robot.slip_variance_per_m, np.random.default_rng(4))
-    assert read.tolist() == (rolling + errors).tolist()
+    """From rest, before the lag reacts, a tick's encoder error is that of `wheel_errors`."""
+    rolling = 0.002, -0.001
+    slip = drive(kr=1e-4, kl=3e-4).start_slip(DT_S, np.random.default_rng(4))
+    errors = wheel_errors(rolling, [1e-4, 3e-4], np.random.default_rng(4))
+    assert list(slip.advance(rolling)) == (rolling + errors).tolist()
+
+
+def driven(robot, n_ticks):
+    """Rolling and encoder increments (n, 2) of wheels that are commanded 0.5 m/s."""
+    slip, rows = robot.start_slip(DT_S, np.random.default_rng(0)), []
+    for _ in range(n_ticks):
+        rolling = tuple((0.5 - correction) * DT_S for correction in slip.correction_mps)
+        rows.append((rolling, slip.advance(rolling)))
+    return np.moveaxis(rows, 1, 0)
 
 
 def test_bias_makes_the_encoder_read_more():
-    robot = DifferentialDrive(0.05, 0.19, bias_right=0.05)
-    slip = Wheels(robot, DT_S)
-    encoder = ground = np.zeros(2)
-    for _ in range(3000):
-        rolling = (0.5 - slip.correction_mps) * DT_S
-        encoder, ground = encoder + slip.advance(rolling, np.zeros(2)), ground + rolling
+    ground, encoder = driven(drive(bias_right=0.05), 3000).sum(axis=1)
     assert (encoder / ground).tolist() == pytest.approx([1.05, 1.0])
     assert encoder[0] == pytest.approx(5.0, rel=2e-3)  # closed on the encoder, but for the lag
 
@@ -122,28 +101,27 @@ def test_bias_makes_the_encoder_read_more():
 @pytest.mark.parametrize("factor", [0.34, 3.0])
 def test_bias_up_to_a_factor_of_three_settles(factor):
     """The wheel's loop, closed on the encoder, brings the encoder to the command."""
-    robot = DifferentialDrive(0.05, 0.19, bias_right=factor - 1.0)
-    slip = Wheels(robot, DT_S)
-    for _ in range(1500):
-        rolling = (0.5 - slip.correction_mps) * DT_S
-        read = slip.advance(rolling, np.zeros(2))
-    assert (read / DT_S).tolist() == pytest.approx([0.5, 0.5])
-    assert (rolling / DT_S).tolist() == pytest.approx([0.5 / factor, 0.5])
+    _, read = driven(drive(bias_right=factor - 1.0), 1500)
+    assert (read[-1] / DT_S).tolist() == pytest.approx([0.5, 0.5])
 
 
 def test_nominal_geometry_turns_commands_into_wheel_speeds():
-    robot = DifferentialDrive(0.05, 0.2, nominal_wheel_radius_m=0.04, nominal_track_m=0.1)
+    robot = DifferentialDrive(
+        wheel_radius_m=0.05, track_m=0.2, nominal_wheel_radius_m=0.04, nominal_track_m=0.1
+    )
     assert robot.nominal == RobotGeometry(0.04, 0.1)
     rates = robot.wheel_speeds(0.4, 2.0) / 0.05
     assert (rates * 0.04).tolist() == pytest.approx([0.4 + 0.1, 0.4 - 0.1])
-    right = DifferentialDrive(0.05, 0.2)
+    right = DifferentialDrive(wheel_radius_m=0.05, track_m=0.2)
     assert right.nominal == RobotGeometry(0.05, 0.2)
     assert right.wheel_speeds(0.4, 2.0).tolist() == [0.4 + 0.2, 0.4 - 0.2]
 
 
 def test_pulses_are_counted_by_the_formula():
     """Travel per pulse is 2 pi r / (pulses * gear), decristoforis2020, eq. (1)."""
-    robot = DifferentialDrive(0.05, 0.19, encoder_pulses_per_turn=13, gear_ratio=34.0)
+    robot = DifferentialDrive(
+        wheel_radius_m=0.05, track_m=0.19, encoder_pulses_per_turn=13, gear_ratio=34.0
+    )
     quantum = 2 * math.pi * 0.05 / (13 * 34)
     assert robot.encoder_quantum_m == pytest.approx(quantum)
     read = robot.encoder_reading(np.array([[100.5, -0.5], [0.25, 441.0001]]) * quantum)
@@ -155,7 +133,11 @@ def test_pulses_are_counted_by_the_formula():
 def test_counts_become_metres_by_the_nominal_radius():
     """The wheel's angle is true, and the radius that makes it metres is the controller's."""
     robot = DifferentialDrive(
-        0.05, 0.19, nominal_wheel_radius_m=0.06, encoder_pulses_per_turn=100, gear_ratio=2.0
+        wheel_radius_m=0.05,
+        track_m=0.19,
+        nominal_wheel_radius_m=0.06,
+        encoder_pulses_per_turn=100,
+        gear_ratio=2.0,
     )
     turns = np.array([1.503, 0.2511])
     read = robot.encoder_reading(turns * 2 * math.pi * 0.05)

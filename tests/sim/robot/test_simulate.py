@@ -9,18 +9,25 @@ from experiments.runs.experiment import Experiment
 from experiments.runs.seeds import stream
 from sim import se2
 from sim.errors import InputError
-from sim.robot.drive import DifferentialDrive, arc_increment
+from sim.robot.arc import arc_increment
+from sim.robot.collisions import overlaps
+from sim.robot.drive import DifferentialDrive
 from sim.routes.route import OpenLoop, Tour
 from sim.sensors import Encoder, Laser, Lidar3D, Mount, StereoCamera
 from sim.sensors.stereo import points_in_camera
-from sim.simulate import overlaps, record
+from sim.simulate import Member, record
 from sim.worlds.world import World
 from tests.fixtures.fakes import true_ids
 
 EMPTY = World("open", np.zeros((0, 4)), np.zeros((0, 2)))
-PUZZLEBOT = DifferentialDrive(0.05, 0.19)
+PUZZLEBOT = DifferentialDrive(wheel_radius_m=0.05, track_m=0.19)
 ROBOCOM = DifferentialDrive(
-    0.10, 0.44, body_length_m=0.48, body_width_m=0.36, body_height_m=0.3, mass_kg=15.0
+    wheel_radius_m=0.10,
+    track_m=0.44,
+    body_length_m=0.48,
+    body_width_m=0.36,
+    body_height_m=0.3,
+    mass_kg=15.0,
 )
 
 
@@ -33,7 +40,10 @@ def drive(robot, *segments, sensors=None, physics="bullet", seed=0, world=EMPTY,
     rays = "bullet" if physics == "bullet" else "exact"
     options = {"rays": rays, **options}
     return record(
-        world, robot, sensors, OpenLoop(segments), streams(seed), physics=physics, **options
+        world,
+        Member(robot, sensors, OpenLoop(segments=segments), streams(seed)),
+        physics=physics,
+        **options,
     )
 
 
@@ -62,7 +72,7 @@ def test_without_slip_the_track_is_the_nominal_one(robot):
 def test_slip_law_of_the_engine(k):
     """k within 5 %, wheels uncorrelated and white, for kr != kl."""
     robot = dataclasses.replace(PUZZLEBOT, kr=k, kl=2 * k)
-    recording = drive(robot, (0.5, 0.3, 50.0), sensors={"encoder": Encoder(100.0)}, seed=1)
+    recording = drive(robot, (0.5, 0.3, 50.0), sensors={"encoder": Encoder(rate_hz=100.0)}, seed=1)
     ground = np.diff(recording.truth.wheel_travel_m, axis=0)
     error = np.diff(recording.wheels.position_m, axis=0) - ground
     found = np.sum(error**2, axis=0) / np.sum(np.abs(ground), axis=0)
@@ -88,7 +98,7 @@ def test_engine_and_kinematic_robot_agree_run_by_run():
 @pytest.mark.bullet
 def test_wheel_travel_integrates_to_the_true_pose():
     robot = dataclasses.replace(PUZZLEBOT, kr=1e-4, kl=1e-4)
-    truth = drive(robot, (0.4, 0.5, 8.0), sensors={"encoder": Encoder(100.0)}).truth
+    truth = drive(robot, (0.4, 0.5, 8.0), sensors={"encoder": Encoder(rate_hz=100.0)}).truth
     pose = truth.poses[0]
     for increment in np.diff(truth.wheel_travel_m, axis=0):
         pose = se2.compose(pose, arc_increment(increment, robot.track_m))
@@ -117,10 +127,10 @@ def test_unmodelled_slip_is_off_unless_asked_for_and_adds_up_when_it_is():
 def test_frames_come_from_every_sensor_at_its_own_rate():
     world = Experiment.compose(["world=room", "seed=0"]).world()
     sensors = {
-        "encoder": Encoder(20.0),
+        "encoder": Encoder(rate_hz=20.0),
         "laser": Laser(rate_hz=15.0, n_beams=31),
         "stereo": StereoCamera(rate_hz=5.0),
-        "lidar3d": Lidar3D(1.0),
+        "lidar3d": Lidar3D(rate_hz=1.0),
     }
     recording = drive(PUZZLEBOT, (0.2, 0.0, 2.0), sensors=sensors, physics="kinematic", world=world)
     end = recording.frame_stamps[-1]
@@ -141,10 +151,7 @@ def test_stereo_sees_what_geometry_says():
     )
     recording = record(
         world,
-        ROBOCOM,
-        {"stereo": camera},
-        Tour(distance_m=15.0),
-        streams(),
+        Member(ROBOCOM, {"stereo": camera}, Tour(distance_m=15.0), streams()),
         physics="kinematic",
         rays="exact",
     )
@@ -170,7 +177,9 @@ def test_selection_keeps_b_of_them(selection):
 
     def tour(sensors):
         route = Tour(distance_m=8.0)
-        return record(world, ROBOCOM, sensors, route, streams(), physics="kinematic", rays="exact")
+        return record(
+            world, Member(ROBOCOM, sensors, route, streams()), physics="kinematic", rays="exact"
+        )
 
     recording = tour(sensors)
     counts = np.diff(recording.log("stereo").splits)
@@ -211,10 +220,12 @@ def test_leaving_the_route_is_reported():
     rough = dataclasses.replace(PUZZLEBOT, max_acceleration_mps2=0.02)
     recording = record(
         EMPTY,
-        rough,
-        {"encoder": Encoder()},
-        Tour(speed_mps=1.0, waypoints=((0, 0), (6, 0), (6, 6)), tolerance_m=0.05),
-        streams(),
+        Member(
+            rough,
+            {"encoder": Encoder()},
+            Tour(speed_mps=1.0, waypoints=((0, 0), (6, 0), (6, 6)), tolerance_m=0.05),
+            streams(),
+        ),
         physics="kinematic",
         rays="exact",
     )
@@ -237,7 +248,10 @@ def test_tours_are_driven_to_their_end(name, robot):
 def test_a_longer_distance_goes_round_again():
     tour = Tour(waypoints=((0, 0), (2, 0), (2, 2), (0, 2), (0, 0)), distance_m=19.0)
     recording = record(
-        EMPTY, PUZZLEBOT, {"encoder": Encoder()}, tour, streams(), physics="kinematic", rays="exact"
+        EMPTY,
+        Member(PUZZLEBOT, {"encoder": Encoder()}, tour, streams()),
+        physics="kinematic",
+        rays="exact",
     )
     assert recording.status == "ok"
     assert np.sum(np.hypot(*np.diff(recording.truth.poses[:, :2], axis=0).T)) > 17.5
@@ -258,9 +272,13 @@ def test_footprint_overlap():
 
 def test_rates_must_divide_the_clock():
     with pytest.raises(InputError, match=r"sensors\.encoder\.rate_hz=7 does not divide"):
-        drive(PUZZLEBOT, (0.1, 0, 1), physics="kinematic", sensors={"encoder": Encoder(7.0)})
+        drive(
+            PUZZLEBOT, (0.1, 0, 1), physics="kinematic", sensors={"encoder": Encoder(rate_hz=7.0)}
+        )
     with pytest.raises(InputError, match="no sensor fires"):
-        drive(PUZZLEBOT, (0.1, 0, 1), physics="kinematic", sensors={"encoder": Encoder(None)})
+        drive(
+            PUZZLEBOT, (0.1, 0, 1), physics="kinematic", sensors={"encoder": Encoder(rate_hz=None)}
+        )
 
 
 @pytest.mark.slow

@@ -17,8 +17,10 @@ ROBOT = DifferentialDrive(
     wheel_radius_m=0.1, track_m=0.4, kr=0.0, kl=0.0, body_length_m=0.4, body_width_m=0.32
 )
 SENSORS = {
-    "encoder": Encoder(5.0),
-    "laser": Laser(5.0, 180, 2.0 * math.pi, max_range_m=5.0, sigma_range_m=0.01),
+    "encoder": Encoder(rate_hz=5.0),
+    "laser": Laser(
+        rate_hz=5.0, n_beams=180, fov_rad=2.0 * math.pi, max_range_m=5.0, sigma_range_m=0.01
+    ),
 }
 
 
@@ -114,7 +116,9 @@ def world():
 def explored(strategy, n_robots=2, distance_m=12.0, **changes):
     members = []
     for number in range(n_robots):
-        route = Explore(strategy, distance_m, start_offset_m=(0.0, 0.8 * number), **changes)
+        route = Explore(
+            strategy=strategy, distance_m=distance_m, start_offset_m=(0.0, 0.8 * number), **changes
+        )
         streams = {k: np.random.default_rng([number, k == "slip"]) for k in ("slip", "sensors")}
         members.append(Member(ROBOT, SENSORS, route, streams))
     return record_team(world(), members, physics="kinematic", rays="exact")
@@ -154,16 +158,16 @@ def test_an_exploration_is_the_same_again_and_follows_its_draw():
 
 def test_what_makes_no_sense_is_refused():
     with pytest.raises(InputError, match=r"route\.strategy must be one of random"):
-        Explore("best", 10.0)
+        Explore(strategy="best", distance_m=10.0)
     with pytest.raises(InputError, match=r"route\.decay_m"):
-        Explore("random", 10.0, decay_m=0.0)
+        Explore(strategy="random", distance_m=10.0, decay_m=0.0)
     with pytest.raises(InputError, match=r"route\.laser: no sensor named lidar"):
         explored("random", laser="lidar")
     mixed = [
         Member(
             ROBOT,
             SENSORS,
-            Explore(strategy, 5.0, start_offset_m=(offset_m, 0.0)),
+            Explore(strategy=strategy, distance_m=5.0, start_offset_m=(offset_m, 0.0)),
             {k: np.random.default_rng(0) for k in ("slip", "sensors")},
         )
         for strategy, offset_m in (("random", 0.0), ("coordinated", 0.6))

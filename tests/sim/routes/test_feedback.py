@@ -12,15 +12,16 @@ from experiments.runs.experiment import Experiment
 from experiments.runs.seeds import stream
 from sim import se2
 from sim.errors import InputError
-from sim.robot.drive import DifferentialDrive, arc_increment
+from sim.robot.arc import arc_increment
+from sim.robot.drive import DifferentialDrive
 from sim.routes.feedback import CONTROL_TICKS, OdometryFeedback
 from sim.routes.route import OpenLoop, Tour
 from sim.sensors import Encoder
-from sim.simulate import record
+from sim.simulate import Member, record
 from sim.worlds.world import World
 
 EMPTY = World("open", np.zeros((0, 4)), np.zeros((0, 2)))
-PUZZLEBOT = DifferentialDrive(0.05, 0.19)
+PUZZLEBOT = DifferentialDrive(wheel_radius_m=0.05, track_m=0.19)
 SLIPPING = dataclasses.replace(PUZZLEBOT, kr=1.5e-4, kl=5e-5)
 SHORT = dataclasses.replace(PUZZLEBOT, nominal_track_m=0.44 * 0.19)
 SQUARE = Experiment.compose(["route=square", "robot=puzzlebot"]).route()
@@ -30,8 +31,8 @@ CORNER = np.array(SQUARE.points[-1])
 
 def drive(robot, route=SQUARE, physics="kinematic", seed=0):
     streams = {axis: stream(seed, axis) for axis in ("slip", "sensors")}
-    sensors = {"encoder": Encoder(50.0)}
-    return record(EMPTY, robot, sensors, route, streams, physics=physics, rays="exact")
+    sensors = {"encoder": Encoder(rate_hz=50.0)}
+    return record(EMPTY, Member(robot, sensors, route, streams), physics=physics, rays="exact")
 
 
 def steered_by(feedback, route=SQUARE):
@@ -102,8 +103,8 @@ def test_odometry_is_reckoned_from_counts_at_the_control_rate():
 def turned(physics, **robot):
     """Radians turned of one commanded, and metres driven of one."""
     robot = dataclasses.replace(PUZZLEBOT, **robot)
-    poses = drive(robot, OpenLoop(((0.0, 0.5, 2.0),)), physics).truth.poses
-    straight = drive(robot, OpenLoop(((0.5, 0.0, 2.0),)), physics).truth.poses
+    poses = drive(robot, OpenLoop(segments=((0.0, 0.5, 2.0),)), physics).truth.poses
+    straight = drive(robot, OpenLoop(segments=((0.5, 0.0, 2.0),)), physics).truth.poses
     return poses[-1, 2] - poses[0, 2], straight[-1, 0] - straight[0, 0]
 
 
@@ -119,7 +120,7 @@ def test_nominal_geometry_decides_what_becomes_of_a_command(physics):
 @pytest.mark.parametrize("factor", [0.34, 3.0])
 def test_wheels_biased_threefold_settle(physics, factor):
     robot = dataclasses.replace(PUZZLEBOT, bias_right=factor - 1.0, bias_left=factor - 1.0)
-    recording = drive(robot, OpenLoop(((0.15, 0.0, 8.0),), rest_s=3.0), physics)
+    recording = drive(robot, OpenLoop(segments=((0.15, 0.0, 8.0),), rest_s=3.0), physics)
     assert recording.status == "ok"
     assert recording.wheels.position_m[-1] == pytest.approx([1.2, 1.2], rel=0.01)
     assert recording.truth.poses[-1, 0] == pytest.approx(1.2 / factor, rel=0.01)
@@ -157,13 +158,15 @@ def test_an_estimator_on_board_steers_by_what_it_makes_of_the_recording():
 
     recording = record(
         experiment.world(),
-        experiment.robot(),
-        experiment.sensors(),
-        experiment.route(),
-        {axis: np.random.default_rng(i) for i, axis in enumerate(("slip", "sensors"))},
+        Member(
+            experiment.robot(),
+            experiment.sensors(),
+            experiment.route(),
+            {axis: np.random.default_rng(i) for i, axis in enumerate(("slip", "sensors"))},
+            onboard=spied,
+        ),
         physics="kinematic",
         rays="exact",
-        onboard=spied,
     )
     assert recording.status == "ok"
     truth = recording.truth

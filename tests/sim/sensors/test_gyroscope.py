@@ -10,7 +10,7 @@ from sim.errors import InputError
 from sim.robot.drive import DifferentialDrive
 from sim.routes.route import OpenLoop
 from sim.sensors import Encoder, Gyroscope, View
-from sim.simulate import record
+from sim.simulate import Member, record
 from sim.worlds.world import World
 
 EMPTY = World("open", np.zeros((0, 4)), np.zeros((0, 2)))
@@ -57,7 +57,9 @@ def test_biases_at_the_start_have_their_variance():
 def test_the_bias_walks_with_a_variance_that_grows_with_time(rate_hz, seconds):
     """At any rate: the walk is a law of time, not of readings."""
     walk = 0.01
-    gyroscope = Gyroscope(rate_hz, 0.0, 0.0, walk)
+    gyroscope = Gyroscope(
+        rate_hz=rate_hz, sigma_rate_radps=0.0, sigma_bias_radps=0.0, bias_walk_radps_per_sqrt_s=walk
+    )
     poses = np.zeros((int(seconds * rate_hz) + 1, 3))
     biases = np.array([readings(gyroscope, poses, seed)["bias_radps"] for seed in range(1500)])
     at_s = np.arange(1, 5) / 4 * seconds
@@ -71,25 +73,39 @@ def test_without_noise_it_is_the_mean_rate_of_an_arc():
     rate = 0.7
     heading = rate * np.arange(200) / 50.0  # through the seam at pi
     poses = np.column_stack([np.sin(heading), 1.0 - np.cos(heading), se2.wrap(heading)])
-    read = readings(Gyroscope(50.0, 0.0, 0.0, 0.0), poses)
+    read = readings(
+        Gyroscope(
+            rate_hz=50.0, sigma_rate_radps=0.0, sigma_bias_radps=0.0, bias_walk_radps_per_sqrt_s=0.0
+        ),
+        poses,
+    )
     np.testing.assert_allclose(read["yaw_rate_radps"], rate, atol=1e-12)
     uneven = np.zeros((3, 3))
     uneven[:, 2] = [0.0, 0.01, 0.05]
-    read = readings(Gyroscope(10.0, 0.0, 0.0, 0.0), uneven)
+    read = readings(
+        Gyroscope(
+            rate_hz=10.0, sigma_rate_radps=0.0, sigma_bias_radps=0.0, bias_walk_radps_per_sqrt_s=0.0
+        ),
+        uneven,
+    )
     np.testing.assert_allclose(read["yaw_rate_radps"], [0.1, 0.4])
 
 
 def test_in_a_recording():
     """Frames show the rate and not the bias; the first firing is a Frame without a reading."""
-    robot = DifferentialDrive(0.05, 0.19)
-    exact = Gyroscope(100.0, 0.0, 0.01, 0.0)
+    robot = DifferentialDrive(wheel_radius_m=0.05, track_m=0.19)
+    exact = Gyroscope(
+        rate_hz=100.0, sigma_rate_radps=0.0, sigma_bias_radps=0.01, bias_walk_radps_per_sqrt_s=0.0
+    )
     streams = {axis: np.random.default_rng(i) for i, axis in enumerate(("slip", "sensors"))}
     recording = record(
         EMPTY,
-        robot,
-        {"encoder": Encoder(20.0), "gyroscope": exact},
-        OpenLoop(((0.3, 0.5, 4.0),)),
-        streams,
+        Member(
+            robot,
+            {"encoder": Encoder(rate_hz=20.0), "gyroscope": exact},
+            OpenLoop(segments=((0.3, 0.5, 4.0),)),
+            streams,
+        ),
         physics="kinematic",
         rays="exact",
     )

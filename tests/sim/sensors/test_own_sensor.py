@@ -29,11 +29,14 @@ from sim.sensors import (
     sensors_from_config,
 )
 from sim.sensors.base import RecordedSensor, schema_from_meta
-from sim.simulate import record
+from sim.simulate import Member, record
 from tests.fixtures.beacons import Beacons, Compass, Forgetful
 from tests.fixtures.fakes import square_room
 
-FRONT, REAR = Laser(n_beams=31), Laser(5.0, 17, mount=Mount(x_m=-0.1, yaw_rad=np.pi))
+FRONT, REAR = (
+    Laser(n_beams=31),
+    Laser(rate_hz=5.0, n_beams=17, mount=Mount(x_m=-0.1, yaw_rad=np.pi)),
+)
 SENSORS = {"encoder": Encoder(), "beacons": Beacons(), "laser": FRONT}
 COUNTS, ANY_COUNTS = Field("", "i4", (3,)), Field("", "i4", (None,))
 ENDINGS = [".mcap", ".bag", ".db3", ""]
@@ -44,10 +47,12 @@ def drive(sensors, seconds=2.0, seed=0):
     streams = {axis: np.random.default_rng([seed, i]) for i, axis in enumerate(("slip", "sensors"))}
     return record(
         square_room(),
-        DifferentialDrive(0.05, 0.19, kr=1e-4, kl=1e-4),
-        sensors,
-        OpenLoop(((0.2, 0.3, seconds),)),
-        streams,
+        Member(
+            DifferentialDrive(wheel_radius_m=0.05, track_m=0.19, kr=1e-4, kl=1e-4),
+            sensors,
+            OpenLoop(segments=((0.2, 0.3, seconds),)),
+            streams,
+        ),
         physics="kinematic",
         rays="exact",
     )
@@ -137,7 +142,7 @@ def test_bags_hold_it_by_its_schema(recording, tmp_path, ending):
 
 def test_a_sensor_that_never_read_anything(tmp_path):
     pytest.importorskip("rosbags")
-    quiet = drive({"encoder": Encoder(), "gyroscope": Gyroscope(1.0)}, seconds=0.3)
+    quiet = drive({"encoder": Encoder(), "gyroscope": Gyroscope(rate_hz=1.0)}, seconds=0.3)
     assert len(quiet.log("gyroscope").stamps) == 0
     assert quiet.truth.readings["gyroscope"]["bias_radps"].shape == (0,)
     assert save(quiet, tmp_path / "a.npz") == load(tmp_path / "a.npz").checksum
@@ -358,7 +363,7 @@ def test_two_lasers_have_topics_of_their_own(tmp_path, ending):
 
 
 def test_the_noise_of_a_sensor_does_not_depend_on_the_others():
-    one, two = Gyroscope(50.0), Beacons()
+    one, two = Gyroscope(rate_hz=50.0), Beacons()
     alone = drive({"gyro": one})
     for others in (
         {"gyro": one, "beacons": two},
@@ -467,84 +472,3 @@ def test_a_schema_that_does_not_fit_the_file(recording, tmp_path, field, words):
     with pytest.raises(InputError, match=words) as caught:
         load(tmp_path / "b.npz")
     assert "\n" not in str(caught.value)
-
-
-@dataclasses.dataclass(frozen=True)
-class Odd:
-    """A sensor whose probe does what `does` says."""
-
-    does: str = "nothing"
-    rate_hz: float = 10.0
-
-    @property
-    def schema(self):
-        return {"a": Field("m", shape=(3,)), "n": Field("", "u1")}
-
-    def start(self, rng):
-        buffer = np.zeros(3)
-        if self.does == "no probe":
-            return None
-
-        def probe(view):
-            if self.does == "write":
-                view.pose[:2] += 1.0
-            if self.does == "divide":
-                return {"a": 1 // 0, "n": 0}
-            if self.does == "exit":
-                raise SystemExit(0)
-            buffer[:] = view.stamp
-            wrong = {"none": [None] * 3, "complex": 1j * buffer}
-            count = {"large": 1000, "part": 0.5}.get(self.does, 7)
-            return Unprinted({"a": wrong.get(self.does, buffer), "n": count})
-
-        return probe
-
-
-class Unprinted(dict):
-    """A sound reading is never made into text, which takes a hundred times as long as the rest."""
-
-    def __repr__(self):
-        raise AssertionError("printed")
-
-
-def test_a_reading_is_copied_when_it_is_taken():
-    log = drive({"odd": Odd()}).log("odd")
-    assert log["a"][:, 0].tolist() == log.stamps.tolist()
-    assert log["n"].tolist() == [7] * len(log.stamps)
-
-
-@pytest.mark.parametrize(
-    ("does", "message"),
-    [
-        ("write", r"sensors\.odd raised ValueError: .*read-only.*\(test_own_sensor\.py:\d+\)"),
-        ("divide", r"sensors\.odd raised ZeroDivisionError"),
-        ("exit", r"sensors\.odd raised SystemExit"),
-        ("no probe", r"sensors\.odd: start must return a function"),
-        ("none", r"sensors\.odd\.a must hold numbers, got object"),
-        ("complex", r"sensors\.odd\.a must hold numbers, got complex"),
-        ("large", r"sensors\.odd\.n must lie in \[0, 255\]"),
-        ("part", r"sensors\.odd\.n must hold whole numbers"),
-    ],
-)
-def test_what_a_probe_does_wrong_is_one_line(does, message):
-    with pytest.raises(InputError, match=message) as caught:
-        drive({"odd": Odd(does)})
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("rate_hz", [0.0, -1.0, float("nan"), float("inf"), "fast"])
-def test_a_rate_is_a_positive_number(rate_hz):
-    with pytest.raises(InputError, match=r"sensors\.odd\.rate_hz must be a positive number"):
-        drive({"odd": Odd(rate_hz=rate_hz)})
-
-
-@pytest.mark.parametrize("shape", [3, (-1,), (2.5,), [3]])
-def test_a_shape_is_a_tuple_of_sizes(shape):
-    with pytest.raises(InputError, match="shape must be a tuple"):
-        Field("m", shape=shape)
-
-
-@pytest.mark.parametrize("name", ["wheels", "commands", "truth"])
-def test_names_of_what_a_recording_holds_besides_are_taken(name):
-    with pytest.raises(InputError, match="none of wheels, commands, truth"):
-        sensors_from_config({name: {"_target_": "sim.sensors.encoder.Encoder"}})

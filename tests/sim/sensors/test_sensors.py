@@ -97,11 +97,11 @@ LASER, STEREO = "sim.sensors.laser.Laser", "sim.sensors.stereo.StereoCamera"
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"laser": {"_target_": LASER, "n_beams": 0}}, "n_beams must be at least 1"),
+        ({"laser": {"_target_": LASER, "n_beams": 0}}, "n_beams must be a whole number, from 1"),
         ({"front": {"_target_": LASER, "n_beans": 7}}, r"unknown key sensors\.front\.n_beans"),
         ({"laser": {"_target_": LASER, "n_beams": "many"}}, "whole number"),
         ({"laser": {"_target_": LASER, "sigma_range_m": float("nan")}}, "sigma_range_m"),
-        ({"stereo": {"_target_": STEREO, "selection": "best"}}, "nearest, random or spread"),
+        ({"stereo": {"_target_": STEREO, "selection": "best"}}, "nearest, random, spread"),
         ({"laser": {"_target_": LASER, "mount": {"z": 1}}}, r"sensors\.laser\.mount\.z"),
         (
             {"encoder": {"_target_": "sim.sensors.encoder.Encoder", "rate_hz": -1}},
@@ -113,7 +113,7 @@ LASER, STEREO = "sim.sensors.laser.Laser", "sim.sensors.stereo.StereoCamera"
         ({"laser": {"_target_": "sim.lasers.Laser"}}, r"no module sim\.lasers; is its folder"),
         ({"laser": {"_target_": "Laser"}}, "must name a class"),
         ({"laser": {"_target_": 3}}, "must name a class"),
-        ({"laser": {"_target_": "sim.settings.build"}}, r"laser\._target_=.* must be a dataclass"),
+        ({"laser": {"_target_": "sim.options.build"}}, r"laser\._target_=.* must be a dataclass"),
         ({"laser": {"_target_": "sim.errors.InputError"}}, "must be a dataclass"),
         ({"laser": {"_target_": "sim.robot.drive.RobotGeometry", "wheel_radius_m": 1,
                     "track_m": 1}},
@@ -150,9 +150,9 @@ def test_a_missing_sensor_is_named():
 @pytest.mark.parametrize(
     "sensor",
     [
-        Encoder(None),
+        Encoder(rate_hz=None),
         Gyroscope(),
-        Laser(100),
+        Laser(rate_hz=100),
         Lidar3D(),
         PlaceDescriptor(),
         RobotCamera(),
