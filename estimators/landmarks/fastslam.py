@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from estimators.base import Belief, Estimate, Prior
 from estimators.gaussian import STILL, Gaussian, compose, root, rotated
-from estimators.landmarks import particle_maps as ekf
+from estimators.landmarks import particle_kernels as ekf
 from estimators.landmarks.particle_maps import LandmarkMaps, Maps
 from estimators.landmarks.sightings import Sightings, dead_reckoning, team_starts
 from estimators.landmarks.slam_frontend import Association, Image, SlamFrontEnd
@@ -363,13 +363,11 @@ class FastSLAM:
     def _associate(self, path: _Path, image: Image, spread: Array) -> Ints:
         """Slots (K, M) of each particle, -1 for new ones."""
         maps, points = self._maps, image.points
-        slots = np.full((len(points), self.n_particles), -1)
         unlikeness = self.front_end.unlikeness(image)
         if len(points) == 0 or maps.n_slots == 0:
-            return slots
+            return np.full((len(points), self.n_particles), -1)
         near = maps.nearby(path.state, self.front_end.reach_m)
-        maps.touch(near)
-        ekf.associate(
+        return ekf.associate(
             maps.data,
             ekf.Candidates(near, maps.place, maps.counts, maps.births),
             points,
@@ -378,9 +376,7 @@ class FastSLAM:
             self.front_end.d0,
             path.state,
             self._camera,
-            slots,
         )
-        return slots
 
     def _passed(self, path: _Path, image: Image, slots: Ints) -> NDArray[np.bool_]:
         """Which observations (K,) of landmarks in these slots pass the best particle's gate."""
