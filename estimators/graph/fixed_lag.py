@@ -57,7 +57,7 @@ from estimators.landmarks.stereo import StereoModel
 from estimators.laser.icp import PreparedScan
 from estimators.laser.scan_matching import ScanMatcher
 from estimators.options import require_counts, require_laser, require_stereo, start_pose
-from estimators.wheels import WheelPrediction
+from estimators.wheels import WheelOptions, WheelPrediction
 from sim import se2
 from sim.arrays import Array, Ints
 from sim.recording import Frame
@@ -120,7 +120,7 @@ class FixedLag:
     ) -> None:
         self.stereo, self.laser = stereo, laser
         self._matcher = ScanMatcher("point_to_line", "censi", sigma_range_m)
-        self.wheels = WheelPrediction(kr, kl, window_s)
+        self.wheels = WheelOptions(kr=kr, kl=kl, window_s=window_s)
         require_counts(lag_images=lag_images, iterations=iterations)
         self.lag_images, self.iterations = lag_images, iterations
         self.keep_landmarks = keep_landmarks
@@ -129,7 +129,7 @@ class FixedLag:
         """Start from the prior's pose, with an empty map."""
         self._camera = StereoModel.of(require_stereo(prior, self.stereo, "fixed_lag"))
         self._belief = start_pose(prior, "fixed_lag")
-        self.wheels.reset(prior.robot.track_m)
+        self._wheels = WheelPrediction(self.wheels, prior.robot.track_m)
         self._drive = LandmarkDrive(self._camera, self._belief)
         self._laser = None if self.laser is None else require_laser(prior, self.laser, "fixed_lag")
         self._scan: PreparedScan | None = None  # of the last image
@@ -143,7 +143,7 @@ class FixedLag:
 
     def step(self, frame: Frame) -> Belief:
         """Roll by the wheels; at an image, solve the window, and let its oldest pose go."""
-        motion = self.wheels.predict(frame)
+        motion = self._wheels.predict(frame)
         loose = loosened(motion)
         self._belief, self._motion = self._belief.then(motion), self._motion.then(loose)
         seen, rejected = observed(frame, self.stereo, self._camera, "fixed_lag")

@@ -49,7 +49,7 @@ from estimators.options import (
     require_shares,
     start_pose,
 )
-from estimators.wheels import WheelPrediction
+from estimators.wheels import EncoderTickOptions, WheelPrediction
 from sim import se2
 from sim.arrays import Array, Ints
 from sim.errors import InputError, require
@@ -145,8 +145,12 @@ class GraphSlam:
         self.laser = laser
         most_m = math.inf if most_gap_m is None else most_gap_m
         self._matcher = ScanMatcher(metric, covariance, sigma_range_m, most_gap_m=most_m)
-        self.wheels = WheelPrediction(
-            kr, kl, window_s, lateral_slip_m=lateral_slip_m, encoder_tick_m=encoder_tick_m
+        self.wheels = EncoderTickOptions(
+            kr=kr,
+            kl=kl,
+            window_s=window_s,
+            lateral_slip_m=lateral_slip_m,
+            encoder_tick_m=encoder_tick_m,
         )
         require_non_negative(
             keyframe_distance_m=keyframe_distance_m,
@@ -186,7 +190,7 @@ class GraphSlam:
             self.loop_least_gain,
         )
         start = start_pose(prior, "graph_slam")
-        self.wheels.reset(prior.robot.track_m)
+        self._wheels = WheelPrediction(self.wheels, prior.robot.track_m)
         self._graph = PoseGraph(Gaussian(start.mean, start.covariance + FLOOR), self.robust_sigma)
         self._scans: list[PreparedScan | None] = [None]  # node 0 is the start
         self._signatures = np.full((1, N_QUANTILES), np.inf)
@@ -208,7 +212,7 @@ class GraphSlam:
 
     def step(self, frame: Frame) -> Belief:
         """Move by the wheels; register a scan with the key frame; at a new one look for loops."""
-        motion = loosened(self.wheels.predict(frame))
+        motion = loosened(self._wheels.predict(frame))
         self._in_key, self._by_wheels = self._in_key.then(motion), self._by_wheels.then(motion)
         self._now = frame.stamp
         extras: dict[str, Any] = {}

@@ -26,7 +26,7 @@ from estimators.options import (
     require_stereo,
     start_pose,
 )
-from estimators.wheels import WheelPrediction
+from estimators.wheels import WheelOptions
 from sim.arrays import Array
 from sim.errors import require
 from sim.recording import Frame
@@ -80,7 +80,7 @@ class Smoother:
         robots: str | None = None,
     ) -> None:
         self.stereo, self.robots = stereo, robots
-        self.wheels = WheelPrediction(kr, kl, window_s)
+        self.wheels = WheelOptions(kr=kr, kl=kl, window_s=window_s)
         require_choices(robust=(robust, Robust))
         require_positive(robust_sigma=robust_sigma)
         require_counts(max_iterations=max_iterations)

@@ -20,7 +20,7 @@ from estimators.landmarks.slam_frontend import Association, Image, SlamFrontEnd
 from estimators.landmarks.stereo import LEAST_DEPTH_M, NoiseAt, NoiseModel
 from estimators.landmarks.wheel_gains import NO_MOTION, GainBelief, gained_motion
 from estimators.options import require_choices, require_positive
-from estimators.wheels import WheelPrediction
+from estimators.wheels import ForwardSlipOptions
 from sim.arrays import Array, Ints
 from sim.errors import require
 from sim.recording import Frame
@@ -124,7 +124,9 @@ class EkfSlam:
         require_choices(errors=(errors, Errors))
         self.stereo, self.robots, self.sighting_d0 = stereo, robots, sighting_d0
         self.invariant = errors == "invariant"
-        self.wheels = WheelPrediction(kr, kl, window_s, forward_slip_m=forward_slip_m)
+        self.wheels = ForwardSlipOptions(
+            kr=kr, kl=kl, window_s=window_s, forward_slip_m=forward_slip_m
+        )
         self._gain_belief = GainBelief(gain_sigma, gain_wander_m)
         require(
             not (gain_sigma and self.invariant),

@@ -30,7 +30,7 @@ from estimators.particles import (
     resample,
     underflowed,
 )
-from estimators.wheels import WheelPrediction
+from estimators.wheels import ForwardSlipOptions, WheelPrediction
 from sim import se2
 from sim.arrays import Array, Ints
 from sim.errors import InputError, require
@@ -156,7 +156,9 @@ class FastSLAM:
         if slip_dof is not None:
             require_positive(slip_dof=slip_dof)
         self._noise = noise_model, noise_at
-        self.wheels = WheelPrediction(kr, kl, window_s, forward_slip_m=forward_slip_m)
+        self.wheels = ForwardSlipOptions(
+            kr=kr, kl=kl, window_s=window_s, forward_slip_m=forward_slip_m
+        )
         self.front_end = SlamFrontEnd(
             "fastslam",
             stereo,

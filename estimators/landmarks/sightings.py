@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -13,7 +12,7 @@ from estimators.gaussian import Gaussian
 from estimators.landmarks.slam_frontend import SlamFrontEnd
 from estimators.landmarks.stereo import NoiseAt, NoiseModel, StereoModel
 from estimators.options import start_pose
-from estimators.wheels import WheelPrediction
+from estimators.wheels import WheelOptions, WheelPrediction
 from sim import se2
 from sim.arrays import Array, Ints
 from sim.errors import InputError, require
@@ -49,12 +48,9 @@ def team_starts(
     return [front_end.reset(first), *starts]
 
 
-def dead_reckoning(wheels: WheelPrediction, priors: Sequence[Prior]) -> list[WheelPrediction]:
+def dead_reckoning(believed: WheelOptions, priors: Sequence[Prior]) -> list[WheelPrediction]:
     """One prediction by the wheels for each robot, alike but for the track."""
-    each = [copy.copy(wheels) for _ in priors]
-    for own, prior in zip(each, priors, strict=True):
-        own.reset(prior.robot.track_m)
-    return each
+    return [WheelPrediction(believed, prior.robot.track_m) for prior in priors]
 
 
 @dataclass(frozen=True)

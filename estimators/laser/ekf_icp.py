@@ -25,7 +25,7 @@ from estimators.laser.scan_matching import (
     moved_beyond,
 )
 from estimators.options import require_laser, require_non_negative, require_shares, start_pose
-from estimators.wheels import WheelPrediction
+from estimators.wheels import EncoderTickOptions, WheelPrediction
 from sim.arrays import Array
 from sim.errors import require
 from sim.recording import Frame
@@ -120,8 +120,12 @@ class EkfIcp:
         self.laser = laser
         rules = Rules(trim, kernel, max_iterations, stop_error_m, neighbours)
         self._matcher = ScanMatcher(metric, covariance, sigma_range_m, rules)
-        self.wheels = WheelPrediction(
-            kr, kl, window_s, lateral_slip_m=lateral_slip_m, encoder_tick_m=encoder_tick_m
+        self.wheels = EncoderTickOptions(
+            kr=kr,
+            kl=kl,
+            window_s=window_s,
+            lateral_slip_m=lateral_slip_m,
+            encoder_tick_m=encoder_tick_m,
         )
         require_non_negative(
             keyframe_distance_m=keyframe_distance_m,
@@ -157,7 +161,7 @@ class EkfIcp:
         start = start_pose(prior, "ekf_icp")
         self._origin = np.append(np.rint(start.mean[:2] / _ORIGIN_STEP_M) * _ORIGIN_STEP_M, 0.0)
         start = Gaussian(start.mean - self._origin, start.covariance)
-        self.wheels.reset(prior.robot.track_m)
+        self._wheels = WheelPrediction(self.wheels, prior.robot.track_m)
         self._key: PreparedScan | None = None
         self._last: PreparedScan | None = None
         # of the key frame's first degenerate match, as twists: as in `Match`
@@ -186,7 +190,7 @@ class EkfIcp:
 
     def _predict(self, frame: Frame) -> None:
         """Move the robot's pose by the wheels; the clones stay."""
-        motion = self.wheels.predict(frame)
+        motion = self._wheels.predict(frame)
         self._mean[_POSE], _, by_motion = compose(self._mean[_POSE], motion.mean)
         by_motion = _from_twist(-self._mean[_POSE]) @ by_motion
         self._covariance[_POSE, _POSE] += by_motion @ motion.covariance @ by_motion.T
@@ -288,7 +292,7 @@ class EkfIcp:
         """Take a registration in as `_take_in` does, if the wheels slipped since the last scan."""
         if not self.slip_burst_m or found.status != "ok":
             return False
-        turn_rad = 2.0 * self.slip_burst_m / self.wheels.track_m
+        turn_rad = 2.0 * self.slip_burst_m / self._wheels.track_m
         burst = np.diag(np.square([self.slip_burst_m, self.slip_burst_m, turn_rad]))
         to_twist, before = _from_twist(-self._mean[_POSE]), self._covariance
         self._covariance = before.copy()

@@ -17,7 +17,7 @@ from estimators.laser.scan_matching import (
     ScanMatcher,
 )
 from estimators.options import require_laser, require_non_negative, start_pose
-from estimators.wheels import WheelPrediction
+from estimators.wheels import LateralSlipOptions, WheelPrediction
 from sim.arrays import Array
 from sim.recording import Frame
 
@@ -85,7 +85,9 @@ class EkfIcpPaper:
         self.laser = laser
         rules = Rules(trim, kernel, max_iterations, stop_error_m, neighbours)
         self._matcher = ScanMatcher(metric, covariance, sigma_range_m, rules)
-        self.wheels = WheelPrediction(kr, kl, window_s, lateral_slip_m=lateral_slip_m)
+        self.wheels = LateralSlipOptions(
+            kr=kr, kl=kl, window_s=window_s, lateral_slip_m=lateral_slip_m
+        )
         require_non_negative(acceleration_noise=acceleration_noise, turn_noise=turn_noise)
         self.acceleration_noise, self.turn_noise = acceleration_noise, turn_noise
 
@@ -93,7 +95,7 @@ class EkfIcpPaper:
         """Start from the prior's pose, with velocities unknown."""
         self._laser, self._rng = require_laser(prior, self.laser, "ekf_icp_paper"), rng
         start = start_pose(prior, "ekf_icp_paper")
-        self.wheels.reset(prior.robot.track_m)
+        self._wheels = WheelPrediction(self.wheels, prior.robot.track_m)
         self._mean = np.concatenate([start.mean, np.zeros(3)])
         self._covariance = np.zeros((6, 6))
         self._covariance[:3, :3] = start.covariance
@@ -107,7 +109,7 @@ class EkfIcpPaper:
         extras: dict[str, Any] = {}
         if dt > 0.0:
             self._predict(dt)
-            motion = self.wheels.predict(frame)
+            motion = self._wheels.predict(frame)
             self._rolled, self._since_s = self._rolled.then(motion), self._since_s + dt
             self._measure(motion, dt, np.eye(3))
         scan = frame.readings.get(self.laser)

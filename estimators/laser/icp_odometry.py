@@ -20,7 +20,7 @@ from estimators.laser.scan_matching import (
     moved_beyond,
 )
 from estimators.options import require_choices, require_laser, require_non_negative, start_pose
-from estimators.wheels import WheelPrediction
+from estimators.wheels import WheelOptions, WheelPrediction
 from sim import se2
 from sim.recording import Frame
 
@@ -97,7 +97,7 @@ class IcpOdometry:
         self.laser = laser
         rules = Rules(trim, kernel, max_iterations, stop_error_m, neighbours)
         self._matcher = ScanMatcher(metric, covariance, sigma_range_m, rules)
-        self.wheels = WheelPrediction(kr, kl, window_s)
+        self.wheels = WheelOptions(kr=kr, kl=kl, window_s=window_s)
         require_choices(reference=(reference, Reference))
         require_non_negative(
             keyframe_distance_m=keyframe_distance_m, keyframe_turn_rad=keyframe_turn_rad
@@ -111,7 +111,7 @@ class IcpOdometry:
         self._key = self._last = _Anchor(start_pose(prior, "icp_odometry"), None)
         self._key_to_last = STILL
         self._lost = False
-        self.wheels.reset(prior.robot.track_m)
+        self._wheels = WheelPrediction(self.wheels, prior.robot.track_m)
         self._rolled, self._since_s = STILL, 0.0  # since the last scan, by the wheels
         self._velocity = np.zeros(3)  # twist between the last two scans, per second
 
@@ -119,7 +119,7 @@ class IcpOdometry:
         """Register the Frame's scan, if it has one, and compose."""
         self._since_s += frame.duration_s
         if self.use_odometry_guess:
-            self._rolled = self._rolled.then(self.wheels.predict(frame))
+            self._rolled = self._rolled.then(self._wheels.predict(frame))
         reading = frame.readings.get(self.laser)
         if reading is None:
             return _belief(self._last.belief.then(self._rolled), {})

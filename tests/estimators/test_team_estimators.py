@@ -15,6 +15,7 @@ from estimators.landmarks.fastslam import FastSLAM
 from estimators.landmarks.sightings import Sightings, pose_by_points
 from estimators.landmarks.stereo import StereoModel
 from estimators.team import Communication, run_team
+from estimators.wheels import WheelPrediction
 from experiments.evaluation.metrics import nees
 from experiments.runs.experiment import Experiment
 from experiments.runs.team import TeamExperiment, in_range
@@ -347,10 +348,10 @@ def test_kinds_of_communication():
         assert determinants[0] < determinants[1]
     # the answer of six Frames ago, carried on by the wheels
     estimator = EkfSlam(**SEEING)
-    estimator.wheels.reset(team.robots[0].robot.track_m)
+    wheels = WheelPrediction(estimator.wheels, team.robots[0].robot.track_m)
     belief = None
     for i, frame in enumerate(team.robots[0].frames()):
-        motion = estimator.wheels.predict(frame)
+        motion = wheels.predict(frame)
         if i == n - 7:
             belief = type(motion)(always[0][0].means[i], always[0][0].covariances[i])
         elif belief is not None:

@@ -7,7 +7,7 @@ import pytest
 
 from estimators.landmarks.ekf_slam import EkfSlam
 from estimators.landmarks.wheel_gains import NO_MOTION, GainBelief, gained_motion
-from estimators.wheels import WheelPrediction
+from estimators.wheels import WheelOptions, WheelPrediction
 from experiments.evaluation.metrics import nees, position_errors_m, rms
 from experiments.gate.conform import check_estimator
 from experiments.runs.experiment import Experiment
@@ -27,8 +27,7 @@ DRIVE = (
 
 
 def motion_by(gains):
-    wheels = WheelPrediction(1e-4, 1e-4)
-    wheels.reset(0.3)
+    wheels = WheelPrediction(WheelOptions(), 0.3)
     motion = NO_MOTION
     for i, increments in enumerate(INCREMENTS_M):
         motion = motion.then(gained_motion(wheels, Frame(float(i), 1.0, increments), gains, 0.3))

@@ -35,7 +35,7 @@ def test_follows_a_curve_better_than_the_wheels():
         poses, frames = drive(ROOM, 60, wheel_noise_m=0.002, seed=seed)
         for name, estimator in (
             ("fusion", EkfIcp(kr=8e-5, kl=8e-5)),
-            ("wheels", Odometry(8e-5, 8e-5)),
+            ("wheels", Odometry(kr=8e-5, kl=8e-5)),
         ):
             off = errors(follow(estimator, frames), poses)
             rms.setdefault(name, []).append(np.sqrt(np.mean(off[:, :2] ** 2)))
@@ -226,7 +226,7 @@ def test_what_the_scans_do_not_hold_is_left_to_the_wheels(world):
     poses, frames = drive(walls, 30, travel, start, laser=laser)
     given = Prior(prior().robot, prior(laser).sensors, start, 1e-6 * np.eye(3))
     k = 1e-3
-    wheels = follow(Odometry(k, k), frames, given)[-1].covariance
+    wheels = follow(Odometry(kr=k, kl=k), frames, given)[-1].covariance
     beliefs = follow(EkfIcp(kr=k, kl=k), frames, given)
     fused = beliefs[-1].covariance
     assert 0.7 * wheels[loose, loose] < fused[loose, loose] < 1.1 * wheels[loose, loose]
