@@ -130,6 +130,26 @@ class Estimator(Protocol):
         ...
 
 
+class OfTeams:
+    """A method for teams of any size (`estimators.team.TeamEstimator`): a robot is a team of one."""
+
+    def reset_team(self, priors: Sequence[Prior], rng: np.random.Generator) -> None:
+        """Start from the priors of the robots."""
+        raise NotImplementedError
+
+    def step_team(self, frames: Sequence[Frame]) -> list[Belief]:
+        """Take in the Frames of one instant; the belief of each of their robots."""
+        raise NotImplementedError
+
+    def reset(self, prior: Prior, rng: np.random.Generator) -> None:
+        """Start a robot alone from its prior."""
+        self.reset_team((prior,), rng)
+
+    def step(self, frame: Frame) -> Belief:
+        """Take in a Frame of a robot alone; the belief after it."""
+        return self.step_team((frame,))[0]
+
+
 def run(
     estimator: Estimator,
     recording: Recording,

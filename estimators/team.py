@@ -142,7 +142,7 @@ def run_team(
     online = [journal.estimate() for journal in journals.values()]
     revised: Sequence[Estimate | None] = [None] * n
     if communication.delay_s is not None:
-        late = dead_reckoning(filters[0].wheels, priors)
+        late = dead_reckoning(filters[0], priors)
         online = [
             _late(*each, communication.delay_s)
             for each in zip(online, team.robots, priors, late, strict=True)
