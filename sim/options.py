@@ -31,6 +31,7 @@ T = TypeVar("T")
 Positive = Annotated[float, Field(gt=0.0)]
 NonNegative = Annotated[float, Field(ge=0.0)]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
+Probability = Annotated[float, Field(gt=0.0, lt=1.0)]
 Count = Annotated[int, Field(ge=1)]
 
 _CONFIG = ConfigDict(
@@ -45,6 +46,7 @@ _WHOLE = {
     (("gt", 0.0),): "a positive number",
     (("ge", 0.0),): "zero or a positive number",
     (("ge", 0.0), ("le", 1.0)): "a number in [0, 1]",
+    (("gt", 0.0), ("lt", 1.0)): "a number between 0 and 1",
 }
 
 

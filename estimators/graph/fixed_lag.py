@@ -55,7 +55,7 @@ from estimators.graph.least_squares import (
 )
 from estimators.landmarks.stereo import StereoModel
 from estimators.laser.icp import PreparedScan
-from estimators.laser.scan_matching import ScanMatcher
+from estimators.laser.scan_matching import MatcherOptions, ScanMatcher
 from estimators.options import require_counts, require_laser, require_stereo, start_pose
 from estimators.wheels import WheelOptions, WheelPrediction
 from sim import se2
@@ -119,7 +119,7 @@ class FixedLag:
         sigma_range_m: float | None = None,
     ) -> None:
         self.stereo, self.laser = stereo, laser
-        self._matcher = ScanMatcher("point_to_line", "censi", sigma_range_m)
+        self._matcher = ScanMatcher(MatcherOptions(sigma_range_m=sigma_range_m))
         self.wheels = WheelOptions(kr=kr, kl=kl, window_s=window_s)
         require_counts(lag_images=lag_images, iterations=iterations)
         self.lag_images, self.iterations = lag_images, iterations

@@ -40,7 +40,14 @@ from estimators.graph.loop_closing import (
 )
 from estimators.graph.pose_graph import Edge, PoseGraph
 from estimators.laser.icp import Metric, PreparedScan
-from estimators.laser.scan_matching import FAILED, Covariance, Match, ScanMatcher, moved_beyond
+from estimators.laser.scan_matching import (
+    FAILED,
+    Covariance,
+    Match,
+    MatcherOptions,
+    ScanMatcher,
+    moved_beyond,
+)
 from estimators.options import (
     require_counts,
     require_laser,
@@ -143,8 +150,8 @@ class GraphSlam:
         laser: str = "laser",
     ) -> None:
         self.laser = laser
-        most_m = math.inf if most_gap_m is None else most_gap_m
-        self._matcher = ScanMatcher(metric, covariance, sigma_range_m, most_gap_m=most_m)
+        believed = MatcherOptions(metric=metric, covariance=covariance, sigma_range_m=sigma_range_m)
+        self._matcher = ScanMatcher(believed, most_gap_m)
         self.wheels = EncoderTickOptions(
             kr=kr,
             kl=kl,

@@ -4,7 +4,7 @@ import numpy as np
 
 from estimators.base import Belief
 from estimators.gaussian import STILL, Gaussian, update, wrap
-from estimators.laser.scan_matching import ScanMatcher
+from estimators.laser.scan_matching import MatcherOptions, ScanMatcher
 from estimators.options import require_laser, start_pose
 from estimators.wheels import WheelOptions, WheelPrediction
 from sim.sensors import sensor_of
@@ -21,7 +21,7 @@ class Fused:
     def __init__(self, lasers=("laser",), beacon="beacon", kr=1e-4, kl=1e-4):
         self.lasers, self.beacon = list(lasers), beacon
         self.wheels = WheelOptions(kr=kr, kl=kl)
-        self.matcher = ScanMatcher("point_to_line", "censi", None)
+        self.matcher = ScanMatcher(MatcherOptions())
 
     def reset(self, prior, rng):
         """Start from the prior's pose."""

@@ -15,7 +15,7 @@ from estimators.graph.loop_closing import LoopSearch, look_alike, signature
 from estimators.graph.pose_graph import Edge, PoseGraph
 from estimators.laser.icp import prepare
 from estimators.laser.scan_lines import without_sparse_lines
-from estimators.laser.scan_matching import ScanMatcher
+from estimators.laser.scan_matching import MatcherOptions, ScanMatcher
 from estimators.odometry import Odometry
 from experiments.bench import graph_robustness
 from experiments.gate.conform import check_estimator
@@ -51,7 +51,7 @@ def closure(truth, first, second, rng, off=(0.0, 0.0, 0.0)):
 
 def search(**changed):
     settings = {"reach_m": 3.0, "gate_probability": 1e-3, "least_gain": 1.0} | changed
-    return LoopSearch(ScanMatcher("point_to_line", "censi", None), Laser(), **settings)
+    return LoopSearch(ScanMatcher(MatcherOptions()), Laser(), **settings)
 
 
 def test_the_sparse_solution_is_the_dense_one(monkeypatch):

@@ -79,7 +79,7 @@ def test_consistent_where_its_model_holds(share):
         estimator = EkfIcp(kr=k, kl=k, lateral_slip_m=0.0, shared_noise=share)
         fake = _Perfect(R, share)
         fake.rng = rng
-        estimator._matcher = fake
+        estimator.matcher = fake
         ground = travel - np.sqrt(k * travel) * rng.standard_normal((40, 2))
         poses = [start]
         for step in ground[1:]:
@@ -102,7 +102,7 @@ def test_a_robot_at_rest_does_not_learn(share):
     estimator = EkfIcp(kr=1e-2, kl=1e-2, shared_noise=share)
     fake = _Perfect(np.diag([4e-6, 4e-6, 1e-6]), share)
     fake.poses = np.tile(START, (50, 1))
-    estimator._matcher = fake
+    estimator.matcher = fake
     estimator.reset(prior(), np.random.default_rng(0))
     for i in range(50):
         belief = estimator.step(scan_frame(0.1 * i, 0.1, np.zeros(2), np.ones(9)))
@@ -122,7 +122,7 @@ def test_wheels_that_know_nothing_leave_the_last_registration(share):
     )
     fake = _Perfect(R, share)
     fake.poses = np.tile(START, (n, 1))
-    estimator._matcher = fake
+    estimator.matcher = fake
     still = dataclasses.replace(prior(), covariance=np.zeros((3, 3)))
     estimator.reset(still, np.random.default_rng(0))
     for i in range(n):

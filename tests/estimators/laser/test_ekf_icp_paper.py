@@ -93,7 +93,7 @@ def test_the_printed_equations():
     truth = arc_increment(STEP_M / 200.0, TRACK_M)
     scans = [None] + [Gaussian(rng.multivariate_normal(truth, R), R) for _ in frames[1:]]
     filtered = EkfIcpPaper(kr=1e-4, kl=3e-4, window_s=0.0)
-    filtered._matcher = Replayed(scans)
+    filtered.matcher = Replayed(scans)
     found = follow(filtered, frames)
     means, last = printed(frames, scans, 1e-4, 3e-4, (1.0, 1.0, 2.0))
     np.testing.assert_allclose([b.mean for b in found], means[:, :3], atol=1e-5)
