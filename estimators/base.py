@@ -131,7 +131,7 @@ class Estimator(Protocol):
 
 
 class OfTeams:
-    """A method for teams of any size (`estimators.team.TeamEstimator`): a robot is a team of one."""
+    """A method for teams of any size; a robot alone is a team of one."""
 
     def reset_team(self, priors: Sequence[Prior], rng: np.random.Generator) -> None:
         """Start from the priors of the robots."""

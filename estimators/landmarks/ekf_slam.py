@@ -137,7 +137,9 @@ class EkfSlam(EkfSlamOptions, OfTeams):
         """Add a Frame to a robot's motion since its last image."""
         robot, wheels = frame.robot, self._wheels[frame.robot]
         if self._gains:
-            by_gains = gained_motion(wheels, frame, self._state.mean[self._gains], self._nominal_track_m)
+            by_gains = gained_motion(
+                wheels, frame, self._state.mean[self._gains], self._nominal_track_m
+            )
             self._gained = self._gained.then(by_gains)
         else:
             self._motions[robot] = self._motions[robot].then(wheels.predict(frame))
@@ -335,7 +337,9 @@ class EkfSlam(EkfSlamOptions, OfTeams):
 
     def _predict(self, robot: int, landmarks: Array) -> tuple[Array, Array, Array]:
         """Predicted points of landmarks (K, 3) and their derivatives by the errors."""
-        predicted, of_pose, of_landmark = self._camera.predict(self._state.mean[_own(robot)], landmarks)
+        predicted, of_pose, of_landmark = self._camera.predict(
+            self._state.mean[_own(robot)], landmarks
+        )
         if self.invariant:
             of_pose = of_pose * [1.0, 1.0, 0.0]
         return predicted, of_pose, of_landmark
@@ -370,7 +374,9 @@ class EkfSlam(EkfSlamOptions, OfTeams):
         for robot in (frame.robot, *known):
             self._move(robot)
         own, at = _own(frame.robot), 3 * others[:, None] + np.arange(3)
-        predicted, of_pose, of_other = sightings.predict(self._state.mean[own], self._state.mean[at])
+        predicted, of_pose, of_other = sightings.predict(
+            self._state.mean[own], self._state.mean[at]
+        )
         spread = self._predicted_spread(own, at, of_pose, of_other)
         v, R = sightings.camera.innovation(predicted[None], points[:, None])
         distances = mahalanobis_squared(v, spread + R)

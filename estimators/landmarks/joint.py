@@ -96,5 +96,5 @@ class JointGaussian:
 
 
 def mahalanobis_squared(v: Array, S: Array) -> Array:
-    """Squared Mahalanobis distances (...) of innovations v (..., 3) of covariances S (..., 3, 3)."""
+    """Squared distances (...) of innovations v (..., 3) by their covariances S (..., 3, 3)."""
     return np.asarray(np.sum(v * np.linalg.solve(S, v[..., None])[..., 0], axis=-1))
