@@ -97,7 +97,7 @@ class Smoother:
             "smoother: the starts of a team must be known; set team.starts=known",
         )
         self._camera = StereoModel.of(require_stereo(priors[0], self.stereo, "smoother"))
-        self._sightings = Sightings.of(priors, self.robots, "camera", "predicted", "smoother")
+        self._sightings = Sightings.of(priors, self.robots, "smoother")
         self._beliefs = [start_pose(prior, "smoother") for prior in priors]
         self._wheels = dead_reckoning(self.wheels, priors)
         self._drives = [LandmarkDrive(self._camera, start) for start in self._beliefs]
