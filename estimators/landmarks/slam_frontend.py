@@ -156,7 +156,7 @@ class SlamFrontEnd:
     ----------
     camera
         What is believed of the camera.
-    start
+    first_pose
         The prior's pose in map.
     reach_m
         Distance within which a predicted landmark may be one that was seen.
@@ -167,7 +167,7 @@ class SlamFrontEnd:
     def __init__(self, believed: LandmarkSlamOptions, prior: Prior, estimator: str) -> None:
         self.believed, self._estimator = believed, estimator
         camera = require_stereo(prior, believed.stereo, estimator)
-        self.start = start_pose(prior, estimator)
+        self.first_pose = start_pose(prior, estimator)
         require(
             believed.association != "known" or camera.identifies,
             "the camera does not identify landmarks; set estimator.association=mahalanobis "
