@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtri  # scipy.stats takes half a second to import
 
 from estimators.base import Prior
-from estimators.landmarks.stereo import NoiseAt, NoiseModel, StereoModel, StereoOptions
+from estimators.landmarks.stereo import NoiseAt, NoiseModel, StereoModel, TeamEyesOptions
 from estimators.options import require_stereo, start_pose
 from estimators.wheels import ForwardSlipOptions
 from sim.arrays import Array, Floats, Ints
@@ -31,7 +31,7 @@ _BLIND_IMAGES = 100  # images without a landmark after which the status reports 
 
 
 @options("estimator")
-class LandmarkSlamOptions(ForwardSlipOptions, StereoOptions):
+class LandmarkSlamOptions(ForwardSlipOptions, TeamEyesOptions):
     """What the filters of landmark SLAM have in common."""
 
     association: Association = "known"
@@ -64,8 +64,6 @@ class LandmarkSlamOptions(ForwardSlipOptions, StereoOptions):
     0: in every image."""
     keep_map: bool = False
     """Put the map into every Belief; of FastSLAM, that of the best particle."""
-    robots: str | None = None
-    """Name of the sensor that sees the other robots of a team; null: sightings are not used."""
     sighting_d0: Positive = 16.27
     """Squared Mahalanobis distance from which on a sighting is a misread robot, and rejected."""
 
