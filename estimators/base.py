@@ -130,16 +130,19 @@ class Estimator(Protocol):
         ...
 
 
-class OfTeams:
-    """A method for teams of any size; a robot alone is a team of one."""
+class TeamEstimator(Protocol):
+    """A method for teams of any size, which a robot alone is too.
+
+    It may also have `finish_team() -> list[Estimate]`, the revised trajectories.
+    """
 
     def reset_team(self, priors: Sequence[Prior], rng: np.random.Generator) -> None:
-        """Start from the priors of the robots."""
-        raise NotImplementedError
+        """Forget everything and start from the priors of the robots."""
+        ...
 
     def step_team(self, frames: Sequence[Frame]) -> list[Belief]:
-        """Take in the Frames of one instant; the belief of each of their robots."""
-        raise NotImplementedError
+        """Take in Frames of one instant; the belief of each of their robots."""
+        ...
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Start a robot alone from its prior."""

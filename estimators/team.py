@@ -6,14 +6,13 @@ import dataclasses
 import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from estimators.base import (
     Answer,
-    Belief,
     Estimate,
     Journal,
     Prior,
@@ -31,23 +30,6 @@ from sim.recording import Frame, Recording
 from sim.team import Team
 
 Kind = Literal["always", "range", "delayed", "never"]
-
-
-class TeamEstimator(Protocol):
-    """A method for teams of any size. It may also have `finish_team() -> list[Estimate]`.
-
-    To run robots that never communicate, it is an `Estimator` too.
-    """
-
-    wheels: Any
-
-    def reset_team(self, priors: Sequence[Prior], rng: np.random.Generator) -> None:
-        """Forget everything and start from the priors of the robots."""
-        ...
-
-    def step_team(self, frames: Sequence[Frame]) -> list[Belief]:
-        """Take in Frames of one instant; the belief of each of their robots."""
-        ...
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from estimators.base import Belief, Estimate, OfTeams, Prior
+from estimators.base import Belief, Estimate, Prior, TeamEstimator
 from estimators.graph.landmark_drive import LandmarkDrive, Sighted, loosened, observed, revised
 from estimators.graph.least_squares import LeastSquaresOptions, Problem
 from estimators.landmarks.sightings import Sightings, dead_reckoning
@@ -26,7 +26,7 @@ class SmootherOptions(WheelOptions, TeamEyesOptions, LeastSquaresOptions):
     """Options of batch least squares."""
 
 
-class Smoother(SmootherOptions, OfTeams):
+class Smoother(SmootherOptions, TeamEstimator):
     """Dead reckoning online; `finish` gives the least-squares trajectory over everything seen.
 
     Notes

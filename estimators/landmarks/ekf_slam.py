@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from estimators.base import Belief, OfTeams, Prior
+from estimators.base import Belief, Prior, TeamEstimator
 from estimators.gaussian import STILL, Gaussian, compose, wrap
 from estimators.landmarks.joint import JointGaussian, mahalanobis_squared
 from estimators.landmarks.sightings import Sightings, dead_reckoning, pose_by_points, team_starts
@@ -54,7 +54,7 @@ class EkfSlamOptions(LandmarkSlamOptions, GainOptions):
         )
 
 
-class EkfSlam(EkfSlamOptions, OfTeams):
+class EkfSlam(EkfSlamOptions, TeamEstimator):
     """Extended Kalman filter over pose and landmarks.
 
     At an image the motion since the last one is applied, the landmarks seen are associated, all of

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from estimators.base import Belief, Estimate, OfTeams, Prior
+from estimators.base import Belief, Estimate, Prior, TeamEstimator
 from estimators.gaussian import STILL, Gaussian, compose, rotated
 from estimators.landmarks import particle_kernels as ekf
 from estimators.landmarks.joint import mahalanobis_squared
@@ -57,7 +57,7 @@ class FastSlamOptions(LandmarkSlamOptions):
     normal cloud behind. Each particle draws its own scale at each image. null: normal."""
 
 
-class FastSLAM(FastSlamOptions, OfTeams):
+class FastSLAM(FastSlamOptions, TeamEstimator):
     """Rao-Blackwellised SLAM: each particle is a path, and has a map of its own.
 
     At an image the motion since the last one is drawn, the landmarks seen are associated,
