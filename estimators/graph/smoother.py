@@ -70,19 +70,10 @@ class Smoother(SmootherOptions, TeamEstimator):
             beliefs.append(Belief(belief.mean.copy(), belief.covariance.copy(), extras))
         if self._sightings is not None:
             for frame in frames:
-                self._sight(self._sightings, frame, {f.robot for f in frames} - {frame.robot})
+                for number, point in self._sightings.identified(frame, frames, "smoother"):
+                    pins = [(robot, self._drives[robot].pin()) for robot in (frame.robot, number)]
+                    self._sighted.append((pins[0], pins[1], point))
         return beliefs
-
-    def _sight(self, sightings: Sightings, frame: Frame, others: set[int]) -> None:
-        points, numbers = sightings.read(frame)
-        complaint = "smoother: sightings without ids; set sensors.robots.identifies=true"
-        require(numbers is not None or len(points) == 0, complaint)
-        for point, number in zip(points, () if numbers is None else numbers.tolist(), strict=False):
-            if number in others:
-                seeing, seen = (
-                    (robot, self._drives[robot].pin()) for robot in (frame.robot, number)
-                )
-                self._sighted.append((seeing, seen, point))
 
     def finish(self) -> Estimate:
         """Least squares over all Frames so far, see `estimators.graph.landmark_drive.revised`."""

@@ -20,7 +20,7 @@ from estimators.landmarks.sightings import Sightings, dead_reckoning, team_start
 from estimators.landmarks.slam_frontend import Image, LandmarkSlamOptions, SlamFrontEnd
 from estimators.particles import Scheme, in_place, normalize, resample, underflowed
 from sim.arrays import Array, Ints
-from sim.errors import InputError, require
+from sim.errors import InputError
 from sim.options import NonNegative, Positive, options
 from sim.recording import Frame
 
@@ -199,19 +199,10 @@ class FastSLAM(FastSlamOptions, TeamEstimator):
 
         A robot that is seen is, in each particle, a landmark known without error.
         """
-        points, numbers = sightings.read(frame)
-        if numbers is None:
-            require(
-                len(points) == 0, "fastslam: sightings without ids; set sensors.robots.identifies"
-            )
-            return False
-        others = {f.robot for f in frames} - {frame.robot}
         camera, path = sightings.camera.packed, self._paths[frame.robot]
         mount, state = packed_mount(sightings.camera.mount), ekf.new_state(self._maps.n_blocks)
         used = False
-        for point, number in zip(points, numbers.tolist(), strict=True):
-            if number not in others:
-                continue
+        for number, point in sightings.identified(frame, frames, "fastslam"):
             for each in (path, self._paths[number]):
                 if each.rolled is not STILL:
                     each.draw(self._rng)

@@ -105,6 +105,25 @@ class Sightings:
         ids = seen.get("ids")
         return seen["points_in_camera"][used], None if ids is None else ids[used]
 
+    def identified(
+        self, frame: Frame, frames: Sequence[Frame], estimator: str
+    ) -> list[tuple[int, Array]]:
+        """Number and point (3,) of each robot seen that has a Frame at this instant too.
+
+        Raises
+        ------
+        InputError
+            If the sensor does not identify the robots.
+        """
+        points, numbers = self.read(frame)
+        if numbers is None:
+            complaint = "sightings without ids; set sensors.robots.identifies=true"
+            require(len(points) == 0, f"{estimator}: {complaint}")
+            return []
+        others = {other.robot for other in frames} - {frame.robot}
+        seen = zip(numbers.tolist(), points, strict=True)
+        return [(number, point) for number, point in seen if number in others]
+
     def markers(self, poses: Array) -> Array:
         """Markers (..., 3) in map of robots at poses (..., 3)."""
         heights = np.full(poses.shape[:-1], self.marker_z_m)
