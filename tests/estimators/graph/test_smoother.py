@@ -9,6 +9,7 @@ from scipy.optimize import least_squares
 
 from estimators.base import run
 from estimators.gaussian import Gaussian
+from estimators.graph.fixed_lag import FixedLag
 from estimators.graph.landmark_drive import _between, _merged
 from estimators.graph.least_squares import LeastSquaresOptions, Problem, solve
 from estimators.graph.smoother import Smoother
@@ -343,28 +344,39 @@ def test_odd_observations_are_survived():
     assert smoother.finish().means.shape == (1, 3)
 
 
-def test_conforms():
+@pytest.mark.parametrize("method", [Smoother, FixedLag])
+def test_conforms(method):
     recording = circle(3, n_frames=30)
-    for check in check_estimator(Smoother, recording, tracking_prior(recording)):
+    for check in check_estimator(method, recording, tracking_prior(recording)):
         assert check.passed, f"{check.name}: {check.message}"
 
 
-def test_wrong_input_is_named():
+@pytest.mark.parametrize("method", [Smoother, FixedLag])
+def test_what_is_missing_is_named(method):
     recording = circle(0, n_frames=10)
     prior, rng = tracking_prior(recording), np.random.default_rng(0)
     with pytest.raises(InputError, match="start pose"):
-        Smoother().reset(dataclasses.replace(prior, mean=None), rng)
+        method().reset(dataclasses.replace(prior, mean=None), rng)
     with pytest.raises(InputError, match="identifies"):
-        run(Smoother(), circle(0, n_frames=10, identifies=False), prior, rng)
-    fresh = Smoother()
+        run(method(), circle(0, n_frames=10, identifies=False), prior, rng)
+    fresh = method()
     fresh.reset(prior, rng)
     with pytest.raises(InputError, match="no Frame"):
         fresh.finish()
-    for options, word in (
-        ({"robust": "tukey"}, "cauchy"),
-        ({"robust_sigma": 0.0}, "robust_sigma"),
-        ({"kl": np.nan}, "kl"),
-        ({"max_iterations": 0}, "max_iterations"),
-    ):
-        with pytest.raises(InputError, match=word):
-            Smoother(**options)
+
+
+@pytest.mark.parametrize(
+    ("method", "wrong", "word"),
+    [
+        (Smoother, {"robust": "tukey"}, "cauchy"),
+        (Smoother, {"robust_sigma": 0.0}, "robust_sigma"),
+        (Smoother, {"kl": np.nan}, "kl"),
+        (Smoother, {"max_iterations": 0}, "max_iterations"),
+        (FixedLag, {"lag_images": 0}, "lag_images"),
+        (FixedLag, {"iterations": 1.5}, "iterations"),
+        (FixedLag, {"kl": np.nan}, "kl"),
+    ],
+)
+def test_wrong_options_are_named(method, wrong, word):
+    with pytest.raises(InputError, match=word):
+        method(**wrong)
