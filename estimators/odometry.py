@@ -7,49 +7,43 @@ import numpy as np
 
 from estimators.base import Belief, Prior
 from estimators.gaussian import Gaussian
-from estimators.options import require_choices, start_pose
-from estimators.wheels import WheelPrediction
+from estimators.options import start_pose
+from estimators.wheels import WheelOptions, WheelPrediction
 from sim import se2
 from sim.arrays import Array
+from sim.options import options
 from sim.recording import Frame
 from sim.robot.arc import arc_increment, arc_increment_jacobian
 
 Integration = Literal["arc", "midpoint", "euler"]
 
 
-class Odometry:
+@options("estimator")
+class OdometryOptions(WheelOptions):
+    """Options of dead reckoning."""
+
+    integration: Integration = "arc"
+    """`arc`: the exact arc and its Jacobian. `midpoint`: second form of eq. (6), the heading
+    halfway. `euler`: eqs. (4) and first form of eq. (6), the heading before the step."""
+
+
+class Odometry(OdometryOptions):
     """Integrate the wheels and propagate the covariance of their slip.
 
     Sigma_k = H Sigma_{k-1} H^T + G diag(k |ds|) G^T (puzzlebot2024, eqs. (2) and (5)), with G of
     eq. (6) in which the right wheel turns the robot counter-clockwise: (1/b, -1/b).
-
-    Parameters
-    ----------
-    kr, kl
-        Believed slip variance per metre of the right and left wheel, m.
-    integration
-        `arc`: the exact arc and its Jacobian. `midpoint`: second form of eq. (6), the heading
-        halfway. `euler`: eqs. (4) and first form of eq. (6), the heading before the step.
-    window_s
-        |ds| is netted over at least this time, so that encoder noise does not inflate it.
     """
-
-    def __init__(
-        self, kr: float, kl: float, integration: Integration = "arc", window_s: float = 0.05
-    ) -> None:
-        require_choices(integration=(integration, Integration))
-        self.wheels, self.integration = WheelPrediction(kr, kl, window_s), integration
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Start from the prior's pose; dead reckoning cannot start without one."""
         self._belief = start_pose(prior, "odometry")
-        self.wheels.reset(prior.robot.track_m)
+        self._wheels = WheelPrediction(self, prior.robot.track_m)
 
     def step(self, frame: Frame) -> Belief:
         """Compose the Frame's arc and add its covariance."""
-        _, variances = self.wheels.slip(frame)
+        _, variances = self._wheels.slip(frame)
         increment, by_wheels = relative_motion(
-            frame.wheel_increments_m, self.wheels.track_m, self.integration
+            frame.wheel_increments_m, self._wheels.track_m, self.integration
         )
         mean, covariance = self._belief.mean, self._belief.covariance
         H, by_increment = se2.compose_jacobians(mean, increment)

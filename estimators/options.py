@@ -7,9 +7,18 @@ from typing import Any, TypeVar, get_args
 from estimators.base import Prior
 from estimators.gaussian import Gaussian
 from sim.errors import InputError, require
+from sim.options import options
 from sim.sensors import Laser, StereoCamera, sensor_of
 
 S = TypeVar("S")
+
+
+@options("estimator")
+class LaserOptions:
+    """Options of a method that reads a laser."""
+
+    laser: str = "laser"
+    """Name of the laser that it reads."""
 
 
 def require_choices(owner: str = "estimator.", /, **choices: tuple[str, Any]) -> None:

@@ -5,11 +5,49 @@ import math
 import numpy as np
 
 from estimators.gaussian import Gaussian, wheel_motion
-from estimators.options import require_non_negative
 from sim.arrays import Array
+from sim.options import NonNegative, options
 from sim.recording import Frame
 from sim.robot.arc import TravelWindow
 from sim.robot.slip import wheel_variances
+
+
+@options("estimator")
+class WheelOptions:
+    """What a method believes of the wheels that it rolls by."""
+
+    kr: NonNegative = 1e-4
+    """Believed slip variance per metre of the right wheel, m (puzzlebot2024, eq. (5))."""
+    kl: NonNegative = 1e-4
+    """Believed slip variance per metre of the left wheel, m."""
+    window_s: NonNegative = 0.05
+    """Travel is netted over at least this time, so that encoder noise does not inflate it, s."""
+
+
+@options("estimator")
+class LateralSlipOptions(WheelOptions):
+    """Wheels that slip sideways as well."""
+
+    lateral_slip_m: NonNegative = 1e-7
+    """Variance per metre of sideways slip, m."""
+
+
+@options("estimator")
+class ForwardSlipOptions(WheelOptions):
+    """Wheels that slip together as well."""
+
+    forward_slip_m: NonNegative = 0.0
+    """Variance per metre of what both wheels slip together, m: it moves the robot without turning
+    it. Velocities that lag behind their stamps make such errors."""
+
+
+@options("estimator")
+class EncoderTickOptions(LateralSlipOptions):
+    """Wheels that slip sideways, and whose encoders are coarse."""
+
+    encoder_tick_m: NonNegative = 0.0
+    """Travel of a wheel per encoder tick, m. Ticks do not add up over Frames, so their variance
+    overstates that of many."""
 
 
 class WheelPrediction:
@@ -23,53 +61,28 @@ class WheelPrediction:
         Q = G (diag(kr |ds_r| + q_r, kl |ds_l| + q_l) + f |ds| 1 1^T) G^T + diag(0, s |ds|, 0)
 
     where q is tick^2 / 6 for a wheel that moved, else 0, |ds| is the mean of both wheels', f is
-    `forward_slip_m` and s is `lateral_slip_m`.
+    `forward_slip_m` and s is `lateral_slip_m`; each is zero for a method without that option.
     `Gaussian.then` composes the motion with a belief: H Sigma H^T + G Q G^T (puzzlebot2024,
     eqs. (2) and (5)).
 
     Parameters
     ----------
-    kr, kl
-        Believed slip variance per metre of the right and left wheel, m.
-    window_s
-        |ds| is the net travel over at least this time, shared out to the Frame, so that encoder
-        noise does not inflate it (`sim.robot.drive.TravelWindow`).
-    lateral_slip_m
-        Variance per metre of sideways slip, m.
-    forward_slip_m
-        Variance per metre of what both wheels slip together, m: it moves the robot without turning
-        it. Velocities that lag behind their stamps make such errors.
-    encoder_tick_m
-        Travel of a wheel per encoder tick, m. Ticks do not add up over Frames, so q overstates
-        their variance over many.
+    believed
+        The method's options of the wheels.
+    track_m
+        Believed distance between the wheels.
     """
 
-    def __init__(
-        self,
-        kr: float,
-        kl: float,
-        window_s: float = 0.05,
-        *,
-        lateral_slip_m: float = 0.0,
-        forward_slip_m: float = 0.0,
-        encoder_tick_m: float = 0.0,
-    ) -> None:
-        require_non_negative(
-            kr=kr,
-            kl=kl,
-            window_s=window_s,
-            lateral_slip_m=lateral_slip_m,
-            forward_slip_m=forward_slip_m,
-            encoder_tick_m=encoder_tick_m,
-        )
-        self.kr, self.kl, self.window_s = kr, kl, window_s
-        self.lateral_slip_m, self.encoder_tick_m = lateral_slip_m, encoder_tick_m
-        self.forward_slip_m = forward_slip_m
-
-    def reset(self, track_m: float) -> None:
-        """Forget the travel so far; the wheels are believed to be this far apart."""
-        self.track_m = track_m
-        self._window = TravelWindow(self.window_s)
+    def __init__(self, believed: WheelOptions, track_m: float) -> None:
+        self.kr, self.kl, self.track_m = believed.kr, believed.kl, track_m
+        self.lateral_slip_m = self.forward_slip_m = self.encoder_tick_m = 0.0
+        if isinstance(believed, LateralSlipOptions):
+            self.lateral_slip_m = believed.lateral_slip_m
+        if isinstance(believed, ForwardSlipOptions):
+            self.forward_slip_m = believed.forward_slip_m
+        if isinstance(believed, EncoderTickOptions):
+            self.encoder_tick_m = believed.encoder_tick_m
+        self._window = TravelWindow(believed.window_s)
 
     def slip(self, frame: Frame) -> tuple[Array, Array]:
         """Travel |ds| (2,) m over the window, and variances (2,) m^2 of the Frame's increments.

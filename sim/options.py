@@ -46,6 +46,7 @@ T = TypeVar("T")
 Positive = Annotated[float, Field(gt=0.0)]
 NonNegative = Annotated[float, Field(ge=0.0)]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
+Probability = Annotated[float, Field(gt=0.0, lt=1.0)]
 Count = Annotated[int, Field(ge=1)]
 Acute = Annotated[float, Field(gt=0.0, lt=math.pi)]
 # Of a YAML's lists; a text in an Annotated says what the type accepts
@@ -64,6 +65,7 @@ _WHOLE = {
     (("gt", 0.0),): "a positive number",
     (("ge", 0.0),): "zero or a positive number",
     (("ge", 0.0), ("le", 1.0)): "a number in [0, 1]",
+    (("gt", 0.0), ("lt", 1.0)): "a number between 0 and 1",
 }
 
 
@@ -98,6 +100,8 @@ def options(where: str) -> Callable[[type[T]], type[T]]:
     """
 
     def decorate(cls: type[T]) -> type[T]:
+        # as they are, also where `from __future__ import annotations` makes texts of them
+        cls.__annotations__ = inspect.get_annotations(cls, eval_str=True)
         made: Any = checked_dataclass(frozen=True, kw_only=True, config=_CONFIG)(cls)
         construct = made.__init__
 

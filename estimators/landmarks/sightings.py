@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -13,7 +12,7 @@ from estimators.gaussian import Gaussian
 from estimators.landmarks.slam_frontend import SlamFrontEnd
 from estimators.landmarks.stereo import NoiseAt, NoiseModel, StereoModel
 from estimators.options import start_pose
-from estimators.wheels import WheelPrediction
+from estimators.wheels import WheelOptions, WheelPrediction
 from sim import se2
 from sim.arrays import Array, Ints
 from sim.errors import InputError, require
@@ -26,7 +25,7 @@ _APART_M = 1.0  # two points this far apart show a heading
 def team_starts(
     priors: Sequence[Prior], front_end: SlamFrontEnd, estimator: str
 ) -> list[Gaussian | None]:
-    """Reset the front end, and return the pose in map of each robot; None where it is not known.
+    """Pose in map of each robot; None where it is not known.
 
     Raises
     ------
@@ -42,19 +41,16 @@ def team_starts(
         )
     starts = [None if p.mean is None else start_pose(p, estimator) for p in others]
     require(
-        None not in starts or front_end.association == "known",
+        None not in starts or front_end.identified,
         f"{estimator}: a robot of unknown start is placed by landmarks with ids; set "
         "estimator.association=known",
     )
-    return [front_end.reset(first), *starts]
+    return [front_end.first_pose, *starts]
 
 
-def dead_reckoning(wheels: WheelPrediction, priors: Sequence[Prior]) -> list[WheelPrediction]:
+def dead_reckoning(believed: WheelOptions, priors: Sequence[Prior]) -> list[WheelPrediction]:
     """One prediction by the wheels for each robot, alike but for the track."""
-    each = [copy.copy(wheels) for _ in priors]
-    for own, prior in zip(each, priors, strict=True):
-        own.reset(prior.robot.track_m)
-    return each
+    return [WheelPrediction(believed, prior.robot.track_m) for prior in priors]
 
 
 @dataclass(frozen=True)
@@ -80,9 +76,9 @@ class Sightings:
         cls,
         priors: Sequence[Prior],
         sensor: str | None,
-        noise_model: NoiseModel,
-        noise_at: NoiseAt,
         estimator: str,
+        noise_model: NoiseModel = "camera",
+        noise_at: NoiseAt = "predicted",
     ) -> Sightings | None:
         """Believe the sensor's own figures; None if it has no name.
 
@@ -108,6 +104,25 @@ class Sightings:
         used = self.camera.usable(seen["points_in_camera"])
         ids = seen.get("ids")
         return seen["points_in_camera"][used], None if ids is None else ids[used]
+
+    def identified(
+        self, frame: Frame, frames: Sequence[Frame], estimator: str
+    ) -> list[tuple[int, Array]]:
+        """Number and point (3,) of each robot seen that has a Frame at this instant too.
+
+        Raises
+        ------
+        InputError
+            If the sensor does not identify the robots.
+        """
+        points, numbers = self.read(frame)
+        if numbers is None:
+            complaint = "sightings without ids; set sensors.robots.identifies=true"
+            require(len(points) == 0, f"{estimator}: {complaint}")
+            return []
+        others = {other.robot for other in frames} - {frame.robot}
+        seen = zip(numbers.tolist(), points, strict=True)
+        return [(number, point) for number, point in seen if number in others]
 
     def markers(self, poses: Array) -> Array:
         """Markers (..., 3) in map of robots at poses (..., 3)."""

@@ -17,17 +17,18 @@ from scipy.special import chdtri
 
 from estimators.base import Belief, Prior
 from estimators.gaussian import STILL, Gaussian, between, compose, rotated, update, wrap
-from estimators.laser.icp import Kernel, Metric, PreparedScan, Rules
+from estimators.laser.icp import PreparedScan, Rules
 from estimators.laser.scan_matching import (
-    Covariance,
+    KeyFrameOptions,
     Match,
-    ScanMatcher,
+    MatcherOptions,
     moved_beyond,
 )
-from estimators.options import require_laser, require_non_negative, require_shares, start_pose
-from estimators.wheels import WheelPrediction
+from estimators.options import require_laser, start_pose
+from estimators.wheels import EncoderTickOptions, WheelPrediction
 from sim.arrays import Array
 from sim.errors import require
+from sim.options import NonNegative, Probability, Share, options
 from sim.recording import Frame
 
 _PATIENCE = 2  # scans in a row that may fail before the newest becomes the key frame
@@ -38,7 +39,41 @@ _KEY, _LAST, _POSE, _NEW = (slice(3 * i, 3 * i + 3) for i in range(4))
 _ROWS = np.arange(12)
 
 
-class EkfIcp:
+@options("estimator")
+class EkfIcpOptions(EncoderTickOptions, KeyFrameOptions, Rules, MatcherOptions):
+    """Options of the filter with a clone of the key frame's pose."""
+
+    register_distance_m: NonNegative = 0.0
+    """How far the robot is believed to go before another scan is registered, m: it must exceed
+    this or `register_turn_rad`. 0 and 0: every scan is. One cannot be set without the other."""
+    register_turn_rad: NonNegative = 0.0
+    """How far it is believed to turn before that, rad."""
+    gate_probability: Probability | None = 1e-9
+    """Reject a registration if only this share of all should have a larger innovation; null: use
+    all. The default rejects only what must be a wrong match."""
+    slip_burst_m: NonNegative = 0.0
+    """What a wheel may slip at once, as a standard deviation, m: then a registration outside the
+    gate that did not fail is explained by slip since the last scan, which neither kr nor kl
+    describes. 0: it is left out."""
+    shared_noise: Share = 0.75
+    """Share of a registration's covariance that comes from the scans' own errors, half from
+    each; 0: registrations are independent. Registrations before and after a key frame then
+    correlate by minus half of it."""
+
+    def __post_init__(self) -> None:
+        require(
+            (self.register_distance_m > 0.0) == (self.register_turn_rad > 0.0),
+            "estimator.register_distance_m and register_turn_rad go together, since a scan is "
+            "registered once either is exceeded: set both, or neither",
+        )
+        require(
+            not self.slip_burst_m or self.gate_probability is not None,
+            "estimator.slip_burst_m is for registrations outside the gate; "
+            "set estimator.gate_probability",
+        )
+
+
+class EkfIcp(EkfIcpOptions):
     """Predict by the wheels, correct by the scan's pose relative to the key frame.
 
     Each scan is modelled as seen from an apparent pose, x * d, whose error d enters all its
@@ -46,38 +81,6 @@ class EkfIcp:
     registration compares apparent poses, and those of the key frame and of the last scan are in
     the state. So the noise that all registrations of a key frame share is counted once, and a
     scan's error cancels when it turns from source to reference.
-
-    Parameters
-    ----------
-    metric, covariance, sigma_range_m
-        As in `estimators.laser.scan_matching.ScanMatcher`; each scan contributes half of the
-        covariance.
-    trim, kernel, max_iterations, stop_error_m, neighbours
-        As in `estimators.laser.icp.Rules`.
-    keyframe_distance_m, keyframe_turn_rad
-        How far the robot goes before it takes a new key frame.
-    register_distance_m, register_turn_rad
-        How far the robot is believed to go before another scan is registered: it must exceed one
-        of them. 0 and 0: every scan is. One cannot be set without the other.
-    kr, kl
-        Believed slip variance per metre of the wheels, m.
-    lateral_slip_m
-        Variance per metre of the sideways slip, m.
-    encoder_tick_m
-        Travel of a wheel per encoder tick, m: see `estimators.wheels.WheelPrediction`.
-    gate_probability
-        Reject a registration if only this share of all should have a larger innovation; None to
-        use all. The default rejects only what must be a wrong match.
-    slip_burst_m
-        What a wheel may slip at once, as a standard deviation: then a registration outside the gate
-        that did not fail is explained by slip since the last scan, which neither kr nor kl
-        describes. 0: it is left out.
-    shared_noise
-        Share of a registration's covariance that comes from the scans' own errors, half from
-        each; 0: registrations are independent. Registrations before and after a key frame then
-        correlate by minus half of it.
-    window_s
-        |ds| is netted over at least this time.
 
     Notes
     -----
@@ -93,71 +96,13 @@ class EkfIcp:
 
     needs = frozenset({"laser"})
 
-    def __init__(
-        self,
-        metric: Metric = "point_to_line",
-        covariance: Covariance = "censi",
-        sigma_range_m: float | None = None,
-        keyframe_distance_m: float = 0.5,
-        keyframe_turn_rad: float = 0.35,
-        register_distance_m: float = 0.0,
-        register_turn_rad: float = 0.0,
-        kr: float = 1e-4,
-        kl: float = 1e-4,
-        lateral_slip_m: float = 1e-7,
-        encoder_tick_m: float = 0.0,
-        gate_probability: float | None = 1e-9,
-        slip_burst_m: float = 0.0,
-        shared_noise: float = 0.75,
-        window_s: float = 0.05,
-        laser: str = "laser",
-        trim: float = 0.0,
-        kernel: Kernel = "tukey",
-        max_iterations: int = 100,
-        stop_error_m: float = 0.0,
-        neighbours: int = 6,
-    ) -> None:
-        self.laser = laser
-        rules = Rules(trim, kernel, max_iterations, stop_error_m, neighbours)
-        self._matcher = ScanMatcher(metric, covariance, sigma_range_m, rules)
-        self.wheels = WheelPrediction(
-            kr, kl, window_s, lateral_slip_m=lateral_slip_m, encoder_tick_m=encoder_tick_m
-        )
-        require_non_negative(
-            keyframe_distance_m=keyframe_distance_m,
-            keyframe_turn_rad=keyframe_turn_rad,
-            slip_burst_m=slip_burst_m,
-            register_distance_m=register_distance_m,
-            register_turn_rad=register_turn_rad,
-        )
-        require(
-            (register_distance_m > 0.0) == (register_turn_rad > 0.0),
-            "estimator.register_distance_m and register_turn_rad go together, since a scan is "
-            "registered once either is exceeded: set both, or neither",
-        )
-        require_shares(shared_noise=shared_noise)
-        require(
-            gate_probability is None or 0.0 < gate_probability < 1.0,
-            "estimator.gate_probability must lie between 0 and 1 or be null, "
-            f"got {gate_probability}",
-        )
-        require(
-            not slip_burst_m or gate_probability is not None,
-            "estimator.slip_burst_m is for registrations outside the gate; "
-            "set estimator.gate_probability",
-        )
-        self.slip_burst_m = slip_burst_m
-        self.keyframe_distance_m, self.keyframe_turn_rad = keyframe_distance_m, keyframe_turn_rad
-        self.register_distance_m, self.register_turn_rad = register_distance_m, register_turn_rad
-        self.gate_probability, self.shared_noise = gate_probability, shared_noise
-
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Start from the prior's pose; the first scan becomes the key frame."""
         self._laser, self._rng = require_laser(prior, self.laser, "ekf_icp"), rng
         start = start_pose(prior, "ekf_icp")
         self._origin = np.append(np.rint(start.mean[:2] / _ORIGIN_STEP_M) * _ORIGIN_STEP_M, 0.0)
         start = Gaussian(start.mean - self._origin, start.covariance)
-        self.wheels.reset(prior.robot.track_m)
+        self._wheels = WheelPrediction(self, prior.robot.track_m)
         self._key: PreparedScan | None = None
         self._last: PreparedScan | None = None
         # of the key frame's first degenerate match, as twists: as in `Match`
@@ -178,7 +123,7 @@ class EkfIcp:
         extras: dict[str, Any] = {}
         scan = frame.readings.get(self.laser)
         if scan is not None and self._is_due():
-            self._correct(self._matcher.prepare(scan["ranges_m"], self._laser), extras)
+            self._correct(self.matcher.prepare(scan["ranges_m"], self._laser), extras)
         by_twist = _from_twist(self._mean[_POSE])
         covariance = by_twist @ self._covariance[_POSE, _POSE] @ by_twist.T
         mean = self._mean[_POSE] + self._origin
@@ -186,7 +131,7 @@ class EkfIcp:
 
     def _predict(self, frame: Frame) -> None:
         """Move the robot's pose by the wheels; the clones stay."""
-        motion = self.wheels.predict(frame)
+        motion = self._wheels.predict(frame)
         self._mean[_POSE], _, by_motion = compose(self._mean[_POSE], motion.mean)
         by_motion = _from_twist(-self._mean[_POSE]) @ by_motion
         self._covariance[_POSE, _POSE] += by_motion @ motion.covariance @ by_motion.T
@@ -213,7 +158,7 @@ class EkfIcp:
             references.append((_LAST, self._last))
         outside: tuple[Match, slice, PreparedScan] | None = None
         for place, reference in references:
-            found = self._matcher.match(
+            found = self.matcher.match(
                 scan, reference, self._expected(place)[0], self._laser, self._rng
             )
             extras["registration_status"] = found.status
@@ -241,7 +186,7 @@ class EkfIcp:
     ) -> None:
         """Keep the reference as key frame, or take the scan, which was registered, for it."""
         self._failures = 0
-        left_key = moved_beyond(found.motion.mean, self.keyframe_distance_m, self.keyframe_turn_rad)
+        left_key = self.left_key_frame(found.motion.mean)
         key, source = (scan, _NEW) if left_key else (reference, place)
         self._keep(key, scan, (source, _NEW))
 
@@ -288,7 +233,7 @@ class EkfIcp:
         """Take a registration in as `_take_in` does, if the wheels slipped since the last scan."""
         if not self.slip_burst_m or found.status != "ok":
             return False
-        turn_rad = 2.0 * self.slip_burst_m / self.wheels.track_m
+        turn_rad = 2.0 * self.slip_burst_m / self._wheels.track_m
         burst = np.diag(np.square([self.slip_burst_m, self.slip_burst_m, turn_rad]))
         to_twist, before = _from_twist(-self._mean[_POSE]), self._covariance
         self._covariance = before.copy()
@@ -340,7 +285,7 @@ class EkfIcp:
 
     def _own_noise(self, scan: PreparedScan) -> Array:
         """Shared noise (3, 3) in map of a scan that was not registered: from one against itself."""
-        found = self._matcher.match(scan, scan, STILL, self._laser, self._rng)
+        found = self.matcher.match(scan, scan, STILL, self._laser, self._rng)
         noise = self.shared_noise / 2.0 * found.known_covariance
         return np.zeros((3, 3)) if found.failed else rotated(noise, self._mean[8])
 

@@ -11,43 +11,42 @@ import numpy as np
 
 from estimators.base import Belief, Prior
 from estimators.gaussian import STILL, Gaussian, update, wrap
-from estimators.laser.icp import Kernel, Metric, PreparedScan, Rules
-from estimators.laser.scan_matching import (
-    Covariance,
-    ScanMatcher,
-)
-from estimators.options import require_laser, require_non_negative, start_pose
-from estimators.wheels import WheelPrediction
+from estimators.laser.icp import Metric, PreparedScan, Rules
+from estimators.laser.scan_matching import Covariance, MatcherOptions
+from estimators.options import require_laser, start_pose
+from estimators.wheels import LateralSlipOptions, WheelPrediction
 from sim.arrays import Array
+from sim.options import NonNegative, options
 from sim.recording import Frame
 
 _FIRST_SPREAD = 1.0  # standard deviation of the unknown first velocities, m/s and rad/s
 _TINY = 1e-14  # keeps the update solvable where a measurement has no noise in some direction
 
 
-class EkfIcpPaper:
+@options("estimator")
+class EkfIcpPaperOptions(LateralSlipOptions, Rules, MatcherOptions):
+    """Options of the filter of decristoforis2020."""
+
+    metric: Metric = "point_to_plane"
+    """What registrations minimise: see `estimators.laser.icp.register`."""
+    covariance: Covariance = "censi_last"
+    """Method of `estimators.laser.icp_covariance`; the paper's counts the last scan's noise."""
+    lateral_slip_m: NonNegative = 0.0
+    """Variance per metre of sideways slip, m; the paper has none."""
+    acceleration_noise: NonNegative = 1.0
+    """Standard deviation of the velocity's change in one second, m/s; it grows with the root of
+    time."""
+    turn_noise: NonNegative = 2.0
+    """Standard deviation of the turn rate's change in one second, rad/s; it grows likewise."""
+
+
+class EkfIcpPaper(EkfIcpPaperOptions):
     """Constant velocities in the world, corrected by odometry and by registrations.
 
     The state is (x, y, heading, vx, vy, omega) in map; x += vx dt, y += vy dt, heading += omega dt
     (decristoforis2020, sec. II-D). Both sensors measure (R(-heading) (vx, vy), omega): odometry
     its increment over dt, with the covariance of eqs. (1)-(4), and ICP the motion since the
     previous scan over its time, with that of eq. (8).
-
-    Parameters
-    ----------
-    metric, covariance, sigma_range_m
-        As in `estimators.laser.scan_matching.ScanMatcher`.
-    trim, kernel, max_iterations, stop_error_m, neighbours
-        As in `estimators.laser.icp.Rules`.
-    kr, kl
-        Believed slip variance per metre of the wheels, m.
-    lateral_slip_m
-        Variance per metre of the sideways slip, m; the paper has none.
-    acceleration_noise, turn_noise
-        Standard deviation of the change of the velocities in one second, m/s and rad/s; it grows
-        with the root of time.
-    window_s
-        |ds| is netted over at least this time.
 
     Notes
     -----
@@ -64,36 +63,11 @@ class EkfIcpPaper:
 
     needs = frozenset({"laser"})
 
-    def __init__(
-        self,
-        metric: Metric = "point_to_plane",
-        covariance: Covariance = "censi_last",
-        sigma_range_m: float | None = None,
-        kr: float = 1e-4,
-        kl: float = 1e-4,
-        lateral_slip_m: float = 0.0,
-        acceleration_noise: float = 1.0,
-        turn_noise: float = 2.0,
-        window_s: float = 0.05,
-        laser: str = "laser",
-        trim: float = 0.0,
-        kernel: Kernel = "tukey",
-        max_iterations: int = 100,
-        stop_error_m: float = 0.0,
-        neighbours: int = 6,
-    ) -> None:
-        self.laser = laser
-        rules = Rules(trim, kernel, max_iterations, stop_error_m, neighbours)
-        self._matcher = ScanMatcher(metric, covariance, sigma_range_m, rules)
-        self.wheels = WheelPrediction(kr, kl, window_s, lateral_slip_m=lateral_slip_m)
-        require_non_negative(acceleration_noise=acceleration_noise, turn_noise=turn_noise)
-        self.acceleration_noise, self.turn_noise = acceleration_noise, turn_noise
-
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Start from the prior's pose, with velocities unknown."""
         self._laser, self._rng = require_laser(prior, self.laser, "ekf_icp_paper"), rng
         start = start_pose(prior, "ekf_icp_paper")
-        self.wheels.reset(prior.robot.track_m)
+        self._wheels = WheelPrediction(self, prior.robot.track_m)
         self._mean = np.concatenate([start.mean, np.zeros(3)])
         self._covariance = np.zeros((6, 6))
         self._covariance[:3, :3] = start.covariance
@@ -107,12 +81,12 @@ class EkfIcpPaper:
         extras: dict[str, Any] = {}
         if dt > 0.0:
             self._predict(dt)
-            motion = self.wheels.predict(frame)
+            motion = self._wheels.predict(frame)
             self._rolled, self._since_s = self._rolled.then(motion), self._since_s + dt
             self._measure(motion, dt, np.eye(3))
         scan = frame.readings.get(self.laser)
         if scan is not None:
-            self._correct(self._matcher.prepare(scan["ranges_m"], self._laser), extras)
+            self._correct(self.matcher.prepare(scan["ranges_m"], self._laser), extras)
         return Belief(self._mean[:3].copy(), self._covariance[:3, :3].copy(), extras)
 
     def _predict(self, dt: float) -> None:
@@ -133,7 +107,7 @@ class EkfIcpPaper:
         if self._previous is None:
             extras["registration_status"] = "first"
         else:
-            found = self._matcher.match(scan, self._previous, self._rolled, self._laser, self._rng)
+            found = self.matcher.match(scan, self._previous, self._rolled, self._laser, self._rng)
             extras["registration_status"] = found.status
             if found.failed:
                 extras["status"] = found.status

@@ -9,16 +9,17 @@ Poses `T_target_source` take points of the source scan into the frame of the tar
 
 import math
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import Field
 
 from estimators.laser.scan_lines import PreparedScan, Segments, prepare, ranked
-from estimators.options import require_choices, require_counts, require_non_negative
 from sim.arrays import Array, Ints
 from sim.compiled import njit
 from sim.errors import InputError, require
+from sim.options import Count, NonNegative, options
 
 __all__ = ["PreparedScan", "Registration", "Rules", "prepare", "register"]
 
@@ -42,44 +43,27 @@ LEAST_AGREEMENT = 0.5  # the same of those, in both scans, that bear on any one 
 LEAST_INFORMATION = 4.0  # times the spurious information that the noise of the lines makes
 
 
-@dataclass(frozen=True)
+@options("estimator")
 class Rules:
-    """Which matches count, and when iterations end.
+    """Which matches count, and when iterations end."""
 
-    Parameters
-    ----------
-    trim
-        Share of the matches, those farthest apart, that is left out of each iteration.
-    kernel
-        How matches within the last gate weigh by their distance: `tukey` leaves out those beyond 6
-        standard deviations, `huber` weakens those beyond 1.345, `none` counts all alike.
-    max_iterations
-        Most iterations of each of the stages, whose gates narrow from one to the next.
-    stop_error_m
-        Root mean square of the distances at which the pose is good enough (decristoforis2020, sec.
-        II-C); 0: iterations end when the pose rests.
-    neighbours
-        Points of a plane, with its own (point to plane only); the paper gives no number. With 10
-        and more, corners bend the planes, and registrations of successive scans (721 beams, 1 cm,
-        tuning seeds) jump by decimetres now and then.
-    """
-
-    trim: float = 0.0
+    trim: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.0
+    """Share of the matches, those farthest apart, that is left out of each iteration."""
     kernel: Kernel = "tukey"
-    max_iterations: int = 100
-    stop_error_m: float = 0.0
-    neighbours: int = 6
+    """How matches within the last gate weigh by their distance: `tukey` leaves out those beyond 6
+    standard deviations, `huber` weakens those beyond 1.345, `none` counts all alike."""
+    max_iterations: Count = 100
+    """Most iterations of each of the stages, whose gates narrow from one to the next."""
+    stop_error_m: NonNegative = 0.0
+    """Root mean square of the distances at which the pose is good enough (decristoforis2020, sec.
+    II-C), m; 0: iterations end when the pose rests."""
+    neighbours: Annotated[int, Field(ge=2, le=100)] = 6
+    """Points of a plane, with its own (point to plane only); the paper gives no number. With 10
+    and more, corners bend the planes, and registrations of successive scans (721 beams, 1 cm,
+    tuning seeds) jump by decimetres now and then."""
 
-    def __post_init__(self) -> None:
-        require_choices(kernel=(self.kernel, Kernel))
-        require_counts(max_iterations=self.max_iterations)
-        require_counts(100, neighbours=self.neighbours)
-        require(self.neighbours > 1, f"estimator.neighbours must be above 1, got {self.neighbours}")
-        require_non_negative(trim=self.trim, stop_error_m=self.stop_error_m)
-        require(self.trim < 1.0, f"estimator.trim must be below 1, got {self.trim}")
 
-
-_USUAL = Rules()
+USUAL = Rules()
 
 
 @dataclass(frozen=True)
@@ -716,7 +700,7 @@ def register(
     gate_m: float = 2.0,
     gate_rad: float | None = None,
     heading_window_rad: float | None = None,
-    rules: Rules = _USUAL,
+    rules: Rules = USUAL,
     increment_m: float = 1e-5,
     increment_rad: float = 1e-5,
 ) -> Registration:
@@ -752,7 +736,8 @@ def register(
         raise InputError(
             f"an initial guess is three finite numbers (x, y, heading), got {initial!r}"
         )
-    require_choices("", metric=(metric, Metric))
+    known = get_args(Metric)
+    require(metric in known, f"metric must be one of {', '.join(known)}, got {metric!r}")
     whole_lines = metric == "point_to_line"
     too_few = min(len(source.points), len(target.points)) < LEAST_POINTS
     if too_few or (whole_lines and len(target.lines) == 0):

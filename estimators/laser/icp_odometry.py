@@ -12,16 +12,16 @@ import numpy as np
 
 from estimators.base import Belief, Prior
 from estimators.gaussian import STILL, Gaussian
-from estimators.laser.icp import Kernel, Metric, PreparedScan, Rules
+from estimators.laser.icp import PreparedScan, Rules
 from estimators.laser.scan_matching import (
     FAILED,
-    Covariance,
-    ScanMatcher,
-    moved_beyond,
+    KeyFrameOptions,
+    MatcherOptions,
 )
-from estimators.options import require_choices, require_laser, require_non_negative, start_pose
-from estimators.wheels import WheelPrediction
+from estimators.options import require_laser, start_pose
+from estimators.wheels import WheelOptions, WheelPrediction
 from sim import se2
+from sim.options import options
 from sim.recording import Frame
 
 Reference = Literal["previous", "keyframe"]
@@ -39,27 +39,20 @@ class _Anchor:
     scan: PreparedScan | None
 
 
-class IcpOdometry:
-    """Compose registrations of scans.
+@options("estimator")
+class IcpOdometryOptions(WheelOptions, KeyFrameOptions, Rules, MatcherOptions):
+    """Options of odometry by registration of laser scans."""
 
-    Parameters
-    ----------
-    metric, covariance, sigma_range_m
-        As in `estimators.laser.scan_matching.ScanMatcher`.
-    trim, kernel, max_iterations, stop_error_m, neighbours
-        As in `estimators.laser.icp.Rules`.
-    reference
-        What a scan is registered against: the `previous` scan (decristoforis2020, eq. (5)), or a
-        `keyframe`, kept until the robot has left it by more than the thresholds.
-    keyframe_distance_m, keyframe_turn_rad
-        How far the robot goes before it takes a new key frame.
-    use_odometry_guess
-        Start registrations from the wheel increments. Without it they start from constant
-        velocity, and the wheels are not used at all.
-    kr, kl
-        Believed slip variance per metre of the wheels, m, for the guess.
-    window_s
-        |ds| is netted over at least this time.
+    reference: Reference = "keyframe"
+    """What a scan is registered against: the `previous` scan (decristoforis2020, eq. (5)), or a
+    `keyframe`, kept until the robot has left it by more than the thresholds."""
+    use_odometry_guess: bool = True
+    """Start registrations from the wheel increments. Without it they start from constant velocity,
+    and the wheels are not used at all."""
+
+
+class IcpOdometry(IcpOdometryOptions):
+    """Compose registrations of scans.
 
     Notes
     -----
@@ -75,43 +68,13 @@ class IcpOdometry:
 
     needs = frozenset({"laser"})
 
-    def __init__(
-        self,
-        metric: Metric = "point_to_line",
-        reference: Reference = "keyframe",
-        keyframe_distance_m: float = 0.5,
-        keyframe_turn_rad: float = 0.35,
-        use_odometry_guess: bool = True,
-        covariance: Covariance = "censi",
-        sigma_range_m: float | None = None,
-        kr: float = 1e-4,
-        kl: float = 1e-4,
-        window_s: float = 0.05,
-        laser: str = "laser",
-        trim: float = 0.0,
-        kernel: Kernel = "tukey",
-        max_iterations: int = 100,
-        stop_error_m: float = 0.0,
-        neighbours: int = 6,
-    ) -> None:
-        self.laser = laser
-        rules = Rules(trim, kernel, max_iterations, stop_error_m, neighbours)
-        self._matcher = ScanMatcher(metric, covariance, sigma_range_m, rules)
-        self.wheels = WheelPrediction(kr, kl, window_s)
-        require_choices(reference=(reference, Reference))
-        require_non_negative(
-            keyframe_distance_m=keyframe_distance_m, keyframe_turn_rad=keyframe_turn_rad
-        )
-        self.reference, self.use_odometry_guess = reference, use_odometry_guess
-        self.keyframe_distance_m, self.keyframe_turn_rad = keyframe_distance_m, keyframe_turn_rad
-
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Start from the prior's pose; the first scan becomes the reference."""
         self._laser, self._rng = require_laser(prior, self.laser, "icp_odometry"), rng
         self._key = self._last = _Anchor(start_pose(prior, "icp_odometry"), None)
         self._key_to_last = STILL
         self._lost = False
-        self.wheels.reset(prior.robot.track_m)
+        self._wheels = WheelPrediction(self, prior.robot.track_m)
         self._rolled, self._since_s = STILL, 0.0  # since the last scan, by the wheels
         self._velocity = np.zeros(3)  # twist between the last two scans, per second
 
@@ -119,11 +82,11 @@ class IcpOdometry:
         """Register the Frame's scan, if it has one, and compose."""
         self._since_s += frame.duration_s
         if self.use_odometry_guess:
-            self._rolled = self._rolled.then(self.wheels.predict(frame))
+            self._rolled = self._rolled.then(self._wheels.predict(frame))
         reading = frame.readings.get(self.laser)
         if reading is None:
             return _belief(self._last.belief.then(self._rolled), {})
-        scan = self._matcher.prepare(reading["ranges_m"], self._laser)
+        scan = self.matcher.prepare(reading["ranges_m"], self._laser)
         guess = self._guess()
         belief = self._last.belief.then(guess)
         if scan is None:
@@ -153,9 +116,7 @@ class IcpOdometry:
             moved = se2.between(self._last.belief.mean, belief.mean)
             self._velocity = se2.log(moved) / self._since_s
         self._last = _Anchor(belief, scan)
-        left_key = self.reference == "previous" or moved_beyond(
-            self._key_to_last.mean, self.keyframe_distance_m, self.keyframe_turn_rad
-        )
+        left_key = self.reference == "previous" or self.left_key_frame(self._key_to_last.mean)
         # after a single lost scan the key frame gets another chance: the scan may be at fault
         if (failed and self._lost) or (not failed and left_key):
             self._key, self._key_to_last = self._last, STILL
@@ -176,7 +137,7 @@ class IcpOdometry:
         self, scan: PreparedScan, reference: PreparedScan, guess: Gaussian
     ) -> tuple[Gaussian, str]:
         """Motion of base_link from the reference to the scan, and the registration's status."""
-        found = self._matcher.match(
+        found = self.matcher.match(
             scan,
             reference,
             guess,

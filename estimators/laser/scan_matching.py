@@ -4,7 +4,10 @@ The guess sets how far to look, the chosen method the covariance; directions tha
 not constrain are reported.
 """
 
+from __future__ import annotations
+
 import dataclasses
+import functools
 import math
 from dataclasses import dataclass
 from typing import Literal
@@ -16,6 +19,7 @@ from estimators.gaussian import Gaussian
 from estimators.laser import icp_covariance
 from estimators.laser.icp import (
     LEAST_POINTS,
+    USUAL,
     Metric,
     PreparedScan,
     Registration,
@@ -24,9 +28,10 @@ from estimators.laser.icp import (
     register,
 )
 from estimators.laser.scan_lines import without_sparse_lines
-from estimators.options import require_choices, require_non_negative
+from estimators.options import LaserOptions
 from sim import se2
 from sim.arrays import Array
+from sim.options import NonNegative, options
 from sim.sensors import Laser
 
 Covariance = Literal["censi", "censi_last", "hessian", "sampling", "unscented_censi"]
@@ -95,43 +100,63 @@ def moved_beyond(motion: Array, distance_m: float, turn_rad: float) -> bool:
     return math.hypot(x, y) > distance_m or abs(turn) > turn_rad
 
 
+@options("estimator")
+class MatcherOptions(LaserOptions):
+    """How scans are registered, and what is believed of their noise."""
+
+    metric: Metric = "point_to_line"
+    """What registrations minimise: see `estimators.laser.icp.register`."""
+    covariance: Covariance = "censi"
+    """Method of `estimators.laser.icp_covariance`; `censi_last` counts the noise of the last scan
+    only, as decristoforis2020 prints it. Point to point by `censi` lets matches slide."""
+    sigma_range_m: NonNegative | None = None
+    """Believed range noise, m; null: that of the laser."""
+
+    @functools.cached_property
+    def matcher(self) -> ScanMatcher:
+        """Registers scans by these options."""
+        return ScanMatcher(self)
+
+
+@options("estimator")
+class KeyFrameOptions:
+    """How far the robot goes before it takes a new key frame: beyond either."""
+
+    keyframe_distance_m: NonNegative = 0.5
+    """Distance from a key frame at which the next is taken, m."""
+    keyframe_turn_rad: NonNegative = 0.35
+    """Turn from a key frame at which the next is taken, rad."""
+
+    def left_key_frame(self, motion: Array) -> bool:
+        """Whether a motion (3,) from the key frame calls for a new one."""
+        return moved_beyond(motion, self.keyframe_distance_m, self.keyframe_turn_rad)
+
+
 @dataclass(frozen=True)
 class ScanMatcher:
-    """How scans are registered, and what is believed of their noise.
+    """Registers scans by a method's options.
 
     Parameters
     ----------
-    metric
-        As in `estimators.laser.icp.register`.
-    covariance
-        Method of `estimators.laser.icp_covariance`; `censi_last` counts the noise of the last scan
-        only, as decristoforis2020 prints it. Point to point by `censi` lets matches slide.
-    sigma_range_m
-        Believed range noise; None for that of the prior's laser.
-    rules
-        Which matches count, and when iterations end.
+    believed
+        The method's; those of `Rules` too, if it has them.
     most_gap_m
-        Lines of which no three points in a row lie this near each other are left out.
+        Lines of which no three points in a row lie this near each other are left out; None keeps
+        all.
     """
 
-    metric: Metric
-    covariance: Covariance
-    sigma_range_m: float | None
-    rules: Rules = dataclasses.field(default_factory=Rules)
-    most_gap_m: float = math.inf
+    believed: MatcherOptions
+    most_gap_m: float | None = None
 
-    def __post_init__(self) -> None:
-        require_choices(
-            metric=(self.metric, Metric),
-            covariance=(self.covariance, Covariance),
-        )
-        if self.sigma_range_m is not None:
-            require_non_negative(sigma_range_m=self.sigma_range_m)
+    @property
+    def rules(self) -> Rules:
+        """Which matches count, and when iterations end."""
+        return self.believed if isinstance(self.believed, Rules) else USUAL
 
     def prepare(self, ranges_m: ArrayLike, laser: Laser) -> PreparedScan | None:
         """Prepare a scan of this laser; None if it shows too little to be registered."""
         scan = prepare(ranges_m, laser.bearings_rad, laser.max_range_m)
-        if self.most_gap_m < math.inf:
+        if self.most_gap_m is not None:
             scan = without_sparse_lines(scan, self.most_gap_m)
         return scan if len(scan.points) >= LEAST_POINTS else None
 
@@ -164,7 +189,7 @@ class ScanMatcher:
             scan,
             reference,
             in_laser.mean,
-            metric=self.metric,
+            metric=self.believed.metric,
             gate_m=min(_LEAST_GATE_M + 4.0 * math.sqrt(max(xx + yy, 0.0)), _MOST_GATE_M),
             gate_rad=min(_LEAST_GATE_RAD + 4.0 * math.sqrt(max(turn, 0.0)), _MOST_GATE_RAD),
             heading_window_rad=heading_window_rad,
@@ -195,8 +220,8 @@ class ScanMatcher:
 
     def sigma_m(self, laser: Laser) -> float:
         """Believed range noise, m."""
-        sigma = laser.sigma_range_m if self.sigma_range_m is None else self.sigma_range_m
-        return max(sigma, _LEAST_SIGMA_M)
+        sigma = self.believed.sigma_range_m
+        return max(laser.sigma_range_m if sigma is None else sigma, _LEAST_SIGMA_M)
 
     def _covariance_of(
         self,
@@ -207,13 +232,13 @@ class ScanMatcher:
         sigma_m: float,
         rng: np.random.Generator,
     ) -> Array:
-        if self.covariance == "hessian":
+        if self.believed.covariance == "hessian":
             return icp_covariance.hessian(found)
-        if self.covariance == "sampling":
+        if self.believed.covariance == "sampling":
             return icp_covariance.sampling(found, source, target, rng, sigma_m)
-        if self.covariance == "unscented_censi":
+        if self.believed.covariance == "unscented_censi":
             return icp_covariance.unscented_censi(
                 found, source, target, of_guess, sigma_m, matches="sliding"
             )
-        scans: icp_covariance.Scans = "last" if self.covariance == "censi_last" else "both"
+        scans: icp_covariance.Scans = "last" if self.believed.covariance == "censi_last" else "both"
         return icp_covariance.censi(found, source, target, sigma_m, scans=scans, matches="sliding")

@@ -34,7 +34,7 @@ from estimators.particles import (
     resample,
     underflowed,
 )
-from estimators.wheels import WheelPrediction
+from estimators.wheels import WheelOptions, WheelPrediction
 from sim import se2
 from sim.arrays import Array, Floats, Ints
 from sim.compiled import njit
@@ -156,7 +156,7 @@ class Mcl:
         laser: str = "laser",
     ) -> None:
         self.laser = laser
-        self.wheels = WheelPrediction(kr, kl, window_s)
+        self.wheels = WheelOptions(kr=kr, kl=kl, window_s=window_s)
         require_counts(
             n_least=n_least,
             n_beams=n_beams,
@@ -218,7 +218,7 @@ class Mcl:
             isinstance(prior.map, self.maps),
             "mcl needs a map of walls; set prior.map=world, or to a grid's .yaml",
         )
-        self.wheels.reset(prior.robot.track_m)
+        self._wheels = WheelPrediction(self.wheels, prior.robot.track_m)
         self._field = likelihood_field(
             prior.map,
             self._laser,
@@ -260,7 +260,7 @@ class Mcl:
 
     def step(self, frame: Frame) -> Belief:
         """Roll by the wheels; with a scan from a new place, weight and resample."""
-        self._motion = self._motion.then(self.wheels.predict(frame))
+        self._motion = self._motion.then(self._wheels.predict(frame))
         extras: dict[str, Any] = {"status": "start off the map"} if self._off_map else {}
         self._off_map = False
         scan = frame.readings.get(self.laser)

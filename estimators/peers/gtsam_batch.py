@@ -12,7 +12,7 @@ from estimators.landmarks.stereo import StereoModel
 from estimators.options import require_counts, require_stereo, start_pose
 from estimators.peers import package
 from estimators.peers.gtsam_model import GtsamModel, Isam2
-from estimators.wheels import WheelPrediction
+from estimators.wheels import WheelOptions, WheelPrediction
 from sim.arrays import Array
 from sim.recording import Frame
 
@@ -48,21 +48,21 @@ class GtsamBatch:
         self._gtsam = package("gtsam", "gtsam")
         require_counts(max_iterations=max_iterations)
         self.stereo, self.max_iterations = stereo, max_iterations
-        self.wheels = WheelPrediction(kr, kl, window_s)
+        self.wheels = WheelOptions(kr=kr, kl=kl, window_s=window_s)
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Start from the prior's pose, with nothing seen."""
         self._camera = StereoModel.of(require_stereo(prior, self.stereo, "gtsam_batch"))
         self._model = GtsamModel(self._camera)
         self._belief = start_pose(prior, "gtsam_batch")
-        self.wheels.reset(prior.robot.track_m)
+        self._wheels = WheelPrediction(self.wheels, prior.robot.track_m)
         self._drive = LandmarkDrive(self._camera, self._belief)
         self._isam2 = Isam2(self._camera, self._belief)
         self._motion = STILL  # since the last image
 
     def step(self, frame: Frame) -> Belief:
         """Keep what the Frame shows; at an image, update iSAM2."""
-        motion = self.wheels.predict(frame)
+        motion = self._wheels.predict(frame)
         loose = loosened(motion)
         self._belief, self._motion = self._belief.then(motion), self._motion.then(loose)
         seen, status = observed(frame, self.stereo, self._camera, "gtsam_batch")

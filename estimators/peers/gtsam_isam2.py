@@ -12,7 +12,7 @@ from estimators.landmarks.stereo import StereoModel
 from estimators.options import require_counts, require_positive, require_stereo, start_pose
 from estimators.peers import package
 from estimators.peers.gtsam_model import Isam2
-from estimators.wheels import WheelPrediction
+from estimators.wheels import WheelOptions, WheelPrediction
 from sim.recording import Frame
 
 
@@ -52,13 +52,13 @@ class GtsamIsam2:
         self.stereo, self.updates = stereo, updates
         self.relinearize_threshold = relinearize_threshold
         self.relinearize_skip = relinearize_skip
-        self.wheels = WheelPrediction(kr, kl, window_s)
+        self.wheels = WheelOptions(kr=kr, kl=kl, window_s=window_s)
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Start from the prior's pose, with an empty map."""
         self._camera = StereoModel.of(require_stereo(prior, self.stereo, "gtsam_isam2"))
         self._belief = start_pose(prior, "gtsam_isam2")
-        self.wheels.reset(prior.robot.track_m)
+        self._wheels = WheelPrediction(self.wheels, prior.robot.track_m)
         self._isam2 = Isam2(
             self._camera,
             self._belief,
@@ -70,7 +70,7 @@ class GtsamIsam2:
 
     def step(self, frame: Frame) -> Belief:
         """Roll by the wheels; at an image, update."""
-        motion = self.wheels.predict(frame)
+        motion = self._wheels.predict(frame)
         self._belief = self._belief.then(motion)
         self._motion = self._motion.then(loosened(motion))
         seen, status = observed(frame, self.stereo, self._camera, "gtsam_isam2")

@@ -5,8 +5,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from estimators.base import Prior
-from estimators.team import TeamEstimator
+from estimators.base import Prior, TeamEstimator
 from experiments.bench.measure import Measurement
 from experiments.runs.evaluate import limited_blas
 from experiments.runs.experiment import Experiment

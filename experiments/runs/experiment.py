@@ -16,8 +16,7 @@ from typing import Any, cast
 import numpy as np
 from omegaconf import OmegaConf
 
-from estimators.base import Estimator, Prior
-from estimators.team import TeamEstimator
+from estimators.base import Estimator, Prior, TeamEstimator
 from experiments.runs import paths
 from experiments.runs.cache import cached, key_of
 from experiments.runs.calibration import read_calibration

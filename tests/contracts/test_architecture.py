@@ -114,13 +114,13 @@ def test_no_circle():
 
 
 def is_method(path):
-    """Whether a module holds a class with `reset` and `step`: the protocol of an estimator."""
+    """Whether a module holds an estimator: a class with `reset` and `step`, or those of a team."""
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ClassDef) and "Protocol" not in {
             ast.unparse(b) for b in node.bases
         }:
             defined = {item.name for item in node.body if isinstance(item, ast.FunctionDef)}
-            if {"reset", "step"} <= defined:
+            if {"reset", "step"} <= defined or {"reset_team", "step_team"} <= defined:
                 return True
     return False
 

@@ -24,10 +24,11 @@ def failed(make, case):
 
 
 def test_dead_reckoning_conforms(case):
-    assert failed(lambda: Odometry(1e-5, 1e-5), case) == set()
+    assert failed(lambda: Odometry(kr=1e-5, kl=1e-5), case) == set()
     recording = fakes.circle()
     assert (
-        failed(lambda: Odometry(1e-5, 1e-5), (recording, fakes.tracking_prior(recording))) == set()
+        failed(lambda: Odometry(kr=1e-5, kl=1e-5), (recording, fakes.tracking_prior(recording)))
+        == set()
     )
 
 

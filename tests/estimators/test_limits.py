@@ -67,7 +67,7 @@ def test_a_full_map_takes_no_more_landmarks(recording, association, monkeypatch)
         assert len(estimator.map["origins"]) == counts[-1] <= 30
         if association == "known":
             assert len(estimator.map["ids"]) == counts[-1]
-    assert len(estimator._room) <= 3 + 3 * 30
+    assert len(estimator._state._room) <= 3 + 3 * 30
     assert statuses[0] == "ok"
     if association == "known":
         assert counts == [15, 27, 30, 30, 30]

@@ -69,7 +69,7 @@ def test_covariance_matches_sampled_wheel_noise():
     kr, kl = 2e-6, 5e-6
     rng = np.random.default_rng(1)
     true = np.tile([0.03, 0.02], (40, 1))
-    belief = drive(Odometry(kr, kl), true)[-1]
+    belief = drive(Odometry(kr=kr, kl=kl), true)[-1]
     noise = rng.standard_normal((20_000, 40, 2)) * np.sqrt(np.abs(true) * [kr, kl])
     ends = np.zeros((20_000, 3))
     for i in range(40):
@@ -81,15 +81,15 @@ def test_covariance_matches_sampled_wheel_noise():
 
 
 def test_arc_is_exact_whatever_the_step():
-    coarse = drive(Odometry(1e-5, 1e-5), np.tile([0.3, 0.2], (4, 1)), 0.4)[-1]
-    fine = drive(Odometry(1e-5, 1e-5), np.tile([0.03, 0.02], (40, 1)), 0.04)[-1]
+    coarse = drive(Odometry(kr=1e-5, kl=1e-5), np.tile([0.3, 0.2], (4, 1)), 0.4)[-1]
+    fine = drive(Odometry(kr=1e-5, kl=1e-5), np.tile([0.03, 0.02], (40, 1)), 0.04)[-1]
     assert np.allclose(coarse.mean, fine.mean, atol=1e-12)
 
 
 def test_a_start_pose_is_needed():
     lost = Prior(RobotGeometry(0.05, TRACK_M), {})
     with pytest.raises(InputError, match="start pose"):
-        Odometry(1e-5, 1e-5).reset(lost, np.random.default_rng(0))
+        Odometry(kr=1e-5, kl=1e-5).reset(lost, np.random.default_rng(0))
 
 
 @pytest.mark.parametrize("bad", [{"kr": -1.0}, {"kl": math.nan}, {"integration": "simpson"}])

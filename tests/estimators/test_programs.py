@@ -57,7 +57,7 @@ def run(estimator, recording, prior=None, seed=0):
 
 
 def midpoint(recording):
-    online, _ = run(Odometry(1e-5, 1e-5, "midpoint"), recording)
+    online, _ = run(Odometry(kr=1e-5, kl=1e-5, integration="midpoint"), recording)
     return online.means
 
 

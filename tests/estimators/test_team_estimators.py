@@ -15,6 +15,7 @@ from estimators.landmarks.fastslam import FastSLAM
 from estimators.landmarks.sightings import Sightings, pose_by_points
 from estimators.landmarks.stereo import StereoModel
 from estimators.team import Communication, run_team
+from estimators.wheels import WheelPrediction
 from experiments.evaluation.metrics import nees
 from experiments.runs.experiment import Experiment
 from experiments.runs.team import TeamExperiment, in_range
@@ -130,9 +131,7 @@ def test_a_team_of_one_is_the_robot_alone(make):
 
 def test_derivatives_of_sightings():
     eye = dataclasses.replace(EYE, mount=Mount(x_m=0.2, y_m=-0.1, z_m=0.4, yaw_rad=0.3))
-    sightings = Sightings.of(
-        [Prior(None, {"robots": eye})], "robots", "camera", "predicted", "test"
-    )
+    sightings = Sightings.of([Prior(None, {"robots": eye})], "robots", "test")
     pose, other = np.array([0.3, -0.2, 0.7]), np.array([3.0, 2.5, -1.0])
     _, *by = sightings.predict(pose, other)
     residuals = PoseSightings(
@@ -347,10 +346,10 @@ def test_kinds_of_communication():
         assert determinants[0] < determinants[1]
     # the answer of six Frames ago, carried on by the wheels
     estimator = EkfSlam(**SEEING)
-    estimator.wheels.reset(team.robots[0].robot.track_m)
+    wheels = WheelPrediction(estimator, team.robots[0].robot.track_m)
     belief = None
     for i, frame in enumerate(team.robots[0].frames()):
-        motion = estimator.wheels.predict(frame)
+        motion = wheels.predict(frame)
         if i == n - 7:
             belief = type(motion)(always[0][0].means[i], always[0][0].covariances[i])
         elif belief is not None:

@@ -3,8 +3,14 @@
 import numpy as np
 import pytest
 
-from estimators.wheels import WheelPrediction
+from estimators.wheels import (
+    EncoderTickOptions,
+    ForwardSlipOptions,
+    WheelOptions,
+    WheelPrediction,
+)
 from sim.errors import InputError
+from sim.options import described
 from sim.recording import Frame
 from sim.robot.arc import arc_increment, arc_increment_jacobian
 
@@ -17,8 +23,8 @@ def frame(right_m, left_m, duration_s=0.1):
 
 @pytest.mark.parametrize("travel_m", [(0.1, 0.08), (-0.02, 0.05), (0.0, 0.03)])
 def test_covariance_is_slip_ticks_and_sideways_slip(travel_m):
-    wheels = WheelPrediction(1e-4, 3e-4, lateral_slip_m=2e-5, encoder_tick_m=1e-3)
-    wheels.reset(TRACK_M)
+    believed = EncoderTickOptions(kr=1e-4, kl=3e-4, lateral_slip_m=2e-5, encoder_tick_m=1e-3)
+    wheels = WheelPrediction(believed, TRACK_M)
     motion, root = wheels.predict_with_root(frame(*travel_m))
     travel_m = np.array(travel_m)
     G = arc_increment_jacobian(travel_m, TRACK_M)
@@ -30,30 +36,24 @@ def test_covariance_is_slip_ticks_and_sideways_slip(travel_m):
 
 
 def test_what_both_wheels_slip_together_does_not_turn():
-    wheels = WheelPrediction(1e-4, 1e-4, forward_slip_m=5e-3)
-    wheels.reset(TRACK_M)
+    wheels = WheelPrediction(ForwardSlipOptions(forward_slip_m=5e-3), TRACK_M)
     motion, root = wheels.predict_with_root(frame(0.1, 0.1))
-    alone = WheelPrediction(1e-4, 1e-4)
-    alone.reset(TRACK_M)
+    alone = WheelPrediction(WheelOptions(), TRACK_M)
     more = motion.covariance - alone.predict(frame(0.1, 0.1)).covariance
     np.testing.assert_allclose(more, np.diag([5e-3 * 0.1, 0.0, 0.0]), atol=1e-18)
     np.testing.assert_allclose(root @ root.T, motion.covariance, atol=1e-18)
 
 
-def test_travel_is_netted_over_the_window_and_forgotten_at_reset():
-    wheels = WheelPrediction(1e-4, 1e-4, window_s=0.2)
-    wheels.reset(TRACK_M)
+def test_travel_is_netted_over_the_window():
+    wheels = WheelPrediction(WheelOptions(window_s=0.2), TRACK_M)
     wheels.slip(frame(0.01, 0.01))
     travel_m, variances = wheels.slip(frame(-0.01, -0.01))
     assert travel_m.tolist() == [0.0, 0.0]
     assert variances.tolist() == [0.0, 0.0]
-    wheels.reset(TRACK_M)
-    assert wheels.slip(frame(-0.01, -0.01))[0].tolist() == [0.01, 0.01]
 
 
-@pytest.mark.parametrize(
-    "name", ["kr", "kl", "window_s", "lateral_slip_m", "encoder_tick_m", "forward_slip_m"]
-)
-def test_wrong_options_are_named(name):
-    with pytest.raises(InputError, match=rf"^estimator\.{name} must be"):
-        WheelPrediction(**{"kr": 1e-4, "kl": 1e-4, name: -1.0})
+@pytest.mark.parametrize("made", [EncoderTickOptions, ForwardSlipOptions])
+def test_wrong_options_are_named(made):
+    for option in described(made):
+        with pytest.raises(InputError, match=rf"^estimator\.{option.name} must be"):
+            made(**{option.name: -1.0})

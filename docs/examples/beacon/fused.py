@@ -4,9 +4,9 @@ import numpy as np
 
 from estimators.base import Belief
 from estimators.gaussian import STILL, Gaussian, update, wrap
-from estimators.laser.scan_matching import ScanMatcher
+from estimators.laser.scan_matching import MatcherOptions, ScanMatcher
 from estimators.options import require_laser, start_pose
-from estimators.wheels import WheelPrediction
+from estimators.wheels import WheelOptions, WheelPrediction
 from sim.sensors import sensor_of
 
 
@@ -20,8 +20,8 @@ class Fused:
 
     def __init__(self, lasers=("laser",), beacon="beacon", kr=1e-4, kl=1e-4):
         self.lasers, self.beacon = list(lasers), beacon
-        self.wheels = WheelPrediction(kr, kl)
-        self.matcher = ScanMatcher("point_to_line", "censi", None)
+        self.wheels = WheelOptions(kr=kr, kl=kl)
+        self.matcher = ScanMatcher(MatcherOptions())
 
     def reset(self, prior, rng):
         """Start from the prior's pose."""
@@ -29,12 +29,12 @@ class Fused:
         self.sensors = {name: require_laser(prior, name, "fused") for name in self.lasers}
         beacon = sensor_of(prior.sensors, self.beacon)
         self.R = (beacon.sigma_m**2 + beacon.wander_m**2) * np.eye(2)
-        self.wheels.reset(prior.robot.track_m)
+        self._wheels = WheelPrediction(self.wheels, prior.robot.track_m)
         self.rolled, self.scans = STILL, {}  # since the last scans
 
     def step(self, frame):
         """Predict by the wheels; correct by each scan, then by the beacon."""
-        self.rolled = self.rolled.then(self.wheels.predict(frame))
+        self.rolled = self.rolled.then(self._wheels.predict(frame))
         scanned = [name for name in self.lasers if name in frame.readings]
         for name in scanned:
             self.register(name, frame.readings[name]["ranges_m"])

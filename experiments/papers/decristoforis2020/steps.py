@@ -10,7 +10,7 @@ import pandas as pd
 from estimators.base import Estimate
 from estimators.gaussian import STILL, Gaussian
 from estimators.laser import icp_covariance
-from estimators.laser.icp import Metric, Rules, prepare, register
+from estimators.laser.icp import USUAL, Metric, Rules, prepare, register
 from estimators.laser.scan_matching import FAILED
 from experiments.evaluation.metrics import travelled_m
 from experiments.evaluation.scan_bound import fisher_bound
@@ -88,7 +88,7 @@ def ellipse_path(
     world: World,
     metric: Metric,
     scans: icp_covariance.Scans,
-    neighbours: int = Rules.neighbours,
+    neighbours: int = USUAL.neighbours,
 ) -> pd.DataFrame:
     """Ellipse of each registration of successive scans, in the axes of the map, along the path.
 

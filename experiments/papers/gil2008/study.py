@@ -100,7 +100,7 @@ def rows_of(runs: Sequence[TableRun]) -> list[tuple[str, Row]]:
     scene, recording = Scene.of(first.config), whole(first.config)
     truth, robot = recording.truth_at(recording.frame_stamps), first.robot()
     prior = first.prior(recording)
-    odometry = walk(Odometry(robot.kr, robot.kl), recording, prior, stream(0, "odometry"))
+    odometry = walk(Odometry(kr=robot.kr, kl=robot.kl), recording, prior, stream(0, "odometry"))
     common: Row = {
         **dataclasses.asdict(scene),
         "odometry_rmse_m": rms(position_errors_m(truth, odometry.means)),

@@ -132,7 +132,7 @@ def dead_reckoning(batch: BatchRuns, kr: float, kl: float) -> Estimate:
     wheels = WheelLog(batch.stamps, batch.encoder_m[0])
     recording = Recording(batch.stamps, wheels, geometry)
     prior = Prior(geometry, mean=np.zeros(3), covariance=np.zeros((3, 3)))
-    return run_estimator(Odometry(kr, kl), recording, prior, np.random.default_rng(0))
+    return run_estimator(Odometry(kr=kr, kl=kl), recording, prior, np.random.default_rng(0))
 
 
 def areas() -> pd.DataFrame:

@@ -122,7 +122,7 @@ def closed_loops() -> tuple[pd.DataFrame, dict[str, NDArray[Any]]]:
     """Errors on all logs, and grids of Intel by its edges alone and with its loops closed."""
     graph, recording = intel_by_edges()
     rows, after = scored("intel", "SEQUENTIAL edges", recording, graph, {})
-    before = tracked(Odometry(_OPTIONS["kr"], _OPTIONS["kl"]), recording)
+    before = tracked(Odometry(kr=_OPTIONS["kr"], kl=_OPTIONS["kl"]), recording)
     grids = _grids(recording, before=before, after=after)
     log, recording = freiburg_by_edges()
     rows += scored("fr079", "SEQUENTIAL edges", recording, log, {})[0]

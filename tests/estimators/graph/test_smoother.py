@@ -9,8 +9,9 @@ from scipy.optimize import least_squares
 
 from estimators.base import run
 from estimators.gaussian import Gaussian
+from estimators.graph.fixed_lag import FixedLag
 from estimators.graph.landmark_drive import _between, _merged
-from estimators.graph.least_squares import Problem, solve
+from estimators.graph.least_squares import LeastSquaresOptions, Problem, solve
 from estimators.graph.smoother import Smoother
 from estimators.landmarks.stereo import LEAST_DEPTH_M, StereoModel
 from experiments.evaluation.metrics import nees
@@ -149,7 +150,9 @@ def test_robust_losses(robust):
     rows = problem.landmark_rows.copy()
     rows[::25] = (rows[::25] + 5) % (rows.max() + 1)
     problem = dataclasses.replace(problem, landmark_rows=rows)
-    robustly, squarely = (solve(problem, guess, robust=r) for r in (robust, "none"))
+    robustly, squarely = (
+        solve(problem, guess, LeastSquaresOptions(robust=r)) for r in (robust, "none")
+    )
     error, plain = (np.hypot(*(s.poses - poses)[:, :2].T).max() for s in (robustly, squarely))
     assert error < 0.1 < plain
     assert np.median(np.abs(robustly.landmarks - landmarks)) < 0.1
@@ -341,28 +344,39 @@ def test_odd_observations_are_survived():
     assert smoother.finish().means.shape == (1, 3)
 
 
-def test_conforms():
+@pytest.mark.parametrize("method", [Smoother, FixedLag])
+def test_conforms(method):
     recording = circle(3, n_frames=30)
-    for check in check_estimator(Smoother, recording, tracking_prior(recording)):
+    for check in check_estimator(method, recording, tracking_prior(recording)):
         assert check.passed, f"{check.name}: {check.message}"
 
 
-def test_wrong_input_is_named():
+@pytest.mark.parametrize("method", [Smoother, FixedLag])
+def test_what_is_missing_is_named(method):
     recording = circle(0, n_frames=10)
     prior, rng = tracking_prior(recording), np.random.default_rng(0)
     with pytest.raises(InputError, match="start pose"):
-        Smoother().reset(dataclasses.replace(prior, mean=None), rng)
+        method().reset(dataclasses.replace(prior, mean=None), rng)
     with pytest.raises(InputError, match="identifies"):
-        run(Smoother(), circle(0, n_frames=10, identifies=False), prior, rng)
-    fresh = Smoother()
+        run(method(), circle(0, n_frames=10, identifies=False), prior, rng)
+    fresh = method()
     fresh.reset(prior, rng)
     with pytest.raises(InputError, match="no Frame"):
         fresh.finish()
-    for options, word in (
-        ({"robust": "tukey"}, "cauchy"),
-        ({"robust_sigma": 0.0}, "robust_sigma"),
-        ({"kl": np.nan}, "kl"),
-        ({"max_iterations": 0}, "max_iterations"),
-    ):
-        with pytest.raises(InputError, match=word):
-            Smoother(**options)
+
+
+@pytest.mark.parametrize(
+    ("method", "wrong", "word"),
+    [
+        (Smoother, {"robust": "tukey"}, "cauchy"),
+        (Smoother, {"robust_sigma": 0.0}, "robust_sigma"),
+        (Smoother, {"kl": np.nan}, "kl"),
+        (Smoother, {"max_iterations": 0}, "max_iterations"),
+        (FixedLag, {"lag_images": 0}, "lag_images"),
+        (FixedLag, {"iterations": 1.5}, "iterations"),
+        (FixedLag, {"kl": np.nan}, "kl"),
+    ],
+)
+def test_wrong_options_are_named(method, wrong, word):
+    with pytest.raises(InputError, match=word):
+        method(**wrong)

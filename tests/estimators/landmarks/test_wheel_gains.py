@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from estimators.landmarks.ekf_slam import EkfSlam
-from estimators.landmarks.wheel_gains import NO_MOTION, GainBelief, gained_motion
-from estimators.wheels import WheelPrediction
+from estimators.landmarks.wheel_gains import NO_MOTION, GainOptions, gained_motion
+from estimators.wheels import WheelOptions, WheelPrediction
 from experiments.evaluation.metrics import nees, position_errors_m, rms
 from experiments.gate.conform import check_estimator
 from experiments.runs.experiment import Experiment
@@ -27,8 +27,7 @@ DRIVE = (
 
 
 def motion_by(gains):
-    wheels = WheelPrediction(1e-4, 1e-4)
-    wheels.reset(0.3)
+    wheels = WheelPrediction(WheelOptions(), 0.3)
     motion = NO_MOTION
     for i, increments in enumerate(INCREMENTS_M):
         motion = motion.then(gained_motion(wheels, Frame(float(i), 1.0, increments), gains, 0.3))
@@ -107,8 +106,8 @@ def test_states_of_no_deviation_are_none_and_small_ones_change_little():
 
 def test_what_has_no_effect_is_refused():
     with pytest.raises(InputError, match="gain_wander_m has no effect"):
-        GainBelief(0.0, 1e-4)
-    with pytest.raises(InputError, match="must be below"):
-        GainBelief(0.7, 0.0)
+        GainOptions(gain_wander_m=1e-4)
+    with pytest.raises(InputError, match=r"below 0\.5, got 0\.7"):
+        GainOptions(gain_sigma=0.7)
     with pytest.raises(InputError, match=r"set estimator\.gain_sigma=0"):
         EkfSlam(errors="invariant", gain_sigma=0.1)

@@ -35,7 +35,7 @@ def test_follows_a_curve_better_than_the_wheels():
         poses, frames = drive(ROOM, 60, wheel_noise_m=0.002, seed=seed)
         for name, estimator in (
             ("fusion", EkfIcp(kr=8e-5, kl=8e-5)),
-            ("wheels", Odometry(8e-5, 8e-5)),
+            ("wheels", Odometry(kr=8e-5, kl=8e-5)),
         ):
             off = errors(follow(estimator, frames), poses)
             rms.setdefault(name, []).append(np.sqrt(np.mean(off[:, :2] ** 2)))
@@ -79,7 +79,7 @@ def test_consistent_where_its_model_holds(share):
         estimator = EkfIcp(kr=k, kl=k, lateral_slip_m=0.0, shared_noise=share)
         fake = _Perfect(R, share)
         fake.rng = rng
-        estimator._matcher = fake
+        estimator.matcher = fake
         ground = travel - np.sqrt(k * travel) * rng.standard_normal((40, 2))
         poses = [start]
         for step in ground[1:]:
@@ -102,7 +102,7 @@ def test_a_robot_at_rest_does_not_learn(share):
     estimator = EkfIcp(kr=1e-2, kl=1e-2, shared_noise=share)
     fake = _Perfect(np.diag([4e-6, 4e-6, 1e-6]), share)
     fake.poses = np.tile(START, (50, 1))
-    estimator._matcher = fake
+    estimator.matcher = fake
     estimator.reset(prior(), np.random.default_rng(0))
     for i in range(50):
         belief = estimator.step(scan_frame(0.1 * i, 0.1, np.zeros(2), np.ones(9)))
@@ -122,7 +122,7 @@ def test_wheels_that_know_nothing_leave_the_last_registration(share):
     )
     fake = _Perfect(R, share)
     fake.poses = np.tile(START, (n, 1))
-    estimator._matcher = fake
+    estimator.matcher = fake
     still = dataclasses.replace(prior(), covariance=np.zeros((3, 3)))
     estimator.reset(still, np.random.default_rng(0))
     for i in range(n):
@@ -226,7 +226,7 @@ def test_what_the_scans_do_not_hold_is_left_to_the_wheels(world):
     poses, frames = drive(walls, 30, travel, start, laser=laser)
     given = Prior(prior().robot, prior(laser).sensors, start, 1e-6 * np.eye(3))
     k = 1e-3
-    wheels = follow(Odometry(k, k), frames, given)[-1].covariance
+    wheels = follow(Odometry(kr=k, kl=k), frames, given)[-1].covariance
     beliefs = follow(EkfIcp(kr=k, kl=k), frames, given)
     fused = beliefs[-1].covariance
     assert 0.7 * wheels[loose, loose] < fused[loose, loose] < 1.1 * wheels[loose, loose]

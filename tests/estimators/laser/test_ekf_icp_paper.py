@@ -52,7 +52,7 @@ def test_wheels_alone_are_dead_reckoning():
     _, frames = drive(ROOM, 40, wheel_noise_m=0.002)
     scanless = [blind(f) for f in frames]
     found = follow(EkfIcpPaper(acceleration_noise=30.0, turn_noise=30.0), scanless)[-1]
-    wheels = follow(Odometry(1e-4, 1e-4), scanless)[-1]
+    wheels = follow(Odometry(kr=1e-4, kl=1e-4), scanless)[-1]
     np.testing.assert_allclose(found.mean, wheels.mean, atol=2e-3)
     np.testing.assert_allclose(np.diag(found.covariance), np.diag(wheels.covariance), rtol=0.1)
 
@@ -93,7 +93,7 @@ def test_the_printed_equations():
     truth = arc_increment(STEP_M / 200.0, TRACK_M)
     scans = [None] + [Gaussian(rng.multivariate_normal(truth, R), R) for _ in frames[1:]]
     filtered = EkfIcpPaper(kr=1e-4, kl=3e-4, window_s=0.0)
-    filtered._matcher = Replayed(scans)
+    filtered.matcher = Replayed(scans)
     found = follow(filtered, frames)
     means, last = printed(frames, scans, 1e-4, 3e-4, (1.0, 1.0, 2.0))
     np.testing.assert_allclose([b.mean for b in found], means[:, :3], atol=1e-5)
@@ -135,7 +135,7 @@ def test_fusion_follows_a_curve():
     for seed in range(4):
         poses, frames = drive(ROOM, 60, wheel_noise_m=0.002, seed=seed)
         off["fusion"].append(errors(follow(EkfIcpPaper(kr=8e-5, kl=8e-5), frames), poses))
-        off["wheels"].append(errors(follow(Odometry(8e-5, 8e-5), frames), poses))
+        off["wheels"].append(errors(follow(Odometry(kr=8e-5, kl=8e-5), frames), poses))
     rms = {name: np.sqrt(np.mean(np.square(values), axis=(0, 1))) for name, values in off.items()}
     assert np.all(rms["fusion"] < 0.5 * rms["wheels"])
     assert rms["fusion"][0] < 0.02

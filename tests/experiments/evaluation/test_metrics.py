@@ -179,7 +179,7 @@ def test_dead_reckoning_of_the_circle_is_consistent():
     for seed in range(n):
         recording = fakes.circle(seed, kr=1e-4, kl=3e-5)
         prior = fakes.tracking_prior(recording, sigma=(0.0, 0.0, 0.0))
-        found = run(Odometry(1e-4, 3e-5), recording, prior, np.random.default_rng(0))
+        found = run(Odometry(kr=1e-4, kl=3e-5), recording, prior, np.random.default_rng(0))
         truth = recording.truth_at(found.stamps)
         values.append(metrics.nees_at_distances(truth, found.means, found.covariances, distances))
     low, high = stats.chi2.ppf([0.025, 0.975], 3 * n) / n

@@ -208,7 +208,7 @@ def test_failed_runs_leave_rows_and_the_rest_goes_on(name, tmp_path):
         "from estimators.odometry import Odometry\n"
         "class Broken(Odometry):\n"
         "    def step(self, frame):\n"
-        "        if frame.stamp > 1.0 and self.wheels.kr > 1e-4:\n"
+        "        if frame.stamp > 1.0 and self.kr > 1e-4:\n"
         "            raise ValueError('a planted fault')\n"
         "        return super().step(frame)\n"
     )

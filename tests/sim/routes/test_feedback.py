@@ -42,7 +42,7 @@ def steered_by(feedback, route=SQUARE):
 def odometry(recording):
     """Poses (F, 3) by the estimator, with the geometry that the recording states."""
     prior = Prior(recording.robot, recording.sensors, recording.truth.poses[0], np.zeros((3, 3)))
-    return run(Odometry(0.0, 0.0), recording, prior, np.random.default_rng(0)).means
+    return run(Odometry(kr=0.0, kl=0.0), recording, prior, np.random.default_rng(0)).means
 
 
 def test_without_a_word_on_feedback_the_driver_gets_the_truth():
