@@ -150,10 +150,11 @@ def _complaint(cls: type, where: str, error: ValidationError) -> str:
     """One line about the first field that is wrong."""
     first = error.errors(include_url=False)[0]
     name = str(first["loc"][0]) if first["loc"] else ""
+    place = f"{where}.{name}" if where else name
     known = {option.name: option for option in described(cls)}
     if name not in known:
-        return f"unknown key {where}.{name}; known: {', '.join(known)}"
+        return f"unknown key {place}; known: {', '.join(known)}"
     if first["type"] == "missing":
-        return f"{where}.{name} is missing"
+        return f"{place} is missing"
     wanted = known[name].accepts
-    return f"{where}.{name} must be {wanted or first['msg']}, got {first['input']!r}"
+    return f"{place} must be {wanted or first['msg']}, got {first['input']!r}"

@@ -17,10 +17,8 @@ from experiments.runs.experiment import Experiment
 from experiments.runs.schema import Config
 from experiments.runs.store import read_runs
 from experiments.runs.targets import checked
-from experiments.runs.team import recorded
 from experiments.sweeps.collect import commands, folder_of
 from sim.errors import InputError, require
-from sim.recording import Recording
 from sim.team import Team
 
 _SHORT = 10  # digits of a key that tell tens of thousands of runs apart
@@ -34,7 +32,7 @@ class Again:
     repeat: int
     checksum: str
 
-    def recording(self) -> Recording | Team:
+    def recordings(self) -> Team:
         """What the run read.
 
         Raises
@@ -42,7 +40,7 @@ class Again:
         InputError
             If it is no longer the same.
         """
-        read = recorded(self.experiment)
+        read = self.experiment.recordings()
         require(read.checksum == self.checksum, "the recording of the run is not what it was")
         return read
 
