@@ -216,10 +216,12 @@ class Objects:
             enough = self.size <= len(team)
             require(enough, f"{path}: a team of {len(team)} robots; set team.size")
             return team if self.size == len(team) else team.first(self.size)
-        if len(team) > 1:  # which `check_size` complains of
-            return team
-        self._compare_slip(team.only)
-        return Team((self._calibrated(self._with_classes(team.only)),))
+        try:
+            recording = team.only
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from error
+        self._compare_slip(recording)
+        return Team((self._calibrated(self._with_classes(recording)),))
 
     def check_size(self, team: Team) -> None:
         """Check that recordings are of as many robots as the experiment.

@@ -130,12 +130,12 @@ def test_sweeps_of_teams():
 @pytest.mark.parametrize(
     ("overrides", "complaint"),
     [
-        (["team.size=0"], r"team\.size must be from 1 to the 5 of team\.robots, got 0"),
+        (["team.size=0"], r"team\.size must be a whole number, at least 1, got 0"),
         (["team.size=40"], r"team\.size must be from 1 to the 5 of team\.robots, got 40"),
         (["team.size=two"], r"team\.size must be a whole number"),
         (["team.size=.nan"], r"team\.size must be a whole number"),
-        (["team.robots=3"], r"team\.robots must list the keys of each robot"),
-        (["team.robots=[3,4]"], r"team\.robots must list the keys of each robot"),
+        (["team.robots=3"], r"team\.robots must be a valid list, got 3"),
+        (["team.robots=[3,4]"], r"team\.robots must be a valid dictionary, got 3"),
         (["team.robots=[{},{route: 3}]"], r"team\.robots\[1\]\.route must hold keys"),
         (
             ["team.robots=[{},{route: {wheels: 9}}]"],
