@@ -18,7 +18,14 @@ from experiments.runs.compose import composing, with_study_file
 from experiments.runs.key import applied, run_key, version_of
 from experiments.runs.objects import OF_TEAMS, Objects, is_grid_file
 from experiments.runs.row import Row
-from experiments.runs.schema import OPTIONS, Config, RunOptions, check_shape
+from experiments.runs.schema import (
+    OPTIONS,
+    Config,
+    Leaf,
+    RunOptions,
+    check_shape,
+    with_leaf,
+)
 from experiments.runs.seeds import stream
 from experiments.runs.targets import checked
 from sim.errors import InputError, require
@@ -41,6 +48,13 @@ class Experiment(Objects):
         """Return the experiment with other values of top-level keys, such as `seed=3`."""
         return dataclasses.replace(self, config={**self.config, **values})
 
+    def with_leaves(self, changed: Iterable[tuple[Leaf, Any]]) -> Experiment:
+        """Return the experiment with other values of places, such as `("robot", "kr")`."""
+        config = self.config
+        for leaf, value in changed:
+            config = with_leaf(config, leaf, value)
+        return dataclasses.replace(self, config=config)
+
     def using(self, estimator: Estimator) -> Experiment:
         """Return the experiment with an estimator that is not an option of the configuration."""
         kind = type(estimator)
@@ -53,6 +67,10 @@ class Experiment(Objects):
     def with_estimator(self, **settings: Any) -> Experiment:
         """Return the experiment with other values of keys of its estimator."""
         return self.replaced(estimator={**self.config["estimator"], **settings})
+
+    def with_estimator_of(self, other: Experiment) -> Experiment:
+        """Return the experiment with the estimator of another."""
+        return self.replaced(estimator=other.config["estimator"])
 
     def over(self, recording: Recording) -> Experiment:
         """Return the experiment over a recording in memory, identified by its checksum."""
@@ -77,6 +95,11 @@ class Experiment(Objects):
         return self.config["recording"] is not None
 
     @property
+    def is_read(self) -> bool:
+        """Whether its recording is read from a file."""
+        return isinstance(self.config["recording"], str)
+
+    @property
     def calibrated(self) -> bool:
         """Whether a calibration says what is believed of the robot."""
         return self.config["calibration"] is not None
@@ -87,9 +110,35 @@ class Experiment(Objects):
         return self.config["estimator"].get("command")
 
     @property
+    def estimator_options(self) -> Mapping[str, Any]:
+        """Options of its estimator."""
+        return {k: v for k, v in self.config["estimator"].items() if k != "_target_"}
+
+    @property
+    def route_options(self) -> Mapping[str, Any]:
+        """Its route, with `_target_`."""
+        return {**self.config["route"]}
+
+    @property
+    def recording_options(self) -> Mapping[str, Any]:
+        """Those of the function that makes its recording; none of another recording."""
+        wanted = self.config["recording"]
+        return {**wanted} if isinstance(wanted, dict) else {}
+
+    @property
+    def map_options(self) -> Mapping[str, Any]:
+        """Those of the function that makes the prior's map; none of another map."""
+        wanted = self.config["prior"]["map"]
+        return {**wanted} if isinstance(wanted, dict) else {}
+
+    def label(self, key: str) -> Any:
+        """Value of a key that a study adds to the configuration's own."""
+        return self.config[key]
+
+    @property
     def believed_slip(self) -> tuple[float, float] | None:
         """The kr and kl that the estimator believes, m; None if it has no such options."""
-        settings = self.config["estimator"]
+        settings = self.estimator_options
         return (settings["kr"], settings["kl"]) if {"kr", "kl"} <= set(settings) else None
 
     @property
@@ -169,6 +218,16 @@ class Experiment(Objects):
         self._check_team()
         self._check_needs()
         self._check_map()
+
+    def check_estimator(self) -> None:
+        """Check that the estimator can be found, and takes its options.
+
+        Raises
+        ------
+        InputError
+            Naming the option, and the remedy.
+        """
+        checked(self.config["estimator"], "estimator")
 
     def _check_needs(self) -> None:
         """Check that the estimator gets the sensors and the map that it needs."""

@@ -118,6 +118,15 @@ def leaves(tree: Mapping[str, Any], above: Leaf = ()) -> Iterator[tuple[Leaf, An
             yield (*above, name), value
 
 
+def with_leaf(tree: Mapping[str, Any], leaf: Leaf, value: Any) -> Config:
+    """The configuration with another value of a leaf, whose mappings are made if need be."""
+    first, *rest = leaf
+    if not rest:
+        return {**tree, first: value}
+    inside = tree.get(first)
+    return {**tree, first: with_leaf(inside if isinstance(inside, dict) else {}, (*rest,), value)}
+
+
 # The defaults of what is named
 
 

@@ -66,7 +66,7 @@ def _run(
         recording,
         experiment.estimator(),
         experiment.prior(recording),
-        stream(experiment.seed, f"estimator/{name}", 0),
+        stream(experiment.seed, f"estimator/{experiment.estimator_name}", 0),
         on_step=on_step,
     )
     return online if revised is None else revised

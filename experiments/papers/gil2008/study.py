@@ -82,15 +82,14 @@ def plan(profile: Profile) -> Iterator[TableRun]:
     for table in settings.LABELS:
         few = profile is Profile.QUICK and table != "repeats"  # which has one world
         for one in planned([f"study=gil2008/{table}", *few * [f"seed={settings.QUICK_SEEDS}"]]):
-            drawn = one.config["recording"]
+            drawn = one.recording_options
             if drawn["draw"] < n_draws and drawn["image_draw"] <= n_repeats:
                 yield table, one.replaced(repeats=min(one.repeats, n_repeats))
 
 
 def _drawn_from(run: TableRun) -> tuple[Scene, str]:
     """What runs over one recording have in common."""
-    config = run[1].config
-    return Scene.of(config), json.dumps(config["route"])
+    return Scene.of(run[1].config), json.dumps(run[1].route_options)
 
 
 def rows_of(runs: Sequence[TableRun]) -> list[tuple[str, Row]]:
@@ -120,7 +119,7 @@ def rows_of(runs: Sequence[TableRun]) -> list[tuple[str, Row]]:
 
 def labels_of(table: str, experiment: Experiment) -> Row:
     """Columns that name a run in its table; their text names its stream."""
-    choice, chosen = experiment.estimator_name, experiment.config["estimator"]
+    choice, chosen = experiment.estimator_name, experiment.estimator_options
     name = {"fastslam_paper": "paper", "smoother": "batch"}.get(choice, choice)
     if choice == "fastslam":
         name = {"motion": "fastslam1", "optimal": "fastslam2"}[chosen["proposal"]]

@@ -40,7 +40,7 @@ def plan(profile: Profile) -> Iterator[Experiment]:
     """All runs, or those of the quick profile."""
     few = profile is Profile.QUICK
     for one in planned(["study=fastslam_consistency", *few * [f"seed={QUICK_SEEDS}"]]):
-        if not few or one.config["estimator"].get("n_particles", 0) <= MOST_QUICK:
+        if not few or one.estimator_options.get("n_particles", 0) <= MOST_QUICK:
             yield one
 
 
@@ -64,14 +64,14 @@ def rows_of(runs: Sequence[Experiment]) -> list[Row]:
 
 def labels_of(one: Experiment) -> Row:
     """Columns that name a run: its filter, M, and in what it differs from the default."""
-    own, true = one.config["estimator"], one.config["robot"]
+    own, true = one.estimator_options, one.robot()
     name = {"smoother": "batch"}.get(one.estimator_name, one.estimator_name)
     if name == "fastslam":
         name = {"motion": "fastslam1", "optimal": "fastslam2"}[own["proposal"]]
     changed = {
         "resampled at every image": own.get("ess_share") == 1.0,
         "resampled below M / 10": own.get("ess_share") == 0.1,
-        "four times the slip": own["kr"] > true["kr"],
+        "four times the slip": own["kr"] > true.kr,
         "twice the image noise": own.get("sigma_column_px") is not None,
     }
     remedy = next((words for words, is_so in changed.items() if is_so), "none")
