@@ -12,7 +12,7 @@ from experiments.bench.measure import Measurement, median_time_s, time_s
 from experiments.runs import paths, store
 from experiments.runs.experiment import Experiment
 from experiments.runs.seeds import stream
-from experiments.sweeps.launch import run_and_record
+from experiments.sweeps.work import run_and_record
 from sim.team import Team
 
 _NAME = "bench_sweep"

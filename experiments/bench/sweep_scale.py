@@ -22,7 +22,7 @@ from experiments.runs import paths, store
 from experiments.runs.columns import COLUMNS
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row, Status
-from experiments.sweeps import launch
+from experiments.sweeps import launch, work
 from experiments.sweeps.collect import collect
 from experiments.sweeps.plan import Family, packed, plan_of
 from experiments.sweeps.summary import summary
@@ -100,7 +100,7 @@ def _planned() -> tuple[float, list[Path]]:
     for part in packed(plan.recordings, jobs.count):
         jobs.add(plan, part)
     seconds = time.perf_counter() - begun
-    return seconds, [launch.share_of(jobs.plan, number) for number in range(len(jobs.sizes))]
+    return seconds, [work.share_of(jobs.plan, number) for number in range(len(jobs.sizes))]
 
 
 def _written(share: Path) -> None:

@@ -17,10 +17,16 @@ from estimators.team import TeamEstimator
 from experiments.runs.cache import cached
 from experiments.runs.calibration import read_calibration
 from experiments.runs.key import recording_key
-from experiments.runs.schema import SIMULATED_KEYS, Config, PriorOptions, SimulationOptions
+from experiments.runs.schema import (
+    SIMULATED_KEYS,
+    Config,
+    PriorOptions,
+    SimulationOptions,
+    TeamSettings,
+    own_config,
+)
 from experiments.runs.seeds import stream
 from experiments.runs.targets import make
-from experiments.runs.team_settings import TeamSettings, own_config
 from sim.arrays import Array
 from sim.errors import InputError, blaming, require
 from sim.recording import Frame, Recording

@@ -24,7 +24,7 @@ from experiments.runs.compose import (
 from experiments.runs.console import RunFailedError, progress, show
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
-from experiments.runs.interrupts import held_interrupts
+from experiments.runs.processes import held_interrupts
 from experiments.runs.row import Outcome, Row
 from experiments.runs.store import write_run
 from experiments.trajectories.convert import write_estimate

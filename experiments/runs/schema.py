@@ -12,6 +12,7 @@ from typing import Any, Literal
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from estimators.team import Communication
 from sim.errors import InputError, require
 from sim.options import Count, NonNegative, Option, Positive, described, options
 from sim.robot.drive import DifferentialDrive
@@ -21,6 +22,7 @@ Config = dict[str, Any]
 Leaf = tuple[str, ...]  # a place in the configuration: ("robot", "kr")
 GROUPS = ("world", "robot", "sensors", "route", "estimator")
 SIMULATED_KEYS = ("world", "robot", "sensors", "route", "simulation", "seed", "world_seed")
+_OWN = ("robot", "sensors", "route")  # groups in which a robot of a team may differ
 _INJECTED = ("rng", "config", "recording")  # arguments that the program passes
 _UNSET = object()
 
@@ -77,6 +79,31 @@ class RunOptions:
     """Names of belief extras to record."""
     picture: bool
     """Whether a single run is drawn."""
+
+
+@options("team")
+class TeamSettings:
+    """The key `team`."""
+
+    size: Count
+    """How many of the robots drive."""
+    starts: Literal["known", "unknown"]
+    """`known`: each robot has a prior. `unknown`: robot 0 alone has one."""
+    communication: Communication
+    """See `estimators.team.Communication`."""
+    robots: list[dict[str, Any]]
+    """For each robot, keys of `robot`, `sensors` and `route` in which it differs; {} for none."""
+
+    def __post_init__(self) -> None:
+        require(
+            self.size <= len(self.robots),
+            f"team.size must be from 1 to the {len(self.robots)} of team.robots, got {self.size}",
+        )
+        require(
+            self.starts == "known" or self.communication.kind != "never",
+            "team.starts=unknown: a robot that hears nothing of the others is never placed; set "
+            "another team.communication",
+        )
 
 
 OPTIONS: dict[str, type] = {
@@ -296,3 +323,23 @@ def _holds_nan(value: Any) -> bool:
     if isinstance(value, (list, tuple)):
         return any(map(_holds_nan, value))
     return isinstance(value, float) and math.isnan(value)
+
+
+def own_config(config: Config, settings: TeamSettings, number: int) -> Config:
+    """Configuration of one of the robots, which has no key `team`.
+
+    Raises
+    ------
+    InputError
+        If the robot has a key that its group has not.
+    """
+    own = {key: value for key, value in config.items() if key != "team"}
+    for group, values in settings.robots[number].items():
+        where = f"team.robots[{number}].{group}"
+        require(group in _OWN, f"unknown key {where}; known: {', '.join(_OWN)}")
+        require(isinstance(values, Mapping), f"{where} must hold keys, got {values!r}")
+        for key in values:
+            known = (f"{where}.{name}" for name in own[group])
+            require(key in own[group], unknown(f"{where}.{key}", known))
+        own[group] = {**own[group], **values}
+    return own

@@ -33,7 +33,7 @@ from experiments.runs.columns import REVISED
 from experiments.runs.compose import composed_options, option_called, searched
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
-from experiments.runs.interrupts import held_interrupts
+from experiments.runs.processes import held_interrupts
 from experiments.runs.row import Outcome, Row, read_rows, write_frame
 from experiments.sweeps.plan import planned
 from experiments.sweeps.ranges import FIRST_JUDGED_SEED, Range, Tuning
