@@ -95,6 +95,7 @@ class Composer:
     """
 
     def __init__(self, extra: Sequence[str] = ()) -> None:
+        check_overrides(extra)
         self.extra = list(extra)
         self.parse = functools.lru_cache(maxsize=4096)(parsed)
         self._is_group: dict[str, bool] = {}

@@ -9,10 +9,12 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from enum import Enum
 from typing import Any, Literal
 
+from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from estimators.team import Communication
+from experiments.runs.paths import CONF
 from sim.errors import InputError, require
 from sim.options import Count, NonNegative, Option, Positive, described, options
 from sim.robot.drive import DifferentialDrive
@@ -244,10 +246,9 @@ def describe_option(group: str, name: str) -> str:
     InputError
         If there is no such group, or what the option names cannot be found.
     """
-    from experiments.runs.compose import composed_options
-
-    require(group in GROUPS, unknown(group, GROUPS))
-    cfg = composed_options([f"{group}={name}"])
+    require(group in GROUPS, f"no group {group}; there are: {', '.join(GROUPS)}")
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        cfg = compose("config", overrides=[f"{group}={name}"])
     places = [f"sensors.{sensor}" for sensor in cfg.sensors] if group == "sensors" else [group]
     parts = []
     for place in places:

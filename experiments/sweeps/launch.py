@@ -256,7 +256,7 @@ def _launch(plan: Plan, runs: Numbers, jobs: Jobs, launching: Sequence[str]) -> 
 
     parts = packed(plan.recordings[runs], jobs.count)
     numbers = [jobs.add(plan, runs[part]) for part in parts]
-    arguments = sys.argv
+    arguments, os.environ["HYDRA_FULL_ERROR"] = sys.argv, "1"  # its errors come to the caller
     sys.argv = [
         "estima run",
         "-m",
