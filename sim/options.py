@@ -265,11 +265,12 @@ def _complaint(cls: type, where: str, error: ValidationError) -> str:
     """One line about the first field that is wrong."""
     first = error.errors(include_url=False)[0]
     name = str(first["loc"][0]) if first["loc"] else ""
+    place = f"{where}.{name}" if where else name
     known = {option.name: option for option in described(cls)}
     if name not in known:
-        return f"unknown key {where}.{name}; known: {', '.join(known)}"
+        return f"unknown key {place}; known: {', '.join(known)}"
     if first["type"] == "missing" and len(first["loc"]) == 1:
-        return f"{where}.{name} is missing"
-    wanted = known[name].accepts
-    row = "".join(f"[{place}]" for place in first["loc"][1:2])  # of a list
-    return f"{where}.{name}{row} must be {wanted or first['msg']}, got {first['input']!r}"
+        return f"{place} is missing"
+    wanted = known[name].accepts or first["msg"].removeprefix("Input should be ")
+    row = "".join(f"[{number}]" for number in first["loc"][1:2])  # of a list
+    return f"{place}{row} must be {wanted}, got {first['input']!r}"

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from estimators.base import Belief, Estimator
-from experiments.runs.machine import machine
+from experiments.runs.version import machine
 from sim.recording import Frame
 
 

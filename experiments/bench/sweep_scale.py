@@ -22,7 +22,7 @@ from experiments.runs import paths, store
 from experiments.runs.columns import COLUMNS
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row, Status
-from experiments.sweeps import launch
+from experiments.sweeps import launch, work
 from experiments.sweeps.collect import collect
 from experiments.sweeps.plan import Family, packed, plan_of
 from experiments.sweeps.summary import summary
@@ -100,7 +100,7 @@ def _planned() -> tuple[float, list[Path]]:
     for part in packed(plan.recordings, jobs.count):
         jobs.add(plan, part)
     seconds = time.perf_counter() - begun
-    return seconds, [launch.share_of(jobs.plan, number) for number in range(len(jobs.sizes))]
+    return seconds, [work.share_of(jobs.plan, number) for number in range(len(jobs.sizes))]
 
 
 def _written(share: Path) -> None:
@@ -117,10 +117,10 @@ def _written(share: Path) -> None:
 
 
 def _row(labels: Row, experiment: Experiment, rng: np.random.Generator) -> Row:
-    changed = experiment.config["robot"]
+    robot = experiment.robot()
     row: Row = {**labels, "seed": experiment.seed, "world_seed": experiment.seed}
-    row |= {f"robot.{name}": value for name, value in changed.items() if name in ("kr", "kl")}
-    row |= {"estimator.kr": changed["kr"], "estimator.kl": changed["kl"]}
+    row |= {"robot.kr": robot.kr, "robot.kl": robot.kl}
+    row |= {"estimator.kr": robot.kr, "estimator.kl": robot.kl}
     row |= {"run_key": experiment.key, "recording_checksum": rng.bytes(32).hex()}
     metrics = dict(zip(COLUMNS, rng.random(len(COLUMNS)).tolist(), strict=True))
     return {**row, **Status().columns(), **metrics}

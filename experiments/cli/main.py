@@ -201,20 +201,16 @@ def record(
     from experiments.runs.compose import searched
     from experiments.runs.experiment import Experiment
     from experiments.runs.run import expected_s
-    from experiments.runs.team import TeamExperiment
-    from sim import recording, team
+    from sim import team
 
     if out.suffix != ".npz":
         raise InputError(f"-o {out}: a recording is an .npz file")
     experiment = Experiment.compose([*searched(config_dir), *(overrides or [])])
     with progress("simulated seconds", expected_s(experiment)) as on_progress:
-        if experiment.team is None:
-            made = experiment.simulate(on_progress)
-            robots, checksum = {"": made}, recording.save(made, out)
-        else:
-            several = TeamExperiment(experiment).record(on_progress)
-            robots = {f"robot {n}: ": robot for n, robot in enumerate(several.robots)}
-            checksum = team.save(several, out)
+        made = experiment.simulated(on_progress)
+    named = [f"robot {number}: " for number in range(len(made))] if experiment.of_team else [""]
+    robots = dict(zip(named, made.robots, strict=True))
+    checksum = team.save(made, out)
     said = [f"{whose}{robot.status}, {robot.duration_s:.1f} s" for whose, robot in robots.items()]
     print(f"{out}: {'; '.join(said)}, checksum {checksum}")
     if any(robot.status != "ok" for robot in robots.values()):
@@ -476,7 +472,7 @@ def _show_run(
 ) -> None:
     from dataclasses import replace
 
-    from experiments.runs.team import TeamExperiment
+    from experiments.runs.evaluate import run_robots
     from experiments.viewing import live, team_view, view
     from sim.formats.detect import read_all
     from sim.team import Team
@@ -492,7 +488,8 @@ def _show_run(
         held = read_all([what])
         read = held if len(held) > 1 else held.only
     else:
-        read = what.recording()
+        given = what.recordings()
+        read = given if again is not None and again.experiment.of_team else given.only
     name = source if again is None else again.experiment.estimator_name
     if isinstance(read, Team):
         require(out is not None, "a team is drawn in files; add -o team.html, .gif or .mp4")
@@ -511,8 +508,7 @@ def _show_run(
                 if again is None:
                     several = team_view.with_estimates(several, read, name, overrides, on_step)
                 else:
-                    team = TeamExperiment(again.experiment)
-                    answers = team.run(read, again.repeat, on_step=on_step)
+                    answers = run_robots(again.experiment, read, again.repeat, on_step)
                     several = several.beside([online for online, _ in answers], name)
         several = replace(several, grid=known, seconds=length_s)
         run: view.Played = several

@@ -13,9 +13,8 @@ import numpy as np
 import pandas as pd
 
 from experiments.judging.verdict import Claim, Conclusion, Profile, Role, Verdict
-from experiments.runs.machine import machine
 from experiments.runs.row import read_rows, write_frame
-from experiments.runs.version import code_version
+from experiments.runs.version import code_version, machine
 from sim.errors import InputError
 from sim.files import require_file, write_whole
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.runs import paths
-from experiments.runs.locks import locked
+from experiments.runs.processes import locked
 from experiments.runs.version import SIMULATION, code_version
 from sim.errors import InputError
 from sim.files import require_file

@@ -78,7 +78,9 @@ class Composed:
         if simulation["rays"] is None:
             kinematic = simulation["physics"] == "kinematic"  # it has no engine to cast rays
             simulation["rays"] = "exact" if kinematic else "bullet"
-        return config, {group: str(self.choices.get(group)) for group in GROUPS}
+        # an option of a folder, such as peers/kiss_icp, is called by its last part
+        named = {group: str(self.choices.get(group)).rpartition("/")[2] for group in GROUPS}
+        return config, named
 
 
 class Composer:
@@ -93,6 +95,7 @@ class Composer:
     """
 
     def __init__(self, extra: Sequence[str] = ()) -> None:
+        check_overrides(extra)
         self.extra = list(extra)
         self.parse = functools.lru_cache(maxsize=4096)(parsed)
         self._is_group: dict[str, bool] = {}
@@ -200,6 +203,13 @@ class CommandLine:
         return cls(given.overrides, given.config_dir, given.cfg is not None, given.resolve)
 
 
+def option_called(group: str, name: str, config_dir: str | Path | None = None) -> str:
+    """The option of a group that has this name, such as `peers/kiss_icp`; else the name itself."""
+    folders = [None, *([Path(config_dir)] if config_dir else [])]
+    every = [option for folder in folders for option in paths.option_names(group, folder)]
+    return next((option for option in every if option.rpartition("/")[2] == name), name)
+
+
 def composed_options(overrides: Sequence[str]) -> DictConfig:
     """A configuration, not resolved, of overrides that may name a study's file."""
     with composing() as composer:
@@ -271,7 +281,7 @@ def searched(config_dir: str | Path | None) -> list[str]:
         raise InputError(f"--config-dir must name a folder, got {config_dir}")
     require("${" not in str(folder), f"{folder}: Hydra takes ${{ for a value; rename the folder")
     for group in (*GROUPS, "study"):
-        for path in sorted((folder / group).glob("*.yaml")):
+        for path in sorted((folder / group).rglob("*.yaml")):
             option = read_yaml(path)  # within bounds, which Hydra does not know
             keys = option is None or (
                 isinstance(option, dict) and all(isinstance(key, str) for key in option)

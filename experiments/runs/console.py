@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, NoReturn
 
+from experiments.runs.paths import option_names
 from sim.errors import InputError, printable
 
 _QUIET_S = 2.0  # what ends sooner shows no progress
@@ -156,7 +157,8 @@ def _refusal(error: BaseException) -> str | None:
     missing, options = (getattr(error, name, None) for name in ("missing_cfg_file", "options"))
     if missing and options:
         group, _, name = missing.rpartition("/")
-        return f"no {group} named {name}; there are: {', '.join(options)}"
+        every = sorted({*options, *option_names(group)})
+        return f"no {group} named {name}; there are: {', '.join(every)}"
     return None
 
 

@@ -7,30 +7,117 @@ import difflib
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from enum import Enum
-from typing import Any
+from typing import Any, Literal
 
+from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from estimators.team import Communication
+from experiments.runs.paths import CONF
 from sim.errors import InputError, require
-from sim.options import Option, described, find
+from sim.options import Count, NonNegative, Option, Positive, described, find, options
 from sim.robot.drive import DifferentialDrive
 
 Config = dict[str, Any]
 Leaf = tuple[str, ...]  # a place in the configuration: ("robot", "kr")
 GROUPS = ("world", "robot", "sensors", "route", "estimator")
 SIMULATED_KEYS = ("world", "robot", "sensors", "route", "simulation", "seed", "world_seed")
-_MAPPINGS = (*GROUPS, "simulation", "prior", "scoring")
+_OWN = ("robot", "sensors", "route")  # groups in which a robot of a team may differ
+_INJECTED = ("rng", "config", "recording")  # arguments that the program passes
+_UNSET = object()
+
+
+@options("simulation")
+class SimulationOptions:
+    """The key `simulation`."""
+
+    physics: Literal["bullet", "kinematic"]
+    """The engine, or the same slip law with ideal rolling."""
+    rays: Literal["bullet", "exact"]
+    """How rays are cast; the geometry is the same."""
+
+    def __post_init__(self) -> None:
+        require(
+            self.physics == "bullet" or self.rays == "exact",
+            "simulation.rays=bullet needs the engine; set simulation.rays=exact",
+        )
+
+
+@options("prior")
+class PriorOptions:
+    """The key `prior`: what the estimator knows at the start."""
+
+    start: Literal["tracking", "global"]
+    """The first true pose, or none."""
+    sigma_position_m: NonNegative
+    """Of the first belief, m; its mean is drawn with it."""
+    sigma_heading_rad: NonNegative
+    wheel_radius_m: Positive | None
+    """What the estimator believes of the robot, m; null: what the recording says."""
+    track_m: Positive | None
+    map: Any
+    """none, world, a grid's file, or a mapping with `_target_`."""
+
+
+@options("scoring")
+class ScoringOptions:
+    """The key `scoring`: options of `experiments.evaluation.metrics.score`."""
+
+    longest_gap_s: NonNegative
+    """Of the truth, over which it is interpolated, s; Frames in longer ones do not count."""
+    after_s: NonNegative
+    """Frames of the first seconds do not count, s."""
+
+
+@options("")
+class RunOptions:
+    """Keys of a run that stand alone."""
+
+    repeats: Count
+    """Runs of the estimator over the same recording, a row each."""
+    keep: list[str]
+    """Names of belief extras to record."""
+    picture: bool
+    """Whether a single run is drawn."""
+
+
+@options("team")
+class TeamSettings:
+    """The key `team`."""
+
+    size: Count
+    """How many of the robots drive."""
+    starts: Literal["known", "unknown"]
+    """`known`: each robot has a prior. `unknown`: robot 0 alone has one."""
+    communication: Communication
+    """See `estimators.team.Communication`."""
+    robots: list[dict[str, Any]]
+    """For each robot, keys of `robot`, `sensors` and `route` in which it differs; {} for none."""
+
+    def __post_init__(self) -> None:
+        require(
+            self.size <= len(self.robots),
+            f"team.size must be from 1 to the {len(self.robots)} of team.robots, got {self.size}",
+        )
+        require(
+            self.starts == "known" or self.communication.kind != "never",
+            "team.starts=unknown: a robot that hears nothing of the others is never placed; set "
+            "another team.communication",
+        )
+
+
+OPTIONS: dict[str, type] = {
+    "simulation": SimulationOptions,
+    "prior": PriorOptions,
+    "scoring": ScoringOptions,
+}
+_MAPPINGS = (*GROUPS, *OPTIONS)
 _KEYS = (
     *_MAPPINGS,
-    *("seed", "world_seed", "repeats", "recording", "calibration", "name", "picture", "keep"),
-    *("simulation.physics", "simulation.rays"),
-    *("prior.start", "prior.sigma_position_m", "prior.sigma_heading_rad"),
-    *("prior.wheel_radius_m", "prior.track_m", "prior.map"),
-    *("scoring.longest_gap_s", "scoring.after_s"),
+    *("seed", "world_seed", "recording", "calibration", "name", "repeats", "keep", "picture"),
+    *(f"{place}.{option.name}" for place, kind in OPTIONS.items() for option in described(kind)),
 )
-_INJECTED = ("rng", "config", "recording")  # arguments that the program passes, not the user
-_UNSET = object()
 
 
 def unknown(key: str, known: Iterable[str]) -> str:
@@ -57,6 +144,15 @@ def leaves(tree: Mapping[str, Any], above: Leaf = ()) -> Iterator[tuple[Leaf, An
             yield from leaves(value, (*above, name))
         else:
             yield (*above, name), value
+
+
+def with_leaf(tree: Mapping[str, Any], leaf: Leaf, value: Any) -> Config:
+    """The configuration with another value of a leaf, whose mappings are made if need be."""
+    first, *rest = leaf
+    if not rest:
+        return {**tree, first: value}
+    inside = tree.get(first)
+    return {**tree, first: with_leaf(inside if isinstance(inside, dict) else {}, (*rest,), value)}
 
 
 # The defaults of what is named
@@ -149,10 +245,9 @@ def describe_option(group: str, name: str) -> str:
     InputError
         If there is no such group, or what the option names cannot be found.
     """
-    from experiments.runs.compose import composed_options
-
-    require(group in GROUPS, unknown(group, GROUPS))
-    cfg = composed_options([f"{group}={name}"])
+    require(group in GROUPS, f"no group {group}; there are: {', '.join(GROUPS)}")
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        cfg = compose("config", overrides=[f"{group}={name}"])
     places = [f"sensors.{sensor}" for sensor in cfg.sensors] if group == "sensors" else [group]
     parts = []
     for place in places:
@@ -228,3 +323,23 @@ def _holds_nan(value: Any) -> bool:
     if isinstance(value, (list, tuple)):
         return any(map(_holds_nan, value))
     return isinstance(value, float) and math.isnan(value)
+
+
+def own_config(config: Config, settings: TeamSettings, number: int) -> Config:
+    """Configuration of one of the robots, which has no key `team`.
+
+    Raises
+    ------
+    InputError
+        If the robot has a key that its group has not.
+    """
+    own = {key: value for key, value in config.items() if key != "team"}
+    for group, values in settings.robots[number].items():
+        where = f"team.robots[{number}].{group}"
+        require(group in _OWN, f"unknown key {where}; known: {', '.join(_OWN)}")
+        require(isinstance(values, Mapping), f"{where} must hold keys, got {values!r}")
+        for key in values:
+            known = (f"{where}.{name}" for name in own[group])
+            require(key in own[group], unknown(f"{where}.{key}", known))
+        own[group] = {**own[group], **values}
+    return own

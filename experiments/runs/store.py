@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from experiments.runs.columns import REPEAT
-from experiments.runs.locks import locked
+from experiments.runs.processes import locked
 from experiments.runs.row import (
     WITH_DIGEST,
     Outcome,

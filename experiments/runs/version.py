@@ -1,12 +1,15 @@
-"""Digests of the source code, so that results of different versions never mix silently."""
+"""Where results come from: the machine, and digests of the code, so that versions never mix."""
 
 import ast
 import functools
 import hashlib
 import importlib.util
 import json
+import os
+import platform
 import shlex
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +22,13 @@ RUNS = (
     "estimators",
     "experiments/evaluation/metrics.py",
     "experiments/papers/maximo2024/places.py",
-    "experiments/runs/evaluate.py",
-    "experiments/runs/experiment.py",
-    "experiments/runs/seeds.py",
-    "experiments/runs/targets.py",
+    *(
+        f"experiments/runs/{name}.py"
+        for name in (
+            *("compose", "evaluate", "experiment", "key", "objects"),
+            *("schema", "seeds", "targets", "team"),
+        )
+    ),
 )
 
 
@@ -108,3 +114,28 @@ def _with_imports(module: Path) -> list[Path]:
         beside = {module.parent / f"{name.partition('.')[0]}.py" for name in names}
         left |= {path for path in beside if path.is_file()} - found
     return sorted(found)
+
+
+def machine() -> dict[str, str | int]:
+    """Processor, core count and versions."""
+    import numba
+    import numpy as np
+
+    return {
+        "cpu": _cpu_model(),
+        "cores": os.cpu_count() or 1,
+        "system": platform.system(),
+        "architecture": platform.machine(),
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "numba": numba.__version__,
+    }
+
+
+def _cpu_model() -> str:
+    """Name of the processor, from the kernel if it gives one, else from the platform."""
+    with suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    return platform.processor() or platform.machine()

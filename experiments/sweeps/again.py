@@ -12,15 +12,11 @@ import pandas as pd
 from hydra.errors import HydraException, MissingConfigException
 
 from experiments.runs.columns import REPEAT, is_setting
-from experiments.runs.compose import searched
+from experiments.runs.compose import option_called, searched
 from experiments.runs.experiment import Experiment
-from experiments.runs.schema import Config
 from experiments.runs.store import read_runs
-from experiments.runs.targets import checked
-from experiments.runs.team import recorded
 from experiments.sweeps.collect import commands, folder_of
 from sim.errors import InputError, require
-from sim.recording import Recording
 from sim.team import Team
 
 _SHORT = 10  # digits of a key that tell tens of thousands of runs apart
@@ -34,7 +30,7 @@ class Again:
     repeat: int
     checksum: str
 
-    def recording(self) -> Recording | Team:
+    def recordings(self) -> Team:
         """What the run read.
 
         Raises
@@ -42,7 +38,7 @@ class Again:
         InputError
             If it is no longer the same.
         """
-        read = recorded(self.experiment)
+        read = self.experiment.recordings()
         require(read.checksum == self.checksum, "the recording of the run is not what it was")
         return read
 
@@ -108,9 +104,13 @@ def run_again(
     """
     settings = {str(c): row[c] for c in row.index if is_setting(str(c)) and str(c) != "name"}
     chosen = {c.partition(".")[2]: v for c, v in settings.items() if c.startswith("choice.")}
-    choices = [f"{group}={name}" for group, name in chosen.items() if isinstance(name, str)]
     if config_dir is None and noted is not None and Path(noted).is_dir():
         config_dir = noted
+    choices = [
+        f"{group}={option_called(group, name, config_dir)}"
+        for group, name in chosen.items()
+        if isinstance(name, str)
+    ]
     try:
         base = Experiment.compose([*searched(config_dir), *choices])
     except MissingConfigException as error:
@@ -120,13 +120,13 @@ def run_again(
         ) from error
     except HydraException as error:
         raise InputError(f"{', '.join(choices)}: {str(error).splitlines()[0]}") from error
-    config: Config = json.loads(json.dumps(base.config))
-    defaults = base.labels("")
+    defaults, changed = base.labels(""), []
     for name in [*(n for n in defaults if n in settings), *settings]:
         value, default = settings[name], defaults.get(name)
         if not name.startswith("choice.") and (name in defaults or _known(value)):
-            _set(config, name, _plain(value, default) if _known(value) else None)
-    again = Experiment(config, base.choices)
+            plain = _plain(value, default) if _known(value) else None
+            changed.append((tuple(name.split(".")), plain))
+    again = base.with_leaves(changed)
     made = again.labels("")
     for name, value in settings.items():
         mine = made.get(name)
@@ -134,7 +134,7 @@ def run_again(
             str(mine) == str(value) or mine == value or not (_known(mine) or _known(value)),
             f"the run had {name}={value}, and would have {mine} if it was made again",
         )
-    checked(config["estimator"], "estimator")  # without its module its version is another
+    again.check_estimator()  # without its module its version is another
     require(
         made["code_version"] == row["code_version"],
         f"the run is of another version of the code, {row['code_version']}; run the sweep again",
@@ -156,13 +156,3 @@ def _plain(value: Any, default: Any) -> Any:
     if isinstance(value, str) and value.startswith("["):
         return json.loads(value)
     return int(value) if isinstance(value, (str, float)) and type(default) is int else value
-
-
-def _set(config: Config, name: str, value: Any) -> None:
-    """Set a dotted key."""
-    *groups, last = name.split(".")
-    for group in groups:
-        if not isinstance(config.get(group), dict):
-            config[group] = {}
-        config = config[group]
-    config[last] = value

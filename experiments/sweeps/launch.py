@@ -17,11 +17,10 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import hydra
 import numpy as np
@@ -30,18 +29,14 @@ from omegaconf import DictConfig
 from experiments.runs import paths, store
 from experiments.runs.compose import CommandLine, check_hydra
 from experiments.runs.console import RunFailedError, counted, progress
-from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
-from experiments.runs.interrupts import held_interrupts
-from experiments.runs.row import Outcome, Row, Status, check_row
-from experiments.runs.team import recorded
+from experiments.runs.row import Outcome, Status
 from experiments.sweeps.collect import COMMAND, UNFINISHED
-from experiments.sweeps.plan import Family, Numbers, Plan, packed, plan_of
+from experiments.sweeps.plan import Numbers, Plan, packed, plan_of
+from experiments.sweeps.work import compiling_file, end_with, failure, is_there, run_share, share_of
 from sim.compiled import ANNOUNCED, note_compiling
 from sim.errors import InputError, require
 from sim.files import require_file, write_whole
-from sim.recording import Recording
-from sim.team import Team
 
 _JOBS_PER_CORE = 4  # enough to keep all busy to the end, few enough to cost little
 # What launchers raise when a process of theirs has died; Ray and submitit are extras
@@ -134,7 +129,7 @@ def _name(plan: Plan, own: Sequence[str], config_dir: str | None) -> str | None:
     So the same command goes on where it stopped, and two sweeps do not pool their rows.
     """
     given = any(argument.lstrip("+").startswith("name=") for argument in own)
-    if given or plan.experiment(0).config["name"] != _UNNAMED:
+    if given or plan.experiment(0).name != _UNNAMED:
         return None
     last = {argument.partition("=")[0]: argument for argument in own}  # that one is swept
     text = json.dumps([sorted(last.values()), config_dir and str(Path(config_dir).resolve())])
@@ -218,16 +213,6 @@ class Jobs:
         return str(number)
 
 
-def share_of(plan: str | Path, job: int) -> Path:
-    """File of a job's share of the plan."""
-    return Path(f"{plan}.jobs") / f"share-{job}.json"
-
-
-def _compiling(plan: str | Path) -> Path:
-    """File that is touched whenever a job compiles numerical code."""
-    return Path(f"{plan}.jobs") / "compiling"
-
-
 def _plan_of(folder: Path, journal: str) -> Path:
     """The plan that a journal belongs to."""
     return folder / f"plan-{journal.removeprefix('rows-').rpartition('-')[0]}.json"
@@ -271,7 +256,7 @@ def _launch(plan: Plan, runs: Numbers, jobs: Jobs, launching: Sequence[str]) -> 
 
     parts = packed(plan.recordings[runs], jobs.count)
     numbers = [jobs.add(plan, runs[part]) for part in parts]
-    arguments = sys.argv
+    arguments, os.environ["HYDRA_FULL_ERROR"] = sys.argv, "1"  # its errors come to the caller
     sys.argv = [
         "estima run",
         "-m",
@@ -335,24 +320,13 @@ def _clear_plans(folder: Path) -> None:
         require_file(plan)
         try:
             node, planner = json.loads(plan.read_text())["planner"]
-            if node != platform.node() or _is_there(planner):
+            if node != platform.node() or is_there(planner):
                 continue
         except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
             continue
         _remove(plan)
         for part in folder.glob(f".rows-{plan.stem.removeprefix('plan-')}*.part*"):
             part.unlink(missing_ok=True)
-
-
-def _is_there(process: int) -> bool:
-    """Whether a process of this machine lives."""
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:  # another user's
-        return True
-    return True
 
 
 _UNNAMED = "run"  # the default of conf/config.yaml
@@ -392,90 +366,12 @@ def job_application(cfg: DictConfig) -> None:
         share = json.loads(share_of(cfg.plan, cfg.job).read_text())
     except OSError as error:
         raise InputError(f"{cfg.plan}: the plan is gone; start the sweep again") from error
-    _end_with(*share["planner"])
+    end_with(*share["planner"])
     if os.getpid() != share["planner"][1]:  # joblib's workers stay, as they were, for later sweeps
         folder, os.environ["ESTIMA_RESULTS"] = share["places"]
         os.chdir(folder)
-    note_compiling(_compiling(cfg.plan))
+    note_compiling(compiling_file(cfg.plan))
     run_share(share)
-
-
-def run_share(share: Mapping[str, Any]) -> None:
-    """Run a job's share of the plan, as `Jobs.add` wrote it, but for what its journal has.
-
-    A run that fails leaves its row, and the next follows.
-    """
-    held: dict[str, Recording | Team] = {}
-    path = Path(share["journal"])
-    over = store.ended(path.parent, f"{path.stem}.")  # something if the launcher tries it again
-    keys = {*over.done.tolist(), *over.failed}
-    with store.journal(path) as journal:
-        for family in share["families"]:
-            for experiment in Family.experiments(family):
-                if not keys or int(experiment.key, 16) not in keys:
-                    run_and_record(experiment, held, journal)
-    store.compact(path)
-
-
-def _end_with(node: str, planner: int) -> None:
-    """End this process when the planner ends, if the planner started it, and not by Ctrl-C."""
-    if platform.node() != node or os.getpid() == planner:
-        return
-    if os.getppid() != planner:  # started by a launcher's own processes, or left behind just now
-        if not _is_there(planner):
-            os._exit(1)
-        return
-
-    def watch() -> None:
-        while os.getppid() == planner:
-            time.sleep(0.5)
-        os._exit(1)
-
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the terminal sends it to all; the planner acts
-    if "planner" not in {thread.name for thread in threading.enumerate()}:
-        threading.Thread(target=watch, name="planner", daemon=True).start()
-
-
-def run_and_record(
-    experiment: Experiment, held: dict[str, Recording | Team], journal: store.Journal
-) -> None:
-    """Run one experiment; what goes wrong becomes the status of its row.
-
-    Parameters
-    ----------
-    held
-        The last recording by its key; most runs of a job share it.
-    journal
-        Takes the rows.
-    """
-    journal.begin(experiment.key)
-    with held_interrupts() as on_step:  # what one causes is no result
-        try:
-            rows = evaluate(
-                experiment,
-                lambda: _held(experiment, held, on_step),
-                shown=lambda _: nullcontext(on_step),
-            )
-            for row in rows:
-                check_row(row)
-        except (Exception, SystemExit) as error:
-            rows = [_failure(experiment, Status.of_error(error))]
-    journal.append(rows)
-
-
-def _held(
-    experiment: Experiment, held: dict[str, Recording | Team], on_progress: Callable[..., None]
-) -> Recording | Team:
-    key = experiment.recording_key
-    if key not in held:
-        held.clear()
-        held[key] = recorded(experiment, on_progress)
-    return held[key]
-
-
-def _failure(experiment: Experiment, status: Status) -> Row:
-    """Row of a run that left none itself."""
-    return {**experiment.labels(""), **status.columns()}
 
 
 def _record_death(experiment: Experiment, jobs: Jobs) -> None:
@@ -483,7 +379,7 @@ def _record_death(experiment: Experiment, jobs: Jobs) -> None:
     status = Status(Outcome.FAILED, "died", "its process died (out of memory?)")
     path = jobs.folder / f"rows-{jobs.name}-{experiment.key}{store.JOURNAL}"
     with store.journal(path) as journal:
-        journal.append([_failure(experiment, status)])
+        journal.append([failure(experiment, status)])
 
 
 @contextmanager
@@ -502,7 +398,7 @@ def _watched(jobs: Jobs, n_runs: int) -> Iterator[None]:
             over = False
             while not over:
                 over = ended.wait(0.5)
-                noted_ns = _touched_ns(_compiling(jobs.plan))
+                noted_ns = _touched_ns(compiling_file(jobs.plan))
                 if noted_ns and not compiled_ns:
                     print(ANNOUNCED, file=sys.stderr, flush=True)
                 for journal in list(jobs.sizes):

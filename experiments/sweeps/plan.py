@@ -33,7 +33,7 @@ from experiments.runs.compose import (
 )
 from experiments.runs.experiment import Experiment
 from experiments.runs.key import decides_recording, files_of_options, leaf_digests
-from experiments.runs.schema import Config, Leaf, leaves
+from experiments.runs.schema import Leaf, leaves
 from sim.errors import InputError, require
 
 Numbers = NDArray[np.int64]
@@ -84,14 +84,13 @@ class Family:
 
     Attributes
     ----------
-    config, choices
-        Those of the first run.
+    first
+        One run; the axes change its values.
     axes
         What changes; the last one changes fastest.
     """
 
-    config: Config
-    choices: Mapping[str, str]
+    first: Experiment
     axes: tuple[Axis, ...] = ()
 
     @property
@@ -101,11 +100,10 @@ class Family:
 
     def experiment(self, number: int) -> Experiment:
         """One of the runs."""
-        config = self.config
-        for axis, place in zip(self.axes, np.unravel_index(number, self.shape), strict=True):
-            for leaf in axis.leaves:
-                config = _with(config, leaf, axis.values[int(place)])
-        return Experiment(config, self.choices)
+        places = zip(self.axes, np.unravel_index(number, self.shape), strict=True)
+        return self.first.with_leaves(
+            (leaf, axis.values[int(place)]) for axis, place in places for leaf in axis.leaves
+        )
 
     def keys(self) -> Digests:
         """Keys of all the runs, in the shape of the axes."""
@@ -113,8 +111,7 @@ class Family:
 
     def recordings(self) -> Digests:
         """A digest for each run that is the same for runs of the same recording."""
-        from_file = isinstance(self.config["recording"], str)
-        counts = functools.partial(decides_recording, from_file=from_file)
+        counts = functools.partial(decides_recording, from_file=self.first.is_read)
         first = self.experiment(0).recording_key[:16]
         return _sums(first, [axis.digests(counts) for axis in self.axes])
 
@@ -139,15 +136,14 @@ class Family:
             else [a.leaves, a.values]
             for a in self.axes
         ]
-        return [self.config, self.choices, axes, numbers.tolist()]
+        return [self.first.config, self.first.choices, axes, numbers.tolist()]
 
     @classmethod
     def experiments(cls, stored: Any) -> Iterator[Experiment]:
         """Runs of what `as_json` gave."""
         config, choices, axes, numbers = stored
         family = cls(
-            config,
-            choices,
+            Experiment(config, choices),
             tuple(
                 Axis(
                     tuple(map(tuple, leaves)),
@@ -193,13 +189,13 @@ class Plan:
         InputError
             If its runs have several names.
         """
-        names = {f.config["name"] for f in self.families}
+        names = {f.first.name for f in self.families}
         swept_ = any(("name",) in axis.leaves for f in self.families for axis in f.axes)
         if len(names) > 1 or swept_:
             raise InputError("name is the folder of all the rows; a sweep has one, not several")
         if name is None:
             return self
-        families = [replace(f, config={**f.config, "name": name}) for f in self.families]
+        families = [replace(f, first=f.first.replaced(name=name)) for f in self.families]
         return replace(self, families=families)
 
     def as_json(self, runs: Numbers) -> list[Any]:
@@ -326,7 +322,7 @@ def _grid(
         lines = [texts[key][place] for key, place in at.items()]
         found, axes = _composed(composer, lines, {key: choices[key] for key in inner})
         first = Experiment(*found.resolved()).replaced(picture=False)
-        made = Family(first.config, first.choices, tuple(axes[key] for key in inner))
+        made = Family(first, tuple(axes[key] for key in inner))
         cells = tuple(at.get(key, slice(None)) for key in choices)
         family[cells] = len(families)
         number[cells] = np.arange(math.prod(made.shape)).reshape(made.shape)
@@ -421,12 +417,6 @@ def _decides_more(leaf: Leaf, values: Sequence[Any]) -> bool:
         ("world", "path"),
     )
     return files or leaf[0] == "simulation" or leaf[-1] in ("_target_", "path")
-
-
-def _with(tree: Config, leaf: Leaf, value: Any) -> Config:
-    """The configuration with another value of a leaf."""
-    first, *rest = leaf
-    return {**tree, first: _with(tree[first], tuple(rest), value) if rest else value}
 
 
 def _sums(first: str, steps: Sequence[Digests]) -> Digests:

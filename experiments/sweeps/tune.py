@@ -30,10 +30,10 @@ from omegaconf import OmegaConf
 from experiments.evaluation.statistics import Interval, log_ratio_interval
 from experiments.runs import paths
 from experiments.runs.columns import REVISED
-from experiments.runs.compose import composed_options, searched
+from experiments.runs.compose import composed_options, option_called, searched
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
-from experiments.runs.interrupts import held_interrupts
+from experiments.runs.processes import held_interrupts
 from experiments.runs.row import Outcome, Row, read_rows, write_frame
 from experiments.sweeps.plan import planned
 from experiments.sweeps.ranges import FIRST_JUDGED_SEED, Range, Tuning
@@ -125,19 +125,20 @@ def tune(
 
 def yaml_of(tuned: Tuned, study: str, tuning: Tuning) -> str:
     """An option of conf/estimator: the default with the winner's values."""
-    return (
+    option = option_called("estimator", tuned.estimator)
+    return ("# @package estimator\n" if "/" in option else "") + (
         f"# {tuned.estimator}, tuned: {tuning.trials} trials on seeds {list(tuning.seeds)} of "
         f"study={study}.\n"
         f"# On {tuned.n_judged} other recordings its error is {tuned.gain.value:.2f} "
         f"[{tuned.gain.low:.2f}, {tuned.gain.high:.2f}] times the default's.\n"
-        f"defaults:\n  - {tuned.estimator}\n  - _self_\n"
+        f"defaults:\n  - {option}\n  - _self_\n"
         + (yaml.safe_dump(dict(tuned.values), sort_keys=False) if tuned.values else "")
     )
 
 
 def write(tuned: Tuned, study: str, tuning: Tuning, folder: Path) -> Path:
     """Write the winner's YAML, `ESTIMATOR_tuned.yaml`; return its path."""
-    path = folder / f"{tuned.estimator}_tuned.yaml"
+    path = folder / f"{option_called('estimator', tuned.estimator)}_tuned.yaml"
     write_text(path, yaml_of(tuned, study, tuning))
     return path
 
@@ -220,7 +221,11 @@ def _plan(
     study: str, name: str, tuning: Tuning, config_dir: str | None
 ) -> tuple[list[Experiment], list[Experiment]]:
     """Experiments to tune on, all worlds of a seed together, and to judge by."""
-    common = [f"study={study}", "sweeps=[]", f"estimator={name}"]
+    common = [
+        f"study={study}",
+        "sweeps=[]",
+        f"estimator={option_called('estimator', name, config_dir)}",
+    ]
     seeds = f"seed={','.join(map(str, tuning.seeds))}"
     drives = sorted(planned([*common, seeds], config_dir), key=lambda e: e.seed)
     judged = list(planned(common, config_dir))
@@ -230,22 +235,20 @@ def _plan(
     )
     first = drives[0]
     first.check()
-    for option, allowed in tuning.estimators[name].items():
-        default = _value(first, option)
+    for key, allowed in tuning.estimators[name].items():
+        default = _value(first, key)
         require(
             allowed.has(default),
-            f"tune.estimators.{name}.{option} must hold the default, {default!r}, so that it is a "
+            f"tune.estimators.{name}.{key} must hold the default, {default!r}, so that it is a "
             "trial too",
         )
     return drives, judged
 
 
 def _value(experiment: Experiment, option: str) -> Any:
-    settings = experiment.config["estimator"]
-    known = ", ".join(key for key in settings if key != "_target_")
-    require(
-        option in settings, f"{experiment.estimator_name} has no option {option}; it has {known}"
-    )
+    settings = experiment.estimator_options
+    known = f"{experiment.estimator_name} has no option {option}; it has {', '.join(settings)}"
+    require(option in settings, known)
     return settings[option]
 
 

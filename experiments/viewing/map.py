@@ -9,7 +9,7 @@ import numpy as np
 
 from estimators.base import Estimate
 from experiments.evaluation.time_sync import interpolate
-from experiments.runs.evaluate import estimates
+from experiments.runs.evaluate import run_over
 from experiments.runs.seeds import stream
 from experiments.viewing.view import experiment_over, is_file_of_estimate, read_estimate
 from sim.arrays import Array, Floats
@@ -62,11 +62,11 @@ def _run(
     recording: Recording, name: str, overrides: Sequence[str], on_step: Callable[[int], None]
 ) -> Estimate:
     experiment = experiment_over(recording, name, overrides)
-    online, revised = estimates(
-        experiment.estimator(),
+    online, revised = run_over(
         recording,
+        experiment.estimator(),
         experiment.prior(recording),
-        stream(experiment.seed, f"estimator/{name}", 0),
+        stream(experiment.seed, f"estimator/{experiment.estimator_name}", 0),
         on_step=on_step,
     )
     return online if revised is None else revised

@@ -105,7 +105,7 @@ def with_estimates(
             experiment.team_estimator,
             team,
             priors,
-            lambda robot: stream(experiment.seed, f"estimator/{source}", robot),
+            lambda robot: stream(experiment.seed, f"estimator/{experiment.estimator_name}", robot),
             on_step=on_step,
         )
         found = [revised or online for online, revised in answers]

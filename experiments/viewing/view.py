@@ -176,7 +176,7 @@ def estimate_by(
     repeat: int = 0,
 ) -> Estimate:
     """Online estimate of an experiment's estimator, with what is drawn at the shown Frames."""
-    if "keep_map" in experiment.config["estimator"]:
+    if "keep_map" in experiment.estimator_options:
         experiment = experiment.with_estimator(keep_map=True)
     sparing = _Sparing(experiment.estimator(), set(rows.tolist()))
     rng = stream(experiment.seed, f"estimator/{experiment.estimator_name}", repeat)

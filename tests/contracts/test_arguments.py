@@ -3,10 +3,9 @@
 import pytest
 
 from experiments.runs import cache
-from experiments.runs.compose import searched
+from experiments.runs.compose import CommandLine, check_hydra, searched
 from experiments.runs.console import end
 from experiments.runs.experiment import Experiment
-from experiments.runs.run import _split, application
 from sim.errors import InputError
 
 
@@ -34,23 +33,34 @@ def test_another_endless_recursion_is_an_internal_error(capsys):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "overrides"),
+    ("arguments", "line"),
     [
-        (["seed=1", "--config-dir", "a=b", "estimator=x"], ["seed=1", "estimator=x"]),
-        (["~route", "--resolve", "seed=1", "--cfg", "job", "a=2"], ["~route", "seed=1", "a=2"]),
-        (["--config-dir=a", "seed=1"], ["seed=1"]),
+        (["seed=1", "--config-dir", "a=b", "estimator=x"], (["seed=1", "estimator=x"], "a=b")),
+        (["~route", "--resolve", "seed=1", "--cfg", "job", "a=2"], (["~route", "seed=1", "a=2"],)),
+        (["--config-dir=a", "seed=1"], (["seed=1"], "a")),
     ],
 )
-def test_overrides_may_stand_before_and_after_options(arguments, overrides):
-    found, options = _split(arguments)
-    assert found == overrides
-    assert options == [argument for argument in arguments if argument not in overrides]
+def test_overrides_may_stand_before_and_after_options(arguments, line):
+    found = CommandLine.of(arguments)
+    assert found.overrides == line[0]
+    assert found.config_dir == (line[1] if line[1:] else None)
+    assert found.shown == found.resolved == ("--cfg" in arguments)
 
 
-@pytest.mark.parametrize("argument", ["--shell-completion", "-sc", "--package=x", "-p"])
-def test_options_of_hydra_that_have_no_effect_are_refused(argument):
-    with pytest.raises(InputError, match=r"--install-completion|without --cfg"):
-        application(["seed=1", argument, "robot"], draw=lambda *_: None)
+@pytest.mark.parametrize("argument", ["--shell-completion", "-sc", "--package=x", "--info"])
+def test_unknown_options_are_refused_with_the_known_ones(argument):
+    with pytest.raises(InputError, match=rf"^{argument}.*: estima run takes .*--config-dir"):
+        CommandLine.of(["seed=1", argument])
+    with pytest.raises(InputError, match=r"config-dir.*expected one argument"):
+        CommandLine.of(["seed=1", "--config-dir"])
+
+
+@pytest.mark.parametrize(
+    "override", ["hydra.run.dir=x", "hydra/sweeper=ax", "hydra.verbose=true", "hydra.job.name=x"]
+)
+def test_settings_of_hydra_that_nothing_reads_are_refused(override):
+    with pytest.raises(InputError, match=override.partition("=")[0]):
+        check_hydra([override])
 
 
 def test_a_cache_that_cannot_be_cleared_is_one_line(tmp_path, monkeypatch):

@@ -9,6 +9,7 @@ import pytest
 import yaml
 
 from experiments.runs.experiment import Experiment
+from experiments.runs.paths import option_names
 from experiments.runs.targets import make
 from sim.errors import InputError
 from sim.robot.drive import DifferentialDrive, RobotGeometry
@@ -19,7 +20,7 @@ CONF = Path(__file__).resolve().parents[2] / "conf"
 
 
 def options(group):
-    return sorted(path.stem for path in (CONF / group).glob("*.yaml"))
+    return option_names(group)
 
 
 @pytest.mark.parametrize("name", options("world"))

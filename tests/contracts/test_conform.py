@@ -8,7 +8,7 @@ from estimators.base import Belief
 from estimators.laser.icp_odometry import IcpOdometry
 from estimators.odometry import Odometry
 from experiments.gate.conform import check_estimator, conform_target, example
-from experiments.runs.paths import CONF
+from experiments.runs.paths import option_names
 from sim import se2
 from sim.errors import InputError
 from tests.fixtures import fakes
@@ -263,7 +263,7 @@ def test_the_sensors_can_be_chosen():
         IcpOdometry(laser="side").reset(prior, np.random.default_rng(0))
 
 
-OPTIONS = sorted(path.stem for path in (CONF / "estimator").glob("*.yaml"))
+OPTIONS = option_names("estimator")
 OPTIONS = [name for name in OPTIONS if not name.endswith("_tuned")]  # other values only
 FEWER = {
     "mcl": ["estimator.n_most=1000", "estimator.n_least=300"],  # particles; else 20 s

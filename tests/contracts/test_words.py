@@ -43,7 +43,7 @@ def test_the_table_is_read():
 def test_no_house_words(path):
     text = path.read_text(encoding="utf-8")
     if path == CONTRIBUTING:
-        before, heading, rest = text.partition("## Words")
+        before, _, rest = text.partition("## Words")
         text = before + rest.partition("\n## ")[2]
     for number, line in enumerate(text.splitlines(), start=1):
         assert misuse(line) is None, f"line {number}: {line.strip()}"

@@ -52,6 +52,7 @@ from experiments.sweeps.plan import planned
 from sim.arrays import Array
 from sim.recording import Recording
 from sim.sensors import Laser, sensor_of
+from sim.team import Team
 
 Tables = dict[str, pd.DataFrame]
 Job = tuple[float, Callable[..., Tables], Sequence[Any]]  # cost, function, arguments
@@ -157,7 +158,7 @@ def _planned(study: str, n_seeds: int, *overrides: str) -> list[list[Experiment]
 
 
 def _only(methods: Sequence[str], group: Sequence[Experiment]) -> list[Experiment]:
-    return [experiment for experiment in group if experiment.config["method"] in methods]
+    return [experiment for experiment in group if experiment.label("method") in methods]
 
 
 def _run(
@@ -175,7 +176,9 @@ def _run(
     """
     seen: list[Estimate] = []
     (found,) = evaluate(
-        experiment, lambda: recording, on_estimate=lambda _, __, online, ___: seen.append(online)
+        experiment,
+        lambda: Team((recording,)),
+        on_estimate=lambda _, __, online, ___: seen.append(online),
     )
     if not seen or found["status"] == Outcome.FAILED:
         raise RunFailedError(f"{experiment.name}: {found['status_code']}: {found['status_detail']}")
@@ -295,10 +298,10 @@ def _closeup(group: Sequence[Experiment], out: Results | None = None) -> Tables:
     recording, world = group[0].recording(), group[0].world()
     rows, tables = [], {}
     for experiment in group:
-        believed = experiment.config["estimator"]
+        believed = experiment.estimator_options
         scans: Scans = "last" if believed["covariance"] == "censi_last" else "both"
         path = ellipse_path(recording, world, believed["metric"], scans, believed["neighbours"])
-        origin = {"seed": experiment.seed, "method": experiment.config["method"]}
+        origin = {"seed": experiment.seed, "method": experiment.label("method")}
         rows.append(origin | ellipse_summary(path))
         if out is not None and origin["method"] == "printed":
             out.write_arrays("corridor", walls=world.walls, wall_z_m=world.wall_z_m)

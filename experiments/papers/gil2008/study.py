@@ -21,7 +21,7 @@ from experiments.judging.results import Results
 from experiments.judging.verdict import Profile
 from experiments.papers.gil2008 import scores, settings
 from experiments.papers.gil2008.recordings import Scene, landmark_distances_m, thinned, whole
-from experiments.runs.evaluate import estimates, scored, status_of
+from experiments.runs.evaluate import run_over, scored, status_of
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
 from experiments.runs.seeds import stream
@@ -83,15 +83,14 @@ def plan(profile: Profile) -> Iterator[TableRun]:
     for table in settings.LABELS:
         few = profile is Profile.QUICK and table != "repeats"  # which has one world
         for one in planned([f"study=gil2008/{table}", *few * [f"seed={settings.QUICK_SEEDS}"]]):
-            drawn = one.config["recording"]
+            drawn = one.recording_options
             if drawn["draw"] < n_draws and drawn["image_draw"] <= n_repeats:
                 yield table, one.replaced(repeats=min(one.repeats, n_repeats))
 
 
 def _drawn_from(run: TableRun) -> tuple[Scene, str]:
     """What runs over one recording have in common."""
-    config = run[1].config
-    return Scene.of(config), json.dumps(config["route"])
+    return Scene.of(run[1].config), json.dumps(run[1].route_options)
 
 
 def rows_of(runs: Sequence[TableRun]) -> list[tuple[str, Row]]:
@@ -121,7 +120,7 @@ def rows_of(runs: Sequence[TableRun]) -> list[tuple[str, Row]]:
 
 def labels_of(table: str, experiment: Experiment) -> Row:
     """Columns that name a run in its table; their text names its stream."""
-    choice, chosen = experiment.estimator_name, experiment.config["estimator"]
+    choice, chosen = experiment.estimator_name, experiment.estimator_options
     name = {"fastslam_paper": "paper", "smoother": "batch"}.get(choice, choice)
     if choice == "fastslam":
         name = {"motion": "fastslam1", "optimal": "fastslam2"}[chosen["proposal"]]
@@ -144,8 +143,8 @@ def _shown(recording: Recording) -> Row:
 
 def one_run(experiment: Experiment, recording: Recording, rng: np.random.Generator) -> Row:
     """Scores of one run; an estimator without `finish` is scored by its online path."""
-    online, revised = estimates(
-        experiment.estimator(), recording, experiment.prior(recording), rng, scores.KEEP
+    online, revised = run_over(
+        recording, experiment.estimator(), experiment.prior(recording), rng, scores.KEEP
     )
     revised = revised or online
     found = scored(recording, online, revised)
@@ -175,7 +174,7 @@ def write_arrays(out: Results) -> None:
     for option in ("odometry", "fastslam_paper", "fastslam", "smoother"):
         one = Experiment.compose(["study=gil2008", f"estimator={option}"])
         rng = stream(one.seed, "example")
-        online, revised = estimates(one.estimator(), recording, one.prior(recording), rng)
+        online, revised = run_over(recording, one.estimator(), one.prior(recording), rng)
         found, name = revised or online, str(labels_of("bound", one)["filter"])
         pictured[name] = found.means
         pictured |= _gridded(name, scanned, found.stamps, found.means)

@@ -313,7 +313,7 @@ def campus_runs(seed: int) -> tuple[Experiment, Experiment]:
     along = np.gradient(way, axis=0)
     along[[0, -1]] = way[1] - way[-2]  # the tour is closed
     left = along[:, ::-1] * [-1.0, 1.0] / np.hypot(*along.T)[:, None]
-    route = {**mapping.config["route"], "waypoints": (way + CAMPUS_SHIFT_M * left).tolist()}
+    route = {**mapping.route_options, "waypoints": (way + CAMPUS_SHIFT_M * left).tolist()}
     return mapping, mapping.replaced(seed=seed + 500, route=route)  # the same world_seed
 
 
@@ -327,7 +327,7 @@ def campus_rows(seed: int, profile: Profile, *, with_clusters: bool) -> dict[str
     """
     mapping, taking = campus_runs(seed)
     mapped, taken = mapping.recording(), taking.recording()
-    settings = mapping.config["prior"]["map"]
+    settings = mapping.map_options
     tables: dict[str, Rows] = {"clusters": []}
     for descriptor in describers.KINDS if with_clusters else ():
         known = from_recording(mapped, descriptor, settings["spacing_m"])
@@ -355,8 +355,8 @@ def _one_query_a_node(case: Case) -> Case:
     """As in the paper: one query per node, the filter as printed, nothing tuned for it."""
     gone = travelled_m(case.recording.truth_at(case.recording.frame_stamps))
     rows = np.unique(np.searchsorted(gone, np.arange(0.0, gone[-1], case.known_map.spacing_m)))
-    printed = Experiment.compose(["estimator=topological_mcl_paper"]).config["estimator"]
-    experiment = case.experiment.replaced(estimator=printed)
+    printed = Experiment.compose(["estimator=topological_mcl_paper"])
+    experiment = case.experiment.with_estimator_of(printed)
     return replace(case, experiment=experiment, recording=resequenced(case.recording, rows))
 
 

@@ -13,7 +13,7 @@ from experiments.evaluation.metrics import nees_at_distances
 from experiments.judging.jobs import grouped, in_parallel
 from experiments.judging.results import Results
 from experiments.judging.verdict import Profile
-from experiments.runs.evaluate import estimates
+from experiments.runs.evaluate import run_over
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
 from experiments.runs.seeds import stream
@@ -40,7 +40,7 @@ def plan(profile: Profile) -> Iterator[Experiment]:
     """All runs, or those of the quick profile."""
     few = profile is Profile.QUICK
     for one in planned(["study=fastslam_consistency", *few * [f"seed={QUICK_SEEDS}"]]):
-        if not few or one.config["estimator"].get("n_particles", 0) <= MOST_QUICK:
+        if not few or one.estimator_options.get("n_particles", 0) <= MOST_QUICK:
             yield one
 
 
@@ -51,7 +51,7 @@ def rows_of(runs: Sequence[Experiment]) -> list[Row]:
     for one in runs:
         labels = labels_of(one)
         rng = stream(one.seed, f"estimator/{labels}")
-        online, revised = estimates(one.estimator(), recording, one.prior(recording), rng)
+        online, revised = run_over(recording, one.estimator(), one.prior(recording), rng)
         found = revised if one.estimator_name == "smoother" and revised else online
         truth = recording.truth_at(found.stamps)
         nees = nees_at_distances(truth, found.means, found.covariances, np.array(DISTANCES_M))
@@ -64,14 +64,14 @@ def rows_of(runs: Sequence[Experiment]) -> list[Row]:
 
 def labels_of(one: Experiment) -> Row:
     """Columns that name a run: its filter, M, and in what it differs from the default."""
-    own, true = one.config["estimator"], one.config["robot"]
+    own, true = one.estimator_options, one.robot()
     name = {"smoother": "batch"}.get(one.estimator_name, one.estimator_name)
     if name == "fastslam":
         name = {"motion": "fastslam1", "optimal": "fastslam2"}[own["proposal"]]
     changed = {
         "resampled at every image": own.get("ess_share") == 1.0,
         "resampled below M / 10": own.get("ess_share") == 0.1,
-        "four times the slip": own["kr"] > true["kr"],
+        "four times the slip": own["kr"] > true.kr,
         "twice the image noise": own.get("sigma_column_px") is not None,
     }
     remedy = next((words for words, is_so in changed.items() if is_so), "none")

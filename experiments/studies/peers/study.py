@@ -61,7 +61,7 @@ def missing(experiment: Experiment) -> str:
     InputError
         If the configuration is wrong.
     """
-    program = (experiment.config["estimator"].get("command") or "").partition(" ")[0]
+    program = (experiment.command or "").partition(" ")[0]
     if program and shutil.which(program) is None:
         return f"there is no {program}; `make peers` compiles it where libmrpt-slam-dev is"
     try:

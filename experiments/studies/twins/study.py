@@ -83,7 +83,7 @@ def errors(log: str, seed: int | None, runs: dict[str, dict[str, Experiment]]) -
 def _error(twin: Twin, run: Experiment, recording: Recording, seed: int | None) -> Row:
     """Run an estimator from the true start; it believes the calibration's slip."""
     slip = vars(twin.found.calibration.slip)
-    believed = {key: value for key, value in slip.items() if key in run.config["estimator"]}
+    believed = {key: value for key, value in slip.items() if key in run.estimator_options}
     start = recording.truth_at(recording.frame_stamps[:1])[0]
     prior = Prior(recording.robot, recording.sensors, start, _START)
     rng = stream(seed or 0, f"estimator/{run.estimator_name}")

@@ -18,13 +18,13 @@ import pytest
 from experiments.runs import cache, store
 from experiments.runs.compose import searched
 from experiments.runs.experiment import Experiment
-from experiments.runs.interrupts import held_interrupts
 from experiments.runs.key import files_digest
 from experiments.runs.paths import quoted, results
+from experiments.runs.processes import held_interrupts
 from experiments.runs.row import Status, read_rows
 from experiments.runs.store import read_runs
 from experiments.runs.version import source_digest
-from experiments.sweeps import launch, plan
+from experiments.sweeps import launch, plan, work
 from experiments.sweeps.collect import collect
 from sim.errors import InputError
 from tests.experiments.cli.test_cli import QUICK, ROOT, called, estima, refused
@@ -397,10 +397,10 @@ def test_an_interrupt_is_no_result_of_a_run(tmp_path, monkeypatch):
         signal.raise_signal(signal.SIGINT)
         raise SystemError("returned a result with an exception set")
 
-    monkeypatch.setattr(launch, "evaluate", evaluated)
+    monkeypatch.setattr(work, "evaluate", evaluated)
     experiment = Experiment.compose(SHORT)
     with store.journal(tmp_path / "rows.journal") as journal, pytest.raises(KeyboardInterrupt):
-        launch.run_and_record(experiment, {}, journal)
+        work.run_and_record(experiment, {}, journal)
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     ended = store.ended(tmp_path)
     assert not len(ended.done)
@@ -436,8 +436,8 @@ def test_a_sweep_that_has_not_ended_says_so(name, monkeypatch, capsys):
             raise KeyboardInterrupt
         return original(experiment, *_)
 
-    original = launch.run_and_record
-    monkeypatch.setattr(launch, "run_and_record", interrupted)
+    original = work.run_and_record
+    monkeypatch.setattr(work, "run_and_record", interrupted)
     with pytest.raises(KeyboardInterrupt, match="2 of 3 runs are kept"):
         launch.sweep(words)
     capsys.readouterr()
@@ -523,7 +523,7 @@ def test_the_last_value_of_a_key_decides_a_sweeps_own_name():
         (["hydra.verbose=true"], ["hydra.verbose", "no log"]),
         (["-m", "robot.kr=interval(0,1)"], ["interval(0,1)", "range(0,1,0.1)"]),
         (["-m", "route=glob(nothing*)"], ["empty range or list"]),
-        (["-m", "--info"], ["--info", "leave out -m"]),
+        (["-m", "--info"], ["--info", "--config-dir"]),
         (["-m", "--cfg", "job"], ["--cfg", "leave out -m"]),
     ],
 )
@@ -663,7 +663,7 @@ def test_a_job_tried_again_goes_on(tmp_path, monkeypatch):
     every = plan.plan_of([*QUICK, "seed=range(0,4)"])
     jobs = launch.Jobs(tmp_path, 1)
     jobs.add(every, np.arange(4))
-    share = json.loads(launch.share_of(jobs.plan, 0).read_text())
+    share = json.loads(work.share_of(jobs.plan, 0).read_text())
     ran = []
 
     def run(experiment, _, journal):
@@ -675,11 +675,11 @@ def test_a_job_tried_again_goes_on(tmp_path, monkeypatch):
                 file.write('0123abcd b"half a li')
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(launch, "run_and_record", run)
+    monkeypatch.setattr(work, "run_and_record", run)
     with pytest.raises(KeyboardInterrupt):
-        launch.run_share(share)
+        work.run_share(share)
     for _ in range(2):
-        launch.run_share(share)
+        work.run_share(share)
         assert ran == [0, 1, 2, 3]
     assert sorted(read_runs(tmp_path)["seed"]) == [0, 1, 2, 3]
 
@@ -694,7 +694,7 @@ def test_a_bad_combination_in_a_large_family_fails_alone(tmp_path):
     launch.check(every, np.arange(2400))
     with store.journal(tmp_path / "rows-0.journal") as journal:
         for i in (1, 3):
-            launch.run_and_record(every.experiment(i), {}, journal)
+            work.run_and_record(every.experiment(i), {}, journal)
     rows = read_runs(tmp_path).set_index("estimator.n_least")
     assert rows.loc[100, "status"] != "failed"
     assert rows.loc[5000, "status"] == "failed"
@@ -773,7 +773,7 @@ def test_damaged_files_are_made_again(name):
 
 def test_compiling_is_said_once_and_restarts_the_rate(tmp_path, monkeypatch, capsys):
     jobs, restarts = launch.Jobs(tmp_path, 1), []
-    note = launch._compiling(jobs.plan)
+    note = work.compiling_file(jobs.plan)
     note.parent.mkdir()
     ended = iter([1, 2, 3, 4, 5])  # runs at each look; code is compiled before the second
 

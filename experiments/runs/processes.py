@@ -1,9 +1,15 @@
-"""Interrupts (Ctrl-C, and SIGTERM where it ends a command alike) that wait for a safe place."""
+"""Between processes: locks, and interrupts (Ctrl-C, SIGTERM) that wait for a safe place."""
 
+import fcntl
+import os
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import TextIO
+
+from sim.files import require_file
 
 
 @contextmanager
@@ -42,3 +48,28 @@ def held_interrupts() -> Iterator[Callable[..., None]]:
         for number in usual:
             signal.signal(number, signal.default_int_handler)
         check()
+
+
+@contextmanager
+def locked(lock: Path) -> Iterator[None]:
+    """Hold an exclusive lock, by a file that goes with it; the system frees it if its holder dies.
+
+    The file is opened to be written, since a lock on a network file system asks for that. Who
+    waited for one that is gone takes the next.
+    """
+    with _held(lock):
+        try:
+            yield
+        finally:
+            lock.unlink(missing_ok=True)
+
+
+def _held(lock: Path) -> TextIO:
+    while True:
+        require_file(lock)  # a pipe would wait for ever
+        handle = lock.open("w")
+        fcntl.flock(handle, fcntl.LOCK_EX)
+        with suppress(FileNotFoundError):
+            if os.path.samestat(os.fstat(handle.fileno()), lock.stat()):
+                return handle
+        handle.close()

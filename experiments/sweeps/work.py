@@ -1,0 +1,114 @@
+"""One job of a sweep: its share of the plan, run by run."""
+
+import os
+import platform
+import signal
+import threading
+import time
+from collections.abc import Callable, Mapping
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any
+
+from experiments.runs import store
+from experiments.runs.evaluate import evaluate
+from experiments.runs.experiment import Experiment
+from experiments.runs.processes import held_interrupts
+from experiments.runs.row import Row, Status, check_row
+from experiments.sweeps.plan import Family
+from sim.team import Team
+
+
+def share_of(plan: str | Path, job: int) -> Path:
+    """File of a job's share of the plan."""
+    return Path(f"{plan}.jobs") / f"share-{job}.json"
+
+
+def compiling_file(plan: str | Path) -> Path:
+    """File that is touched whenever a job compiles numerical code."""
+    return Path(f"{plan}.jobs") / "compiling"
+
+
+def run_share(share: Mapping[str, Any]) -> None:
+    """Run a job's share of the plan, as `Jobs.add` wrote it, but for what its journal has.
+
+    A run that fails leaves its row, and the next follows.
+    """
+    held: dict[str, Team] = {}
+    path = Path(share["journal"])
+    over = store.ended(path.parent, f"{path.stem}.")  # something if the launcher tries it again
+    keys = {*over.done.tolist(), *over.failed}
+    with store.journal(path) as journal:
+        for family in share["families"]:
+            for experiment in Family.experiments(family):
+                if not keys or int(experiment.key, 16) not in keys:
+                    run_and_record(experiment, held, journal)
+    store.compact(path)
+
+
+def end_with(node: str, planner: int) -> None:
+    """End this process when the planner ends, if the planner started it, and not by Ctrl-C."""
+    if platform.node() != node or os.getpid() == planner:
+        return
+    if os.getppid() != planner:  # started by a launcher's own processes, or left behind just now
+        if not is_there(planner):
+            os._exit(1)
+        return
+
+    def watch() -> None:
+        while os.getppid() == planner:
+            time.sleep(0.5)
+        os._exit(1)
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the terminal sends it to all; the planner acts
+    if "planner" not in {thread.name for thread in threading.enumerate()}:
+        threading.Thread(target=watch, name="planner", daemon=True).start()
+
+
+def run_and_record(experiment: Experiment, held: dict[str, Team], journal: store.Journal) -> None:
+    """Run one experiment; what goes wrong becomes the status of its row.
+
+    Parameters
+    ----------
+    held
+        The last recording by its key; most runs of a job share it.
+    journal
+        Takes the rows.
+    """
+    journal.begin(experiment.key)
+    with held_interrupts() as on_step:  # what one causes is no result
+        try:
+            rows = evaluate(
+                experiment,
+                lambda: _held(experiment, held, on_step),
+                shown=lambda _: nullcontext(on_step),
+            )
+            for row in rows:
+                check_row(row)
+        except (Exception, SystemExit) as error:
+            rows = [failure(experiment, Status.of_error(error))]
+    journal.append(rows)
+
+
+def _held(experiment: Experiment, held: dict[str, Team], on_progress: Callable[..., None]) -> Team:
+    key = experiment.recording_key
+    if key not in held:
+        held.clear()
+        held[key] = experiment.recordings(on_progress)
+    return held[key]
+
+
+def failure(experiment: Experiment, status: Status) -> Row:
+    """Row of a run that left none itself."""
+    return {**experiment.labels(""), **status.columns()}
+
+
+def is_there(process: int) -> bool:
+    """Whether a process of this machine lives."""
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:  # another user's
+        return True
+    return True
