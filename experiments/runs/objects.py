@@ -12,8 +12,7 @@ from typing import Any, Self, cast
 
 import numpy as np
 
-from estimators.base import Estimator, Prior
-from estimators.team import TeamEstimator
+from estimators.base import Estimator, Prior, TeamEstimator
 from experiments.runs.cache import cached
 from experiments.runs.calibration import read_calibration
 from experiments.runs.key import recording_key
@@ -31,7 +30,7 @@ from sim.arrays import Array
 from sim.errors import InputError, blaming, require
 from sim.options import build
 from sim.recording import Frame, Recording
-from sim.robot.drive import RobotGeometry
+from sim.robot.base import RobotGeometry, robot_from_config
 from sim.sensors import Sensor, Sensors, sensors_from_config
 from sim.sensors.base import RecordedSensor, sensor_settings
 from sim.team import Team, load
