@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.arrays import Array
-from sim.errors import InputError, require
+from sim.errors import require
 from sim.recording import (
     FORMAT_VERSION,
     REMEDY,
@@ -27,6 +27,7 @@ from sim.recording import (
     digest_of,
     write_arrays,
 )
+from sim.recording import load as load_recording
 from sim.sensors import RobotCamera
 
 MOST_ROBOTS = 100
@@ -50,6 +51,8 @@ class Team:
     def __post_init__(self) -> None:
         n = len(self.robots)
         require(0 < n <= MOST_ROBOTS, f"a team has 1 to {MOST_ROBOTS} robots, got {n}")
+        if n == 1:
+            return
         for number, (recording, stamps) in enumerate(
             zip(self.robots, _on_one_clock(self.robots), strict=True)
         ):
@@ -72,8 +75,18 @@ class Team:
 
     @property
     def checksum(self) -> str:
-        """SHA-256 over all the team holds, as hex."""
+        """SHA-256 over all the team holds, as hex; of one robot, that of its recording."""
         return digest_of(*_parts(self))
+
+    @property
+    def only(self) -> Recording:
+        """The recording of a team of one; InputError if there are several robots."""
+        require(
+            len(self) == 1,
+            "it holds a team; run all of its robots by study=teams, or take one by --robot, as "
+            "`estima convert FILE.npz --robot 0 -o robot_0.npz` does",
+        )
+        return self.robots[0]
 
     def __len__(self) -> int:
         return len(self.robots)
@@ -81,6 +94,8 @@ class Team:
     @classmethod
     def on_one_clock(cls, recordings: Sequence[Recording]) -> Team:
         """Team of recordings in one time base: each gets Frames at the stamps of all of them."""
+        if len(recordings) == 1:
+            return cls(tuple(recordings))
         clock = _on_one_clock(recordings)
         return cls(
             tuple(
@@ -114,6 +129,8 @@ class Team:
 def save(team: Team, path: Path) -> str:
     """Write a team into one `.npz` file, whole; return its checksum.
 
+    The file of one robot is that of its recording.
+
     Raises
     ------
     InputError
@@ -124,6 +141,8 @@ def save(team: Team, path: Path) -> str:
 
 def _parts(team: Team) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     """Every array of a team under the name it is saved by, and plain values."""
+    if len(team) == 1:
+        return arrays_of(team.robots[0]), described(team.robots[0])
     arrays = {
         f"{number}.{name}": values
         for number, recording in enumerate(team.robots)
@@ -142,19 +161,19 @@ def is_team(path: Path) -> bool:
 
 
 def load(path: Path) -> Team:
-    """Read a team and check it against its checksum.
+    """Read a team, or a recording as a team of one, and check it against its checksum.
 
     Raises
     ------
     InputError
-        If the file is missing, altered, or holds no team.
+        If the file is missing, altered, or not a recording.
     """
+    if not is_team(path):
+        return Team((load_recording(path),))
     with blamed(path, REMEDY):
         stored, meta = checked_arrays(path)
-    parts = meta.get("team")
-    if not isinstance(parts, list):
-        raise InputError(f"{path}: it holds one robot, and no team; leave out study and team")
-    with blamed(path, REMEDY):
+        parts = meta["team"]
+        require(isinstance(parts, list), "it does not say what its robots are")
         own = [
             {
                 name.removeprefix(f"{number}."): values

@@ -243,14 +243,14 @@ def info(
     """
     from experiments.viewing.describe import describe
     from sim.formats.detect import read_all
-    from sim.team import Team
 
-    recording = read_all(log, robot)
-    if isinstance(recording, Team):
+    team = read_all(log, robot)
+    if len(team) > 1:
         require(not check, "--check is of one robot; name it by --robot")
-        for number, own in enumerate(recording.robots):
+        for number, own in enumerate(team.robots):
             show(f"robot {number}\n{describe(own)}\n")
         return
+    recording = team.only
     show(describe(recording))
     if check:
         from experiments.calibration.log_check import check_log
@@ -491,7 +491,11 @@ def _show_run(
         view.check_output(out)
     known = None if grid is None else read_grid(grid)
     again = None if isinstance(what, Path) else what
-    read = read_all([what]) if isinstance(what, Path) else what.recording()
+    if isinstance(what, Path):
+        held = read_all([what])
+        read = held if len(held) > 1 else held.only
+    else:
+        read = what.recording()
     name = source if again is None else again.experiment.estimator_name
     if isinstance(read, Team):
         require(out is not None, "a team is drawn in files; add -o team.html, .gif or .mp4")

@@ -71,7 +71,9 @@ class TeamExperiment:
         if isinstance(wanted, str):
             team = load(Path(wanted))
             if size > len(team):
-                raise InputError(f"{wanted}: a team of {len(team)} robots; set team.size")
+                held = f"a team of {len(team)} robots; set team.size"
+                alone = "it holds one robot, and no team; leave out study and team"
+                raise InputError(f"{wanted}: {held if len(team) > 1 else alone}")
             return team if size == len(team) else team.first(size)
         if wanted is not None:
             raise InputError("recording: a team is simulated, or read from a file")

@@ -13,10 +13,9 @@ from sim.formats.rawseeds import read_rawseeds
 from sim.formats.rosbag_in import read_bag
 from sim.formats.text import read_bytes, read_members
 from sim.formats.wean import read_wean
-from sim.recording import Recording, load
+from sim.recording import Recording
 from sim.recording_check import check_recording
-from sim.team import Team, is_team
-from sim.team import load as load_team
+from sim.team import Team, load
 
 KINDS = ("recording", "rosbag", "mrclam", "carmen", "intel", "khepera", "lego", "rawseeds", "wean")
 _HEAD_BYTES = 1 << 16
@@ -78,16 +77,8 @@ def _kind_of_text(head: bytes, path: Path) -> str:
     )
 
 
-def read_all(paths: Sequence[Path], robot: int | None = None) -> Recording | Team:
-    """A Recording of one log as `read_any` reads it, or the team of a file that holds one."""
-    several = robot is None and paths[0].is_file() and is_team(paths[0])
-    return load_team(paths[0]) if several else read_any(paths, robot)
-
-
-def read_any(
-    paths: Sequence[Path], robot: int | None = None, member: str | None = None
-) -> Recording:
-    """A Recording of one log.
+def read_all(paths: Sequence[Path], robot: int | None = None, member: str | None = None) -> Team:
+    """A Team of what a log holds: of one robot, or of all those of a team's file.
 
     Parameters
     ----------
@@ -104,30 +95,45 @@ def read_any(
     InputError
         If the format is not known, a file is missing, or cannot be read.
     """
-    kind = kind_of(paths[0])
+    first, kind = paths[0], kind_of(paths[0])
+    _check_count(paths, kind)
+    if kind == "recording":  # which is checked as it is loaded
+        team = load(first)
+        if robot is None or len(team) == 1:
+            return team
+        known = 0 <= robot < len(team)
+        require(known, f"{first}: its robots are 0 to {len(team) - 1}, got {robot}")
+        return Team((team.robots[robot],))
     recording = _read(paths, kind, robot, member)
-    if kind != "recording":  # which is checked as it is loaded
-        try:
-            check_recording(recording)
-        except InputError as error:
-            raise InputError(f"{paths[0]}: {error}") from error
-    return recording
+    try:
+        check_recording(recording)
+    except InputError as error:
+        raise InputError(f"{first}: {error}") from error
+    return Team((recording,))
+
+
+def read_any(
+    paths: Sequence[Path], robot: int | None = None, member: str | None = None
+) -> Recording:
+    """The recording of one robot, as `read_all` reads it; InputError if there are several."""
+    team = read_all(paths, robot, member)
+    try:
+        return team.only
+    except InputError as error:
+        raise InputError(f"{paths[0]}: {error}") from error
+
+
+def _check_count(paths: Sequence[Path], kind: str) -> None:
+    least, most = {"intel": (1, 2), "rawseeds": (2, 3), "lego": (2, 4)}.get(kind, (1, 1))
+    if not least <= len(paths) <= most:
+        wanted = f"{least} to {most} files" if most > 1 else "one file"
+        raise InputError(f"{paths[0]}: a {kind} log is {wanted}, got {len(paths)}")
 
 
 def _read(paths: Sequence[Path], kind: str, robot: int | None, member: str | None) -> Recording:
     first, rest = paths[0], paths[1:]
-    least, most = {"intel": (1, 2), "rawseeds": (2, 3), "lego": (2, 4)}.get(kind, (1, 1))
-    if not least <= len(paths) <= most:
-        wanted = f"{least} to {most} files" if most > 1 else "one file"
-        raise InputError(f"{first}: a {kind} log is {wanted}, got {len(paths)}")
     if kind == "mrclam":
         return read_mrclam(first, 1 if robot is None else robot)
-    if kind == "recording" and robot is not None and is_team(first):
-        team = load_team(first)
-        require(
-            0 <= robot < len(team), f"{first}: its robots are 0 to {len(team) - 1}, got {robot}"
-        )
-        return team.robots[robot]
     if kind == "carmen":
         return carmen.to_recording(carmen.read_carmen(first))
     if kind == "khepera":
@@ -136,7 +142,6 @@ def _read(paths: Sequence[Path], kind: str, robot: int | None, member: str | Non
             member = min(tuples, key=lambda name: (len(name), name))
         return khepera.to_recording(khepera.read_khepera(first, member))
     readers: dict[str, Callable[..., Recording]] = {
-        "recording": load,
         "rosbag": read_bag,
         "intel": read_intel,
         "lego": read_lego,

@@ -136,8 +136,10 @@ def test_files_of_teams(tmp_path):
     with pytest.raises(InputError, match=r"team.npz: it holds a team; run all"):
         recordings.load(path)
     recordings.save(team.robots[0], path)
-    with pytest.raises(InputError, match=r"team.npz: it holds one robot, and no team"):
-        teams.load(path)
+    alone = teams.load(path)
+    assert alone.only.checksum == alone.checksum == team.robots[0].checksum
+    with pytest.raises(InputError, match="it holds a team; run all of its robots by study=teams"):
+        assert again.only
 
 
 @pytest.mark.parametrize(
