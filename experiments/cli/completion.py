@@ -38,9 +38,10 @@ def overrides(incomplete: str) -> list[str]:
     return sorted({prefix + text for text in found if text.startswith(word)})
 
 
-def options(group: str) -> list[str]:
-    """Options of a group of the configuration."""
-    return sorted(path.stem for path in (paths.CONF / group).glob("*.yaml"))
+def options(group: str, config_dir: Path | None = None) -> list[str]:
+    """Options of a group of the configuration, and of a folder of further ones."""
+    folders = [paths.CONF, *([config_dir] if config_dir else [])]
+    return sorted({path.stem for folder in folders for path in (folder / group).glob("*.yaml")})
 
 
 def estimators(incomplete: str) -> list[str]:

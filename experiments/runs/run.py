@@ -30,11 +30,11 @@ from experiments.runs.experiment import (
 from experiments.runs.interrupts import held_interrupts
 from experiments.runs.row import Outcome, Row
 from experiments.runs.store import write_run
-from experiments.runs.team import recorded, robots_of
+from experiments.runs.team import TeamExperiment, recorded, robots_of
 from experiments.trajectories.convert import write_estimate
 from sim.errors import InputError, require
 from sim.recording import Recording
-from sim.team import Team
+from sim.team import Team, save
 
 # Of each robot: its recording and its estimate
 Draw = Callable[[Sequence[tuple[Recording, Estimate]], Experiment, Path], None]
@@ -120,6 +120,24 @@ def expected_s(experiment: Experiment) -> float | None:
     one = experiment if experiment.team is None else experiment.of_robot(0)
     about_s = getattr(one.route(), "about_s", None)
     return None if about_s is None else round(about_s(one.world(), one.robot()), 1)
+
+
+def record(experiment: Experiment, out: Path) -> bool:
+    """Simulate what an experiment reads, save it and say so; return whether all drives were ok."""
+    require(out.suffix == ".npz", f"{out}: a recording is an .npz file")
+    with progress("simulated seconds", expected_s(experiment)) as on_progress:
+        if experiment.team is None:
+            made = Team((experiment.simulate(on_progress),))
+        else:
+            made = TeamExperiment(experiment).record(on_progress)
+    checksum = save(made, out)
+    alone = len(made) == 1
+    said = [
+        f"{'' if alone else f'robot {n}: '}{robot.status}, {robot.duration_s:.1f} s"
+        for n, robot in enumerate(made.robots)
+    ]
+    print(f"{out}: {'; '.join(said)}, checksum {checksum}")
+    return all(robot.status == "ok" for robot in made.robots)
 
 
 def _trace(error: Exception | SystemExit) -> None:

@@ -68,9 +68,7 @@ def with_estimates_by(
     return shown.believing(found, experiment.estimator_name)
 
 
-def _sparing(
-    experiment: Experiment, shown: Playback, on_step: OnStep, repeat: int = 0
-) -> Estimate:
+def _sparing(experiment: Experiment, shown: Playback, on_step: OnStep, repeat: int = 0) -> Estimate:
     """Online estimate of a robot alone, with what is drawn at the shown Frames."""
     if "keep_map" in experiment.config["estimator"]:
         experiment = experiment.with_estimator(keep_map=True)

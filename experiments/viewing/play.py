@@ -1,17 +1,22 @@
-"""A run as it moves: in a window, or in a file."""
+"""A run as it moves: in a window, or in a file. Pictures of worlds and maps."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from experiments.runs import paths
 from experiments.runs.console import progress
+from experiments.runs.experiment import Experiment
 from experiments.viewing import live, movie
-from experiments.viewing.estimates import OnStep
+from experiments.viewing.estimates import OnStep, with_estimates
+from experiments.viewing.grid import grid_figure
 from experiments.viewing.playback import FPS, Playback
+from experiments.viewing.style import save_figure
+from experiments.viewing.world import world_figure
 from sim.errors import require
+from sim.formats.detect import read_all
 from sim.team import Team
 from sim.worlds.grid_file import read_grid
 
@@ -104,3 +109,31 @@ def play(
         movie.save(shown, how.out, on_progress, title)
     said = f"{len(shown.stamps)} pictures, {length_s:.1f} s, {shown.speed}"
     return f"{paths.short(how.out)}: {said}"
+
+
+def play_file(log: Path, source: str | None, overrides: Sequence[str], how: Showing) -> str:
+    """Show a log, with the estimates of a `source` if it is given; see `play`.
+
+    Parameters
+    ----------
+    source, overrides
+        As for `viewing.estimates.with_estimates`.
+    """
+
+    def estimated(shown: Playback, on_step: OnStep) -> Playback:
+        return with_estimates(shown, str(source), overrides, on_step)
+
+    return play(read_all([log]), how, log.name, source, estimated)
+
+
+def draw_world(overrides: Sequence[str], out: Path) -> Path:
+    """Write the picture of the world of a configuration."""
+    given = [f"world={o}" if "=" not in o else o for o in overrides]
+    save_figure(world_figure(Experiment.compose(given).world()), out)
+    return out
+
+
+def draw_map(path: Path, out: Path) -> Path:
+    """Write the picture of an occupancy grid's file."""
+    save_figure(grid_figure(read_grid(path), path.stem), out)
+    return out
