@@ -12,7 +12,8 @@ from experiments.calibration.residual_figure import residual_figure
 from experiments.calibration.result import CalibrationResult
 from experiments.calibration.sheet import calibrate_sheet
 from experiments.runs.calibration import write_calibration
-from experiments.runs.experiment import Experiment, searched
+from experiments.runs.compose import searched
+from experiments.runs.experiment import Experiment
 from experiments.viewing.style import save_figure
 from sim.errors import require
 from sim.formats.detect import read_any

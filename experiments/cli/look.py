@@ -123,7 +123,7 @@ def view(
 
       estima view --map map.yaml -o map.png
     """
-    from experiments.runs.experiment import searched
+    from experiments.runs.compose import searched
     from experiments.sweeps.again import draw_again, row_of
     from experiments.viewing import play
 
@@ -193,7 +193,7 @@ def build_map(
 
       estima run world=office seed=3 sensors=lms291 estimator=mcl prior.map=map.yaml
     """
-    from experiments.runs.experiment import searched
+    from experiments.runs.compose import searched
     from experiments.viewing.map import Gridding, map_file
 
     how = Gridding(resolution_m, max_range_m, laser, raw)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Annotated
 
@@ -11,7 +10,7 @@ import typer
 from experiments.cli import completion
 from experiments.cli.flags import ConfigDir, Overrides
 from experiments.runs.console import show
-from sim.errors import InputError, require
+from sim.errors import require
 
 
 def run(
@@ -45,18 +44,14 @@ def run(
 
       estima run --cfg job (print the configuration; estima options lists the groups)
     """
-    os.environ["HYDRA_FULL_ERROR"] = "1"  # errors come to `main`, which puts them in a line
     arguments = [*(overrides or []), *context.args]
     many = {"-m", "--multirun"} & set(arguments)
-    shown = {"--cfg", "-c", "--info", "-i"} & set(arguments)
-    if many and shown:
-        raise InputError(f"{shown.pop()} shows one configuration; leave out -m and the lists")
     if out is not None:
         from experiments.trajectories.convert import check_estimate_name
 
         require(not many, f"-o {out}: one file is of one run; leave out -m")
         check_estimate_name(out)
-    if many and "--hydra-help" not in arguments:
+    if many:
         from experiments.report.of_sweep import after_sweep
         from experiments.sweeps.launch import sweep_arguments
 
@@ -80,7 +75,8 @@ def record(
 
     Example: estima record -o office.npz world=office sensors=lms291 seed=3
     """
-    from experiments.runs.experiment import Experiment, searched
+    from experiments.runs.compose import searched
+    from experiments.runs.experiment import Experiment
     from experiments.runs.run import record as record_to
 
     experiment = Experiment.compose([*searched(config_dir), *(overrides or [])])

@@ -153,7 +153,7 @@ def conform(
       estima conform estimators.odometry:Odometry kr=1e-5 kl=1e-5
     """
     from experiments.gate.conform import conform_target
-    from experiments.runs.experiment import searched
+    from experiments.runs.compose import searched
 
     results = conform_target(target, arguments or [], searched(config_dir))
     for result in results:

@@ -20,8 +20,9 @@ from estimators.base import Estimate, Prior
 from estimators.team import Answer, run_team
 from experiments.runs.cache import cached
 from experiments.runs.columns import REVISED, Average, average_of
-from experiments.runs.experiment import SIMULATED_KEYS, Experiment
+from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome, Row, Status
+from experiments.runs.schema import SIMULATED_KEYS
 from experiments.runs.seeds import stream
 from experiments.runs.team_settings import TeamSettings
 from sim.arrays import Array
