@@ -40,8 +40,8 @@ def overrides(incomplete: str) -> list[str]:
 
 def options(group: str, config_dir: Path | None = None) -> list[str]:
     """Options of a group of the configuration, and of a folder of further ones."""
-    folders = [paths.CONF, *([config_dir] if config_dir else [])]
-    return sorted({path.stem for folder in folders for path in (folder / group).glob("*.yaml")})
+    own = paths.option_names(group, config_dir) if config_dir else []
+    return sorted({*paths.option_names(group), *own})
 
 
 def estimators(incomplete: str) -> list[str]:

@@ -49,22 +49,22 @@ def options(
         f"--config-dir must name a folder, got {config_dir}",
     )
     if group is not None and name is None and group not in groups:
-        group, name = _group_of(group, config_dir), group
+        group, name = _group_of(group), group
     if group is not None and name is not None:
         from experiments.runs.schema import describe_option
 
-        show(describe_option(group, name, config_dir))
+        show(describe_option(group, name))
         return
     for one in groups if group is None else (group,):
         print(f"{one:>10}: {', '.join(completion.options(one, config_dir))}")
 
 
-def _group_of(name: str, config_dir: Path | None) -> str:
+def _group_of(name: str) -> str:
     """Group of an option that is called by its name alone."""
-    groups = completion.GROUPS
-    found = [group for group in groups if name in completion.options(group, config_dir)]
-    require(found, f"no group or option {name}; the groups are: {', '.join(groups)}, metrics")
-    several = " or ".join(f"estima options {group} {name}" for group in found)
+    found = [group for group in completion.GROUPS if name in completion.options(group)]
+    known = ", ".join(completion.GROUPS)
+    require(found, f"no group or option {name}; the groups are: {known}, metrics")
+    several = " or ".join(f"`estima options {group} {name}`" for group in found)
     require(len(found) == 1, f"{name} is an option of several groups: {several}")
     return found[0]
 

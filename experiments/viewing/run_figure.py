@@ -42,8 +42,8 @@ _AROUND_M = 3.0  # of the path that is shown
 def run_figure(found: Sequence[tuple[Recording, Estimate]], name: str) -> Figure:
     """Picture of a run.
 
-    Of a robot alone it has its path with 95 % ellipses, and the errors of its pose with their bands;
-    of a team all paths and sightings, and the position errors.
+    Of a robot alone it has the path with 95 % ellipses, and the errors of the pose with their
+    bands; of a team all paths and sightings, and the position errors.
 
     Parameters
     ----------
