@@ -9,7 +9,7 @@ import typer
 
 from experiments.cli import completion
 from experiments.cli.flags import ConfigDir
-from experiments.runs import columns
+from experiments.runs import columns, paths
 from experiments.runs.console import show
 from sim.errors import InputError, require
 
@@ -51,12 +51,22 @@ def options(
     if group is not None and name is None and group not in groups:
         group, name = _group_of(group), group
     if group is not None and name is not None:
-        from experiments.runs.schema import describe_option
-
-        show(describe_option(group, name))
+        _describe(group, name)
         return
     for one in groups if group is None else (group,):
         print(f"{one:>10}: {', '.join(completion.options(one, config_dir))}")
+
+
+def _describe(group: str, name: str) -> None:
+    """Print an option's keys; a study states its own."""
+    from experiments.runs.schema import describe_option
+
+    names = completion.options(group)
+    require(name in names, f"no {group} named {name}; there are: {', '.join(names)}")
+    if group == "study":
+        show((paths.CONF / group / f"{name}.yaml").read_text(encoding="utf-8").rstrip())
+    else:
+        show(describe_option(group, name))
 
 
 def _group_of(name: str) -> str:

@@ -257,7 +257,7 @@ def bounds(run: Playback) -> Bounds:
     A diverging estimate is followed to twice the size of all else.
     """
     sides = np.array([_bounds(own, run) for own in run.robots])
-    x1, y1, x2, y2 = (*sides[:, :2].min(axis=0).tolist(), *sides[:, 2:].max(axis=0).tolist())
+    (x1, y1), (x2, y2) = sides[:, :2].min(axis=0).tolist(), sides[:, 2:].max(axis=0).tolist()
     return x1, y1, x2, y2
 
 

@@ -18,12 +18,14 @@ from experiments.cli.main import app
 from experiments.gate.conform import check_estimator
 from experiments.runs.experiment import Experiment
 from experiments.runs.seeds import stream
-from experiments.viewing import view
+from experiments.viewing.animation import pictures
 from experiments.viewing.map import grid_along, path_of
+from experiments.viewing.playback import Playback
 from sim import se2
 from sim.errors import InputError
 from sim.recording import save
 from sim.sensors import Laser
+from sim.team import Team
 from sim.worlds.buildings import from_grid
 from sim.worlds.grid import OccupancyGrid, of_world, rasterized
 from sim.worlds.grid_file import image_of, read_grid, write_grid
@@ -551,9 +553,9 @@ def test_map_and_run_and_view_by_the_command_line(tmp_path):
 def test_the_grid_is_drawn_under_the_run():
     recording = circle(n_frames=10, n_beams=61)
     grid, _ = grid_along(recording, *path_of(recording, "truth", [], None), resolution_m=0.1)
-    bare = view.Playback(recording, np.array([0]))
+    bare = Playback.of(Team((recording,)), 2)
     with_grid = dataclasses.replace(bare, grid=grid)
-    unknown = [np.all(next(view.pictures(shown)) == 222, axis=2) for shown in (bare, with_grid)]
+    unknown = [np.all(next(pictures(shown)) == 222, axis=2) for shown in (bare, with_grid)]
     assert unknown[0].mean() < 0.001
     assert unknown[1].mean() > 0.05
 
