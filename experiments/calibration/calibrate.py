@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 
 from experiments.calibration.end_poses import Manoeuvre, from_end_poses
+from experiments.calibration.reference import spaced_rows
 from experiments.calibration.result import CalibrationResult
 from experiments.calibration.wheel_truth import from_wheel_truth
 from sim import se2
@@ -74,10 +75,8 @@ def _wheel_intervals(recording: Recording, i: int, interval_s: float) -> tuple[A
             "poses, or give -o FILE.yaml for a real log"
         )
     known = (truth.stamps >= wheels.stamps[0] - 1e-9) & (truth.stamps <= wheels.stamps[-1] + 1e-9)
-    rows: list[int] = []
-    for row in np.flatnonzero(known).tolist():
-        if not rows or truth.stamps[row] - truth.stamps[rows[-1]] >= interval_s - 1e-9:
-            rows.append(row)
+    rows = np.flatnonzero(known)
+    rows = rows[spaced_rows(truth.stamps[rows], interval_s)]
     require(len(rows) >= 2, f"recording {i} is shorter than one interval of {interval_s:g} s")
     encoder = [np.interp(truth.stamps[rows], wheels.stamps, way) for way in wheels.position_m.T]
     heading = np.unwrap(truth.poses[:, 2])[rows]

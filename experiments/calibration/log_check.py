@@ -5,12 +5,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from experiments.calibration.from_log import (
-    Reference,
-    calibrate_against,
-    reference_of,
-    wheel_delay_s,
-)
+from experiments.calibration.from_log import calibrate_against
+from experiments.calibration.reference import Reference, reference_of, wheel_delay_s
 from experiments.evaluation.statistics import Interval
 from sim.arrays import Array
 from sim.errors import InputError

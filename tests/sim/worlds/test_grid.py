@@ -564,12 +564,12 @@ def test_what_the_command_line_refuses(tmp_path):
     log = tmp_path / "run.npz"
     save(dataclasses.replace(circle(n_frames=10, n_beams=61), truth=None), log)
     out = str(tmp_path / "map.yaml")
-    refused(called("map", str(log), "-o", out), "no truth", "-e")
+    refused(called("map", str(log), "-o", out), "no truth", "name an estimator")
     for words, said in (
         (["map", str(log), "-o", "map.pgm"], "a .yaml file"),
         (["map", "seed=3", "-o", out], "name a recording"),
         (["map", str(log), "-o", out, "seed=3"], "run now"),
-        (["view", str(log), "-e", "odometry", "--map", str(MAP)], "-o run.html"),
+        (["view", str(log), "-e", "odometry", "--map", str(MAP)], "run.html"),
         (["view", "--world", "--map", str(MAP)], "one at a time"),
     ):
         error = CliRunner().invoke(app, words).exception
