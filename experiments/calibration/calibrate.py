@@ -71,8 +71,8 @@ def _wheel_intervals(recording: Recording, i: int, interval_s: float) -> tuple[A
     truth, wheels = recording.truth, recording.wheels
     if truth is None or len(truth.wheel_travel_m) == 0:
         raise InputError(
-            f"recording {i} has no true wheel travel; record it in simulation, calibrate from end "
-            "poses, or give -o FILE.yaml for a real log"
+            f"recording {i} has no true wheel travel; record it in simulation, or calibrate from "
+            "end poses; of a real log `estima calibrate` writes a .yaml file"
         )
     known = (truth.stamps >= wheels.stamps[0] - 1e-9) & (truth.stamps <= wheels.stamps[-1] + 1e-9)
     rows = np.flatnonzero(known)

@@ -139,22 +139,23 @@ def calibrate_against(reference: Reference, part: Recording) -> Found:
     sensors: dict[str, SensorBelief] = {}
     left = [np.zeros(0)] * 4
     lasers = [name for name in part.logs if isinstance(part.sensors[name], Laser)]
-    if reference.source is Source.SCANS:
-        name, laser = first_of(part, Laser)
-        # the reference moves the laser as the log mounts it; the mount found comes before that
-        x, y, yaw = se2.compose(mount, laser.mount.pose)
-        noise, share, left = laser_noise(part, name, reference)
-        sensors[name] = SensorBelief(float(x), float(y), float(yaw), sigma_range_m=noise.value)
-        for key, value, of_mount in zip(("x_m", "y_m", "yaw_rad"), (x, y, yaw), mount, strict=True):
-            found, by = mount_intervals[key], float(value - of_mount)
-            moved = Interval(float(value), found.low + by, found.high + by)
-            intervals[f"sensors.{name}.{key}"] = moved
-        intervals |= {f"sensors.{name}.sigma_range_m": noise, f"{name}: outliers": share}
-    elif lasers and reference.source is Source.TRUTH:
+    if lasers and reference.source is not Source.LANDMARKS:
+        name, laser = lasers[0], part.sensor(lasers[0], Laser)
+        found, by_scans = SensorBelief(), reference.source is Source.SCANS
+        if by_scans:
+            # the reference moves the laser as the log mounts it; the mount found comes before that
+            x, y, yaw = moved = se2.compose(mount, laser.mount.pose)
+            found = SensorBelief(float(x), float(y), float(yaw))
+            for (key, known), value, by in zip(
+                mount_intervals.items(), moved, moved - mount, strict=True
+            ):
+                interval = Interval(float(value), known.low + float(by), known.high + float(by))
+                intervals[f"sensors.{name}.{key}"] = interval
         # a truth errs from scan to scan by more than the laser does
-        noise, share, left = laser_noise(part, lasers[0], registered(part, lasers[0]))
-        sensors[lasers[0]] = SensorBelief(sigma_range_m=noise.value)
-        intervals |= {f"sensors.{lasers[0]}.sigma_range_m": noise, f"{lasers[0]}: outliers": share}
+        scans = reference if by_scans else registered(part, name)
+        noise, share, left = laser_noise(part, name, scans)
+        sensors[name] = dataclasses.replace(found, sigma_range_m=noise.value)
+        intervals |= {f"sensors.{name}.sigma_range_m": noise, f"{name}: outliers": share}
     if part.world is not None and any(
         isinstance(sensor, StereoCamera) and sensor.identifies for sensor in part.sensors.values()
     ):

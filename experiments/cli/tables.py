@@ -89,8 +89,12 @@ def table(
       estima table slip --rows -o slip.csv
     """
     from experiments.report import of_sweep
+    from experiments.report.table import check_name
 
-    of_sweep.check_table(out, size, every=every)
+    check_name(out, size)
+    require(not every or out is not None, "--rows: name the file to write, such as -o rows.csv")
+    known = not every or out is None or out.suffix in (".csv", ".parquet")
+    require(known, f"-o {out}: with --rows it is .csv or .parquet")
     timed = times or any(column.endswith("_time_us") for column in metric or [])
     rows = _rows(name, kept, timed)
     if every and out is not None:

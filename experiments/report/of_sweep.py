@@ -12,7 +12,7 @@ import pandas as pd
 from experiments.report.page import write_report
 from experiments.report.plot import Size, sweep_figure
 from experiments.report.sweep_page import extremes, picture_path, write_sweep_page
-from experiments.report.table import as_lines, check_name, notes, statuses, write_table
+from experiments.report.table import as_lines, notes, statuses, write_table
 from experiments.runs import paths
 from experiments.runs.console import counted, progress, show
 from experiments.runs.row import Outcome, write_frame
@@ -47,14 +47,6 @@ def after_sweep(folder: Path, n_runs: int) -> None:
     print(f"\nNext: estima table {folder.name}{against} -o table.tex")
     print(f"      estima plot {folder.name}")
     print(f"      estima report {folder.name}")
-
-
-def check_table(out: Path | None, size: str | None, *, every: bool) -> None:
-    """Refuse a table's file that could not be written, before rows are read."""
-    check_name(out, size)
-    require(not every or out is not None, "--rows: name the file to write, such as -o rows.csv")
-    known = not every or out is None or out.suffix in (".csv", ".parquet")
-    require(known, f"-o {out}: with --rows it is .csv or .parquet")
 
 
 def write_rows(rows: pd.DataFrame, out: Path) -> str:
@@ -98,7 +90,7 @@ class Panels:
 
 def plot_of(rows: pd.DataFrame, name: str, panels: Panels, out: Path) -> str:
     """Draw a sweep's chart into a file; return what was chosen, if it was."""
-    require(panels.size in list(Size), f"--size must be {', '.join(Size)}, got {panels.size}")
+    require(panels.size in list(Size), f"the size must be {', '.join(Size)}, got {panels.size}")
     failed = rows["status"] == Outcome.FAILED
     if failed.all():
         every = f"all {len(rows)} runs" if len(rows) > 1 else "the run"
