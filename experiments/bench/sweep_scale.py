@@ -102,10 +102,10 @@ def _written(share: Path) -> None:
 
 
 def _row(labels: Row, experiment: Experiment, rng: np.random.Generator) -> Row:
-    changed = experiment.config["robot"]
+    robot = experiment.robot()
     row: Row = {**labels, "seed": experiment.seed, "world_seed": experiment.seed}
-    row |= {f"robot.{name}": value for name, value in changed.items() if name in ("kr", "kl")}
-    row |= {"estimator.kr": changed["kr"], "estimator.kl": changed["kl"]}
+    for name in ("kr", "kl"):
+        row |= {f"{group}.{name}": getattr(robot, name) for group in ("robot", "estimator")}
     row |= {"run_key": experiment.key, "recording_checksum": rng.bytes(32).hex()}
     metrics = dict(zip(COLUMNS, rng.random(len(COLUMNS)).tolist(), strict=True))
     return {**row, **Status().columns(), **metrics}

@@ -9,13 +9,22 @@ from experiments.calibration.reference import LARGEST_DELAY_S, N_PARTS, Referenc
 from experiments.evaluation.statistics import Interval, mean_interval, share_interval
 from experiments.runs.calibration import SensorBelief
 from sim import se2
-from sim.arrays import Array
+from sim.arrays import Array, Ints
 from sim.errors import require
 from sim.recording import Recording
 from sim.sensors import Laser, StereoCamera
+from sim.worlds.world import World
 
 MAD = 1.4826  # standard deviation of a normal over its median absolute deviation
 _OUTLIER = 6.0  # in robust standard deviations
+
+
+def sightings(recording: Recording, name: str, world: World) -> tuple[Array, Ints, Array]:
+    """Stamps (K,) s, ids (K,) and points (K, 3) in the camera of a world's landmarks as seen."""
+    log = recording.log(name)
+    stamps = np.repeat(log.stamps, np.diff(log.known_splits))
+    known = (log["ids"] >= 0) & (log["ids"] < len(world.landmarks))
+    return stamps[known], log["ids"][known], log["points_in_camera"][known]
 
 
 def camera_noise(
@@ -24,14 +33,15 @@ def camera_noise(
     """Scale, mount, delay and noise of a camera among known landmarks; only from a truth."""
     if reference.source is not Source.TRUTH or recording.world is None:
         return SensorBelief(), {}, [np.zeros(0)] * 4
-    log, landmarks = recording.log(name), recording.world.landmarks
-    inside = (log.stamps > reference.stamps[0] + LARGEST_DELAY_S) & (
-        log.stamps < reference.stamps[-1] - LARGEST_DELAY_S
+    stamps, ids, points = sightings(recording, name, recording.world)
+    inside = (stamps > reference.stamps[0] + LARGEST_DELAY_S) & (
+        stamps < reference.stamps[-1] - LARGEST_DELAY_S
     )
-    per_row = np.repeat(np.arange(len(log.stamps)), np.diff(log.known_splits))
-    used = inside[per_row] & (log["ids"] >= 0) & (log["ids"] < len(landmarks))
-    stamps, points = log.stamps[per_row][used], log["points_in_camera"][used]
-    placed = landmarks[log["ids"][used], :2]
+    stamps, points, placed = (
+        stamps[inside],
+        points[inside],
+        recording.world.landmarks[ids[inside], :2],
+    )
     require(
         len(stamps) >= 30, f"only {len(stamps)} sightings of known landmarks; give more of the log"
     )
@@ -72,7 +82,7 @@ def camera_noise(
             flat: Array = (errors(unknowns)[:, near] / spread[:, None]).ravel()  # noqa: B023
             return flat
 
-        fit = optimize.min_squares(weighted, start, loss="soft_l1", x_scale=[0.01] * 4)
+        fit = optimize.least_squares(weighted, start, loss="soft_l1", x_scale=[0.01] * 4)
         found = errors(fit.x)
         spread = MAD * np.median(np.abs(found[:, near]), axis=1) + 1e-6
         near = finite & np.all(np.abs(found) < _OUTLIER * spread[:, None], axis=0)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
 
+from experiments.calibration.sensor_noise import sightings
 from sim import se2
 from sim.arrays import Array
 from sim.errors import require
@@ -36,12 +37,10 @@ def real_camera(
     InputError
         If it saw too few landmarks.
     """
-    camera, log = recording.sensor(name, StereoCamera), recording.log(name)
-    per_row = np.repeat(np.arange(len(log.stamps)), np.diff(log.known_splits))
-    ids = log["ids"]
-    times = log.stamps[per_row]
-    used = (times >= stamps[0]) & (times <= stamps[-1]) & (ids >= 0) & (ids < len(world.landmarks))
-    times, ids, points = times[used], ids[used], log["points_in_camera"][used]
+    camera = recording.sensor(name, StereoCamera)
+    times, ids, points = sightings(recording, name, world)
+    used = (times >= stamps[0]) & (times <= stamps[-1])
+    times, ids, points = times[used], ids[used], points[used]
     require(len(times) >= 30, f"only {len(times)} sightings of landmarks; give more of the log")
     poses = poses_at(stamps, way, times)
     true = np.array(

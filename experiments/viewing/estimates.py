@@ -70,7 +70,7 @@ def with_estimates_by(
 
 def _sparing(experiment: Experiment, shown: Playback, on_step: OnStep, repeat: int = 0) -> Estimate:
     """Online estimate of a robot alone, with what is drawn at the shown Frames."""
-    if "keep_map" in experiment.config["estimator"]:
+    if hasattr(experiment.estimator(), "keep_map"):
         experiment = experiment.with_estimator(keep_map=True)
     recording = shown.robots[0].recording
     sparing = _Sparing(experiment.estimator(), set(shown.rows.tolist()))
