@@ -17,7 +17,7 @@ from experiments.trajectories.odometry import read_odometry_csv
 from experiments.trajectories.read import SUFFIXES as TRAJECTORIES
 from experiments.trajectories.read import read_trajectory
 from experiments.viewing.playback import Playback
-from sim.errors import require
+from sim.errors import InputError, require
 from sim.recording import Frame, Recording
 from sim.team import Team
 
@@ -40,7 +40,7 @@ def with_estimates(
     """
     team, path = Team(tuple(own.recording for own in shown.robots)), Path(source)
     if is_file_of_estimate(path):
-        require(not overrides, f"{[*overrides, ''][0]}: overrides are for estimators that run now")
+        check_no_overrides(overrides)
         return shown.believing(_read_all(team, path), "estimate")
     experiment = experiment_over(team.robots[0], source, overrides)
     if len(team) == 1:
@@ -84,13 +84,19 @@ def estimate_along(
     """Read a trajectory, or the best one of an estimator: its revised path if it has one."""
     path = Path(source)
     if is_file_of_estimate(path):
-        require(not overrides, f"{[*overrides, ''][0]}: overrides are for estimators that run now")
+        check_no_overrides(overrides)
         return read_estimate(recording, path)
     experiment = experiment_over(recording, source, overrides)
     rng = stream(experiment.seed, f"estimator/{source}", 0)
     prior = experiment.prior(recording)
     online, revised = estimates(experiment.estimator(), recording, prior, rng, on_step=on_step)
     return revised or online
+
+
+def check_no_overrides(overrides: Sequence[str]) -> None:
+    """Refuse overrides where no estimator runs."""
+    for override in overrides:
+        raise InputError(f"{override}: overrides are for estimators that run now")
 
 
 def is_file_of_estimate(path: Path) -> bool:

@@ -10,7 +10,7 @@ import numpy as np
 
 from experiments.evaluation.time_sync import interpolate
 from experiments.runs.console import progress
-from experiments.viewing.estimates import estimate_along
+from experiments.viewing.estimates import check_no_overrides, estimate_along
 from experiments.viewing.grid import described
 from sim.arrays import Array, Floats
 from sim.errors import require, required
@@ -45,7 +45,7 @@ def path_of(
         Called with the number of Frames done.
     """
     if source == "truth":
-        require(not overrides, f"{[*overrides, ''][0]}: overrides are for estimators that run now")
+        check_no_overrides(overrides)
         truth = required(recording.truth, "this recording has no truth; name an estimator")
         return truth.stamps, truth.poses
     found = estimate_along(recording, source, overrides, on_step)
