@@ -200,6 +200,7 @@ def run(*given: Any, estimator: str | Estimator | None = None) -> Run:
     """  # noqa: E501 the message is one line
     from experiments.runs.evaluate import evaluate
     from sim.errors import InputError
+    from sim.team import Team
 
     recording = given[0] if given and not isinstance(given[0], str) else None
     overrides = given if recording is None else given[1:]
@@ -218,7 +219,7 @@ def run(*given: Any, estimator: str | Estimator | None = None) -> Run:
     found: list[tuple[Recording, Estimate, Estimate | None]] = []
     rows = evaluate(
         experiment,
-        None if recording is None else lambda: recording,
+        None if recording is None else lambda: Team((recording,)),
         on_estimate=lambda read, _, online, revised: found.append((read, online, revised)),
         on_error=_raise,
     )

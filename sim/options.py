@@ -79,6 +79,8 @@ def options(where: str) -> Callable[[type[T]], type[T]]:
     """
 
     def decorate(cls: type[T]) -> type[T]:
+        # as they are, also where `from __future__ import annotations` makes texts of them
+        cls.__annotations__ = inspect.get_annotations(cls, eval_str=True)
         made: Any = checked_dataclass(frozen=True, kw_only=True, config=_CONFIG)(cls)
         construct = made.__init__
 
@@ -150,10 +152,11 @@ def _complaint(cls: type, where: str, error: ValidationError) -> str:
     """One line about the first field that is wrong."""
     first = error.errors(include_url=False)[0]
     name = str(first["loc"][0]) if first["loc"] else ""
+    place = f"{where}.{name}" if where else name
     known = {option.name: option for option in described(cls)}
     if name not in known:
-        return f"unknown key {where}.{name}; known: {', '.join(known)}"
+        return f"unknown key {place}; known: {', '.join(known)}"
     if first["type"] == "missing":
-        return f"{where}.{name} is missing"
-    wanted = known[name].accepts
-    return f"{where}.{name} must be {wanted or first['msg']}, got {first['input']!r}"
+        return f"{place} is missing"
+    wanted = known[name].accepts or first["msg"].removeprefix("Input should be ")
+    return f"{place} must be {wanted}, got {first['input']!r}"

@@ -67,7 +67,7 @@ def _others() -> None:
     import numpy as np
 
     from experiments.calibration.end_pose_model import EndPoseModel
-    from experiments.runs.evaluate import estimates
+    from experiments.runs.evaluate import run_over
     from experiments.runs.experiment import Experiment
     from sim.robot.drive import DifferentialDrive
     from sim.robot.kinematic import run_batch
@@ -92,7 +92,7 @@ def _others() -> None:
             laser, scan = recording.sensor("laser", Laser), recording.log("laser")["ranges_m"][:1]
             map_scans(np.zeros((1, 3)), scan, laser, resolution_m=0.5)
         prior = experiment.prior(recording)
-        estimates(experiment.estimator(), recording.cut(12), prior, rng)
+        run_over(recording.cut(12), experiment.estimator(), prior, rng)
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ from statistics import geometric_mean
 from estimators.base import Estimate
 from experiments.bench.measure import Measurement
 from experiments.evaluation.metrics import score
-from experiments.runs.evaluate import estimates
+from experiments.runs.evaluate import run_over
 from experiments.runs.experiment import Experiment
 from experiments.runs.seeds import stream
 from sim.recording import Recording
@@ -51,4 +51,4 @@ def run() -> Iterator[Measurement]:
 def _run(name: str, recording: Recording, repeat: int, *options: str) -> Estimate:
     experiment = Experiment.compose([*_OFFICE, f"estimator={name}", *options])
     prior = experiment.prior(recording)
-    return estimates(experiment.estimator(), recording, prior, stream(repeat, "bench"))[0]
+    return run_over(recording, experiment.estimator(), prior, stream(repeat, "bench"))[0]

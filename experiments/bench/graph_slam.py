@@ -19,7 +19,7 @@ from estimators.graph.graph_slam import GraphSlam
 from estimators.graph.pose_graph import Edge
 from experiments.bench.measure import Measurement
 from experiments.evaluation.metrics import nees, position_errors_m
-from experiments.runs.evaluate import estimates
+from experiments.runs.evaluate import run_over
 from experiments.runs.experiment import Experiment
 from experiments.runs.seeds import stream
 from sim import se2
@@ -108,7 +108,7 @@ def run_rooms(seed: int, planted: float = 0.0) -> RoomRun:
     recording, robot = experiment.recording(), experiment.robot()
     estimator = Planted(planted, stream(seed, "bench"), kr=robot.kr, kl=robot.kl)
     rng = stream(seed, "estimator/graph_slam")
-    online, revised = estimates(estimator, recording, experiment.prior(recording), rng)
+    online, revised = run_over(recording, estimator, experiment.prior(recording), rng)
     assert revised is not None
     return RoomRun(
         *_judged_closures(estimator, recording),

@@ -9,7 +9,7 @@ import numpy as np
 from estimators.graph.least_squares import solve
 from estimators.graph.smoother import Smoother
 from experiments.bench.measure import Measurement, time_s
-from experiments.runs.evaluate import estimates, limited_blas
+from experiments.runs.evaluate import limited_blas, run_over
 from experiments.runs.experiment import Experiment
 from experiments.runs.seeds import stream
 
@@ -43,7 +43,7 @@ def run() -> Iterator[Measurement]:
     for name, goal in (("ekf_slam", 0.35), ("fixed_lag", 0.3)):
         online = Experiment.compose([*_DRIVE, f"estimator={name}"]).estimator()
         seconds = [
-            float(estimates(online, recording, prior, stream(0, "bench"))[0].step_seconds.sum())
+            float(run_over(recording, online, prior, stream(0, "bench"))[0].step_seconds.sum())
             for _ in range(4)
         ]
         note = "all steps, one BLAS thread"

@@ -9,11 +9,10 @@ from collections.abc import Callable, Sequence
 
 from experiments.bench.measure import Measurement, median_time_s, time_s
 from experiments.runs import paths, store
-from experiments.runs.evaluate import estimates
+from experiments.runs.evaluate import run_over
 from experiments.runs.experiment import Experiment
 from experiments.runs.seeds import stream
 from experiments.sweeps.launch import run_and_record
-from sim.recording import Recording
 from sim.team import Team
 
 _NAME = "bench_sweep"
@@ -55,17 +54,18 @@ def run() -> list[Measurement]:
 
 def _overheads() -> list[Measurement]:
     experiment = Experiment.compose([*_SHORT, f"name={_NAME}", "picture=false"])
-    recording = experiment.recording()
-    _packed_s([experiment], {experiment.recording_key: recording})
+    read = experiment.recordings()
+    recording = read.only
+    _packed_s([experiment], {experiment.recording_key: read})
     prior, estimator = experiment.prior(recording), experiment.estimator()
     own_s = median_time_s(
-        lambda: estimates(estimator, recording, prior, stream(0, "bench")),
+        lambda: run_over(recording, estimator, prior, stream(0, "bench")),
         clock=time.process_time,
     )
 
     def packed_s(repeats: int) -> float:
         many = experiment.replaced(repeats=repeats)
-        return _packed_s([many], {many.recording_key: recording})
+        return _packed_s([many], {many.recording_key: read})
 
     def swept_s(n_runs: int) -> float:
         """Wall time of a sweep over values of a belief, the recording being cached."""
@@ -94,7 +94,7 @@ def _cheapest_run_ms() -> float:
     return 1e3 * _packed_s(runs[20:], {}) / len(runs[20:])
 
 
-def _packed_s(runs: Sequence[Experiment], held: dict[str, Recording | Team]) -> float:
+def _packed_s(runs: Sequence[Experiment], held: dict[str, Team]) -> float:
     """Processor time of runs in one job, their rows included."""
     begun = time.process_time()
     with store.journal(runs[0].rows_folder / f"bench{store.JOURNAL}") as journal:

@@ -10,7 +10,6 @@ from estimators.team import TeamEstimator
 from experiments.bench.measure import Measurement
 from experiments.runs.evaluate import limited_blas
 from experiments.runs.experiment import Experiment
-from experiments.runs.team import TeamExperiment
 from sim.arrays import Array
 from sim.team import Team
 
@@ -32,7 +31,7 @@ _ARMS = {
 
 def run() -> list[Measurement]:
     """Median and 99th percentile of an instant, of each estimator and size."""
-    whole = TeamExperiment(Experiment.compose(_DRIVE)).recording()
+    whole = Experiment.compose(_DRIVE).recordings()
     return [found for name in _ARMS for size in _SIZES for found in _measured(name, size, whole)]
 
 
@@ -40,9 +39,7 @@ def _measured(name: str, size: int, whole: Team) -> Iterator[Measurement]:
     experiment = Experiment.compose([*_DRIVE, *_ARMS[name], f"team.size={size}"])
     team = whole.first(size)
     with limited_blas():
-        spent_ms = 1e3 * instant_s(
-            experiment.team_estimator(), team, TeamExperiment(experiment).priors(team)
-        )
+        spent_ms = 1e3 * instant_s(experiment.team_estimator(), team, experiment.priors(team))
     where = f"teams.{name}.robots_{size}"
     last = float(np.quantile(spent_ms, 0.99))
     yield Measurement(f"{where}_ms", float(np.median(spent_ms)), "ms", note="median of an instant")

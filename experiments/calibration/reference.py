@@ -14,7 +14,7 @@ from estimators.landmarks.ekf_slam import EkfSlam
 from estimators.laser.icp_odometry import IcpOdometry
 from estimators.laser.scan_matching import FAILED
 from experiments.evaluation.statistics import Interval, mean_interval
-from experiments.runs.evaluate import estimates
+from experiments.runs.evaluate import run_over
 from sim.arrays import Array, Ints
 from sim.errors import InputError, require
 from sim.recording import Recording, WheelLog
@@ -90,7 +90,7 @@ def reference_of(recording: Recording) -> Reference:
     prior = Prior(recording.robot, recording.sensors, np.zeros(3), _START)
     # online, and gated: a batch that starts from wrong wheels and misread landmarks ends anywhere
     mapper = EkfSlam(kr=3e-3, kl=3e-3, errors="invariant", gate_probability=1e-6, stereo=name)
-    found, _ = estimates(mapper, recording, prior, np.random.default_rng(0))
+    found, _ = run_over(recording, mapper, prior, np.random.default_rng(0))
     rows = np.flatnonzero(np.isin(found.stamps, recording.log(name).stamps))
     stamps = found.stamps[rows]
     return Reference(
@@ -106,7 +106,7 @@ def registered(recording: Recording, name: str) -> Reference:
     prior = Prior(recording.robot, recording.sensors, np.zeros(3), _START)
     matcher = IcpOdometry(kr=3e-3, kl=3e-3, sigma_range_m=0.03, reference="previous", laser=name)
     keep = ("registration_status",)
-    found, _ = estimates(matcher, recording, prior, np.random.default_rng(0), keep)
+    found, _ = run_over(recording, matcher, prior, np.random.default_rng(0), keep)
     rows = np.flatnonzero(np.isin(found.stamps, recording.log(name).stamps))
     sound = [found.extras["registration_status"][i] not in FAILED for i in rows[1:]]
     return Reference(Source.SCANS, found.stamps[rows], found.means[rows], np.array(sound, bool))

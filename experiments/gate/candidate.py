@@ -20,6 +20,7 @@ from sim.files import write_text
 from sim.formats.carmen import write_carmen
 from sim.formats.rosbag_out import write_bag
 from sim.recording import Recording
+from sim.team import Team
 
 LONGEST_GAP_S = 1.0  # without a pose; longer ones fail, so that no candidate chooses what is scored
 
@@ -39,7 +40,8 @@ def write_recordings(
     bags = importlib.util.find_spec("rosbags") is not None
     done = 0
     for group in groups:
-        for seed, experiment, recording in _recordings(suite, group):
+        for seed, experiment, team in _recordings(suite, group):
+            recording = team.only
             prior = experiment.prior(recording)
             copy = recording_of(list(recording.frames()), prior)
             stem = folder / f"{group}_{seed}"
@@ -88,13 +90,13 @@ def candidate_rows(
             f"several repeats {group}_{suite.first_seed}.0.tum",
         )
         read = set[Path | None]()
-        for i, (seed, _, recording) in enumerate(_recordings(suite, group)):
-            origin = {"checksum": recording.checksum[:12], "fingerprint": fingerprint(recording)}
+        for i, (seed, _, team) in enumerate(_recordings(suite, group)):
+            origin = {"checksum": team.checksum[:12], "fingerprint": fingerprint(team)}
             for repeat in range(repeats[entry.name]):
                 which = {"estimator": entry.name, "recording": seed, "repeat": repeat}
                 path = trajectory_path(own, entry, seed, repeat)
                 read.add(path)
-                errors, status = _errors(path, entry, seed, repeat, recording)
+                errors, status = _errors(path, entry, seed, repeat, team.only)
                 rows.append({**which, **origin, **errors, "status": status})
             on_progress((place + (i + 1) / count) / len(suite.estimators))
         _tell_of_others(own, read)
@@ -134,10 +136,10 @@ def _errors(
     return {name: scores[name] for name in ERRORS}, "ok"
 
 
-def _recordings(suite: Suite, group: str) -> Iterator[tuple[int, Experiment, Recording]]:
+def _recordings(suite: Suite, group: str) -> Iterator[tuple[int, Experiment, Team]]:
     """Seed, experiment and recording, one after another."""
     whole = Experiment.compose(suite.overrides[group])
     for i in range(suite.counts[group]):
         seed = suite.first_seed + i
         experiment = whole.replaced(seed=seed, world_seed=seed)
-        yield seed, experiment, experiment.recording()
+        yield seed, experiment, experiment.recordings()

@@ -25,7 +25,6 @@ from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome
 from experiments.runs.seeds import stream
-from experiments.runs.team import recorded, robots_of
 from experiments.viewing.run_figure import run_figure
 from experiments.viewing.style import save_figure
 from sim.errors import InputError, printable, require
@@ -308,7 +307,7 @@ def _run_recording(
 ) -> list[dict[str, Any]]:
     """Rows of all runs over one recording."""
     rows = []
-    recording = recorded(runs[0][1].replaced(seed=seed, world_seed=seed))
+    recording = runs[0][1].replaced(seed=seed, world_seed=seed).recordings()
     origin = {"checksum": recording.checksum[:12], "fingerprint": fingerprint(recording)}
     for entry, experiment, planted in runs:
         for row in evaluate(
@@ -341,7 +340,7 @@ def _plant(
     return lambda estimator, repeat: planted(estimator, _stream("fault", seed, reseed, repeat))
 
 
-def fingerprint(read: Recording | Team) -> float:
+def fingerprint(read: Team) -> float:
     """Sum of weighted means over each sensor's first field, and over the true positions.
 
     That of a team is the sum of its robots'.
@@ -349,7 +348,7 @@ def fingerprint(read: Recording | Team) -> float:
     Machines that differ in the last bits make recordings with different checksums, but with
     fingerprints that agree to a millionth; those of different recordings do not.
     """
-    return sum(map(_fingerprint, robots_of(read)))
+    return sum(map(_fingerprint, read.robots))
 
 
 def _fingerprint(recording: Recording) -> float:

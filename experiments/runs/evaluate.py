@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import os
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection
 from contextlib import AbstractContextManager, nullcontext
 
 import numpy as np
@@ -21,13 +21,7 @@ from experiments.runs.columns import OF_THE_RUN
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import GAP, Outcome, Row, Status
 from experiments.runs.seeds import stream
-from experiments.runs.team import (
-    TeamExperiment,
-    recorded,
-    robots_of,
-    scores_of_team,
-    status_of_team,
-)
+from experiments.runs.team import answers_of_team, scores_of_team, status_of_team
 from sim.arrays import Array
 from sim.compiled import processor_s
 from sim.errors import InputError, require
@@ -38,14 +32,14 @@ REMARKED_PAUSE_S = 1.0  # without a pose
 
 Streams = Callable[[int], np.random.Generator]
 Planted = Callable[[Estimator, int], AbstractContextManager[object]]
-Shown = Callable[[Recording | Team], AbstractContextManager[Callable[[int], None]]]
+Shown = Callable[[Team], AbstractContextManager[Callable[[int], None]]]
 OnStep = Callable[[int], None] | None
 Answers = list[tuple[Estimate, Estimate | None]]  # of each robot: online and revised
 
 
 def evaluate(
     experiment: Experiment,
-    fetch: Callable[[], Recording | Team] | None = None,
+    fetch: Callable[[], Team] | None = None,
     *,
     streams: Streams | None = None,
     planted: Planted | None = None,
@@ -53,20 +47,20 @@ def evaluate(
     on_estimate: Callable[[Recording, int, Estimate, Estimate | None], None] = lambda *_: None,
     on_error: Callable[[Exception | SystemExit], None] = lambda _: None,
 ) -> list[Row]:
-    """Run an experiment's estimator `repeats` times over its recording, and score each run.
+    """Run an experiment's estimator `repeats` times over its recordings, and score each run.
 
     Parameters
     ----------
     fetch
-        Gives the recording, or those of a team, once the configuration is known to fit together; by
-        default the experiment's own.
+        Gives the recordings, once the configuration is known to fit together; by default the
+        experiment's own.
     streams
-        The estimator's generator of each repeat, or a team's (see `TeamExperiment.run`); by default
+        The estimator's generator of each repeat, or a team's (see `answers_of_team`); by default
         that of the axis `estimator/NAME`.
     planted
         Gives a context in which the estimator is faulty, for each repeat; not of a team.
     shown
-        Shows the progress over a recording: gives a function of the number of Frames done, as a
+        Shows the progress over the recordings: gives a function of the number of Frames done, as a
         context around each repeat.
     on_estimate
         Called for each robot, with its recording, the repeat, its online estimate and the revised
@@ -86,10 +80,9 @@ def evaluate(
         If the configuration or the recording does not fit together.
     """
     experiment.check()
-    read = fetch() if fetch else recorded(experiment)
-    answers_of = _runner(experiment, read, streams)
-    require(planted is None or not isinstance(read, Team), "faults are planted in one robot's runs")
-    robots = robots_of(read)
+    read = fetch() if fetch else experiment.recordings()
+    answers_of = runner(experiment, read, streams)
+    require(planted is None or experiment.team is None, "faults are planted in one robot's runs")
     labels = experiment.labels(read.checksum)
     rows = []
     for repeat in range(experiment.repeats):
@@ -101,65 +94,66 @@ def evaluate(
                 shown(read) if shown else nullcontext() as on_step,
             ):
                 answers = answers_of(estimator, repeat, on_step)
-            status, scores = _scored_run(read, answers, experiment.scoring)
+            status, scores = _scored_run(experiment, read, answers)
         except InputError:
             raise
         except (Exception, SystemExit) as error:
             status = Status.of_error(error)
             on_error(error)
         else:
-            for recording, answer in zip(robots, answers, strict=True):
+            for recording, answer in zip(read.robots, answers, strict=True):
                 on_estimate(recording, repeat, *answer)
         rows.append({**labels, "repeat": repeat, **status.columns(), **scores})
     return rows
 
 
-def _runner(
-    experiment: Experiment, read: Recording | Team, streams: Streams | None
+def runner(
+    experiment: Experiment, read: Team, streams: Streams | None = None
 ) -> Callable[[Estimator, int, OnStep], Answers]:
-    """Function that runs an estimator of one robot, or of a team, over what was read."""
-    require(
-        isinstance(read, Team) == (experiment.team is not None),
-        "team: the recording is of one robot, and the experiment of several"
-        if experiment.team is not None
-        else "the recording is of a team; choose study=teams",
-    )
-    if isinstance(read, Team):
-        team, several = read, TeamExperiment(experiment)
+    """Function that runs an estimator over recordings: of it, the repeat, and the progress.
 
-        def run_several(
-            _: Estimator, repeat: int, on_step: Callable[[int], None] | None
-        ) -> Answers:
-            with limited_blas():
-                return several.run(team, repeat, streams, on_step)
+    Raises
+    ------
+    InputError
+        If the recordings are of more or fewer robots than the experiment, or lack what is known at
+        the start.
+    """
+    experiment.check_size(read)
+    priors = experiment.priors(read)
+    axis = f"estimator/{experiment.estimator_name}"
+    own = streams or functools.partial(stream, experiment.seed, axis)
 
-        return run_several
-    recording, prior = read, experiment.prior(read)
-    own = streams or functools.partial(
-        stream, experiment.seed, f"estimator/{experiment.estimator_name}"
-    )
-    keep = (*SCORED_EXTRAS, *experiment.keep)
-    return lambda estimator, repeat, on_step: [
-        estimates(estimator, recording, prior, own(repeat), keep, on_step)
-    ]
+    def answers(estimator: Estimator, repeat: int, on_step: OnStep) -> Answers:
+        if experiment.team is None:
+            keep = (*SCORED_EXTRAS, *experiment.keep)
+            return [run_over(read.only, estimator, priors[0], own(repeat), keep, on_step)]
+        with limited_blas():
+            return answers_of_team(experiment, read, priors, repeat, own, on_step)
+
+    return answers
 
 
-def _scored_run(
-    read: Recording | Team, answers: Answers, scoring: Mapping[str, float]
-) -> tuple[Status, Row]:
+def run_robots(
+    experiment: Experiment, read: Team, repeat: int = 0, on_step: OnStep = None
+) -> Answers:
+    """Online and revised estimate of each robot, of one repeat, as `evaluate` makes them."""
+    return runner(experiment, read)(experiment.estimator(), repeat, on_step)
+
+
+def _scored_run(experiment: Experiment, read: Team, answers: Answers) -> tuple[Status, Row]:
     """How a run ended, and its scores."""
     statuses, scores = [], []
-    for recording, (online, revised) in zip(robots_of(read), answers, strict=True):
+    for recording, (online, revised) in zip(read.robots, answers, strict=True):
         statuses.append(status_of(recording, online, revised))
-        scores.append(scored(recording, online, revised, **scoring))
-    if isinstance(read, Team):
-        return status_of_team(statuses), scores_of_team(read, scores)
-    return statuses[0], scores[0]
+        scores.append(scored(recording, online, revised, **experiment.scoring))
+    if experiment.team is None:
+        return statuses[0], scores[0]
+    return status_of_team(statuses), scores_of_team(read, scores)
 
 
-def estimates(
-    estimator: Estimator,
+def run_over(
     recording: Recording,
+    estimator: Estimator,
     prior: Prior,
     rng: np.random.Generator,
     keep: Collection[str] = (),

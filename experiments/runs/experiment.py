@@ -1,68 +1,35 @@
-"""A resolved configuration and the objects it names. Nothing else reads configuration keys."""
+"""An experiment: what a configuration names, what its runs are called, and whether it fits."""
 
 from __future__ import annotations
 
 import dataclasses
 import inspect
 import json
-import math
 import re
-import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
-import numpy as np
 from omegaconf import OmegaConf
 
-from estimators.base import Estimator, Prior
-from estimators.team import TeamEstimator
+from estimators.base import Estimator
 from experiments.runs import paths
-from experiments.runs.cache import cached, key_of
-from experiments.runs.calibration import read_calibration
 from experiments.runs.compose import composing, with_study_file
-from experiments.runs.key import TEAM_KEYS, digest_of, files_digest, files_of_options, leaf_digest
+from experiments.runs.key import applied, run_key, version_of
+from experiments.runs.objects import OF_TEAMS, Objects, is_grid_file
 from experiments.runs.row import Row
-from experiments.runs.schema import SIMULATED_KEYS, Config, check_shape, leaves
+from experiments.runs.schema import OPTIONS, Config, RunOptions, check_shape
 from experiments.runs.seeds import stream
-from experiments.runs.targets import checked, make, targets
-from experiments.runs.team_settings import TeamSettings, own_config, team_settings
-from experiments.runs.version import code_version, source_digest, version_with
-from sim.arrays import Array
-from sim.errors import InputError, blaming, require, required
-from sim.recording import Frame, Recording, load
-from sim.robot.drive import DifferentialDrive, RobotGeometry
-from sim.sensors import Sensor, Sensors, sensors_from_config
-from sim.sensors.base import RecordedSensor, sensor_settings
+from experiments.runs.targets import checked
+from sim.errors import InputError, require
+from sim.recording import Recording
 from sim.settings import build, find
 from sim.worlds import grid_file
 from sim.worlds.grid import OccupancyGrid
-from sim.worlds.world import World
-
-_NOT_IN_KEY = ("name", "picture", "recording")
-_OF_TEAMS = "ekf_slam, fastslam or smoother"
-_PHYSICS = ("bullet", "kinematic")
-_RAYS = ("bullet", "exact")
 
 
-@dataclass(frozen=True)
-class Experiment:
-    """A world, a robot, its sensors and route, or a recording of them; and an estimator.
-
-    Attributes
-    ----------
-    config
-        Resolved configuration, plain values.
-    choices
-        Name of the chosen option of each configuration group.
-    own_estimator
-        An object in place of the configured estimator; see `using`.
-    """
-
-    config: Config
-    choices: Mapping[str, str] = field(default_factory=dict)
-    own_estimator: Estimator | None = None
+class Experiment(Objects):
+    """A world, a robot, its sensors and route, or a recording of them; and an estimator."""
 
     @classmethod
     def compose(cls, overrides: Sequence[str] = ()) -> Experiment:
@@ -105,11 +72,6 @@ class Experiment:
         return str(self.config["name"])
 
     @property
-    def estimator_name(self) -> str:
-        """The chosen option, or the class of an estimator without one."""
-        return self.choices.get("estimator") or str(self.config["estimator"]["_target_"])
-
-    @property
     def from_file(self) -> bool:
         """Whether its recording is read or made, rather than simulated."""
         return self.config["recording"] is not None
@@ -129,11 +91,6 @@ class Experiment:
         """The kr and kl that the estimator believes, m; None if it has no such options."""
         settings = self.config["estimator"]
         return (settings["kr"], settings["kl"]) if {"kr", "kl"} <= set(settings) else None
-
-    @property
-    def seed(self) -> int:
-        """Seed of every stream of randomness but the world's."""
-        return int(self.config["seed"])
 
     @property
     def repeats(self) -> int:
@@ -168,57 +125,27 @@ class Experiment:
 
     @property
     def key(self) -> str:
-        """Digest of what decides the rows: configuration, recording, map, files named, code.
-
-        It is the sum of a digest for each leaf, and one of files and code, modulo 2^64. So the
-        keys of a product of values are sums too, and a sweep of a million runs knows them at once.
-        """
-        settings = {key: value for key, value in self.config.items() if key not in _NOT_IN_KEY}
-        files = files_digest(self.config["prior"].get("map"))
-        files |= files_of_options(self.config["estimator"])
-        files |= files_digest(self.config.get("calibration"))
-        total = leaf_digest((), [self._recording_sources(), files, self._code_version()])
-        total += sum(leaf_digest(leaf, value) for leaf, value in leaves(settings))
-        return f"{total % 2**64:016x}"
-
-    @property
-    def recording_key(self) -> str:
-        """Digest of what decides the recording's bits: its settings, or a file's; and the code."""
-        return key_of(self._recording_settings())
+        """Digest of what decides the rows; see `experiments.runs.key.run_key`."""
+        return run_key(self.config)
 
     def labels(self, checksum: str) -> Row:
         """Columns that state a row's origin: choices, keys, versions, the recording's checksum.
 
         Settings that did not make the recording have no column.
         """
-        applied = self._applied()
-        brought = ("world", "sensors", "route") if self.config["recording"] is not None else ()
-        choices = {g: name for g, name in self.choices.items() if g in applied and g not in brought}
+        stated = applied(self.config)
+        brought = ("world", "sensors", "route") if self.from_file else ()
+        choices = {g: name for g, name in self.choices.items() if g in stated and g not in brought}
         return {
             **{f"choice.{group}": name for group, name in choices.items()},
-            **_flat({k: v for k, v in applied.items() if k not in ("keep", "picture")}),
+            **_flat({k: v for k, v in stated.items() if k not in ("keep", "picture")}),
             "repeat": 0,
             "run_key": self.key,
-            "code_version": self._code_version(),
+            "code_version": version_of(self.config),
             "recording_checksum": checksum,
         }
 
-    def _applied(self) -> Config:
-        """Settings without those of a simulation that a recording from a file takes the place of.
-
-        A function that makes the recording or the map may read all of them.
-        """
-        places = (self.config["recording"], self.config["prior"].get("map"))
-        made = any(isinstance(place, dict) and "_target_" in place for place in places)
-        if self.config["recording"] is None or made:
-            return self.config
-        unused = set(SIMULATED_KEYS) - {"seed"}
-        return {key: value for key, value in self.config.items() if key not in unused}
-
-    def _code_version(self) -> str:
-        return version_with(targets(self._applied()), self.config["estimator"].get("command"))
-
-    # What it names
+    # Whether it fits
 
     def check(self) -> None:
         """Find what is wrong or does not fit together, before any run.
@@ -230,61 +157,18 @@ class Experiment:
         """
         config = self.config
         check_shape(config)
-        repeats, keep = config["repeats"], config["keep"]
-        if isinstance(repeats, bool) or not isinstance(repeats, int) or repeats < 1:
-            raise InputError(f"repeats must be a whole number from 1 on, got {repeats!r}")
-        if not (isinstance(keep, list) and all(isinstance(key, str) for key in keep)):
-            raise InputError(f"keep must be a list of names, such as [ess], got {keep!r}")
+        RunOptions(**{key: config[key] for key in ("repeats", "keep", "picture")})
+        for place, kind in OPTIONS.items():
+            build(kind, config[place], place)
         self.robot()
         self.sensors()
         self.route()
         checked(config["world"], "world", ("rng",))
         stream(config["seed"], "slip")
         stream(config["world_seed"], "world", key="world_seed")
-        self._check_simulation()
-        self._check_prior()
-        self._check_scoring()
         self._check_team()
         self._check_needs()
         self._check_map()
-
-    def _check_simulation(self) -> None:
-        simulation = self.config["simulation"]
-        for key, allowed in (("physics", _PHYSICS), ("rays", _RAYS)):
-            if simulation[key] not in allowed:
-                raise InputError(
-                    f"simulation.{key} must be {' or '.join(allowed)}, got {simulation[key]!r}"
-                )
-        if simulation["physics"] == "kinematic" and simulation["rays"] == "bullet":
-            raise InputError("simulation.rays=bullet needs the engine; set simulation.rays=exact")
-
-    def _check_prior(self) -> None:
-        settings = self.config["prior"]
-        start, known_map = settings["start"], settings["map"]
-        if start not in ("tracking", "global"):
-            raise InputError(f"prior.start must be tracking or global, got {start!r}")
-        for key in ("sigma_position_m", "sigma_heading_rad"):
-            sigma = settings[key]
-            number = isinstance(sigma, (int, float)) and not isinstance(sigma, bool)
-            if not (number and 0.0 <= sigma < math.inf):
-                raise InputError(f"prior.{key} must be zero or a positive number, got {sigma!r}")
-        believed = {key: settings[key] for key in ("wheel_radius_m", "track_m")}
-        build(RobotGeometry, {k: 1.0 if v is None else v for k, v in believed.items()}, "prior")
-        if isinstance(known_map, dict):
-            checked(known_map, "prior.map", ("config", "recording"))
-        elif known_map not in ("none", "world") and not _is_grid_file(known_map):
-            raise InputError(
-                "prior.map must be none, world, a grid's .yaml file or a mapping with _target_, "
-                f"got {known_map!r}"
-            )
-
-    def _check_scoring(self) -> None:
-        for key, value in self.config["scoring"].items():
-            number = isinstance(value, (int, float)) and not isinstance(value, bool)
-            if not (number and value >= 0.0):
-                raise InputError(
-                    f"scoring.{key} must be zero or a positive number of seconds, got {value!r}"
-                )
 
     def _check_needs(self) -> None:
         """Check that the estimator gets the sensors and the map that it needs."""
@@ -293,7 +177,7 @@ class Experiment:
         if str(settings.get("_target_")).startswith("estimators."):
             estimator = self.estimator()  # its values too; one from elsewhere may take long to make
         needs = frozenset(getattr(estimator, "needs", ()))
-        if self.config["recording"] is None:
+        if not self.from_file:
             self._check_sensors(f"estimator={self.estimator_name}", needs - {"map"}, settings)
             onboard = self.config["route"].get("feedback")
             if isinstance(onboard, dict):
@@ -307,19 +191,26 @@ class Experiment:
             )
 
     def _check_map(self) -> None:
-        """Check that a grid can be read, and that the estimator can use one."""
+        """Check that the prior's map can be made or read, and that the estimator can use it."""
         known_map, settings = self.config["prior"]["map"], self.config["estimator"]
-        if not _is_grid_file(known_map):
-            return
-        grid_file.read_grid(known_map)
-        estimator = self.own_estimator or checked(settings, "estimator")
-        kinds = getattr(estimator, "maps", None)
-        if kinds and OccupancyGrid not in kinds and not settings.get("map_path"):
-            names = " or ".join(kind.__name__ for kind in kinds)
-            raise InputError(
-                f"estimator={self.estimator_name} takes a {names}, and prior.map={known_map} is an "
-                "occupancy grid"
+        if isinstance(known_map, dict):
+            checked(known_map, "prior.map", ("config", "recording"))
+        elif not is_grid_file(known_map):
+            require(
+                known_map in ("none", "world"),
+                "prior.map must be none, world, a grid's .yaml file or a mapping with _target_, "
+                f"got {known_map!r}",
             )
+        else:
+            grid_file.read_grid(known_map)
+            estimator = self.own_estimator or checked(settings, "estimator")
+            kinds = getattr(estimator, "maps", None)
+            if kinds and OccupancyGrid not in kinds and not settings.get("map_path"):
+                names = " or ".join(kind.__name__ for kind in kinds)
+                raise InputError(
+                    f"estimator={self.estimator_name} takes a {names}, and prior.map={known_map} "
+                    "is an occupancy grid"
+                )
 
     def _check_team(self) -> None:
         """Check each robot of a team, and what is of one robot only."""
@@ -329,10 +220,10 @@ class Experiment:
         kind = find(self.config["estimator"].get("_target_"), "estimator")
         require(
             not inspect.isclass(kind) or hasattr(kind, "step_team"),
-            f"estimator={self.estimator_name} is of one robot; a team takes {_OF_TEAMS}",
+            f"estimator={self.estimator_name} is of one robot; a team takes {OF_TEAMS}",
         )
         settings = self.config["estimator"]
-        if settings.get("robots") is not None and self.config["recording"] is None:
+        if settings.get("robots") is not None and not self.from_file:
             self._check_sensors(f"estimator={self.estimator_name}", ["robots"], settings)
         for number in range(team.size):
             own = self.of_robot(number)
@@ -362,248 +253,6 @@ class Experiment:
                     f"sensors={self.choices.get('sensors')} has none; {remedy}"
                 )
 
-    def world(self) -> World:
-        """Make the world, from its own stream."""
-        rng = stream(self.config["world_seed"], "world", key="world_seed")
-        world: World = make(self.config["world"], "world", rng=rng)
-        return world
-
-    def robot(self) -> DifferentialDrive:
-        """Make the true robot."""
-        return build(DifferentialDrive, self.config["robot"], "robot")
-
-    def sensors(self) -> dict[str, Sensor]:
-        """Make the sensors."""
-        return sensors_from_config(self.config["sensors"])
-
-    def estimator(self) -> Estimator:
-        """Make the estimator: anything with `reset` and `step`."""
-        estimator: Estimator = self.own_estimator or make(self.config["estimator"], "estimator")
-        for method in ("reset", "step"):
-            if not callable(getattr(estimator, method, None)):
-                raise InputError(
-                    f"estimator {type(estimator).__name__} has no method {method}; "
-                    "see estimators/base.py for the protocol"
-                )
-        return estimator
-
-    def team_estimator(self) -> TeamEstimator:
-        """Make the estimator of a team: anything with `reset_team` and `step_team`."""
-        estimator: Any = self.estimator()
-        require(
-            hasattr(estimator, "reset_team") and hasattr(estimator, "step_team"),
-            f"estimator={self.estimator_name} is of one robot; a team takes {_OF_TEAMS}",
-        )
-        return cast(TeamEstimator, estimator)
-
-    @property
-    def team(self) -> TeamSettings | None:
-        """The key `team` of a study of several robots; None of one robot."""
-        given = self.config.get("team")
-        return None if given is None else team_settings(given)
-
-    def of_robot(self, number: int) -> Experiment:
-        """The experiment of one robot of the team, alone, with what it has of its own."""
-        team = required(self.team, "team: this experiment is of one robot")
-        return dataclasses.replace(self, config=own_config(self.config, team, number))
-
-    def route(self) -> Any:
-        """Make the route: anything with `start`, as in `sim.simulate.Route`."""
-        return make(self.config["route"], "route")
-
-    def simulate(
-        self,
-        on_progress: Callable[[float], None] | None = None,
-        streams: Mapping[str, np.random.Generator] | None = None,
-    ) -> Recording:
-        """Simulate the recording.
-
-        Parameters
-        ----------
-        on_progress
-            Called with the seconds simulated.
-        streams
-            Generators `slip` and `sensors`, in place of the seed's own.
-        """
-        from sim.simulate import record
-
-        self._check_one_robot()
-        self._check_simulation()
-        return record(
-            self.world(),
-            self.robot(),
-            self.sensors(),
-            self.route(),
-            streams or {axis: stream(self.config["seed"], axis) for axis in ("slip", "sensors")},
-            physics=self.config["simulation"]["physics"],
-            rays=self.config["simulation"]["rays"],
-            config={key: self.config[key] for key in SIMULATED_KEYS},
-            on_progress=on_progress,
-            onboard=self.onboard,
-        )
-
-    def onboard(
-        self, world: World, robot: RobotGeometry, sensors: Sensors, start: Array
-    ) -> Callable[[Frame], Array]:
-        """Start the estimator that the route's feedback names; it knows the start and the map."""
-        estimator = self._steering()
-        prior = Prior(robot, sensors, start.copy(), np.zeros((3, 3)), world)
-        with blaming("route.feedback"):
-            estimator.reset(prior, stream(self.config["seed"], "onboard"))
-        return lambda frame: estimator.step(frame).mean
-
-    def _steering(self) -> Estimator:
-        """Make the estimator that the route's feedback names."""
-        estimator: Estimator = make(self.config["route"]["feedback"], "route.feedback")
-        whole = all(callable(getattr(estimator, name, None)) for name in ("reset", "step"))
-        require(whole, "route.feedback names no estimator: it has no reset and step")
-        return estimator
-
-    def recording(self, on_progress: Callable[[float], None] | None = None) -> Recording:
-        """Read the recording, find it in the cache, or simulate it.
-
-        A mapping in place of a path names a function that makes one.
-        """
-        self._check_one_robot()
-        wanted = self.config["recording"]
-        if isinstance(wanted, dict):
-            made = make(wanted, "recording", config=self.config)
-            if not isinstance(made, Recording):
-                raise InputError(
-                    f"recording: {wanted['_target_']} must return a Recording, "
-                    f"got {type(made).__name__}"
-                )
-            return self._calibrated(made)
-        if wanted is not None:
-            recording = load(Path(wanted))
-            self._compare_slip(recording)
-            return self._calibrated(self._with_classes(recording))
-        recording = cached(self.recording_key, lambda: self.simulate(on_progress))
-        # a file does not choose what code runs, but the configuration does
-        return dataclasses.replace(recording, sensors=self.sensors())
-
-    def _check_one_robot(self) -> None:
-        require(
-            self.team is None,
-            "team: a recording is of one robot; `estima record` and `estima run` take teams",
-        )
-
-    def _calibrated(self, recording: Recording) -> Recording:
-        """Return the recording as the calibration has it."""
-        path = self.config["calibration"]
-        return recording if path is None else read_calibration(Path(path)).applied(recording)
-
-    def _with_classes(self, recording: Recording) -> Recording:
-        """Return the recording with the classes of its sensors that the configuration names too."""
-        again = {
-            name: sensor_settings(sensor)
-            for name, sensor in recording.sensors.items()
-            if isinstance(sensor, RecordedSensor)
-            and (self.config["sensors"].get(name) or {}).get("_target_") == sensor.target
-        }
-        return dataclasses.replace(
-            recording, sensors={**recording.sensors, **sensors_from_config(again)}
-        )
-
-    def _compare_slip(self, recording: Recording) -> None:
-        """Warn if kr or kl are not those that the recording was made with."""
-        made_with, believed = recording.config.get("robot"), self.config["robot"]
-        if not isinstance(made_with, dict):  # of a log of many robots, the number of one
-            return
-        for key in ("kr", "kl"):
-            asked = key in made_with and key in self.config["estimator"]
-            if asked and made_with[key] != believed[key]:
-                print(
-                    f"the recording was made with robot.{key}={made_with[key]:g}; "
-                    f"{believed[key]:g} is believed unless robot.{key} or estimator.{key} is set",
-                    file=sys.stderr,
-                )
-
-    def _simulated(self) -> Config:
-        """Settings of the recording that would be simulated."""
-        return {key: self.config[key] for key in SIMULATED_KEYS}
-
-    def _recording_settings(self) -> Config:
-        """What decides the recording."""
-        made = {} if isinstance(self.config["recording"], str) else self._simulated()
-        if (team := self.config.get("team")) is not None:
-            made["team"] = {key: team.get(key) for key in TEAM_KEYS}
-        return {**made, **self._recording_sources()}
-
-    def _recording_sources(self) -> Config:
-        """Files and code that decide the recording, beside the simulation's settings."""
-        wanted = self.config["recording"]
-        if isinstance(wanted, dict):  # its function may read all of the settings
-            return {"recording": wanted, "files": files_digest(wanted)}
-        if wanted is not None:
-            return {"recording": digest_of(Path(wanted))}
-        sources: Config = {}
-        world_file = self.config["world"].get("path")
-        if world_file is not None and Path(world_file).is_file():  # an edited file: another world
-            sources["world_file"] = digest_of(Path(world_file))
-            if (image := grid_file.image_of(Path(world_file))) is not None:
-                sources["world_image"] = digest_of(image)
-        if way := files_digest(self.config["route"].get("path")):
-            sources["way"] = list(way.values())
-        if files := files_of_options(self.config["route"].get("feedback")):
-            sources["feedback_files"] = files
-        elsewhere = {target: source_digest(target) for target in sorted(targets(self._simulated()))}
-        if any(elsewhere.values()):  # a sensor, route or world of one's own, edited: another one
-            sources["sources"] = elsewhere
-        if any(target.startswith("estimators.") for target in elsewhere):  # one on board
-            sources["code"] = code_version()
-        return sources
-
-    def prior(self, recording: Recording, number: int = 0) -> Prior:
-        """Return what the estimator knows at the start of the robot of this number.
-
-        Raises
-        ------
-        InputError
-            If a start pose is wanted, and the truth does not cover the first Frame.
-        """
-        self._check_prior()
-        settings = self.config["prior"]
-        geometry = dataclasses.asdict(recording.robot)
-        geometry |= {key: settings[key] for key in geometry if settings[key] is not None}
-        robot = build(RobotGeometry, geometry, "prior")
-        known_map = self._map(recording)
-        if settings["start"] == "global":
-            return Prior(robot, recording.sensors, map=known_map)
-        sigma = np.array([settings["sigma_position_m"]] * 2 + [settings["sigma_heading_rad"]])
-        start = np.zeros(3)
-        if recording.truth is not None:
-            start = _true_start(recording)
-        offset = sigma * stream(self.config["seed"], "prior", number).standard_normal(3)
-        return Prior(robot, recording.sensors, start + offset, np.diag(np.square(sigma)), known_map)
-
-    def _map(self, recording: Recording) -> Any:
-        """Map of the prior: none, the recording's world, a grid, or what a function makes."""
-        wanted = self.config["prior"]["map"]
-        if isinstance(wanted, dict):
-            return make(wanted, "prior.map", config=self.config, recording=recording)
-        if wanted == "none":
-            return None
-        if _is_grid_file(wanted):
-            return grid_file.read_grid(wanted)
-        if recording.world is None:
-            raise InputError("prior.map=world, but the recording has no map; set prior.map=none")
-        return recording.world
-
-
-def _true_start(recording: Recording) -> Array:
-    """True pose (3,) at the first Frame."""
-    begin_s = float(recording.frame_stamps[0])
-    start: Array = recording.truth_at(recording.frame_stamps[:1])[0]
-    spans = recording.known_truth.stamps[[0, -1]]
-    require(
-        bool(np.isfinite(start).all()),
-        f"the first Frame is at {begin_s:.2f} s, and the truth spans {spans[0]:.2f} to "
-        f"{spans[1]:.2f} s: no start pose is known; cut the recording to the time of its truth, "
-        "or set prior.start=global",
-    )
-    return start
-
 
 def rows_folder(name: Any) -> Path:
     """Folder of rows of a name, which must be one word."""
@@ -618,10 +267,6 @@ def _presets_with(names: Sequence[str]) -> list[str]:
     """Options of conf/sensors that have one of these sensors."""
     found = {path.stem: OmegaConf.load(path) for path in (paths.CONF / "sensors").glob("*.yaml")}
     return sorted(preset for preset, sensors in found.items() if any(n in sensors for n in names))
-
-
-def _is_grid_file(known_map: Any) -> bool:
-    return isinstance(known_map, str) and Path(known_map).suffix in grid_file.SUFFIXES
 
 
 def _flat(tree: Mapping[str, Any], prefix: str = "") -> Row:

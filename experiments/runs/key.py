@@ -8,11 +8,15 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-from experiments.runs.schema import SIMULATED_KEYS, Leaf, leaves
+from experiments.runs.cache import key_of
+from experiments.runs.schema import SIMULATED_KEYS, Config, Leaf, leaves
+from experiments.runs.targets import targets
+from experiments.runs.version import code_version, source_digest, version_with
 from sim.errors import InputError
 from sim.worlds import grid_file
 
-TEAM_KEYS = ("size", "robots")  # of the key `team`, those that decide what is read
+_NOT_IN_KEY = ("name", "picture", "recording")
+_TEAM_KEYS = ("size", "robots")  # of the key `team`, those that decide what is read
 
 
 def files_digest(tree: Any) -> dict[str, str]:
@@ -62,7 +66,7 @@ def digest_of(path: Path) -> str:
 
 def decides_recording(leaf: Leaf, *, from_file: bool) -> bool:
     """Whether a leaf of the configuration decides which recording is read."""
-    of_team = leaf[0] == "team" and leaf[1] in TEAM_KEYS
+    of_team = leaf[0] == "team" and leaf[1] in _TEAM_KEYS
     return of_team or (leaf[0] in SIMULATED_KEYS and not from_file)
 
 
@@ -79,3 +83,71 @@ def leaf_digests(leaf: Leaf, values: Iterable[Any]) -> Iterator[int]:
         digest = place.copy()
         digest.update((json.dumps(value, sort_keys=True) if nested else json.dumps(value)).encode())
         yield int.from_bytes(digest.digest())
+
+
+def run_key(config: Config) -> str:
+    """Digest of what decides the rows: configuration, recording, map, files named, code.
+
+    It is the sum of a digest for each leaf, and one of files and code, modulo 2^64. So the keys of
+    a product of values are sums too, and a sweep of a million runs knows them at once.
+    """
+    settings = {key: value for key, value in config.items() if key not in _NOT_IN_KEY}
+    files = files_digest(config["prior"].get("map"))
+    files |= files_of_options(config["estimator"])
+    files |= files_digest(config.get("calibration"))
+    total = leaf_digest((), [_recording_sources(config), files, version_of(config)])
+    total += sum(leaf_digest(leaf, value) for leaf, value in leaves(settings))
+    return f"{total % 2**64:016x}"
+
+
+def recording_key(config: Config) -> str:
+    """Digest of what decides the recording's bits: its settings, or a file's; and the code."""
+    made = {} if isinstance(config["recording"], str) else _simulated(config)
+    if (team := config.get("team")) is not None:
+        made["team"] = {key: team.get(key) for key in _TEAM_KEYS}
+    return key_of({**made, **_recording_sources(config)})
+
+
+def applied(config: Config) -> Config:
+    """Settings without those of a simulation that a recording from a file takes the place of.
+
+    A function that makes the recording or the map may read all of them.
+    """
+    places = (config["recording"], config["prior"].get("map"))
+    made = any(isinstance(place, dict) and "_target_" in place for place in places)
+    if config["recording"] is None or made:
+        return config
+    unused = set(SIMULATED_KEYS) - {"seed"}
+    return {key: value for key, value in config.items() if key not in unused}
+
+
+def version_of(config: Config) -> str:
+    """The code's version, and a digest of what the settings name from elsewhere."""
+    return version_with(targets(applied(config)), config["estimator"].get("command"))
+
+
+def _simulated(config: Config) -> Config:
+    """Settings of the recording that would be simulated."""
+    return {key: config[key] for key in SIMULATED_KEYS}
+
+
+def _recording_sources(config: Config) -> Config:
+    """Files and code that decide the recording, besides the simulation's settings."""
+    wanted = config["recording"]
+    if isinstance(wanted, dict):  # its function may read all of the settings
+        return {"recording": wanted, "files": files_digest(wanted)}
+    if wanted is not None:
+        return {"recording": digest_of(Path(wanted))}
+    sources: Config = {}
+    if world := files_digest(config["world"].get("path")):  # an edited file: another world
+        sources["world_files"] = list(world.values())
+    if way := files_digest(config["route"].get("path")):
+        sources["way"] = list(way.values())
+    if files := files_of_options(config["route"].get("feedback")):
+        sources["feedback_files"] = files
+    elsewhere = {target: source_digest(target) for target in sorted(targets(_simulated(config)))}
+    if any(elsewhere.values()):  # a sensor, route or world of one's own, edited: another one
+        sources["sources"] = elsewhere
+    if any(target.startswith("estimators.") for target in elsewhere):  # one on board
+        sources["code"] = code_version()
+    return sources

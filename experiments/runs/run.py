@@ -27,7 +27,6 @@ from experiments.runs.experiment import Experiment
 from experiments.runs.interrupts import held_interrupts
 from experiments.runs.row import Outcome, Row
 from experiments.runs.store import write_run
-from experiments.runs.team import TeamExperiment, recorded, robots_of
 from experiments.trajectories.convert import write_estimate
 from sim.errors import InputError, require
 from sim.recording import Recording
@@ -60,19 +59,17 @@ def run_once(experiment: Experiment, draw: Draw, out: Path | None = None) -> lis
     )
     found: list[tuple[Recording, Estimate]] = []
 
-    def fetch() -> Recording | Team:
+    def fetch() -> Team:
         with shown("simulated seconds", expected_s(experiment)) as on_progress:
-            recording = recorded(experiment, on_progress)
+            read = experiment.recordings(on_progress)
         slip = experiment.believed_slip
-        if isinstance(recording, Team):
-            return recording
-        if "source" in recording.config and not experiment.calibrated and slip:
+        if len(read) == 1 and "source" in read.only.config and not experiment.calibrated and slip:
             show(
                 f"believed of this real robot: kr={slip[0]:g} and kl={slip[1]:g} m, and the "
                 "geometry that the log's reader assumes; to find its own: "
                 "estima calibrate LOG -o cal.yaml, then calibration=cal.yaml"
             )
-        return recording
+        return read
 
     def keep(recording: Recording, repeat: int, online: Estimate, revised: Estimate | None) -> None:
         if repeat == 0:
@@ -93,7 +90,7 @@ def run_once(experiment: Experiment, draw: Draw, out: Path | None = None) -> lis
         rows = evaluate(
             experiment,
             fetch,
-            shown=lambda read: shown(name, sum(len(r.frame_stamps) for r in robots_of(read))),
+            shown=lambda read: shown(name, sum(len(r.frame_stamps) for r in read.robots)),
             on_estimate=keep,
             on_error=_trace,
         )
@@ -114,7 +111,7 @@ def expected_s(experiment: Experiment) -> float | None:
     """About how long the simulated drive will be; None if that is not known before."""
     if experiment.from_file:
         return None
-    one = experiment if experiment.team is None else experiment.of_robot(0)
+    one = experiment.of_robot(0)
     about_s = getattr(one.route(), "about_s", None)
     return None if about_s is None else round(about_s(one.world(), one.robot()), 1)
 
@@ -123,12 +120,9 @@ def record(experiment: Experiment, out: Path) -> bool:
     """Simulate what an experiment reads, save it and say so; return whether all drives were ok."""
     require(out.suffix == ".npz", f"{out}: a recording is an .npz file")
     with progress("simulated seconds", expected_s(experiment)) as on_progress:
-        if experiment.team is None:
-            made = Team((experiment.simulate(on_progress),))
-        else:
-            made = TeamExperiment(experiment).record(on_progress)
+        made = experiment.simulated(on_progress)
     checksum = save(made, out)
-    alone = len(made) == 1
+    alone = not experiment.of_team
     said = [
         f"{'' if alone else f'robot {n}: '}{robot.status}, {robot.duration_s:.1f} s"
         for n, robot in enumerate(made.robots)

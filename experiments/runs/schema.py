@@ -7,13 +7,13 @@ import difflib
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from enum import Enum
-from typing import Any
+from typing import Any, Literal
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from sim.errors import InputError, require
-from sim.options import Option, described
+from sim.options import Count, NonNegative, Option, Positive, described, options
 from sim.robot.drive import DifferentialDrive
 from sim.settings import find
 
@@ -21,17 +21,75 @@ Config = dict[str, Any]
 Leaf = tuple[str, ...]  # a place in the configuration: ("robot", "kr")
 GROUPS = ("world", "robot", "sensors", "route", "estimator")
 SIMULATED_KEYS = ("world", "robot", "sensors", "route", "simulation", "seed", "world_seed")
-_MAPPINGS = (*GROUPS, "simulation", "prior", "scoring")
+_INJECTED = ("rng", "config", "recording")  # arguments that the program passes
+_UNSET = object()
+
+
+@options("simulation")
+class SimulationOptions:
+    """The key `simulation`."""
+
+    physics: Literal["bullet", "kinematic"]
+    """The engine, or the same slip law with ideal rolling."""
+    rays: Literal["bullet", "exact"]
+    """How rays are cast; the geometry is the same."""
+
+    def __post_init__(self) -> None:
+        require(
+            self.physics == "bullet" or self.rays == "exact",
+            "simulation.rays=bullet needs the engine; set simulation.rays=exact",
+        )
+
+
+@options("prior")
+class PriorOptions:
+    """The key `prior`: what the estimator knows at the start."""
+
+    start: Literal["tracking", "global"]
+    """The first true pose, or none."""
+    sigma_position_m: NonNegative
+    """Of the first belief, m; its mean is drawn with it."""
+    sigma_heading_rad: NonNegative
+    wheel_radius_m: Positive | None
+    """What the estimator believes of the robot, m; null: what the recording says."""
+    track_m: Positive | None
+    map: Any
+    """none, world, a grid's file, or a mapping with `_target_`."""
+
+
+@options("scoring")
+class ScoringOptions:
+    """The key `scoring`: options of `experiments.evaluation.metrics.score`."""
+
+    longest_gap_s: NonNegative
+    """Of the truth, over which it is interpolated, s; Frames in longer ones do not count."""
+    after_s: NonNegative
+    """Frames of the first seconds do not count, s."""
+
+
+@options("")
+class RunOptions:
+    """Keys of a run that stand alone."""
+
+    repeats: Count
+    """Runs of the estimator over the same recording, a row each."""
+    keep: list[str]
+    """Names of belief extras to record."""
+    picture: bool
+    """Whether a single run is drawn."""
+
+
+OPTIONS: dict[str, type] = {
+    "simulation": SimulationOptions,
+    "prior": PriorOptions,
+    "scoring": ScoringOptions,
+}
+_MAPPINGS = (*GROUPS, *OPTIONS)
 _KEYS = (
     *_MAPPINGS,
-    *("seed", "world_seed", "repeats", "recording", "calibration", "name", "picture", "keep"),
-    *("simulation.physics", "simulation.rays"),
-    *("prior.start", "prior.sigma_position_m", "prior.sigma_heading_rad"),
-    *("prior.wheel_radius_m", "prior.track_m", "prior.map"),
-    *("scoring.longest_gap_s", "scoring.after_s"),
+    *("seed", "world_seed", "recording", "calibration", "name", "repeats", "keep", "picture"),
+    *(f"{place}.{option.name}" for place, kind in OPTIONS.items() for option in described(kind)),
 )
-_INJECTED = ("rng", "config", "recording")  # arguments that the program passes, not the user
-_UNSET = object()
 
 
 def unknown(key: str, known: Iterable[str]) -> str:

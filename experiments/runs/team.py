@@ -1,16 +1,10 @@
-"""Experiments of a team: its recordings, its estimates, and the one row of a run.
-
-`recorded` gives what an experiment reads, be it of one robot or of a team.
-"""
+"""Runs of a team: the estimates of its robots, and the one row of them all."""
 
 from __future__ import annotations
 
 import dataclasses
-import functools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,165 +12,63 @@ from numpy.typing import NDArray
 
 from estimators.base import Estimate, Prior
 from estimators.team import Answer, run_team
-from experiments.runs.cache import cached
 from experiments.runs.columns import REVISED, Average, average_of
-from experiments.runs.experiment import Experiment
+from experiments.runs.objects import Objects
 from experiments.runs.row import Outcome, Row, Status
-from experiments.runs.schema import SIMULATED_KEYS
-from experiments.runs.seeds import stream
-from experiments.runs.team_settings import TeamSettings
 from sim.arrays import Array
 from sim.compiled import processor_s
-from sim.errors import InputError, required
-from sim.recording import Recording
+from sim.errors import required
 from sim.sensors import RobotCamera
-from sim.simulate import Member, record_team
-from sim.team import Team, load
+from sim.team import Team
 
 _ADDED = ("stamps_scored", "stamps_left_out", "step_time_us")  # over the robots
 _STREAMS = 100  # of a run's filters
 
 
-@dataclass(frozen=True)
-class TeamExperiment:
-    """An experiment of several robots. Robot 0 has the random streams of a robot alone.
+def answers_of_team(
+    experiment: Objects,
+    team: Team,
+    priors: Sequence[Prior],
+    repeat: int,
+    streams: Callable[[int], np.random.Generator],
+    on_step: Callable[[int], None] | None = None,
+) -> list[Answer]:
+    """Online and revised estimate of each robot.
+
+    A robot whose start is not known has no estimate until it is placed. The estimates share the
+    processor time of the run.
 
     Parameters
     ----------
-    experiment
-        Its `team` says who drives.
-
-    Raises
-    ------
-    InputError
-        If there is no key `team`, or one of its keys is missing, unknown, or makes no sense.
+    repeat
+        Which of the runs over the same team.
+    streams
+        Generators of the filters by number.
+    on_step
+        Called with the number of Frames done.
     """
-
-    experiment: Experiment
-
-    def __post_init__(self) -> None:
-        for number in range(self.settings.size):
-            self.experiment.of_robot(number)
-
-    @property
-    def settings(self) -> TeamSettings:
-        """The key `team`."""
-        return required(self.experiment.team, "team must hold keys; choose study=teams")
-
-    def recording(self, on_progress: Callable[[float], None] | None = None) -> Team:
-        """Read the team from its file, find it in the cache, or simulate it.
-
-        Of a team from a file the first `team.size` robots are taken.
-        """
-        wanted, size = self.experiment.config["recording"], self.settings.size
-        if isinstance(wanted, str):
-            team = load(Path(wanted))
-            if size > len(team):
-                held = f"a team of {len(team)} robots; set team.size"
-                alone = "it holds one robot, and no team; leave out study and team"
-                raise InputError(f"{wanted}: {held if len(team) > 1 else alone}")
-            return team if size == len(team) else team.first(size)
-        if wanted is not None:
-            raise InputError("recording: a team is simulated, or read from a file")
-        simulate = functools.cache(lambda: self.record(on_progress))
-
-        def of_robot(number: int) -> Recording:
-            key = f"{self.experiment.recording_key}-{number}"
-            found = cached(key, lambda: simulate().robots[number])
-            # a file does not choose what code runs, but the configuration does
-            return dataclasses.replace(found, sensors=self.experiment.of_robot(number).sensors())
-
-        return Team(tuple(map(of_robot, range(size))))
-
-    def record(self, on_progress: Callable[[float], None] | None = None) -> Team:
-        """Simulate the team."""
-        members = []
-        for number in range(self.settings.size):
-            own = self.experiment.of_robot(number)
-            streams = {axis: stream(own.seed, axis, number) for axis in ("slip", "sensors")}
-            config = {key: own.config[key] for key in SIMULATED_KEYS}
-            what = own.robot(), own.sensors(), own.route(), streams, config, own.onboard
-            members.append(Member(*what))
-        simulation = self.experiment.config["simulation"]
-        return record_team(
-            self.experiment.world(),
-            members,
-            physics=simulation["physics"],
-            rays=simulation["rays"],
-            on_progress=on_progress,
-        )
-
-    def priors(self, team: Team) -> list[Prior]:
-        """What is known of each robot at the start; each has a draw of its own."""
-        priors = []
-        for number, recording in enumerate(team.robots):
-            prior = self.experiment.of_robot(number).prior(recording, number)
-            if number and self.settings.starts == "unknown":
-                prior = dataclasses.replace(prior, mean=None, covariance=None)
-            priors.append(prior)
-        return priors
-
-    def run(
-        self,
-        team: Team,
-        repeat: int = 0,
-        streams: Callable[[int], np.random.Generator] | None = None,
-        on_step: Callable[[int], None] | None = None,
-    ) -> list[Answer]:
-        """Online and revised estimate of each robot.
-
-        A robot whose start is not known has no estimate until it is placed. The estimates share the
-        processor time of the run.
-
-        Parameters
-        ----------
-        repeat
-            Which of the runs over the same team.
-        streams
-            Generators of the filters by number; by default those of the axis `estimator/NAME`.
-        on_step
-            Called with the number of Frames done.
-        """
-        experiment, communication = self.experiment, self.settings.communication
-        axis = f"estimator/{experiment.estimator_name}"
-        own = streams or functools.partial(stream, experiment.seed, axis)
-        contacts = None
-        if communication.range_m is not None:
-            contacts = in_range(team, communication.range_m)
-        begun = processor_s()
-        found = run_team(
-            experiment.team_estimator,
-            team,
-            self.priors(team),
-            lambda robot: own(_STREAMS * repeat + robot),
-            communication,
-            contacts,
-            on_step,
-        )
-        spent_s = processor_s() - begun
-        n_frames = sum(len(online.stamps) for online, _ in found)
-        answers = []
-        for number, (online, revised) in enumerate(found):
-            share_s = spent_s * len(online.stamps) / n_frames
-            online = dataclasses.replace(online, cpu_seconds=share_s)
-            if number and self.settings.starts == "unknown":
-                online, revised = _placed(online), revised and _placed(revised)
-            answers.append((online, revised))
-        return answers
-
-
-def recorded(
-    experiment: Experiment, on_progress: Callable[[float], None] | None = None
-) -> Recording | Team:
-    """What an experiment reads: a recording, or those of a team."""
-    if experiment.team is None:
-        return experiment.recording(on_progress)
-    return TeamExperiment(experiment).recording(on_progress)
-
-
-def robots_of(recorded: Recording | Team) -> tuple[Recording, ...]:
-    """The recording of each robot."""
-    return recorded.robots if isinstance(recorded, Team) else (recorded,)
+    settings = required(experiment.team, "team must hold keys; choose study=teams")
+    range_m = settings.communication.range_m
+    begun = processor_s()
+    found = run_team(
+        experiment.team_estimator,
+        team,
+        priors,
+        lambda robot: streams(_STREAMS * repeat + robot),
+        settings.communication,
+        None if range_m is None else in_range(team, range_m),
+        on_step,
+    )
+    spent_s = processor_s() - begun
+    n_frames = sum(len(online.stamps) for online, _ in found)
+    answers = []
+    for number, (online, revised) in enumerate(found):
+        share_s = spent_s * len(online.stamps) / n_frames
+        online = dataclasses.replace(online, cpu_seconds=share_s)
+        if number and settings.starts == "unknown":
+            online, revised = _placed(online), revised and _placed(revised)
+        answers.append((online, revised))
+    return answers
 
 
 def status_of_team(statuses: Sequence[Status]) -> Status:

@@ -17,13 +17,11 @@ from experiments.runs.experiment import Experiment
 from experiments.runs.schema import Config
 from experiments.runs.store import read_runs
 from experiments.runs.targets import checked
-from experiments.runs.team import recorded, robots_of
 from experiments.sweeps.collect import commands, folder_of
 from experiments.viewing.estimates import OnStep, with_estimates_by
 from experiments.viewing.play import Showing, play
 from experiments.viewing.playback import Playback
 from sim.errors import InputError, require
-from sim.recording import Recording
 from sim.team import Team
 
 _SHORT = 10  # digits of a key that tell tens of thousands of runs apart
@@ -37,7 +35,7 @@ class Again:
     repeat: int
     checksum: str
 
-    def recording(self) -> Recording | Team:
+    def recordings(self) -> Team:
         """What the run read.
 
         Raises
@@ -45,13 +43,9 @@ class Again:
         InputError
             If it is no longer the same.
         """
-        read = recorded(self.experiment)
+        read = self.experiment.recordings()
         require(read.checksum == self.checksum, "the recording of the run is not what it was")
         return read
-
-    def team(self) -> Team:
-        """What the run read, as a team."""
-        return Team(robots_of(self.recording()))
 
 
 def short_key(row: pd.Series[Any]) -> str:
@@ -172,7 +166,7 @@ def draw_again(
     def estimated(shown: Playback, on_step: OnStep) -> Playback:
         return with_estimates_by(shown, again.experiment, again.repeat, on_step)
 
-    return play(again.team(), how, called, name, estimated)
+    return play(again.recordings(), how, called, name, estimated)
 
 
 def _known(value: Any) -> bool:

@@ -34,13 +34,11 @@ from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from experiments.runs.interrupts import held_interrupts
 from experiments.runs.row import Outcome, Row, Status, check_row
-from experiments.runs.team import recorded
 from experiments.sweeps.collect import COMMAND, UNFINISHED
 from experiments.sweeps.plan import Family, Numbers, Plan, packed, plan_of
 from sim.compiled import ANNOUNCED, note_compiling
 from sim.errors import InputError, require
 from sim.files import require_file, write_whole
-from sim.recording import Recording
 from sim.team import Team
 
 _JOBS_PER_CORE = 4  # enough to keep all busy to the end, few enough to cost little
@@ -134,7 +132,7 @@ def _name(plan: Plan, own: Sequence[str], config_dir: str | None) -> str | None:
     So the same command goes on where it stopped, and two sweeps do not pool their rows.
     """
     given = any(argument.lstrip("+").startswith("name=") for argument in own)
-    if given or plan.experiment(0).config["name"] != _UNNAMED:
+    if given or plan.experiment(0).name != _UNNAMED:
         return None
     last = {argument.partition("=")[0]: argument for argument in own}  # that one is swept
     text = json.dumps([sorted(last.values()), config_dir and str(Path(config_dir).resolve())])
@@ -405,7 +403,7 @@ def run_share(share: Mapping[str, Any]) -> None:
 
     A run that fails leaves its row, and the next follows.
     """
-    held: dict[str, Recording | Team] = {}
+    held: dict[str, Team] = {}
     path = Path(share["journal"])
     over = store.ended(path.parent, f"{path.stem}.")  # something if the launcher tries it again
     keys = {*over.done.tolist(), *over.failed}
@@ -436,9 +434,7 @@ def _end_with(node: str, planner: int) -> None:
         threading.Thread(target=watch, name="planner", daemon=True).start()
 
 
-def run_and_record(
-    experiment: Experiment, held: dict[str, Recording | Team], journal: store.Journal
-) -> None:
+def run_and_record(experiment: Experiment, held: dict[str, Team], journal: store.Journal) -> None:
     """Run one experiment; what goes wrong becomes the status of its row.
 
     Parameters
@@ -463,13 +459,11 @@ def run_and_record(
     journal.append(rows)
 
 
-def _held(
-    experiment: Experiment, held: dict[str, Recording | Team], on_progress: Callable[..., None]
-) -> Recording | Team:
+def _held(experiment: Experiment, held: dict[str, Team], on_progress: Callable[..., None]) -> Team:
     key = experiment.recording_key
     if key not in held:
         held.clear()
-        held[key] = recorded(experiment, on_progress)
+        held[key] = experiment.recordings(on_progress)
     return held[key]
 
 

@@ -7,7 +7,7 @@ from estimators.graph.graph_slam import GraphSlam
 from estimators.graph.smoother import Smoother
 from experiments.calibration.reference import spaced_rows, travel_at
 from experiments.runs.calibration import Slip
-from experiments.runs.evaluate import estimates
+from experiments.runs.evaluate import run_over
 from sim import se2
 from sim.arrays import Array
 from sim.errors import InputError, require
@@ -52,7 +52,7 @@ def best_poses(recording: Recording, slip: Slip) -> tuple[Array, Array]:
         else Smoother(kr=slip.kr, kl=slip.kl, robust="cauchy", stereo=name)
     )
     prior = Prior(recording.robot, recording.sensors, np.zeros(3), _START)
-    _, found = estimates(batch, recording, prior, np.random.default_rng(0))
+    _, found = run_over(recording, batch, prior, np.random.default_rng(0))
     assert found is not None
     return found.stamps, found.means
 

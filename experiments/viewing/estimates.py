@@ -9,10 +9,9 @@ import numpy as np
 
 from estimators.base import Belief, Estimate, Estimator
 from estimators.team import run_team
-from experiments.runs.evaluate import estimates
+from experiments.runs.evaluate import run_over, run_robots
 from experiments.runs.experiment import Experiment
 from experiments.runs.seeds import stream
-from experiments.runs.team import TeamExperiment
 from experiments.trajectories.odometry import read_odometry_csv
 from experiments.trajectories.read import SUFFIXES as TRAJECTORIES
 from experiments.trajectories.read import read_trajectory
@@ -59,12 +58,11 @@ def with_estimates_by(
     shown: Playback, experiment: Experiment, repeat: int, on_step: OnStep
 ) -> Playback:
     """Show the online estimates of one of an experiment's repeats."""
-    if len(shown.robots) == 1:
+    if experiment.team is None:
         found = [_sparing(experiment, shown, on_step, repeat)]
     else:
         team = Team(tuple(own.recording for own in shown.robots))
-        several = TeamExperiment(experiment).run(team, repeat, on_step=on_step)
-        found = [online for online, _ in several]
+        found = [online for online, _ in run_robots(experiment, team, repeat, on_step)]
     return shown.believing(found, experiment.estimator_name)
 
 
@@ -75,7 +73,7 @@ def _sparing(experiment: Experiment, shown: Playback, on_step: OnStep, repeat: i
     recording = shown.robots[0].recording
     sparing = _Sparing(experiment.estimator(), set(shown.rows.tolist()))
     rng = stream(experiment.seed, f"estimator/{experiment.estimator_name}", repeat)
-    return estimates(sparing, recording, experiment.prior(recording), rng, _EXTRAS, on_step)[0]
+    return run_over(recording, sparing, experiment.prior(recording), rng, _EXTRAS, on_step)[0]
 
 
 def estimate_along(
@@ -89,7 +87,7 @@ def estimate_along(
     experiment = experiment_over(recording, source, overrides)
     rng = stream(experiment.seed, f"estimator/{source}", 0)
     prior = experiment.prior(recording)
-    online, revised = estimates(experiment.estimator(), recording, prior, rng, on_step=on_step)
+    online, revised = run_over(recording, experiment.estimator(), prior, rng, on_step=on_step)
     return revised or online
 
 

@@ -18,7 +18,7 @@ from estimators.programs.offline import Offline, recording_of
 from estimators.programs.program import ProgramError
 from experiments.gate.conform import check_estimator
 from experiments.gate.suite import read_suite, run_suite
-from experiments.runs.evaluate import estimates, evaluate
+from experiments.runs.evaluate import evaluate, run_over
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome
 from experiments.runs.version import version_with
@@ -53,7 +53,7 @@ def listening(out):
 
 def run(estimator, recording, prior=None, seed=0):
     prior = fakes.tracking_prior(recording) if prior is None else prior
-    return estimates(estimator, recording, prior, np.random.default_rng(seed))
+    return run_over(recording, estimator, prior, np.random.default_rng(seed))
 
 
 def midpoint(recording):

@@ -52,6 +52,7 @@ from experiments.sweeps.plan import planned
 from sim.arrays import Array
 from sim.recording import Recording
 from sim.sensors import Laser, sensor_of
+from sim.team import Team
 
 Tables = dict[str, pd.DataFrame]
 Job = tuple[float, Callable[..., Tables], Sequence[Any]]  # cost, function, arguments
@@ -175,7 +176,9 @@ def _run(
     """
     seen: list[Estimate] = []
     (found,) = evaluate(
-        experiment, lambda: recording, on_estimate=lambda _, __, online, ___: seen.append(online)
+        experiment,
+        lambda: Team((recording,)),
+        on_estimate=lambda _, __, online, ___: seen.append(online),
     )
     if not seen or found["status"] == Outcome.FAILED:
         raise RunFailedError(f"{experiment.name}: {found['status_code']}: {found['status_detail']}")

@@ -21,7 +21,7 @@ from experiments.judging.results import Results
 from experiments.judging.verdict import Profile
 from experiments.papers.gil2008 import scores, settings
 from experiments.papers.gil2008.recordings import Scene, landmark_distances_m, thinned, whole
-from experiments.runs.evaluate import estimates, scored, status_of
+from experiments.runs.evaluate import run_over, scored, status_of
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
 from experiments.runs.seeds import stream
@@ -143,8 +143,8 @@ def _shown(recording: Recording) -> Row:
 
 def one_run(experiment: Experiment, recording: Recording, rng: np.random.Generator) -> Row:
     """Scores of one run; an estimator without `finish` is scored by its online path."""
-    online, revised = estimates(
-        experiment.estimator(), recording, experiment.prior(recording), rng, scores.KEEP
+    online, revised = run_over(
+        recording, experiment.estimator(), experiment.prior(recording), rng, scores.KEEP
     )
     revised = revised or online
     found = scored(recording, online, revised)
@@ -174,7 +174,7 @@ def write_arrays(out: Results) -> None:
     for option in ("odometry", "fastslam_paper", "fastslam", "smoother"):
         one = Experiment.compose(["study=gil2008", f"estimator={option}"])
         rng = stream(one.seed, "example")
-        online, revised = estimates(one.estimator(), recording, one.prior(recording), rng)
+        online, revised = run_over(recording, one.estimator(), one.prior(recording), rng)
         found, name = revised or online, str(labels_of("bound", one)["filter"])
         pictured[name] = found.means
         pictured |= _gridded(name, scanned, found.stamps, found.means)

@@ -16,9 +16,9 @@ from experiments.evaluation.map_quality import landmark_errors
 from experiments.judging.jobs import in_parallel
 from experiments.judging.results import Results
 from experiments.judging.verdict import Profile
+from experiments.runs.evaluate import run_robots
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
-from experiments.runs.team import TeamExperiment
 from experiments.studies.exploration import settings
 from sim import se2
 from sim.arrays import Array
@@ -62,10 +62,10 @@ def row_of(seed: int, strategy: str) -> tuple[Row, pd.DataFrame]:
     The map is that of the paper's method, run over the drive.
     """
     experiment = composed(seed, strategy)
-    team = experiment.recording()
+    team = experiment.recordings()
     driven_m, area_m2 = coverage(team, settings.RESOLUTION_M)
     labels: Row = {"seed": seed, "strategy": strategy}
-    online, revised = experiment.run(team)[0]
+    online, revised = run_robots(experiment, team)[0]
     row: Row = {
         **labels,
         "area_m2": float(np.interp(settings.AFTER_M, driven_m, area_m2)),
@@ -78,10 +78,10 @@ def row_of(seed: int, strategy: str) -> tuple[Row, pd.DataFrame]:
     return row, curve
 
 
-def composed(seed: int, strategy: str) -> TeamExperiment:
+def composed(seed: int, strategy: str) -> Experiment:
     """The experiment of one strategy in one world."""
     given = [f"seed={seed}", f"route.strategy={strategy}"]
-    return TeamExperiment(Experiment.compose(["study=exploration", *given]))
+    return Experiment.compose(["study=exploration", *given])
 
 
 def coverage(team: Team, resolution_m: float) -> tuple[Array, Array]:
@@ -121,9 +121,9 @@ def _driven_m(robot: Recording, stamps: Array) -> Array:
     return np.asarray(np.interp(stamps, truth.stamps, np.append(0.0, np.cumsum(steps_m))))
 
 
-def paths(experiment: TeamExperiment) -> dict[str, Any]:
+def paths(experiment: Experiment) -> dict[str, Any]:
     """True paths of a team up to where its area is judged, and the walls, for the figure."""
-    team = experiment.recording()
+    team = experiment.recordings()
     world = team.robots[0].known_world
     arrays: dict[str, Any] = {"walls": world.walls, "wall_z_m": world.wall_z_m}
     for number, robot in enumerate(team.robots):

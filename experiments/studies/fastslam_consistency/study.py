@@ -13,7 +13,7 @@ from experiments.evaluation.metrics import nees_at_distances
 from experiments.judging.jobs import grouped, in_parallel
 from experiments.judging.results import Results
 from experiments.judging.verdict import Profile
-from experiments.runs.evaluate import estimates
+from experiments.runs.evaluate import run_over
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
 from experiments.runs.seeds import stream
@@ -51,7 +51,7 @@ def rows_of(runs: Sequence[Experiment]) -> list[Row]:
     for one in runs:
         labels = labels_of(one)
         rng = stream(one.seed, f"estimator/{labels}")
-        online, revised = estimates(one.estimator(), recording, one.prior(recording), rng)
+        online, revised = run_over(recording, one.estimator(), one.prior(recording), rng)
         found = revised if one.estimator_name == "smoother" and revised else online
         truth = recording.truth_at(found.stamps)
         nees = nees_at_distances(truth, found.means, found.covariances, np.array(DISTANCES_M))

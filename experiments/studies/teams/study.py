@@ -26,7 +26,6 @@ from experiments.judging.verdict import Profile
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
-from experiments.runs.team import TeamExperiment
 from experiments.studies.real_logs.logs import calibration_by_truth
 from experiments.studies.real_logs.settings import CALIBRATED_S, DATA
 from experiments.studies.teams import settings
@@ -77,7 +76,7 @@ def team_jobs(profile: Profile) -> Iterator[tuple[int, str]]:
 
 def rows_of(seed: int, option: str) -> list[Row]:
     """Rows of an estimator's runs in one world, for each size of the team."""
-    whole = TeamExperiment(_composed(seed, {})).recording()
+    whole = _composed(seed, {}).recordings()
     rows = []
     for size in settings.SIZES:
         for overrides, labels in _arms(size, option):
@@ -116,7 +115,7 @@ def _known(truth: Array, found: Estimate) -> tuple[Array, NDArray[np.bool_]]:
 
 def drive(seed: int) -> dict[str, Array]:
     """True paths of a team, and its sightings as lines, for the figure."""
-    robots = TeamExperiment(_composed(seed, {})).recording().robots
+    robots = _composed(seed, {}).recordings().robots
     world = robots[0].known_world
     arrays: dict[str, Array] = {"walls": world.walls, "wall_z_m": world.wall_z_m}
     for number, recording in enumerate(robots):

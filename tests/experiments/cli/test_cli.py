@@ -21,6 +21,7 @@ from experiments.runs.experiment import Experiment
 from experiments.runs.row import read_rows
 from experiments.sweeps.collect import where
 from sim.errors import InputError
+from sim.team import Team
 from tests.fixtures.fakes import circle
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -212,7 +213,7 @@ def test_a_step_that_returns_no_belief_names_step_and_the_shapes(belief, words):
 
     experiment = Experiment.compose(["simulation.physics=kinematic"]).using(Mine())
     with pytest.raises(InputError, match=rf"Mine.step .*\(3,\).*\(3, 3\).*{words}"):
-        evaluate(experiment, lambda: circle(n_frames=3))
+        evaluate(experiment, lambda: Team((circle(n_frames=3),)))
 
 
 def test_where_lists_the_columns():

@@ -27,7 +27,6 @@ from experiments.gate.suite import (
 )
 from experiments.runs.experiment import Experiment
 from experiments.runs.paths import results
-from experiments.runs.team import recorded, robots_of
 from sim import se2
 from sim.errors import InputError
 from sim.formats import assemble, carmen
@@ -495,8 +494,8 @@ def test_recordings_of_the_check_turn():
     suite = read_suite(suite_path("check"))
     for group, overrides in suite.overrides.items():
         seed = suite.first_seed
-        read = recorded(Experiment.compose(overrides).replaced(seed=seed, world_seed=seed))
-        for recording in robots_of(read):
+        read = Experiment.compose(overrides).replaced(seed=seed, world_seed=seed).recordings()
+        for recording in read.robots:
             assert recording.status == "ok"
             turned = np.abs(np.diff(np.unwrap(recording.truth.poses[:, 2]))).sum()
             assert turned > 1.0, group

@@ -12,6 +12,7 @@ from experiments.papers.maximo2024.settings import POSITIONS
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from sim.errors import InputError
+from sim.team import Team
 from tests.fixtures import fakes
 
 
@@ -188,7 +189,7 @@ def test_a_network_of_ones_own_describes_clouds():
     points = recording.sensors["lidar3d"].points_in_sensor(recording.log("lidar3d")["ranges_m"][3])
     np.testing.assert_allclose(seen[3], fakes.outline(points), rtol=1e-6)
     assert experiment.prior(recording).map.descriptors.shape[1] == 16
-    (row,) = evaluate(experiment, lambda: recording)
+    (row,) = evaluate(experiment, lambda: Team((recording,)))
     assert row["status"] == "ok"
     assert row["ate_mean_m"] < 10.0
     for name in ("outline", "Outline"):  # a function, and a class, with a setting

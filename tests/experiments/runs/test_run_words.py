@@ -89,10 +89,10 @@ def test_the_picture_shows_the_path_and_few_ellipses_however_large():
         ["study=first_run", "simulation.physics=kinematic", "route.distance_m=6"]
     )
     recording = experiment.simulate()
-    from experiments.runs.evaluate import estimates
+    from experiments.runs.evaluate import run_over
 
     prior = experiment.prior(recording)
-    estimate, _ = estimates(experiment.estimator(), recording, prior, np.random.default_rng(0))
+    estimate, _ = run_over(recording, experiment.estimator(), prior, np.random.default_rng(0))
     page = run_figure([(recording, estimate)], "ekf_slam")
     plan = page.axes[0]
     assert len(plan.patches) <= 8

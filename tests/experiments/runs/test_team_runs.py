@@ -13,7 +13,7 @@ from experiments.gate.suite import draw_run, read_suite, run_suite
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome, Status
-from experiments.runs.team import TeamExperiment, recorded, scores_of_team, status_of_team
+from experiments.runs.team import scores_of_team, status_of_team
 from experiments.sweeps.collect import collect
 from experiments.sweeps.launch import sweep
 from experiments.sweeps.plan import plan_of
@@ -55,7 +55,7 @@ def test_a_run_of_a_team_is_one_row_of_pooled_errors():
 
 
 def test_sums_squares_and_means_of_scores():
-    team = TeamExperiment(composed()).recording()
+    team = composed().recordings()
     row = scores_of_team(
         team,
         [
@@ -100,7 +100,7 @@ def test_a_robot_of_unknown_start_is_scored_from_where_it_is_placed():
 
 
 def test_a_team_is_simulated_once_and_a_smaller_one_is_another():
-    first, again = recorded(composed()), recorded(composed("team.starts=unknown"))
+    first, again = composed().recordings(), composed("team.starts=unknown").recordings()
     assert first.checksum == again.checksum
     keys = [composed(o).recording_key for o in ("team.size=2", "team.size=1", "team.starts=known")]
     assert keys[0] == keys[2] != keys[1]
@@ -132,12 +132,12 @@ def test_sweeps_of_teams():
 @pytest.mark.parametrize(
     ("overrides", "complaint"),
     [
-        (["team.size=0"], r"team\.size must be from 1 to the 5 of team\.robots, got 0"),
+        (["team.size=0"], r"team\.size must be a whole number, at least 1, got 0"),
         (["team.size=40"], r"team\.size must be from 1 to the 5 of team\.robots, got 40"),
         (["team.size=two"], r"team\.size must be a whole number"),
         (["team.size=.nan"], r"team\.size must be a whole number"),
-        (["team.robots=3"], r"team\.robots must list the keys of each robot"),
-        (["team.robots=[3,4]"], r"team\.robots must list the keys of each robot"),
+        (["team.robots=3"], r"team\.robots must be a valid list, got 3"),
+        (["team.robots=[3,4]"], r"team\.robots must be a valid dictionary, got 3"),
         (["team.robots=[{},{route: 3}]"], r"team\.robots\[1\]\.route must hold keys"),
         (
             ["team.robots=[{},{route: {wheels: 9}}]"],
@@ -215,7 +215,7 @@ def test_files_of_teams_by_the_command_line(tmp_path):
 
 
 def test_pictures_of_a_team(tmp_path):
-    team, found = recorded(composed()), []
+    team, found = composed().recordings(), []
     evaluate(composed(), lambda: team, on_estimate=lambda own, _, e, __: found.append((own, e)))
     run_figure(found, "ekf_slam").savefig(tmp_path / "team.png")
     shown = Playback.of(team, 4)

@@ -49,8 +49,8 @@ def test_it_is_the_same_run_whose_picture_is_drawn(results):
     assert isinstance(row["estimator.n_particles"], float)
     again = run_again(row)
     assert again.experiment.key == experiment.key
-    recording = again.recording()
-    shown = Playback.of(again.team(), 5)
+    recording = again.recordings().only
+    shown = Playback.of(again.recordings(), 5)
     shown = with_estimates_by(shown, again.experiment, again.repeat, lambda _: None)
     made = shown.robots[0].estimate
     errors = made.means[:, :2] - recording.truth_at(made.stamps)[:, :2]
@@ -72,7 +72,7 @@ def test_another_run_than_the_rows_is_refused(results):
     changed = row.copy()
     changed["recording_checksum"] = "other"
     with pytest.raises(InputError, match="not what it was"):
-        run_again(changed).recording()
+        run_again(changed).recordings()
 
 
 def test_own_options_are_found_where_the_sweep_found_them(results, tmp_path):

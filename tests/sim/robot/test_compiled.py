@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 
 from estimators.base import Belief
-from experiments.runs.evaluate import estimates
+from experiments.runs.evaluate import run_over
 from sim.compiled import _Announcer, _Clock
 from tests.fixtures.fakes import circle, tracking_prior
 
@@ -51,7 +51,7 @@ class Compiles:
 def test_the_times_of_a_run_are_without_compiling():
     recording = circle(n_frames=3)
     begun = time.process_time()
-    online, _ = estimates(Compiles(), recording, tracking_prior(recording), None)
+    online, _ = run_over(recording, Compiles(), tracking_prior(recording), None)
     spent_s = time.process_time() - begun
     assert 0.0 < online.cpu_seconds < 0.5 * spent_s
     assert 0.0 < online.step_seconds.sum() < 0.5 * spent_s
