@@ -88,7 +88,7 @@ def _command_profile(recording: Recording, i: int) -> Array:
     log = recording.commands
     if log is None or len(log.stamps) == 0:
         raise InputError(
-            f"recording {i} has no commands; end poses are of no use without them: record it in "
+            f"recording {i} has no commands; end poses need them: record it in "
             "simulation, or use the wheel truth"
         )
     ticks = np.arange(round(recording.duration_s / TICK_S))

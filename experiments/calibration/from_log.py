@@ -47,7 +47,7 @@ class Residuals:
     block_stamps, turn_rad, forward_m, path_m
         (B,) end of each block, s; turn and advance less those of the wheels; (B, 2) wheel travel.
     range_m, range_error_m, bearing_rad, bearing_error_rad
-        (K,) of the sensor; empty where not known. The errors of a laser are of ranges alone.
+        (K,) of the sensor; empty where not known. A laser has errors of ranges alone.
     """
 
     block_stamps: Array

@@ -114,7 +114,7 @@ def _outliers(intervals: Mapping[str, Interval]) -> list[str]:
 
 
 def _by_bearing(depth_m: Array, error_m: Array, bearing_rad: Array) -> list[str]:
-    """Depths whose relative error changes with the bearing are no depths, but ranges."""
+    """Depths whose relative error changes with the bearing are ranges, not depths."""
     inner, outer = np.quantile(bearing_rad, [0.3, 0.8])
     share = error_m / depth_m
     near, far = share[bearing_rad < inner], share[bearing_rad > outer]

@@ -34,13 +34,13 @@ def info(
     from sim.formats.detect import read_all
 
     robots = read_all(log, robot).robots
-    require(len(robots) == 1 or not check, "--check is of one robot; name it by --robot")
+    require(len(robots) == 1 or not check, "--check takes one robot; name it by --robot")
     for number, own in enumerate(robots):
         show(describe(own) if len(robots) == 1 else f"robot {number}\n{describe(own)}\n")
     if check:
         from experiments.calibration.log_check import check_log
 
-        for warning in check_log(robots[0]) or ["nothing odd found"]:
+        for warning in check_log(robots[0]) or ["nothing is odd"]:
             show(f"check       {warning}")
 
 
@@ -166,11 +166,11 @@ def calibrate(
         others = {"--sheet": by.sheet, "--method": by.method, "--config-dir": config_dir}
         given = {**others, "--joint": joint or None, "--json": as_json or None}
         for option in (name for name, value in given.items() if value is not None):
-            raise InputError(f"{option} is not of a real log; leave it or -o out")
+            raise InputError(f"{option} does not go with a real log; leave it or -o out")
         show(calibrate_log([Path(path) for path in what or []], real.out, real.robot, real.until_s))
         return
     alone = real.robot is None and real.until_s is None
-    require(alone, "--robot and --until are of a real log; give -o too")
+    require(alone, "--robot and --until go with a real log; give -o too")
     known = by.method in (None, *METHODS)
     require(known, f"--method must be {' or '.join(METHODS)}, got {by.method!r}")
     if by.sheet is not None:

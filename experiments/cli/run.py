@@ -49,7 +49,7 @@ def run(
     if out is not None:
         from experiments.trajectories.convert import check_estimate_name
 
-        require(not many, f"-o {out}: one file is of one run; leave out -m")
+        require(not many, f"-o {out}: one file holds one run; leave out -m")
         check_estimate_name(out)
     if many:
         from experiments.report.of_sweep import after_sweep

@@ -21,7 +21,7 @@ from sim.worlds.world import World
 
 Mask = NDArray[np.bool_]
 
-_MISREAD_RAD, _MISREAD_SHARE = 0.25, 0.25  # errors beyond are of another landmark
+_MISREAD_RAD, _MISREAD_SHARE = 0.25, 0.25  # errors beyond belong to another landmark
 _LAGS_S = np.array([0.25, 0.5, 1.0, 2.0, 4.0])  # at which errors of a landmark are compared
 _MOST_SCANS = 300
 _SHORT_SIGMAS, _SHORT_M = 6.0, 0.3  # a beam that ends so far before its wall hit something else

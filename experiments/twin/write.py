@@ -1,4 +1,4 @@
-"""Files of a twin: a study for `estima run`, its world and way, and the log that it is of."""
+"""Files of a twin: a study for `estima run`, its world and way, and the log that it was made of."""
 
 import dataclasses
 from pathlib import Path

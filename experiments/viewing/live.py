@@ -33,7 +33,7 @@ def check_display() -> None:
     """Refuse to open a window where there is nothing to show it on."""
     require(
         not sys.platform.startswith("linux") or os.environ.get("DISPLAY"),
-        f"there is no display for a window (DISPLAY is not set); {_REMEDY}",
+        f"no display for a window (DISPLAY is not set); {_REMEDY}",
     )
 
 
@@ -48,7 +48,7 @@ def watch(run: Playback, seconds: float | None = None) -> None:
     Raises
     ------
     InputError
-        If there is no display, or no window can be opened on it.
+        Without a display, or if no window can be opened on it.
     """
     check_display()
     process = multiprocessing.get_context("spawn").Process(target=_window, args=(run, seconds))

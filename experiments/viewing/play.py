@@ -41,7 +41,7 @@ class Showing:
     Raises
     ------
     InputError
-        If the file could not be written, or there is no display for a window.
+        If the file could not be written, or a window should show a map.
     """
 
     out: Path | None = None

@@ -66,7 +66,7 @@ class Playback:
     def of(cls, team: Team, n_shown: int) -> "Playback":
         """Show a team at about `n_shown` instants, evenly spaced in time.
 
-        Those of a robot alone are of its Frames, at which its particles are kept.
+        A robot alone is shown at its Frames, at which its particles are kept.
         """
         frames = [robot.frame_stamps for robot in team.robots]
         first, last = min(own[0] for own in frames), max(own[-1] for own in frames)
