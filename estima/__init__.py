@@ -102,7 +102,8 @@ class Run:
         from experiments.viewing.run_figure import run_figure
 
         estimate = self.online if self.revised is None else self.revised
-        return _saved(run_figure(self.recording, estimate, str(self.row["choice.estimator"])), path)
+        found = [(self.recording, estimate)]
+        return _saved(run_figure(found, str(self.row["choice.estimator"])), path)
 
 
 def simulate(*overrides: str) -> Recording:

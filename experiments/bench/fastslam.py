@@ -9,13 +9,13 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from estimators.base import Prior
-from estimators.base import run as walk
 from estimators.landmarks import particle_kernels as ekf
 from estimators.landmarks.fastslam import FastSLAM
 from estimators.landmarks.particle_maps import LandmarkMaps
 from estimators.landmarks.stereo import StereoModel
 from experiments.bench.measure import Measurement, median_time_s, timed_steps
 from experiments.evaluation.statistics import log_log_slope
+from experiments.runs.evaluate import run_over
 from sim.arrays import Array
 from sim.recording import Log, Recording, WheelLog
 from sim.robot.drive import RobotGeometry
@@ -42,7 +42,7 @@ def run_steps(
     recording = circling(n_landmarks, n_seen, n_steps, camera)
     prior = Prior(recording.robot, recording.sensors, np.zeros(3), np.zeros((3, 3)))
     estimator = FastSLAM(n_particles=n_particles, kr=_K_M, kl=_K_M, **options)
-    walk(estimator, recording.cut(40), prior, np.random.default_rng(0))
+    run_over(recording.cut(40), estimator, prior, np.random.default_rng(0))
     estimator.reset(prior, np.random.default_rng(0))
     steps = timed_steps(estimator, recording.frames())
     seconds, resampled = np.array([(s, belief.extras["resampled"]) for s, belief in steps]).T

@@ -2,18 +2,14 @@
 
 Laps of 100 m with a key frame each 0.5 m, every third of which closes the lap. The graph and its
 scans are real, the drive is not: registrations cost the same at any length, and are left out.
-`python -m experiments.bench.graph_growth FOLDER` prints a table and draws the figure.
 """
 
 from __future__ import annotations
 
 import math
 import statistics
-import sys
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -26,7 +22,6 @@ from experiments.bench.growth import resident_mib
 from experiments.bench.measure import Measurement, time_s
 from experiments.runs.evaluate import limited_blas
 from experiments.runs.seeds import stream
-from experiments.viewing.style import CYCLE, save_figure, subplots
 from sim.sensors import Laser
 
 LENGTHS_M = (250, 500, 1000, 2000, 3500, 5000)
@@ -37,30 +32,17 @@ _NOISE = np.diag([1e-5, 1e-5, 1e-6])
 _LASER = Laser(n_beams=181, fov_rad=math.pi)
 
 
-@dataclass(frozen=True)
-class Grown:
-    """What it costs after this length.
+def run() -> Iterator[Measurement]:
+    """Times and memory after each of `LENGTHS_M`, on one graph that grows.
 
-    Attributes
-    ----------
-    key_frame_ms
-        Processor time of adding a key frame and choosing its candidates.
-    closure_ms
-        The same of a closure and its solution.
-    memory_mib
-        Of the graph and of the scans of its key frames.
+    A key frame is added, and its candidates are chosen; a closure is added, and the graph is
+    solved; the memory is that of the graph and of the scans of its key frames.
     """
-
-    length_m: int
-    n_key_frames: int
-    n_closures: int
-    key_frame_ms: float
-    closure_ms: float
-    memory_mib: float
+    with limited_blas():
+        yield from _grown()
 
 
-def grown() -> Iterator[Grown]:
-    """Cost after each of `LENGTHS_M`, on one graph that grows."""
+def _grown() -> Iterator[Measurement]:
     rng = stream(0, "bench")
     graph = PoseGraph(Gaussian(np.zeros(3), 1e-6 * np.eye(3)), robust_sigma=5.0)
     search = LoopSearch(ScanMatcher(MatcherOptions()), _LASER, LoopOptions())
@@ -84,14 +66,13 @@ def grown() -> Iterator[Grown]:
         closing = [
             time_s(graph.close, [_closure(n - 1)], 1e-4, clock=time.process_time) for _ in range(3)
         ]
-        yield Grown(
-            length_m,
-            n,
-            len(graph.closures),
-            1e3 * statistics.median(seconds),
-            1e3 * min(closing),
-            resident_mib() - before_mib,
-        )
+        name = f"graph_slam.at_{length_m}_m"
+        key_frame_ms, closure_ms = 1e3 * statistics.median(seconds), 1e3 * min(closing)
+        note = f"{n} key frames, {len(graph.closures)} closures"
+        yield Measurement(f"{name}.key_frame_ms", key_frame_ms, "ms", note=note)
+        yield Measurement(f"{name}.closure_ms", closure_ms, "ms", note="its solution too")
+        memory_mib = resident_mib() - before_mib
+        yield Measurement(f"{name}.memory_mib", memory_mib, "MiB", note="with the scans")
 
 
 def _closure(second: int) -> Edge:
@@ -103,41 +84,3 @@ def _scan(rng: np.random.Generator) -> PreparedScan:
     bearings = _LASER.bearings_rad
     walls_m = 3.0 / np.maximum(np.abs(np.cos(bearings)), np.abs(np.sin(bearings)))
     return prepare(walls_m + 0.01 * rng.standard_normal(len(bearings)), bearings)
-
-
-def run() -> Iterator[Measurement]:
-    """The same as measurements."""
-    with limited_blas():
-        for found in grown():
-            name = f"graph_slam.at_{found.length_m}_m"
-            note = f"{found.n_key_frames} key frames, {found.n_closures} closures"
-            yield Measurement(f"{name}.key_frame_ms", found.key_frame_ms, "ms", note=note)
-            yield Measurement(f"{name}.closure_ms", found.closure_ms, "ms", note="its solution too")
-            yield Measurement(f"{name}.memory_mib", found.memory_mib, "MiB", note="with the scans")
-
-
-def draw(found: list[Grown], picture: Path) -> None:
-    """Time and memory over the length of the path."""
-    page, (left, right) = subplots(9.0, 3.4, 1, 2)
-    km = [one.length_m / 1e3 for one in found]
-    left.plot(km, [one.closure_ms for one in found], "o-", color=CYCLE[1], label="a closure")
-    left.plot(km, [one.key_frame_ms for one in found], "o-", color=CYCLE[0], label="a key frame")
-    left.set(yscale="log", xlabel="length of the path, km", ylabel="processor time, ms")
-    left.legend()
-    right.plot(km, [one.memory_mib for one in found], "o-", color=CYCLE[0])
-    right.set(xlabel="length of the path, km", ylabel="memory, MiB", ylim=(0.0, None))
-    save_figure(page, picture)
-
-
-def _main(folders: list[str]) -> None:
-    with limited_blas():
-        found = []
-        for one in grown():
-            found.append(one)
-            print(one, flush=True)
-    for folder in folders:
-        draw(found, Path(folder) / "graph_growth.png")
-
-
-if __name__ == "__main__":
-    _main(sys.argv[1:])

@@ -10,22 +10,18 @@ import ctypes
 import gc
 import itertools
 import os
-import resource
 import statistics
 import time
-from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from estimators.base import Belief
-from experiments.bench.measure import Measurement, time_s, timed_steps
+from experiments.bench.measure import Measurement, alone, peak_mib, time_s, timed_steps
 from experiments.runs.evaluate import limited_blas
 from experiments.runs.experiment import Experiment
 from experiments.runs.seeds import stream
 
-T = TypeVar("T")
 _MINUTES = 30
 _ROOMS = (
     "world=gil2008",
@@ -62,7 +58,7 @@ _FINISHED = (5, 10, 20, 30)  # minutes after which the whole path is solved for
 def run() -> Iterator[Measurement]:
     """Step and memory at the end of the drive beside those at its beginning; times of `finish`."""
     for name in (*_IN_ROOMS, *_ON_CAMPUS):
-        step_us, memory_mib = _alone(driven, name)
+        step_us, memory_mib = alone(driven, name)[0]
         first, last = step_us[_SETTLED : _SETTLED + 3], step_us[-3:]
         early, middle, late = (statistics.median(t) for t in (step_us[1:4], first, last))
         yield Measurement(
@@ -78,15 +74,9 @@ def run() -> Iterator[Measurement]:
             note="at the end, beyond that after minute 7",
         )
     for name in _WITH_FINISH:
-        for minutes, (seconds, peak_mib) in _alone(finished, name).items():
-            note = f"peak {peak_mib:.0f} MiB"
+        for minutes, (seconds, most_mib) in alone(finished, name)[0].items():
+            note = f"peak {most_mib:.0f} MiB"
             yield Measurement(f"growth.{name}.finish_{minutes}min_s", seconds, "s", note=note)
-
-
-def _alone(function: Callable[[str], T], name: str) -> T:
-    """What a function returns in a process of its own."""
-    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
-        return pool.submit(function, name).result()
 
 
 def driven(name: str) -> tuple[list[float], list[float]]:
@@ -105,8 +95,7 @@ def finished(name: str) -> dict[int, tuple[float, float]]:
         collections.deque(steps, maxlen=0)
         if minute in _FINISHED:
             seconds = time_s(estimator.finish, clock=time.process_time)
-            peak_kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-            found[minute] = seconds, peak_kib / 1024.0
+            found[minute] = seconds, peak_mib()
     return found
 
 

@@ -22,6 +22,7 @@ import numpy as np
 
 from estimators.laser import icp_covariance
 from estimators.laser.icp import Metric, PreparedScan, Registration, prepare, register
+from estimators.peers.planar import pose_of
 from experiments.bench.measure import Measurement, median_time_s
 from experiments.evaluation.scan_bound import cast, fisher_bound
 from sim import se2
@@ -202,7 +203,7 @@ def _match_by_gicp(target_m: Array, source_m: Array) -> Array:
         rotation_epsilon=1e-5,
         translation_epsilon=1e-5,
     )
-    return _planar(np.asarray(found.T_target_source))
+    return pose_of(np.asarray(found.T_target_source))
 
 
 def _match_by_open3d(target_m: Array, source_m: Array) -> Array:
@@ -224,7 +225,7 @@ def _match_by_open3d(target_m: Array, source_m: Array) -> Array:
         ways.TransformationEstimationPointToPlane(),
         ways.ICPConvergenceCriteria(1e-8, 1e-8, 50),
     )
-    return _planar(np.asarray(found.transformation))
+    return pose_of(np.asarray(found.transformation))
 
 
 def _points(ranges_m: Array) -> Array:
@@ -236,10 +237,6 @@ def _points(ranges_m: Array) -> Array:
 def _two_layers(ranges_m: Array) -> Array:
     flat = _points(ranges_m)
     return np.concatenate([np.column_stack([flat, np.full(len(flat), z)]) for z in (0.0, 0.02)])
-
-
-def _planar(T: Array) -> Array:
-    return np.array([T[0, 3], T[1, 3], math.atan2(T[1, 0], T[0, 0])])
 
 
 def _room(rng: np.random.Generator) -> tuple[Array, tuple[float, float, float, float]]:

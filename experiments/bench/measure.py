@@ -2,15 +2,20 @@
 
 import io
 import json
+import resource
 import statistics
 import time
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from typing import Any, Literal
+from multiprocessing import get_context
+from typing import Any, Literal, TypeVar
 
 from estimators.base import Belief, Estimator
 from experiments.runs.version import machine
 from sim.recording import Frame
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -88,6 +93,18 @@ def median_time_s(
     while len(times_s) < repeats * len(arguments) or time.perf_counter() < until:
         times_s += [time_s(function, *given, clock=clock) for given in arguments]
     return statistics.median(times_s)
+
+
+def alone(function: Callable[..., T], *arguments: Any) -> tuple[T, float]:
+    """What a function returns in a process of its own, and the most memory that took, MiB."""
+    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+        found = pool.submit(function, *arguments).result()
+        return found, pool.submit(peak_mib).result()
+
+
+def peak_mib() -> float:
+    """The most memory that this process has had, MiB."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
 
 
 def timed_steps(estimator: Estimator, frames: Iterable[Frame]) -> Iterator[tuple[float, Belief]]:

@@ -1,11 +1,10 @@
 """Speed of recording with the physics engine and its rays, from the first tick to the last."""
 
-import resource
 import statistics
 import time
 
 from experiments.bench.casting import hall
-from experiments.bench.measure import Measurement, median_time_s, time_s
+from experiments.bench.measure import Measurement, median_time_s, peak_mib, time_s
 from experiments.runs.experiment import Experiment
 from experiments.runs.seeds import stream
 from sim.robot.bullet import BulletBody
@@ -58,7 +57,7 @@ def run() -> list[Measurement]:
                 f"{physics}, exact rays, 721 beams, a tour of rooms; processor time",
             )
         )
-    memory_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+    memory_mib = peak_mib()
     hall_30, poses = hall(30, 50)
     laser = Laser(n_beams=721)
     with BulletBody(hall_30, _ROBOT, poses[0]) as body:

@@ -7,9 +7,9 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 
-from estimators.base import run as run_estimator
 from experiments.bench.measure import Measurement, median_time_s, time_s
 from experiments.runs import paths, store
+from experiments.runs.evaluate import run_over
 from experiments.runs.experiment import Experiment
 from experiments.runs.seeds import stream
 from experiments.sweeps.work import run_and_record
@@ -59,7 +59,7 @@ def _overheads() -> list[Measurement]:
     _packed_s([experiment], {experiment.recording_key: read})
     prior, estimator = experiment.prior(recording), experiment.estimator()
     own_s = median_time_s(
-        lambda: run_estimator(estimator, recording, prior, stream(0, "bench")),
+        lambda: run_over(recording, estimator, prior, stream(0, "bench")),
         clock=time.process_time,
     )
 

@@ -7,17 +7,14 @@ so the simulation is left out.
 import json
 import math
 import multiprocessing
-import resource
 import shutil
 import time
-from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 
-from experiments.bench.measure import Measurement, time_s
+from experiments.bench.measure import Measurement, alone, time_s
 from experiments.runs import paths, store
 from experiments.runs.columns import COLUMNS
 from experiments.runs.experiment import Experiment
@@ -27,7 +24,6 @@ from experiments.sweeps.collect import collect
 from experiments.sweeps.plan import Family, packed, plan_of
 from experiments.sweeps.summary import summary
 
-T = TypeVar("T")
 _NAME = "bench_sweep_scale"
 _N_SEEDS, _N_VALUES = 2000, 500
 _N_RUNS = _N_SEEDS * _N_VALUES
@@ -46,14 +42,14 @@ def run() -> list[Measurement]:
     folder = paths.results() / "runs" / _NAME
     shutil.rmtree(folder, ignore_errors=True)
     try:
-        (plan_s, shares), plan_mib = _alone(_planned)
+        (plan_s, shares), plan_mib = alone(_planned)
         with ProcessPoolExecutor(2, multiprocessing.get_context("spawn")) as pool:
             list(pool.map(_written, shares))
         for share in {share.parent for share in shares}:
             shutil.rmtree(share)
         sizes = [path.stat().st_size for path in folder.iterdir()]
-        resume_s, resume_mib = _alone(_resumed)
-        table_s, table_mib = _alone(_tabulated)
+        resume_s, resume_mib = alone(_resumed)
+        table_s, table_mib = alone(_tabulated)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
     return [
@@ -77,17 +73,6 @@ def run() -> list[Measurement]:
         ),
         Measurement("sweep.planner_memory_mib", max(plan_mib, resume_mib), "MiB", 1024.0),
     ]
-
-
-def _alone(function: Callable[[], T]) -> tuple[T, float]:
-    """What a function returns in a process of its own, and the memory it took, MiB."""
-    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
-        found = pool.submit(function).result()
-        return found, pool.submit(_peak_mib).result()
-
-
-def _peak_mib() -> float:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
 
 
 def _planned() -> tuple[float, list[Path]]:
@@ -119,8 +104,8 @@ def _written(share: Path) -> None:
 def _row(labels: Row, experiment: Experiment, rng: np.random.Generator) -> Row:
     robot = experiment.robot()
     row: Row = {**labels, "seed": experiment.seed, "world_seed": experiment.seed}
-    row |= {"robot.kr": robot.kr, "robot.kl": robot.kl}
-    row |= {"estimator.kr": robot.kr, "estimator.kl": robot.kl}
+    for name in ("kr", "kl"):
+        row |= {f"{group}.{name}": getattr(robot, name) for group in ("robot", "estimator")}
     row |= {"run_key": experiment.key, "recording_checksum": rng.bytes(32).hex()}
     metrics = dict(zip(COLUMNS, rng.random(len(COLUMNS)).tolist(), strict=True))
     return {**row, **Status().columns(), **metrics}

@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 
 from experiments.calibration.end_poses import Manoeuvre, from_end_poses
+from experiments.calibration.reference import spaced_rows
 from experiments.calibration.result import CalibrationResult
 from experiments.calibration.wheel_truth import from_wheel_truth
 from sim import se2
@@ -70,14 +71,12 @@ def _wheel_intervals(recording: Recording, i: int, interval_s: float) -> tuple[A
     truth, wheels = recording.truth, recording.wheels
     if truth is None or len(truth.wheel_travel_m) == 0:
         raise InputError(
-            f"recording {i} has no true wheel travel; record it in simulation, calibrate from end "
-            "poses, or give -o FILE.yaml for a real log"
+            f"recording {i} has no true wheel travel; record it in simulation, or calibrate from "
+            "end poses; of a real log `estima calibrate` writes a .yaml file"
         )
     known = (truth.stamps >= wheels.stamps[0] - 1e-9) & (truth.stamps <= wheels.stamps[-1] + 1e-9)
-    rows: list[int] = []
-    for row in np.flatnonzero(known).tolist():
-        if not rows or truth.stamps[row] - truth.stamps[rows[-1]] >= interval_s - 1e-9:
-            rows.append(row)
+    rows = np.flatnonzero(known)
+    rows = rows[spaced_rows(truth.stamps[rows], interval_s)]
     require(len(rows) >= 2, f"recording {i} is shorter than one interval of {interval_s:g} s")
     encoder = [np.interp(truth.stamps[rows], wheels.stamps, way) for way in wheels.position_m.T]
     heading = np.unwrap(truth.poses[:, 2])[rows]
@@ -89,7 +88,7 @@ def _command_profile(recording: Recording, i: int) -> Array:
     log = recording.commands
     if log is None or len(log.stamps) == 0:
         raise InputError(
-            f"recording {i} has no commands; end poses are of no use without them: record it in "
+            f"recording {i} has no commands; end poses need them: record it in "
             "simulation, or use the wheel truth"
         )
     ticks = np.arange(round(recording.duration_s / TICK_S))

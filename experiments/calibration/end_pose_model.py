@@ -80,7 +80,7 @@ class EndPoseModel:
 def knots(commands_m: Array) -> Ticks:
     """Ticks (S + 1,) that cut the run: evenly, and where the robot comes to rest between moves."""
     speed = np.abs(commands_m).max(axis=1)
-    # a rounded plateau is no turning point: a minimum must lie clearly below its surroundings
+    # a rounded plateau is not a turning point: a minimum must lie clearly below its surroundings
     change = np.diff(speed) / max(float(speed.max()), 1e-12)
     turning_points = np.flatnonzero((change[:-1] <= 0.0) & (change[1:] > 1e-6)) + 1
     even = np.linspace(0, len(commands_m), _KNOTS + 1).round().astype(np.int64)

@@ -5,12 +5,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from experiments.calibration.from_log import (
-    Reference,
-    calibrate_against,
-    reference_of,
-    wheel_delay_s,
-)
+from experiments.calibration.from_log import calibrate_against
+from experiments.calibration.reference import Reference, reference_of, wheel_delay_s
 from experiments.evaluation.statistics import Interval
 from sim.arrays import Array
 from sim.errors import InputError
@@ -118,7 +114,7 @@ def _outliers(intervals: Mapping[str, Interval]) -> list[str]:
 
 
 def _by_bearing(depth_m: Array, error_m: Array, bearing_rad: Array) -> list[str]:
-    """Depths whose relative error changes with the bearing are no depths, but ranges."""
+    """Depths whose relative error changes with the bearing are ranges, not depths."""
     inner, outer = np.quantile(bearing_rad, [0.3, 0.8])
     share = error_m / depth_m
     near, far = share[bearing_rad < inner], share[bearing_rad > outer]

@@ -5,7 +5,8 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments.calibration.from_log import BLOCK_S, Residuals
+from experiments.calibration.from_log import Residuals
+from experiments.calibration.slip import BLOCK_S
 from experiments.viewing.style import BLACK, BLUE, subplots
 from sim.arrays import Array
 

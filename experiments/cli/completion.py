@@ -4,7 +4,7 @@ Nothing heavy is imported here, since a shell waits for it.
 """
 
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from experiments.runs import columns, paths
@@ -38,41 +38,32 @@ def overrides(incomplete: str) -> list[str]:
     return sorted({prefix + text for text in found if text.startswith(word)})
 
 
-def options(group: str) -> list[str]:
-    """Options of a group of the configuration."""
-    return paths.option_names(group)
+def options(group: str, config_dir: Path | None = None) -> list[str]:
+    """Options of a group of the configuration, and of a folder of further ones."""
+    own = paths.option_names(group, config_dir) if config_dir else []
+    return sorted({*paths.option_names(group), *own})
 
 
-def estimators(incomplete: str) -> list[str]:
-    """Options of conf/estimator."""
-    return [name for name in options("estimator") if name.startswith(incomplete)]
+def _offering(names: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
+    """Completion by names of which a word is the beginning."""
+
+    def offered(incomplete: str) -> list[str]:
+        return [name for name in names() if name.startswith(incomplete)]
+
+    return offered
 
 
-def studies(incomplete: str) -> list[str]:
-    """Options of conf/study."""
-    return [name for name in options("study") if name.startswith(incomplete)]
-
-
-def groups(incomplete: str) -> list[str]:
-    """What `estima options` lists."""
-    return [name for name in (*GROUPS, "metrics") if name.startswith(incomplete)]
-
-
-def suites(incomplete: str) -> list[str]:
-    """Suites of conf/suite, and YAML files."""
-    own = [str(path) for path in Path().glob("*.yaml")]
-    return [name for name in (*options("suite"), *own) if name.startswith(incomplete)]
-
-
-def sweeps(incomplete: str) -> list[str]:
+def _in_results() -> list[str]:
     """Names of folders of rows in results/runs."""
-    there = sorted(path.name for path in (paths.results() / "runs").glob("*") if path.is_dir())
-    return [name for name in there if name.startswith(incomplete)]
+    return sorted(path.name for path in (paths.results() / "runs").glob("*") if path.is_dir())
 
 
-def metrics(incomplete: str) -> list[str]:
-    """Metrics of a run."""
-    return [name for name in columns.COLUMNS if name.startswith(incomplete)]
+estimators = _offering(lambda: options("estimator"))
+studies = _offering(lambda: options("study"))
+groups = _offering(lambda: (*GROUPS, "metrics"))
+suites = _offering(lambda: (*options("suite"), *(str(path) for path in Path().glob("*.yaml"))))
+sweeps = _offering(_in_results)
+metrics = _offering(lambda: columns.COLUMNS)
 
 
 def settings(incomplete: str) -> list[str]:

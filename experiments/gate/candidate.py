@@ -2,7 +2,7 @@
 
 import importlib.util
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,8 @@ import pandas as pd
 
 from estimators.programs.offline import recording_of, start_text
 from experiments.evaluation.metrics import path_scores
-from experiments.gate.suite import ERRORS, Entry, Suite, fingerprint
+from experiments.gate.suite import ERRORS, Entry, Suite, fingerprint, read_suite, suite_path
+from experiments.runs.console import progress
 from experiments.runs.experiment import Experiment
 from experiments.runs.score import Scoring, scored_against
 from experiments.trajectories.read import SUFFIXES, read_trajectory
@@ -52,6 +53,13 @@ def write_recordings(
             done += 1
             on_progress(done / total)
     return total
+
+
+def export_recordings(suite: str, only: Sequence[str], folder: Path) -> str:
+    """Write the recordings of a suite's entries that are made elsewhere; say how many."""
+    chosen = read_suite(suite_path(suite)).of(only).made(elsewhere=True)
+    with progress("recordings", 1.0) as on_progress:
+        return f"{folder}: {write_recordings(chosen, folder, on_progress)} recordings"
 
 
 def candidate_rows(

@@ -25,7 +25,7 @@ from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome
 from experiments.runs.seeds import stream
-from experiments.viewing.run_figure import figure_of
+from experiments.viewing.run_figure import run_figure
 from experiments.viewing.style import save_figure
 from sim.errors import InputError, printable, require
 from sim.recording import Recording
@@ -275,7 +275,7 @@ def draw_run(suite: Suite, estimator: str, recording: int, path: Path) -> bool:
         on_estimate=keep,
     )
     if found:
-        save_figure(figure_of(found, estimator), path)
+        save_figure(run_figure(found, estimator), path)
     return rows[0]["status"] != Outcome.FAILED
 
 

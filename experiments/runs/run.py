@@ -30,7 +30,7 @@ from experiments.runs.store import write_run
 from experiments.trajectories.convert import write_estimate
 from sim.errors import InputError, require
 from sim.recording import Recording
-from sim.team import Team
+from sim.team import Team, save
 
 # Of each robot: its recording and its estimate
 Draw = Callable[[Sequence[tuple[Recording, Estimate]], Experiment, Path], None]
@@ -114,6 +114,21 @@ def expected_s(experiment: Experiment) -> float | None:
     one = experiment.of_robot(0)
     about_s = getattr(one.route(), "about_s", None)
     return None if about_s is None else round(about_s(one.world(), one.robot()), 1)
+
+
+def record(experiment: Experiment, out: Path) -> bool:
+    """Simulate what an experiment reads, save it and say so; return whether all drives were ok."""
+    require(out.suffix == ".npz", f"{out}: a recording is an .npz file")
+    with progress("simulated seconds", expected_s(experiment)) as on_progress:
+        made = experiment.simulated(on_progress)
+    checksum = save(made, out)
+    alone = not experiment.of_team
+    said = [
+        f"{'' if alone else f'robot {n}: '}{robot.status}, {robot.duration_s:.1f} s"
+        for n, robot in enumerate(made.robots)
+    ]
+    print(f"{out}: {'; '.join(said)}, checksum {checksum}")
+    return all(robot.status == "ok" for robot in made.robots)
 
 
 def _trace(error: Exception | SystemExit) -> None:

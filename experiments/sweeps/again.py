@@ -16,6 +16,9 @@ from experiments.runs.compose import option_called, searched
 from experiments.runs.experiment import Experiment
 from experiments.runs.store import read_runs
 from experiments.sweeps.collect import commands, folder_of
+from experiments.viewing.estimates import OnStep, with_estimates_by
+from experiments.viewing.play import Showing, play
+from experiments.viewing.playback import Playback
 from sim.errors import InputError, require
 from sim.team import Team
 
@@ -140,6 +143,32 @@ def run_again(
         f"the run is of another version of the code, {row['code_version']}; run the sweep again",
     )
     return Again(again, int(row[REPEAT]), str(row["recording_checksum"]))
+
+
+def draw_again(
+    row: pd.Series[Any],
+    how: Showing,
+    called: str,
+    config_dir: Path | None = None,
+    folder: str | None = None,
+) -> str:
+    """Show a run of a sweep as it moves; see `viewing.play.play`.
+
+    Parameters
+    ----------
+    called
+        What the run is called, NAME/KEY.
+    config_dir, folder
+        A folder of further options, and that of the sweep's rows, by default that of NAME.
+    """
+    noted = noted_config_dir(folder_of(folder or str(Path(called).parent)))
+    again = run_again(row, config_dir, noted)
+    name = again.experiment.estimator_name
+
+    def estimated(shown: Playback, on_step: OnStep) -> Playback:
+        return with_estimates_by(shown, again.experiment, again.repeat, on_step)
+
+    return play(again.recordings(), how, called, name, estimated)
 
 
 def _known(value: Any) -> bool:

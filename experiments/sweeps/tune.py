@@ -31,6 +31,7 @@ from experiments.evaluation.statistics import Interval, log_ratio_interval
 from experiments.runs import paths
 from experiments.runs.columns import REVISED
 from experiments.runs.compose import composed_options, option_called, searched
+from experiments.runs.console import progress
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from experiments.runs.processes import held_interrupts
@@ -38,7 +39,7 @@ from experiments.runs.row import Outcome, Row, read_rows, write_frame
 from experiments.sweeps.plan import planned
 from experiments.sweeps.ranges import FIRST_JUDGED_SEED, Range, Tuning
 from experiments.viewing.plotting import plain_log
-from experiments.viewing.style import SERIES, subplots
+from experiments.viewing.style import SERIES, save_figure, subplots
 from sim.errors import InputError, require
 from sim.files import write_text
 
@@ -121,6 +122,34 @@ def tune(
     for done, (name, (drives, judged)) in enumerate(plans.items(), start=1):
         yield _tuned(study, name, tuning, drives, judged, jobs)
         on_progress(done / len(names))
+
+
+def tune_study(
+    study: str,
+    only: Collection[str] = (),
+    jobs: int = 1,
+    config_dir: str | None = None,
+    folder: Path | None = None,
+) -> str:
+    """Tune, write options, tables and their figure; return the gains and the options' files.
+
+    Parameters
+    ----------
+    folder
+        Where the options go; by default results/tuned/estimator.
+    """
+    plan, place = tuning_of(study, config_dir), paths.results()
+    found, written = [], []
+    with progress(f"tune {study}", 1.0) as on_progress:
+        for tuned in tune(study, only, jobs=jobs, config_dir=config_dir, on_progress=on_progress):
+            found.append(tuned)
+            written.append(write(tuned, study, plan, folder or place / "tuned" / "estimator"))
+    tables = place / "tables"
+    trials = written_beside(trials_table(found), tables / f"{study}_trials_tuning.csv", plan)
+    gains = written_beside(gains_table(found), tables / f"{study}_tuning.csv", plan)
+    save_figure(curves(trials, gains), place / "figures" / f"{study}_tuning.png")
+    text = gains.to_string(index=False, float_format=lambda v: f"{v:.4g}")
+    return "\n".join([text, *map(paths.short, written)])
 
 
 def yaml_of(tuned: Tuned, study: str, tuning: Tuning) -> str:

@@ -12,9 +12,13 @@ from experiments.trajectories.odometry import (
     write_odometry_csv,
     write_odometry_json,
 )
+from experiments.trajectories.read import read_trajectory
 from sim.errors import InputError, require, required
+from sim.formats.detect import kind_of, read_any
+from sim.formats.mrclam import read_team
 from sim.formats.tum import write_tum
 from sim.recording import Recording, save
+from sim.team import save as save_team
 
 _BAGS = (".mcap", ".bag", ".db3", "")
 ESTIMATES = (".tum", ".csv", ".json", *_BAGS)
@@ -119,3 +123,50 @@ def _slip(recording: Recording) -> tuple[float, float] | None:
     slip = [made_with.get(name) for name in ("kr", "kl")]
     known = [float(k) for k in slip if isinstance(k, (int, float)) and 0.0 <= k < math.inf]
     return (known[0], known[1]) if len(known) == 2 else None
+
+
+def convert_log(
+    log: Sequence[Path], out: Path, robot: int | None = None, topic: str | None = None
+) -> str:
+    """Convert a log, or an estimate, to the file that its new name says; say what was written.
+
+    Parameters
+    ----------
+    robot
+        Which robot of a log of several.
+    topic
+        Of a bag, the odometry to convert alone.
+    """
+    _check_output(log, out)
+    if topic is not None or is_estimate(log):
+        require(len(log) == 1, f"{log[0]}: an estimate is one file, got {len(log)}")
+        estimate = read_trajectory(log[0], topic)
+        write_estimate(out, estimate)
+        seconds = estimate.stamps[-1] - estimate.stamps[0]
+        return f"{out}: {len(estimate.stamps)} poses, {seconds:.1f} s"
+    recording = read_any(log, robot)
+    write_recording(out, recording)
+    said = f"{out}: {recording.duration_s:.1f} s, {len(recording.frame_stamps)} frames"
+    dropped = [name for name in recording.logs if name != "laser"] if out.suffix == ".log" else []
+    if dropped:
+        said += f"\nleft out, since a CARMEN log holds one laser: {', '.join(dropped)}"
+    return said
+
+
+def convert_team(log: Sequence[Path], out: Path) -> str:
+    """Convert an MRCLAM set to the .npz of a team; say what was written."""
+    _check_output(log, out)
+    require(out.suffix == ".npz", f"{out}: a team is an .npz file")
+    require(
+        len(log) == 1 and kind_of(log[0]) == "mrclam",
+        f"{log[0]}: not an MRCLAM set; `estima record study=teams` simulates a team",
+    )
+    team = read_team(log[0])
+    checksum = save_team(team, out)
+    return f"{out}: a team of {len(team)} robots, {team.duration_s:.1f} s, {checksum}"
+
+
+def _check_output(log: Sequence[Path], out: Path) -> None:
+    require(out.name, f"{out}: name the file to write, such as run.mcap")
+    itself = out.exists() and any(path.exists() and out.samefile(path) for path in log)
+    require(not itself, f"{out}: that is the log itself; give another name")

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
 
+from experiments.calibration.sensor_noise import sightings
 from sim import se2
 from sim.arrays import Array
 from sim.errors import require
@@ -20,7 +21,7 @@ from sim.worlds.world import World
 
 Mask = NDArray[np.bool_]
 
-_MISREAD_RAD, _MISREAD_SHARE = 0.25, 0.25  # errors beyond are of another landmark
+_MISREAD_RAD, _MISREAD_SHARE = 0.25, 0.25  # errors beyond belong to another landmark
 _LAGS_S = np.array([0.25, 0.5, 1.0, 2.0, 4.0])  # at which errors of a landmark are compared
 _MOST_SCANS = 300
 _SHORT_SIGMAS, _SHORT_M = 6.0, 0.3  # a beam that ends so far before its wall hit something else
@@ -36,12 +37,10 @@ def real_camera(
     InputError
         If it saw too few landmarks.
     """
-    camera, log = recording.sensor(name, StereoCamera), recording.log(name)
-    per_row = np.repeat(np.arange(len(log.stamps)), np.diff(log.known_splits))
-    ids = log["ids"]
-    times = log.stamps[per_row]
-    used = (times >= stamps[0]) & (times <= stamps[-1]) & (ids >= 0) & (ids < len(world.landmarks))
-    times, ids, points = times[used], ids[used], log["points_in_camera"][used]
+    camera = recording.sensor(name, StereoCamera)
+    times, ids, points = sightings(recording, name, world)
+    used = (times >= stamps[0]) & (times <= stamps[-1])
+    times, ids, points = times[used], ids[used], points[used]
     require(len(times) >= 30, f"only {len(times)} sightings of landmarks; give more of the log")
     poses = poses_at(stamps, way, times)
     true = np.array(

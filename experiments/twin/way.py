@@ -3,10 +3,11 @@
 import numpy as np
 
 from estimators.base import Prior
-from estimators.base import run as run_estimator
 from estimators.graph.graph_slam import GraphSlam
 from estimators.graph.smoother import Smoother
+from experiments.calibration.reference import spaced_rows, travel_at
 from experiments.runs.calibration import Slip
+from experiments.runs.evaluate import run_over
 from sim import se2
 from sim.arrays import Array
 from sim.errors import InputError, require
@@ -51,8 +52,8 @@ def best_poses(recording: Recording, slip: Slip) -> tuple[Array, Array]:
         else Smoother(kr=slip.kr, kl=slip.kl, robust="cauchy", stereo=name)
     )
     prior = Prior(recording.robot, recording.sensors, np.zeros(3), _START)
-    run_estimator(batch, recording, prior, np.random.default_rng(0))
-    found = batch.finish()
+    _, found = run_over(recording, batch, prior, np.random.default_rng(0))
+    assert found is not None
     return found.stamps, found.means
 
 
@@ -66,14 +67,11 @@ def way_of(recording: Recording, stamps: Array, poses: Array) -> tuple[Array, Ar
     inside = (stamps >= wheels.stamps[0]) & (stamps <= wheels.stamps[-1])
     stamps, poses = stamps[inside], poses[inside]
     require(len(stamps) >= 2, "a twin needs two poses or more within the time of the wheels")
-    rows = [0]
-    for row in range(1, len(stamps)):
-        if stamps[row] - stamps[rows[-1]] >= _KNOTS_S - 1e-9:
-            rows.append(row)
+    rows = spaced_rows(stamps, _KNOTS_S)
     stamps, poses = stamps[rows], poses[rows]
     times = np.unique(np.concatenate([np.arange(stamps[0], stamps[-1], STEP_S), stamps]))
-    travel = np.stack([np.interp(times, wheels.stamps, p) for p in wheels.position_m.T], axis=1)
-    rolled = se2.chain(arc_increment(np.diff(travel, axis=0), recording.robot.track_m))
+    travel = np.diff(travel_at(wheels, times), axis=0)
+    rolled = se2.chain(arc_increment(travel, recording.robot.track_m))
     knots = np.searchsorted(times, stamps)
     before = np.clip(np.searchsorted(stamps, times, side="right") - 1, 0, len(stamps) - 2)
     by_wheels = se2.between(rolled[knots[:-1]], rolled[knots[1:]])

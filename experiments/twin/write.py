@@ -1,4 +1,4 @@
-"""Files of a twin: a study for `estima run`, its world and way, and the log that it is of."""
+"""Files of a twin: a study for `estima run`, its world and way, and the log that it was made of."""
 
 import dataclasses
 from pathlib import Path
@@ -67,7 +67,7 @@ def check_name(out: Path) -> None:
     """Refuse a name that is not one of a study."""
     require(
         out.suffix == ".yaml" and out.stem.isidentifier(),
-        f"-o {out}: a twin is a .yaml file whose name is one word, such as twin.yaml",
+        f"{out}: a twin is a .yaml file whose name is one word, such as twin.yaml",
     )
 
 

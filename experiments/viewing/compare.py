@@ -42,7 +42,7 @@ def compare_files(
     if log is not None:
         recording = read_any([log])
     else:
-        require(len(given) >= 2, "one trajectory alone: add others, or --recording for the truth")
+        require(len(given) >= 2, "one trajectory alone: add others, or a recording with the truth")
         reference = next(iter(given))
         recording = reference_of(given.pop(reference))
     found, paths = {}, dict(zip(short, trajectories, strict=True))

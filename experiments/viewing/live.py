@@ -13,13 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from experiments.viewing.view import Playback, bounds, seen
+from experiments.viewing.animation import bounds, seen
+from experiments.viewing.playback import Playback
 from sim.arrays import Array
 from sim.errors import require
 from sim.worlds.world import World
 
 FPS = 20
-_REMEDY = "save the run instead: add -o run.html, run.gif or run.mp4"
+_REMEDY = "save the run in a file instead, such as run.html, run.gif or run.mp4"
 _HEIGHT_M = 0.1  # of the robots
 _CUT_M = 0.4  # walls are shown up to this height
 _TRAIL_EVERY = 5  # pictures
@@ -32,7 +33,7 @@ def check_display() -> None:
     """Refuse to open a window where there is nothing to show it on."""
     require(
         not sys.platform.startswith("linux") or os.environ.get("DISPLAY"),
-        f"there is no display for a window (DISPLAY is not set); {_REMEDY}",
+        f"no display for a window (DISPLAY is not set); {_REMEDY}",
     )
 
 
@@ -47,7 +48,7 @@ def watch(run: Playback, seconds: float | None = None) -> None:
     Raises
     ------
     InputError
-        If there is no display, or no window can be opened on it.
+        Without a display, or if no window can be opened on it.
     """
     check_display()
     process = multiprocessing.get_context("spawn").Process(target=_window, args=(run, seconds))
@@ -81,17 +82,17 @@ def _window(run: Playback, seconds: float | None) -> None:
 def _play(engine: Any, run: Playback, seconds: float | None) -> None:
     """Move the robots by the clock, from the first shown Frame to the last."""
     engine.configureDebugVisualizer(engine.COV_ENABLE_GUI, 0)
-    recording = run.recording
-    stamps = recording.frame_stamps[run.rows]
+    (own,), stamps = run.robots, run.stamps
+    recording = own.recording
     if recording.world is not None and len(recording.world.walls):
         _build_walls(engine, recording.world)
-    truth = run.truth_at(stamps)
-    _aim(engine, run, truth)
+    truth = own.truth_at(stamps)
+    _aim(engine, run)
     radius = max(recording.robot.track_m / 2.0, 0.1)
     bodies = {}
     if recording.truth is not None:
         bodies["truth"] = _body(engine, radius, _BLACK, 1.0)
-    if run.estimate is not None:
+    if own.estimate is not None:
         bodies["estimate"] = _body(engine, 1.1 * radius, _BLUE, 0.5)
     colours = {"truth": _BLACK, "estimate": _BLUE}
     trails: dict[str, Array] = {}
@@ -100,10 +101,10 @@ def _play(engine: Any, run: Playback, seconds: float | None) -> None:
     begun = time.monotonic()
     for i, stamp in enumerate(stamps):
         time.sleep(max(0.0, (stamp - stamps[0]) / speed - (time.monotonic() - begun)))
-        belief = run.belief_row(float(stamp))
+        belief = own.belief_row(float(stamp))
         poses = {"truth": truth[i]}
-        if run.estimate is not None and belief >= 0:
-            poses["estimate"] = run.estimate.means[belief]
+        if own.estimate is not None and belief >= 0:
+            poses["estimate"] = own.estimate.means[belief]
         for name, body in bodies.items():
             pose = poses.get(name, _UNKNOWN)
             if not np.isfinite(pose).all():
@@ -114,7 +115,7 @@ def _play(engine: Any, run: Playback, seconds: float | None) -> None:
             if i % _TRAIL_EVERY == 0:
                 engine.addUserDebugLine([*before[:2], 0.02], [*pose[:2], 0.02], colours[name], 2)
                 trails[name] = pose
-        points = seen(run, float(stamp))[::3] if i % _SCAN_EVERY == 0 else np.zeros((0, 2))
+        points = seen(own, float(stamp))[::3] if i % _SCAN_EVERY == 0 else np.zeros((0, 2))
         if len(points):
             raised = np.column_stack([points, np.full(len(points), 0.2)]).tolist()
             scan = engine.addUserDebugPoints(raised, [_RED] * len(points), 3, **replaced)
@@ -122,9 +123,9 @@ def _play(engine: Any, run: Playback, seconds: float | None) -> None:
         engine.stepSimulation()  # lets the window respond
 
 
-def _aim(engine: Any, run: Playback, truth: Array) -> None:
+def _aim(engine: Any, run: Playback) -> None:
     """Look at the world and the whole path from above."""
-    x1, y1, x2, y2 = bounds(run, truth)
+    x1, y1, x2, y2 = bounds(run)
     distance_m = 1.2 * math.hypot(x2 - x1, y2 - y1) + 2.0
     engine.resetDebugVisualizerCamera(distance_m, 0, -65, [(x1 + x2) / 2.0, (y1 + y2) / 2.0, 0.0])
 

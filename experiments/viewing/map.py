@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from estimators.base import Estimate
 from experiments.evaluation.time_sync import interpolate
-from experiments.runs.evaluate import run_over
-from experiments.runs.seeds import stream
-from experiments.viewing.view import experiment_over, is_file_of_estimate, read_estimate
+from experiments.runs.console import progress
+from experiments.viewing.estimates import check_no_overrides, estimate_along
+from experiments.viewing.grid import described
 from sim.arrays import Array, Floats
-from sim.errors import InputError, require, required
+from sim.errors import require, required
+from sim.formats.detect import read_any
 from sim.recording import Recording
 from sim.sensors import Laser
 from sim.worlds.grid import OccupancyGrid
+from sim.worlds.grid_file import check_name, write_grid
 from sim.worlds.grid_mapping import map_scans
 
 _LONGEST_GAP_S = 3.0  # between poses; scans in longer ones are left out
@@ -36,40 +38,70 @@ def path_of(
     Parameters
     ----------
     source
-        `truth`; an estimate.csv or its folder; or the name of an estimator to run over the
-        recording, whose revised path is taken if it has one.
+        `truth`, or what `viewing.estimates.estimate_along` takes.
     overrides
-        Hydra overrides for that estimator.
+        Hydra overrides for an estimator that runs now.
     on_step
         Called with the number of Frames done.
     """
-    file = Path(source)
-    if overrides and (source == "truth" or is_file_of_estimate(file)):
-        raise InputError(f"{overrides[0]}: overrides are for estimators that are run now")
     if source == "truth":
-        truth = required(recording.truth, "this recording has no truth; name an estimator with -e")
+        check_no_overrides(overrides)
+        truth = required(recording.truth, "this recording has no truth; name an estimator")
         return truth.stamps, truth.poses
-    found = (
-        read_estimate(recording, file)
-        if is_file_of_estimate(file)
-        else _run(recording, source, overrides, on_step)
-    )
+    found = estimate_along(recording, source, overrides, on_step)
     sound = np.isfinite(found.means).all(axis=1)
     return found.stamps[sound], found.means[sound]
 
 
-def _run(
-    recording: Recording, name: str, overrides: Sequence[str], on_step: Callable[[int], None]
-) -> Estimate:
-    experiment = experiment_over(recording, name, overrides)
-    online, revised = run_over(
-        recording,
-        experiment.estimator(),
-        experiment.prior(recording),
-        stream(experiment.seed, f"estimator/{experiment.estimator_name}", 0),
-        on_step=on_step,
-    )
-    return online if revised is None else revised
+@dataclass(frozen=True)
+class Gridding:
+    """How a grid is built.
+
+    Attributes
+    ----------
+    resolution_m
+        Side of a cell, m.
+    max_range_m
+        Beams longer than this only clear cells, m; None: the laser's range.
+    laser
+        Name of the laser in the recording.
+    raw
+        Whether the file keeps probabilities in percent, not three states.
+    """
+
+    resolution_m: float
+    max_range_m: float | None
+    laser: str
+    raw: bool
+
+
+def map_file(log: str, source: str, overrides: Sequence[str], out: Path, how: Gridding) -> str:
+    """Build a grid from a log's scans along a path, write it, and say what it is.
+
+    Parameters
+    ----------
+    source, overrides
+        As for `path_of`.
+    out
+        File to write, .yaml; beside it .pgm.
+    """
+    check_name(out)
+    require("=" not in log, f"{log}: name a recording first, such as run.npz")
+    recording = read_any([Path(log)])
+    n_all = len(laser_scans(recording, how.laser)[0])
+    with progress(source, len(recording.frame_stamps)) as on_step:
+        path = path_of(recording, source, overrides, on_step)
+    with progress("mapping", n_all, "scans") as on_progress:
+        grid, n_scans = grid_along(
+            recording,
+            *path,
+            resolution_m=how.resolution_m,
+            max_range_m=how.max_range_m,
+            laser=how.laser,
+            on_progress=on_progress,
+        )
+    write_grid(grid, out, "raw" if how.raw else "trinary")
+    return f"{out}: {described(grid)}, from {n_scans} of {n_all} scans"
 
 
 def grid_along(

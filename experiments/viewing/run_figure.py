@@ -1,15 +1,33 @@
 """One run at a glance: truth and estimate in the world, and the errors with their 2-sigma bands."""
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from estimators.base import Estimate
+from experiments.evaluation.metrics import position_errors_m
+from experiments.runs.experiment import Experiment
+from experiments.trajectories.convert import write_estimate
 from experiments.viewing.plotting import draw_ellipses, literal, plan_axes
-from experiments.viewing.style import ESTIMATE, GREEN, ORANGE, TRUTH, figure
-from experiments.viewing.team_figure import team_figure
+from experiments.viewing.style import (
+    ESTIMATE,
+    GREEN,
+    ORANGE,
+    TRUTH,
+    figure,
+    save_figure,
+    subplots,
+)
+from experiments.viewing.team_figure import (
+    colour_of,
+    draw_sightings,
+    path_width,
+    sightings,
+)
 from experiments.viewing.world import draw_world, sees_landmarks
 from sim import se2
 from sim.arrays import Array
@@ -21,12 +39,34 @@ _MOST_POINTS = 4000
 _AROUND_M = 3.0  # of the path that is shown
 
 
-def figure_of(found: Sequence[tuple[Recording, Estimate]], name: str) -> Figure:
-    """Picture of a run: the recording and the estimate of its robot, or of each of a team."""
-    return run_figure(*found[0], name) if len(found) == 1 else team_figure(found, name)
+def run_figure(found: Sequence[tuple[Recording, Estimate]], name: str) -> Figure:
+    """Picture of a run.
+
+    Of a robot alone it has the path with 95 % ellipses, and the errors of the pose with their
+    bands; of a team all paths and sightings, and the position errors.
+
+    Parameters
+    ----------
+    found
+        Of each robot: its recording and its estimate.
+    name
+        Of the estimates.
+    """
+    return _figure_alone(*found[0], name) if len(found) == 1 else _team_figure(found, name)
 
 
-def run_figure(recording: Recording, estimate: Estimate, name: str) -> Figure:
+def draw_run(
+    found: Sequence[tuple[Recording, Estimate]], experiment: Experiment, folder: Path
+) -> None:
+    """Write the picture of a run, and the trajectory of each of its robots, into a folder."""
+    for number, (recording, estimate) in enumerate(found):
+        name = "estimate.csv" if len(found) == 1 else f"estimate_{number}.csv"
+        write_estimate(folder / name, estimate, recording, slip=experiment.believed_slip)
+    revised = " (revised)" if found[0][1].kind == "revised" else ""
+    save_figure(run_figure(found, f"{experiment.estimator_name}{revised}"), folder / "run.png")
+
+
+def _figure_alone(recording: Recording, estimate: Estimate, name: str) -> Figure:
     """Map with both trajectories and 95 % ellipses; errors against time."""
     page = figure(9.0, 4.6)
     halves: Any = page.subfigures(1, 2, width_ratios=(1.1, 1.0))
@@ -94,3 +134,36 @@ def _draw_errors(axes: Array, estimate: Estimate, truth: Array) -> None:
         ax.set_ylabel(label)
     axes[0].set_title("error, and the belief's 95 % band", fontsize="medium")
     axes[-1].set_xlabel("time, s")
+
+
+def _team_figure(found: Sequence[tuple[Recording, Estimate]], name: str) -> Figure:
+    """Map with all paths and sightings; position errors against time."""
+    page, (plan, errors) = subplots(10.0, 4.8, 1, 2, width_ratios=(1.0, 1.0))
+    robots = [recording for recording, _ in found]
+    if robots[0].world is not None:
+        draw_world(plan, robots[0].world)
+    for number, (recording, estimate) in enumerate(found):
+        colour: Any = {"color": colour_of(number)}
+        if recording.truth is not None:
+            truth = recording.truth_at(estimate.stamps)
+            lw = path_width(number, len(found))
+            plan.plot(*recording.truth.poses[:, :2].T, lw=lw, **colour)
+            draw_sightings(plan, sightings(robots, number)[1], number)
+            off_m = position_errors_m(truth, estimate.means)
+            errors.plot(estimate.stamps, off_m, lw=1.2, label=f"robot {number}", **colour)
+        plan.plot(*estimate.means[:, :2].T, "--", color=TRUTH, lw=0.8)
+        plan.plot(*estimate.means[:1, :2].T, "o", ms=5, **colour)
+    plan_axes(plan)
+    plan.autoscale_view()
+    errors.set(xlabel="time, s", ylabel="position error, m")
+    errors.set_ylim(bottom=0.0)
+    errors.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=5, fontsize="small")
+    lines = [
+        Line2D([], [], color=TRUTH, lw=1.6, label="truth, a colour a robot"),
+        Line2D([], [], color=TRUTH, lw=0.8, ls="--", label=name),
+        Line2D([], [], color=TRUTH, lw=0.5, alpha=0.6, label="sightings"),
+    ]
+    plan.legend(
+        handles=lines, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, fontsize="small"
+    )
+    return page

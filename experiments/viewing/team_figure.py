@@ -1,20 +1,15 @@
-"""A team at a glance: paths and sightings in the world, and each robot's error."""
+"""Paths of a team in the world, and who saw whom."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
-from estimators.base import Estimate
-from experiments.evaluation.metrics import position_errors_m
 from experiments.viewing.plotting import plan_axes
-from experiments.viewing.style import BLACK, PURPLE, SERIES, TRUTH, subplots
-from experiments.viewing.world import draw_walls, draw_world
+from experiments.viewing.style import BLACK, PURPLE, SERIES
+from experiments.viewing.world import draw_walls
 from sim.arrays import Array
 from sim.recording import Recording
 from sim.sensors import RobotCamera
@@ -78,42 +73,3 @@ def draw_paths(ax: Axes, run: Mapping[str, Array]) -> None:
         ax.plot(*path[0], "o", color=colour, mec=BLACK, ms=8, zorder=3)
     ax.plot([], [], "o", color="white", mec=BLACK, ms=8, label="start")
     plan_axes(ax)
-
-
-def team_figure(found: Sequence[tuple[Recording, Estimate]], name: str) -> Figure:
-    """Map with all paths and sightings; position errors against time.
-
-    Parameters
-    ----------
-    found
-        Of each robot: its recording and its estimate.
-    """
-    page, (plan, errors) = subplots(10.0, 4.8, 1, 2, width_ratios=(1.0, 1.0))
-    robots = [recording for recording, _ in found]
-    if robots[0].world is not None:
-        draw_world(plan, robots[0].world)
-    for number, (recording, estimate) in enumerate(found):
-        colour: Any = {"color": colour_of(number)}
-        if recording.truth is not None:
-            truth = recording.truth_at(estimate.stamps)
-            lw = path_width(number, len(found))
-            plan.plot(*recording.truth.poses[:, :2].T, lw=lw, **colour)
-            draw_sightings(plan, sightings(robots, number)[1], number)
-            off_m = position_errors_m(truth, estimate.means)
-            errors.plot(estimate.stamps, off_m, lw=1.2, label=f"robot {number}", **colour)
-        plan.plot(*estimate.means[:, :2].T, "--", color=TRUTH, lw=0.8)
-        plan.plot(*estimate.means[:1, :2].T, "o", ms=5, **colour)
-    plan_axes(plan)
-    plan.autoscale_view()
-    errors.set(xlabel="time, s", ylabel="position error, m")
-    errors.set_ylim(bottom=0.0)
-    errors.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=5, fontsize="small")
-    lines = [
-        Line2D([], [], color=TRUTH, lw=1.6, label="truth, a colour a robot"),
-        Line2D([], [], color=TRUTH, lw=0.8, ls="--", label=name),
-        Line2D([], [], color=TRUTH, lw=0.5, alpha=0.6, label="sightings"),
-    ]
-    plan.legend(
-        handles=lines, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, fontsize="small"
-    )
-    return page

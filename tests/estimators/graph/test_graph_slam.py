@@ -3,7 +3,6 @@
 import dataclasses
 
 import numpy as np
-import pandas as pd
 import pytest
 
 from estimators.base import run
@@ -17,7 +16,6 @@ from estimators.laser.icp import prepare
 from estimators.laser.scan_lines import without_sparse_lines
 from estimators.laser.scan_matching import MatcherOptions, ScanMatcher
 from estimators.odometry import Odometry
-from experiments.bench import graph_robustness
 from experiments.gate.conform import check_estimator
 from experiments.studies.real_logs import building
 from sim import se2
@@ -216,23 +214,6 @@ def test_edges_far_behind_one_another_are_no_wall():
     assert np.count_nonzero(kept.line_of_point == 0) == 30
     np.testing.assert_allclose(kept.lines[0], [1.0 / 3.0, 0.0], atol=1e-9)
     assert without_sparse_lines(scan, 10.0) is scan
-
-
-def test_planted_drives_are_summed_by_share_and_threshold():
-    names = ["share", "support", "gate", "closures", "false", "planted", "revisits", "closed"]
-    drives = pd.DataFrame(
-        [
-            [0.0, 3, 1e-3, 10, 0, 0, 8, 8, 0.1],
-            [0.5, 3, 1e-3, 6, 1, 9, 8, 4, 0.1],
-            [0.5, 3, 1e-3, 4, 1, 9, 2, 1, 0.9],
-            [0.5, 5, 1e-3, 0, 0, 9, 5, 0, 0.2],
-        ],
-        columns=[*names, "revised_worst_m"],
-    )
-    sums = graph_robustness.table(drives)
-    assert sums.precision.tolist() == [1.0, 0.8, 1.0]
-    assert sums.recall.tolist() == [1.0, 0.5, 0.0]
-    assert sums.bent.tolist() == [0, 1, 0]
 
 
 def test_relations_of_unknown_stamps_and_of_a_scan_with_itself_judge_nothing():

@@ -9,7 +9,9 @@ from typer.testing import CliRunner
 
 from estimators.base import Prior
 from estimators.odometry import Odometry
-from experiments.calibration.from_log import BLOCK_S, Source, _slip, calibrate_log
+from experiments.calibration.from_log import calibrate_log
+from experiments.calibration.reference import Source
+from experiments.calibration.slip import BLOCK_S, slip_of_blocks
 from experiments.cli.main import app
 from experiments.evaluation.metrics import position_errors_m
 from experiments.runs.calibration import read_calibration, write_calibration
@@ -178,7 +180,7 @@ def test_how_long_forward_slip_lasts_is_found(length_m):
     path = rng.uniform(0.2, 0.32, (n, 2))
     off = np.sqrt(3e-4 * path.sum(axis=1)) * rng.standard_normal(n)
     forward += np.sqrt(3e-4 * 0.52) / 2.0 * rng.standard_normal(n)
-    slip, _ = _slip(BLOCK_S * np.arange(n), off, forward, path, rng)
+    slip, _ = slip_of_blocks(BLOCK_S * np.arange(n), off, forward, path, rng)
     assert slip.kr == slip.kl == pytest.approx(3e-4, rel=0.2)
     assert slip.forward_slip_m == pytest.approx(5e-3, rel=0.3)
     if length_m:
@@ -187,7 +189,7 @@ def test_how_long_forward_slip_lasts_is_found(length_m):
     else:
         assert slip.forward_slip_length_m == 0.0
     gaps = 2.0 * BLOCK_S * np.arange(n)  # no block follows another
-    assert _slip(gaps, off, forward, path, rng)[0].forward_slip_length_m == 0.0
+    assert slip_of_blocks(gaps, off, forward, path, rng)[0].forward_slip_length_m == 0.0
 
 
 def test_file_round_trip_and_its_errors(tmp_path, found):

@@ -93,7 +93,7 @@ def test_the_picture_shows_the_path_and_few_ellipses_however_large():
 
     prior = experiment.prior(recording)
     estimate, _ = run_over(recording, experiment.estimator(), prior, np.random.default_rng(0))
-    page = run_figure(recording, estimate, "ekf_slam")
+    page = run_figure([(recording, estimate)], "ekf_slam")
     plan = page.axes[0]
     assert len(plan.patches) <= 8
     assert {"truth", "ekf_slam", "95 % ellipse"} <= set(plan.get_legend_handles_labels()[1])

@@ -17,8 +17,10 @@ from experiments.runs.team import scores_of_team, status_of_team
 from experiments.sweeps.collect import collect
 from experiments.sweeps.launch import sweep
 from experiments.sweeps.plan import plan_of
-from experiments.viewing import team_view
-from experiments.viewing.run_figure import figure_of
+from experiments.viewing.animation import pictures
+from experiments.viewing.estimates import with_estimates
+from experiments.viewing.playback import Playback
+from experiments.viewing.run_figure import run_figure
 from sim import recording as recordings
 from sim import team as teams
 from sim.errors import InputError
@@ -201,7 +203,7 @@ def test_files_of_teams_by_the_command_line(tmp_path):
     for words, complaint in (
         (["convert", str(path), "-o", "x.mcap"], "it holds a team"),
         (["convert", str(path), "--robot", "2", "-o", "x.mcap"], "its robots are 0 to 1, got 2"),
-        (["convert", str(path), "--team", "-o", "x.npz"], "--team is of MRCLAM sets"),
+        (["convert", str(path), "--team", "-o", "x.npz"], "not an MRCLAM set"),
         (["score", str(path), "x.tum"], "it holds a team"),
         (["map", str(path), "-o", "x.yaml"], "it holds a team"),
         (["calibrate", str(path), "-o", "x.yaml"], "it holds a team"),
@@ -215,14 +217,14 @@ def test_files_of_teams_by_the_command_line(tmp_path):
 def test_pictures_of_a_team(tmp_path):
     team, found = composed().recordings(), []
     evaluate(composed(), lambda: team, on_estimate=lambda own, _, e, __: found.append((own, e)))
-    figure_of(found, "ekf_slam").savefig(tmp_path / "team.png")
-    shown = team_view.TeamPlayback.of(team, 4)
-    bare = list(team_view.pictures(shown))
+    run_figure(found, "ekf_slam").savefig(tmp_path / "team.png")
+    shown = Playback.of(team, 4)
+    bare = list(pictures(shown))
     assert len(bare) == len(shown.stamps) == 4
     assert not np.array_equal(bare[0], bare[-1])
-    seeing = team_view.with_estimates(shown, team, "ekf_slam", [], lambda _: None)
-    assert [own.name for own in seeing.robots] == ["ekf_slam", "ekf_slam"]
-    assert not np.array_equal(bare[-1], list(team_view.pictures(seeing))[-1])
+    seeing = with_estimates(shown, "ekf_slam", [], lambda _: None)
+    assert seeing.name == "ekf_slam"
+    assert not np.array_equal(bare[-1], list(pictures(seeing))[-1])
 
 
 def test_a_suite_may_hold_a_team(tmp_path):

@@ -11,7 +11,8 @@ from experiments.runs.experiment import Experiment
 from experiments.runs.paths import CONF
 from experiments.runs.store import write_run
 from experiments.sweeps.again import row_of, run_again, short_key
-from experiments.viewing.view import estimate_by, shown_rows
+from experiments.viewing.estimates import with_estimates_by
+from experiments.viewing.playback import Playback
 from sim.errors import InputError
 
 DRIVE = ["simulation.physics=kinematic", "route.distance_m=2", "sensors=laser_stereo", "name=mine"]
@@ -49,8 +50,9 @@ def test_it_is_the_same_run_whose_picture_is_drawn(results):
     again = run_again(row)
     assert again.experiment.key == experiment.key
     recording = again.recordings().only
-    rows = shown_rows(recording, 5)
-    made = estimate_by(again.experiment, recording, rows, lambda _: None, again.repeat)
+    shown = Playback.of(again.recordings(), 5)
+    shown = with_estimates_by(shown, again.experiment, again.repeat, lambda _: None)
+    made = shown.robots[0].estimate
     errors = made.means[:, :2] - recording.truth_at(made.stamps)[:, :2]
     assert np.sqrt((errors**2).sum(axis=1).mean()) == pytest.approx(row["ate_rmse_m"], rel=1e-9)
 
@@ -95,7 +97,10 @@ def test_view_and_report_draw_runs_of_a_sweep(results, tmp_path):
     page = tmp_path / "page.html"
     drawn = []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("experiments.cli.main._show_run", lambda *given: drawn.append(given[3]))
+        patch.setattr(
+            "experiments.report.of_sweep.draw_again",
+            lambda row, how, *_: drawn.append(how.out) or "",
+        )
         CliRunner().invoke(app, ["report", "mine", "--pictures", "-o", str(page)])
     assert {path.parent for path in drawn} == {tmp_path / "page" / "pictures"}
     assert f"{key}.html" in {path.name for path in drawn}

@@ -8,7 +8,6 @@ import sys
 import time
 from itertools import pairwise
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,10 +17,14 @@ from typer.testing import CliRunner
 from estimators.base import Estimate
 from experiments.cli.main import app
 from experiments.trajectories.odometry import write_odometry_csv
-from experiments.viewing import live, view
+from experiments.viewing import live, movie
+from experiments.viewing.animation import ellipse_outlines, pictures, seen_points
+from experiments.viewing.estimates import with_estimates
+from experiments.viewing.playback import Playback, Shown
 from sim import se2
 from sim.errors import InputError
 from sim.recording import save
+from sim.team import Team
 from tests.fixtures import browser
 from tests.fixtures.fakes import HALF_ROOM_M, circle
 
@@ -39,10 +42,13 @@ def recording():
 
 @pytest.fixture(scope="module")
 def run(recording):
-    rows = view.shown_rows(recording, 6)
-    overrides = ["estimator.n_particles=20"]
-    found, name = view.estimate_of(recording, "fastslam", overrides, rows, silent)
-    return view.Playback(recording, rows, found, name)
+    shown = Playback.of(Team((recording,)), 6)
+    return with_estimates(shown, "fastslam", ["estimator.n_particles=20"], silent)
+
+
+def played(recording, rows, estimate=None):
+    """A robot at rows of its Frames."""
+    return Playback((Shown(recording, estimate),), recording.frame_stamps[rows])
 
 
 def believed(recording, poses):
@@ -51,17 +57,17 @@ def believed(recording, poses):
 
 
 def test_shown_frames_are_evenly_apart_and_hold_both_ends(recording):
-    rows = view.shown_rows(recording, 6)
+    rows = Playback.of(Team((recording,)), 6).rows
     assert rows[0] == 0
     assert rows[-1] == 29
     assert set(np.diff(rows)) <= {5, 6}
-    assert len(view.shown_rows(recording, 1000)) == 30
+    assert len(Playback.of(Team((recording,)), 1000).stamps) == 30
 
 
 def test_the_scan_lies_on_the_walls_of_the_truth(recording):
-    run = view.Playback(recording, np.array([0]))
+    run = Shown(recording)
     for stamp in recording.frame_stamps[[0, 17]]:
-        points = view.seen_points(run, "laser", stamp)
+        points = seen_points(run, "laser", stamp)
         assert len(points) == 61
         assert np.allclose(np.abs(points).max(axis=1), HALF_ROOM_M, atol=1e-5)
 
@@ -69,26 +75,26 @@ def test_the_scan_lies_on_the_walls_of_the_truth(recording):
 def test_with_an_estimate_the_scan_goes_where_it_is_believed_to_be(recording):
     shift = np.array([0.3, -0.2, 0.5])
     moved = se2.compose(shift, recording.truth_at(recording.frame_stamps))
-    run = view.Playback(recording, np.array([0]), believed(recording, moved))
-    plain = view.seen_points(view.Playback(recording, np.array([0])), "laser", 1.0)
-    assert np.allclose(view.seen_points(run, "laser", 1.0), se2.transform(shift, plain), atol=1e-9)
+    run = Shown(recording, believed(recording, moved))
+    plain = seen_points(Shown(recording), "laser", 1.0)
+    assert np.allclose(seen_points(run, "laser", 1.0), se2.transform(shift, plain), atol=1e-9)
 
 
 def test_landmarks_seen_are_the_true_ones(recording):
-    run = view.Playback(recording, np.array([0]))
-    seen = view.seen_points(run, "stereo", recording.frame_stamps[4])
+    run = Shown(recording)
+    seen = seen_points(run, "stereo", recording.frame_stamps[4])
     true = recording.truth.world.landmarks[:, :2]
     nearest = np.hypot(*(seen[:, None] - true).transpose(2, 0, 1)).min(axis=1)
     assert len(seen) > 3
     assert np.median(nearest) < 0.4  # a stereo camera errs by some decimetres
-    assert len(view.seen_points(run, "stereo", -1.0)) == 0
+    assert len(seen_points(run, "stereo", -1.0)) == 0
 
 
 def test_outlines_lie_on_the_ellipse():
     rng = np.random.default_rng(0)
     roots = rng.normal(size=(3, 2, 2))
     covariances, means = roots @ roots.transpose(0, 2, 1), rng.normal(size=(3, 2))
-    outlines = view.ellipse_outlines(means, covariances).reshape(3, -1, 2)
+    outlines = ellipse_outlines(means, covariances).reshape(3, -1, 2)
     assert np.isnan(outlines[:, -1]).all()  # gaps, so that one line draws them all
     for outline, mean, covariance in zip(outlines, means, covariances, strict=True):
         error = outline[:-1] - mean
@@ -98,37 +104,39 @@ def test_outlines_lie_on_the_ellipse():
 
 def test_extras_are_kept_where_they_are_shown_only(run):
     for name in ("particles", "landmarks", "landmark_covariances"):
-        kept = [i for i, value in enumerate(run.estimate.extras[name]) if value is not None]
+        kept = [
+            i for i, value in enumerate(run.robots[0].estimate.extras[name]) if value is not None
+        ]
         assert kept == run.rows.tolist()
 
 
 def test_pictures_show_what_moves(run):
-    images = list(view.pictures(run))
+    images = list(pictures(run))
     assert len(images) == len(run.rows)
     assert len({image.shape for image in images}) == 1
     assert all(side % 2 == 0 for side in images[0].shape[:2])  # which video needs
     changed = [(first != second).any() for first, second in pairwise(images)]
     assert all(changed)
-    bare = next(iter(view.pictures(view.Playback(run.recording, run.rows[-1:]))))
+    bare = next(iter(pictures(played(run.robots[0].recording, run.rows[-1:]))))
     assert (bare == [0, 114, 178]).all(axis=2).sum() == 0  # no blue without an estimate
     assert (images[-1] == [0, 114, 178]).all(axis=2).sum() > 20
 
 
 def test_a_log_without_truth_needs_an_estimate(recording):
     blind = dataclasses.replace(recording, truth=None)
-    with pytest.raises(InputError, match="--estimate"):
-        next(view.pictures(view.Playback(blind, np.array([0, 5]))))
+    with pytest.raises(InputError, match="give an estimate"):
+        next(pictures(played(blind, [0, 5])))
     poses = recording.truth_at(recording.frame_stamps)
-    run = view.Playback(blind, np.array([0, 5]), believed(blind, poses))
-    assert len(list(view.pictures(run))) == 2
+    run = played(blind, [0, 5], believed(blind, poses))
+    assert len(list(pictures(run))) == 2
 
 
 def test_an_estimate_that_runs_away_or_is_not_finite_is_still_drawn(recording):
     poses = recording.truth_at(recording.frame_stamps)
     poses[10:, 0] = 1e6
     poses[20:] = np.nan
-    run = view.Playback(recording, np.array([0, 15, 25]), believed(recording, poses))
-    assert len(list(view.pictures(run))) == 3
+    run = played(recording, [0, 15, 25], believed(recording, poses))
+    assert len(list(pictures(run))) == 3
 
 
 def test_estimates_of_something_else_are_refused(recording, tmp_path):
@@ -147,18 +155,20 @@ def test_estimates_of_something_else_are_refused(recording, tmp_path):
     ):
         path.write_text(text)
         with pytest.raises(InputError, match=words):
-            view.estimate_of(recording, str(path), [], np.arange(3), silent)
+            with_estimates(Playback.of(Team((recording,)), 3), str(path), [], silent)
 
 
 def test_a_robot_given_by_its_number(recording):
     """As the logs of several robots do."""
     numbered = dataclasses.replace(recording, config={"robot": 3})
-    assert view.estimate_of(numbered, "odometry", [], np.arange(3), silent)[1] == "odometry"
+    assert (
+        with_estimates(Playback.of(Team((numbered,)), 3), "odometry", [], silent).name == "odometry"
+    )
 
 
 def test_gif(run, tmp_path):
     shares = []
-    view.save(run, view.pictures(run), tmp_path / "run.gif", shares.append)
+    movie.save(run, tmp_path / "run.gif", shares.append)
     assert shares[-1] == 1.0
     with Image.open(tmp_path / "run.gif") as image:
         assert image.n_frames == len(run.rows)
@@ -171,7 +181,7 @@ def test_gif(run, tmp_path):
 @pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="no ffmpeg on this machine")
 def test_mp4(run, tmp_path):
     path = tmp_path / "run.mp4"
-    view.save(run, view.pictures(run), path, silent)
+    movie.save(run, path, silent)
     played = subprocess.run(
         ["ffmpeg", "-i", str(path), "-f", "null", "-"], capture_output=True, text=True
     )
@@ -182,12 +192,12 @@ def test_mp4(run, tmp_path):
 def test_without_ffmpeg_the_remedy_is_named(monkeypatch):
     monkeypatch.setattr(shutil, "which", lambda _: None)
     with pytest.raises(InputError, match=r"ffmpeg.*\.gif"):
-        view.check_output(Path("run.mp4"))
+        movie.check_output(Path("run.mp4"))
 
 
 @pytest.mark.skipif(browser.find() is None, reason="no Chromium on this machine")
 def test_html_plays_in_a_browser(run, tmp_path):
-    view.save(run, view.pictures(run), tmp_path / "run.html", silent, "<mcl>: run.npz")
+    movie.save(run, tmp_path / "run.html", silent, "<mcl>: run.npz")
     assert "://" not in (tmp_path / "run.html").read_text()
     with browser.page() as tab:
         tab.open((tmp_path / "run.html").as_uri())
@@ -213,8 +223,8 @@ def test_html_plays_in_a_browser(run, tmp_path):
     [(62.0, 62.0, "real time"), (62.0, 20.0, "3.1 times real time"), (9.0, 20.0, "0.45 times")],
 )
 def test_how_fast_it_plays_is_said(drive_s, seconds, words):
-    stamps = np.linspace(0.0, drive_s, 200)
-    assert view.speed(SimpleNamespace(stamps=stamps, fps=200 / seconds)).startswith(words)
+    run = Playback((), np.linspace(0.0, drive_s, 200), seconds=seconds)
+    assert run.speed.startswith(words)
 
 
 def test_from_the_command_line(recording, tmp_path, monkeypatch):
@@ -237,7 +247,7 @@ def test_from_the_command_line(recording, tmp_path, monkeypatch):
         ([log, "-o", "run.avi"], ".mp4, .gif, .html"),
         ([log, "estimator.kr=1", "-o", out], "--estimate"),
         ([log, "-e", str(tmp_path / "kept"), "estimator.kr=1", "-o", out], "overrides"),
-        ([log, "-o", out, "--seconds", "-1"], "--seconds"),
+        ([log, "-o", out, "--seconds", "-1"], "seconds must"),
         (["-o", out], "name a recording"),
         ([str(tmp_path / "none.npz"), "-o", out], "none.npz"),
     ):
@@ -299,8 +309,8 @@ def orange(path):
 def test_a_folder_without_estimates_hides_no_estimator(recording, tmp_path, monkeypatch):
     (tmp_path / "odometry").mkdir()
     monkeypatch.chdir(tmp_path)
-    rows = np.arange(3)
-    assert view.estimate_of(recording, "odometry", [], rows, silent)[1] == "odometry"
+    shown = Playback.of(Team((recording,)), 3)
+    assert with_estimates(shown, "odometry", [], silent).name == "odometry"
     (tmp_path / "runs" / "1").mkdir(parents=True)
     with pytest.raises(InputError, match=r"runs/1/estimate\.csv"):
-        view.estimate_of(recording, "runs/1", [], rows, silent)
+        with_estimates(shown, "runs/1", [], silent)

@@ -11,10 +11,12 @@ from typer.testing import CliRunner
 
 from experiments.cli.main import app
 from experiments.runs.experiment import Experiment
-from experiments.viewing import view
+from experiments.viewing.animation import pictures
 from experiments.viewing.map import grid_along, path_of
+from experiments.viewing.playback import Playback
 from sim.errors import InputError
 from sim.recording import save
+from sim.team import Team
 from sim.worlds.buildings import from_grid
 from sim.worlds.grid import rasterized
 from sim.worlds.grid_mapping import _between, map_scans
@@ -167,9 +169,9 @@ def test_map_and_run_and_view_by_the_command_line(tmp_path):
 def test_the_grid_is_drawn_under_the_run():
     recording = circle(n_frames=10, n_beams=61)
     grid, _ = grid_along(recording, *path_of(recording, "truth", [], None), resolution_m=0.1)
-    bare = view.Playback(recording, np.array([0]))
+    bare = Playback.of(Team((recording,)), 2)
     with_grid = dataclasses.replace(bare, grid=grid)
-    unknown = [np.all(next(view.pictures(shown)) == 222, axis=2) for shown in (bare, with_grid)]
+    unknown = [np.all(next(pictures(shown)) == 222, axis=2) for shown in (bare, with_grid)]
     assert unknown[0].mean() < 0.001
     assert unknown[1].mean() > 0.05
 
@@ -178,12 +180,12 @@ def test_what_the_command_line_refuses(tmp_path):
     log = tmp_path / "run.npz"
     save(dataclasses.replace(circle(n_frames=10, n_beams=61), truth=None), log)
     out = str(tmp_path / "map.yaml")
-    refused(called("map", str(log), "-o", out), "no truth", "-e")
+    refused(called("map", str(log), "-o", out), "no truth", "name an estimator")
     for words, said in (
         (["map", str(log), "-o", "map.pgm"], "a .yaml file"),
         (["map", "seed=3", "-o", out], "name a recording"),
         (["map", str(log), "-o", out, "seed=3"], "run now"),
-        (["view", str(log), "-e", "odometry", "--map", str(MAP)], "-o run.html"),
+        (["view", str(log), "-e", "odometry", "--map", str(MAP)], "run.html"),
         (["view", "--world", "--map", str(MAP)], "one at a time"),
     ):
         error = CliRunner().invoke(app, words).exception

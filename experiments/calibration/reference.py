@@ -1,0 +1,161 @@
+"""What a log's wheels are compared with: its truth, else its scans, else its landmarks."""
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+from itertools import pairwise
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimators.base import Prior
+from estimators.landmarks.ekf_slam import EkfSlam
+from estimators.laser.icp_odometry import IcpOdometry
+from estimators.laser.scan_matching import FAILED
+from experiments.evaluation.statistics import Interval, mean_interval
+from experiments.runs.evaluate import run_over
+from sim.arrays import Array, Ints
+from sim.errors import InputError, require
+from sim.recording import Recording, WheelLog
+from sim.sensors import Laser, StereoCamera
+
+INTERVAL_S = 1.0  # least length of the steps that the mount of a laser is found by
+LARGEST_DELAY_S, _DELAY_STEP_S = 1.0, 0.01
+N_PARTS = 8  # of the log, for the spread of a delay or of a noise
+_LONGEST_GAP_S = 1.0  # of the truth
+_START = np.diag([1e-6] * 3)  # covariance of a known start
+S = TypeVar("S")
+
+
+class Source(StrEnum):
+    """What the wheels are compared with."""
+
+    TRUTH = "truth"
+    SCANS = "scans"
+    LANDMARKS = "landmarks"
+
+
+@dataclass(frozen=True)
+class Reference:
+    """Poses (N, 3) of the robot or of its laser, at stamps (N,) s.
+
+    Attributes
+    ----------
+    joined
+        (N - 1,) whether the motion from each to the next is known.
+    """
+
+    source: Source
+    stamps: Array
+    poses: Array
+    joined: NDArray[np.bool_]
+
+
+def first_of(recording: Recording, kind: type[S]) -> tuple[str, S]:
+    """Name and sensor of the first sensor of a class that has readings."""
+    for name in recording.logs:
+        sensor = recording.sensors[name]
+        if isinstance(sensor, kind):
+            return name, sensor
+    raise InputError(f"the log has no readings of a {kind.__name__}")
+
+
+def reference_of(recording: Recording) -> Reference:
+    """Return what the wheels can be compared with: truth, else scans, else landmarks.
+
+    Raises
+    ------
+    InputError
+        If the log has none of them.
+    """
+    has_laser, has_camera = (
+        any(isinstance(recording.sensors[name], kind) for name in recording.logs)
+        for kind in (Laser, StereoCamera)
+    )
+    if recording.truth is not None and len(recording.truth.stamps) > 2:
+        stamps, poses = recording.truth.stamps, recording.truth.poses
+        inside = (stamps >= recording.frame_stamps[0]) & (stamps <= recording.frame_stamps[-1])
+        stamps, poses = stamps[inside], poses[inside]
+        dense = len(stamps) > 2 and float(np.median(np.diff(stamps))) <= _LONGEST_GAP_S
+        if dense or not has_laser:
+            return Reference(Source.TRUTH, stamps, poses, np.diff(stamps) <= _LONGEST_GAP_S)
+    if has_laser:
+        return registered(recording, first_of(recording, Laser)[0])
+    require(
+        has_camera,
+        "the log has no truth, no scans and no landmarks to compare its wheels with",
+    )
+    name, _ = first_of(recording, StereoCamera)
+    prior = Prior(recording.robot, recording.sensors, np.zeros(3), _START)
+    # online, and gated: a batch that starts from wrong wheels and misread landmarks ends anywhere
+    mapper = EkfSlam(kr=3e-3, kl=3e-3, errors="invariant", gate_probability=1e-6, stereo=name)
+    found, _ = run_over(recording, mapper, prior, np.random.default_rng(0))
+    rows = np.flatnonzero(np.isin(found.stamps, recording.log(name).stamps))
+    stamps = found.stamps[rows]
+    return Reference(
+        Source.LANDMARKS, stamps, found.means[rows], np.diff(stamps) <= 2.0 * INTERVAL_S
+    )
+
+
+def registered(recording: Recording, name: str) -> Reference:
+    """Poses of a laser by registering each of its scans to the one before.
+
+    What moves is the laser, as the log has its mount on the robot.
+    """
+    prior = Prior(recording.robot, recording.sensors, np.zeros(3), _START)
+    matcher = IcpOdometry(kr=3e-3, kl=3e-3, sigma_range_m=0.03, reference="previous", laser=name)
+    keep = ("registration_status",)
+    found, _ = run_over(recording, matcher, prior, np.random.default_rng(0), keep)
+    rows = np.flatnonzero(np.isin(found.stamps, recording.log(name).stamps))
+    sound = [found.extras["registration_status"][i] not in FAILED for i in rows[1:]]
+    return Reference(Source.SCANS, found.stamps[rows], found.means[rows], np.array(sound, bool))
+
+
+def travel_at(wheels: WheelLog, stamps: Array) -> Array:
+    """Wheel positions (N, 2) interpolated at stamps (N,), m."""
+    return np.stack([np.interp(stamps, wheels.stamps, p) for p in wheels.position_m.T], axis=1)
+
+
+def wheel_delay_s(wheels: WheelLog, reference: Reference) -> Interval:
+    """What to add to the stamps of the wheels so that they turn when the reference turns.
+
+    The delay at which the turns of both correlate best, over steps of at least a tenth of a second;
+    the interval is that of the mean over eight parts of the log.
+    """
+    rows = spaced_rows(reference.stamps, 0.1)
+    stamps, heading = reference.stamps[rows], np.unwrap(reference.poses[rows, 2])
+    joined = np.array([reference.joined[a:b].all() for a, b in pairwise(rows)])
+    joined &= np.diff(stamps) < 2.0
+    turns = np.diff(heading)
+    delays = np.arange(-LARGEST_DELAY_S, LARGEST_DELAY_S + 1e-9, _DELAY_STEP_S)
+    by_wheels = [np.diff(np.diff(travel_at(wheels, stamps - d), axis=1)[:, 0]) for d in delays]
+    rolled = -np.array(by_wheels)
+
+    def best(part: Ints) -> float:
+        if len(part) < 10 or np.ptp(turns[part]) == 0.0:
+            return math.nan
+        with np.errstate(invalid="ignore"):
+            likeness = [np.corrcoef(turns[part], r[part])[0, 1] for r in rolled]
+        if not np.isfinite(likeness).any():
+            return math.nan
+        return float(delays[int(np.nanargmax(likeness))])
+
+    known = np.flatnonzero(joined)
+    require(len(known) >= 10, "too few motions of the reference to find the wheels' delay")
+    whole = best(known)
+    require(math.isfinite(whole), "the robot never turned; a calibration needs turns and straights")
+    parts = np.array([best(part) for part in np.array_split(known, N_PARTS)])
+    spread = mean_interval(parts[np.isfinite(parts)])
+    half = (spread.high - spread.low) / 2.0
+    whole = round(whole / _DELAY_STEP_S) * _DELAY_STEP_S  # no rounding errors of the steps
+    return Interval(whole, whole - half, whole + half)
+
+
+def spaced_rows(stamps: Array, min_s: float) -> Ints:
+    """Rows of stamps (N,) that are at least so far apart."""
+    rows: list[int] = []
+    for row, stamp in enumerate(stamps):
+        if not rows or stamp - stamps[rows[-1]] >= min_s - 1e-9:
+            rows.append(row)
+    return np.array(rows, np.int64)

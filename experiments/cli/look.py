@@ -1,0 +1,210 @@
+"""Commands that show what there is: options, view, map."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from experiments.cli import completion
+from experiments.cli.flags import ConfigDir
+from experiments.runs import columns, paths
+from experiments.runs.console import show
+from sim.errors import InputError, require
+
+
+def options(
+    group: Annotated[
+        str | None,
+        typer.Argument(
+            help="world, robot, ..., study; or metrics.", autocompletion=completion.groups
+        ),
+    ] = None,
+    name: Annotated[
+        str | None,
+        typer.Argument(help="An option whose keys to show; its group may be left out."),
+    ] = None,
+    config_dir: ConfigDir = None,
+) -> None:
+    """List the configuration groups and their options, or the keys of an option, or the metrics.
+
+    Of each key it shows the default, what it accepts, and what it means.
+
+    Examples
+    --------
+      estima options estimator
+
+      estima options ekf_slam
+
+      estima options metrics
+    """
+    if group == "metrics":
+        require(name is None, f"{name}: metrics have no options of their own")
+        show(columns.as_text())
+        return
+    groups = completion.GROUPS
+    require(
+        config_dir is None or config_dir.is_dir(),
+        f"--config-dir must name a folder, got {config_dir}",
+    )
+    if group is not None and name is None and group not in groups:
+        group, name = _group_of(group), group
+    if group is not None and name is not None:
+        _describe(group, name)
+        return
+    for one in groups if group is None else (group,):
+        print(f"{one:>10}: {', '.join(completion.options(one, config_dir))}")
+
+
+def _describe(group: str, name: str) -> None:
+    """Print an option's keys; a study states its own."""
+    from experiments.runs.schema import describe_option
+
+    names = completion.options(group)
+    require(name in names, f"no {group} named {name}; there are: {', '.join(names)}")
+    if group == "study":
+        show((paths.CONF / group / f"{name}.yaml").read_text(encoding="utf-8").rstrip())
+    else:
+        show(describe_option(group, name))
+
+
+def _group_of(name: str) -> str:
+    """Group of an option that is called by its name alone."""
+    found = [group for group in completion.GROUPS if name in completion.options(group)]
+    known = ", ".join(completion.GROUPS)
+    require(found, f"no group or option {name}; the groups are: {known}, metrics")
+    several = " or ".join(f"`estima options {group} {name}`" for group in found)
+    require(len(found) == 1, f"{name} is an option of several groups: {several}")
+    return found[0]
+
+
+def view(
+    what: Annotated[
+        list[str] | None,
+        typer.Argument(
+            help="A recording or a log of any format, then Hydra overrides; or a sweep's NAME/KEY."
+        ),
+    ] = None,
+    estimate: Annotated[
+        str | None,
+        typer.Option(
+            "--estimate",
+            "-e",
+            help="A trajectory (.csv, .tum, .mcap), a run's folder, or an estimator to run now.",
+            autocompletion=completion.estimators,
+        ),
+    ] = None,
+    world: Annotated[
+        bool, typer.Option("--world", help="Draw the world of the overrides instead.")
+    ] = False,
+    grid: Annotated[
+        Path | None,
+        typer.Option("--map", help="An occupancy grid (.yaml) to draw underneath, or alone."),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="File to write: .mp4, .gif, .html; a world or map: .png."),
+    ] = None,
+    seconds: Annotated[
+        float | None,
+        typer.Option(help="Duration (default: real time; of a drive over 70 s in a file, 20)."),
+    ] = None,
+    config_dir: ConfigDir = None,
+) -> None:
+    """Show a run as an animation, in a window or in a file; or draw a world or a map.
+
+    It shows robot, scan, particles or landmarks, truth and estimate. Without -o it opens a window.
+    A run of a sweep is called by the first digits of its key, as `estima report NAME` gives them.
+
+    Examples
+    --------
+      estima view run.npz
+
+      estima view run.npz --estimate fastslam -o run.html
+
+      estima view run.npz --estimate mcl prior.map=world estimator.n_most=2000 -o run.mp4
+
+      estima view --world world=office seed=3 -o office.png
+
+      estima view run.npz -e ekf_icp --map map.yaml -o run.html
+
+      estima view slip/1f0c33ab -o run.html (a run of the sweep slip)
+
+      estima view --map map.yaml -o map.png
+    """
+    from experiments.runs.compose import searched
+    from experiments.sweeps.again import draw_again, row_of
+    from experiments.viewing import play
+
+    if world or (grid is not None and not what):
+        require(not (world and grid), "--world and --map: draw one at a time")
+        print(
+            play.draw_world([*searched(config_dir), *(what or [])], out or Path("world.png"))
+            if grid is None
+            else play.draw_map(grid, out or Path("map.png"))
+        )
+        return
+    if not what or "=" in what[0]:
+        raise InputError("name a recording to view, such as run.npz, or say --world")
+    first, *overrides = what
+    how = play.Showing(out, seconds, grid)
+    if not Path(first).exists() and (row := row_of(first)) is not None:
+        own = "a run of a sweep has its estimator and its settings; leave out others"
+        require(estimate is None and not overrides, f"{first}: {own}")
+        said = draw_again(row, how, first, config_dir)
+    else:
+        ran = estimate is not None or not overrides
+        require(ran, f"{[*overrides, ''][0]}: overrides need an estimator; add --estimate NAME")
+        said = play.play_file(Path(first), estimate, [*searched(config_dir), *overrides], how)
+    if said:
+        print(said)
+
+
+def build_map(
+    what: Annotated[
+        list[str],
+        typer.Argument(help="A recording or a log of any format, then Hydra overrides."),
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="File to write, .yaml; beside it .pgm.")],
+    estimate: Annotated[
+        str,
+        typer.Option(
+            "--estimate",
+            "-e",
+            help="truth, a trajectory (.csv, .tum), a run's folder, or an estimator to run now.",
+            autocompletion=completion.estimators,
+        ),
+    ] = "truth",
+    resolution_m: Annotated[float, typer.Option("--resolution", help="Side of a cell, m.")] = 0.05,
+    max_range_m: Annotated[
+        float | None,
+        typer.Option(
+            "--max-range",
+            help="Beams longer than this only clear cells; metres (default: the laser's range).",
+        ),
+    ] = None,
+    raw: Annotated[
+        bool,
+        typer.Option("--raw", help="Keep probabilities in percent (mode raw), not three states."),
+    ] = False,
+    laser: Annotated[str, typer.Option(help="Name of the laser in the recording.")] = "laser",
+    config_dir: ConfigDir = None,
+) -> None:
+    """Build an occupancy grid from a recording's laser scans and any estimate of its path.
+
+    The files are those of ROS's map server. An estimator with a revised path gives that one.
+
+    Examples
+    --------
+      estima map run.npz -e ekf_icp -o map.yaml
+
+      estima map fr079.log.gz -e truth -o fr079.yaml --max-range 20
+
+      estima run world=office seed=3 sensors=lms291 estimator=mcl prior.map=map.yaml
+    """
+    from experiments.runs.compose import searched
+    from experiments.viewing.map import Gridding, map_file
+
+    how = Gridding(resolution_m, max_range_m, laser, raw)
+    print(map_file(what[0], estimate, [*searched(config_dir), *what[1:]], out, how))

@@ -1,0 +1,163 @@
+"""What is made of a sweep's rows: a table, a chart or a page, as a text or a file."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pandas as pd
+
+from experiments.report.page import write_report
+from experiments.report.plot import Size, sweep_figure
+from experiments.report.sweep_page import extremes, picture_path, write_sweep_page
+from experiments.report.table import as_lines, notes, statuses, write_table
+from experiments.runs import paths
+from experiments.runs.console import counted, progress, show
+from experiments.runs.row import Outcome, write_frame
+from experiments.sweeps.again import draw_again, short_key
+from experiments.sweeps.collect import collect, folder_of, suggested
+from experiments.sweeps.summary import ERROR, summary
+from experiments.viewing.play import Showing
+from experiments.viewing.style import save_figure
+from sim.errors import InputError, require
+
+_FEW_RUNS, _FEW_LINES = 2000, 30
+
+
+def after_sweep(folder: Path, n_runs: int) -> None:
+    """Print a sweep's small table, and what can be done next."""
+    against = ""
+    if n_runs <= _FEW_RUNS:
+        rows = collect(str(folder))
+        if (rows["status"] == Outcome.FAILED).all():
+            (why, count), *_ = statuses(rows)
+            reason = why.removeprefix("failed: ")
+            often = f"All {len(rows)} runs failed, most often ({count}) so"
+            show(f"{often if len(rows) > 1 else 'The run failed'}: {reason}")
+            print(f"\nNext: estima table {folder.name} --rows -o rows.csv  (how each run ended)")
+            return
+        found = summary(rows, metrics=[ERROR] if "ate_rmse_m" in rows else [])
+        if len(found) <= _FEW_LINES:
+            show(as_lines(found, notes(found, None)))
+        sound = rows[rows["status"] != Outcome.FAILED]
+        estimators = sound["choice.estimator"].unique()
+        against = f" --against {estimators[0]}" if len(estimators) > 1 else ""
+    print(f"\nNext: estima table {folder.name}{against} -o table.tex")
+    print(f"      estima plot {folder.name}")
+    print(f"      estima report {folder.name}")
+
+
+def write_rows(rows: pd.DataFrame, out: Path) -> str:
+    """Write every row, with all its columns; say how many."""
+    write_frame(rows, out)
+    return f"{out}: {counted(len(rows), 'row')}, {len(rows.columns)} columns"
+
+
+def table_of(
+    rows: pd.DataFrame,
+    name: str,
+    out: Path | None,
+    against: str | None,
+    metrics: Sequence[str],
+    size: str | None,
+) -> str:
+    """Mean errors of a sweep as lines, or in a file; then it says how many rows that has."""
+    found = summary(rows, against, metrics)
+    note = notes(found, against)
+    if out is not None:
+        write_table(found, note, out, Path(name).name, size)
+        return f"{out}: {counted(len(found), 'row')}"
+    lines = as_lines(found, note)
+    if (rows["status"] != Outcome.OK).any():
+        lines += "\n\n" + "\n".join(f"{count} {words}" for words, count in statuses(rows))
+    return lines
+
+
+@dataclass(frozen=True)
+class Panels:
+    """What a chart shows; see `report.plot.sweep_figure`. Without `x`, all of it is suggested."""
+
+    x: str | None
+    y: str
+    by: Sequence[str]
+    row: str | None
+    col: str | None
+    size: str
+    pool: bool
+
+
+def plot_of(rows: pd.DataFrame, name: str, panels: Panels, out: Path) -> str:
+    """Draw a sweep's chart into a file; return what was chosen, if it was."""
+    require(panels.size in list(Size), f"the size must be {', '.join(Size)}, got {panels.size}")
+    failed = rows["status"] == Outcome.FAILED
+    if failed.all():
+        every = f"all {len(rows)} runs" if len(rows) > 1 else "the run"
+        raise InputError(f"{name}: {every} failed; `estima table {name}` says how")
+    if failed.any():
+        print(f"{failed.sum()} of {len(rows)} runs failed; left out", file=sys.stderr)
+        rows = rows[~failed]
+    chosen = ""
+    if panels.x is None:
+        taken = [each for each in (*panels.by, panels.row, panels.col) if each]
+        x, *others = suggested(rows, taken)
+        panels = replace(panels, x=x)
+        if not taken:
+            panels = replace(panels, by=others[:1], col=next(iter(others[1:]), None))
+        words = [f"--x {x}", *(f"--by {each}" for each in panels.by)]
+        words += [f"--col {panels.col}"] if panels.col else []
+        chosen = f"drawn with {' '.join(words)}"
+    page = sweep_figure(
+        rows,
+        str(panels.x),
+        panels.y,
+        panels.by or None,
+        row=panels.row,
+        col=panels.col,
+        size=panels.size,
+        pool=panels.pool,
+    )
+    save_figure(page, out)
+    return chosen
+
+
+def page_of(
+    rows: pd.DataFrame, name: str, out: Path | None, config_dir: Path | None, *, pictures: bool
+) -> str:
+    """Write a sweep's page, and on request pictures of its extreme runs; return its path."""
+    folder, called = folder_of(name), Path(name).name
+    written = out or folder.parent / f"{called}.html"
+    called = called if folder.parent == paths.results() / "runs" else name
+    if pictures:
+        _draw_extremes(rows, str(folder), called, written, config_dir)
+    write_sweep_page(rows, called, folder, written, config_dir)
+    return paths.short(written)
+
+
+def page_of_papers() -> Path:
+    """Write the page of the papers' studies; return its path."""
+    results = paths.results()
+    require(
+        any((results / name).exists() for name in ("claims.csv", "figures", "tables")),
+        f"{paths.short(results)}: no claims, figures or tables to report; "
+        "`estima reproduce` makes them, and `estima table NAME` shows a sweep",
+    )
+    with progress("report", 1.0) as on_progress:
+        return write_report(results, on_progress)
+
+
+def _draw_extremes(
+    rows: pd.DataFrame, folder: str, called: str, page: Path, config_dir: Path | None
+) -> None:
+    """Draw the best and the worst run of each estimator, unless they are there."""
+    runs = extremes(rows)
+    for _, row in runs[runs["first"] & (runs["kind"] != "failed")].iterrows():
+        out = picture_path(row, page)
+        if out.exists():
+            continue
+        out.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            show(draw_again(row, Showing(out), f"{called}/{short_key(row)}", config_dir, folder))
+        except InputError as error:
+            print(f"{out.name} is not drawn: {error}", file=sys.stderr)

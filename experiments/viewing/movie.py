@@ -1,0 +1,110 @@
+"""Files of an animation: MP4, GIF, or an HTML page that plays."""
+
+import base64
+import html
+import io
+import shutil
+import subprocess
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from experiments.viewing.animation import Picture, pictures
+from experiments.viewing.playback import Playback
+from sim.errors import require
+from sim.files import write_whole
+
+_PLAYER = Path(__file__).parent / "player.html"
+
+
+def check_output(path: Path) -> None:
+    """Refuse a file that could not be written, before anything is computed."""
+    require(path.suffix in _WRITERS, f"{path}: animations are {', '.join(_WRITERS)}")
+    require(
+        path.suffix != ".mp4" or shutil.which("ffmpeg") is not None,
+        f"{path}: MP4 needs ffmpeg, which is not installed; take .gif or .html",
+    )
+
+
+def save(
+    run: Playback, path: Path, on_progress: Callable[[float], None], title: str = "A run"
+) -> None:
+    """Write a run as `.mp4` (needs ffmpeg), `.gif` or `.html`, whole or not at all.
+
+    Parameters
+    ----------
+    on_progress
+        Called with the share done.
+    title
+        Of an `.html`.
+    """
+    check_output(path)
+
+    def counted() -> Iterator[Picture]:
+        for done, picture in enumerate(pictures(run), start=1):
+            yield picture
+            on_progress(done / len(run.stamps))
+
+    with write_whole(path) as part:
+        _WRITERS[path.suffix](run, counted(), part, title)
+
+
+def _write_mp4(run: Playback, images: Iterator[Picture], path: Path, _: str) -> None:
+    first = next(images)
+    size = f"{first.shape[1]}x{first.shape[0]}"
+    raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", f"{run.fps:.4f}", "-i", "-"]
+    command = ["ffmpeg", "-y", "-loglevel", "error", *raw, "-pix_fmt", "yuv420p", str(path)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdin is not None
+        assert process.stderr is not None
+        try:
+            process.stdin.write(first.tobytes())
+            for image in images:
+                process.stdin.write(image.tobytes())
+            process.stdin.close()
+        except BrokenPipeError:
+            pass  # its message says why
+        message = process.stderr.read().decode(errors="replace").strip()
+    require(
+        not process.returncode,
+        f"ffmpeg: {(message.splitlines() or ['failed'])[-1]}; take .gif or .html",
+    )
+
+
+def _reduced(image: Picture) -> Any:
+    """The picture with a palette of its own: a third of the size, with no visible difference."""
+    from PIL import Image
+
+    return Image.fromarray(image).quantize(96, method=Image.Quantize.FASTOCTREE)
+
+
+def _write_gif(run: Playback, images: Iterator[Picture], path: Path, _: str) -> None:
+    first, *rest = (_reduced(image) for image in images)
+    duration_ms = round(1000.0 / run.fps)
+    first.save(path, "GIF", save_all=True, append_images=rest, duration=duration_ms, loop=0)
+
+
+def _write_html(run: Playback, images: Iterator[Picture], path: Path, title: str) -> None:
+    frames: list[str] = []
+    for image in images:
+        data = io.BytesIO()
+        _reduced(image).save(data, format="PNG")
+        frames.append("data:image/png;base64," + base64.b64encode(data.getvalue()).decode())
+    values = {
+        "width": image.shape[1],
+        "height": image.shape[0],
+        "last": len(frames) - 1,
+        "speed": run.speed,
+        "fps": f"{run.fps:.4f}",
+        "times": ", ".join(f'"{run.clock(float(stamp))} s"' for stamp in run.stamps),
+        "first": frames[0],
+        "frames": ",\n".join(f'"{frame}"' for frame in frames),
+        "title": html.escape(title),
+    }
+    page = _PLAYER.read_text(encoding="utf-8")
+    for name, value in values.items():
+        page = page.replace(f"@{name}@", str(value))
+    path.write_text(page, encoding="utf-8")
+
+
+_WRITERS = {".mp4": _write_mp4, ".gif": _write_gif, ".html": _write_html}

@@ -1,0 +1,139 @@
+"""A run as it moves: in a window, or in a file. Pictures of worlds and maps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from experiments.runs import paths
+from experiments.runs.console import progress
+from experiments.runs.experiment import Experiment
+from experiments.viewing import live, movie
+from experiments.viewing.estimates import OnStep, with_estimates
+from experiments.viewing.grid import grid_figure
+from experiments.viewing.playback import FPS, Playback
+from experiments.viewing.style import save_figure
+from experiments.viewing.world import world_figure
+from sim.errors import require
+from sim.formats.detect import read_all
+from sim.team import Team
+from sim.worlds.grid_file import read_grid
+
+MOST_PICTURES = 200  # a page of some 6 MB
+REAL_TIME_S = 70.0  # longest drive of which so many show three instants a second
+SECONDS = 20.0  # how long a longer drive plays
+
+
+@dataclass(frozen=True)
+class Showing:
+    """How a run is shown.
+
+    Attributes
+    ----------
+    out
+        File to write; None for a window, which shows one robot.
+    seconds
+        How long it plays, s; None: in real time, or if a file of a long drive, `SECONDS`.
+    grid
+        File of a map to draw underneath, in files only.
+
+    Raises
+    ------
+    InputError
+        If the file could not be written, or a window should show a map.
+    """
+
+    out: Path | None = None
+    seconds: float | None = None
+    grid: Path | None = None
+
+    def __post_init__(self) -> None:
+        seconds = self.seconds
+        require(
+            seconds is None or 0.0 < seconds <= 3600.0,
+            f"seconds must lie between 0 and 3600, got {seconds}",
+        )
+        require(
+            self.out is not None or self.grid is None,
+            f"{self.grid}: a map is drawn in files only; name one, such as run.html",
+        )
+        if self.out is not None:
+            movie.check_output(self.out)
+
+    def length_s(self, drive_s: float) -> float:
+        """How long a drive plays, s."""
+        in_real_time = self.out is None or drive_s <= REAL_TIME_S
+        return self.seconds or (drive_s if in_real_time else SECONDS)
+
+    def n_pictures(self, drive_s: float) -> int:
+        """How many pictures of it are shown."""
+        count = int(self.length_s(drive_s) * (live.FPS if self.out is None else FPS))
+        limited = self.out is not None and self.seconds is None
+        return min(count, MOST_PICTURES) if limited else count
+
+
+def play(
+    team: Team,
+    how: Showing,
+    called: str,
+    name: str | None = None,
+    estimated: Callable[[Playback, OnStep], Playback] = lambda shown, _: shown,
+) -> str:
+    """Show a run; say what was written, or nothing of a window.
+
+    Parameters
+    ----------
+    called
+        What the run is called.
+    name
+        Of the estimates, or None for the recordings alone.
+    estimated
+        Gives the playback with its estimates.
+    """
+    grid = None if how.grid is None else read_grid(how.grid)
+    if how.out is None:
+        require(len(team) == 1, "a team is drawn in files; name one, such as team.html")
+        live.check_display()
+    shown = Playback.of(team, how.n_pictures(team.duration_s))
+    if name is not None:
+        with progress(name, sum(len(robot.frame_stamps) for robot in team.robots)) as on_step:
+            shown = estimated(shown, on_step)
+    if how.out is None:
+        live.watch(shown, how.seconds)
+        return ""
+    length_s = how.length_s(team.duration_s)
+    shown = replace(shown, grid=grid, seconds=length_s)
+    title = called if name is None else f"{Path(name).name}: {called}"
+    with progress(f"drawing {how.out.name}", 1.0) as on_progress:
+        movie.save(shown, how.out, on_progress, title)
+    said = f"{len(shown.stamps)} pictures, {length_s:.1f} s, {shown.speed}"
+    return f"{paths.short(how.out)}: {said}"
+
+
+def play_file(log: Path, source: str | None, overrides: Sequence[str], how: Showing) -> str:
+    """Show a log, with the estimates of a `source` if it is given; see `play`.
+
+    Parameters
+    ----------
+    source, overrides
+        As for `viewing.estimates.with_estimates`.
+    """
+
+    def estimated(shown: Playback, on_step: OnStep) -> Playback:
+        return with_estimates(shown, str(source), overrides, on_step)
+
+    return play(read_all([log]), how, log.name, source, estimated)
+
+
+def draw_world(overrides: Sequence[str], out: Path) -> Path:
+    """Write the picture of the world of a configuration."""
+    given = [f"world={o}" if "=" not in o else o for o in overrides]
+    save_figure(world_figure(Experiment.compose(given).world()), out)
+    return out
+
+
+def draw_map(path: Path, out: Path) -> Path:
+    """Write the picture of an occupancy grid's file."""
+    save_figure(grid_figure(read_grid(path), path.stem), out)
+    return out
