@@ -133,9 +133,9 @@ def accepted(kind: Any) -> str:
         whole = parts[0] is int
         if not whole and tuple(bounds) in _WHOLE:
             return _WHOLE[tuple(bounds)]
-        said = " and ".join(f"{_SIGNS[sign]} {limit:g}" for sign, limit in bounds)
+        said = " and ".join(f"{_SIGNS[sign]} {_shown(limit)}" for sign, limit in bounds)
         if [sign for sign, _ in bounds] == ["ge", "le"]:
-            said = f"from {bounds[0][1]:g} to {bounds[1][1]:g}"
+            said = f"from {_shown(bounds[0][1])} to {_shown(bounds[1][1])}"
         return (
             f"{'a whole number' if whole else 'a number'}, {said}" if said else accepted(parts[0])
         )
@@ -146,6 +146,11 @@ def accepted(kind: Any) -> str:
         return f"{' or '.join(filter(None, others)) or 'a value'} or null"
     plain = {float: "a number", int: "a whole number", bool: "true or false", str: "a text"}
     return plain.get(kind, "")
+
+
+def _shown(limit: float) -> str:
+    """A bound; whole numbers in full."""
+    return str(limit) if isinstance(limit, int) else f"{limit:g}"
 
 
 def _complaint(cls: type, where: str, error: ValidationError) -> str:

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from estimators.base import Prior, run
+from estimators.topological.node_weights import node_log_weights
 from estimators.topological.place_refinement import Refiner, likely_turns_rad
-from estimators.topological.topological_map import from_arrays, from_recording
-from estimators.topological.topological_mcl import Graph, TopologicalMcl, node_log_weights
+from estimators.topological.topological_map import Edges, from_arrays, from_recording
+from estimators.topological.topological_mcl import TopologicalMcl
 from experiments.gate.conform import check_estimator
 from experiments.papers.maximo2024 import places
 from sim import se2
@@ -92,7 +93,7 @@ def test_the_graph_goes_on_and_never_back_but_at_dead_ends():
         from_arrays(np.random.default_rng(0).normal(size=(6, 2)), np.eye(6)),
         edges=np.array([[0, 1], [1, 2], [1, 4], [2, 3]]),
     )
-    graph = Graph(known)
+    graph = Edges(known)
     assert np.all(graph.tail[graph.reverse] == graph.head)
     assert np.all(graph.reverse[graph.reverse] == np.arange(len(graph.tail)))
     rng = np.random.default_rng(1)
