@@ -1,13 +1,15 @@
 """What every estimator takes and gives: Prior, Belief, Estimate, and the protocol itself."""
 
-from collections.abc import Callable, Collection
-from dataclasses import dataclass, field
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Protocol
 
 import numpy as np
 
 from sim.arrays import Array
-from sim.compiled import wall_s
+from sim.compiled import processor_s, wall_s
 from sim.errors import InputError, require
 from sim.recording import Frame, Recording
 from sim.robot.drive import RobotGeometry
@@ -105,6 +107,9 @@ class Estimate:
     left_out: str = ""
 
 
+Answer = tuple[Estimate, Estimate | None]  # of one robot: online and revised
+
+
 class Estimator(Protocol):
     """A localization method. It may also have `finish() -> Estimate`, the revised trajectory.
 
@@ -123,6 +128,26 @@ class Estimator(Protocol):
     def step(self, frame: Frame) -> Belief:
         """Take in one Frame and answer with the belief after it."""
         ...
+
+
+class OfTeams:
+    """A method for teams of any size; a robot alone is a team of one."""
+
+    def reset_team(self, priors: Sequence[Prior], rng: np.random.Generator) -> None:
+        """Start from the priors of the robots."""
+        raise NotImplementedError
+
+    def step_team(self, frames: Sequence[Frame]) -> list[Belief]:
+        """Take in the Frames of one instant; the belief of each of their robots."""
+        raise NotImplementedError
+
+    def reset(self, prior: Prior, rng: np.random.Generator) -> None:
+        """Start a robot alone from its prior."""
+        self.reset_team((prior,), rng)
+
+    def step(self, frame: Frame) -> Belief:
+        """Take in a Frame of a robot alone; the belief after it."""
+        return self.step_team((frame,))[0]
 
 
 def run(
@@ -152,37 +177,138 @@ def run(
     InputError
         If the first step returns no Belief, or one of other shapes.
     """
-    n_frames = len(recording.frame_stamps)
-    means, covariances = np.empty((n_frames, 3)), np.empty((n_frames, 3, 3))
-    seconds = np.empty(n_frames)
-    extras: dict[str, list[Any]] = {name: [] for name in keep}
-    status = "ok"
+    journal = Journal(estimator, recording, keep, on_step)
     estimator.reset(prior, rng)
-    for i, frame in enumerate(recording.frames()):
+    instants = ((frame,) for frame in recording.frames())
+    walk(lambda frames: [estimator.step(frames[0])], instants, {0: journal})
+    return journal.estimate()
+
+
+def run_to_the_end(
+    estimator: Estimator,
+    recording: Recording,
+    prior: Prior,
+    rng: np.random.Generator,
+    keep: Collection[str] = (),
+    on_step: Callable[[int], None] | None = None,
+) -> Answer:
+    """Run an estimator as `run` does; its online estimate, and the revised one or None.
+
+    The online one has the processor time of all, `finish` included, but for compiling code.
+    """
+    begun = processor_s()
+    online = run(estimator, recording, prior, rng, keep, on_step)
+    revised = revised_by(estimator, 1)
+    own_s = processor_s() - begun
+    spent_s = getattr(estimator, "program_seconds", own_s)  # without the transport to it
+    return answers_of([online], revised, spent_s)[0]
+
+
+def revised_by(estimator: Any, n_robots: int) -> Sequence[Estimate | None]:
+    """Estimate of each robot that `finish` or `finish_team` gives, or None."""
+    finish = getattr(estimator, "finish", None)
+    if n_robots == 1 and finish is not None:
+        return [finish()]
+    finish_team = getattr(estimator, "finish_team", None)
+    paths: Sequence[Estimate | None] = [None] * n_robots if finish_team is None else finish_team()
+    return paths
+
+
+def answers_of(
+    online: Sequence[Estimate], revised: Sequence[Estimate | None], spent_s: float
+) -> list[Answer]:
+    """Answer of each robot; they share the processor time by their Frames."""
+    answers: list[Answer] = []
+    n_frames = sum(len(own.stamps) for own in online)
+    for own, path in zip(online, revised, strict=True):
+        share_s = spent_s * (len(own.stamps) / n_frames)
+        if path is not None and path.kind == "online":
+            own, path = path, None
+        answers.append((replace(own, cpu_seconds=share_s), path))
+    return answers
+
+
+def walk(
+    step: Callable[[tuple[Frame, ...]], Sequence[Belief]],
+    instants: Iterable[tuple[Frame, ...]],
+    journals: Mapping[int, Journal],
+) -> None:
+    """Take in instant by instant, and note the beliefs of the robots that have a journal.
+
+    Parameters
+    ----------
+    step
+        Takes in the Frames of one instant; the belief of each of their robots.
+    journals
+        By number of the robot. The time of a step is shared out evenly among its Frames.
+    """
+    for frames in instants:
         begun = wall_s()
-        belief = estimator.step(frame)
-        seconds[i] = wall_s() - begun
+        beliefs = step(frames)
+        share_s = (wall_s() - begun) / len(frames)
+        for frame, belief in zip(frames, beliefs, strict=True):
+            if frame.robot in journals:
+                journals[frame.robot].note(frame, belief, share_s)
+
+
+class Journal:
+    """The beliefs that an estimator holds of a robot, one for each of its Frames.
+
+    Parameters
+    ----------
+    keep, on_step
+        As in `run`.
+    """
+
+    def __init__(
+        self,
+        estimator: Any,
+        recording: Recording,
+        keep: Collection[str] = (),
+        on_step: Callable[[int], None] | None = None,
+    ) -> None:
+        n_frames = len(recording.frame_stamps)
+        self._estimator, self._stamps, self._on_step = estimator, recording.frame_stamps, on_step
+        self._means, self._covariances = np.empty((n_frames, 3)), np.empty((n_frames, 3, 3))
+        self._seconds, self._n_noted = np.empty(n_frames), 0
+        self._extras: dict[str, list[Any]] = {name: [] for name in keep}
+        self._status = "ok"
+
+    def note(self, frame: Frame, belief: Belief, seconds: float) -> None:
+        """Add the belief after a Frame, which took a step of this time.
+
+        Raises
+        ------
+        InputError
+            If the first is not a Belief, or has other shapes.
+        """
+        i = self._n_noted
         if i == 0:
-            _check_belief(belief, estimator)
-        means[i], covariances[i] = belief.mean, belief.covariance
-        for name in keep:
-            extras[name].append(belief.extras.get(name))
-        if status == "ok" and belief.extras.get("status", "ok") != "ok":
-            status = f"{belief.extras['status']} at {frame.stamp:.2f} s"
-        if on_step is not None:
-            on_step(i + 1)
-    return Estimate(
-        stamps=recording.frame_stamps.copy(),
-        means=means,
-        covariances=covariances,
-        step_seconds=seconds,
-        map=getattr(estimator, "map", None),
-        extras=extras,
-        status=status,
-    )
+            _check_belief(belief, self._estimator)
+        self._means[i], self._covariances[i] = belief.mean, belief.covariance
+        self._seconds[i] = seconds
+        for name, values in self._extras.items():
+            values.append(belief.extras.get(name))
+        if self._status == "ok" and belief.extras.get("status", "ok") != "ok":
+            self._status = f"{belief.extras['status']} at {frame.stamp:.2f} s"
+        self._n_noted = i + 1
+        if self._on_step is not None:
+            self._on_step(i + 1)
+
+    def estimate(self) -> Estimate:
+        """Online estimate of what was noted."""
+        return Estimate(
+            stamps=self._stamps.copy(),
+            means=self._means,
+            covariances=self._covariances,
+            step_seconds=self._seconds,
+            map=getattr(self._estimator, "map", None),
+            extras=self._extras,
+            status=self._status,
+        )
 
 
-def _check_belief(belief: Any, estimator: Estimator) -> None:
+def _check_belief(belief: Any, estimator: Any) -> None:
     wanted = (
         f"{type(estimator).__name__}.step must return a Belief with a mean of shape (3,) "
         "and a covariance of shape (3, 3)"

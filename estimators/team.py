@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -10,22 +11,33 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from estimators.base import Belief, Estimate, Prior
+from estimators.base import (
+    Answer,
+    Belief,
+    Estimate,
+    Journal,
+    Prior,
+    answers_of,
+    revised_by,
+    run_to_the_end,
+    walk,
+)
 from estimators.gaussian import Gaussian
 from estimators.landmarks.sightings import dead_reckoning
 from estimators.options import require_choices
-from sim.compiled import wall_s
+from sim.compiled import processor_s
 from sim.errors import require, required
-from sim.recording import Frame
+from sim.recording import Frame, Recording
 from sim.team import Team
 
 Kind = Literal["always", "range", "delayed", "never"]
-Step = tuple[float, Belief, float]  # stamp, belief, seconds of the step
-Answer = tuple[Estimate, Estimate | None]  # of one robot: online and revised
 
 
 class TeamEstimator(Protocol):
-    """A method for teams. It may also have `finish_team() -> list[Estimate]`, revised paths."""
+    """A method for teams of any size. It may also have `finish_team() -> list[Estimate]`.
+
+    To run robots that never communicate, it is an `Estimator` too.
+    """
 
     wheels: Any
 
@@ -75,7 +87,7 @@ class Communication:
 
 
 def run_team(
-    make: Callable[[], TeamEstimator],
+    make: Callable[[], Any],
     team: Team,
     priors: Sequence[Prior],
     rng: Callable[[int], np.random.Generator],
@@ -88,7 +100,7 @@ def run_team(
     Parameters
     ----------
     make
-        Makes an estimator.
+        Makes a `TeamEstimator`; of robots that never communicate, any `Estimator`.
     rng
         Gives the generator of each robot's filter; a common filter has that of robot 0.
     communication
@@ -101,80 +113,56 @@ def run_team(
     Returns
     -------
     list
-        Of each robot, the online estimate at its Frames, and the revised one or None.
+        Of each robot, the online estimate at its Frames, and the revised one or None. Robots that
+        communicate share the processor time.
     """
-    kind = (communication or Communication()).kind
-    counted = _counter(on_step or (lambda _: None))
-    if kind == "never":
+    communication = communication or Communication()
+    count = itertools.count(1)
+    tell = None if on_step is None else lambda _: on_step(next(count))
+    if communication.kind == "never":
         return [
-            _run_alone(make(), map(counted, recording.frames()), prior, rng(number))
+            run_to_the_end(make(), recording, prior, rng(number), on_step=tell)
             for number, (recording, prior) in enumerate(zip(team.robots, priors, strict=True))
         ]
-    instants = (tuple(map(counted, frames)) for frames in team.instants())
-    if kind == "range":
-        near = required(contacts, "communication by range needs the contacts of the robots")
-        return _run_in_contact(make, instants, priors, rng, near)
-    estimator = make()
-    estimator.reset_team(priors, rng(0))
-    steps: list[list[Step]] = [[] for _ in priors]
-    for frames in instants:
-        for robot, each in _stepped(estimator, frames).items():
-            steps[robot].append(each)
-    if communication is not None and communication.delay_s is not None:
-        late = dead_reckoning(estimator.wheels, priors)
-        return [
-            (_estimate(_late(*each, communication.delay_s), estimator), None)
-            for each in zip(steps, team.robots, priors, late, strict=True)
-        ]
-    revised = _revised(estimator, len(priors))
-    return [(_estimate(each, estimator), path) for each, path in zip(steps, revised, strict=True)]
-
-
-def _counter(on_step: Callable[[int], None]) -> Callable[[Frame], Frame]:
-    """Function that passes Frames on, and tells how many."""
-    numbers = itertools.count(1)
-
-    def counted(frame: Frame) -> Frame:
-        on_step(next(numbers))
-        return frame
-
-    return counted
-
-
-def _stepped(estimator: TeamEstimator, frames: Sequence[Frame]) -> dict[int, Step]:
-    """Beliefs by robot after one instant; the time is shared out evenly."""
-    begun = wall_s()
-    beliefs = estimator.step_team(frames)
-    share_s = (wall_s() - begun) / len(frames)
-    return {
-        frame.robot: (frame.stamp, belief, share_s)
-        for frame, belief in zip(frames, beliefs, strict=True)
-    }
-
-
-def _run_alone(
-    estimator: TeamEstimator, frames: Iterator[Frame], prior: Prior, rng: np.random.Generator
-) -> Answer:
-    estimator.reset_team((prior,), rng)
-    steps = [_stepped(estimator, (frame,))[0] for frame in frames]
-    return _estimate(steps, estimator), _revised(estimator, 1)[0]
-
-
-def _run_in_contact(
-    make: Callable[[], TeamEstimator],
-    instants: Iterator[tuple[Frame, ...]],
-    priors: Sequence[Prior],
-    rng: Callable[[int], np.random.Generator],
-    contacts: NDArray[np.bool_],
-) -> list[Answer]:
-    """Each robot with a filter of the team, which takes in each Frame that reaches it once."""
-    n = len(priors)
-    filters = [make() for _ in range(n)]
+    begun, n = processor_s(), len(team)
+    filters = [make() for _ in range(n if communication.kind == "range" else 1)]
     for number, each in enumerate(filters):
         each.reset_team(priors, rng(number))
+    of_robots = filters if len(filters) == n else n * filters
+    journals = {
+        number: Journal(each, recording, on_step=tell)
+        for number, (each, recording) in enumerate(zip(of_robots, team.robots, strict=True))
+    }
+    if communication.kind == "range":
+        near = required(contacts, "communication by range needs the contacts of the robots")
+        for robot, instants in _heard(team.instants(), near):
+            walk(filters[robot].step_team, instants, {robot: journals[robot]})
+    else:
+        walk(filters[0].step_team, team.instants(), journals)
+    online = [journal.estimate() for journal in journals.values()]
+    revised: Sequence[Estimate | None] = [None] * n
+    if communication.delay_s is not None:
+        late = dead_reckoning(filters[0], priors)
+        online = [
+            _late(*each, communication.delay_s)
+            for each in zip(online, team.robots, priors, late, strict=True)
+        ]
+    else:
+        paths = [revised_by(each, n) for each in filters]
+        revised = paths[0] if len(filters) == 1 else [own[k] for k, own in enumerate(paths)]
+    return answers_of(online, revised, processor_s() - begun)
+
+
+def _heard(
+    instants: Iterator[tuple[Frame, ...]], contacts: NDArray[np.bool_]
+) -> Iterator[tuple[int, list[tuple[Frame, ...]]]]:
+    """Number of each robot that has a Frame, and the instants that it did not know before.
+
+    Each Frame reaches each robot once; its own at once, and last of all.
+    """
+    n = contacts.shape[1]
     logs: list[list[Frame]] = [[] for _ in range(n)]
     known, taken = np.zeros((2, n, n), np.int64)  # of each robot, how many Frames of each other
-    steps: list[list[Step]] = [[] for _ in range(n)]
     for frames, near in zip(instants, contacts, strict=True):
         for frame in frames:
             logs[frame.robot].append(frame)
@@ -190,19 +178,14 @@ def _run_in_contact(
             ]
             taken[robot] = known[robot]
             news.sort(key=lambda one: (one.stamp, one.robot))
-            for _, instant in itertools.groupby(news, key=lambda one: one.stamp):
-                beliefs = _stepped(filters[robot], tuple(instant))
-            steps[robot].append(beliefs[robot])
-    return [
-        (_estimate(each, one), _revised(one, n)[number])
-        for number, (each, one) in enumerate(zip(steps, filters, strict=True))
-    ]
+            grouped = itertools.groupby(news, key=lambda one: one.stamp)
+            yield robot, [tuple(instant) for _, instant in grouped]
 
 
 def _late(
-    steps: list[Step], recording: Any, prior: Prior, wheels: Any, delay_s: float
-) -> list[Step]:
-    """Beliefs that answers so late leave: the last answer, carried on by the wheels."""
+    online: Estimate, recording: Recording, prior: Prior, wheels: Any, delay_s: float
+) -> Estimate:
+    """What estimates so late leave: the last one known, carried on by the wheels."""
     frames = list(recording.frames())
     motions = [wheels.predict(frame) for frame in frames]
     nowhere = np.full(3, np.nan), np.full((3, 3), np.nan)
@@ -210,33 +193,14 @@ def _late(
     start = Gaussian(*((prior.mean, prior.covariance) if known else nowhere))
     answered, found = -1, []
     for row, frame in enumerate(frames):
-        while answered + 1 < row and steps[answered + 1][0] <= frame.stamp - delay_s + 1e-9:
+        while answered + 1 < row and online.stamps[answered + 1] <= frame.stamp - delay_s + 1e-9:
             answered += 1
-        last = steps[answered][1] if answered >= 0 else None
-        belief = start if last is None else Gaussian(last.mean, last.covariance)
+        belief = start
+        if answered >= 0:
+            belief = Gaussian(online.means[answered], online.covariances[answered])
         for motion in motions[answered + 1 : row + 1]:
             belief = belief.then(motion)
-        found.append((frame.stamp, Belief(belief.mean, belief.covariance), steps[row][2]))
-    return found
-
-
-def _revised(estimator: TeamEstimator, n_robots: int) -> Sequence[Estimate | None]:
-    finish = getattr(estimator, "finish_team", None)
-    paths: Sequence[Estimate | None] = [None] * n_robots if finish is None else finish()
-    return paths
-
-
-def _estimate(steps: Sequence[Step], estimator: TeamEstimator) -> Estimate:
-    odd = (
-        f"{belief.extras['status']} at {stamp:.2f} s"
-        for stamp, belief, _ in steps
-        if belief.extras.get("status", "ok") != "ok"
-    )
-    return Estimate(
-        stamps=np.array([stamp for stamp, _, _ in steps]),
-        means=np.array([belief.mean for _, belief, _ in steps]),
-        covariances=np.array([belief.covariance for _, belief, _ in steps]),
-        step_seconds=np.array([seconds for _, _, seconds in steps]),
-        map=getattr(estimator, "map", None),
-        status=next(odd, "ok"),
-    )
+        found.append(belief)
+    means = np.array([belief.mean for belief in found])
+    covariances = np.array([belief.covariance for belief in found])
+    return dataclasses.replace(online, means=means, covariances=covariances, status="ok")

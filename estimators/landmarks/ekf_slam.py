@@ -11,18 +11,17 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
-from estimators.base import Belief, Prior
+from estimators.base import Belief, OfTeams, Prior
 from estimators.gaussian import STILL, Gaussian, compose, wrap
+from estimators.landmarks.joint import JointGaussian, mahalanobis_squared
 from estimators.landmarks.sightings import Sightings, dead_reckoning, pose_by_points, team_starts
-from estimators.landmarks.slam_frontend import Association, Image, SlamFrontEnd
-from estimators.landmarks.stereo import LEAST_DEPTH_M, NoiseAt, NoiseModel
-from estimators.landmarks.wheel_gains import NO_MOTION, GainBelief, gained_motion
-from estimators.options import require_choices, require_positive
-from estimators.wheels import ForwardSlipOptions
+from estimators.landmarks.slam_frontend import Image, LandmarkSlamOptions, SlamFrontEnd
+from estimators.landmarks.stereo import LEAST_DEPTH_M
+from estimators.landmarks.wheel_gains import NO_MOTION, GainOptions, gained_motion
 from sim.arrays import Array, Ints
 from sim.errors import require
+from sim.options import options
 from sim.recording import Frame
 
 Errors = Literal["coordinates", "invariant"]
@@ -34,7 +33,28 @@ _ENTERS = np.diag(np.square([10.0, 10.0, 1.0]))
 _REFINEMENTS = 5
 
 
-class EkfSlam:
+@options("estimator")
+class EkfSlamOptions(LandmarkSlamOptions, GainOptions):
+    """Options of EKF-SLAM."""
+
+    errors: Errors = "coordinates"
+    """What the covariance is of. `coordinates`: the differences of headings and positions.
+    `invariant`: the turn and shift of the whole map about the origin of the map frame, and what is
+    left of each landmark: x = R(e_turn) x_hat + e_x for every position x, the robot's too. What is
+    seen does not change with the turn, so no update can make the heading of the whole map look
+    known, which linearising at ever other estimates does (Barrau and Bonnabel, "An EKF-SLAM
+    algorithm with consistency properties", 2015)."""
+
+    def __post_init__(self) -> None:
+        LandmarkSlamOptions.__post_init__(self)
+        GainOptions.__post_init__(self)
+        require(
+            not (self.gain_sigma and self.errors == "invariant"),
+            "ekf_slam: errors=invariant knows the gains; set estimator.gain_sigma=0",
+        )
+
+
+class EkfSlam(EkfSlamOptions, OfTeams):
     """Extended Kalman filter over pose and landmarks.
 
     At an image the motion since the last one is applied, the landmarks seen are associated, all of
@@ -43,45 +63,6 @@ class EkfSlam:
     Of a team, a sighting updates the poses of both robots. One of unknown start enters the map at
     the first instant that shows two points of it a metre apart: landmarks, robots that it sees, or
     itself as another sees it.
-
-    Parameters
-    ----------
-    association
-        `known`: by the ids that the sensor gives. `mahalanobis`: least distance below `d0`,
-        gil2008, eq. (15). `descriptor`: of those below `d0`, the one that distance and descriptor
-        together favour.
-    d0
-        Threshold of the squared Mahalanobis distance (99.9 % of three degrees of freedom).
-    noise_model, noise_at
-        As in `estimators.landmarks.stereo.StereoModel.of`.
-    sigma_column_px, sigma_row_px, sigma_disparity_px, sigma_descriptor
-        Believed noise; None for that of the prior's camera.
-    errors
-        What the covariance is of. `coordinates`: the differences of headings and positions.
-        `invariant`: the turn and shift of the whole map about the origin of the map frame, and what
-        is left of each landmark: x = R(e_turn) x_hat + e_x for every position x, the robot's too.
-        What is seen does not change with the turn, so no update can make the heading of the whole
-        map look known, which linearising at ever other estimates does (Barrau and Bonnabel, "An
-        EKF-SLAM algorithm with consistency properties", 2015).
-    gate_probability, repeat_s
-        Of known ids, as in `estimators.landmarks.slam_frontend.SlamFrontEnd`: misread ones are
-        left out, and a landmark counts once in `repeat_s`.
-    kr, kl
-        Believed slip variance per metre of the wheels, m.
-    forward_slip_m
-        Believed variance per metre of what both wheels slip together, m.
-    gain_sigma, gain_wander_m
-        The wheels' gains and the track are states too, of this deviation at the start, a share of
-        them, and this variance per metre of the way (`estimators.landmarks.wheel_gains`). 0: they
-        are known.
-    window_s
-        |ds| is netted over at least this time.
-    keep_map
-        Put the map into every Belief.
-    robots
-        Name of the sensor that sees the other robots of a team; None: sightings are not used.
-    sighting_d0
-        Squared Mahalanobis distance from which on a sighting is a misread robot, and rejected.
 
     Notes
     -----
@@ -96,63 +77,6 @@ class EkfSlam:
 
     needs = frozenset({"stereo"})
 
-    def __init__(
-        self,
-        association: Association = "known",
-        d0: float = 16.27,
-        noise_model: NoiseModel = "camera",
-        noise_at: NoiseAt = "predicted",
-        sigma_column_px: float | None = None,
-        sigma_row_px: float | None = None,
-        sigma_disparity_px: float | None = None,
-        sigma_descriptor: float | None = None,
-        errors: Errors = "coordinates",
-        gate_probability: float | None = None,
-        repeat_s: float = 0.0,
-        kr: float = 5e-5,
-        kl: float = 5e-5,
-        forward_slip_m: float = 0.0,
-        gain_sigma: float = 0.0,
-        gain_wander_m: float = 0.0,
-        window_s: float = 0.05,
-        keep_map: bool = False,
-        stereo: str = "stereo",
-        robots: str | None = None,
-        sighting_d0: float = 16.27,
-    ) -> None:
-        require_positive(sighting_d0=sighting_d0)
-        require_choices(errors=(errors, Errors))
-        self.stereo, self.robots, self.sighting_d0 = stereo, robots, sighting_d0
-        self.invariant = errors == "invariant"
-        self.wheels = ForwardSlipOptions(
-            kr=kr, kl=kl, window_s=window_s, forward_slip_m=forward_slip_m
-        )
-        self._gain_belief = GainBelief(gain_sigma, gain_wander_m)
-        require(
-            not (gain_sigma and self.invariant),
-            "ekf_slam: errors=invariant knows the gains; set estimator.gain_sigma=0",
-        )
-        self.front_end = SlamFrontEnd(
-            "ekf_slam",
-            stereo,
-            association,
-            d0,
-            noise_model,
-            noise_at,
-            gate_probability,
-            repeat_s,
-            sigma_column_px=sigma_column_px,
-            sigma_row_px=sigma_row_px,
-            sigma_disparity_px=sigma_disparity_px,
-            sigma_descriptor=sigma_descriptor,
-        )
-        self._noise = noise_model, noise_at
-        self.keep_map = keep_map
-
-    def reset(self, prior: Prior, rng: np.random.Generator) -> None:
-        """Start from the prior's pose, with an empty map."""
-        self.reset_team((prior,), rng)
-
     def reset_team(self, priors: Sequence[Prior], rng: np.random.Generator) -> None:
         """Start a team from the priors of its robots; that of robot 0 has a pose.
 
@@ -162,36 +86,32 @@ class EkfSlam:
             If the robots do not carry the same sensors, a start is unknown and the camera does not
             identify landmarks, or the errors are invariant.
         """
+        n, self.invariant = len(priors), self.errors == "invariant"
         require(
-            len(priors) == 1 or not self.invariant,
+            n == 1 or not self.invariant,
             "ekf_slam: errors=invariant is of one robot; set estimator.errors=coordinates",
         )
         require(
-            len(priors) == 1 or not self._gain_belief.sigma,
+            n == 1 or not self.gain_sigma,
             "ekf_slam: gains of wheels are of one robot; set estimator.gain_sigma=0",
         )
+        self.front_end = SlamFrontEnd(self, priors[0], "ekf_slam")
         starts = team_starts(priors, self.front_end, "ekf_slam")
-        self._sightings = Sightings.of(priors, self.robots, *self._noise, "ekf_slam")
-        self._camera = self.front_end.camera
-        self._wheels = dead_reckoning(self.wheels, priors)
-        n = len(priors)
+        noise = self.noise_model, self.noise_at
+        self._sightings = Sightings.of(priors, self.robots, "ekf_slam", *noise)
+        self._camera, self._wheels = self.front_end.camera, dead_reckoning(self, priors)
         self._is_placed = [start is not None for start in starts]
-        self._gains = slice(3 * n, 3 * n + 3) if self._gain_belief.sigma else None
-        self._first_landmark = 3 * n + (3 if self._gains else 0)
-        self._mean = np.zeros(self._first_landmark)
-        self._room = np.zeros((self._first_landmark, self._first_landmark))
+        self._gains = slice(3 * n, 3 * n + 3) if self.gain_sigma else None
+        self._first_landmark = first = 3 * n + (3 if self._gains else 0)
+        mean, P = np.zeros(first), np.zeros((first, first))
         if self._gains:
-            self._room[self._gains, self._gains] = self._gain_belief.covariance
+            P[self._gains, self._gains] = self.gain_sigma**2 * np.eye(3)
             self._gained, self._nominal_track_m = NO_MOTION, priors[0].robot.track_m
         for robot, start in enumerate(starts):
             if start is not None:
-                self._mean[_own(robot)] = start.mean
-                self._room[_own(robot), _own(robot)] = start.covariance
+                mean[_own(robot)], P[_own(robot), _own(robot)] = start.mean, start.covariance
+        self._state = JointGaussian(mean, P, first + 3 * _MOST_LANDMARKS)
         self._motions = [STILL] * n  # since the last image
-
-    def step(self, frame: Frame) -> Belief:
-        """Roll by the wheels; at an image, associate, update, and add new landmarks."""
-        return self.step_team((frame,))[0]
 
     def step_team(self, frames: Sequence[Frame]) -> list[Belief]:
         """Take in the Frames of one instant; the belief of each of their robots.
@@ -217,7 +137,9 @@ class EkfSlam:
         """Add a Frame to a robot's motion since its last image."""
         robot, wheels = frame.robot, self._wheels[frame.robot]
         if self._gains:
-            by_gains = gained_motion(wheels, frame, self._mean[self._gains], self._nominal_track_m)
+            by_gains = gained_motion(
+                wheels, frame, self._state.mean[self._gains], self._nominal_track_m
+            )
             self._gained = self._gained.then(by_gains)
         else:
             self._motions[robot] = self._motions[robot].then(wheels.predict(frame))
@@ -226,13 +148,13 @@ class EkfSlam:
         if not self._is_placed[frame.robot]:
             return Belief(np.full(3, np.nan), np.full((3, 3), np.nan), extras)
         own = _own(frame.robot)
-        pose = Gaussian(self._mean[own], self._pose_covariance(frame.robot))
+        pose = Gaussian(self._state.mean[own], self._pose_covariance(frame.robot))
         if self._gains:
             both = slice(own.start, self._gains.stop)  # of one robot: its pose and the gains
-            P = self._covariance[both, both].copy()
+            P = self._state.covariance[both, both].copy()
             mean = self._gained.applied(pose.mean, P, slice(0, 3), slice(3, 6))
             pose = Gaussian(mean, P[:3, :3])
-            extras["wheel_gains"] = self._mean[self._gains].copy()
+            extras["wheel_gains"] = self._state.mean[self._gains].copy()
         else:
             pose = pose.then(self._motions[frame.robot])
         if self.keep_map:
@@ -246,7 +168,7 @@ class EkfSlam:
         `origins` (N,) are the observations, counted over the run, that started them; `ids` (N,)
         are the sensor's, if it gives any.
         """
-        n, P, first = self._n_landmarks, self._covariance, self._first_landmark
+        n, P, first = self._n_landmarks, self._state.covariance, self._first_landmark
         every = np.arange(n)
         blocks = P[first:, first:].reshape(n, 3, n, 3)[every, :, every].reshape(n, 3, 3)
         means = self._landmarks.copy()
@@ -258,35 +180,25 @@ class EkfSlam:
         return self.front_end.map(means, blocks, slice(n))
 
     @property
-    def _n_robots(self) -> int:
-        return len(self._motions)
-
-    @property
     def _n_landmarks(self) -> int:
-        return (len(self._mean) - self._first_landmark) // 3
+        return (len(self._state.mean) - self._first_landmark) // 3
 
     @property
     def _landmarks(self) -> Array:
-        return self._mean[self._first_landmark :].reshape(-1, 3)
-
-    @property
-    def _covariance(self) -> Array:
-        """The part of the allotted room that is in use."""
-        n = len(self._mean)
-        return self._room[:n, :n]
+        return self._state.mean[self._first_landmark :].reshape(-1, 3)
 
     def _move(self, robot: int) -> None:
         """Apply a robot's motion since its last image to its pose and to its correlations."""
-        P, own, motion = self._covariance, _own(robot), self._motions[robot]
+        P, own, motion = self._state.covariance, _own(robot), self._motions[robot]
         if self._gains:
-            walked = self._gain_belief.wander_m * self._gained.travel_m
-            self._mean[own] = self._gained.applied(self._mean[own], P, own, self._gains)
+            walked = self.gain_wander_m * self._gained.travel_m
+            self._state.mean[own] = self._gained.applied(self._state.mean[own], P, own, self._gains)
             P[self._gains, self._gains] += walked * np.eye(3)
             self._gained = NO_MOTION
             return
-        mean, by_pose, by_motion = compose(self._mean[own], motion.mean)
+        mean, by_pose, by_motion = compose(self._state.mean[own], motion.mean)
         noise = by_motion @ motion.covariance @ by_motion.T
-        self._mean[own], self._motions[robot] = mean, STILL
+        self._state.mean[own], self._motions[robot] = mean, STILL
         if self.invariant:
             # a turn of the robot alone is one of the whole map, and of the landmarks back
             by_noise = np.zeros((len(P), 3))
@@ -309,10 +221,10 @@ class EkfSlam:
             extras["status"] = f"observations beyond {_MOST_OBSERVATIONS} rejected"
         slots = (
             self.front_end.known(image)
-            if self.front_end.association == "known"
+            if self.front_end.identified
             else self._associate(robot, image.points, self.front_end.unlikeness(image))
         )
-        if self.front_end.gated and len(slots):
+        if self.gate_probability is not None and len(slots):
             passed = self._passed(robot, image, slots)
             image, slots = image.of(passed), slots[passed]
         self.front_end.counted(image, frame)
@@ -334,7 +246,7 @@ class EkfSlam:
         slots = np.full(len(points), -1)
         if len(points) == 0 or self._n_landmarks == 0:
             return slots
-        predicted = self._camera.predict(self._mean[_own(robot)], self._landmarks)[0]
+        predicted = self._camera.predict(self._state.mean[_own(robot)], self._landmarks)[0]
         near = predicted[:, 2] > LEAST_DEPTH_M
         candidates = np.flatnonzero(
             near & (np.linalg.norm(predicted, axis=1) < self.front_end.reach_m)
@@ -344,8 +256,8 @@ class EkfSlam:
         _, *by = self._predict(robot, self._landmarks[candidates])
         spread = self._predicted_spread(_own(robot), self._rows(candidates), *by)
         v, R = self._camera.innovation(predicted[None, candidates], points[:, None])
-        distances = _distances(spread, v, R)
-        scores = np.where(distances < self.front_end.d0, distances, np.inf)
+        distances = mahalanobis_squared(v, spread + R)
+        scores = np.where(distances < self.d0, distances, np.inf)
         if unlikeness.shape[1] > 0:
             unlike = unlikeness[:, candidates]
             scores = np.where(unlike > 0.0, np.inf, scores + unlike)
@@ -361,8 +273,8 @@ class EkfSlam:
         own, old = _own(robot), slots[slots >= 0]
         predicted, *by = self._predict(robot, self._landmarks[old])
         v, R = self._camera.innovation(predicted, image.points[slots >= 0])
-        distances = _distances(self._predicted_spread(own, self._rows(old), *by), v, R)
-        return self.front_end.passed(image, slots, distances, self._mean[own])
+        distances = mahalanobis_squared(v, self._predicted_spread(own, self._rows(old), *by) + R)
+        return self.front_end.passed(image, slots, distances, self._state.mean[own])
 
     def _rows(self, slots: Ints) -> Ints:
         """Rows (K, 3) of landmarks in the state."""
@@ -370,7 +282,7 @@ class EkfSlam:
 
     def _predicted_spread(self, own: slice, at: Ints, of_pose: Array, of_other: Array) -> Array:
         """H P H^T (n, 3, 3) of each of n observations apart; arguments as in `_update`."""
-        P = self._covariance
+        P = self._state.covariance
         cross = P[own][:, at].transpose(1, 0, 2)
         theirs = P[at[:, :, None], at[:, None, :]]
         turned = of_other.transpose(0, 2, 1)
@@ -400,76 +312,57 @@ class EkfSlam:
         of_pose, of_other
             (K, 3, 3) derivatives of the predicted points by these.
         """
-        P, K, n = self._covariance, len(at), 3 * len(at)
-        rows = P[at].reshape(K, 3, -1)
-        HP = (of_pose @ P[own] + of_other @ rows).reshape(n, -1)  # H has two blocks a row
-        along = HP[:, at].reshape(n, K, 3).transpose(1, 0, 2)
-        S = HP[:, own] @ of_pose.reshape(n, 3).T
-        S += (along @ of_other.transpose(0, 2, 1)).transpose(1, 0, 2).reshape(n, n)
-        for k in range(K):
+        HP, S, by_other = self._state.predicted(own, at, of_pose, of_other)
+        S += by_other
+        for k in range(len(at)):
             S[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += R[k]
-        try:
-            factor = cho_factor((S + S.T) / 2.0, lower=True)
-        except np.linalg.LinAlgError:
-            return False
-        self._correct(HP.T @ cho_solve(factor, v.ravel()))
-        half = solve_triangular(factor[0], HP, lower=True)
-        P -= half.T @ half  # symmetric to the last bit
-        return True
+        correction = self._state.update(HP, S, v)
+        if correction is not None:
+            self._correct(correction)
+        return correction is not None
 
     def _correct(self, by: Array) -> None:
         """Correct the mean by an error (n,): added, or a motion of the whole map."""
         if self.invariant:
             turn = float(by[2])
             R, V = _exponential(turn)
-            blocks = self._mean.reshape(-1, 3)  # pose and landmarks
+            blocks = self._state.mean.reshape(-1, 3)  # pose and landmarks
             blocks[:, :2] = blocks[:, :2] @ R.T + by.reshape(-1, 3)[:, :2] @ V.T
-            self._mean[5::3] += by[5::3]
-            self._mean[2] += turn
+            self._state.mean[5::3] += by[5::3]
+            self._state.mean[2] += turn
         else:
-            self._mean += by
-        for row in range(2, 3 * self._n_robots, 3):
-            self._mean[row] = wrap(float(self._mean[row]))
+            self._state.mean += by
+        for row in range(2, 3 * len(self._motions), 3):
+            self._state.mean[row] = wrap(float(self._state.mean[row]))
 
     def _predict(self, robot: int, landmarks: Array) -> tuple[Array, Array, Array]:
         """Predicted points of landmarks (K, 3) and their derivatives by the errors."""
-        predicted, of_pose, of_landmark = self._camera.predict(self._mean[_own(robot)], landmarks)
+        predicted, of_pose, of_landmark = self._camera.predict(
+            self._state.mean[_own(robot)], landmarks
+        )
         if self.invariant:
             of_pose = of_pose * [1.0, 1.0, 0.0]
         return predicted, of_pose, of_landmark
 
     def _pose_covariance(self, robot: int) -> Array:
         """Covariance (3, 3) of the coordinates of a robot's pose."""
-        P = self._covariance[_own(robot), _own(robot)]
+        P = self._state.covariance[_own(robot), _own(robot)]
         if not self.invariant:
             return P
         by_error = np.eye(3)
-        by_error[:2, 2] = _quarter_turned(self._mean[:3])[:2]
+        by_error[:2, 2] = _quarter_turned(self._state.mean[:3])[:2]
         covariance: Array = by_error @ P @ by_error.T
         return covariance
 
     def _create(self, robot: int, points: Array) -> None:
         """Append landmarks at points (K, 3), gil2008, eqs. (16)-(18), with their correlations."""
-        own, before, n = _own(robot), len(self._mean), 3 * len(points)
-        pose = self._mean[own]
-        placed = self._camera.place(np.tile(pose, (len(points), 1)), points)
+        own = _own(robot)
+        placed = self._camera.place(np.tile(self._state.mean[own], (len(points), 1)), points)
         predicted, of_pose, of_landmark = self._predict(robot, placed)
         # p = C (l - t(pose)) and so l = t(pose) + C^T p
         C_T = of_landmark.transpose(0, 2, 1)
-        by_pose = -(C_T @ of_pose).reshape(n, 3)
         R = self._camera.innovation(predicted, points)[1]
-        after = before + n
-        if after > len(self._room):
-            wanted = min(after + after // 2, self._first_landmark + 3 * _MOST_LANDMARKS)
-            self._room = np.pad(self._covariance, (0, wanted - before))
-        P = self._room[:after, :after]
-        P[before:, :before] = by_pose @ P[own, :before]
-        P[:before, before:] = P[before:, :before].T
-        fresh = by_pose @ P[own, own] @ by_pose.T
-        for k, block in enumerate(C_T @ R @ of_landmark):
-            fresh[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += block
-        P[before:, before:] = (fresh + fresh.T) / 2.0
-        self._mean = np.concatenate([self._mean, placed.ravel()])
+        self._state.extend(own, -(C_T @ of_pose), placed, C_T @ R @ of_landmark)
 
     def _sight(self, sightings: Sightings, frame: Frame, frames: Sequence[Frame]) -> None:
         """Update by a robot's sightings of others that have a Frame at this instant too."""
@@ -481,10 +374,12 @@ class EkfSlam:
         for robot in (frame.robot, *known):
             self._move(robot)
         own, at = _own(frame.robot), 3 * others[:, None] + np.arange(3)
-        predicted, of_pose, of_other = sightings.predict(self._mean[own], self._mean[at])
+        predicted, of_pose, of_other = sightings.predict(
+            self._state.mean[own], self._state.mean[at]
+        )
         spread = self._predicted_spread(own, at, of_pose, of_other)
-        innovations = sightings.camera.innovation(predicted[None], points[:, None])
-        distances = _distances(spread, *innovations)
+        v, R = sightings.camera.innovation(predicted[None], points[:, None])
+        distances = mahalanobis_squared(v, spread + R)
         distances[:, predicted[:, 2] < LEAST_DEPTH_M] = np.inf
         if numbers is not None:
             distances[numbers[:, None] != others] = np.inf
@@ -512,14 +407,14 @@ class EkfSlam:
             own = _own(frame.robot)
             if len(slots) >= 2:
                 pose = self._refined(pose, slots, points)
-            self._mean[own], self._covariance[own, own] = pose, _ENTERS
+            self._state.mean[own], self._state.covariance[own, own] = pose, _ENTERS
             self._motions[frame.robot] = STILL
             self._is_placed[frame.robot] = True
 
     def _refined(self, pose: Array, slots: Ints, points: Array) -> Array:
         """Pose that fits points (K, 3) of landmarks best, about which the update linearises."""
         at = self._rows(slots)
-        spread = self._covariance[at[:, :, None], at[:, None, :]]
+        spread = self._state.covariance[at[:, :, None], at[:, None, :]]
         for _ in range(_REFINEMENTS):
             predicted, H, of_landmark = self._camera.predict(pose, self._landmarks[slots])
             v, R = self._camera.innovation(predicted, points)
@@ -529,18 +424,12 @@ class EkfSlam:
         return pose
 
     def _pose_now(self, robot: int) -> Array:
-        return compose(self._mean[_own(robot)], self._motions[robot].mean)[0]
+        return compose(self._state.mean[_own(robot)], self._motions[robot].mean)[0]
 
 
 def _own(robot: int) -> slice:
     """Rows of a robot's pose in the state."""
     return slice(3 * robot, 3 * robot + 3)
-
-
-def _distances(spread: Array, v: Array, R: Array) -> Array:
-    """Squared Mahalanobis distances (K, n) of innovations v (K, n, 3); R may be common to all K."""
-    S = spread + R
-    return np.asarray(np.sum(v * np.linalg.solve(S, v[..., None])[..., 0], axis=-1))
 
 
 def _matches(distances: Array, d0: float) -> tuple[Ints, Ints]:

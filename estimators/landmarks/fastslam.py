@@ -4,36 +4,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
-from estimators.base import Belief, Estimate, Prior
-from estimators.gaussian import STILL, Gaussian, compose, root, rotated
-from estimators.landmarks import particle_maps as ekf
+from estimators.base import Belief, Estimate, OfTeams, Prior
+from estimators.gaussian import STILL, Gaussian, compose, rotated
+from estimators.landmarks import particle_kernels as ekf
+from estimators.landmarks.joint import mahalanobis_squared
 from estimators.landmarks.particle_maps import LandmarkMaps, Maps
+from estimators.landmarks.particle_path import ParticlePath, packed_mount
 from estimators.landmarks.sightings import Sightings, dead_reckoning, team_starts
-from estimators.landmarks.slam_frontend import Association, Image, SlamFrontEnd
-from estimators.landmarks.stereo import NoiseAt, NoiseModel
-from estimators.options import (
-    require_choices,
-    require_counts,
-    require_non_negative,
-    require_positive,
-)
-from estimators.particles import (
-    Lineages,
-    Scheme,
-    in_place,
-    normalize,
-    resample,
-    underflowed,
-)
-from estimators.wheels import ForwardSlipOptions, WheelPrediction
-from sim import se2
+from estimators.landmarks.slam_frontend import Image, LandmarkSlamOptions, SlamFrontEnd
+from estimators.particles import Scheme, in_place, normalize, resample, underflowed
 from sim.arrays import Array, Ints
 from sim.errors import InputError, require
+from sim.options import NonNegative, Positive, options
 from sim.recording import Frame
 
 Proposal = Literal["motion", "optimal"]
@@ -43,7 +31,33 @@ _PLACING = 4  # observations after which the proposal is linearised again
 _MOST_DRIFT_RAD = 0.1  # heading spread at which motion is drawn without waiting for an image
 
 
-class FastSLAM:
+@options("estimator")
+class FastSlamOptions(LandmarkSlamOptions):
+    """Options of FastSLAM."""
+
+    n_particles: Annotated[int, Field(ge=1, le=_MOST_PARTICLES)] = 200
+    """M."""
+    proposal: Proposal = "optimal"
+    """`motion`: FastSLAM 1.0, drawn from the motion model and weighted by eq. (13). `optimal`:
+    FastSLAM 2.0, drawn from the motion given the image too, with the importance weight
+    p(z | x) p(x) / q(x): a poor linearisation lowers the effective sample size, without bias."""
+    resampling: Scheme = "systematic"
+    """Scheme of `estimators.particles.resample`."""
+    ess_share: NonNegative = 0.5
+    """Resample when the effective sample size is below this share of M; 1: at every image, as the
+    paper does."""
+    p0: Positive = 1e-3
+    """Weight of an observation that starts a landmark, eq. (19), as a density, 1/m^3. It cancels
+    when all particles start the same ones, as under known association."""
+    maps: Maps = "shared"
+    """`shared` or `contiguous`, see `estimators.landmarks.particle_maps.LandmarkMaps`: the same
+    bits, at different speeds."""
+    slip_dof: Positive | None = None
+    """Degrees of freedom of the slip, which is then Student's t: wheels that slip in bursts leave a
+    normal cloud behind. Each particle draws its own scale at each image. null: normal."""
+
+
+class FastSLAM(FastSlamOptions, OfTeams):
     """Rao-Blackwellised SLAM: each particle is a path, and has a map of its own.
 
     At an image the motion since the last one is drawn, the landmarks seen are associated,
@@ -52,56 +66,6 @@ class FastSLAM:
 
     Of a team each particle holds the paths of all robots, and one map. A sighting weighs the
     particle by the distance that it gives the two robots; it is not part of the proposal.
-
-    Parameters
-    ----------
-    n_particles
-        M.
-    proposal
-        `motion`: FastSLAM 1.0, drawn from the motion model and weighted by eq. (13). `optimal`:
-        FastSLAM 2.0, drawn from the motion given the image too, with the importance weight
-        p(z | x) p(x) / q(x): a poor linearisation lowers the effective sample size, without bias.
-    resampling
-        `systematic`, `stratified`, `residual` or `multinomial`.
-    ess_share
-        Resample when the effective sample size is below this share of M; 1: at every image, as
-        the paper does.
-    association
-        `known`: by the ids that the sensor gives. `mahalanobis`: least distance below `d0`, per
-        particle, eq. (15). `descriptor`: of those below `d0`, the one that distance and
-        descriptor together favour.
-    d0
-        Threshold of the squared Mahalanobis distance (99.9 % of three degrees of freedom).
-    p0
-        Weight of an observation that starts a landmark, eq. (19), as a density, 1/m^3. It cancels
-        when all particles start the same ones, as under known association.
-    noise_model, noise_at
-        As in `estimators.landmarks.stereo.StereoModel.of`.
-    sigma_column_px, sigma_row_px, sigma_disparity_px, sigma_descriptor
-        Believed noise; None for that of the prior's camera.
-    gate_probability, repeat_s
-        Of known ids, as in `estimators.landmarks.slam_frontend.SlamFrontEnd`: misread ones are
-        left out, and a landmark counts once in `repeat_s`.
-    maps
-        `shared` or `contiguous`, see `estimators.landmarks.particle_maps.LandmarkMaps`: the same
-        bits, at different speeds.
-    kr, kl
-        Believed slip variance per metre of the wheels, m.
-    forward_slip_m
-        Believed variance per metre of what both wheels slip together, m.
-    slip_dof
-        Degrees of freedom of the slip, which is then Student's t: wheels that slip in bursts leave
-        a normal cloud behind. Each particle draws its own scale at each image. None: normal.
-    window_s
-        |ds| is netted over at least this time.
-    keep_map
-        Put the best particle's map into every Belief.
-    robots
-        Name of the sensor that sees the other robots of a team, with ids; None: sightings are not
-        used.
-    sighting_d0
-        Squared Mahalanobis distance from which on, in every particle, a sighting is a misread
-        robot, and rejected.
 
     Notes
     -----
@@ -118,69 +82,6 @@ class FastSLAM:
 
     needs = frozenset({"stereo"})
 
-    def __init__(
-        self,
-        n_particles: int = 200,
-        proposal: Proposal = "optimal",
-        resampling: Scheme = "systematic",
-        ess_share: float = 0.5,
-        association: Association = "known",
-        d0: float = 16.27,
-        p0: float = 1e-3,
-        noise_model: NoiseModel = "camera",
-        noise_at: NoiseAt = "predicted",
-        sigma_column_px: float | None = None,
-        sigma_row_px: float | None = None,
-        sigma_disparity_px: float | None = None,
-        sigma_descriptor: float | None = None,
-        gate_probability: float | None = None,
-        repeat_s: float = 0.0,
-        maps: Maps = "shared",
-        kr: float = 5e-5,
-        kl: float = 5e-5,
-        forward_slip_m: float = 0.0,
-        slip_dof: float | None = None,
-        window_s: float = 0.05,
-        keep_map: bool = False,
-        stereo: str = "stereo",
-        robots: str | None = None,
-        sighting_d0: float = 16.27,
-    ) -> None:
-        self.stereo, self.robots, self.sighting_d0 = stereo, robots, sighting_d0
-        require_counts(_MOST_PARTICLES, n_particles=n_particles)
-        require_choices(
-            proposal=(proposal, Proposal), resampling=(resampling, Scheme), maps=(maps, Maps)
-        )
-        require_non_negative(ess_share=ess_share)
-        require_positive(p0=p0, sighting_d0=sighting_d0)
-        if slip_dof is not None:
-            require_positive(slip_dof=slip_dof)
-        self._noise = noise_model, noise_at
-        self.wheels = ForwardSlipOptions(
-            kr=kr, kl=kl, window_s=window_s, forward_slip_m=forward_slip_m
-        )
-        self.front_end = SlamFrontEnd(
-            "fastslam",
-            stereo,
-            association,
-            d0,
-            noise_model,
-            noise_at,
-            gate_probability,
-            repeat_s,
-            sigma_column_px=sigma_column_px,
-            sigma_row_px=sigma_row_px,
-            sigma_disparity_px=sigma_disparity_px,
-            sigma_descriptor=sigma_descriptor,
-        )
-        self.n_particles, self.proposal, self.resampling = n_particles, proposal, resampling
-        self.slip_dof = slip_dof
-        self.ess_share, self.p0, self.maps, self.keep_map = ess_share, p0, maps, keep_map
-
-    def reset(self, prior: Prior, rng: np.random.Generator) -> None:
-        """Draw the particles from the prior, all with an empty map."""
-        self.reset_team((prior,), rng)
-
     def reset_team(self, priors: Sequence[Prior], rng: np.random.Generator) -> None:
         """Draw the particles of a team from the priors of its robots, whose starts are known.
 
@@ -189,26 +90,26 @@ class FastSLAM:
         InputError
             If the robots do not carry the same sensors, or a start is unknown.
         """
+        self.front_end = SlamFrontEnd(self, priors[0], "fastslam")
         starts = team_starts(priors, self.front_end, "fastslam")
-        self._sightings = Sightings.of(priors, self.robots, *self._noise, "fastslam")
+        noise = self.noise_model, self.noise_at
+        self._sightings = Sightings.of(priors, self.robots, "fastslam", *noise)
         self._camera = self.front_end.camera.packed
         self._rng = rng
         n = self.n_particles
-        self._maps = LandmarkMaps(n, self.maps, births=self.front_end.association != "known")
+        self._maps = LandmarkMaps(n, self.maps, births=not self.front_end.identified)
         mount, n_blocks = self.front_end.camera.mount, self._maps.n_blocks
         self._paths = []
-        for start, wheels in zip(starts, dead_reckoning(self.wheels, priors), strict=True):
+        for start, wheels in zip(starts, dead_reckoning(self, priors), strict=True):
             if start is None:
                 raise InputError("fastslam needs the starts of all robots; ekf_slam does not")
-            self._paths.append(_Path(wheels, self.slip_dof, start, mount, n, n_blocks, rng))
+            path = ParticlePath(wheels, self.slip_dof, mount, n, n_blocks)
+            path.scatter(start, rng)
+            self._paths.append(path)
         self._log_weights, self._accumulated = np.zeros(n), np.zeros(n)
         for path in self._paths:
             path.settle()
         self._weigh()
-
-    def step(self, frame: Frame) -> Belief:
-        """Roll by the wheels; at an image, draw, associate, weight, update and resample."""
-        return self.step_team((frame,))[0]
 
     def step_team(self, frames: Sequence[Frame]) -> list[Belief]:
         """Take in the Frames of one instant; the belief of each of their robots."""
@@ -250,17 +151,17 @@ class FastSLAM:
         path.note(frame.stamp)
         return Belief(belief.mean, belief.covariance, extras)
 
-    def _see(self, path: _Path, frame: Frame, extras: dict[str, Any]) -> None:
+    def _see(self, path: ParticlePath, frame: Frame, extras: dict[str, Any]) -> None:
         """Take in one image of a robot."""
         image = self.front_end.read(frame)
         if image.status:
             extras["status"] = image.status
         points, normals = image.points, path.normals(self._rng)
         gained = np.zeros(self.n_particles)
-        known = self.front_end.association == "known"
+        known = self.front_end.identified
         if known:
             slots = self.front_end.known(image)
-            if self.front_end.gated and len(slots):
+            if self.gate_probability is not None and len(slots):
                 passed = self._passed(path, image, slots)
                 image, slots, points = image.of(passed), slots[passed], points[passed]
             self._maps.touch(slots[slots >= 0])
@@ -306,7 +207,7 @@ class FastSLAM:
             return False
         others = {f.robot for f in frames} - {frame.robot}
         camera, path = sightings.camera.packed, self._paths[frame.robot]
-        mount, state = _packed(sightings.camera.mount), ekf.new_state(self._maps.n_blocks)
+        mount, state = packed_mount(sightings.camera.mount), ekf.new_state(self._maps.n_blocks)
         used = False
         for point, number in zip(points, numbers.tolist(), strict=True):
             if number not in others:
@@ -362,29 +263,25 @@ class FastSLAM:
         for path in self._paths:
             path.belief = Gaussian(*ekf.moments(path.drawn, weights))
 
-    def _associate(self, path: _Path, image: Image, spread: Array) -> Ints:
+    def _associate(self, path: ParticlePath, image: Image, spread: Array) -> Ints:
         """Slots (K, M) of each particle, -1 for new ones."""
         maps, points = self._maps, image.points
-        slots = np.full((len(points), self.n_particles), -1)
         unlikeness = self.front_end.unlikeness(image)
         if len(points) == 0 or maps.n_slots == 0:
-            return slots
+            return np.full((len(points), self.n_particles), -1)
         near = maps.nearby(path.state, self.front_end.reach_m)
-        maps.touch(near)
-        ekf.associate(
+        return ekf.associate(
             maps.data,
             ekf.Candidates(near, maps.place, maps.counts, maps.births),
             points,
             unlikeness,
             spread,
-            self.front_end.d0,
+            self.d0,
             path.state,
             self._camera,
-            slots,
         )
-        return slots
 
-    def _passed(self, path: _Path, image: Image, slots: Ints) -> NDArray[np.bool_]:
+    def _passed(self, path: ParticlePath, image: Image, slots: Ints) -> NDArray[np.bool_]:
         """Which observations (K,) of landmarks in these slots pass the best particle's gate."""
         camera, old = self.front_end.camera, slots >= 0
         moved = Gaussian(path.drawn[self._best], np.zeros((3, 3))).then(path.rolled)
@@ -394,15 +291,14 @@ class FastSLAM:
         turned = of_landmark.transpose(0, 2, 1)
         S = of_pose @ moved.covariance @ of_pose.transpose(0, 2, 1) + R
         S += of_landmark @ covariances[slots[old]] @ turned
-        distances = np.sum(v * np.linalg.solve(S, v[..., None])[..., 0], axis=-1)
-        return self.front_end.passed(image, slots, distances, moved.mean)
+        return self.front_end.passed(image, slots, mahalanobis_squared(v, S), moved.mean)
 
-    def _seen_spread(self, path: _Path) -> Array:
+    def _seen_spread(self, path: ParticlePath) -> Array:
         """Covariance of the motion not yet drawn, in axes of the camera after it."""
         angle = -float(path.rolled.mean[2] + self.front_end.camera.mount[2])
         return rotated(path.rolled.covariance, angle)
 
-    def _propose(self, path: _Path, normals: Array, slots: Ints, points: Array) -> Array:
+    def _propose(self, path: ParticlePath, normals: Array, slots: Ints, points: Array) -> Array:
         """Turn normals into draws given the image; their log importance weights (M,).
 
         The first few observations place the particle, and all are linearised again there: the
@@ -424,7 +320,7 @@ class FastSLAM:
         log_owed: Array = 0.5 * owed[0] - np.log(owed[1])
         return log_owed[: self.n_particles]
 
-    def _observe(self, path: _Path, slots: Ints, points: Array) -> Array:
+    def _observe(self, path: ParticlePath, slots: Ints, points: Array) -> Array:
         """Update the landmarks seen again; log weights (M,), gil2008, eqs. (13) and (14)."""
         gained = np.zeros(self.n_particles)
         old = slots >= 0
@@ -444,7 +340,7 @@ class FastSLAM:
             gained += ekf.summed(path.state, self.n_particles)
         return gained
 
-    def _create(self, path: _Path, slots: Ints, image: Image) -> None:
+    def _create(self, path: ParticlePath, slots: Ints, image: Image) -> None:
         """Start a landmark for each observation without one, gil2008, eqs. (16)-(18)."""
         maps, each = self._maps, slots.ndim == 2
         fresh = slots < 0
@@ -477,126 +373,3 @@ class FastSLAM:
             path.resample(ancestors)
         self._accumulated = self._accumulated[ancestors]
         self._log_weights = np.zeros(n)
-
-
-class _Path:
-    """What all particles hold of one robot's path.
-
-    Attributes
-    ----------
-    poses
-        (5, lanes) x, y, heading, and its cosine and sine; lanes beyond the last particle are moved
-        along, and never looked at.
-    drawn
-        (M, 3) the same, as of the last draw.
-    rolled, root
-        Motion not yet drawn, and the root (3, K) of its covariance.
-    stretch
-        (lanes,) by which slip of Student's t is wider than normal slip.
-    state
-        Of `estimators.landmarks.particle_maps`, for the robot's camera.
-    belief
-        Moments of `drawn`.
-    """
-
-    def __init__(
-        self,
-        wheels: WheelPrediction,
-        slip_dof: float | None,
-        start: Gaussian,
-        mount: Array,
-        n_particles: int,
-        n_blocks: int,
-        rng: np.random.Generator,
-    ) -> None:
-        self._wheels, self._slip_dof, self._n = wheels, slip_dof, n_particles
-        self._mount = _packed(mount)
-        self.state = ekf.new_state(n_blocks)
-        turned = rotated(start.covariance, -float(start.mean[2]))
-        normals = rng.standard_normal((3, n_blocks * ekf.LANES))
-        scatter = root((turned + turned.T) / 2.0) @ normals
-        drawn = se2.compose(start.mean, scatter.T)
-        headings = drawn[:, 2]
-        self.poses = np.stack([*drawn.T, np.cos(headings), np.sin(headings)])
-        self._lineages = Lineages(n_particles)
-        self.rolled, self.root, self.belief = STILL, np.zeros((3, 2)), start
-        self.stretch = np.ones(self.poses.shape[1])
-        # of each Frame: its stamp, the draw it follows, and the motion since
-        self._frames: list[tuple[float, int, Array]] = []
-
-    def roll(self, frame: Frame) -> None:
-        """Add the Frame's arc to the motion that is not yet drawn."""
-        motion, root_ = self._wheels.predict_with_root(frame)
-        if self.rolled is STILL:
-            self.rolled, self.root = motion, root_ if root_.shape[1] < 3 else np.zeros((3, 0))
-        else:
-            self.rolled, self.root = self.rolled.then(motion), np.zeros((3, 0))
-
-    def normals(self, rng: np.random.Generator) -> Array:
-        """Standard normal draws (3, lanes); two rows for a single arc, which has two wheels."""
-        rolled, rank = np.zeros((3, 3)), self.root.shape[1] or 3
-        covariance = self.rolled.covariance
-        rolled[:, :rank] = self.root if rank < 3 else root((covariance + covariance.T) / 2.0)
-        normals = np.zeros((3, self.poses.shape[1]))
-        rng.standard_normal(out=normals[:rank])
-        if self._slip_dof is not None:  # Student's t: a normal over the root of its own chi-square
-            squares = rng.chisquare(self._slip_dof, len(self.stretch)) / self._slip_dof
-            self.stretch = 1.0 / np.sqrt(squares)
-        self.root = rolled
-        return normals
-
-    def moved(
-        self, normals: Array, mount: Array | None = None, state: Array | None = None
-    ) -> Array:
-        """Poses (5, lanes) after the motion; writes the state of a camera, by default the own."""
-        mount = self._mount if mount is None else mount
-        state = self.state if state is None else state
-        noise = self.stretch * normals
-        return ekf.move(self.poses, self.rolled.mean, self.root, noise, mount, state)
-
-    def draw(self, rng: np.random.Generator) -> None:
-        """Draw the motion by the wheels alone."""
-        self.poses = self.moved(self.normals(rng))
-        self.settle()
-
-    def settle(self) -> None:
-        """Take the poses as drawn."""
-        self.drawn = np.ascontiguousarray(self.poses[:3, : self._n].T)
-        self.drawn[:, 2] = se2.wrap(self.drawn[:, 2])
-        self._lineages.append(self.drawn)
-        self.rolled = STILL
-
-    def note(self, stamp: float) -> None:
-        """Note a Frame."""
-        self._frames.append((stamp, len(self._lineages) - 1, self.rolled.mean))
-
-    def resample(self, ancestors: Ints) -> None:
-        """Give particle m the path of `ancestors[m]`, (M,)."""
-        self._lineages.resample(ancestors)
-        self.poses[:, : self._n] = np.take(self.poses, ancestors, axis=1)
-        self.drawn = self.drawn[ancestors]
-
-    def revised(self, best: int, weights: Array, made: dict[str, Array | Ints]) -> Estimate:
-        """Path of one particle, with the covariances of all weighted ones."""
-        n = len(self._lineages)
-        drawn: list[Gaussian] = []
-        for poses, rows in self._lineages.paths():
-            by_row = np.bincount(rows, weights, minlength=len(poses)).astype(np.float64)
-            drawn.append(Gaussian(poses[rows[best]], ekf.moments(poses, by_row)[1]))
-        beliefs = [
-            drawn[n - 1 - draw].then(Gaussian(since, np.zeros((3, 3))))
-            for _, draw, since in self._frames
-        ]
-        return Estimate(
-            np.array([stamp for stamp, _, _ in self._frames]),
-            np.array([belief.mean for belief in beliefs]),
-            np.array([belief.covariance for belief in beliefs]),
-            kind="revised",
-            map=made,
-        )
-
-
-def _packed(mount: Array) -> Array:
-    """(4,) x, y, and cosine and sine of the yaw of a mount (3,)."""
-    x, y, yaw = mount
-    return np.array([x, y, math.cos(yaw), math.sin(yaw)])

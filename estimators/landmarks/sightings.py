@@ -25,7 +25,7 @@ _APART_M = 1.0  # two points this far apart show a heading
 def team_starts(
     priors: Sequence[Prior], front_end: SlamFrontEnd, estimator: str
 ) -> list[Gaussian | None]:
-    """Reset the front end, and return the pose in map of each robot; None where it is not known.
+    """Pose in map of each robot; None where it is not known.
 
     Raises
     ------
@@ -41,11 +41,11 @@ def team_starts(
         )
     starts = [None if p.mean is None else start_pose(p, estimator) for p in others]
     require(
-        None not in starts or front_end.association == "known",
+        None not in starts or front_end.identified,
         f"{estimator}: a robot of unknown start is placed by landmarks with ids; set "
         "estimator.association=known",
     )
-    return [front_end.reset(first), *starts]
+    return [start_pose(first, estimator), *starts]
 
 
 def dead_reckoning(believed: WheelOptions, priors: Sequence[Prior]) -> list[WheelPrediction]:
@@ -76,9 +76,9 @@ class Sightings:
         cls,
         priors: Sequence[Prior],
         sensor: str | None,
-        noise_model: NoiseModel,
-        noise_at: NoiseAt,
         estimator: str,
+        noise_model: NoiseModel = "camera",
+        noise_at: NoiseAt = "predicted",
     ) -> Sightings | None:
         """Believe the sensor's own figures; None if it has no name.
 

@@ -9,29 +9,74 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 from scipy.special import chdtri  # scipy.stats takes half a second to import
 
 from estimators.base import Prior
-from estimators.gaussian import Gaussian
-from estimators.landmarks.stereo import NoiseAt, NoiseModel, StereoModel
-from estimators.options import (
-    require_choices,
-    require_non_negative,
-    require_positive,
-    require_stereo,
-    start_pose,
-)
+from estimators.landmarks.stereo import NoiseAt, NoiseModel, StereoModel, StereoOptions
+from estimators.options import require_stereo
+from estimators.wheels import ForwardSlipOptions
 from sim.arrays import Array, Floats, Ints
 from sim.errors import require
+from sim.options import NonNegative, Positive, options
 from sim.recording import Frame
 
 Association = Literal["known", "mahalanobis", "descriptor"]
+OpenShare = Annotated[float, Field(gt=0.0, lt=1.0)]
 
+_SIGMAS = ("sigma_column_px", "sigma_row_px", "sigma_disparity_px", "sigma_descriptor")
 _BLIND_IMAGES = 100  # images without a landmark after which the status reports it
+
+
+@options("estimator")
+class LandmarkSlamOptions(ForwardSlipOptions, StereoOptions):
+    """What the filters of landmark SLAM have in common."""
+
+    association: Association = "known"
+    """`known`: by the ids that the sensor gives. `mahalanobis`: least distance below `d0`, gil2008,
+    eq. (15). `descriptor`: of those below `d0`, the one that distance and descriptor together
+    favour."""
+    d0: Positive = 16.27
+    """Threshold of the squared Mahalanobis distance (99.9 % of three degrees of freedom)."""
+    noise_model: NoiseModel = "camera"
+    """`diagonal`: R of gil2008, eqs. (10)-(12). `correlated`: with the terms beside the diagonal.
+    `image`: image coordinates. `camera`: `image` if the camera's noise is correlated, else
+    `diagonal`, which is how each is made."""
+    noise_at: NoiseAt = "predicted"
+    """Point at which R is taken: `predicted` or `measured`."""
+    sigma_column_px: NonNegative | None = None
+    """Believed noise of the column, px; null: the camera's own."""
+    sigma_row_px: NonNegative | None = None
+    """Believed noise of the row, px; null: the camera's own."""
+    sigma_disparity_px: NonNegative | None = None
+    """Believed noise of the disparity, px; null: the camera's own."""
+    sigma_descriptor: NonNegative | None = None
+    """Believed noise of descriptors; null: the camera's own."""
+    gate_probability: OpenShare | None = None
+    """Under known association, an observation less probable than this is left out, and a landmark
+    enters the map only when two sightings in a row agree: a misread id is neither an update nor a
+    landmark. null: every id is believed."""
+    repeat_s: NonNegative = 0.0
+    """Under known association, a landmark counts at most once in this time for each robot, s:
+    errors of a sensor that last longer than an image would count again as if they were independent.
+    0: in every image."""
+    keep_map: bool = False
+    """Put the map into every Belief; of FastSLAM, that of the best particle."""
+    robots: str | None = None
+    """Name of the sensor that sees the other robots of a team; null: sightings are not used."""
+    sighting_d0: Positive = 16.27
+    """Squared Mahalanobis distance from which on a sighting is a misread robot, and rejected."""
+
+    def __post_init__(self) -> None:
+        require(
+            self.association == "known" or (self.gate_probability is None and self.repeat_s == 0.0),
+            "estimator.gate_probability and repeat_s are of ids; leave them at null and 0 under "
+            f"association={self.association}, which has the gate d0",
+        )
 
 
 @dataclass(frozen=True)
@@ -102,26 +147,12 @@ class SlamFrontEnd:
 
     Parameters
     ----------
+    believed
+        Options of the method.
+    prior
+        Its camera and start pose are needed.
     estimator
-        Name of the estimator, for error messages.
-    association
-        `known`: by the ids that the sensor gives. `mahalanobis`: the filter takes the landmark of
-        least distance below `d0`. `descriptor`: of those, the one that distance and descriptor
-        together favour.
-    d0
-        Threshold of the squared Mahalanobis distance.
-    noise_model, noise_at
-        As in `estimators.landmarks.stereo.StereoModel.of`.
-    gate_probability
-        Under known association, an observation less probable than this is left out, and a landmark
-        enters the map only when two sightings in a row agree: a misread id is neither an update nor
-        a landmark. None: every id is believed.
-    repeat_s
-        Under known association, a landmark counts at most once in this time for each robot: errors
-        of a sensor that last longer than an image would count again as if they were independent. 0:
-        always.
-    sigmas
-        Believed noise, by the camera's attribute; None for the prior's camera's own.
+        Name of the method, for error messages.
 
     Attributes
     ----------
@@ -133,61 +164,22 @@ class SlamFrontEnd:
         (N,) number of the observation that started each landmark.
     """
 
-    def __init__(
-        self,
-        estimator: str,
-        stereo: str,
-        association: Association,
-        d0: float,
-        noise_model: NoiseModel,
-        noise_at: NoiseAt,
-        gate_probability: float | None = None,
-        repeat_s: float = 0.0,
-        **sigmas: float | None,
-    ) -> None:
-        require_choices(
-            association=(association, Association),
-            noise_model=(noise_model, NoiseModel),
-            noise_at=(noise_at, NoiseAt),
-        )
-        self._sigmas = {name: sigma for name, sigma in sigmas.items() if sigma is not None}
-        require_non_negative(**self._sigmas)
-        require_positive(d0=d0)
-        require_non_negative(repeat_s=repeat_s)
+    def __init__(self, believed: LandmarkSlamOptions, prior: Prior, estimator: str) -> None:
+        self.believed, self._estimator = believed, estimator
+        camera = require_stereo(prior, believed.stereo, estimator)
         require(
-            gate_probability is None or 0.0 < gate_probability < 1.0,
-            f"estimator.gate_probability must lie between 0 and 1, or be null: {gate_probability}",
-        )
-        require(
-            association == "known" or (gate_probability is None and repeat_s == 0.0),
-            "estimator.gate_probability and repeat_s are of ids; leave them at null and 0 under "
-            f"association={association}, which has the gate d0",
-        )
-        self.gated, self._repeat_s = gate_probability is not None, repeat_s
-        self._gate = math.inf if gate_probability is None else float(chdtri(3, gate_probability))
-        self.association, self.d0 = association, d0
-        self._stereo, self._estimator = stereo, estimator
-        self._noise_model, self._noise_at = noise_model, noise_at
-
-    def reset(self, prior: Prior) -> Gaussian:
-        """Forget all landmarks; return the prior's pose in map.
-
-        Raises
-        ------
-        InputError
-            If there is no camera, no start pose, or no ids where association needs them.
-        """
-        camera = require_stereo(prior, self._stereo, self._estimator)
-        start = start_pose(prior, self._estimator)
-        require(
-            self.association != "known" or camera.identifies,
+            believed.association != "known" or camera.identifies,
             "the camera does not identify landmarks; set estimator.association=mahalanobis "
             "or descriptor",
         )
-        camera = dataclasses.replace(camera, **self._sigmas)  # type: ignore[arg-type]
-        self.camera = StereoModel.of(camera, self._noise_model, self._noise_at)
+        sigmas = {name: getattr(believed, name) for name in _SIGMAS}
+        given = {name: sigma for name, sigma in sigmas.items() if sigma is not None}
+        camera = dataclasses.replace(camera, **given)
+        self.camera = StereoModel.of(camera, believed.noise_model, believed.noise_at)
         # a landmark may be predicted beyond dmax and still be the one that was seen
         self.reach_m = 1.5 * camera.max_distance_m + 1.0
+        share = believed.gate_probability
+        self._gate = math.inf if share is None else float(chdtri(3, share))
         self._rho = 1.0 / (1.0 + camera.sigma_descriptor**2)
         self.origins = np.zeros(0, np.int64)
         self._landmark_of_id: dict[int, int] = {}
@@ -195,16 +187,19 @@ class SlamFrontEnd:
         self._n_observations, self._n_blind = 0, 0
         self._tentative: dict[int, Array] = {}  # by id, where a first sighting places it in map
         self._last_s: dict[tuple[int, int], float] = {}  # by robot and id, when it counted last
-        return start
+
+    @property
+    def identified(self) -> bool:
+        """Whether landmarks are associated by the ids that the sensor gives."""
+        return self.believed.association == "known"
 
     def read(self, frame: Frame) -> Image:
         """Observations of a Frame's image that can be used; of duplicate ids the first."""
-        seen = frame.readings[self._stereo]
+        seen = frame.readings[self.believed.stereo]
         all_points, all_ids = seen["points_in_camera"], seen.get("ids")
-        known = self.association == "known"
-        used, status = screened(self.camera, all_points, all_ids if known else None)
+        used, status = screened(self.camera, all_points, all_ids if self.identified else None)
         require(
-            not (known and all_ids is None and used.any()),
+            not (self.identified and all_ids is None and used.any()),
             f"{self._estimator}: observations without ids; set "
             "estimator.association=mahalanobis or descriptor",
         )
@@ -216,16 +211,16 @@ class SlamFrontEnd:
         ids = None if all_ids is None else all_ids[used]
         points = np.ascontiguousarray(all_points[used])
         image = Image(points, numbers, ids, seen["descriptors"][used], used, status)
-        return self._without_repeats(image, frame) if self._repeat_s > 0.0 else image
+        return self._without_repeats(image, frame) if self.believed.repeat_s > 0.0 else image
 
     def _without_repeats(self, image: Image, frame: Frame) -> Image:
         """Leave out landmarks that the robot counted less than `repeat_s` ago."""
         last = [self._last_s.get((frame.robot, i), -math.inf) for i in _listed(image)]
-        return image.of(frame.stamp - np.array(last) >= self._repeat_s)
+        return image.of(frame.stamp - np.array(last) >= self.believed.repeat_s)
 
     def counted(self, image: Image, frame: Frame) -> None:
         """Note when the landmarks of a Frame's image counted."""
-        if self._repeat_s > 0.0:
+        if self.believed.repeat_s > 0.0:
             self._last_s |= {(frame.robot, i): frame.stamp for i in _listed(image)}
 
     def passed(
@@ -264,7 +259,7 @@ class SlamFrontEnd:
 
         (K, 0) unless association is by descriptor.
         """
-        if self.association != "descriptor":
+        if self.believed.association != "descriptor":
             return np.zeros((len(image.points), 0))
         require(
             not (image.descriptors.shape[1] == 0 < len(image.points)),
@@ -280,9 +275,9 @@ class SlamFrontEnd:
         """Number the landmarks that these of the image's observations start."""
         n = len(self.origins)
         self.origins = np.concatenate([self.origins, image.numbers[rows]])
-        if self.association == "known" and image.ids is not None:
+        if self.identified and image.ids is not None:
             self._landmark_of_id |= {i: n + k for k, i in enumerate(image.ids[rows].tolist())}
-        if self.association == "descriptor":
+        if self.believed.association == "descriptor":
             fresh = image.descriptors[rows]
             self._descriptors = np.concatenate([self._descriptors, fresh]) if n else fresh
 
@@ -309,7 +304,7 @@ class SlamFrontEnd:
             "landmark_covariances": covariances,
             "origins": self.origins[landmarks].copy(),
         }
-        if self.association == "known":
+        if self.identified:
             made["ids"] = np.array(list(self._landmark_of_id), dtype=np.int64)
         return made
 

@@ -32,14 +32,22 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from estimators.options import require_choices
 from sim.arrays import Array
+from sim.options import options
 from sim.sensors import StereoCamera
 
 NoiseModel = Literal["camera", "diagonal", "correlated", "image"]
 NoiseAt = Literal["predicted", "measured"]
 
 LEAST_DEPTH_M = 0.1  # nearer than this no camera sees, and noise laws end
+
+
+@options("estimator")
+class StereoOptions:
+    """Which camera a method reads."""
+
+    stereo: str = "stereo"
+    """Name of the stereo camera."""
 
 
 class PackedCamera(NamedTuple):
@@ -109,16 +117,8 @@ class StereoModel:
     ) -> StereoModel:
         """Believe the camera's own figures.
 
-        Parameters
-        ----------
-        noise_model
-            `diagonal`: eqs. (10)-(12). `correlated`: with the terms beside the diagonal. `image`:
-            image coordinates. `camera`: `image` if the camera's noise is correlated, else
-            `diagonal`, which is how each is made.
-        noise_at
-            Where R is taken.
+        The noise is as `estimators.landmarks.slam_frontend.LandmarkSlamOptions` describes it.
         """
-        require_choices(noise_model=(noise_model, NoiseModel), noise_at=(noise_at, NoiseAt))
         if noise_model == "camera":
             noise_model = "image" if camera.correlated else "diagonal"
         sigma = (camera.sigma_column_px, camera.sigma_row_px, camera.sigma_disparity_px)

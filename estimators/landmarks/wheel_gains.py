@@ -8,47 +8,34 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 
 from estimators.gaussian import STILL, Gaussian, compose
-from estimators.options import require_non_negative
 from estimators.wheels import WheelPrediction
 from sim.arrays import Array
 from sim.errors import require
+from sim.options import NonNegative, options
 from sim.recording import Frame
 
 
-@dataclass(frozen=True)
-class GainBelief:
-    """What is believed of the gains: deviations at the start, and variance per metre after it.
+@options("estimator")
+class GainOptions:
+    """What is believed of the gains: deviations at the start, and how far they wander."""
 
-    Attributes
-    ----------
-    sigma
-        Of each of the three at the start; 0: the wheels are as stated.
-    wander_m
-        Variance per metre of the way, 1/m.
-    """
-
-    sigma: float
-    wander_m: float
+    gain_sigma: Annotated[float, Field(ge=0.0, lt=0.5)] = 0.0
+    """The wheels' gains and the track are states too, of this deviation at the start, a share of
+    them (`estimators.landmarks.wheel_gains`); 0: they are known."""
+    gain_wander_m: NonNegative = 0.0
+    """Variance of these states per metre of the way, 1/m."""
 
     def __post_init__(self) -> None:
-        require_non_negative(gain_sigma=self.sigma, gain_wander_m=self.wander_m)
         require(
-            self.sigma < 0.5,
-            f"estimator.gain_sigma is a share; must be below 0.5, got {self.sigma}",
-        )
-        require(
-            not self.wander_m or self.sigma,
+            not self.gain_wander_m or self.gain_sigma,
             "estimator.gain_wander_m has no effect on known gains; set estimator.gain_sigma",
         )
-
-    @property
-    def covariance(self) -> Array:
-        """(3, 3) at the start."""
-        return self.sigma**2 * np.eye(3)
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from estimators.base import Prior
 from estimators.base import run as walk
-from estimators.landmarks import particle_maps as ekf
+from estimators.landmarks import particle_kernels as ekf
 from estimators.landmarks.fastslam import FastSLAM
+from estimators.landmarks.particle_maps import LandmarkMaps
 from estimators.landmarks.stereo import StereoModel
 from experiments.bench.measure import Measurement, median_time_s, timed_steps
 from experiments.evaluation.statistics import log_log_slope
@@ -93,7 +94,7 @@ def circling(n_landmarks: int, n_seen: int, n_steps: int, camera: StereoCamera) 
 def update_ns(n_particles: int, n_landmarks: int, n_seen: int = 20) -> float:
     """Time of one landmark update, ns per particle and observation."""
     rng = np.random.default_rng(0)
-    maps = ekf.LandmarkMaps(n_particles, "contiguous", births=False)
+    maps = LandmarkMaps(n_particles, "contiguous", births=False)
     points = rng.uniform([-3.0, -1.0, 2.0], [3.0, 1.0, 8.0], (n_landmarks, 3))
     maps.reserve(n_landmarks)
     state, packed = ekf.new_state(maps.n_blocks), StereoModel.of(StereoCamera()).packed

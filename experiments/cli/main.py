@@ -123,18 +123,14 @@ def run(
 
       estima run --cfg job (print the configuration; estima options lists the groups)
     """
-    os.environ["HYDRA_FULL_ERROR"] = "1"  # errors come to `main`, which puts them in a line
     arguments = [*(overrides or []), *context.args]
     many = {"-m", "--multirun"} & set(arguments)
-    shown = {"--cfg", "-c", "--info", "-i"} & set(arguments)
-    if many and shown:
-        raise InputError(f"{shown.pop()} shows one configuration; leave out -m and the lists")
     if out is not None:
         from experiments.trajectories.convert import check_estimate_name
 
         require(not many, f"-o {out}: one file is of one run; leave out -m")
         check_estimate_name(out)
-    if many and "--hydra-help" not in arguments:
+    if many:
         from experiments.sweeps.launch import sweep_arguments
 
         sweep_arguments([a for a in arguments if a not in many], _show_sweep)
@@ -202,7 +198,8 @@ def record(
 
     Example: estima record -o office.npz world=office sensors=lms291 seed=3
     """
-    from experiments.runs.experiment import Experiment, searched
+    from experiments.runs.compose import searched
+    from experiments.runs.experiment import Experiment
     from experiments.runs.run import expected_s
     from experiments.runs.team import TeamExperiment
     from sim import recording, team
@@ -419,7 +416,7 @@ def view(
 
       estima view --map map.yaml -o map.png
     """
-    from experiments.runs.experiment import searched
+    from experiments.runs.compose import searched
     from experiments.sweeps.again import noted_config_dir, row_of, run_again
     from experiments.sweeps.collect import folder_of
 
@@ -583,7 +580,7 @@ def build_map(
 
       estima run world=office seed=3 sensors=lms291 estimator=mcl prior.map=map.yaml
     """
-    from experiments.runs.experiment import searched
+    from experiments.runs.compose import searched
     from experiments.viewing.grid import described
     from experiments.viewing.map import grid_along, laser_scans, path_of
     from sim.formats.detect import read_any
@@ -880,7 +877,8 @@ def twin(
 
 def _robot_of(overrides: list[str], config_dir: Path | None) -> DifferentialDrive:
     """Make the robot that overrides choose; they may say nothing else."""
-    from experiments.runs.experiment import Experiment, searched
+    from experiments.runs.compose import searched
+    from experiments.runs.experiment import Experiment
 
     for override in overrides:
         if not override.lstrip("+~").startswith(("robot=", "robot.")):
@@ -970,7 +968,7 @@ def conform(
       estima conform estimators.odometry:Odometry kr=1e-5 kl=1e-5
     """
     from experiments.gate.conform import conform_target
-    from experiments.runs.experiment import searched
+    from experiments.runs.compose import searched
 
     results = conform_target(target, arguments or [], searched(config_dir))
     for result in results:

@@ -2,13 +2,12 @@
 
 import importlib
 import math
-import re
 import signal
 import sys
 import textwrap
 import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, NoReturn
 
@@ -152,28 +151,13 @@ def _in_defaults(error: BaseException) -> bool:
     return any(f.f_globals.get("__name__") == "hydra._internal.defaults_list" for f, _ in frames)
 
 
-def unknown_key(key: str, config: Mapping[str, Any]) -> str:
-    """Say that a key is unknown, and which ones are known beside it."""
-    place = ""
-    for part in key.split(".")[:-1]:
-        if not isinstance(config.get(part), Mapping):
-            break
-        place, config = f"{place}{part}.", config[part]
-    known = (f"{place}{name}" for name in config if name != "hydra")
-    return f"unknown key {key}; known: {', '.join(known)}"
-
-
 def _refusal(error: BaseException) -> str | None:
     """Say what Hydra could not find, and what there is; None if the error is another."""
     missing, options = (getattr(error, name, None) for name in ("missing_cfg_file", "options"))
     if missing and options:
         group, _, name = missing.rpartition("/")
         return f"no {group} named {name}; there are: {', '.join(options)}"
-    found = re.match(r"Could not override '(.+?)'", str(error))
-    root = getattr(error.__cause__, "parent_node", None)
-    if found is None or root is None:
-        return None
-    return unknown_key(found[1], root._get_root())
+    return None
 
 
 def _configuration_errors() -> tuple[type[Exception], ...]:

@@ -1,6 +1,5 @@
 """The one runner: an experiment's rows."""
 
-import dataclasses
 import functools
 import os
 from collections.abc import Callable, Collection, Mapping
@@ -9,7 +8,7 @@ from contextlib import AbstractContextManager, nullcontext
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
-from estimators.base import Estimate, Estimator, Prior, run
+from estimators.base import Estimate, Estimator, Prior, run_to_the_end
 from experiments.evaluation.map_quality import landmark_errors
 from experiments.evaluation.metrics import (
     LONGEST_GAP_S,
@@ -29,7 +28,6 @@ from experiments.runs.team import (
     status_of_team,
 )
 from sim.arrays import Array
-from sim.compiled import processor_s
 from sim.errors import InputError, require
 from sim.recording import Recording
 from sim.team import Team
@@ -174,15 +172,7 @@ def estimates(
     and the matrices of filters are small.
     """
     with limited_blas():
-        begun = processor_s()
-        online = run(estimator, recording, prior, rng, keep, on_step)
-        finish = getattr(estimator, "finish", None)
-        revised: Estimate | None = None if finish is None else finish()
-        own_s = processor_s() - begun
-        spent_s = getattr(estimator, "program_seconds", own_s)  # without the transport to it
-    if revised is not None and revised.kind == "online":
-        online, revised = revised, None
-    return dataclasses.replace(online, cpu_seconds=spent_s), revised
+        return run_to_the_end(estimator, recording, prior, rng, keep, on_step)
 
 
 def limited_blas() -> AbstractContextManager[object]:

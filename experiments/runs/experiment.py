@@ -3,36 +3,34 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import inspect
 import json
 import math
 import re
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-from hydra import compose, initialize_config_dir
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import InterpolationKeyError
+from omegaconf import OmegaConf
 
 from estimators.base import Estimator, Prior
 from estimators.team import TeamEstimator
 from experiments.runs import paths
 from experiments.runs.cache import cached, key_of
 from experiments.runs.calibration import read_calibration
+from experiments.runs.compose import composing, with_study_file
+from experiments.runs.key import TEAM_KEYS, digest_of, files_digest, files_of_options, leaf_digest
 from experiments.runs.row import Row
+from experiments.runs.schema import SIMULATED_KEYS, Config, check_shape, leaves
 from experiments.runs.seeds import stream
 from experiments.runs.targets import checked, make, targets
 from experiments.runs.team_settings import TeamSettings, own_config, team_settings
 from experiments.runs.version import code_version, source_digest, version_with
 from sim.arrays import Array
 from sim.errors import InputError, blaming, require, required
-from sim.files import write_text
 from sim.recording import Frame, Recording, load
 from sim.robot.drive import DifferentialDrive, RobotGeometry
 from sim.sensors import Sensor, Sensors, sensors_from_config
@@ -41,23 +39,8 @@ from sim.settings import build, find
 from sim.worlds import grid_file
 from sim.worlds.grid import OccupancyGrid
 from sim.worlds.world import World
-from sim.yaml_file import read_yaml
 
-Config = dict[str, Any]
-GROUPS = ("world", "robot", "sensors", "route", "estimator")
-_MAPPINGS = (*GROUPS, "simulation", "prior", "scoring")
-SIMULATED_KEYS = ("world", "robot", "sensors", "route", "simulation", "seed", "world_seed")
-_TEAM_KEYS = ("size", "robots")  # of the key `team`, those that decide what is read
-_KEYS = (
-    *_MAPPINGS,
-    *("seed", "world_seed", "repeats", "recording", "calibration", "name", "picture", "keep"),
-    *("simulation.physics", "simulation.rays"),
-    *("prior.start", "prior.sigma_position_m", "prior.sigma_heading_rad"),
-    *("prior.wheel_radius_m", "prior.track_m", "prior.map"),
-    *("scoring.longest_gap_s", "scoring.after_s"),
-)
 _NOT_IN_KEY = ("name", "picture", "recording")
-_READ_OF_HYDRA = ("hydra/launcher", "hydra.launcher", "hydra.searchpath")
 _OF_TEAMS = "ekf_slam, fastslam or smoother"
 _PHYSICS = ("bullet", "kinematic")
 _RAYS = ("bullet", "exact")
@@ -84,34 +67,8 @@ class Experiment:
     @classmethod
     def compose(cls, overrides: Sequence[str] = ()) -> Experiment:
         """Compose an experiment from Hydra's overrides, such as `world=office seed=3`."""
-        with initialize_config_dir(str(paths.CONF), version_base="1.3"):
-            return cls.resolved(*composed(with_study_file(overrides)))
-
-    @classmethod
-    def resolved(cls, cfg: DictConfig, choices: Mapping[str, str]) -> Experiment:
-        """Resolve a composed configuration.
-
-        Raises
-        ------
-        InputError
-            If a key is missing, or is no mapping where it must be one.
-        """
-        _believe(cfg)
-        try:
-            config: Config = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
-        except InterpolationKeyError as error:
-            raise InputError(
-                f"{error.full_key} follows a key that is missing: {str(error).splitlines()[0]}; "
-                f"keep that key, or set {error.full_key} too"
-            ) from error
-        for of_sweeps in ("sweeps", "tune"):
-            config.pop(of_sweeps, None)
-        _check_shape(config)
-        simulation = config["simulation"]
-        if simulation["rays"] is None:
-            kinematic = simulation["physics"] == "kinematic"  # it has no engine to cast rays
-            simulation["rays"] = "exact" if kinematic else "bullet"
-        return cls(config, {group: str(choices.get(group)) for group in GROUPS})
+        with composing() as composer:
+            return cls(*composer.composed(with_study_file(overrides)).resolved())
 
     def replaced(self, **values: Any) -> Experiment:
         """Return the experiment with other values of top-level keys, such as `seed=3`."""
@@ -151,6 +108,21 @@ class Experiment:
     def estimator_name(self) -> str:
         """The chosen option, or the class of an estimator without one."""
         return self.choices.get("estimator") or str(self.config["estimator"]["_target_"])
+
+    @property
+    def from_file(self) -> bool:
+        """Whether its recording is read or made, rather than simulated."""
+        return self.config["recording"] is not None
+
+    @property
+    def calibrated(self) -> bool:
+        """Whether a calibration says what is believed of the robot."""
+        return self.config["calibration"] is not None
+
+    @property
+    def command(self) -> Any:
+        """The command of an estimator that is a program; None of one that is not."""
+        return self.config["estimator"].get("command")
 
     @property
     def believed_slip(self) -> tuple[float, float] | None:
@@ -206,7 +178,7 @@ class Experiment:
         files |= files_of_options(self.config["estimator"])
         files |= files_digest(self.config.get("calibration"))
         total = leaf_digest((), [self._recording_sources(), files, self._code_version()])
-        total += sum(leaf_digest(leaf, value) for leaf, value in _leaves(settings))
+        total += sum(leaf_digest(leaf, value) for leaf, value in leaves(settings))
         return f"{total % 2**64:016x}"
 
     @property
@@ -257,7 +229,7 @@ class Experiment:
             Naming the key, and the remedy.
         """
         config = self.config
-        _check_shape(config)
+        check_shape(config)
         repeats, keep = config["repeats"], config["keep"]
         if isinstance(repeats, bool) or not isinstance(repeats, int) or repeats < 1:
             raise InputError(f"repeats must be a whole number from 1 on, got {repeats!r}")
@@ -555,7 +527,7 @@ class Experiment:
         """What decides the recording."""
         made = {} if isinstance(self.config["recording"], str) else self._simulated()
         if (team := self.config.get("team")) is not None:
-            made["team"] = {key: team.get(key) for key in _TEAM_KEYS}
+            made["team"] = {key: team.get(key) for key in TEAM_KEYS}
         return {**made, **self._recording_sources()}
 
     def _recording_sources(self) -> Config:
@@ -564,13 +536,13 @@ class Experiment:
         if isinstance(wanted, dict):  # its function may read all of the settings
             return {"recording": wanted, "files": files_digest(wanted)}
         if wanted is not None:
-            return {"recording": _digest(Path(wanted))}
+            return {"recording": digest_of(Path(wanted))}
         sources: Config = {}
         world_file = self.config["world"].get("path")
         if world_file is not None and Path(world_file).is_file():  # an edited file: another world
-            sources["world_file"] = _digest(Path(world_file))
+            sources["world_file"] = digest_of(Path(world_file))
             if (image := grid_file.image_of(Path(world_file))) is not None:
-                sources["world_image"] = _digest(image)
+                sources["world_image"] = digest_of(image)
         if way := files_digest(self.config["route"].get("path")):
             sources["way"] = list(way.values())
         if files := files_of_options(self.config["route"].get("feedback")):
@@ -619,23 +591,6 @@ class Experiment:
         return recording.world
 
 
-def _believe(cfg: DictConfig) -> None:
-    """Put the slip of a calibration in the place of a simulated robot's."""
-    path = cfg.get("calibration")
-    if path is None:
-        return
-    require(isinstance(path, str) and path, f"calibration must be a path or null, got {path!r}")
-    require(
-        cfg.get("recording") is not None,
-        "calibration is of a real log: set recording too, made by `estima convert LOG -o FILE.npz`",
-    )
-    slip = read_calibration(Path(path)).slip
-    for key in ("kr", "kl"):
-        OmegaConf.update(cfg, f"robot.{key}", getattr(slip, key))
-    if cfg.estimator.get("forward_slip_m") == 0.0:
-        OmegaConf.update(cfg, "estimator.forward_slip_m", slip.forward_slip_m)
-
-
 def _true_start(recording: Recording) -> Array:
     """True pose (3,) at the first Frame."""
     begin_s = float(recording.frame_stamps[0])
@@ -659,276 +614,14 @@ def rows_folder(name: Any) -> Path:
     return paths.results() / "runs" / name
 
 
-def _check_shape(config: Config) -> None:
-    """Check that every key is there, holds keys or a path where it must, and nowhere NaN."""
-    for key in _KEYS:
-        parent, _, leaf = key.rpartition(".")
-        if leaf not in (config[parent] if parent else config):
-            remedy = f"choose one of `estima options {key}`" if key in GROUPS else "set it"
-            raise InputError(f"{key} is missing; {remedy}")
-        if key in _MAPPINGS and not isinstance(config[key], dict):
-            raise InputError(f"{key} must hold keys, got {config[key]!r}")
-    for place in ("simulation", "prior", "scoring"):
-        for name in config[place]:
-            _check_known(f"{place}.{name}")
-    wanted = config["recording"]
-    if not (wanted is None or isinstance(wanted, dict) or (isinstance(wanted, str) and wanted)):
-        got = "nothing" if wanted == "" else repr(wanted)
-        raise InputError(f"recording must be a path, null, or a mapping with _target_, got {got}")
-    for place, value in _leaves(config):
-        require(not _holds_nan(value), f"{'.'.join(map(str, place))} holds NaN; give a number")
-
-
-def _holds_nan(value: Any) -> bool:
-    """Whether a value is NaN, or a list or mapping that has one."""
-    if isinstance(value, dict):
-        return any(map(_holds_nan, value.values()))
-    if isinstance(value, (list, tuple)):
-        return any(map(_holds_nan, value))
-    return isinstance(value, float) and math.isnan(value)
-
-
 def _presets_with(names: Sequence[str]) -> list[str]:
     """Options of conf/sensors that have one of these sensors."""
     found = {path.stem: OmegaConf.load(path) for path in (paths.CONF / "sensors").glob("*.yaml")}
     return sorted(preset for preset, sensors in found.items() if any(n in sensors for n in names))
 
 
-def searched(config_dir: str | Path | None) -> list[str]:
-    """Override that makes Hydra look for options in another folder too; none for None.
-
-    Raises
-    ------
-    InputError
-        If there is no such folder, or one of its options is no YAML that can be read.
-    """
-    if config_dir is None:
-        return []
-    folder = Path(config_dir).resolve()
-    if not folder.is_dir():
-        raise InputError(f"--config-dir must name a folder, got {config_dir}")
-    require("${" not in str(folder), f"{folder}: Hydra takes ${{ for a value; rename the folder")
-    for group in (*GROUPS, "study"):
-        for path in sorted((folder / group).glob("*.yaml")):
-            option = read_yaml(path)  # within bounds, which Hydra does not know
-            keys = option is None or (
-                isinstance(option, dict) and all(isinstance(key, str) for key in option)
-            )
-            require(keys, f"{path}: an option holds keys and their values")
-            _check_hydra_of(path, option or {})
-    return [f"hydra.searchpath=[{paths.quoted(f'file://{folder}')}]"]
-
-
-def with_study_file(overrides: Sequence[str]) -> list[str]:
-    """Overrides in which `study=FILE.yaml` is a name, and the folder in which Hydra looks for it.
-
-    Hydra knows an option by its name in a folder of its group, so a study that lies elsewhere is
-    copied to one.
-
-    Raises
-    ------
-    InputError
-        If there is no such file.
-    """
-    found: list[str] = []
-    for override in overrides:
-        key, _, value = override.partition("=")
-        path = Path(value)
-        if key != "study" or path.suffix != ".yaml":
-            found.append(override)
-            continue
-        require(path.is_file(), f"{override}: there is no such file")
-        place = path.resolve()
-        if place.parent.name != "study":
-            place = paths.results() / "cache" / "studies" / _digest(path)[:16] / "study" / path.name
-            write_text(place, path.read_text())
-        found += [*searched(place.parents[1]), f"study={path.stem}"]
-    return found
-
-
-def _check_hydra_of(path: Path, option: Mapping[str, Any]) -> None:
-    """Check that an option's file has none of Hydra's settings that nothing here reads."""
-    defaults = option.get("defaults")
-    entries = [e for e in defaults if isinstance(e, dict)] if isinstance(defaults, list) else []
-    set_here = [group for entry in entries for group in entry if "/hydra/" in str(group)]
-    set_here += [
-        ".".join(map(str, leaf))
-        for leaf, value in _leaves({"hydra": option.get("hydra")})
-        if value not in (None, {}) and leaf[:3] != ("hydra", "sweeper", "params")
-    ]
-    if set_here:
-        raise InputError(
-            f"{path}: {set_here[0]}: of Hydra's settings a file's hydra.sweeper.params alone has "
-            "an effect; give hydra/launcher and hydra.launcher on the command line"
-        )
-
-
-def _check_known(key: str) -> None:
-    """Check that a key is one of the configuration's own."""
-    if key not in _KEYS:
-        place = key.rpartition(".")[0]
-        known = [other for other in _KEYS if other.rpartition(".")[0] == place]
-        raise InputError(f"unknown key {key}; known: {', '.join(known)}")
-
-
-def check_added(hydra: Any) -> None:
-    """Check that no override adds a key that nothing reads.
-
-    A study's YAML may have keys of its own; the command line sets those without a +.
-
-    Parameters
-    ----------
-    hydra
-        Hydra's own settings of a composed configuration.
-
-    Raises
-    ------
-    InputError
-        Naming the key, and the known ones.
-    """
-    groups = {choice.partition("@")[0] for choice in hydra.runtime.choices}
-    overrides = OverridesParser.create().parse_overrides(list(hydra.overrides.task))
-    calibrated = any(o.key_or_group == "calibration" and o.value() is not None for o in overrides)
-    for override in overrides:
-        if override.key_or_group in ("robot.kr", "robot.kl") and calibrated:
-            key = override.key_or_group.removeprefix("robot.")
-            raise InputError(
-                f"{override.input_line}: the calibration has its own {key}; set estimator.{key} to "
-                "believe another, or leave calibration out"
-            )
-        added = override.is_add() or override.is_force_add()
-        if added and override.key_or_group not in groups:
-            _check_known(override.key_or_group.partition(".")[0])
-
-
-def check_hydra(overrides: Sequence[str]) -> None:
-    """Check that no override is one of Hydra's own settings that nothing here reads.
-
-    Raises
-    ------
-    InputError
-        Naming what to do instead.
-    """
-    for override in overrides:
-        key = override.lstrip("+~").partition("=")[0]
-        if re.match(r"hydra\b", key) is None or key.startswith(_READ_OF_HYDRA):
-            continue
-        remedies = {
-            "hydra/sweeper": "-m runs every combination of the values; an optimizer may call "
-            "estima.sweep from Python",
-            "hydra.sweeper": "give the values themselves, such as seed=1,2",
-            "hydra.verbose": "there is no log; a failed run's row says how",
-        }
-        usual = "rows go to results/runs/NAME: set name, or --results for another folder"
-        remedy = next((remedies[start] for start in remedies if key.startswith(start)), usual)
-        raise InputError(f"{override}: {key} has no effect here; {remedy}")
-
-
-def check_overrides(overrides: Sequence[str]) -> None:
-    """Check what Hydra itself does not: that each override has a key, and groups have names.
-
-    Raises
-    ------
-    InputError
-        Naming the override.
-    """
-    for override in OverridesParser.create().parse_overrides(list(overrides)):
-        key, value = override.key_or_group, override.value()
-        if not key:
-            raise InputError(f"{override.input_line}: no key before the =")
-        named = override.is_sweep_override() or isinstance(value, (str, list))
-        if key == "hydra.searchpath" and isinstance(value, list):
-            for entry in value:
-                scheme, _, place = str(getattr(entry, "text", entry)).rpartition("://")
-                there = scheme not in ("", "file") or Path(place).is_dir()
-                require(there, f"{override.input_line}: there is no folder {place}")
-        if key in (*GROUPS, "study") and not (named or override.is_delete()):
-            raise InputError(
-                f"{override.input_line}: {key} must name one of `estima options {key}`"
-            )
-
-
-def composed(overrides: Sequence[str]) -> tuple[DictConfig, Mapping[str, str]]:
-    """Have Hydra, once initialized, compose a configuration; also give the options it chose."""
-    check_overrides(overrides)
-    cfg = compose("config", overrides=list(overrides), return_hydra_config=True)
-    check_added(cfg.hydra)
-    choices = cfg.hydra.runtime.choices
-    OmegaConf.set_struct(cfg, False)
-    del cfg["hydra"]
-    return cfg, choices
-
-
 def _is_grid_file(known_map: Any) -> bool:
     return isinstance(known_map, str) and Path(known_map).suffix in grid_file.SUFFIXES
-
-
-def files_digest(tree: Any) -> dict[str, str]:
-    """Digest of every file that a mapping names, and of the files in each folder it names.
-
-    A grid's image counts with its YAML file.
-    """
-    if isinstance(tree, dict):
-        return {k: v for value in tree.values() for k, v in files_digest(value).items()}
-    if not isinstance(tree, str) or not Path(tree).name:
-        return {}
-    path = Path(tree)
-    try:
-        files = [path] if path.is_file() else sorted(path.glob("*")) if path.is_dir() else []
-        files += [image for file in files if (image := grid_file.image_of(file)) is not None]
-    except OSError:  # too long for a path, say
-        return {}
-    return {str(file): _digest(file) for file in files if file.is_file()}
-
-
-def files_of_options(options: Any) -> dict[str, str]:
-    """Digest of every file that an estimator's options name, a list's items included.
-
-    A word without a suffix or a slash is no file, but the name of a sensor or a method.
-    """
-    found: dict[str, str] = {}
-    for _, value in _leaves({"": options}):
-        for text in value if isinstance(value, list) else [value]:
-            if isinstance(text, str) and ("/" in text or Path(text).suffix):
-                found |= files_digest(text)
-    return found
-
-
-def _digest(path: Path) -> str:
-    try:
-        return hashlib.sha256(path.read_bytes()).hexdigest()
-    except OSError as error:
-        raise InputError(f"{path}: cannot read it ({error.strerror})") from error
-
-
-def decides_recording(leaf: tuple[str, ...], *, from_file: bool) -> bool:
-    """Whether a leaf of the configuration decides which recording is read."""
-    of_team = leaf[0] == "team" and leaf[1] in _TEAM_KEYS
-    return of_team or (leaf[0] in SIMULATED_KEYS and not from_file)
-
-
-def leaf_digest(leaf: tuple[str, ...], value: Any) -> int:
-    """Return 64 bits of a digest of a plain value and its place in the configuration."""
-    return next(leaf_digests(leaf, [value]))
-
-
-def leaf_digests(leaf: tuple[str, ...], values: Iterable[Any]) -> Iterator[int]:
-    """Give the digest of each of many values of one leaf."""
-    place = hashlib.blake2b(json.dumps(leaf).encode(), digest_size=8)
-    for value in values:
-        nested = isinstance(value, (list, dict))
-        digest = place.copy()
-        digest.update((json.dumps(value, sort_keys=True) if nested else json.dumps(value)).encode())
-        yield int.from_bytes(digest.digest())
-
-
-def _leaves(tree: Mapping[str, Any], above: tuple[str, ...] = ()) -> Iterator[tuple[Any, Any]]:
-    """Every place of a configuration that holds no keys, and its value."""
-    for name, value in tree.items():
-        if isinstance(value, dict) and value:
-            yield from _leaves(value, (*above, name))
-        else:
-            yield (*above, name), value
 
 
 def _flat(tree: Mapping[str, Any], prefix: str = "") -> Row:

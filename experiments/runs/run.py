@@ -1,32 +1,29 @@
-"""The Hydra application: a configuration's rows, in results/runs/NAME/KEY.DIGEST.parquet."""
+"""One run by the command line: a configuration's rows, in results/runs/NAME/KEY.DIGEST.parquet."""
 
 import math
 import shlex
-import sys
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from statistics import fmean
 
-import hydra
-from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig
+from omegaconf import OmegaConf
 
 from estimators.base import Estimate
 from estimators.programs.program import ProgramError
 from experiments.runs import paths
 from experiments.runs.columns import COLUMNS, REVISED
-from experiments.runs.console import RunFailedError, end, progress, show
-from experiments.runs.evaluate import evaluate
-from experiments.runs.experiment import (
-    Experiment,
-    check_added,
+from experiments.runs.compose import (
+    CommandLine,
     check_hydra,
-    check_overrides,
+    composing,
     searched,
     with_study_file,
 )
+from experiments.runs.console import RunFailedError, progress, show
+from experiments.runs.evaluate import evaluate
+from experiments.runs.experiment import Experiment
 from experiments.runs.interrupts import held_interrupts
 from experiments.runs.row import Outcome, Row
 from experiments.runs.store import write_run
@@ -69,7 +66,7 @@ def run_once(experiment: Experiment, draw: Draw, out: Path | None = None) -> lis
         slip = experiment.believed_slip
         if isinstance(recording, Team):
             return recording
-        if "source" in recording.config and experiment.config["calibration"] is None and slip:
+        if "source" in recording.config and not experiment.calibrated and slip:
             show(
                 f"believed of this real robot: kr={slip[0]:g} and kl={slip[1]:g} m, and the "
                 "geometry that the log's reader assumes; to find its own: "
@@ -115,7 +112,7 @@ def run_once(experiment: Experiment, draw: Draw, out: Path | None = None) -> lis
 
 def expected_s(experiment: Experiment) -> float | None:
     """About how long the simulated drive will be; None if that is not known before."""
-    if experiment.config["recording"] is not None:
+    if experiment.from_file:
         return None
     one = experiment if experiment.team is None else experiment.of_robot(0)
     about_s = getattr(one.route(), "about_s", None)
@@ -129,65 +126,40 @@ def _trace(error: Exception | SystemExit) -> None:
 
 
 def application(arguments: Sequence[str], draw: Draw, out: Path | None = None) -> None:
-    """Run one configuration by a command line's arguments; sweeps are those of `sweeps.launch`."""
+    """Run one configuration by a command line's arguments, or print it.
 
-    def run(cfg: DictConfig) -> None:
-        try:
-            hydra_settings = HydraConfig.get()
-            check_added(hydra_settings)
-            choices = hydra_settings.runtime.choices
-            if cfg.get("sweeps") or hydra_settings.sweeper.get("params"):
-                study = choices.get("study")
-                raise InputError(
-                    f"study={study} sweeps values; add -m: estima run -m study={study}"
-                )
-            experiment = Experiment.resolved(cfg, choices)
-            run_once(experiment, draw, out)
-            others = [word for word in given if word.lstrip("+").partition("=")[0] != "seed"]
-            said = shlex.join(["estima", "run", *others, *options])
-            if experiment.config["recording"] is None:
-                show(f"Next: intervals over ten drives: {said} -m 'seed=range(0,10)'")
-                drive = shlex.join(["estima", "record", "-o", "run.npz", *given, *options])
-                if "command" not in experiment.config["estimator"]:  # `view` cannot be told it
-                    view = ["estima", "view", "run.npz", "-e", experiment.estimator_name, *options]
-                    place = "in a window"
-                    if experiment.team is not None:
-                        view, place = [*view, "-o", "run.html"], "in a file"
-                    show(f"      as it moves, {place}: {drive} && {shlex.join(view)}")
-        except Exception as error:
-            end(error)  # here, since Hydra would add a line of its own
-
-    given, options = _split(arguments)
-    overrides = with_study_file(given)
-    names = {option.partition("=")[0] for option in options}
-    if names & {"--shell-completion", "-sc"}:
-        raise InputError("--shell-completion is Hydra's; estima --install-completion is ours")
-    if names & {"--package", "-p"} and not names & {"--cfg", "-c"}:
-        raise InputError("--package has no effect without --cfg; leave it out")
-    for option, argument in zip(["", *options], options, strict=False):
-        name, equals, value = argument.partition("=")
-        if (name if equals else option) in ("--config-dir", "-cd"):
-            searched(value if equals else argument)
-    check_hydra(overrides)
-    check_overrides(overrides)
-    sys.argv = ["estima run", *overrides, *options]  # Hydra takes overrides in one place only
-    hydra.main(version_base="1.3", config_path=str(paths.CONF), config_name="config")(run)()
+    Sweeps are those of `sweeps.launch`.
+    """
+    line = CommandLine.of(arguments)
+    check_hydra(line.overrides)
+    with composing(searched(line.config_dir)) as composer:
+        found = composer.composed(with_study_file(line.overrides))
+    if line.shown:
+        print(OmegaConf.to_yaml(found.cfg, resolve=line.resolved))
+        return
+    if found.cfg.get("sweeps") or found.params:
+        study = found.choices.get("study")
+        raise InputError(f"study={study} sweeps values; add -m: estima run -m study={study}")
+    experiment = Experiment(*found.resolved())
+    run_once(experiment, draw, out)
+    _say_next(experiment, line)
 
 
-_WITH_VALUE = (
-    *("--cfg", "-c", "--package", "-p", "--config-path", "-cp", "--config-name", "-cn"),
-    *("--config-dir", "-cd", "--experimental-rerun"),
-)
-
-
-def _split(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Overrides, and Hydra's options with their values, which may hold a = too."""
-    overrides: list[str] = []
-    options: list[str] = []
-    for before, argument in zip(["", *arguments], arguments, strict=False):
-        is_option = argument.startswith("-") or before in _WITH_VALUE or "=" not in argument
-        (options if is_option and argument[:1] != "~" else overrides).append(argument)
-    return overrides, options
+def _say_next(experiment: Experiment, line: CommandLine) -> None:
+    """Say what can be done after a simulated run."""
+    if experiment.from_file:
+        return
+    options = ["--config-dir", line.config_dir] if line.config_dir else []
+    others = [word for word in line.overrides if word.lstrip("+").partition("=")[0] != "seed"]
+    said = shlex.join(["estima", "run", *others, *options])
+    show(f"Next: intervals over ten drives: {said} -m 'seed=range(0,10)'")
+    if experiment.command is not None:  # `view` cannot be told it
+        return
+    drive = shlex.join(["estima", "record", "-o", "run.npz", *line.overrides, *options])
+    view, place = ["estima", "view", "run.npz", "-e", experiment.estimator_name, *options], "window"
+    if experiment.team is not None:
+        view, place = [*view, "-o", "run.html"], "file"
+    show(f"      as it moves, in a {place}: {drive} && {shlex.join(view)}")
 
 
 _SHOWN = (

@@ -26,7 +26,8 @@ from experiments.evaluation.metrics import (
 from experiments.evaluation.time_sync import Rows, nearest
 from experiments.runs.columns import OF_THE_RUN, REVISED
 from experiments.runs.evaluate import status_of_pauses
-from experiments.runs.experiment import files_digest, rows_folder
+from experiments.runs.experiment import rows_folder
+from experiments.runs.key import files_digest
 from experiments.runs.row import Outcome, Row, Status
 from experiments.runs.store import write_run
 from experiments.runs.version import code_version

@@ -16,16 +16,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from estimators.base import Estimate, Prior
-from estimators.team import Answer, run_team
+from estimators.base import Answer, Estimate, Prior
+from estimators.team import run_team
 from experiments.runs.cache import cached
 from experiments.runs.columns import REVISED, Average, average_of
-from experiments.runs.experiment import SIMULATED_KEYS, Experiment
+from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome, Row, Status
+from experiments.runs.schema import SIMULATED_KEYS
 from experiments.runs.seeds import stream
 from experiments.runs.team_settings import TeamSettings
 from sim.arrays import Array
-from sim.compiled import processor_s
 from sim.errors import InputError, required
 from sim.recording import Recording
 from sim.sensors import RobotCamera
@@ -140,7 +140,6 @@ class TeamExperiment:
         contacts = None
         if communication.range_m is not None:
             contacts = in_range(team, communication.range_m)
-        begun = processor_s()
         found = run_team(
             experiment.team_estimator,
             team,
@@ -150,16 +149,10 @@ class TeamExperiment:
             contacts,
             on_step,
         )
-        spent_s = processor_s() - begun
-        n_frames = sum(len(online.stamps) for online, _ in found)
-        answers = []
-        for number, (online, revised) in enumerate(found):
-            share_s = spent_s * len(online.stamps) / n_frames
-            online = dataclasses.replace(online, cpu_seconds=share_s)
-            if number and self.settings.starts == "unknown":
-                online, revised = _placed(online), revised and _placed(revised)
-            answers.append((online, revised))
-        return answers
+        if self.settings.starts == "known":
+            return found
+        placed = [(_placed(online), revised and _placed(revised)) for online, revised in found[1:]]
+        return [found[0], *placed]
 
 
 def recorded(

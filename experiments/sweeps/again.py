@@ -12,7 +12,9 @@ import pandas as pd
 from hydra.errors import HydraException, MissingConfigException
 
 from experiments.runs.columns import REPEAT, is_setting
-from experiments.runs.experiment import Config, Experiment, searched
+from experiments.runs.compose import searched
+from experiments.runs.experiment import Experiment
+from experiments.runs.schema import Config
 from experiments.runs.store import read_runs
 from experiments.runs.targets import checked
 from experiments.runs.team import recorded

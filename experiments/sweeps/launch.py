@@ -28,16 +28,17 @@ import numpy as np
 from omegaconf import DictConfig
 
 from experiments.runs import paths, store
+from experiments.runs.compose import CommandLine, check_hydra
 from experiments.runs.console import RunFailedError, counted, progress
 from experiments.runs.evaluate import evaluate
-from experiments.runs.experiment import Experiment, check_hydra
+from experiments.runs.experiment import Experiment
 from experiments.runs.interrupts import held_interrupts
 from experiments.runs.row import Outcome, Row, Status, check_row
 from experiments.runs.team import recorded
 from experiments.sweeps.collect import COMMAND, UNFINISHED
 from experiments.sweeps.plan import Family, Numbers, Plan, packed, plan_of
 from sim.compiled import ANNOUNCED, note_compiling
-from sim.errors import InputError
+from sim.errors import InputError, require
 from sim.files import require_file, write_whole
 from sim.recording import Recording
 from sim.team import Team
@@ -50,20 +51,10 @@ OnDone = Callable[[Path, int], None]
 
 def sweep_arguments(arguments: Sequence[str], on_done: OnDone) -> None:
     """Sweep by a command line's arguments: overrides, and `--config-dir` with its folder."""
-    overrides, config_dir = [], None
-    rest = iter(arguments)
-    for argument in rest:
-        name, equals, value = argument.partition("=")
-        if name in ("--config-dir", "-cd"):
-            config_dir = value if equals else next(rest, None)
-            if config_dir is None or not Path(config_dir).is_dir():
-                raise InputError(f"--config-dir must name a folder, got {config_dir}")
-        elif argument.startswith("-"):
-            raise InputError(f"a sweep takes overrides and --config-dir, not {argument}")
-        else:
-            overrides.append(argument)
+    line = CommandLine.of(arguments)
+    require(not line.shown, "--cfg shows one configuration; leave out -m and the lists")
     signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGINT))  # end as by Ctrl-C
-    sweep(overrides, config_dir, on_done)
+    sweep(line.overrides, line.config_dir, on_done)
 
 
 def sweep(

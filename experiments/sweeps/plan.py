@@ -16,29 +16,26 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, RangeSweep
 from numpy.typing import NDArray
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
-from experiments.runs import paths
-from experiments.runs.console import unknown_key
-from experiments.runs.experiment import (
-    Config,
-    Experiment,
-    check_overrides,
-    composed,
-    decides_recording,
-    files_of_options,
-    leaf_digests,
+from experiments.runs.compose import (
+    Composed,
+    Composer,
+    composing,
     searched,
+    select,
+    set_value,
     with_study_file,
 )
+from experiments.runs.experiment import Experiment
+from experiments.runs.key import decides_recording, files_of_options, leaf_digests
+from experiments.runs.schema import Config, Leaf, leaves
 from sim.errors import InputError, require
 
-Leaf = tuple[str, ...]  # a place in the configuration: ("robot", "kr")
 Numbers = NDArray[np.int64]
 Digests = NDArray[np.uint64]
 _MOST_RUNS = 10**8  # of a sweep; a million take 0.3 GiB in the planner
@@ -230,18 +227,15 @@ def plan_of(arguments: Sequence[str], config_dir: str | None = None) -> Plan:
         If an override is wrong, or a key is unknown.
     """
     arguments = with_study_file(arguments)
-    with initialize_config_dir(str(paths.CONF), version_base="1.3"):
-        composer = _Composer(config_dir)
-        composer.extra += [a for a in arguments if a.lstrip("+~").startswith("hydra.")]
-        arguments = [a for a in arguments if a not in composer.extra]
+    searching = [a for a in arguments if a.lstrip("+~").startswith("hydra.")]
+    arguments = [a for a in arguments if a not in searching]
+    with composing([*searched(config_dir), *searching]) as composer:
         given = OverridesParser.create().parse_overrides(list(arguments))
         fixed = [o.input_line or "" for o in given if not o.is_sweep_override()]
-        check_overrides([*composer.extra, *fixed])
-        study = compose("config", overrides=composer.extra + fixed, return_hydra_config=True)
-        params: dict[str, str] = dict(study.hydra.sweeper.get("params") or {})
+        study = composer.composed(fixed)
         parts = []
-        for part in _sweeps(study):
-            lines = [f"{key}={value}" for key, value in {**params, **part}.items()]
+        for part in _sweeps(study.cfg):
+            lines = [f"{key}={value}" for key, value in {**study.params, **part}.items()]
             parts.append(swept([*lines, *arguments]))
         n_runs = sum(math.prod(map(len, part.values())) for part in parts)
         require(n_runs <= _MOST_RUNS, f"{n_runs:.3g} runs: {_TOO_MANY}")
@@ -305,18 +299,20 @@ def _values(override: Override, key: str) -> Sequence[Any]:
 
 
 def _grid(
-    choices: Mapping[str, Sequence[Any]], composer: _Composer
+    choices: Mapping[str, Sequence[Any]], composer: Composer
 ) -> tuple[list[Family], Numbers, Numbers, Digests, Digests]:
     """Families of the product, and of each run: family, number, key and recording."""
     shape = tuple(map(len, choices.values()))
     if not math.prod(shape):
         none, no_digest = np.zeros(0, np.int64), np.zeros(0, np.uint64)
         return [], none, none, no_digest, no_digest
-    inner = [key for key in choices if len(choices[key]) > 1 and composer.may_follow(key, choices)]
+    inner = [
+        key for key in choices if len(choices[key]) > 1 and _may_follow(composer, key, choices)
+    ]
     outer = [key for key in choices if key not in inner]
     texts = {key: [_text(key, value) for value in choices[key]] for key in outer}
     for combination in itertools.product(*texts.values()):  # what is no axis in one is in none
-        _, _, axes = composer.composed(combination, {key: choices[key] for key in inner})
+        _, axes = _composed(composer, combination, {key: choices[key] for key in inner})
         for key in [key for key in inner if key not in axes]:
             inner.remove(key)
             outer.append(key)
@@ -327,10 +323,9 @@ def _grid(
     families: list[Family] = []
     for places in itertools.product(*(range(len(choices[key])) for key in outer)):
         at = dict(zip(outer, places, strict=True))
-        cfg, chosen, axes = composer.composed(
-            [texts[key][place] for key, place in at.items()], {key: choices[key] for key in inner}
-        )
-        first = Experiment.resolved(cfg, chosen).replaced(picture=False)
+        lines = [texts[key][place] for key, place in at.items()]
+        found, axes = _composed(composer, lines, {key: choices[key] for key in inner})
+        first = Experiment(*found.resolved()).replaced(picture=False)
         made = Family(first.config, first.choices, tuple(axes[key] for key in inner))
         cells = tuple(at.get(key, slice(None)) for key in choices)
         family[cells] = len(families)
@@ -340,83 +335,54 @@ def _grid(
     return families, family.ravel(), number.ravel(), keys.ravel(), recordings.ravel()
 
 
-class _Composer:
-    """Compose many configurations that share most of their choices.
-
-    Hydra composes each choice of options once; plain values are then put in place.
-    """
-
-    def __init__(self, config_dir: str | None) -> None:
-        self._is_group: dict[str, bool] = {}
-        self._bases: dict[tuple[str, ...], tuple[DictConfig, Mapping[str, str]]] = {}
-        self._parse = functools.lru_cache(maxsize=4096)(_parsed)
-        self.extra = searched(config_dir)
-
-    def may_follow(self, key: str, choices: Mapping[str, Sequence[Any]]) -> bool:
-        """Whether a swept key's values are plain, and no other override is above or below it."""
-        values = choices[key]
-        overrides = [self._parse(v) for v in values if isinstance(v, str)]
-        return all(
-            self._is_plain(o)
+def _may_follow(composer: Composer, key: str, choices: Mapping[str, Sequence[Any]]) -> bool:
+    """Whether a swept key's values are plain, and no other override is above or below it."""
+    values = choices[key]
+    overrides = [composer.parse(v) for v in values if isinstance(v, str)]
+    return (
+        not key.endswith("_target_")
+        and all(
+            composer.is_plain(o)
             and (isinstance(o.value(), (str, int, float)) or o.value() is None)
             and "${" not in str(o.value())
-            for o in [*overrides, self._parse(f"{key}=x")]
-        ) and not any(
+            for o in [*overrides, composer.parse(f"{key}=x")]
+        )
+        and not any(
             (other.startswith(f"{key}.") or key.startswith(f"{other}."))
-            and self._is_plain(self._parse(f"{other}=x"))
+            and composer.is_plain(composer.parse(f"{other}=x"))
             for other in choices
             if other[0] not in "+~"
         )
-
-    def composed(
-        self, overrides: Sequence[str], followed: Mapping[str, Sequence[Any]]
-    ) -> tuple[DictConfig, Mapping[str, str], dict[str, Axis]]:
-        """Configuration with the first of the followed values; and the axes, where they can be.
-
-        A key is an axis where all that depends on it takes its value unchanged, and where no
-        file and no code is chosen by it.
-        """
-        parsed = [self._parse(o) for o in overrides]
-        options = tuple(o.input_line or "" for o in parsed if not self._is_plain(o))
-        if options not in self._bases:
-            self._bases[options] = composed([*self.extra, *options])
-        base, choices = self._bases[options]
-        cfg = base.copy()
-        OmegaConf.set_struct(cfg, True)
-        for override in filter(self._is_plain, parsed):
-            _set(cfg, override.key_or_group, override.value())
-        values = {key: [self._plain(v) for v in swept_] if not isinstance(swept_, range) else swept_
-                  for key, swept_ in followed.items()}  # fmt: skip
-        was_leaf = {key for key in values if not OmegaConf.is_config(_select(cfg, key))}
-        for key, each in values.items():
-            _set(cfg, key, each[0])
-        following = _following(OmegaConf.to_container(cfg, resolve=False))
-        axes = {}
-        for key in was_leaf if following is not None else ():
-            leaf = tuple(key.split("."))
-            leaves = (leaf, *(following or {}).get(leaf, ()))
-            if not any(_decides_more(leaf, values[key]) for leaf in leaves):
-                axes[key] = Axis(leaves, values[key])
-        return cfg, choices, axes
-
-    def _plain(self, value: Any) -> Any:
-        """A swept value, of which texts are still overrides."""
-        return self._parse(value).value() if isinstance(value, str) else value
-
-    def _is_plain(self, override: Override) -> bool:
-        """Whether it only sets a value, rather than choosing an option or adding a key."""
-        if override.is_add() or override.is_force_add() or override.is_delete():
-            return False
-        key = override.key_or_group
-        if key not in self._is_group:  # slow to ask for
-            loader = GlobalHydra.instance().config_loader()
-            self._is_group[key] = bool(loader.get_group_options(key))
-        return not self._is_group[key]
+    )
 
 
-def _parsed(text: str) -> Override:
-    (override,) = OverridesParser.create().parse_overrides([text])
-    return override
+def _composed(
+    composer: Composer, overrides: Sequence[str], followed: Mapping[str, Sequence[Any]]
+) -> tuple[Composed, dict[str, Axis]]:
+    """Configuration with the first of the followed values; and the axes, where they can be.
+
+    A key is an axis where all that depends on it takes its value unchanged, and where no file and
+    no code is chosen by it.
+    """
+    found = composer.composed(overrides)
+    cfg = found.cfg
+    values = {
+        key: each
+        if isinstance(each, range)
+        else [composer.parse(v).value() if isinstance(v, str) else v for v in each]
+        for key, each in followed.items()
+    }
+    was_leaf = {key for key in values if not OmegaConf.is_config(select(cfg, key))}
+    for key, each in values.items():
+        set_value(cfg, key, each[0])
+    following = _following(OmegaConf.to_container(cfg, resolve=False))
+    axes = {}
+    for key in was_leaf if following is not None else ():
+        leaf = tuple(key.split("."))
+        of_key = (leaf, *(following or {}).get(leaf, ()))
+        if not any(_decides_more(leaf, values[key]) for leaf in of_key):
+            axes[key] = Axis(of_key, values[key])
+    return found, axes
 
 
 def _text(key: str, value: Any) -> str:
@@ -424,31 +390,12 @@ def _text(key: str, value: Any) -> str:
     return value if isinstance(value, str) else f"{key}={'null' if value is None else value}"
 
 
-def _set(cfg: DictConfig, key: str, value: Any) -> None:
-    if not _has(cfg, key):
-        raise InputError(unknown_key(key, cfg))
-    OmegaConf.update(cfg, key, value, merge=True)
-
-
-def _has(cfg: DictConfig, key: str) -> bool:
-    """Whether the configuration has the key, even if its value is still missing."""
-    parent, _, leaf = key.rpartition(".")
-    node = _select(cfg, parent) if parent else cfg
-    if isinstance(node, ListConfig):
-        return leaf.isdecimal() and int(leaf) < len(node)
-    return isinstance(node, DictConfig) and leaf in node.keys()  # noqa: SIM118 `in node` says no to ???
-
-
-def _select(cfg: DictConfig, key: str) -> Any:
-    return OmegaConf.select(cfg, key, throw_on_resolution_failure=False)
-
-
 def _following(tree: Any) -> dict[Leaf, list[Leaf]] | None:
     """Leaves by the leaf whose value they take, `${robot.kr}`.
 
     None if a value is worked out in any other way, such as `${data}/map.npy`.
     """
-    raw = dict(_leaves(tree))
+    raw = dict(leaves(tree))
     found: dict[Leaf, list[Leaf]] = {}
     for leaf, value in raw.items():
         root, n_steps = leaf, 0
@@ -462,14 +409,6 @@ def _following(tree: Any) -> dict[Leaf, list[Leaf]] | None:
         if root != leaf:
             found.setdefault(root, []).append(leaf)
     return found
-
-
-def _leaves(tree: Mapping[str, Any], above: Leaf = ()) -> Iterator[tuple[Leaf, Any]]:
-    for name, value in tree.items():
-        if isinstance(value, dict):
-            yield from _leaves(value, (*above, str(name)))
-        else:
-            yield (*above, str(name)), value
 
 
 def _decides_more(leaf: Leaf, values: Sequence[Any]) -> bool:

@@ -23,7 +23,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import yaml
-from hydra import initialize_config_dir
 from joblib import Parallel, delayed
 from matplotlib.figure import Figure
 from omegaconf import OmegaConf
@@ -31,8 +30,9 @@ from omegaconf import OmegaConf
 from experiments.evaluation.statistics import Interval, log_ratio_interval
 from experiments.runs import paths
 from experiments.runs.columns import REVISED
+from experiments.runs.compose import composed_options, searched
 from experiments.runs.evaluate import evaluate
-from experiments.runs.experiment import Experiment, composed, searched
+from experiments.runs.experiment import Experiment
 from experiments.runs.interrupts import held_interrupts
 from experiments.runs.row import Outcome, Row, read_rows, write_frame
 from experiments.sweeps.plan import planned
@@ -79,8 +79,7 @@ class Tuned:
 
 def tuning_of(study: str, config_dir: str | None = None) -> Tuning:
     """The `tune` of a study's YAML."""
-    with initialize_config_dir(str(paths.CONF), version_base="1.3"):
-        cfg, _ = composed([*searched(config_dir), f"study={study}"])
+    cfg = composed_options([*searched(config_dir), f"study={study}"])
     return Tuning.of(study, OmegaConf.to_container(cfg).get("tune"))  # type: ignore[union-attr]
 
 

@@ -3,8 +3,9 @@
 import pytest
 
 from experiments.runs import cache
+from experiments.runs.compose import searched
 from experiments.runs.console import end
-from experiments.runs.experiment import Experiment, searched
+from experiments.runs.experiment import Experiment
 from experiments.runs.run import _split, application
 from sim.errors import InputError
 

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from experiments.papers.gil2008.settings import FARTHEST_M
-from experiments.runs.experiment import Config, Experiment
+from experiments.runs.experiment import Experiment
+from experiments.runs.schema import Config
 from experiments.runs.seeds import stream
 from sim.arrays import Array
 from sim.errors import InputError

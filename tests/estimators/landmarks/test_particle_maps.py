@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from estimators.landmarks import particle_maps as ekf
-from estimators.landmarks.particle_maps import LANES, LandmarkMaps
+from estimators.landmarks import particle_kernels as ekf
+from estimators.landmarks.particle_kernels import LANES
+from estimators.landmarks.particle_maps import LandmarkMaps
 from estimators.landmarks.stereo import StereoModel
 from estimators.particles import in_place
 from sim import se2
@@ -257,10 +258,9 @@ def test_association_is_the_least_distance_of_each_particle(described):
     births = np.tile(np.arange(8)[:, None], (1, N_PARTICLES))
     unlikeness = rng.normal(-3.0, 3.0, (6, 8)) if described else np.zeros((6, 0))
     spread = np.array([[0.02, 0.005, 0.001], [0.005, 0.01, 0.002], [0.001, 0.002, 0.003]])
-    slots = np.full((6, N_PARTICLES), -7)
     candidates = batch.maps.nearby(batch.state, 20.0)
     assert np.array_equal(candidates, np.arange(8))
-    ekf.associate(
+    slots = ekf.associate(
         batch.maps.data,
         ekf.Candidates(candidates, batch.maps.place, batch.maps.counts, births),
         points,
@@ -269,7 +269,6 @@ def test_association_is_the_least_distance_of_each_particle(described):
         12.0,
         batch.state,
         batch.camera,
-        slots,
     )
     for m in range(N_PARTICLES):
         angle = batch.poses[m, 2] + batch.model.mount[2]

@@ -16,8 +16,10 @@ import pandas as pd
 import pytest
 
 from experiments.runs import cache, store
-from experiments.runs.experiment import Experiment, files_digest, searched
+from experiments.runs.compose import searched
+from experiments.runs.experiment import Experiment
 from experiments.runs.interrupts import held_interrupts
+from experiments.runs.key import files_digest
 from experiments.runs.paths import quoted, results
 from experiments.runs.row import Status, read_rows
 from experiments.runs.store import read_runs

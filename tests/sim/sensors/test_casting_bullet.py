@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import yaml
 
-from experiments.runs.experiment import make
+from experiments.runs.targets import make
 from sim.robot.bullet import BulletBody
 from sim.robot.drive import DifferentialDrive
 from sim.sensors import Laser, Lidar3D, Mount

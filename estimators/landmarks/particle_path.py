@@ -1,0 +1,138 @@
+"""The path of one robot as all particles of FastSLAM hold it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from estimators.base import Estimate
+from estimators.gaussian import STILL, Gaussian, root, rotated
+from estimators.landmarks import particle_kernels as ekf
+from estimators.particles import Lineages
+from estimators.wheels import WheelPrediction
+from sim import se2
+from sim.arrays import Array, Ints
+from sim.recording import Frame
+
+
+class ParticlePath:
+    """What all particles hold of one robot's path.
+
+    Attributes
+    ----------
+    poses
+        (5, lanes) x, y, heading, and its cosine and sine; lanes beyond the last particle are moved
+        along, and never looked at.
+    drawn
+        (M, 3) the same, as of the last draw.
+    rolled, root
+        Motion not yet drawn, and the root (3, K) of its covariance.
+    stretch
+        (lanes,) by which slip of Student's t is wider than normal slip.
+    state
+        Of `estimators.landmarks.particle_maps`, for the robot's camera.
+    belief
+        Moments of `drawn`.
+    """
+
+    def __init__(
+        self,
+        wheels: WheelPrediction,
+        slip_dof: float | None,
+        mount: Array,
+        n_particles: int,
+        n_blocks: int,
+    ) -> None:
+        self._wheels, self._slip_dof, self._n = wheels, slip_dof, n_particles
+        self._mount, self.state = packed_mount(mount), ekf.new_state(n_blocks)
+        self._lineages = Lineages(n_particles)
+        # of each Frame: its stamp, the draw it follows, and the motion since
+        self._frames: list[tuple[float, int, Array]] = []
+
+    def scatter(self, start: Gaussian, rng: np.random.Generator) -> None:
+        """Draw the particles from the start."""
+        turned = rotated(start.covariance, -float(start.mean[2]))
+        normals = rng.standard_normal((3, len(self.state) * ekf.LANES))
+        drawn = se2.compose(start.mean, (root((turned + turned.T) / 2.0) @ normals).T)
+        headings = drawn[:, 2]
+        self.poses = np.stack([*drawn.T, np.cos(headings), np.sin(headings)])
+        self.rolled, self.root, self.belief = STILL, np.zeros((3, 2)), start
+        self.stretch = np.ones(self.poses.shape[1])
+
+    def roll(self, frame: Frame) -> None:
+        """Add the Frame's arc to the motion that is not yet drawn."""
+        motion, root_ = self._wheels.predict_with_root(frame)
+        if self.rolled is STILL:
+            self.rolled, self.root = motion, root_ if root_.shape[1] < 3 else np.zeros((3, 0))
+        else:
+            self.rolled, self.root = self.rolled.then(motion), np.zeros((3, 0))
+
+    def normals(self, rng: np.random.Generator) -> Array:
+        """Standard normal draws (3, lanes); two rows for a single arc, which has two wheels."""
+        rolled, rank = np.zeros((3, 3)), self.root.shape[1] or 3
+        covariance = self.rolled.covariance
+        rolled[:, :rank] = self.root if rank < 3 else root((covariance + covariance.T) / 2.0)
+        normals = np.zeros((3, self.poses.shape[1]))
+        rng.standard_normal(out=normals[:rank])
+        if self._slip_dof is not None:  # Student's t: a normal over the root of its own chi-square
+            squares = rng.chisquare(self._slip_dof, len(self.stretch)) / self._slip_dof
+            self.stretch = 1.0 / np.sqrt(squares)
+        self.root = rolled
+        return normals
+
+    def moved(
+        self, normals: Array, mount: Array | None = None, state: Array | None = None
+    ) -> Array:
+        """Poses (5, lanes) after the motion; writes the state of a camera, by default the own."""
+        mount = self._mount if mount is None else mount
+        state = self.state if state is None else state
+        noise = self.stretch * normals
+        return ekf.move(self.poses, self.rolled.mean, self.root, noise, mount, state)
+
+    def draw(self, rng: np.random.Generator) -> None:
+        """Draw the motion by the wheels alone."""
+        self.poses = self.moved(self.normals(rng))
+        self.settle()
+
+    def settle(self) -> None:
+        """Take the poses as drawn."""
+        self.drawn = np.ascontiguousarray(self.poses[:3, : self._n].T)
+        self.drawn[:, 2] = se2.wrap(self.drawn[:, 2])
+        self._lineages.append(self.drawn)
+        self.rolled = STILL
+
+    def note(self, stamp: float) -> None:
+        """Note a Frame."""
+        self._frames.append((stamp, len(self._lineages) - 1, self.rolled.mean))
+
+    def resample(self, ancestors: Ints) -> None:
+        """Give particle m the path of `ancestors[m]`, (M,)."""
+        self._lineages.resample(ancestors)
+        self.poses[:, : self._n] = np.take(self.poses, ancestors, axis=1)
+        self.drawn = self.drawn[ancestors]
+
+    def revised(self, best: int, weights: Array, made: dict[str, Array | Ints]) -> Estimate:
+        """Path of one particle, with the covariances of all weighted ones."""
+        n = len(self._lineages)
+        drawn: list[Gaussian] = []
+        for poses, rows in self._lineages.paths():
+            by_row = np.bincount(rows, weights, minlength=len(poses)).astype(np.float64)
+            drawn.append(Gaussian(poses[rows[best]], ekf.moments(poses, by_row)[1]))
+        beliefs = [
+            drawn[n - 1 - draw].then(Gaussian(since, np.zeros((3, 3))))
+            for _, draw, since in self._frames
+        ]
+        return Estimate(
+            np.array([stamp for stamp, _, _ in self._frames]),
+            np.array([belief.mean for belief in beliefs]),
+            np.array([belief.covariance for belief in beliefs]),
+            kind="revised",
+            map=made,
+        )
+
+
+def packed_mount(mount: Array) -> Array:
+    """(4,) x, y, and cosine and sine of the yaw of a mount (3,)."""
+    x, y, yaw = mount
+    return np.array([x, y, math.cos(yaw), math.sin(yaw)])

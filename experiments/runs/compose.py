@@ -1,0 +1,397 @@
+"""Compose configurations with Hydra: options of groups first, then defaults, then plain values."""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import re
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf.errors import InterpolationKeyError
+
+from experiments.runs import paths
+from experiments.runs.calibration import read_calibration
+from experiments.runs.key import digest_of
+from experiments.runs.schema import (
+    GROUPS,
+    Config,
+    check_known,
+    check_shape,
+    fill,
+    leaves,
+    unknown_key,
+)
+from sim.errors import InputError, require
+from sim.files import write_text
+from sim.yaml_file import read_yaml
+
+_READ_OF_HYDRA = ("hydra/launcher", "hydra.launcher", "hydra.searchpath")
+
+
+@dataclass(frozen=True)
+class Composed:
+    """A composed configuration, whose interpolations are not resolved.
+
+    Attributes
+    ----------
+    cfg
+        The configuration, filled up with the defaults of what it names.
+    choices
+        Name of the chosen option of each configuration group.
+    params
+        `hydra.sweeper.params` of a study's file: values by key, as texts.
+    """
+
+    cfg: DictConfig
+    choices: Mapping[str, str]
+    params: Mapping[str, str]
+
+    def resolved(self) -> tuple[Config, dict[str, str]]:
+        """Plain values, and the choice of each group.
+
+        Raises
+        ------
+        InputError
+            If a key is missing, or is not a mapping where it must be one.
+        """
+        _believe(self.cfg)
+        try:
+            config: Config = OmegaConf.to_container(self.cfg, resolve=True)  # type: ignore[assignment]
+        except InterpolationKeyError as error:
+            raise InputError(
+                f"{error.full_key} follows a key that is missing: {str(error).splitlines()[0]}; "
+                f"keep that key, or set {error.full_key} too"
+            ) from error
+        for of_sweeps in ("sweeps", "tune"):
+            config.pop(of_sweeps, None)
+        check_shape(config)
+        simulation = config["simulation"]
+        if simulation["rays"] is None:
+            kinematic = simulation["physics"] == "kinematic"  # it has no engine to cast rays
+            simulation["rays"] = "exact" if kinematic else "bullet"
+        return config, {group: str(self.choices.get(group)) for group in GROUPS}
+
+
+class Composer:
+    """Compose many configurations that share most of their choices.
+
+    Hydra composes each choice of options once; plain values are then put in place.
+
+    Parameters
+    ----------
+    extra
+        Overrides of every configuration, such as `searched` gives.
+    """
+
+    def __init__(self, extra: Sequence[str] = ()) -> None:
+        self.extra = list(extra)
+        self.parse = functools.lru_cache(maxsize=4096)(parsed)
+        self._is_group: dict[str, bool] = {}
+        self._bases: dict[tuple[str, ...], Composed] = {}
+
+    def composed(self, overrides: Sequence[str]) -> Composed:
+        """Compose a configuration.
+
+        Raises
+        ------
+        InputError
+            If an override is of a key that is not known.
+        """
+        check_overrides(overrides)
+        each = [self.parse(override) for override in overrides]
+        options = [o for o in each if not self.is_plain(o)]
+        plain = [o for o in each if self.is_plain(o)]
+        targets = [o for o in plain if o.key_or_group.endswith("_target_")]
+        base = self._base(options, targets)
+        _check_calibrated(each)
+        cfg = base.cfg.copy()
+        for override in plain:
+            set_value(cfg, override.key_or_group, override.value())
+        if any(isinstance(o.value(), dict) for o in plain):
+            fill(cfg)
+        return Composed(cfg, base.choices, base.params)
+
+    def _base(self, options: Sequence[Override], targets: Sequence[Override]) -> Composed:
+        """The configuration of some options, and of targets in place of theirs, filled up."""
+        key = tuple(o.input_line or "" for o in (*options, *targets))
+        if key not in self._bases:
+            lines = [*self.extra, *(o.input_line or "" for o in options)]
+            cfg = compose("config", overrides=lines, return_hydra_config=True)
+            choices, params = cfg.hydra.runtime.choices, cfg.hydra.sweeper.get("params") or {}
+            _check_added(options, {choice.partition("@")[0] for choice in choices})
+            OmegaConf.set_struct(cfg, False)
+            del cfg["hydra"]
+            for override in targets:
+                set_value(cfg, override.key_or_group, override.value())
+            fill(cfg)
+            self._bases[key] = Composed(cfg, choices, dict(params))
+        return self._bases[key]
+
+    def is_plain(self, override: Override) -> bool:
+        """Whether it only sets a value, rather than choosing an option or adding a key."""
+        if override.is_add() or override.is_force_add() or override.is_delete():
+            return False
+        key = override.key_or_group
+        if key.startswith("hydra."):
+            return False
+        if key not in self._is_group:  # slow to ask for
+            loader = GlobalHydra.instance().config_loader()
+            self._is_group[key] = bool(loader.get_group_options(key))
+        return not self._is_group[key]
+
+
+@contextmanager
+def composing(extra: Sequence[str] = ()) -> Iterator[Composer]:
+    """Yield a composer of the project's configuration."""
+    with initialize_config_dir(str(paths.CONF), version_base="1.3"):
+        yield Composer(extra)
+
+
+@dataclass(frozen=True)
+class CommandLine:
+    """Arguments of `estima run`.
+
+    Attributes
+    ----------
+    overrides
+        Hydra's.
+    config_dir
+        A further folder of options.
+    shown
+        Whether the configuration is printed, rather than run.
+    resolved
+        Whether it is printed with values in place of interpolations.
+    """
+
+    overrides: Sequence[str]
+    config_dir: str | None
+    shown: bool
+    resolved: bool
+
+    @classmethod
+    def of(cls, arguments: Sequence[str]) -> CommandLine:
+        """Read overrides and options, in any order.
+
+        Raises
+        ------
+        InputError
+            If an option is unknown, or lacks its value.
+        """
+        parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+        parser.add_argument("overrides", nargs="*")
+        parser.add_argument("--config-dir", "-cd")
+        parser.add_argument("--cfg", "-c", choices=["job"])
+        parser.add_argument("--resolve", action="store_true")
+        known = "estima run takes overrides, -m, --config-dir FOLDER, --cfg job and --resolve"
+        try:
+            given, others = parser.parse_known_intermixed_args(arguments)
+        except argparse.ArgumentError as error:
+            raise InputError(f"{error}; {known}") from error
+        require(not others, f"{' '.join(others)}: {known}")
+        return cls(given.overrides, given.config_dir, given.cfg is not None, given.resolve)
+
+
+def composed_options(overrides: Sequence[str]) -> DictConfig:
+    """A configuration, not resolved, of overrides that may name a study's file."""
+    with composing() as composer:
+        return composer.composed(with_study_file(overrides)).cfg
+
+
+def parsed(text: str) -> Override:
+    """One override of Hydra's grammar."""
+    (override,) = OverridesParser.create().parse_overrides([text])
+    return override
+
+
+def set_value(cfg: DictConfig, key: str, value: Any) -> None:
+    """Set a key that the configuration has.
+
+    Raises
+    ------
+    InputError
+        If it has none of that name.
+    """
+    if not _has(cfg, key):
+        raise InputError(unknown_key(key, cfg))
+    OmegaConf.update(cfg, key, value, merge=True)
+
+
+def _has(cfg: DictConfig, key: str) -> bool:
+    """Whether the configuration has the key, even if its value is still missing."""
+    parent, _, leaf = key.rpartition(".")
+    node = select(cfg, parent) if parent else cfg
+    if isinstance(node, ListConfig):
+        return leaf.isdecimal() and int(leaf) < len(node)
+    return isinstance(node, DictConfig) and leaf in node.keys()  # noqa: SIM118 `in node` says no to ???
+
+
+def select(cfg: DictConfig, key: str) -> Any:
+    """What stands at a key; None if it cannot be resolved."""
+    return OmegaConf.select(cfg, key, throw_on_resolution_failure=False)
+
+
+def _believe(cfg: DictConfig) -> None:
+    """Put the slip of a calibration in the place of a simulated robot's."""
+    path = cfg.get("calibration")
+    if path is None:
+        return
+    require(isinstance(path, str) and path, f"calibration must be a path or null, got {path!r}")
+    require(
+        cfg.get("recording") is not None,
+        "calibration is of a real log: set recording too, made by `estima convert LOG -o FILE.npz`",
+    )
+    slip = read_calibration(Path(path)).slip
+    for key in ("kr", "kl"):
+        OmegaConf.update(cfg, f"robot.{key}", getattr(slip, key))
+    if cfg.estimator.get("forward_slip_m") == 0.0:
+        OmegaConf.update(cfg, "estimator.forward_slip_m", slip.forward_slip_m)
+
+
+def searched(config_dir: str | Path | None) -> list[str]:
+    """Override that makes Hydra look for options in another folder too; none for None.
+
+    Raises
+    ------
+    InputError
+        If there is no such folder, or one of its options is no YAML that can be read.
+    """
+    if config_dir is None:
+        return []
+    folder = Path(config_dir).resolve()
+    if not folder.is_dir():
+        raise InputError(f"--config-dir must name a folder, got {config_dir}")
+    require("${" not in str(folder), f"{folder}: Hydra takes ${{ for a value; rename the folder")
+    for group in (*GROUPS, "study"):
+        for path in sorted((folder / group).glob("*.yaml")):
+            option = read_yaml(path)  # within bounds, which Hydra does not know
+            keys = option is None or (
+                isinstance(option, dict) and all(isinstance(key, str) for key in option)
+            )
+            require(keys, f"{path}: an option holds keys and their values")
+            _check_hydra_of(path, option or {})
+    return [f"hydra.searchpath=[{paths.quoted(f'file://{folder}')}]"]
+
+
+def with_study_file(overrides: Sequence[str]) -> list[str]:
+    """Overrides in which `study=FILE.yaml` is a name, and the folder in which Hydra looks for it.
+
+    Hydra knows an option by its name in a folder of its group, so a study that lies elsewhere is
+    copied to one.
+
+    Raises
+    ------
+    InputError
+        If there is no such file.
+    """
+    found: list[str] = []
+    for override in overrides:
+        key, _, value = override.partition("=")
+        path = Path(value)
+        if key != "study" or path.suffix != ".yaml":
+            found.append(override)
+            continue
+        require(path.is_file(), f"{override}: there is no such file")
+        place = path.resolve()
+        if place.parent.name != "study":
+            place = (
+                paths.results() / "cache" / "studies" / digest_of(path)[:16] / "study" / path.name
+            )
+            write_text(place, path.read_text())
+        found += [*searched(place.parents[1]), f"study={path.stem}"]
+    return found
+
+
+def _check_hydra_of(path: Path, option: Mapping[str, Any]) -> None:
+    """Check that an option's file has none of Hydra's settings that nothing here reads."""
+    defaults = option.get("defaults")
+    entries = [e for e in defaults if isinstance(e, dict)] if isinstance(defaults, list) else []
+    set_here = [group for entry in entries for group in entry if "/hydra/" in str(group)]
+    set_here += [
+        ".".join(map(str, leaf))
+        for leaf, value in leaves({"hydra": option.get("hydra")})
+        if value not in (None, {}) and leaf[:3] != ("hydra", "sweeper", "params")
+    ]
+    if set_here:
+        raise InputError(
+            f"{path}: {set_here[0]}: of Hydra's settings a file's hydra.sweeper.params alone has "
+            "an effect; give hydra/launcher and hydra.launcher on the command line"
+        )
+
+
+def _check_calibrated(overrides: Sequence[Override]) -> None:
+    """Check that a calibration's slip is not set as if the robot were simulated."""
+    calibrated = any(o.key_or_group == "calibration" and o.value() is not None for o in overrides)
+    for override in overrides if calibrated else ():
+        if override.key_or_group in ("robot.kr", "robot.kl"):
+            key = override.key_or_group.removeprefix("robot.")
+            raise InputError(
+                f"{override.input_line}: the calibration has its own {key}; set estimator.{key} to "
+                "believe another, or leave calibration out"
+            )
+
+
+def _check_added(overrides: Sequence[Override], groups: Collection[str]) -> None:
+    """Check that no override adds a key that nothing reads.
+
+    A study's YAML may have keys of its own; the command line sets those without a +.
+    """
+    for override in overrides:
+        added = override.is_add() or override.is_force_add()
+        if added and override.key_or_group not in groups:
+            check_known(override.key_or_group.partition(".")[0])
+
+
+def check_hydra(overrides: Sequence[str]) -> None:
+    """Check that no override is one of Hydra's own settings that nothing here reads.
+
+    Raises
+    ------
+    InputError
+        Naming what to do instead.
+    """
+    for override in overrides:
+        key = override.lstrip("+~").partition("=")[0]
+        if re.match(r"hydra\b", key) is None or key.startswith(_READ_OF_HYDRA):
+            continue
+        remedies = {
+            "hydra/sweeper": "-m runs every combination of the values; an optimizer may call "
+            "estima.sweep from Python",
+            "hydra.sweeper": "give the values themselves, such as seed=1,2",
+            "hydra.verbose": "there is no log; a failed run's row says how",
+        }
+        usual = "rows go to results/runs/NAME: set name, or --results for another folder"
+        remedy = next((remedies[start] for start in remedies if key.startswith(start)), usual)
+        raise InputError(f"{override}: {key} has no effect here; {remedy}")
+
+
+def check_overrides(overrides: Sequence[str]) -> None:
+    """Check what Hydra itself does not: that each override has a key, and groups have names.
+
+    Raises
+    ------
+    InputError
+        Naming the override.
+    """
+    for override in OverridesParser.create().parse_overrides(list(overrides)):
+        key, value = override.key_or_group, override.value()
+        if not key:
+            raise InputError(f"{override.input_line}: no key before the =")
+        named = override.is_sweep_override() or isinstance(value, (str, list))
+        if key == "hydra.searchpath" and isinstance(value, list):
+            for entry in value:
+                scheme, _, place = str(getattr(entry, "text", entry)).rpartition("://")
+                there = scheme not in ("", "file") or Path(place).is_dir()
+                require(there, f"{override.input_line}: there is no folder {place}")
+        if key in (*GROUPS, "study") and not (named or override.is_delete()):
+            raise InputError(
+                f"{override.input_line}: {key} must name one of `estima options {key}`"
+            )
