@@ -9,55 +9,40 @@ from estimators.base import Belief, Estimate, Prior
 from estimators.gaussian import STILL, Gaussian
 from estimators.graph.landmark_drive import LandmarkDrive, loosened, observed
 from estimators.landmarks.stereo import StereoModel
-from estimators.options import require_counts, require_stereo, start_pose
+from estimators.options import require_stereo, start_pose
 from estimators.peers import package
-from estimators.peers.gtsam_model import GtsamModel, Isam2
-from estimators.wheels import WheelOptions, WheelPrediction
+from estimators.peers.gtsam_model import GtsamModel, GtsamOptions, Isam2, Isam2Options
+from estimators.wheels import WheelPrediction
 from sim.arrays import Array
+from sim.options import Count, options
 from sim.recording import Frame
 
 
-class GtsamBatch:
+@options("estimator")
+class GtsamBatchOptions(GtsamOptions):
+    """Options of GTSAM's batch solution."""
+
+    max_iterations: Count = 100
+    """Most iterations of Levenberg-Marquardt; GTSAM's own, with its default."""
+
+
+class GtsamBatch(GtsamBatchOptions):
     """Online iSAM2 as GTSAM ships it; from there `finish` solves for everything seen.
 
     Started from dead reckoning instead, Levenberg-Marquardt ended in a false minimum in three of
     fifteen drives of 30 m.
-
-    Parameters
-    ----------
-    stereo
-        The sensor that it reads; its landmarks must be identified.
-    kr, kl
-        Believed slip variance per metre of the right and left wheel, m.
-    max_iterations
-        GTSAM's own, with its default.
-    window_s
-        |ds| is netted over at least this time.
     """
 
     needs = frozenset({"stereo"})
-
-    def __init__(
-        self,
-        stereo: str = "stereo",
-        kr: float = 1e-4,
-        kl: float = 1e-4,
-        max_iterations: int = 100,
-        window_s: float = 0.05,
-    ) -> None:
-        self._gtsam = package("gtsam", "gtsam")
-        require_counts(max_iterations=max_iterations)
-        self.stereo, self.max_iterations = stereo, max_iterations
-        self.wheels = WheelOptions(kr=kr, kl=kl, window_s=window_s)
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Start from the prior's pose, with nothing seen."""
         self._camera = StereoModel.of(require_stereo(prior, self.stereo, "gtsam_batch"))
         self._model = GtsamModel(self._camera)
         self._belief = start_pose(prior, "gtsam_batch")
-        self._wheels = WheelPrediction(self.wheels, prior.robot.track_m)
+        self._wheels = WheelPrediction(self, prior.robot.track_m)
         self._drive = LandmarkDrive(self._camera, self._belief)
-        self._isam2 = Isam2(self._camera, self._belief)
+        self._isam2 = Isam2(self._camera, self._belief, Isam2Options())
         self._motion = STILL  # since the last image
 
     def step(self, frame: Frame) -> Belief:
@@ -91,14 +76,14 @@ class GtsamBatch:
             if landmark not in known:
                 known.add(landmark)
                 model.add_landmark(values, landmark, self._camera.place(guess[pose], point))
-        params = self._gtsam.LevenbergMarquardtParams()
+        params = package("gtsam", "gtsam").LevenbergMarquardtParams()
         params.setMaxIterations(self.max_iterations)
-        optimizer = self._gtsam.LevenbergMarquardtOptimizer(graph, values, params)
+        optimizer = package("gtsam", "gtsam").LevenbergMarquardtOptimizer(graph, values, params)
         found = optimizer.optimize()
         poses = np.array(
             [model.planar(found.atPose3(model.pose_key(i))) for i in range(len(guess))]
         )
-        marginals = self._gtsam.Marginals(graph, found)
+        marginals = package("gtsam", "gtsam").Marginals(graph, found)
         means, covariances = self._drive.filled_in(poses, self._joint(marginals, poses))
         converged = optimizer.iterations() < self.max_iterations
         return Estimate(

@@ -10,17 +10,39 @@ import numpy as np
 
 from estimators.gaussian import Gaussian, rotated
 from estimators.graph.landmark_drive import FLOOR
-from estimators.landmarks.stereo import StereoModel
+from estimators.landmarks.stereo import StereoModel, StereoOptions
 from estimators.peers import package
 from estimators.peers.planar import matrix_of
+from estimators.wheels import WheelOptions
 from sim import se2
 from sim.arrays import Array, Ints
 from sim.errors import require
+from sim.options import Count, Positive, options
 
 _FLAT_SIGMA = 1e-5  # height m, roll and pitch rad, of every pose
 _FREE_SIGMA = 1e3
 _IN_PLANE = [3, 4, 2]  # x, y, yaw of a Pose3's tangent: roll, pitch, yaw, x, y, z
 _OUT_OF_PLANE = [0, 1, 5]
+
+
+@options("estimator")
+class GtsamOptions(WheelOptions, StereoOptions):
+    """Options of both of GTSAM's solvers; the camera's landmarks must be identified."""
+
+    def __post_init__(self) -> None:
+        package("gtsam", "gtsam")
+
+
+@options("estimator")
+class Isam2Options(GtsamOptions):
+    """GTSAM's own options of iSAM2, with its defaults."""
+
+    relinearize_threshold: Positive = 0.1
+    """How far a variable moves before it is linearised again."""
+    relinearize_skip: Count = 10
+    """At how many updates that is looked at."""
+    updates: Count = 1
+    """Calls of `update` at every image."""
 
 
 class GtsamModel:
@@ -131,7 +153,7 @@ class GtsamModel:
 
 
 class Isam2:
-    """GTSAM's iSAM2 over images; options as in `estimators.peers.gtsam_isam2.GtsamIsam2`.
+    """GTSAM's iSAM2 over images.
 
     Parameters
     ----------
@@ -139,19 +161,12 @@ class Isam2:
         Pose in map before the first image.
     """
 
-    def __init__(
-        self,
-        camera: StereoModel,
-        start: Gaussian,
-        relinearize_threshold: float = 0.1,
-        relinearize_skip: int = 10,
-        updates: int = 1,
-    ) -> None:
+    def __init__(self, camera: StereoModel, start: Gaussian, believed: Isam2Options) -> None:
         gtsam = package("gtsam", "gtsam")
-        self._camera, self._model, self._updates = camera, GtsamModel(camera), updates
+        self._camera, self._model, self._updates = camera, GtsamModel(camera), believed.updates
         params = gtsam.ISAM2Params()
-        params.setRelinearizeThreshold(relinearize_threshold)
-        params.relinearizeSkip = relinearize_skip
+        params.setRelinearizeThreshold(believed.relinearize_threshold)
+        params.relinearizeSkip = believed.relinearize_skip
         self._isam = gtsam.ISAM2(params)
         graph, values = self._model.graph_and_values()
         self._model.add_start(graph, Gaussian(start.mean, start.covariance + FLOOR))
