@@ -33,6 +33,7 @@ Kernel = Literal["tukey", "huber", "none"]
 # those look. For the first it is that of the guess.
 _TURN_THEN, _TURN_LAST = 0.01, 0.002
 _SEARCHED_RAD, _GUESSED_RAD = 0.08, 0.2  # after a search of the heading, and without
+_REST_M, _REST_RAD = 1e-5, 1e-5  # iterations end when the increment falls below both
 # Tuning constants, in standard deviations; without a kernel every match within the gate counts
 _WIDTHS = {"tukey": 6.0, "huber": 1.345, "none": math.inf}
 _AGREEMENT = 6.0  # range standard deviations from a line of the other scan
@@ -158,8 +159,6 @@ def register(
     gate_rad: float | None = None,
     heading_window_rad: float | None = None,
     rules: Rules = USUAL,
-    increment_m: float = 1e-5,
-    increment_rad: float = 1e-5,
 ) -> Registration:
     """Find the pose of the source scan in the frame of the target scan.
 
@@ -185,8 +184,6 @@ def register(
         iteration; by default 30 degrees without an initial guess, and 0 (no search) with one.
     rules
         Which matches count, and when iterations end.
-    increment_m, increment_rad
-        Iterations end when both parts of the increment fall below these.
     """
     pose = np.zeros(3) if initial is None else np.array(initial, dtype=np.float64)
     if pose.shape != (3,) or not np.all(np.isfinite(pose)):
@@ -208,7 +205,7 @@ def register(
     if gate_rad is None:
         gate_rad = _SEARCHED_RAD if window > 0.0 else _GUESSED_RAD
     settings = Settings(
-        rules.max_iterations, rules.trim, rules.stop_error_m, increment_m, increment_rad,
+        rules.max_iterations, rules.trim, rules.stop_error_m, _REST_M, _REST_RAD,
         gate_m / 4.0, gate_rad / 4.0,
     )  # fmt: skip
     width, huber = _WIDTHS[rules.kernel], rules.kernel == "huber"

@@ -48,7 +48,7 @@ class Settings(NamedTuple):
     max_iterations, trim, stop_error_m
         See `Rules`.
     increment_m, increment_rad
-        See `register`.
+        Iterations end when both parts of the increment fall below these.
     sigma_m, sigma_rad
         Standard deviations of the guess.
     """

@@ -6,13 +6,10 @@ from typing import Any
 import numpy as np
 
 from estimators.base import Belief, Estimate, Prior
-from estimators.gaussian import STILL, Gaussian
-from estimators.graph.landmark_drive import LandmarkDrive, loosened, observed
-from estimators.landmarks.stereo import StereoModel
-from estimators.options import require_stereo, start_pose
+from estimators.gaussian import Gaussian
+from estimators.graph.landmark_drive import LandmarkDrive
 from estimators.peers import package
-from estimators.peers.gtsam_model import GtsamModel, GtsamOptions, Isam2, Isam2Options
-from estimators.wheels import WheelPrediction
+from estimators.peers.gtsam_model import GtsamOptions, Isam2, Isam2Options
 from sim.arrays import Array
 from sim.options import Count, options
 from sim.recording import Frame
@@ -37,30 +34,20 @@ class GtsamBatch(GtsamBatchOptions):
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Start from the prior's pose, with nothing seen."""
-        self._camera = StereoModel.of(require_stereo(prior, self.stereo, "gtsam_batch"))
-        self._model = GtsamModel(self._camera)
-        self._belief = start_pose(prior, "gtsam_batch")
-        self._wheels = WheelPrediction(self, prior.robot.track_m)
-        self._drive = LandmarkDrive(self._camera, self._belief)
-        self._isam2 = Isam2(self._camera, self._belief, Isam2Options())
-        self._motion = STILL  # since the last image
+        believed = Isam2Options(stereo=self.stereo, kr=self.kr, kl=self.kl, window_s=self.window_s)
+        self._isam2 = Isam2(believed, prior, "gtsam_batch")
+        self._drive = LandmarkDrive(self._isam2.camera, self._isam2.belief)
 
     def step(self, frame: Frame) -> Belief:
         """Keep what the Frame shows; at an image, update iSAM2."""
-        motion = self._wheels.predict(frame)
-        loose = loosened(motion)
-        self._belief, self._motion = self._belief.then(motion), self._motion.then(loose)
-        seen, status = observed(frame, self.stereo, self._camera, "gtsam_batch")
-        if seen is not None:
-            self._belief, self._motion = self._isam2.see(self._motion, *seen), STILL
-        self._drive.add(frame.stamp, loose, self._belief.mean, seen)
-        extras = {"status": status} if status else {}
-        return Belief(self._belief.mean.copy(), self._belief.covariance.copy(), extras)
+        belief, motion, seen = self._isam2.step(frame)
+        self._drive.add(frame.stamp, motion, belief.mean, seen)
+        return belief
 
     def finish(self) -> Estimate:
         """Least squares over all Frames so far."""
         problem, guess = self._drive.problem()
-        model = self._model
+        model, camera = self._isam2.model, self._isam2.camera
         graph, values = model.graph_and_values()
         model.add_start(graph, Gaussian(problem.prior_mean, problem.prior_covariance))
         for i, pose in enumerate(guess):
@@ -75,7 +62,7 @@ class GtsamBatch(GtsamBatchOptions):
             model.add_seen(graph, pose, landmark, point)
             if landmark not in known:
                 known.add(landmark)
-                model.add_landmark(values, landmark, self._camera.place(guess[pose], point))
+                model.add_landmark(values, landmark, camera.place(guess[pose], point))
         params = package("gtsam", "gtsam").LevenbergMarquardtParams()
         params.setMaxIterations(self.max_iterations)
         optimizer = package("gtsam", "gtsam").LevenbergMarquardtOptimizer(graph, values, params)
@@ -96,7 +83,7 @@ class GtsamBatch(GtsamBatchOptions):
 
     def _joint(self, marginals: Any, poses: Array) -> Array:
         """Covariance (3 T, 3 T) of the poses; only those of neighbours are filled in."""
-        model, n = self._model, len(poses)
+        model, n = self._isam2.model, len(poses)
         joint = np.zeros((3 * n, 3 * n))
         if n == 1:
             block = marginals.marginalCovariance(model.pose_key(0))

@@ -32,7 +32,7 @@ class KissIcpOptions(LaserOptions):
     """Most iterations of a registration."""
 
     def __post_init__(self) -> None:
-        package("kiss_icp", "peers")
+        package("kiss_icp.config", "peers")
 
 
 class KissIcp(KissIcpOptions):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from estimators.laser import icp_iterations, icp_start
+from estimators.laser import icp, icp_iterations, icp_start
 from estimators.laser.icp import Rules, prepare, register
 from experiments.bench.icp import BEARINGS_RAD, SIGMA_RANGE_M, pair
 from experiments.evaluation.scan_bound import cast, fisher_bound, fisher_information
@@ -188,10 +188,12 @@ def test_a_turned_sensor_sees_the_same_motion_turned(rng):
 
 
 @pytest.mark.parametrize("metric", ["point_to_line", "point_to_plane", "point_to_point"])
-def test_result_is_a_minimum_with_its_normal_matrix(metric, rng):
+def test_result_is_a_minimum_with_its_normal_matrix(metric, rng, monkeypatch):
     target = scan(ROOM, [0.3, 0.4, 0.7], rng)
     source = scan(ROOM, [0.35, 0.42, 0.72], rng)
-    found = register(source, target, metric=metric, increment_m=1e-9, increment_rad=1e-9)
+    for name in ("_REST_M", "_REST_RAD"):
+        monkeypatch.setattr(icp, name, 1e-9)
+    found = register(source, target, metric=metric)
     kept = found.inliers
 
     def residuals(pose):
