@@ -283,7 +283,6 @@ def test_a_failing_program_is_a_status_of_its_row(tmp_path):
         ({"command": "build/peers/mrpt icp"}, "`make peers` compiles it"),
         ({"command": "python3 'open"}, "No closing quotation"),
         ({"command": PYTHON, "step_s": 0}, "step_s must be a number, above 0"),
-        ({"command": PYTHON, "start_s": True}, "start_s must be a number, above 0"),
     ],
 )
 def test_wrong_settings_are_named(settings, message, tmp_path, monkeypatch):
@@ -297,9 +296,6 @@ def test_wrong_settings_are_named(settings, message, tmp_path, monkeypatch):
     [
         ({"command": "sh {log}"}, r"must have \{out\}"),
         ({"command": "sh {truth} {out}"}, r"nothing is called \{truth\}"),
-        ({"command": "sh {out}", "output": "csv"}, "output"),
-        ({"command": "sh {out}", "kind": "batch"}, "kind"),
-        ({"command": "sh {out}", "limit_s": -1}, "limit_s"),
     ],
 )
 def test_wrong_settings_of_offline_programs_are_named(settings, message):

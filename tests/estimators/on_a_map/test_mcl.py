@@ -212,10 +212,6 @@ def test_wrong_input_is_named():
         Mcl().reset(dataclasses.replace(prior(), map=None), rng)
     for options, word in (
         ({"n_least": 100, "n_most": 50}, "n_least"),
-        ({"n_beams": 0}, "n_beams"),
-        ({"sigma_m": 0.0}, "sigma_m"),
-        ({"kr": np.nan}, "kr"),
-        ({"resampling": "wheel"}, "systematic"),
         ({"least_ess": 0.5, "ess_share": 0.5}, "ess_share"),
         ({"n_most": 10**12}, "n_most must be a whole number, from 1 to 10000000"),
         ({"n_most": 10**6, "tries": 10**12}, "tries"),
