@@ -81,6 +81,8 @@ def options(where: str) -> Callable[[type[T]], type[T]]:
     """
 
     def decorate(cls: type[T]) -> type[T]:
+        # as they are, also where `from __future__ import annotations` makes texts of them
+        cls.__annotations__ = inspect.get_annotations(cls, eval_str=True)
         made: Any = checked_dataclass(frozen=True, kw_only=True, config=_CONFIG)(cls)
         construct = made.__init__
 

@@ -39,28 +39,25 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.linalg import cho_factor, cho_solve
 
 from estimators.base import Belief, Estimate, Prior
 from estimators.gaussian import STILL, Gaussian, between, wrap
-from estimators.graph.landmark_drive import FLOOR, LandmarkDrive, loosened, observed
-from estimators.graph.least_squares import (
-    LEAST_INFORMATION,
-    camera_whitening,
-    inverse,
-    residuals_of,
-    times,
-    transposed,
-    whitening_of,
-)
-from estimators.landmarks.stereo import StereoModel
+from estimators.graph.landmark_drive import FLOOR, LandmarkDrive, loosened, observed, revised
+from estimators.graph.least_squares import LEAST_INFORMATION, camera_whitening, residuals_of
+from estimators.graph.matrices import inverse, times, transposed, whitening_of
+from estimators.landmarks.joint import JointGaussian
+from estimators.landmarks.stereo import StereoModel, StereoOptions
 from estimators.laser.icp import PreparedScan
 from estimators.laser.scan_matching import MatcherOptions, ScanMatcher
-from estimators.options import require_counts, require_laser, require_stereo, start_pose
+from estimators.options import require_laser, require_stereo, start_pose
 from estimators.wheels import WheelOptions, WheelPrediction
 from sim import se2
 from sim.arrays import Array, Ints
+from sim.options import Count, NonNegative, options
 from sim.recording import Frame
+
+_POSE = slice(0, 3)  # rows of the prior's
 
 
 @dataclass(frozen=True)
@@ -72,27 +69,26 @@ class _Image:
     points: Array
 
 
-class FixedLag:
-    """Least squares over the last images on a Gaussian prior of all older ones.
+@options("estimator")
+class FixedLagOptions(WheelOptions, StereoOptions):
+    """Options of fixed-lag smoothing."""
 
-    Parameters
-    ----------
-    kr, kl
-        Believed slip variance per metre of the right and left wheel, m.
-    lag_images
-        W, the images whose poses are estimated together.
-    iterations
-        Gauss-Newton steps at every image.
-    keep_landmarks
-        Keep landmarks that the window sees no more, so that they count when they come back. If
-        not, time and memory do not grow with the map.
-    window_s
-        |ds| is netted over at least this time.
-    laser
-        Name of a laser whose scans are registered where a Frame has a scan beside its image; None
-        for none.
-    sigma_range_m
-        Believed range noise of it; None for its own.
+    lag_images: Count = 20
+    """W, the images whose poses are estimated together."""
+    iterations: Count = 1
+    """Gauss-Newton steps at every image."""
+    keep_landmarks: bool = True
+    """Keep landmarks that the window sees no more, so that they count when they come back. If not,
+    time and memory do not grow with the map."""
+    laser: str | None = None
+    """Name of a laser whose scans are registered where a Frame has a scan beside its image; null
+    for none."""
+    sigma_range_m: NonNegative | None = None
+    """Believed range noise of that laser, m; null: its own."""
+
+
+class FixedLag(FixedLagOptions):
+    """Least squares over the last images on a Gaussian prior of all older ones.
 
     Notes
     -----
@@ -106,35 +102,17 @@ class FixedLag:
 
     needs = frozenset({"stereo"})
 
-    def __init__(
-        self,
-        kr: float = 1e-4,
-        kl: float = 1e-4,
-        lag_images: int = 20,
-        iterations: int = 1,
-        keep_landmarks: bool = True,
-        window_s: float = 0.05,
-        stereo: str = "stereo",
-        laser: str | None = None,
-        sigma_range_m: float | None = None,
-    ) -> None:
-        self.stereo, self.laser = stereo, laser
-        self._matcher = ScanMatcher(MatcherOptions(sigma_range_m=sigma_range_m))
-        self.wheels = WheelOptions(kr=kr, kl=kl, window_s=window_s)
-        require_counts(lag_images=lag_images, iterations=iterations)
-        self.lag_images, self.iterations = lag_images, iterations
-        self.keep_landmarks = keep_landmarks
-
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Start from the prior's pose, with an empty map."""
         self._camera = StereoModel.of(require_stereo(prior, self.stereo, "fixed_lag"))
         self._belief = start_pose(prior, "fixed_lag")
-        self._wheels = WheelPrediction(self.wheels, prior.robot.track_m)
+        self._wheels = WheelPrediction(self, prior.robot.track_m)
         self._drive = LandmarkDrive(self._camera, self._belief)
         self._laser = None if self.laser is None else require_laser(prior, self.laser, "fixed_lag")
         self._scan: PreparedScan | None = None  # of the last image
+        self._matcher = ScanMatcher(MatcherOptions(sigma_range_m=self.sigma_range_m))
         self._rng = rng
-        self._mean, self._room = self._belief.mean.copy(), self._belief.covariance + FLOOR
+        self._prior = JointGaussian(self._belief.mean.copy(), self._belief.covariance + FLOOR)
         self._motion = STILL  # since the last image
         self._images: list[_Image] = []
         self._poses = self._belief.mean[None].copy()  # of the prior, then of each image
@@ -160,9 +138,9 @@ class FixedLag:
     def finish(self) -> Estimate:
         """Least squares over all Frames so far, as `estimators.graph.smoother` solves it.
 
-        It starts from the online estimate, and gives what `LandmarkDrive.revised` does.
+        It starts from the online estimate.
         """
-        return self._drive.revised("none", 3.0, 100)
+        return revised([self._drive])[0]
 
     def _registered(self, frame: Frame) -> Gaussian | None:
         """Motion since the last image by the scans; None without both, or if that fails."""
@@ -227,8 +205,11 @@ class FixedLag:
 
         of_prior = np.concatenate([(3 + 3 * old[:, None] + np.arange(3)).ravel(), [0, 1, 2]])
         rows = np.concatenate([np.arange(3 * len(old)), 3 * n_landmarks + np.arange(3)])
-        factor = cho_factor(self._covariance[np.ix_(of_prior, of_prior)], lower=True)
-        off = np.concatenate([self._landmarks[old].ravel(), self._poses[0]]) - self._mean[of_prior]
+        factor = cho_factor(self._prior.covariance[np.ix_(of_prior, of_prior)], lower=True)
+        off = (
+            np.concatenate([self._landmarks[old].ravel(), self._poses[0]])
+            - self._prior.mean[of_prior]
+        )
         off[-1] = wrap(off[-1])
         flat[np.ix_(rows, rows)] = cho_solve(factor, np.eye(len(rows)))
         flat_g[rows] = cho_solve(factor, off)
@@ -268,24 +249,27 @@ class FixedLag:
         taken = self._update(image.landmarks[old], e[old], by_pose[old], by_landmark[old])
         new = np.flatnonzero(~old)[np.argsort(image.landmarks[~old])]
         # until now, e was at the prior's x_1 before the update
-        e[new] += by_pose[new] @ (self._mean[:3] - self._poses[0] - moved)
-        self._create(image.landmarks[new], e[new], by_pose[new], by_landmark[new])
-        self._mean[2] = wrap(float(self._mean[2]))
+        e[new] += by_pose[new] @ (self._prior.mean[:3] - self._poses[0] - moved)
+        by_residual = -inverse(by_landmark[new])
+        placed = self._landmarks[image.landmarks[new]] + times(by_residual, e[new])
+        noise = by_residual @ transposed(by_residual)
+        self._prior.extend(_POSE, by_residual @ by_pose[new], placed, noise)
+        self._prior.mean[2] = wrap(float(self._prior.mean[2]))
         idle = np.ones(self._n_prior, dtype=bool)
         for other in self._images:
             idle[other.landmarks[other.landmarks < self._n_prior]] = False
         if self.keep_landmarks:  # out of the window they go with the prior, by their correlations
-            self._landmarks[: self._n_prior][idle] = self._mean[3:].reshape(-1, 3)[idle]
+            self._landmarks[: self._n_prior][idle] = self._prior.mean[3:].reshape(-1, 3)[idle]
         else:
             self._forget(idle)
         return taken
 
     def _move(self, motion: Gaussian) -> Array:
         """Put x_1 in place of x_0 in the prior; its mean (3,) less the window's x_1*."""
-        P = self._covariance
+        P = self._prior.covariance
         r, A, B = between(self._poses[0], self._poses[1])
         r -= motion.mean
-        off = self._mean[:3] - self._poses[0]
+        off = self._prior.mean[:3] - self._poses[0]
         r[2], off[2] = wrap(r[2]), wrap(off[2])
         by_motion = inverse(B)
         by_pose = -by_motion @ A
@@ -293,7 +277,7 @@ class FixedLag:
         P[:3, :3] = by_pose @ P[:3, :3] @ by_pose.T + by_motion @ motion.covariance @ by_motion.T
         P[:3, 3:] = by_pose @ P[:3, 3:]
         P[3:, :3] = P[:3, 3:].T
-        self._mean[:3] = self._poses[1] + moved
+        self._prior.mean[:3] = self._poses[1] + moved
         return moved
 
     def _update(self, landmarks: Ints, e: Array, by_pose: Array, by_landmark: Array) -> bool:
@@ -303,48 +287,20 @@ class FixedLag:
         """
         if not len(landmarks):
             return True
-        P, n = self._covariance, 3 * len(landmarks)
         at = 3 + 3 * landmarks[:, None] + np.arange(3)
-        e = e + times(by_landmark, self._mean[at] - self._landmarks[landmarks])
-        HP = (by_pose @ P[:3] + by_landmark @ P[at]).reshape(n, -1)  # H has two blocks a row
-        along = HP[:, at].reshape(n, len(landmarks), 3).transpose(1, 0, 2)
-        S = HP[:, :3] @ by_pose.reshape(n, 3).T + np.eye(n)
-        S += (along @ transposed(by_landmark)).transpose(1, 0, 2).reshape(n, n)
-        try:
-            factor = cho_factor((S + S.T) / 2.0, lower=True)
-        except np.linalg.LinAlgError:
-            return False
-        self._mean -= HP.T @ cho_solve(factor, e.ravel())
-        half = solve_triangular(factor[0], HP, lower=True)
-        P -= half.T @ half  # symmetric to the last bit
-        return True
-
-    def _create(self, landmarks: Ints, e: Array, by_pose: Array, by_landmark: Array) -> None:
-        """Append landmarks to the prior, from whitened residuals (K, 3) at its mean pose."""
-        before, n = len(self._mean), 3 * len(landmarks)
-        after = before + n
-        if after > len(self._room):
-            size = after + after // 2
-            room = np.zeros((size, size))
-            room[:before, :before] = self._covariance
-            self._room = room
-        by_residual = -inverse(by_landmark)
-        J = (by_residual @ by_pose).reshape(n, 3)
-        P = self._room[:after, :after]
-        P[before:, :before] = J @ P[:3, :before]
-        P[:before, before:] = P[before:, :before].T
-        own = J @ P[:3, :3] @ J.T
-        for k, block in enumerate(by_residual @ transposed(by_residual)):
-            own[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += block
-        P[before:, before:] = (own + own.T) / 2.0
-        placed = self._landmarks[landmarks] + times(by_residual, e)
-        self._mean = np.concatenate([self._mean, placed.ravel()])
+        e = e + times(by_landmark, self._prior.mean[at] - self._landmarks[landmarks])
+        HP, S, by_other = self._prior.predicted(_POSE, at, by_pose, by_landmark)
+        S += np.eye(len(S))
+        S += by_other
+        correction = self._prior.update(HP, S, e)
+        if correction is not None:
+            self._prior.mean -= correction
+        return correction is not None
 
     def _forget(self, gone: NDArray[np.bool_]) -> None:
         """Drop these (N,) of the prior's landmarks, and number the others without gaps."""
         of_prior = np.concatenate([np.ones(3, dtype=bool), np.repeat(~gone, 3)])
-        self._room = self._covariance[np.ix_(of_prior, of_prior)]
-        self._mean = self._mean[of_prior]
+        self._prior.keep(of_prior)
         kept = np.ones(len(self._landmarks), dtype=bool)
         kept[: len(gone)] = ~gone
         number = np.cumsum(kept) - 1
@@ -361,16 +317,9 @@ class FixedLag:
         return times(whitening, e), whitening @ by_pose, whitening @ by_landmark
 
     @property
-    def _covariance(self) -> Array:
-        """P of the prior's pose and landmarks, a view of the room kept for more."""
-        n = len(self._mean)
-        P: Array = self._room[:n, :n]
-        return P
-
-    @property
     def _n_prior(self) -> int:
         """Landmarks that the prior covers."""
-        return len(self._mean) // 3 - 1
+        return len(self._prior.mean) // 3 - 1
 
 
 def _add(

@@ -24,42 +24,37 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import Field
 
 from estimators.base import Belief, Estimate, Prior
 from estimators.gaussian import STILL, Gaussian
 from estimators.graph.landmark_drive import FLOOR, loosened
 from estimators.graph.loop_closing import (
     N_QUANTILES,
+    LoopOptions,
     LoopSearch,
     look_alike,
     signature,
     within_gate,
 )
 from estimators.graph.pose_graph import Edge, PoseGraph
-from estimators.laser.icp import Metric, PreparedScan
+from estimators.laser.icp import PreparedScan
 from estimators.laser.scan_matching import (
     FAILED,
-    Covariance,
+    KeyFrameOptions,
     Match,
     MatcherOptions,
     ScanMatcher,
-    moved_beyond,
 )
-from estimators.options import (
-    require_counts,
-    require_laser,
-    require_non_negative,
-    require_positive,
-    require_shares,
-    start_pose,
-)
+from estimators.options import require_laser, start_pose
 from estimators.wheels import EncoderTickOptions, WheelPrediction
 from sim import se2
 from sim.arrays import Array, Ints
-from sim.errors import InputError, require
+from sim.errors import InputError
+from sim.options import Positive, Probability, options
 from sim.recording import Frame
 
 _PATIENCE = 2  # scans in a row that may fail before the newest becomes a key frame
@@ -77,41 +72,27 @@ class _Placed:
     in_key: Gaussian
 
 
-class GraphSlam:
-    """Key frames, closures, and a sparse least-squares solution whenever a loop closes.
+@options("estimator")
+class GraphSlamOptions(EncoderTickOptions, KeyFrameOptions, MatcherOptions, LoopOptions):
+    """Options of graph SLAM."""
 
-    Parameters
-    ----------
-    metric, covariance, sigma_range_m
-        As in `estimators.laser.scan_matching.ScanMatcher`.
-    most_gap_m
-        Leave out a line of which no three points in a row lie this near each other: door posts
-        far behind one another are no wall. None to keep all lines.
-    keyframe_distance_m, keyframe_turn_rad
-        How far the robot goes before it takes a new key frame.
-    kr, kl
-        Believed slip variance per metre of the right and left wheel, m.
-    lateral_slip_m, encoder_tick_m, window_s
-        As in `estimators.wheels.WheelPrediction`.
-    gate_probability
-        Leave a registration with the key frame out if only this share of all should differ more
-        from what the wheels say; None to use all.
-    shared_noise
-        Share of a registration's covariance that comes from the scans' own errors, half from each.
-    loop_reach_m
-        Two key frames may see the same place if they are no farther apart.
-    loop_gate_probability
-        A closure is refused if only this share of all right ones misses the graph by more.
-    loop_least_gain
-        Information about the relative pose that a closure must add online, nats.
-    loop_candidates
-        Older key frames that a new one is registered with, at most.
-    loop_support
-        Closures of the last 15 key frames that must be consistent before any is believed.
-    robust_sigma
-        Mahalanobis distance from which on a closure counts less.
-    revisions
-        Searches for further closures in `finish`, each followed by a solution.
+    most_gap_m: Positive | None = 1.5
+    """Leave out a line of which no three points in a row lie this near each other, m: door posts
+    far behind one another are no wall. null: all lines are kept."""
+    gate_probability: Probability | None = 1e-9
+    """Leave a registration with the key frame out if only this share of all should differ more from
+    what the wheels say; null: all are used."""
+    shared_noise: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.75
+    """Share of a registration's covariance that comes from the scans' own errors, half from
+    each."""
+    robust_sigma: Positive = 5.0
+    """Mahalanobis distance from which on a closure counts less."""
+    revisions: Annotated[int, Field(ge=0)] = 2
+    """Searches for further closures in `finish`, each followed by a solution."""
+
+
+class GraphSlam(GraphSlamOptions):
+    """Key frames, closures, and a sparse least-squares solution whenever a loop closes.
 
     Notes
     -----
@@ -125,79 +106,13 @@ class GraphSlam:
 
     needs = frozenset({"laser"})
 
-    def __init__(
-        self,
-        metric: Metric = "point_to_line",
-        covariance: Covariance = "censi",
-        sigma_range_m: float | None = None,
-        most_gap_m: float | None = 1.5,
-        keyframe_distance_m: float = 0.5,
-        keyframe_turn_rad: float = 0.35,
-        kr: float = 1e-4,
-        kl: float = 1e-4,
-        lateral_slip_m: float = 1e-7,
-        encoder_tick_m: float = 0.0,
-        gate_probability: float | None = 1e-9,
-        shared_noise: float = 0.75,
-        loop_reach_m: float = 3.0,
-        loop_gate_probability: float = 1e-3,
-        loop_least_gain: float = 2.0,
-        loop_candidates: int = 5,
-        loop_support: int = 3,
-        robust_sigma: float = 5.0,
-        revisions: int = 2,
-        window_s: float = 0.05,
-        laser: str = "laser",
-    ) -> None:
-        self.laser = laser
-        believed = MatcherOptions(metric=metric, covariance=covariance, sigma_range_m=sigma_range_m)
-        self._matcher = ScanMatcher(believed, most_gap_m)
-        self.wheels = EncoderTickOptions(
-            kr=kr,
-            kl=kl,
-            window_s=window_s,
-            lateral_slip_m=lateral_slip_m,
-            encoder_tick_m=encoder_tick_m,
-        )
-        require_non_negative(
-            keyframe_distance_m=keyframe_distance_m,
-            keyframe_turn_rad=keyframe_turn_rad,
-            loop_least_gain=loop_least_gain,
-            revisions=revisions,
-        )
-        require_positive(loop_reach_m=loop_reach_m, robust_sigma=robust_sigma)
-        if most_gap_m is not None:
-            require_positive(most_gap_m=most_gap_m)
-        require_shares(shared_noise=shared_noise, loop_gate_probability=loop_gate_probability)
-        require(
-            shared_noise < 1.0 and loop_gate_probability > 0.0,
-            "estimator.shared_noise must be below 1, and loop_gate_probability above 0",
-        )
-        require(
-            gate_probability is None or 0.0 < gate_probability < 1.0,
-            "estimator.gate_probability must lie between 0 and 1 or be null, "
-            f"got {gate_probability}",
-        )
-        require_counts(loop_candidates=loop_candidates, loop_support=loop_support)
-        self.keyframe_distance_m, self.keyframe_turn_rad = keyframe_distance_m, keyframe_turn_rad
-        self.gate_probability = gate_probability
-        self.shared_noise, self.robust_sigma = shared_noise, robust_sigma
-        self.loop_reach_m, self.loop_gate_probability = loop_reach_m, loop_gate_probability
-        self.loop_least_gain, self.loop_candidates = loop_least_gain, loop_candidates
-        self.loop_support, self.revisions = loop_support, int(revisions)
-
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Start from the prior's pose; the first scan becomes a key frame."""
         self._laser, self._rng = require_laser(prior, self.laser, "graph_slam"), rng
-        self._search = LoopSearch(
-            self._matcher,
-            self._laser,
-            self.loop_reach_m,
-            self.loop_gate_probability,
-            self.loop_least_gain,
-        )
+        self._matcher = ScanMatcher(self, self.most_gap_m)
+        self._search = LoopSearch(self._matcher, self._laser, self)
         start = start_pose(prior, "graph_slam")
-        self._wheels = WheelPrediction(self.wheels, prior.robot.track_m)
+        self._wheels = WheelPrediction(self, prior.robot.track_m)
         self._graph = PoseGraph(Gaussian(start.mean, start.covariance + FLOOR), self.robust_sigma)
         self._scans: list[PreparedScan | None] = [None]  # node 0 is the start
         self._signatures = np.full((1, N_QUANTILES), np.inf)
@@ -278,7 +193,7 @@ class GraphSlam:
         self._failures = 0
         of_base = _scaled(found.motion, 1.0 - self.shared_noise / 2.0)
         self._in_key = dataclasses.replace(found, motion=of_base).completed(self._in_key)
-        if moved_beyond(found.motion.mean, self.keyframe_distance_m, self.keyframe_turn_rad):
+        if self.left_key_frame(found.motion.mean):
             own_noise = self.shared_noise / 2.0 * found.known_covariance
             self._add_key_frame(scan, found.motion)
             self._in_key = Gaussian(STILL.mean, own_noise)

@@ -7,6 +7,7 @@ the odometry on both sides, which loses nothing.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import itertools
 import math
@@ -16,7 +17,14 @@ import numpy as np
 
 from estimators.base import Estimate
 from estimators.gaussian import Gaussian, compose, wrap
-from estimators.graph.least_squares import PoseSightings, Problem, Robust, Solution, solve
+from estimators.graph.least_squares import (
+    SQUARES,
+    LeastSquaresOptions,
+    PoseSightings,
+    Problem,
+    Solution,
+    solve,
+)
 from estimators.landmarks.sightings import Sightings
 from estimators.landmarks.slam_frontend import screened
 from estimators.landmarks.stereo import StereoModel
@@ -81,34 +89,6 @@ class LandmarkDrive:
     def tie(self, motion: Gaussian) -> None:
         """Add another measurement of the motion between the last two images."""
         self._ties.append((self._images[-2][0], self._images[-1][0], motion))
-
-    def revised(self, robust: Robust, robust_sigma: float, max_iterations: int) -> Estimate:
-        """Least squares over all Frames so far; options as in `least_squares.solve`.
-
-        Returns
-        -------
-        Estimate
-            Its `map` is a mapping of `ids` (N,), `landmarks` (N, 3) m and `landmark_covariances`
-            (N, 3, 3); its status is `no_landmarks` when it is dead reckoning alone, and
-            `not_converged` when the steps did not suffice.
-
-        Raises
-        ------
-        InputError
-            If there is no Frame yet.
-        """
-        if not self._stamps:
-            raise InputError("the estimator has seen no Frame; step before finish")
-        rows = self._rows()
-        problem, ids = self._problem(rows)
-        solution = solve(
-            problem,
-            self._guessed(rows),
-            robust=robust,
-            robust_sigma=robust_sigma,
-            max_iterations=max_iterations,
-        )
-        return self._estimate(solution, solution.poses, solution.covariance, ids)
 
     def _estimate(
         self, solution: Solution, poses: Array, joint_covariance: Array, ids: Ints
@@ -196,72 +176,87 @@ class LandmarkDrive:
         return np.array(self._stamps)
 
 
-def revised_team(
+def revised(
     drives: Sequence[LandmarkDrive],
-    camera: Sightings | None,
-    sighted: Sequence[Sighted],
-    robust: Robust,
-    robust_sigma: float,
-    max_iterations: int,
+    how: LeastSquaresOptions = SQUARES,
+    camera: Sightings | None = None,
+    sighted: Sequence[Sighted] = (),
 ) -> list[Estimate]:
-    """Least squares over the drives of a team in one map: the estimate of each robot.
+    """Least squares over all Frames so far of the drives of a team, in one map.
 
-    `camera` is what sees the robots; the Frames of `sighted` are pinned. Other arguments and errors
-    are those of `LandmarkDrive.revised`.
+    Parameters
+    ----------
+    camera, sighted
+        What sees the other robots, and what it saw; the Frames are pinned.
+
+    Returns
+    -------
+    list of Estimate
+        One a drive. Its `map` is a mapping of `ids` (N,), `landmarks` (N, 3) m and
+        `landmark_covariances` (N, 3, 3); its status is `no_landmarks` when it is dead reckoning
+        alone, and `not_converged` when the steps did not suffice.
+
+    Raises
+    ------
+    InputError
+        If there is no Frame yet.
     """
-    if len(drives) == 1:
-        return [drives[0].revised(robust, robust_sigma, max_iterations)]
+    if not all(len(drive.stamps) for drive in drives):
+        raise InputError("the estimator has seen no Frame; step before finish")
     rows = [drive._rows() for drive in drives]
+    guesses = [drive._guessed(own) for drive, own in zip(drives, rows, strict=True)]
     parts, ids_of = zip(*map(LandmarkDrive._problem, drives, rows), strict=True)
-    seen = [ids[part.landmark_rows] for part, ids in zip(parts, ids_of, strict=True)]
-    ids, landmark_rows = np.unique(np.concatenate(seen), return_inverse=True)
-    # pose 0 is the origin of the map, to which the starts are tied
-    ends = 1 + np.cumsum([0, *map(len, rows)])
-    begins, own = ends[:-1], list(zip(parts, ends, strict=False))
-    pose_of = {
-        (robot, row): begins[robot] + pose
-        for robot, each in enumerate(rows)
-        for pose, row in enumerate(each)
-    }
-    sightings = None
-    if camera is not None and sighted:
-        sightings = PoseSightings(
-            camera.camera,
-            camera.marker_z_m,
-            np.array([pose_of[seeing] for seeing, _, _ in sighted], np.int64),
-            np.array([pose_of[seen_] for _, seen_, _ in sighted], np.int64),
-            np.array([point for _, _, point in sighted]),
+    if len(drives) == 1:
+        problem, ids, ends = parts[0], ids_of[0], np.array([0, len(rows[0])])
+    else:
+        # pose 0 is the origin of the map, to which the starts are tied
+        ends = 1 + np.cumsum([0, *map(len, rows)])
+        guesses = [np.zeros((1, 3)), *guesses]
+        seen = [own[part.landmark_rows] for part, own in zip(parts, ids_of, strict=True)]
+        ids, landmark_rows = np.unique(np.concatenate(seen), return_inverse=True)
+        problem = dataclasses.replace(
+            _joined(parts, ends), landmark_rows=landmark_rows.astype(np.int64)
         )
-    starts = [np.array([part.prior_mean for part in parts])]
-    start_covariances = [np.array([part.prior_covariance for part in parts])]
-    problem = Problem(
+        if camera is not None and sighted:
+            pose_of = {
+                (robot, row): ends[robot] + pose
+                for robot, own in enumerate(rows)
+                for pose, row in enumerate(own)
+            }
+            sightings = PoseSightings(
+                camera.camera,
+                camera.marker_z_m,
+                np.array([pose_of[seeing] for seeing, _, _ in sighted], np.int64),
+                np.array([pose_of[seen_] for _, seen_, _ in sighted], np.int64),
+                np.array([point for _, _, point in sighted]),
+            )
+            problem = dataclasses.replace(problem, sightings=sightings)
+    solution = solve(problem, np.concatenate(guesses), how)
+    estimates = []
+    for drive, (low, high) in zip(drives, itertools.pairwise(ends), strict=True):
+        covariance = solution.covariance[3 * low : 3 * high, 3 * low : 3 * high]
+        estimates.append(drive._estimate(solution, solution.poses[low:high], covariance, ids))
+    return estimates
+
+
+def _joined(parts: Sequence[Problem], ends: Ints) -> Problem:
+    """The problems of several drives as one, whose poses of drive k begin at `ends[k]`."""
+    begins, own = ends[:-1], list(zip(parts, ends, strict=False))
+    starts = np.array([part.prior_mean for part in parts])
+    start_covariances = np.array([part.prior_covariance for part in parts])
+    return Problem(
         prior_mean=np.zeros(3),
         prior_covariance=FLOOR,
         first=np.concatenate([0 * begins, *(part.first + at for part, at in own)]),
         second=np.concatenate([begins, *(part.second + at for part, at in own)]),
-        motions=np.concatenate(starts + [part.motions for part in parts]),
+        motions=np.concatenate([starts, *(part.motions for part in parts)]),
         motion_covariances=np.concatenate(
-            start_covariances + [part.motion_covariances for part in parts]
+            [start_covariances, *(part.motion_covariances for part in parts)]
         ),
         camera=parts[0].camera,
         pose_rows=np.concatenate([part.pose_rows + at for part, at in own]),
-        landmark_rows=landmark_rows.astype(np.int64),
         points_in_camera=np.concatenate([part.points_in_camera for part in parts]),
-        sightings=sightings,
     )
-    guesses = [drive._guessed(each) for drive, each in zip(drives, rows, strict=True)]
-    solution = solve(
-        problem,
-        np.concatenate([np.zeros((1, 3)), *guesses]),
-        robust=robust,
-        robust_sigma=robust_sigma,
-        max_iterations=max_iterations,
-    )
-    estimates = []
-    for drive, low, high in zip(drives, begins, ends[1:], strict=True):
-        covariance = solution.covariance[3 * low : 3 * high, 3 * low : 3 * high]
-        estimates.append(drive._estimate(solution, solution.poses[low:high], covariance, ids))
-    return estimates
 
 
 def observed(

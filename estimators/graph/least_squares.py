@@ -19,20 +19,42 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve, lapack
 from scipy.sparse import bsr_array, csc_array
-from scipy.sparse.linalg import splu
 
+from estimators.graph.matrices import (
+    Factor,
+    NormalEquations,
+    inverse,
+    times,
+    transposed,
+    whitening_of,
+)
 from estimators.landmarks.stereo import LEAST_DEPTH_M, StereoModel
 from sim import se2
 from sim.arrays import Array, Ints
+from sim.options import Count, Positive, options
 
 Robust = Literal["none", "huber", "cauchy", "dcs"]
 
 LEAST_INFORMATION = 1e-6  # wrong ids can send a landmark to infinity; a kilometre is enough
 _LEAST_DAMPING, _MOST_DAMPING = 1e-9, 1e6
 _SPARSE_POSES = 100  # without landmarks, from so many on the matrix is kept sparse
-_AT_ONCE = 50  # poses whose columns of a covariance are solved for together
+
+
+@options("estimator")
+class LeastSquaresOptions:
+    """How least squares are solved."""
+
+    robust: Robust = "none"
+    """Loss of each residual that may be wrong, such as an observation of a landmark by its id:
+    `none` (squares); `huber`, `cauchy` or `dcs` from `robust_sigma` on."""
+    robust_sigma: Positive = 3.0
+    """Mahalanobis distance at which the loss turns."""
+    max_iterations: Count = 100
+    """Most steps of each of the two stages."""
+
+
+SQUARES = LeastSquaresOptions()
 
 
 @dataclass(frozen=True)
@@ -142,77 +164,11 @@ class Solution:
         return self.information.inverse
 
 
-class Factor:
-    """A symmetric, positive definite matrix, factorised: sparse, or dense.
-
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        If it is not positive definite.
-    """
-
-    def __init__(self, matrix: Array | bsr_array) -> None:
-        self.n = matrix.shape[0]
-        if isinstance(matrix, np.ndarray):
-            self._dense = cho_factor(matrix, lower=True, check_finite=False)
-            return
-        self._dense = None
-        try:  # with the pivots on the diagonal L U is L D L'
-            self._sparse = splu(
-                csc_array(matrix),
-                permc_spec="MMD_AT_PLUS_A",
-                diag_pivot_thresh=0.0,
-                options={"SymmetricMode": True},
-            )
-        except RuntimeError as error:
-            raise np.linalg.LinAlgError(str(error)) from None
-        if not (self._sparse.U.diagonal() > 0.0).all():
-            raise np.linalg.LinAlgError("not positive definite")
-
-    def solve(self, right: Array) -> Array:
-        """The matrix's inverse times (n,) or (n, K)."""
-        if self._dense is not None:
-            return np.asarray(cho_solve(self._dense, right), dtype=np.float64)
-        return np.asarray(self._sparse.solve(right), dtype=np.float64)
-
-    def columns(self, poses: Ints) -> Array:
-        """(n, 3 K) columns of the inverse: covariances of all with these K poses."""
-        chosen = (3 * np.asarray(poses)[:, None] + np.arange(3)).ravel()
-        units = np.zeros((self.n, len(chosen)))
-        units[chosen, np.arange(len(chosen))] = 1.0
-        return self.solve(units)
-
-    def joint(self, poses: Ints) -> Array:
-        """(3 K, 3 K) joint covariance of these poses."""
-        chosen = (3 * np.asarray(poses)[:, None] + np.arange(3)).ravel()
-        block: Array = self.columns(poses)[chosen]
-        return (block + block.T) / 2.0
-
-    def marginals(self, poses: Ints) -> Array:
-        """(K, 3, 3) covariance of each of these poses."""
-        found = np.empty((len(poses), 3, 3))
-        for begin in range(0, len(poses), _AT_ONCE):
-            part = np.asarray(poses)[begin : begin + _AT_ONCE]
-            own = self.columns(part).reshape(-1, 3, len(part), 3)[part, :, np.arange(len(part))]
-            found[begin : begin + len(part)] = (own + transposed(own)) / 2.0
-        return found
-
-    @cached_property
-    def inverse(self) -> Array:
-        """(n, n)."""
-        if self._dense is None:
-            return self.columns(np.arange(self.n // 3))
-        lower = np.tril(lapack.dpotri(self._dense[0], lower=1)[0])
-        return np.asarray(lower + np.tril(lower, -1).T, dtype=np.float64)
-
-
 def solve(
     problem: Problem,
     poses: Array,
+    how: LeastSquaresOptions = SQUARES,
     *,
-    robust: Robust = "none",
-    robust_sigma: float = 3.0,
-    max_iterations: int = 100,
     tolerance: float = 1e-9,
 ) -> Solution:
     """Least squares from guessed poses (T, 3), by Levenberg-Marquardt.
@@ -230,7 +186,7 @@ def solve(
         points_in_camera=problem.points_in_camera[order],
     )
     splits = np.searchsorted(problem.landmark_rows, np.arange(n_landmarks + 1))
-    residuals = _Residuals(problem, splits, robust, robust_sigma)
+    residuals = _Residuals(problem, splits, how)
 
     by_depth = np.lexsort((problem.points_in_camera[:, 2], problem.landmark_rows))
     nearest = by_depth[splits[:-1]]
@@ -242,10 +198,8 @@ def solve(
     iterations, converged = 0, True
     last = (True, tolerance)
     for in_image, enough in [last] if n_landmarks == 0 else [(False, 1e-4), last]:
-        poses, landmarks, taken = _descend(
-            residuals, poses, landmarks, in_image, enough, max_iterations
-        )
-        iterations, converged = iterations + taken, taken < max_iterations
+        poses, landmarks, taken = _descend(residuals, poses, landmarks, in_image, enough)
+        iterations, converged = iterations + taken, taken < how.max_iterations
     poses = np.column_stack([poses[:, :2], se2.wrap(poses[:, 2])])
     whitening = residuals.whitening(poses, landmarks, True)
     system = residuals.linearised(poses, landmarks, whitening, True)
@@ -253,22 +207,15 @@ def solve(
     return Solution(poses, information, landmarks, of_landmarks, system.cost, iterations, converged)
 
 
-def information_at(
-    problem: Problem, poses: Array, *, robust: Robust = "none", robust_sigma: float = 3.0
-) -> Factor:
+def information_at(problem: Problem, poses: Array, how: LeastSquaresOptions) -> Factor:
     """Information about poses (T, 3), linearised where they are, of a problem without landmarks."""
-    residuals = _Residuals(problem, np.zeros(1, np.int64), robust, robust_sigma)
+    residuals = _Residuals(problem, np.zeros(1, np.int64), how)
     nothing = np.zeros((0, 3))
     return residuals.linearised(poses, nothing, nothing[:, None], True).marginals()[0]
 
 
 def _descend(
-    residuals: _Residuals,
-    poses: Array,
-    landmarks: Array,
-    in_image: bool,
-    tolerance: float,
-    max_iterations: int,
+    residuals: _Residuals, poses: Array, landmarks: Array, in_image: bool, tolerance: float
 ) -> tuple[Array, Array, int]:
     """Levenberg-Marquardt until a step gains less than this share of the cost.
 
@@ -279,7 +226,7 @@ def _descend(
     tuple
         Poses, landmarks, and the number of steps; `max_iterations` if they did not suffice.
     """
-    damping = _LEAST_DAMPING
+    damping, max_iterations = _LEAST_DAMPING, residuals.how.max_iterations
     for taken in range(max_iterations):
         whitening = residuals.whitening(poses, landmarks, in_image)
         system = residuals.linearised(poses, landmarks, whitening, in_image)
@@ -380,8 +327,7 @@ class _Residuals:
 
     problem: Problem
     splits: Ints
-    robust: Robust
-    robust_sigma: float
+    how: LeastSquaresOptions
 
     def whitening(self, poses: Array, landmarks: Array, in_image: bool) -> Array:
         """(K, 3, 3) that makes the residuals of the observations unit white noise."""
@@ -414,24 +360,16 @@ class _Residuals:
         self, poses: Array, landmarks: Array, whitening: Array, in_image: bool
     ) -> _Linearised:
         """Normal equations about these poses and landmarks."""
-        p, n, n_landmarks = self.problem, len(poses), len(landmarks)
-        g = np.zeros((n, 3))
+        p, n_landmarks, sums = self.problem, len(landmarks), NormalEquations(len(poses))
         start, motion = self._of_motions(poses)
-        by_start = self._start_whitening
-        g[0] += by_start.T @ start
+        by_start, first = self._start_whitening[None], np.zeros(1, np.int64)
+        sums.add([first], [by_start], start[None])
         weights = np.ones(len(motion))
         if p.doubtful is not None:
             weights[p.doubtful] = self._loss(np.sum(motion[p.doubtful] ** 2, axis=1))[1]
         by_ends = se2.between_jacobians(poses[p.first], poses[p.second])
         sides = [self._motion_whitening @ side for side in by_ends]
-        ends = list(zip((p.first, p.second), sides, strict=True))
-        blocks = _Blocks(n)
-        blocks.add(np.zeros(1, np.int64), np.zeros(1, np.int64), (by_start.T @ by_start)[None])
-        for rows, by_pose in ends:
-            weighted = weights[:, None, None] * transposed(by_pose)
-            np.add.at(g, rows, times(weighted, motion))
-            for columns, by_other in ends:
-                blocks.add(rows, columns, weighted @ by_other)
+        sums.add([p.first, p.second], sides, motion, weights)
 
         seen, by_pose, by_landmark = self._of_image(poses, landmarks, in_image)
         seen = times(whitening, seen)
@@ -440,25 +378,19 @@ class _Residuals:
         seen = seen * np.sqrt(weight)[:, None]
         by_pose, by_landmark = weighted @ by_pose, weighted @ by_landmark
         of_pose, of_landmark = transposed(by_pose), transposed(by_landmark)
-        blocks.add(p.pose_rows, p.pose_rows, of_pose @ by_pose)
-        np.add.at(g, p.pose_rows, times(of_pose, seen))
+        sums.add([p.pose_rows], [by_pose], seen)
         if p.sightings is not None:
             sighted, *sides = p.sightings.residuals(poses, in_image)
             lost, weight = self._loss(np.sum(sighted**2, axis=1))
             loss = np.append(loss, lost)
-            both = list(zip((p.sightings.seeing_rows, p.sightings.seen_rows), sides, strict=True))
-            for rows, by_side in both:
-                pulled = weight[:, None, None] * transposed(by_side)
-                np.add.at(g, rows, times(pulled, sighted))
-                for columns, by_other in both:
-                    blocks.add(rows, columns, pulled @ by_other)
+            sums.add([p.sightings.seeing_rows, p.sightings.seen_rows], sides, sighted, weight)
         V = np.tile(LEAST_INFORMATION * np.eye(3), (n_landmarks, 1, 1))
         h = np.zeros((n_landmarks, 3))
         np.add.at(V, p.landmark_rows, of_landmark @ by_landmark)
         np.add.at(h, p.landmark_rows, times(of_landmark, seen))
         return _Linearised(
-            blocks.matrix(),
-            g,
+            sums.matrix(),
+            sums.g,
             V,
             h,
             of_pose @ by_landmark,
@@ -496,40 +428,17 @@ class _Residuals:
 
     def _loss(self, squares: Array) -> tuple[Array, Array]:
         """Loss (K,) of squared Mahalanobis distances, and its derivative by them."""
-        turn = self.robust_sigma**2
-        if self.robust == "huber":
+        turn = self.how.robust_sigma**2
+        if self.how.robust == "huber":
             beyond = squares > turn
             root = np.sqrt(np.where(beyond, squares, turn) * turn)
             return np.where(beyond, 2.0 * root - turn, squares), np.where(beyond, turn / root, 1.0)
-        if self.robust == "cauchy":
+        if self.how.robust == "cauchy":
             return turn * np.log1p(squares / turn), 1.0 / (1.0 + squares / turn)
-        if self.robust == "dcs":
+        if self.how.robust == "dcs":
             scale = np.minimum(1.0, 2.0 * turn / (turn + squares))
             return np.where(scale < 1.0, turn * (3.0 - 2.0 * scale), squares), scale**2
         return squares, np.ones_like(squares)
-
-
-class _Blocks:
-    """Sum of blocks (3, 3) at rows and columns of n poses, as a sparse matrix."""
-
-    def __init__(self, n: int) -> None:
-        self._n = n
-        self._places: list[Ints] = []
-        self._values: list[Array] = []
-
-    def add(self, rows: Ints, columns: Ints, blocks: Array) -> None:
-        """Add K blocks (K, 3, 3); places may come twice."""
-        self._places.append(rows * self._n + columns)
-        self._values.append(blocks)
-
-    def matrix(self) -> bsr_array:
-        """(3 n, 3 n)."""
-        n = self._n
-        places, row_of = np.unique(np.concatenate(self._places), return_inverse=True)
-        summed = np.zeros((len(places), 3, 3))
-        np.add.at(summed, row_of, np.concatenate(self._values))
-        starts = np.searchsorted(places, n * np.arange(n + 1))
-        return bsr_array((summed, places % n, starts), shape=(3 * n, 3 * n))
 
 
 def residuals_of(
@@ -571,23 +480,3 @@ def camera_whitening(camera: StereoModel, poses: Array, landmarks: Array) -> Arr
         roots = np.diag(1.0 / np.sqrt(camera.variances_px2))
         return np.broadcast_to(roots, (len(poses), 3, 3))
     return whitening_of(camera.covariance(camera.predict(poses, landmarks)[0]))
-
-
-def times(matrices: Array, vectors: Array) -> Array:
-    """Products (K, m) of matrices (K, m, n) and vectors (K, n)."""
-    return (matrices @ vectors[:, :, None])[:, :, 0]
-
-
-def transposed(matrices: Array) -> Array:
-    """Each of the matrices (K, m, n) transposed."""
-    return matrices.transpose(0, 2, 1)
-
-
-def inverse(matrices: Array) -> Array:
-    """Inverses of matrices (K, m, m)."""
-    return np.asarray(np.linalg.inv(matrices), dtype=np.float64)
-
-
-def whitening_of(covariances: Array) -> Array:
-    """Matrices (..., 3, 3) that make residuals of these covariances unit white noise."""
-    return inverse(np.asarray(np.linalg.cholesky(covariances), dtype=np.float64))

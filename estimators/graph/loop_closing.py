@@ -17,9 +17,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 from scipy.special import chdtri
 
 from estimators.gaussian import Gaussian
@@ -28,6 +30,7 @@ from estimators.laser.icp import PreparedScan
 from estimators.laser.scan_matching import ScanMatcher
 from sim import se2
 from sim.arrays import Array, Ints
+from sim.options import Count, NonNegative, Positive, options
 from sim.sensors import Laser
 
 N_QUANTILES = 16
@@ -41,27 +44,37 @@ _SAME_M, _SAME_RAD = 0.1, 0.03  # results of two starts that differ by less are 
 _RIVAL = 0.9  # another result with this share of the best one's overlap makes it ambiguous
 
 
+@options("estimator")
+class LoopOptions:
+    """How loops are looked for and checked."""
+
+    loop_reach_m: Positive = 3.0
+    """Two key frames may see the same place if they are no farther apart, m."""
+    loop_gate_probability: Annotated[float, Field(gt=0.0, le=1.0)] = 1e-3
+    """A closure is refused if only this share of all right ones misses the graph by more."""
+    loop_least_gain: NonNegative = 2.0
+    """Information about the relative pose that a closure must add online, nats."""
+    loop_candidates: Count = 5
+    """Older key frames that a new one is registered with, at most."""
+    loop_support: Count = 3
+    """Closures of the last 15 key frames that must be consistent before any is believed."""
+
+
 @dataclass(frozen=True)
 class LoopSearch:
-    """How loops are looked for and checked.
+    """Looks for loops, and checks them.
 
     Attributes
     ----------
     matcher, laser
         How scans are registered, and what took them.
-    reach_m
-        Two key frames may see the same place if they are no farther apart.
-    gate_probability
-        A closure is refused if only this share of all right ones misses the graph by more.
-    least_gain
-        Information that a closure must add, nats.
+    how
+        The method's options.
     """
 
     matcher: ScanMatcher
     laser: Laser
-    reach_m: float
-    gate_probability: float
-    least_gain: float
+    how: LoopOptions
 
     def candidates(self, means: Array, covariances: Array, alike: NDArray[np.bool_]) -> Ints:
         """Those of K relative poses that may close a loop, the nearest first.
@@ -77,16 +90,16 @@ class LoopSearch:
         spread_m = np.linalg.eigvalsh(covariances[:, :2, :2])[:, 1]
         sigma_m, sigma_rad = np.sqrt(np.maximum([spread_m, covariances[:, 2, 2]], 0.0))
         widest = self.laser.fov_rad / 2.0  # at more, two views share less than half
-        near = away_m - _REACH_SIGMAS * sigma_m < self.reach_m
+        near = away_m - _REACH_SIGMAS * sigma_m < self.how.loop_reach_m
         facing = turn - _REACH_SIGMAS * sigma_rad < widest
         chosen = np.flatnonzero(near & facing & alike)
-        order = np.argsort((away_m / self.reach_m + turn / widest)[chosen], kind="stable")
+        order = np.argsort((away_m / self.how.loop_reach_m + turn / widest)[chosen], kind="stable")
         return np.asarray(chosen[order])
 
     def worthwhile(self, covariance: Array, noise: Array) -> bool:
         """Whether a measurement of this noise teaches enough about a motion of this covariance."""
         gain = np.linalg.slogdet(noise + covariance)[1] - np.linalg.slogdet(noise)[1]
-        return bool(gain / 2.0 >= self.least_gain)
+        return bool(gain / 2.0 >= self.how.loop_least_gain)
 
     def register(
         self, scan: PreparedScan, other: PreparedScan, expected: Gaussian, rng: np.random.Generator
@@ -120,7 +133,7 @@ class LoopSearch:
             for b in range(a + 1):
                 both = np.unique(np.r_[3 * a : 3 * a + 3, 3 * b : 3 * b + 3])
                 agree[a, b] = agree[b, a] = within_gate(
-                    off[both], S[np.ix_(both, both)], self.gate_probability
+                    off[both], S[np.ix_(both, both)], self.how.loop_gate_probability
                 )
         best = _largest_clique(agree, np.flatnonzero(agree.diagonal()))
         against = agree.diagonal() & ~agree[:, best].all(axis=1)

@@ -16,16 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from estimators.gaussian import Gaussian, compose
-from estimators.graph.least_squares import (
-    Factor,
-    Problem,
-    information_at,
-    inverse,
-    solve,
-    times,
-    transposed,
-    whitening_of,
-)
+from estimators.graph.least_squares import LeastSquaresOptions, Problem, information_at, solve
+from estimators.graph.matrices import Factor, inverse, times, transposed, whitening_of
 from sim import se2
 from sim.arrays import Array, Ints
 
@@ -157,9 +149,8 @@ class PoseGraph:
         self.closures += edges
         sigma = max(self._robust_sigma, self._farthest(edges))
         while True:
-            solution = solve(
-                self._problem(), self._poses, robust="dcs", robust_sigma=sigma, tolerance=tolerance
-            )
+            how = LeastSquaresOptions(robust="dcs", robust_sigma=sigma)
+            solution = solve(self._problem(), self._poses, how, tolerance=tolerance)
             self._poses = solution.poses
             if sigma == self._robust_sigma:
                 break
@@ -191,9 +182,8 @@ class PoseGraph:
 
     def _information(self) -> Factor:
         if self._now is None:
-            self._now = information_at(
-                self._problem(), self._poses, robust="dcs", robust_sigma=self._robust_sigma
-            )
+            how = LeastSquaresOptions(robust="dcs", robust_sigma=self._robust_sigma)
+            self._now = information_at(self._problem(), self._poses, how)
         return self._now
 
     def _problem(self) -> Problem:

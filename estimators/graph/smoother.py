@@ -8,49 +8,26 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from estimators.base import Belief, Estimate, Prior
-from estimators.graph.landmark_drive import (
-    LandmarkDrive,
-    Sighted,
-    loosened,
-    observed,
-    revised_team,
-)
-from estimators.graph.least_squares import Problem, Robust
+from estimators.base import Belief, Estimate, OfTeams, Prior
+from estimators.graph.landmark_drive import LandmarkDrive, Sighted, loosened, observed, revised
+from estimators.graph.least_squares import LeastSquaresOptions, Problem
 from estimators.landmarks.sightings import Sightings, dead_reckoning
-from estimators.landmarks.stereo import StereoModel
-from estimators.options import (
-    require_choices,
-    require_counts,
-    require_positive,
-    require_stereo,
-    start_pose,
-)
+from estimators.landmarks.stereo import StereoModel, TeamEyesOptions
+from estimators.options import require_stereo, start_pose
 from estimators.wheels import WheelOptions
 from sim.arrays import Array
 from sim.errors import require
+from sim.options import options
 from sim.recording import Frame
 
 
-class Smoother:
-    """Dead reckoning online; `finish` gives the least-squares trajectory over everything seen.
+@options("estimator")
+class SmootherOptions(WheelOptions, TeamEyesOptions, LeastSquaresOptions):
+    """Options of batch least squares."""
 
-    Parameters
-    ----------
-    kr, kl
-        Believed slip variance per metre of the right and left wheel, m.
-    robust
-        Loss of each observation of a landmark: `none` (squares), `huber` or `cauchy` from
-        `robust_sigma` standard deviations on, for ids that are sometimes wrong.
-    robust_sigma
-        Mahalanobis distance at which the loss turns.
-    max_iterations
-        Most steps of each of the two stages.
-    window_s
-        |ds| is netted over at least this time.
-    robots
-        Name of the sensor that sees the other robots of a team, with ids; None: sightings are not
-        used.
+
+class Smoother(SmootherOptions, OfTeams):
+    """Dead reckoning online; `finish` gives the least-squares trajectory over everything seen.
 
     Notes
     -----
@@ -68,28 +45,6 @@ class Smoother:
 
     needs = frozenset({"stereo"})
 
-    def __init__(
-        self,
-        kr: float = 1e-4,
-        kl: float = 1e-4,
-        robust: Robust = "none",
-        robust_sigma: float = 3.0,
-        max_iterations: int = 100,
-        window_s: float = 0.05,
-        stereo: str = "stereo",
-        robots: str | None = None,
-    ) -> None:
-        self.stereo, self.robots = stereo, robots
-        self.wheels = WheelOptions(kr=kr, kl=kl, window_s=window_s)
-        require_choices(robust=(robust, Robust))
-        require_positive(robust_sigma=robust_sigma)
-        require_counts(max_iterations=max_iterations)
-        self.robust, self.robust_sigma, self.max_iterations = robust, robust_sigma, max_iterations
-
-    def reset(self, prior: Prior, rng: np.random.Generator) -> None:
-        """Start from the prior's pose, with nothing seen."""
-        self.reset_team((prior,), rng)
-
     def reset_team(self, priors: Sequence[Prior], rng: np.random.Generator) -> None:
         """Start a team from the priors of its robots, whose starts are known."""
         require(
@@ -97,15 +52,11 @@ class Smoother:
             "smoother: the starts of a team must be known; set team.starts=known",
         )
         self._camera = StereoModel.of(require_stereo(priors[0], self.stereo, "smoother"))
-        self._sightings = Sightings.of(priors, self.robots, "camera", "predicted", "smoother")
+        self._sightings = Sightings.of(priors, self.robots, "smoother")
         self._beliefs = [start_pose(prior, "smoother") for prior in priors]
-        self._wheels = dead_reckoning(self.wheels, priors)
+        self._wheels = dead_reckoning(self, priors)
         self._drives = [LandmarkDrive(self._camera, start) for start in self._beliefs]
         self._sighted: list[Sighted] = []
-
-    def step(self, frame: Frame) -> Belief:
-        """Keep what the Frame shows; the belief is dead reckoning alone."""
-        return self.step_team((frame,))[0]
 
     def step_team(self, frames: Sequence[Frame]) -> list[Belief]:
         """Keep what the Frames of an instant show; the beliefs are dead reckoning alone."""
@@ -134,13 +85,12 @@ class Smoother:
                 self._sighted.append((seeing, seen, point))
 
     def finish(self) -> Estimate:
-        """Least squares over all Frames so far: `LandmarkDrive.revised`."""
+        """Least squares over all Frames so far, see `estimators.graph.landmark_drive.revised`."""
         return self.finish_team()[0]
 
     def finish_team(self) -> list[Estimate]:
         """Least squares over all Frames of a team: the path of each robot."""
-        options = self.robust, self.robust_sigma, self.max_iterations
-        return revised_team(self._drives, self._sightings, self._sighted, *options)
+        return revised(self._drives, self, self._sightings, self._sighted)
 
     def problem(self) -> tuple[Problem, Array]:
         """The least-squares problem over all Frames so far, and poses (T, 3) to start from."""

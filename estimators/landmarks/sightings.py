@@ -45,7 +45,7 @@ def team_starts(
         f"{estimator}: a robot of unknown start is placed by landmarks with ids; set "
         "estimator.association=known",
     )
-    return [start_pose(first, estimator), *starts]
+    return [front_end.first_pose, *starts]
 
 
 def dead_reckoning(believed: WheelOptions, priors: Sequence[Prior]) -> list[WheelPrediction]:

@@ -9,31 +9,29 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 from scipy.special import chdtri  # scipy.stats takes half a second to import
 
 from estimators.base import Prior
-from estimators.landmarks.stereo import NoiseAt, NoiseModel, StereoModel, StereoOptions
-from estimators.options import require_stereo
+from estimators.landmarks.stereo import NoiseAt, NoiseModel, StereoModel, TeamEyesOptions
+from estimators.options import require_stereo, start_pose
 from estimators.wheels import ForwardSlipOptions
 from sim.arrays import Array, Floats, Ints
 from sim.errors import require
-from sim.options import NonNegative, Positive, options
+from sim.options import NonNegative, Positive, Probability, options
 from sim.recording import Frame
 
 Association = Literal["known", "mahalanobis", "descriptor"]
-OpenShare = Annotated[float, Field(gt=0.0, lt=1.0)]
 
 _SIGMAS = ("sigma_column_px", "sigma_row_px", "sigma_disparity_px", "sigma_descriptor")
 _BLIND_IMAGES = 100  # images without a landmark after which the status reports it
 
 
 @options("estimator")
-class LandmarkSlamOptions(ForwardSlipOptions, StereoOptions):
+class LandmarkSlamOptions(ForwardSlipOptions, TeamEyesOptions):
     """What the filters of landmark SLAM have in common."""
 
     association: Association = "known"
@@ -56,7 +54,7 @@ class LandmarkSlamOptions(ForwardSlipOptions, StereoOptions):
     """Believed noise of the disparity, px; null: the camera's own."""
     sigma_descriptor: NonNegative | None = None
     """Believed noise of descriptors; null: the camera's own."""
-    gate_probability: OpenShare | None = None
+    gate_probability: Probability | None = None
     """Under known association, an observation less probable than this is left out, and a landmark
     enters the map only when two sightings in a row agree: a misread id is neither an update nor a
     landmark. null: every id is believed."""
@@ -66,8 +64,6 @@ class LandmarkSlamOptions(ForwardSlipOptions, StereoOptions):
     0: in every image."""
     keep_map: bool = False
     """Put the map into every Belief; of FastSLAM, that of the best particle."""
-    robots: str | None = None
-    """Name of the sensor that sees the other robots of a team; null: sightings are not used."""
     sighting_d0: Positive = 16.27
     """Squared Mahalanobis distance from which on a sighting is a misread robot, and rejected."""
 
@@ -158,6 +154,8 @@ class SlamFrontEnd:
     ----------
     camera
         What is believed of the camera.
+    first_pose
+        The prior's pose in map.
     reach_m
         Distance within which a predicted landmark may be one that was seen.
     origins
@@ -167,6 +165,7 @@ class SlamFrontEnd:
     def __init__(self, believed: LandmarkSlamOptions, prior: Prior, estimator: str) -> None:
         self.believed, self._estimator = believed, estimator
         camera = require_stereo(prior, believed.stereo, estimator)
+        self.first_pose = start_pose(prior, estimator)
         require(
             believed.association != "known" or camera.identifies,
             "the camera does not identify landmarks; set estimator.association=mahalanobis "

@@ -50,6 +50,15 @@ class StereoOptions:
     """Name of the stereo camera."""
 
 
+@options("estimator")
+class TeamEyesOptions(StereoOptions):
+    """Which cameras a method for teams reads."""
+
+    robots: str | None = None
+    """Name of the sensor that sees the other robots of a team, with ids (`ekf_slam` does without);
+    null: sightings are not used."""
+
+
 class PackedCamera(NamedTuple):
     """A `StereoModel` as plain numbers.
 

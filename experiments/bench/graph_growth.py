@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from estimators.gaussian import Gaussian
-from estimators.graph.loop_closing import LoopSearch, look_alike, signature
+from estimators.graph.loop_closing import LoopOptions, LoopSearch, look_alike, signature
 from estimators.graph.pose_graph import Edge, PoseGraph
 from estimators.laser.icp import PreparedScan, prepare
 from estimators.laser.scan_matching import MatcherOptions, ScanMatcher
@@ -63,7 +63,7 @@ def grown() -> Iterator[Grown]:
     """Cost after each of `LENGTHS_M`, on one graph that grows."""
     rng = stream(0, "bench")
     graph = PoseGraph(Gaussian(np.zeros(3), 1e-6 * np.eye(3)), robust_sigma=5.0)
-    search = LoopSearch(ScanMatcher(MatcherOptions()), _LASER, 3.0, 1e-3, 2.0)
+    search = LoopSearch(ScanMatcher(MatcherOptions()), _LASER, LoopOptions())
     scans = [_scan(rng)]
     marks = np.tile(signature(scans[0]), (1, 1))
     before_mib = resident_mib()  # with the compiled code

@@ -200,7 +200,7 @@ def rows_of(seed: int) -> Iterator[dict[str, Any]]:
     experiment = Experiment.compose([*DRIVE, "sensors.stereo.correlated=true", f"seed={seed}"])
     recording, robot = experiment.recording(), experiment.robot()
     prior = experiment.prior(recording)
-    ours, whole = FixedLag(robot.kr, robot.kl), Smoother(robot.kr, robot.kl)
+    ours, whole = FixedLag(kr=robot.kr, kl=robot.kl), Smoother(kr=robot.kr, kl=robot.kl)
     with limited_blas():
         run_estimator(whole, recording, prior, stream(seed, "bench"))
         problem, guesses = whole.problem()

@@ -131,9 +131,7 @@ def test_a_team_of_one_is_the_robot_alone(make):
 
 def test_derivatives_of_sightings():
     eye = dataclasses.replace(EYE, mount=Mount(0.2, -0.1, 0.4, 0.3))
-    sightings = Sightings.of(
-        [Prior(None, {"robots": eye})], "robots", "camera", "predicted", "test"
-    )
+    sightings = Sightings.of([Prior(None, {"robots": eye})], "robots", "test")
     pose, other = np.array([0.3, -0.2, 0.7]), np.array([3.0, 2.5, -1.0])
     _, *by = sightings.predict(pose, other)
     residuals = PoseSightings(
@@ -348,7 +346,7 @@ def test_kinds_of_communication():
         assert determinants[0] < determinants[1]
     # the answer of six Frames ago, carried on by the wheels
     estimator = EkfSlam(**SEEING)
-    wheels = WheelPrediction(estimator.wheels, team.robots[0].robot.track_m)
+    wheels = WheelPrediction(estimator, team.robots[0].robot.track_m)
     belief = None
     for i, frame in enumerate(team.robots[0].frames()):
         motion = wheels.predict(frame)

@@ -229,7 +229,8 @@ def test_odd_observations_are_survived():
     frames = list(recording.frames())
     for frame in frames[:10]:
         assert "status" not in broken.step(frame).extras
-    broken._room -= 10.0 * np.eye(len(broken._room))
+    covariance = broken._prior.covariance
+    covariance -= 10.0 * np.eye(len(covariance))
     belief = broken.step(frames[10])
     assert "not positive definite" in belief.extras["status"]
     assert np.isfinite(belief.mean).all()

@@ -10,8 +10,8 @@ from estimators.base import run
 from estimators.gaussian import Gaussian
 from estimators.graph import least_squares
 from estimators.graph.graph_slam import GraphSlam
-from estimators.graph.least_squares import Problem, solve
-from estimators.graph.loop_closing import LoopSearch, look_alike, signature
+from estimators.graph.least_squares import LeastSquaresOptions, Problem, solve
+from estimators.graph.loop_closing import LoopOptions, LoopSearch, look_alike, signature
 from estimators.graph.pose_graph import Edge, PoseGraph
 from estimators.laser.icp import prepare
 from estimators.laser.scan_lines import without_sparse_lines
@@ -50,8 +50,8 @@ def closure(truth, first, second, rng, off=(0.0, 0.0, 0.0)):
 
 
 def search(**changed):
-    settings = {"reach_m": 3.0, "gate_probability": 1e-3, "least_gain": 1.0} | changed
-    return LoopSearch(ScanMatcher(MatcherOptions()), Laser(), **settings)
+    how = LoopOptions(**{"loop_least_gain": 1.0} | changed)
+    return LoopSearch(ScanMatcher(MatcherOptions()), Laser(), how)
 
 
 def test_the_sparse_solution_is_the_dense_one(monkeypatch):
@@ -59,9 +59,9 @@ def test_the_sparse_solution_is_the_dense_one(monkeypatch):
     graph, _, closures = lap(150, rng)
     graph.closures += closures
     problem, start = graph._problem(), graph.poses
-    sparse = solve(problem, start, robust="dcs", robust_sigma=5.0)
+    sparse = solve(problem, start, LeastSquaresOptions(robust="dcs", robust_sigma=5.0))
     monkeypatch.setattr(least_squares, "_SPARSE_POSES", 10**6)
-    dense = solve(problem, start, robust="dcs", robust_sigma=5.0)
+    dense = solve(problem, start, LeastSquaresOptions(robust="dcs", robust_sigma=5.0))
     assert sparse.converged
     np.testing.assert_allclose(sparse.poses, dense.poses, atol=1e-8)
     some = np.array([3, 149, 70])
@@ -124,7 +124,9 @@ def test_a_long_loop_closes_however_far_it_has_drifted():
 
 def test_the_loss_of_closures_is_the_integral_of_its_weight():
     problem = Problem(np.zeros(3), np.eye(3), *(np.zeros(0, int),) * 2, *(np.zeros((0, 3)),) * 2)
-    residuals = least_squares._Residuals(problem, np.zeros(1, int), "dcs", 3.0)
+    residuals = least_squares._Residuals(
+        problem, np.zeros(1, int), LeastSquaresOptions(robust="dcs")
+    )
     squares = np.linspace(0.0, 200.0, 20001)
     loss, weight = residuals._loss(squares)
     np.testing.assert_allclose(np.gradient(loss, squares)[1:-1], weight[1:-1], atol=2e-3)

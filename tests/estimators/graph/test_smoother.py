@@ -10,7 +10,7 @@ from scipy.optimize import least_squares
 from estimators.base import run
 from estimators.gaussian import Gaussian
 from estimators.graph.landmark_drive import _between, _merged
-from estimators.graph.least_squares import Problem, solve
+from estimators.graph.least_squares import LeastSquaresOptions, Problem, solve
 from estimators.graph.smoother import Smoother
 from estimators.landmarks.stereo import LEAST_DEPTH_M, StereoModel
 from experiments.evaluation.metrics import nees
@@ -149,7 +149,9 @@ def test_robust_losses(robust):
     rows = problem.landmark_rows.copy()
     rows[::25] = (rows[::25] + 5) % (rows.max() + 1)
     problem = dataclasses.replace(problem, landmark_rows=rows)
-    robustly, squarely = (solve(problem, guess, robust=r) for r in (robust, "none"))
+    robustly, squarely = (
+        solve(problem, guess, LeastSquaresOptions(robust=r)) for r in (robust, "none")
+    )
     error, plain = (np.hypot(*(s.poses - poses)[:, :2].T).max() for s in (robustly, squarely))
     assert error < 0.1 < plain
     assert np.median(np.abs(robustly.landmarks - landmarks)) < 0.1

@@ -313,7 +313,8 @@ def test_a_broken_covariance_is_told():
     filtered.reset(tracking_prior(recording), np.random.default_rng(0))
     frames = list(recording.frames())
     assert "status" not in filtered.step(frames[0]).extras
-    filtered._room -= 10.0 * np.eye(len(filtered._room))
+    covariance = filtered._state.covariance
+    covariance -= 10.0 * np.eye(len(covariance))
     assert "broken" in filtered.step(frames[2]).extras["status"]
 
 
@@ -358,6 +359,7 @@ def test_wrong_input_is_named():
         ({"kr": -1.0}, "kr"),
         ({"sigma_row_px": np.nan}, "sigma_row_px"),
         ({"noise_model": "flat"}, "diagonal"),
+        ({"noise_at": "later"}, "noise_at"),
     ):
         with pytest.raises(InputError, match=word):
             EkfSlam(**options)

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from estimators.landmarks.stereo import StereoModel
-from sim.errors import InputError
 from sim.sensors import Mount, StereoCamera
 from sim.sensors.stereo import points_in_camera
 
@@ -93,7 +92,3 @@ def test_camera_decides_unless_told():
     paper = StereoModel.of(StereoCamera(correlated=False))
     assert not paper.in_image
     assert not paper.correlated
-    with pytest.raises(InputError, match="noise_model"):
-        StereoModel.of(StereoCamera(), "pixel")
-    with pytest.raises(InputError, match="noise_at"):
-        StereoModel.of(StereoCamera(), noise_at="later")

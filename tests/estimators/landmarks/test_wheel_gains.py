@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from estimators.landmarks.ekf_slam import EkfSlam
-from estimators.landmarks.wheel_gains import NO_MOTION, GainBelief, gained_motion
+from estimators.landmarks.wheel_gains import NO_MOTION, GainOptions, gained_motion
 from estimators.wheels import WheelOptions, WheelPrediction
 from experiments.evaluation.metrics import nees, position_errors_m, rms
 from experiments.gate.conform import check_estimator
@@ -106,8 +106,8 @@ def test_states_of_no_deviation_are_none_and_small_ones_change_little():
 
 def test_what_has_no_effect_is_refused():
     with pytest.raises(InputError, match="gain_wander_m has no effect"):
-        GainBelief(0.0, 1e-4)
-    with pytest.raises(InputError, match="must be below"):
-        GainBelief(0.7, 0.0)
+        GainOptions(gain_wander_m=1e-4)
+    with pytest.raises(InputError, match=r"below 0\.5, got 0\.7"):
+        GainOptions(gain_sigma=0.7)
     with pytest.raises(InputError, match=r"set estimator\.gain_sigma=0"):
         EkfSlam(errors="invariant", gain_sigma=0.1)
