@@ -166,12 +166,12 @@ class Mcl(MclOptions):
             self._bounded = likelihood_field(prior.map, self._laser, blunt)
         self._bins = Bins(self._field, self)
         self._off_map = prior.mean is not None and not self._field.holds(prior.mean)
-        self._everywhere = prior.mean is None or prior.covariance is None
-        if prior.mean is None or prior.covariance is None:
+        start, self._everywhere = prior.start, prior.start is None
+        if start is None:
             self._poses = self._field.draw(self.n_most, rng)
         else:
             normals = rng.standard_normal((self.n_most, 3))
-            self._poses = prior.mean + normals @ root(prior.covariance).T
+            self._poses = start.mean + normals @ root(start.covariance).T
             self._poses[:, 2] = se2.wrap(self._poses[:, 2])
         self._log_weights = np.zeros(len(self._poses))
         self._contest: Array | None = None  # (2, n_rivals, 3) poses of defenders and rivals

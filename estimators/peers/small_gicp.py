@@ -79,8 +79,8 @@ class SmallGicp(SmallGicpOptions):
         points = scan_of(frame, self.laser, self._laser)
         guess = self._rolled if self.use_odometry_guess else self._motion
         if points is None:
-            between = se2.compose(self._pose, self._rolled) if self.use_odometry_guess else None
-            return _belief(self._pose if between is None else between)
+            rolled = se2.compose(self._pose, self._rolled)
+            return _belief(rolled if self.use_odometry_guess else self._pose)
         predicted = se2.compose(self._pose, guess)
         if len(points) < _LEAST_POINTS:
             return self._moved(predicted, "empty")

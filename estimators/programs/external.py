@@ -142,15 +142,12 @@ class External(ExternalOptions):
 
 def reset_message(prior: Prior, seed: int) -> dict[str, Any]:
     """What a program is told before the first Frame."""
-    first = None
-    if prior.mean is not None and prior.covariance is not None:
-        first = {"mean": prior.mean, "covariance": prior.covariance}
     return {
         "type": "reset",
         "protocol": PROTOCOL,
         "seed": seed,
         "robot": dataclasses.asdict(prior.robot),
         "sensors": {name: sensor_settings(sensor) for name, sensor in prior.sensors.items()},
-        "prior": first,
+        "prior": prior.start and vars(prior.start),
         "map": map_message(prior.map),
     }

@@ -173,9 +173,7 @@ def _filled(word: str, places: dict[str, str]) -> str:
 
 def start_text(prior: Prior) -> str:
     """A line `x y heading` and the three rows of its covariance; empty if it is not known."""
-    if prior.mean is None or prior.covariance is None:
-        return ""
-    rows = [prior.mean, *prior.covariance]
+    rows = [] if prior.start is None else [prior.start.mean, *prior.start.covariance]
     return "".join(" ".join(f"{value:.17g}" for value in row) + "\n" for row in rows)
 
 

@@ -160,8 +160,8 @@ class TopologicalMcl(TopologicalMclOptions):
             self._along_m = reach * rng.uniform(-1.0, 1.0, len(node))
             self._cross_nodes(noisy=False)
         self._log_weights = np.full(len(node), -math.log(len(node)))
-        if prior.mean is not None and prior.covariance is not None:
-            self._log_weights += self._log_prior(prior.mean, prior.covariance)
+        if (start := prior.start) is not None:
+            self._log_weights += self._log_prior(start.mean, start.covariance)
         self._observed = False
         self._belief, self._registered = self._summary({}), False
 
