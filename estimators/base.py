@@ -8,6 +8,7 @@ from typing import Any, Literal, Protocol
 
 import numpy as np
 
+from estimators.gaussian import Gaussian
 from sim.arrays import Array
 from sim.compiled import processor_s, wall_s
 from sim.errors import InputError, require
@@ -47,6 +48,13 @@ class Prior:
         for name, values in (("mean", self.mean), ("covariance", self.covariance)):
             sound = values is None or bool(np.isfinite(values).all())
             require(sound, f"the {name} of the prior must be finite, got {values}")
+
+    @property
+    def start(self) -> Gaussian | None:
+        """First belief; None where it is not known."""
+        if self.mean is None or self.covariance is None:
+            return None
+        return Gaussian(self.mean, self.covariance)
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -23,48 +22,38 @@ from estimators.base import (
 )
 from estimators.gaussian import Gaussian
 from estimators.landmarks.sightings import dead_reckoning
-from estimators.options import require_choices
 from sim.compiled import processor_s
 from sim.errors import require, required
+from sim.options import Positive, options
 from sim.recording import Frame, Recording
 from sim.team import Team
 
 Kind = Literal["always", "range", "delayed", "never"]
 
 
-@dataclass(frozen=True)
+@options("team.communication")
 class Communication:
-    """Which Frames reach whom.
-
-    Attributes
-    ----------
-    kind
-        `always`: one filter has all Frames at once. `never`: each robot has its own, and cannot use
-        its sightings. `range`: each robot has a filter of the team; robots within `range_m`, also
-        by way of others, give each other all Frames that they have, each once. `delayed`: one
-        filter, whose answers come `delay_s` late; meanwhile a robot reckons by its wheels.
-    range_m, delay_s
-        Of these kinds; None for the others.
-    """
+    """Which Frames reach whom."""
 
     kind: Kind = "always"
-    range_m: float | None = None
-    delay_s: float | None = None
+    """`always`: one filter has all Frames at once. `never`: each robot has its own, and cannot use
+    its sightings. `range`: each robot has a filter of the team; robots within `range_m`, also
+    by way of others, give each other all Frames that they have, each once. `delayed`: one
+    filter, whose answers come `delay_s` late; meanwhile a robot reckons by its wheels."""
+    range_m: Positive | None = None
+    """Distance at which robots of `range` hear each other, m; null for the others."""
+    delay_s: Positive | None = None
+    """Time by which the answers of `delayed` are late, s; null for the others."""
 
     def __post_init__(self) -> None:
-        require_choices("team.communication.", kind=(self.kind, Kind))
         for kind, name in (("range", "range_m"), ("delayed", "delay_s")):
-            value = getattr(self, name)
+            where, value = f"team.communication.{name}", getattr(self, name)
             if self.kind == kind:
-                number = isinstance(value, (int, float)) and not isinstance(value, bool)
-                sound = number and 0.0 < value < np.inf
-                require(
-                    sound, f"team.communication.{name} must be a positive number, got {value!r}"
-                )
+                require(value is not None, f"{where} must be a positive number, got {value!r}")
             else:
                 require(
                     value is None,
-                    f"team.communication.{name} has no effect on kind={self.kind}; set it to null",
+                    f"{where} has no effect on kind={self.kind}; set it to null",
                 )
 
 

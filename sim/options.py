@@ -224,9 +224,9 @@ def accepted(kind: Any) -> str:
         whole = parts[0] is int
         if not whole and tuple(bounds) in _WHOLE:
             return _WHOLE[tuple(bounds)]
-        said = " and ".join(f"{_SIGNS[sign]} {limit:g}" for sign, limit in bounds)
+        said = " and ".join(f"{_SIGNS[sign]} {_shown(limit)}" for sign, limit in bounds)
         if [sign for sign, _ in bounds] == ["ge", "le"]:
-            said = f"from {bounds[0][1]:g} to {bounds[1][1]:g}"
+            said = f"from {_shown(bounds[0][1])} to {_shown(bounds[1][1])}"
         return (
             f"{'a whole number' if whole else 'a number'}, {said}" if said else accepted(parts[0])
         )
@@ -259,6 +259,11 @@ def _fitted(value: Any, kind: Any, where: str, *, check: bool) -> Any:
 def _classes(kinds: tuple[Any, ...]) -> list[type]:
     """Classes of which a checked value may be; True is an int, and yet no number."""
     return [k for k in kinds if isinstance(k, type) and k not in (float, int)]
+
+
+def _shown(limit: float) -> str:
+    """A bound; whole numbers in full."""
+    return str(limit) if isinstance(limit, int) else f"{limit:g}"
 
 
 def _complaint(cls: type, where: str, error: ValidationError) -> str:

@@ -24,6 +24,7 @@ from sim import se2
 from sim.arrays import Array, Floats, Ints
 from sim.compiled import njit
 from sim.errors import require
+from sim.options import Positive, options
 from sim.sensors import Laser
 from sim.worlds.grid import FREE_BELOW, OCCUPIED_ABOVE, OccupancyGrid
 from sim.worlds.world import World
@@ -91,14 +92,22 @@ class LikelihoodField:
         return -self.step * counts.astype(np.float64)
 
 
+@options("estimator")
+class FieldOptions:
+    """How beams are believed to end."""
+
+    sigma_m: Positive = 0.2
+    """Spread of beam ends about the walls, m: range noise, half a cell, and errors of the map."""
+    z_hit: Positive = 0.9
+    """Share of beams that end at a wall."""
+    z_rand: Positive = 0.1
+    """Share of beams that end anywhere up to the laser's greatest range z_max."""
+    cell_m: Positive = 0.05
+    """Side of a cell, m."""
+
+
 def likelihood_field(
-    known_map: World | OccupancyGrid,
-    laser: Laser,
-    *,
-    cell_m: float = 0.05,
-    sigma_m: float = 0.1,
-    z_hit: float = 0.9,
-    z_rand: float = 0.1,
+    known_map: World | OccupancyGrid, laser: Laser, believed: FieldOptions
 ) -> LikelihoodField:
     """Work out the field of a world's walls at the height of the laser, or of a grid.
 
@@ -106,10 +115,6 @@ def likelihood_field(
     ----------
     known_map
         World or grid. A grid has no heights: it is taken to be of the laser's.
-    sigma_m
-        Spread of beam ends about the walls: range noise, half a cell, and errors of the map.
-    z_hit, z_rand
-        Shares of beams that end at a wall and anywhere; z_max is the laser's greatest range.
 
     Raises
     ------
@@ -117,8 +122,9 @@ def likelihood_field(
         If no wall is at that height, or the table would be too large.
     """
     walls, extent = _walls(known_map, laser)
-    normal = z_hit / (sigma_m * math.sqrt(2.0 * math.pi))
-    anywhere = z_rand / laser.max_range_m
+    cell_m, sigma_m = believed.cell_m, believed.sigma_m
+    normal = believed.z_hit / (sigma_m * math.sqrt(2.0 * math.pi))
+    anywhere = believed.z_rand / laser.max_range_m
     # Beyond this distance beams that hit are a thousandth of those that end anywhere
     reach_m = sigma_m * math.sqrt(2.0 * math.log(max(1000.0 * normal / anywhere, math.e)))
     reach_m = max(reach_m, 2.0 * _CLEARANCE_M)

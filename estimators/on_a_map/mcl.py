@@ -13,20 +13,21 @@ mistakes for being lost.
 """
 
 import math
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import Field
 
 from estimators.base import Belief, Prior
 from estimators.gaussian import STILL, Gaussian, root
-from estimators.on_a_map.likelihood_field import LikelihoodField, beam_ends, likelihood_field
-from estimators.options import (
-    require_choices,
-    require_counts,
-    require_laser,
-    require_non_negative,
-    require_positive,
+from estimators.on_a_map.kld import BinOptions, Bins
+from estimators.on_a_map.likelihood_field import (
+    FieldOptions,
+    LikelihoodField,
+    beam_ends,
+    likelihood_field,
 )
+from estimators.options import LaserOptions, require_laser
 from estimators.particles import (
     Scheme,
     effective_sample_size,
@@ -36,9 +37,10 @@ from estimators.particles import (
 )
 from estimators.wheels import WheelOptions, WheelPrediction
 from sim import se2
-from sim.arrays import Array, Floats, Ints
+from sim.arrays import Array, Floats
 from sim.compiled import njit
 from sim.errors import require
+from sim.options import Count, NonNegative, Positive, options
 from sim.recording import Frame
 from sim.worlds.grid import OccupancyGrid
 from sim.worlds.world import World
@@ -48,60 +50,81 @@ Recovery = Literal["none", "average", "rivals"]
 _OFF_WALLS = 2.0  # what a beam of a contest loses, in log likelihood, by ending off the walls
 _BISECTIONS = 12
 _MOST_PARTICLES, _MOST_TRIES = 10_000_000, 100_000_000  # 0.2 and 2 GB of poses
-_MOST_BINS = 250_000_000  # 2 GB
 _FARTHEST_M, _FARTHEST_RAD = 1.0, 0.5  # of what belongs to one hypothesis
 
 
-class Mcl:
-    """Monte Carlo localization with a likelihood field of a world's walls or an occupancy grid.
+@options("estimator")
+class MclOptions(WheelOptions, FieldOptions, BinOptions, LaserOptions):
+    """Options of Monte Carlo localization."""
 
-    Parameters
-    ----------
-    n_least, n_most
-        Bounds of the number of particles; it starts with the greater one.
-    kld_error, kld_quantile
-        KLD sampling: the draw differs from the belief by at most `kld_error`, with the
-        probability that this standard normal quantile has (2.33: 99 %).
-    bin_m, bin_rad
-        Size of the bins that KLD sampling counts.
-    n_beams
-        Beams of each scan that are used, evenly spaced.
-    beam_power
-        Each beam's likelihood is raised to this power, since neighbouring beams err together and
-        particles are few for so sharp a likelihood; 1 for independent beams.
-    least_ess
-        A scan counts for less when it would leave less than this share of the particles; below
-        `ess_share`.
-    tries
-        Poses tried on the floor for each particle injected there by the scan.
-    sigma_m, z_hit, z_rand, cell_m
-        The likelihood field, see `estimators.on_a_map.likelihood_field`.
-    update_distance_m, update_turn_rad
-        How far the robot goes between scans that are used.
-    resampling, ess_share
-        Scheme, and share of the particles that the effective sample size must fall below.
-    jitter_m, jitter_rad
-        Spread added to each particle drawn, so that copies differ.
-    recovery
-        `none`, `average` or `rivals`, as above.
-    alpha_slow, alpha_fast
-        Of `average`: rates of the long and the short average of a beam's likelihood; 0 for no
-        recovery.
-    recovery_ratio
-        Of `average`: particles are injected when the short average falls below this share of the
-        long one.
-    n_rivals, rival_scans
-        Of `rivals`: their number, and the scans after which they are judged.
-    rival_margin
-        Of `rivals`: how much greater the mean log likelihood of a beam must be along their best
-        path.
-    kr, kl
-        Believed slip variance per metre of the wheels, m; `amcl_alphas` converts them for AMCL.
-    window_s
-        |ds| is netted over at least this time.
+    n_least: Count = 1000
+    """Least number of particles."""
+    n_most: Annotated[int, Field(ge=1, le=_MOST_PARTICLES)] = 20_000
+    """Greatest number of particles, with which it starts."""
+    n_beams: Count = 60
+    """Beams of each scan that are used, evenly spaced."""
+    beam_power: Positive = 0.1
+    """Each beam's likelihood is raised to this power, since neighbouring beams err together and
+    particles are few for so sharp a likelihood; 1 for independent beams."""
+    least_ess: NonNegative = 0.4
+    """A scan counts for less when it would leave less than this share of the particles; below
+    `ess_share`."""
+    tries: Count = 100
+    """Poses tried on the floor for each particle injected there by the scan."""
+    update_distance_m: NonNegative = 0.2
+    """Distance that the robot goes between scans that are used, m, or turns by the next."""
+    update_turn_rad: NonNegative = 0.2
+    """Angle that it turns between scans that are used, rad."""
+    resampling: Scheme = "systematic"
+    """Scheme of resampling: see `estimators.particles.resample`."""
+    ess_share: NonNegative = 0.5
+    """Particles are resampled when the effective sample size is below this share of them."""
+    jitter_m: NonNegative = 0.01
+    """Spread added to the place of each particle drawn, so that copies differ, m."""
+    jitter_rad: NonNegative = 0.005
+    """Spread added to the heading of each particle drawn, rad."""
+    recovery: Recovery = "average"
+    """Recovery from being lost: by the `average` of the fit over time, by `rivals` that see the
+    same scans, or `none`."""
+    alpha_slow: NonNegative = 0.01
+    """Of `average`: rate of the long average of a beam's likelihood; 0 for no recovery."""
+    alpha_fast: NonNegative = 0.2
+    """Of `average`: rate of the short average."""
+    recovery_ratio: NonNegative = 0.9
+    """Of `average`: particles are injected when the short average falls below this share of the
+    long one."""
+    n_rivals: Count = 2000
+    """Of `rivals`: their number."""
+    rival_scans: Count = 15
+    """Of `rivals`: scans after which they are judged."""
+    rival_margin: NonNegative = 0.2
+    """Of `rivals`: how much greater the mean log likelihood of a beam must be along their best
+    path."""
+
+    def __post_init__(self) -> None:
+        most = max(self.n_most, self.n_rivals)
+        require(
+            most * self.tries <= _MOST_TRIES,
+            f"estimator.n_most={self.n_most}, n_rivals={self.n_rivals} and tries={self.tries} draw "
+            f"{most * self.tries} poses at once; at most {_MOST_TRIES} are drawn",
+        )
+        require(
+            self.n_least <= self.n_most,
+            f"estimator.n_least={self.n_least} is above n_most={self.n_most}",
+        )
+        require(
+            self.least_ess < self.ess_share,
+            f"estimator.least_ess={self.least_ess} is not below ess_share={self.ess_share}",
+        )
+
+
+class Mcl(MclOptions):
+    """Monte Carlo localization with a likelihood field of a world's walls or an occupancy grid.
 
     Notes
     -----
+    `amcl_alphas` converts kr and kl for AMCL.
+
     The defaults are for finding the robot anywhere: blunt likelihoods and a jitter that widens the
     belief to twice its error or more. A tracker that knows its error wants beam_power=1,
     least_ess=0, sigma_m of 0.05 to 0.1, and no jitter; it is consistent then.
@@ -121,96 +144,6 @@ class Mcl:
     maps = (World, OccupancyGrid)
     global_or_grid = True
 
-    def __init__(
-        self,
-        n_least: int = 1000,
-        n_most: int = 20_000,
-        kld_error: float = 0.05,
-        kld_quantile: float = 2.33,
-        bin_m: float = 0.5,
-        bin_rad: float = 0.17,
-        n_beams: int = 60,
-        beam_power: float = 0.1,
-        least_ess: float = 0.4,
-        tries: int = 100,
-        sigma_m: float = 0.2,
-        z_hit: float = 0.9,
-        z_rand: float = 0.1,
-        cell_m: float = 0.05,
-        update_distance_m: float = 0.2,
-        update_turn_rad: float = 0.2,
-        resampling: Scheme = "systematic",
-        ess_share: float = 0.5,
-        jitter_m: float = 0.01,
-        jitter_rad: float = 0.005,
-        recovery: Recovery = "average",
-        alpha_slow: float = 0.01,
-        alpha_fast: float = 0.2,
-        recovery_ratio: float = 0.9,
-        n_rivals: int = 2000,
-        rival_scans: int = 15,
-        rival_margin: float = 0.2,
-        kr: float = 1e-4,
-        kl: float = 1e-4,
-        window_s: float = 0.05,
-        laser: str = "laser",
-    ) -> None:
-        self.laser = laser
-        self.wheels = WheelOptions(kr=kr, kl=kl, window_s=window_s)
-        require_counts(
-            n_least=n_least,
-            n_beams=n_beams,
-            tries=tries,
-            n_rivals=n_rivals,
-            rival_scans=rival_scans,
-        )
-        require_counts(_MOST_PARTICLES, n_most=n_most)
-        require(
-            max(n_most, n_rivals) * tries <= _MOST_TRIES,
-            f"estimator.n_most={n_most}, n_rivals={n_rivals} and tries={tries} draw "
-            f"{max(n_most, n_rivals) * tries} poses at once; at most {_MOST_TRIES} are drawn",
-        )
-        require_choices(resampling=(resampling, Scheme), recovery=(recovery, Recovery))
-        require_positive(
-            kld_error=kld_error,
-            bin_m=bin_m,
-            bin_rad=bin_rad,
-            beam_power=beam_power,
-            sigma_m=sigma_m,
-            z_hit=z_hit,
-            z_rand=z_rand,
-            cell_m=cell_m,
-        )
-        require_non_negative(
-            kld_quantile=kld_quantile,
-            least_ess=least_ess,
-            update_distance_m=update_distance_m,
-            update_turn_rad=update_turn_rad,
-            ess_share=ess_share,
-            jitter_m=jitter_m,
-            jitter_rad=jitter_rad,
-            alpha_slow=alpha_slow,
-            alpha_fast=alpha_fast,
-            recovery_ratio=recovery_ratio,
-            rival_margin=rival_margin,
-        )
-        require(n_least <= n_most, f"estimator.n_least={n_least} is above n_most={n_most}")
-        require(
-            least_ess < ess_share,
-            f"estimator.least_ess={least_ess} is not below ess_share={ess_share}",
-        )
-        self.n_least, self.n_most, self.n_beams = n_least, n_most, n_beams
-        self.kld_error, self.kld_quantile = kld_error, kld_quantile
-        self.bin_m, self.bin_rad, self.beam_power = bin_m, bin_rad, beam_power
-        self.least_ess, self.tries = least_ess, tries
-        self.sigma_m, self.z_hit, self.z_rand, self.cell_m = sigma_m, z_hit, z_rand, cell_m
-        self.update_distance_m, self.update_turn_rad = update_distance_m, update_turn_rad
-        self.resampling, self.ess_share = resampling, ess_share
-        self.jitter_m, self.jitter_rad = jitter_m, jitter_rad
-        self.alpha_slow, self.alpha_fast = alpha_slow, alpha_fast
-        self.recovery, self.recovery_ratio = recovery, recovery_ratio
-        self.n_rivals, self.rival_scans, self.rival_margin = n_rivals, rival_scans, rival_margin
-
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Draw particles from the prior's pose, or from all the floor if there is none."""
         self._laser, self._rng = require_laser(prior, self.laser, "mcl"), rng
@@ -218,35 +151,27 @@ class Mcl:
             isinstance(prior.map, self.maps),
             "mcl needs a map of walls; set prior.map=world, or to a grid's .yaml",
         )
-        self._wheels = WheelPrediction(self.wheels, prior.robot.track_m)
-        self._field = likelihood_field(
-            prior.map,
-            self._laser,
-            cell_m=self.cell_m,
-            sigma_m=self.sigma_m,
-            z_hit=self.z_hit,
-            z_rand=self.z_rand,
-        )
+        self._wheels = WheelPrediction(self, prior.robot.track_m)
+        self._field = likelihood_field(prior.map, self._laser, self)
         if self.recovery == "rivals":
             # off the walls every end is as unlikely: else beams that end short, at people, outweigh
             # all others, and beams that end in the unknown are better than those
             off_walls = math.exp(-_OFF_WALLS) * self._laser.max_range_m
-            self._bounded = likelihood_field(
-                prior.map,
-                self._laser,
+            blunt = FieldOptions(
                 cell_m=self.cell_m,
                 sigma_m=self.sigma_m,
                 z_hit=1.0,
                 z_rand=off_walls / (self.sigma_m * math.sqrt(2.0 * math.pi)),
             )
-        self._shape = self._shape_of_bins()
+            self._bounded = likelihood_field(prior.map, self._laser, blunt)
+        self._bins = Bins(self._field, self)
         self._off_map = prior.mean is not None and not self._field.holds(prior.mean)
-        self._everywhere = prior.mean is None or prior.covariance is None
-        if prior.mean is None or prior.covariance is None:
+        start, self._everywhere = prior.start, prior.start is None
+        if start is None:
             self._poses = self._field.draw(self.n_most, rng)
         else:
             normals = rng.standard_normal((self.n_most, 3))
-            self._poses = prior.mean + normals @ root(prior.covariance).T
+            self._poses = start.mean + normals @ root(start.covariance).T
             self._poses[:, 2] = se2.wrap(self._poses[:, 2])
         self._log_weights = np.zeros(len(self._poses))
         self._contest: Array | None = None  # (2, n_rivals, 3) poses of defenders and rivals
@@ -393,47 +318,15 @@ class Mcl:
             poses = self._poses[drawn]
             if n_injected > 0:
                 poses = np.concatenate([poses, self._drawn_by_scan(n_injected, ends, self._field)])
-            needed = min(max(self._kld_number(poses), self.n_least), self.n_most)
+            needed = min(max(self._bins.needed(poses), self.n_least), self.n_most)
         self._poses, self._log_weights = self._jittered(poses), np.zeros(n)
         self._extras["injected"] = n_injected
-
-    def _kld_number(self, poses: Array) -> int:
-        """Particles that the number of bins in use calls for (Fox 2003)."""
-        k = np.count_nonzero(np.bincount(self._bins(poses)))
-        if k < 2:
-            return 1
-        a = 2.0 / (9.0 * (k - 1))
-        cube = (1.0 - a + math.sqrt(a) * self.kld_quantile) ** 3
-        return math.ceil((k - 1) / (2.0 * self.kld_error) * cube)
-
-    def _shape_of_bins(self) -> tuple[int, int, int]:
-        """Numbers of bins along x, along y and in heading."""
-        sides_m = self._field.cell_m * np.array(self._field.table.shape[::-1])
-        with np.errstate(over="ignore"):  # counted in floats, which do not wrap
-            shape = np.ceil(np.array([*sides_m / self.bin_m, 2.0 * math.pi / self.bin_rad]))
-            n_bins = float(np.prod(shape))
-        require(
-            n_bins <= _MOST_BINS,
-            f"estimator.bin_m={self.bin_m} and bin_rad={self.bin_rad} make {n_bins:.3g} bins of "
-            "the map; make them larger",
-        )
-        columns, rows, headings = shape.astype(int).tolist()
-        return columns, rows, headings
-
-    def _bins(self, poses: Array) -> Ints:
-        """Number of the bin (M,) of each pose; what lies off the map counts to its rim."""
-        field, (columns, rows, n_headings) = self._field, self._shape
-        x, y = ((poses[:, i] - field.origin_m[i]) / self.bin_m for i in (0, 1))
-        heading = np.floor((poses[:, 2] + math.pi) / self.bin_rad).astype(np.int64)
-        column = np.clip(x.astype(np.int64), 0, columns - 1)
-        row = np.clip(y.astype(np.int64), 0, rows - 1)
-        return np.asarray((row * columns + column) * n_headings + heading % n_headings)
 
     def _summed_up(self) -> Gaussian:
         """Belief of the weighted particles, and its extras."""
         weights = normalize(self._log_weights)
         poses = self._poses
-        bins = self._bins(poses)
+        bins = self._bins.of(poses)
         heaviest = bins == np.argmax(np.bincount(bins, weights))
         mean = weights[heaviest] @ poses[heaviest] / weights[heaviest].sum()
         for _ in range(2):

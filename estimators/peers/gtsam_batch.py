@@ -6,76 +6,48 @@ from typing import Any
 import numpy as np
 
 from estimators.base import Belief, Estimate, Prior
-from estimators.gaussian import STILL, Gaussian
-from estimators.graph.landmark_drive import LandmarkDrive, loosened, observed
-from estimators.landmarks.stereo import StereoModel
-from estimators.options import require_counts, require_stereo, start_pose
+from estimators.gaussian import Gaussian
+from estimators.graph.landmark_drive import LandmarkDrive
 from estimators.peers import package
-from estimators.peers.gtsam_model import GtsamModel, Isam2
-from estimators.wheels import WheelOptions, WheelPrediction
+from estimators.peers.gtsam_model import GtsamOptions, Isam2, Isam2Options
 from sim.arrays import Array
+from sim.options import Count, options
 from sim.recording import Frame
 
 
-class GtsamBatch:
+@options("estimator")
+class GtsamBatchOptions(GtsamOptions):
+    """Options of GTSAM's batch solution."""
+
+    max_iterations: Count = 100
+    """Most iterations of Levenberg-Marquardt; GTSAM's own, with its default."""
+
+
+class GtsamBatch(GtsamBatchOptions):
     """Online iSAM2 as GTSAM ships it; from there `finish` solves for everything seen.
 
     Started from dead reckoning instead, Levenberg-Marquardt ended in a false minimum in three of
     fifteen drives of 30 m.
-
-    Parameters
-    ----------
-    stereo
-        The sensor that it reads; its landmarks must be identified.
-    kr, kl
-        Believed slip variance per metre of the right and left wheel, m.
-    max_iterations
-        GTSAM's own, with its default.
-    window_s
-        |ds| is netted over at least this time.
     """
 
     needs = frozenset({"stereo"})
 
-    def __init__(
-        self,
-        stereo: str = "stereo",
-        kr: float = 1e-4,
-        kl: float = 1e-4,
-        max_iterations: int = 100,
-        window_s: float = 0.05,
-    ) -> None:
-        self._gtsam = package("gtsam", "gtsam")
-        require_counts(max_iterations=max_iterations)
-        self.stereo, self.max_iterations = stereo, max_iterations
-        self.wheels = WheelOptions(kr=kr, kl=kl, window_s=window_s)
-
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Start from the prior's pose, with nothing seen."""
-        self._camera = StereoModel.of(require_stereo(prior, self.stereo, "gtsam_batch"))
-        self._model = GtsamModel(self._camera)
-        self._belief = start_pose(prior, "gtsam_batch")
-        self._wheels = WheelPrediction(self.wheels, prior.robot.track_m)
-        self._drive = LandmarkDrive(self._camera, self._belief)
-        self._isam2 = Isam2(self._camera, self._belief)
-        self._motion = STILL  # since the last image
+        believed = Isam2Options(stereo=self.stereo, kr=self.kr, kl=self.kl, window_s=self.window_s)
+        self._isam2 = Isam2(believed, prior, "gtsam_batch")
+        self._drive = LandmarkDrive(self._isam2.camera, self._isam2.belief)
 
     def step(self, frame: Frame) -> Belief:
         """Keep what the Frame shows; at an image, update iSAM2."""
-        motion = self._wheels.predict(frame)
-        loose = loosened(motion)
-        self._belief, self._motion = self._belief.then(motion), self._motion.then(loose)
-        seen, status = observed(frame, self.stereo, self._camera, "gtsam_batch")
-        if seen is not None:
-            self._belief, self._motion = self._isam2.see(self._motion, *seen), STILL
-        self._drive.add(frame.stamp, loose, self._belief.mean, seen)
-        extras = {"status": status} if status else {}
-        return Belief(self._belief.mean.copy(), self._belief.covariance.copy(), extras)
+        belief, motion, seen = self._isam2.step(frame)
+        self._drive.add(frame.stamp, motion, belief.mean, seen)
+        return belief
 
     def finish(self) -> Estimate:
         """Least squares over all Frames so far."""
         problem, guess = self._drive.problem()
-        model = self._model
+        model, camera = self._isam2.model, self._isam2.camera
         graph, values = model.graph_and_values()
         model.add_start(graph, Gaussian(problem.prior_mean, problem.prior_covariance))
         for i, pose in enumerate(guess):
@@ -90,15 +62,15 @@ class GtsamBatch:
             model.add_seen(graph, pose, landmark, point)
             if landmark not in known:
                 known.add(landmark)
-                model.add_landmark(values, landmark, self._camera.place(guess[pose], point))
-        params = self._gtsam.LevenbergMarquardtParams()
+                model.add_landmark(values, landmark, camera.place(guess[pose], point))
+        params = package("gtsam", "gtsam").LevenbergMarquardtParams()
         params.setMaxIterations(self.max_iterations)
-        optimizer = self._gtsam.LevenbergMarquardtOptimizer(graph, values, params)
+        optimizer = package("gtsam", "gtsam").LevenbergMarquardtOptimizer(graph, values, params)
         found = optimizer.optimize()
         poses = np.array(
             [model.planar(found.atPose3(model.pose_key(i))) for i in range(len(guess))]
         )
-        marginals = self._gtsam.Marginals(graph, found)
+        marginals = package("gtsam", "gtsam").Marginals(graph, found)
         means, covariances = self._drive.filled_in(poses, self._joint(marginals, poses))
         converged = optimizer.iterations() < self.max_iterations
         return Estimate(
@@ -111,7 +83,7 @@ class GtsamBatch:
 
     def _joint(self, marginals: Any, poses: Array) -> Array:
         """Covariance (3 T, 3 T) of the poses; only those of neighbours are filled in."""
-        model, n = self._model, len(poses)
+        model, n = self._isam2.model, len(poses)
         joint = np.zeros((3 * n, 3 * n))
         if n == 1:
             block = marginals.marginalCovariance(model.pose_key(0))

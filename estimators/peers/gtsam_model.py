@@ -8,19 +8,44 @@ from typing import Any
 
 import numpy as np
 
-from estimators.gaussian import Gaussian, rotated
-from estimators.graph.landmark_drive import FLOOR
-from estimators.landmarks.stereo import StereoModel
+from estimators.base import Belief, Prior
+from estimators.gaussian import STILL, Gaussian, rotated
+from estimators.graph.landmark_drive import FLOOR, loosened, observed
+from estimators.landmarks.stereo import StereoModel, StereoOptions
+from estimators.options import require_stereo, start_pose
 from estimators.peers import package
 from estimators.peers.planar import matrix_of
+from estimators.wheels import WheelOptions, WheelPrediction
 from sim import se2
 from sim.arrays import Array, Ints
 from sim.errors import require
+from sim.options import Count, Positive, options
+from sim.recording import Frame
 
 _FLAT_SIGMA = 1e-5  # height m, roll and pitch rad, of every pose
 _FREE_SIGMA = 1e3
 _IN_PLANE = [3, 4, 2]  # x, y, yaw of a Pose3's tangent: roll, pitch, yaw, x, y, z
 _OUT_OF_PLANE = [0, 1, 5]
+
+
+@options("estimator")
+class GtsamOptions(WheelOptions, StereoOptions):
+    """Options of both of GTSAM's solvers; the camera's landmarks must be identified."""
+
+    def __post_init__(self) -> None:
+        package("gtsam", "gtsam")
+
+
+@options("estimator")
+class Isam2Options(GtsamOptions):
+    """GTSAM's own options of iSAM2, with its defaults."""
+
+    relinearize_threshold: Positive = 0.1
+    """How far a variable moves before it is linearised again."""
+    relinearize_skip: Count = 10
+    """At how many updates that is looked at."""
+    updates: Count = 1
+    """Calls of `update` at every image."""
 
 
 class GtsamModel:
@@ -131,34 +156,49 @@ class GtsamModel:
 
 
 class Isam2:
-    """GTSAM's iSAM2 over images; options as in `estimators.peers.gtsam_isam2.GtsamIsam2`.
+    """GTSAM's iSAM2 over images; between them it follows the wheels.
 
     Parameters
     ----------
-    start
-        Pose in map before the first image.
+    estimator
+        For messages.
+
+    Attributes
+    ----------
+    camera, model
+        What is believed of the camera, and GTSAM's factors by it.
+    belief
+        Pose in map, of the prior at first.
     """
 
-    def __init__(
-        self,
-        camera: StereoModel,
-        start: Gaussian,
-        relinearize_threshold: float = 0.1,
-        relinearize_skip: int = 10,
-        updates: int = 1,
-    ) -> None:
+    def __init__(self, believed: Isam2Options, prior: Prior, estimator: str) -> None:
         gtsam = package("gtsam", "gtsam")
-        self._camera, self._model, self._updates = camera, GtsamModel(camera), updates
+        self._believed, self._estimator = believed, estimator
+        self.camera = StereoModel.of(require_stereo(prior, believed.stereo, estimator))
+        self.model, self.belief = GtsamModel(self.camera), start_pose(prior, estimator)
+        self._wheels = WheelPrediction(believed, prior.robot.track_m)
         params = gtsam.ISAM2Params()
-        params.setRelinearizeThreshold(relinearize_threshold)
-        params.relinearizeSkip = relinearize_skip
+        params.setRelinearizeThreshold(believed.relinearize_threshold)
+        params.relinearizeSkip = believed.relinearize_skip
         self._isam = gtsam.ISAM2(params)
-        graph, values = self._model.graph_and_values()
-        self._model.add_start(graph, Gaussian(start.mean, start.covariance + FLOOR))
-        self._model.add_pose(graph, values, 0, start.mean)
+        start, (graph, values) = self.belief, self.model.graph_and_values()
+        self.model.add_start(graph, Gaussian(start.mean, start.covariance + FLOOR))
+        self.model.add_pose(graph, values, 0, start.mean)
         self._isam.update(graph, values)
         self._pose, self._n_poses = start.mean, 1
         self._known: set[int] = set()
+        self._motion = STILL  # since the last image
+
+    def step(self, frame: Frame) -> tuple[Belief, Gaussian, tuple[Array, Ints] | None]:
+        """Belief after a Frame, its motion as the graph takes it, and what its image shows."""
+        motion = self._wheels.predict(frame)
+        loose = loosened(motion)
+        self.belief, self._motion = self.belief.then(motion), self._motion.then(loose)
+        seen, status = observed(frame, self._believed.stereo, self.camera, self._estimator)
+        if seen is not None:
+            self.belief, self._motion = self.see(self._motion, *seen), STILL
+        extras = {"status": status} if status else {}
+        return Belief(self.belief.mean.copy(), self.belief.covariance.copy(), extras), loose, seen
 
     def see(self, motion: Gaussian, points: Array, ids: Ints) -> Gaussian:
         """Pose in map after an image of points (K, 3) m in the camera frame and ids (K,).
@@ -168,7 +208,7 @@ class Isam2:
         motion
             Since the last image, or the start.
         """
-        model, i = self._model, self._n_poses
+        model, i = self.model, self._n_poses
         guess = se2.compose(self._pose, motion.mean)
         graph, values = model.graph_and_values()
         model.add_pose(graph, values, i, guess)
@@ -177,9 +217,9 @@ class Isam2:
             model.add_seen(graph, i, landmark, point)
             if landmark not in self._known:
                 self._known.add(landmark)
-                model.add_landmark(values, landmark, self._camera.place(guess, point))
+                model.add_landmark(values, landmark, self.camera.place(guess, point))
         self._isam.update(graph, values)
-        for _ in range(self._updates - 1):
+        for _ in range(self._believed.updates - 1):
             self._isam.update()
         key = model.pose_key(i)
         self._pose, self._n_poses = model.planar(self._isam.calculateEstimatePose3(key)), i + 1

@@ -14,13 +14,14 @@ from estimators.base import Belief, Estimate, Prior
 from estimators.programs.program import (
     Program,
     ProgramError,
+    ProgramOptions,
+    Seconds,
     apart,
     map_message,
-    require_limits,
-    words_of,
 )
 from sim.arrays import Array
 from sim.formats.trajectory import FARTHEST_M, sound_covariances
+from sim.options import options
 from sim.recording import Frame
 from sim.sensors.base import sensor_settings
 
@@ -28,40 +29,30 @@ PROTOCOL = 1
 _STEP_BYTES, _FINISH_BYTES = 1 << 20, 1 << 28  # of an answer
 
 
-class External:
-    """Ask a child process for each belief.
+@options("estimator")
+class ExternalOptions(ProgramOptions):
+    """Options of a program that is asked Frame by Frame."""
 
-    Parameters
-    ----------
-    command
-        The program and its arguments, a list or a line.
-    start_s, step_s, finish_s
-        Longest time for the answer to `reset`, to a Frame and to `finish`, s.
-    global_or_grid
-        Whether `estima conform` compares it in distribution, when the world is moved.
-    """
+    start_s: Seconds = 30.0
+    """Longest time for the answer to `reset`, s."""
+    step_s: Seconds = 10.0
+    """Longest time for the answer to a Frame, s."""
+    finish_s: Seconds = 600.0
+    """Longest time for the answer to `finish`, s."""
 
-    def __init__(
-        self,
-        command: Any,
-        start_s: float = 30.0,
-        step_s: float = 10.0,
-        finish_s: float = 600.0,
-        global_or_grid: bool = False,
-    ) -> None:
-        require_limits(start_s=start_s, step_s=step_s, finish_s=finish_s)
-        self._words = words_of(command)
-        self.start_s, self.step_s, self.finish_s = start_s, step_s, finish_s
-        self.global_or_grid = global_or_grid
-        self.program_seconds = 0.0
-        self._program: Program | None = None
+
+class External(ExternalOptions):
+    """Ask a child process for each belief."""
+
+    program_seconds = 0.0
+    _program: Program | None = None
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Start the program, and tell it what is known."""
         message = reset_message(prior, int(rng.integers(2**32)))
         if self._program is not None:
             self._program.close()
-        self._program, self._stamps = Program(self._words), list[float]()
+        self._program, self._stamps = Program(self.words), list[float]()
         self._ask(message, self.start_s, "reset")
 
     def step(self, frame: Frame) -> Belief:
@@ -151,15 +142,12 @@ class External:
 
 def reset_message(prior: Prior, seed: int) -> dict[str, Any]:
     """What a program is told before the first Frame."""
-    first = None
-    if prior.mean is not None and prior.covariance is not None:
-        first = {"mean": prior.mean, "covariance": prior.covariance}
     return {
         "type": "reset",
         "protocol": PROTOCOL,
         "seed": seed,
         "robot": dataclasses.asdict(prior.robot),
         "sensors": {name: sensor_settings(sensor) for name, sensor in prior.sensors.items()},
-        "prior": first,
+        "prior": prior.start and vars(prior.start),
         "map": map_message(prior.map),
     }

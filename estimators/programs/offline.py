@@ -6,21 +6,22 @@ The log is made of the Frames and the Prior, so it holds neither the truth nor w
 import re
 import tempfile
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Literal, cast
 
 import numpy as np
 import orjson
 
 from estimators.base import Belief, Estimate, Prior
-from estimators.options import require_choices, require_laser
+from estimators.options import require_laser
 from estimators.programs.program import (
     Program,
     ProgramError,
+    ProgramOptions,
+    Seconds,
     apart,
     map_message,
-    require_limits,
-    words_of,
 )
 from sim import se2
 from sim.errors import InputError, require
@@ -28,6 +29,7 @@ from sim.files import write_text
 from sim.formats.carmen import write_carmen
 from sim.formats.rosbag_out import write_bag
 from sim.formats.trajectory import read_track
+from sim.options import options
 from sim.recording import Frame, Recording, WheelLog, joined, save
 from sim.robot.arc import arc_increment
 from sim.worlds.grid import OccupancyGrid, rasterized
@@ -41,54 +43,50 @@ _NEEDED_BY = {"laser": ("log", "grid"), "map": ("map", "grid")}
 _CELL_M = 0.05  # of a world's {grid}
 
 
-class Offline:
+@options("estimator")
+class OfflineOptions(ProgramOptions):
+    """Options of a program that reads a whole log.
+
+    In the command {log} (CARMEN), {mcap}, {npz}, {map}, {grid}, {start}, {seed} and {out} stand for
+    the files' names.
+    """
+
+    limit_s: Seconds = 600.0
+    """Longest time that it may take, s."""
+    output: Output = "tum"
+    """Format of {out}: `tum`, or with covariances `mcap` or `bag` (nav_msgs/Odometry)."""
+    kind: Kind = "revised"
+    """`revised`, or `online` where each pose of its trajectory saw only its past."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        known = ", ".join(f"{{{place}}}" for place in _PLACES)
+        for name in self.places:
+            require(
+                name in _PLACES,
+                f"estimator.command: nothing is called {{{name}}}; known: {known}",
+            )
+        require("out" in self.places, "estimator.command must have {out}, the file it writes")
+
+    @cached_property
+    def places(self) -> set[str]:
+        """Names of files in the command."""
+        return set(re.findall(r"\{(\w+)\}", " ".join(self.words)))
+
+    @property
+    def needs(self) -> frozenset[str]:
+        """What the named files are made of."""
+        return frozenset(need for need, of in _NEEDED_BY.items() if self.places.intersection(of))
+
+
+class Offline(OfflineOptions):
     """Run a command over the whole log when the last Frame is there.
 
     Until then its beliefs are dead reckoning without a covariance.
-
-    Parameters
-    ----------
-    command
-        The program and its arguments, a list or a line, with {log} (CARMEN), {mcap}, {npz}, {map},
-        {grid}, {start}, {seed} and {out} in place of the files' names.
-    limit_s
-        Longest time that it may take, s.
-    output
-        Format of {out}: `tum`, or with covariances `mcap` or `bag` (nav_msgs/Odometry).
-    kind
-        `revised`, or `online` where each pose of its trajectory saw only its past.
-    global_or_grid
-        Whether `estima conform` compares it in distribution, when the world is moved.
     """
 
     answers_at_finish = True
-
-    def __init__(
-        self,
-        command: Any,
-        limit_s: float = 600.0,
-        output: Output = "tum",
-        kind: Kind = "revised",
-        global_or_grid: bool = False,
-    ) -> None:
-        require_choices(output=(output, Output), kind=(kind, Kind))
-        require_limits(limit_s=limit_s)
-        self._words = words_of(command)
-        self._used = re.findall(r"\{(\w+)\}", " ".join(self._words))
-        for name in self._used:
-            require(
-                name in _PLACES,
-                f"estimator.command: nothing is called {{{name}}}; known: "
-                f"{', '.join(f'{{{place}}}' for place in _PLACES)}",
-            )
-        require("out" in self._used, "estimator.command must have {out}, the file it writes")
-        used = set(self._used)
-        self.needs = frozenset(
-            need for need, places in _NEEDED_BY.items() if not used.isdisjoint(places)
-        )
-        self.limit_s, self.output, self.kind = limit_s, output, kind
-        self.global_or_grid = global_or_grid
-        self.program_seconds = 0.0
+    program_seconds = 0.0
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Keep what is known at the start."""
@@ -113,7 +111,7 @@ class Offline:
         """Write the log, run the command, and read its trajectory."""
         with tempfile.TemporaryDirectory(prefix="estima-") as name:
             places = self._written(Path(name))
-            words = [_filled(word, places) for word in self._words]
+            words = [_filled(word, places) for word in self.words]
             program = Program(words)
             try:
                 program.wait(self.limit_s)
@@ -143,7 +141,7 @@ class Offline:
             "start": ("start.txt", lambda path: write_text(path, start_text(self._prior))),
         }
         places = {"seed": str(self._seed), "out": str(folder / f"out.{self.output}")}
-        for key in set(self._used) & set(files):
+        for key in self.places & set(files):
             name, write = files[key]
             write(folder / name)
             places[key] = str(folder / name)
@@ -175,9 +173,7 @@ def _filled(word: str, places: dict[str, str]) -> str:
 
 def start_text(prior: Prior) -> str:
     """A line `x y heading` and the three rows of its covariance; empty if it is not known."""
-    if prior.mean is None or prior.covariance is None:
-        return ""
-    rows = [prior.mean, *prior.covariance]
+    rows = [] if prior.start is None else [prior.start.mean, *prior.start.covariance]
     return "".join(" ".join(f"{value:.17g}" for value in row) + "\n" for row in rows)
 
 

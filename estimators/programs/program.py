@@ -16,14 +16,19 @@ import time
 import weakref
 from collections.abc import Sequence
 from contextlib import suppress
-from typing import Any
+from functools import cached_property
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import Field
 
 from sim.arrays import Array
 from sim.errors import InputError, printable, require
+from sim.options import options
 from sim.worlds.grid import OccupancyGrid
 from sim.worlds.world import World
+
+Seconds = Annotated[float, Field(gt=0.0, le=1e6)]  # the longest that something may take
 
 PEERS_PROGRAM = "build/peers/mrpt"  # of the estimators mrpt_*
 _TAIL = 2000  # bytes of its messages that are kept
@@ -36,40 +41,37 @@ class ProgramError(Exception):
     """A program did not do what was asked of it; the run's Status says what."""
 
 
-def words_of(command: Any) -> list[str]:
-    """Words of a command, a list or a line as for a shell; the program must be there.
+@options("estimator")
+class ProgramOptions:
+    """Options of every program that is an estimator."""
 
-    Raises
-    ------
-    InputError
-        If it is neither, or there is no such program.
-    """
-    try:
-        words = shlex.split(command) if isinstance(command, str) else command
-    except ValueError as error:
-        raise InputError(f"estimator.command: {error}; got {command!r}") from error
-    texts = isinstance(words, Sequence) and words and all(isinstance(w, str) for w in words)
-    require(
-        texts,
-        f"estimator.command must be a program and its arguments, such as [python3, mine.py], got "
-        f"{command!r}",
-    )
-    remedy = "`make peers` compiles it" if words[0] == PEERS_PROGRAM else "give its path"
-    require(
-        shutil.which(words[0]),
-        f"estimator.command: no program {words[0]} that can be run; {remedy}",
-    )
-    return list(words)
+    command: Any = None
+    """The program and its arguments, a list such as [./my_filter, --fast], or a line."""
+    global_or_grid: bool = False
+    """Whether `estima conform` compares it in distribution when the world is moved."""
 
-
-def require_limits(**seconds: Any) -> None:
-    """Check time limits, in seconds."""
-    for name, value in seconds.items():
-        number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    def __post_init__(self) -> None:
         require(
-            number and 0.0 < value <= 1e6,
-            f"estimator.{name} must be a positive number of seconds, got {value!r}",
+            shutil.which(name := self.words[0]),
+            f"estimator.command: no program {name} that can be run; "
+            f"{'`make peers` compiles it' if name == PEERS_PROGRAM else 'give its path'}",
         )
+
+    @cached_property
+    def words(self) -> list[str]:
+        """The command's words, as a shell reads a line."""
+        command = self.command
+        try:
+            words = shlex.split(command) if isinstance(command, str) else command
+        except ValueError as error:
+            raise InputError(f"estimator.command: {error}; got {command!r}") from error
+        texts = isinstance(words, Sequence) and words and all(isinstance(w, str) for w in words)
+        require(
+            texts,
+            "estimator.command must be a program and its arguments, such as [python3, mine.py], "
+            f"got {command!r}",
+        )
+        return list(words)
 
 
 class Program:

@@ -115,6 +115,53 @@ class TopologicalMap:
         )
 
 
+class Edges:
+    """The map's edges in both directions, in the order of their tails.
+
+    A node without neighbours has an endless edge to itself, so that every particle has one.
+
+    Attributes
+    ----------
+    tail, head, reverse
+        (F,) node numbers, and the edge that leads back.
+    length_m, heading_rad
+        (F,) from tail to head. Nodes in the same place are a hundredth of the median apart.
+    first_out, degree
+        (N,) the edges that leave node i are the `degree[i]` from `first_out[i]` on.
+    """
+
+    def __init__(self, known_map: TopologicalMap) -> None:
+        n, joined = len(known_map), known_map.edges
+        alone = np.setdiff1d(np.arange(n), joined)
+        tail = np.concatenate([joined[:, 0], joined[:, 1], alone])
+        head = np.concatenate([joined[:, 1], joined[:, 0], alone])
+        order = np.argsort(tail, kind="stable")
+        self.tail, self.head = tail[order], head[order]
+        # the k-th edge by (tail, head) leads back along the k-th by (head, tail)
+        self.reverse = np.empty(len(order), np.int64)
+        self.reverse[np.lexsort((self.head, self.tail))] = np.lexsort((self.tail, self.head))
+        self.first_out = np.searchsorted(self.tail, np.arange(n))
+        self.degree = np.bincount(self.tail, minlength=n)
+        way = known_map.positions_m[self.head] - known_map.positions_m[self.tail]
+        lone = self.head == self.tail
+        self.length_m = np.maximum(np.hypot(*way.T), 0.01 * known_map.spacing_m)
+        self.length_m[lone | (known_map.spacing_m == 0.0)] = np.inf
+        self.heading_rad = np.arctan2(way[:, 1], way[:, 0])
+        self.heading_rad[lone] = np.nan_to_num(known_map.headings_rad[self.tail[lone]])
+
+    def next(self, edges: Ints, uniform: Array) -> Ints:
+        """Edge after each, past its head: any but the one back, which is left for dead ends."""
+        node, back = self.head.take(edges), self.reverse.take(edges)
+        others = self.degree.take(node) - 1
+        chosen = self.first_out.take(node) + (uniform * others).astype(np.int64)
+        chosen += chosen >= back
+        return np.where(others > 0, chosen, back)
+
+    def before(self, edges: Ints, uniform: Array) -> Ints:
+        """Edge before each, for driving backwards."""
+        return np.asarray(self.reverse[self.next(self.reverse[edges], uniform)])
+
+
 def from_arrays(
     positions_m: ArrayLike,
     descriptors: ArrayLike,

@@ -11,24 +11,19 @@ from typing import Any, Literal
 import numpy as np
 
 from estimators.base import Belief, Prior
-from estimators.options import (
-    require_choices,
-    require_counts,
-    require_positive,
-    require_shares,
-)
 from estimators.particles import Scheme, effective_sample_size, resample
 from estimators.topological import descriptors as describers
+from estimators.topological.node_weights import Weighting, node_log_weights, scaled
 from estimators.topological.place_refinement import Refiner
-from estimators.topological.topological_map import TopologicalMap, load
+from estimators.topological.topological_map import Edges, TopologicalMap, load
 from sim import se2
 from sim.arrays import Array, Floats, Ints
 from sim.errors import InputError, require
+from sim.options import Count, Positive, Share, options
 from sim.recording import Frame
 from sim.robot.arc import arc_increment
 from sim.sensors import Lidar3D, sensor_of
 
-Weighting = Literal["M1", "M2", "M3"]
 Motion = Literal["odometry", "paper"]
 Resampling = Literal["ess", "always"]
 Summary = Literal["mode", "mean"]
@@ -39,55 +34,6 @@ _MOST_HOPS = 100  # of one particle between two Frames
 _LEAST_HEADING = 0.01  # variance of the heading on an edge, rad^2
 _CARRIED_SHARE = 0.05  # error of the wheels' motion, as a share of it
 _FACING_RAD = 0.8  # how far a robot's heading may be from its edge's
-
-
-def node_log_weights(
-    nodes_m: Array,
-    nearest_m: Array,
-    descriptor_distances: Array,
-    weighting: Weighting,
-    sigma_l_m: float,
-    sigma_m: float,
-) -> Array:
-    """Log weights (N,) of a particle at each node (maximo2024, eqs. (1)-(3)).
-
-    With v_j the way from the node to place j of the B most alike, and h_j their descriptors'
-    distances, scaled to sum to one over the B:
-
-    - M1: sum_j exp(-|v_j|^2 / sigma_l^2)
-    - M2: sum_j exp(-|v_j|^2 / sigma_l^2) exp(-h_j^2 / sigma_m^2)
-    - M3: the product of M2's terms in place of their sum.
-
-    Parameters
-    ----------
-    nodes_m, nearest_m
-        (N, 2) and (B, 2) m.
-    descriptor_distances
-        (B,) not negative, not yet scaled.
-    sigma_l_m, sigma_m
-        Spread in metres, and of the scaled distances.
-
-    Notes
-    -----
-    Eqs. (2) and (3) print Sigma_l in the descriptor's factor; the text has a Sigma_m of its own,
-    which is used here, with sigma_m as a spread. In M3 that factor is the same for every
-    particle and cancels, so M3 is a Gaussian of variance sigma_l^2 / (2 B) about the centroid of
-    the B places: one look-alike among them drags it away.
-    """
-    away = (nodes_m[:, :1] - nearest_m[:, 0]) ** 2 + (nodes_m[:, 1:] - nearest_m[:, 1]) ** 2
-    exponents = away / -(sigma_l_m**2)
-    if weighting != "M1":
-        exponents -= (_scaled(descriptor_distances) / sigma_m) ** 2
-    if weighting == "M3":
-        return np.asarray(exponents.sum(axis=1))
-    highest = exponents.max(axis=1)
-    return np.asarray(highest + np.log(np.exp(exponents - highest[:, None]).sum(axis=1)))
-
-
-def _scaled(distances: Array) -> Array:
-    """Scale distances (B,) to sum to one; those that are all zero stay so."""
-    total = float(distances.sum())
-    return distances / total if total > 0.0 else distances
 
 
 def _normalized(log_weights: Array) -> Array:
@@ -101,90 +47,60 @@ def _sums(places: Ints, values: Array, n: int) -> Array:
     return np.asarray(np.bincount(places, values, minlength=n), np.float64)
 
 
-class Graph:
-    """The map's edges in both directions, in the order of their tails.
+@options("estimator")
+class TopologicalMclOptions:
+    """Options of the filter among the nodes of a topological map."""
 
-    A node without neighbours has an endless edge to itself, so that every particle has one.
+    place: str = "place"
+    """Name of the sensor of place descriptors that it reads."""
+    lidar3d: str = "lidar3d"
+    """Name of the 3D lidar whose clouds it describes where there are no descriptors."""
+    weighting: Weighting = "M2"
+    """M1, M2 or M3 of `node_log_weights` (maximo2024, eqs. (1)-(3))."""
+    particles_per_node: Count = 4
+    """Particles, over the map's nodes; they face its neighbours in turn."""
+    n_nearest: Count = 5
+    """B: how many of the map's most similar descriptors count."""
+    sigma_l_m: Positive | None = None
+    """Spread about their places, m; null: the map's spacing."""
+    sigma_m: Positive = 0.1
+    """Spread of their descriptor distances, which sum to one."""
+    motion: Motion = "odometry"
+    """`paper`: one node at every observation, regardless of the wheels. `odometry`: along the
+    graph by the wheels' travel."""
+    p_stay: Share = 0.1
+    """With `odometry`: chance at each node to be late by one, since the graph's edges are not what
+    the robot drives."""
+    p_skip: Share = 0.1
+    """With `odometry`: chance at each node to be early by one."""
+    p_turn: Share = 0.01
+    """With `odometry`: chance at each node to turn round."""
+    resampling: Resampling = "ess"
+    """`always`, as the paper, or `ess`: when the effective sample size is below half."""
+    scheme: Scheme = "systematic"
+    """Scheme of resampling: see `estimators.particles.resample`; the paper's is multinomial."""
+    injection: Share = 0.02
+    """Share of the particles that is put, at every observation, at the B places instead. With
+    none, a hypothesis once discarded never comes back."""
+    estimate: Summary = "mode"
+    """`mean`: of all particles, eq. (4). `mode`: of those at the heaviest node and its
+    neighbours."""
+    refine: bool = True
+    """Register the level slice of the cloud with that of the mode's node, if the map has slices;
+    the pose is then as good as the registration, not as the nodes' spacing. Where that fails the
+    wheels carry the last one on."""
+    map_path: str | None = None
+    """A map's file, .npz; null: the prior's map."""
 
-    Attributes
-    ----------
-    tail, head, reverse
-        (F,) node numbers, and the edge that leads back.
-    length_m, heading_rad
-        (F,) from tail to head. Nodes in the same place are a hundredth of the median apart.
-    first_out, degree
-        (N,) the edges that leave node i are the `degree[i]` from `first_out[i]` on.
-    """
-
-    def __init__(self, known_map: TopologicalMap) -> None:
-        n, joined = len(known_map), known_map.edges
-        alone = np.setdiff1d(np.arange(n), joined)
-        tail = np.concatenate([joined[:, 0], joined[:, 1], alone])
-        head = np.concatenate([joined[:, 1], joined[:, 0], alone])
-        order = np.argsort(tail, kind="stable")
-        self.tail, self.head = tail[order], head[order]
-        # the k-th edge by (tail, head) leads back along the k-th by (head, tail)
-        self.reverse = np.empty(len(order), np.int64)
-        self.reverse[np.lexsort((self.head, self.tail))] = np.lexsort((self.tail, self.head))
-        self.first_out = np.searchsorted(self.tail, np.arange(n))
-        self.degree = np.bincount(self.tail, minlength=n)
-        way = known_map.positions_m[self.head] - known_map.positions_m[self.tail]
-        lone = self.head == self.tail
-        self.length_m = np.maximum(np.hypot(*way.T), 0.01 * known_map.spacing_m)
-        self.length_m[lone | (known_map.spacing_m == 0.0)] = np.inf
-        self.heading_rad = np.arctan2(way[:, 1], way[:, 0])
-        self.heading_rad[lone] = np.nan_to_num(known_map.headings_rad[self.tail[lone]])
-
-    def next(self, edges: Ints, uniform: Array) -> Ints:
-        """Edge after each, past its head: any but the one back, which is left for dead ends."""
-        node, back = self.head.take(edges), self.reverse.take(edges)
-        others = self.degree.take(node) - 1
-        chosen = self.first_out.take(node) + (uniform * others).astype(np.int64)
-        chosen += chosen >= back
-        return np.where(others > 0, chosen, back)
-
-    def before(self, edges: Ints, uniform: Array) -> Ints:
-        """Edge before each, for driving backwards."""
-        return np.asarray(self.reverse[self.next(self.reverse[edges], uniform)])
+    def __post_init__(self) -> None:
+        require(
+            self.p_stay + self.p_skip <= 1.0,
+            "estimator.p_stay and p_skip must not exceed 1 together",
+        )
 
 
-class TopologicalMcl:
+class TopologicalMcl(TopologicalMclOptions):
     """Global localization on a topological map by the descriptors of 3D lidar clouds.
-
-    Parameters
-    ----------
-    weighting
-        M1, M2 or M3 of `node_log_weights`.
-    particles_per_node
-        Particles, over the map's nodes; they face its neighbours in turn.
-    n_nearest
-        B: how many of the map's most similar descriptors count.
-    sigma_l_m
-        Spread about their places, m; None for the map's spacing.
-    sigma_m
-        Spread of their descriptor distances, which sum to one.
-    motion
-        `paper`: one node at every observation, regardless of the wheels. `odometry`: along the
-        graph by the wheels' travel.
-    p_stay, p_skip, p_turn
-        With `odometry`: chance at each node to be late by one, to be early by one, and to turn
-        round, since the graph's edges are not what the robot drives.
-    resampling
-        `always`, as the paper, or `ess`: when the effective sample size is below half.
-    scheme
-        As in `estimators.particles.resample`; the paper's is multinomial.
-    injection
-        Share of the particles that is put, at every observation, at the B places instead. With
-        none, a hypothesis once discarded never comes back.
-    estimate
-        `mean`: of all particles, eq. (4). `mode`: of those at the heaviest node and its
-        neighbours.
-    refine
-        Register the level slice of the cloud with that of the mode's node, if the map has
-        slices; the pose is then as good as the registration, not as the nodes' spacing. Where that
-        fails the wheels carry the last one on.
-    map_path
-        A map's file; None for the prior's map.
 
     Notes
     -----
@@ -201,47 +117,6 @@ class TopologicalMcl:
     maps = (TopologicalMap,)
     global_or_grid = True
 
-    def __init__(
-        self,
-        weighting: Weighting = "M2",
-        particles_per_node: int = 4,
-        n_nearest: int = 5,
-        sigma_l_m: float | None = None,
-        sigma_m: float = 0.1,
-        motion: Motion = "odometry",
-        p_stay: float = 0.1,
-        p_skip: float = 0.1,
-        p_turn: float = 0.01,
-        resampling: Resampling = "ess",
-        scheme: Scheme = "systematic",
-        injection: float = 0.02,
-        estimate: Summary = "mode",
-        refine: bool = True,
-        map_path: str | None = None,
-        place: str = "place",
-        lidar3d: str = "lidar3d",
-    ) -> None:
-        self.place, self.lidar3d = place, lidar3d
-        require_choices(
-            weighting=(weighting, Weighting),
-            motion=(motion, Motion),
-            resampling=(resampling, Resampling),
-            scheme=(scheme, Scheme),
-            estimate=(estimate, Summary),
-        )
-        require_counts(particles_per_node=particles_per_node, n_nearest=n_nearest)
-        require_positive(sigma_m=sigma_m)
-        if sigma_l_m is not None:
-            require_positive(sigma_l_m=sigma_l_m)
-        require_shares(p_stay=p_stay, p_skip=p_skip, p_turn=p_turn, injection=injection)
-        require(p_stay + p_skip <= 1.0, "estimator.p_stay and p_skip must not exceed 1 together")
-        self.weighting, self.n_nearest = weighting, n_nearest
-        self.particles_per_node = particles_per_node
-        self.sigma_l_m, self.sigma_m, self.motion = sigma_l_m, sigma_m, motion
-        self.p_stay, self.p_skip, self.p_turn = p_stay, p_skip, p_turn
-        self.resampling, self.scheme, self.injection = resampling, scheme, injection
-        self.estimate, self.refine, self.map_path = estimate, refine, map_path
-
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Spread the particles over the nodes, weighted by the prior's pose if it has one."""
         known = prior.map if self.map_path is None else load(Path(self.map_path))
@@ -256,7 +131,7 @@ class TopologicalMcl:
             f"estimator.particles_per_node={self.particles_per_node} makes {n_particles} particles "
             f"on a map of {len(known)} nodes; at most {_MOST_PARTICLES} are held",
         )
-        self._rng, self._map, self._graph = rng, known, Graph(known)
+        self._rng, self._map, self._graph = rng, known, Edges(known)
         require(
             {self.place, self.lidar3d} & set(prior.sensors),
             "topological_mcl needs place descriptors or a 3D lidar; choose sensors=lidar3d",
@@ -285,8 +160,8 @@ class TopologicalMcl:
             self._along_m = reach * rng.uniform(-1.0, 1.0, len(node))
             self._cross_nodes(noisy=False)
         self._log_weights = np.full(len(node), -math.log(len(node)))
-        if prior.mean is not None and prior.covariance is not None:
-            self._log_weights += self._log_prior(prior.mean, prior.covariance)
+        if (start := prior.start) is not None:
+            self._log_weights += self._log_prior(start.mean, start.covariance)
         self._observed = False
         self._belief, self._registered = self._summary({}), False
 
@@ -346,7 +221,7 @@ class TopologicalMcl:
         n_new = rng.binomial(n, self.injection) if self.injection > 0.0 else 0
         if n_new:
             slots = rng.choice(n, n_new, replace=False)
-            unlike = 0.0 * away if self.weighting == "M1" else _scaled(away) / self.sigma_m
+            unlike = 0.0 * away if self.weighting == "M1" else scaled(away) / self.sigma_m
             node = nearest[resample(-(unlike**2), n_new, rng, "multinomial")]
             out = (rng.random(n_new) * self._graph.degree[node]).astype(np.int64)
             self._edge[slots] = self._graph.first_out[node] + out

@@ -30,7 +30,7 @@ def run() -> Iterator[Measurement]:
         Frame(0.1 * i, 0.1, rng.standard_normal(2), {"laser": {"ranges_m": scan}})
         for i, scan in enumerate(ranges_m)
     ]
-    estimator = External([sys.executable, "-c", _ECHO])
+    estimator = External(command=[sys.executable, "-c", _ECHO])
     estimator.reset(Prior(RobotGeometry(0.1, 0.3), mean=np.zeros(3), covariance=np.eye(3)), rng)
     median_s = median_time_s(estimator.step, [(frame,) for frame in frames])
     estimator.finish()

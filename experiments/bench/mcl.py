@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimators.base import Prior
-from estimators.on_a_map.likelihood_field import beam_ends, likelihood_field
+from estimators.on_a_map.likelihood_field import FieldOptions, beam_ends, likelihood_field
 from estimators.on_a_map.mcl import Mcl
 from experiments.bench.measure import Measurement, median_time_s, timed_steps
 from experiments.runs.seeds import stream
@@ -56,7 +56,10 @@ def run() -> Iterator[Measurement]:
         Measurement("mcl.particle_beams_per_s", rate, "1/s", 400e6, "higher", whole),
         Measurement("mcl.update_ms", update_s * 1e3, "ms", note=whole),
     )
-    field, rng = likelihood_field(world, _LASER), np.random.default_rng(0)
+    field, rng = (
+        likelihood_field(world, _LASER, FieldOptions(sigma_m=0.1)),
+        np.random.default_rng(0),
+    )
     ends = [beam_ends(scan, _LASER, _LASER.n_beams) for scan in scans[::24]]
     spread = [0.1, 0.1, 0.03]
     near = [pose + rng.standard_normal((_N_PARTICLES, 3)) * spread for pose in poses[::24]]

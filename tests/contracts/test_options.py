@@ -1,51 +1,33 @@
 """Each check of an option accepts its bounds, and names the key of what it rejects."""
 
-import math
-from typing import Literal
+import dataclasses
 
 import numpy as np
 import pytest
+from omegaconf import OmegaConf
 
 from estimators.base import Prior
-from estimators.options import (
-    require_choices,
-    require_counts,
-    require_laser,
-    require_non_negative,
-    require_positive,
-    require_shares,
-    require_stereo,
-    start_pose,
-)
+from estimators.options import require_laser, require_stereo, start_pose
+from experiments.runs.paths import packaged
 from sim.errors import InputError
+from sim.options import described, find
 from sim.robot.drive import RobotGeometry
 from sim.sensors import Encoder, Laser
 
-NUMBERS = {
-    require_non_negative: ([0, 0.0, 1e-300, 2], [-1e-300, math.nan, math.inf, None, "1"]),
-    require_positive: ([1e-300, 2, np.float64(3.0)], [0, 0.0, -0.0, -1.0, math.nan, math.inf]),
-    require_shares: ([0.0, 0.5, 1.0], [-1e-9, 1.0 + 1e-9, math.nan]),
-    require_counts: ([1, 5], [0, -1, 2.0, True, None]),
-}
+_FILES = packaged("conf/estimator").glob("*.yaml")
+_TARGETS = {OmegaConf.load(path).get("_target_") for path in _FILES} - {None}
+ESTIMATORS = list(
+    filter(dataclasses.is_dataclass, (find(name, "estimator") for name in sorted(_TARGETS)))
+)
 
 
-@pytest.mark.parametrize("require", NUMBERS)
-def test_numbers_within_bounds_pass_and_others_are_named(require):
-    allowed, rejected = NUMBERS[require]
-    for number in allowed:
-        require(sound=1, size=number)
-    for number in rejected:
-        with pytest.raises(InputError, match=r"^estimator\.size must be .*, got "):
-            require(sound=1, size=number)
-
-
-def test_choices_are_those_of_the_literal():
-    kind = Literal["tukey", "huber"]
-    require_choices(kernel=("huber", kind))
-    with pytest.raises(InputError, match=r"^estimator\.kernel must be one of tukey, huber, got"):
-        require_choices(kernel=("flat", kind))
-    with pytest.raises(InputError, match=r"^kernel must"):
-        require_choices("", kernel=(None, kind))
+@pytest.mark.parametrize("cls", ESTIMATORS)
+def test_every_option_of_an_estimator_is_documented_and_rejects_what_it_does_not_accept(cls):
+    for option in described(cls):
+        assert option.meaning, option.name
+        assert option.accepts not in ("a number", "a whole number"), f"{option.name} has no bound"
+        with pytest.raises(InputError, match=rf"^estimator\.{option.name} must be .*, got "):
+            cls(**{option.name: object()})
 
 
 def test_a_prior_without_what_an_estimator_needs_names_the_estimator():

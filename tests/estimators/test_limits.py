@@ -14,7 +14,7 @@ from estimators.landmarks.fastslam import FastSLAM
 from estimators.laser.ekf_icp import EkfIcp
 from estimators.laser.icp_odometry import IcpOdometry
 from estimators.laser.scan_lines import prepare
-from estimators.on_a_map.likelihood_field import beam_ends, likelihood_field
+from estimators.on_a_map.likelihood_field import FieldOptions, beam_ends, likelihood_field
 from experiments.runs.experiment import Experiment
 from sim.errors import InputError
 from sim.sensors import Laser
@@ -124,7 +124,7 @@ def test_poses_that_are_not_finite_do_not_reach_compiled_code(recording):
         with pytest.raises(InputError, match=f"the {next(iter(poor))} of the prior"):
             dataclasses.replace(prior, **poor)
     assert Prior(prior.robot).mean is None
-    field = likelihood_field(prior.map, recording.sensors["laser"])
+    field = likelihood_field(prior.map, recording.sensors["laser"], FieldOptions())
     with pytest.raises(FloatingPointError, match="not finite"):
         field.log_likelihood(np.array([[0.0, np.nan, 0.0]]), np.ones((2, 4), np.float32))
 

@@ -90,9 +90,3 @@ def test_a_start_pose_is_needed():
     lost = Prior(RobotGeometry(0.05, TRACK_M), {})
     with pytest.raises(InputError, match="start pose"):
         Odometry(kr=1e-5, kl=1e-5).reset(lost, np.random.default_rng(0))
-
-
-@pytest.mark.parametrize("bad", [{"kr": -1.0}, {"kl": math.nan}, {"integration": "simpson"}])
-def test_wrong_arguments_name_their_key(bad):
-    with pytest.raises(InputError, match=f"estimator.{next(iter(bad))}"):
-        Odometry(**{"kr": 1e-5, "kl": 1e-5, **bad})

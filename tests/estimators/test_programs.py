@@ -62,7 +62,7 @@ def midpoint(recording):
 
 
 def test_the_example_in_python_is_dead_reckoning(recording):
-    estimator = External(PYTHON)
+    estimator = External(command=PYTHON)
     online, revised = run(estimator, recording)
     assert revised is None
     assert np.abs(online.means - midpoint(recording)).max() < 1e-12
@@ -77,10 +77,13 @@ def test_the_example_in_cpp_is_dead_reckoning(recording, tmp_path):
     source = EXAMPLES / "external_odometry.cpp"
     options = ["-std=c++17", "-O1", "-Wall", "-Werror"]
     subprocess.run(["g++", *options, "-o", program, source], check=True)
-    online, _ = run(External([str(program)]), recording)
+    online, _ = run(External(command=[str(program)]), recording)
     assert np.abs(online.means - midpoint(recording)).max() < 1e-12
     results = check_estimator(
-        lambda: External([str(program)]), recording, fakes.tracking_prior(recording), n_frames=10
+        lambda: External(command=[str(program)]),
+        recording,
+        fakes.tracking_prior(recording),
+        n_frames=10,
     )
     assert all(result.passed for result in results), results
 
@@ -88,15 +91,15 @@ def test_the_example_in_cpp_is_dead_reckoning(recording, tmp_path):
 @pytest.mark.skipif(shutil.which("awk") is None, reason="no awk")
 def test_the_example_as_a_script_is_dead_reckoning(recording):
     command = f"sh {EXAMPLES / 'offline_odometry.sh'} {{log}} {{start}} {{out}}"
-    estimator = Offline(command)
+    estimator = Offline(command=command)
     online, revised = run(estimator, recording)
     assert np.abs(revised.means - online.means).max() < 1e-9  # the arc, which CARMEN logs hold
     assert revised.kind == "revised"
     assert online.cpu_seconds == estimator.program_seconds > 0.0
-    online, revised = run(Offline(command, kind="online"), recording)
+    online, revised = run(Offline(command=command, kind="online"), recording)
     assert revised is None
     results = check_estimator(
-        lambda: Offline(command), recording, fakes.tracking_prior(recording), n_frames=10
+        lambda: Offline(command=command), recording, fakes.tracking_prior(recording), n_frames=10
     )
     assert all(result.passed for result in results), results
 
@@ -105,7 +108,7 @@ def test_messages_hold_the_frames_exactly(recording, tmp_path):
     out = tmp_path / "said.jsonl"
     command = child(tmp_path, listening(out))
     prior = fakes.tracking_prior(recording)
-    run(External(command), recording, prior)
+    run(External(command=command), recording, prior)
     reset, *frames, finish = map(json.loads, out.read_text().splitlines())
     assert (reset["type"], finish) == ("reset", {"type": "finish"})
     assert reset["robot"] == {
@@ -129,7 +132,7 @@ def test_no_return_is_null_and_floats_are_short(recording, tmp_path):
     ranges_m[:, 0], ranges_m[:, 1] = np.inf, np.float32(0.1)
     out = tmp_path / "said.jsonl"
     command = child(tmp_path, listening(out))
-    run(External(command), fakes.with_field(recording, "laser", ranges_m=ranges_m))
+    run(External(command=command), fakes.with_field(recording, "laser", ranges_m=ranges_m))
     assert '"ranges_m":[null,0.1,' in out.read_text().splitlines()[1]
 
 
@@ -172,7 +175,9 @@ def test_what_a_program_does_wrong_is_said_and_never_hangs(recording, tmp_path, 
         command = child(
             tmp_path, f"if m['type'] == 'reset': print('{{}}', flush=True); continue\n{body}"
         )
-    estimator = External(command, step_s=0.3 if "0.3" in message or "within" in message else 5.0)
+    estimator = External(
+        command=command, step_s=0.3 if "0.3" in message or "within" in message else 5.0
+    )
     begun = time.monotonic()
     with pytest.raises(ProgramError, match=message) as caught:
         run(estimator, recording)
@@ -183,7 +188,7 @@ def test_what_a_program_does_wrong_is_said_and_never_hangs(recording, tmp_path, 
 
 def test_much_talk_on_standard_error_does_no_harm(recording, tmp_path):
     body = f"sys.stderr.write('x' * 200000 + chr(10)); print('{_BELIEF}', flush=True)"
-    online, _ = run(External(child(tmp_path, body)), recording.cut(5))
+    online, _ = run(External(command=child(tmp_path, body)), recording.cut(5))
     assert len(online.means) == 5
 
 
@@ -196,7 +201,7 @@ def test_a_program_that_reads_late_is_waited_for(recording, tmp_path):
     grid = rasterized(recording.known_world, 0.01, 0.5)  # far more than a pipe holds
     prior = fakes.tracking_prior(recording)
     prior = type(prior)(**{**vars(prior), "map": grid})
-    online, _ = run(External([sys.executable, str(path)]), recording.cut(3), prior)
+    online, _ = run(External(command=[sys.executable, str(path)]), recording.cut(3), prior)
     assert len(online.means) == 3
 
 
@@ -208,9 +213,9 @@ def test_children_of_the_program_are_ended_too(recording, tmp_path):
         f"    p = subprocess.Popen(['sleep', '600']); open({str(pid)!r}, 'w').write(str(p.pid))\n"
         f"print('{_BELIEF}', flush=True)"
     )
-    run(External(child(tmp_path, body)), recording.cut(3))
+    run(External(command=child(tmp_path, body)), recording.cut(3))
     assert _gone(int(pid.read_text()))
-    estimator = External(child(tmp_path, body))
+    estimator = External(command=child(tmp_path, body))
     estimator.reset(fakes.tracking_prior(recording), np.random.default_rng(0))
     del estimator  # nobody asks it to finish
     assert _gone(int(pid.read_text()))
@@ -235,7 +240,7 @@ def test_a_revised_trajectory_comes_at_the_end(recording, tmp_path):
         f"else: print('{_BELIEF}')\n"
         "sys.stdout.flush()"
     )
-    online, revised = run(External(child(tmp_path, body)), recording)
+    online, revised = run(External(command=child(tmp_path, body)), recording)
     assert np.array_equal(revised.means[:, 0], np.arange(len(recording.frame_stamps)))
     assert np.array_equal(revised.stamps, online.stamps)
     assert not revised.covariances.any()
@@ -246,7 +251,7 @@ def test_revised_stamps_of_another_time_are_refused(recording, tmp_path):
     command = child(tmp_path, f"print('{answer}' if m['type'] == 'finish' else '{_BELIEF}')\n"
                     "sys.stdout.flush()")  # fmt: skip
     with pytest.raises(ProgramError, match="stamps of the Frames; its path is from"):
-        run(External(command), recording)
+        run(External(command=command), recording)
 
 
 def test_a_revised_path_of_one_pose_gets_a_remark(tmp_path):
@@ -277,8 +282,7 @@ def test_a_failing_program_is_a_status_of_its_row(tmp_path):
         ({"command": "no_such_program_here --fast"}, "no program no_such_program_here"),
         ({"command": "build/peers/mrpt icp"}, "`make peers` compiles it"),
         ({"command": "python3 'open"}, "No closing quotation"),
-        ({"command": PYTHON, "step_s": 0}, "step_s must be a positive number"),
-        ({"command": PYTHON, "start_s": True}, "start_s must be a positive number"),
+        ({"command": PYTHON, "step_s": 0}, "step_s must be a number, above 0"),
     ],
 )
 def test_wrong_settings_are_named(settings, message, tmp_path, monkeypatch):
@@ -292,9 +296,6 @@ def test_wrong_settings_are_named(settings, message, tmp_path, monkeypatch):
     [
         ({"command": "sh {log}"}, r"must have \{out\}"),
         ({"command": "sh {truth} {out}"}, r"nothing is called \{truth\}"),
-        ({"command": "sh {out}", "output": "csv"}, "output"),
-        ({"command": "sh {out}", "kind": "batch"}, "kind"),
-        ({"command": "sh {out}", "limit_s": -1}, "limit_s"),
     ],
 )
 def test_wrong_settings_of_offline_programs_are_named(settings, message):
@@ -310,7 +311,7 @@ def test_a_program_gets_a_grid_of_the_map(recording, tmp_path, known):
     if known == "grid":
         prior = dataclasses.replace(prior, map=expected)
     copied = f"cp -r $(dirname {{grid}}) {kept} && echo 0 0 0 0 0 0 0 1 > {{out}}"
-    run(Offline(["sh", "-c", copied]), recording, prior)
+    run(Offline(command=["sh", "-c", copied]), recording, prior)
     found = read_grid(kept / "grid.yaml")
     assert "mode: trinary" in (kept / "grid.yaml").read_text()
     np.testing.assert_array_equal(found.occupied, expected.occupied)
@@ -336,7 +337,7 @@ def test_what_an_offline_program_needs_is_told_before_anything_is_simulated(lack
 def test_an_offline_program_without_a_map_is_told(recording):
     prior = fakes.tracking_prior(recording, with_map=False)
     with pytest.raises(InputError, match=r"set prior\.map=world"):
-        run(Offline("sh {map} {out}"), recording, prior)
+        run(Offline(command="sh {map} {out}"), recording, prior)
 
 
 OFFLINE_BAD = {
@@ -356,7 +357,9 @@ def test_what_an_offline_program_does_wrong_is_said(recording, tmp_path, fault):
     body, message = OFFLINE_BAD[fault]
     script = tmp_path / "run.sh"
     script.write_text(body + "\n")
-    estimator = Offline(["sh", str(script), "{out}"], limit_s=0.5 if "within" in message else 5.0)
+    estimator = Offline(
+        command=["sh", str(script), "{out}"], limit_s=0.5 if "within" in message else 5.0
+    )
     begun = time.monotonic()
     with pytest.raises(ProgramError, match=message) as caught:
         run(estimator, recording)
@@ -402,9 +405,9 @@ def test_what_a_program_is_given_holds_no_truth(tmp_path, monkeypatch):
     spy.write_text(_SPY)
     prior = fakes.tracking_prior(recording, with_map=False)
     command = [sys.executable, str(spy), "{out}", "{log}", "{npz}", "{mcap}", "{start}"]
-    run(Offline(command), recording, prior)
+    run(Offline(command=command), recording, prior)
     out = tmp_path / "said.jsonl"
-    run(External(child(tmp_path, listening(out))), recording, prior)
+    run(External(command=child(tmp_path, listening(out))), recording, prior)
     for given in ((tmp_path / "spy.py.found").read_bytes(), out.read_bytes()):
         assert len(given) > 1000
         for secret in secrets_of(recording):
@@ -456,6 +459,6 @@ def test_an_edited_program_is_another_version(tmp_path):
 def test_no_seed_or_cache_is_in_the_environment(recording, tmp_path, monkeypatch):
     monkeypatch.setenv("ESTIMA_RESULTS", str(tmp_path))
     body = f"import os\nassert 'ESTIMA_RESULTS' not in os.environ\nprint('{_BELIEF}', flush=True)"
-    online, _ = run(External(child(tmp_path, body)), recording.cut(2))
+    online, _ = run(External(command=child(tmp_path, body)), recording.cut(2))
     assert len(online.means) == 2
     assert os.environ["ESTIMA_RESULTS"]

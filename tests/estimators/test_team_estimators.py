@@ -298,7 +298,7 @@ def test_what_comes_back_by_way_of_others_is_not_counted_twice():
         made.append(Listener())
         return made[-1]
 
-    answers(make, team, priors_of(team), Communication("range", range_m=1.0), contacts)
+    answers(make, team, priors_of(team), Communication(kind="range", range_m=1.0), contacts)
     every = sorted((k, t) for k in range(3) for t in team.robots[k].frame_stamps)
     for listener in made:
         assert sorted(listener.heard) == every
@@ -312,7 +312,7 @@ def test_a_robot_gains_nothing_from_itself():
     pair = Team(tuple(dataclasses.replace(each, sensors=own.sensors) for each in unseen))
     priors = priors_of(team)
     contacts = np.ones((len(own.frame_stamps), 2, 2), bool)
-    talk = Communication("range", range_m=9.0)
+    talk = Communication(kind="range", range_m=9.0)
     [(found, _), _] = answers(lambda: EkfSlam(**SEEING), pair, priors, talk, contacts)
     alone = run(EkfSlam(**WHEELS), own, priors[0], np.random.default_rng(0))
     np.testing.assert_allclose(found.covariances, alone.covariances, rtol=1e-9, atol=1e-15)
@@ -332,10 +332,10 @@ def test_kinds_of_communication():
     make = lambda: EkfSlam(**SEEING)  # noqa: E731
     always = answers(make, team, priors)
     together = np.ones((n, 2, 2), bool)
-    near = answers(make, team, priors, Communication("range", range_m=9.0), together)
-    never = answers(make, team, priors, Communication("never"))
-    apart = answers(make, team, priors, Communication("range", range_m=9.0), ~together)
-    late = answers(make, team, priors, Communication("delayed", delay_s=0.55))
+    near = answers(make, team, priors, Communication(kind="range", range_m=9.0), together)
+    never = answers(make, team, priors, Communication(kind="never"))
+    apart = answers(make, team, priors, Communication(kind="range", range_m=9.0), ~together)
+    late = answers(make, team, priors, Communication(kind="delayed", delay_s=0.55))
     for k, recording in enumerate(team.robots):
         alone = run(EkfSlam(**WHEELS), recording, priors[k], np.random.default_rng(0))
         assert same(near[k][0], always[k][0])
@@ -360,11 +360,11 @@ def test_kinds_of_communication():
 
 def test_communication_refuses_what_has_no_effect():
     with pytest.raises(InputError, match=r"communication.range_m must be a positive number"):
-        Communication("range")
+        Communication(kind="range")
     with pytest.raises(InputError, match=r"communication.delay_s has no effect on kind=always"):
-        Communication("always", delay_s=1.0)
+        Communication(kind="always", delay_s=1.0)
     with pytest.raises(InputError, match="kind"):
-        Communication("sometimes")
+        Communication(kind="sometimes")
 
 
 def test_robots_of_a_team_carry_the_same_sensors():

@@ -156,7 +156,7 @@ def mrclam_rows(log: Path, n_frames: int | None = None) -> list[Row]:
             team,
             priors,
             lambda robot: np.random.default_rng(robot),
-            Communication(kind),
+            Communication(kind=kind),
         )
         for number, (own, (online, _)) in enumerate(zip(team.robots, found, strict=True)):
             truth, known = _known(own.truth_at(online.stamps), online)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from estimators.laser import icp, scan_lines
+from estimators.laser import icp_iterations, icp_judgement, icp_start, scan_lines
 from estimators.laser.icp import prepare
 from experiments.bench.icp import BEARINGS_RAD, pair
 from sim import se2
@@ -23,17 +23,17 @@ def scans(request):
 
 def pair_of(scans, to_lines):
     source, target = scans
-    surface = target.segments if to_lines else icp._as_segments(target)
+    surface = target.segments if to_lines else icp_start.as_segments(target)
     noise_m = max(source.noise_m, target.noise_m)
-    return icp._Pair(source, target, to_lines, to_lines, surface, surface, noise_m)
+    return icp_iterations.Pair(source, target, to_lines, to_lines, surface, surface, noise_m)
 
 
 def fit_at(pair, pose=POSE):
     """A fit whose matches are the nearest, and the squared misses."""
     n = len(pair.source.points)
-    fit, misses = icp._Fit(np.zeros(n, np.int64), np.zeros(n), np.zeros(n)), np.empty(n)
-    every = icp._Sample(np.arange(n), np.linspace(0.5, 2.0, n))
-    icp._match(pair, math.inf, every, pose, True, fit, misses)
+    fit, misses = icp_iterations.Fit(np.zeros(n, np.int64), np.zeros(n), np.zeros(n)), np.empty(n)
+    every = icp_iterations.Sample(np.arange(n), np.linspace(0.5, 2.0, n))
+    icp_iterations._match(pair, math.inf, every, pose, True, fit, misses)
     return fit, misses, every
 
 
@@ -180,16 +180,16 @@ def test_heading_is_the_peak_of_the_votes(scans):
     best = 2 + np.argmax(np.convolve(votes, [0.3, 0.7, 1.0, 0.7, 0.3], "valid")[: bins - 3])
     near = np.arange(best - 2, best + 3)
     expected = guess + (votes[near] @ near / votes[near].sum() * 2.0 / bins - 1.0) * window
-    assert icp._heading_by_lines(source, target, guess, window) == pytest.approx(expected)
+    assert icp_start.heading_by_lines(source, target, guess, window) == pytest.approx(expected)
 
 
 def test_representatives_stand_for_the_root_of_a_lines_points(scans):
     scan = scans[0]
-    points, counts = icp._representatives(scan)
+    points, counts = icp_start.representatives(scan)
     of_line = scan.line_of_point[points]
     for k, (first, last) in enumerate(scan.line_ends):
         own = points[of_line == k]
-        assert len(own) <= min(icp._COARSE_POINTS, last - first + 1)
+        assert len(own) <= min(icp_start._COARSE_POINTS, last - first + 1)
         assert np.all((own >= first) & (own <= last))
         np.testing.assert_allclose(
             counts[of_line == k], math.sqrt(last - first + 1) / min(6, last - first + 1)
@@ -201,8 +201,8 @@ def test_representatives_stand_for_the_root_of_a_lines_points(scans):
 def test_normal_equations_and_their_step(scans, to_lines, coarse):
     pair = pair_of(scans, to_lines)
     fit, misses, every = fit_at(pair)
-    stage = icp._Stage(coarse, False, 0.2, 0.1 if coarse else 6.0, math.inf, 1.0)
-    normal, gradient = icp._linearise(pair, stage, every, POSE, fit, misses)
+    stage = icp_iterations.Stage(coarse, False, 0.2, 0.1 if coarse else 6.0, math.inf, 1.0)
+    normal, gradient = icp_iterations._linearise(pair, stage, every, POSE, fit, misses)
     kept = misses <= 0.2**2
     assert np.array_equal(np.isnan(fit.residuals), ~kept)
     q = turned(POSE[2], pair.source.points[kept])
@@ -210,7 +210,7 @@ def test_normal_equations_and_their_step(scans, to_lines, coarse):
         n, d, *_ = (a[fit.matches[kept]] for a in pair.target.segments)
         J, e = [jacobian(n, q)], [np.sum(n * (q + POSE[:2]), axis=1) - d]
         facing = np.sum(n * turned(POSE[2], pair.source.rays[kept]), axis=1)
-        variance = pair.noise_m**2 * (facing**2 + icp._GRAZING)
+        variance = pair.noise_m**2 * (facing**2 + icp_iterations._GRAZING)
     else:
         off = q + POSE[:2] - pair.target.points[fit.matches[kept]]
         J, e = [jacobian(np.tile(axis, (len(q), 1)), q) for axis in np.eye(2)], list(off.T)
@@ -227,7 +227,7 @@ def test_normal_equations_and_their_step(scans, to_lines, coarse):
     np.testing.assert_allclose(full(normal), A, rtol=1e-6, atol=1e-9 * A.max())
     np.testing.assert_allclose(gradient, b, rtol=1e-6, atol=1e-9 * np.abs(A).max())
     pose = POSE.copy()
-    moved, turn, gained = icp._step(normal, gradient, pose)
+    moved, turn, gained = icp_iterations._step(normal, gradient, pose)
     step = -np.linalg.solve(full(normal), gradient)
     np.testing.assert_allclose(pose - POSE, step, rtol=1e-3, atol=1e-5)  # it is slightly damped
     assert (moved, turn) == pytest.approx((np.hypot(*step[:2]), abs(step[2])), rel=1e-3, abs=1e-5)
@@ -238,9 +238,9 @@ def test_normal_equations_and_their_step(scans, to_lines, coarse):
 def test_information_is_that_of_the_lines(scans, to_lines):
     pair = pair_of(scans, to_lines)
     fit, misses, every = fit_at(pair)
-    stage = icp._Stage(False, False, 0.1, 6.0, math.inf, 1.0)
-    metric, _ = icp._linearise(pair, stage, every, POSE, fit, misses)
-    normal, information, spurious = icp._judge(pair, POSE, fit)
+    stage = icp_iterations.Stage(False, False, 0.1, 6.0, math.inf, 1.0)
+    metric, _ = icp_iterations._linearise(pair, stage, every, POSE, fit, misses)
+    normal, information, spurious = icp_judgement.judge(pair, POSE, fit)
     np.testing.assert_allclose(normal, metric, rtol=1e-12, atol=1e-12 * metric.max())
     assert np.array_equal(fit.matches < 0, np.isnan(fit.residuals))
     kept = fit.weights > 0.0
@@ -249,7 +249,11 @@ def test_information_is_that_of_the_lines(scans, to_lines):
     facing = np.sum(
         pair.target.segments.normals[lines] * turned(POSE[2], pair.source.rays[kept]), axis=1
     )
-    w = fit.weights[kept] if to_lines else 1 / (pair.noise_m**2 * (facing**2 + icp._GRAZING))
+    w = (
+        fit.weights[kept]
+        if to_lines
+        else 1 / (pair.noise_m**2 * (facing**2 + icp_iterations._GRAZING))
+    )
     held = (lines >= 0) & (np.bincount(lines[lines >= 0], minlength=9999)[lines] >= 3)
     n, variance = (pair.target.segments[k][lines[held]] for k in (0, 4))
     for found, normals, weight in (
@@ -272,7 +276,7 @@ def test_points_agree_are_denied_or_cannot_be_judged(full_circle):
     scan, other = scans
     tolerance, agreed, denied = 0.05, np.zeros((3, 3)), np.zeros((3, 3))
     pose, lever = np.array([0.3, 0.2, 0.1]), (0.1, -0.2)
-    icp._confront(scan, other, pose, 0.3, lever, tolerance, agreed, denied)
+    icp_judgement.confront(scan, other, pose, 0.3, lever, tolerance, agreed, denied)
     expected = [np.zeros((3, 3)), np.zeros((3, 3))]  # denied, agreed
     for point, line in zip(scan.points, scan.line_of_point, strict=True):
         at = se2.transform(pose, point[None])[0]
@@ -296,7 +300,7 @@ def test_points_agree_are_denied_or_cannot_be_judged(full_circle):
 
 def test_planes_are_those_of_the_nearest_neighbours(scans):
     points = scans[0].points
-    normals, offsets = icp._planes(points, 6)
+    normals, offsets = icp_start.planes_of(points, 6)
     near = points[KDTree(points).query(points, k=6)[1]]
     share = 0
     for row, own in enumerate(near):
@@ -310,14 +314,16 @@ def test_planes_are_those_of_the_nearest_neighbours(scans):
 
 def test_trimming_leaves_out_the_farthest():
     misses = np.array([0.3, np.inf, 0.1, 0.4, 0.2])
-    icp._trim(misses, 0.25)
+    icp_iterations._trim(misses, 0.25)
     np.testing.assert_array_equal(misses, [0.3, np.inf, 0.1, np.inf, 0.2])
-    icp._trim(misses, 0.999)
+    icp_iterations._trim(misses, 0.999)
     np.testing.assert_array_equal(misses, [np.inf, np.inf, 0.1, np.inf, np.inf])
 
 
 @pytest.mark.parametrize(("huber", "expected"), [(False, [0.25, 0.0]), (True, [1.0, 0.5])])
 def test_kernels_weigh_by_standard_deviations(huber, expected):
-    stage = icp._Stage(False, huber, 1.0, 2.0, math.inf, 1.0)
-    found = [icp._weight(stage, size**2 * 2.0**2 * 0.01, 0.01) for size in (0.5**0.5, 2.0)]
+    stage = icp_iterations.Stage(False, huber, 1.0, 2.0, math.inf, 1.0)
+    found = [
+        icp_iterations._weight(stage, size**2 * 2.0**2 * 0.01, 0.01) for size in (0.5**0.5, 2.0)
+    ]
     assert found == pytest.approx(expected)

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from estimators.laser import icp, scan_lines
+from estimators.laser import icp_iterations, icp_start, scan_lines
 from estimators.laser.icp import prepare
 from experiments.bench.icp import BEARINGS_RAD, pair
 from sim import se2
@@ -104,16 +104,16 @@ def test_representatives_are_spaced_by_beams_and_by_length(scans):
     along = np.column_stack([-scan.segments.normals[:, 1], scan.segments.normals[:, 0]])
     for k, (first, last) in enumerate(scan.line_ends):
         own = np.arange(first, last + 1)
-        here = min(icp._COARSE_POINTS, len(own))
+        here = min(icp_start._COARSE_POINTS, len(own))
         run = scan.points[own] @ along[k]
         wanted = run[0] + (run[-1] - run[0]) * np.arange(here) / (here - 1)
         run[-1] = math.inf  # the last one, if rounding leaves none
         by_length = own[np.argmax(run >= wanted[:, None], axis=1)]
         by_beams = first + (last - first) * np.arange(here) // (here - 1)
-        odd = (np.arange(here) % 2 == 1) & (here == icp._COARSE_POINTS)
+        odd = (np.arange(here) % 2 == 1) & (here == icp_start._COARSE_POINTS)
         chosen = np.where(odd, by_length, by_beams)
         expected += [i for i in chosen if scan.line_of_point[i] == k]
-    np.testing.assert_array_equal(icp._representatives(scan).points, expected)
+    np.testing.assert_array_equal(icp_start.representatives(scan).points, expected)
 
 
 @pytest.mark.parametrize("to_lines", [True, False])
@@ -121,14 +121,14 @@ def test_representatives_are_spaced_by_beams_and_by_length(scans):
 @pytest.mark.parametrize("warm", [True, False])
 def test_points_are_matched_with_the_nearest(scans, to_lines, reach_m, warm):
     source, target = scans
-    surface = target.segments if to_lines else icp._as_segments(target)
-    both = icp._Pair(source, target, to_lines, to_lines, surface, surface, source.noise_m)
+    surface = target.segments if to_lines else icp_start.as_segments(target)
+    both = icp_iterations.Pair(source, target, to_lines, to_lines, surface, surface, source.noise_m)
     n = len(source.points)
-    every = icp._Sample(np.arange(n), np.ones(n))
-    fit, misses = icp._Fit(np.zeros(n, np.int64), np.zeros(n), np.zeros(n)), np.empty(n)
+    every = icp_iterations.Sample(np.arange(n), np.ones(n))
+    fit, misses = icp_iterations.Fit(np.zeros(n, np.int64), np.zeros(n), np.zeros(n)), np.empty(n)
     if warm:  # from the matches at another pose
-        icp._match(both, reach_m, every, np.zeros(3), True, fit, misses)
-    icp._match(both, reach_m, every, POSE, not warm, fit, misses)
+        icp_iterations._match(both, reach_m, every, np.zeros(3), True, fit, misses)
+    icp_iterations._match(both, reach_m, every, POSE, not warm, fit, misses)
     at = se2.transform(POSE, source.points)
     if to_lines:
         normals, distances, spans, *_ = surface

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from estimators.on_a_map.likelihood_field import beam_ends, likelihood_field
+from estimators.on_a_map.likelihood_field import FieldOptions, beam_ends, likelihood_field
 from sim import se2
 from sim.errors import InputError
 from sim.sensors import Laser, Mount
@@ -23,7 +23,7 @@ def world(walls=ROOM, heights=(0.0, 1.0)):
 
 def field(cell_m=0.1, **options):
     given = {"sigma_m": SIGMA_M, "z_hit": Z_HIT, "z_rand": Z_RAND, **options}
-    return likelihood_field(world(), LASER, cell_m=cell_m, **given)
+    return likelihood_field(world(), LASER, FieldOptions(cell_m=cell_m, **given))
 
 
 def log_p(points):
@@ -120,9 +120,9 @@ def test_free_floor():
 def test_only_walls_at_the_lasers_height_count():
     low = world(heights=(0.0, 0.2))
     with pytest.raises(InputError, match=r"0\.3 m"):
-        likelihood_field(low, LASER)
+        likelihood_field(low, LASER, FieldOptions())
     high = dataclasses.replace(LASER, mount=Mount(z_m=0.1))
-    assert likelihood_field(low, high).table.min() < 6000
+    assert likelihood_field(low, high, FieldOptions(sigma_m=0.1)).table.min() < 6000
 
 
 def test_too_fine_a_table_is_refused():
@@ -130,4 +130,4 @@ def test_too_fine_a_table_is_refused():
         with pytest.raises(InputError, match=r"cell_m=.* cells of world room; make it larger"):
             field(cell_m=cell_m)
     with pytest.raises(InputError, match=r"cell_m=0\.05 makes inf cells"):
-        likelihood_field(world(ROOM * 1e300), LASER)
+        likelihood_field(world(ROOM * 1e300), LASER, FieldOptions())

@@ -10,7 +10,7 @@ import yaml
 from PIL import Image
 
 from estimators.base import Prior, run
-from estimators.on_a_map.likelihood_field import likelihood_field
+from estimators.on_a_map.likelihood_field import FieldOptions, likelihood_field
 from estimators.on_a_map.mcl import Mcl
 from experiments.gate.conform import check_estimator
 from experiments.runs.seeds import stream
@@ -327,8 +327,8 @@ def test_a_world_as_a_grid():
 
 def test_the_field_is_that_of_the_walls_to_half_a_cell():
     world = square_room()
-    exact = likelihood_field(world, LASER, sigma_m=0.15)
-    ofgrid = likelihood_field(rasterized(world, 0.05, 0.2), LASER, sigma_m=0.15)
+    exact = likelihood_field(world, LASER, FieldOptions(sigma_m=0.15))
+    ofgrid = likelihood_field(rasterized(world, 0.05, 0.2), LASER, FieldOptions(sigma_m=0.15))
     rng = np.random.default_rng(0)
     ends = np.ascontiguousarray(rng.uniform(-4.0, 4.0, (2, 50)).astype(np.float32))
     here = np.zeros((1, 3))
@@ -345,7 +345,7 @@ def test_unknown_is_no_floor_and_likelier_than_free_but_not_than_walls(yaw):
     values[40], values[41:] = 1.0, np.nan
     grid = OccupancyGrid(values, 0.05, np.array([2.0, 1.0, yaw]))
     z_hit, z_rand, sigma_m = 0.9, 0.1, 0.1
-    field = likelihood_field(grid, LASER, cell_m=0.02, sigma_m=sigma_m)
+    field = likelihood_field(grid, LASER, FieldOptions(cell_m=0.02, sigma_m=sigma_m))
     peak = z_hit / (sigma_m * math.sqrt(2 * math.pi)) + z_rand / 30.0
 
     def likelihood(y_cells):
@@ -363,7 +363,7 @@ def test_unknown_is_no_floor_and_likelier_than_free_but_not_than_walls(yaw):
     assert np.all((places >= -0.5) & (places[:, :2] <= [120.5, 40.5]))
     assert places[:, 1].max() < 38.5  # off the wall, too
     with pytest.raises(InputError, match="no occupied cell"):
-        likelihood_field(OccupancyGrid(np.zeros((3, 3), np.float32), 0.1), LASER)
+        likelihood_field(OccupancyGrid(np.zeros((3, 3), np.float32), 0.1), LASER, FieldOptions())
 
 
 def test_mcl_on_a_grid_is_about_as_good_as_on_walls():
