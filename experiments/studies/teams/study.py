@@ -20,7 +20,7 @@ from estimators.base import Estimate, Prior
 from estimators.landmarks.ekf_slam import EkfSlam
 from estimators.team import Communication, Kind, run_team
 from experiments.evaluation.metrics import position_errors_m, rms
-from experiments.judging.jobs import in_parallel
+from experiments.judging.jobs import Tables, tables_of
 from experiments.judging.results import Results
 from experiments.judging.verdict import Profile
 from experiments.runs.evaluate import evaluate
@@ -61,8 +61,7 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
         Called with the share of the work done.
     """
     jobs = list(team_jobs(profile))
-    rows = [row for part in in_parallel(rows_of, jobs, on_progress) for row in part]
-    out.write_tables(errors=pd.DataFrame(rows))
+    out.write_tables(**tables_of(rows_of, jobs, on_progress))
     if (log := mrclam_log()).exists():
         out.write_tables(mrclam=pd.DataFrame(mrclam_rows(log)))
     out.write_arrays("drive", **drive(settings.FIRST_SEED))
@@ -75,7 +74,7 @@ def team_jobs(profile: Profile) -> Iterator[tuple[int, str]]:
             yield seed, option
 
 
-def rows_of(seed: int, option: str) -> list[Row]:
+def rows_of(seed: int, option: str) -> Tables:
     """Rows of an estimator's runs in one world, for each size of the team."""
     whole = TeamExperiment(_composed(seed, {})).recording()
     rows = []
@@ -87,7 +86,7 @@ def rows_of(seed: int, option: str) -> list[Row]:
             found = with_answers(made, list(_KEPT)).iloc[0]
             labels = {"seed": seed, "size": size, "filter": option, **labels}
             rows.append({**labels, **{_KEPT[name]: found[name] for name in _KEPT if name in found}})
-    return rows
+    return {"errors": rows}
 
 
 def _arms(size: int, option: str) -> Iterator[tuple[dict[str, Any], Row]]:
