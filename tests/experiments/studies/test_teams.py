@@ -7,11 +7,10 @@ import pandas as pd
 import pytest
 
 from experiments.judging.claim import select_all
-from experiments.judging.folders import findings
 from experiments.judging.results import Results
-from experiments.judging.sentences import conclude
 from experiments.judging.verdict import Role, Verdict
 from experiments.studies.teams import claims, figures, settings
+from tests.fixtures.claims import concluded
 
 
 def table_of(ratio, n_worlds=30, spread=0.4, seed=0):
@@ -37,11 +36,6 @@ def headlines(table):
     return select_all(list(claims.gi9(table)), role=Role.HEADLINE)
 
 
-def concluded(found):
-    [conclusion] = conclude(found, findings("teams"))
-    return conclusion
-
-
 def test_gi9_is_one_statistic_for_each_size_by_the_papers_method():
     found = headlines(table_of(0.5))
     assert len(found) == len(settings.SIZES)
@@ -57,7 +51,7 @@ def test_gi9_can_fail():
     mixed = table_of(0.5)
     worse = (mixed["size"] == 4) & (mixed["filter"] == "fastslam") & mixed["sightings"]
     mixed.loc[worse, "ate_rmse_m"] *= 6.0
-    assert concluded(claims.gi9(mixed)).verdict is Verdict.NOT_REPRODUCED
+    assert concluded("teams", claims.gi9(mixed)).verdict is Verdict.NOT_REPRODUCED
 
 
 def test_what_communication_costs():
@@ -75,12 +69,12 @@ def test_the_sentence_says_the_factors(tmp_path):
     ]
     made.write_tables(errors=table_of(0.5), mrclam=pd.DataFrame(log))
     found = claims.judge(made)
-    conclusion = concluded(found)
+    conclusion = concluded("teams", found)
     assert conclusion.verdict is Verdict.REPRODUCED
     assert "with 2 robots," in conclusion.sentence
     assert "On MRCLAM 6 a team of five errs 0.33 times a robot alone." in conclusion.sentence
     bare = [c for c in found if c.about.quantity != "MRCLAM 6"]
-    assert "MRCLAM" not in concluded(bare).sentence
+    assert "MRCLAM" not in concluded("teams", bare).sentence
 
 
 def test_figures_draw(tmp_path):
