@@ -40,7 +40,7 @@ def overrides(incomplete: str) -> list[str]:
 
 def options(group: str) -> list[str]:
     """Options of a group of the configuration."""
-    return sorted(path.stem for path in (paths.CONF / group).glob("*.yaml"))
+    return paths.option_names(group)
 
 
 def estimators(incomplete: str) -> list[str]:

@@ -360,7 +360,7 @@ def options(
         raise InputError(f"no group {group}; there are: {', '.join(groups)}, metrics")
     for name in groups if group is None else (group,):
         folders = [paths.CONF, *([config_dir] if config_dir else [])]
-        names = sorted({path.stem for folder in folders for path in (folder / name).glob("*.yaml")})
+        names = sorted({n for folder in folders for n in paths.option_names(name, folder)})
         print(f"{name:>10}: {', '.join(names)}")
 
 

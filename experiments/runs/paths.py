@@ -19,6 +19,18 @@ def packaged(name: str) -> Path:
 CONF = packaged("conf")
 
 
+def option_names(group: str, folder: Path | None = None) -> list[str]:
+    """Options of a group of the configuration, such as `office` and `gil2008/particles`.
+
+    Parameters
+    ----------
+    folder
+        Folder of the groups; by default that of the package.
+    """
+    place = (folder or CONF) / group
+    return sorted(p.relative_to(place).with_suffix("").as_posix() for p in place.rglob("*.yaml"))
+
+
 def results() -> Path:
     """Return the folder of results: `results` in the current folder, or $ESTIMA_RESULTS."""
     return Path.cwd() / (os.environ.get("ESTIMA_RESULTS") or "results")

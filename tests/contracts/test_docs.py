@@ -10,14 +10,15 @@ import pytest
 
 import estima
 from experiments.papers.puzzlebot2024 import study as puzzlebot2024
+from experiments.runs.paths import option_names
 
 # studies of questions of ours, beyond the parts of the papers
 NOT_OF_A_PART = {
-    "decristoforis2020_beliefs",
-    "decristoforis2020_office",
-    "decristoforis2020_ordering",
-    "gil2008_bound",
-    "puzzlebot2024_engine",
+    "decristoforis2020/beliefs",
+    "decristoforis2020/office",
+    "decristoforis2020/ordering",
+    "gil2008/bound",
+    "puzzlebot2024/engine",
 }
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -25,10 +26,10 @@ ROOT = Path(__file__).resolve().parents[2]
 def test_the_papers_page_names_what_there_is():
     """Every study, option and file on the page exists, and every study of a paper is on it."""
     page = (ROOT / "docs" / "papers.md").read_text().partition("\n## ")[2]
-    studies = set(re.findall(r"study=(\w+)", page))
-    there = {path.stem for path in (ROOT / "conf" / "study").glob("*.yaml")}
+    studies = set(re.findall(r"study=([\w/]+)", page))
+    there = set(option_names("study"))
     assert studies <= there
-    papers = ("puzzlebot2024_", "decristoforis2020_", "maximo2024_", "gil2008")
+    papers = ("puzzlebot2024/", "decristoforis2020/", "maximo2024/", "gil2008")
     for group, option in re.findall(r" (world|robot|sensors|route|estimator)=(\w+)", page):
         assert (ROOT / "conf" / group / f"{option}.yaml").exists(), option
     for name in re.findall(r"`((?:sim|estimators|experiments|conf|docs)/[\w./]+\.\w+)`", page):

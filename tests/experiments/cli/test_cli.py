@@ -14,7 +14,7 @@ import pandas as pd
 import pytest
 
 from estimators.base import Belief
-from experiments import cli
+from experiments.cli import main as cli
 from experiments.bench import SUITES
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment

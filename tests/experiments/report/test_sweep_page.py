@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 
-from experiments import cli
+from experiments.cli import main as cli
 from experiments.report import sweep_page
 from experiments.report.sweep_page import extremes, picture_path, write_sweep_page
 from experiments.sweeps.again import noted_config_dir

@@ -8,7 +8,7 @@ from evo.core.metrics import PoseRelation, Unit
 from evo.core.trajectory import PoseTrajectory3D
 
 from estimators.base import Estimate
-from experiments import cli
+from experiments.cli import main as cli
 from experiments.runs.score import Align, Match, Scoring, described, error_table, scored_against
 from experiments.trajectories.convert import write_estimate
 from experiments.trajectories.read import read_trajectory
