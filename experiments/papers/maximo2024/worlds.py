@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
 
-from estimators.base import Estimate, Prior, run
+from estimators.base import Estimate, Prior
 from estimators.topological import descriptors as describers
 from estimators.topological.topological_map import TopologicalMap, from_recording
 from experiments.evaluation.metrics import position_errors_m, rms, travelled_m
@@ -37,6 +37,7 @@ from experiments.papers.maximo2024.settings import (
     TUNED,
     WITHIN,
 )
+from experiments.runs.evaluate import estimates
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
 from experiments.runs.seeds import stream
@@ -128,7 +129,7 @@ def localize(
         Further Belief extras to record.
     """
     taken = case.recording if recording is None else recording
-    estimate = run(
+    estimate, _ = estimates(
         case.experiment.with_estimator(**settings).estimator(),
         taken,
         Prior(taken.robot, taken.sensors, map=case.known_map),

@@ -16,14 +16,13 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
 from estimators.base import Estimate, Prior
-from estimators.base import run as run_estimator
 from estimators.odometry import Odometry
 from experiments.calibration.calibrate import calibrate_recordings, end_pose
 from experiments.calibration.end_poses import Manoeuvre, from_end_poses
 from experiments.calibration.result import CalibrationResult
 from experiments.calibration.wheel_truth import from_wheel_truth
 from experiments.evaluation.metrics import ellipse_area_m2, travelled_m
-from experiments.judging.jobs import in_parallel
+from experiments.judging.jobs import Tables, tables_of
 from experiments.judging.results import Results
 from experiments.judging.verdict import Profile
 from experiments.papers.puzzlebot2024.settings import (
@@ -41,6 +40,7 @@ from experiments.papers.puzzlebot2024.settings import (
     SQUARE_SAMPLES,
     TABLE_1_K_M,
 )
+from experiments.runs.evaluate import estimates
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
 from experiments.runs.seeds import stream
@@ -132,7 +132,7 @@ def dead_reckoning(batch: BatchRuns, kr: float, kl: float) -> Estimate:
     wheels = WheelLog(batch.stamps, batch.encoder_m[0])
     recording = Recording(batch.stamps, wheels, geometry)
     prior = Prior(geometry, mean=np.zeros(3), covariance=np.zeros((3, 3)))
-    return run_estimator(Odometry(kr, kl), recording, prior, np.random.default_rng(0))
+    return estimates(Odometry(kr, kl), recording, prior, np.random.default_rng(0))[0]
 
 
 def areas() -> pd.DataFrame:
@@ -221,7 +221,8 @@ def square_feedback(*overrides: str) -> tuple[pd.DataFrame, dict[str, NDArray[np
     for experiment in planned(["study=puzzlebot2024/square_feedback", *overrides]):
         route, recording = experiment.route(), experiment.simulate()
         prior, rng = experiment.prior(recording), np.random.default_rng(0)
-        believed = run_estimator(experiment.estimator(), recording, prior, rng).means[:, :2]
+        online, _ = estimates(experiment.estimator(), recording, prior, rng)
+        believed = online.means[:, :2]
         stamps = recording.frame_stamps
         true = recording.truth_at(stamps)[:, :2]
         corner = np.array(route.points[-1])
@@ -274,12 +275,11 @@ def calibration(
         for repetition in range(n_repetitions)
         for arm in robots
     ]
-    parts = in_parallel(_calibration_rows, repeated, on_progress)
-    return pd.DataFrame(list(itertools.chain.from_iterable(parts)))
+    return tables_of(_calibration_rows, repeated, on_progress)["calibration"]
 
 
-def _calibration_rows(arm: Arm) -> list[Row]:
-    return [
+def _calibration_rows(arm: Arm) -> Tables:
+    rows: list[Row] = [
         {
             "k_m": arm.k_m,
             "joint": arm.joint,
@@ -292,6 +292,7 @@ def _calibration_rows(arm: Arm) -> list[Row]:
         for result in calibrate_once(arm)
         for name, interval in result.found.items()
     ]
+    return {"calibration": rows}
 
 
 def table_1(arm: Arm) -> pd.DataFrame:

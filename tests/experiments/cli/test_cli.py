@@ -14,8 +14,8 @@ import pandas as pd
 import pytest
 
 from estimators.base import Belief
-from experiments.cli import main as cli
 from experiments.bench import SUITES
+from experiments.cli import main as cli
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import read_rows

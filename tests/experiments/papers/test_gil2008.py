@@ -121,8 +121,9 @@ def test_rows_say_what_was_run(small):
     batch = Experiment.compose(["study=gil2008", "seed=3", noise, "estimator=smoother"])
     runs = [("particles", experiment(noise, "repeats=2")), ("bound", batch)]
     rows = study.rows_of(runs)
-    assert [table for table, _ in rows] == ["particles", "particles", "bound"]
-    first, second, bound = (row for _, row in rows)
+    assert list(rows) == ["particles", "bound"]
+    first, second = rows["particles"]
+    (bound,) = rows["bound"]
     assert first["revised_ate_rmse_m"] != second["revised_ate_rmse_m"]
     assert first["right_share"] == 1.0
     assert first["share_beyond_10_m"] == 0.0
@@ -130,7 +131,7 @@ def test_rows_say_what_was_run(small):
         assert row["revised_ate_rmse_m"] < 0.5 * row["odometry_rmse_m"]
         assert row["map_aligned_rmse_m"] <= row["map_rmse_m"] + 1e-12
     again = study.rows_of(runs[:1])
-    assert again[0][1]["revised_ate_rmse_m"] == first["revised_ate_rmse_m"]
+    assert again["particles"][0]["revised_ate_rmse_m"] == first["revised_ate_rmse_m"]
 
 
 def test_association_in_studies(small):
@@ -140,7 +141,7 @@ def test_association_in_studies(small):
         ("association", experiment("sensors=stereo_pixel", *guess)),
         ("association", Experiment.compose(single)),
     ]
-    for _, row in study.rows_of(runs):
+    for row in study.rows_of(runs)["association"]:
         assert 0.7 < row["right_share"] <= 1.0
 
 
