@@ -1,4 +1,4 @@
-"""A statistic of a claim: what it is about, what was found, and the verdict on it.
+"""A statistic of a claim: its subject, its value with an interval, and the verdict on it.
 
 A study's `judge` makes claims; they are found again by their fields, never by their words.
 """

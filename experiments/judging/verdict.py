@@ -13,7 +13,7 @@ class Verdict(StrEnum):
     REPRODUCED = "reproduced"
     NOT_REPRODUCED = "not_reproduced"
     UNDECIDED = "undecided"  # the interval spans the criterion, or the data are too few
-    SHOWN = "shown"  # there is no criterion
+    SHOWN = "shown"  # without a criterion
 
     @property
     def label(self) -> str:

@@ -156,15 +156,15 @@ def judged_map(quality: pd.DataFrame, name: str, compare: Compare) -> pd.DataFra
     Returns
     -------
     DataFrame
-        Columns noise_weight, n_nearest, statistic, value, verdict.
+        Columns noise_weight, n_nearest, about (a `Subject`), value, verdict.
     """
     part = quality[quality["geometry"] == name]
     rows = []
     for key, cell in part.groupby(["noise_weight", "n_nearest"]):
         claim = compare(name, _by_world(cell, COMPARISONS[compare]))
         if claim is not None:
-            rows.append((*key, claim.statistic, claim.found.value, claim.verdict))
-    columns = ["noise_weight", "n_nearest", "statistic", "value", "verdict"]
+            rows.append((*key, claim.about, claim.found.value, claim.verdict))
+    columns = ["noise_weight", "n_nearest", "about", "value", "verdict"]
     return pd.DataFrame(rows, columns=columns)
 
 

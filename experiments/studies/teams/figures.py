@@ -11,7 +11,7 @@ from experiments.evaluation.statistics import log_ratio_interval
 from experiments.judging.results import Results
 from experiments.studies.teams.claims import NAMES
 from experiments.studies.teams.settings import ALWAYS
-from experiments.viewing.plotting import plain_log, with_legend
+from experiments.viewing.plotting import draw_interval, plain_log, with_legend
 from experiments.viewing.style import BLACK, BLUE, PURPLE, SKY, WALL, subplots
 from experiments.viewing.team_figure import draw_paths, draw_sightings
 
@@ -53,10 +53,8 @@ def by_size(errors: pd.DataFrame) -> Figure:
             label = f"{NAMES[name]}, {words}"
             _line(left, medians.index, medians[seen], label, colour, marker, line)
         ratios = {size: log_ratio_interval(w[True], w[False]) for size, w in wide.groupby("size")}
-        found = np.array([[r.value, r.low, r.high] for r in ratios.values()]).T
-        at = np.array(list(ratios)) + 0.06 * (k - 1)
-        right.plot(at, found[0], marker, color=colour, ms=6)
-        right.vlines(at, found[1], found[2], color=colour, lw=1.4)
+        for size, ratio in ratios.items():
+            draw_interval(right, size + 0.06 * (k - 1), ratio, marker=marker, color=colour, ms=6)
     right.axhline(1.0, color=WALL, lw=0.8)
     left.set(ylabel="median RMS position error of the team, m", yscale="log")
     right.set(ylabel="error with sightings over without, 95 % interval", yscale="log")
