@@ -13,6 +13,7 @@ from experiments.judging.verdict import Profile, Verdict
 from experiments.papers.gil2008 import claims as gil2008
 from experiments.papers.maximo2024 import claims as maximo2024
 from experiments.papers.puzzlebot2024 import claims, study
+from experiments.papers.puzzlebot2024.descent import gradient_descent
 from experiments.papers.puzzlebot2024.settings import NOMINAL
 from experiments.studies.real_logs import claims as real_logs
 from sim.errors import InputError
@@ -75,7 +76,7 @@ def pb3(table):
     return {(c.about.quantity, c.about.metric): c for c in judged}
 
 
-DESCENT = study.gradient_descent()
+DESCENT = gradient_descent()
 COVERAGE, BIAS = ("coverage", "kr and kl"), ("bias", None)
 
 
