@@ -19,6 +19,7 @@ from experiments.judging.claims_file import (
     write_verdicts,
 )
 from experiments.judging.folders import code_folder
+from experiments.judging.logs import missing
 from experiments.judging.results import Results
 from experiments.judging.verdict import Claim, Conclusion, Profile, Verdict
 from experiments.report.contents import findings
@@ -58,7 +59,7 @@ def reproduce(*, full: bool = False, only: str | None = None) -> None:
     lines = []
     for paper in _chosen(only):
         begun = time.monotonic()
-        if paper in LOGS and (why := _part(paper, "study").missing()):
+        if paper in LOGS and (why := missing()):
             print(f"{paper}: left out, {why}", file=sys.stderr)
             continue
         conclusions = reproduce_paper(paper, profile)

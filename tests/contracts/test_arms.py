@@ -57,7 +57,7 @@ def of_one_seed(name):
     ],
 )  # fmt: skip
 def test_runs_of_gil2008_differ_in_what_their_table_compares(table, compared):
-    runs = of_one_seed(f"gil2008_{table}")
+    runs = of_one_seed(f"gil2008/{table}")
     noises = {False: [], True: []}
     for run in runs:
         noises[run.config["sensors"]["stereo"]["correlated"]].append(run)
@@ -92,14 +92,14 @@ def test_the_printed_filter_is_the_papers_and_alone_takes_r_at_the_measured_poin
     keys = ("proposal", "resampling", "ess_share", "noise_model", "noise_at")
     assert tuple(own[key] for key in keys) == printed
     for table in ("particles", "laps", "distance", "observations", "repeats", "association"):
-        for run in of_one_seed(f"gil2008_{table}"):
+        for run in of_one_seed(f"gil2008/{table}"):
             if run.estimator_name == "fastslam_paper":
                 assert tuple(run.config["estimator"][key] for key in keys) == printed
 
 
 def test_ekf_slam_is_compared_where_r_is_taken_at_the_same_point():
     guessed = {}
-    for run in of_one_seed("gil2008_association"):
+    for run in of_one_seed("gil2008/association"):
         own, camera = run.config["estimator"], run.config["sensors"]["stereo"]
         if own["association"] == "mahalanobis":
             kind = (camera["correlated"], own["noise_at"])
@@ -112,7 +112,7 @@ def test_ekf_slam_is_compared_where_r_is_taken_at_the_same_point():
 
 
 def test_filters_that_guess_associations_have_the_same_gate():
-    for run in of_one_seed("gil2008_association"):
+    for run in of_one_seed("gil2008/association"):
         own = run.config["estimator"]
         if own["association"] != "mahalanobis" or run.config["sensors"]["stereo"]["correlated"]:
             continue
@@ -121,7 +121,7 @@ def test_filters_that_guess_associations_have_the_same_gate():
 
 
 def test_particle_filters_are_compared_by_the_same_m_and_repeats():
-    runs = of_one_seed("gil2008_particles")
+    runs = of_one_seed("gil2008/particles")
     own = {}
     for run in runs:
         if (
@@ -221,7 +221,7 @@ def test_intels_fusion_and_its_rivals_read_the_same_log():
 
 
 def test_bullet_and_kinematic_robots_drive_the_same_routes_with_the_same_noise():
-    runs = of_one_seed("puzzlebot2024_engine")
+    runs = of_one_seed("puzzlebot2024/engine")
     assert differing(runs) == {"route.segments", "simulation.physics"}
     by_physics = {}
     for run in runs:

@@ -1,25 +1,21 @@
 """Methods of other projects beside ours: errors and processor times on the same recordings."""
 
 import importlib.metadata
-import itertools
-import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pandas as pd
 
 from estimators.peers import MissingPackageError
 from experiments.evaluation.statistics import log_ratio_interval
-from experiments.judging.jobs import grouped, in_parallel
+from experiments.judging.jobs import answer_of, grouped, table_of
 from experiments.judging.results import Results
 from experiments.judging.verdict import Profile
-from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome, Row
 from experiments.studies.peers.settings import LASER, PACKAGES, READS, TUNED
-from experiments.sweeps.collect import with_answers
 from experiments.sweeps.plan import planned
 from experiments.sweeps.tune import FAILED_M
 
@@ -45,8 +41,7 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
         print(f"{name}: left out, {reason}", file=sys.stderr)
     present = [e for e in experiments if e.estimator_name not in absent]
     drives = grouped(present, lambda e: (e.choices["world"], e.seed))
-    rows = itertools.chain.from_iterable(in_parallel(runs, [(d,) for d in drives], on_progress))
-    table = pd.DataFrame(list(rows))
+    table = table_of(runs, [(drive,) for drive in drives], on_progress)
     out.write_tables(runs=table, methods=methods(table))
     if absent:
         named = pd.DataFrame({"estimator": list(absent), "reason": list(absent.values())})
@@ -61,9 +56,6 @@ def missing(experiment: Experiment) -> str:
     InputError
         If the configuration is wrong.
     """
-    program = (experiment.config["estimator"].get("command") or "").partition(" ")[0]
-    if program and shutil.which(program) is None:
-        return f"there is no {program}; `make peers` compiles it where libmrpt-slam-dev is"
     try:
         experiment.check()
     except MissingPackageError as error:
@@ -71,18 +63,15 @@ def missing(experiment: Experiment) -> str:
     return ""
 
 
-def runs(drive: list[Experiment]) -> list[Row]:
+def runs(drive: list[Experiment]) -> Iterator[Row]:
     """Rows of all methods on one recording."""
-    rows = []
-    for experiment in drive:
-        found = with_answers(pd.DataFrame(evaluate(experiment)), _KEPT).iloc[0]
-        label = {
-            "world": experiment.choices["world"],
-            "seed": experiment.seed,
-            "estimator": experiment.estimator_name,
+    for one in drive:
+        labels: Row = {
+            "world": one.choices["world"],
+            "seed": one.seed,
+            "estimator": one.estimator_name,
         }
-        rows.append({**label, **{key: found.get(key) for key in _KEPT}})
-    return rows
+        yield {**labels, **answer_of(one, _KEPT)}
 
 
 def methods(table: pd.DataFrame) -> pd.DataFrame:

@@ -1,7 +1,4 @@
-"""Twins of real logs: the errors that they predict beside those on the logs' second halves.
-
-The logs are not part of the project; they are expected in ../shared/data.
-"""
+"""Twins of real logs: the errors that they predict next to those on the logs' second halves."""
 
 import functools
 import math
@@ -10,16 +7,15 @@ from collections.abc import Callable
 import numpy as np
 import pandas as pd
 
-from estimators.base import Prior
-from estimators.base import run as run_estimator
 from experiments.evaluation.metrics import score
-from experiments.judging.jobs import in_parallel
+from experiments.judging.jobs import table_of
+from experiments.judging.logs import known_start
 from experiments.judging.results import Results
 from experiments.judging.verdict import Profile
+from experiments.runs.evaluate import estimates
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
 from experiments.runs.seeds import stream
-from experiments.studies.real_logs.study import missing as missing
 from experiments.studies.twins.settings import (
     DEAD_RECKONING,
     FIRST_SEED,
@@ -36,7 +32,7 @@ from experiments.twin.make import Twin, make_twin
 from sim.formats.detect import read_any
 from sim.recording import Recording
 
-_START = np.diag([1e-6] * 3)
+_SCORES = ("ate_rmse_m", "heading_rmse_rad", "nees_mean")
 
 
 def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) -> None:
@@ -55,8 +51,7 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
     }
     seeds = range(FIRST_SEED, FIRST_SEED + RUNS[profile])
     jobs = [(log, seed, runs) for log in LOGS for seed in (None, *seeds)]
-    rows = [row for part in in_parallel(errors, jobs, on_progress) for row in part]
-    table = pd.DataFrame(rows)
+    table = table_of(errors, jobs, on_progress)
     pairs = predicted(table)
     out.write_tables(runs=table, pairs=pairs, others=of_others(pairs))
 
@@ -83,15 +78,12 @@ def errors(log: str, seed: int | None, runs: dict[str, dict[str, Experiment]]) -
 def _error(twin: Twin, run: Experiment, recording: Recording, seed: int | None) -> Row:
     """Run an estimator from the true start; it believes the calibration's slip."""
     slip = vars(twin.found.calibration.slip)
-    believed = {key: value for key, value in slip.items() if key in run.config["estimator"]}
-    start = recording.truth_at(recording.frame_stamps[:1])[0]
-    prior = Prior(recording.robot, recording.sensors, start, _START)
+    believed = {key: value for key, value in slip.items() if run.option(key) is not None}
+    estimator = run.with_estimator(**believed).estimator()
     rng = stream(seed or 0, f"estimator/{run.estimator_name}")
-    found = run_estimator(run.with_estimator(**believed).estimator(), recording, prior, rng)
-    scores = score(recording, found)
-    return {
-        key: scores.get(key, math.nan) for key in ("ate_rmse_m", "heading_rmse_rad", "nees_mean")
-    }
+    online, _ = estimates(estimator, recording, known_start(recording), rng)
+    scores = score(recording, online)
+    return {key: scores.get(key, math.nan) for key in _SCORES}
 
 
 def predicted(runs: pd.DataFrame) -> pd.DataFrame:

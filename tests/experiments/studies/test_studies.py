@@ -3,14 +3,15 @@
 import numpy as np
 import pytest
 
+from experiments.judging.logs import missing
 from experiments.runs.evaluate import evaluate
 from experiments.runs.paths import CONF
 from experiments.runs.row import Outcome
-from experiments.studies.real_logs.study import missing
 from experiments.sweeps.plan import planned
 from tests.fixtures.fakes import peers_may_be_missing
 
-STUDIES = sorted(path.stem for path in (CONF / "study").glob("*.yaml"))
+FOLDER = CONF / "study"
+STUDIES = sorted(str(p.relative_to(FOLDER).with_suffix("")) for p in FOLDER.rglob("*.yaml"))
 
 
 def shortened(experiment):
@@ -27,8 +28,8 @@ def shortened(experiment):
 def runs_of(name, folder):
     """One run of a study for each of its estimators."""
     given = {
-        "maximo2024_own": f"data={own_places(folder)}",
-        "maximo2024_network": "network._target_=tests.fixtures.fakes.outline",
+        "maximo2024/own": f"data={own_places(folder)}",
+        "maximo2024/network": "network._target_=tests.fixtures.fakes.outline",
     }
     runs = list(planned([f"study={name}", *([given[name]] if name in given else [])]))
     return list({run.estimator_name: run for run in reversed(runs)}.values())
@@ -47,9 +48,9 @@ def test_each_study_fits_together(name, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", STUDIES)
 def test_each_study_runs(name, tmp_path):
-    if name == "decristoforis2020_rawseeds":
+    if name == "decristoforis2020/rawseeds":
         pytest.skip("needs a log of Rawseeds")
-    if name.startswith(("real_logs", "decristoforis2020_log")) and (why := missing()):
+    if name.startswith(("real_logs", "decristoforis2020/log")) and (why := missing()):
         pytest.skip(why)
     for experiment in runs_of(name, tmp_path):
         with peers_may_be_missing():
