@@ -10,6 +10,7 @@ from collections import Counter
 from pathlib import Path
 from types import ModuleType
 
+from experiments.judging.claim import Claim
 from experiments.judging.claims_file import (
     note_provenance,
     read_claims,
@@ -18,11 +19,11 @@ from experiments.judging.claims_file import (
     write_claims,
     write_verdicts,
 )
-from experiments.judging.folders import code_folder
+from experiments.judging.folders import code_folder, findings
 from experiments.judging.logs import missing
 from experiments.judging.results import Results
-from experiments.judging.verdict import Claim, Conclusion, Profile, Verdict
-from experiments.report.contents import findings
+from experiments.judging.sentences import Conclusion, conclude
+from experiments.judging.verdict import Profile, Verdict
 from experiments.report.page import write_report
 from experiments.runs.console import progress
 from experiments.runs.paths import results, short
@@ -150,7 +151,9 @@ def _judgement(made: Results) -> tuple[list[Claim], list[Conclusion]]:
     """Statistics of a paper's claims, and the one verdict on each claim."""
     module = _part(made.paper, "claims")
     claims = module.judge(made)
-    return claims, module.conclusions(made, claims)
+    if hasattr(module, "conclusions"):
+        return claims, module.conclusions(made, claims)
+    return claims, conclude(claims, findings(made.paper))
 
 
 def _write(

@@ -1,6 +1,7 @@
-"""The jobs of a study: which runs go together, and how all cores share them."""
+"""The jobs of a study: which runs go together, how all cores share them, and their tables."""
 
-from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
+from itertools import chain
 from typing import Any, TypeVar
 
 import numpy as np
@@ -15,12 +16,13 @@ from experiments.sweeps.collect import with_answers
 from sim.team import Team
 
 T = TypeVar("T")
+Tables = Mapping[str, Sequence[Row] | pd.DataFrame]  # rows by the table's name
 
 
 def in_parallel(
     function: Callable[..., T],
     jobs: Sequence[Sequence[Any]],
-    on_progress: Callable[[float], None],
+    on_progress: Callable[[float], None] = lambda _: None,
     costs: ArrayLike | None = None,
 ) -> Iterator[T]:
     """Yield `function(*job)` for every job, in order, computed on all cores.
@@ -39,20 +41,24 @@ def in_parallel(
         on_progress(float(share))
 
 
-def table_of(
-    function: Callable[..., Iterable[Row]],
+def tables_of(
+    function: Callable[..., Tables],
     jobs: Sequence[Sequence[Any]],
-    on_progress: Callable[[float], None],
+    on_progress: Callable[[float], None] = lambda _: None,
     costs: ArrayLike | None = None,
-) -> pd.DataFrame:
-    """Table of the rows that `function(*job)` gives for every job; see `in_parallel`."""
-    parts = in_parallel(_listed, [(function, *job) for job in jobs], on_progress, costs)
-    return pd.DataFrame([row for part in parts for row in part])
+) -> dict[str, pd.DataFrame]:
+    """Run jobs by `in_parallel` and join the rows that they give, by table, in their order."""
+    parts: dict[str, list[Any]] = {}
+    for tables in in_parallel(function, jobs, on_progress, costs):
+        for name, rows in tables.items():
+            parts.setdefault(name, []).append(rows)
+    return {name: _joined(several) for name, several in parts.items()}
 
 
-def _listed(function: Callable[..., Iterable[Row]], *job: Any) -> list[Row]:
-    """A list, since what a worker gives back cannot be a generator."""
-    return list(function(*job))
+def _joined(parts: list[Any]) -> pd.DataFrame:
+    if isinstance(parts[0], pd.DataFrame):
+        return pd.concat(parts, ignore_index=True)
+    return pd.DataFrame(list(chain.from_iterable(parts)))
 
 
 def answer_of(

@@ -9,8 +9,7 @@ import pandas as pd
 
 from experiments.evaluation.registration_errors import METRICS
 from experiments.evaluation.statistics import Interval, log_ratio_interval, mean_interval
-from experiments.judging.results import Results
-from experiments.judging.verdict import (
+from experiments.judging.by_words import (
     Claim,
     Conclusion,
     Verdict,
@@ -23,6 +22,7 @@ from experiments.judging.verdict import (
     plain,
     shown,
 )
+from experiments.judging.results import Results
 from experiments.papers.decristoforis2020.settings import CONSISTENT, PLACES, RATE_HZ
 from sim.arrays import Array
 

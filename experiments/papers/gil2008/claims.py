@@ -20,8 +20,7 @@ from experiments.evaluation.statistics import (
     mean_interval,
     page_trend_p,
 )
-from experiments.judging.results import Results
-from experiments.judging.verdict import (
+from experiments.judging.by_words import (
     Claim,
     Conclusion,
     Role,
@@ -37,6 +36,7 @@ from experiments.judging.verdict import (
     remarked,
     shown,
 )
+from experiments.judging.results import Results
 from experiments.papers.gil2008.settings import P0
 from sim.arrays import Array
 

@@ -16,8 +16,7 @@ from experiments.evaluation.statistics import (
     mean_interval,
     share_interval,
 )
-from experiments.judging.results import Results
-from experiments.judging.verdict import (
+from experiments.judging.by_words import (
     Claim,
     Conclusion,
     Role,
@@ -34,6 +33,7 @@ from experiments.judging.verdict import (
     remarked,
     shown,
 )
+from experiments.judging.results import Results
 from experiments.papers.maximo2024.settings import (
     BETWEEN_NODES_S,
     JUDGED_QUALITY,

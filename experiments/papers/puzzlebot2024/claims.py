@@ -10,8 +10,7 @@ import numpy as np
 import pandas as pd
 
 from experiments.evaluation.statistics import Interval, mean_interval, share_interval
-from experiments.judging.results import Results
-from experiments.judging.verdict import (
+from experiments.judging.by_words import (
     Claim,
     Conclusion,
     Role,
@@ -28,6 +27,7 @@ from experiments.judging.verdict import (
     plain,
     shown,
 )
+from experiments.judging.results import Results
 from experiments.papers.puzzlebot2024.settings import NOMINAL, REPORTED_TURN_RATIO
 from sim.arrays import Array
 

@@ -10,8 +10,7 @@ from collections.abc import Iterator, Sequence
 import pandas as pd
 
 from experiments.evaluation.statistics import log_ratio_interval, share_interval
-from experiments.judging.results import Results
-from experiments.judging.verdict import (
+from experiments.judging.by_words import (
     Claim,
     Conclusion,
     banded,
@@ -22,6 +21,7 @@ from experiments.judging.verdict import (
     plain,
     shown,
 )
+from experiments.judging.results import Results
 from experiments.studies.exploration.settings import (
     AFTER_M,
     BASE,

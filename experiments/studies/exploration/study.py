@@ -14,7 +14,7 @@ import pandas as pd
 from estimators.base import Estimate
 from experiments.evaluation.map_quality import landmark_errors
 from experiments.evaluation.metrics import travelled_m
-from experiments.judging.jobs import in_parallel
+from experiments.judging.jobs import Tables, tables_of
 from experiments.judging.results import Results
 from experiments.judging.verdict import Profile
 from experiments.runs.evaluate import evaluate
@@ -50,17 +50,13 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
         for strategy in settings.STRATEGIES
         for i in range(settings.WORLDS[profile])
     ]
-    parts = [*in_parallel(row_of, jobs, on_progress)]
-    out.write_tables(
-        runs=pd.DataFrame([row for row, _ in parts]),
-        coverage=pd.concat([curve for _, curve in parts], ignore_index=True),
-    )
+    out.write_tables(**tables_of(tables_from, jobs, on_progress))
     for strategy in (settings.BASE, settings.JUDGED):
         team = TeamExperiment(composed(settings.FIRST_SEED, strategy)).recording()
         out.write_arrays(f"drive_{strategy}", **drive_of(team.robots, settings.AFTER_M))
 
 
-def row_of(seed: int, strategy: str) -> tuple[Row, pd.DataFrame]:
+def tables_from(seed: int, strategy: str) -> Tables:
     """What one exploration came to, and the area seen by the distance driven.
 
     The map is that of the paper's method, run over the drive.
@@ -80,7 +76,7 @@ def row_of(seed: int, strategy: str) -> tuple[Row, pd.DataFrame]:
     }
     at = np.arange(0.0, driven_m[-1] + _EVERY_M, _EVERY_M)
     curve = pd.DataFrame({**labels, "driven_m": at, "area_m2": np.interp(at, driven_m, area_m2)})
-    return row, curve
+    return {"runs": [row], "coverage": curve}
 
 
 def composed(seed: int, strategy: str) -> Experiment:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 
 from experiments.evaluation.metrics import nees_at_distances
-from experiments.judging.jobs import grouped, table_of
+from experiments.judging.jobs import Tables, grouped, tables_of
 from experiments.judging.results import Results
 from experiments.judging.verdict import Profile
 from experiments.runs.evaluate import estimates
@@ -30,7 +30,7 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
         Called with the share of the work done.
     """
     jobs = [[part] for part in grouped(plan(profile), lambda one: one.seed)]
-    out.write_tables(nees=table_of(rows_of, jobs, on_progress))
+    out.write_tables(**tables_of(rows_of, jobs, on_progress))
 
 
 def plan(profile: Profile) -> Iterator[Experiment]:
@@ -41,7 +41,7 @@ def plan(profile: Profile) -> Iterator[Experiment]:
     return (one for one in runs if one.option("n_particles", 0) <= MAX_QUICK)
 
 
-def rows_of(runs: Sequence[Experiment]) -> list[Row]:
+def rows_of(runs: Sequence[Experiment]) -> Tables:
     """NEES at each distance of every run over one recording; NaN where it is not known."""
     recording = runs[0].recording()
     rows: list[Row] = []
@@ -56,7 +56,7 @@ def rows_of(runs: Sequence[Experiment]) -> list[Row]:
             {**labels, "seed": one.seed, "distance_m": distance_m, "nees": float(value)}
             for distance_m, value in zip(DISTANCES_M, nees, strict=True)
         ]
-    return rows
+    return {"nees": rows}
 
 
 def labels_of(one: Experiment) -> Row:

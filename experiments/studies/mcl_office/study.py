@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from experiments.evaluation.metrics import heading_errors_rad, position_errors_m, travelled_m
 from experiments.evaluation.statistics import bootstrap_interval, share_interval
-from experiments.judging.jobs import table_of
+from experiments.judging.jobs import Tables, tables_of
 from experiments.judging.results import Results
 from experiments.judging.verdict import Profile
 from experiments.runs.console import RunFailedError
@@ -40,8 +40,8 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
     """
     n_starts, fewer = (20, []) if profile is Profile.FULL else (3, ["seed=range(1000,1004)"])
     jobs = [(office, n_starts) for office in planned(["study=mcl_office", *fewer])]
-    table = table_of(starts, jobs, on_progress)
-    out.write_tables(starts=table, share=localised_share(table))
+    made = tables_of(starts, jobs, on_progress)
+    out.write_tables(**made, share=localised_share(made["starts"]))
 
 
 def localised_share(table: pd.DataFrame) -> pd.DataFrame:
@@ -73,13 +73,13 @@ def found_after_m(travel_m: Array, near: NDArray[np.bool_]) -> float:
     return math.inf
 
 
-def starts(experiment: Experiment, n_starts: int) -> list[Row]:
+def starts(experiment: Experiment, n_starts: int) -> Tables:
     """Localize from starts spread along the tour of an office.
 
     Returns
     -------
-    list of Row
-        One per start: `seed`, `start`; where, `x_m`, `y_m`; `localised`; the travel after which the
+    Tables
+        `starts`, a row a start: `seed`, `start`; where, `x_m`, `y_m`; `localised`; the travel after which the
         belief is near and stays near for 10 m, `found_m` (infinite: never within 30 m); `error_m`,
         `error_deg` at the end; `near_share` of the Frames after it was found; `particles_mean`.
 
@@ -94,10 +94,11 @@ def starts(experiment: Experiment, n_starts: int) -> list[Row]:
     travel_m = travelled_m(recording.truth_at(recording.frame_stamps))
     last_m = travel_m[-1] - WITHIN_M - FOR_M - 1.0
     first_rows = np.searchsorted(travel_m, (np.arange(n_starts) + 0.5) / n_starts * last_m)
-    return [
+    rows: list[Row] = [
         {"seed": experiment.seed, "start": i, **_start(experiment, recording, travel_m, row, i)}
         for i, row in enumerate(first_rows.tolist())
     ]
+    return {"starts": rows}
 
 
 def _start(

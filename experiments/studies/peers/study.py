@@ -3,14 +3,14 @@
 import importlib.metadata
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import numpy as np
 import pandas as pd
 
 from estimators.peers import MissingPackageError
 from experiments.evaluation.statistics import log_ratio_interval
-from experiments.judging.jobs import answer_of, grouped, table_of
+from experiments.judging.jobs import Tables, answer_of, grouped, tables_of
 from experiments.judging.results import Results
 from experiments.judging.verdict import Profile
 from experiments.runs.experiment import Experiment
@@ -41,8 +41,8 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
         print(f"{name}: left out, {reason}", file=sys.stderr)
     present = [e for e in experiments if e.estimator_name not in absent]
     drives = grouped(present, lambda e: (e.choices["world"], e.seed))
-    table = table_of(runs, [(drive,) for drive in drives], on_progress)
-    out.write_tables(runs=table, methods=methods(table))
+    made = tables_of(runs, [(drive,) for drive in drives], on_progress)
+    out.write_tables(**made, methods=methods(made["runs"]))
     if absent:
         named = pd.DataFrame({"estimator": list(absent), "reason": list(absent.values())})
         out.write_tables(missing=named)
@@ -63,15 +63,14 @@ def missing(experiment: Experiment) -> str:
     return ""
 
 
-def runs(drive: list[Experiment]) -> Iterator[Row]:
+def runs(drive: list[Experiment]) -> Tables:
     """Rows of all methods on one recording."""
-    for one in drive:
-        labels: Row = {
-            "world": one.choices["world"],
-            "seed": one.seed,
-            "estimator": one.estimator_name,
-        }
-        yield {**labels, **answer_of(one, _KEPT)}
+    return {"runs": [{**_labels(one), **answer_of(one, _KEPT)} for one in drive]}
+
+
+def _labels(one: Experiment) -> Row:
+    """Columns that name a run."""
+    return {"world": one.choices["world"], "seed": one.seed, "estimator": one.estimator_name}
 
 
 def methods(table: pd.DataFrame) -> pd.DataFrame:

@@ -8,8 +8,7 @@ import numpy as np
 import pandas as pd
 
 from experiments.evaluation.statistics import Interval
-from experiments.judging.results import Results
-from experiments.judging.verdict import (
+from experiments.judging.by_words import (
     Claim,
     Conclusion,
     Role,
@@ -24,6 +23,7 @@ from experiments.judging.verdict import (
     remarked,
     shown,
 )
+from experiments.judging.results import Results
 from experiments.studies.real_logs.settings import FUSION, INTEL, LOGGED, MRCLAM_CHOSEN
 
 

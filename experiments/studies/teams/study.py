@@ -19,7 +19,7 @@ import pandas as pd
 from estimators.landmarks.ekf_slam import EkfSlam
 from estimators.team import Communication, run_team
 from experiments.evaluation.metrics import score
-from experiments.judging.jobs import answer_of, table_of
+from experiments.judging.jobs import Tables, answer_of, tables_of
 from experiments.judging.logs import CALIBRATED_S, MRCLAM_6, calibration_by_truth, known_start
 from experiments.judging.results import Results
 from experiments.judging.verdict import Profile
@@ -61,22 +61,23 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
         for option, n_worlds in settings.WORLDS[profile].items()
         for seed in range(settings.FIRST_SEED, settings.FIRST_SEED + n_worlds)
     ]
-    out.write_tables(errors=table_of(rows_of, jobs, on_progress))
+    out.write_tables(**tables_of(rows_of, jobs, on_progress))
     if MRCLAM_6.exists():
         out.write_tables(mrclam=pd.DataFrame(mrclam_rows(MRCLAM_6)))
     out.write_arrays("drive", **drive(settings.FIRST_SEED))
 
 
-def rows_of(seed: int, option: str) -> Iterator[Row]:
+def rows_of(seed: int, option: str) -> Tables:
     """Rows of an estimator's runs in one world, for each size of the team."""
+    rows: list[Row] = []
     whole = TeamExperiment(composed(seed, {})).recording()
     for size in settings.SIZES:
         team = functools.partial(whole.first, size)
         for overrides, labels in _arms(size, option):
             found = answer_of(composed(seed, overrides), _KEPT, team)
-            yield {"seed": seed, "size": size, "filter": option, **labels} | {
-                _KEPT[name]: value for name, value in found.items()
-            }
+            shared = {"seed": seed, "size": size, "filter": option, **labels}
+            rows.append(shared | {_KEPT[name]: value for name, value in found.items()})
+    return {"errors": rows}
 
 
 def _arms(size: int, option: str) -> Iterator[tuple[dict[str, Any], Row]]:

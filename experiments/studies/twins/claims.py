@@ -9,8 +9,7 @@ import pandas as pd
 from scipy import stats
 
 from experiments.evaluation.statistics import Interval, mean_interval, share_interval
-from experiments.judging.results import Results
-from experiments.judging.verdict import (
+from experiments.judging.by_words import (
     Claim,
     Conclusion,
     banded,
@@ -22,6 +21,7 @@ from experiments.judging.verdict import (
     plain,
     shown,
 )
+from experiments.judging.results import Results
 from experiments.studies.twins.settings import LEAST_SHARE, SHOWN
 
 _HELD, _OTHERS = "pairs held by the log's own twin", "by a twin of another log"

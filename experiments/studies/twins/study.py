@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from experiments.evaluation.metrics import score
-from experiments.judging.jobs import table_of
+from experiments.judging.jobs import Tables, tables_of
 from experiments.judging.logs import known_start
 from experiments.judging.results import Results
 from experiments.judging.verdict import Profile
@@ -51,9 +51,9 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
     }
     seeds = range(FIRST_SEED, FIRST_SEED + RUNS[profile])
     jobs = [(log, seed, runs) for log in LOGS for seed in (None, *seeds)]
-    table = table_of(errors, jobs, on_progress)
-    pairs = predicted(table)
-    out.write_tables(runs=table, pairs=pairs, others=of_others(pairs))
+    made = tables_of(errors, jobs, on_progress)
+    pairs = predicted(made["runs"])
+    out.write_tables(**made, pairs=pairs, others=of_others(pairs))
 
 
 @functools.lru_cache(maxsize=1)
@@ -63,16 +63,17 @@ def twin_of(log: str) -> Twin:
     return make_twin(read_any(paths, robot))
 
 
-def errors(log: str, seed: int | None, runs: dict[str, dict[str, Experiment]]) -> list[Row]:
+def errors(log: str, seed: int | None, runs: dict[str, dict[str, Experiment]]) -> Tables:
     """Error of each estimator on a simulation of a log's second half; seed None: on the log."""
     twin = twin_of(log)
     kind = SCANS if twin.grid is not None else LANDMARKS
     recording = twin.rest if seed is None else twin.simulated(seed)
     about: Row = {"log": log, "kind": kind, "seed": -1 if seed is None else seed}
-    return [
+    rows = [
         {**about, "method": name, "status": recording.status, **_error(twin, run, recording, seed)}
         for name, run in runs[kind].items()
     ]
+    return {"runs": rows}
 
 
 def _error(twin: Twin, run: Experiment, recording: Recording, seed: int | None) -> Row:

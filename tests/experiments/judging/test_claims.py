@@ -7,8 +7,10 @@ import pandas as pd
 import pytest
 
 from experiments.evaluation.statistics import Interval
+from experiments.judging.by_words import conclude, lower
+from experiments.judging.claim import Subject
 from experiments.judging.claims_file import COLUMNS, read_claims, write_claims
-from experiments.judging.verdict import Profile, Verdict, conclude, lower, overall
+from experiments.judging.verdict import Profile, Verdict, overall
 from experiments.papers.gil2008 import claims as gil2008
 from experiments.papers.maximo2024 import claims as maximo2024
 from experiments.papers.puzzlebot2024 import claims, study
@@ -216,7 +218,7 @@ def write(judged, path, paper="puzzlebot2024"):
 def test_writing_keeps_other_papers_rows(tmp_path):
     path = tmp_path / "claims.csv"
     one = claims.pb1()[0]
-    write([dataclasses.replace(one, id="XX1")], path, "another")
+    write([dataclasses.replace(one, about=Subject("XX1", ""))], path, "another")
     write([one], path)
     write([dataclasses.replace(one, found=Interval.exact(0.5))], path)
     frame = pd.read_csv(path)
@@ -244,7 +246,7 @@ def test_statistics_of_a_claim_stay_in_the_order_given(tmp_path):
     path = tmp_path / "claims.csv"
     first = claims.pb1()[0]
     given = [dataclasses.replace(first, statistic=s) for s in ("the headline", "a detail")]
-    write([dataclasses.replace(first, id="PB2"), *given], path)
+    write([dataclasses.replace(first, about=Subject("PB2", "")), *given], path)
     assert read_claims(path)["statistic"].tolist()[:2] == ["the headline", "a detail"]
 
 

@@ -9,8 +9,8 @@ import pytest
 
 from experiments import reproduce as module
 from experiments.evaluation.statistics import Interval
+from experiments.judging.by_words import Claim, Verdict, conclude
 from experiments.judging.claims_file import read_claims, read_verdicts
-from experiments.judging.verdict import Claim, Verdict, conclude
 from experiments.runs.row import write_frame
 from experiments.viewing.style import figure
 from sim.errors import InputError

@@ -8,6 +8,20 @@ import pandas as pd
 import pytest
 
 from experiments.evaluation.statistics import Interval, mean_interval
+from experiments.judging.by_words import (
+    Claim,
+    Conclusion,
+    Role,
+    Verdict,
+    banded,
+    beside,
+    conclude,
+    more_to_settle,
+    percent,
+    pick,
+    plain,
+    shown,
+)
 from experiments.judging.claims_file import (
     VERDICT_COLUMNS,
     read_claims,
@@ -16,24 +30,9 @@ from experiments.judging.claims_file import (
     write_claims,
     write_verdicts,
 )
+from experiments.judging.folders import findings
 from experiments.judging.results import Results
-from experiments.judging.verdict import (
-    Claim,
-    Conclusion,
-    Profile,
-    Role,
-    Verdict,
-    banded,
-    beside,
-    conclude,
-    headline_verdict,
-    more_to_settle,
-    percent,
-    pick,
-    plain,
-    shown,
-)
-from experiments.report.contents import findings
+from experiments.judging.verdict import Profile, headline_verdict
 from experiments.reproduce import LOGS, NAMED, PAPERS, _judgement
 from experiments.runs.paths import SOURCE
 from sim.errors import InputError

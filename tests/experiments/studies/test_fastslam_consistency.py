@@ -31,7 +31,7 @@ def test_rows_hold_the_nees_at_distances(runs, monkeypatch):
     monkeypatch.setattr(Experiment, "recording", lambda self: driven)
     monkeypatch.setattr(study, "DISTANCES_M", (2.0, 4.0, 1000.0))
     chosen = [r for r in runs if r.seed == 1000 and r.estimator_name in ("ekf_slam", "smoother")]
-    rows = pd.DataFrame(study.rows_of(chosen))
+    rows = pd.DataFrame(study.rows_of(chosen)["nees"])
     assert set(rows["filter"]) == {"ekf_slam", "batch"}
     assert np.isnan(rows["nees"][rows["distance_m"] == 1000.0]).all()  # it never came so far
     near = rows["nees"][rows["distance_m"] < 10.0]

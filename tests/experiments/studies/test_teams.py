@@ -6,7 +6,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from experiments.judging.claim import select_all
+from experiments.judging.folders import findings
 from experiments.judging.results import Results
+from experiments.judging.sentences import conclude
 from experiments.judging.verdict import Role, Verdict
 from experiments.studies.teams import claims, figures, settings
 
@@ -31,13 +34,18 @@ def table_of(ratio, n_worlds=30, spread=0.4, seed=0):
 
 
 def headlines(table):
-    return [claim for claim in claims.gi9(table) if claim.role is Role.HEADLINE]
+    return select_all(list(claims.gi9(table)), role=Role.HEADLINE)
+
+
+def concluded(found):
+    [conclusion] = conclude(found, findings("teams"))
+    return conclusion
 
 
 def test_gi9_is_one_statistic_for_each_size_by_the_papers_method():
     found = headlines(table_of(0.5))
     assert len(found) == len(settings.SIZES)
-    assert all("FastSLAM" in claim.statistic for claim in found)
+    assert {claim.about.method for claim in found} == {"fastslam"}
     assert {claim.verdict for claim in found} == {Verdict.REPRODUCED}
     assert all(0.4 < claim.found.value < 0.6 for claim in found)
 
@@ -49,12 +57,11 @@ def test_gi9_can_fail():
     mixed = table_of(0.5)
     worse = (mixed["size"] == 4) & (mixed["filter"] == "fastslam") & mixed["sightings"]
     mixed.loc[worse, "ate_rmse_m"] *= 6.0
-    [conclusion] = claims.conclusions(None, list(claims.gi9(mixed)))
-    assert conclusion.verdict is Verdict.NOT_REPRODUCED
+    assert concluded(claims.gi9(mixed)).verdict is Verdict.NOT_REPRODUCED
 
 
 def test_what_communication_costs():
-    costs = [c for c in claims.gi9(table_of(0.5)) if "communication" in c.statistic]
+    costs = select_all(list(claims.gi9(table_of(0.5))), quantity="communication")
     assert len(costs) == len(settings.LINKS)
     assert [c.found.value for c in costs] == pytest.approx([2.0] * len(costs))
 
@@ -68,13 +75,12 @@ def test_the_sentence_says_the_factors(tmp_path):
     ]
     made.write_tables(errors=table_of(0.5), mrclam=pd.DataFrame(log))
     found = claims.judge(made)
-    [conclusion] = claims.conclusions(made, found)
+    conclusion = concluded(found)
     assert conclusion.verdict is Verdict.REPRODUCED
     assert "with 2 robots," in conclusion.sentence
     assert "On MRCLAM 6 a team of five errs 0.33 times a robot alone." in conclusion.sentence
-    bare = [c for c in found if "MRCLAM" not in c.statistic]
-    [conclusion] = claims.conclusions(made, bare)
-    assert "MRCLAM" not in conclusion.sentence
+    bare = [c for c in found if c.about.quantity != "MRCLAM 6"]
+    assert "MRCLAM" not in concluded(bare).sentence
 
 
 def test_figures_draw(tmp_path):
