@@ -47,7 +47,7 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
     """
     jobs = [
         (settings.FIRST_SEED + i, strategy)
-        for strategy in settings.STRATEGIES
+        for strategy in settings.NAMES
         for i in range(settings.WORLDS[profile])
     ]
     out.write_tables(**tables_of(tables_from, jobs, on_progress))

@@ -79,9 +79,10 @@ def starts(experiment: Experiment, n_starts: int) -> Tables:
     Returns
     -------
     Tables
-        `starts`, a row a start: `seed`, `start`; where, `x_m`, `y_m`; `localised`; the travel after which the
-        belief is near and stays near for 10 m, `found_m` (infinite: never within 30 m); `error_m`,
-        `error_deg` at the end; `near_share` of the Frames after it was found; `particles_mean`.
+        `starts`, a row a start: `seed`, `start`; where, `x_m`, `y_m`; `localised`; the travel after
+        which the belief is near and stays near for 10 m, `found_m` (infinite: never within 30 m);
+        `error_m`, `error_deg` at the end; `near_share` of the Frames after it was found;
+        `particles_mean`.
 
     Raises
     ------

@@ -50,6 +50,7 @@ from experiments.studies.real_logs.settings import (
     LEGO_START_RAD,
     MRCLAM,
     MRCLAM_DRAWN,
+    MRCLAM_METHODS,
     MRCLAM_ROBOTS,
     RAWSEEDS,
     TUNED_ROBOTS,
@@ -234,7 +235,7 @@ def landmark_slam(
         for kind, n_seeds in seeds.items()
         for robot, by_method in runs.items()
         for method, run in by_method.items()
-        if method.startswith(kind)
+        if MRCLAM_METHODS[method][0] == kind
         for seed in range(n_seeds)
     ]
     truth = runs[DRAWN_ROBOT][MRCLAM[1]].recording().known_truth
