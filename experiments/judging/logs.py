@@ -111,7 +111,7 @@ def calibrated_by_scans(recording: Recording, until_s: float) -> Recording:
     estimate, _ = tracked(matcher, recording)
     stamps, wheels = recording.log("laser").stamps, recording.wheels
     rows = np.searchsorted(estimate.stamps, stamps)
-    poses, travel = estimate.means[rows], _wheels_at(wheels, stamps)
+    poses, travel = estimate.means[rows], wheels.at(stamps)
     status = np.array([str(estimate.extras["registration_status"][i]) for i in rows])
     trusted = (status[1:] == "ok") & (stamps[1:] < until_s)
     log = WheelLaserLog(
@@ -141,8 +141,3 @@ def calibration_by_truth(recording: Recording) -> Calibration:
         for name, belief in found.sensors.items()
     }
     return dataclasses.replace(found, sensors=sensors)
-
-
-def _wheels_at(wheels: WheelLog, stamps: Array) -> Array:
-    """Wheel positions (N, 2) interpolated at stamps (N,), m."""
-    return np.stack([np.interp(stamps, wheels.stamps, p) for p in wheels.position_m.T], axis=1)

@@ -65,12 +65,12 @@ def missing(experiment: Experiment) -> str:
 
 def runs(drive: list[Experiment]) -> Tables:
     """Rows of all methods on one recording."""
-    return {"runs": [{**_labels(one), **answer_of(one, _KEPT)} for one in drive]}
-
-
-def _labels(one: Experiment) -> Row:
-    """Columns that name a run."""
-    return {"world": one.choices["world"], "seed": one.seed, "estimator": one.estimator_name}
+    rows: list[Row] = [
+        {"world": one.choices["world"], "seed": one.seed, "estimator": one.estimator_name}
+        | answer_of(one, _KEPT)
+        for one in drive
+    ]
+    return {"runs": rows}
 
 
 def methods(table: pd.DataFrame) -> pd.DataFrame:

@@ -7,7 +7,7 @@ import pytest
 from experiments import reproduce
 from experiments.judging.verdict import Profile
 from experiments.runs.experiment import Experiment
-from experiments.studies.fastslam_consistency import figures, settings, study
+from experiments.studies.fastslam_consistency import figures, study
 from tests.fixtures.fakes import circle
 
 
@@ -23,7 +23,7 @@ def test_arms_differ_in_nothing_but_the_filter(runs):
     assert all(each == settings_of[0] for each in settings_of)
     labels = [tuple(study.labels_of(run).values()) for run in one_seed]
     assert len(set(labels)) == len(labels)  # each arm has a name of its own
-    assert max(run.config["estimator"].get("n_particles", 0) for run in runs) <= settings.MAX_QUICK
+    assert max(run.config["estimator"].get("n_particles", 0) for run in runs) <= study.MAX_QUICK
 
 
 def test_rows_hold_the_nees_at_distances(runs, monkeypatch):
