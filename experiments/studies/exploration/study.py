@@ -25,7 +25,6 @@ from experiments.studies.exploration import settings
 from experiments.viewing.team_figure import drive_of
 from sim import se2
 from sim.arrays import Array
-from sim.recording import Recording
 from sim.sensors.laser import Laser
 from sim.team import Team
 from sim.worlds.grid import rasterized
@@ -110,11 +109,6 @@ def coverage(team: Team, resolution_m: float) -> tuple[Array, Array]:
                 poses = se2.compose(robot.truth_at(log.stamps[rows]), laser.mount.pose)
                 grid.add(poses, ranges_m.astype(np.float32), laser.bearings_rad, laser.max_range_m)
         area_m2.append(resolution_m**2 * np.count_nonzero(floor & (grid.last_scan > 0)))
-    driven_m = np.mean([_driven_m(robot, stamps) for robot in team.robots], axis=0)
-    return driven_m, np.array(area_m2)
-
-
-def _driven_m(robot: Recording, stamps: Array) -> Array:
-    """True length (T,) m of a robot's path up to each stamp."""
-    truth = robot.known_truth
-    return np.asarray(np.interp(stamps, truth.stamps, travelled_m(truth.poses)))
+    truths = [robot.known_truth for robot in team.robots]
+    driven_m = [np.interp(stamps, own.stamps, travelled_m(own.poses)) for own in truths]
+    return np.mean(driven_m, axis=0), np.array(area_m2)

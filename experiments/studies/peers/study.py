@@ -79,9 +79,10 @@ def methods(table: pd.DataFrame) -> pd.DataFrame:
     Errors are geometric means over the recordings, a failed run counting as 100 m; `over_best_ours`
     is the paired ratio to the best of ours for that sensor with its 95 % interval.
     """
-    failed = (table["status"] == Outcome.FAILED) | ~np.isfinite(table[_ERROR].astype(float))
-    errors_m = table[_ERROR].astype(float).where(~failed, FAILED_M)
-    wide = table.assign(e=errors_m).pivot(index=["world", "seed"], columns="estimator", values="e")
+    errors_m = table[_ERROR].astype(float)
+    failed = (table["status"] == Outcome.FAILED) | ~np.isfinite(errors_m)
+    kept = table.assign(e=errors_m.where(~failed, FAILED_M))
+    wide = kept.pivot(index=["world", "seed"], columns="estimator", values="e")
     means_m = np.exp(np.log(wide).mean())
     by_world = np.exp(np.log(wide).groupby("world").mean())
     times = table.groupby("estimator")["cpu_time_us"].median()

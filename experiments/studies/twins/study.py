@@ -17,7 +17,6 @@ from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
 from experiments.runs.seeds import stream
 from experiments.studies.twins.settings import (
-    DEAD_RECKONING,
     FIRST_SEED,
     LANDMARKS,
     LOGS,
@@ -25,7 +24,7 @@ from experiments.studies.twins.settings import (
     RUNS,
     SCANS,
     WIDEST,
-    WIDEST_RECKONING,
+    WIDEST_OTHERS,
 )
 from experiments.sweeps.plan import planned
 from experiments.twin.make import Twin, make_twin
@@ -94,7 +93,6 @@ def predicted(runs: pd.DataFrame) -> pd.DataFrame:
         real = group[group.seed < 0].iloc[0]
         simulated = group[group.seed >= 0].ate_rmse_m.to_numpy(float)
         low, median, high = np.quantile(simulated, [0.025, 0.5, 0.975])
-        widest = WIDEST_RECKONING if method == DEAD_RECKONING else WIDEST
         rows.append(
             {
                 "log": log,
@@ -105,7 +103,7 @@ def predicted(runs: pd.DataFrame) -> pd.DataFrame:
                 "low_m": low,
                 "high_m": high,
                 "inside": bool(low <= real.ate_rmse_m <= high),
-                "narrow": bool(high <= widest * low),
+                "narrow": bool(high <= WIDEST.get(str(method), WIDEST_OTHERS) * low),
                 "nees": real.nees_mean,
                 "nees_median": float(np.median(group[group.seed >= 0].nees_mean)),
                 "n": len(simulated),
@@ -116,10 +114,7 @@ def predicted(runs: pd.DataFrame) -> pd.DataFrame:
 
 def of_others(pairs: pd.DataFrame) -> pd.DataFrame:
     """A row a log and the twin of another log of its kind: the share of errors that it holds."""
-    rows: list[Row] = []
-    for (log, kind), real in pairs.groupby(["log", "kind"], sort=False):
-        for other, twin in pairs[pairs.kind == kind].groupby("log", sort=False):
-            both = real.merge(twin, on="method", suffixes=("", "_twin"))
-            held = (both.low_m_twin <= both.error_m) & (both.error_m <= both.high_m_twin)
-            rows.append({"log": log, "twin": other, "held": int(held.sum()), "pairs": len(both)})
-    return pd.DataFrame(rows)
+    both = pairs.merge(pairs, on=["kind", "method"], suffixes=("", "_twin"))
+    both["held"] = (both.low_m_twin <= both.error_m) & (both.error_m <= both.high_m_twin)
+    by_logs = both.groupby(["log", "log_twin"], sort=False).held.agg(held="sum", pairs="size")
+    return by_logs.reset_index(names=["log", "twin"])
