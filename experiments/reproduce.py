@@ -19,6 +19,7 @@ from experiments.judging.claims_file import (
     write_verdicts,
 )
 from experiments.judging.folders import code_folder, findings
+from experiments.judging.logs import missing
 from experiments.judging.results import Results
 from experiments.judging.sentences import Conclusion, conclude
 from experiments.judging.verdict import Profile, Verdict
@@ -58,7 +59,7 @@ def reproduce(*, full: bool = False, only: str | None = None) -> None:
     lines = []
     for paper in _chosen(only):
         begun = time.monotonic()
-        if paper in LOGS and (why := _part(paper, "study").missing()):
+        if paper in LOGS and (why := missing()):
             print(f"{paper}: left out, {why}", file=sys.stderr)
             continue
         conclusions = reproduce_paper(paper, profile)
@@ -126,10 +127,7 @@ def folder_of(profile: Profile) -> Path:
 
 def judgement(made: Results) -> tuple[list[Claim], list[Conclusion]]:
     """Statistics of a paper's claims by its tables, and the one verdict on each claim."""
-    module = _part(made.paper, "claims")
-    claims = module.judge(made)
-    if hasattr(module, "conclusions"):
-        return claims, module.conclusions(made, claims)
+    claims = _part(made.paper, "claims").judge(made)
     return claims, conclude(claims, findings(made.paper))
 
 

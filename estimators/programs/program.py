@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from estimators.peers import MissingPackageError
 from sim.arrays import Array
 from sim.errors import InputError, printable, require
 from sim.worlds.grid import OccupancyGrid
@@ -42,7 +43,7 @@ def words_of(command: Any) -> list[str]:
     Raises
     ------
     InputError
-        If it is neither, or there is no such program.
+        If it is neither; MissingPackageError if there is no such program.
     """
     try:
         words = shlex.split(command) if isinstance(command, str) else command
@@ -55,10 +56,10 @@ def words_of(command: Any) -> list[str]:
         f"{command!r}",
     )
     remedy = "`make peers` compiles it" if words[0] == PEERS_PROGRAM else "give its path"
-    require(
-        shutil.which(words[0]),
-        f"estimator.command: no program {words[0]} that can be run; {remedy}",
-    )
+    if shutil.which(words[0]) is None:
+        raise MissingPackageError(
+            f"estimator.command: no program {words[0]} that can be run; {remedy}"
+        )
     return list(words)
 
 

@@ -1,6 +1,6 @@
 """The jobs of a study: which runs go together, how all cores share them, and their tables."""
 
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from itertools import chain
 from typing import Any, TypeVar
 
@@ -9,7 +9,11 @@ import pandas as pd
 from joblib import Parallel, delayed
 from numpy.typing import ArrayLike
 
+from experiments.runs.evaluate import evaluate
+from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
+from experiments.sweeps.collect import with_answers
+from sim.team import Team
 
 T = TypeVar("T")
 Tables = Mapping[str, Sequence[Row] | pd.DataFrame]  # rows by the table's name
@@ -55,6 +59,22 @@ def _joined(parts: list[Any]) -> pd.DataFrame:
     if isinstance(parts[0], pd.DataFrame):
         return pd.concat(parts, ignore_index=True)
     return pd.DataFrame(list(chain.from_iterable(parts)))
+
+
+def answer_of(
+    experiment: Experiment, names: Collection[str], fetch: Callable[[], Team] | None = None
+) -> Row:
+    """Those columns of an experiment's one row, or of its best answer, that it has.
+
+    Parameters
+    ----------
+    names
+        As for `experiments.sweeps.collect.with_answers`.
+    fetch
+        As for `experiments.runs.evaluate.evaluate`.
+    """
+    found = with_answers(pd.DataFrame(evaluate(experiment, fetch)), list(names)).iloc[0]
+    return {name: found[name] for name in names if name in found}
 
 
 def grouped(runs: Iterable[T], key: Callable[[T], Hashable]) -> list[list[T]]:

@@ -130,6 +130,10 @@ class Experiment:
         """Return the experiment with other values of keys of its estimator."""
         return self.replaced(estimator={**self.config["estimator"], **settings})
 
+    def option(self, name: str, default: Any = None) -> Any:
+        """An option of the estimator; `default` if it has none of this name."""
+        return self.config["estimator"].get(name, default)
+
     def over(self, recording: Recording) -> Experiment:
         """Return the experiment over a recording in memory, identified by its checksum."""
         require(

@@ -72,8 +72,8 @@ def way_of(recording: Recording, stamps: Array, poses: Array) -> tuple[Array, Ar
             rows.append(row)
     stamps, poses = stamps[rows], poses[rows]
     times = np.unique(np.concatenate([np.arange(stamps[0], stamps[-1], STEP_S), stamps]))
-    travel = np.stack([np.interp(times, wheels.stamps, p) for p in wheels.position_m.T], axis=1)
-    rolled = se2.chain(arc_increment(np.diff(travel, axis=0), recording.robot.track_m))
+    travel_m = wheels.at(times)
+    rolled = se2.chain(arc_increment(np.diff(travel_m, axis=0), recording.robot.track_m))
     knots = np.searchsorted(times, stamps)
     before = np.clip(np.searchsorted(stamps, times, side="right") - 1, 0, len(stamps) - 2)
     by_wheels = se2.between(rolled[knots[:-1]], rolled[knots[1:]])

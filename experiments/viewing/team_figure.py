@@ -1,5 +1,6 @@
 """A team at a glance: paths and sightings in the world, and each robot's error."""
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -11,7 +12,7 @@ from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from estimators.base import Estimate
-from experiments.evaluation.metrics import position_errors_m
+from experiments.evaluation.metrics import position_errors_m, travelled_m
 from experiments.viewing.plotting import plan_axes
 from experiments.viewing.style import BLACK, PURPLE, SERIES, TRUTH, subplots
 from experiments.viewing.world import draw_walls, draw_world
@@ -60,6 +61,16 @@ def draw_sightings(ax: Axes, lines: Array, number: int) -> None:
     """Draw a robot's sightings (S, 2, 2), m, in map."""
     colour = colour_of(number)
     ax.add_collection(LineCollection(list(lines), colors=colour, lw=0.5, alpha=0.6, zorder=1))
+
+
+def drive_of(robots: Sequence[Recording], until_m: float = math.inf) -> dict[str, Array]:
+    """Arrays for `draw_paths`: the walls, and true paths until a distance driven, m."""
+    world = robots[0].known_world
+    arrays: dict[str, Array] = {"walls": world.walls, "wall_z_m": world.wall_z_m}
+    for number, robot in enumerate(robots):
+        poses = robot.known_truth.poses
+        arrays[f"truth_{number}"] = poses[travelled_m(poses) <= until_m, :2]
+    return arrays
 
 
 def draw_paths(ax: Axes, run: Mapping[str, Array]) -> None:

@@ -27,6 +27,7 @@ from experiments.evaluation.metrics import (
 )
 from experiments.evaluation.registration_errors import METRICS, measured, scenes
 from experiments.judging.jobs import Tables, grouped, tables_of
+from experiments.judging.logs import DATA
 from experiments.judging.results import Results
 from experiments.judging.verdict import Profile
 from experiments.papers.decristoforis2020.claims import judged_runs
@@ -47,7 +48,6 @@ from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome, Row
 from experiments.runs.seeds import stream
-from experiments.studies.real_logs.settings import DATA
 from experiments.sweeps.plan import planned
 from sim.arrays import Array
 from sim.recording import Recording

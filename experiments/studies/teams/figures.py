@@ -4,7 +4,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from experiments.evaluation.statistics import log_ratio_interval
@@ -50,8 +49,8 @@ def by_size(errors: pd.DataFrame) -> Figure:
             (False, "--", "without sightings"),
             (True, "-", "with sightings"),
         ):
-            label = f"{NAMES[name]}, {words}"
-            _line(left, medians.index, medians[seen], label, colour, marker, line)
+            style = {"marker": marker, "color": colour, "ms": 4.5, "lw": 1.4}
+            left.plot(medians.index, medians[seen], line, label=f"{NAMES[name]}, {words}", **style)
         ratios = {size: log_ratio_interval(w[True], w[False]) for size, w in wide.groupby("size")}
         for size, ratio in ratios.items():
             draw_interval(right, size + 0.06 * (k - 1), ratio, marker=marker, color=colour, ms=6)
@@ -82,7 +81,3 @@ def by_link(errors: pd.DataFrame) -> Figure:
     ax.set_xlabel("communication (dot: a world; bar: median)", labelpad=20)
     plain_log(ax.yaxis)
     return page
-
-
-def _line(ax: Axes, x: Any, y: Any, label: str, colour: str, marker: str, line: str) -> None:
-    ax.plot(x, y, line, marker=marker, color=colour, ms=4.5, lw=1.4, label=label)

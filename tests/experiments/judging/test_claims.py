@@ -15,7 +15,6 @@ from experiments.papers.maximo2024 import claims as maximo2024
 from experiments.papers.puzzlebot2024 import claims, study
 from experiments.papers.puzzlebot2024.descent import gradient_descent
 from experiments.papers.puzzlebot2024.settings import NOMINAL
-from experiments.studies.real_logs import claims as real_logs
 from sim.errors import InputError
 from tests.fixtures.claims import concluded
 
@@ -294,75 +293,6 @@ def test_verdicts_are_whole_words():
     for wrong in ("reproducedX", "Reproduced", "not reproduced", "", "reproduced?"):
         with pytest.raises(ValueError, match="not a valid Verdict"):
             Verdict(wrong)
-
-
-def test_rl2_judges_after_the_tuned_part_and_shows_the_whole():
-    methods = ("odometry, as logged", "odometry, calibrated", "ICP alone", "ICP from the wheels")
-    rows = [
-        ("intel", method, part, mean, fused - mean, fused - mean - 0.1, fused - mean + 0.1, 10)
-        for part, fused in (("judged", 0.1), ("all", 9.0))
-        for method, mean in (*((m, 1.0) for m in methods), ("EKF of wheels and ICP", fused))
-    ]
-    differences = [f"difference_{name}_m" for name in ("mean", "low", "high")]
-    columns = ["log", "method", "part", "translation_mean_m", *differences, "difference_minutes"]
-    said = list(real_logs.rl2(pd.DataFrame(rows, columns=columns)))
-    assert [c.verdict for c in said] == ["reproduced"] * 4 + ["shown"] * 4
-    assert said[0].reason == "fusion 0.100 m, the other 1.000 m"
-    assert [c.role for c in said[:4]] == ["beside", "headline", "headline", "headline"]
-    assert all("the whole log" in c.statistic for c in said[4:])
-
-
-def test_rl2_judges_the_paired_difference():
-    def judged(low, high):
-        table = pd.DataFrame(
-            {
-                "log": "intel",
-                "method": ["EKF of wheels and ICP", *real_logs.INTEL[1:5]] * 2,
-                "part": np.repeat(["judged", "all"], 5),
-                **dict.fromkeys([f"translation_{e}_m" for e in ("mean", "low", "high")], 1.0),
-                "difference_mean_m": (low + high) / 2.0,
-                "difference_low_m": low,
-                "difference_high_m": high,
-                "difference_minutes": 10,
-            }
-        )
-        return list(real_logs.rl2(table))[:4]
-
-    assert {c.verdict for c in judged(-0.2, -0.1)} == {"reproduced"}
-    assert {c.verdict for c in judged(0.1, 0.2)} == {"not_reproduced"}
-    open_ones = judged(-0.2, 0.1)
-    assert {(c.verdict, c.more) for c in open_ones} == {("undecided", 80)}  # 9 times as long
-    assert open_ones[0].statistic.startswith("translational error of EKF of wheels and ICP less")
-
-
-def test_rl1_rl4_and_rl5_can_fail():
-    ate = pd.DataFrame({"ate_m": [0.1491, 0.2272], "printed_m": ["0.149", "0.227"]})
-    assert real_logs.rl1(ate)[0].verdict == "reproduced"
-    assert real_logs.rl1(ate.assign(ate_m=[0.1496, 0.2272]))[0].verdict == "not_reproduced"
-    wheels = pd.DataFrame({"value": [0.0415, 0.0880], "published": [0.0414, 0.0880]})
-    lego = pd.DataFrame({"case": ["geometric width", "calibrated"], "rms_m": [0.6, 0.04]})
-    assert {c.verdict for c in real_logs.rl4(wheels, lego)} == {"reproduced"}
-    far, late = wheels.assign(value=[0.0420, 0.0880]), lego.assign(rms_m=[0.6, 0.11])
-    assert {c.verdict for c in real_logs.rl4(far, late)} == {"not_reproduced"}
-    wean = pd.DataFrame({"one_means": ["free", "occupied"], "score": [0.5, 0.2]})
-    assert real_logs.rl5(wean)[0].verdict == "reproduced"
-    assert real_logs.rl5(wean.assign(score=[0.5, 0.45]))[0].verdict == "not_reproduced"
-
-
-def test_rl3_wants_every_robot():
-    rows = [(r, "dead reckoning, calibrated", 1.0) for r in (1, 2, 3)]
-    rows += [(r, "good", 0.5) for r in (1, 2, 3)]
-    rows += [(1, "bad", 1.5), (2, "bad", 0.1), (3, "bad", 1.1), (3, "last", 1.1), (2, "last", 0.1)]
-    table = pd.DataFrame(rows, columns=["robot", "method", "ate_rmse_m"]).assign(judged=True)
-    said = {c.statistic.split()[2]: (c.verdict, c.reason) for c in real_logs.rl3(table)}
-    assert said == {
-        "good": ("reproduced", "robots 1, 2, 3"),
-        "bad": ("not_reproduced", "robots 1, 2, 3; not on robots 1, 3"),
-        "last": ("not_reproduced", "robots 2, 3; not on robot 3"),
-    }
-    table["judged"] = table["robot"] < 3  # robots on which the noise was chosen do not count
-    said = {c.statistic.split()[2]: c.verdict for c in real_logs.rl3(table)}
-    assert said == {"good": "reproduced", "bad": "not_reproduced", "last": "reproduced"}
 
 
 def test_intervals_of_two_one_sided_tests_are_named():
