@@ -66,8 +66,12 @@ def missing(experiment: Experiment) -> str:
 def runs(drive: list[Experiment]) -> Tables:
     """Rows of all methods on one recording."""
     rows: list[Row] = [
-        {"world": one.choices["world"], "seed": one.seed, "estimator": one.estimator_name}
-        | answer_of(one, _KEPT)
+        {
+            "world": one.choices["world"],
+            "seed": one.seed,
+            "estimator": one.estimator_name,
+            **answer_of(one, _KEPT),
+        }
         for one in drive
     ]
     return {"runs": rows}
