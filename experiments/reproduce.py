@@ -10,18 +10,19 @@ from collections import Counter
 from pathlib import Path
 from types import ModuleType
 
+from experiments.judging.claim import Claim
 from experiments.judging.claims_file import (
     note_provenance,
     read_claims,
-    read_provenance,
     read_verdicts,
     write_claims,
     write_verdicts,
 )
-from experiments.judging.folders import code_folder
+from experiments.judging.folders import code_folder, findings
+from experiments.judging.logs import missing
 from experiments.judging.results import Results
-from experiments.judging.verdict import Claim, Conclusion, Profile, Verdict
-from experiments.report.contents import findings
+from experiments.judging.sentences import Conclusion, conclude
+from experiments.judging.verdict import Profile, Verdict
 from experiments.report.page import write_report
 from experiments.runs.console import progress
 from experiments.runs.paths import results, short
@@ -58,7 +59,7 @@ def reproduce(*, full: bool = False, only: str | None = None) -> None:
     lines = []
     for paper in _chosen(only):
         begun = time.monotonic()
-        if paper in LOGS and (why := _part(paper, "study").missing()):
+        if paper in LOGS and (why := missing()):
             print(f"{paper}: left out, {why}", file=sys.stderr)
             continue
         conclusions = reproduce_paper(paper, profile)
@@ -98,27 +99,6 @@ def redraw(only: str | None = None) -> None:
         print(f"{paper}: {time.monotonic() - begun:.0f} s", file=sys.stderr)
 
 
-def judge_again(only: str | None = None) -> None:
-    """Judge the claims again, from the tables that the studies left, and write the report.
-
-    Raises
-    ------
-    InputError
-        If the tables are damaged.
-    """
-    place, made = results(), read_provenance(results())
-    for paper in _chosen(only):
-        if paper in OWN or not any((place / "tables").glob(f"{paper}_*.csv")):
-            continue
-        profile = Profile(made.get(paper, {}).get("profile", Profile.QUICK))
-        tables = Results(place, paper)
-        with tables.as_found():
-            claims, conclusions = _judgement(tables)
-        _write(claims, conclusions, place, paper, profile)
-        _print(conclusions)
-    write_report(place)
-
-
 def reproduce_paper(paper: str, profile: Profile) -> list[Conclusion]:
     """Run one paper's study, and put its files, claims, verdicts and origin in place.
 
@@ -132,7 +112,7 @@ def reproduce_paper(paper: str, profile: Profile) -> list[Conclusion]:
         with progress(paper, 1.0) as on_progress:
             _part(paper, "study").run(profile, made, on_progress)
         _draw(made)
-        claims, conclusions = ([], []) if paper in OWN else _judgement(made)
+        claims, conclusions = ([], []) if paper in OWN else judgement(made)
         for kind in ("tables", "arrays", "figures"):
             _put_in_place(made.folder / kind, place / kind, paper)
         _write(claims, conclusions, place, paper, profile)
@@ -145,11 +125,10 @@ def folder_of(profile: Profile) -> Path:
     return results() if profile is Profile.FULL else results() / "quick"
 
 
-def _judgement(made: Results) -> tuple[list[Claim], list[Conclusion]]:
-    """Statistics of a paper's claims, and the one verdict on each claim."""
-    module = _part(made.paper, "claims")
-    claims = module.judge(made)
-    return claims, module.conclusions(made, claims)
+def judgement(made: Results) -> tuple[list[Claim], list[Conclusion]]:
+    """Statistics of a paper's claims by its tables, and the one verdict on each claim."""
+    claims = _part(made.paper, "claims").judge(made)
+    return claims, conclude(claims, findings(made.paper))
 
 
 def _write(

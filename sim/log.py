@@ -22,6 +22,10 @@ class WheelLog:
     stamps: Array
     position_m: Array
 
+    def at(self, stamps: Array) -> Array:
+        """Wheel positions (T, 2) interpolated at stamps (T,), m."""
+        return np.stack([np.interp(stamps, self.stamps, p) for p in self.position_m.T], axis=1)
+
 
 @dataclass(frozen=True)
 class Log:

@@ -187,10 +187,7 @@ class Recording:
         at every Frame, so the interpolation is exact there.
         """
         stamps = self.frame_stamps
-        position = np.stack(
-            [np.interp(stamps, self.wheels.stamps, self.wheels.position_m[:, i]) for i in (0, 1)],
-            axis=1,
-        )
+        position = self.wheels.at(stamps)
         increments = np.diff(position, axis=0, prepend=position[:1])
         durations = np.diff(stamps, prepend=stamps[:1])
         increments.setflags(write=False)

@@ -7,7 +7,7 @@ from sim.errors import InputError
 
 
 class MissingPackageError(InputError):
-    """A peer's package is not installed."""
+    """A peer's package or program is not installed."""
 
 
 def package(name: str, extra: str) -> Any:

@@ -22,6 +22,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
+from estimators.peers import MissingPackageError
 from sim.arrays import Array
 from sim.errors import InputError, printable, require
 from sim.options import options
@@ -51,11 +52,11 @@ class ProgramOptions:
     """Whether `estima conform` compares it in distribution when the world is moved."""
 
     def __post_init__(self) -> None:
-        require(
-            shutil.which(name := self.words[0]),
-            f"estimator.command: no program {name} that can be run; "
-            f"{'`make peers` compiles it' if name == PEERS_PROGRAM else 'give its path'}",
-        )
+        if shutil.which(name := self.words[0]) is None:
+            remedy = "`make peers` compiles it" if name == PEERS_PROGRAM else "give its path"
+            raise MissingPackageError(
+                f"estimator.command: no program {name} that can be run; {remedy}"
+            )
 
     @cached_property
     def words(self) -> list[str]:

@@ -20,7 +20,6 @@ from experiments.calibration.reference import (
     reference_of,
     registered,
     spaced_rows,
-    travel_at,
     wheel_delay_s,
 )
 from experiments.calibration.sensor_noise import MAD, camera_noise, laser_noise
@@ -199,7 +198,7 @@ def _steps(wheels: WheelLog, reference: Reference, min_s: float) -> tuple[WheelL
         f"only {len(pairs)} motions of the wheels have a reference; give a longer log",
     )
     first, second = np.array(pairs).T
-    stamps, travel = reference.stamps, travel_at(wheels, reference.stamps)
+    stamps, travel = reference.stamps, wheels.at(reference.stamps)
     steps = WheelLaserLog(
         stamps[second] - stamps[first],
         2.0 * (travel[second] - travel[first]),  # of diameter 1, so that what is found are gains

@@ -112,11 +112,6 @@ def registered(recording: Recording, name: str) -> Reference:
     return Reference(Source.SCANS, found.stamps[rows], found.means[rows], np.array(sound, bool))
 
 
-def travel_at(wheels: WheelLog, stamps: Array) -> Array:
-    """Wheel positions (N, 2) interpolated at stamps (N,), m."""
-    return np.stack([np.interp(stamps, wheels.stamps, p) for p in wheels.position_m.T], axis=1)
-
-
 def wheel_delay_s(wheels: WheelLog, reference: Reference) -> Interval:
     """What to add to the stamps of the wheels so that they turn when the reference turns.
 
@@ -129,7 +124,7 @@ def wheel_delay_s(wheels: WheelLog, reference: Reference) -> Interval:
     joined &= np.diff(stamps) < 2.0
     turns = np.diff(heading)
     delays = np.arange(-LARGEST_DELAY_S, LARGEST_DELAY_S + 1e-9, _DELAY_STEP_S)
-    by_wheels = [np.diff(np.diff(travel_at(wheels, stamps - d), axis=1)[:, 0]) for d in delays]
+    by_wheels = [np.diff(np.diff(wheels.at(stamps - d), axis=1)[:, 0]) for d in delays]
     rolled = -np.array(by_wheels)
 
     def best(part: Ints) -> float:

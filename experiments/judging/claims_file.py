@@ -12,7 +12,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from experiments.judging.verdict import Claim, Conclusion, Profile, Role, Verdict
+from experiments.judging.claim import Claim
+from experiments.judging.sentences import Conclusion
+from experiments.judging.verdict import Profile, Role, Verdict
 from experiments.runs.row import read_rows, write_frame
 from experiments.runs.version import code_version, machine
 from sim.errors import InputError
@@ -53,7 +55,7 @@ def write_claims(
     The statistics of a claim stay in the order given.
     """
     origin = {"paper": paper, "profile": profile, "study": paper, "command": command}
-    rows = [{**vars(claim), **vars(claim.found), **origin} for claim in claims]
+    rows = [{**vars(claim), "id": claim.id, **vars(claim.found), **origin} for claim in claims]
     new = pd.DataFrame(rows, columns=list(COLUMNS)).astype(dict.fromkeys(_ENUMS, "str"))
     _replace(new, read_claims(path), path, paper)
 

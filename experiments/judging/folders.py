@@ -1,8 +1,10 @@
-"""Where the code of a paper or of a study of ours lies."""
+"""Where the code of a paper or of a study of ours lies, and what it says of its findings."""
 
 from pathlib import Path
+from typing import Any
 
 from experiments.runs.paths import SOURCE
+from sim.yaml_file import read_yaml
 
 ROOMS = tuple(SOURCE / "experiments" / room for room in ("papers", "studies"))
 
@@ -11,3 +13,15 @@ def code_folder(study: str) -> Path:
     """Folder of a paper's or a study's code, findings and settings; it need not exist."""
     folders = [room / study for room in ROOMS]
     return next((folder for folder in folders if folder.is_dir()), folders[0])
+
+
+def findings(study: str) -> dict[str, Any]:
+    """A study's findings in our words.
+
+    They are its `title`, `about`, `claims` and `sentences` by id, the `unit` that intervals narrow
+    with, and `figures` by file name.
+    """
+    path = code_folder(study) / "findings.yaml"
+    found = read_yaml(path) if path.exists() else {}
+    empty = {"title": study, "about": "", "claims": {}, "sentences": {}, "figures": {}}
+    return {**empty, **found}

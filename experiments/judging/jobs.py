@@ -1,19 +1,28 @@
-"""The jobs of a study: which runs go together, and how all cores share them."""
+"""The jobs of a study: which runs go together, how all cores share them, and their tables."""
 
-from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
+from itertools import chain
 from typing import Any, TypeVar
 
 import numpy as np
+import pandas as pd
 from joblib import Parallel, delayed
 from numpy.typing import ArrayLike
 
+from experiments.runs.evaluate import evaluate
+from experiments.runs.experiment import Experiment
+from experiments.runs.row import Row
+from experiments.sweeps.collect import with_answers
+from sim.team import Team
+
 T = TypeVar("T")
+Tables = Mapping[str, Sequence[Row] | pd.DataFrame]  # rows by the table's name
 
 
 def in_parallel(
     function: Callable[..., T],
     jobs: Sequence[Sequence[Any]],
-    on_progress: Callable[[float], None],
+    on_progress: Callable[[float], None] = lambda _: None,
     costs: ArrayLike | None = None,
 ) -> Iterator[T]:
     """Yield `function(*job)` for every job, in order, computed on all cores.
@@ -30,6 +39,42 @@ def in_parallel(
     for share, result in zip(done / done[-1], results, strict=True):
         yield result
         on_progress(float(share))
+
+
+def tables_of(
+    function: Callable[..., Tables],
+    jobs: Sequence[Sequence[Any]],
+    on_progress: Callable[[float], None] = lambda _: None,
+    costs: ArrayLike | None = None,
+) -> dict[str, pd.DataFrame]:
+    """Run jobs by `in_parallel` and join the rows that they give, by table, in their order."""
+    parts: dict[str, list[Any]] = {}
+    for tables in in_parallel(function, jobs, on_progress, costs):
+        for name, rows in tables.items():
+            parts.setdefault(name, []).append(rows)
+    return {name: _joined(several) for name, several in parts.items()}
+
+
+def _joined(parts: list[Any]) -> pd.DataFrame:
+    if isinstance(parts[0], pd.DataFrame):
+        return pd.concat(parts, ignore_index=True)
+    return pd.DataFrame(list(chain.from_iterable(parts)))
+
+
+def answer_of(
+    experiment: Experiment, names: Collection[str], fetch: Callable[[], Team] | None = None
+) -> Row:
+    """Those columns of an experiment's one row, or of its best answer, that it has.
+
+    Parameters
+    ----------
+    names
+        As for `experiments.sweeps.collect.with_answers`.
+    fetch
+        As for `experiments.runs.evaluate.evaluate`.
+    """
+    found = with_answers(pd.DataFrame(evaluate(experiment, fetch)), list(names)).iloc[0]
+    return {name: found[name] for name in names if name in found}
 
 
 def grouped(runs: Iterable[T], key: Callable[[T], Hashable]) -> list[list[T]]:

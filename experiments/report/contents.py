@@ -13,7 +13,7 @@ from typing import Any
 import pandas as pd
 
 from experiments.judging.claims_file import read_claims, read_provenance, read_verdicts, this_code
-from experiments.judging.folders import code_folder
+from experiments.judging.folders import code_folder, findings
 from experiments.judging.verdict import Profile, Role, Verdict, headline_verdict
 from experiments.report.export import as_text, folded, numeric, plain
 from experiments.report.leaderboard import by_world, on_lasers
@@ -23,7 +23,6 @@ from experiments.runs.row import read_rows
 from experiments.sweeps.summary import COUNT_WORDS
 from sim.errors import InputError
 from sim.files import require_file
-from sim.yaml_file import read_yaml
 
 Entry = Mapping[str, Any]
 PAPERS = ("puzzlebot2024", "decristoforis2020", "gil2008", "maximo2024")
@@ -126,13 +125,6 @@ def tally(claims: Iterable[Entry]) -> list[tuple[Verdict, int]]:
     """How many claims came to each verdict; those that were not judged are left out."""
     counts = Counter(claim["ruling"] for claim in claims if claim["statistics"])
     return [(verdict, counts[verdict]) for verdict in Verdict if counts[verdict]]
-
-
-def findings(name: str) -> dict[str, Any]:
-    """A paper's findings in our words: `title`, `about`, `claims` by id, `figures` by file name."""
-    path = code_folder(name) / "findings.yaml"
-    found = read_yaml(path) if path.exists() else {}
-    return {"title": name, "about": "", "claims": {}, "figures": {}, **found}
 
 
 def judged_claims(

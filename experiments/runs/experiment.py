@@ -72,6 +72,10 @@ class Experiment(Objects):
         """Return the experiment with the estimator of another."""
         return self.replaced(estimator=other.config["estimator"])
 
+    def option(self, name: str, default: Any = None) -> Any:
+        """An option of the estimator; `default` if it has none of this name."""
+        return self.config["estimator"].get(name, default)
+
     def over(self, recording: Recording) -> Experiment:
         """Return the experiment over a recording in memory, identified by its checksum."""
         require(

@@ -47,8 +47,7 @@ def wheel_twist_covariances(
     slip
         Believed kr and kl, m.
     """
-    wheels = recording.wheels
-    position_m = np.column_stack([np.interp(stamps, wheels.stamps, w) for w in wheels.position_m.T])
+    position_m = recording.wheels.at(stamps)
     travel_m = np.diff(position_m, axis=0, prepend=position_m[:1])
     lapse = np.diff(stamps, prepend=stamps[:1])
     return wheel_covariances(lapse, travel_m, recording.robot.track_m, *slip)

@@ -5,7 +5,7 @@ import numpy as np
 from estimators.base import Prior
 from estimators.graph.graph_slam import GraphSlam
 from estimators.graph.smoother import Smoother
-from experiments.calibration.reference import spaced_rows, travel_at
+from experiments.calibration.reference import spaced_rows
 from experiments.runs.calibration import Slip
 from experiments.runs.evaluate import run_over
 from sim import se2
@@ -70,8 +70,8 @@ def way_of(recording: Recording, stamps: Array, poses: Array) -> tuple[Array, Ar
     rows = spaced_rows(stamps, _KNOTS_S)
     stamps, poses = stamps[rows], poses[rows]
     times = np.unique(np.concatenate([np.arange(stamps[0], stamps[-1], STEP_S), stamps]))
-    travel = np.diff(travel_at(wheels, times), axis=0)
-    rolled = se2.chain(arc_increment(travel, recording.robot.track_m))
+    travel_m = wheels.at(times)
+    rolled = se2.chain(arc_increment(np.diff(travel_m, axis=0), recording.robot.track_m))
     knots = np.searchsorted(times, stamps)
     before = np.clip(np.searchsorted(stamps, times, side="right") - 1, 0, len(stamps) - 2)
     by_wheels = se2.between(rolled[knots[:-1]], rolled[knots[1:]])

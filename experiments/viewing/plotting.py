@@ -1,9 +1,12 @@
-"""Parts of many figures: plans, 95 % ellipses, plain numbers on logarithmic axes, one legend."""
+"""Parts of many figures: plans, ellipses, intervals, bands, tables, logarithmic axes, legends."""
+
+from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
@@ -12,6 +15,8 @@ from matplotlib.ticker import LogLocator
 from numpy.typing import ArrayLike
 
 from experiments.evaluation.metrics import CHI2_95_2DOF
+from experiments.evaluation.statistics import Interval
+from experiments.viewing.style import subplots
 
 
 def plan_axes(ax: Axes, **settings: Any) -> None:
@@ -54,9 +59,63 @@ def plain_log(axis: Axis, multiples: Sequence[float] = (1.0, 2.0, 5.0)) -> None:
 
 
 def with_legend(
-    page: Figure, ncols: int, loc: str = "outside lower center", markerscale: float = 1.0
+    page: Figure,
+    ncols: int,
+    loc: str = "outside lower center",
+    of: Axes | None = None,
+    **style: Any,
 ) -> Figure:
-    """Add one legend for all axes, of what the first of them shows; return the page."""
-    handles, labels = page.axes[0].get_legend_handles_labels()
-    page.legend(handles, labels, loc=loc, ncols=ncols, markerscale=markerscale)  # type: ignore[call-overload]
+    """Add one legend for all axes, of what the first of them (or `of`) shows; return the page."""
+    handles, labels = (of or page.axes[0]).get_legend_handles_labels()
+    page.legend(handles, labels, loc=loc, ncols=ncols, **style)  # type: ignore[call-overload]
+    return page
+
+
+def draw_band(
+    ax: Axes, middle: pd.Series[float], ends: tuple[ArrayLike, ArrayLike], alpha: float, **line: Any
+) -> None:
+    """Draw a line by the index of `middle`, and a band between its ends."""
+    (drawn,) = ax.plot(middle.index, middle, **line)
+    ax.fill_between(middle.index, *ends, color=drawn.get_color(), alpha=alpha, lw=0)
+
+
+def draw_interval(
+    ax: Axes, at: float, found: Interval, *, along: str = "y", ms: float = 5.0, **style: Any
+) -> None:
+    """Draw a value as a dot and its interval as a bar, along x or y."""
+    ends, level = [found.low, found.high], [at, at]
+    bar, dot = (ends, level), (found.value, at)
+    if along == "y":
+        bar, dot = bar[::-1], dot[::-1]
+    ax.plot(*bar, color=style["color"], lw=style.pop("lw", 1.4))
+    ax.plot(*dot, style.pop("marker", "o"), ms=ms, **style)
+
+
+def draw_dots(
+    ax: Axes, at: float, values: ArrayLike, *, along: str = "y", spread: float = 0.2, **style: Any
+) -> None:
+    """Draw a dot for each value, side by side about a place, along x or y."""
+    shown = np.asarray(values, float)
+    places = at + (np.linspace(-spread, spread, len(shown)) if len(shown) > 1 else np.zeros(1))
+    ax.plot(*((shown, places) if along == "x" else (places, shown)), ".", ms=4, **style)
+
+
+def draw_table(
+    header: Sequence[str], cells: Sequence[Sequence[str]], title: str, size_in: tuple[float, float]
+) -> Figure:
+    """Draw a table as a picture; a line break in the header makes its row twice as high."""
+    page, ax = subplots(*size_in)
+    ax.axis("off")
+    drawn = ax.table(cells, colLabels=header, loc="center", cellLoc="center")
+    drawn.auto_set_font_size(False)
+    drawn.set_fontsize(7.5)
+    drawn.auto_set_column_width(list(range(len(header))))
+    drawn.scale(1.0, 1.35)
+    tall = any("\n" in name for name in header)
+    for (row, _), cell in drawn.get_celld().items():
+        cell.set_edgecolor("#cccccc")
+        cell.set_text_props(weight="normal" if row else "bold")
+        if tall and row == 0:
+            cell.set_height(2.0 * cell.get_height())
+    ax.set_title(title, fontsize="medium")
     return page

@@ -1,5 +1,6 @@
 """Paths of a team in the world, and who saw whom."""
 
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -7,6 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from numpy.typing import NDArray
 
+from experiments.evaluation.metrics import travelled_m
 from experiments.viewing.plotting import plan_axes
 from experiments.viewing.style import BLACK, PURPLE, SERIES
 from experiments.viewing.world import draw_walls
@@ -55,6 +57,16 @@ def draw_sightings(ax: Axes, lines: Array, number: int) -> None:
     """Draw a robot's sightings (S, 2, 2), m, in map."""
     colour = colour_of(number)
     ax.add_collection(LineCollection(list(lines), colors=colour, lw=0.5, alpha=0.6, zorder=1))
+
+
+def drive_of(robots: Sequence[Recording], until_m: float = math.inf) -> dict[str, Array]:
+    """Arrays for `draw_paths`: the walls, and true paths until a distance driven, m."""
+    world = robots[0].known_world
+    arrays: dict[str, Array] = {"walls": world.walls, "wall_z_m": world.wall_z_m}
+    for number, robot in enumerate(robots):
+        poses = robot.known_truth.poses
+        arrays[f"truth_{number}"] = poses[travelled_m(poses) <= until_m, :2]
+    return arrays
 
 
 def draw_paths(ax: Axes, run: Mapping[str, Array]) -> None:

@@ -57,7 +57,7 @@ def of_one_seed(name):
     ],
 )  # fmt: skip
 def test_runs_of_gil2008_differ_in_what_their_table_compares(table, compared):
-    runs = of_one_seed(f"gil2008_{table}")
+    runs = of_one_seed(f"gil2008/{table}")
     noises = {False: [], True: []}
     for run in runs:
         noises[run.config["sensors"]["stereo"]["correlated"]].append(run)
@@ -92,7 +92,7 @@ def test_the_printed_filter_is_the_papers_and_alone_takes_r_at_the_measured_poin
     keys = ("proposal", "resampling", "ess_share", "noise_model", "noise_at")
     assert tuple(own[key] for key in keys) == printed
     for table in ("particles", "laps", "distance", "observations", "repeats", "association"):
-        for run in of_one_seed(f"gil2008_{table}"):
+        for run in of_one_seed(f"gil2008/{table}"):
             if run.estimator_name == "fastslam_paper":
                 assert tuple(run.config["estimator"][key] for key in keys) == printed
 

@@ -11,8 +11,8 @@ from tests.fixtures import independent_check as check
 
 @pytest.mark.parametrize("key", check.CHECKS)
 def test_a_statistic_comes_out_the_same(key):
-    recomputed, words = check.CHECKS[key]
-    assert recomputed() == pytest.approx(check.claimed(key, words), rel=1e-6, abs=1e-9)
+    recomputed, statistic = check.CHECKS[key]
+    assert recomputed() == pytest.approx(check.claimed(key, statistic), rel=1e-6, abs=1e-9)
 
 
 def test_it_shares_no_code_with_what_it_checks():
@@ -33,7 +33,7 @@ def test_a_changed_number_is_noticed(tmp_path):
         out = csv.DictWriter(file, rows[0])
         out.writeheader()
         out.writerows(rows)
-    for key, (recomputed, words) in check.CHECKS.items():
-        assert not check.same(recomputed(), check.claimed(key, words, tmp_path))
-    with pytest.raises(LookupError, match="no statistic of MX1 with nonsense"):
-        check.claimed("MX1", ("nonsense",))
+    for key, (recomputed, statistic) in check.CHECKS.items():
+        assert not check.same(recomputed(), check.claimed(key, statistic, tmp_path))
+    with pytest.raises(LookupError, match="no statistic of MX1: nonsense"):
+        check.claimed("MX1", "nonsense")

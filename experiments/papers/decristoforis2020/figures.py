@@ -17,7 +17,9 @@ from experiments.judging.results import Results
 from experiments.papers.decristoforis2020.claims import judged_runs, nees_intervals
 from experiments.papers.decristoforis2020.settings import CONSISTENT, PAPERS_OWN, PLACES
 from experiments.viewing.plotting import (
+    draw_dots,
     draw_ellipses,
+    draw_interval,
     plain_log,
     plain_ticks,
     plan_axes,
@@ -255,8 +257,7 @@ def runs(table: pd.DataFrame) -> Figure:
     for ax, (column, believed, label, unit) in zip(axes, panels, strict=True):
         for i, method in enumerate(methods):
             own = rows[rows["method"] == method]
-            spread = np.linspace(-0.2, 0.2, len(own))
-            ax.plot(i + spread, unit * own[column], ".", color=COLORS[method], ms=4)
+            draw_dots(ax, i, unit * own[column], color=COLORS[method])
             ax.plot([i - 0.3, i + 0.3], [unit * own[column].median()] * 2, color=TRUTH, lw=1.2)
             if believed:
                 ax.plot(
@@ -316,10 +317,9 @@ def beliefs(table: pd.DataFrame) -> Figure:
     for i, (_, rows) in enumerate(by_belief):
         ratio = rows["ate_rmse_m"] / right["ate_rmse_m"]
         for ax, values in zip(axes, (ratio, rows["nees_mean"] / 3.0), strict=True):
-            ax.plot(values, i + np.linspace(-0.15, 0.15, len(values)), ".", color=SKY, ms=4)
+            draw_dots(ax, i, values, along="x", spread=0.15, color=SKY)
             mean = log_ratio_interval(values, np.ones(len(values)))
-            ax.plot([mean.low, mean.high], [i, i], color=TRUTH, lw=1.2)
-            ax.plot(mean.value, i, "o", color=TRUTH, ms=5)
+            draw_interval(ax, i, mean, along="x", color=TRUTH, lw=1.2)
     axes[0].axvline(1.0, color=TRUTH, lw=0.6)
     axes[1].axvspan(*CONSISTENT, color=GREEN, alpha=0.2, lw=0)
     axes[0].set(

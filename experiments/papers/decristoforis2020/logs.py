@@ -3,7 +3,7 @@
 import dataclasses
 from pathlib import Path
 
-from experiments.studies.real_logs import logs
+from experiments.judging import logs
 from sim.errors import required
 from sim.formats.rawseeds import read_rawseeds
 from sim.recording import Recording

@@ -26,7 +26,8 @@ from experiments.evaluation.metrics import (
     position_errors_m,
 )
 from experiments.evaluation.registration_errors import METRICS, measured, scenes
-from experiments.judging.jobs import grouped, in_parallel
+from experiments.judging.jobs import Tables, grouped, tables_of
+from experiments.judging.logs import DATA
 from experiments.judging.results import Results
 from experiments.judging.verdict import Profile
 from experiments.papers.decristoforis2020.claims import judged_runs
@@ -47,14 +48,12 @@ from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome, Row
 from experiments.runs.seeds import stream
-from experiments.studies.real_logs.settings import DATA
 from experiments.sweeps.plan import planned
 from sim.arrays import Array
 from sim.recording import Recording
 from sim.sensors import Laser, sensor_of
 from sim.team import Team
 
-Tables = dict[str, pd.DataFrame]
 Job = tuple[float, Callable[..., Tables], Sequence[Any]]  # cost, function, arguments
 
 _RUN = {
@@ -87,11 +86,7 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
     """
     costs, functions, arguments = zip(*_jobs(profile is Profile.FULL, out), strict=True)
     calls = [(function, *given) for function, given in zip(functions, arguments, strict=True)]
-    parts: dict[str, list[pd.DataFrame]] = {}
-    for tables in in_parallel(operator.call, calls, on_progress, costs):
-        for name, frame in tables.items():
-            parts.setdefault(name, []).append(frame)
-    whole = {name: pd.concat(frames, ignore_index=True) for name, frames in parts.items()}
+    whole = tables_of(operator.call, calls, on_progress, costs)
     whole["boxes"] = _boxes(judged_runs(whole.pop("errors")))
     if "log_errors" in whole:
         whole["log_boxes"] = _boxes(whole.pop("log_errors"))

@@ -5,7 +5,7 @@ anything is compared. Errors of position and map are those of the revised path a
 best particle, as the paper has them, raw and rigidly aligned.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -20,23 +20,19 @@ from experiments.evaluation.statistics import (
     mean_interval,
     page_trend_p,
 )
-from experiments.judging.results import Results
-from experiments.judging.verdict import (
+from experiments.judging.claim import (
     Claim,
-    Conclusion,
-    Role,
-    Verdict,
+    Subject,
     banded,
     beside,
-    conclude,
     equivalent,
-    holds,
-    percent,
-    pick,
-    plain,
+    more_by_p,
     remarked,
     shown,
 )
+from experiments.judging.results import Results
+from experiments.judging.sentences import percent
+from experiments.judging.verdict import Role, Verdict, holds
 from experiments.papers.gil2008.settings import P0
 from sim.arrays import Array
 
@@ -53,7 +49,6 @@ NAMES = {
     "ekf_slam": "EKF-SLAM",
 }
 NOISE = {"paper": "noise of 10 px", "pixel": "noise of 1 px"}
-PRINTED = (NAMES["paper"], NOISE["paper"])  # of the headlines: the paper's filter and noise
 REVISITS_GROW = 1.25  # error at later visits over that at the first: odometry must be above it
 NOT_WORSE = 1.3  # 10 m against 20 m
 _DESCRIPTORS = 0.9  # their noise in the headline of GI7
@@ -72,21 +67,6 @@ def judge(made: Results) -> list[Claim]:
         *gi7(made.table("association")),
         *gi8(made.table("cost")),
     ]
-
-
-def conclusions(_made: Results, claims: Sequence[Claim]) -> list[Conclusion]:
-    """Verdict and sentence of GI1-GI8."""
-    sentences = {
-        "GI1": gi1_sentence,
-        "GI2": gi2_sentence,
-        "GI3": gi3_sentence,
-        "GI4": gi4_sentence,
-        "GI5": gi5_sentence,
-        "GI6": gi6_sentence,
-        "GI7": gi7_sentence,
-        "GI8": gi8_sentence,
-    }
-    return conclude(claims, sentences, "worlds")
 
 
 def pooled(table: pd.DataFrame, column: str, by: str) -> pd.DataFrame:
@@ -121,11 +101,13 @@ def gi1(particles: pd.DataFrame, laps: pd.DataFrame) -> Iterator[Claim]:
             found[m] = log_ratio_interval(ours[name], odometry[name]), len(ours)
         m, (worst, n) = max(found.items(), key=lambda item: item[1][0].high)
         label = f"error of SLAM over odometry's, the worst of M >= 50: {where}"
-        claim = banded("GI1", label, worst, at_most=0.5, criterion="below 0.5", n=n)
+        about = Subject("GI1", "over odometry", method=name, noise=noise, size=int(m))
+        claim = banded(about, label, worst, at_most=0.5, criterion="below 0.5", n=n)
         yield beside(remarked(claim, f"M = {m}"), is_beside)
     yield from _revisits(laps)
     own = mean_interval(particles.groupby("seed")["odometry_rmse_m"].mean())
-    yield shown("GI1", "RMS position error of odometry, m (the paper: 3)", own)
+    about = Subject("GI1", "odometry")
+    yield shown(about, "RMS position error of odometry, m (the paper: 3)", own)
 
 
 def _revisits(laps: pd.DataFrame) -> Iterator[Claim]:
@@ -135,32 +117,17 @@ def _revisits(laps: pd.DataFrame) -> Iterator[Claim]:
     grows = f"above {REVISITS_GROW:g}: a growing error shows on this course"
     own = _growth(laps.drop_duplicates("seed"), "odometry_revisit_ratio")
     n = laps["seed"].nunique()
-    claim = banded("GI1", f"error of odometry {label}", own, REVISITS_GROW, criterion=grows, n=n)
-    yield beside(claim)
+    about, words = Subject("GI1", "revisits", method="odometry"), f"error of odometry {label}"
+    yield beside(banded(about, words, own, REVISITS_GROW, criterion=grows, n=n))
     for (noise, name), table in laps.groupby(["noise", "filter"], sort=False):
         growth, words = _growth(table, "revisit_ratio"), f"{NAMES[name]}, {NOISE[noise]}"
+        about, words = Subject("GI1", "revisits", method=name, noise=noise), f"{label}: {words}"
         claim = banded(
-            "GI1", f"error of SLAM {label}: {words}", growth, at_most=REVISITS_GROW,
-            criterion=criterion, n=n,
-        )  # fmt: skip
+            about, f"error of SLAM {words}", growth, at_most=REVISITS_GROW, criterion=criterion, n=n
+        )
         if not own.low > REVISITS_GROW:
             claim = _undecided(claim, "odometry's is not clearly above it on this course")
         yield beside(claim, not _printed(name, noise))
-
-
-def gi1_sentence(rows: Sequence[Claim]) -> str:
-    """Say how large the filter's error is beside odometry's, and what happens on known ground."""
-    ratio = pick(rows, "over odometry's", *PRINTED)
-    again = pick(rows, "SLAM at later visits", *PRINTED)
-    said = (
-        f"From 50 particles on, the printed filter has at most {plain(ratio.found.value)} "
-        f"[{plain(ratio.found.low)}, {plain(ratio.found.high)}] times odometry's error."
-    )
-    odometry = pick(rows, "error of odometry at later visits")
-    return (
-        f"{said} When a place is visited again, its error is {plain(again.found.value)} times that "
-        f"at the first visit, and odometry's {plain(odometry.found.value)} times."
-    )
 
 
 def gi2(particles: pd.DataFrame, bound: pd.DataFrame) -> Iterator[Claim]:
@@ -168,28 +135,15 @@ def gi2(particles: pd.DataFrame, bound: pd.DataFrame) -> Iterator[Claim]:
     first = particles[particles["draw"] == 0]
     for (noise, name), table in first.groupby(["noise", "filter"], sort=False):
         where, is_beside = f"{NAMES[name]}, {NOISE[noise]}", not _printed(name, noise)
-        for claim in _trends("GI2", table, "n_particles", "M", 0.001, where):
+        about = Subject("GI2", "", method=name, noise=noise)
+        for claim in _trends(about, table, "n_particles", "M", 0.001, where):
             yield beside(claim, is_beside)
         best = bound[bound["noise"] == noise].set_index("seed")
         some = table[table["n_particles"] == 500].groupby("seed").first()
         for column, what in list(ERRORS.items())[:2]:
             found = median_interval((some[column] / best[column]).dropna().to_numpy())
             label = f"{what} error at M = 500 over the batch bound, median of worlds: {where}"
-            yield shown("GI2", label, found, "ours: 2")
-
-
-def gi2_sentence(rows: Sequence[Claim]) -> str:
-    """Say how much error 1000 particles leave of that of 10, and how far the bound is."""
-    position, above = (
-        pick(rows, what, *PRINTED) for what in ("position error, M", "position error at M = 500")
-    )
-    landmarks = pick(rows, "map error, M", *PRINTED)
-    return (
-        f"With 1000 particles the printed filter has {percent(position.found.value)} of the "
-        f"position error of 10 ({position.reason}), and {percent(landmarks.found.value)} of the "
-        f"map's ({landmarks.reason}); with 500 it still has {plain(above.found.value)} times the "
-        "least error that its data allow."
-    )
+            yield shown(replace(about, quantity=f"{what} over bound"), label, found, "ours: 2")
 
 
 def gi3(particles: pd.DataFrame) -> Iterator[Claim]:
@@ -202,53 +156,29 @@ def gi3(particles: pd.DataFrame) -> Iterator[Claim]:
     for name, part in table.groupby("filter", sort=False):
         for column, what in ERRORS.items():
             values = ratios(part, column, "n_particles", 200, 1000)
-            remark = (
-                f"{len(part.drop_duplicates(['seed', 'draw']))} recordings in {len(values)} worlds"
-            )
+            n_recordings = len(part.drop_duplicates(["seed", "draw"]))
+            remark = f"{n_recordings} recordings in {len(values)} worlds"
             is_beside = name != "paper" or column != POSITION
-            label = f"{what} error, M = 200 over M = 1000"
-            claim = equivalent("GI3", f"{label}: {NAMES[name]}", values, np.ones(len(values)), 0.25)
-            yield beside(remarked(claim, remark), is_beside)
-            found = log_ratio_interval(values, np.ones(len(values)))
+            label, ones = f"{what} error, M = 200 over M = 1000", np.ones(len(values))
+            about = Subject("GI3", what, method=name, noise="paper")
+            claim = equivalent(about, f"{label}: {NAMES[name]}", values, ones, 0.25)
+            claim = remarked(claim, remark, n_recordings=n_recordings, n_worlds=len(values))
+            yield beside(claim, is_beside)
+            found, about = log_ratio_interval(values, ones), replace(about, arm="significance")
             verdict = holds(not found.low > 1.0) if np.isfinite(found.low) else Verdict.UNDECIDED
             label = f"{label}, its gain's significance: {NAMES[name]}"
-            yield Claim(
-                "GI3", label, found, "1 is in the interval", verdict, remark, role=Role.BESIDE
-            )
-
-
-def gi3_sentence(rows: Sequence[Claim]) -> str:
-    """Say what 1000 particles gain over 200."""
-    ours = [
-        row for row in rows if row.statistic.startswith("position") and PRINTED[0] in row.statistic
-    ]
-    row, plainly = pick(ours, "(90 % interval)"), pick(ours, "significance")
-    significant = "significant" if plainly.verdict is Verdict.NOT_REPRODUCED else "not significant"
-    return (
-        f"200 particles leave {plain(row.found.value)} times the position error of 1000 (90 % "
-        f"interval {plain(row.found.low)} to {plain(row.found.high)}, {row.reason}): the gain is "
-        f"{significant}, and {_within(row)} 25 %."
-    )
+            criterion = "1 is in the interval"
+            yield Claim(about, label, found, criterion, verdict, remark, role=Role.BESIDE)
 
 
 def gi4(distance: pd.DataFrame) -> Iterator[Claim]:
     """GI4: the error falls with dmax."""
-    for words, is_beside, is_ours, part in _kinds(distance[distance["occluded"]]):
+    for about, words, is_beside, is_ours, part in _kinds("GI4", distance[distance["occluded"]]):
         errors = pooled(part, POSITION, "max_distance_m")
         found = log_ratio_interval(errors[3], errors[10])
         label, n = f"position error, dmax = 3 m over 10 m: {words}", len(errors)
-        claim = banded("GI4", label, found, at_least=1.5, criterion="above 1.5", n=n)
-        yield shown("GI4", label, found) if is_ours else beside(claim, is_beside)
-
-
-def gi4_sentence(rows: Sequence[Claim]) -> str:
-    """Say how much error near landmarks alone leave."""
-    row = pick(rows, *PRINTED, "all visible")
-    return (
-        f"The printed filter that sees landmarks up to 3 m has {plain(row.found.value)} "
-        f"[{plain(row.found.low)}, {plain(row.found.high)}] times the position error of the one "
-        "that sees them up to 10 m."
-    )
+        claim = banded(about, label, found, at_least=1.5, criterion="above 1.5", n=n)
+        yield shown(about, label, found) if is_ours else beside(claim, is_beside)
 
 
 def gi5(distance: pd.DataFrame) -> Iterator[Claim]:
@@ -256,49 +186,24 @@ def gi5(distance: pd.DataFrame) -> Iterator[Claim]:
 
     The test is one-sided: an error that grows beyond 10 m agrees with the paper.
     """
-    for words, is_beside, is_ours, part in _kinds(distance):
+    for about, words, is_beside, is_ours, part in _kinds("GI5", distance):
         far = float(part[part["max_distance_m"] == 20]["share_beyond_10_m"].mean())
         values = ratios(part, POSITION, "max_distance_m", 10, 20)
         found = log_ratio_interval(values, np.ones(len(values)), level=0.90)
         label = f"position error, dmax = 10 m over 20 m (90 % interval): {words}"
-        claim = banded("GI5", label, found, at_most=NOT_WORSE, criterion="below 1.3", n=len(values))
+        claim = banded(about, label, found, at_most=NOT_WORSE, criterion="below 1.3", n=len(values))
         if far < 0.1:
             claim = _undecided(claim, "too few far observations")
-        claim = remarked(claim, f"{percent(far)} of observations beyond 10 m")
-        yield shown("GI5", label, found, claim.reason) if is_ours else beside(claim, is_beside)
-
-
-def gi5_sentence(rows: Sequence[Claim]) -> str:
-    """Say what landmarks beyond 10 m gain, with walls and without."""
-    row = pick(rows, *PRINTED, "all visible", "behind walls")
-    free = [r for r in rows if all(w in r.statistic for w in ("no walls", "all visible", *PRINTED))]
-    said = (
-        f"With landmarks up to 10 m the printed filter has {plain(row.found.value)} times the "
-        f"position error that it has with those up to 20 m (90 % interval {plain(row.found.low)} "
-        f"to {plain(row.found.high)}; {row.reason})."
-    )
-    if free:
-        said += f" Without walls it has {plain(free[0].found.value)} times."
-    return said
+        claim = remarked(claim, f"{percent(far)} of observations beyond 10 m", far=far)
+        yield shown(about, label, found, claim.reason) if is_ours else beside(claim, is_beside)
 
 
 def gi6(observations: pd.DataFrame) -> Iterator[Claim]:
     """GI6: the error against the number of observations of an image."""
     for name, table in observations.groupby("filter", sort=False):
-        for claim in _trends("GI6", table, "n_seen", "B", 0.01, NAMES[name]):
+        about = Subject("GI6", "", method=name)
+        for claim in _trends(about, table, "n_seen", "B", 0.01, NAMES[name]):
             yield beside(claim, name != "paper")
-
-
-def gi6_sentence(rows: Sequence[Claim]) -> str:
-    """Say how much error twenty observations an image leave of that of one."""
-    position, landmarks = (
-        pick(rows, f"{what} error, B", PRINTED[0]) for what in ("position", "map")
-    )
-    return (
-        f"With 20 observations an image the printed filter has {percent(position.found.value)} of "
-        f"the position error of a single one ({position.reason}), and "
-        f"{percent(landmarks.found.value)} of the map's ({landmarks.reason})."
-    )
 
 
 def gi7(association: pd.DataFrame) -> Iterator[Claim]:
@@ -317,7 +222,8 @@ def gi7(association: pd.DataFrame) -> Iterator[Claim]:
                 f"descriptors {sigma:g}: {where}"
             )
             both = pd.concat([part.set_index("seed")[POSITION], known], axis=1, join="inner")
-            claim = equivalent("GI7", label, both.iloc[:, 0], both.iloc[:, 1], 0.5)
+            about = Subject("GI7", "descriptor", method=name, noise=noise, setting=sigma)
+            claim = equivalent(about, label, both.iloc[:, 0], both.iloc[:, 1], 0.5)
             remark = (
                 f"descriptors alone match {percent(alone)}, together {percent(right)} are right"
             )
@@ -333,9 +239,11 @@ def gi7(association: pd.DataFrame) -> Iterator[Claim]:
             continue
         relative = [p["ate_rmse_m"] / p["odometry_rmse_m"] for p in (single, guessed)]
         ekf, ours = pd.concat(relative, axis=1, join="inner").to_numpy().T
-        yield beside(_divergence(ekf > 0.5, ours > 0.5, where), is_beside)
+        about = Subject("GI7", "divergence", method=name, noise=noise)
+        yield beside(_divergence(about, ekf > 0.5, ours > 0.5, where), is_beside)
         label = f"error of EKF-SLAM over FastSLAM's, both by Mahalanobis distance: {where}"
-        yield beside(banded("GI7", label, log_ratio_interval(ekf, ours), 1.0, n=len(ekf)))
+        about = replace(about, quantity="EKF-SLAM over FastSLAM")
+        yield beside(banded(about, label, log_ratio_interval(ekf, ours), 1.0, n=len(ekf)))
 
 
 def _particle_filters(
@@ -346,47 +254,30 @@ def _particle_filters(
     yield from ours[np.isclose(ours["p0"], P0)].groupby(["noise", "filter"], sort=False)
 
 
-def _divergence(ekf: NDArray[np.bool_], fastslam: NDArray[np.bool_], where: str) -> Claim:
+def _divergence(
+    about: Subject, ekf: NDArray[np.bool_], fastslam: NDArray[np.bool_], where: str
+) -> Claim:
     """Judge by McNemar's test that EKF-SLAM diverges in more worlds than FastSLAM.
 
     Only worlds in which one of them diverges tell; under the null hypothesis either is as likely.
     """
     found = mean_interval(ekf.astype(float) - fastslam)
     alone, other = int(np.sum(ekf & ~fastslam)), int(np.sum(fastslam & ~ekf))
-    p = (
-        stats.binomtest(alone, alone + other, alternative="greater").pvalue
-        if alone + other
-        else 1.0
-    )
+    n = alone + other
+    p = float(stats.binomtest(alone, n, alternative="greater").pvalue) if n else 1.0
     label = f"share of runs that diverge, EKF-SLAM less FastSLAM, both by Mahalanobis: {where}"
     verdict, more = Verdict.UNDECIDED, 0
     if len(ekf) >= 2 and p < 0.01:
         verdict = Verdict.REPRODUCED
-    elif found.high <= 0.0 and alone + other:
+    elif found.high <= 0.0 and n:
         verdict = Verdict.NOT_REPRODUCED
     elif alone > other:
-        more = int(np.ceil(len(ekf) * (stats.norm.isf(0.01) / max(stats.norm.isf(p), 0.1)) ** 2))
-        more -= len(ekf)
-    remark = (
-        f"EKF-SLAM in {percent(ekf.mean())}, FastSLAM in {percent(fastslam.mean())}, with half of "
-        f"odometry's error or more; p = {p:.2g}"
-    )
-    criterion = "above 0, McNemar's p < 0.01"
-    return Claim("GI7", label, found, criterion, verdict, remark, more=max(more, 0))
-
-
-def gi7_sentence(rows: Sequence[Claim]) -> str:
-    """Say what descriptors leave of the error of wrong associations, and who diverges."""
-    by_descriptor, diverge = (
-        next(row for row in rows if row.role is Role.HEADLINE and words in row.statistic)
-        for words in ("by distance and descriptor", "diverge")
-    )
-    who = by_descriptor.statistic.rsplit(": ", 1)[-1].split(",")[0]
-    return (
-        f"By distance and descriptor, {who} has {plain(by_descriptor.found.value)} times the "
-        f"position error of known association (90 % interval {plain(by_descriptor.found.low)} to "
-        f"{plain(by_descriptor.found.high)}). By distance alone runs diverge: {diverge.reason}."
-    )
+        more = more_by_p(len(ekf), p, 0.01)
+    shares = f"EKF-SLAM in {percent(ekf.mean())}, FastSLAM in {percent(fastslam.mean())}"
+    reason = f"{shares}, with half of odometry's error or more; p = {p:.2g}"
+    facts = {"ekf": float(ekf.mean()), "fastslam": float(fastslam.mean()), "p": p}
+    claim = Claim(about, label, found, "above 0, McNemar's p < 0.01", verdict, reason, facts=facts)
+    return replace(claim, more=max(more, 0))
 
 
 def gi8(cost: pd.DataFrame) -> Iterator[Claim]:
@@ -399,22 +290,14 @@ def gi8(cost: pd.DataFrame) -> Iterator[Claim]:
         repeats = table.groupby("repeat")
         found = mean_interval([log_log_slope(p["n_landmarks"], p["step_ms"]) for _, p in repeats])
         label = f"exponent of N in the time of a step, {maps} maps, resampling at every image"
-        yield banded("GI8", label, found, *bands[maps], n=len(repeats))
+        yield banded(
+            Subject("GI8", "exponent", arm=maps), label, found, *bands[maps], n=len(repeats)
+        )
     wide = cost.groupby(["n_landmarks", "maps"])["step_ms"].median().unstack("maps")
     for n, ratio in (wide["contiguous"] / wide["shared"]).items():
         label = f"time of a step, contiguous over shared, at N = {n}"
-        yield shown("GI8", label, Interval.exact(float(ratio)))
-
-
-def gi8_sentence(rows: Sequence[Claim]) -> str:
-    """Say how the time of a step grows with the number of landmarks."""
-    shared, contiguous = (pick(rows, f", {maps} maps").found for maps in ("shared", "contiguous"))
-    least = pick(rows, "contiguous over shared").found.value
-    return (
-        f"The time of a step grows as N^{shared.value:.2f} with maps that particles share, and as "
-        f"N^{contiguous.value:.2f} with maps that are copied, which at the least N takes "
-        f"{plain(least)} times as long."
-    )
+        about = Subject("GI8", "contiguous over shared", size=int(n))
+        yield shown(about, label, Interval.exact(float(ratio)))
 
 
 def median_interval(values: Array) -> Interval:
@@ -434,36 +317,30 @@ def _growth(table: pd.DataFrame, column: str) -> Interval:
     return log_ratio_interval(np.exp(logs), np.ones(len(logs)))
 
 
-def _kinds(distance: pd.DataFrame) -> Iterator[tuple[str, bool, bool, pd.DataFrame]]:
+def _kinds(
+    claim: str, distance: pd.DataFrame
+) -> Iterator[tuple[Subject, str, bool, bool, pd.DataFrame]]:
     """Runs that differ in dmax alone.
 
-    Yields their name, whether they stand beside the paper's, whether no claim is about them (the
-    nearest landmarks are our addition), and their rows.
+    Yields what the claim is about, the same in words, whether they stand beside the paper's,
+    whether no claim is about them (the nearest landmarks are our addition), and their rows.
     """
     keys = ["filter", "occluded", "noise", "n_seen", "rule"]
     for (name, occluded, noise, n_seen, rule), part in distance.groupby(keys, sort=False):
         seen = f"{n_seen} {rule}" if n_seen else "all visible"
         walls = "behind walls" if occluded else "no walls"
         words = f"{NAMES[name]}, {seen}, {walls}, {NOISE[noise]}"
+        about = Subject(claim, "dmax", method=name, noise=noise, arm=seen, place=walls)
         is_beside = not _printed(name, noise) or not occluded or n_seen > 0
-        yield words, is_beside, rule == "nearest", part
+        yield about, words, is_beside, rule == "nearest", part
 
 
 def _undecided(claim: Claim, reason: str) -> Claim:
     return replace(claim, verdict=Verdict.UNDECIDED, reason=reason, more=0)
 
 
-def _within(row: Claim) -> str:
-    """Whether an equivalence holds, in words."""
-    return {
-        Verdict.REPRODUCED: "it is within",
-        Verdict.NOT_REPRODUCED: "it is more than",
-        Verdict.UNDECIDED: "it may or may not be within",
-    }[row.verdict]
-
-
 def _trends(
-    claim_id: str, table: pd.DataFrame, by: str, symbol: str, limit: float, where: str
+    about: Subject, table: pd.DataFrame, by: str, symbol: str, limit: float, where: str
 ) -> Iterator[Claim]:
     """Judge by Page's test that errors fall; few worlds or p up to 5 % are undecided.
 
@@ -476,10 +353,12 @@ def _trends(
         if p < limit:
             verdict = Verdict.REPRODUCED
         elif p < 0.05 or n < 20:
-            verdict = Verdict.UNDECIDED
-            more = max(round(n * (stats.norm.isf(limit) / max(stats.norm.isf(p), 0.1)) ** 2) - n, 0)
+            verdict, more = Verdict.UNDECIDED, max(more_by_p(n, p, limit), 0)
         label = f"{what} error, {symbol} = {last} over {symbol} = {first}: {where}"
         found = log_ratio_interval(errors[last], errors[first])
-        criterion = f"Page's p below {limit:g}"
-        claim = Claim(claim_id, label, found, criterion, verdict, f"Page's p = {p:.2g}", more=more)
+        criterion, reason = f"Page's p below {limit:g}", f"Page's p = {p:.2g}"
+        claim = Claim(
+            replace(about, quantity=what), label, found, criterion, verdict, reason, more=more,
+            facts={"p": p},
+        )  # fmt: skip
         yield beside(claim, what.startswith("aligned"))

@@ -16,6 +16,7 @@ from experiments.papers.gil2008.claims import pooled
 from experiments.papers.gil2008.settings import CELL_M
 from experiments.viewing.grid import UNKNOWN, draw_grid
 from experiments.viewing.plotting import (
+    draw_band,
     draw_ellipses,
     plain_log,
     plain_ticks,
@@ -298,8 +299,7 @@ def by_particles_over_worlds(particles: pd.DataFrame, bound: pd.DataFrame) -> Fi
     page.suptitle(f"by image noise; aligned: fitted to the truth; {_INTERVALS}", size=9)
     # the noise that most filters ran on
     fullest = max(grid[:, 0], key=lambda ax: len(ax.get_legend_handles_labels()[0]))
-    page.legend(*fullest.get_legend_handles_labels(), loc="outside lower center", ncols=4)
-    return page
+    return with_legend(page, ncols=4, of=fullest)
 
 
 def by_distance(distance: pd.DataFrame) -> Figure:
@@ -321,9 +321,8 @@ def by_distance(distance: pd.DataFrame) -> Figure:
         for kind, (colour, line, words) in kinds.items():
             if kind in parts:
                 middle, bars = _intervals(parts[kind], "max_distance_m", column)
-                ax.plot(middle, line, marker="o", ms=3.5, color=colour, label=words)
-                band = (middle - bars[0], middle + bars[1])
-                ax.fill_between(middle.index, *band, color=colour, alpha=0.08, lw=0)
+                style = {"ls": line, "marker": "o", "ms": 3.5, "color": colour, "label": words}
+                draw_band(ax, middle, (middle - bars[0], middle + bars[1]), 0.08, **style)
         ax.axvline(10.0, color=BLACK, lw=0.6, ls=":")
         ax.set(xlabel="farthest distance of an observation (dmax), m", ylabel=label, yscale="log")
         plain_log(ax.yaxis)
@@ -434,8 +433,12 @@ def cost(table: pd.DataFrame) -> Figure:
     for maps_kind, part in table.groupby("maps", sort=False):
         colour, words = (BLUE, "shared") if maps_kind == "shared" else (ORANGE, "copied")
         wide = part.groupby("n_landmarks")["step_ms"]
-        ax.plot(wide.median(), "o-", color=colour, label=f"{words} maps: median, least to greatest")
-        ax.fill_between(list(wide.groups), wide.min(), wide.max(), color=colour, alpha=0.2, lw=0)
+        style = {
+            "marker": "o",
+            "color": colour,
+            "label": f"{words} maps: median, least to greatest",
+        }
+        draw_band(ax, wide.median(), (wide.min(), wide.max()), 0.2, **style)
     ax.set(xscale="log", yscale="log", xlabel="landmarks N", ylabel="time of a step, ms")
     ax.set_title("M = 1000, B = 20, resampling at every image", loc="left")
     plain_ticks(ax, table["n_landmarks"], fontsize=8)

@@ -10,13 +10,11 @@ from collections.abc import Callable, Iterator, Sequence
 from itertools import accumulate
 
 import numpy as np
-import pandas as pd
 
-from estimators.base import run as walk
 from estimators.odometry import Odometry
 from experiments.bench.fastslam import cost_by_landmarks
 from experiments.evaluation.metrics import position_errors_m, rms, travelled_m
-from experiments.judging.jobs import grouped, in_parallel
+from experiments.judging.jobs import Tables, grouped, tables_of
 from experiments.judging.results import Results
 from experiments.judging.verdict import Profile
 from experiments.papers.gil2008 import scores, settings
@@ -67,12 +65,8 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
         for part in grouped(plan(profile), _drawn_from)
         for low in range(0, len(part), _RUNS_PER_JOB)
     ]
-    rows: dict[str, list[Row]] = {table: [] for table in settings.LABELS}
-    for job in in_parallel(rows_of, jobs, lambda share: on_progress(0.95 * share)):
-        for table, row in job:
-            rows[table].append(row)
-    cost = cost_by_landmarks(settings.N_TIMINGS[profile])
-    out.write_tables(**{table: pd.DataFrame(part) for table, part in rows.items()}, cost=cost)
+    tables = tables_of(rows_of, jobs, lambda share: on_progress(0.95 * share))
+    out.write_tables(**tables, cost=cost_by_landmarks(settings.N_TIMINGS[profile]))
     write_arrays(out)
     on_progress(1.0)
 
@@ -93,20 +87,21 @@ def _drawn_from(run: TableRun) -> tuple[Scene, str]:
     return Scene.of(run[1].config), json.dumps(run[1].route_options)
 
 
-def rows_of(runs: Sequence[TableRun]) -> list[tuple[str, Row]]:
-    """Table and row of every run over one recording."""
+def rows_of(runs: Sequence[TableRun]) -> Tables:
+    """Rows of every run over one recording, by table."""
     first = runs[0][1]
     scene, recording = Scene.of(first.config), whole(first.config)
     truth, robot = recording.truth_at(recording.frame_stamps), first.robot()
     prior = first.prior(recording)
-    odometry = walk(Odometry(kr=robot.kr, kl=robot.kl), recording, prior, stream(0, "odometry"))
+    rng = stream(0, "odometry")
+    odometry, _ = run_over(recording, Odometry(kr=robot.kr, kl=robot.kl), prior, rng)
     common: Row = {
         **dataclasses.asdict(scene),
         "odometry_rmse_m": rms(position_errors_m(truth, odometry.means)),
         "odometry_revisit_ratio": scores.revisit_ratio(truth, odometry.means),
         "matching_precision": scores.matching_precision(recording),
     }
-    rows = []
+    rows: dict[str, list[Row]] = {}
     for table, experiment in runs:
         seen = thinned(recording, experiment.config)
         labels = labels_of(table, experiment)
@@ -114,7 +109,8 @@ def rows_of(runs: Sequence[TableRun]) -> list[tuple[str, Row]]:
         for repeat in range(experiment.repeats):
             index = 100 * scene.draw + scene.image_draw + repeat
             rng = stream(scene.seed, f"estimator/{table}/{labels}", index)
-            rows.append((table, {**shown, "repeat": repeat, **one_run(experiment, seen, rng)}))
+            row = {**shown, "repeat": repeat, **one_run(experiment, seen, rng)}
+            rows.setdefault(table, []).append(row)
     return rows
 
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
-from typing import Any
+from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -16,24 +16,18 @@ from experiments.evaluation.statistics import (
     mean_interval,
     share_interval,
 )
-from experiments.judging.results import Results
-from experiments.judging.verdict import (
+from experiments.judging.claim import (
     Claim,
-    Conclusion,
-    Role,
-    Verdict,
+    Subject,
     banded,
     beside,
-    conclude,
     equivalent,
     lower,
-    overall,
-    percent,
-    pick,
-    plain,
     remarked,
     shown,
 )
+from experiments.judging.results import Results
+from experiments.judging.verdict import Verdict, overall
 from experiments.papers.maximo2024.settings import (
     BETWEEN_NODES_S,
     JUDGED_QUALITY,
@@ -42,6 +36,7 @@ from experiments.papers.maximo2024.settings import (
     WITHIN,
 )
 
+_PAPERS, _BETWEEN = "the paper's", f"{BETWEEN_NODES_S:g} s between nodes"
 _LEAST_M = 1e-3  # added to dispersions that may be zero, before a logarithm
 
 
@@ -59,21 +54,6 @@ def judge(made: Results) -> list[Claim]:
         mx7(made.table("campus_starts")),
         *mx8(made.table("kidnapping")),
     ]
-
-
-def conclusions(_made: Results, claims: Sequence[Claim]) -> list[Conclusion]:
-    """Verdict and sentence of MX1-MX8."""
-    sentences: dict[str, Callable[[Sequence[Claim]], str]] = {
-        "MX1": mx1_sentence,
-        "MX2": mx2_sentence,
-        "MX3": mx3_sentence,
-        "MX4": mx4_sentence,
-        "MX5": mx5_sentence,
-        "MX6": mx6_sentence,
-        "MX7": mx7_sentence,
-        "MX8": mx8_sentence,
-    }
-    return conclude(claims, sentences, "worlds")
 
 
 def geometries(table: pd.DataFrame) -> list[str]:
@@ -107,48 +87,34 @@ def mx1(
         for compare in (_m3_error, _m2_error):
             claim = compare(name, errors)
             if claim is not None:
-                claim = remarked(claim, _where(compare, quality, name))
-                yield beside(claim, name not in decisive)
+                yield beside(_where(claim, compare, quality, name), name not in decisive)
     if runs is not None:
         errors = runs.pivot_table(index="run", columns="method", values="error_m")
-        for hits, what in (
-            (errors["M2"] < errors["M1"], "M2 below M1"),
-            (errors["M3"] > 5.0 * errors["M2"], "M3 worse than 5 times M2"),
+        for method, hits, what in (
+            ("M2", errors["M2"] < errors["M1"], "M2 below M1"),
+            ("M3", errors["M3"] > 5.0 * errors["M2"], "M3 worse than 5 times M2"),
         ):
             found = share_interval(int(hits.sum()), len(hits))
-            yield shown("MX1", f"share of Oxford runs, real positions, with {what}", found)
+            label = f"share of Oxford runs, real positions, with {what}"
+            yield shown(Subject("MX1", "runs", method=method), label, found)
 
 
 def _m3_error(name: str, errors: pd.DataFrame) -> Claim | None:
     """Judge M3 by the errors of worlds: it fails on Oxford, and holds on UMH."""
+    about = Subject("MX1", "error", method="M3", over="M2", place=NAMES[name])
     if name.startswith("oxford"):
         label = f"share of worlds with M3 worse than 5 times M2, {NAMES[name]}"
-        return _share("MX1", label, errors["M3"] > 5.0 * errors["M2"], at_least=0.8)
+        fails = replace(about, quantity="failures")
+        return _share(fails, label, errors["M3"] > 5.0 * errors["M2"], at_least=0.8)
     if name.startswith("umh"):
         label = f"error of M3 over M2, {NAMES[name]}"
-        return equivalent("MX1", label, errors["M3"], errors["M2"], 0.25)
+        return equivalent(about, label, errors["M3"], errors["M2"], 0.25)
     return None
 
 
 def _m2_error(name: str, errors: pd.DataFrame) -> Claim:
-    return lower("MX1", f"error of M2 over M1, {NAMES[name]}", errors["M2"], errors["M1"])
-
-
-def mx1_sentence(rows: Sequence[Claim]) -> str:
-    """Say which weighting errs least, and where M3 fails."""
-    judged_rows = list(filter(_is_headline, rows))
-    below = [row for row in judged_rows if row.statistic.startswith("error of M2 over M1")]
-    parts = [f"{plain(row.found.value, 3)} on {_place(row)} ({_p(row)})" for row in below]
-    fails = pick(judged_rows, "5 times M2")
-    said = (
-        f"With shared parameters M2's error over M1's is {' and '.join(parts)}. M3 is worse than 5 "
-        f"times M2 in {percent(fails.found.value)} of worlds on Oxford"
-    )
-    same = [row for row in judged_rows if "error of M3 over M2" in row.statistic]
-    if same:
-        said += f", and has {plain(same[0].found.value)} times M2's error on UMH"
-    where = f" Of the numbers B tried, that on Oxford {fails.reason}." if fails.reason else ""
-    return f"{said}.{where}"
+    about = Subject("MX1", "error", method="M2", over="M1", place=NAMES[name])
+    return lower(about, f"error of M2 over M1, {NAMES[name]}", errors["M2"], errors["M1"])
 
 
 def mx3(dispersion: pd.DataFrame, quality: pd.DataFrame) -> Iterator[Claim]:
@@ -162,45 +128,16 @@ def mx3(dispersion: pd.DataFrame, quality: pd.DataFrame) -> Iterator[Claim]:
         for name in geometries(at_10):
             worlds = _by_world(at_10[at_10["geometry"] == name], "dispersion_m")
             claim = compare(name, worlds)
-            where = _where(compare, quality, name)
-            yield beside(remarked(claim, where), name not in decisive)
+            yield beside(_where(claim, compare, quality, name), name not in decisive)
 
 
-def _m2_dispersion(name: str, worlds: pd.DataFrame) -> Claim:
-    return _less_dispersed("M2", name, worlds)
-
-
-def _m3_dispersion(name: str, worlds: pd.DataFrame) -> Claim:
-    return _less_dispersed("M3", name, worlds)
-
-
-def _less_dispersed(method: str, name: str, worlds: pd.DataFrame) -> Claim:
+def _dispersion(method: str, name: str, worlds: pd.DataFrame) -> Claim:
+    about = Subject("MX3", "dispersion", method=method, over="M1", place=NAMES[name])
     label = f"dispersion of {method} over M1 at step 10, {NAMES[name]}"
-    return lower("MX3", label, worlds[method] + _LEAST_M, worlds["M1"] + _LEAST_M)
+    return lower(about, label, worlds[method] + _LEAST_M, worlds["M1"] + _LEAST_M)
 
 
-def mx3_sentence(rows: Sequence[Claim]) -> str:
-    """Say how far particles have concentrated after ten steps, by the weighting."""
-    judged_rows = list(filter(_is_headline, rows))
-    parts = [
-        f"{row.statistic.removeprefix('dispersion of ').split(' at ')[0]} on {_place(row)} "
-        f"{plain(row.found.value)} ({_p(row)})"
-        for row in judged_rows
-    ]
-    return f"Ratios of the dispersions after ten steps: {'; '.join(parts)}."
-
-
-def _is_headline(row: Claim) -> bool:
-    return row.role is Role.HEADLINE
-
-
-def _place(row: Claim) -> str:
-    """The geometry, which ends a statistic."""
-    return row.statistic.split(", ", 1)[1].removesuffix(" (90 % interval)")
-
-
-def _p(row: Claim) -> str:
-    return f"p = {row.reason.split('p = ')[-1].split(';')[0]}"
+_m2_dispersion, _m3_dispersion = partial(_dispersion, "M2"), partial(_dispersion, "M3")
 
 
 Compare = Callable[[str, pd.DataFrame], Claim | None]
@@ -219,26 +156,27 @@ def judged_map(quality: pd.DataFrame, name: str, compare: Compare) -> pd.DataFra
     Returns
     -------
     DataFrame
-        Columns noise_weight, n_nearest, statistic, value, verdict.
+        Columns noise_weight, n_nearest, about (a `Subject`), value, verdict.
     """
     part = quality[quality["geometry"] == name]
     rows = []
     for key, cell in part.groupby(["noise_weight", "n_nearest"]):
         claim = compare(name, _by_world(cell, COMPARISONS[compare]))
         if claim is not None:
-            rows.append((*key, claim.statistic, claim.found.value, claim.verdict))
-    columns = ["noise_weight", "n_nearest", "statistic", "value", "verdict"]
+            rows.append((*key, claim.about, claim.found.value, claim.verdict))
+    columns = ["noise_weight", "n_nearest", "about", "value", "verdict"]
     return pd.DataFrame(rows, columns=columns)
 
 
-def _where(compare: Compare, quality: pd.DataFrame, name: str) -> str:
-    """Name the B at which a comparison holds in the map, at the descriptors of the study."""
+def _where(claim: Claim, compare: Compare, quality: pd.DataFrame, name: str) -> Claim:
+    """Add the B at which a comparison holds in the map, at the descriptors of the study."""
     cells = judged_map(quality, name, compare)
     cells = cells[cells["noise_weight"] == JUDGED_QUALITY]
-    good = cells.loc[cells["verdict"] == Verdict.REPRODUCED, "n_nearest"]
-    where = f"B = {', '.join(map(str, good))}" if len(good) else "no B"
-    tried = ", ".join(map(str, cells["n_nearest"]))
-    return "" if cells.empty else f"holds at {where} of {tried}"
+    tried = cells["n_nearest"].tolist()
+    good = cells.loc[cells["verdict"] == Verdict.REPRODUCED, "n_nearest"].tolist()
+    where = f"B = {', '.join(map(str, good))}" if good else "no B"
+    remark = f"holds at {where} of {', '.join(map(str, tried))}" if tried else ""
+    return remarked(claim, remark, holds_at=good, tried=tried)
 
 
 def mx2(particles: pd.DataFrame, times: pd.DataFrame) -> Iterator[Claim]:
@@ -251,7 +189,8 @@ def mx2(particles: pd.DataFrame, times: pd.DataFrame) -> Iterator[Claim]:
         label = (
             f"error with more or fewer particles a node over that with 4, the worst, {NAMES[name]}"
         )
-        each = {n: equivalent("MX2", label, errors[n], errors[4], 0.05) for n in errors if n != 4}
+        about = Subject("MX2", "error", over="4 particles a node", place=NAMES[name])
+        each = {n: equivalent(about, label, errors[n], errors[4], 0.05) for n in errors if n != 4}
         worst = max(each, key=lambda n: abs(math.log(each[n].found.value)))
         verdict, more = (
             overall([c.verdict for c in each.values()]),
@@ -262,9 +201,9 @@ def mx2(particles: pd.DataFrame, times: pd.DataFrame) -> Iterator[Claim]:
         yield beside(claim, name not in headlines(particles["geometry"]))
     for name, part in times.groupby("geometry", sort=False):
         counts = part.groupby("particles")["time_s"]
-        shares = {"the paper's": part["time_s"] / part["paper_s"]}
+        shares = {_PAPERS: part["time_s"] / part["paper_s"]}
         if name.startswith("oxford"):
-            shares[f"{BETWEEN_NODES_S:g} s between nodes"] = part["time_s"] / BETWEEN_NODES_S
+            shares[_BETWEEN] = part["time_s"] / BETWEEN_NODES_S
         for what, share in shares.items():
             label = f"time a node over {what}, the largest, {NAMES[name]}"
             each = share.groupby(part["particles"])
@@ -272,16 +211,18 @@ def mx2(particles: pd.DataFrame, times: pd.DataFrame) -> Iterator[Claim]:
             found = Interval(
                 *(float(getattr(each, end)()[most]) for end in ("median", "min", "max"))
             )
-            yield banded("MX2", label, found, at_most=0.1)
-        (least, fewest), *_, (most, largest) = ((k, v.to_numpy()) for k, v in counts)
+            about = Subject("MX2", "time", over=what, place=NAMES[name])
+            yield banded(about, label, found, at_most=0.1)
+        (low, fewest), *_, (most, largest) = ((k, v.to_numpy()) for k, v in counts)
         grown = Interval(
             float(np.median(largest) / np.median(fewest)),
             float(largest.min() / fewest.max()),
             float(largest.max() / fewest.min()),
         )
         label = f"time a node with the most particles over that with the fewest, {NAMES[name]}"
-        claim = banded("MX2", label, grown, at_least=1.0, criterion="above 1")
-        yield remarked(claim, f"{most} particles over {least}")
+        about = Subject("MX2", "time", over="the fewest", place=NAMES[name])
+        claim = banded(about, label, grown, at_least=1.0, criterion="above 1")
+        yield remarked(claim, f"{most} particles over {low}")
     yield from _oxford_slower(times)
 
 
@@ -299,166 +240,77 @@ def _oxford_slower(times: pd.DataFrame) -> Iterator[Claim]:
             float(ours["max"][least] / other["min"][least]),
         )
         label = f"time a node over that of UMH, the smallest, {NAMES[oxford]}"
-        yield banded("MX2", label, found, at_least=1.0, criterion="above 1")
+        about = Subject("MX2", "time", over="UMH", place=NAMES[oxford])
+        yield banded(about, label, found, at_least=1.0, criterion="above 1")
 
 
-def mx2_sentence(rows: Sequence[Claim]) -> str:
-    """Say how the error and the time depend on the number of particles."""
-    judged_rows = list(filter(_is_headline, rows))
-    errors = [row for row in judged_rows if row.statistic.startswith("error")]
-    parts = [
-        f"{plain(row.found.value, 3)} times as large on {_place(row).split(', ', 1)[-1]}"
-        for row in errors
-    ]
-    share, gap, grows = (
-        max(row.found.value for row in judged_rows if words in row.statistic)
-        for words in ("over the paper's", "between nodes", "the fewest")
-    )
-    slower = pick(judged_rows, "over that of UMH").found.value
-    return (
-        f"Against 4 particles a node, the error with another number is at its farthest "
-        f"{' and '.join(parts)}. The time grows up to {plain(grows)} times, is at most "
-        f"{plain(100.0 * share)} % of the paper's and {plain(100.0 * gap)} % of the time between "
-        f"nodes, and on Oxford is at least {plain(slower)} times that on UMH."
-    )
-
-
-def _share(claim: str, statistic: str, hits: pd.Series[bool], **judging: Any) -> Claim:
+def _share(
+    about: Subject,
+    label: str,
+    hits: pd.Series[bool],
+    at_least: float = -math.inf,
+    at_most: float = math.inf,
+    *,
+    criterion: str = "",
+) -> Claim:
     found = share_interval(int(hits.sum()), len(hits))
-    return banded(claim, statistic, found, **judging, n=len(hits))
+    return banded(about, label, found, at_least, at_most, criterion=criterion, n=len(hits))
 
 
-def mx4(starts: pd.DataFrame) -> list[Claim]:
+def mx4(starts: pd.DataFrame) -> Iterator[Claim]:
     """MX4: any starting node works."""
-    return [
-        beside(
-            _share(
-                "MX4",
-                f"share of starts that M2 localises within {WITHIN} steps, {NAMES[name]}",
-                part["settled_at"] <= WITHIN,
-                at_least=0.95,
-                criterion="lower bound above 0.95",
-            ),
-            name not in headlines(starts["geometry"]),
-        )
-        for name, part in starts.groupby("geometry", sort=False)
-    ]
+    decisive = headlines(starts["geometry"])
+    for name, part in starts.groupby("geometry", sort=False):
+        label = f"share of starts that M2 localises within {WITHIN} steps, {NAMES[name]}"
+        about = Subject("MX4", "starts", place=NAMES[name], setting=WITHIN)
+        settled = part["settled_at"] <= WITHIN
+        claim = _share(about, label, settled, at_least=0.95, criterion="lower bound above 0.95")
+        yield beside(claim, name not in decisive)
 
 
-def mx4_sentence(rows: Sequence[Claim]) -> str:
-    """Say from how many starts the robot is localized."""
-    return f"Within {WITHIN} steps M2 is localized from {_shares(rows)} of the starts."
-
-
-def mx5(clusters: pd.DataFrame) -> list[Claim]:
+def mx5(clusters: pd.DataFrame) -> Iterator[Claim]:
     """MX5: clusters of descriptors are stretches of the route.
 
     On the synthetic field this holds by construction. Scan Context is left out, since it turns
     with the robot, which k-means does not allow for.
     """
     asked = clusters[clusters["descriptor"] != "scan_context"]
+    decisive = headlines(asked["geometry"])
     shares = asked.groupby(["geometry", "descriptor"], sort=False)["contiguous"]
-    return [
-        beside(
-            banded(
-                "MX5",
-                f"share of nodes with a route neighbour in their cluster, {NAMES[name]}"
-                + (f", {descriptor}" if descriptor != "synthetic" else ""),
-                mean_interval(part),
-                at_least=0.8,
-                criterion="above 0.8",
-                n=len(part),
-            ),
-            name not in headlines(asked["geometry"]),
-        )
-        for (name, descriptor), part in shares
-    ]
-
-
-def mx5_sentence(rows: Sequence[Claim]) -> str:
-    """Say how contiguous the clusters are, on the made descriptors and on those of clouds."""
-    ours = [row for row in rows if not _is_headline(row) and "campus" in row.statistic]
-    said = (
-        f"A route neighbour shares the cluster of {_shares(rows)} of the nodes, where the made "
-        "descriptors are contiguous by construction"
-    )
-    if ours:
-        return f"{said}; with descriptors of simulated clouds, of {_shares(ours, all_rows=True)}."
-    return f"{said}."
+    for (name, descriptor), part in shares:
+        place = NAMES[name] if descriptor == "synthetic" else f"{NAMES[name]}, {descriptor}"
+        about = Subject("MX5", "contiguous", method=descriptor, place=place)
+        label = f"share of nodes with a route neighbour in their cluster, {place}"
+        found, n = mean_interval(part), len(part)
+        claim = banded(about, label, found, at_least=0.8, criterion="above 0.8", n=n)
+        yield beside(claim, name not in decisive)
 
 
 def mx6(starts: pd.DataFrame) -> Claim:
     """Our own: global localization on simulated clouds."""
-    return _share(
-        "MX6",
-        "share of starts localised on campus clouds (our own)",
-        starts["settled_at"] <= WITHIN,
-        at_least=0.95,
-    )
-
-
-def mx6_sentence(rows: Sequence[Claim]) -> str:
-    """Say from how many starts on the campus the robot is localized."""
-    (row,) = rows
-    return (
-        f"On simulated clouds {percent(row.found.value)} of the starts are localized within "
-        f"{WITHIN} steps (at least {percent(row.found.low)})."
-    )
+    label = "share of starts localised on campus clouds (our own)"
+    about = Subject("MX6", "starts", setting=WITHIN)
+    return _share(about, label, starts["settled_at"] <= WITHIN, at_least=0.95)
 
 
 def mx7(starts: pd.DataFrame) -> Claim:
     """Our own, the paper's future work: registration brings the error below the spacing."""
     worlds = starts.dropna(subset="rms_m").groupby("seed")[["spacing_m", "rms_m"]].mean()
     ratio = log_ratio_interval(worlds["spacing_m"], worlds["rms_m"])
-    statistic = "node spacing over RMS error with refinement, campus clouds (our own)"
-    return banded("MX7", statistic, ratio, at_least=5.0, n=len(worlds))
+    label = "node spacing over RMS error with refinement, campus clouds (our own)"
+    return banded(Subject("MX7", "spacing"), label, ratio, at_least=5.0, n=len(worlds))
 
 
-def mx7_sentence(rows: Sequence[Claim]) -> str:
-    """Say how far below the spacing registration brings the error."""
-    (row,) = rows
-    low = row.found.low
-    bound = f"at least {plain(low)} times" if math.isfinite(low) else "too few worlds for a bound"
-    return (
-        f"With registration the RMS error is {plain(row.found.value)} times smaller than the node "
-        f"spacing ({bound})."
-    )
-
-
-def mx8(kidnapping: pd.DataFrame) -> list[Claim]:
+def mx8(kidnapping: pd.DataFrame) -> Iterator[Claim]:
     """Our own: a kidnapped robot is found again with injection, and not without."""
     known = kidnapping[kidnapping["known_before"]]
     back = known["settled_at"] <= RECOVERED_WITHIN
     trials = back.groupby([known["geometry"], known["injection"] > 0.0], sort=False)
-    return [
-        _share(
-            "MX8",
-            f"share recovered within {RECOVERED_WITHIN} nodes {'with' if injects else 'without'} "
-            f"injection, {NAMES[name]} (our own)",
-            recovered,
-            **({"at_least": 0.95} if injects else {"at_most": 0.5}),
+    for (name, injects), recovered in trials:
+        arm = "with" if injects else "without"
+        about = Subject("MX8", "recovered", arm=arm, place=NAMES[name], setting=RECOVERED_WITHIN)
+        label = (
+            f"share recovered within {RECOVERED_WITHIN} nodes {arm} injection, "
+            f"{NAMES[name]} (our own)"
         )
-        for (name, injects), recovered in trials
-    ]
-
-
-def mx8_sentence(rows: Sequence[Claim]) -> str:
-    """Say how often a kidnapped robot is found again."""
-    found, lost = (
-        [row.found for row in rows if f"{how} injection" in row.statistic]
-        for how in ("with", "without")
-    )
-    return (
-        f"With injection {percent(min(f.value for f in found))} of kidnapped robots are found "
-        f"again within {RECOVERED_WITHIN} nodes, whatever the route (at least "
-        f"{percent(min(f.low for f in found))}); without it at most "
-        f"{percent(max(f.value for f in lost))}."
-    )
-
-
-def _shares(rows: Sequence[Claim], *, all_rows: bool = False) -> str:
-    """Shares of the headlines, or of all rows, with their geometries."""
-    wanted = [row for row in rows if all_rows or _is_headline(row)]
-    return " and ".join(
-        f"{percent(row.found.value)} ({row.statistic.split(', ', 1)[-1]})" for row in wanted
-    )
+        yield _share(about, label, recovered, *((0.95,) if injects else (-math.inf, 0.5)))

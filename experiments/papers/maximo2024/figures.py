@@ -25,7 +25,13 @@ from experiments.papers.maximo2024.settings import (
     PRINTED_5,
     RECOVERED_WITHIN,
 )
-from experiments.viewing.plotting import plain_log, plan_axes, with_legend
+from experiments.viewing.plotting import (
+    draw_band,
+    draw_dots,
+    plain_log,
+    plan_axes,
+    with_legend,
+)
 from experiments.viewing.style import BLACK, BLUE, CYCLE, GREEN, ORANGE, RED, SKY, WALL, subplots
 
 Arrays = dict[str, NDArray[Any]]
@@ -38,6 +44,11 @@ _VERDICT = {
     Verdict.NOT_REPRODUCED: "#F2B48C",
 }
 _DESCRIPTORS = {"scan_context": "Scan Context", "ring_key": "ring key", "m2dp": "M2DP"}
+_COMPARED = {  # what a comparison of weightings is about, by its quantity
+    "error": "error of {0.method} over {0.over}",
+    "failures": "share of worlds with {0.method} worse than 5 times {0.over}",
+    "dispersion": "dispersion of {0.method} over {0.over} at step 10",
+}
 _RECALL = {"recall_at_1": "recall@1", "recall_at_1_percent": "recall@1 %"}
 
 
@@ -115,9 +126,8 @@ def dispersion(table: pd.DataFrame) -> Figure:
             steps = part.groupby(["method", "step"])[value].quantile([0.1, 0.5, 0.9]).unstack()
             for method in METHODS:
                 spread = steps.clip(lower=_FLOOR_M[name.partition("_")[0]]).loc[method]
-                ax.plot(spread[0.5], color=_COLOUR[method], label=method)
-                between = (spread.index, spread[0.1], spread[0.9])
-                ax.fill_between(*between, color=_COLOUR[method], alpha=0.15, lw=0)
+                style = {"color": _COLOUR[method], "label": method}
+                draw_band(ax, spread[0.5], (spread[0.1], spread[0.9]), 0.15, **style)
             _log_scale(ax, bottom=_FLOOR_M[name.partition("_")[0]])
         axes[0].set(title=NAMES[name])
         axes[1].set(xlabel="step")
@@ -171,9 +181,8 @@ def table_1(table: pd.DataFrame, weighting: pd.DataFrame) -> Figure:
     for (ax,), name, part in columns:
         for i, method in enumerate(METHODS):
             errors, row = worlds[name, method], part.set_index("method").loc[method]
-            spread = np.linspace(-0.18, 0.18, len(errors)) if len(errors) > 1 else np.zeros(1)
             label = "a world (mean of its repeats)" if i == 1 else ""
-            ax.plot(i + spread, errors, ".", color=_COLOUR[method], ms=4, label=label)
+            draw_dots(ax, i, errors, spread=0.18, color=_COLOUR[method], label=label)
             ax.plot(i, row["error_m"], "_", color=BLACK, ms=26, mew=1.6, label="mean" * (i == 0))
             if np.isfinite(row["paper_m"]):
                 bar = {"fmt": "D", "color": RED, "ms": 5, "label": "paper" * (i == 0)}
@@ -233,7 +242,8 @@ def quality(table: pd.DataFrame) -> Figure:
                 yticks=range(len(values)),
                 yticklabels=[f"{w:g} ({recall[w]:.2f})" for w in values.index],
             )
-            label = str(cells["statistic"].iloc[0]).removesuffix(" (90 % interval)")
+            about = cells["about"].iloc[0]
+            label = f"{_COMPARED[about.quantity].format(about)}, {about.place}"
             ax.set_title(textwrap.fill(label, 30), fontsize=9)
             ax.spines[:].set_visible(False)
         row[0].set(ylabel="noise weight (recall@1)")

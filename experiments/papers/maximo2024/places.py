@@ -307,10 +307,7 @@ def resequenced(recording: Recording, rows: NDArray[np.int64]) -> Recording:
     """
     kept = [name for name in ("place", "lidar3d") if name in recording.logs]
     stamps = recording.log(kept[0] if kept else "lidar3d").stamps
-    rolled = np.stack(
-        [np.interp(stamps, recording.wheels.stamps, p) for p in recording.wheels.position_m.T],
-        axis=1,
-    )
+    rolled = recording.wheels.at(stamps)
     steps = np.diff(rolled, axis=0, prepend=2.0 * rolled[:1] - rolled[1:2])
     new_stamps = np.cumsum(np.diff(stamps, prepend=2.0 * stamps[0] - stamps[1])[rows])
     return dataclasses.replace(

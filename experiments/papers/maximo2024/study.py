@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from estimators.topological.topological_map import from_recording
 from experiments.bench import topological
-from experiments.judging.jobs import in_parallel
+from experiments.judging.jobs import Tables, tables_of
 from experiments.judging.results import Results
 from experiments.judging.verdict import Profile
 from experiments.papers.maximo2024.claims import headlines
@@ -70,6 +70,7 @@ from sim.sensors import Lidar3D
 
 Arrays = dict[str, NDArray[np.generic]]
 
+_TUNED_BY = ("geometry", "sigma_l", "sigma_m", "n_nearest")
 _REACH_M = 65.0  # of the clouds kept, from the middle of the nodes drawn
 _CLOUD_GRID_M = 0.05
 
@@ -86,14 +87,8 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
     on_progress
         Called with the share of the work done.
     """
-    jobs = _jobs(profile)
-    rows: dict[str, Rows] = {}
-    parts = in_parallel(_rows, [job for job, _ in jobs], on_progress, [cost for _, cost in jobs])
-    for ((_, name, seed, _), _), part in zip(jobs, parts, strict=True):
-        for table, found in part.items():
-            labelled = ({"geometry": name, "seed": seed, **row} for row in found)
-            rows.setdefault(table, []).extend(labelled)
-    tables = {name: pd.DataFrame(found) for name, found in rows.items()}
+    jobs, costs = zip(*_jobs(profile), strict=True)
+    tables = tables_of(_labelled, jobs, on_progress, costs)
     tables["times"] = times(N_TIMINGS[profile])
     tables["table_1"] = table_1(tables["weighting"])
     tables["table_2"] = table_2(tables["particles"], tables["times"])
@@ -128,6 +123,14 @@ def _jobs(profile: Profile) -> list[tuple[Job, float]]:
         for i in range(n[profile])
         for name in names
     ]
+
+
+def _labelled(what: str, name: str, seed: int, profile: Profile) -> Tables:
+    """All rows of a job, by table, with the geometry and seed of its world."""
+    return {
+        table: [{"geometry": name, "seed": seed, **row} for row in rows]
+        for table, rows in _rows(what, name, seed, profile).items()
+    }
 
 
 def _rows(what: str, name: str, seed: int, profile: Profile) -> dict[str, Rows]:
@@ -310,20 +313,19 @@ def tune(out: Results, n_worlds: int = 8) -> None:
     Takes about ten minutes on two cores. The settings see the same worlds and draws.
     """
     jobs = [(name, seed) for seed in range(n_worlds) for name in routes()]
-    parts = in_parallel(_tuning_rows, jobs, lambda _share: None)
-    columns = ["geometry", "sigma_l", "sigma_m", "n_nearest", "error_m"]
-    table = pd.DataFrame(list(itertools.chain.from_iterable(parts)), columns=columns)
-    by = table.groupby(columns[:-1], as_index=False, sort=False)
+    table = tables_of(_tuning_rows, jobs)["tuning"]
+    by = table.groupby(list(_TUNED_BY), as_index=False, sort=False)
     out.write_tables(tuning=by["error_m"].mean())
 
 
-def _tuning_rows(name: str, seed: int) -> list[tuple[str, float, float, int, float]]:
+def _tuning_rows(name: str, seed: int) -> Tables:
     case, rows = case_of(name, seed), []
     for sigma_l, sigma_m, n_nearest in itertools.product(GRID_SIGMA_L, GRID_SIGMA_M, GRID_B):
         settings = options(case, "M2", (sigma_l, sigma_m, n_nearest))
         walk = localize(case, settings, stream(seed, "estimator/tuning"))
-        rows.append((name, sigma_l, sigma_m, n_nearest, float(walk.errors_m.mean())))
-    return rows
+        setting = dict(zip(_TUNED_BY, (name, sigma_l, sigma_m, n_nearest), strict=True))
+        rows.append({**setting, "error_m": float(walk.errors_m.mean())})
+    return {"tuning": rows}
 
 
 def routes() -> list[str]:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
 
-from estimators.base import Estimate, Prior, run
+from estimators.base import Estimate, Prior
 from estimators.topological import descriptors as describers
 from estimators.topological.topological_map import TopologicalMap, from_recording
 from experiments.evaluation.metrics import position_errors_m, rms, travelled_m
@@ -128,9 +128,9 @@ def localize(
         Further Belief extras to record.
     """
     taken = case.recording if recording is None else recording
-    estimate = run(
-        case.experiment.with_estimator(**settings).estimator(),
+    estimate, _ = run_over(
         taken,
+        case.experiment.with_estimator(**settings).estimator(),
         Prior(taken.robot, taken.sensors, map=case.known_map),
         rng,
         keep=("dispersion_m", "refinement", *keep),

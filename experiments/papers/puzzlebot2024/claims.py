@@ -4,30 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 
 import numpy as np
 import pandas as pd
 
 from experiments.evaluation.statistics import Interval, mean_interval, share_interval
+from experiments.judging.claim import Claim, Subject, banded, beside, shown
 from experiments.judging.results import Results
-from experiments.judging.verdict import (
-    Claim,
-    Conclusion,
-    Role,
-    Verdict,
-    banded,
-    beside,
-    conclude,
-    holds,
-    judged,
-    more_to_settle,
-    overall,
-    percent,
-    pick,
-    plain,
-    shown,
-)
+from experiments.judging.verdict import Role, Verdict, holds, judged, more_to_settle, overall
 from experiments.papers.puzzlebot2024.settings import NOMINAL, REPORTED_TURN_RATIO
 from sim.arrays import Array
 
@@ -51,20 +36,8 @@ def judge(made: Results) -> list[Claim]:
         *pb2(made.table("areas"), made.table("crossover"), NOMINAL.track_m),
         *pb3(made.table("calibration"), made.table("gradient_descent"), made.table("engine_k")),
         *pb3_short_turns(made.table("short_turns"), made.table("short_turns_found")),
-        *pb4(made.table("coverage"), made.table("engine")),
+        *pb4(made.table("coverage"), made.table("engine"), made.table("table_1")),
     ]
-
-
-def conclusions(made: Results, claims: Sequence[Claim]) -> list[Conclusion]:
-    """Verdict and sentence of PB1-PB4."""
-    coverage, cases = made.table("coverage"), made.table("table_1").set_index("case")
-    sentences: dict[str, Callable[[Sequence[Claim]], str]] = {
-        "PB1": pb1_sentence,
-        "PB2": pb2_sentence,
-        "PB3": pb3_sentence,
-        "PB4": lambda _: pb4_sentence(coverage, cases),
-    }
-    return conclude(claims, sentences, "repetitions")
 
 
 def worked_matrices() -> tuple[Array, Array]:
@@ -88,16 +61,8 @@ def pb1() -> list[Claim]:
         for worked, (printed, half_unit) in zip(worked_matrices(), PRINTED, strict=True)
     )
     statistic = "largest deviation of Sigma_1 and Sigma_2, in half units of the last printed digit"
-    return [Claim("PB1", statistic, Interval.exact(worst), "at most 1", holds(worst <= 1.0))]
-
-
-def pb1_sentence(rows: Sequence[Claim]) -> str:
-    """Say how far the worked matrices are from the printed ones."""
-    (row,) = rows
-    return (
-        f"The worked matrices come within {plain(row.found.value)} half units of the last printed "
-        "digit, with 0.998 in Sigma_2 read as 0.9998, a misprint."
-    )
+    about = Subject("PB1", "deviation")
+    return [Claim(about, statistic, Interval.exact(worst), "at most 1", holds(worst <= 1.0))]
 
 
 def pb2(areas: pd.DataFrame, crossover: pd.DataFrame, track_m: float) -> Iterator[Claim]:
@@ -106,27 +71,14 @@ def pb2(areas: pd.DataFrame, crossover: pd.DataFrame, track_m: float) -> Iterato
         steps = np.concatenate([np.diff(part["area_m2"]) for _, part in table.groupby("k_m")])
         shrinking = float(np.mean(steps < -1e-9 * table["area_m2"].max()))
         statistic = f"share of steps in which the 95 % ellipse shrinks, {name}"
-        found = Interval.exact(shrinking)
+        found, about = Interval.exact(shrinking), Subject("PB2", "shrinks", arm=str(name))
         if name == _OUT_AND_BACK:
-            yield shown("PB2", statistic, found, "it shrinks on the way back")
+            yield shown(about, statistic, found, "it shrinks on the way back")
         else:
-            yield Claim("PB2", statistic, found, "0", holds(shrinking <= 0.0))
+            yield Claim(about, statistic, found, "0", holds(shrinking <= 0.0))
     ratio = mean_interval(crossover["crossover_m"] / (track_m * math.sqrt(3.0) / 2.0))
     statistic = "distance at which heading-borne spread overtakes, over track sqrt(3) / 2"
-    yield banded("PB2", statistic, ratio, 0.98, 1.02, n=len(crossover))
-
-
-def pb2_sentence(rows: Sequence[Claim]) -> str:
-    """Say where the ellipse grows and where it shrinks, and when the heading takes over."""
-    grows = [r for r in rows if "shrinks" in r.statistic and r.role is Role.HEADLINE]
-    most = max(row.found.value for row in grows)
-    return (
-        f"The ellipse {'never shrinks' if most <= 0.0 else f'shrinks in {percent(most)} of steps'} "
-        f"on straights and arcs; the heading's part overtakes after "
-        f"{pick(rows, 'overtakes').found.value:.3f} times the distance that theory gives. "
-        f"Driven out and back, it shrinks in {percent(pick(rows, _OUT_AND_BACK).found.value)} of "
-        "steps, since a heading error that is driven back cancels."
-    )
+    yield banded(Subject("PB2", "crossover"), statistic, ratio, 0.98, 1.02, n=len(crossover))
 
 
 def pb3(
@@ -140,6 +92,9 @@ def pb3(
     """
     for (method, joint, k), table in calibration.groupby(["method", "joint", "k_m"], sort=False):
         where = f"{method}, k = {k:g} m, {'gain and track joint' if joint else 'nominal geometry'}"
+        about = Subject(
+            "PB3", "bias", method=str(method), setting=float(k), arm="joint" if joint else None
+        )
         is_beside = method not in _HEADLINE_METHODS
         is_slip = table["parameter"].isin(["kr", "kl"])
         slips, parts = table[is_slip], {"kr and kl": table[is_slip]}
@@ -149,26 +104,29 @@ def pb3(
         for names, part in parts.items():
             share = _clustered_share(part["truth"].between(part["low"], part["high"]), part["seed"])
             label = f"coverage of the 95 % intervals of {names}: {where}"
-            claim = banded("PB3", label, share, 0.90, 0.99, n=n)
+            covered = dataclasses.replace(about, quantity="coverage", metric=names)
+            claim = banded(covered, label, share, 0.90, 0.99, n=n)
             yield beside(claim, is_beside or names != "kr and kl")
         relative = slips["value"] / slips["truth"] - 1.0
         biases = [mean_interval(part) for _, part in relative.groupby(slips["parameter"])]
         worse = max(biases, key=lambda bias: abs(bias.value))
         label = f"relative bias, the worse of kr and kl: {where}"
         verdict = overall([judged(bias, -0.05, 0.05) for bias in biases])
-        claim = dataclasses.replace(banded("PB3", label, worse, -0.05, 0.05, n=n), verdict=verdict)
+        claim = dataclasses.replace(banded(about, label, worse, -0.05, 0.05, n=n), verdict=verdict)
         yield beside(claim, is_beside)
     for row in engine_k.itertuples():
         label = (
             f"{row.parameter} of PyBullet's robot by wheel truth, over the truth, k = {row.k_m:g} m"
         )
         ratio = Interval(row.value / row.truth, row.low / row.truth, row.high / row.truth)
-        yield beside(banded("PB3", label, ratio, 0.95, 1.05))
+        about = Subject("PB3", "k of PyBullet's robot", setting=row.k_m, metric=row.parameter)
+        yield beside(banded(about, label, ratio, 0.95, 1.05))
     limits = np.abs(descent["k_in_the_end"] - 0.5)
     what = "the report's gradient descent: largest distance of its limit from 1/2, any data"
     judgement = ("above 0.01: it depends on the data", holds(float(limits.max()) > 0.01))
     found = Interval.exact(float(limits.max()))
-    yield Claim("PB3", what, found, *judgement, "it should estimate kr and kl", Role.BESIDE)
+    about, why = Subject("PB3", "gradient descent"), "it should estimate kr and kl"
+    yield Claim(about, what, found, *judgement, why, Role.BESIDE)
 
 
 def pb3_short_turns(ends: pd.DataFrame, found: pd.DataFrame) -> Iterator[Claim]:
@@ -182,36 +140,26 @@ def pb3_short_turns(ends: pd.DataFrame, found: pd.DataFrame) -> Iterator[Claim]:
         ratios = turns[f"{who}_heading_mean_rad"] / turns["ideal_heading_rad"]
         what = f"turns over commanded ones, {where}, {label}"
         reported = f"the report: {REPORTED_TURN_RATIO}" if who == "real" else ""
-        yield shown("PB3", what, mean_interval(ratios), reported)
+        yield shown(Subject("PB3", "turns", arm=who), what, mean_interval(ratios), reported)
     row = found.set_index("parameter").loc["track_m"]
     ratio = Interval(*(float(row[name] / row["truth"]) for name in ("value", "low", "high")))
     what = f"track over the true one, {where}, gains and track by sampled end poses"
-    yield beside(banded("PB3", what, ratio, 0.98, 1.02))
+    yield beside(banded(Subject("PB3", "track"), what, ratio, 0.98, 1.02))
 
 
-def pb3_sentence(rows: Sequence[Claim]) -> str:
-    """Say how well each method finds kr and kl, and what the report's own procedure returns."""
-    judged_rows = [row for row in rows if row.role is Role.HEADLINE]
-    covered = [row.found.value for row in judged_rows if row.statistic.startswith("coverage")]
-    off = [abs(row.found.value) for row in judged_rows if row.statistic.startswith("relative")]
-    linear = [abs(r.found.value) for r in rows if "bias" in r.statistic and "linear" in r.statistic]
-    few = [row for row in judged_rows if row.verdict is not Verdict.REPRODUCED]
-    worst = "".join(f" Not within its bounds: {row.statistic}." for row in few[:1])
-    stuck = pick(rows, "gradient descent").verdict is Verdict.NOT_REPRODUCED
-    descent = "returns 1/2 whatever the data" if stuck else "depends on the data"
-    beyond = f"; linearised end poses are off by up to {percent(max(linear))}" if linear else ""
-    return (
-        f"Wheel truth and sampled end poses cover kr and kl in {percent(min(covered))} to "
-        f"{percent(max(covered))} of repetitions with a bias of at most {plain(100.0 * max(off))} "
-        f"%{beyond}, and the report's own gradient descent {descent}.{worst}"
-    )
-
-
-def pb4(coverage: pd.DataFrame, engine: pd.DataFrame) -> Iterator[Claim]:
+def pb4(coverage: pd.DataFrame, engine: pd.DataFrame, cases: pd.DataFrame) -> Iterator[Claim]:
     """PB4: the true end lies in the ideal robot's 95 % ellipse, per k; and where that ends.
 
-    Headlines are the k up to 1e-4 m, where the ellipse has to hold.
+    Headlines are the k up to 1e-4 m, where the ellipse has to hold. The manoeuvre that does worst
+    is a fact, and its length, if it is a straight.
+
+    Parameters
+    ----------
+    cases
+        Velocities and duration of each manoeuvre, `case`.
     """
+    straights = cases[cases["omega_radps"] == 0.0].set_index("case")
+    length_m = straights["v_mps"] * straights["duration_s"]
     left = []
     for k, table in coverage.groupby("k_m"):
         runs = [int(n) for n in table["runs"]]
@@ -219,62 +167,26 @@ def pb4(coverage: pd.DataFrame, engine: pd.DataFrame) -> Iterator[Claim]:
         worst = int(np.argmin([share.value for share in shares]))
         parts = [judged(share, *_BAND) for share in shares]
         more = [more_to_settle(share, n, *_BAND) for share, n in zip(shares, runs, strict=True)]
+        case = table.iloc[worst]["case"]
+        n_within = f"{parts.count(Verdict.REPRODUCED)} of {len(parts)}"
         claim = Claim(
-            "PB4",
+            Subject("PB4", "ends in the ellipse", setting=float(k)),
             f"least share of ends in the 95 % ellipse over nine manoeuvres, k = {k:g}",
             shares[worst],
             "every manoeuvre's interval within 0.93 and 0.97",
             overall(parts),
-            f"{parts.count(Verdict.REPRODUCED)} of {len(parts)} manoeuvres within; the least in "
-            f"{table.iloc[worst]['case']}",
+            f"{n_within} manoeuvres within; the least in {case}",
             more=max(more),
+            facts={"case": case, "straight_m": length_m.get(case), "band": _BAND},
         )
         yield beside(claim, k > HELD_UP_TO_M * (1 + 1e-9))
         left += [k] if claim.verdict is Verdict.NOT_REPRODUCED else []
-    yield beside(
-        banded(
-            "PB4",
-            "distance of PyBullet's end from the kinematic robot's, same noise, over the spread",
-            mean_interval(_engine_gap(engine)),
-            at_most=0.05,
-            criterion="at most 0.05",
-        )
-    )
+    label = "distance of PyBullet's end from the kinematic robot's, same noise, over the spread"
+    gap = mean_interval(_engine_gap(engine))
+    yield beside(banded(Subject("PB4", "engine"), label, gap, at_most=0.05))
     if left:
         what = "least k at which a manoeuvre leaves the band, m"
-        yield shown("PB4", what, Interval.exact(left[0]))
-
-
-def pb4_sentence(coverage: pd.DataFrame, cases: pd.DataFrame) -> str:
-    """Say up to which k the ellipse holds, and what it fails on.
-
-    Parameters
-    ----------
-    cases
-        Velocities and duration of each manoeuvre, by its name.
-    """
-    shares = (coverage["in_ellipse"] / coverage["runs"]).groupby(coverage["k_m"])
-    rows = coverage.loc[shares.idxmin()].assign(share=shares.min().to_numpy())
-    last = rows[rows["k_m"] <= HELD_UP_TO_M * (1 + 1e-9)].iloc[-1]
-    if last["share"] >= _BAND[0]:
-        return (
-            f"The ideal robot's ellipse holds at least {percent(last['share'])} of the true ends "
-            f"up to k = {last['k_m']:g} m."
-        )
-    highs = [share_interval(int(r.in_ellipse), int(r.runs)).high for r in rows.itertuples()]
-    below = rows[np.array(highs) < _BAND[0]]
-    first, worst = (below if len(below) else rows).iloc[0], rows.iloc[-1]
-    case = cases.loc[first["case"]]
-    length_m = float(case["v_mps"] * case["duration_s"])
-    what = (
-        f"A straight of {length_m:.2g} m bends the cloud of ends"
-        if length_m > 0.0 and case["omega_radps"] == 0.0
-        else f"Manoeuvre {first['case']} bends the cloud of ends"
-    )
-    return (
-        f"{what}: the linear ellipse holds {percent(first['share'])} of them at k = "
-        f"{first['k_m']:g} m and {percent(worst['share'])} at {worst['k_m']:g} m, in place of 95 %."
-    )
+        yield shown(Subject("PB4", "limit"), what, Interval.exact(left[0]))
 
 
 def _engine_gap(engine: pd.DataFrame) -> pd.Series[float]:

@@ -1,6 +1,6 @@
 """The figures of puzzlebot2024."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,13 @@ from experiments.papers.puzzlebot2024.settings import (
     REPORTED_TURN_RATIO,
     TABLE_1_K_M,
 )
-from experiments.viewing.plotting import draw_ellipses, plain_ticks, plan_axes, with_legend
+from experiments.viewing.plotting import (
+    draw_ellipses,
+    draw_table,
+    plain_ticks,
+    plan_axes,
+    with_legend,
+)
 from experiments.viewing.style import BLACK, BLUE, CYCLE, ORANGE, subplots
 
 Arrays = Mapping[str, NDArray[Any]]
@@ -194,7 +200,7 @@ def table_1(table: pd.DataFrame) -> Figure:
         f"table 1, {CALIBRATION_RUNS} runs a case; true $k_r$ = {1.5e4 * TABLE_1_K_M:g}e-4 m, "
         f"$k_l$ = {0.5e4 * TABLE_1_K_M:g}e-4 m"
     )
-    return _printed(header, cells, title)
+    return draw_table(header, cells, title, (9.0, 3.4))
 
 
 def table_1_short_turns(table: pd.DataFrame) -> Figure:
@@ -220,7 +226,7 @@ def table_1_short_turns(table: pd.DataFrame) -> Figure:
         f"table 1 by the robot that turns short, {CALIBRATION_RUNS} runs a case; "
         f"the report: turns come out at {REPORTED_TURN_RATIO} of the ideal ones"
     )
-    return _printed(header, cells, title)
+    return draw_table(header, cells, title, (9.0, 3.4))
 
 
 _OF_THE_CASE = ("case", "v, m/s", "ω, rad/s", "T, s", "ideal x, m", "ideal θ, rad")
@@ -231,25 +237,6 @@ def _case(row: Any) -> tuple[str, ...]:
     command = (f"{value:g}" for value in (row.v_mps, row.omega_radps, row.duration_s))
     ideal = (f"{value:.2f}" for value in (row.ideal_x_m, row.ideal_heading_rad))
     return row.case.replace("_", " "), *command, *ideal
-
-
-def _printed(header: Sequence[str], cells: Sequence[Sequence[str]], title: str) -> Figure:
-    """Draw a table."""
-    page, ax = subplots(9.0, 3.4)
-    ax.axis("off")
-    drawn = ax.table(cells, colLabels=header, loc="center", cellLoc="center")
-    drawn.auto_set_font_size(False)
-    drawn.set_fontsize(7.5)
-    drawn.auto_set_column_width(list(range(len(header))))
-    drawn.scale(1.0, 1.35)
-    tall = any("\n" in name for name in header)
-    for (row_number, _), cell in drawn.get_celld().items():
-        cell.set_edgecolor("#cccccc")
-        cell.set_text_props(weight="normal" if row_number else "bold")
-        if tall and row_number == 0:
-            cell.set_height(2.0 * cell.get_height())
-    ax.set_title(title, fontsize="medium")
-    return page
 
 
 def short_turns(ends: pd.DataFrame, found: pd.DataFrame) -> Figure:

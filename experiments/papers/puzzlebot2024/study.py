@@ -12,27 +12,26 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy import stats
 
 from estimators.base import Estimate, Prior
-from estimators.base import run as run_estimator
 from estimators.odometry import Odometry
 from experiments.calibration.calibrate import calibrate_recordings, end_pose
 from experiments.calibration.end_poses import Manoeuvre, from_end_poses
 from experiments.calibration.result import CalibrationResult
 from experiments.calibration.wheel_truth import from_wheel_truth
 from experiments.evaluation.metrics import ellipse_area_m2, travelled_m
-from experiments.judging.jobs import in_parallel
+from experiments.judging.jobs import Tables, tables_of
 from experiments.judging.results import Results
 from experiments.judging.verdict import Profile
+from experiments.papers.puzzlebot2024.descent import convergence, gradient_descent
 from experiments.papers.puzzlebot2024.settings import (
     AREA_K_M,
     CALIBRATION_RUNS,
     CALIBRATIONS,
     CLOSE_K_M,
     COVERAGE_RUNS,
-    DESCENTS,
     ENGINE_OVERRIDES,
     FEEDBACK_OVERRIDES,
     LOOPS,
@@ -41,6 +40,7 @@ from experiments.papers.puzzlebot2024.settings import (
     SQUARE_SAMPLES,
     TABLE_1_K_M,
 )
+from experiments.runs.evaluate import run_over
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
 from experiments.runs.seeds import stream
@@ -132,7 +132,7 @@ def dead_reckoning(batch: BatchRuns, kr: float, kl: float) -> Estimate:
     wheels = WheelLog(batch.stamps, batch.encoder_m[0])
     recording = Recording(batch.stamps, wheels, geometry)
     prior = Prior(geometry, mean=np.zeros(3), covariance=np.zeros((3, 3)))
-    return run_estimator(Odometry(kr=kr, kl=kl), recording, prior, np.random.default_rng(0))
+    return run_over(recording, Odometry(kr=kr, kl=kl), prior, np.random.default_rng(0))[0]
 
 
 def areas() -> pd.DataFrame:
@@ -221,7 +221,8 @@ def square_feedback(*overrides: str) -> tuple[pd.DataFrame, dict[str, NDArray[np
     for experiment in planned(["study=puzzlebot2024/square_feedback", *overrides]):
         route, recording = experiment.route(), experiment.simulate()
         prior, rng = experiment.prior(recording), np.random.default_rng(0)
-        believed = run_estimator(experiment.estimator(), recording, prior, rng).means[:, :2]
+        online, _ = run_over(recording, experiment.estimator(), prior, rng)
+        believed = online.means[:, :2]
         stamps = recording.frame_stamps
         true = recording.truth_at(stamps)[:, :2]
         corner = np.array(route.points[-1])
@@ -274,12 +275,11 @@ def calibration(
         for repetition in range(n_repetitions)
         for arm in robots
     ]
-    parts = in_parallel(_calibration_rows, repeated, on_progress)
-    return pd.DataFrame(list(itertools.chain.from_iterable(parts)))
+    return tables_of(_calibration_rows, repeated, on_progress)["calibration"]
 
 
-def _calibration_rows(arm: Arm) -> list[Row]:
-    return [
+def _calibration_rows(arm: Arm) -> Tables:
+    rows: list[Row] = [
         {
             "k_m": arm.k_m,
             "joint": arm.joint,
@@ -292,6 +292,7 @@ def _calibration_rows(arm: Arm) -> list[Row]:
         for result in calibrate_once(arm)
         for name, interval in result.found.items()
     ]
+    return {"calibration": rows}
 
 
 def table_1(arm: Arm) -> pd.DataFrame:
@@ -453,66 +454,3 @@ def engine_k(driven: Driven) -> pd.DataFrame:
         for name, interval in found.found.items()
     ]
     return pd.DataFrame(rows)
-
-
-def report_gradient_descent(
-    final_ideal: float,
-    final_real: ArrayLike,
-    time_s: float,
-    *,
-    rate: float = 0.01,
-    n_iterations: int = 100,
-) -> Array:
-    """The report's own calibration, kept to show what it returns; it does not estimate kr or kl.
-
-    It fits k so that (k + k) v comes near v by gradient descent from k = 1; v is the deviation of
-    the end over the time. The data cancel: the minimum is 1/2 whatever they are, and they only set
-    how fast the descent gets there, (1 - 8 rate mean(v^2)) a step.
-
-    Parameters
-    ----------
-    final_ideal, final_real
-        Promised and real end positions (n,), m or rad.
-    time_s
-        Duration, s.
-
-    Returns
-    -------
-    Array
-        (n_iterations + 1,) values of k, the first one 1.
-    """
-    v = (np.atleast_1d(np.asarray(final_real, float)) - final_ideal) / time_s
-    slope = float(np.mean(v**2))
-    k = np.ones(n_iterations + 1)
-    for i in range(n_iterations):
-        k[i + 1] = k[i] - rate * 4.0 * (2.0 * k[i] - 1.0) * slope
-    return k
-
-
-def gradient_descent() -> pd.DataFrame:
-    """Run the report's own procedure on its example data and on others: it converges to 1/2."""
-    rows = []
-    for name, (ideal, real, time_s) in DESCENTS.items():
-        last = min(math.ceil(30.0 / (0.08 * (ideal - real) ** 2 / time_s**2)), 10**6)
-        k = report_gradient_descent(ideal, real, time_s, n_iterations=max(100, last))
-        rows.append({"data": name, "k_after_100": k[100], "k_in_the_end": k[last]})
-    return pd.DataFrame(rows)
-
-
-def convergence() -> pd.DataFrame:
-    """The 100 iterations that the report plots, on its example data, from the start on.
-
-    Returns
-    -------
-    pandas.DataFrame
-        `data`, `iteration`, `k`, and the `error` that is minimised, (2 k v - v)^2 with v in m/s or
-        rad/s.
-    """
-    parts = []
-    for name in itertools.islice(DESCENTS, 2):
-        ideal, real, time_s = DESCENTS[name]
-        k = report_gradient_descent(ideal, real, time_s)
-        error = ((2.0 * k - 1.0) * (real - ideal) / time_s) ** 2
-        columns = {"data": name, "iteration": np.arange(len(k)), "k": k, "error": error}
-        parts.append(pd.DataFrame(columns))
-    return pd.concat(parts, ignore_index=True)

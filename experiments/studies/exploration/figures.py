@@ -6,8 +6,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from experiments.judging.results import Results
-from experiments.studies.exploration.claims import NAMES
-from experiments.studies.exploration.settings import AFTER_M, BASE, JUDGED
+from experiments.studies.exploration.settings import AFTER_M, BASE, JUDGED, NAMES
 from experiments.viewing.plotting import with_legend
 from experiments.viewing.style import BLACK, BLUE, GREEN, ORANGE, PURPLE, RED, WALL, subplots
 from experiments.viewing.team_figure import draw_paths

@@ -4,7 +4,13 @@ from experiments.judging.verdict import Profile
 
 BASE, JUDGED = "nearest_frontier", "coordinated"
 SHARED, GAIN = "shared_frontiers", "information_gain"  # each with one half of what is judged
-STRATEGIES = ("random", BASE, SHARED, GAIN, JUDGED)
+NAMES = {  # of the strategies, in words
+    "random": "random",
+    BASE: "nearest frontier",
+    SHARED: "shared out by cost",
+    GAIN: "information gain",
+    JUDGED: "coordinated",
+}
 FIRST_SEED = 1000  # of the judged worlds
 WORLDS = {Profile.FULL: 30, Profile.QUICK: 2}
 AFTER_M = 15.0  # driven a robot, after which the area is judged

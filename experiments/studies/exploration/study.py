@@ -7,22 +7,23 @@ the truth: floor that a beam has crossed, from where the robots were.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from estimators.base import Estimate
 from experiments.evaluation.map_quality import landmark_errors
-from experiments.judging.jobs import in_parallel
+from experiments.evaluation.metrics import travelled_m
+from experiments.judging.jobs import Tables, tables_of
 from experiments.judging.results import Results
 from experiments.judging.verdict import Profile
-from experiments.runs.evaluate import run_robots
+from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
 from experiments.studies.exploration import settings
+from experiments.viewing.team_figure import drive_of
 from sim import se2
 from sim.arrays import Array
-from sim.recording import Recording
 from sim.sensors.laser import Laser
 from sim.team import Team
 from sim.worlds.grid import rasterized
@@ -44,19 +45,16 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
     """
     jobs = [
         (settings.FIRST_SEED + i, strategy)
-        for strategy in settings.STRATEGIES
+        for strategy in settings.NAMES
         for i in range(settings.WORLDS[profile])
     ]
-    parts = [*in_parallel(row_of, jobs, on_progress)]
-    out.write_tables(
-        runs=pd.DataFrame([row for row, _ in parts]),
-        coverage=pd.concat([curve for _, curve in parts], ignore_index=True),
-    )
+    out.write_tables(**tables_of(tables_from, jobs, on_progress))
     for strategy in (settings.BASE, settings.JUDGED):
-        out.write_arrays(f"drive_{strategy}", **paths(composed(settings.FIRST_SEED, strategy)))
+        team = composed(settings.FIRST_SEED, strategy).recordings()
+        out.write_arrays(f"drive_{strategy}", **drive_of(team.robots, settings.AFTER_M))
 
 
-def row_of(seed: int, strategy: str) -> tuple[Row, pd.DataFrame]:
+def tables_from(seed: int, strategy: str) -> Tables:
     """What one exploration came to, and the area seen by the distance driven.
 
     The map is that of the paper's method, run over the drive.
@@ -65,23 +63,23 @@ def row_of(seed: int, strategy: str) -> tuple[Row, pd.DataFrame]:
     team = experiment.recordings()
     driven_m, area_m2 = coverage(team, settings.RESOLUTION_M)
     labels: Row = {"seed": seed, "strategy": strategy}
-    online, revised = run_robots(experiment, team)[0]
+    maps: list[Estimate] = []
+    evaluate(experiment, lambda: team, on_estimate=lambda *one: maps.append(one[3] or one[2]))
     row: Row = {
         **labels,
         "area_m2": float(np.interp(settings.AFTER_M, driven_m, area_m2)),
         "driven_m": float(driven_m[-1]),
         "stopped": sum(robot.status != "ok" for robot in team.robots),
-        **landmark_errors(team.robots[0], (revised or online).map),
+        **landmark_errors(team.robots[0], maps[0].map),
     }
     at = np.arange(0.0, driven_m[-1] + _EVERY_M, _EVERY_M)
     curve = pd.DataFrame({**labels, "driven_m": at, "area_m2": np.interp(at, driven_m, area_m2)})
-    return row, curve
+    return {"runs": [row], "coverage": curve}
 
 
 def composed(seed: int, strategy: str) -> Experiment:
     """The experiment of one strategy in one world."""
-    given = [f"seed={seed}", f"route.strategy={strategy}"]
-    return Experiment.compose(["study=exploration", *given])
+    return Experiment.compose(["study=exploration", f"seed={seed}", f"route.strategy={strategy}"])
 
 
 def coverage(team: Team, resolution_m: float) -> tuple[Array, Array]:
@@ -110,24 +108,6 @@ def coverage(team: Team, resolution_m: float) -> tuple[Array, Array]:
                 poses = se2.compose(robot.truth_at(log.stamps[rows]), laser.mount.pose)
                 grid.add(poses, ranges_m.astype(np.float32), laser.bearings_rad, laser.max_range_m)
         area_m2.append(resolution_m**2 * np.count_nonzero(floor & (grid.last_scan > 0)))
-    driven_m = np.mean([_driven_m(robot, stamps) for robot in team.robots], axis=0)
-    return driven_m, np.array(area_m2)
-
-
-def _driven_m(robot: Recording, stamps: Array) -> Array:
-    """True length (T,) m of a robot's path up to each stamp."""
-    truth = robot.known_truth
-    steps_m = np.hypot(*np.diff(truth.poses[:, :2], axis=0).T)
-    return np.asarray(np.interp(stamps, truth.stamps, np.append(0.0, np.cumsum(steps_m))))
-
-
-def paths(experiment: Experiment) -> dict[str, Any]:
-    """True paths of a team up to where its area is judged, and the walls, for the figure."""
-    team = experiment.recordings()
-    world = team.robots[0].known_world
-    arrays: dict[str, Any] = {"walls": world.walls, "wall_z_m": world.wall_z_m}
-    for number, robot in enumerate(team.robots):
-        truth = robot.known_truth
-        near = _driven_m(robot, truth.stamps) <= settings.AFTER_M
-        arrays[f"truth_{number}"] = truth.poses[near, :2]
-    return arrays
+    truths = [robot.known_truth for robot in team.robots]
+    driven_m = [np.interp(stamps, own.stamps, travelled_m(own.poses)) for own in truths]
+    return np.mean(driven_m, axis=0), np.array(area_m2)

@@ -3,22 +3,22 @@
 All estimators run over the same recordings, whose noise is the one that they believe.
 """
 
-import itertools
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
-import pandas as pd
 
 from experiments.evaluation.metrics import nees_at_distances
-from experiments.judging.jobs import grouped, in_parallel
+from experiments.judging.jobs import Tables, grouped, tables_of
 from experiments.judging.results import Results
 from experiments.judging.verdict import Profile
 from experiments.runs.evaluate import run_over
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
 from experiments.runs.seeds import stream
-from experiments.studies.fastslam_consistency.settings import DISTANCES_M, MOST_QUICK, QUICK_SEEDS
 from experiments.sweeps.plan import planned
+
+DISTANCES_M = (10.0, 20.0, 30.0, 40.0, 50.0, 60.0, 70.0, 80.0, 90.0)
+MAX_QUICK = 1000  # particles
 
 
 def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) -> None:
@@ -32,20 +32,19 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
         Called with the share of the work done.
     """
     jobs = [[part] for part in grouped(plan(profile), lambda one: one.seed)]
-    rows = itertools.chain.from_iterable(in_parallel(rows_of, jobs, on_progress))
-    out.write_tables(nees=pd.DataFrame(list(rows)))
+    out.write_tables(**tables_of(rows_of, jobs, on_progress))
 
 
 def plan(profile: Profile) -> Iterator[Experiment]:
     """All runs, or those of the quick profile."""
-    few = profile is Profile.QUICK
-    for one in planned(["study=fastslam_consistency", *few * [f"seed={QUICK_SEEDS}"]]):
-        if not few or one.estimator_options.get("n_particles", 0) <= MOST_QUICK:
-            yield one
+    if profile is Profile.FULL:
+        return planned(["study=fastslam_consistency"])
+    runs = planned(["study=fastslam_consistency", "seed=range(1000,1004)"])
+    return (one for one in runs if one.option("n_particles", 0) <= MAX_QUICK)
 
 
-def rows_of(runs: Sequence[Experiment]) -> list[Row]:
-    """NEES at each distance of every run over one recording; NaN where it cannot be told."""
+def rows_of(runs: Sequence[Experiment]) -> Tables:
+    """NEES at each distance of every run over one recording; NaN where it is not known."""
     recording = runs[0].recording()
     rows: list[Row] = []
     for one in runs:
@@ -59,20 +58,20 @@ def rows_of(runs: Sequence[Experiment]) -> list[Row]:
             {**labels, "seed": one.seed, "distance_m": distance_m, "nees": float(value)}
             for distance_m, value in zip(DISTANCES_M, nees, strict=True)
         ]
-    return rows
+    return {"nees": rows}
 
 
 def labels_of(one: Experiment) -> Row:
     """Columns that name a run: its filter, M, and in what it differs from the default."""
-    own, true = one.estimator_options, one.robot()
-    name = {"smoother": "batch"}.get(one.estimator_name, one.estimator_name)
+    name = one.estimator_name
     if name == "fastslam":
-        name = {"motion": "fastslam1", "optimal": "fastslam2"}[own["proposal"]]
+        name = {"motion": "fastslam1", "optimal": "fastslam2"}[one.option("proposal")]
     changed = {
-        "resampled at every image": own.get("ess_share") == 1.0,
-        "resampled below M / 10": own.get("ess_share") == 0.1,
-        "four times the slip": own["kr"] > true.kr,
-        "twice the image noise": own.get("sigma_column_px") is not None,
+        "resampled at every image": one.option("ess_share") == 1.0,
+        "resampled below M / 10": one.option("ess_share") == 0.1,
+        "four times the slip": one.option("kr") > one.robot().kr,
+        "twice the image noise": one.option("sigma_column_px") is not None,
     }
     remedy = next((words for words, is_so in changed.items() if is_so), "none")
-    return {"filter": name, "n_particles": own.get("n_particles", 0), "remedy": remedy}
+    name = {"smoother": "batch"}.get(name, name)
+    return {"filter": name, "n_particles": one.option("n_particles", 0), "remedy": remedy}

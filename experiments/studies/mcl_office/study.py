@@ -5,7 +5,6 @@ filter begins without a pose and is judged over the next 40 m.
 """
 
 import dataclasses
-import itertools
 import math
 from collections.abc import Callable
 
@@ -15,10 +14,11 @@ from numpy.typing import NDArray
 
 from experiments.evaluation.metrics import heading_errors_rad, position_errors_m, travelled_m
 from experiments.evaluation.statistics import bootstrap_interval, share_interval
-from experiments.judging.jobs import in_parallel
+from experiments.judging.jobs import Tables, tables_of
 from experiments.judging.results import Results
 from experiments.judging.verdict import Profile
 from experiments.runs.console import RunFailedError
+from experiments.runs.evaluate import run_over
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
 from experiments.runs.seeds import stream
@@ -40,9 +40,8 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
     """
     n_starts, fewer = (20, []) if profile is Profile.FULL else (3, ["seed=range(1000,1004)"])
     jobs = [(office, n_starts) for office in planned(["study=mcl_office", *fewer])]
-    rows = itertools.chain.from_iterable(in_parallel(starts, jobs, on_progress))
-    table = pd.DataFrame(list(rows))
-    out.write_tables(starts=table, share=localised_share(table))
+    made = tables_of(starts, jobs, on_progress)
+    out.write_tables(**made, share=localised_share(made["starts"]))
 
 
 def localised_share(table: pd.DataFrame) -> pd.DataFrame:
@@ -74,15 +73,16 @@ def found_after_m(travel_m: Array, near: NDArray[np.bool_]) -> float:
     return math.inf
 
 
-def starts(experiment: Experiment, n_starts: int) -> list[Row]:
+def starts(experiment: Experiment, n_starts: int) -> Tables:
     """Localize from starts spread along the tour of an office.
 
     Returns
     -------
-    list of Row
-        One per start: `seed`, `start`; where, `x_m`, `y_m`; `localised`; the travel after which the
-        belief is near and stays near for 10 m, `found_m` (infinite: never within 30 m); `error_m`,
-        `error_deg` at the end; `near_share` of the Frames after it was found; `particles_mean`.
+    Tables
+        `starts`, a row a start: `seed`, `start`; where, `x_m`, `y_m`; `localised`; the travel after
+        which the belief is near and stays near for 10 m, `found_m` (infinite: never within 30 m);
+        `error_m`, `error_deg` at the end; `near_share` of the Frames after it was found;
+        `particles_mean`.
 
     Raises
     ------
@@ -95,10 +95,11 @@ def starts(experiment: Experiment, n_starts: int) -> list[Row]:
     travel_m = travelled_m(recording.truth_at(recording.frame_stamps))
     last_m = travel_m[-1] - WITHIN_M - FOR_M - 1.0
     first_rows = np.searchsorted(travel_m, (np.arange(n_starts) + 0.5) / n_starts * last_m)
-    return [
+    rows: list[Row] = [
         {"seed": experiment.seed, "start": i, **_start(experiment, recording, travel_m, row, i)}
         for i, row in enumerate(first_rows.tolist())
     ]
+    return {"starts": rows}
 
 
 def _start(
@@ -106,14 +107,13 @@ def _start(
 ) -> Row:
     """One start, at a row of the Frames."""
     end = int(np.searchsorted(travel_m, travel_m[row] + WITHIN_M + FOR_M + 0.5))
-    first, *rest = list(recording.frames())[row:end]
-    estimator = experiment.estimator()
-    estimator.reset(experiment.prior(recording), stream(experiment.seed, "starts", start))
-    first = dataclasses.replace(first, duration_s=0.0, wheel_increments_m=np.zeros(2))
-    beliefs = [estimator.step(frame) for frame in (first, *rest)]
-    means = np.array([belief.mean for belief in beliefs])
-    poses = recording.truth_at(recording.frame_stamps[row:end])
-    errors_m, errors_rad = position_errors_m(poses, means), heading_errors_rad(poses, means)
+    part = dataclasses.replace(recording, frame_stamps=recording.frame_stamps[row:end])
+    rng = stream(experiment.seed, "starts", start)
+    prior = experiment.prior(recording)
+    found, _ = run_over(part, experiment.estimator(), prior, rng, keep=["particles"])
+    poses = recording.truth_at(found.stamps)
+    errors_m = position_errors_m(poses, found.means)
+    errors_rad = heading_errors_rad(poses, found.means)
     near = (errors_m < NEAR_M) & (np.abs(errors_rad) < NEAR_RAD)
     gone_m = travel_m[row:end] - travel_m[row]
     found_m = found_after_m(gone_m, near)
@@ -126,5 +126,5 @@ def _start(
         "error_m": float(errors_m[-1]),
         "error_deg": math.degrees(abs(errors_rad[-1])),
         "near_share": float(near[after].mean()) if after.any() else math.nan,
-        "particles_mean": float(np.mean([len(b.extras["particles"]) for b in beliefs])),
+        "particles_mean": float(np.mean(list(map(len, found.extras["particles"])))),
     }

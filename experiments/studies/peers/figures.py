@@ -65,18 +65,14 @@ def _label(name: str, answer: str) -> str:
 
 def _legend() -> list[Line2D]:
     """One entry a colour, a filling and a world."""
-    kinds = [
-        ("ours", BLUE, BLUE),
-        ("of another project", ORANGE, ORANGE),
-        ("default", "black", "white"),
-        ("tuned", "black", "black"),
+    entries = [
+        ("ours", BLUE, BLUE, "o", 7),
+        ("of another project", ORANGE, ORANGE, "o", 7),
+        ("default", "black", "white", "o", 7),
+        ("tuned", "black", "black", "o", 7),
+        *((world, WALL, WALL, shape, 4) for world, shape in _WORLDS.items()),
     ]
-    marks = [
-        Line2D([], [], color=color, mfc=filled, ls="", marker="o", ms=7, label=label)
-        for label, color, filled in kinds
+    return [
+        Line2D([], [], color=color, mfc=filled, ls="", marker=shape, ms=size, label=label)
+        for label, color, filled, shape, size in entries
     ]
-    worlds = [
-        Line2D([], [], color=WALL, ls="", marker=shape, ms=4, label=world)
-        for world, shape in _WORLDS.items()
-    ]
-    return [*marks, *worlds]

@@ -1,8 +1,6 @@
 """Methods of other projects beside ours: errors and processor times on the same recordings."""
 
 import importlib.metadata
-import itertools
-import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -12,14 +10,12 @@ import pandas as pd
 
 from estimators.peers import MissingPackageError
 from experiments.evaluation.statistics import log_ratio_interval
-from experiments.judging.jobs import grouped, in_parallel
+from experiments.judging.jobs import Tables, answer_of, grouped, tables_of
 from experiments.judging.results import Results
 from experiments.judging.verdict import Profile
-from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome, Row
 from experiments.studies.peers.settings import LASER, PACKAGES, READS, TUNED
-from experiments.sweeps.collect import with_answers
 from experiments.sweeps.plan import planned
 from experiments.sweeps.tune import FAILED_M
 
@@ -45,9 +41,8 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
         print(f"{name}: left out, {reason}", file=sys.stderr)
     present = [e for e in experiments if e.estimator_name not in absent]
     drives = grouped(present, lambda e: (e.choices["world"], e.seed))
-    rows = itertools.chain.from_iterable(in_parallel(runs, [(d,) for d in drives], on_progress))
-    table = pd.DataFrame(list(rows))
-    out.write_tables(runs=table, methods=methods(table))
+    made = tables_of(runs, [(drive,) for drive in drives], on_progress)
+    out.write_tables(**made, methods=methods(made["runs"]))
     if absent:
         named = pd.DataFrame({"estimator": list(absent), "reason": list(absent.values())})
         out.write_tables(missing=named)
@@ -61,9 +56,6 @@ def missing(experiment: Experiment) -> str:
     InputError
         If the configuration is wrong.
     """
-    program = (experiment.command or "").partition(" ")[0]
-    if program and shutil.which(program) is None:
-        return f"there is no {program}; `make peers` compiles it where libmrpt-slam-dev is"
     try:
         experiment.check()
     except MissingPackageError as error:
@@ -71,18 +63,18 @@ def missing(experiment: Experiment) -> str:
     return ""
 
 
-def runs(drive: list[Experiment]) -> list[Row]:
+def runs(drive: list[Experiment]) -> Tables:
     """Rows of all methods on one recording."""
-    rows = []
-    for experiment in drive:
-        found = with_answers(pd.DataFrame(evaluate(experiment)), _KEPT).iloc[0]
-        label = {
-            "world": experiment.choices["world"],
-            "seed": experiment.seed,
-            "estimator": experiment.estimator_name,
+    rows: list[Row] = [
+        {
+            "world": one.choices["world"],
+            "seed": one.seed,
+            "estimator": one.estimator_name,
+            **answer_of(one, _KEPT),
         }
-        rows.append({**label, **{key: found.get(key) for key in _KEPT}})
-    return rows
+        for one in drive
+    ]
+    return {"runs": rows}
 
 
 def methods(table: pd.DataFrame) -> pd.DataFrame:
@@ -91,9 +83,10 @@ def methods(table: pd.DataFrame) -> pd.DataFrame:
     Errors are geometric means over the recordings, a failed run counting as 100 m; `over_best_ours`
     is the paired ratio to the best of ours for that sensor with its 95 % interval.
     """
-    failed = (table["status"] == Outcome.FAILED) | ~np.isfinite(table[_ERROR].astype(float))
-    errors_m = table[_ERROR].astype(float).where(~failed, FAILED_M)
-    wide = table.assign(e=errors_m).pivot(index=["world", "seed"], columns="estimator", values="e")
+    errors_m = table[_ERROR].astype(float)
+    failed = (table["status"] == Outcome.FAILED) | ~np.isfinite(errors_m)
+    kept = table.assign(e=errors_m.where(~failed, FAILED_M))
+    wide = kept.pivot(index=["world", "seed"], columns="estimator", values="e")
     means_m = np.exp(np.log(wide).mean())
     by_world = np.exp(np.log(wide).groupby("world").mean())
     times = table.groupby("estimator")["cpu_time_us"].median()

@@ -20,14 +20,21 @@ from estimators.graph.graph_slam import GraphSlam
 from estimators.odometry import Odometry
 from experiments.evaluation.relations import relation_errors
 from experiments.evaluation.time_sync import nearest
+from experiments.judging.logs import (
+    GRAPHS,
+    freiburg,
+    intel,
+    intel_known_stamps,
+    relations_of,
+    tracked,
+)
 from experiments.runs.row import Row
-from experiments.studies.real_logs.logs import intel, intel_known_stamps, tracked
-from experiments.studies.real_logs.settings import DATA, KUEMMERLE, RESOLUTION_M
+from experiments.studies.real_logs.settings import KUEMMERLE, RESOLUTION_M
 from experiments.viewing.map import grid_along
 from sim import se2
 from sim.arrays import Array
 from sim.formats import carmen
-from sim.formats.relations import Relations, read_relations
+from sim.formats.relations import Relations
 from sim.recording import Recording
 from sim.sensors import Laser
 
@@ -42,33 +49,17 @@ _OPTIONS: dict[str, Any] = {
     "kr": 1e-3,
     "kl": 1e-3,
 }
-_WHEELED: dict[str, Any] = {
-    "kr": 3e-3,
-    "kl": 3e-3,
-    "lateral_slip_m": 3e-3,
-}  # of the Intel robot, as for `ekf_icp`
-
-
-def intel_by_edges() -> tuple[carmen.CarmenLog, Recording]:
-    """The Intel log with the FLIRT poses, and a Recording whose wheels are its SEQUENTIAL edges."""
-    log = carmen.read_carmen(DATA / "intel_lab/intel-lab.flirt.log.gz")
-    return log, carmen.to_recording(log)
-
-
-def freiburg_by_edges() -> tuple[carmen.CarmenLog, Recording]:
-    """The same of Freiburg 079."""
-    log = carmen.read_carmen(DATA / "fr079_flirt/fr079.flirt.log.gz")
-    return log, carmen.to_recording(log)
+# Of the Intel robot, as for `ekf_icp`
+_WHEELED: dict[str, Any] = {"kr": 3e-3, "kl": 3e-3, "lateral_slip_m": 3e-3}
 
 
 def scored(
     name: str,
     wheels: str,
     recording: Recording,
-    graph: carmen.CarmenLog,
-    options: dict[str, Any],
     known_stamps: Array | None = None,
     T_base_judged: Array = _ORIGIN,
+    **options: Any,
 ) -> tuple[list[Row], Estimate]:
     """Errors of graph SLAM online and revised, and of the FLIRT poses; the revised estimate.
 
@@ -78,31 +69,33 @@ def scored(
         `intel` or `fr079`.
     wheels
         What stands for them.
-    options
-        Of `estimators.graph.graph_slam.GraphSlam`, beside those of all logs.
     known_stamps
         Of the scans that may be judged; None for all.
     T_base_judged
         (3,) the frame that the relations are of, in base_link.
+    options
+        Of `estimators.graph.graph_slam.GraphSlam`, besides those of all logs.
     """
-    scans = recording.log("laser").stamps
-    folder = {"intel": "intel_lab", "fr079": "fr079_flirt"}[name]
-    relations = read_relations(DATA / folder / f"{name}.relations.gz")
+    scans, graph = recording.log("laser").stamps, carmen.read_carmen(GRAPHS[name])
     known = scans if known_stamps is None else known_stamps
-    judged = _shared(relations, known, graph.scan_stamps)
-    estimator = GraphSlam(**_OPTIONS | options)
-    online = tracked(estimator, recording)
-    revised = estimator.finish()
+    judged = _shared(relations_of(name), known, graph.scan_stamps)
+    online, revised = tracked(GraphSlam(**_OPTIONS | options), recording)
+    assert revised is not None
     at_scans = np.searchsorted(online.stamps, scans)
     paths = {
         "graph_slam, online": (scans, se2.compose(online.means[at_scans], T_base_judged)),
         "graph_slam, revised": (scans, se2.compose(revised.means[at_scans], T_base_judged)),
         "FLIRT poses": (graph.scan_stamps, graph.scan_poses),
     }
-    rows: list[Row] = []
-    for method, path in paths.items():
-        errors = relation_errors(judged, *path)
-        rows.append({"log": name, "wheels": wheels, "method": method, **errors.summary()})
+    rows: list[Row] = [
+        {
+            "log": name,
+            "wheels": wheels,
+            "method": method,
+            **relation_errors(judged, *path).summary(),
+        }
+        for method, path in paths.items()
+    ]
     mean_m = KUEMMERLE[name]["graph"][0]
     rows.append({"log": name, "method": "graph (printed)", "translation_mean_m": mean_m})
     return rows, revised
@@ -120,20 +113,16 @@ def _shared(relations: Relations, *stamps: Array) -> Relations:
 
 def closed_loops() -> tuple[pd.DataFrame, dict[str, NDArray[Any]]]:
     """Errors on all logs, and grids of Intel by its edges alone and with its loops closed."""
-    graph, recording = intel_by_edges()
-    rows, after = scored("intel", "SEQUENTIAL edges", recording, graph, {})
-    before = tracked(Odometry(kr=_OPTIONS["kr"], kl=_OPTIONS["kl"]), recording)
-    grids = _grids(recording, before=before, after=after)
-    log, recording = freiburg_by_edges()
-    rows += scored("fr079", "SEQUENTIAL edges", recording, log, {})[0]
-    recording, logged = intel("calibrated"), intel("logged")
-    mounts = [one.sensor("laser", Laser).mount.pose for one in (recording, logged)]
+    edges = carmen.to_recording(carmen.read_carmen(GRAPHS["intel"]))
+    rows, after = scored("intel", "SEQUENTIAL edges", edges)
+    before, _ = tracked(Odometry(_OPTIONS["kr"], _OPTIONS["kl"]), edges)
+    rows += scored("fr079", "SEQUENTIAL edges", freiburg())[0]
+    wheels, logged = intel("calibrated"), intel("logged")
+    mounts = [one.sensor("laser", Laser).mount.pose for one in (wheels, logged)]
     T_base_logged = se2.compose(mounts[0], se2.inverse(mounts[1]))  # calibration moved base_link
-    known = intel_known_stamps(recording)
-    rows += scored("intel", "wheels, calibrated", recording, graph, _WHEELED, known, T_base_logged)[
-        0
-    ]
-    return pd.DataFrame(rows), grids
+    known = intel_known_stamps(wheels)
+    rows += scored("intel", "wheels, calibrated", wheels, known, T_base_logged, **_WHEELED)[0]
+    return pd.DataFrame(rows), _grids(edges, before=before, after=after)
 
 
 def _grids(recording: Recording, **paths: Estimate) -> dict[str, NDArray[Any]]:

@@ -3,9 +3,6 @@
 import math
 
 from experiments.judging.verdict import Profile
-from experiments.runs.paths import SOURCE
-
-DATA = SOURCE.parent / "shared" / "data"  # the logs are not part of the project
 
 RAWSEEDS = {  # printed with the logs: SE(2)-aligned ATE by session, m
     "25a": {
@@ -50,28 +47,31 @@ INTEL = (
 )
 INTEL_DRAWN = (INTEL[2], INTEL[4], FUSION)
 FREIBURG = ("graph's own edges", "ICP alone", "ICP from the edges")
-MRCLAM = (
-    "dead reckoning, as logged",
-    "dead reckoning, calibrated",
-    "FastSLAM, known",
-    "FastSLAM, known, wider noise",
-    "FastSLAM, unknown, wider noise",
-    "FastSLAM, known, slip in bursts",
-    "EKF-SLAM, known",
-    "EKF-SLAM, known, wider noise",
-    "EKF-SLAM, unknown, wider noise",
-    "EKF-SLAM, known, gated",
-    "EKF-SLAM, known, repeats once",
-    "EKF-SLAM, known, invariant",
-)
-MRCLAM_CHOSEN = ("slip in bursts", "invariant", "unknown, wider noise")  # the headlines of RL3
-MRCLAM_DRAWN = (MRCLAM[1], MRCLAM[5])
+MRCLAM_METHODS = {  # by name: kind, ids, and what is changed
+    ", ".join(parts): parts
+    for parts in (
+        ("dead reckoning", "as logged"),
+        ("dead reckoning", "calibrated"),
+        ("FastSLAM", "known"),
+        ("FastSLAM", "known", "wider noise"),
+        ("FastSLAM", "unknown", "wider noise"),
+        ("FastSLAM", "known", "slip in bursts"),
+        ("EKF-SLAM", "known"),
+        ("EKF-SLAM", "known", "wider noise"),
+        ("EKF-SLAM", "unknown", "wider noise"),
+        ("EKF-SLAM", "known", "gated"),
+        ("EKF-SLAM", "known", "repeats once"),
+        ("EKF-SLAM", "known", "invariant"),
+    )
+}
+MRCLAM = tuple(MRCLAM_METHODS)
+MRCLAM_BASE = MRCLAM[1]
+MRCLAM_CHOSEN = (MRCLAM[4], MRCLAM[5], MRCLAM[8], MRCLAM[11])  # the headlines of RL3
+MRCLAM_DRAWN = (MRCLAM_BASE, MRCLAM[5])
 MRCLAM_SHOWN = (*MRCLAM[:3], *MRCLAM[4:7], MRCLAM[8], MRCLAM[11])  # as many as there are colours
 
 RESOLUTION_M = 0.05  # of the grid maps
-TUNED_SHARE = 0.4  # of the Intel log, on which options were chosen; the rest judges
 TUNED_ROBOTS = (1, 2)  # of MRCLAM; robots 3 to 5 judge
-CALIBRATED_S = 300.0  # from the start of a log of MRCLAM
 DRAWN_ROBOT = 4
 MRCLAM_ROBOTS = {Profile.QUICK: (1, 4), Profile.FULL: (1, 2, 3, 4, 5)}
 FASTSLAM_SEEDS = {Profile.QUICK: 1, Profile.FULL: 5}

@@ -1,7 +1,4 @@
-"""The estimators on logs that others recorded, beside the errors published with them.
-
-The logs are not part of the project; they are expected in ../shared/data.
-"""
+"""The estimators on logs that others recorded, next to the errors published with them."""
 
 import dataclasses
 import itertools
@@ -24,16 +21,23 @@ from experiments.evaluation.metrics import score, travelled_m
 from experiments.evaluation.relations import relation_errors
 from experiments.evaluation.time_sync import aligned_ate_m
 from experiments.judging.jobs import in_parallel
+from experiments.judging.logs import (
+    CALIBRATED_S,
+    DATA,
+    GRAPHS,
+    known_start,
+    relations_of,
+    tracked,
+    tuned_until_s,
+)
 from experiments.judging.results import Results
 from experiments.judging.verdict import Profile
+from experiments.runs.evaluate import run_over
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
 from experiments.studies.real_logs.building import closed_loops
 from experiments.studies.real_logs.grid_match import beam_points, best_fit
-from experiments.studies.real_logs.logs import tracked, tuned_until_s
 from experiments.studies.real_logs.settings import (
-    CALIBRATED_S,
-    DATA,
     DRAWN_ROBOT,
     FASTSLAM_SEEDS,
     FREIBURG,
@@ -46,6 +50,7 @@ from experiments.studies.real_logs.settings import (
     LEGO_START_RAD,
     MRCLAM,
     MRCLAM_DRAWN,
+    MRCLAM_METHODS,
     MRCLAM_ROBOTS,
     RAWSEEDS,
     TUNED_ROBOTS,
@@ -56,18 +61,13 @@ from sim import se2
 from sim.arrays import Array
 from sim.formats import carmen, lego, rawseeds, wean
 from sim.formats.khepera import read_khepera
-from sim.formats.relations import Relations, read_relations
+from sim.formats.relations import Relations
 from sim.formats.text import read_members, read_words, split_words
 from sim.sensors import Laser
 
 Paths = dict[str, NDArray[np.float32]]  # (T, 2) m, by name
 
 _SCORES = ("ate_rmse_m", "ate_aligned_rmse_m", "heading_rmse_rad", "nees_mean", "step_time_us")
-
-
-def missing() -> str:
-    """Why the study cannot run; empty if it can."""
-    return "" if DATA.is_dir() else f"the real logs are not in {DATA.parent.name}/{DATA.name}"
 
 
 def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) -> None:
@@ -131,8 +131,7 @@ def rawseeds_ate() -> pd.DataFrame:
 
 def intel_relations() -> tuple[list[Row], Paths]:
     """The relations metric of our estimates and of the references on the Intel log; and paths."""
-    folder = DATA / "intel_lab"
-    truth = read_relations(folder / "intel.relations.gz")
+    truth = relations_of("intel")
     runs = dict(zip(INTEL, planned(["study=real_logs/intel"]), strict=True))
     by_recording = {run.recording_key: run for run in runs.values()}
     recordings = {key: run.recording() for key, run in by_recording.items()}
@@ -140,10 +139,10 @@ def intel_relations() -> tuple[list[Row], Paths]:
     until_s = tuned_until_s(logged)
     found: dict[str, tuple[Array, Array]] = {}
     for name, run in runs.items():
-        estimate = tracked(run.estimator(), recordings[run.recording_key])
+        estimate, _ = tracked(run.estimator(), recordings[run.recording_key])
         found[name] = estimate.stamps, estimate.means
     found[GMAPPING] = sparse.known_truth.stamps, sparse.known_truth.poses
-    graph = carmen.read_carmen(folder / "intel-lab.flirt.log.gz")
+    graph = carmen.read_carmen(GRAPHS["intel"])
     rows = [
         row
         for name, path in found.items()
@@ -157,15 +156,13 @@ def intel_relations() -> tuple[list[Row], Paths]:
 
 def freiburg_relations() -> Iterator[Row]:
     """The relations metric of our estimates and of the graph on the log of Freiburg 079."""
-    folder = DATA / "fr079_flirt"
-    truth = read_relations(folder / "fr079.relations.gz")
+    truth = relations_of("fr079")
     for name, run in zip(FREIBURG, planned(["study=real_logs/fr079"]), strict=True):
-        found = tracked(run.estimator(), run.recording())
+        found, _ = tracked(run.estimator(), run.recording())
         yield from _relation_rows("fr079", name, truth, found.stamps, found.means)
-    log = carmen.read_carmen(folder / "fr079.flirt.log.gz")
+    log = carmen.read_carmen(GRAPHS["fr079"])
     for name, near in (("graph (FLIRT)", False), ("graph (FLIRT), exact stamps", True)):
-        stamps, poses = log.scan_stamps, log.scan_poses
-        yield from _relation_rows("fr079", name, truth, stamps, poses, near=near)
+        yield from _relation_rows("fr079", name, truth, log.scan_stamps, log.scan_poses, near=near)
 
 
 def _relation_rows(
@@ -238,7 +235,7 @@ def landmark_slam(
         for kind, n_seeds in seeds.items()
         for robot, by_method in runs.items()
         for method, run in by_method.items()
-        if method.startswith(kind)
+        if MRCLAM_METHODS[method][0] == kind
         for seed in range(n_seeds)
     ]
     truth = runs[DRAWN_ROBOT][MRCLAM[1]].recording().known_truth
@@ -253,8 +250,8 @@ def landmark_slam(
 def _landmark_job(
     run: Experiment, method: str, robot: int, seed: int
 ) -> tuple[Row, NDArray[np.float32]]:
-    log = run.recording()
-    estimate = tracked(run.estimator(), log, seed, log.truth_at(log.frame_stamps[:1])[0])
+    log, rng = run.recording(), np.random.default_rng(seed)
+    estimate, _ = run_over(log, run.estimator(), known_start(log), rng)
     found = score(log, estimate, after_s=CALIBRATED_S)
     row: Row = {"robot": robot, "method": method, "seed": seed, "judged": robot not in TUNED_ROBOTS}
     row |= {key: found.get(key, math.nan) for key in _SCORES}
@@ -333,7 +330,7 @@ def wean_fit(logs: str) -> tuple[pd.DataFrame, dict[str, NDArray[Any]]]:
     for number, run in zip(logs.split(","), studies, strict=True):
         recording = run.recording()
         laser, scans = recording.sensor("laser", Laser), recording.log("laser")
-        estimate = tracked(run.estimator(), recording)
+        estimate, _ = tracked(run.estimator(), recording)
         poses = estimate.means[np.searchsorted(estimate.stamps, scans.stamps)]
         travelled = travelled_m(poses)
         chosen = np.searchsorted(travelled, np.arange(0.0, min(travelled[-1], 15.0), 0.5))

@@ -4,22 +4,13 @@ A world is the unit of inference. The paper's own method, FastSLAM, decides; EKF
 bound stand beside it, and what communication costs.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import pandas as pd
 
 from experiments.evaluation.statistics import log_ratio_interval
+from experiments.judging.claim import Claim, Subject, beside, lower, shown
 from experiments.judging.results import Results
-from experiments.judging.verdict import (
-    Claim,
-    Conclusion,
-    beside,
-    conclude,
-    lower,
-    pick,
-    plain,
-    shown,
-)
 from experiments.studies.teams.settings import ALWAYS, MRCLAM_ARMS
 
 NAMES = {"fastslam": "FastSLAM 2.0", "ekf_slam": "EKF-SLAM", "smoother": "batch"}
@@ -32,25 +23,22 @@ def judge(made: Results) -> list[Claim]:
     return [*gi9(made.table("errors")), *on_the_log(log)]
 
 
-def conclusions(made: Results, claims: Sequence[Claim]) -> list[Conclusion]:
-    """Verdict and sentence of GI9."""
-    return conclude(claims, {"GI9": gi9_sentence}, "worlds")
-
-
 def gi9(errors: pd.DataFrame) -> Iterator[Claim]:
     """GI9: the error with sightings is below that without, for each size of the team."""
     linked = errors[errors["link"] == ALWAYS]
     for (name, size), part in linked.groupby(["filter", "size"], sort=False):
         wide = part.pivot_table(index="seed", columns="sightings", values=_ERROR).dropna()
         words = f"error with sightings over without, {size} robots: {NAMES[name]}"
-        yield beside(lower("GI9", words, wide[True], wide[False]), name != "fastslam")
+        about = Subject("GI9", "sightings", method=str(name), size=int(size))
+        yield beside(lower(about, words, wide[True], wide[False]), name != "fastslam")
     own = errors[(errors["filter"] == "ekf_slam") & errors["sightings"]]
     for (link, size), part in own[own["link"] != ALWAYS].groupby(["link", "size"], sort=False):
         both = pd.concat([part, linked[(linked["size"] == size) & linked["sightings"]]])
         both = both[both["filter"] == "ekf_slam"]
         wide = both.pivot_table(index="seed", columns="link", values=_ERROR).dropna()
         words = f"error of {size} robots, communication {link}, over always: {NAMES['ekf_slam']}"
-        yield shown("GI9", words, log_ratio_interval(wide[link], wide[ALWAYS]))
+        about = Subject("GI9", "communication", method="ekf_slam", arm=str(link), size=int(size))
+        yield shown(about, words, log_ratio_interval(wide[link], wide[ALWAYS]))
 
 
 def on_the_log(mrclam: pd.DataFrame | None) -> Iterator[Claim]:
@@ -60,23 +48,5 @@ def on_the_log(mrclam: pd.DataFrame | None) -> Iterator[Claim]:
     wide = mrclam.pivot_table(index="robot", columns="arm", values=_ERROR).dropna()
     for arm in MRCLAM_ARMS[1:]:
         words = f"error on MRCLAM 6 as a {arm}, over each robot alone: {NAMES['ekf_slam']}"
-        yield shown("GI9", words, log_ratio_interval(wide[arm], wide[MRCLAM_ARMS[0]]))
-
-
-def gi9_sentence(rows: Sequence[Claim]) -> str:
-    """Say by how much sightings change the error, by the size of the team."""
-    words = "error with sightings over without"
-    sizes = [row for row in rows if words in row.statistic and NAMES["fastslam"] in row.statistic]
-    said = ", ".join(
-        f"{plain(row.found.value)} times with {row.statistic.split(', ')[1].split(':')[0]}"
-        for row in sizes
-    )
-    ekf = [row for row in rows if words in row.statistic and NAMES["ekf_slam"] in row.statistic]
-    beside_ = ", ".join(plain(row.found.value) for row in ekf)
-    sentence = f"Sightings of one another change the error of FastSLAM to {said}"
-    sentence += f"; of EKF-SLAM, to {beside_} times." if ekf else "."
-    try:
-        log = pick(rows, "MRCLAM 6 as a team with sightings").found
-    except LookupError:
-        return sentence
-    return f"{sentence} On MRCLAM 6 a team of five errs {plain(log.value)} times a robot alone."
+        about = Subject("GI9", "MRCLAM 6", method="ekf_slam", arm=arm)
+        yield shown(about, words, log_ratio_interval(wide[arm], wide[MRCLAM_ARMS[0]]))

@@ -4,14 +4,13 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from experiments.evaluation.statistics import log_ratio_interval
 from experiments.judging.results import Results
 from experiments.studies.teams.claims import NAMES
 from experiments.studies.teams.settings import ALWAYS
-from experiments.viewing.plotting import plain_log, with_legend
+from experiments.viewing.plotting import draw_interval, plain_log, with_legend
 from experiments.viewing.style import BLACK, BLUE, PURPLE, SKY, WALL, subplots
 from experiments.viewing.team_figure import draw_paths, draw_sightings
 
@@ -50,13 +49,11 @@ def by_size(errors: pd.DataFrame) -> Figure:
             (False, "--", "without sightings"),
             (True, "-", "with sightings"),
         ):
-            label = f"{NAMES[name]}, {words}"
-            _line(left, medians.index, medians[seen], label, colour, marker, line)
+            style = {"marker": marker, "color": colour, "ms": 4.5, "lw": 1.4}
+            left.plot(medians.index, medians[seen], line, label=f"{NAMES[name]}, {words}", **style)
         ratios = {size: log_ratio_interval(w[True], w[False]) for size, w in wide.groupby("size")}
-        found = np.array([[r.value, r.low, r.high] for r in ratios.values()]).T
-        at = np.array(list(ratios)) + 0.06 * (k - 1)
-        right.plot(at, found[0], marker, color=colour, ms=6)
-        right.vlines(at, found[1], found[2], color=colour, lw=1.4)
+        for size, ratio in ratios.items():
+            draw_interval(right, size + 0.06 * (k - 1), ratio, marker=marker, color=colour, ms=6)
     right.axhline(1.0, color=WALL, lw=0.8)
     left.set(ylabel="median RMS position error of the team, m", yscale="log")
     right.set(ylabel="error with sightings over without, 95 % interval", yscale="log")
@@ -84,7 +81,3 @@ def by_link(errors: pd.DataFrame) -> Figure:
     ax.set_xlabel("communication (dot: a world; bar: median)", labelpad=20)
     plain_log(ax.yaxis)
     return page
-
-
-def _line(ax: Axes, x: Any, y: Any, label: str, colour: str, marker: str, line: str) -> None:
-    ax.plot(x, y, line, marker=marker, color=colour, ms=4.5, lw=1.4, label=label)

@@ -1,5 +1,8 @@
 """Constants of the study of teams; the configuration is in conf/study/teams.yaml."""
 
+from typing import Any
+
+from estimators.team import Kind
 from experiments.judging.verdict import Profile
 
 SIZES = (2, 3, 4, 5)
@@ -17,5 +20,6 @@ LINKS: dict[str, dict[str, object]] = {
     "never": {"team.communication.kind": "never"},
 }
 # MRCLAM: as EKF-SLAM with a gate in the single robots' study, conf/study/real_logs/mrclam.yaml
-MRCLAM_OPTIONS = {"gate_probability": 1e-6, "repeat_s": 0.5, "kr": 1e-3, "kl": 1e-3}
+MRCLAM_OPTIONS: dict[str, Any] = {"gate_probability": 1e-6, "repeat_s": 0.5, "kr": 1e-3, "kl": 1e-3}
 MRCLAM_ARMS = ("alone", "team", "team with sightings")
+MRCLAM_LINKS: tuple[Kind, ...] = ("never", "always", "always")  # communication in each

@@ -8,29 +8,25 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
-from estimators.base import Estimate, Prior
 from estimators.landmarks.ekf_slam import EkfSlam
-from estimators.team import Communication, Kind, run_team
-from experiments.evaluation.metrics import position_errors_m, rms
-from experiments.judging.jobs import in_parallel
+from estimators.team import Communication, run_team
+from experiments.evaluation.metrics import score
+from experiments.judging.jobs import Tables, answer_of, tables_of
+from experiments.judging.logs import CALIBRATED_S, MRCLAM_6, calibration_by_truth, known_start
 from experiments.judging.results import Results
 from experiments.judging.verdict import Profile
-from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
-from experiments.studies.real_logs.logs import calibration_by_truth
-from experiments.studies.real_logs.settings import CALIBRATED_S, DATA
 from experiments.studies.teams import settings
-from experiments.sweeps.collect import with_answers
-from experiments.viewing.team_figure import sightings
+from experiments.viewing.team_figure import drive_of, sightings
 from sim.arrays import Array
 from sim.formats import mrclam
 from sim.recording import Recording
@@ -59,34 +55,28 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
     on_progress
         Called with the share of the work done.
     """
-    jobs = list(team_jobs(profile))
-    rows = [row for part in in_parallel(rows_of, jobs, on_progress) for row in part]
-    out.write_tables(errors=pd.DataFrame(rows))
-    if (log := mrclam_log()).exists():
-        out.write_tables(mrclam=pd.DataFrame(mrclam_rows(log)))
+    jobs = [
+        (seed, option)
+        for option, n_worlds in settings.WORLDS[profile].items()
+        for seed in range(settings.FIRST_SEED, settings.FIRST_SEED + n_worlds)
+    ]
+    out.write_tables(**tables_of(rows_of, jobs, on_progress))
+    if MRCLAM_6.exists():
+        out.write_tables(mrclam=pd.DataFrame(mrclam_rows(MRCLAM_6)))
     out.write_arrays("drive", **drive(settings.FIRST_SEED))
 
 
-def team_jobs(profile: Profile) -> Iterator[tuple[int, str]]:
-    """World and estimator of each job; the slower estimators run in fewer worlds."""
-    for option, n_worlds in settings.WORLDS[profile].items():
-        for seed in range(settings.FIRST_SEED, settings.FIRST_SEED + n_worlds):
-            yield seed, option
-
-
-def rows_of(seed: int, option: str) -> list[Row]:
+def rows_of(seed: int, option: str) -> Tables:
     """Rows of an estimator's runs in one world, for each size of the team."""
-    whole = _composed(seed, {}).recordings()
-    rows = []
+    rows: list[Row] = []
+    whole = composed(seed, {}).recordings()
     for size in settings.SIZES:
+        team = functools.partial(whole.first, size)
         for overrides, labels in _arms(size, option):
-            made = pd.DataFrame(
-                evaluate(_composed(seed, overrides), functools.partial(whole.first, size))
-            )
-            found = with_answers(made, list(_KEPT)).iloc[0]
-            labels = {"seed": seed, "size": size, "filter": option, **labels}
-            rows.append({**labels, **{_KEPT[name]: found[name] for name in _KEPT if name in found}})
-    return rows
+            found = answer_of(composed(seed, overrides), _KEPT, team)
+            shared = {"seed": seed, "size": size, "filter": option, **labels}
+            rows.append(shared | {_KEPT[name]: value for name, value in found.items()})
+    return {"errors": rows}
 
 
 def _arms(size: int, option: str) -> Iterator[tuple[dict[str, Any], Row]]:
@@ -102,31 +92,18 @@ def _arms(size: int, option: str) -> Iterator[tuple[dict[str, Any], Row]]:
             yield base | link, {"sightings": True, "link": kind}
 
 
-def _composed(seed: int, overrides: Mapping[str, Any]) -> Experiment:
+def composed(seed: int, overrides: Mapping[str, Any]) -> Experiment:
+    """The experiment of one arm in one world."""
     given = [f"{key}={value}" for key, value in overrides.items()]
     return Experiment.compose(["study=teams", f"seed={seed}", *given])
 
 
-def _known(truth: Array, found: Estimate) -> tuple[Array, NDArray[np.bool_]]:
-    """True poses where there are some and the estimate knows the robot's place; and which."""
-    known = np.asarray(np.isfinite(truth).all(axis=1) & np.isfinite(found.means).all(axis=1))
-    return truth[known], known
-
-
 def drive(seed: int) -> dict[str, Array]:
     """True paths of a team, and its sightings as lines, for the figure."""
-    robots = _composed(seed, {}).recordings().robots
-    world = robots[0].known_world
-    arrays: dict[str, Array] = {"walls": world.walls, "wall_z_m": world.wall_z_m}
-    for number, recording in enumerate(robots):
-        arrays[f"truth_{number}"] = recording.known_truth.poses[:, :2]
-        arrays[f"sightings_{number}"] = sightings(robots, number)[1].reshape(-1, 4)
-    return arrays
-
-
-def mrclam_log() -> Path:
-    """Where MRCLAM 6 is looked for; it is not part of the project."""
-    return DATA / "mrclam6" / "MRCLAM_Dataset6.tar.xz"
+    robots = composed(seed, {}).recordings().robots
+    lines = (sightings(robots, number)[1] for number in range(len(robots)))
+    seen = {f"sightings_{number}": each.reshape(-1, 4) for number, each in enumerate(lines)}
+    return drive_of(robots) | seen
 
 
 def mrclam_rows(log: Path, n_frames: int | None = None) -> list[Row]:
@@ -142,27 +119,15 @@ def mrclam_rows(log: Path, n_frames: int | None = None) -> list[Row]:
     """
     robots = [_calibrated(recording) for recording in mrclam.read_team(log).robots]
     team = Team.on_one_clock([own if n_frames is None else own.cut(n_frames) for own in robots])
-    priors = [
-        Prior(own.robot, own.sensors, own.truth_at(own.frame_stamps[:1])[0], np.diag([1e-6] * 3))
-        for own in team.robots
-    ]
+    priors = list(map(known_start, team.robots))
     rows: list[Row] = []
-    for arm in settings.MRCLAM_ARMS:
-        kind: Kind = "never" if arm == settings.MRCLAM_ARMS[0] else "always"
-        sightings = "robots" if arm == settings.MRCLAM_ARMS[2] else None
-        options: Any = settings.MRCLAM_OPTIONS
-        found = run_team(
-            functools.partial(EkfSlam, robots=sightings, **options),
-            team,
-            priors,
-            lambda robot: np.random.default_rng(robot),
-            Communication(kind=kind),
-        )
+    for arm, kind in zip(settings.MRCLAM_ARMS, settings.MRCLAM_LINKS, strict=True):
+        seen = "robots" if arm == settings.MRCLAM_ARMS[-1] else None
+        make = functools.partial(EkfSlam, robots=seen, **settings.MRCLAM_OPTIONS)
+        found = run_team(make, team, priors, np.random.default_rng, Communication(kind=kind))
         for number, (own, (online, _)) in enumerate(zip(team.robots, found, strict=True)):
-            truth, known = _known(own.truth_at(online.stamps), online)
-            scored = online.stamps[known] >= own.frame_stamps[0] + CALIBRATED_S
-            ate_m = rms(position_errors_m(truth, online.means[known])[scored])
-            rows.append({"robot": number + 1, "arm": arm, "ate_rmse_m": ate_m})
+            scores = score(own, online, math.inf, CALIBRATED_S)
+            rows.append({"robot": number + 1, "arm": arm, "ate_rmse_m": scores["ate_rmse_m"]})
     return rows
 
 

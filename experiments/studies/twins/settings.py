@@ -1,27 +1,17 @@
 """Constants of the study of twins; the estimators' configuration is in conf/study/twins/*.yaml."""
 
+from experiments.judging.logs import GRAPHS, INTEL_910, MRCLAM_6
 from experiments.judging.verdict import Profile
-from experiments.studies.real_logs.settings import DATA
 
-MRCLAM = DATA / "mrclam6" / "MRCLAM_Dataset6.tar.xz"
 LOGS = {  # name: files, and the number of the robot in them
-    **{f"MRCLAM 6, robot {robot}": ((MRCLAM,), robot) for robot in range(1, 6)},
-    "fr079": ((DATA / "fr079_flirt" / "fr079.flirt.log.gz",), 1),
-    "Intel": (
-        tuple(DATA / "intel_lab" / f"intel_{part}_910.json.gz" for part in ("raw", "gmapping")),
-        1,
-    ),
+    **{f"MRCLAM 6, robot {robot}": ((MRCLAM_6,), robot) for robot in range(1, 6)},
+    "fr079": ((GRAPHS["fr079"],), 1),
+    "Intel": (INTEL_910, 1),
 }
 SHOWN = ("MRCLAM 6, robot 1", "MRCLAM 6, robot 2")  # the twin was built on them; others judge
 LANDMARKS, SCANS = "landmarks", "scans"  # kinds of logs
 METHODS = {  # of conf/study/twins/KIND.yaml, in its order
-    LANDMARKS: (
-        "dead reckoning",
-        "EKF-SLAM",
-        "EKF-SLAM, invariant",
-        "FastSLAM",
-        "fixed lag",
-    ),
+    LANDMARKS: ("dead reckoning", "EKF-SLAM", "EKF-SLAM, invariant", "FastSLAM", "fixed lag"),
     SCANS: (
         "dead reckoning",
         "ICP from the wheels",
@@ -30,8 +20,7 @@ METHODS = {  # of conf/study/twins/KIND.yaml, in its order
         "EKF of wheels and ICP",
     ),
 }
-DEAD_RECKONING = "dead reckoning"
 FIRST_SEED = 1000
 RUNS = {Profile.QUICK: 4, Profile.FULL: 50}
 LEAST_SHARE = 17.0 / 20.0  # of the pairs of log and estimator
-WIDEST, WIDEST_RECKONING = 4.0, 12.0  # ends of an interval, as a ratio
+WIDEST, WIDEST_OTHERS = {"dead reckoning": 12.0}, 4.0  # ends of an interval, as a ratio

@@ -1,7 +1,4 @@
-"""Twins of real logs: the errors that they predict beside those on the logs' second halves.
-
-The logs are not part of the project; they are expected in ../shared/data.
-"""
+"""Twins of real logs: the errors that they predict next to those on the logs' second halves."""
 
 import functools
 import math
@@ -10,18 +7,16 @@ from collections.abc import Callable
 import numpy as np
 import pandas as pd
 
-from estimators.base import Prior
-from estimators.base import run as run_estimator
 from experiments.evaluation.metrics import score
-from experiments.judging.jobs import in_parallel
+from experiments.judging.jobs import Tables, tables_of
+from experiments.judging.logs import known_start
 from experiments.judging.results import Results
 from experiments.judging.verdict import Profile
+from experiments.runs.evaluate import run_over
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
 from experiments.runs.seeds import stream
-from experiments.studies.real_logs.study import missing as missing
 from experiments.studies.twins.settings import (
-    DEAD_RECKONING,
     FIRST_SEED,
     LANDMARKS,
     LOGS,
@@ -29,14 +24,14 @@ from experiments.studies.twins.settings import (
     RUNS,
     SCANS,
     WIDEST,
-    WIDEST_RECKONING,
+    WIDEST_OTHERS,
 )
 from experiments.sweeps.plan import planned
 from experiments.twin.make import Twin, make_twin
 from sim.formats.detect import read_any
 from sim.recording import Recording
 
-_START = np.diag([1e-6] * 3)
+_SCORES = ("ate_rmse_m", "heading_rmse_rad", "nees_mean")
 
 
 def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) -> None:
@@ -55,10 +50,9 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
     }
     seeds = range(FIRST_SEED, FIRST_SEED + RUNS[profile])
     jobs = [(log, seed, runs) for log in LOGS for seed in (None, *seeds)]
-    rows = [row for part in in_parallel(errors, jobs, on_progress) for row in part]
-    table = pd.DataFrame(rows)
-    pairs = predicted(table)
-    out.write_tables(runs=table, pairs=pairs, others=of_others(pairs))
+    made = tables_of(errors, jobs, on_progress)
+    pairs = predicted(made["runs"])
+    out.write_tables(**made, pairs=pairs, others=of_others(pairs))
 
 
 @functools.lru_cache(maxsize=1)
@@ -68,30 +62,28 @@ def twin_of(log: str) -> Twin:
     return make_twin(read_any(paths, robot))
 
 
-def errors(log: str, seed: int | None, runs: dict[str, dict[str, Experiment]]) -> list[Row]:
+def errors(log: str, seed: int | None, runs: dict[str, dict[str, Experiment]]) -> Tables:
     """Error of each estimator on a simulation of a log's second half; seed None: on the log."""
     twin = twin_of(log)
     kind = SCANS if twin.grid is not None else LANDMARKS
     recording = twin.rest if seed is None else twin.simulated(seed)
     about: Row = {"log": log, "kind": kind, "seed": -1 if seed is None else seed}
-    return [
+    rows = [
         {**about, "method": name, "status": recording.status, **_error(twin, run, recording, seed)}
         for name, run in runs[kind].items()
     ]
+    return {"runs": rows}
 
 
 def _error(twin: Twin, run: Experiment, recording: Recording, seed: int | None) -> Row:
     """Run an estimator from the true start; it believes the calibration's slip."""
     slip = vars(twin.found.calibration.slip)
-    believed = {key: value for key, value in slip.items() if key in run.estimator_options}
-    start = recording.truth_at(recording.frame_stamps[:1])[0]
-    prior = Prior(recording.robot, recording.sensors, start, _START)
+    believed = {key: value for key, value in slip.items() if run.option(key) is not None}
+    estimator = run.with_estimator(**believed).estimator()
     rng = stream(seed or 0, f"estimator/{run.estimator_name}")
-    found = run_estimator(run.with_estimator(**believed).estimator(), recording, prior, rng)
-    scores = score(recording, found)
-    return {
-        key: scores.get(key, math.nan) for key in ("ate_rmse_m", "heading_rmse_rad", "nees_mean")
-    }
+    online, _ = run_over(recording, estimator, known_start(recording), rng)
+    scores = score(recording, online)
+    return {key: scores.get(key, math.nan) for key in _SCORES}
 
 
 def predicted(runs: pd.DataFrame) -> pd.DataFrame:
@@ -101,7 +93,6 @@ def predicted(runs: pd.DataFrame) -> pd.DataFrame:
         real = group[group.seed < 0].iloc[0]
         simulated = group[group.seed >= 0].ate_rmse_m.to_numpy(float)
         low, median, high = np.quantile(simulated, [0.025, 0.5, 0.975])
-        widest = WIDEST_RECKONING if method == DEAD_RECKONING else WIDEST
         rows.append(
             {
                 "log": log,
@@ -112,7 +103,7 @@ def predicted(runs: pd.DataFrame) -> pd.DataFrame:
                 "low_m": low,
                 "high_m": high,
                 "inside": bool(low <= real.ate_rmse_m <= high),
-                "narrow": bool(high <= widest * low),
+                "narrow": bool(high <= WIDEST.get(str(method), WIDEST_OTHERS) * low),
                 "nees": real.nees_mean,
                 "nees_median": float(np.median(group[group.seed >= 0].nees_mean)),
                 "n": len(simulated),
@@ -123,10 +114,7 @@ def predicted(runs: pd.DataFrame) -> pd.DataFrame:
 
 def of_others(pairs: pd.DataFrame) -> pd.DataFrame:
     """A row a log and the twin of another log of its kind: the share of errors that it holds."""
-    rows: list[Row] = []
-    for (log, kind), real in pairs.groupby(["log", "kind"], sort=False):
-        for other, twin in pairs[pairs.kind == kind].groupby("log", sort=False):
-            both = real.merge(twin, on="method", suffixes=("", "_twin"))
-            held = (both.low_m_twin <= both.error_m) & (both.error_m <= both.high_m_twin)
-            rows.append({"log": log, "twin": other, "held": int(held.sum()), "pairs": len(both)})
-    return pd.DataFrame(rows)
+    both = pairs.merge(pairs, on=["kind", "method"], suffixes=("", "_twin"))
+    both["held"] = (both.low_m_twin <= both.error_m) & (both.error_m <= both.high_m_twin)
+    by_logs = both.groupby(["log", "log_twin"], sort=False).held.agg(held="sum", pairs="size")
+    return by_logs.reset_index(names=["log", "twin"])

@@ -9,14 +9,13 @@ from experiments.calibration.calibrate import calibrate_recordings
 from experiments.calibration.end_pose_model import EndPoseModel, knots
 from experiments.calibration.end_poses import Manoeuvre, from_end_poses
 from experiments.calibration.wheel_truth import from_wheel_truth
+from experiments.papers.puzzlebot2024.descent import convergence, report_gradient_descent
 from experiments.papers.puzzlebot2024.settings import NOMINAL
 from experiments.papers.puzzlebot2024.study import (
     Arm,
     arms,
     calibrate_once,
-    convergence,
     ideal,
-    report_gradient_descent,
 )
 from experiments.runs.seeds import stream
 from sim.errors import InputError

@@ -3,8 +3,11 @@ import pytest
 
 from experiments.evaluation import statistics
 from experiments.evaluation.statistics import Interval
-from experiments.judging.verdict import equivalent, judged
+from experiments.judging.claim import Subject, equivalent
+from experiments.judging.verdict import judged
 from sim.errors import InputError
+
+ABOUT = Subject("X1", "a ratio")
 
 
 def test_verdicts():
@@ -44,8 +47,8 @@ def test_share_interval_is_conservative():
 def test_equivalence_and_trend():
     rng = np.random.default_rng(2)
     a = rng.lognormal(0, 0.1, 100)
-    same = equivalent("", "", a * rng.lognormal(0.0, 0.1, 100), a, 0.25)
-    other = equivalent("", "", a * rng.lognormal(0.4, 0.1, 100), a, 0.25)
+    same = equivalent(ABOUT, "", a * rng.lognormal(0.0, 0.1, 100), a, 0.25)
+    other = equivalent(ABOUT, "", a * rng.lognormal(0.4, 0.1, 100), a, 0.25)
     assert same.verdict == "reproduced"
     assert other.verdict == "not_reproduced"
     assert other.found.value == pytest.approx(np.exp(0.4), rel=0.05)
@@ -64,7 +67,7 @@ def test_too_few_data_decide_nothing():
         statistics.bootstrap_interval([], lambda v: float(v.mean()), rng),
         statistics.share_interval(0, 0),
         statistics.log_ratio_interval([1.0], [1.0]),
-        equivalent("", "", [1.0], [1.0], 0.25).found,
+        equivalent(ABOUT, "", [1.0], [1.0], 0.25).found,
     ):
         assert judged(found, 0.5, 2.0) == "undecided"
 
@@ -94,17 +97,19 @@ def test_the_bootstrap_of_few_recordings_is_wide_enough():
 
 
 def test_equivalence_without_spread():
-    same = equivalent("", "", [1.1, 2.2, 3.3], [1.0, 2.0, 3.0], 0.25)
+    same = equivalent(ABOUT, "", [1.1, 2.2, 3.3], [1.0, 2.0, 3.0], 0.25)
     assert same.found.value == pytest.approx(1.1)
     assert same.verdict == "reproduced"
-    assert equivalent("", "", [2.0, 4.0], [1.0, 2.0], 0.25).verdict == "not_reproduced"
+    assert equivalent(ABOUT, "", [2.0, 4.0], [1.0, 2.0], 0.25).verdict == "not_reproduced"
 
 
 def test_equivalence_errs_as_often_as_it_says():
     """At the margin itself, the test wrongly finds equivalence in about 5 % of samples."""
     rng, n = np.random.default_rng(7), 600
     found = [
-        equivalent("", "", rng.lognormal(np.log(1.25), 0.1, 30), np.ones(30), 0.25).verdict
+        equivalent(
+            Subject("X1", ""), "", rng.lognormal(np.log(1.25), 0.1, 30), np.ones(30), 0.25
+        ).verdict
         for _ in range(n)
     ]
     assert 0.025 < found.count("reproduced") / n < 0.08

@@ -7,14 +7,18 @@ import pandas as pd
 import pytest
 
 from experiments.evaluation.statistics import Interval
+from experiments.judging.claim import Subject, lower, select, select_all
 from experiments.judging.claims_file import COLUMNS, read_claims, write_claims
-from experiments.judging.verdict import Profile, Verdict, conclude, lower, overall
+from experiments.judging.verdict import Profile, Verdict
 from experiments.papers.gil2008 import claims as gil2008
 from experiments.papers.maximo2024 import claims as maximo2024
 from experiments.papers.puzzlebot2024 import claims, study
+from experiments.papers.puzzlebot2024.descent import gradient_descent
 from experiments.papers.puzzlebot2024.settings import NOMINAL
-from experiments.studies.real_logs import claims as real_logs
 from sim.errors import InputError
+from tests.fixtures.claims import concluded
+
+ABOUT = Subject("X1", "a ratio")
 
 
 def test_worked_matrices_come_out_and_the_misprint_does_not():
@@ -33,9 +37,9 @@ def test_pb1_fails_on_a_wrong_sign(monkeypatch):
 def test_areas_grow_on_straights_and_arcs_and_shrink_on_the_way_back():
     areas, crossover = study.areas(), study.crossover("seed=range(1000,1003)")
     judged = list(claims.pb2(areas, crossover, NOMINAL.track_m))
-    by_name = {c.statistic.rsplit(", ", 1)[-1]: c for c in judged}
-    assert by_name["straight"].verdict == by_name["arc"].verdict == "reproduced"
-    assert by_name["out and back"].found.value > 0
+    assert select(judged, arm="straight").verdict == "reproduced"
+    assert select(judged, arm="arc").verdict == "reproduced"
+    assert select(judged, arm="out and back").found.value > 0
     assert judged[-1].verdict == "reproduced"
     *_, wrong = claims.pb2(areas, crossover, 1.1 * NOMINAL.track_m)
     assert wrong.verdict == "not_reproduced"
@@ -67,12 +71,12 @@ ENGINE_K = pd.DataFrame(
 
 
 def pb3(table):
-    return {c.statistic.split(":")[0]: c for c in claims.pb3(table, DESCENT, ENGINE_K)}
+    judged = list(claims.pb3(table, DESCENT, ENGINE_K))
+    return {(c.about.quantity, c.about.metric): c for c in judged}
 
 
-DESCENT = study.gradient_descent()
-COVERAGE = "coverage of the 95 % intervals of kr and kl"
-BIAS = "relative bias, the worse of kr and kl"
+DESCENT = gradient_descent()
+COVERAGE, BIAS = ("coverage", "kr and kl"), ("bias", None)
 
 
 def test_pb3_judges_coverage_and_bias():
@@ -81,7 +85,7 @@ def test_pb3_judges_coverage_and_bias():
     biased = pb3(calibrated(200, offset=0.2))
     assert biased[COVERAGE].verdict == biased[BIAS].verdict == "not_reproduced"
     assert pb3(calibrated(200, half=0.02))[COVERAGE].verdict == "not_reproduced"
-    descent = good["the report's gradient descent"]
+    descent = good["gradient descent", None]
     assert (descent.verdict, descent.role) == ("not_reproduced", "beside")
     sound = DESCENT.assign(k_in_the_end=[1e-5, 2e-5, 3e-5, 4e-5])
     *_, depends = claims.pb3(calibrated(200), sound, ENGINE_K)
@@ -94,12 +98,12 @@ def test_pb3_judges_coverage_and_bias():
 def test_pb3_is_decided_by_wheel_truth_and_the_sampled_likelihood_alone():
     good, bad = calibrated(200), calibrated(200, offset=0.3).assign(method="linearised")
     judged = list(claims.pb3(pd.concat([good, bad]), DESCENT, ENGINE_K))
-    assert {c.role for c in judged if "linearised" in c.statistic} == {"beside"}
-    (said,) = conclude(judged, {"PB3": claims.pb3_sentence})
+    assert {c.role for c in select_all(judged, method="linearised")} == {"beside"}
+    said = concluded("puzzlebot2024", judged)
     assert said.verdict == "reproduced"
     assert "returns 1/2 whatever the data" in said.sentence
     worse = calibrated(200, offset=0.3)
-    (said,) = conclude(list(claims.pb3(worse, DESCENT, ENGINE_K)), {"PB3": claims.pb3_sentence})
+    said = concluded("puzzlebot2024", claims.pb3(worse, DESCENT, ENGINE_K))
     assert said.verdict == "not_reproduced"
 
 
@@ -116,7 +120,7 @@ def test_pb3_judges_the_gains_and_the_track_of_the_joint_arm_apart():
     geometry = table.assign(parameter="track_m", low=2.0, high=3.0)
     judged = pb3(pd.concat([table, geometry], ignore_index=True))
     assert judged[COVERAGE].verdict == "reproduced"
-    assert judged["coverage of the 95 % intervals of gains and track"].verdict == "not_reproduced"
+    assert judged["coverage", "gains and track"].verdict == "not_reproduced"
 
 
 def test_pb3_shows_the_short_turns_and_judges_the_track_that_is_found():
@@ -154,25 +158,20 @@ def test_pb4_names_the_k_at_which_the_band_is_left():
             for case in ("linear_1", "angular_1")
         ]
     )
-    engine = ends(0.0)
-    judged = list(claims.pb4(coverage, engine))
-    assert [c.verdict for c in judged[:3]] == ["reproduced", "reproduced", "not_reproduced"]
-    assert [c.role for c in judged[:3]] == ["headline", "headline", "beside"]
-    assert [c.reason.split(";")[0] for c in judged[1:3]] == [
-        "2 of 2 manoeuvres within",
-        "0 of 2 manoeuvres within",
-    ]
-    assert judged[-1].found == Interval.exact(1e-3)
     cases = pd.DataFrame(
         {"case": ["linear_1", "angular_1"], "v_mps": [0.5, 0.0], "omega_radps": [0.0, 1.0]}
-    )
-    cases = cases.assign(duration_s=5.0).set_index("case")
-    assert "holds at least 95 %" in claims.pb4_sentence(coverage, cases)
+    ).assign(duration_s=5.0)
+    judged = list(claims.pb4(coverage, ends(0.0), cases))
+    assert [c.verdict for c in judged[:3]] == ["reproduced", "reproduced", "not_reproduced"]
+    assert [c.role for c in judged[:3]] == ["headline", "headline", "beside"]
+    assert judged[1].reason.startswith("2 of 2 manoeuvres within;")
+    assert judged[2].reason.startswith("0 of 2 manoeuvres within;")
+    assert judged[-1].found == Interval.exact(1e-3)
+    assert "holds at least 95 %" in concluded("puzzlebot2024", judged).sentence
     early = coverage.assign(k_m=coverage["k_m"] / 10.0)
-    assert overall([c.verdict for c in claims.pb4(early, engine) if c.role == "headline"]) == (
-        "not_reproduced"
-    )
-    assert claims.pb4_sentence(early, cases).startswith("A straight of 2.5 m bends the cloud")
+    said = concluded("puzzlebot2024", claims.pb4(early, ends(0.0), cases))
+    assert said.verdict == "not_reproduced"
+    assert said.sentence.startswith("A straight of 2.5 m bends the cloud")
 
 
 def ends(gap_m):
@@ -187,8 +186,10 @@ def ends(gap_m):
 
 def test_the_engines_gap_is_held_against_the_spread_of_its_own_case():
     coverage = pd.DataFrame([{"case": "a", "k_m": 1e-4, "runs": 4000, "in_ellipse": 3800}])
-    assert list(claims.pb4(coverage, ends(1e-6)))[1].verdict == "reproduced"
-    assert list(claims.pb4(coverage, ends(2e-4)))[1].verdict == "not_reproduced"
+    cases = pd.DataFrame(columns=["case", "v_mps", "omega_radps", "duration_s"])
+    for gap_m, verdict in ((1e-6, "reproduced"), (2e-4, "not_reproduced")):
+        judged = list(claims.pb4(coverage, ends(gap_m), cases))
+        assert select(judged, quantity="engine").verdict == verdict
 
 
 def test_coverage_is_95_percent_where_the_first_order_holds():
@@ -216,7 +217,7 @@ def write(judged, path, paper="puzzlebot2024"):
 def test_writing_keeps_other_papers_rows(tmp_path):
     path = tmp_path / "claims.csv"
     one = claims.pb1()[0]
-    write([dataclasses.replace(one, id="XX1")], path, "another")
+    write([dataclasses.replace(one, about=Subject("XX1", ""))], path, "another")
     write([one], path)
     write([dataclasses.replace(one, found=Interval.exact(0.5))], path)
     frame = pd.read_csv(path)
@@ -227,13 +228,13 @@ def test_writing_keeps_other_papers_rows(tmp_path):
 
 def test_arms_that_are_equal_or_few_decide_rightly():
     same = np.linspace(1.0, 2.0, 20)
-    assert lower("", "", same, same).verdict == "not_reproduced"
-    assert lower("", "", same[:1], same[:1]).verdict == "undecided"
+    assert lower(ABOUT, "", same, same).verdict == "not_reproduced"
+    assert lower(ABOUT, "", same[:1], same[:1]).verdict == "undecided"
     rng = np.random.default_rng(0)
     spread = np.exp(0.02 * rng.standard_normal(20))
-    assert lower("", "", 0.8 * same * spread, same).verdict == "reproduced"
-    assert lower("", "", 1.2 * same * spread, same).verdict == "not_reproduced"
-    said = lower("", "", 1.001 * same * spread, same)
+    assert lower(ABOUT, "", 0.8 * same * spread, same).verdict == "reproduced"
+    assert lower(ABOUT, "", 1.2 * same * spread, same).verdict == "not_reproduced"
+    said = lower(ABOUT, "", 1.001 * same * spread, same)
     assert said.found.low < 1.0 < said.found.high
     assert said.found.low > 0.95  # hardly a gain, but the interval spans the criterion
     assert said.verdict == "undecided"
@@ -244,7 +245,7 @@ def test_statistics_of_a_claim_stay_in_the_order_given(tmp_path):
     path = tmp_path / "claims.csv"
     first = claims.pb1()[0]
     given = [dataclasses.replace(first, statistic=s) for s in ("the headline", "a detail")]
-    write([dataclasses.replace(first, id="PB2"), *given], path)
+    write([dataclasses.replace(first, about=Subject("PB2", "")), *given], path)
     assert read_claims(path)["statistic"].tolist()[:2] == ["the headline", "a detail"]
 
 
@@ -294,75 +295,6 @@ def test_verdicts_are_whole_words():
             Verdict(wrong)
 
 
-def test_rl2_judges_after_the_tuned_part_and_shows_the_whole():
-    methods = ("odometry, as logged", "odometry, calibrated", "ICP alone", "ICP from the wheels")
-    rows = [
-        ("intel", method, part, mean, fused - mean, fused - mean - 0.1, fused - mean + 0.1, 10)
-        for part, fused in (("judged", 0.1), ("all", 9.0))
-        for method, mean in (*((m, 1.0) for m in methods), ("EKF of wheels and ICP", fused))
-    ]
-    differences = [f"difference_{name}_m" for name in ("mean", "low", "high")]
-    columns = ["log", "method", "part", "translation_mean_m", *differences, "difference_minutes"]
-    said = list(real_logs.rl2(pd.DataFrame(rows, columns=columns)))
-    assert [c.verdict for c in said] == ["reproduced"] * 4 + ["shown"] * 4
-    assert said[0].reason == "fusion 0.100 m, the other 1.000 m"
-    assert [c.role for c in said[:4]] == ["beside", "headline", "headline", "headline"]
-    assert all("the whole log" in c.statistic for c in said[4:])
-
-
-def test_rl2_judges_the_paired_difference():
-    def judged(low, high):
-        table = pd.DataFrame(
-            {
-                "log": "intel",
-                "method": ["EKF of wheels and ICP", *real_logs.INTEL[1:5]] * 2,
-                "part": np.repeat(["judged", "all"], 5),
-                **dict.fromkeys([f"translation_{e}_m" for e in ("mean", "low", "high")], 1.0),
-                "difference_mean_m": (low + high) / 2.0,
-                "difference_low_m": low,
-                "difference_high_m": high,
-                "difference_minutes": 10,
-            }
-        )
-        return list(real_logs.rl2(table))[:4]
-
-    assert {c.verdict for c in judged(-0.2, -0.1)} == {"reproduced"}
-    assert {c.verdict for c in judged(0.1, 0.2)} == {"not_reproduced"}
-    open_ones = judged(-0.2, 0.1)
-    assert {(c.verdict, c.more) for c in open_ones} == {("undecided", 80)}  # 9 times as long
-    assert open_ones[0].statistic.startswith("translational error of EKF of wheels and ICP less")
-
-
-def test_rl1_rl4_and_rl5_can_fail():
-    ate = pd.DataFrame({"ate_m": [0.1491, 0.2272], "printed_m": ["0.149", "0.227"]})
-    assert real_logs.rl1(ate)[0].verdict == "reproduced"
-    assert real_logs.rl1(ate.assign(ate_m=[0.1496, 0.2272]))[0].verdict == "not_reproduced"
-    wheels = pd.DataFrame({"value": [0.0415, 0.0880], "published": [0.0414, 0.0880]})
-    lego = pd.DataFrame({"case": ["geometric width", "calibrated"], "rms_m": [0.6, 0.04]})
-    assert {c.verdict for c in real_logs.rl4(wheels, lego)} == {"reproduced"}
-    far, late = wheels.assign(value=[0.0420, 0.0880]), lego.assign(rms_m=[0.6, 0.11])
-    assert {c.verdict for c in real_logs.rl4(far, late)} == {"not_reproduced"}
-    wean = pd.DataFrame({"one_means": ["free", "occupied"], "score": [0.5, 0.2]})
-    assert real_logs.rl5(wean)[0].verdict == "reproduced"
-    assert real_logs.rl5(wean.assign(score=[0.5, 0.45]))[0].verdict == "not_reproduced"
-
-
-def test_rl3_wants_every_robot():
-    rows = [(r, "dead reckoning, calibrated", 1.0) for r in (1, 2, 3)]
-    rows += [(r, "good", 0.5) for r in (1, 2, 3)]
-    rows += [(1, "bad", 1.5), (2, "bad", 0.1), (3, "bad", 1.1), (3, "last", 1.1), (2, "last", 0.1)]
-    table = pd.DataFrame(rows, columns=["robot", "method", "ate_rmse_m"]).assign(judged=True)
-    said = {c.statistic.split()[2]: (c.verdict, c.reason) for c in real_logs.rl3(table)}
-    assert said == {
-        "good": ("reproduced", "robots 1, 2, 3"),
-        "bad": ("not_reproduced", "robots 1, 2, 3; not on robots 1, 3"),
-        "last": ("not_reproduced", "robots 2, 3; not on robot 3"),
-    }
-    table["judged"] = table["robot"] < 3  # robots on which the noise was chosen do not count
-    said = {c.statistic.split()[2]: c.verdict for c in real_logs.rl3(table)}
-    assert said == {"good": "reproduced", "bad": "not_reproduced", "last": "reproduced"}
-
-
 def test_intervals_of_two_one_sided_tests_are_named():
     worlds = pd.DataFrame(
         [
@@ -378,6 +310,6 @@ def test_intervals_of_two_one_sided_tests_are_named():
         worlds[column] = worlds["error_m"]
     no_times = pd.DataFrame({"geometry": [], "particles": [], "time_s": []})
     said = [*gil2008.gi3(worlds), *maximo2024.mx2(worlds, no_times)]
-    tested = [claim for claim in said if "significance" not in claim.statistic]
+    tested = select_all(said, arm=None)
     assert len(tested) == 5
     assert all("(90 % interval)" in claim.statistic for claim in tested)

@@ -9,8 +9,10 @@ import pytest
 
 from experiments import reproduce as module
 from experiments.evaluation.statistics import Interval
+from experiments.judging.claim import Claim, Subject
 from experiments.judging.claims_file import read_claims, read_verdicts
-from experiments.judging.verdict import Claim, Verdict, conclude
+from experiments.judging.folders import findings
+from experiments.judging.verdict import Verdict
 from experiments.runs.row import write_frame
 from experiments.viewing.style import figure
 from sim.errors import InputError
@@ -37,16 +39,12 @@ def study(*, names=("runs", "noise"), fails=False):
     def judge(made):
         assert len(made.table("runs")) == 1
         found = Interval(0.5, 0.4, 0.6)
-        return [Claim("GI1", "a share", found, "above 0", Verdict.REPRODUCED)]
-
-    def conclusions(made, claims):
-        says = {"GI1": lambda rows: f"The share is {rows[0].found.value}. Half of it."}
-        return conclude(claims, says)
+        return [Claim(Subject("GI1", "share"), "a share", found, "above 0", Verdict.REPRODUCED)]
 
     return {
         "study": SimpleNamespace(run=run),
         "figures": SimpleNamespace(draw=draw),
-        "claims": SimpleNamespace(judge=judge, conclusions=conclusions),
+        "claims": SimpleNamespace(judge=judge),
     }
 
 
@@ -62,6 +60,9 @@ def results(tmp_path, monkeypatch):
 
 def take(monkeypatch, parts):
     monkeypatch.setattr(module, "_part", lambda paper, name: parts[name])
+    said = "The share is {{ rows[0].found.value }}. Half of it."
+    about = findings(PAPER) | {"sentences": {"GI1": said}}
+    monkeypatch.setattr(module, "findings", lambda paper: about)
 
 
 def state(results):
@@ -111,15 +112,6 @@ def test_each_claim_gets_one_row_and_one_line(results, capsys):
     assert blank == ""
     assert paper.startswith("gil2008: 1 reproduced (")
     assert "quick/report.html" in page
-
-
-def test_claims_are_judged_again_from_disk(results, monkeypatch):
-    before = state(results)
-    (results / "claims.csv").unlink()
-    (results / "verdicts.csv").unlink()
-    module.judge_again(PAPER)
-    assert state(results) == before
-    assert len(read_verdicts(results / "verdicts.csv")) == 1
 
 
 def test_an_interrupted_run_leaves_the_results_as_they_were(results, monkeypatch):

@@ -6,8 +6,10 @@ import re
 
 import pandas as pd
 import pytest
+from jinja2 import UndefinedError
 
 from experiments.evaluation.statistics import Interval, mean_interval
+from experiments.judging.claim import Claim, Subject, banded, beside, select, select_all, shown
 from experiments.judging.claims_file import (
     VERDICT_COLUMNS,
     read_claims,
@@ -16,36 +18,30 @@ from experiments.judging.claims_file import (
     write_claims,
     write_verdicts,
 )
+from experiments.judging.folders import findings
 from experiments.judging.results import Results
-from experiments.judging.verdict import (
-    Claim,
+from experiments.judging.sentences import (
     Conclusion,
-    Profile,
-    Role,
-    Verdict,
-    banded,
-    beside,
     conclude,
-    headline_verdict,
-    more_to_settle,
     percent,
-    pick,
     plain,
-    shown,
+    sentence,
 )
-from experiments.report.contents import findings
-from experiments.reproduce import LOGS, NAMED, PAPERS, _judgement
+from experiments.judging.verdict import Profile, Role, Verdict, headline_verdict, more_to_settle
+from experiments.reproduce import LOGS, NAMED, PAPERS, judgement
 from experiments.runs.paths import SOURCE
 from sim.errors import InputError
 
 RESULTS = SOURCE / "results"
-GOOD = banded("PB1", "a ratio", Interval(1.0, 0.9, 1.1), 0.8, 1.25)
-BAD = banded("PB1", "another", Interval(2.0, 1.9, 2.1), 0.8, 1.25)
-OPEN = banded("PB1", "a third", Interval(1.2, 1.1, 1.3), 0.8, 1.25, n=20)
+ABOUT = Subject("PB1", "ratio", method="icp", size=3)
+GOOD = banded(ABOUT, "a ratio", Interval(1.0, 0.9, 1.1), 0.8, 1.25)
+BAD = banded(dataclasses.replace(ABOUT, size=4), "another", Interval(2.0, 1.9, 2.1), 0.8, 1.25)
+FUSED = dataclasses.replace(ABOUT, method="fusion")
+OPEN = banded(FUSED, "a third", Interval(1.2, 1.1, 1.3), 0.8, 1.25, n=20)
 
 
 def verdict_of(*claims):
-    (said,) = conclude(claims, {"PB1": lambda rows: f"There are {len(rows)} rows."})
+    (said,) = conclude(claims, {"sentences": {"PB1": "There are {{ rows|length }} rows."}})
     return said
 
 
@@ -54,14 +50,14 @@ def test_a_verdict_follows_from_the_headlines_alone():
     assert verdict_of(GOOD, OPEN).verdict == "undecided"
     assert verdict_of(GOOD, OPEN, BAD).verdict == "not_reproduced"
     assert verdict_of(GOOD, beside(OPEN), beside(BAD)).verdict == "reproduced"
-    assert verdict_of(beside(GOOD), shown("PB1", "only shown", Interval.exact(1.0))).verdict == (
+    assert verdict_of(beside(GOOD), shown(ABOUT, "only shown", Interval.exact(1.0))).verdict == (
         "shown"
     )
     assert headline_verdict([]) == "shown"
 
 
 def test_what_is_only_shown_stands_beside():
-    claim = shown("PB1", "a share", Interval.exact(0.5), "why")
+    claim = shown(ABOUT, "a share", Interval.exact(0.5), "why")
     assert (claim.role, claim.verdict, claim.reason) == (Role.BESIDE, Verdict.SHOWN, "why")
     assert beside(GOOD, False) is GOOD
 
@@ -112,10 +108,26 @@ def test_numbers_in_sentences():
     assert (plain(float("nan")), percent(float("nan"))) == ("unknown", "an unknown share")
 
 
-def test_a_missing_statistic_is_named():
-    assert pick([GOOD, BAD], "anoth") is BAD
-    with pytest.raises(LookupError, match="no statistic with x and y"):
-        pick([GOOD], "x", "y")
+def test_statistics_are_selected_by_their_fields():
+    rows = [GOOD, BAD, beside(OPEN)]
+    assert select(rows, size=4) is BAD
+    assert select_all(rows, method="icp", quantity="ratio") == [GOOD, BAD]
+    assert select(rows, role=Role.BESIDE, verdict="undecided").about.method == "fusion"
+    for wanted, found in (({"size": 5}, 0), ({"method": "icp"}, 2)):
+        with pytest.raises(LookupError, match=f"{found} statistics with"):
+            select(rows, **wanted)
+
+
+def test_a_sentence_is_a_template_filled_from_the_statistics():
+    template = """{% for row in select_all(method="icp") %}
+        {{ row.found|bracketed }} with {{ row.about.size }}{{ "." if loop.last else ";" }}
+    {% endfor %}
+    {{ select(method="fusion").found|plain(3) }}, {{ rows|span }}."""
+    assert sentence(template, [GOOD, BAD, OPEN]) == (
+        "1 [0.9, 1.1] with 3; 2 [1.9, 2.1] with 4. 1.2, 1 to 2."
+    )
+    with pytest.raises(UndefinedError, match="no_such_field"):
+        sentence("{{ rows[0].no_such_field }}", [GOOD])
 
 
 def write(conclusions, path, paper="puzzlebot2024", profile=Profile.FULL):
@@ -157,7 +169,7 @@ def test_damaged_verdicts_are_refused_in_one_line(tmp_path, row, wrong):
 @pytest.fixture(scope="module", params=[*PAPERS, *LOGS, *NAMED])
 def tracked(request):
     """A paper's statistics and conclusions by the tracked tables."""
-    return request.param, *_judgement(Results(RESULTS, request.param))
+    return request.param, *judgement(Results(RESULTS, request.param))
 
 
 def test_the_tracked_verdicts_are_those_of_the_tracked_tables(tracked, tmp_path):
@@ -200,4 +212,4 @@ def test_criteria_hold_the_rule_and_nothing_that_came_out(tracked):
 
 
 def test_a_claim_says_its_role():
-    assert Claim("PB1", "s", Interval.exact(1.0), "c", Verdict.REPRODUCED).role is Role.HEADLINE
+    assert Claim(ABOUT, "s", Interval.exact(1.0), "c", Verdict.REPRODUCED).role is Role.HEADLINE

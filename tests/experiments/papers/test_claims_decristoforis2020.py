@@ -5,8 +5,9 @@ import pandas as pd
 import pytest
 
 from experiments.evaluation.registration_errors import METRICS
-from experiments.judging.verdict import conclude
+from experiments.judging.claim import select_all
 from experiments.papers.decristoforis2020 import claims
+from tests.fixtures.claims import concluded
 
 SEEDS = np.arange(1000, 1020)
 
@@ -46,11 +47,6 @@ def verdicts(found):
     return {c.statistic: c.verdict for c in found}
 
 
-def conclusion(key, sentence, found):
-    (said,) = conclude(list(found), {key: sentence})
-    return said
-
-
 def test_dc1_follows_the_order():
     found = verdicts(claims.dc1(runs(**RIGHT), ordering({1e-6, 1e-4})))
     (region,) = (s for s in found if s.startswith("share"))
@@ -85,11 +81,11 @@ def test_dc1s_heading_over_10_m_is_judged_beside():
     table.loc[table["method"] == "fusion", "rpe_10m_heading_rmse_rad"] = 9.0
     rows = list(claims.dc1(table, ordering(set())))
     assert verdicts(rows)["heading over 10 m RMSE, fusion over icp"] == "not_reproduced"
-    assert conclusion("DC1", claims.dc1_sentence, rows).verdict == "reproduced"
+    assert concluded("decristoforis2020", rows).verdict == "reproduced"
     shorter = table.drop(columns="rpe_10m_heading_rmse_rad")  # drives of less than 10 m
     rows = list(claims.dc1(shorter, ordering(set())))
-    assert not any("over 10 m" in row.statistic for row in rows)
-    assert "10 m" not in conclusion("DC1", claims.dc1_sentence, rows).sentence
+    assert not any("over 10 m" in row.about.quantity for row in rows)
+    assert "10 m" not in concluded("decristoforis2020", rows).sentence
 
 
 def test_the_order_holds_in_a_cell_only_if_all_intervals_do():
@@ -150,25 +146,25 @@ def test_dc2_and_dc3_by_their_bands():
 def test_dc1_to_dc6_follow_from_the_papers_own_arms():
     """Our key frames and clone, the corner and point to point cannot turn a claim's verdict."""
     good = RIGHT | {"icp_guess": 0.1, "fusion_clone": 0.9}
-    said = conclusion("DC1", claims.dc1_sentence, claims.dc1(runs(**good), ordering(set())))
+    said = concluded("decristoforis2020", claims.dc1(runs(**good), ordering(set())))
     assert said.verdict == "reproduced"
-    said = conclusion("DC6", claims.dc6_sentence, claims.dc6(runs(**good)))
+    said = concluded("decristoforis2020", claims.dc6(runs(**good)))
     assert said.verdict == "reproduced"
     corner = ellipses(long_after_corner_m=9e-3, long_median_in_curve_m=1e-3)
-    assert conclusion("DC3", claims.dc3_sentence, claims.dc3(corner)).verdict == "reproduced"
+    assert concluded("decristoforis2020", claims.dc3(corner)).verdict == "reproduced"
     curve = ellipses(long_in_curve_m=1.1e-3, long_median_in_curve_m=0.7e-3)
-    said = conclusion("DC3", claims.dc3_sentence, claims.dc3(curve))
+    said = concluded("decristoforis2020", claims.dc3(curve))
     assert said.verdict == "not_reproduced"
     assert "shorter than before (median 69 %)" in said.sentence
-    assert conclusion("DC2", claims.dc2_sentence, claims.dc2(ellipses())).verdict == "reproduced"
+    assert concluded("decristoforis2020", claims.dc2(ellipses())).verdict == "reproduced"
     swapped = ellipses()
     swapped["method"] = swapped["method"].map({"printed": "lines", "lines": "printed"})
-    assert conclusion("DC2", claims.dc2_sentence, claims.dc2(swapped)).verdict == "reproduced"
+    assert concluded("decristoforis2020", claims.dc2(swapped)).verdict == "reproduced"
     table = covariances(censi=3.0, censi_sliding=3.0)
     table.loc[table["metric"] != "point_to_plane", "nees_over_dof"] = 1e3
-    assert conclusion("DC4", claims.dc4_sentence, claims.dc4(table)).verdict == "reproduced"
+    assert concluded("decristoforis2020", claims.dc4(table)).verdict == "reproduced"
     table = covariances(censi_last=2.1)
-    said = conclusion("DC4", claims.dc4_sentence, claims.dc4(table))
+    said = concluded("decristoforis2020", claims.dc4(table))
     assert said.verdict == "not_reproduced"
     assert "leave out the noise" in said.sentence
     assert "bias of -0.25 of the motion" in said.sentence
@@ -204,14 +200,13 @@ def test_dc4_wants_the_hessian_outside_and_the_others_inside():
     assert len(biases) == 12
     assert {c.verdict for c in found} == {"reproduced", "shown"}
     assert len([c for c in found if c.role == "headline"]) == 4 * 3 + 1
-    assert sum("censi_sliding" in c.statistic for c in found) == 4  # point to point only
+    assert len(select_all(found, method="censi_sliding")) == 4  # point to point only
     wrong = covariances(hessian_points=1.0, sampling=2.0, censi_last=3.0)
-    found = verdicts(claims.dc4(wrong))
-    names = {s.split(",")[0]: v for s, v in found.items() if "point_to_plane" in s}
-    assert names["ANEES over dof of hessian_points"] == "not_reproduced"
-    assert names["ANEES over dof of censi_last"] == "not_reproduced"
-    assert names["ANEES over dof of sampling"] == "not_reproduced"
-    assert names["ANEES over dof of censi"] == "reproduced"
+    found = select_all(list(claims.dc4(wrong)), quantity="ANEES", metric="point_to_plane")
+    by_method = {c.about.method: c.verdict for c in found}
+    assert by_method.pop("censi") == by_method.pop("hessian") == "reproduced"
+    assert set(by_method) == {"hessian_points", "sampling", "censi_last"}
+    assert set(by_method.values()) == {"not_reproduced"}
     slow = wrong.copy()
     slow.loc[slow["method"].isin(["censi_last", "hessian"]), "time_us"] = 1e4
     found = verdicts(claims.dc4(slow))
@@ -220,7 +215,7 @@ def test_dc4_wants_the_hessian_outside_and_the_others_inside():
 
 
 def test_dc4s_hessian_has_the_residuals_of_points():
-    said = conclusion("DC4", claims.dc4_sentence, claims.dc4(covariances(hessian_points=1.0)))
+    said = concluded("decristoforis2020", claims.dc4(covariances(hessian_points=1.0)))
     assert said.verdict == "not_reproduced"  # then it is accurate
     assert "expects from the residuals of points" in said.sentence
 
@@ -245,7 +240,7 @@ def test_dc5_wants_both_lower():
         ]  # fmt: skip
         found = list(claims.dc5(pd.DataFrame(rows)))
         assert [c.role for c in found] == ["headline"] * 3 + ["beside"] * 3
-        assert "point to plane has" in claims.dc5_sentence(found)
+        assert "point to plane has" in concluded("decristoforis2020", found).sentence
         return [c.verdict for c in found]
 
     good, bad = ["reproduced"] * 3, ["not_reproduced"] * 3

@@ -11,11 +11,13 @@ from joblib import Parallel, delayed
 
 from estimators.landmarks.fastslam import FastSLAM
 from experiments.gate.conform import walk
-from experiments.judging.verdict import Profile, Role, Verdict, conclude
+from experiments.judging.claim import select, select_all
+from experiments.judging.verdict import Profile, Role, Verdict
 from experiments.papers.gil2008 import claims as judge
 from experiments.papers.gil2008 import recordings, scores, settings, study
 from experiments.runs.experiment import Experiment
 from experiments.sweeps.plan import planned
+from tests.fixtures.claims import concluded
 from tests.fixtures.fakes import circle, tracking_prior, true_ids
 
 K_M = 5e-5
@@ -119,8 +121,9 @@ def test_rows_say_what_was_run(small):
     batch = Experiment.compose(["study=gil2008", "seed=3", noise, "estimator=smoother"])
     runs = [("particles", experiment(noise, "repeats=2")), ("bound", batch)]
     rows = study.rows_of(runs)
-    assert [table for table, _ in rows] == ["particles", "particles", "bound"]
-    first, second, bound = (row for _, row in rows)
+    assert list(rows) == ["particles", "bound"]
+    first, second = rows["particles"]
+    (bound,) = rows["bound"]
     assert first["revised_ate_rmse_m"] != second["revised_ate_rmse_m"]
     assert first["right_share"] == 1.0
     assert first["share_beyond_10_m"] == 0.0
@@ -128,7 +131,7 @@ def test_rows_say_what_was_run(small):
         assert row["revised_ate_rmse_m"] < 0.5 * row["odometry_rmse_m"]
         assert row["map_aligned_rmse_m"] <= row["map_rmse_m"] + 1e-12
     again = study.rows_of(runs[:1])
-    assert again[0][1]["revised_ate_rmse_m"] == first["revised_ate_rmse_m"]
+    assert again["particles"][0]["revised_ate_rmse_m"] == first["revised_ate_rmse_m"]
 
 
 def test_association_in_studies(small):
@@ -138,7 +141,7 @@ def test_association_in_studies(small):
         ("association", experiment("sensors=stereo_pixel", *guess)),
         ("association", Experiment.compose(single)),
     ]
-    for _, row in study.rows_of(runs):
+    for row in study.rows_of(runs)["association"]:
         assert 0.7 < row["right_share"] <= 1.0
 
 
@@ -210,10 +213,10 @@ def test_the_number_of_processes_changes_no_bit():
     assert all(np.array_equal(a, b) for a, b in zip(alone, together, strict=True))
 
 
-@pytest.mark.parametrize("name", ["gil2008", *(f"gil2008_{t}" for t in settings.LABELS)])
+@pytest.mark.parametrize("name", ["gil2008", *(f"gil2008/{t}" for t in settings.LABELS)])
 def test_studies_compose(name):
     composed = Experiment.compose([f"study={name}"])
-    assert composed.name == name
+    assert composed.name == name.replace("/", "_")
     assert composed.config["sensors"]["stereo"] is not None
 
 
@@ -261,11 +264,6 @@ def laps(filter_ratio=1.0, odometry_ratio=2.0, name="paper"):
     )
 
 
-def conclusion(key, sentence, claims):
-    (said,) = conclude(list(claims), {key: sentence}, "worlds")
-    return said
-
-
 def test_gi1_holds_slam_against_odometry():
     good = sweep("n_particles", PARTICLES, lambda m: 0.5, filter="paper")
     assert headlines(judge.gi1(good, laps())) == ["reproduced", "reproduced"]
@@ -273,7 +271,7 @@ def test_gi1_holds_slam_against_odometry():
     assert headlines(judge.gi1(bad, laps(1.5))) == ["not_reproduced", "not_reproduced"]
     ours = pd.concat([laps(), laps(1.5, name="fastslam2")])  # stands beside
     assert headlines(judge.gi1(good, ours)) == ["reproduced", "reproduced"]
-    said = conclusion("GI1", judge.gi1_sentence, judge.gi1(good, laps()))
+    said = concluded("gil2008", judge.gi1(good, laps()))
     assert said.verdict == "reproduced"
     assert "its error is 1.0 times that at the first visit, and odometry's 1.9" in said.sentence
 
@@ -296,7 +294,7 @@ def test_dead_reckoning_fails_gi1():
     assert headlines(judge.gi1(drive, lost)) == ["not_reproduced", "not_reproduced"]
     short = list(judge.gi1(drive, laps(1.0, odometry_ratio=1.0)))
     assert headlines(short)[1] == "undecided"
-    own = next(c for c in short if c.statistic.startswith("error of odometry"))
+    own = select(short, quantity="revisits", method="odometry")
     assert (own.verdict, own.role) == ("not_reproduced", "beside")
 
 
@@ -313,9 +311,9 @@ def test_gi2_and_gi3_tell_a_trend_from_none():
     assert "reproduced" not in verdicts(judge.gi2(flat, bound))
     assert headlines(judge.gi3(flat)) == ["reproduced"]
     assert headlines(judge.gi3(falling)) == ["not_reproduced"]
-    shown = [c for c in judge.gi2(falling, bound) if "batch bound" in c.statistic]
+    shown = select_all(list(judge.gi2(falling, bound)), quantity="position over bound")
     assert shown[0].found.value == pytest.approx(500**-0.4 / 0.1, rel=0.1)
-    assert conclusion("GI2", judge.gi2_sentence, judge.gi2(flat, bound)).verdict != "reproduced"
+    assert concluded("gil2008", judge.gi2(flat, bound)).verdict != "reproduced"
 
 
 def test_gi3_states_equivalence_and_significance_apart():
@@ -324,7 +322,8 @@ def test_gi3_states_equivalence_and_significance_apart():
     same, plainly = list(judge.gi3(some))[:2]
     assert (same.verdict, plainly.verdict) == ("reproduced", "not_reproduced")
     assert (same.role, plainly.role) == ("headline", "beside")
-    assert "the gain is significant, and it is within 25 %" in judge.gi3_sentence([same, plainly])
+    said = concluded("gil2008", [same, plainly]).sentence
+    assert "the gain is significant, and it is within 25 %" in said
     noise = np.exp(np.random.default_rng(1).standard_normal(len(some)))
     wide = some.assign(revised_ate_rmse_m=some["revised_ate_rmse_m"] * noise)
     same, plainly = list(judge.gi3(wide))[:2]
@@ -354,10 +353,10 @@ def test_gi4_and_gi5_read_the_distance():
     assert headlines(judge.gi5(falling)) == ["not_reproduced"]
     worse = distances(lambda d: 3.0 * d)
     assert headlines(judge.gi5(worse)) == ["reproduced"]  # far landmarks that harm agree
-    assert conclusion("GI5", judge.gi5_sentence, judge.gi5(worse)).verdict == "reproduced"
+    assert concluded("gil2008", judge.gi5(worse)).verdict == "reproduced"
     flat = distances(lambda d: 1.0)
     assert headlines(judge.gi4(flat)) == ["not_reproduced"]
-    assert conclusion("GI4", judge.gi4_sentence, judge.gi4(flat)).verdict == "not_reproduced"
+    assert concluded("gil2008", judge.gi4(flat)).verdict == "not_reproduced"
     (claim,) = judge.gi5(distances(lambda d: 1.0, share_beyond_10_m=0.05))
     assert claim.verdict == "undecided"
     assert claim.reason == "5 % of observations beyond 10 m; too few far observations"
@@ -370,7 +369,7 @@ def test_gi4_and_gi5_read_the_distance():
 def test_gi6_reads_the_number_of_observations():
     more = sweep("n_seen", (1, 2, 4, 8, 12, 20), lambda b: b**-0.3, filter="paper")
     assert set(verdicts(judge.gi6(more))) == {"reproduced"}
-    assert conclusion("GI6", judge.gi6_sentence, judge.gi6(more)).verdict == "reproduced"
+    assert concluded("gil2008", judge.gi6(more)).verdict == "reproduced"
     fewer = more.assign(n_seen=21 - more["n_seen"])
     assert set(verdicts(judge.gi6(fewer))) == {"not_reproduced"}
 
@@ -409,7 +408,7 @@ def test_gi7_compares_associations():
     assert headlines(judge.gi7(associated())) == ["reproduced", "reproduced"]
     assert headlines(judge.gi7(associated(descriptor=0.9)))[0] == "not_reproduced"
     assert headlines(judge.gi7(associated(fastslam=2.5, ekf=0.9)))[1] == "not_reproduced"
-    said = conclusion("GI7", judge.gi7_sentence, judge.gi7(associated()))
+    said = concluded("gil2008", judge.gi7(associated()))
     assert said.verdict == "reproduced"
     assert "EKF-SLAM in 100 %, FastSLAM in 0 %" in said.sentence
     fastslam2 = associated(descriptor=5.0, name="fastslam2").query("filter == 'fastslam2'")
@@ -453,7 +452,7 @@ def test_gi8_reads_exponents():
     linear = table[table["maps"] == "contiguous"].assign(maps="shared")
     both = pd.concat([linear, table[table["maps"] == "shared"].assign(maps="contiguous")])
     assert verdicts(judge.gi8(both)) == ["not_reproduced", "not_reproduced"]
-    said = conclusion("GI8", judge.gi8_sentence, judge.gi8(table))
+    said = concluded("gil2008", judge.gi8(table))
     assert "grows as N^0.10 with maps that particles share" in said.sentence
 
 

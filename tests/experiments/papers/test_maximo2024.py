@@ -6,12 +6,14 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from experiments.judging.claim import select, select_all
 from experiments.judging.results import Results
-from experiments.judging.verdict import Profile, Role, conclude
+from experiments.judging.verdict import Profile, Role
 from experiments.papers.maximo2024 import claims, figures, places, settings, study, worlds
 from experiments.runs.paths import SOURCE
 from experiments.runs.seeds import stream
 from experiments.sweeps.plan import planned
+from tests.fixtures.claims import concluded
 
 
 @pytest.fixture(scope="module")
@@ -46,17 +48,12 @@ def headlines(said):
     return [c.verdict for c in said if c.role is Role.HEADLINE]
 
 
-def conclusion(key, sentence, said):
-    (found,) = conclude(list(said), {key: sentence}, "worlds")
-    return found
-
-
 def test_mx1_follows_the_errors():
     said = list(claims.mx1(weighting(11.5, 9.6, 205.0), quality()))
     assert [c.verdict for c in said] == ["reproduced", "reproduced"]
     assert said[0].reason == "holds at B = 5, 10 of 2, 5, 10"
     assert said[1].reason.startswith("holds at B = 10 of 2, 5, 10; p = ")
-    found = conclusion("MX1", claims.mx1_sentence, said)
+    found = concluded("maximo2024", said)
     assert found.verdict == "reproduced"
     assert "M3 is worse than 5 times M2 in 100 % of worlds on Oxford" in found.sentence
     assert "Of the numbers B tried, that on Oxford holds at B = 5, 10" in found.sentence
@@ -77,7 +74,7 @@ def test_the_papers_data_sets_are_the_headlines():
     names = ("oxford", "oxford_real", "umh", "campus", "oxford_plane", "umh_plane")
     table = pd.concat([weighting(11.5, 9.6, 205.0, name) for name in names])
     qualities = pd.concat([quality(), quality(name="umh")])
-    said = [c for c in claims.mx1(table, qualities) if "M2 over M1" in c.statistic]
+    said = select_all(list(claims.mx1(table, qualities)), method="M2")
     assert [c.role for c in said] == ["beside", "headline", "headline"] + ["beside"] * 3
     assert claims.headlines(["oxford", "umh", "campus"]) == {"oxford", "umh"}
 
@@ -99,9 +96,7 @@ def test_the_map_judges_each_cell_as_the_study_is_judged():
     assert list(cells.index) == [2, 5, 10]
     assert cells["verdict"].tolist() == ["not_reproduced", "reproduced", "reproduced"]
     assert cells["value"].tolist() == [0.0, 1.0, 1.0]
-    whole = next(
-        c for c in claims.mx1(table[table["n_nearest"] == 10], table) if "M1" in c.statistic
-    )
+    whole = select(list(claims.mx1(table[table["n_nearest"] == 10], table)), method="M2")
     cell = claims.judged_map(table, "oxford", m2).set_index("n_nearest").loc[10]
     assert (cell["value"], cell["verdict"]) == (whole.found.value, whole.verdict)
     page = figures.quality(table.assign(recall_at_1=0.9))
@@ -115,7 +110,7 @@ def test_mx2_wants_equal_errors_and_rising_times():
     assert [c.verdict for c in said] == ["reproduced"] * 7
     assert said[3].found.low == pytest.approx(2.0 / 1.1)  # the interval spans the timings
     assert said[6].found.value == pytest.approx(2.0)
-    found = conclusion("MX2", claims.mx2_sentence, said)
+    found = concluded("maximo2024", said)
     assert "The time grows up to 2 times" in found.sentence
     assert "on Oxford is at least 2 times that on UMH" in found.sentence
     worse = table.assign(error_m=table["error_m"] * np.where(table["per_node"] == 2, 1.3, 1.0))
@@ -146,54 +141,56 @@ def verdicts_of_times(times):
     equal = weighting(1.0, 1.0, 1.0).replace({"method": {"M1": 2, "M2": 4, "M3": 8}})
     table = equal.rename(columns={"method": "per_node"})
     return {
-        words: [c.verdict for c in claims.mx2(table, times) if words in c.statistic]
-        for words in ("the paper's", "between nodes", "the fewest", "that of UMH")
+        over: [c.verdict for c in select_all(list(claims.mx2(table, times)), over=over)]
+        for over in ("the paper's", "2.56 s between nodes", "the fewest", "UMH")
     }
 
 
 def test_mx2_fails_by_each_of_its_times():
     times = node_times()
-    good = {"the paper's": 2, "between nodes": 1, "the fewest": 2, "that of UMH": 1}
+    good = {"the paper's": 2, "2.56 s between nodes": 1, "the fewest": 2, "UMH": 1}
     assert verdicts_of_times(times) == {k: ["reproduced"] * n for k, n in good.items()}
     slower = times.assign(time_s=10.0 * times["time_s"])  # on another machine
     assert verdicts_of_times(slower) == verdicts_of_times(times)
     slow = times.assign(time_s=1e4 * times["time_s"])
     found = verdicts_of_times(slow)
-    assert set(found["the paper's"] + found["between nodes"]) == {"not_reproduced"}
+    assert set(found["the paper's"] + found["2.56 s between nodes"]) == {"not_reproduced"}
     flat = times.assign(time_s=np.where(times["particles"] % 397, 1.0, 2.0) * 1e-4)
     flat.loc[flat["particles"].isin([1588, 544]), "time_s"] *= 0.5
     assert set(verdicts_of_times(flat)["the fewest"]) == {"not_reproduced"}
     as_fast = times.assign(time_s=np.where(times["geometry"] == "umh", 3e-4, times["time_s"]))
-    assert verdicts_of_times(as_fast)["that of UMH"] == ["not_reproduced"]
+    assert verdicts_of_times(as_fast)["UMH"] == ["not_reproduced"]
 
 
 def test_mx3_judges_every_weighting():
     spread = weighting(5.0, 2.0, 1.0, column="dispersion_m").assign(step=10)
     said = list(claims.mx3(spread, quality()))
     assert [c.verdict for c in said] == ["reproduced", "reproduced"]
-    assert [c.statistic[:22] for c in said] == ["dispersion of M2 over ", "dispersion of M3 over "]
+    assert [c.about.method for c in said] == ["M2", "M3"]
     assert list(claims.mx3(spread.assign(step=9), quality())) == []
     slow = weighting(1.0, 1.5, 2.0, column="dispersion_m").assign(step=10)
     assert headlines(claims.mx3(slow, quality())) == ["not_reproduced", "not_reproduced"]
-    found = conclusion("MX3", claims.mx3_sentence, claims.mx3(spread, quality()))
+    found = concluded("maximo2024", claims.mx3(spread, quality()))
     assert "M3 over M1 on Oxford, made route 0.2 (p = " in found.sentence
 
 
 def test_mx4_and_mx5_follow_their_tables():
     starts = pd.DataFrame({"geometry": "umh", "settled_at": [3.0] * 200})
-    assert claims.mx4(starts)[0].verdict == "reproduced"
+    assert next(claims.mx4(starts)).verdict == "reproduced"
     late = starts.assign(settled_at=[3.0] * 100 + [np.nan] * 60 + [41.0] * 40)
-    assert claims.mx4(late)[0].verdict == "not_reproduced"
-    assert claims.mx4(late)[0].found.value == 0.5
-    assert "50 % (UMH)" in conclusion("MX4", claims.mx4_sentence, claims.mx4(late)).sentence
+    assert next(claims.mx4(late)).verdict == "not_reproduced"
+    assert next(claims.mx4(late)).found.value == 0.5
+    assert "50 % (UMH)" in concluded("maximo2024", claims.mx4(late)).sentence
     clusters = pd.DataFrame(
         {"geometry": "umh", "descriptor": "synthetic", "contiguous": [0.9, 0.92, 0.91]}
     )
-    assert claims.mx5(clusters)[0].verdict == "reproduced"
-    assert claims.mx5(clusters.assign(contiguous=[0.5, 0.52, 0.51]))[0].verdict == "not_reproduced"
-    assert claims.mx5(clusters.assign(descriptor="scan_context")) == []
+    assert next(claims.mx5(clusters)).verdict == "reproduced"
+    assert {c.verdict for c in claims.mx5(clusters.assign(contiguous=[0.5, 0.52, 0.51]))} == {
+        "not_reproduced"
+    }
+    assert list(claims.mx5(clusters.assign(descriptor="scan_context"))) == []
     both = pd.concat([clusters, clusters.assign(geometry="campus", descriptor="m2dp")])
-    found = conclusion("MX5", claims.mx5_sentence, claims.mx5(both))
+    found = concluded("maximo2024", claims.mx5(both))
     assert "simulated clouds, of 91 % (campus clouds, m2dp)" in found.sentence
 
 
@@ -215,7 +212,7 @@ def test_our_own_claims_follow_their_tables():
         }
     )
     assert [c.verdict for c in claims.mx8(trials)] == ["reproduced", "reproduced"]
-    found = conclusion("MX8", claims.mx8_sentence, claims.mx8(trials))
+    found = concluded("maximo2024", claims.mx8(trials))
     assert "With injection 100 % of kidnapped robots are found again" in found.sentence
     quick = trials.assign(settled_at=4.0)  # found again even without injection
     assert [c.verdict for c in claims.mx8(quick)] == ["not_reproduced", "reproduced"]

@@ -12,13 +12,15 @@ import pytest
 from matplotlib.figure import Figure
 
 from experiments.evaluation.statistics import Interval
+from experiments.judging.claim import Claim, Subject, beside
 from experiments.judging.claims_file import (
     note_provenance,
     read_claims,
     write_claims,
     write_verdicts,
 )
-from experiments.judging.verdict import Claim, Conclusion, Profile, Verdict, beside
+from experiments.judging.sentences import Conclusion
+from experiments.judging.verdict import Profile, Verdict
 from experiments.report import contents, leaderboard
 from experiments.report import page as report
 from experiments.report.export import to_latex, to_markdown
@@ -32,7 +34,7 @@ VOID = {"meta", "link", "img", "br"}
 
 def claim(key, verdict, statistic="a < b & c", value=0.5, reason=""):
     found = Interval(value, 0.4, 0.6)
-    return Claim(key, statistic, found, "at least 0.45", Verdict(verdict), reason)
+    return Claim(Subject(key, ""), statistic, found, "at least 0.45", Verdict(verdict), reason)
 
 
 @pytest.fixture(scope="module")
@@ -264,7 +266,7 @@ def test_a_damaged_figure_is_named(tmp_path, results):
 @pytest.mark.parametrize("paper", [*contents.PAPERS, *contents.OWN, "real_logs"])
 def test_findings_are_complete(paper):
     about = contents.findings(paper)
-    assert set(about) == {"title", "about", "claims", "figures"}
+    assert set(about) - {"unit"} == {"title", "about", "claims", "sentences", "figures"}
     for name, figure in about["figures"].items():
         assert name.startswith(f"{paper}_")
         assert set(figure) - {"table"} == {"title", "alt", "paper", "claims"}

@@ -3,7 +3,10 @@
 import numpy as np
 import pandas as pd
 
+from experiments.judging.claim import select
+from experiments.judging.folders import findings
 from experiments.judging.results import Results
+from experiments.judging.sentences import conclude
 from experiments.judging.verdict import Role, Verdict
 from experiments.studies.exploration import claims, figures, settings
 
@@ -12,7 +15,7 @@ def table_of(area_gain=1.3, map_ratio=1.0, n_worlds=20, spread=0.05, seed=0):
     """Runs in which coordination changes the area and the map's error by these factors."""
     rng, rows = np.random.default_rng(seed), []
     for world in range(n_worlds):
-        for strategy in settings.STRATEGIES:
+        for strategy in settings.NAMES:
             better = strategy == settings.JUDGED
             area = 150.0 * (area_gain if better else 1.0) * np.exp(rng.normal(0.0, spread))
             error = 0.1 * (map_ratio if better else 1.0) * np.exp(rng.normal(0.0, spread))
@@ -35,10 +38,10 @@ def test_gi10_needs_more_area_and_a_map_that_is_no_worse():
 
 def test_the_sentence_says_the_factors():
     found = [*claims.gi10(table_of(spread=1e-6))]
-    [conclusion] = claims.conclusions(None, found)
+    [conclusion] = conclude(found, findings("exploration"))
     assert conclusion.verdict is Verdict.REPRODUCED
     assert "1.3 times the area" in conclusion.sentence
-    [share] = [c for c in found if "hit something, coordinated" in c.statistic]
+    share = select(found, quantity="hit something", method="coordinated")
     assert share.found.value == 1.0 / (settings.N_ROBOTS * 20)
 
 
@@ -47,7 +50,7 @@ def test_figures_draw(tmp_path):
     at = np.arange(0.0, 16.0, 0.5)
     curves = [
         pd.DataFrame({"seed": world, "strategy": name, "driven_m": at, "area_m2": 10.0 * at + k})
-        for k, name in enumerate(settings.STRATEGIES)
+        for k, name in enumerate(settings.NAMES)
         for world in range(3)
     ]
     made.write_tables(coverage=pd.concat(curves))

@@ -7,7 +7,7 @@ import pytest
 from experiments import reproduce
 from experiments.judging.verdict import Profile
 from experiments.runs.experiment import Experiment
-from experiments.studies.fastslam_consistency import figures, settings, study
+from experiments.studies.fastslam_consistency import figures, study
 from tests.fixtures.fakes import circle
 
 
@@ -23,7 +23,7 @@ def test_arms_differ_in_nothing_but_the_filter(runs):
     assert all(each == settings_of[0] for each in settings_of)
     labels = [tuple(study.labels_of(run).values()) for run in one_seed]
     assert len(set(labels)) == len(labels)  # each arm has a name of its own
-    assert max(run.config["estimator"].get("n_particles", 0) for run in runs) <= settings.MOST_QUICK
+    assert max(run.config["estimator"].get("n_particles", 0) for run in runs) <= study.MAX_QUICK
 
 
 def test_rows_hold_the_nees_at_distances(runs, monkeypatch):
@@ -31,7 +31,7 @@ def test_rows_hold_the_nees_at_distances(runs, monkeypatch):
     monkeypatch.setattr(Experiment, "recording", lambda self: driven)
     monkeypatch.setattr(study, "DISTANCES_M", (2.0, 4.0, 1000.0))
     chosen = [r for r in runs if r.seed == 1000 and r.estimator_name in ("ekf_slam", "smoother")]
-    rows = pd.DataFrame(study.rows_of(chosen))
+    rows = pd.DataFrame(study.rows_of(chosen)["nees"])
     assert set(rows["filter"]) == {"ekf_slam", "batch"}
     assert np.isnan(rows["nees"][rows["distance_m"] == 1000.0]).all()  # it never came so far
     near = rows["nees"][rows["distance_m"] < 10.0]

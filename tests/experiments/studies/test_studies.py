@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from experiments.judging.logs import missing
 from experiments.runs.evaluate import evaluate
 from experiments.runs.paths import option_names
 from experiments.runs.row import Outcome
-from experiments.studies.real_logs.study import missing
 from experiments.sweeps.plan import planned
 from tests.fixtures.fakes import peers_may_be_missing
 

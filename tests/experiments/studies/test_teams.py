@@ -6,9 +6,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from experiments.judging.claim import select_all
 from experiments.judging.results import Results
 from experiments.judging.verdict import Role, Verdict
 from experiments.studies.teams import claims, figures, settings
+from tests.fixtures.claims import concluded
 
 
 def table_of(ratio, n_worlds=30, spread=0.4, seed=0):
@@ -31,13 +33,13 @@ def table_of(ratio, n_worlds=30, spread=0.4, seed=0):
 
 
 def headlines(table):
-    return [claim for claim in claims.gi9(table) if claim.role is Role.HEADLINE]
+    return select_all(list(claims.gi9(table)), role=Role.HEADLINE)
 
 
 def test_gi9_is_one_statistic_for_each_size_by_the_papers_method():
     found = headlines(table_of(0.5))
     assert len(found) == len(settings.SIZES)
-    assert all("FastSLAM" in claim.statistic for claim in found)
+    assert {claim.about.method for claim in found} == {"fastslam"}
     assert {claim.verdict for claim in found} == {Verdict.REPRODUCED}
     assert all(0.4 < claim.found.value < 0.6 for claim in found)
 
@@ -49,12 +51,11 @@ def test_gi9_can_fail():
     mixed = table_of(0.5)
     worse = (mixed["size"] == 4) & (mixed["filter"] == "fastslam") & mixed["sightings"]
     mixed.loc[worse, "ate_rmse_m"] *= 6.0
-    [conclusion] = claims.conclusions(None, list(claims.gi9(mixed)))
-    assert conclusion.verdict is Verdict.NOT_REPRODUCED
+    assert concluded("teams", claims.gi9(mixed)).verdict is Verdict.NOT_REPRODUCED
 
 
 def test_what_communication_costs():
-    costs = [c for c in claims.gi9(table_of(0.5)) if "communication" in c.statistic]
+    costs = select_all(list(claims.gi9(table_of(0.5))), quantity="communication")
     assert len(costs) == len(settings.LINKS)
     assert [c.found.value for c in costs] == pytest.approx([2.0] * len(costs))
 
@@ -68,13 +69,12 @@ def test_the_sentence_says_the_factors(tmp_path):
     ]
     made.write_tables(errors=table_of(0.5), mrclam=pd.DataFrame(log))
     found = claims.judge(made)
-    [conclusion] = claims.conclusions(made, found)
+    conclusion = concluded("teams", found)
     assert conclusion.verdict is Verdict.REPRODUCED
     assert "with 2 robots," in conclusion.sentence
     assert "On MRCLAM 6 a team of five errs 0.33 times a robot alone." in conclusion.sentence
-    bare = [c for c in found if "MRCLAM" not in c.statistic]
-    [conclusion] = claims.conclusions(made, bare)
-    assert "MRCLAM" not in conclusion.sentence
+    bare = [c for c in found if c.about.quantity != "MRCLAM 6"]
+    assert "MRCLAM" not in concluded("teams", bare).sentence
 
 
 def test_figures_draw(tmp_path):
@@ -92,11 +92,11 @@ def test_figures_draw(tmp_path):
 
 
 def test_the_arms_of_a_filter_differ_in_sightings_alone():
-    from experiments.studies.teams.study import _arms, _composed
+    from experiments.studies.teams.study import _arms, composed
 
     for option in settings.WORLDS[next(iter(settings.WORLDS))]:
         arms = [arm for arm, labels in _arms(2, option) if labels["link"] == settings.ALWAYS]
-        first, second = (dataclasses.asdict(_composed(0, arm)) for arm in arms)
+        first, second = (dataclasses.asdict(composed(0, arm)) for arm in arms)
         assert first["config"]["estimator"].pop("robots") is None
         assert second["config"]["estimator"].pop("robots") == "robots"
         assert first == second

@@ -4,6 +4,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from experiments.judging.folders import findings
+from experiments.judging.sentences import conclude
 from experiments.judging.verdict import Role, Verdict
 from experiments.studies.twins import claims, figures, study
 from experiments.studies.twins.settings import LOGS, METHODS, SHOWN
@@ -31,7 +33,7 @@ def runs(errors=None, spread=0.25, n=50):
 def verdicts(table):
     pairs = study.predicted(table)
     made = [*claims.tw1(pairs, study.of_others(pairs)), *claims.tw2(pairs)]
-    said = claims.conclusions(None, made)
+    said = conclude(made, findings("twins"))
     assert [s.id for s in said] == ["TW1", "TW2"]
     assert all(s.sentence.endswith(".") for s in said)
     return made, {s.id: s.verdict for s in said}
@@ -63,7 +65,7 @@ def test_errors_outside_and_intervals_too_wide_fail():
 def test_the_interval_of_tau_stays_within_its_range():
     pairs = study.predicted(runs())
     pairs.loc[pairs.log == JUDGED[0], "error_m"] = ERRORS_M[::-1]
-    found = claims.tw2(pairs)[0].found
+    found = next(claims.tw2(pairs)).found
     assert -1.0 <= found.low < found.value < found.high == 1.0
 
 

@@ -1,4 +1,7 @@
-"""Recordings of the real logs that conf/study/real_logs/*.yaml name."""
+"""Real logs: where they lie, and the recordings of them that conf/study/*.yaml name.
+
+They are not part of the project; they are expected in ../shared/data.
+"""
 
 import dataclasses
 from typing import Literal
@@ -6,29 +9,47 @@ from typing import Literal
 import numpy as np
 
 from estimators.base import Estimate, Estimator, Prior
-from estimators.base import run as run_estimator
 from estimators.laser.icp_odometry import IcpOdometry
 from experiments.calibration.from_log import calibrate_log
 from experiments.calibration.logs import calibrate_wheels
 from experiments.runs.calibration import Calibration
-from experiments.studies.real_logs.settings import CALIBRATED_S, DATA, TUNED_SHARE
+from experiments.runs.evaluate import run_over
+from experiments.runs.paths import SOURCE
 from sim import se2
 from sim.arrays import Array
 from sim.formats import carmen, mrclam, wean
 from sim.formats import intel as intel_lab
 from sim.formats.khepera import WheelLaserLog
+from sim.formats.relations import Relations, read_relations
 from sim.recording import Recording, WheelLog
 from sim.robot.drive import RobotGeometry
 from sim.sensors import Laser, Mount
 
+DATA = SOURCE.parent / "shared" / "data"
+MRCLAM_6 = DATA / "mrclam6" / "MRCLAM_Dataset6.tar.xz"
+INTEL_910 = tuple(DATA / "intel_lab" / f"intel_{part}_910.json.gz" for part in ("raw", "gmapping"))
+GRAPHS = {  # logs with the poses of a graph that others optimised
+    "intel": DATA / "intel_lab" / "intel-lab.flirt.log.gz",
+    "fr079": DATA / "fr079_flirt" / "fr079.flirt.log.gz",
+}
+TUNED_SHARE = 0.4  # of the Intel log, on which options were chosen; the rest judges
+CALIBRATED_S = 300.0  # from the start of a log of MRCLAM; the rest judges
+
+
+def missing() -> str:
+    """Why a study of real logs cannot run; empty if it can."""
+    return "" if DATA.is_dir() else f"the real logs are not in {DATA.parent.name}/{DATA.name}"
+
+
+def relations_of(name: str) -> Relations:
+    """True relations of the log of a graph."""
+    return read_relations(GRAPHS[name].parent / f"{name}.relations.gz")
+
 
 def intel(version: Literal["sparse", "logged", "calibrated"]) -> Recording:
     """The Intel Research Lab: 910 scans with a mapper's poses, or the log with all its scans."""
-    folder = DATA / "intel_lab"
     if version == "sparse":
-        return intel_lab.read_intel(
-            folder / "intel_raw_910.json.gz", folder / "intel_gmapping_910.json.gz"
-        )
+        return intel_lab.read_intel(*INTEL_910)
     logged, _ = _thinned_intel()
     return calibrated_by_scans(logged, tuned_until_s(logged)) if version == "calibrated" else logged
 
@@ -50,13 +71,13 @@ def _thinned_intel() -> tuple[Recording, Array]:
 
 def freiburg() -> Recording:
     """Freiburg 079; its wheels are the edges of a graph that others optimised."""
-    return carmen.to_recording(carmen.read_carmen(DATA / "fr079_flirt" / "fr079.flirt.log.gz"))
+    return carmen.to_recording(carmen.read_carmen(GRAPHS["fr079"]))
 
 
 def landmarks(robot: int, calibrated: bool, identifies: bool) -> Recording:
     """One robot of MRCLAM 6, with ranges and bearings to landmarks."""
-    logged = mrclam.read_mrclam(DATA / "mrclam6" / "MRCLAM_Dataset6.tar.xz", robot, identifies)
-    return calibrated_by_truth(logged) if calibrated else logged
+    logged = mrclam.read_mrclam(MRCLAM_6, robot, identifies)
+    return calibration_by_truth(logged).applied(logged) if calibrated else logged
 
 
 def wean_hall(number: int) -> Recording:
@@ -64,14 +85,16 @@ def wean_hall(number: int) -> Recording:
     return wean.read_wean(DATA / "wean_hall_mcl" / f"robotdata{number}.log.gz")
 
 
-def tracked(
-    estimator: Estimator, recording: Recording, seed: int = 0, start: Array | None = None
-) -> Estimate:
-    """Estimate from a start pose (3,) known to 1 mm and 1 mrad; the origin by default."""
-    mean, covariance = np.zeros(3) if start is None else start, np.diag([1e-6, 1e-6, 1e-6])
-    prior = Prior(recording.robot, recording.sensors, mean, covariance)
-    rng = np.random.default_rng(seed)
-    return run_estimator(estimator, recording, prior, rng, keep=("registration_status",))
+def known_start(recording: Recording, start: Array | None = None) -> Prior:
+    """Prior at a pose (3,) known to 1 mm and 1 mrad; by default at the true start."""
+    mean = recording.truth_at(recording.frame_stamps[:1])[0] if start is None else start
+    return Prior(recording.robot, recording.sensors, mean, np.diag([1e-6] * 3))
+
+
+def tracked(estimator: Estimator, recording: Recording) -> tuple[Estimate, Estimate | None]:
+    """Online and revised estimate from the origin."""
+    prior, rng = known_start(recording, np.zeros(3)), np.random.default_rng(0)
+    return run_over(recording, estimator, prior, rng, keep=("registration_status",))
 
 
 def tuned_until_s(logged: Recording) -> float:
@@ -85,10 +108,10 @@ def calibrated_by_scans(recording: Recording, until_s: float) -> Recording:
     The wheels of a log of poses are rebuilt with nominal sizes, so the calibration corrects those.
     """
     matcher = IcpOdometry(kr=3e-3, kl=3e-3, sigma_range_m=0.03, reference="previous")
-    estimate = tracked(matcher, recording)
+    estimate, _ = tracked(matcher, recording)
     stamps, wheels = recording.log("laser").stamps, recording.wheels
     rows = np.searchsorted(estimate.stamps, stamps)
-    poses, travel = estimate.means[rows], _wheels_at(wheels, stamps)
+    poses, travel = estimate.means[rows], wheels.at(stamps)
     status = np.array([str(estimate.extras["registration_status"][i]) for i in rows])
     trusted = (status[1:] == "ok") & (stamps[1:] < until_s)
     log = WheelLaserLog(
@@ -107,11 +130,6 @@ def calibrated_by_scans(recording: Recording, until_s: float) -> Recording:
     )
 
 
-def calibrated_by_truth(recording: Recording) -> Recording:
-    """The recording with `calibration_by_truth` applied."""
-    return calibration_by_truth(recording).applied(recording)
-
-
 def calibration_by_truth(recording: Recording) -> Calibration:
     """Calibration on the first `CALIBRATED_S`, with the noise that the log believes.
 
@@ -123,8 +141,3 @@ def calibration_by_truth(recording: Recording) -> Calibration:
         for name, belief in found.sensors.items()
     }
     return dataclasses.replace(found, sensors=sensors)
-
-
-def _wheels_at(wheels: WheelLog, stamps: Array) -> Array:
-    """Wheel positions (N, 2) interpolated at stamps (N,), m."""
-    return np.stack([np.interp(stamps, wheels.stamps, p) for p in wheels.position_m.T], axis=1)

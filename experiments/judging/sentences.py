@@ -1,0 +1,116 @@
+"""One sentence a claim: a template of the study's findings, filled from the claim's statistics.
+
+A template selects statistics by their fields, `select(quantity="error", size=3)` for the one and
+`select_all(...)` for all with them, and writes their numbers by the filters of this module.
+"""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from jinja2 import Environment, StrictUndefined
+
+from experiments.evaluation.statistics import Interval
+from experiments.judging.claim import Claim, select, select_all
+from experiments.judging.verdict import Role, Verdict, headline_verdict
+
+
+@dataclass(frozen=True)
+class Conclusion:
+    """The one verdict on a claim, and a sentence that says what came out."""
+
+    id: str
+    verdict: Verdict
+    sentence: str
+
+
+def conclude(claims: Iterable[Claim], findings: Mapping[str, Any]) -> list[Conclusion]:
+    """Give each claim its verdict, which follows from its headlines alone, and its sentence.
+
+    Without headlines a claim is shown. If it is undecided, the sentence also says how many more
+    recordings would settle it.
+
+    Parameters
+    ----------
+    findings
+        `sentences`, a template by the claim's id, and `unit`, what intervals narrow with.
+    """
+    by_id: dict[str, list[Claim]] = {}
+    for claim in claims:
+        by_id.setdefault(claim.id, []).append(claim)
+    conclusions = []
+    for key, rows in by_id.items():
+        verdict = headline_verdict([(row.role, row.verdict) for row in rows])
+        said = sentence(findings["sentences"][key], rows)
+        if verdict is Verdict.UNDECIDED:
+            said += more_needed(rows, findings.get("unit", "recordings"))
+        conclusions.append(Conclusion(key, verdict, said))
+    return conclusions
+
+
+def sentence(template: str, rows: Sequence[Claim]) -> str:
+    """Fill a claim's template with its statistics."""
+    names = {"select": partial(select, rows), "select_all": partial(select_all, rows), "rows": rows}
+    return " ".join(_environment().from_string(template).render(names).split())
+
+
+def more_needed(rows: Sequence[Claim], unit: str) -> str:
+    """Say how many more recordings would settle an undecided claim; empty if that is unknown."""
+    open_ones = select_all(rows, role=Role.HEADLINE, verdict=Verdict.UNDECIDED)
+    more = max(row.more for row in open_ones)
+    if not more:
+        return ""
+    what = "it" if all(row.more for row in open_ones) else "what is open"
+    units = unit.removesuffix("s") if more == 1 else unit
+    return f" About {_rounded(more)} more {units} would settle {what}."
+
+
+def plain(number: float | Interval, digits: int = 2) -> str:
+    """Write a number, or an interval's value, with so many significant digits."""
+    value = _value(number)
+    if not math.isfinite(value):
+        return "unknown"
+    short = f"{value:.{digits}g}"
+    if short.lstrip("-").isdigit() and abs(value) < 10 and value != round(value):
+        short += ".0"  # 0.998 is not 1
+    return f"{float(short):,.0f}" if abs(value) >= 10**digits else short
+
+
+def percent(share: float | Interval) -> str:
+    """Write a share, or an interval's value, in percent."""
+    value = _value(share)
+    return f"{100.0 * value:.0f} %" if math.isfinite(value) else "an unknown share"
+
+
+def bracketed(found: Interval) -> str:
+    """Write a value with its interval in brackets."""
+    return f"{plain(found)} [{plain(found.low)}, {plain(found.high)}]"
+
+
+def ends(found: Interval) -> str:
+    """Write the ends of an interval."""
+    return f"{plain(found.low)} to {plain(found.high)}"
+
+
+def span(claims: Sequence[Claim]) -> str:
+    """Write the lowest and the highest value of some statistics."""
+    values = [claim.found.value for claim in claims]
+    return f"{plain(min(values))} to {plain(max(values))}"
+
+
+def _environment() -> Environment:
+    environment = Environment(undefined=StrictUndefined, autoescape=False)
+    environment.filters |= {each.__name__: each for each in (plain, percent, bracketed, ends, span)}
+    return environment
+
+
+def _value(number: float | Interval) -> float:
+    return number.value if isinstance(number, Interval) else number
+
+
+def _rounded(number: int) -> int:
+    """Two leading digits of a positive number, rounded up."""
+    unit: int = 10 ** max(len(str(number)) - 2, 0)
+    return -(-number // unit) * unit
