@@ -116,7 +116,7 @@ def sweep_figure(
     names = sorted(means[x].unique())
     numeric = means[x].dtype.kind in "fi"
     joined = numeric and x not in (*DRAWN, REPEAT)  # seeds have no order
-    wide = joined and _by_factors(names)
+    wide = joined and by_factors(names)
     for (i, above), (j, left) in itertools.product(enumerate(down), enumerate(across)):
         ax = axes[i, j]
         panel = _within(_within(means, row, above), col, left)
@@ -377,7 +377,7 @@ def _is_log(y: str, values: pd.Series[float]) -> bool:
     return scale == "log" and values.min() > 0.0 and values.max() >= _WIDE * values.min()
 
 
-def _by_factors(values: Sequence[float]) -> bool:
+def by_factors(values: Sequence[float]) -> bool:
     """Whether ordered numbers differ by factors rather than by steps."""
     if len(values) < 2 or values[0] <= 0.0 or values[-1] < _LEAST * values[0]:
         return False
