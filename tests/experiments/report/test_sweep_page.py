@@ -289,7 +289,8 @@ def test_colours_stand_beside_each_other_over_the_name_of_their_word(tab):
 
 
 def test_seeds_are_not_joined(tab):
-    lines = "[...document.querySelectorAll('#chart .mark-line path')].map(p => +(p.getAttribute('stroke-opacity') ?? 1))"
+    paths = "[...document.querySelectorAll('#chart .mark-line path')]"
+    lines = f"{paths}.map(p => Number(p.getAttribute('stroke-opacity') ?? 1))"
     assert set(tab.js(lines)) == {1}
     choose(tab, "x", "seed")
     assert set(tab.js(lines)) == {0}
@@ -313,7 +314,8 @@ def test_of_each_estimator_the_best_and_the_worst_run_are_shown_and_more_of_one(
 
 def test_a_click_on_a_run_gives_its_command_or_its_picture(tab):
     picked = "byId('picked')"
-    dot = "[...document.querySelectorAll('#chart .mark-symbol path')].find(p => p.__data__.datum.row === 5)"
+    dots = "[...document.querySelectorAll('#chart .mark-symbol path')]"
+    dot = f"{dots}.find(p => p.__data__.datum.row === 5)"
     at = tab.js(f"({dot}.scrollIntoView(), {dot}.getBoundingClientRect().toJSON())")
     for kind in ("mouseMoved", "mousePressed", "mouseReleased"):
         tab.call("Input.dispatchMouseEvent", type=kind, button="left", clickCount=1,
