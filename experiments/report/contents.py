@@ -169,12 +169,11 @@ def judged_claims(
 def verdict_on(statistics: Sequence[Entry]) -> Entry:
     """The one verdict on a claim, also in words, and its style."""
     ruling = headline_verdict([(row["role"], row["verdict"]) for row in statistics])
-    if not statistics:
-        return {"ruling": ruling, "verdict": "not judged yet", "style": "quiet"}
     quick = " (quick)" if any(row["profile"] == Profile.QUICK for row in statistics) else ""
+    words, style = ruling.label + quick, ruling.value
     if ruling is Verdict.SHOWN:
-        return {"ruling": ruling, "verdict": f"shown, not judged{quick}", "style": "quiet"}
-    return {"ruling": ruling, "verdict": ruling.label + quick, "style": ruling.value}
+        words, style = f"shown, not judged{quick}" if statistics else "not judged yet", "quiet"
+    return {"ruling": ruling, "verdict": words, "style": style}
 
 
 def study(results: Path, name: str, about: Entry, claims: Mapping[str, Entry]) -> Entry:
@@ -193,7 +192,7 @@ def study(results: Path, name: str, about: Entry, claims: Mapping[str, Entry]) -
         "figures": [
             {
                 **picture(there[figure], about["figures"].get(figure, {}), claims),
-                **shown_as_table(tables, about["figures"].get(figure, {})),
+                "table": tables.get(about["figures"].get(figure, {}).get("table", "")),
             }
             for figure in dict.fromkeys([*described, *there])
         ],
@@ -205,11 +204,6 @@ def study(results: Path, name: str, about: Entry, claims: Mapping[str, Entry]) -
             if path.exists()
         },
     }
-
-
-def shown_as_table(tables: Mapping[str, Entry], about: Entry) -> Entry:
-    """The table that stands in the page for a picture of it, as its finding says; none if gone."""
-    return {"table": tables.get(about.get("table", ""))}
 
 
 def picture(path: Path, about: Entry, claims: Mapping[str, Entry]) -> Entry:
