@@ -69,10 +69,11 @@ function draw() {
   const box = byId("chart").parentElement.clientWidth - 40; // less the menu
   const [low, high] = [Math.min(...runs.map((r) => r.y)), Math.max(...runs.map((r) => r.y))];
   const log = metric.log && low > 0 && high >= 10 * low;
+  const step = across.numbers ? 3 : Math.min(8, 60 / colour.words.length);
+  const aside = across.numbers || points.every((point) => point.length === 1) ? 0
+    : -12 - step * (colour.words.length - 1);
   const values = {
-    average: metric.average, joined: across.joined, floor: metric.floor, t975: data.t975,
-    step: across.numbers ? 3 : Math.min(8, 60 / colour.words.length),
-    aside: across.numbers || points.every((point) => point.length === 1) ? 0 : -12 - 3 * colour.words.length,
+    average: metric.average, joined: across.joined, floor: metric.floor, t975: data.t975, step, aside,
   };
   spec.params = spec.params.map(({ name }) => ({ name, value: values[name] }));
   const { x, y, color } = spec.spec.encoding;
