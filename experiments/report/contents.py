@@ -4,23 +4,24 @@ from __future__ import annotations
 
 import base64
 import math
-import struct
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
+from PIL import Image, UnidentifiedImageError
 
 from experiments.judging.claims_file import read_claims, read_provenance, read_verdicts, this_code
 from experiments.judging.folders import code_folder, findings
 from experiments.judging.verdict import Profile, Role, Verdict, headline_verdict
 from experiments.report.export import as_text, folded, numeric, plain
 from experiments.report.leaderboard import by_world, on_lasers
-from experiments.report.panels import panels
 from experiments.runs.paths import CONF
 from experiments.runs.row import read_rows
 from experiments.sweeps.summary import COUNT_WORDS
+from experiments.viewing.panels import noted_panels
 from sim.errors import InputError
 from sim.files import require_file
 
@@ -160,12 +161,11 @@ def judged_claims(
 def verdict_on(statistics: Sequence[Entry]) -> Entry:
     """The one verdict on a claim, also in words, and its style."""
     ruling = headline_verdict([(row["role"], row["verdict"]) for row in statistics])
-    if not statistics:
-        return {"ruling": ruling, "verdict": "not judged yet", "style": "quiet"}
     quick = " (quick)" if any(row["profile"] == Profile.QUICK for row in statistics) else ""
+    words, style = ruling.label + quick, ruling.value
     if ruling is Verdict.SHOWN:
-        return {"ruling": ruling, "verdict": f"shown, not judged{quick}", "style": "quiet"}
-    return {"ruling": ruling, "verdict": ruling.label + quick, "style": ruling.value}
+        words, style = f"shown, not judged{quick}" if statistics else "not judged yet", "quiet"
+    return {"ruling": ruling, "verdict": words, "style": style}
 
 
 def study(results: Path, name: str, about: Entry, claims: Mapping[str, Entry]) -> Entry:
@@ -184,7 +184,7 @@ def study(results: Path, name: str, about: Entry, claims: Mapping[str, Entry]) -
         "figures": [
             {
                 **picture(there[figure], about["figures"].get(figure, {}), claims),
-                **shown_as_table(tables, about["figures"].get(figure, {})),
+                "table": tables.get(about["figures"].get(figure, {}).get("table", "")),
             }
             for figure in dict.fromkeys([*described, *there])
         ],
@@ -196,11 +196,6 @@ def study(results: Path, name: str, about: Entry, claims: Mapping[str, Entry]) -
             if path.exists()
         },
     }
-
-
-def shown_as_table(tables: Mapping[str, Entry], about: Entry) -> Entry:
-    """The table that stands in the page for a picture of it, as its finding says; none if gone."""
-    return {"table": tables.get(about.get("table", ""))}
 
 
 def picture(path: Path, about: Entry, claims: Mapping[str, Entry]) -> Entry:
@@ -216,11 +211,13 @@ def picture(path: Path, about: Entry, claims: Mapping[str, Entry]) -> Entry:
         data = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot read ({error.strerror}); {_REMEDY}") from error
-    if data[:8] != b"\x89PNG\r\n\x1a\n" or len(data) < 24:
-        raise InputError(f"{path}: not a PNG; {_REMEDY}")
+    try:
+        with Image.open(BytesIO(data), formats=["PNG"]) as image:
+            width, height, parts = *image.size, noted_panels(image)
+    except UnidentifiedImageError as error:
+        raise InputError(f"{path}: not a PNG; {_REMEDY}") from error
     if data[-8:] != b"IEND\xaeB`\x82":
         raise InputError(f"{path}: the picture is cut off; {_REMEDY}")
-    width, height = struct.unpack(">II", data[16:24])
     words = path.stem.split("_", 1)[-1].replace("_", " ")
     return {
         "title": words,
@@ -231,7 +228,7 @@ def picture(path: Path, about: Entry, claims: Mapping[str, Entry]) -> Entry:
         "claims": [claims[key] for key in about.get("claims", [])],
         "width": width,
         "height": height,
-        "panels": panels(data),
+        "panels": parts,
         "png": base64.b64encode(data).decode(),
     }
 

@@ -234,19 +234,29 @@ def _tabular(cells: pd.DataFrame, columns: str) -> str:
     """Cells of one or several lines as the rows of a `tabular`; headings stand at the bottom."""
     heads = [str(head).split("\n") for head in cells]
     most = max(map(len, heads))
-    lines = [*_lines([[*[""] * (most - len(head)), *head] for head in heads]), r"\midrule"]
-    rows = [_lines([cell.split("\n") for cell in row]) for row in cells.to_numpy().tolist()]
-    apart = [r"\addlinespace"] if max(map(len, rows), default=1) > 1 else []
-    for i, row in enumerate(rows):
-        lines += [*(apart if i else []), *row]
-    begin, end = rf"\begin{{tabular}}{{{columns}}}", r"\end{tabular}"
-    return "\n".join([begin, r"\toprule", *lines, r"\bottomrule", end, ""])
+    rows = [[cell.split("\n") for cell in row] for row in cells.to_numpy().tolist()]
+    apart = any(len(cell) > 1 for row in rows for cell in row)
+    frame = pd.DataFrame(
+        [_row(row, "\\addlinespace\n" if i and apart else "") for i, row in enumerate(rows)],
+        columns=_row([[*[""] * (most - len(head)), *head] for head in heads]),
+    )
+    with pd.option_context(
+        "styler.render.max_elements", frame.size + 1
+    ):  # else rows may be left out
+        tabular: str = frame.style.hide(axis=0).to_latex(column_format=columns, hrules=True)
+    return tabular
 
 
-def _lines(cells: list[list[str]]) -> list[str]:
-    """Lines of a row; one that begins with * or [ would be an argument of the row before."""
-    lines = [" & ".join(line) for line in zip_longest(*cells, fillvalue="")]
-    return ["{}" * line.startswith(("*", "[")) + line + r" \\" for line in lines]
+def _row(cells: list[list[str]], before: str = "") -> list[str]:
+    """The last lines of cells, with all that is above them in the first.
+
+    A line that begins with * or [ would be an argument of the row before.
+    """
+    lines = [[*line] for line in zip_longest(*cells, fillvalue="")]
+    for line in lines:
+        line[0] = "{}" * line[0].startswith(("*", "[")) + line[0]
+    above = [" & ".join(line) + " \\\\\n" for line in lines[:-1]]
+    return [before + "".join(above) + lines[-1][0], *lines[-1][1:]]
 
 
 def latex(text: str) -> str:

@@ -21,7 +21,7 @@ from experiments.report.export import plain, significant
 from sim.errors import printable
 from sim.files import write_whole
 
-_TEMPLATES = Path(__file__).parent / "templates"
+TEMPLATES = Path(__file__).parent / "templates"
 
 
 def write_report(results: Path, on_progress: Callable[[float], None] = lambda _: None) -> Path:
@@ -64,7 +64,7 @@ def render(template: str, **found: Any) -> str:
 
 def _script(name: str) -> Mapping[str, str]:
     """Text of a script of the page, and the hash by which the page's policy allows it."""
-    text = (_TEMPLATES / name).read_text(encoding="utf-8")
+    text = (TEMPLATES / name).read_text(encoding="utf-8")
     digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
     return {"text": Markup(text), "allowed": f"'sha256-{digest}'"}
 

@@ -6,6 +6,7 @@ import itertools
 import math
 import textwrap
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
@@ -113,10 +114,8 @@ def sweep_figure(
     across, down = (_values(means, name) for name in (col, row))
     chosen = Size(size)
     page, axes = _panels(chosen, len(down), len(across))
-    names = sorted(means[x].unique())
     numeric = means[x].dtype.kind in "fi"
-    joined = numeric and x not in (*DRAWN, REPEAT)  # seeds have no order
-    wide = joined and _by_factors(names)
+    shown = _Across(sorted(means[x].unique()), numeric, numeric and x not in (*DRAWN, REPEAT))
     for (i, above), (j, left) in itertools.product(enumerate(down), enumerate(across)):
         ax = axes[i, j]
         panel = _within(_within(means, row, above), col, left)
@@ -124,16 +123,15 @@ def sweep_figure(
             points = _on_line(panel, by, line)
             if points.empty:
                 continue
-            line_of = (k, len(lines))
-            at = _places(points[x], names, line_of, wide=wide, numeric=numeric, joined=joined)
+            at = shown.places(points[x], k, len(lines))
             value, low, high = points[["value", "low", "high"]].to_numpy(float).T
             colour, marker = SERIES[k]
             ax.errorbar(
                 at, value, yerr=(value - low, high - value), color=colour, marker=marker, ms=4,
-                capsize=2, lw=1.2, ls="-" if joined else "none", label=label,
+                capsize=2, lw=1.2, ls="-" if shown.joined else "none", label=label,
             )  # fmt: skip
             alone = _on_line(_within(_within(dots, row, above), col, left), by, line)
-            at = _places(alone[x], names, line_of, wide=wide, numeric=numeric, joined=joined)
+            at = shown.places(alone[x], k, len(lines))
             ax.plot(at, alone[y], ".", color=colour, ms=4, alpha=0.5)
         words = [
             _named(name, value, texts[name]) for name, value in ((row, above), (col, left)) if name
@@ -143,8 +141,7 @@ def sweep_figure(
         axes,
         texts[x],
         means,
-        wide=wide,
-        numeric=numeric,
+        shown,
         log=_is_log(y, means[["value", "low", "high"]].stack()),
     )
     for ax in axes[-1]:
@@ -166,7 +163,7 @@ def sweep_figure(
     page.suptitle(textwrap.fill(note, characters), fontsize=0.85 * _FONT[chosen], color="#555555")
     if by:
         heading = literal(title(by[0])) if len(by) == 1 else ""
-        _name_lines(page, axes, heading, chosen, direct=joined)
+        _name_lines(page, axes, heading, chosen, direct=shown.joined)
     _grow(page, axes, least_in)
     return page
 
@@ -218,28 +215,30 @@ def _on_line(means: pd.DataFrame, by: Sequence[str], line: tuple[Any, ...]) -> p
     return means[(means[list(by)] == list(line)).all(axis=1)] if by else means
 
 
-def _places(
-    values: pd.Series[Any],
-    names: Sequence[Any],
-    line_of: tuple[int, int],
-    *,
-    wide: bool,
-    numeric: bool,
-    joined: bool,
-) -> Any:
-    """Where values stand on the x axis, moved a little so that no line's bars hide another's.
+@dataclass(frozen=True)
+class _Across:
+    """How the values of a setting stand on the x axis."""
 
-    `line_of` is which line it is, and of how many.
-    """
-    at = np.array([v if numeric else names.index(v) for v in values], float)
-    line, n_lines = line_of
-    beside = line - (n_lines - 1) / 2
-    if wide:
-        return at * (names[-1] / names[0]) ** (_BESIDE * beside)
-    if joined:
-        return at + beside * _BESIDE * (names[-1] - names[0])
-    apart = np.diff(names).min(initial=names[-1] - names[0]) if numeric else 1.0
-    return at + beside * apart * min(_BESIDE_WORD, _MOST_BESIDE / n_lines)
+    names: Sequence[Any]  # in order
+    numeric: bool
+    joined: bool  # by lines; seeds have no order
+
+    @property
+    def wide(self) -> bool:
+        """Whether the axis is logarithmic."""
+        return self.joined and by_factors(self.names)
+
+    def places(self, values: pd.Series[Any], line: int, n_lines: int) -> Any:
+        """Where values stand, moved a little so that no line's bars hide another's."""
+        first, last = self.names[0], self.names[-1]
+        at = np.array([v if self.numeric else self.names.index(v) for v in values], float)
+        beside = line - (n_lines - 1) / 2
+        if self.wide:
+            return at * (last / first) ** (_BESIDE * beside)
+        if self.joined:
+            return at + beside * _BESIDE * (last - first)
+        apart = np.diff(self.names).min(initial=last - first) if self.numeric else 1.0
+        return at + beside * apart * min(_BESIDE_WORD, _MOST_BESIDE / n_lines)
 
 
 def _within(means: pd.DataFrame, name: str | None, value: Any) -> pd.DataFrame:
@@ -292,22 +291,21 @@ def _scale(
     axes: Any,
     names: Mapping[Any, str],
     means: pd.DataFrame,
+    across: _Across,
     *,
-    wide: bool,
-    numeric: bool,
     log: bool,
 ) -> None:
     """Choose the axes' scales and ticks; all panels share them. `names` are the values' texts."""
     ax = axes[0, 0]
     ax.margins(x=0.08)
-    if wide:
+    if across.wide:
         ax.set_xscale("log")
         if len(names) <= _FEW:
             ax.set_xticks(list(names), list(names.values()))
             ax.minorticks_off()
-    elif numeric and all(float(name).is_integer() for name in names):
+    elif across.numeric and all(float(name).is_integer() for name in names):
         ax.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))  # no half a seed
-    if not numeric:
+    if not across.numeric:
         for each in axes[-1]:
             each.set_xticks(range(len(names)), list(names.values()), rotation=25, ha="right")
             each.set_xlim(-0.6, len(names) - 0.4)
@@ -377,7 +375,7 @@ def _is_log(y: str, values: pd.Series[float]) -> bool:
     return scale == "log" and values.min() > 0.0 and values.max() >= _WIDE * values.min()
 
 
-def _by_factors(values: Sequence[float]) -> bool:
+def by_factors(values: Sequence[float]) -> bool:
     """Whether ordered numbers differ by factors rather than by steps."""
     if len(values) < 2 or values[0] <= 0.0 or values[-1] < _LEAST * values[0]:
         return False

@@ -17,15 +17,17 @@ from markupsafe import Markup
 from scipy import stats
 
 from experiments.report.export import in_words, numeric, plain, written
-from experiments.report.page import render
+from experiments.report.page import TEMPLATES, render
+from experiments.report.plot import by_factors
 from experiments.report.table import DIGITS, HTML, WORDS, notes, shown, statuses
-from experiments.runs.columns import ANSWER, COLUMNS, PATH, REPEAT, average_of, is_setting
+from experiments.runs.columns import ANSWER, COLUMNS, PATH, REPEAT, REVISED, average_of, is_setting
 from experiments.runs.columns import title as titled
 from experiments.runs.row import Outcome
 from experiments.sweeps.again import noted_config_dir, short_key
-from experiments.sweeps.averages import RECORDING
+from experiments.sweeps.averages import RECORDING, rule
 from experiments.sweeps.collect import (
     DRAWN,
+    FEW,
     commands,
     measured,
     suggested,
@@ -36,8 +38,13 @@ from experiments.sweeps.collect import (
 from experiments.sweeps.summary import ERROR, summary
 from sim.errors import InputError, printable, require
 from sim.files import write_whole
+from sim.yaml_file import read_yaml
 
-MOST_RUNS = 10_000  # with 1.2 MB of the charting library the page stays below 5 MB
+Entry = Mapping[str, Any]
+
+MOST_RUNS = 10_000  # with 0.9 MB of the charting library the page stays below 5 MB
+_FILTERED = 24  # values of a setting of which some can be chosen
+_FEW_TICKS = 8  # values that are ticks of their own
 _DIGITS = 5  # of the numbers behind the chart
 _SHOWN_RUNS = 3  # of an estimator, best, worst and failed
 
@@ -73,8 +80,8 @@ def write_sweep_page(
         raise InputError(
             f"{name}: no run has a result to show; `estima table {name}` says how they ended"
         )
-    settings = telling(table)
-    named = [c for c in settings if c != "choice.estimator"]
+    telling_apart = telling(table)
+    named = [c for c in telling_apart if c != "choice.estimator"]
     pictures = {
         path.stem: quote(path.relative_to(out.parent).as_posix())
         for path in _pictures(out).glob("*.html")
@@ -84,12 +91,40 @@ def write_sweep_page(
     runs = extremes(table)
     found = summary(table)
     means = written(shown(found), HTML, DIGITS)
+    drawn_by = list(dict.fromkeys([*telling_apart, REPEAT]))
+    settings = [_setting(every[name], name) for name in drawn_by]
+    kinds = [name for name, each in zip(drawn_by, settings, strict=True) if each["pooled"]]
+    place = {metric: i for i, metric in enumerate(metrics)}
     text = render(
         "sweep.html",
         name=name,
         n_runs=len(table),
         unfinished=unfinished(folder),
-        data=_data(every, (name, options), settings, metrics, pictures),
+        controls=_controls(every, drawn_by, settings, metrics),
+        filters=[
+            (i, each["title"], each["words"])
+            for i, each in enumerate(settings)
+            if 2 <= len(each["words"]) <= _FILTERED
+        ],
+        data=_as_json(
+            {
+                "spec": read_yaml(TEMPLATES / "chart.yaml"),
+                "settings": settings,
+                "metrics": [_metric(every[c], c, place) for c in metrics],
+                "revised": (every[PATH] == "revised").astype(int).tolist(),
+                "t975": stats.t.ppf(0.975, np.arange(1, 200)).round(4).tolist(),
+                "name": name,
+                "options": options,
+                "pictures": pictures,
+                "keys": [short_key(row) for _, row in table[["run_key", REPEAT]].iterrows()],
+                "kinds": _numbered(every, kinds),
+                "recording": _numbered(table, [RECORDING]),
+                "repeat": table[REPEAT].tolist(),
+                "failed": (table["status"] == Outcome.FAILED).astype(int).tolist(),
+                "statuses": [*WORDS.values()],
+                "status": [[*WORDS].index(Outcome(s)) for s in table["status"]],
+            }
+        ),
         statuses=statuses(table),
         note=notes(found, None),
         head=[Markup(cell) for cell in means],
@@ -108,54 +143,107 @@ def write_sweep_page(
         part.write_text(text, encoding="utf-8")
 
 
-def _data(
-    table: pd.DataFrame,
-    called: tuple[str, str],
-    settings: list[str],
-    metrics: list[str],
-    pictures: Mapping[str, str],
-) -> Markup:
-    """All that the chart draws, as JSON that no HTML can end."""
-    first = next((m for m in (ERROR, "ate_rmse_m") if m in metrics), metrics[0])
+def _controls(
+    table: pd.DataFrame, names: Sequence[str], settings: Sequence[Entry], metrics: Sequence[str]
+) -> list[tuple[str, list[tuple[int, str]], int]]:
+    """What the reader chooses: its name, the options by their places, and the first choice."""
     x, colour, panels, *_ = [*suggested(table), "", ""]
-    columns = [*settings, *([REPEAT] if REPEAT not in settings else [])]
-    found = {
-        "settings": [{"name": c, "title": titled(c), "values": _cells(table[c])} for c in columns],
-        "metrics": [
-            {
-                "name": c,
-                "title": titled(c),
-                "average": average_of(c),
-                "log": COLUMNS[c].scale == "log",
-                # the page takes those of the best answers from the paths' own
-                "values": [] if c.startswith(ANSWER) else _cells(table[c]),
-            }
-            for c in metrics
-        ],
-        "revised": (table[PATH] == "revised").astype(int).tolist(),
-        "recording": pd.factorize(table[RECORDING])[0].tolist(),
-        "repeat": table[REPEAT].tolist(),
-        "failed": (table["status"] == Outcome.FAILED).astype(int).tolist(),
-        "status": pd.factorize(table["status"])[0].tolist(),
-        "statuses": [WORDS[Outcome(s)] for s in pd.factorize(table["status"])[1]],
-        "keys": [short_key(row) for _, row in table[["run_key", REPEAT]].iterrows()],
-        "pictures": pictures,
-        "name": called[0],
-        "options": called[1],
-        "drawn": list(DRAWN),
-        "start": {"x": x, "y": first, "colour": colour, "panels": panels},
-        "t975": [round(float(stats.t.ppf(0.975, n)), 4) for n in range(1, 200)],
+    y = next((m for m in (ERROR, "ate_rmse_m") if m in metrics), metrics[0])
+    every = [(i, each["title"]) for i, each in enumerate(settings)]
+    few = [(-1, "none"), *(each for each in every if len(settings[each[0]]["words"]) <= FEW)]
+    place = {"": -1} | {name: i for i, name in enumerate(names)}
+    return [
+        ("x", every, place[x]),
+        ("y", [(i, titled(name)) for i, name in enumerate(metrics)], metrics.index(y)),
+        ("colour", few, place[colour]),
+        ("panels", few, place[panels]),
+    ]
+
+
+def _numbered(table: pd.DataFrame, names: Sequence[str]) -> list[int]:
+    """Number each row's combination of values."""
+    numbers: list[int] = table.groupby(list(names) or (lambda _: 0), dropna=False).ngroup().tolist()
+    return numbers
+
+
+def _setting(column: pd.Series[Any], name: str) -> dict[str, Any]:
+    """A setting as the chart reads it.
+
+    Returns
+    -------
+    dict
+        `title`; `words`, its distinct values in order as texts; `numbers`, those of a numeric one,
+        else None; `codes`, each run's place among them, -1 without a value; `axis`, its encoding in
+        Vega-Lite; whether lines are `joined` over it; whether runs that differ in it are `pooled`
+        as such, rather than as repeats.
+    """
+    is_number = column.dtype.kind in "iuf"
+    if is_number:
+        column = column.where(np.isfinite(column))
+    elif column.dtype.kind != "b":
+        column = column.map(lambda value: printable(str(value)), na_action="ignore")
+    codes, values = pd.factorize(column, sort=True)
+    is_drawn = name in (*DRAWN, REPEAT)  # such numbers have no order
+    words = in_words(pd.Series(values), 6)
+    axis: dict[str, Any] = {
+        "type": "nominal",
+        "sort": words,
+        "scale": {"type": "point", "padding": 0.6},
     }
+    ticks: dict[str, Any] = {"labelAngle": -35, "labelLimit": 130}
+    if is_number:
+        kind = "log" if by_factors(values) and not is_drawn else "linear"
+        axis = {
+            "type": "quantitative",
+            "scale": {"type": kind, "nice": False, "padding": 25}
+            | ({"zero": False} if kind == "linear" else {}),
+        }
+        ticks = {"labelFlush": False}
+        if len(values) <= _FEW_TICKS:
+            texts = f"{json.dumps(words)}[indexof({json.dumps(values.tolist())}, datum.value)]"
+            ticks |= {"values": values.tolist(), "labelExpr": texts}
+    return {
+        "title": titled(name),
+        "words": words,
+        "numbers": values.tolist() if is_number else None,
+        "codes": codes.tolist(),
+        "axis": {**axis, "title": titled(name), "axis": ticks},
+        "joined": is_number and not is_drawn,
+        "pooled": not is_drawn,
+    }
+
+
+def _metric(column: pd.Series[float], name: str, place: Mapping[str, int]) -> dict[str, Any]:
+    """A metric as the chart reads it.
+
+    Returns
+    -------
+    dict
+        `title`; `average`; whether its axis may be `log`; `floor`, the lowest bound of an interval;
+        `rules`, how it is averaged over recordings and repeats, in words, without intervals, with
+        some and with all; `values`, None for those of the best answers, which the page takes from
+        the metrics at `paths`, the online and the revised one.
+    """
+    intervals = ([False], [False, True], [True])
+    return {
+        "title": titled(name),
+        "average": average_of(name),
+        "rules": [[rule(unit, [name], some) for some in intervals] for unit in (RECORDING, REPEAT)],
+        "log": COLUMNS[name].scale == "log",
+        "floor": None if (column < 0.0).any() else 0,
+        "values": None if name.startswith(ANSWER) else _numbers(column),
+        "paths": [place.get(path + name.removeprefix(ANSWER)) for path in ("", REVISED)],
+    }
+
+
+def _numbers(column: pd.Series[float]) -> list[float | None]:
+    return [float(f"{v:.{_DIGITS}g}") if math.isfinite(v) else None for v in column]
+
+
+def _as_json(found: Mapping[str, Any]) -> Markup:
+    """JSON that no HTML can end."""
     text = json.dumps(found, allow_nan=False, separators=(",", ":"))
     return Markup(re.sub("[<>&\u2028\u2029]", lambda c: f"\\u{ord(c[0]):04x}", text))
-
-
-def _cells(column: pd.Series[Any]) -> list[Any]:
-    """Values as JSON has them; what is missing or not finite is null."""
-    if column.dtype.kind == "f":
-        return [float(f"{v:.{_DIGITS}g}") if math.isfinite(v) else None for v in column]
-    return [None if pd.isna(v) else v if isinstance(v, (bool, int)) else printable(str(v))
-            for v in column.tolist()]  # fmt: skip
 
 
 def extremes(table: pd.DataFrame) -> pd.DataFrame:

@@ -8,6 +8,7 @@ from cycler import cycler
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from experiments.viewing.panels import note_panels
 from sim.errors import require
 from sim.files import write_whole
 
@@ -48,11 +49,17 @@ def subplots(
 
 
 def save_figure(page: Figure, path: Path) -> None:
-    """Write a figure whole, in the format of the path's suffix; its bytes carry no date."""
+    """Write a figure whole, in the format of the path's suffix; its bytes carry no date.
+
+    A PNG notes its panels, for pages on phones.
+    """
     require(path.suffix in _SUFFIXES, f"{path}: a picture is {', '.join(_SUFFIXES)}")
     metadata = {"Software": None} if path.suffix == ".png" else {"Date": None}
     with write_whole(path) as part:
-        page.savefig(part, dpi=130, metadata=metadata)
+        page.savefig(part, dpi=_DPI, metadata=metadata)
+        if path.suffix == ".png":
+            note_panels(part, page, _DPI / page.dpi)
 
 
 _SUFFIXES = (".png", ".pdf", ".svg")
+_DPI = 130

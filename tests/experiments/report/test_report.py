@@ -1,4 +1,4 @@
-"""The report as a file and in a real browser; tables as LaTeX and Markdown."""
+"""The report as a file and in a real browser."""
 
 import json
 import re
@@ -23,7 +23,6 @@ from experiments.judging.sentences import Conclusion
 from experiments.judging.verdict import Profile, Verdict
 from experiments.report import contents, leaderboard
 from experiments.report import page as report
-from experiments.report.export import to_latex, to_markdown
 from experiments.runs.row import write_frame
 from experiments.viewing.style import save_figure, subplots
 from sim.errors import InputError
@@ -166,11 +165,20 @@ def test_a_figure_without_a_caption_still_shows(text):
     assert "Not made yet: puzzlebot2024_ideal_and_real" in page.all("main")[0]["text"]
 
 
-def test_a_picture_of_a_table_is_shown_as_the_table():
-    tables = {"a": {"name": "a"}}
-    assert contents.shown_as_table(tables, {"table": "a"}) == {"table": {"name": "a"}}
-    assert contents.shown_as_table(tables, {"table": "gone"}) == {"table": None}
-    assert contents.shown_as_table(tables, {}) == {"table": None}
+def test_a_picture_of_a_table_is_shown_as_the_table(results, tmp_path):
+    copied = shutil.copytree(results, tmp_path / "results")
+    picture = copied / "figures" / "puzzlebot2024_surprise.png"
+    about = contents.findings("puzzlebot2024")["figures"]
+    name = next(name for name, figure in about.items() if figure.get("table"))
+    shutil.copy(picture, picture.with_name(f"{name}.png"))
+    for there in (False, True):
+        if there:
+            small = copied / "tables" / "puzzlebot2024_small.csv"
+            shutil.copy(small, small.with_name(f"{about[name]['table']}.csv"))
+        text = report.write_report(copied).read_text()
+        figure = text[text.index(f'<figure id="{name}"') :].partition("</figure>")[0]
+        assert ("<table" in figure) == there
+        assert ("<img" in figure) != there
 
 
 def test_spreads_and_bounds_share_the_cell_of_their_value():
@@ -472,44 +480,3 @@ def contrast(first, second):
     """Contrast ratio of WCAG 2."""
     low, high = sorted([luminance(first), luminance(second)])
     return (high + 0.05) / (low + 0.05)
-
-
-TABLE = pd.DataFrame(
-    {"case_name": ["a|b", "50 % & {x}\\"], "k_m": [1e-5, np.nan], "n": [3, 4], "ok": [True, False]}
-)
-
-
-def test_markdown():
-    assert to_markdown(TABLE).splitlines() == [
-        r"| case name     |   k, m |   n | ok   |",
-        r"|:--------------|-------:|----:|:-----|",
-        r"| a\|b          |  1e-05 |   3 | yes  |",
-        r"| 50 % \& {x}\\ |        |   4 | no   |",
-    ]
-
-
-def test_latex():
-    lines = to_latex(TABLE).splitlines()
-    assert lines[0] == r"\begin{tabular}{lrrl}"
-    assert lines[2] == r"case name & k, m & n & ok \\"
-    assert lines[4] == r"a\textbar{}b & $1 \times 10^{-5}$ & 3 & yes \\"
-    assert lines[5] == r"50 \% \& \{x\}\textbackslash{} &  & 4 & no \\"
-    assert "$-1.5$" in to_latex(pd.DataFrame({"x": [-1.5]}))
-    assert lines[-1] == r"\end{tabular}"
-
-
-def test_export_from_the_command_line(tmp_path):
-    from typer.testing import CliRunner
-
-    from experiments.cli.main import app
-
-    write_frame(TABLE[["n"]], tmp_path / "t.csv")
-    done = CliRunner().invoke(app, ["export-table", str(tmp_path / "t.csv")])
-    assert done.stdout == "|   n |\n|----:|\n|   3 |\n|   4 |\n\n"
-    out = tmp_path / "exported"
-    CliRunner().invoke(
-        app, ["export-table", str(tmp_path / "t.csv"), "--format", "latex", "-o", str(out)]
-    )
-    assert (out / "t.tex").read_text().startswith(r"\begin{tabular}{r}")
-    wrong = CliRunner().invoke(app, ["export-table", str(tmp_path / "t.csv"), "--format", "x"])
-    assert "--format must be markdown or latex" in str(wrong.exception)

@@ -5,6 +5,7 @@ import json
 import re
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from experiments.cli import main as cli
@@ -45,9 +46,9 @@ def path(tmp_path_factory):
 def test_the_page_is_one_small_file_in_which_nothing_from_files_is_code(path):
     text = path.read_text()
     assert len(text) < 2_000_000
-    assert "<img" not in text
+    assert "<img src=x" not in text
     held = re.search(r'id="data">(.*?)</script>', text)[1]
-    assert EVIL in json.loads(held)["settings"][0]["values"]
+    assert EVIL in json.loads(held)["settings"][0]["words"]
     assert "The sweep of 60 is unfinished; to go on: <code>estima run -m world=" in text
     for words in ("2 ran, with a remark: gated at ... s", "1 failed: bad", "estima run -m world="):
         assert words in text
@@ -89,120 +90,167 @@ def test_a_page_too_large_is_refused(tmp_path, monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def tab(path):
+def chromium():
     if browser.find() is None:
         pytest.skip("no Chromium on this machine")
     with browser.page() as tab:
-        tab.shape(1400, 900)
-        tab.open(path.as_uri())
         yield tab
 
 
+@pytest.fixture
+def tab(chromium, path):
+    chromium.events.clear()
+    chromium.shape(1400, 900)
+    chromium.open(path.as_uri())
+    chromium.js("drawn")
+    return chromium
+
+
 def choose(tab, name, value):
+    """Choose in a list, by the text of the option."""
     tab.js(
-        f"(() => {{ const s = document.getElementById('{name}'); s.value = '{value}';"
-        "s.dispatchEvent(new Event('change')); })()"
+        f"(() => {{ const s = byId('{name}');"
+        f"s.value = [...s.options].find((o) => o.text === {json.dumps(value)}).value;"
+        "s.dispatchEvent(new Event('change', { bubbles: true })); return drawn; })()"
     )
+
+
+SAID = "byId('said').textContent"
+Y = "position RMSE, best answer, m"
+
+
+def drawn(tab, *names):
+    """These values of every mean of the chart, sorted, from its `datum` or its `item`."""
+    found = tab.js(
+        "(() => { const found = []; const walk = (item) => {"
+        "if (item.mark?.marktype === 'symbol' && 'spread' in item.datum)"
+        f"{{ const datum = item.datum; found.push([{', '.join(names)}]); }}"
+        "(item.items ?? []).forEach(walk); }; walk(chart.scenegraph().root); return found; })()"
+    )
+    return sorted(found, key=lambda values: values[0])
+
+
+def texts(tab, part):
+    """The texts of a part of the chart, such as `axis-label`."""
+    return tab.js(
+        f"[...document.querySelectorAll('#chart .role-{part} text')].map(t => t.textContent)"
+    )
+
+
+def sound():
+    table = with_answers(rows(), ["answer_ate_rmse_m"])
+    return table[table["status"] != "failed"]
 
 
 def test_the_chart_draws_the_means_of_tables_and_plots(tab):
+    means = np.array(drawn(tab, "datum.value", "datum.low", "datum.high"), float)
     assert tab.complaints() == []
-    table = with_answers(rows(), ["answer_ate_rmse_m"])
-    table = table[table["status"] != "failed"]
     by = ["choice.estimator", "choice.world", "estimator.n_particles"]
-    expected = averages(table, by, "recording_checksum", "answer_ate_rmse_m")
-    drawn = tab.js(
-        "document.getElementById('chart').data.filter(t => t.error_y)"
-        ".flatMap(t => Array.from(t.y, (y, i) => [y, ...t.customdata[i]]))"
-    )
-    found = np.array(sorted(drawn))[:, :3].astype(float)
-    order = expected.sort_values("value").to_numpy()
-    np.testing.assert_allclose(found, order, rtol=1e-3)
-    assert tab.js("document.getElementById('chart').layout.xaxis.type") == "log"
-    assert "with 95 % intervals" in tab.js("document.getElementById('said').textContent")
+    expected = averages(sound(), by, "recording_checksum", "answer_ate_rmse_m")
+    np.testing.assert_allclose(means, expected.sort_values("value").to_numpy(), rtol=1e-4)
+    assert tab.js("chart.scale('x').type") == "log"
+    assert "[95 % interval of 3 or more]" in tab.js(SAID)
+
+
+def test_a_mean_of_repeats_is_that_of_squares_and_one_over_a_zero_is_zero(tmp_path, tab):
+    """The averages of the page follow `sweeps.averages` where its rule has cases."""
+    table = sound().query("`choice.estimator` == 'm02'")
+    again = table.assign(repeat=1, ate_rmse_m=2.0 * table["ate_rmse_m"], nees_mean=1.0)
+    table = pd.concat([table.assign(nees_mean=4.0), again], ignore_index=True)
+    table.loc[0, "ate_rmse_m"] = table.loc[len(again), "ate_rmse_m"] = 0.0
+    write_sweep_page(table, "mine", tmp_path, tmp_path / "page.html")
+    tab.open((tmp_path / "page.html").as_uri())
+    tab.js("drawn")
+    for unit, data in (("recording_checksum", table), ("repeat", table.query("seed == 1"))):
+        if unit == "repeat":
+            tab.js("document.querySelectorAll('#filters label').forEach((label) => {"
+                   "if (label.closest('details').textContent.includes('seed')"
+                   "&& label.textContent.trim() !== '1') label.click(); })")  # fmt: skip
+        for text, name in (
+            (Y, "answer_ate_rmse_m"),
+            ("mean NEES (3 when consistent)", "nees_mean"),
+        ):
+            choose(tab, "y", text)
+            groups = ["choice.world", "estimator.n_particles"]
+            expected = averages(with_answers(data, [name]), groups, unit, name).to_numpy()
+            found = np.array(drawn(tab, "datum.value", "datum.low", "datum.high"), float)
+            order = np.lexsort(expected.T[::-1])
+            np.testing.assert_allclose(found[:, 0], expected[order, 0], rtol=1e-4)
+            bounded = np.isfinite(expected[order]).all(axis=1) & (found[:, 0] > 0.0)
+            np.testing.assert_allclose(found[bounded], expected[order][bounded], rtol=1e-4)
+            assert ("over repeats" in tab.js(SAID)) == (unit == "repeat")
 
 
 def test_what_is_chosen_is_drawn_and_what_is_pooled_is_said(tab):
-    choose(tab, "panels", "")
-    assert "also averages over world" in tab.js("document.getElementById('said').textContent")
-    choose(tab, "panels", "choice.world")
-    assert tab.js("Object.keys(document.getElementById('chart').layout).includes('xaxis2')")
-    said = "document.getElementById('said').textContent"
-    n = f"{said}.split(' ')[0]"
-    assert tab.js(said).startswith("53 runs. Not drawn: 1 failed. ")
+    choose(tab, "panels", "none")
+    assert "also averages over world" in tab.js(SAID)
+    choose(tab, "panels", "world")
+    assert {panel for (panel,) in drawn(tab, "datum.panel")} == {"world: v", "world: w"}
+    n = f"{SAID}.split(' ')[0]"
+    assert tab.js(SAID).startswith("53 runs. Not drawn: 1 failed. ")
     tab.js("document.querySelector('#filters input').click()")
     assert int(tab.js(n)) < 53
     tab.js("document.querySelector('#filters input').click()")
     assert tab.js(n) == "53"
-    tab.js("[0, 1, 2].forEach((row) => { columns.get(byId('y').value).values[row] = null; })")
-    choose(tab, "panels", "")
-    assert tab.js(said).startswith("51 runs. Not drawn: 1 failed, 2 have no finite value. ")
-    tab.open(tab.js("location.href"))
+    tab.js("[0, 1, 2].forEach((row) => { data.metrics[byId('y').value].values[row] = null; })")
+    choose(tab, "panels", "none")
+    said = "51 runs. Not drawn: 1 failed, 2 without a finite value. "
+    assert tab.js(SAID).startswith(said)
 
 
 def test_without_a_run_there_are_no_axes(tab):
-    said = "document.getElementById('said').textContent"
     boxes = "[...document.querySelector('#filters details').querySelectorAll('input')]"
     tab.js(f"{boxes}.forEach((box) => box.click())")
-    assert tab.js(said) == "Nothing is chosen."
-    assert tab.js("document.getElementById('chart').hidden")
+    assert tab.js(SAID) == "Nothing is chosen."
+    assert tab.js("byId('chart').hidden")
     tab.js(f"{boxes}[0].click()")
-    assert "Geometric means" in tab.js(said)
-    assert not tab.js("document.getElementById('chart').hidden")
-    tab.open(tab.js("location.href"))
+    assert "Geometric mean" in tab.js(SAID)
+    assert not tab.js("byId('chart').hidden")
 
 
 def test_settings_that_are_not_drawn_are_no_repeats(tab):
     """As in plots: runs of three estimators over one recording are averaged geometrically."""
-    choose(tab, "colour", "")
-    choose(tab, "panels", "")
-    said = tab.js("document.getElementById('said').textContent")
-    assert "also averages over estimator; world, geometrically" in said
-    table = with_answers(rows(), ["answer_ate_rmse_m"])
-    table = table[table["status"] != "failed"]
+    choose(tab, "colour", "none")
+    choose(tab, "panels", "none")
+    assert "also averages over estimator; world: choose" in tab.js(SAID)
     by, others = ["estimator.n_particles"], ["choice.world", "choice.estimator"]
-    expected = averages(table, by, "recording_checksum", "answer_ate_rmse_m", others)
-    drawn = tab.js("Array.from(document.getElementById('chart').data.find(t => t.error_y).y)")
-    np.testing.assert_allclose(drawn, expected["value"], rtol=1e-4)
-    tab.open(tab.js("location.href"))
+    expected = averages(sound(), by, "recording_checksum", "answer_ate_rmse_m", others)
+    found = [value for (value,) in drawn(tab, "datum.value")]
+    np.testing.assert_allclose(found, sorted(expected["value"]), rtol=1e-4)
 
 
 def test_an_estimator_that_always_failed_has_no_tick(tab):
-    column = "columns.get('choice.estimator').values"
-    tab.js(f"{column}.forEach((v, row) => {{ if (v === 'm00') data.failed[row] = 1; }})")
-    choose(tab, "x", "choice.estimator")
-    ticks = tab.js("document.getElementById('chart').layout.xaxis.ticktext")
-    assert len(ticks) == 2
-    assert "m00" not in ticks
-    tab.open(tab.js("location.href"))
+    estimators = "data.settings.find((s) => s.title === 'estimator')"
+    tab.js(f"{estimators}.codes.forEach((c, row) => {{ if ({estimators}.words[c] === 'm00')"
+           "data.failed[row] = 1; })")  # fmt: skip
+    choose(tab, "x", "estimator")
+    labels = texts(tab, "axis-label")
+    assert "m02" in labels
+    assert "m00" not in labels
 
 
 def test_a_page_of_one_run(tmp_path, tab):
-    home = tab.js("location.href")
     one = rows().query("status == 'ok'")[:1].assign(ate_rmse_m=0.006152)
     one["robot.kr"] = 1e-5
     write_sweep_page(one, "one", tmp_path, tmp_path / "one.html")
     tab.open((tmp_path / "one.html").as_uri())
-    assert tab.js("document.getElementById('said').textContent").startswith("1 run. ")
+    tab.js("drawn")
+    assert drawn(tab, "datum.value") == [[pytest.approx(0.006152)]]
+    assert tab.js(SAID).startswith("1 run. ")
     assert tab.js("document.title") == "one: 1 run"
-    ticks = tab.js("[...document.querySelectorAll('#chart .ytick text')].map(t => t.textContent)")
-    assert max(map(len, ticks)) < 8
-    assert tab.js("document.getElementById('chart').data.every(t => t.y[0] === 0.006152)")
-    tab.open(home)
+    assert max(map(len, texts(tab, "axis-label"))) < 8
 
 
 def test_a_setting_is_written_in_one_way(tmp_path, tab):
-    home = tab.js("location.href")
     table = rows().replace({"estimator.n_particles": {1: 1e-5, 2: 1e-4, 4: 1e-3}})
     write_sweep_page(table, "mine", tmp_path, tmp_path / "page.html")
     tab.open((tmp_path / "page.html").as_uri())
+    tab.js("drawn")
     written = ["1e-5", "1e-4", "1e-3"]
-    assert tab.js("document.getElementById('chart').layout.xaxis.ticktext") == written
-    choose(tab, "colour", "estimator.n_particles")
-    legend = "[...document.querySelectorAll('#chart .legendtext')].map(t => t.textContent)"
-    assert tab.js(legend) == written
+    assert set(written) <= {*texts(tab, "axis-label")}
+    choose(tab, "colour", "number of particles")
+    assert texts(tab, "legend-label") == written
     assert ">1e-4</td>" in (tmp_path / "page.html").read_text()
-    tab.open(home)
 
 
 def test_commands_name_the_folder_of_own_options(tmp_path):
@@ -215,44 +263,37 @@ def test_commands_name_the_folder_of_own_options(tmp_path):
 
 
 def test_names_are_no_markup_for_the_chart(tab):
-    legend = "[...document.querySelectorAll('#chart .legendtext')].map(t => t.textContent)"
-    assert EVIL in tab.js(legend)
-    choose(tab, "x", "choice.estimator")
-    ticks = "[...document.querySelectorAll('#chart .xtick text')].map(t => t.textContent)"
-    assert EVIL in tab.js(ticks)
-    choose(tab, "panels", "choice.estimator")
-    assert f"estimator: {EVIL}" in tab.js(
-        "[...document.querySelectorAll('#chart .annotation')].map(t => t.textContent)"
-    )
-    tab.open(tab.js("location.href"))
+    assert EVIL in texts(tab, "legend-label")
+    choose(tab, "x", "estimator")
+    assert any(EVIL.startswith(text.rstrip("…")) for text in texts(tab, "axis-label"))
+    choose(tab, "panels", "estimator")
+    panels = tab.js("[...document.querySelectorAll('#chart text')].map(t => t.textContent)")
+    assert f"estimator: {EVIL}" in panels
+    assert tab.complaints() == []
 
 
 def test_colours_stand_beside_each_other_over_the_name_of_their_word(tab):
-    choose(tab, "x", "choice.world")
-    choose(tab, "colour", "choice.estimator")
-    choose(tab, "panels", "")
-    chart = "document.getElementById('chart')"
-    first = tab.js(f"{chart}.data.filter(t => t.error_y).map(t => t.x[0])")
+    choose(tab, "x", "world")
+    choose(tab, "colour", "estimator")
+    choose(tab, "panels", "none")
+    places = drawn(tab, "datum.x", "item.x")
+    first = [x for word, x in places if word == "v"]
     assert len(set(first)) == 3
-    np.testing.assert_allclose(np.mean(first), 0.0, atol=1e-12)
-    assert tab.js(f"{chart}.layout.xaxis.tickvals") == [0, 1]
-    assert tab.js(f"{chart}.layout.xaxis.ticktext") == ["v", "w"]
-    choose(tab, "panels", "choice.estimator")
-    low, high = tab.js(f"{chart}._fullLayout.yaxis.range")
-    drawn = np.array(tab.js(f"{chart}.data.flatMap(t => t.y)"))
-    if tab.js(f"{chart}.layout.yaxis.type") == "log":
-        drawn = np.log10(drawn)
-    assert low < drawn.min() < drawn.max() < high
-    assert high - low < 2.0 * np.ptp(drawn)  # not Plotly's range of no data
-    tab.open(tab.js("location.href"))
+    np.testing.assert_allclose(np.mean(first), tab.js("chart.scale('x')('v')"), atol=1e-9)
+    assert [text for text in texts(tab, "axis-label") if text.isalpha()] == ["v", "w"]
+    choose(tab, "panels", "estimator")
+    low, high = tab.js("chart.scale('y').domain()")
+    values = np.array(tab.js("data.metrics[byId('y').value].values.filter((v) => v)"))
+    assert low <= values.min() < values.max() <= high
+    assert high - low < 2.0 * np.ptp(values)
 
 
 def test_seeds_are_not_joined(tab):
-    modes = "document.getElementById('chart').data.filter(t => t.error_y).map(t => t.mode)"
-    assert set(tab.js(modes)) == {"lines+markers"}
+    paths = "[...document.querySelectorAll('#chart .mark-line path')]"
+    lines = f"{paths}.map(p => Number(p.getAttribute('stroke-opacity') ?? 1))"
+    assert set(tab.js(lines)) == {1}
     choose(tab, "x", "seed")
-    assert set(tab.js(modes)) == {"markers"}
-    tab.open(tab.js("location.href"))
+    assert set(tab.js(lines)) == {0}
 
 
 def test_of_each_estimator_the_best_and_the_worst_run_are_shown_and_more_of_one(tab):
@@ -269,17 +310,20 @@ def test_of_each_estimator_the_best_and_the_worst_run_are_shown_and_more_of_one(
     assert errors[:3] == sorted(errors[:3])
     assert errors[3:] == sorted(errors[3:], reverse=True)
     assert errors[2] <= errors[5]
-    choose(tab, "of", "")
 
 
-def test_a_click_on_a_run_gives_its_command_or_its_picture(tab, path):
-    click = "document.getElementById('chart').emit('plotly_click', {points: [{customdata: %s}]})"
-    picked = "document.getElementById('picked')"
-    tab.js(click % 5)
+def test_a_click_on_a_run_gives_its_command_or_its_picture(tab):
+    picked = "byId('picked')"
+    dots = "[...document.querySelectorAll('#chart .mark-symbol path')]"
+    dot = f"{dots}.find(p => p.__data__.datum.row === 5)"
+    at = tab.js(f"({dot}.scrollIntoView(), {dot}.getBoundingClientRect().toJSON())")
+    for kind in ("mouseMoved", "mousePressed", "mouseReleased"):
+        tab.call("Input.dispatchMouseEvent", type=kind, button="left", clickCount=1,
+                 x=at["x"] + at["width"] / 2, y=at["y"] + at["height"] / 2)  # fmt: skip
     key = rows()["run_key"][5]
     assert f"/{key[:10]} -o run.html" in tab.js(f"{picked}.textContent")
     before = tab.js(f"{picked}.textContent")
-    tab.js(click % "[1, 2, 3, null]")  # a mean of several runs
+    tab.js("pick({ row: 1, runs: 3 })")  # a mean of several runs
     assert tab.js(f"{picked}.textContent") == before
     tab.js("document.querySelector('#picked .copy').click()")
     assert tab.becomes("document.querySelector('#picked .copy').textContent != 'copy'")
@@ -327,10 +371,9 @@ def test_tables_are_sorted_by_keyboard(tab):
 @pytest.mark.parametrize("dark", [False, True])
 def test_phones_and_dark_mode(tab, dark):
     tab.shape(390, 800, dark=dark)
-    assert tab.becomes("document.getElementById('chart').getBoundingClientRect().width <= 390")
+    assert tab.becomes("document.querySelector('#chart svg').getBoundingClientRect().width <= 390")
     assert tab.becomes("document.documentElement.scrollWidth <= 390")
     ink = tab.js("getComputedStyle(document.body).color")
-    assert tab.becomes(
-        f"getComputedStyle(document.querySelector('#chart .xtick text')).fill == '{ink}'"
-    )
+    label = "document.querySelector('#chart .role-axis-label text')"
+    assert tab.becomes(f"getComputedStyle({label}).fill == '{ink}'")
     assert tab.complaints() == []

@@ -3,10 +3,12 @@
 import io
 import sys
 
+import numpy as np
 import pandas as pd
 import pytest
 
 from experiments.report.export import export, read_table, to_latex, to_markdown
+from experiments.runs.row import write_frame
 from sim.errors import InputError
 
 
@@ -73,3 +75,44 @@ def test_a_file_that_is_no_table_is_refused_without_advice_to_delete_it(tmp_path
         export([tmp_path / name], "markdown", None, 4)
     assert "delete" not in str(refusal.value)
     assert "\n" not in str(refusal.value)
+
+
+TABLE = pd.DataFrame(
+    {"case_name": ["a|b", "50 % & {x}\\"], "k_m": [1e-5, np.nan], "n": [3, 4], "ok": [True, False]}
+)
+
+
+def test_markdown():
+    assert to_markdown(TABLE).splitlines() == [
+        r"| case name     |   k, m |   n | ok   |",
+        r"|:--------------|-------:|----:|:-----|",
+        r"| a\|b          |  1e-05 |   3 | yes  |",
+        r"| 50 % \& {x}\\ |        |   4 | no   |",
+    ]
+
+
+def test_latex():
+    lines = to_latex(TABLE).splitlines()
+    assert lines[0] == r"\begin{tabular}{lrrl}"
+    assert lines[2] == r"case name & k, m & n & ok \\"
+    assert lines[4] == r"a\textbar{}b & $1 \times 10^{-5}$ & 3 & yes \\"
+    assert lines[5] == r"50 \% \& \{x\}\textbackslash{} &  & 4 & no \\"
+    assert "$-1.5$" in to_latex(pd.DataFrame({"x": [-1.5]}))
+    assert lines[-1] == r"\end{tabular}"
+
+
+def test_export_from_the_command_line(tmp_path):
+    from typer.testing import CliRunner
+
+    from experiments.cli.main import app
+
+    write_frame(TABLE[["n"]], tmp_path / "t.csv")
+    done = CliRunner().invoke(app, ["export-table", str(tmp_path / "t.csv")])
+    assert done.stdout == "|   n |\n|----:|\n|   3 |\n|   4 |\n\n"
+    out = tmp_path / "exported"
+    CliRunner().invoke(
+        app, ["export-table", str(tmp_path / "t.csv"), "--format", "latex", "-o", str(out)]
+    )
+    assert (out / "t.tex").read_text().startswith(r"\begin{tabular}{r}")
+    wrong = CliRunner().invoke(app, ["export-table", str(tmp_path / "t.csv"), "--format", "x"])
+    assert "--format must be markdown or latex" in str(wrong.exception)

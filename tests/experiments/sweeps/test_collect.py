@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from experiments.cli.main import app
 from experiments.report.export import as_text
-from experiments.report.plot import _by_factors, sweep_figure
+from experiments.report.plot import by_factors, sweep_figure
 from experiments.runs.columns import COLUMNS, ORIGIN, REPEAT, STATUS, is_setting, title
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
@@ -341,8 +341,8 @@ def test_lines_are_named_at_their_ends_where_that_fits():
         ([0.0, 1.0, 100.0], False),
     ],
 )
-def test_values_that_grow_by_factors_have_a_logarithmic_axis(values, factors):
-    assert _by_factors(values) is factors
+def test_values_that_growby_factors_have_a_logarithmic_axis(values, factors):
+    assert by_factors(values) is factors
 
 
 def test_every_column_of_a_row_is_in_the_schema():

@@ -1,33 +1,40 @@
-"""A figure's panels, found by the white between them."""
-
-from io import BytesIO
+"""A figure's panels, noted in its PNG."""
 
 import numpy as np
 import pytest
+from PIL import Image
 
-from experiments.report.panels import panels
+from experiments.viewing.panels import noted_panels
 from experiments.viewing.plotting import with_legend
-from experiments.viewing.style import subplots
+from experiments.viewing.style import save_figure, subplots
 
 
-def parts(page):
-    """Boxes of a page's parts as the report finds them, and the axes that each part holds."""
-    file = BytesIO()
-    page.savefig(file, dpi=130, format="png")
-    height = page.bbox.height * 130 / page.dpi
-    scale = 130 / page.dpi
-    found = panels(file.getvalue())
-    held = []
-    for *_, (left, top, right, bottom) in found:
-        middles = [(ax.bbox.p0 + ax.bbox.p1) / 2 * scale for ax in page.axes]
-        held.append(
-            [
-                i
-                for i, (x, y) in enumerate(middles)
-                if left < x < right and top < height - y < bottom
-            ]
-        )
-    return found, held
+@pytest.fixture
+def parts(tmp_path):
+    """Boxes of a page's parts as its PNG notes them, and the axes that each part holds."""
+
+    def of(page):
+        save_figure(page, tmp_path / "page.png")
+        with Image.open(tmp_path / "page.png") as image:
+            image.load()
+            scale, height = image.width / page.bbox.width, image.height
+            text = noted_panels(image)
+        found = [
+            [tuple(map(int, box.split(","))) for box in part.split("+")] for part in text.split()
+        ]
+        held = []
+        for *_, (left, top, right, bottom) in found:
+            middles = [(ax.bbox.p0 + ax.bbox.p1) / 2 * scale for ax in page.axes]
+            held.append(
+                [
+                    i
+                    for i, (x, y) in enumerate(middles)
+                    if left < x < right and top < height - y < bottom
+                ]
+            )
+        return found, held
+
+    return of
 
 
 def drawn(n_rows, n_cols, **shared):
@@ -39,7 +46,7 @@ def drawn(n_rows, n_cols, **shared):
     return page, axes
 
 
-def test_panels_stand_alone_as_they_are_read():
+def test_panels_stand_alone_as_they_are_read(parts):
     page, _ = drawn(2, 2)
     found, held = parts(page)
     assert held == [[0], [1], [2], [3]]
@@ -48,7 +55,7 @@ def test_panels_stand_alone_as_they_are_read():
     assert boxes.min() >= 0
 
 
-def test_a_legend_of_several_panels_is_parts_of_its_own():
+def test_a_legend_of_several_panels_is_parts_of_its_own(parts):
     page, _ = drawn(1, 2)
     found, held = parts(with_legend(page, ncols=2))
     assert held == [[0], [1], [], []]
@@ -62,14 +69,14 @@ def test_a_legend_of_several_panels_is_parts_of_its_own():
         ((1, 1), {}, []),
     ],
 )
-def test_panels_that_share_a_horizontal_axis_stay_together(shape, shared, expected):
+def test_panels_that_share_a_horizontal_axis_stay_together(parts, shape, shared, expected):
     page, axes = drawn(*shape, **shared)
     for ax in axes[:-1].flat:
         ax.set(xlabel="")
     assert parts(page)[1] == expected
 
 
-def test_panels_that_share_a_vertical_axis_come_with_its_labels():
+def test_panels_that_share_a_vertical_axis_come_with_its_labels(parts):
     page, axes = drawn(1, 3, sharey=True)
     for ax in axes.flat[1:]:
         ax.set(ylabel="")
@@ -78,7 +85,7 @@ def test_panels_that_share_a_vertical_axis_come_with_its_labels():
     (first,), (of_second, second), (of_third, third) = found
     assert of_second == of_third
     left, top, right, bottom = of_second
-    axis = axes.flat[0].bbox.x0 * 130 / page.dpi
+    axis = axes.flat[0].bbox.x0 * 1.3
     assert first[0] <= left < right <= axis  # all that stands to the left of the first axis
     assert axis - right < 15
     assert first[1] <= top < bottom <= first[3]
@@ -86,14 +93,14 @@ def test_panels_that_share_a_vertical_axis_come_with_its_labels():
     assert third[0] > second[0]
 
 
-def test_a_colour_bar_stays_with_its_panel():
+def test_a_colour_bar_stays_with_its_panel(parts):
     page, axes = drawn(1, 2)
     image = axes[0, 0].imshow(np.eye(4), aspect="auto")
     page.colorbar(image, ax=axes[0, 0], label="share")
     assert parts(page)[1] == [[0, 2], [1]]
 
 
-def test_a_picture_without_axes_is_whole():
+def test_a_picture_without_axes_is_whole(parts):
     page, axes = drawn(1, 1)
     axes[0, 0].remove()
     assert parts(page)[0] == []
