@@ -37,6 +37,7 @@ from experiments.papers.maximo2024.settings import (
     TUNED,
     WITHIN,
 )
+from experiments.runs.evaluate import run_over
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
 from experiments.runs.seeds import stream

@@ -115,7 +115,7 @@ def closed_loops() -> tuple[pd.DataFrame, dict[str, NDArray[Any]]]:
     """Errors on all logs, and grids of Intel by its edges alone and with its loops closed."""
     edges = carmen.to_recording(carmen.read_carmen(GRAPHS["intel"]))
     rows, after = scored("intel", "SEQUENTIAL edges", edges)
-    before, _ = tracked(Odometry(_OPTIONS["kr"], _OPTIONS["kl"]), edges)
+    before, _ = tracked(Odometry(kr=_OPTIONS["kr"], kl=_OPTIONS["kl"]), edges)
     rows += scored("fr079", "SEQUENTIAL edges", freiburg())[0]
     wheels, logged = intel("calibrated"), intel("logged")
     mounts = [one.sensor("laser", Laser).mount.pose for one in (wheels, logged)]
