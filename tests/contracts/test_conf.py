@@ -8,9 +8,12 @@ import numpy as np
 import pytest
 import yaml
 
+from experiments.runs.compose import option_called, searched
 from experiments.runs.experiment import Experiment
 from experiments.runs.paths import option_names
+from experiments.runs.schema import describe_option
 from experiments.runs.targets import make
+from experiments.sweeps.plan import planned
 from sim.errors import InputError
 from sim.robot.drive import DifferentialDrive, RobotGeometry
 from sim.sensors import sensors_from_config
@@ -97,3 +100,26 @@ def test_a_word_for_a_number_is_named(override):
     key, _, word = override.partition("=")
     with pytest.raises(InputError, match=f"{key} must be a number, got '{word}'"):
         Experiment.compose(["world=room", override]).check()
+
+
+def test_what_a_file_does_not_state_is_the_default_of_what_it_names(tmp_path):
+    (tmp_path / "estimator").mkdir()
+    (tmp_path / "estimator" / "bare.yaml").write_text(
+        "_target_: estimators.landmarks.ekf_slam.EkfSlam\nkr: ${robot.kr}\nkl: ${estimator.d0}\n"
+    )
+    own = [*searched(tmp_path), "estimator=bare"]
+    found = Experiment.compose([*own, "estimator.d0=3.0"]).estimator_options
+    whole = Experiment.compose(["estimator=ekf_slam"]).estimator_options
+    assert found == {**whole, "d0": 3.0, "kl": 3.0}
+    swept = [run.estimator_options["d0"] for run in planned([*own, "estimator.d0=1.0,2.0"])]
+    assert swept == [1.0, 2.0]
+    with pytest.raises(InputError, match=r"unknown key estimator\.d1; known: estimator\.d0, "):
+        Experiment.compose([*own, "estimator.d1=3.0"])
+    assert "d0: 16.27" in describe_option("estimator", "ekf_slam")
+
+
+def test_an_option_of_a_folder_is_called_by_its_last_part():
+    experiment = Experiment.compose(["estimator=peers/kiss_icp_tuned"])
+    assert experiment.estimator_name == "kiss_icp_tuned"
+    assert experiment.estimator_options["voxel_size_m"] == 0.2
+    assert option_called("estimator", "kiss_icp") == "peers/kiss_icp"

@@ -409,7 +409,7 @@ def test_in_range():
     ("overrides", "complaint"),
     [
         (["team.size=6"], "team.size must be from 1 to the 5 of team.robots"),
-        (["team.starts=guessed"], "team.starts must be known or unknown"),
+        (["team.starts=guessed"], "team.starts must be one of known, unknown"),
         (["+team.colour=red"], "unknown key team; known: world"),
         (["team.robots=[{wheels: 3}]", "team.size=1"], r"unknown key team.robots\[0\].wheels"),
         (["team.robots=[{route: {speed: 3}}]", "team.size=1"], r"robots\[0\].route.speed"),

@@ -195,7 +195,7 @@ def test_files_of_teams_by_the_command_line(tmp_path):
         evaluate(Experiment.compose([f"recording={path}"]))
     assert command("convert", str(path), "--robot", "1", "-o", str(alone)).returncode == 0
     assert recordings.load(alone).checksum == team.robots[1].checksum
-    with pytest.raises(InputError, match=r"one\.npz: it holds one robot, and no team"):
+    with pytest.raises(InputError, match=r"one\.npz: a team of 1 robots; set team\.size"):
         evaluate(composed(f"recording={alone}"))
     told = command("info", str(path)).stdout
     assert "robot 0" in told
