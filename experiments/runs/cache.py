@@ -4,15 +4,14 @@ It holds at most $ESTIMA_CACHE_GIB (8 unless set); the least recently used go fi
 """
 
 import dataclasses
-import fcntl
 import hashlib
 import json
 import os
 import sys
 import time
 import zlib
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +47,7 @@ def cached(key: str, make: Callable[[], Recording]) -> Recording:
     """
     path = folder() / f"{key}.npz"
     limit = limit_bytes()
-    with _locked(path):
+    with locked(path.with_suffix(".lock")):
         if path.exists():
             require_file(path)
             try:
@@ -62,7 +61,8 @@ def cached(key: str, make: Callable[[], Recording]) -> Recording:
         entry = dataclasses.replace(recording, config={**recording.config, _KEY: key})
         save(entry, path, durable=False)
         size = path.stat().st_size
-    if _draw(key) * limit < size * _TRIMS_PER_LIMIT:
+    draw = zlib.crc32(key.encode()) / 2**32  # from 0 to 1: trimming looks at every file
+    if draw * limit < size * _TRIMS_PER_LIMIT:
         trim(limit)
     return recording
 
@@ -74,11 +74,6 @@ def _entry(path: Path, key: str) -> Recording:
         raise InputError(f"{path}: the recording of another key")
     settings = {name: value for name, value in entry.config.items() if name != _KEY}
     return dataclasses.replace(entry, config=settings)
-
-
-def _draw(key: str) -> float:
-    """A number from 0 to 1 by a key, so that trimming, which looks at every file, is rare."""
-    return zlib.crc32(key.encode()) / 2**32
 
 
 def limit_bytes() -> float:
@@ -128,13 +123,9 @@ def trim(most_bytes: float) -> int:
 
 def _dropped(path: Path) -> bool:
     """Drop a recording, unless a process is reading or writing it; return whether it is gone."""
-    lock = path.with_suffix(".lock")
-    require_file(lock)
     try:
-        with lock.open("w") as handle:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        with locked(path.with_suffix(".lock"), wait=False):
             path.unlink(missing_ok=True)
-            lock.unlink(missing_ok=True)
     except BlockingIOError:
         return False
     except OSError as error:
@@ -142,18 +133,3 @@ def _dropped(path: Path) -> bool:
             f"{path}: cannot delete it ({error.strerror}); make its folder writable"
         ) from error
     return True
-
-
-@contextmanager
-def _locked(path: Path) -> Iterator[None]:
-    """Hold an exclusive lock on an entry."""
-    with ExitStack() as held:
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            held.enter_context(locked(path.with_suffix(".lock")))
-        except OSError as error:
-            raise InputError(
-                f"{path}: cannot lock it in the cache ({error.strerror}); free some space, or "
-                "choose another folder of results with ESTIMA_RESULTS"
-            ) from error
-        yield
