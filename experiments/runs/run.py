@@ -122,12 +122,10 @@ def record(experiment: Experiment, out: Path) -> bool:
     with progress("simulated seconds", expected_s(experiment)) as on_progress:
         made = experiment.simulated(on_progress)
     checksum = save(made, out)
-    alone = not experiment.of_team
-    said = [
-        f"{'' if alone else f'robot {n}: '}{robot.status}, {robot.duration_s:.1f} s"
-        for n, robot in enumerate(made.robots)
-    ]
-    print(f"{out}: {'; '.join(said)}, checksum {checksum}")
+    drives = [f"{robot.status}, {robot.duration_s:.1f} s" for robot in made.robots]
+    if experiment.team is not None:
+        drives = [f"robot {number}: {drive}" for number, drive in enumerate(drives)]
+    print(f"{out}: {'; '.join(drives)}, checksum {checksum}")
     return all(robot.status == "ok" for robot in made.robots)
 
 

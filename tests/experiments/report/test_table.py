@@ -3,7 +3,15 @@ import pytest
 from evo.tools import file_interface
 
 from estimators.base import Estimate
-from experiments.runs.row import Outcome, Status, as_tables, check_row, joined, read_rows, write_frame
+from experiments.runs.row import (
+    Outcome,
+    Status,
+    as_tables,
+    check_row,
+    joined,
+    read_rows,
+    write_frame,
+)
 from sim.errors import InputError
 from sim.formats.tum import read_tum, write_tum
 
