@@ -4,8 +4,6 @@ It holds at most $ESTIMA_CACHE_GIB (8 unless set); the least recently used go fi
 """
 
 import dataclasses
-import hashlib
-import json
 import os
 import sys
 import time
@@ -13,12 +11,10 @@ import zlib
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 from experiments.runs import paths
 from experiments.runs.processes import locked
-from experiments.runs.version import SIMULATION, code_version
-from sim.errors import InputError
+from sim.errors import InputError, require
 from sim.files import require_file
 from sim.recording import Recording, load, save
 
@@ -31,12 +27,6 @@ _KEY = "cache_key"  # in the configuration that an entry holds
 def folder() -> Path:
     """Folder of the cached recordings."""
     return paths.results() / "cache" / "recordings"
-
-
-def key_of(settings: dict[str, Any]) -> str:
-    """Digest of the settings and of the simulator's code: what decides a recording's bits."""
-    text = json.dumps({"settings": settings, "code": code_version(SIMULATION)}, sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()[:24]
 
 
 def cached(key: str, make: Callable[[], Recording]) -> Recording:
@@ -70,8 +60,7 @@ def cached(key: str, make: Callable[[], Recording]) -> Recording:
 def _entry(path: Path, key: str) -> Recording:
     """Read a recording of the cache, which holds its own key, under its checksum."""
     entry = load(path)
-    if entry.config.get(_KEY) != key:
-        raise InputError(f"{path}: the recording of another key")
+    require(entry.config.get(_KEY) == key, f"{path}: the recording of another key")
     settings = {name: value for name, value in entry.config.items() if name != _KEY}
     return dataclasses.replace(entry, config=settings)
 
@@ -113,9 +102,7 @@ def trim(most_bytes: float) -> int:
     kept, dropped = files(), 0
     excess = sum(size for _, size in kept) - most_bytes
     for path, size in kept:
-        if excess <= 0.0:
-            break
-        if _dropped(path):
+        if excess > 0.0 and _dropped(path):
             excess -= size
             dropped += 1
     return dropped

@@ -16,7 +16,7 @@ from experiments.evaluation.metrics import (
     longest_pause_s,
     score,
 )
-from experiments.runs.columns import OF_THE_RUN
+from experiments.runs.columns import OF_THE_RUN, REVISED
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import GAP, Outcome, Row, Status
 from experiments.runs.seeds import stream
@@ -92,15 +92,20 @@ def evaluate(
                 shown(read) if shown else nullcontext() as on_step,
             ):
                 answers = answers_of(estimator, repeat, on_step)
-            status, scores = _scored_run(experiment, read, answers)
+            paired = [(r, *answer) for r, answer in zip(read.robots, answers, strict=True)]
+            statuses = [status_of(*each) for each in paired]
+            every = [scored(*each, **experiment.scoring) for each in paired]
+            status, scores = statuses[0], every[0]
+            if experiment.team is not None:
+                status, scores = status_of_team(statuses), scores_of_team(read, every)
         except InputError:
             raise
         except (Exception, SystemExit) as error:
             status = Status.of_error(error)
             on_error(error)
         else:
-            for recording, answer in zip(read.robots, answers, strict=True):
-                on_estimate(recording, repeat, *answer)
+            for recording, online, revised in paired:
+                on_estimate(recording, repeat, online, revised)
         rows.append({**labels, "repeat": repeat, **status.columns(), **scores})
     return rows
 
@@ -136,17 +141,6 @@ def run_robots(
 ) -> Answers:
     """Online and revised estimate of each robot, of one repeat, as `evaluate` makes them."""
     return runner(experiment, read)(experiment.estimator(), repeat, on_step)
-
-
-def _scored_run(experiment: Experiment, read: Team, answers: Answers) -> tuple[Status, Row]:
-    """How a run ended, and its scores."""
-    statuses, scores = [], []
-    for recording, (online, revised) in zip(read.robots, answers, strict=True):
-        statuses.append(status_of(recording, online, revised))
-        scores.append(scored(recording, online, revised, **experiment.scoring))
-    if experiment.team is None:
-        return statuses[0], scores[0]
-    return status_of_team(statuses), scores_of_team(read, scores)
 
 
 def run_over(
@@ -203,10 +197,8 @@ def scored(
         **score(recording, online, longest_gap_s, after_s),
         **landmark_errors(recording, made),
     }
-    if revised is not None:
-        found = score(recording, revised, longest_gap_s, after_s)
-        scores |= {f"revised_{k}": found[k] for k in found if k not in OF_THE_RUN}
-    return scores
+    own = score(recording, revised, longest_gap_s, after_s) if revised is not None else {}
+    return scores | {f"{REVISED}{k}": v for k, v in own.items() if k not in OF_THE_RUN}
 
 
 def status_of(recording: Recording, online: Estimate, revised: Estimate | None = None) -> Status:
@@ -220,12 +212,14 @@ def status_of(recording: Recording, online: Estimate, revised: Estimate | None =
     if online.status == "ok" and not sound.all():
         when = online.stamps[np.argmin(sound)]
         return Status(Outcome.FAILED, "not_finite", f"not finite at {when:.2f} s")
-    paths = (online.stamps, *([] if revised is None else [revised.stamps]))
-    found = max((status_of_pauses(recording, stamps) for stamps in paths), key=lambda s: s.code)
+    pauses = [
+        status_of_pauses(recording, path.stamps) for path in (online, revised) if path is not None
+    ]
+    worst = max(pauses, key=lambda status: status.code)
     if online.status == "ok":
-        return found
-    detail = "; ".join(filter(None, [found.detail, online.status]))
-    return Status(Outcome.REMARK, found.code or "estimator", detail)
+        return worst
+    detail = "; ".join(filter(None, [worst.detail, online.status]))
+    return Status(Outcome.REMARK, worst.code or "estimator", detail)
 
 
 def status_of_pauses(recording: Recording, stamps: Array) -> Status:

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from statistics import fmean
 
+import numpy as np
 from omegaconf import OmegaConf
 
 from estimators.base import Estimate
@@ -98,9 +99,8 @@ def run_once(experiment: Experiment, draw: Draw, out: Path | None = None) -> lis
         draw(found, experiment, folder)
     if found and out is not None:
         write_estimate(out, found[0][1])
-    path = write_run(rows, folder.parent)
-    written = (path, folder / "run.png", *([out] if out is not None else []))
-    _print(rows, [file for file in written if file.exists()])
+    written = (write_run(rows, folder.parent), folder / "run.png", out)
+    _print(rows, [file for file in written if file is not None and file.exists()])
     for row in rows:
         if row["status"] == Outcome.FAILED:
             raise RunFailedError(f"{row['status_code']}: {row['status_detail']}")
@@ -109,10 +109,8 @@ def run_once(experiment: Experiment, draw: Draw, out: Path | None = None) -> lis
 
 def expected_s(experiment: Experiment) -> float | None:
     """About how long the simulated drive will be; None if that is not known before."""
-    if experiment.from_file:
-        return None
     one = experiment.of_robot(0)
-    about_s = getattr(one.route(), "about_s", None)
+    about_s = None if experiment.from_file else getattr(one.route(), "about_s", None)
     return None if about_s is None else round(about_s(one.world(), one.robot()), 1)
 
 
@@ -185,6 +183,7 @@ _SHOWN = (
 
 
 _CONSISTENT = (1.5, 6.0)  # mean NEES of a run, half and twice the expected
+_CONSISTENCY = ("too cautious", "consistent", "too sure of itself")
 _DOF = 3
 
 
@@ -227,15 +226,11 @@ def in_words(rows: Sequence[Row]) -> str:
     distance_m, nees = mean("distance_m"), mean("nees_mean")
     if not math.isfinite(error_m):
         return ""
-    words = f"position RMSE {error_m:.3g} m"
-    if any(f"{REVISED}ate_rmse_m" in row for row in rows):
-        words = f"revised path: {words}"
+    revised = any(f"{REVISED}ate_rmse_m" in row for row in rows)
+    words = f"{'revised path: ' if revised else ''}position RMSE {error_m:.3g} m"
     if distance_m > 0.0:
         words += f", {100.0 * error_m / distance_m:.2g} % of {distance_m:.3g} m"
     if math.isfinite(nees):
-        low, high = _CONSISTENT
-        kind = (
-            "too sure of itself" if nees > high else "too cautious" if nees < low else "consistent"
-        )
+        kind = _CONSISTENCY[int(np.searchsorted(_CONSISTENT, nees))]
         words += f"; {kind} (NEES {nees:.2g} of {_DOF})"
     return words

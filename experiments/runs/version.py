@@ -7,9 +7,9 @@ import importlib.util
 import json
 import os
 import platform
+import re
 import shlex
 from collections.abc import Iterable
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -57,9 +57,8 @@ def version_with(targets: Iterable[str], command: Any = None) -> str:
     found = {target: digest for target in sorted(targets) if (digest := source_digest(target))}
     for path in command_files(command):
         found[str(path)] = hashlib.sha256(path.read_bytes()).hexdigest()
-    if not found:
-        return code_version()
-    return f"{code_version()}+{hashlib.sha256(repr(found).encode()).hexdigest()[:12]}"
+    elsewhere = f"+{hashlib.sha256(repr(found).encode()).hexdigest()[:12]}" if found else ""
+    return code_version() + elsewhere
 
 
 def command_files(command: Any) -> list[Path]:
@@ -134,8 +133,6 @@ def machine() -> dict[str, str | int]:
 
 def _cpu_model() -> str:
     """Name of the processor, from the kernel if it gives one, else from the platform."""
-    with suppress(OSError):
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    return platform.processor() or platform.machine()
+    info = Path("/proc/cpuinfo")
+    named = re.search(r"^model name\s*: (.*)$", info.read_text() if info.exists() else "", re.M)
+    return named[1].strip() if named else platform.processor() or platform.machine()

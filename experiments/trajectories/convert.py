@@ -147,9 +147,9 @@ def convert_log(
     recording = read_any(log, robot)
     write_recording(out, recording)
     said = f"{out}: {recording.duration_s:.1f} s, {len(recording.frame_stamps)} frames"
-    dropped = [name for name in recording.logs if name != "laser"] if out.suffix == ".log" else []
-    if dropped:
-        said += f"\nleft out, since a CARMEN log holds one laser: {', '.join(dropped)}"
+    dropped = ", ".join(name for name in recording.logs if name != "laser")
+    if dropped and out.suffix == ".log":
+        said += f"\nleft out, since a CARMEN log holds one laser: {dropped}"
     return said
 
 

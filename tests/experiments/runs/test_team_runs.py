@@ -137,7 +137,7 @@ def test_sweeps_of_teams():
         (["team.size=two"], r"team\.size must be a whole number"),
         (["team.size=.nan"], r"team\.size must be a whole number"),
         (["team.robots=3"], r"team\.robots must be a valid list, got 3"),
-        (["team.robots=[3,4]"], r"team\.robots must be a valid dictionary, got 3"),
+        (["team.robots=[3,4]"], r"team\.robots\[0\] must be a valid dictionary, got 3"),
         (["team.robots=[{},{route: 3}]"], r"team\.robots\[1\]\.route must hold keys"),
         (
             ["team.robots=[{},{route: {wheels: 9}}]"],
