@@ -206,7 +206,7 @@ def run(*given: Any, estimator: str | Estimator | None = None) -> Run:
     overrides = given if recording is None else given[1:]
     named = [f"estimator={estimator}"] if isinstance(estimator, str) else []
     experiment = _experiment((*named, *overrides))
-    require(experiment.team is None, "team: estima.run is of one robot; estima.sweep runs teams")
+    require(experiment.team is None, "team: estima.run takes one robot; estima.sweep runs teams")
     require(
         experiment.repeats == 1,
         f"estima.run makes one run; use estima.sweep for repeats={experiment.repeats}",
@@ -234,7 +234,7 @@ def score(recording: Recording, estimate: Estimate) -> dict[str, float]:
     Raises
     ------
     InputError
-        If it is no Estimate, or shares no time with the truth.
+        If it is not an Estimate, or shares no time with the truth.
 
     Examples
     --------
@@ -333,7 +333,7 @@ def plot(
     Raises
     ------
     InputError
-        If there is no such column, it holds no numbers to average, or the table is not a sweep's.
+        If the column is missing, it holds no numbers to average, or the table is not a sweep's.
 
     Examples
     --------

@@ -109,7 +109,7 @@ class Composer:
         Raises
         ------
         InputError
-            If an override is of a key that is not known.
+            If an override names an unknown key.
         """
         check_overrides(overrides)
         each = [self.parse(override) for override in overrides]
@@ -246,7 +246,8 @@ def _believe(cfg: DictConfig) -> None:
     require(isinstance(path, str) and path, f"calibration must be a path or null, got {path!r}")
     require(
         cfg.get("recording") is not None,
-        "calibration is of a real log: set recording too, made by `estima convert LOG -o FILE.npz`",
+        "calibration belongs to a real log: set recording too, made by `estima convert LOG -o "
+        "FILE.npz`",
     )
     slip = read_calibration(Path(path)).slip
     for key in ("kr", "kl"):
@@ -261,7 +262,7 @@ def searched(config_dir: str | Path | None) -> list[str]:
     Raises
     ------
     InputError
-        If there is no such folder, or one of its options is no YAML that can be read.
+        If the folder does not exist, or the YAML of one of its options cannot be read.
     """
     if config_dir is None:
         return []
@@ -289,7 +290,7 @@ def with_study_file(overrides: Sequence[str]) -> list[str]:
     Raises
     ------
     InputError
-        If there is no such file.
+        If the file does not exist.
     """
     named: list[str] = []
     for override in overrides:
@@ -297,7 +298,7 @@ def with_study_file(overrides: Sequence[str]) -> list[str]:
         if not override.startswith("study=") or path.suffix != ".yaml":
             named.append(override)
             continue
-        require(path.is_file(), f"{override}: there is no such file")
+        require(path.is_file(), f"{override}: no such file")
         place, copies = path.resolve(), paths.results() / "cache" / "studies"
         if place.parent.name != "study":
             place = copies / digest_of(path)[:16] / "study" / path.name
@@ -362,7 +363,7 @@ def check_hydra(overrides: Sequence[str]) -> None:
             "hydra/sweeper": "-m runs every combination of the values; an optimizer may call "
             "estima.sweep from Python",
             "hydra.sweeper": "give the values themselves, such as seed=1,2",
-            "hydra.verbose": "there is no log; a failed run's row says how",
+            "hydra.verbose": "nothing is logged; a failed run's row says how",
         }
         usual = "rows go to results/runs/NAME: set name, or --results for another folder"
         remedy = next((remedies[start] for start in remedies if key.startswith(start)), usual)
@@ -384,7 +385,7 @@ def check_overrides(overrides: Sequence[str]) -> None:
             for entry in value:
                 scheme, _, place = str(getattr(entry, "text", entry)).rpartition("://")
                 there = scheme not in ("", "file") or Path(place).is_dir()
-                require(there, f"{override.input_line}: there is no folder {place}")
+                require(there, f"{override.input_line}: no folder {place}")
         named = override.is_sweep_override() or isinstance(value, (str, list))
         require(
             named or override.is_delete() or key not in (*GROUPS, "study"),

@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager, nullcontext
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
-from estimators.base import Estimate, Estimator, Prior, run_to_the_end
+from estimators.base import Answer, Estimate, Estimator, Prior, run_to_the_end
 from experiments.evaluation.map_quality import landmark_errors
 from experiments.evaluation.metrics import (
     LONGEST_GAP_S,
@@ -32,7 +32,6 @@ Streams = Callable[[int], np.random.Generator]
 Planted = Callable[[Estimator, int], AbstractContextManager[object]]
 Shown = Callable[[Team], AbstractContextManager[Callable[[int], None]]]
 OnStep = Callable[[int], None] | None
-Answers = list[tuple[Estimate, Estimate | None]]  # of each robot: online and revised
 
 
 def evaluate(
@@ -56,7 +55,7 @@ def evaluate(
         The estimator's generator of each repeat, or a team's (see `answers_of_team`); by default
         that of the axis `estimator/NAME`.
     planted
-        Gives a context in which the estimator is faulty, for each repeat; not of a team.
+        Gives a context in which the estimator is faulty, for each repeat; of one robot alone.
     shown
         Shows the progress over the recordings: gives a function of the number of Frames done, as a
         context around each repeat.
@@ -94,7 +93,7 @@ def evaluate(
                 answers = answers_of(estimator, repeat, on_step)
             paired = [(r, *answer) for r, answer in zip(read.robots, answers, strict=True)]
             statuses = [status_of(*each) for each in paired]
-            every = [scored(*each, **experiment.scoring) for each in paired]
+            every = [scored(*each, **experiment.config["scoring"]) for each in paired]
             status, scores = statuses[0], every[0]
             if experiment.team is not None:
                 status, scores = status_of_team(statuses), scores_of_team(read, every)
@@ -112,7 +111,7 @@ def evaluate(
 
 def runner(
     experiment: Experiment, read: Team, streams: Streams | None = None
-) -> Callable[[Estimator, int, OnStep], Answers]:
+) -> Callable[[Estimator, int, OnStep], list[Answer]]:
     """Function that runs an estimator over recordings: of it, the repeat, and the progress.
 
     Raises
@@ -126,9 +125,9 @@ def runner(
     axis = f"estimator/{experiment.estimator_name}"
     own = streams or functools.partial(stream, experiment.seed, axis)
 
-    def answers(estimator: Estimator, repeat: int, on_step: OnStep) -> Answers:
+    def answers(estimator: Estimator, repeat: int, on_step: OnStep) -> list[Answer]:
         if experiment.team is None:
-            keep = (*SCORED_EXTRAS, *experiment.keep)
+            keep = (*SCORED_EXTRAS, *experiment.config["keep"])
             return [run_over(read.only, estimator, priors[0], own(repeat), keep, on_step)]
         with limited_blas():
             return answers_of_team(experiment, read, priors, repeat, own, on_step)
@@ -138,7 +137,7 @@ def runner(
 
 def run_robots(
     experiment: Experiment, read: Team, repeat: int = 0, on_step: OnStep = None
-) -> Answers:
+) -> list[Answer]:
     """Online and revised estimate of each robot, of one repeat, as `evaluate` makes them."""
     return runner(experiment, read)(experiment.estimator(), repeat, on_step)
 
@@ -149,8 +148,8 @@ def run_over(
     prior: Prior,
     rng: np.random.Generator,
     keep: Collection[str] = (),
-    on_step: Callable[[int], None] | None = None,
-) -> tuple[Estimate, Estimate | None]:
+    on_step: OnStep = None,
+) -> Answer:
     """Online estimate of a run, and the revised one of an estimator that has `finish`.
 
     The online estimate has the processor time of all, `finish` included, but for compiling code

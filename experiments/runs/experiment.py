@@ -108,11 +108,6 @@ class Experiment(Objects):
         return isinstance(self.config["recording"], str)
 
     @property
-    def calibrated(self) -> bool:
-        """Whether a calibration says what is believed of the robot."""
-        return self.config["calibration"] is not None
-
-    @property
     def command(self) -> Any:
         """The command of an estimator that is a program; None of one that is not."""
         return self.option("command")
@@ -131,21 +126,6 @@ class Experiment(Objects):
     def repeats(self) -> int:
         """Runs of the estimator over the recording."""
         return int(self.config["repeats"])
-
-    @property
-    def keep(self) -> list[str]:
-        """Belief extras to record."""
-        return list(self.config["keep"])
-
-    @property
-    def scoring(self) -> dict[str, float]:
-        """Options of `experiments.evaluation.metrics.score`."""
-        return {name: float(value) for name, value in self.config["scoring"].items()}
-
-    @property
-    def picture(self) -> bool:
-        """Whether a single run is drawn."""
-        return bool(self.config["picture"])
 
     @property
     def rows_folder(self) -> Path:
@@ -258,14 +238,14 @@ class Experiment(Objects):
             )
 
     def _check_team(self) -> None:
-        """Check each robot of a team, and what is of one robot only."""
+        """Check each robot of a team, and what only a robot alone can have."""
         team = self.team
         if team is None:
             return
         kind = find(self.config["estimator"].get("_target_"), "estimator")
         require(
             not inspect.isclass(kind) or hasattr(kind, "step_team"),
-            f"estimator={self.estimator_name} is of one robot; a team takes {OF_TEAMS}",
+            f"estimator={self.estimator_name} localizes one robot; a team takes {OF_TEAMS}",
         )
         if self.option("robots") is not None and not self.from_file:
             self._check_sensors(
@@ -283,7 +263,7 @@ class Experiment(Objects):
             "others may be unknown (team.starts)",
         )
         for key in ("keep", "calibration"):
-            require(not self.config[key], f"{key} is of one robot; leave it out for a team")
+            require(not self.config[key], f"{key} applies to one robot; leave it out for a team")
 
     def _check_sensors(self, who: str, needs: Iterable[str], settings: Config) -> None:
         """Check that the robot has the sensors that an estimator needs."""

@@ -39,7 +39,7 @@ def files_digest(tree: Any) -> dict[str, str]:
 def files_of_options(options: Any) -> dict[str, str]:
     """Digest of every file that an estimator's options name, a list's items included.
 
-    A word without a suffix or a slash is no file, but the name of a sensor or a method.
+    A word without a suffix or a slash is not a file, but the name of a sensor or a method.
     """
     found: dict[str, str] = {}
     for _, value in leaves({"": options}):

@@ -103,7 +103,7 @@ class Objects:
         estimator: Any = self.estimator()
         require(
             hasattr(estimator, "reset_team") and hasattr(estimator, "step_team"),
-            f"estimator={self.estimator_name} is of one robot; a team takes {OF_TEAMS}",
+            f"estimator={self.estimator_name} localizes one robot; a team takes {OF_TEAMS}",
         )
         return cast(TeamEstimator, estimator)
 
@@ -203,7 +203,7 @@ class Objects:
     def _check_one_robot(self) -> None:
         require(
             self.team is None,
-            "team: a recording is of one robot; `estima record` and `estima run` take teams",
+            "team: a recording holds one robot; `estima record` and `estima run` take teams",
         )
 
     def _loaded(self, path: Path) -> Team:
@@ -220,7 +220,7 @@ class Objects:
         return Team((self._calibrated(self._with_classes(recording)),))
 
     def check_size(self, team: Team) -> None:
-        """Check that recordings are of as many robots as the experiment.
+        """Check that there is a recording for each robot of the experiment.
 
         Raises
         ------
@@ -229,7 +229,7 @@ class Objects:
         """
         require(
             self.team is not None or len(team) == 1,
-            "the recording is of a team; choose study=teams",
+            "the recording holds a team; choose study=teams",
         )
         require(
             len(team) == self.size,

@@ -65,7 +65,7 @@ def locked(lock: Path, *, wait: bool = True) -> Iterator[None]:
         If the file cannot be made.
     """
     flags = fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB
-    require_file(lock)  # a pipe would wait for ever
+    require_file(lock)  # a pipe would wait forever
     try:
         lock.parent.mkdir(parents=True, exist_ok=True)
         while True:

@@ -127,7 +127,7 @@ def read_rows(path: Path, remedy: str = "", texts: Sequence[str] = ()) -> pd.Dat
         return read_parquet(path, remedy=remedy).to_pandas(use_threads=False)
     require_file(path)
     with _reading(path, remedy):
-        kinds = dict.fromkeys((*_TEXTS, *texts), "str")  # a digest such as 12e4567 is no number
+        kinds = dict.fromkeys((*_TEXTS, *texts), "str")  # a digest such as 12e4567 is not a number
         return pd.read_csv(path, dtype=kinds, index_col=False)
 
 
@@ -149,7 +149,7 @@ def read_parquet(path: Path, columns: list[str] | None = None, *, remedy: str = 
 
     with _reading(path, remedy):
         if path.exists() and not path.is_file():
-            raise ValueError("not a file")  # a FIFO would wait for ever
+            raise ValueError("not a file")  # a FIFO would wait forever
         content = path.read_bytes()
         named = WITH_DIGEST.fullmatch(path.name)
         if named and hashlib.sha256(content).hexdigest()[:16] != named[1]:

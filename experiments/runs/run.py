@@ -46,7 +46,7 @@ def run_once(experiment: Experiment, draw: Draw, out: Path | None = None) -> lis
         Draws the recordings and estimates of an experiment into a folder.
     out
         File of the first repeat's estimate, the revised one if there is one; None for no file.
-        It is of one robot.
+        It holds one robot.
 
     Raises
     ------
@@ -56,7 +56,7 @@ def run_once(experiment: Experiment, draw: Draw, out: Path | None = None) -> lis
     folder, name = experiment.rows_folder / experiment.key, experiment.estimator_name
     require(
         out is None or experiment.team is None,
-        f"-o {out}: one file is of one robot; those of a team are in the folder of its run",
+        f"-o {out}: one file holds one robot; the estimates of a team are in the folder of its run",
     )
     found: list[tuple[Recording, Estimate]] = []
 
@@ -64,7 +64,12 @@ def run_once(experiment: Experiment, draw: Draw, out: Path | None = None) -> lis
         with shown("simulated seconds", expected_s(experiment)) as on_progress:
             read = experiment.recordings(on_progress)
         slip = experiment.believed_slip
-        if len(read) == 1 and "source" in read.only.config and not experiment.calibrated and slip:
+        if (
+            len(read) == 1
+            and "source" in read.only.config
+            and slip
+            and experiment.config["calibration"] is None
+        ):
             show(
                 f"believed of this real robot: kr={slip[0]:g} and kl={slip[1]:g} m, and the "
                 "geometry that the log's reader assumes; to find its own: "
@@ -95,7 +100,7 @@ def run_once(experiment: Experiment, draw: Draw, out: Path | None = None) -> lis
             on_estimate=keep,
             on_error=_trace,
         )
-    if found and experiment.picture:
+    if found and experiment.config["picture"]:
         draw(found, experiment, folder)
     if found and out is not None:
         write_estimate(out, found[0][1])

@@ -236,7 +236,7 @@ def describe_option(group: str, name: str) -> str:
     Raises
     ------
     InputError
-        If there is no such group, or what the option names cannot be found.
+        If the group is unknown, or what the option names cannot be found.
     """
     require(group in GROUPS, f"no group {group}; there are: {', '.join(GROUPS)}")
     with initialize_config_dir(str(CONF), version_base="1.3"):

@@ -233,7 +233,7 @@ def score_files(
     """
     folder = rows_folder(name)
     alone = len(trajectories) == 1 or (estimator is None and how.cpu_seconds is None)
-    require(alone, "--as and --cpu-seconds are of one trajectory; score them one by one")
+    require(alone, "--as and --cpu-seconds apply to one trajectory; score them one by one")
     names = [estimator or trajectory.stem for trajectory in trajectories]
     require(
         len(set(names)) == len(names),

@@ -27,7 +27,7 @@ def stream(seed: int, axis: str, index: int = 0, *, key: str = "seed") -> np.ran
     Raises
     ------
     InputError
-        If the seed is no such number.
+        If the seed is anything else.
     """
     whole = isinstance(seed, int) and not isinstance(seed, bool)
     require(whole and seed >= 0, f"{key} must be a whole number from 0 on, got {seed!r}")

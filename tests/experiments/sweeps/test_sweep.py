@@ -539,7 +539,7 @@ def test_what_hydra_would_ignore_is_refused(arguments, words):
         (["robot.kr=range(0,inf,0.1)"], "at most 100,000,000 runs"),
         (["seed=range(0,20000)", "robot.kr=range(0,10000)"], "2e[+]08 runs: a sweep has at most"),
         (["seed=range(0,5,0)"], "step of a range must not be 0"),
-        (["seed=1,2", "hydra.searchpath=[file:///nope]"], "there is no folder /nope"),
+        (["seed=1,2", "hydra.searchpath=[file:///nope]"], "no folder /nope"),
     ],
 )
 def test_what_cannot_be_planned_is_refused_before_it_is_listed(arguments, words):
