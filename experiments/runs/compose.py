@@ -37,6 +37,13 @@ from sim.files import write_text
 from sim.yaml_file import read_yaml
 
 _READ_OF_HYDRA = ("hydra/launcher", "hydra.launcher", "hydra.searchpath")
+_REMEDIES = {  # by the beginning of a setting that nothing reads
+    "hydra/sweeper": "-m runs every combination of the values; an optimizer may call estima.sweep "
+    "from Python",
+    "hydra.sweeper": "give the values themselves, such as seed=1,2",
+    "hydra.verbose": "nothing is logged; a failed run's row says how",
+    "": "rows go to results/runs/NAME: set name, or --results for another folder",
+}
 
 
 @dataclass(frozen=True)
@@ -203,8 +210,8 @@ class CommandLine:
 
 def option_called(group: str, name: str, config_dir: str | Path | None = None) -> str:
     """The option of a group that has this name, such as `peers/kiss_icp`; else the name itself."""
-    folders = [None, *([Path(config_dir)] if config_dir else [])]
-    every = [option for folder in folders for option in paths.option_names(group, folder)]
+    folders = (paths.CONF, *filter(None, [config_dir]))
+    every = (option for folder in folders for option in paths.option_names(group, Path(folder)))
     return next((option for option in every if option.rpartition("/")[2] == name), name)
 
 
@@ -357,17 +364,11 @@ def check_hydra(overrides: Sequence[str]) -> None:
     """
     for override in overrides:
         key = override.lstrip("+~").partition("=")[0]
-        if re.match(r"hydra\b", key) is None or key.startswith(_READ_OF_HYDRA):
-            continue
-        remedies = {
-            "hydra/sweeper": "-m runs every combination of the values; an optimizer may call "
-            "estima.sweep from Python",
-            "hydra.sweeper": "give the values themselves, such as seed=1,2",
-            "hydra.verbose": "nothing is logged; a failed run's row says how",
-        }
-        usual = "rows go to results/runs/NAME: set name, or --results for another folder"
-        remedy = next((remedies[start] for start in remedies if key.startswith(start)), usual)
-        raise InputError(f"{override}: {key} has no effect here; {remedy}")
+        remedy = next(text for start, text in _REMEDIES.items() if key.startswith(start))
+        require(
+            re.match(r"hydra\b", key) is None or key.startswith(_READ_OF_HYDRA),
+            f"{override}: {key} has no effect here; {remedy}",
+        )
 
 
 def check_overrides(overrides: Sequence[str]) -> None:

@@ -1,6 +1,5 @@
 """Terminal output: progress, and the one line that ends a failed command."""
 
-import importlib
 import math
 import signal
 import sys
@@ -149,20 +148,18 @@ def _in_defaults(error: BaseException) -> bool:
 def _refusal(error: BaseException) -> str | None:
     """Say what Hydra could not find, and what there is; None if the error is another."""
     missing, options = (getattr(error, name, None) for name in ("missing_cfg_file", "options"))
-    if missing and options:
-        group, _, name = missing.rpartition("/")
-        every = sorted({*options, *option_names(group)})
-        return f"no {group} named {name}; there are: {', '.join(every)}"
-    return None
+    if not (missing and options):
+        return None
+    group, _, name = missing.rpartition("/")
+    every = sorted({*options, *option_names(group)})
+    return f"no {group} named {name}; there are: {', '.join(every)}"
 
 
 def _configuration_errors() -> tuple[type[Exception], ...]:
     """Errors of Hydra, OmegaConf and YAML, if they have been imported."""
-    if "hydra" not in sys.modules:
-        return ()
-    hydra, omegaconf = (importlib.import_module(f"{n}.errors") for n in ("hydra", "omegaconf"))
-    malformed = importlib.import_module("yaml").YAMLError
-    return (hydra.HydraException, omegaconf.OmegaConfBaseException, malformed)
+    names = ("hydra.errors.HydraException", "omegaconf.errors.OmegaConfBaseException")
+    places = [name.rpartition(".") for name in (*names, "yaml.YAMLError")]
+    return tuple(getattr(sys.modules[m], name) for m, _, name in places if m in sys.modules)
 
 
 def counted(n: int, what: str) -> str:

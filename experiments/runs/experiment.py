@@ -251,8 +251,7 @@ class Experiment(Objects):
             self._check_sensors(
                 f"estimator={self.estimator_name}", ["robots"], self.config["estimator"]
             )
-        for number in range(team.size):
-            own = self.of_robot(number)
+        for number, own in enumerate(map(self.of_robot, range(team.size))):
             try:
                 own.robot(), own.sensors(), own.route()
             except InputError as error:

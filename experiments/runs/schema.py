@@ -119,7 +119,7 @@ KEYS += ("repeats", "keep", "picture")
 
 def unknown(key: str, known: Iterable[str]) -> str:
     """Say that a key is unknown, and which ones are known, the nearest spelled first."""
-    names = list(dict.fromkeys(known))
+    names = list(known)
     near = difflib.get_close_matches(key, names, n=3)
     return f"unknown key {key}; known: {', '.join(dict.fromkeys([*near, *names])) or 'none'}"
 
@@ -254,9 +254,8 @@ def _said(target: Callable[..., Any], stated: Mapping[str, Any]) -> Iterator[str
     """A line for each option, and one of its meaning."""
     for option in _options(target):
         value = stated.get(option.name, option.default)
-        shown = "needed" if value is dataclasses.MISSING else "null" if value is None else value
-        if isinstance(value, bool):
-            shown = str(value).lower()
+        words = {dataclasses.MISSING: "needed", None: "null", True: "true", False: "false"}
+        shown = next((said for known, said in words.items() if value is known), value)
         yield f"  {option.name}: {shown}" + (f"  ({option.accepts})" if option.accepts else "")
         if option.meaning:
             yield f"      {option.meaning}"
@@ -310,8 +309,7 @@ def own_config(config: Config, settings: TeamSettings, number: int) -> Config:
         where = f"team.robots[{number}].{group}"
         require(group in _OWN, f"unknown key {where}; known: {', '.join(_OWN)}")
         require(isinstance(values, Mapping), f"{where} must hold keys, got {values!r}")
-        for key in values:
-            known = (f"{where}.{name}" for name in own[group])
-            require(key in own[group], unknown(f"{where}.{key}", known))
+        for key in [key for key in values if key not in own[group]]:
+            raise InputError(unknown(f"{where}.{key}", (f"{where}.{name}" for name in own[group])))
         own[group] = {**own[group], **values}
     return own

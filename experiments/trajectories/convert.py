@@ -120,9 +120,9 @@ def _slip(recording: Recording) -> tuple[float, float] | None:
     made_with = recording.config.get("robot")
     if not isinstance(made_with, dict):  # of a log of many robots, the number of one
         return None
-    slip = [made_with.get(name) for name in ("kr", "kl")]
-    known = [float(k) for k in slip if isinstance(k, (int, float)) and 0.0 <= k < math.inf]
-    return (known[0], known[1]) if len(known) == 2 else None
+    kr, kl = made_with.get("kr"), made_with.get("kl")
+    sound = all(isinstance(k, (int, float)) and 0.0 <= k < math.inf for k in (kr, kl))
+    return (float(kr), float(kl)) if sound else None
 
 
 def convert_log(
