@@ -210,8 +210,8 @@ class CommandLine:
 
 def option_called(group: str, name: str, config_dir: str | Path | None = None) -> str:
     """The option of a group that has this name, such as `peers/kiss_icp`; else the name itself."""
-    folders = (paths.CONF, *filter(None, [config_dir]))
-    every = (option for folder in folders for option in paths.option_names(group, Path(folder)))
+    folders = [paths.CONF, *([Path(config_dir)] if config_dir else [])]
+    every = (option for folder in folders for option in paths.option_names(group, folder))
     return next((option for option in every if option.rpartition("/")[2] == name), name)
 
 

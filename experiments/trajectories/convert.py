@@ -120,7 +120,7 @@ def _slip(recording: Recording) -> tuple[float, float] | None:
     made_with = recording.config.get("robot")
     if not isinstance(made_with, dict):  # of a log of many robots, the number of one
         return None
-    kr, kl = made_with.get("kr"), made_with.get("kl")
+    kr, kl = made_with.get("kr", math.nan), made_with.get("kl", math.nan)
     sound = all(isinstance(k, (int, float)) and 0.0 <= k < math.inf for k in (kr, kl))
     return (float(kr), float(kl)) if sound else None
 
