@@ -520,7 +520,7 @@ def test_the_last_value_of_a_key_decides_a_sweeps_own_name():
         (["-m", "hydra/sweeper=optuna"], ["hydra/sweeper", "every combination"]),
         (["-m", "hydra.sweep.dir=/tmp/x"], ["hydra.sweep.dir", "set name"]),
         (["hydra.run.dir=/tmp/x"], ["hydra.run.dir", "--results"]),
-        (["hydra.verbose=true"], ["hydra.verbose", "no log"]),
+        (["hydra.verbose=true"], ["hydra.verbose", "nothing is logged"]),
         (["-m", "robot.kr=interval(0,1)"], ["interval(0,1)", "range(0,1,0.1)"]),
         (["-m", "route=glob(nothing*)"], ["empty range or list"]),
         (["-m", "--info"], ["--info", "--config-dir"]),
