@@ -199,19 +199,18 @@ def run(*given: Any, estimator: str | Estimator | None = None) -> Run:
     sim.errors.InputError: estimator=ekf_icp needs a sensor laser, and sensors=encoder has none; try sensors=hokuyo, laser_stereo, laser_stereo_lidar3d, lms291, real_laser
     """  # noqa: E501 the message is one line
     from experiments.runs.evaluate import evaluate
-    from sim.errors import InputError
+    from sim.errors import require
     from sim.team import Team
 
     recording = given[0] if given and not isinstance(given[0], str) else None
     overrides = given if recording is None else given[1:]
     named = [f"estimator={estimator}"] if isinstance(estimator, str) else []
     experiment = _experiment((*named, *overrides))
-    if experiment.team is not None:
-        raise InputError("team: estima.run is of one robot; estima.sweep runs teams")
-    if experiment.repeats != 1:
-        raise InputError(
-            f"estima.run makes one run; use estima.sweep for repeats={experiment.repeats}"
-        )
+    require(experiment.team is None, "team: estima.run takes one robot; estima.sweep runs teams")
+    require(
+        experiment.repeats == 1,
+        f"estima.run makes one run; use estima.sweep for repeats={experiment.repeats}",
+    )
     if not (estimator is None or isinstance(estimator, str)):
         experiment = experiment.using(estimator)
     if recording is not None:
@@ -235,7 +234,7 @@ def score(recording: Recording, estimate: Estimate) -> dict[str, float]:
     Raises
     ------
     InputError
-        If it is no Estimate, or shares no time with the truth.
+        If it is not an Estimate, or shares no time with the truth.
 
     Examples
     --------
@@ -247,12 +246,12 @@ def score(recording: Recording, estimate: Estimate) -> dict[str, float]:
     """
     from estimators.base import Estimate
     from experiments.evaluation.metrics import score
-    from sim.errors import InputError
+    from sim.errors import require
 
-    if not isinstance(estimate, Estimate):
-        raise InputError(
-            f"estima.score takes an Estimate, such as run.online, got {type(estimate).__name__}"
-        )
+    require(
+        isinstance(estimate, Estimate),
+        f"estima.score takes an Estimate, such as run.online, got {type(estimate).__name__}",
+    )
     return score(recording, estimate)
 
 
@@ -334,7 +333,7 @@ def plot(
     Raises
     ------
     InputError
-        If there is no such column, it holds no numbers to average, or the table is not a sweep's.
+        If the column is missing, it holds no numbers to average, or the table is not a sweep's.
 
     Examples
     --------
@@ -346,13 +345,13 @@ def plot(
     """
     from experiments.report.plot import sweep_figure
     from experiments.runs.row import Outcome
-    from sim.errors import InputError
+    from sim.errors import require
 
     for column in ("status", "recording_checksum"):
-        if column not in table:
-            raise InputError(
-                f"the table has no column {column}; estima.plot takes what estima.sweep returned"
-            )
+        require(
+            column in table,
+            f"the table has no column {column}; estima.plot takes what estima.sweep returned",
+        )
     rows = table[table["status"] != Outcome.FAILED]
     figure = sweep_figure(rows, x, y, by, row=row, col=col, size=size, pool=pool)
     return _saved(figure, path)

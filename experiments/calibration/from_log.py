@@ -134,7 +134,12 @@ def calibrate_against(reference: Reference, part: Recording) -> Found:
         "wheels.delay_s": delay,
         **slip_intervals,
     }
-    wheels = Wheels(right.value, left_one.value, track_m.value, delay.value)
+    wheels = Wheels(
+        gain_right=right.value,
+        gain_left=left_one.value,
+        track_m=track_m.value,
+        delay_s=delay.value,
+    )
     sensors: dict[str, SensorBelief] = {}
     left = [np.zeros(0)] * 4
     lasers = [name for name in part.logs if isinstance(part.sensors[name], Laser)]
@@ -144,7 +149,7 @@ def calibrate_against(reference: Reference, part: Recording) -> Found:
         if by_scans:
             # the reference moves the laser as the log mounts it; the mount found comes before that
             x, y, yaw = moved = se2.compose(mount, laser.mount.pose)
-            found = SensorBelief(float(x), float(y), float(yaw))
+            found = SensorBelief(x_m=float(x), y_m=float(y), yaw_rad=float(yaw))
             for (key, known), value, by in zip(
                 mount_intervals.items(), moved, moved - mount, strict=True
             ):

@@ -95,7 +95,15 @@ def camera_noise(
     by_square = MAD * np.median(np.abs(found[0, near] / depth[near]))
     disparity_px = camera.focal_px * camera.baseline_m * by_square
     scale, x, y, yaw = map(float, fit.x)
-    belief = SensorBelief(x, y, yaw, scale, delay_s, None, float(sigma_px), float(disparity_px))
+    belief = SensorBelief(
+        x_m=x,
+        y_m=y,
+        yaw_rad=yaw,
+        scale=scale,
+        delay_s=delay_s,
+        sigma_column_px=float(sigma_px),
+        sigma_disparity_px=float(disparity_px),
+    )
     n_out = int(np.sum(finite & ~near))
     names = ("scale", "x_m", "y_m", "yaw_rad")
     intervals = {

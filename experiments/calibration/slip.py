@@ -67,7 +67,7 @@ def slip_of_blocks(
         f"slip.{name}": Interval(float(v), float(a), float(b))
         for name, v, a, b in zip(names, values, low, high, strict=True)
     }
-    return Slip(*map(float, values)), found
+    return Slip(**dict(zip(names, map(float, values), strict=True))), found
 
 
 def lasting_blocks(alike: float) -> float:

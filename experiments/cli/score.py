@@ -80,9 +80,9 @@ def score(
 
       estima score run.npz batch.tum --revised --cpu-seconds 2.5 --name leaderboard
     """
-    from experiments.runs.score import as_scoring, as_text, score_files
+    from experiments.runs.score import Scoring, as_text, score_files
 
-    how = as_scoring(
+    how = Scoring(
         **dataclasses.asdict(matching), revised=made.revised, cpu_seconds=made.cpu_seconds
     )
     results = score_files(
@@ -118,10 +118,10 @@ def compare(
 
       estima compare reference.tum mine.tum --align se2
     """
-    from experiments.runs.score import as_scoring
+    from experiments.runs.score import Scoring
     from experiments.viewing.compare import compare_files
 
-    how = as_scoring(**dataclasses.asdict(matching))
+    how = Scoring(**dataclasses.asdict(matching))
     table = compare_files(trajectories, recording, out, how, topic)
     show(table.to_string(index=False, na_rep="-", float_format=lambda v: f"{v:.4g}"))
     print(out)

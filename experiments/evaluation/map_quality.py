@@ -21,7 +21,7 @@ def landmark_errors(recording: Recording, made: Any) -> dict[str, float]:
     """Score a map of landmarks: their number, and RMS distances from the true ones.
 
     Each landmark is compared with the true one of the observation that started it. The second RMS
-    is after the rigid motion in the plane that fits best. Nothing for what is no map of two
+    is after the rigid motion in the plane that fits best. Nothing for what is not a map of two
     landmarks or more, and for a recording without true landmarks.
 
     Parameters

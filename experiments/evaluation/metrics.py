@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from estimators.base import Estimate
 from sim import se2
 from sim.arrays import Array
-from sim.errors import InputError, require
+from sim.errors import require
 from sim.recording import Recording
 
 CHI2_95_2DOF = 5.991464547107979  # 95 % quantile of chi-square with two degrees of freedom
@@ -172,15 +172,15 @@ def score(
     late = estimate.stamps >= recording.frame_stamps[0] + after_s
     require(late.any(), f"scoring.after_s={after_s:g} is beyond the end of the recording")
     known = np.isfinite(truth).all(axis=1) & late
-    if not known.any():
-        spanned = np.isfinite(recording.truth_at(estimate.stamps)).any()
-        complaint = "no estimate lies within the truth's time span; are the clocks the same?"
-        if spanned:
-            complaint = (
-                f"no estimate lies within {longest_gap_s:g} s between two true poses; raise "
-                "scoring.longest_gap_s"
-            )
-        raise InputError(complaint)
+    require(
+        known.any() or np.isfinite(recording.truth_at(estimate.stamps)).any(),
+        "no estimate lies within the truth's time span; are the clocks the same?",
+    )
+    require(
+        known.any(),
+        f"no estimate lies within {longest_gap_s:g} s between two true poses; raise "
+        "scoring.longest_gap_s",
+    )
     row |= {"stamps_scored": float(known.sum()), "stamps_left_out": float((~known).sum())}
     covariances = estimate.covariances[known]
     return row | path_scores(truth[known], estimate.means[known], covariances)

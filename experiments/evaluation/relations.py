@@ -8,15 +8,13 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from experiments.evaluation.time_sync import interpolate, nearest
+from experiments.evaluation.time_sync import Rows, interpolate, nearest
 from sim import se2
 from sim.arrays import Array
 from sim.errors import require
 from sim.formats.relations import Relations
 
-Rows = NDArray[np.int64]
 Association = Literal["near", "interpolated"]
 
 

@@ -43,8 +43,8 @@ def share_interval(hits: int, trials: int) -> Interval:
     """Share of hits with its Clopper-Pearson interval; without bounds for no trial."""
     if trials == 0:
         return Interval(math.nan, math.nan, math.nan)
-    found = stats.binomtest(hits, trials).proportion_ci(0.95, "exact")
-    return Interval(hits / trials, float(found.low), float(found.high))
+    bounds = stats.binomtest(hits, trials).proportion_ci(0.95, "exact")
+    return Interval(hits / trials, float(bounds.low), float(bounds.high))
 
 
 def bootstrap_interval(

@@ -4,22 +4,17 @@ It holds at most $ESTIMA_CACHE_GIB (8 unless set); the least recently used go fi
 """
 
 import dataclasses
-import fcntl
-import hashlib
-import json
 import os
 import sys
 import time
 import zlib
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 from experiments.runs import paths
 from experiments.runs.processes import locked
-from experiments.runs.version import SIMULATION, code_version
-from sim.errors import InputError
+from sim.errors import InputError, require
 from sim.files import require_file
 from sim.recording import Recording, load, save
 
@@ -34,12 +29,6 @@ def folder() -> Path:
     return paths.results() / "cache" / "recordings"
 
 
-def key_of(settings: dict[str, Any]) -> str:
-    """Digest of the settings and of the simulator's code: what decides a recording's bits."""
-    text = json.dumps({"settings": settings, "code": code_version(SIMULATION)}, sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()[:24]
-
-
 def cached(key: str, make: Callable[[], Recording]) -> Recording:
     """Recording of the key, from the cache, or made now and cached.
 
@@ -48,7 +37,7 @@ def cached(key: str, make: Callable[[], Recording]) -> Recording:
     """
     path = folder() / f"{key}.npz"
     limit = limit_bytes()
-    with _locked(path):
+    with locked(path.with_suffix(".lock")):
         if path.exists():
             require_file(path)
             try:
@@ -62,7 +51,8 @@ def cached(key: str, make: Callable[[], Recording]) -> Recording:
         entry = dataclasses.replace(recording, config={**recording.config, _KEY: key})
         save(entry, path, durable=False)
         size = path.stat().st_size
-    if _draw(key) * limit < size * _TRIMS_PER_LIMIT:
+    draw = zlib.crc32(key.encode()) / 2**32  # from 0 to 1: trimming looks at every file
+    if draw * limit < size * _TRIMS_PER_LIMIT:
         trim(limit)
     return recording
 
@@ -70,15 +60,9 @@ def cached(key: str, make: Callable[[], Recording]) -> Recording:
 def _entry(path: Path, key: str) -> Recording:
     """Read a recording of the cache, which holds its own key, under its checksum."""
     entry = load(path)
-    if entry.config.get(_KEY) != key:
-        raise InputError(f"{path}: the recording of another key")
+    require(entry.config.get(_KEY) == key, f"{path}: the recording of another key")
     settings = {name: value for name, value in entry.config.items() if name != _KEY}
     return dataclasses.replace(entry, config=settings)
-
-
-def _draw(key: str) -> float:
-    """A number from 0 to 1 by a key, so that trimming, which looks at every file, is rare."""
-    return zlib.crc32(key.encode()) / 2**32
 
 
 def limit_bytes() -> float:
@@ -118,9 +102,7 @@ def trim(most_bytes: float) -> int:
     kept, dropped = files(), 0
     excess = sum(size for _, size in kept) - most_bytes
     for path, size in kept:
-        if excess <= 0.0:
-            break
-        if _dropped(path):
+        if excess > 0.0 and _dropped(path):
             excess -= size
             dropped += 1
     return dropped
@@ -128,13 +110,9 @@ def trim(most_bytes: float) -> int:
 
 def _dropped(path: Path) -> bool:
     """Drop a recording, unless a process is reading or writing it; return whether it is gone."""
-    lock = path.with_suffix(".lock")
-    require_file(lock)
     try:
-        with lock.open("w") as handle:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        with locked(path.with_suffix(".lock"), wait=False):
             path.unlink(missing_ok=True)
-            lock.unlink(missing_ok=True)
     except BlockingIOError:
         return False
     except OSError as error:
@@ -142,18 +120,3 @@ def _dropped(path: Path) -> bool:
             f"{path}: cannot delete it ({error.strerror}); make its folder writable"
         ) from error
     return True
-
-
-@contextmanager
-def _locked(path: Path) -> Iterator[None]:
-    """Hold an exclusive lock on an entry."""
-    with ExitStack() as held:
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            held.enter_context(locked(path.with_suffix(".lock")))
-        except OSError as error:
-            raise InputError(
-                f"{path}: cannot lock it in the cache ({error.strerror}); free some space, or "
-                "choose another folder of results with ESTIMA_RESULTS"
-            ) from error
-        yield

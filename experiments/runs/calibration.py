@@ -1,107 +1,72 @@
 """What is believed of a real robot: the YAML file of `estima calibrate LOG`, and its use."""
 
 import dataclasses
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import yaml
+from pydantic import Field
 
 from sim.errors import InputError, require
 from sim.files import write_text
 from sim.formats.assemble import frame_stamps
-from sim.options import build
+from sim.options import NonNegative, Positive, build, options
 from sim.recording import Log, Recording, WheelLog
 from sim.robot.drive import RobotGeometry
 from sim.sensors import Laser, RobotCamera, StereoCamera
 from sim.sensors.base import Sensor
 from sim.yaml_file import read_yaml
 
-_LONGEST_DELAY_S = 60.0
+Delay = Annotated[float, Field(gt=-60.0, lt=60.0), "a number of seconds below a minute"]
 
 
-def _check_numbers(
-    where: str, settings: object, positive: tuple[str, ...] = (), not_negative: tuple[str, ...] = ()
-) -> None:
-    """Check that attributes are finite and positive, or at least not negative."""
-    for name in (*positive, *not_negative):
-        value = getattr(settings, name)
-        wanted = "a positive number" if name in positive else "zero or a positive number"
-        require(
-            math.isfinite(value) and (value > 0.0 or (value == 0.0 and name in not_negative)),
-            f"{where}.{name} must be {wanted}, got {value}",
-        )
-
-
-@dataclass(frozen=True)
+@options("wheels")
 class Wheels:
-    """How the wheels' log becomes travel on the ground.
+    """How the wheels' log becomes travel on the ground."""
 
-    Attributes
-    ----------
-    gain_right, gain_left
-        Ground travel over logged travel.
-    track_m
-        Effective distance of the wheels.
-    delay_s
-        Added to the stamps of the wheels: positive if they are ahead of what they drive.
-    """
-
-    gain_right: float
-    gain_left: float
-    track_m: float
-    delay_s: float
-
-    def __post_init__(self) -> None:
-        _check_numbers("wheels", self, ("gain_right", "gain_left", "track_m"))
-        require(abs(self.delay_s) < _LONGEST_DELAY_S, "wheels.delay_s must be below a minute")
+    gain_right: Positive
+    """Ground travel over logged travel."""
+    gain_left: Positive
+    track_m: Positive
+    """Effective distance of the wheels."""
+    delay_s: Delay
+    """Added to the stamps of the wheels: positive if they are ahead of what they drive."""
 
 
-@dataclass(frozen=True)
+@options("slip")
 class Slip:
-    """Variance per metre of each wheel, m, and of what both slip together, which may last, m."""
+    """Slip of the wheels."""
 
-    kr: float
-    kl: float
-    forward_slip_m: float
-    forward_slip_length_m: float = 0.0
+    kr: NonNegative
+    """Variance per metre of the right wheel, m."""
+    kl: NonNegative
+    """Of the left one."""
+    forward_slip_m: NonNegative
+    """Variance per metre of what both slip together, m."""
+    forward_slip_length_m: NonNegative = 0.0
+    """How far that lasts, m."""
 
-    def __post_init__(self) -> None:
-        _check_numbers("slip", self, (), ("kr", "kl", "forward_slip_m", "forward_slip_length_m"))
 
-
-@dataclass(frozen=True)
+@options("sensors")
 class SensorBelief:
-    """What is believed of a laser or a camera of landmarks.
-
-    Attributes
-    ----------
-    x_m, y_m, yaw_rad
-        Its mount on the robot; None: as the log has it.
-    scale
-        Logged range over true range.
-    delay_s
-        Added to its stamps.
-    sigma_range_m
-        Of a laser.
-    sigma_column_px, sigma_disparity_px
-        Of a camera.
-    """
+    """What is believed of a laser or a camera of landmarks; None: as the log has it."""
 
     x_m: float | None = None
+    """Of its mount on the robot."""
     y_m: float | None = None
     yaw_rad: float | None = None
-    scale: float = 1.0
-    delay_s: float = 0.0
+    scale: Positive = 1.0
+    """Logged range over true range."""
+    delay_s: Delay = 0.0
+    """Added to its stamps."""
     sigma_range_m: float | None = None
+    """Of a laser."""
     sigma_column_px: float | None = None
+    """Of a camera."""
     sigma_disparity_px: float | None = None
-
-    def __post_init__(self) -> None:
-        _check_numbers("sensors", self, ("scale",))
-        require(abs(self.delay_s) < _LONGEST_DELAY_S, "sensors.delay_s must be below a minute")
+    """Of a camera."""
 
 
 @dataclass(frozen=True)
@@ -152,19 +117,19 @@ def _believed(name: str, sensor: Sensor, belief: SensorBelief) -> Sensor:
         isinstance(sensor, (Laser, StereoCamera, RobotCamera)),
         f"calibration: {name} is a {type(sensor).__name__}; only a Laser or a StereoCamera has one",
     )
-    placed = {key: getattr(belief, key) for key in ("x_m", "y_m", "yaw_rad")}
-    mount = {key: value for key, value in placed.items() if value is not None}
-    sigmas = {
-        key: value
-        for key, value in vars(belief).items()
-        if key.startswith("sigma") and value is not None
-    }
-    of_kind = {f.name for f in dataclasses.fields(sensor)}  # type: ignore[arg-type]
-    strange = ", ".join(sigmas.keys() - of_kind)
+    stated = _stated(belief)
+    mount = {key: stated[key] for key in ("x_m", "y_m", "yaw_rad") if key in stated}
+    sigmas = {key: value for key, value in stated.items() if key.startswith("sigma")}
+    strange = ", ".join(sigmas.keys() - {f.name for f in dataclasses.fields(sensor)})  # type: ignore[arg-type]
     require(not strange, f"calibration: {name}, a {type(sensor).__name__}, has no {strange}")
     mounted = dataclasses.replace(sensor.mount, **mount)  # type: ignore[attr-defined]
     changed: Sensor = dataclasses.replace(sensor, mount=mounted, **sigmas)  # type: ignore[type-var]
     return changed
+
+
+def _stated(believed: Any) -> dict[str, float]:
+    """The fields of an options class that are not None."""
+    return {key: v for key, v in dataclasses.asdict(believed).items() if v is not None}
 
 
 def _corrected(log: Log, belief: SensorBelief) -> Log:
@@ -206,15 +171,11 @@ def read_calibration(path: Path) -> Calibration:
 
 def write_calibration(path: Path, found: Calibration, intervals: Mapping[str, list[float]]) -> None:
     """Write a calibration, and the 95 % intervals of what was estimated, which nothing reads."""
-    sensors = {
-        name: {key: value for key, value in vars(belief).items() if value is not None}
-        for name, belief in found.sensors.items()
-    }
     document = {
-        "wheels": vars(found.wheels),
-        "slip": vars(found.slip),
-        "sensors": sensors,
-        "intervals": dict(intervals),
+        "wheels": _stated(found.wheels),
+        "slip": _stated(found.slip),
+        "sensors": {name: _stated(belief) for name, belief in found.sensors.items()},
+        "intervals": intervals,
     }
     rounded = yaml.safe_dump(_rounded(document), sort_keys=False, default_flow_style=None)
     write_text(path, "# Made by `estima calibrate`; read by `estima run calibration=`\n" + rounded)

@@ -23,11 +23,13 @@ from experiments.runs.calibration import read_calibration
 from experiments.runs.key import digest_of
 from experiments.runs.schema import (
     GROUPS,
+    KEYS,
     Config,
-    check_known,
     check_shape,
     fill,
     leaves,
+    select,
+    unknown,
     unknown_key,
 )
 from sim.errors import InputError, require
@@ -35,6 +37,13 @@ from sim.files import write_text
 from sim.yaml_file import read_yaml
 
 _READ_OF_HYDRA = ("hydra/launcher", "hydra.launcher", "hydra.searchpath")
+_REMEDIES = {  # by the beginning of a setting that nothing reads
+    "hydra/sweeper": "-m runs every combination of the values; an optimizer may call estima.sweep "
+    "from Python",
+    "hydra.sweeper": "give the values themselves, such as seed=1,2",
+    "hydra.verbose": "nothing is logged; a failed run's row says how",
+    "": "rows go to results/runs/NAME: set name, or --results for another folder",
+}
 
 
 @dataclass(frozen=True)
@@ -75,8 +84,8 @@ class Composed:
             config.pop(of_sweeps, None)
         check_shape(config)
         simulation = config["simulation"]
-        if simulation["rays"] is None:
-            kinematic = simulation["physics"] == "kinematic"  # it has no engine to cast rays
+        if simulation.get("rays") is None:
+            kinematic = simulation.get("physics") == "kinematic"  # it has no engine to cast rays
             simulation["rays"] = "exact" if kinematic else "bullet"
         # an option of a folder, such as peers/kiss_icp, is called by its last part
         named = {group: str(self.choices.get(group)).rpartition("/")[2] for group in GROUPS}
@@ -107,14 +116,12 @@ class Composer:
         Raises
         ------
         InputError
-            If an override is of a key that is not known.
+            If an override names an unknown key.
         """
         check_overrides(overrides)
         each = [self.parse(override) for override in overrides]
-        options = [o for o in each if not self.is_plain(o)]
-        plain = [o for o in each if self.is_plain(o)]
-        targets = [o for o in plain if o.key_or_group.endswith("_target_")]
-        base = self._base(options, targets)
+        options, plain = ([o for o in each if self.is_plain(o) == kind] for kind in (False, True))
+        base = self._base(options, [o for o in plain if o.key_or_group.endswith("_target_")])
         _check_calibrated(each)
         cfg = base.cfg.copy()
         for override in plain:
@@ -141,10 +148,8 @@ class Composer:
 
     def is_plain(self, override: Override) -> bool:
         """Whether it only sets a value, rather than choosing an option or adding a key."""
-        if override.is_add() or override.is_force_add() or override.is_delete():
-            return False
-        key = override.key_or_group
-        if key.startswith("hydra."):
+        key, adds = override.key_or_group, override.is_add() or override.is_force_add()
+        if adds or override.is_delete() or key.startswith("hydra."):
             return False
         if key not in self._is_group:  # slow to ask for
             loader = GlobalHydra.instance().config_loader()
@@ -205,8 +210,8 @@ class CommandLine:
 
 def option_called(group: str, name: str, config_dir: str | Path | None = None) -> str:
     """The option of a group that has this name, such as `peers/kiss_icp`; else the name itself."""
-    folders = [None, *([Path(config_dir)] if config_dir else [])]
-    every = [option for folder in folders for option in paths.option_names(group, folder)]
+    folders = [paths.CONF, *([Path(config_dir)] if config_dir else [])]
+    every = (option for folder in folders for option in paths.option_names(group, folder))
     return next((option for option in every if option.rpartition("/")[2] == name), name)
 
 
@@ -230,23 +235,14 @@ def set_value(cfg: DictConfig, key: str, value: Any) -> None:
     InputError
         If it has none of that name.
     """
-    if not _has(cfg, key):
-        raise InputError(unknown_key(key, cfg))
-    OmegaConf.update(cfg, key, value, merge=True)
-
-
-def _has(cfg: DictConfig, key: str) -> bool:
-    """Whether the configuration has the key, even if its value is still missing."""
     parent, _, leaf = key.rpartition(".")
     node = select(cfg, parent) if parent else cfg
+    names: Collection[Any] = node.keys() if isinstance(node, DictConfig) else ()
     if isinstance(node, ListConfig):
-        return leaf.isdecimal() and int(leaf) < len(node)
-    return isinstance(node, DictConfig) and leaf in node.keys()  # noqa: SIM118 `in node` says no to ???
-
-
-def select(cfg: DictConfig, key: str) -> Any:
-    """What stands at a key; None if it cannot be resolved."""
-    return OmegaConf.select(cfg, key, throw_on_resolution_failure=False)
+        names = [str(place) for place in range(len(node))]
+    if leaf not in names:
+        raise InputError(unknown_key(key, cfg))
+    OmegaConf.update(cfg, key, value, merge=True)
 
 
 def _believe(cfg: DictConfig) -> None:
@@ -257,7 +253,8 @@ def _believe(cfg: DictConfig) -> None:
     require(isinstance(path, str) and path, f"calibration must be a path or null, got {path!r}")
     require(
         cfg.get("recording") is not None,
-        "calibration is of a real log: set recording too, made by `estima convert LOG -o FILE.npz`",
+        "calibration belongs to a real log: set recording too, made by `estima convert LOG -o "
+        "FILE.npz`",
     )
     slip = read_calibration(Path(path)).slip
     for key in ("kr", "kl"):
@@ -272,22 +269,22 @@ def searched(config_dir: str | Path | None) -> list[str]:
     Raises
     ------
     InputError
-        If there is no such folder, or one of its options is no YAML that can be read.
+        If the folder does not exist, or the YAML of one of its options cannot be read.
     """
     if config_dir is None:
         return []
     folder = Path(config_dir).resolve()
-    if not folder.is_dir():
-        raise InputError(f"--config-dir must name a folder, got {config_dir}")
+    require(folder.is_dir(), f"--config-dir must name a folder, got {config_dir}")
     require("${" not in str(folder), f"{folder}: Hydra takes ${{ for a value; rename the folder")
     for group in (*GROUPS, "study"):
         for path in sorted((folder / group).rglob("*.yaml")):
             option = read_yaml(path)  # within bounds, which Hydra does not know
-            keys = option is None or (
-                isinstance(option, dict) and all(isinstance(key, str) for key in option)
+            option = {} if option is None else option
+            require(
+                isinstance(option, dict) and all(isinstance(key, str) for key in option),
+                f"{path}: an option holds keys and their values",
             )
-            require(keys, f"{path}: an option holds keys and their values")
-            _check_hydra_of(path, option or {})
+            _check_hydra_of(path, option)
     return [f"hydra.searchpath=[{paths.quoted(f'file://{folder}')}]"]
 
 
@@ -300,24 +297,21 @@ def with_study_file(overrides: Sequence[str]) -> list[str]:
     Raises
     ------
     InputError
-        If there is no such file.
+        If the file does not exist.
     """
-    found: list[str] = []
+    named: list[str] = []
     for override in overrides:
-        key, _, value = override.partition("=")
-        path = Path(value)
-        if key != "study" or path.suffix != ".yaml":
-            found.append(override)
+        path = Path(override.removeprefix("study="))
+        if not override.startswith("study=") or path.suffix != ".yaml":
+            named.append(override)
             continue
-        require(path.is_file(), f"{override}: there is no such file")
-        place = path.resolve()
+        require(path.is_file(), f"{override}: no such file")
+        place, copies = path.resolve(), paths.results() / "cache" / "studies"
         if place.parent.name != "study":
-            place = (
-                paths.results() / "cache" / "studies" / digest_of(path)[:16] / "study" / path.name
-            )
+            place = copies / digest_of(path)[:16] / "study" / path.name
             write_text(place, path.read_text())
-        found += [*searched(place.parents[1]), f"study={path.stem}"]
-    return found
+        named += [*searched(place.parents[1]), f"study={path.stem}"]
+    return named
 
 
 def _check_hydra_of(path: Path, option: Mapping[str, Any]) -> None:
@@ -330,23 +324,23 @@ def _check_hydra_of(path: Path, option: Mapping[str, Any]) -> None:
         for leaf, value in leaves({"hydra": option.get("hydra")})
         if value not in (None, {}) and leaf[:3] != ("hydra", "sweeper", "params")
     ]
-    if set_here:
-        raise InputError(
-            f"{path}: {set_here[0]}: of Hydra's settings a file's hydra.sweeper.params alone has "
-            "an effect; give hydra/launcher and hydra.launcher on the command line"
-        )
+    require(
+        not set_here,
+        f"{path}: {''.join(set_here[:1])}: of Hydra's settings a file's hydra.sweeper.params alone "
+        "has an effect; give hydra/launcher and hydra.launcher on the command line",
+    )
 
 
 def _check_calibrated(overrides: Sequence[Override]) -> None:
     """Check that a calibration's slip is not set as if the robot were simulated."""
     calibrated = any(o.key_or_group == "calibration" and o.value() is not None for o in overrides)
     for override in overrides if calibrated else ():
-        if override.key_or_group in ("robot.kr", "robot.kl"):
-            key = override.key_or_group.removeprefix("robot.")
-            raise InputError(
-                f"{override.input_line}: the calibration has its own {key}; set estimator.{key} to "
-                "believe another, or leave calibration out"
-            )
+        key = override.key_or_group.removeprefix("robot.")
+        require(
+            override.key_or_group not in ("robot.kr", "robot.kl"),
+            f"{override.input_line}: the calibration has its own {key}; set estimator.{key} to "
+            "believe another, or leave calibration out",
+        )
 
 
 def _check_added(overrides: Sequence[Override], groups: Collection[str]) -> None:
@@ -355,9 +349,9 @@ def _check_added(overrides: Sequence[Override], groups: Collection[str]) -> None
     A study's YAML may have keys of its own; the command line sets those without a +.
     """
     for override in overrides:
-        added = override.is_add() or override.is_force_add()
-        if added and override.key_or_group not in groups:
-            check_known(override.key_or_group.partition(".")[0])
+        if override.is_add() or override.is_force_add():
+            key = override.key_or_group.partition(".")[0]
+            require(key in KEYS or override.key_or_group in groups, unknown(key, KEYS))
 
 
 def check_hydra(overrides: Sequence[str]) -> None:
@@ -370,17 +364,11 @@ def check_hydra(overrides: Sequence[str]) -> None:
     """
     for override in overrides:
         key = override.lstrip("+~").partition("=")[0]
-        if re.match(r"hydra\b", key) is None or key.startswith(_READ_OF_HYDRA):
-            continue
-        remedies = {
-            "hydra/sweeper": "-m runs every combination of the values; an optimizer may call "
-            "estima.sweep from Python",
-            "hydra.sweeper": "give the values themselves, such as seed=1,2",
-            "hydra.verbose": "there is no log; a failed run's row says how",
-        }
-        usual = "rows go to results/runs/NAME: set name, or --results for another folder"
-        remedy = next((remedies[start] for start in remedies if key.startswith(start)), usual)
-        raise InputError(f"{override}: {key} has no effect here; {remedy}")
+        remedy = next(text for start, text in _REMEDIES.items() if key.startswith(start))
+        require(
+            re.match(r"hydra\b", key) is None or key.startswith(_READ_OF_HYDRA),
+            f"{override}: {key} has no effect here; {remedy}",
+        )
 
 
 def check_overrides(overrides: Sequence[str]) -> None:
@@ -393,15 +381,14 @@ def check_overrides(overrides: Sequence[str]) -> None:
     """
     for override in OverridesParser.create().parse_overrides(list(overrides)):
         key, value = override.key_or_group, override.value()
-        if not key:
-            raise InputError(f"{override.input_line}: no key before the =")
-        named = override.is_sweep_override() or isinstance(value, (str, list))
+        require(key, f"{override.input_line}: no key before the =")
         if key == "hydra.searchpath" and isinstance(value, list):
             for entry in value:
                 scheme, _, place = str(getattr(entry, "text", entry)).rpartition("://")
                 there = scheme not in ("", "file") or Path(place).is_dir()
-                require(there, f"{override.input_line}: there is no folder {place}")
-        if key in (*GROUPS, "study") and not (named or override.is_delete()):
-            raise InputError(
-                f"{override.input_line}: {key} must name one of `estima options {key}`"
-            )
+                require(there, f"{override.input_line}: no folder {place}")
+        named = override.is_sweep_override() or isinstance(value, (str, list))
+        require(
+            named or override.is_delete() or key not in (*GROUPS, "study"),
+            f"{override.input_line}: {key} must name one of `estima options {key}`",
+        )

@@ -1,6 +1,5 @@
 """Terminal output: progress, and the one line that ends a failed command."""
 
-import importlib
 import math
 import signal
 import sys
@@ -9,7 +8,7 @@ import time
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TextIO
 
 from experiments.runs.paths import option_names
 from sim.errors import InputError, printable
@@ -55,7 +54,8 @@ def progress(
         if restart:
             start, start_s = done, now
         rate = (done - start) / max(now - start_s, 1e-9)
-        line = _state(label, done, total, unit, now - begun, rate)
+        state = _state(done, total, unit, now - begun, rate)
+        line = f"{label}: {state}" if label else state
         rated = done - start >= min(_RATED_SHARE * (total or math.inf), _RATED_UNITS)
         if total and done < total and rated and now - start_s >= _RATED_S:
             line += f", {_time((total - done) / rate)} left"
@@ -85,29 +85,22 @@ def _bar(total: float | None) -> Any:
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn
 
-    columns = (BarColumn(20), TextColumn("{task.description}", markup=False))
-    bar = Progress(*columns, console=Console(stderr=True), transient=True)
+    description = TextColumn("{task.description}", markup=False)
+    bar = Progress(BarColumn(20), description, console=Console(stderr=True), transient=True)
     bar.add_task("", total=total)
     return bar
 
 
-def _state(
-    label: str,
-    done: float,
-    total: float | None,
-    unit: str,
-    spent_s: float,
-    rate: float,
-) -> str:
+def _state(done: float, total: float | None, unit: str, spent_s: float, rate: float) -> str:
     """The amount done, and after how long or at what rate."""
     amount = f"{done:.3g}" if isinstance(done, float) else str(done)
-    of_total = f"{amount} of {max(total, done):g}" if total else amount
     if total == 1.0 and not unit:
-        of_total = f"{100 * done:.0f} %"
-    parts = [f"{of_total} {unit}" if unit else f"{of_total} after {spent_s:.0f} s"]
-    if unit and rate:
-        parts.append(f"{rate:.2g} a second")
-    return ": ".join(filter(None, [label, ", ".join(parts)]))
+        amount = f"{100 * done:.0f} %"
+    elif total:
+        amount += f" of {max(total, done):g}"
+    if not unit:
+        return f"{amount} after {spent_s:.0f} s"
+    return f"{amount} {unit}, {rate:.2g} a second" if rate else f"{amount} {unit}"
 
 
 def _time(s: float) -> str:
@@ -155,20 +148,18 @@ def _in_defaults(error: BaseException) -> bool:
 def _refusal(error: BaseException) -> str | None:
     """Say what Hydra could not find, and what there is; None if the error is another."""
     missing, options = (getattr(error, name, None) for name in ("missing_cfg_file", "options"))
-    if missing and options:
-        group, _, name = missing.rpartition("/")
-        every = sorted({*options, *option_names(group)})
-        return f"no {group} named {name}; there are: {', '.join(every)}"
-    return None
+    if not (missing and options):
+        return None
+    group, _, name = missing.rpartition("/")
+    every = sorted({*options, *option_names(group)})
+    return f"no {group} named {name}; there are: {', '.join(every)}"
 
 
 def _configuration_errors() -> tuple[type[Exception], ...]:
     """Errors of Hydra, OmegaConf and YAML, if they have been imported."""
-    if "hydra" not in sys.modules:
-        return ()
-    hydra, omegaconf = (importlib.import_module(f"{n}.errors") for n in ("hydra", "omegaconf"))
-    malformed = importlib.import_module("yaml").YAMLError
-    return (hydra.HydraException, omegaconf.OmegaConfBaseException, malformed)
+    names = ("hydra.errors.HydraException", "omegaconf.errors.OmegaConfBaseException")
+    places = [name.rpartition(".") for name in (*names, "yaml.YAMLError")]
+    return tuple(getattr(sys.modules[m], name) for m, _, name in places if m in sys.modules)
 
 
 def counted(n: int, what: str) -> str:
@@ -181,13 +172,15 @@ def show(text: str) -> None:
 
     Those are characters that would control it, and those that its encoding lacks.
     """
-    encoding = sys.stdout.encoding or "utf-8"
-    safe = "\n".join(printable(line) for line in text.split("\n"))
-    print(safe.encode(encoding, "replace").decode(encoding))
+    _write("\n".join(map(printable, text.split("\n"))), sys.stdout)
 
 
 def _say(message: str, code: int) -> NoReturn:
-    line = printable(" ".join(f"estima: {message}".splitlines()))
-    encoding = sys.stderr.encoding or "utf-8"
-    print(line.encode(encoding, "replace").decode(encoding), file=sys.stderr)
+    _write(printable(" ".join(f"estima: {message}".splitlines())), sys.stderr)
     sys.exit(code)
+
+
+def _write(text: str, stream: TextIO) -> None:
+    """Print text with ? for what the stream's encoding lacks."""
+    encoding = stream.encoding or "utf-8"
+    print(text.encode(encoding, "replace").decode(encoding), file=stream)

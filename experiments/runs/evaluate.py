@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager, nullcontext
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
-from estimators.base import Estimate, Estimator, Prior, run_to_the_end
+from estimators.base import Answer, Estimate, Estimator, Prior, run_to_the_end
 from experiments.evaluation.map_quality import landmark_errors
 from experiments.evaluation.metrics import (
     LONGEST_GAP_S,
@@ -16,7 +16,7 @@ from experiments.evaluation.metrics import (
     longest_pause_s,
     score,
 )
-from experiments.runs.columns import OF_THE_RUN
+from experiments.runs.columns import OF_THE_RUN, REVISED
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import GAP, Outcome, Row, Status
 from experiments.runs.seeds import stream
@@ -32,7 +32,6 @@ Streams = Callable[[int], np.random.Generator]
 Planted = Callable[[Estimator, int], AbstractContextManager[object]]
 Shown = Callable[[Team], AbstractContextManager[Callable[[int], None]]]
 OnStep = Callable[[int], None] | None
-Answers = list[tuple[Estimate, Estimate | None]]  # of each robot: online and revised
 
 
 def evaluate(
@@ -56,7 +55,7 @@ def evaluate(
         The estimator's generator of each repeat, or a team's (see `answers_of_team`); by default
         that of the axis `estimator/NAME`.
     planted
-        Gives a context in which the estimator is faulty, for each repeat; not of a team.
+        Gives a context in which the estimator is faulty, for each repeat; of one robot alone.
     shown
         Shows the progress over the recordings: gives a function of the number of Frames done, as a
         context around each repeat.
@@ -92,22 +91,27 @@ def evaluate(
                 shown(read) if shown else nullcontext() as on_step,
             ):
                 answers = answers_of(estimator, repeat, on_step)
-            status, scores = _scored_run(experiment, read, answers)
+            paired = [(r, *answer) for r, answer in zip(read.robots, answers, strict=True)]
+            statuses = [status_of(*each) for each in paired]
+            every = [scored(*each, **experiment.config["scoring"]) for each in paired]
+            status, scores = statuses[0], every[0]
+            if experiment.team is not None:
+                status, scores = status_of_team(statuses), scores_of_team(read, every)
         except InputError:
             raise
         except (Exception, SystemExit) as error:
             status = Status.of_error(error)
             on_error(error)
         else:
-            for recording, answer in zip(read.robots, answers, strict=True):
-                on_estimate(recording, repeat, *answer)
+            for recording, online, revised in paired:
+                on_estimate(recording, repeat, online, revised)
         rows.append({**labels, "repeat": repeat, **status.columns(), **scores})
     return rows
 
 
 def runner(
     experiment: Experiment, read: Team, streams: Streams | None = None
-) -> Callable[[Estimator, int, OnStep], Answers]:
+) -> Callable[[Estimator, int, OnStep], list[Answer]]:
     """Function that runs an estimator over recordings: of it, the repeat, and the progress.
 
     Raises
@@ -121,9 +125,9 @@ def runner(
     axis = f"estimator/{experiment.estimator_name}"
     own = streams or functools.partial(stream, experiment.seed, axis)
 
-    def answers(estimator: Estimator, repeat: int, on_step: OnStep) -> Answers:
+    def answers(estimator: Estimator, repeat: int, on_step: OnStep) -> list[Answer]:
         if experiment.team is None:
-            keep = (*SCORED_EXTRAS, *experiment.keep)
+            keep = (*SCORED_EXTRAS, *experiment.config["keep"])
             return [run_over(read.only, estimator, priors[0], own(repeat), keep, on_step)]
         with limited_blas():
             return answers_of_team(experiment, read, priors, repeat, own, on_step)
@@ -133,20 +137,9 @@ def runner(
 
 def run_robots(
     experiment: Experiment, read: Team, repeat: int = 0, on_step: OnStep = None
-) -> Answers:
+) -> list[Answer]:
     """Online and revised estimate of each robot, of one repeat, as `evaluate` makes them."""
     return runner(experiment, read)(experiment.estimator(), repeat, on_step)
-
-
-def _scored_run(experiment: Experiment, read: Team, answers: Answers) -> tuple[Status, Row]:
-    """How a run ended, and its scores."""
-    statuses, scores = [], []
-    for recording, (online, revised) in zip(read.robots, answers, strict=True):
-        statuses.append(status_of(recording, online, revised))
-        scores.append(scored(recording, online, revised, **experiment.scoring))
-    if experiment.team is None:
-        return statuses[0], scores[0]
-    return status_of_team(statuses), scores_of_team(read, scores)
 
 
 def run_over(
@@ -155,8 +148,8 @@ def run_over(
     prior: Prior,
     rng: np.random.Generator,
     keep: Collection[str] = (),
-    on_step: Callable[[int], None] | None = None,
-) -> tuple[Estimate, Estimate | None]:
+    on_step: OnStep = None,
+) -> Answer:
     """Online estimate of a run, and the revised one of an estimator that has `finish`.
 
     The online estimate has the processor time of all, `finish` included, but for compiling code
@@ -203,10 +196,8 @@ def scored(
         **score(recording, online, longest_gap_s, after_s),
         **landmark_errors(recording, made),
     }
-    if revised is not None:
-        found = score(recording, revised, longest_gap_s, after_s)
-        scores |= {f"revised_{k}": found[k] for k in found if k not in OF_THE_RUN}
-    return scores
+    own = score(recording, revised, longest_gap_s, after_s) if revised is not None else {}
+    return scores | {f"{REVISED}{k}": v for k, v in own.items() if k not in OF_THE_RUN}
 
 
 def status_of(recording: Recording, online: Estimate, revised: Estimate | None = None) -> Status:
@@ -220,12 +211,14 @@ def status_of(recording: Recording, online: Estimate, revised: Estimate | None =
     if online.status == "ok" and not sound.all():
         when = online.stamps[np.argmin(sound)]
         return Status(Outcome.FAILED, "not_finite", f"not finite at {when:.2f} s")
-    paths = (online.stamps, *([] if revised is None else [revised.stamps]))
-    found = max((status_of_pauses(recording, stamps) for stamps in paths), key=lambda s: s.code)
+    pauses = [
+        status_of_pauses(recording, path.stamps) for path in (online, revised) if path is not None
+    ]
+    worst = max(pauses, key=lambda status: status.code)
     if online.status == "ok":
-        return found
-    detail = "; ".join(filter(None, [found.detail, online.status]))
-    return Status(Outcome.REMARK, found.code or "estimator", detail)
+        return worst
+    detail = "; ".join(filter(None, [worst.detail, online.status]))
+    return Status(Outcome.REMARK, worst.code or "estimator", detail)
 
 
 def status_of_pauses(recording: Recording, stamps: Array) -> Status:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import inspect
 import json
+import operator
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +26,7 @@ from experiments.runs.schema import (
     Leaf,
     RunOptions,
     check_shape,
+    leaves,
     with_leaf,
 )
 from experiments.runs.seeds import stream
@@ -68,13 +71,14 @@ class Experiment(Objects):
         """Return the experiment with other values of keys of its estimator."""
         return self.replaced(estimator={**self.config["estimator"], **settings})
 
-    def with_estimator_of(self, other: Experiment) -> Experiment:
-        """Return the experiment with the estimator of another."""
-        return self.replaced(estimator=other.config["estimator"])
-
     def option(self, name: str, default: Any = None) -> Any:
         """An option of the estimator; `default` if it has none of this name."""
-        return self.config["estimator"].get(name, default)
+        return self.options_of("estimator").get(name, default)
+
+    def options_of(self, place: str) -> Config:
+        """What a place such as `estimator` or `prior.map` holds; nothing if it is a plain value."""
+        value = functools.reduce(operator.getitem, place.split("."), self.config)
+        return {**value} if isinstance(value, dict) else {}
 
     def over(self, recording: Recording) -> Experiment:
         """Return the experiment over a recording in memory, identified by its checksum."""
@@ -104,36 +108,9 @@ class Experiment(Objects):
         return isinstance(self.config["recording"], str)
 
     @property
-    def calibrated(self) -> bool:
-        """Whether a calibration says what is believed of the robot."""
-        return self.config["calibration"] is not None
-
-    @property
     def command(self) -> Any:
         """The command of an estimator that is a program; None of one that is not."""
-        return self.config["estimator"].get("command")
-
-    @property
-    def estimator_options(self) -> Mapping[str, Any]:
-        """Options of its estimator."""
-        return {k: v for k, v in self.config["estimator"].items() if k != "_target_"}
-
-    @property
-    def route_options(self) -> Mapping[str, Any]:
-        """Its route, with `_target_`."""
-        return {**self.config["route"]}
-
-    @property
-    def recording_options(self) -> Mapping[str, Any]:
-        """Those of the function that makes its recording; none of another recording."""
-        wanted = self.config["recording"]
-        return {**wanted} if isinstance(wanted, dict) else {}
-
-    @property
-    def map_options(self) -> Mapping[str, Any]:
-        """Those of the function that makes the prior's map; none of another map."""
-        wanted = self.config["prior"]["map"]
-        return {**wanted} if isinstance(wanted, dict) else {}
+        return self.option("command")
 
     def label(self, key: str) -> Any:
         """Value of a key that a study adds to the configuration's own."""
@@ -142,28 +119,13 @@ class Experiment(Objects):
     @property
     def believed_slip(self) -> tuple[float, float] | None:
         """The kr and kl that the estimator believes, m; None if it has no such options."""
-        settings = self.estimator_options
-        return (settings["kr"], settings["kl"]) if {"kr", "kl"} <= set(settings) else None
+        kr, kl = self.option("kr"), self.option("kl")
+        return None if kr is None or kl is None else (kr, kl)
 
     @property
     def repeats(self) -> int:
         """Runs of the estimator over the recording."""
         return int(self.config["repeats"])
-
-    @property
-    def keep(self) -> list[str]:
-        """Belief extras to record."""
-        return list(self.config["keep"])
-
-    @property
-    def scoring(self) -> dict[str, float]:
-        """Options of `experiments.evaluation.metrics.score`."""
-        return {name: float(value) for name, value in self.config["scoring"].items()}
-
-    @property
-    def picture(self) -> bool:
-        """Whether a single run is drawn."""
-        return bool(self.config["picture"])
 
     @property
     def rows_folder(self) -> Path:
@@ -247,15 +209,15 @@ class Experiment(Objects):
                 steering = getattr(self._steering(), "needs", ())
                 self._check_sensors("route.feedback", frozenset(steering) - {"map"}, onboard)
         mapped = self.config["prior"]["map"] != "none" or settings.get("map_path")
-        if "map" in needs and not mapped:
-            raise InputError(
-                f"estimator={self.estimator_name} needs a map; set prior.map=world, or a mapping "
-                "with _target_"
-            )
+        require(
+            mapped or "map" not in needs,
+            f"estimator={self.estimator_name} needs a map; set prior.map=world, or a mapping with "
+            "_target_",
+        )
 
     def _check_map(self) -> None:
         """Check that the prior's map can be made or read, and that the estimator can use it."""
-        known_map, settings = self.config["prior"]["map"], self.config["estimator"]
+        known_map = self.config["prior"]["map"]
         if isinstance(known_map, dict):
             checked(known_map, "prior.map", ("config", "recording"))
         elif not is_grid_file(known_map):
@@ -266,30 +228,30 @@ class Experiment(Objects):
             )
         else:
             grid_file.read_grid(known_map)
-            estimator = self.own_estimator or checked(settings, "estimator")
-            kinds = getattr(estimator, "maps", None)
-            if kinds and OccupancyGrid not in kinds and not settings.get("map_path"):
-                names = " or ".join(kind.__name__ for kind in kinds)
-                raise InputError(
-                    f"estimator={self.estimator_name} takes a {names}, and prior.map={known_map} "
-                    "is an occupancy grid"
-                )
+            estimator = self.own_estimator or checked(self.config["estimator"], "estimator")
+            kinds = getattr(estimator, "maps", None) or [OccupancyGrid]
+            require(
+                OccupancyGrid in kinds or self.option("map_path"),
+                f"estimator={self.estimator_name} takes a "
+                f"{' or '.join(kind.__name__ for kind in kinds)}, and prior.map={known_map} is an "
+                "occupancy grid",
+            )
 
     def _check_team(self) -> None:
-        """Check each robot of a team, and what is of one robot only."""
+        """Check each robot of a team, and what only a robot alone can have."""
         team = self.team
         if team is None:
             return
         kind = find(self.config["estimator"].get("_target_"), "estimator")
         require(
             not inspect.isclass(kind) or hasattr(kind, "step_team"),
-            f"estimator={self.estimator_name} is of one robot; a team takes {OF_TEAMS}",
+            f"estimator={self.estimator_name} localizes one robot; a team takes {OF_TEAMS}",
         )
-        settings = self.config["estimator"]
-        if settings.get("robots") is not None and not self.from_file:
-            self._check_sensors(f"estimator={self.estimator_name}", ["robots"], settings)
-        for number in range(team.size):
-            own = self.of_robot(number)
+        if self.option("robots") is not None and not self.from_file:
+            self._check_sensors(
+                f"estimator={self.estimator_name}", ["robots"], self.config["estimator"]
+            )
+        for number, own in enumerate(map(self.of_robot, range(team.size))):
             try:
                 own.robot(), own.sensors(), own.route()
             except InputError as error:
@@ -300,7 +262,7 @@ class Experiment(Objects):
             "others may be unknown (team.starts)",
         )
         for key in ("keep", "calibration"):
-            require(not self.config[key], f"{key} is of one robot; leave it out for a team")
+            require(not self.config[key], f"{key} applies to one robot; leave it out for a team")
 
     def _check_sensors(self, who: str, needs: Iterable[str], settings: Config) -> None:
         """Check that the robot has the sensors that an estimator needs."""
@@ -308,9 +270,15 @@ class Experiment(Objects):
         for need in needs:
             # an option of the estimator says how the sensor is called
             names = [settings.get(option, option) for option in need.split("|")]
-            if not has.intersection(names):
-                presets = ", ".join(_presets_with(names))
-                remedy = f"try sensors={presets}" if presets else f"add sensors.{names[0]}"
+            if has.isdisjoint(names):
+                presets = [
+                    path.stem
+                    for path in sorted((paths.CONF / "sensors").glob("*.yaml"))
+                    if OmegaConf.load(path).keys() & set(names)
+                ]
+                remedy = (
+                    f"try sensors={', '.join(presets)}" if presets else f"add sensors.{names[0]}"
+                )
                 raise InputError(
                     f"{who} needs a sensor {' or '.join(names)}, and "
                     f"sensors={self.choices.get('sensors')} has none; {remedy}"
@@ -319,30 +287,20 @@ class Experiment(Objects):
 
 def rows_folder(name: Any) -> Path:
     """Folder of rows of a name, which must be one word."""
-    if not (isinstance(name, str) and re.fullmatch(r"[\w.-]*\w", name)):
-        raise InputError(
-            f"name must be one word for a folder of results, such as slip_2, got {name!r}"
-        )
-    return paths.results() / "runs" / name
+    require(
+        isinstance(name, str) and re.fullmatch(r"[\w.-]*\w", name),
+        f"name must be one word for a folder of results, such as slip_2, got {name!r}",
+    )
+    return paths.results() / "runs" / str(name)
 
 
-def _presets_with(names: Sequence[str]) -> list[str]:
-    """Options of conf/sensors that have one of these sensors."""
-    found = {path.stem: OmegaConf.load(path) for path in (paths.CONF / "sensors").glob("*.yaml")}
-    return sorted(preset for preset, sensors in found.items() if any(n in sensors for n in names))
-
-
-def _flat(tree: Mapping[str, Any], prefix: str = "") -> Row:
+def _flat(tree: Config) -> Row:
     """Flatten nested mappings to dotted keys; lists become their text."""
-    flat: Row = {}
-    for key, value in tree.items():
-        name = f"{prefix}{key}"
-        if isinstance(value, dict):
-            flat.update(_flat(value, f"{name}."))
-        elif isinstance(value, int) and not -(2**63) <= value < 2**63:
-            flat[name] = str(value)  # wider than a column of a table
-        elif value is None or isinstance(value, (bool, int, float, str)):
-            flat[name] = value
-        else:
-            flat[name] = json.dumps(value)
-    return flat
+    return {".".join(map(str, leaf)): _scalar(value) for leaf, value in leaves(tree) if value != {}}
+
+
+def _scalar(value: Any) -> Any:
+    """A value as a table's column holds it."""
+    if isinstance(value, int) and not -(2**63) <= value < 2**63:
+        return str(value)
+    return json.dumps(value) if isinstance(value, (list, tuple)) else value

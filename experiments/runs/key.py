@@ -8,10 +8,9 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-from experiments.runs.cache import key_of
 from experiments.runs.schema import SIMULATED_KEYS, Config, Leaf, leaves
 from experiments.runs.targets import targets
-from experiments.runs.version import code_version, source_digest, version_with
+from experiments.runs.version import SIMULATION, code_version, source_digest, version_with
 from sim.errors import InputError
 from sim.worlds import grid_file
 
@@ -40,7 +39,7 @@ def files_digest(tree: Any) -> dict[str, str]:
 def files_of_options(options: Any) -> dict[str, str]:
     """Digest of every file that an estimator's options name, a list's items included.
 
-    A word without a suffix or a slash is no file, but the name of a sensor or a method.
+    A word without a suffix or a slash is not a file, but the name of a sensor or a method.
     """
     found: dict[str, str] = {}
     for _, value in leaves({"": options}):
@@ -102,10 +101,12 @@ def run_key(config: Config) -> str:
 
 def recording_key(config: Config) -> str:
     """Digest of what decides the recording's bits: its settings, or a file's; and the code."""
-    made = {} if isinstance(config["recording"], str) else _simulated(config)
+    made = {} if isinstance(config["recording"], str) else {k: config[k] for k in SIMULATED_KEYS}
     if (team := config.get("team")) is not None:
         made["team"] = {key: team.get(key) for key in _TEAM_KEYS}
-    return key_of({**made, **_recording_sources(config)})
+    settings = {**made, **_recording_sources(config)}
+    text = json.dumps({"settings": settings, "code": code_version(SIMULATION)}, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:24]
 
 
 def applied(config: Config) -> Config:
@@ -115,20 +116,13 @@ def applied(config: Config) -> Config:
     """
     places = (config["recording"], config["prior"].get("map"))
     made = any(isinstance(place, dict) and "_target_" in place for place in places)
-    if config["recording"] is None or made:
-        return config
-    unused = set(SIMULATED_KEYS) - {"seed"}
+    unused = () if config["recording"] is None or made else set(SIMULATED_KEYS) - {"seed"}
     return {key: value for key, value in config.items() if key not in unused}
 
 
 def version_of(config: Config) -> str:
     """The code's version, and a digest of what the settings name from elsewhere."""
     return version_with(targets(applied(config)), config["estimator"].get("command"))
-
-
-def _simulated(config: Config) -> Config:
-    """Settings of the recording that would be simulated."""
-    return {key: config[key] for key in SIMULATED_KEYS}
 
 
 def _recording_sources(config: Config) -> Config:
@@ -138,16 +132,15 @@ def _recording_sources(config: Config) -> Config:
         return {"recording": wanted, "files": files_digest(wanted)}
     if wanted is not None:
         return {"recording": digest_of(Path(wanted))}
-    sources: Config = {}
-    if world := files_digest(config["world"].get("path")):  # an edited file: another world
-        sources["world_files"] = list(world.values())
-    if way := files_digest(config["route"].get("path")):
-        sources["way"] = list(way.values())
-    if files := files_of_options(config["route"].get("feedback")):
-        sources["feedback_files"] = files
-    elsewhere = {target: source_digest(target) for target in sorted(targets(_simulated(config)))}
+    sources: Config = {  # an edited file: another world
+        "world_files": list(files_digest(config["world"].get("path")).values()),
+        "way": list(files_digest(config["route"].get("path")).values()),
+        "feedback_files": files_of_options(config["route"].get("feedback")),
+    }
+    simulated = {key: config[key] for key in SIMULATED_KEYS}
+    elsewhere = {target: source_digest(target) for target in sorted(targets(simulated))}
     if any(elsewhere.values()):  # a sensor, route or world of one's own, edited: another one
         sources["sources"] = elsewhere
     if any(target.startswith("estimators.") for target in elsewhere):  # one on board
         sources["code"] = code_version()
-    return sources
+    return {name: source for name, source in sources.items() if source}

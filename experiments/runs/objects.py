@@ -27,7 +27,7 @@ from experiments.runs.schema import (
 from experiments.runs.seeds import stream
 from experiments.runs.targets import make
 from sim.arrays import Array
-from sim.errors import InputError, blaming, require
+from sim.errors import InputError, blaming, require, required
 from sim.options import build
 from sim.recording import Frame, Recording
 from sim.robot.base import RobotGeometry, robot_from_config
@@ -91,11 +91,11 @@ class Objects:
         """Make the estimator: anything with `reset` and `step`."""
         estimator: Estimator = self.own_estimator or make(self.config["estimator"], "estimator")
         for method in ("reset", "step"):
-            if not callable(getattr(estimator, method, None)):
-                raise InputError(
-                    f"estimator {type(estimator).__name__} has no method {method}; "
-                    "see estimators/base.py for the protocol"
-                )
+            require(
+                callable(getattr(estimator, method, None)),
+                f"estimator {type(estimator).__name__} has no method {method}; "
+                "see estimators/base.py for the protocol",
+            )
         return estimator
 
     def team_estimator(self) -> TeamEstimator:
@@ -103,7 +103,7 @@ class Objects:
         estimator: Any = self.estimator()
         require(
             hasattr(estimator, "reset_team") and hasattr(estimator, "step_team"),
-            f"estimator={self.estimator_name} is of one robot; a team takes {OF_TEAMS}",
+            f"estimator={self.estimator_name} localizes one robot; a team takes {OF_TEAMS}",
         )
         return cast(TeamEstimator, estimator)
 
@@ -112,11 +112,6 @@ class Objects:
         """The key `team` of a study of several robots; None of one robot."""
         given = self.config.get("team")
         return None if given is None else build(TeamSettings, given, "team")
-
-    @property
-    def of_team(self) -> bool:
-        """Whether a study of several robots, even if only one drives."""
-        return self.team is not None
 
     @property
     def size(self) -> int:
@@ -156,16 +151,13 @@ class Objects:
             own = self.of_robot(number)
             config = {key: own.config[key] for key in SIMULATED_KEYS}
             drawn = streams or {a: stream(own.seed, a, number) for a in ("slip", "sensors")}
-            what = own.robot(), own.sensors(), own.route(), drawn, config, own.onboard
-            members.append(Member(*what))
-        simulation = build(SimulationOptions, self.config["simulation"], "simulation")
-        return record_team(
-            self.world(),
-            members,
-            physics=simulation.physics,
-            rays=simulation.rays,
-            on_progress=on_progress,
+            members.append(
+                Member(own.robot(), own.sensors(), own.route(), drawn, config, own.onboard)
+            )
+        simulation = dataclasses.asdict(
+            build(SimulationOptions, self.config["simulation"], "simulation")
         )
+        return record_team(self.world(), members, **simulation, on_progress=on_progress)
 
     def simulate(
         self,
@@ -186,11 +178,11 @@ class Objects:
         if isinstance(wanted, dict):
             require(self.team is None, "recording: a team is simulated, or read from a file")
             made = make(wanted, "recording", config=self.config)
-            if not isinstance(made, Recording):
-                raise InputError(
-                    f"recording: {wanted['_target_']} must return a Recording, "
-                    f"got {type(made).__name__}"
-                )
+            require(
+                isinstance(made, Recording),
+                f"recording: {wanted['_target_']} must return a Recording, "
+                f"got {type(made).__name__}",
+            )
             return Team((self._calibrated(made),))
         if wanted is not None:
             return self._loaded(Path(wanted))
@@ -211,15 +203,14 @@ class Objects:
     def _check_one_robot(self) -> None:
         require(
             self.team is None,
-            "team: a recording is of one robot; `estima record` and `estima run` take teams",
+            "team: a recording holds one robot; `estima record` and `estima run` take teams",
         )
 
     def _loaded(self, path: Path) -> Team:
         """The robots of a file, as they are believed to be."""
         team = load(path)
         if self.team is not None:
-            enough = self.size <= len(team)
-            require(enough, f"{path}: a team of {len(team)} robots; set team.size")
+            require(self.size <= len(team), f"{path}: a team of {len(team)} robots; set team.size")
             return team if self.size == len(team) else team.first(self.size)
         try:
             recording = team.only
@@ -229,7 +220,7 @@ class Objects:
         return Team((self._calibrated(self._with_classes(recording)),))
 
     def check_size(self, team: Team) -> None:
-        """Check that recordings are of as many robots as the experiment.
+        """Check that there is a recording for each robot of the experiment.
 
         Raises
         ------
@@ -238,7 +229,7 @@ class Objects:
         """
         require(
             self.team is not None or len(team) == 1,
-            "the recording is of a team; choose study=teams",
+            "the recording holds a team; choose study=teams",
         )
         require(
             len(team) == self.size,
@@ -258,8 +249,10 @@ class Objects:
     def _steering(self) -> Estimator:
         """Make the estimator that the route's feedback names."""
         estimator: Estimator = make(self.config["route"]["feedback"], "route.feedback")
-        whole = all(callable(getattr(estimator, name, None)) for name in ("reset", "step"))
-        require(whole, "route.feedback names no estimator: it has no reset and step")
+        require(
+            all(callable(getattr(estimator, name, None)) for name in ("reset", "step")),
+            "route.feedback names no estimator: it has no reset and step",
+        )
         return estimator
 
     def _calibrated(self, recording: Recording) -> Recording:
@@ -304,9 +297,10 @@ class Objects:
             If a start pose is wanted, and the truth does not cover the first Frame.
         """
         given = build(PriorOptions, self.config["prior"], "prior")
-        believed = {"wheel_radius_m": given.wheel_radius_m, "track_m": given.track_m}
-        known = {key: value for key, value in believed.items() if value is not None}
-        robot = dataclasses.replace(recording.robot, **known)
+        robot = RobotGeometry(
+            given.wheel_radius_m or recording.robot.wheel_radius_m,
+            given.track_m or recording.robot.track_m,
+        )
         known_map = self._map(recording)
         if given.start == "global":
             return Prior(robot, recording.sensors, map=known_map)
@@ -334,9 +328,9 @@ class Objects:
             return None
         if is_grid_file(wanted):
             return grid_file.read_grid(wanted)
-        if recording.world is None:
-            raise InputError("prior.map=world, but the recording has no map; set prior.map=none")
-        return recording.world
+        return required(
+            recording.world, "prior.map=world, but the recording has no map; set prior.map=none"
+        )
 
 
 def _true_start(recording: Recording) -> Array:

@@ -38,10 +38,7 @@ def results() -> Path:
 
 def short(path: Path) -> str:
     """Return the path as one would type it from here."""
-    try:
-        return str(path.relative_to(Path.cwd()))
-    except ValueError:
-        return str(path)
+    return str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path)
 
 
 def quoted(text: object) -> str:

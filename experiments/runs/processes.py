@@ -7,8 +7,8 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TextIO
 
+from sim.errors import InputError
 from sim.files import require_file
 
 
@@ -51,25 +51,39 @@ def held_interrupts() -> Iterator[Callable[..., None]]:
 
 
 @contextmanager
-def locked(lock: Path) -> Iterator[None]:
+def locked(lock: Path, *, wait: bool = True) -> Iterator[None]:
     """Hold an exclusive lock, by a file that goes with it; the system frees it if its holder dies.
 
     The file is opened to be written, since a lock on a network file system asks for that. Who
     waited for one that is gone takes the next.
+
+    Raises
+    ------
+    BlockingIOError
+        If another process holds it, and this one shall not wait.
+    InputError
+        If the file cannot be made.
     """
-    with _held(lock):
-        try:
-            yield
-        finally:
-            lock.unlink(missing_ok=True)
-
-
-def _held(lock: Path) -> TextIO:
-    while True:
-        require_file(lock)  # a pipe would wait for ever
-        handle = lock.open("w")
-        fcntl.flock(handle, fcntl.LOCK_EX)
-        with suppress(FileNotFoundError):
-            if os.path.samestat(os.fstat(handle.fileno()), lock.stat()):
-                return handle
+    flags = fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB
+    require_file(lock)  # a pipe would wait forever
+    try:
+        lock.parent.mkdir(parents=True, exist_ok=True)
+        while True:
+            handle = lock.open("w")
+            fcntl.flock(handle, flags)
+            with suppress(FileNotFoundError):
+                if os.path.samestat(os.fstat(handle.fileno()), lock.stat()):
+                    break
+            handle.close()
+    except BlockingIOError:
+        raise
+    except OSError as error:
+        raise InputError(
+            f"{lock}: cannot lock it ({error.strerror}); make its folder writable, free some "
+            "space, or choose another folder of results with ESTIMA_RESULTS"
+        ) from error
+    try:
+        yield
+    finally:
+        lock.unlink(missing_ok=True)
         handle.close()

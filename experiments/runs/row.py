@@ -11,10 +11,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from experiments.runs.columns import ORIGIN, STATUS
-from sim.errors import InputError
+from sim.errors import InputError, require
 from sim.files import require_file, write_whole
 
 if TYPE_CHECKING:
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 Row = dict[str, str | int | float | bool | None]
 _TEXTS = (*STATUS, *ORIGIN)
 WITH_DIGEST = re.compile(r".+\.([0-9a-f]{16})\.parquet")
-_NONE = type(None)
 GAP = "gap"  # the code of a run that gave no pose for some of the drive
 
 
@@ -74,51 +73,25 @@ def check_row(row: Row) -> None:
         If a value is not a scalar that a table can hold, the status is missing, or a number is
         NaN though the status is ok.
     """
-    for key, value in row.items():
-        if not (value is None or isinstance(value, (str, int, float, bool))):
-            raise InputError(f"row key {key} must hold a scalar, got {type(value).__name__}")
-        if isinstance(value, int) and not -(2**63) <= value < 2**63:
-            raise InputError(f"row key {key} must fit in 64 bits, got {value}")
     for key in _TEXTS:
-        if not isinstance(row.get(key), str):
-            raise InputError(f"a row must have the text {key}")
+        require(isinstance(row.get(key), str), f"a row must have the text {key}")
     for key, value in row.items():
-        if row["status"] == "ok" and isinstance(value, float) and not math.isfinite(value):
-            raise InputError(
+        flat = value is None or isinstance(value, (str, int, float, bool))
+        require(flat, f"row key {key} must hold a scalar, got {type(value).__name__}")
+        if isinstance(value, int):
+            fits = -(2**63) <= value < 2**63
+            require(fits, f"row key {key} must fit in 64 bits, got {value}")
+        if isinstance(value, float) and row["status"] == Outcome.OK:
+            require(
+                math.isfinite(value),
                 f"row key {key} is {value} though the status is ok; leave out what does not apply, "
-                "or say in the status what went wrong"
+                "or say in the status what went wrong",
             )
-
-
-def to_frame(rows: Sequence[Row]) -> pd.DataFrame:
-    """Tidy table of rows; a column that some rows lack is empty there.
-
-    A column that mixes numbers, text or booleans becomes text, since a file has one type per
-    column.
-    """
-    import pandas as pd
-
-    for row in rows:
-        check_row(row)
-    columns = {}
-    for name in dict.fromkeys(name for row in rows for name in row):
-        values = [row.get(name) for row in rows]
-        kinds = {(isinstance(v, str), isinstance(v, bool)) for v in values if v is not None}
-        if len(kinds) > 1:
-            values = [None if v is None else str(v) for v in values]
-        columns[name] = values
-    return pd.DataFrame(columns)
-
-
-def write_rows(rows: Sequence[Row], path: Path) -> None:
-    """Write rows to `path` (.parquet or .csv), whole or not at all."""
-    write_frame(to_frame(rows), path)
 
 
 def write_frame(frame: pd.DataFrame, path: Path, digits: int = 10) -> None:
     """Write a table to `path` (.parquet or .csv), whole or not at all."""
-    if path.suffix not in (".parquet", ".csv"):
-        raise InputError(f"{path}: tables are .parquet or .csv")
+    require(path.suffix in (".parquet", ".csv"), f"{path}: tables are .parquet or .csv")
     with write_whole(path) as part:
         if path.suffix == ".csv":
             frame.to_csv(part, index=False, float_format=f"%.{digits}g")
@@ -147,15 +120,14 @@ def read_rows(path: Path, remedy: str = "", texts: Sequence[str] = ()) -> pd.Dat
     files = [path]
     if path.is_dir():  # a killed process may have left a hidden file that it was writing
         files = sorted(file for file in path.glob("*.parquet") if file.name[0] != ".")
-    if not files or not path.exists():
-        raise InputError(f"{path}: no results here; run the study first")
+    require(files and path.exists(), f"{path}: no results here; run the study first")
     if path.is_dir():
         return joined([read_parquet(file, remedy=remedy) for file in files])
     if path.suffix != ".csv":
         return read_parquet(path, remedy=remedy).to_pandas(use_threads=False)
     require_file(path)
     with _reading(path, remedy):
-        kinds = dict.fromkeys((*_TEXTS, *texts), "str")  # a digest such as 12e4567 is no number
+        kinds = dict.fromkeys((*_TEXTS, *texts), "str")  # a digest such as 12e4567 is not a number
         return pd.read_csv(path, dtype=kinds, index_col=False)
 
 
@@ -177,7 +149,7 @@ def read_parquet(path: Path, columns: list[str] | None = None, *, remedy: str = 
 
     with _reading(path, remedy):
         if path.exists() and not path.is_file():
-            raise ValueError("not a file")  # a FIFO would wait for ever
+            raise ValueError("not a file")  # a FIFO would wait forever
         content = path.read_bytes()
         named = WITH_DIGEST.fullmatch(path.name)
         if named and hashlib.sha256(content).hexdigest()[:16] != named[1]:
@@ -211,22 +183,18 @@ def as_tables(rows: Iterable[Row]) -> list[pa.Table]:
     """
     import pyarrow as pa
 
-    types = {str: pa.string(), bool: pa.bool_(), int: pa.int64(), float: pa.float64()}
-    groups: dict[tuple[tuple[str, type], ...], list[list[Any]]] = {}
+    types = {bool: pa.bool_(), int: pa.int64(), float: pa.float64(), str: pa.string()}
+    groups: dict[tuple[tuple[str, type], ...], list[Row]] = {}
     for row in rows:
-        schema = tuple((name, type(value)) for name, value in row.items())
-        columns = groups.setdefault(schema, [[] for _ in schema])
-        for column, value in zip(columns, row.values(), strict=True):
-            column.append(value)
-    return [
-        pa.table(
-            {
-                name: pa.array(column, types.get(kind, pa.null() if kind is _NONE else None))
-                for (name, kind), column in zip(schema, columns, strict=True)
-            }
-        )
-        for schema, columns in groups.items()
-    ]
+        groups.setdefault(tuple((name, type(v)) for name, v in row.items()), []).append(row)
+
+    def schema(columns: Iterable[tuple[str, type]]) -> pa.Schema:
+        def arrow(kind: type) -> pa.DataType:  # of NumPy's numbers, that of the base class
+            return next((types[base] for base in kind.__mro__ if base in types), pa.null())
+
+        return pa.schema([(name, arrow(kind)) for name, kind in columns])
+
+    return [pa.Table.from_pylist(group, schema(columns)) for columns, group in groups.items()]
 
 
 def joined(tables: Sequence[pa.Table]) -> pd.DataFrame:
@@ -236,17 +204,13 @@ def joined(tables: Sequence[pa.Table]) -> pd.DataFrame:
     """
     import pyarrow as pa
 
-    columns = {}
-    for name in _merged(sorted({tuple(table.column_names) for table in tables})):
-        parts = [table[name] if name in table.column_names else None for table in tables]
-        kind = _common({part.type for part in parts if part is not None})
-        chunks = [
-            chunk
-            for part, table in zip(parts, tables, strict=True)
-            for chunk in ([pa.nulls(len(table), kind)] if part is None else _cast(part, kind))
-        ]
-        columns[name] = pa.chunked_array(chunks, kind)
-    return pa.table(columns).to_pandas(use_threads=False, split_blocks=True, self_destruct=True)
+    names = _merged(sorted({tuple(table.column_names) for table in tables}))
+    kinds = {n: _common({t.field(n).type for t in tables if n in t.column_names}) for n in names}
+    fitted = [
+        pa.table({n: _cast(table[n], kinds[n]) for n in table.column_names}) for table in tables
+    ]
+    whole = pa.concat_tables(fitted, promote_options="default").select(names)
+    return whole.to_pandas(use_threads=False, split_blocks=True, self_destruct=True)
 
 
 def _common(kinds: set[pa.DataType]) -> pa.DataType:
@@ -261,13 +225,13 @@ def _common(kinds: set[pa.DataType]) -> pa.DataType:
     return pa.string()
 
 
-def _cast(part: pa.ChunkedArray, kind: pa.DataType) -> list[pa.Array]:
-    """Chunks of a column as another type; texts are those that Python writes."""
+def _cast(part: pa.ChunkedArray, kind: pa.DataType) -> pa.ChunkedArray:
+    """A column as another type; texts are those that Python writes."""
     import pyarrow as pa
 
     if part.type == kind or not pa.types.is_string(kind) or pa.types.is_null(part.type):
-        return list((part if part.type == kind else part.cast(kind)).chunks)
-    return [pa.array([None if v is None else str(v) for v in part.to_pylist()], kind)]
+        return part.cast(kind)
+    return pa.chunked_array([[None if v is None else str(v) for v in part.to_pylist()]], kind)
 
 
 def _merged(orders: Sequence[Sequence[str]]) -> list[str]:

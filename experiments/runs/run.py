@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from statistics import fmean
 
+import numpy as np
 from omegaconf import OmegaConf
 
 from estimators.base import Estimate
@@ -45,7 +46,7 @@ def run_once(experiment: Experiment, draw: Draw, out: Path | None = None) -> lis
         Draws the recordings and estimates of an experiment into a folder.
     out
         File of the first repeat's estimate, the revised one if there is one; None for no file.
-        It is of one robot.
+        It holds one robot.
 
     Raises
     ------
@@ -55,7 +56,7 @@ def run_once(experiment: Experiment, draw: Draw, out: Path | None = None) -> lis
     folder, name = experiment.rows_folder / experiment.key, experiment.estimator_name
     require(
         out is None or experiment.team is None,
-        f"-o {out}: one file is of one robot; those of a team are in the folder of its run",
+        f"-o {out}: one file holds one robot; the estimates of a team are in the folder of its run",
     )
     found: list[tuple[Recording, Estimate]] = []
 
@@ -63,7 +64,12 @@ def run_once(experiment: Experiment, draw: Draw, out: Path | None = None) -> lis
         with shown("simulated seconds", expected_s(experiment)) as on_progress:
             read = experiment.recordings(on_progress)
         slip = experiment.believed_slip
-        if len(read) == 1 and "source" in read.only.config and not experiment.calibrated and slip:
+        if (
+            len(read) == 1
+            and "source" in read.only.config
+            and slip
+            and experiment.config["calibration"] is None
+        ):
             show(
                 f"believed of this real robot: kr={slip[0]:g} and kl={slip[1]:g} m, and the "
                 "geometry that the log's reader assumes; to find its own: "
@@ -94,13 +100,12 @@ def run_once(experiment: Experiment, draw: Draw, out: Path | None = None) -> lis
             on_estimate=keep,
             on_error=_trace,
         )
-    if found and experiment.picture:
+    if found and experiment.config["picture"]:
         draw(found, experiment, folder)
     if found and out is not None:
         write_estimate(out, found[0][1])
-    path = write_run(rows, folder.parent)
-    written = (path, folder / "run.png", *([out] if out is not None else []))
-    _print(rows, [file for file in written if file.exists()])
+    written = (write_run(rows, folder.parent), folder / "run.png", out)
+    _print(rows, [file for file in written if file is not None and file.exists()])
     for row in rows:
         if row["status"] == Outcome.FAILED:
             raise RunFailedError(f"{row['status_code']}: {row['status_detail']}")
@@ -109,10 +114,8 @@ def run_once(experiment: Experiment, draw: Draw, out: Path | None = None) -> lis
 
 def expected_s(experiment: Experiment) -> float | None:
     """About how long the simulated drive will be; None if that is not known before."""
-    if experiment.from_file:
-        return None
     one = experiment.of_robot(0)
-    about_s = getattr(one.route(), "about_s", None)
+    about_s = None if experiment.from_file else getattr(one.route(), "about_s", None)
     return None if about_s is None else round(about_s(one.world(), one.robot()), 1)
 
 
@@ -122,12 +125,10 @@ def record(experiment: Experiment, out: Path) -> bool:
     with progress("simulated seconds", expected_s(experiment)) as on_progress:
         made = experiment.simulated(on_progress)
     checksum = save(made, out)
-    alone = not experiment.of_team
-    said = [
-        f"{'' if alone else f'robot {n}: '}{robot.status}, {robot.duration_s:.1f} s"
-        for n, robot in enumerate(made.robots)
-    ]
-    print(f"{out}: {'; '.join(said)}, checksum {checksum}")
+    drives = [f"{robot.status}, {robot.duration_s:.1f} s" for robot in made.robots]
+    if experiment.team is not None:
+        drives = [f"robot {number}: {drive}" for number, drive in enumerate(drives)]
+    print(f"{out}: {'; '.join(drives)}, checksum {checksum}")
     return all(robot.status == "ok" for robot in made.robots)
 
 
@@ -187,6 +188,7 @@ _SHOWN = (
 
 
 _CONSISTENT = (1.5, 6.0)  # mean NEES of a run, half and twice the expected
+_CONSISTENCY = ("too cautious", "consistent", "too sure of itself")
 _DOF = 3
 
 
@@ -229,15 +231,11 @@ def in_words(rows: Sequence[Row]) -> str:
     distance_m, nees = mean("distance_m"), mean("nees_mean")
     if not math.isfinite(error_m):
         return ""
-    words = f"position RMSE {error_m:.3g} m"
-    if any(f"{REVISED}ate_rmse_m" in row for row in rows):
-        words = f"revised path: {words}"
+    revised = any(f"{REVISED}ate_rmse_m" in row for row in rows)
+    words = f"{'revised path: ' if revised else ''}position RMSE {error_m:.3g} m"
     if distance_m > 0.0:
         words += f", {100.0 * error_m / distance_m:.2g} % of {distance_m:.3g} m"
     if math.isfinite(nees):
-        low, high = _CONSISTENT
-        kind = (
-            "too sure of itself" if nees > high else "too cautious" if nees < low else "consistent"
-        )
+        kind = _CONSISTENCY[int(np.searchsorted(_CONSISTENT, nees))]
         words += f"; {kind} (NEES {nees:.2g} of {_DOF})"
     return words

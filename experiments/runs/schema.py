@@ -6,12 +6,12 @@ import dataclasses
 import difflib
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from enum import Enum
 from typing import Any, Literal
 
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
 from estimators.team import Communication
 from experiments.runs.paths import CONF
@@ -113,16 +113,13 @@ OPTIONS: dict[str, type] = {
     "scoring": ScoringOptions,
 }
 _MAPPINGS = (*GROUPS, *OPTIONS)
-_KEYS = (
-    *_MAPPINGS,
-    *("seed", "world_seed", "recording", "calibration", "name", "repeats", "keep", "picture"),
-    *(f"{place}.{option.name}" for place, kind in OPTIONS.items() for option in described(kind)),
-)
+KEYS = (*_MAPPINGS, "seed", "world_seed", "recording", "calibration", "name")
+KEYS += ("repeats", "keep", "picture")
 
 
 def unknown(key: str, known: Iterable[str]) -> str:
     """Say that a key is unknown, and which ones are known, the nearest spelled first."""
-    names = list(dict.fromkeys(known))
+    names = list(known)
     near = difflib.get_close_matches(key, names, n=3)
     return f"unknown key {key}; known: {', '.join(dict.fromkeys([*near, *names])) or 'none'}"
 
@@ -163,49 +160,45 @@ def fill(cfg: DictConfig) -> None:
 
     These are those of the robot, and of each `_target_` of a world, sensor, route and estimator.
     """
-    places = [group for group in GROUPS if group != "sensors"]
-    if isinstance(_raw(cfg, "sensors"), DictConfig):
-        places += [f"sensors.{name}" for name in cfg.sensors]
-    for place in places:
-        settings = _raw(cfg, place)
-        target = _target(settings, place)
-        if target is not None:
-            given = OmegaConf.to_container(settings, resolve=False)
-            OmegaConf.update(cfg, place, _filled(target, given), merge=False)  # type: ignore[arg-type]
+    for place in _places(cfg, GROUPS):
+        settings = select(cfg, place)
+        if isinstance(settings, DictConfig):
+            with suppress(InputError):  # `check` says it
+                filled = _filled(_target(settings, place), OmegaConf.to_container(settings))  # type: ignore[arg-type]
+                OmegaConf.update(cfg, place, filled, merge=False)
 
 
-def _raw(cfg: DictConfig, place: str) -> Any:
-    """What stands at a place; None if it cannot be resolved."""
-    try:
-        return OmegaConf.select(cfg, place)
-    except OmegaConfBaseException:
-        return None
+def select(cfg: DictConfig, key: str) -> Any:
+    """What stands at a key; None if it cannot be resolved."""
+    return OmegaConf.select(cfg, key, throw_on_resolution_failure=False)
 
 
-def _target(settings: Any, place: str) -> Callable[..., Any] | None:
-    """What takes the settings of a place; None if that is not known, which `check` complains of."""
-    if not isinstance(settings, DictConfig):
-        return None
+def _places(cfg: DictConfig, groups: Iterable[str]) -> Iterator[str]:
+    """Places of some groups that hold a `_target_`: each sensor has one of its own."""
+    for group in groups:
+        if group != "sensors":
+            yield group
+        elif isinstance(sensors := select(cfg, group), DictConfig):
+            yield from (f"sensors.{name!s}" for name in sensors)
+
+
+def _target(settings: DictConfig, place: str) -> Callable[..., Any]:
+    """What takes the settings of a place."""
     if place == "robot" and "_target_" not in settings:
         return DifferentialDrive
-    try:
-        return find(_raw(settings, "_target_"), place)
-    except InputError:
-        return None
+    return find(select(settings, "_target_"), place)
 
 
 def _filled(target: Callable[..., Any], given: Mapping[str, Any]) -> Config:
     """Keys and their values, in the order of the target's own, with its defaults."""
-    found = {"_target_": given["_target_"]} if "_target_" in given else {}
+    filled = {"_target_": given["_target_"]} if "_target_" in given else {}
     for option in _options(target):
-        default = _plain(option.default)
-        if option.name not in given:
-            found |= {} if default is _UNSET else {option.name: default}
-        elif dataclasses.is_dataclass(option.default) and isinstance(given[option.name], dict):
-            found[option.name] = _filled(type(option.default), given[option.name])
-        else:
-            found[option.name] = given[option.name]
-    return {**found, **{name: value for name, value in given.items() if name not in found}}
+        value = given.get(option.name, _plain(option.default))
+        if dataclasses.is_dataclass(option.default) and isinstance(value, dict):
+            value = _filled(type(option.default), value)
+        if value is not _UNSET:
+            filled[option.name] = value
+    return {**filled, **{name: value for name, value in given.items() if name not in filled}}
 
 
 def _options(target: Callable[..., Any]) -> list[Option]:
@@ -219,17 +212,17 @@ def _options(target: Callable[..., Any]) -> list[Option]:
 def _plain(value: Any) -> Any:
     """A default as a configuration holds it; `_UNSET` for one that it cannot hold."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        value = dataclasses.asdict(value) if value is not dataclasses.MISSING else _UNSET
+        value = dataclasses.asdict(value)
     if isinstance(value, Enum):
         value = value.value
+    if isinstance(value, dict):
+        plain = {str(name): _plain(part) for name, part in value.items()}
+        return _UNSET if _UNSET in plain.values() else plain
     if isinstance(value, (list, tuple)):
         parts = [_plain(part) for part in value]
         return _UNSET if _UNSET in parts else parts
-    if isinstance(value, dict):
-        held = {str(name): _plain(part) for name, part in value.items()}
-        return _UNSET if _UNSET in held.values() else held
-    sound = value is None or isinstance(value, (str, bool, int, float))
-    return value if sound and not _holds_nan(value) else _UNSET
+    scalar = value is None or isinstance(value, (str, bool, int, float))
+    return value if scalar and not _holds_nan(value) else _UNSET
 
 
 def describe_option(group: str, name: str) -> str:
@@ -243,21 +236,17 @@ def describe_option(group: str, name: str) -> str:
     Raises
     ------
     InputError
-        If there is no such group, or what the option names cannot be found.
+        If the group is unknown, or what the option names cannot be found.
     """
     require(group in GROUPS, f"no group {group}; there are: {', '.join(GROUPS)}")
     with initialize_config_dir(str(CONF), version_base="1.3"):
         cfg = compose("config", overrides=[f"{group}={name}"])
-    places = [f"sensors.{sensor}" for sensor in cfg.sensors] if group == "sensors" else [group]
     parts = []
-    for place in places:
-        settings = OmegaConf.select(cfg, place)
-        if settings is None:
-            continue
-        stated = OmegaConf.to_container(settings, resolve=False)
-        called = stated.get("_target_", "")  # type: ignore[union-attr]
-        target = find(called, place) if called or place != "robot" else DifferentialDrive
-        parts.append("\n".join([place + (f": {called}" if called else ""), *_said(target, stated)]))  # type: ignore[arg-type]
+    for place in _places(cfg, [group]):
+        if (settings := select(cfg, place)) is not None:
+            stated: Config = OmegaConf.to_container(settings)  # type: ignore[assignment]
+            title = f"{place}: {stated['_target_']}" if "_target_" in stated else place
+            parts.append("\n".join([title, *_said(_target(settings, place), stated)]))
     return "\n\n".join(parts)
 
 
@@ -265,9 +254,8 @@ def _said(target: Callable[..., Any], stated: Mapping[str, Any]) -> Iterator[str
     """A line for each option, and one of its meaning."""
     for option in _options(target):
         value = stated.get(option.name, option.default)
-        shown = "needed" if value is dataclasses.MISSING else "null" if value is None else value
-        if isinstance(value, bool):
-            shown = str(value).lower()
+        words = {dataclasses.MISSING: "needed", None: "null", True: "true", False: "false"}
+        shown = next((said for known, said in words.items() if value is known), value)
         yield f"  {option.name}: {shown}" + (f"  ({option.accepts})" if option.accepts else "")
         if option.meaning:
             yield f"      {option.meaning}"
@@ -276,42 +264,25 @@ def _said(target: Callable[..., Any], stated: Mapping[str, Any]) -> Iterator[str
 # What a configuration must hold
 
 
-def check_known(key: str) -> None:
-    """Check that a key is one of the configuration's own.
-
-    Raises
-    ------
-    InputError
-        Naming the known ones next to it.
-    """
-    place = key.rpartition(".")[0]
-    require(
-        key in _KEYS, unknown(key, (other for other in _KEYS if other.rpartition(".")[0] == place))
-    )
-
-
 def check_shape(config: Config) -> None:
-    """Check that every key is there, holds keys or a path where it must, and nowhere NaN.
+    """Check that every key is there, holds keys or a path where it must, and none holds NaN.
 
     Raises
     ------
     InputError
         Naming the key, and the remedy.
     """
-    for key in _KEYS:
-        parent, _, leaf = key.rpartition(".")
-        if leaf not in (config[parent] if parent else config):
-            remedy = f"choose one of `estima options {key}`" if key in GROUPS else "set it"
-            raise InputError(f"{key} is missing; {remedy}")
-        if key in _MAPPINGS and not isinstance(config[key], dict):
-            raise InputError(f"{key} must hold keys, got {config[key]!r}")
-    for place in ("simulation", "prior", "scoring"):
-        for name in config[place]:
-            check_known(f"{place}.{name}")
+    for key in KEYS:
+        remedy = f"choose one of `estima options {key}`" if key in GROUPS else "set it"
+        require(key in config, f"{key} is missing; {remedy}")
+        holds_keys = isinstance(config[key], dict) or key not in _MAPPINGS
+        require(holds_keys, f"{key} must hold keys, got {config[key]!r}")
     wanted = config["recording"]
-    if not (wanted is None or isinstance(wanted, dict) or (isinstance(wanted, str) and wanted)):
-        got = "nothing" if wanted == "" else repr(wanted)
-        raise InputError(f"recording must be a path, null, or a mapping with _target_, got {got}")
+    require(
+        wanted is None or (isinstance(wanted, (dict, str)) and wanted != ""),
+        "recording must be a path, null, or a mapping with _target_, got "
+        f"{'nothing' if wanted == '' else repr(wanted)}",
+    )
     for leaf_, value in leaves(config):
         require(not _holds_nan(value), f"{'.'.join(map(str, leaf_))} holds NaN; give a number")
 
@@ -338,8 +309,7 @@ def own_config(config: Config, settings: TeamSettings, number: int) -> Config:
         where = f"team.robots[{number}].{group}"
         require(group in _OWN, f"unknown key {where}; known: {', '.join(_OWN)}")
         require(isinstance(values, Mapping), f"{where} must hold keys, got {values!r}")
-        for key in values:
-            known = (f"{where}.{name}" for name in own[group])
-            require(key in own[group], unknown(f"{where}.{key}", known))
+        for key in [key for key in values if key not in own[group]]:
+            raise InputError(unknown(f"{where}.{key}", (f"{where}.{name}" for name in own[group])))
         own[group] = {**own[group], **values}
     return own

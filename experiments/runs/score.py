@@ -1,13 +1,13 @@
 """Rows of trajectories that other programs made of a recording."""
 
+import dataclasses
 import hashlib
 import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import StrEnum
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
 import numpy as np
 
@@ -36,62 +36,30 @@ from sim import se2
 from sim.arrays import Array
 from sim.errors import InputError, require
 from sim.formats.detect import read_any
+from sim.options import NonNegative, options
 from sim.recording import Recording
 
 _FEWEST_POSES = 3  # of fewer, figures say nothing, and stamps of another unit may meet by chance
 
 
-class Align(StrEnum):
-    """How a trajectory is moved before it is scored."""
-
-    NONE = "none"
-    START = "start"  # its first scored pose onto the true one
-    SE2 = "se2"  # least squares of the positions, no scale
-
-
-class Match(StrEnum):
-    """Which true pose belongs to a stamp."""
-
-    INTERPOLATED = "interpolated"
-    NEAREST = "nearest"  # as evo associates: the shorter trajectory's stamps with the other's
-
-
-@dataclass(frozen=True)
+@options("")
 class Scoring:
-    """How a trajectory is scored.
+    """How a trajectory is scored."""
 
-    Attributes
-    ----------
-    align, match
-        How it is moved, and which true poses it meets.
-    tolerance_s
-        Greatest difference of stamps that match, of `nearest`.
-    offset_s
-        Added to the trajectory's stamps.
-    revised
-        Whether it is a revised path, not an online one.
-    cpu_seconds
-        Processor time of the whole run, if it is known.
-    """
-
-    align: Align = Align.NONE
-    match: Match = Match.INTERPOLATED
-    tolerance_s: float = 0.01
+    align: Literal["none", "start", "se2"] = "none"
+    """How it is moved before: its first scored pose onto the true one, or by least squares of the
+    positions, without scale."""
+    match: Literal["interpolated", "nearest"] = "interpolated"
+    """Which true pose belongs to a stamp; `nearest` as evo associates: the shorter trajectory's
+    stamps with the other's."""
+    tolerance_s: NonNegative = 0.01
+    """Greatest difference of stamps that match, of `nearest`."""
     offset_s: float = 0.0
+    """Added to the trajectory's stamps."""
     revised: bool = False
-    cpu_seconds: float | None = None
-
-    def __post_init__(self) -> None:
-        require(math.isfinite(self.offset_s), f"--offset must be finite, got {self.offset_s:g}")
-        require(
-            0.0 <= self.tolerance_s < math.inf,
-            f"--tolerance must be zero or a positive number, got {self.tolerance_s:g}",
-        )
-        spent = self.cpu_seconds
-        require(
-            spent is None or 0.0 <= spent < math.inf,
-            f"--cpu-seconds must be zero or a positive number, got {spent}",
-        )
+    """Whether it is a revised path, not an online one."""
+    cpu_seconds: NonNegative | None = None
+    """Processor time of the whole run, if it is known."""
 
 
 @dataclass(frozen=True)
@@ -131,7 +99,7 @@ def scored_against(recording: Recording, given: Estimate, how: Scoring) -> Score
     require(recording.truth is not None, "this recording has no truth to score against")
     stamps = given.stamps + how.offset_s
     rows: Rows
-    if how.match is Match.NEAREST:
+    if how.match == "nearest":
         rows, true_rows = _associated(stamps, recording.known_truth.stamps, how.tolerance_s)
         truth = recording.known_truth.poses[true_rows]
     else:
@@ -148,21 +116,15 @@ def scored_against(recording: Recording, given: Estimate, how: Scoring) -> Score
     )
     means, covariances = given.means[rows], given.covariances[rows]
     T = np.zeros(3)
-    if how.align is Align.START:
-        T = se2.compose(truth[0], se2.inverse(means[0]))
-    elif how.align is Align.SE2:
-        T = alignment(truth, means)
+    if how.align != "none":
+        to_start = se2.compose(truth[0], se2.inverse(means[0]))
+        T = to_start if how.align == "start" else alignment(truth, means)
     cos, sin = math.cos(T[2]), math.sin(T[2])
     turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
-    moved = Estimate(
-        stamps[rows],
-        se2.compose(T, means),
-        turn @ covariances @ turn.T,
-        left_out=given.left_out,
-    )
+    poses, covariances = se2.compose(T, means), turn @ covariances @ turn.T
+    moved = Estimate(stamps[rows], poses, covariances, left_out=given.left_out)
     pause_s = longest_pause_s(stamps[rows], start, end)
-    left_out = len(stamps) - len(np.unique(rows))
-    return Scored(moved, truth, T, len(stamps), left_out, pause_s)
+    return Scored(moved, truth, T, len(stamps), len(stamps) - len(np.unique(rows)), pause_s)
 
 
 def _associated(stamps: Array, true_stamps: Array, tolerance_s: float) -> tuple[Rows, Rows]:
@@ -178,15 +140,9 @@ def _associated(stamps: Array, true_stamps: Array, tolerance_s: float) -> tuple[
 def statistics(errors: Array) -> dict[str, float]:
     """What evo says of errors: rmse, mean, median, std, min, max, sse."""
     size = np.abs(errors)
-    return {
-        "rmse": rms(size),
-        "mean": float(np.mean(size)),
-        "median": float(np.median(size)),
-        "std": float(np.std(size)),
-        "min": float(np.min(size)),
-        "max": float(np.max(size)),
-        "sse": float(np.sum(np.square(size))),
-    }
+    found = {name: getattr(np, name)(size) for name in ("mean", "median", "std", "min", "max")}
+    found = {"rmse": rms(size), **found, "sse": np.sum(np.square(size))}
+    return {name: float(value) for name, value in found.items()}
 
 
 def error_table(scored: Scored) -> dict[str, dict[str, float]]:
@@ -225,26 +181,26 @@ def row_of(
     estimator, name
         What made the trajectory, and the folder of the row.
     """
-    given = {key: value for key, value in vars(how).items() if key != "cpu_seconds"}
-    settings = {f"trajectory.{key}": value for key, value in given.items()}
-    settings |= {"trajectory.align": how.align.value, "trajectory.match": how.match.value}
-    checksum = recording.checksum
-    origin = [checksum, sorted(files_digest({"file": str(files[1])}).values()), settings, estimator]
-    key = hashlib.sha256(json.dumps(origin).encode()).hexdigest()[:16]
-    seed = recording.config.get("seed")
+    settings = {f"trajectory.{key}": value for key, value in dataclasses.asdict(how).items()}
+    del settings["trajectory.cpu_seconds"]
+    checksum, digests = recording.checksum, sorted(files_digest(str(files[1])).values())
+    origin = json.dumps([checksum, digests, settings, estimator])
+    status, seed = status_of_pauses(recording, scored.estimate.stamps), recording.config.get("seed")
+    if status.outcome is Outcome.OK and scored.estimate.left_out:
+        status = Status(Outcome.REMARK, "planar", scored.estimate.left_out)
     row: Row = {
         "choice.estimator": estimator,
-        "seed": seed if isinstance(seed, int) and not isinstance(seed, bool) else 0,
+        "seed": seed if type(seed) is int else 0,
         "repeats": 1,
         "recording": str(files[0]),
         "name": name,
         "trajectory.file": str(files[1]),
         **settings,
         "repeat": repeat,
-        "run_key": key,
+        "run_key": hashlib.sha256(origin.encode()).hexdigest()[:16],
         "code_version": code_version(),
         "recording_checksum": checksum,
-        **_status(recording, scored).columns(),
+        **status.columns(),
         "duration_s": float(np.ptp(scored.estimate.stamps)),
         "stamps_scored": float(len(scored.truth)),
         "stamps_left_out": float(scored.n_left_out),
@@ -255,14 +211,6 @@ def row_of(
     scores = path_scores(scored.truth, scored.estimate.means, scored.estimate.covariances)
     prefix = REVISED if how.revised else ""
     return row | {k if k in OF_THE_RUN else f"{prefix}{k}": v for k, v in scores.items()}
-
-
-def _status(recording: Recording, scored: Scored) -> Status:
-    """Remark on what is not scored: long pauses, or all that is not planar."""
-    status = status_of_pauses(recording, scored.estimate.stamps)
-    if status.outcome is Outcome.OK and scored.estimate.left_out:
-        return Status(Outcome.REMARK, "planar", scored.estimate.left_out)
-    return status
 
 
 def score_files(
@@ -285,14 +233,13 @@ def score_files(
     """
     folder = rows_folder(name)
     alone = len(trajectories) == 1 or (estimator is None and how.cpu_seconds is None)
-    require(alone, "--as and --cpu-seconds are of one trajectory; score them one by one")
+    require(alone, "--as and --cpu-seconds apply to one trajectory; score them one by one")
     names = [estimator or trajectory.stem for trajectory in trajectories]
     require(
         len(set(names)) == len(names),
         f"two trajectories called {max(names, key=names.count)}; score them one by one with --as",
     )
-    recording = read_any([path])
-    results = []
+    recording, results = read_any([path]), []
     for trajectory, called in zip(trajectories, names, strict=True):
         given = read_trajectory(trajectory, topic)
         try:
@@ -321,16 +268,16 @@ def described(scored: Scored, how: Scoring) -> str:
     stamps = scored.estimate.stamps
     matching = (
         "the truth is interpolated at their stamps"
-        if how.match is Match.INTERPOLATED
+        if how.match == "interpolated"
         else f"each with the nearest true stamp within {how.tolerance_s:g} s"
     )
     x, y, heading = scored.moved_by
     moved = {
-        Align.NONE: "not aligned",
-        Align.START: "aligned at the first scored pose",
-        Align.SE2: "aligned by SE(2), least squares",
+        "none": "not aligned",
+        "start": "aligned at the first scored pose",
+        "se2": "aligned by SE(2), least squares",
     }[how.align]
-    if how.align is not Align.NONE:
+    if how.align != "none":
         moved += f": moved by ({x:.6g} m, {y:.6g} m, {heading:.6g} rad)"
     offset = f", {how.offset_s:+g} s on the stamps" if how.offset_s else ""
     n_again = len(scored.truth) + scored.n_left_out - scored.n_given
@@ -342,13 +289,3 @@ def described(scored: Scored, how: Scoring) -> str:
         f"  longest time without a pose: {scored.longest_gap_s:.3g} s\n"
         f"  {'revised' if how.revised else 'online'} path, {moved}{remark}"
     )
-
-
-def as_scoring(**options: Any) -> Scoring:
-    """Build a Scoring of the command line's words; InputError names the known ones."""
-    for key, kind in (("align", Align), ("match", Match)):
-        word = str(options[key])
-        if word not in list(kind):
-            raise InputError(f"--{key} must be one of {', '.join(kind)}, got {word}")
-        options[key] = kind(word)
-    return Scoring(**options)

@@ -4,7 +4,7 @@ import zlib
 
 import numpy as np
 
-from sim.errors import InputError
+from sim.errors import require
 
 
 def stream(seed: int, axis: str, index: int = 0, *, key: str = "seed") -> np.random.Generator:
@@ -27,9 +27,9 @@ def stream(seed: int, axis: str, index: int = 0, *, key: str = "seed") -> np.ran
     Raises
     ------
     InputError
-        If the seed is no such number.
+        If the seed is anything else.
     """
-    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
-        raise InputError(f"{key} must be a whole number from 0 on, got {seed!r}")
+    whole = isinstance(seed, int) and not isinstance(seed, bool)
+    require(whole and seed >= 0, f"{key} must be a whole number from 0 on, got {seed!r}")
     spawn_key = (zlib.crc32(axis.encode()), index)
     return np.random.default_rng(np.random.SeedSequence(entropy=seed, spawn_key=spawn_key))

@@ -14,7 +14,7 @@ import os
 import re
 import zlib
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -102,14 +102,9 @@ class Journal:
         return crc
 
 
-@contextmanager
-def journal(path: Path) -> Iterator[Journal]:
-    """Open a journal and close it again."""
-    opened = Journal(path)
-    try:
-        yield opened
-    finally:
-        opened.close()
+def journal(path: Path) -> closing[Journal]:
+    """Open a journal, as a context that closes it."""
+    return closing(Journal(path))
 
 
 @dataclass(frozen=True)
@@ -138,26 +133,19 @@ def read_runs(path: Path) -> pd.DataFrame:
     InputError
         If there are none, or a file is damaged or holds no rows.
     """
-    if not path.is_dir():
-        return _with_rows(read_rows(path), path)
-    tables = [_with_rows(table, file) for file in _files(path) for table in _tables(file)]
+    tables = [t for file in _files(path) for t in _tables(file)] if path.is_dir() else []
     if not tables:
-        raise InputError(f"{path}: no results here; run the study first")
-    table = joined(tables)
-    if not {"run_key", "status", REPEAT} <= set(table):
+        table = read_rows(path)
+        require(len(table), f"{path}: a table of no rows; delete it")
         return table
-    if not table.duplicated(["run_key", REPEAT]).any():
+    table = joined(tables)
+    known = {"run_key", "status", REPEAT} <= set(table)
+    if not known or not table.duplicated(["run_key", REPEAT]).any():
         return table
     source = np.repeat(np.arange(len(tables)), [len(t) for t in tables])
     sound = (table["status"] != Outcome.FAILED).groupby([table["run_key"], source])
     order = np.lexsort((source, sound.transform("all")))
     return table.iloc[order].drop_duplicates(["run_key", REPEAT], keep="last", ignore_index=True)
-
-
-def _with_rows(table: Table, file: Path) -> Table:
-    """The table of a file, which has rows."""
-    require(len(table) > 0, f"{file}: a table of no rows; delete it")
-    return table
 
 
 def ended(folder: Path, prefix: str = "", damaged: Any = None) -> Ended:
@@ -292,7 +280,7 @@ def tidy(folder: Path, is_live: Any) -> None:
     """
     if not folder.is_dir():
         return
-    with _alone(folder):
+    with locked(folder / ".tidy.lock"):
         for path in sorted(folder.glob(f"*{JOURNAL}")):
             if not is_live(path.name):
                 compact(path)
@@ -338,7 +326,9 @@ def _tables(path: Path, columns: list[str] | None = None) -> list[pa.Table]:
     """Tables of a file. A journal that became Parquet meanwhile is read as such."""
     require_file(path)
     if path.suffix == ".parquet":
-        return [read_parquet(path, columns)]
+        table = read_parquet(path, columns)
+        require(len(table), f"{path}: a table of no rows; delete it")
+        return [table]
     try:
         content = path.read_bytes()
     except FileNotFoundError:
@@ -350,31 +340,13 @@ def _tables(path: Path, columns: list[str] | None = None) -> list[pa.Table]:
 
 def _as_numbers(keys: pa.ChunkedArray) -> NDArray[np.uint64]:
     """Keys of 16 hexadecimal digits as numbers; others are left out of any match, as 0."""
-    texts = keys.to_pylist()
-    try:
-        packed = bytes.fromhex("".join(texts))
-    except (ValueError, TypeError):
-        packed = b""
-    if len(packed) != 8 * len(texts):
-        packed = b"".join(
-            bytes.fromhex(t) if isinstance(t, str) and _KEY.fullmatch(t) else bytes(8)
-            for t in texts
-        )
-    return np.frombuffer(packed, ">u8").astype(np.uint64)
+    sound = (isinstance(key, str) and _KEY.fullmatch(key) for key in keys.to_pylist())
+    return np.array([int(found[0], 16) if found else 0 for found in sound], np.uint64)
 
 
 def _same(a: Any, b: Any) -> bool:
     """Whether two values are the same, of the same type; 0.0 and -0.0 are not."""
     return type(a) is type(b) and repr(a) == repr(b)
-
-
-@contextmanager
-def _alone(folder: Path) -> Iterator[None]:
-    """Hold the folder's lock."""
-    with ExitStack() as held:
-        with _writing(folder):
-            held.enter_context(locked(folder / ".tidy.lock"))
-        yield
 
 
 @contextmanager

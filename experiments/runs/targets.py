@@ -4,7 +4,7 @@ import inspect
 from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
-from sim.errors import InputError
+from sim.errors import InputError, require
 from sim.options import find
 
 
@@ -36,12 +36,6 @@ def make(settings: Mapping[str, Any], where: str, **injected: Any) -> Any:
         ) from error
 
 
-def _is_number(annotation: Any) -> bool:
-    """Whether a parameter takes a number or nothing."""
-    name = annotation if isinstance(annotation, str) else getattr(annotation, "__name__", "")
-    return name.removesuffix(" | None") in ("int", "float")
-
-
 def checked(
     settings: Mapping[str, Any], where: str, injected: Collection[str] = ()
 ) -> Callable[..., Any]:
@@ -55,18 +49,25 @@ def checked(
     function = find(settings.get("_target_"), where)
     target = settings["_target_"]
     known = inspect.signature(function).parameters
-    variadic = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
-    open_ended = any(p.kind is inspect.Parameter.VAR_KEYWORD for p in known.values())
-    for key, value in settings.items():
-        if key in known and isinstance(value, str) and _is_number(known[key].annotation):
-            raise InputError(f"{where}.{key} must be a number, got {value!r}")
-        if key not in (*known, "_target_") and not open_ended:
-            free = ", ".join(k for k in known if k not in injected) or "none"
-            raise InputError(f"unknown key {where}.{key} for {target}; known: {free}")
+    variadic = {name for name, p in known.items() if p.kind in (p.VAR_KEYWORD, p.VAR_POSITIONAL)}
+    open_ended = any(p.kind is p.VAR_KEYWORD for p in known.values())
+    free = ", ".join(name for name in known if name not in injected) or "none"
+    for key in settings:
+        require(
+            open_ended or key in known or key == "_target_",
+            f"unknown key {where}.{key} for {target}; known: {free}",
+        )
     for name, parameter in known.items():
-        required = parameter.default is inspect.Parameter.empty and parameter.kind not in variadic
-        if required and name not in settings and name not in injected and name != "self":
-            raise InputError(f"{where}.{name} is missing; {target} needs it")
+        if name in settings:
+            kind = getattr(parameter.annotation, "__name__", str(parameter.annotation))
+            number = kind.removesuffix(" | None") in ("int", "float")
+            require(
+                not (number and isinstance(settings[name], str)),
+                f"{where}.{name} must be a number, got {settings[name]!r}",
+            )
+        elif name not in {*variadic, *injected, "self"}:
+            bare = parameter.default is parameter.empty
+            require(not bare, f"{where}.{name} is missing; {target} needs it")
     return function
 
 

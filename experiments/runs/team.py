@@ -76,7 +76,7 @@ def scores_of_team(team: Team, scores: Sequence[Row]) -> Row:
     """The one row of a team's run, of the scores of its robots.
 
     Errors are pooled by their squares over all stamps that count. Counts and times of a step add
-    up; all else is averaged over the stamps. `worst_robot_rmse_m` is of the best answers.
+    up; all else is averaged over the stamps. `worst_robot_rmse_m` comes from the best answers.
     """
     row: Row = {}
     for name in dict.fromkeys(name for own in scores for name in own):

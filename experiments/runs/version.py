@@ -1,15 +1,16 @@
 """Where results come from: the machine, and digests of the code, so that versions never mix."""
 
-import ast
 import functools
 import hashlib
 import importlib.util
 import json
 import os
 import platform
+import re
 import shlex
 from collections.abc import Iterable
 from contextlib import suppress
+from modulefinder import ModuleFinder
 from pathlib import Path
 from typing import Any
 
@@ -57,9 +58,8 @@ def version_with(targets: Iterable[str], command: Any = None) -> str:
     found = {target: digest for target in sorted(targets) if (digest := source_digest(target))}
     for path in command_files(command):
         found[str(path)] = hashlib.sha256(path.read_bytes()).hexdigest()
-    if not found:
-        return code_version()
-    return f"{code_version()}+{hashlib.sha256(repr(found).encode()).hexdigest()[:12]}"
+    elsewhere = f"+{hashlib.sha256(repr(found).encode()).hexdigest()[:12]}" if found else ""
+    return code_version() + elsewhere
 
 
 def command_files(command: Any) -> list[Path]:
@@ -83,37 +83,26 @@ def source_digest(target: str) -> str:
     module, top = target.rpartition(".")[0], target.partition(".")[0]
     if top in ("sim", "estimators"):
         return ""
+    spec, file = importlib.util.find_spec(top), f"{module.replace('.', '/')}.py"
+    files: list[Path] = []
     if top == "experiments":
-        file = f"{module.replace('.', '/')}.py"
         files = [] if file in RUNS else [SOURCE / file]
-    else:
-        spec = importlib.util.find_spec(top)
-        if spec is not None and spec.submodule_search_locations is not None:
-            places = map(Path, spec.submodule_search_locations)
-            files = [path for place in places for path in sorted(place.rglob("*.py"))]
-        else:
-            files = _with_imports(Path(spec.origin)) if spec and spec.origin else []
-    digest = hashlib.sha256()
-    for path in filter(Path.is_file, files):
-        digest.update(path.name.encode() + b"\0" + path.read_bytes())
-    return digest.hexdigest()[:12] if files else ""
+    elif spec is not None and spec.submodule_search_locations is not None:
+        places = map(Path, spec.submodule_search_locations)
+        files = [path for place in places for path in sorted(place.rglob("*.py"))]
+    elif spec is not None and spec.origin:
+        files = _with_imports(Path(spec.origin))
+    content = (path.name.encode() + b"\0" + path.read_bytes() for path in files if path.is_file())
+    return hashlib.sha256(b"".join(content)).hexdigest()[:12] if files else ""
 
 
 def _with_imports(module: Path) -> list[Path]:
     """A module's file and those in its folder that it imports, itself or through others."""
-    found, left = set[Path](), {module}
-    while left:
-        path = left.pop()
-        found.add(path)
-        try:
-            nodes = list(ast.walk(ast.parse(path.read_bytes())))
-        except (OSError, SyntaxError, ValueError):  # it will not run
-            continue
-        names = [node.module or "" for node in nodes if isinstance(node, ast.ImportFrom)]
-        names += [a.name for node in nodes if isinstance(node, ast.Import) for a in node.names]
-        beside = {module.parent / f"{name.partition('.')[0]}.py" for name in names}
-        left |= {path for path in beside if path.is_file()} - found
-    return sorted(found)
+    finder = ModuleFinder([str(module.parent)])
+    with suppress(OSError, SyntaxError, ValueError):  # it will not run
+        finder.run_script(str(module))
+    files = (getattr(each, "__file__", None) for each in finder.modules.values())
+    return sorted({module, *(Path(file) for file in files if file)})
 
 
 def machine() -> dict[str, str | int]:
@@ -134,8 +123,6 @@ def machine() -> dict[str, str | int]:
 
 def _cpu_model() -> str:
     """Name of the processor, from the kernel if it gives one, else from the platform."""
-    with suppress(OSError):
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    return platform.processor() or platform.machine()
+    info = Path("/proc/cpuinfo")
+    named = re.search(r"^model name\s*: (.*)$", info.read_text() if info.exists() else "", re.M)
+    return named[1].strip() if named else platform.processor() or platform.machine()

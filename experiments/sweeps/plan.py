@@ -27,13 +27,12 @@ from experiments.runs.compose import (
     Composer,
     composing,
     searched,
-    select,
     set_value,
     with_study_file,
 )
 from experiments.runs.experiment import Experiment
 from experiments.runs.key import decides_recording, files_of_options, leaf_digests
-from experiments.runs.schema import Leaf, leaves
+from experiments.runs.schema import Leaf, leaves, select
 from sim.errors import InputError, require
 
 Numbers = NDArray[np.int64]

@@ -275,7 +275,8 @@ def _plan(
 
 
 def _value(experiment: Experiment, option: str) -> Any:
-    settings = experiment.estimator_options
+    settings = experiment.options_of("estimator")
+    del settings["_target_"]
     known = f"{experiment.estimator_name} has no option {option}; it has {', '.join(settings)}"
     require(option in settings, known)
     return settings[option]

@@ -120,9 +120,9 @@ def _slip(recording: Recording) -> tuple[float, float] | None:
     made_with = recording.config.get("robot")
     if not isinstance(made_with, dict):  # of a log of many robots, the number of one
         return None
-    slip = [made_with.get(name) for name in ("kr", "kl")]
-    known = [float(k) for k in slip if isinstance(k, (int, float)) and 0.0 <= k < math.inf]
-    return (known[0], known[1]) if len(known) == 2 else None
+    kr, kl = made_with.get("kr", math.nan), made_with.get("kl", math.nan)
+    sound = all(isinstance(k, (int, float)) and 0.0 <= k < math.inf for k in (kr, kl))
+    return (float(kr), float(kl)) if sound else None
 
 
 def convert_log(
@@ -147,9 +147,9 @@ def convert_log(
     recording = read_any(log, robot)
     write_recording(out, recording)
     said = f"{out}: {recording.duration_s:.1f} s, {len(recording.frame_stamps)} frames"
-    dropped = [name for name in recording.logs if name != "laser"] if out.suffix == ".log" else []
-    if dropped:
-        said += f"\nleft out, since a CARMEN log holds one laser: {', '.join(dropped)}"
+    dropped = ", ".join(name for name in recording.logs if name != "laser")
+    if dropped and out.suffix == ".log":
+        said += f"\nleft out, since a CARMEN log holds one laser: {dropped}"
     return said
 
 

@@ -75,8 +75,8 @@ def odometry_records(
         twist_covariances = np.zeros((len(stamps), 3, 3))
     twist_6x6, records = covariance_6x6(twist_covariances), []
     for i, covariance in enumerate(covariance_6x6(estimate.covariances)):
-        x, y, heading = (float(v) for v in poses[i])
-        vx, vy, turn = (float(v) for v in twists[i])
+        x, y, heading = map(float, poses[i])
+        vx, vy, turn = map(float, twists[i])
         records.append(
             {
                 "header": {"stamp": float(stamps[i]), "frame_id": "odom"},
@@ -122,12 +122,12 @@ def write_odometry_csv(
     estimate: Estimate, path: Path, twist_covariances: Array | None = None
 ) -> None:
     """Write one line per record; covariances are pose.covariance.0 to .35, and of the twist."""
-    records = odometry_records(estimate, twist_covariances)
+    records = [_flat(record) for record in odometry_records(estimate, twist_covariances)]
     require(records, f"{path}: the estimate holds no belief; nothing to write")
     with write_whole(path) as part, part.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(_flat_keys(records[0]))
-        writer.writerows(_flat_values(record) for record in records)
+        writer = csv.DictWriter(file, records[0])
+        writer.writeheader()
+        writer.writerows(records)
 
 
 def read_odometry_csv(path: Path) -> Estimate:
@@ -168,17 +168,10 @@ def read_odometry_csv(path: Path) -> Estimate:
     return Estimate(stamps, np.column_stack([x, y, heading]), full[PLANAR])
 
 
-def _flat_keys(tree: Any, prefix: str = "") -> list[str]:
-    """Dotted names of a record's leaves, in order."""
-    if isinstance(tree, dict):
-        return [name for k, v in tree.items() for name in _flat_keys(v, f"{prefix}{k}.")]
-    if isinstance(tree, list):
-        return [f"{prefix}{i}" for i in range(len(tree))]
-    return [prefix[:-1]]
-
-
-def _flat_values(tree: Any) -> list[Any]:
-    """Leaves of a record, in the same order; floats print with all their digits."""
-    if isinstance(tree, dict):
-        return [leaf for value in tree.values() for leaf in _flat_values(value)]
-    return tree if isinstance(tree, list) else [tree]
+def _flat(tree: Any, prefix: str = "") -> dict[str, Any]:
+    """Dotted names of a record's leaves, and their values."""
+    if not isinstance(tree, (dict, list)):
+        return {prefix[:-1]: tree}
+    parts = tree.items() if isinstance(tree, dict) else enumerate(tree)
+    leaves = (_flat(part, f"{prefix}{key}.") for key, part in parts)
+    return {name: value for part in leaves for name, value in part.items()}

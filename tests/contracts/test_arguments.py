@@ -2,7 +2,7 @@
 
 import pytest
 
-from experiments.runs import cache
+from experiments.runs import cache, processes
 from experiments.runs.compose import CommandLine, check_hydra, searched
 from experiments.runs.console import end
 from experiments.runs.experiment import Experiment
@@ -72,8 +72,8 @@ def test_a_cache_that_cannot_be_cleared_is_one_line(tmp_path, monkeypatch):
     def read_only(*_):
         raise OSError(30, "Read-only file system")
 
-    monkeypatch.setattr(cache.fcntl, "flock", read_only)
-    with pytest.raises(InputError, match=r"a\.npz: cannot delete it \(Read-only"):
+    monkeypatch.setattr(processes.fcntl, "flock", read_only)
+    with pytest.raises(InputError, match=r"a\.lock: cannot lock it \(Read-only"):
         cache.trim(0.0)
     monkeypatch.undo()
     monkeypatch.setenv("ESTIMA_RESULTS", str(tmp_path))

@@ -293,7 +293,7 @@ def _closeup(group: Sequence[Experiment], out: Results | None = None) -> Tables:
     recording, world = group[0].recording(), group[0].world()
     rows, tables = [], {}
     for experiment in group:
-        believed = experiment.estimator_options
+        believed = experiment.options_of("estimator")
         scans: Scans = "last" if believed["covariance"] == "censi_last" else "both"
         path = ellipse_path(recording, world, believed["metric"], scans, believed["neighbours"])
         origin = {"seed": experiment.seed, "method": experiment.label("method")}

@@ -77,14 +77,14 @@ def plan(profile: Profile) -> Iterator[TableRun]:
     for table in settings.LABELS:
         few = profile is Profile.QUICK and table != "repeats"  # which has one world
         for one in planned([f"study=gil2008/{table}", *few * [f"seed={settings.QUICK_SEEDS}"]]):
-            drawn = one.recording_options
+            drawn = one.options_of("recording")
             if drawn["draw"] < n_draws and drawn["image_draw"] <= n_repeats:
                 yield table, one.replaced(repeats=min(one.repeats, n_repeats))
 
 
 def _drawn_from(run: TableRun) -> tuple[Scene, str]:
     """What runs over one recording have in common."""
-    return Scene.of(run[1].config), json.dumps(run[1].route_options)
+    return Scene.of(run[1].config), json.dumps(run[1].options_of("route"))
 
 
 def rows_of(runs: Sequence[TableRun]) -> Tables:
@@ -116,7 +116,7 @@ def rows_of(runs: Sequence[TableRun]) -> Tables:
 
 def labels_of(table: str, experiment: Experiment) -> Row:
     """Columns that name a run in its table; their text names its stream."""
-    choice, chosen = experiment.estimator_name, experiment.estimator_options
+    choice, chosen = experiment.estimator_name, experiment.options_of("estimator")
     name = {"fastslam_paper": "paper", "smoother": "batch"}.get(choice, choice)
     if choice == "fastslam":
         name = {"motion": "fastslam1", "optimal": "fastslam2"}[chosen["proposal"]]

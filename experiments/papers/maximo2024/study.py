@@ -268,7 +268,7 @@ def campus_arrays() -> Arrays:
     """
     experiments = campus_runs(JUDGED_SEED)
     mapping, taking = (experiment.recording() for experiment in experiments)
-    spacing_m = experiments[0].map_options["spacing_m"]
+    spacing_m = experiments[0].options_of("prior.map")["spacing_m"]
     known = from_recording(mapping, DRAWN_DESCRIPTOR, spacing_m)
     # where most is seen within 40 m
     seen = np.convolve(np.sum(known.slices_m < 40.0, axis=1), np.ones(4), "valid")

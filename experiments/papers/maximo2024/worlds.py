@@ -314,7 +314,7 @@ def campus_runs(seed: int) -> tuple[Experiment, Experiment]:
     along = np.gradient(way, axis=0)
     along[[0, -1]] = way[1] - way[-2]  # the tour is closed
     left = along[:, ::-1] * [-1.0, 1.0] / np.hypot(*along.T)[:, None]
-    route = {**mapping.route_options, "waypoints": (way + CAMPUS_SHIFT_M * left).tolist()}
+    route = {**mapping.options_of("route"), "waypoints": (way + CAMPUS_SHIFT_M * left).tolist()}
     return mapping, mapping.replaced(seed=seed + 500, route=route)  # the same world_seed
 
 
@@ -328,7 +328,7 @@ def campus_rows(seed: int, profile: Profile, *, with_clusters: bool) -> dict[str
     """
     mapping, taking = campus_runs(seed)
     mapped, taken = mapping.recording(), taking.recording()
-    settings = mapping.map_options
+    settings = mapping.options_of("prior.map")
     tables: dict[str, Rows] = {"clusters": []}
     for descriptor in describers.KINDS if with_clusters else ():
         known = from_recording(mapped, descriptor, settings["spacing_m"])
@@ -357,7 +357,7 @@ def _one_query_a_node(case: Case) -> Case:
     gone = travelled_m(case.recording.truth_at(case.recording.frame_stamps))
     rows = np.unique(np.searchsorted(gone, np.arange(0.0, gone[-1], case.known_map.spacing_m)))
     printed = Experiment.compose(["estimator=topological_mcl_paper"])
-    experiment = case.experiment.with_estimator_of(printed)
+    experiment = case.experiment.replaced(estimator=printed.options_of("estimator"))
     return replace(case, experiment=experiment, recording=resequenced(case.recording, rows))
 
 

@@ -3,7 +3,15 @@ import pytest
 from evo.tools import file_interface
 
 from estimators.base import Estimate
-from experiments.runs.row import Outcome, Status, check_row, read_rows, write_rows
+from experiments.runs.row import (
+    Outcome,
+    Status,
+    as_tables,
+    check_row,
+    joined,
+    read_rows,
+    write_frame,
+)
 from sim.errors import InputError
 from sim.formats.tum import read_tum, write_tum
 
@@ -13,6 +21,10 @@ ROW = {
     "recording_checksum": "b",
     "run_key": "c",
 }
+
+
+def write_rows(rows, path):
+    write_frame(joined(as_tables(rows)), path)
 
 
 def an_estimate(seed=0):

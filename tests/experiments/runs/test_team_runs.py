@@ -137,7 +137,7 @@ def test_sweeps_of_teams():
         (["team.size=two"], r"team\.size must be a whole number"),
         (["team.size=.nan"], r"team\.size must be a whole number"),
         (["team.robots=3"], r"team\.robots must be a valid list, got 3"),
-        (["team.robots=[3,4]"], r"team\.robots must be a valid dictionary, got 3"),
+        (["team.robots=[3,4]"], r"team\.robots\[0\] must be a valid dictionary, got 3"),
         (["team.robots=[{},{route: 3}]"], r"team\.robots\[1\]\.route must hold keys"),
         (
             ["team.robots=[{},{route: {wheels: 9}}]"],
@@ -150,8 +150,8 @@ def test_sweeps_of_teams():
         (["team.communication.kind=range", "team.communication.range_m=-1"], "positive number"),
         (["team.communication.kind=range", "team.communication.range_m=nan"], "holds NaN"),
         (["team.communication.kind=shouting"], "kind"),
-        (["estimator=odometry"], r"estimator=odometry is of one robot; a team takes ekf_slam"),
-        (["keep=[ess]"], "keep is of one robot"),
+        (["estimator=odometry"], r"estimator=odometry localizes one robot; a team takes ekf_slam"),
+        (["keep=[ess]"], "keep applies to one robot"),
         (["estimator.robots=eyes"], r"estimator=ekf_slam needs a sensor eyes"),
         (["estimator=fastslam", "team.starts=unknown"], "fastslam needs the starts of all robots"),
         (["team.robots=[{},{}]"], r"robots 0 and 1 start within each other"),
@@ -174,9 +174,9 @@ def test_a_start_in_a_wall_says_whose():
 
 
 def test_what_is_of_one_robot_refuses_a_team():
-    with pytest.raises(InputError, match=r"estima\.run is of one robot"):
+    with pytest.raises(InputError, match=r"estima\.run takes one robot"):
         run_once(*SHORT)
-    with pytest.raises(InputError, match="a recording is of one robot"):
+    with pytest.raises(InputError, match="a recording holds one robot"):
         simulate(*SHORT)
 
 
@@ -208,8 +208,8 @@ def test_files_of_teams_by_the_command_line(tmp_path):
         (["map", str(path), "-o", "x.yaml"], "it holds a team"),
         (["calibrate", str(path), "-o", "x.yaml"], "it holds a team"),
         (["view", str(path)], "a team is drawn in files"),
-        (["view", str(path), "-e", "odometry", "-o", "x.html"], "is of one robot"),
-        (["run", *SHORT, "-o", "x.tum"], "one file is of one robot"),
+        (["view", str(path), "-e", "odometry", "-o", "x.html"], "localizes one robot"),
+        (["run", *SHORT, "-o", "x.tum"], "one file holds one robot"),
     ):
         refused(command(*words), complaint)
 
