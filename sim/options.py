@@ -112,6 +112,13 @@ def options(where: str) -> Callable[[type[T]], type[T]]:
             except ValidationError as error:
                 raise InputError(_complaint(type(self), where, error)) from None
 
+        # on the constructor, so that a subclass with a constructor of its own has its signature
+        itself = inspect.Parameter("self", inspect.Parameter.POSITIONAL_ONLY)
+        signature = inspect.signature(made)
+        vars(checked)["__signature__"] = signature.replace(
+            parameters=[itself, *signature.parameters.values()]
+        )
+        del made.__signature__
         made.__init__ = checked
         made._place = where
         return cast("type[T]", made)

@@ -85,3 +85,12 @@ def test_functions_are_described_by_their_signature():
         ("n", 3, "a whole number"),
         ("rng", None, ""),
     ]
+
+
+def test_a_subclass_may_have_a_constructor_of_its_own():
+    class Mine(Filter):
+        def __init__(self, how_much=3):
+            super().__init__(q=how_much)
+
+    assert [option.name for option in described(Mine)] == ["how_much"]
+    assert Mine(how_much=2).q == 2.0
