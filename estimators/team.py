@@ -1,7 +1,5 @@
 """How a team's estimators run: what each knows of the other robots, and when."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 from collections.abc import Callable, Iterator, Sequence

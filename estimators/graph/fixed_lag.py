@@ -33,8 +33,6 @@ improving SLAM consistency, ISER 2008 (2009); Kaess et al., iSAM2: incremental s
 using the Bayes tree, IJRR 31, 2012.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -299,8 +297,7 @@ class FixedLag(FixedLagOptions):
 
     def _forget(self, gone: NDArray[np.bool_]) -> None:
         """Drop these (N,) of the prior's landmarks, and number the others without gaps."""
-        of_prior = np.concatenate([np.ones(3, dtype=bool), np.repeat(~gone, 3)])
-        self._prior.keep(of_prior)
+        self._prior.keep(np.concatenate([np.ones(3, dtype=bool), np.repeat(~gone, 3)]))
         kept = np.ones(len(self._landmarks), dtype=bool)
         kept[: len(gone)] = ~gone
         number = np.cumsum(kept) - 1

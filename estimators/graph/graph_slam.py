@@ -19,8 +19,6 @@ Sources: Lu and Milios, Globally consistent range scan alignment for environment
 Robots 4, 1997; Grisetti et al., A tutorial on graph-based SLAM, ITSM 2, 2010.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from dataclasses import dataclass
@@ -237,8 +235,7 @@ class GraphSlam(GraphSlamOptions):
     def proposed(self) -> list[Edge]:
         """Closures of the newest key frame that pass each on its own."""
         newest = len(self._graph) - 1
-        older = np.arange(newest - 1)
-        motions, covariances = self._graph.newest_from(older, exact=False)
+        motions, covariances = self._graph.newest_from(np.arange(newest - 1), exact=False)
         nodes = self._candidates(newest, motions, covariances)
         return self._closures(newest, nodes, *self._graph.newest_from(nodes, exact=True))
 

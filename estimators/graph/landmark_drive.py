@@ -5,8 +5,6 @@ observations (and the first and last) are poses of the problem. Those between ar
 the odometry on both sides, which loses nothing.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import itertools

@@ -13,8 +13,6 @@ Mangelson et al., Pairwise consistent measurement set maximization for robust mu
 merging, ICRA 2018.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Annotated

@@ -1,7 +1,5 @@
 """Matrices of least squares: normal equations by blocks, their factors, and stacks of 3 x 3."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import cached_property
 

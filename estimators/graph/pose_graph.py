@@ -9,8 +9,6 @@ rest of the graph contradicts.
 Source: Yang et al., Graduated non-convexity for robust spatial perception, RA-L 5, 2020.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """FastSLAM: a particle filter over the robot's path, with an EKF for each landmark (gil2008)."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Annotated, Any, Literal

@@ -1,7 +1,5 @@
 """The path of one robot as all particles of FastSLAM hold it."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -409,8 +409,7 @@ def _describe(
 
 @njit(error_model="numpy", fastmath={"contract"})
 def _prepare(ranges: Array, bearings: Array, max_range: float, full_circle: bool) -> PreparedScan:
-    seen = (ranges > 0.0) & (ranges < max_range)
-    beams = np.flatnonzero(seen)
+    beams = np.flatnonzero((ranges > 0.0) & (ranges < max_range))
     rays, points = np.empty((len(beams), 2)), np.empty((len(beams), 2))
     for k in range(len(beams)):
         i = beams[k]

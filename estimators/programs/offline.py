@@ -111,8 +111,7 @@ class Offline(OfflineOptions):
         """Write the log, run the command, and read its trajectory."""
         with tempfile.TemporaryDirectory(prefix="estima-") as name:
             places = self._written(Path(name))
-            words = [_filled(word, places) for word in self.words]
-            program = Program(words)
+            program = Program([_filled(word, places) for word in self.words])
             try:
                 program.wait(self.limit_s)
             finally:
