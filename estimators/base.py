@@ -122,7 +122,7 @@ class Estimator(Protocol):
     """A localization method. It may also have `finish() -> Estimate`, the revised trajectory.
 
     An estimate of `finish` whose kind is `online` takes the place of the beliefs of the steps; None
-    stands for no trajectory. With `answers_at_finish` its beliefs are no answer of its own.
+    stands for no trajectory. With `answers_at_finish` only `finish` gives its estimate.
     `program_seconds` is the processor time of a program that does the work.
 
     `needs`, if it has that, is the set of its options that name a sensor it cannot do without
@@ -190,8 +190,8 @@ def run(
     """
     journal = Journal(estimator, recording, keep, on_step)
     estimator.reset(prior, rng)
-    instants = ((frame,) for frame in recording.frames())
-    walk(lambda frames: [estimator.step(frames[0])], instants, {0: journal})
+    frames = ((frame,) for frame in recording.frames())
+    walk(lambda instant: [estimator.step(*instant)], frames, {0: journal})
     return journal.estimate()
 
 
@@ -217,11 +217,11 @@ def run_to_the_end(
 
 def revised_by(estimator: Any, n_robots: int) -> Sequence[Estimate | None]:
     """Estimate of each robot that `finish` or `finish_team` gives, or None."""
-    finish = getattr(estimator, "finish", None)
-    if n_robots == 1 and finish is not None:
-        return [finish()]
-    finish_team = getattr(estimator, "finish_team", None)
-    paths: Sequence[Estimate | None] = [None] * n_robots if finish_team is None else finish_team()
+    if n_robots == 1 and hasattr(estimator, "finish"):
+        return [estimator.finish()]
+    paths: Sequence[Estimate | None] = (
+        estimator.finish_team() if hasattr(estimator, "finish_team") else [None] * n_robots
+    )
     return paths
 
 

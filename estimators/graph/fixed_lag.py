@@ -92,7 +92,7 @@ class FixedLag(FixedLagOptions):
     -----
     The camera and the odometry are believed as `estimators.graph.smoother` does. Landmarks are
     numbered in the order in which they are seen; those of the prior come first. An image without
-    usable observations is no pose of the window.
+    usable observations does not become a pose of the window.
 
     Extras: `status` when an observation could not be used, or an image not be solved for; the
     belief is then the odometry's from the last one.

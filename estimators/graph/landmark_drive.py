@@ -14,7 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from estimators.base import Estimate
-from estimators.gaussian import Gaussian, compose, wrap
+from estimators.gaussian import Gaussian, compose, stacked, wrap
 from estimators.graph.least_squares import (
     SQUARES,
     LeastSquaresOptions,
@@ -27,7 +27,7 @@ from estimators.landmarks.sightings import Sightings
 from estimators.landmarks.slam_frontend import screened
 from estimators.landmarks.stereo import StereoModel
 from sim.arrays import Array, Ints
-from sim.errors import InputError
+from sim.errors import require
 from sim.recording import Frame
 
 # What a motion and a start pose are uncertain by at least, so that both can be inverted
@@ -122,22 +122,22 @@ class LandmarkDrive:
 
     def _problem(self, rows: list[int]) -> tuple[Problem, Ints]:
         """The problem over the Frames of these rows, and the id of each of its landmarks."""
-        merged = [_merged(self._motions[a + 1 : b + 1]) for a, b in itertools.pairwise(rows)]
+        between = (self._motions[a + 1 : b + 1] for a, b in itertools.pairwise(rows))
+        merged = [functools.reduce(Gaussian.then, motions) for motions in between]
         pose_of = {row: pose for pose, row in enumerate(rows)}
         seen = [np.zeros(0, np.int64), *(seen for _, _, seen in self._images)]
         ids, landmark_rows = np.unique(np.concatenate(seen), return_inverse=True)
         tied = [(pose_of[first], pose_of[second]) for first, second, _ in self._ties]
-        merged += [motion for _, _, motion in self._ties]
+        motions, covariances = stacked([*merged, *(motion for _, _, motion in self._ties)])
         steps = [*itertools.pairwise(range(len(rows))), *tied]
         first, second = np.array(steps, np.int64).reshape(-1, 2).T
-        n = len(merged)
         problem = Problem(
             prior_mean=compose(self._start.mean, self._motions[0].mean)[0],
             prior_covariance=self._start.covariance,
             first=first,
             second=second,
-            motions=np.array([motion.mean for motion in merged]).reshape(n, 3),
-            motion_covariances=np.array([motion.covariance for motion in merged]).reshape(n, 3, 3),
+            motions=motions,
+            motion_covariances=covariances,
             camera=self._camera,
             pose_rows=np.array([pose_of[row] for row, p, _ in self._images for _ in p], np.int64),
             landmark_rows=landmark_rows.astype(np.int64),
@@ -197,10 +197,12 @@ def revised(
     Raises
     ------
     InputError
-        If there is no Frame yet.
+        Before the first Frame.
     """
-    if not all(len(drive.stamps) for drive in drives):
-        raise InputError("the estimator has seen no Frame; step before finish")
+    require(
+        all(len(drive.stamps) for drive in drives),
+        "the estimator has seen no Frame; step before finish",
+    )
     rows = [drive._rows() for drive in drives]
     guesses = [drive._guessed(own) for drive, own in zip(drives, rows, strict=True)]
     parts, ids_of = zip(*map(LandmarkDrive._problem, drives, rows), strict=True)
@@ -222,8 +224,7 @@ def revised(
                 for pose, row in enumerate(own)
             }
             sightings = PoseSightings(
-                camera.camera,
-                camera.marker_z_m,
+                camera,
                 np.array([pose_of[seeing] for seeing, _, _ in sighted], np.int64),
                 np.array([pose_of[seen_] for _, seen_, _ in sighted], np.int64),
                 np.array([point for _, _, point in sighted]),
@@ -272,35 +273,22 @@ def observed(
     seen = frame.readings.get(sensor)
     if seen is None or not len(seen["points_in_camera"]):
         return None, ""
-    if "ids" not in seen:
-        raise InputError(
-            f"{estimator} needs to know which landmark is which; set "
-            f"sensors.{sensor}.identifies=true"
-        )
+    require(
+        "ids" in seen,
+        f"{estimator} needs to know which landmark is which; set sensors.{sensor}.identifies=true",
+    )
     used, status = screened(camera, seen["points_in_camera"], seen["ids"])
     return (seen["points_in_camera"][used], seen["ids"][used]) if used.any() else None, status
 
 
 def loosened(motion: Gaussian) -> Gaussian:
     """Motion of a Frame with what least squares needs beside slip: sideways play, and a floor."""
-    return Gaussian(motion.mean, motion.covariance + _sideways(motion) + FLOOR)
-
-
-def _sideways(motion: Gaussian) -> Array:
-    """Covariance (3, 3) that slip adds within a Frame because it is spread along the way.
-
-    The arc takes each wheel to turn evenly. A heading that wanders by the variance s^2 over the
-    way d also leaves it sideways, by d^2 s^2 / 12 beyond what the final heading accounts for.
-    """
+    # The arc takes each wheel to turn evenly. A heading that wanders by the variance s^2 over the
+    # way d also leaves it sideways, by d^2 s^2 / 12 beyond what the final heading accounts for.
     x, y, turn = motion.mean
     normal = np.array([-math.sin(turn / 2.0), math.cos(turn / 2.0), 0.0])
-    added: Array = np.outer(normal, normal) * ((x**2 + y**2) * motion.covariance[2, 2] / 12.0)
-    return added
-
-
-def _merged(motions: list[Gaussian]) -> Gaussian:
-    """Several motions as one."""
-    return functools.reduce(Gaussian.then, motions)
+    sideways = np.outer(normal, normal) * ((x**2 + y**2) * motion.covariance[2, 2] / 12.0)
+    return Gaussian(motion.mean, motion.covariance + sideways + FLOOR)
 
 
 def _between(motions: list[Gaussian], ends: Array, joint: Array) -> list[Gaussian]:

@@ -107,14 +107,14 @@ class EkfIcpPaper(EkfIcpPaperOptions):
         if self._previous is None:
             extras["registration_status"] = "first"
         else:
-            found = self.matcher.match(scan, self._previous, self._rolled, self._laser, self._rng)
-            extras["registration_status"] = found.status
-            if found.failed:
-                extras["status"] = found.status
+            match = self.matcher.match(scan, self._previous, self._rolled, self._laser, self._rng)
+            extras["registration_status"] = match.status
+            if match.failed:
+                extras["status"] = match.status
             else:
-                extras["registration_covariance"] = found.motion.covariance
+                extras["registration_covariance"] = match.motion.covariance
                 if self._since_s > 0.0:
-                    self._measure(found.motion, self._since_s, found.held)
+                    self._measure(match.motion, self._since_s, match.held)
         self._previous, self._rolled, self._since_s = scan, STILL, 0.0
 
     def _measure(self, motion: Gaussian, dt: float, held: Array) -> None:
