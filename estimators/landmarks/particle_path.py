@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from estimators.base import Estimate
-from estimators.gaussian import STILL, Gaussian, root, rotated
+from estimators.gaussian import STILL, Gaussian, root, rotated, stacked
 from estimators.landmarks import particle_kernels as ekf
 from estimators.particles import Lineages
 from estimators.wheels import WheelPrediction
@@ -110,7 +110,7 @@ class ParticlePath:
         self.poses[:, : self._n] = np.take(self.poses, ancestors, axis=1)
         self.drawn = self.drawn[ancestors]
 
-    def revised(self, best: int, weights: Array, made: dict[str, Array | Ints]) -> Estimate:
+    def revised(self, best: int, weights: Array, known_map: dict[str, Array | Ints]) -> Estimate:
         """Path of one particle, with the covariances of all weighted ones."""
         n = len(self._lineages)
         drawn: list[Gaussian] = []
@@ -121,13 +121,8 @@ class ParticlePath:
             drawn[n - 1 - draw].then(Gaussian(since, np.zeros((3, 3))))
             for _, draw, since in self._frames
         ]
-        return Estimate(
-            np.array([stamp for stamp, _, _ in self._frames]),
-            np.array([belief.mean for belief in beliefs]),
-            np.array([belief.covariance for belief in beliefs]),
-            kind="revised",
-            map=made,
-        )
+        stamps = np.array([stamp for stamp, _, _ in self._frames])
+        return Estimate(stamps, *stacked(beliefs), kind="revised", map=known_map)
 
 
 def packed_mount(mount: Array) -> Array:

@@ -66,11 +66,9 @@ class KissIcp(KissIcpOptions):
     def step(self, frame: Frame) -> Belief:
         """Register the Frame's scan, if it has one."""
         points = scan_of(frame, self.laser, self._laser)
-        status = ""
         if points is not None and len(points):
             cloud = np.column_stack([points, np.zeros(len(points))])
             self._pipeline.register_frame(cloud, np.zeros(len(points)))
             self._pose = se2.compose(self._start, pose_of(self._pipeline.last_pose))
-        elif points is not None:
-            status = "empty"
-        return Belief(self._pose.copy(), np.zeros((3, 3)), {"status": status} if status else {})
+        empty = points is not None and not len(points)
+        return Belief(self._pose.copy(), np.zeros((3, 3)), {"status": "empty"} if empty else {})

@@ -67,8 +67,7 @@ class SmallGicp(SmallGicpOptions):
         self._laser = require_laser(prior, self.laser, "small_gicp")
         self._track_m = prior.robot.track_m
         self._pose = start_pose(prior, "small_gicp").mean  # at the last scan
-        self._rolled = STILL.mean.copy()  # since then, by the wheels
-        self._motion = STILL.mean.copy()  # between the last two scans
+        self._rolled = self._motion = STILL.mean  # since then by the wheels; between the last two
         self._key_pose = self._pose
         self._key: tuple[Any, Any] | None = None
 
@@ -121,7 +120,7 @@ class SmallGicp(SmallGicpOptions):
 
     def _moved(self, pose: Array, status: str) -> Belief:
         self._motion = se2.between(self._pose, pose)
-        self._pose, self._rolled = pose, STILL.mean.copy()
+        self._pose, self._rolled = pose, STILL.mean
         return _belief(pose, status)
 
 

@@ -104,7 +104,7 @@ class External(ExternalOptions):
             answer = None
         if not isinstance(answer, dict):
             shown = text[:60].decode(errors="replace")
-            raise self._wrong(f"answered {what} with {shown!r}, which is no JSON object")
+            raise self._wrong(f"answered {what} with {shown!r}, which is not a JSON object")
         if answer.get("error") is not None:
             raise self._wrong(f"answered {what} with the error {str(answer['error'])[:300]}")
         return answer

@@ -54,7 +54,7 @@ class TopologicalMclOptions:
     place: str = "place"
     """Name of the sensor of place descriptors that it reads."""
     lidar3d: str = "lidar3d"
-    """Name of the 3D lidar whose clouds it describes where there are no descriptors."""
+    """Name of the 3D lidar whose clouds it describes where descriptors are missing."""
     weighting: Weighting = "M2"
     """M1, M2 or M3 of `node_log_weights` (maximo2024, eqs. (1)-(3))."""
     particles_per_node: Count = 4
