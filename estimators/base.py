@@ -4,17 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, TypeVar
 
 import numpy as np
 
 from estimators.gaussian import Gaussian
 from sim.arrays import Array
 from sim.compiled import processor_s, wall_s
-from sim.errors import InputError, require
+from sim.errors import InputError, require, required
+from sim.options import options
 from sim.recording import Frame, Recording
 from sim.robot.drive import RobotGeometry
-from sim.sensors import Sensors
+from sim.sensors import Laser, Sensors, StereoCamera, sensor_of
+
+S = TypeVar("S")
 
 
 @dataclass(frozen=True)
@@ -55,6 +58,33 @@ class Prior:
         if self.mean is None or self.covariance is None:
             return None
         return Gaussian(self.mean, self.covariance)
+
+    def require_start(self, estimator: str) -> Gaussian:
+        """Copy of the first belief, without which this estimator cannot start."""
+        start = required(self.start, f"{estimator} needs a start pose; set prior.start=tracking")
+        return Gaussian(start.mean.copy(), start.covariance.copy())
+
+    def require_laser(self, name: str, estimator: str) -> Laser:
+        """Laser of a name, without which this estimator cannot start."""
+        return self._required(name, Laser, estimator)
+
+    def require_stereo(self, name: str, estimator: str) -> StereoCamera:
+        """Stereo camera of a name, without which this estimator cannot start."""
+        return self._required(name, StereoCamera, estimator)
+
+    def _required(self, name: str, kind: type[S], estimator: str) -> S:
+        try:
+            return sensor_of(self.sensors, name, kind)
+        except InputError as error:
+            raise InputError(f"{estimator}: {error}") from None
+
+
+@options("estimator")
+class LaserOptions:
+    """Options of a method that reads a laser."""
+
+    laser: str = "laser"
+    """Name of the laser that it reads."""
 
 
 @dataclass(frozen=True)

@@ -75,13 +75,9 @@ class WheelPrediction:
 
     def __init__(self, believed: WheelOptions, track_m: float) -> None:
         self.kr, self.kl, self.track_m = believed.kr, believed.kl, track_m
-        self.lateral_slip_m = self.forward_slip_m = self.encoder_tick_m = 0.0
-        if isinstance(believed, LateralSlipOptions):
-            self.lateral_slip_m = believed.lateral_slip_m
-        if isinstance(believed, ForwardSlipOptions):
-            self.forward_slip_m = believed.forward_slip_m
-        if isinstance(believed, EncoderTickOptions):
-            self.encoder_tick_m = believed.encoder_tick_m
+        self.lateral_slip_m: float = getattr(believed, "lateral_slip_m", 0.0)
+        self.forward_slip_m: float = getattr(believed, "forward_slip_m", 0.0)
+        self.encoder_tick_m: float = getattr(believed, "encoder_tick_m", 0.0)
         self._window = TravelWindow(believed.window_s)
 
     def slip(self, frame: Frame) -> tuple[Array, Array]:
@@ -97,19 +93,20 @@ class WheelPrediction:
 
     def predict(self, frame: Frame) -> Gaussian:
         """Motion of base_link over the Frame."""
-        return self.predict_with_root(frame)[0]
+        return self.predict_in_full(frame)[0]
 
-    def predict_with_root(self, frame: Frame) -> tuple[Gaussian, Array]:
-        """Motion over the Frame, and the root (3, K) of what the wheels add to its covariance."""
-        motion, _, root = self._predict(frame)
-        return motion, root
+    def predict_in_full(self, frame: Frame) -> tuple[Gaussian, Array, Array]:
+        """Motion over the Frame, its derivative by the wheels, and a root of its covariance.
 
-    def predict_with_derivative(self, frame: Frame) -> tuple[Gaussian, Array]:
-        """Motion over the Frame, and its derivative (3, 2) by the increments."""
-        motion, by_wheels, _ = self._predict(frame)
-        return motion, by_wheels
-
-    def _predict(self, frame: Frame) -> tuple[Gaussian, Array, Array]:
+        Returns
+        -------
+        motion
+            Of base_link.
+        by_wheels
+            (3, 2) its derivative by the increments.
+        root
+            (3, K) of what the wheels add to its covariance.
+        """
         travel_m, variances = self.slip(frame)
         motion, by_wheels = wheel_motion(frame.wheel_increments_m, variances, self.track_m)
         if self.lateral_slip_m:

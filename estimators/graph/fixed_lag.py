@@ -48,7 +48,6 @@ from estimators.landmarks.joint import JointGaussian
 from estimators.landmarks.stereo import StereoModel, StereoOptions
 from estimators.laser.icp import PreparedScan
 from estimators.laser.scan_matching import MatcherOptions, ScanMatcher
-from estimators.options import require_laser, require_stereo, start_pose
 from estimators.wheels import WheelOptions, WheelPrediction
 from sim import se2
 from sim.arrays import Array, Ints
@@ -102,11 +101,11 @@ class FixedLag(FixedLagOptions):
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Start from the prior's pose, with an empty map."""
-        self._camera = StereoModel.of(require_stereo(prior, self.stereo, "fixed_lag"))
-        self._belief = start_pose(prior, "fixed_lag")
+        self._camera = StereoModel.of(prior.require_stereo(self.stereo, "fixed_lag"))
+        self._belief = prior.require_start("fixed_lag")
         self._wheels = WheelPrediction(self, prior.robot.track_m)
         self._drive = LandmarkDrive(self._camera, self._belief)
-        self._laser = None if self.laser is None else require_laser(prior, self.laser, "fixed_lag")
+        self._laser = None if self.laser is None else prior.require_laser(self.laser, "fixed_lag")
         self._scan: PreparedScan | None = None  # of the last image
         self._matcher = ScanMatcher(MatcherOptions(sigma_range_m=self.sigma_range_m))
         self._rng = rng

@@ -47,7 +47,6 @@ from estimators.laser.scan_matching import (
     MatcherOptions,
     ScanMatcher,
 )
-from estimators.options import require_laser, start_pose
 from estimators.wheels import EncoderTickOptions, WheelPrediction
 from sim import se2
 from sim.arrays import Array, Ints
@@ -108,10 +107,10 @@ class GraphSlam(GraphSlamOptions):
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Start from the prior's pose; the first scan becomes a key frame."""
-        self._laser, self._rng = require_laser(prior, self.laser, "graph_slam"), rng
+        self._laser, self._rng = prior.require_laser(self.laser, "graph_slam"), rng
         self._matcher = ScanMatcher(self, self.most_gap_m)
         self._search = LoopSearch(self._matcher, self._laser, self)
-        start = start_pose(prior, "graph_slam")
+        start = prior.require_start("graph_slam")
         self._wheels = WheelPrediction(self, prior.robot.track_m)
         self.graph = PoseGraph(Gaussian(start.mean, start.covariance + FLOOR), self.robust_sigma)
         self._scans: list[PreparedScan | None] = [None]  # node 0 is the start

@@ -60,7 +60,7 @@ class ParticlePath:
 
     def roll(self, frame: Frame) -> None:
         """Add the Frame's arc to the motion that is not yet drawn."""
-        motion, root_ = self._wheels.predict_with_root(frame)
+        motion, _, root_ = self._wheels.predict_in_full(frame)
         if self.rolled is STILL:
             self.rolled, self.root = motion, root_ if root_.shape[1] < 3 else np.zeros((3, 0))
         else:

@@ -17,7 +17,6 @@ from scipy.special import chdtri  # scipy.stats takes half a second to import
 
 from estimators.base import Prior
 from estimators.landmarks.stereo import NoiseAt, NoiseModel, StereoModel, TeamEyesOptions
-from estimators.options import require_stereo, start_pose
 from estimators.wheels import ForwardSlipOptions
 from sim.arrays import Array, Floats, Ints
 from sim.errors import require
@@ -164,8 +163,8 @@ class SlamFrontEnd:
 
     def __init__(self, believed: LandmarkSlamOptions, prior: Prior, estimator: str) -> None:
         self.believed, self._estimator = believed, estimator
-        camera = require_stereo(prior, believed.stereo, estimator)
-        self.first_pose = start_pose(prior, estimator)
+        camera = prior.require_stereo(believed.stereo, estimator)
+        self.first_pose = prior.require_start(estimator)
         require(
             believed.association != "known" or camera.identifies,
             "the camera does not identify landmarks; set estimator.association=mahalanobis "

@@ -87,7 +87,7 @@ def gained_motion(
     logged_m = frame.wheel_increments_m
     rolled_m = logged_m * (1.0 + gains[:2])
     wheels.track_m = nominal_track_m * (1.0 + gains[2])
-    motion, by_wheels = wheels.predict_with_derivative(
+    motion, by_wheels, _ = wheels.predict_in_full(
         dataclasses.replace(frame, wheel_increments_m=rolled_m)
     )
     # by the turn: a wheel turns the robot by its increment over the track

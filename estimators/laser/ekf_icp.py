@@ -24,7 +24,6 @@ from estimators.laser.scan_matching import (
     MatcherOptions,
     moved_beyond,
 )
-from estimators.options import require_laser, start_pose
 from estimators.wheels import EncoderTickOptions, WheelPrediction
 from sim.arrays import Array
 from sim.errors import require
@@ -98,8 +97,8 @@ class EkfIcp(EkfIcpOptions):
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Start from the prior's pose; the first scan becomes the key frame."""
-        self._laser, self._rng = require_laser(prior, self.laser, "ekf_icp"), rng
-        start = start_pose(prior, "ekf_icp")
+        self._laser, self._rng = prior.require_laser(self.laser, "ekf_icp"), rng
+        start = prior.require_start("ekf_icp")
         self._origin = np.append(np.rint(start.mean[:2] / _ORIGIN_STEP_M) * _ORIGIN_STEP_M, 0.0)
         start = Gaussian(start.mean - self._origin, start.covariance)
         self._wheels = WheelPrediction(self, prior.robot.track_m)

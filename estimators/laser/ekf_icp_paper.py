@@ -13,7 +13,6 @@ from estimators.base import Belief, Prior
 from estimators.gaussian import STILL, Gaussian, update, wrap
 from estimators.laser.icp import Metric, PreparedScan, Rules
 from estimators.laser.scan_matching import Covariance, MatcherOptions
-from estimators.options import require_laser, start_pose
 from estimators.wheels import LateralSlipOptions, WheelPrediction
 from sim.arrays import Array
 from sim.options import NonNegative, options
@@ -65,8 +64,8 @@ class EkfIcpPaper(EkfIcpPaperOptions):
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Start from the prior's pose, with velocities unknown."""
-        self._laser, self._rng = require_laser(prior, self.laser, "ekf_icp_paper"), rng
-        start = start_pose(prior, "ekf_icp_paper")
+        self._laser, self._rng = prior.require_laser(self.laser, "ekf_icp_paper"), rng
+        start = prior.require_start("ekf_icp_paper")
         self._wheels = WheelPrediction(self, prior.robot.track_m)
         self._mean = np.concatenate([start.mean, np.zeros(3)])
         self._covariance = np.zeros((6, 6))

@@ -224,12 +224,12 @@ def sampling(
     sigmas = [scan.noise_m if sigma_range_m is None else sigma_range_m for scan in (source, target)]
     deviations = np.empty((n_samples, 3))
     for k in range(n_samples):
-        resampled = (
+        again, other = (
             prepare(ranges + sigma * rng.standard_normal(len(ranges)), scan.bearings_rad)
             for scan, ranges, sigma in zip((source, target), clean, sigmas, strict=True)
         )
         pose = registration.T_target_source
-        found = register(*resampled, pose, metric=registration.metric, **options)
+        found = register(again, other, pose, metric=registration.metric, **options)
         deviations[k] = _difference(found.T_target_source, pose)
     return _widened(np.cov(deviations.T), registration)
 

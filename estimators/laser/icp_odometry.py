@@ -14,7 +14,6 @@ from estimators.base import Belief, Prior
 from estimators.gaussian import STILL, Gaussian
 from estimators.laser.icp import PreparedScan, Rules
 from estimators.laser.scan_matching import KeyFrameOptions, MatcherOptions
-from estimators.options import require_laser, start_pose
 from estimators.wheels import WheelOptions, WheelPrediction
 from sim import se2
 from sim.options import options
@@ -66,8 +65,8 @@ class IcpOdometry(IcpOdometryOptions):
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Start from the prior's pose; the first scan becomes the reference."""
-        self._laser, self._rng = require_laser(prior, self.laser, "icp_odometry"), rng
-        self._key = self._last = _Anchor(start_pose(prior, "icp_odometry"), None)
+        self._laser, self._rng = prior.require_laser(self.laser, "icp_odometry"), rng
+        self._key = self._last = _Anchor(prior.require_start("icp_odometry"), None)
         self._key_to_last = STILL
         self._lost = False
         self._heading_window_rad = 0.0 if self.use_odometry_guess else _HEADING_WINDOW_RAD

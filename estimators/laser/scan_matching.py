@@ -15,6 +15,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from estimators.base import LaserOptions
 from estimators.gaussian import Gaussian
 from estimators.laser import icp_covariance
 from estimators.laser.icp import (
@@ -28,7 +29,6 @@ from estimators.laser.icp import (
     register,
 )
 from estimators.laser.scan_lines import without_sparse_lines
-from estimators.options import LaserOptions
 from sim import se2
 from sim.arrays import Array
 from sim.options import NonNegative, options

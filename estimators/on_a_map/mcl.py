@@ -18,7 +18,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from estimators.base import Belief, Prior
+from estimators.base import Belief, LaserOptions, Prior
 from estimators.gaussian import STILL, Gaussian, root
 from estimators.on_a_map.kld import BinOptions, Bins
 from estimators.on_a_map.likelihood_field import (
@@ -27,7 +27,6 @@ from estimators.on_a_map.likelihood_field import (
     beam_ends,
     likelihood_field,
 )
-from estimators.options import LaserOptions, require_laser
 from estimators.particles import (
     Scheme,
     effective_sample_size,
@@ -146,7 +145,7 @@ class Mcl(MclOptions):
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Draw particles from the prior's pose, or from all the floor if there is none."""
-        self._laser, self._rng = require_laser(prior, self.laser, "mcl"), rng
+        self._laser, self._rng = prior.require_laser(self.laser, "mcl"), rng
         require(
             isinstance(prior.map, self.maps),
             "mcl needs a map of walls; set prior.map=world, or to a grid's .yaml",
