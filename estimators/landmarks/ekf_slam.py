@@ -18,7 +18,7 @@ from estimators.landmarks.joint import JointGaussian, mahalanobis_squared
 from estimators.landmarks.sightings import Sightings, dead_reckoning, pose_by_points, team_starts
 from estimators.landmarks.slam_frontend import Image, LandmarkSlamOptions, SlamFrontEnd
 from estimators.landmarks.stereo import LEAST_DEPTH_M
-from estimators.landmarks.wheel_gains import NO_MOTION, GainOptions, gained_motion
+from estimators.wheels import NO_MOTION, GainOptions, gained_motion
 from sim.arrays import Array, Ints
 from sim.errors import require
 from sim.options import options

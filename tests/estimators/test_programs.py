@@ -163,7 +163,7 @@ BAD = {
     "far": ("print('{\"mean\": [1e300, 0, 0]}', flush=True)", r"mean, numbers up to 1e\+12"),
     "half_line": ("print('{\"mean\"', end='', flush=True); time.sleep(60)", "no answer within"),
     "endless_line": ("while True: sys.stdout.write('x' * 65536)", "more than 1048576 bytes"),
-    "binary": ("sys.stdout.buffer.write(b'\\xff\\xfe\\n'); sys.stdout.flush()", "not a JSON object"),
+    "binary": ("sys.stdout.buffer.write(b'\\xff\\xfe\\n'); sys.stdout.flush()", "a JSON object"),
 }  # fmt: skip
 
 
