@@ -20,7 +20,6 @@ from estimators.graph.least_squares import (
     LeastSquaresOptions,
     PoseSightings,
     Problem,
-    Solution,
     solve,
 )
 from estimators.landmarks.sightings import Sightings
@@ -88,37 +87,15 @@ class LandmarkDrive:
         """Add another measurement of the motion between the last two images."""
         self._ties.append((self._images[-2][0], self._images[-1][0], motion))
 
-    def _estimate(
-        self, solution: Solution, poses: Array, joint_covariance: Array, ids: Ints
-    ) -> Estimate:
-        """Estimate of this drive's solved poses; arguments as in `filled_in`."""
-        means, covariances = self.filled_in(poses, joint_covariance)
-        status = "ok" if solution.converged else "not_converged"
-        return Estimate(
-            stamps=self.stamps,
-            means=means,
-            covariances=covariances,
-            kind="revised",
-            map={
-                "ids": ids,
-                "landmarks": solution.landmarks,
-                "landmark_covariances": solution.landmark_covariances,
-            },
-            status=status if len(ids) else "no_landmarks",
-        )
-
     def problem(self) -> tuple[Problem, Array]:
         """The least-squares problem over all Frames so far, and poses (T, 3) to start from."""
         rows = self._rows()
-        return self._problem(rows)[0], self._guessed(rows)
+        return self._problem(rows)[0], np.array([self._guesses[row] for row in rows])
 
     def _rows(self) -> list[int]:
         """Frames that are poses of the problem."""
         seeing = (row for row, _, _ in self._images)
         return sorted({0, *seeing, *self._pinned, len(self._stamps) - 1})
-
-    def _guessed(self, rows: list[int]) -> Array:
-        return np.array([self._guesses[row] for row in rows])
 
     def _problem(self, rows: list[int]) -> tuple[Problem, Ints]:
         """The problem over the Frames of these rows, and the id of each of its landmarks."""
@@ -204,7 +181,10 @@ def revised(
         "the estimator has seen no Frame; step before finish",
     )
     rows = [drive._rows() for drive in drives]
-    guesses = [drive._guessed(own) for drive, own in zip(drives, rows, strict=True)]
+    guesses = [
+        np.array([drive._guesses[row] for row in own])
+        for drive, own in zip(drives, rows, strict=True)
+    ]
     parts, ids_of = zip(*map(LandmarkDrive._problem, drives, rows), strict=True)
     if len(drives) == 1:
         problem, ids, ends = parts[0], ids_of[0], np.array([0, len(rows[0])])
@@ -231,10 +211,18 @@ def revised(
             )
             problem = dataclasses.replace(problem, sightings=sightings)
     solution = solve(problem, np.concatenate(guesses), how)
+    known_map = {
+        "ids": ids,
+        "landmarks": solution.landmarks,
+        "landmark_covariances": solution.landmark_covariances,
+    }
+    status = "ok" if solution.converged else "not_converged"
+    status = status if len(ids) else "no_landmarks"
     estimates = []
     for drive, (low, high) in zip(drives, itertools.pairwise(ends), strict=True):
         covariance = solution.covariance[3 * low : 3 * high, 3 * low : 3 * high]
-        estimates.append(drive._estimate(solution, solution.poses[low:high], covariance, ids))
+        path = drive.filled_in(solution.poses[low:high], covariance)
+        estimates.append(Estimate(drive.stamps, *path, "revised", map=known_map, status=status))
     return estimates
 
 
