@@ -6,20 +6,18 @@ covariance is composed along.
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from estimators.base import Belief, Prior
 from estimators.gaussian import STILL, Gaussian
 from estimators.laser.icp import PreparedScan, Rules
-from estimators.laser.scan_matching import KeyFrameOptions, MatcherOptions
+from estimators.laser.scan_matching import KeyFrameOptions, MatcherOptions, Reference
 from estimators.wheels import WheelOptions, WheelPrediction
 from sim import se2
 from sim.options import options
 from sim.recording import Frame
-
-Reference = Literal["previous", "keyframe"]
 
 _HEADING_WINDOW_RAD = math.pi / 6.0  # constant velocity misses the turns: search the headings
 # Constant velocity is not trusted further than to these standard deviations

@@ -11,8 +11,7 @@ import numpy as np
 
 from estimators.base import Belief, LaserOptions, Prior
 from estimators.gaussian import STILL
-from estimators.laser.icp_odometry import Reference
-from estimators.laser.scan_matching import KeyFrameOptions
+from estimators.laser.scan_matching import KeyFrameOptions, Reference
 from estimators.peers import matrix_of, package, pose_of, scan_of
 from sim import se2
 from sim.arrays import Array
