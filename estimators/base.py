@@ -4,17 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, TypeVar
 
 import numpy as np
 
 from estimators.gaussian import Gaussian
 from sim.arrays import Array
 from sim.compiled import processor_s, wall_s
-from sim.errors import InputError, require
+from sim.errors import InputError, require, required
+from sim.options import options
 from sim.recording import Frame, Recording
 from sim.robot.drive import RobotGeometry
-from sim.sensors import Sensors
+from sim.sensors import Laser, Sensors, StereoCamera, sensor_of
+
+S = TypeVar("S")
 
 
 @dataclass(frozen=True)
@@ -55,6 +58,33 @@ class Prior:
         if self.mean is None or self.covariance is None:
             return None
         return Gaussian(self.mean, self.covariance)
+
+    def require_start(self, estimator: str) -> Gaussian:
+        """Copy of the first belief, without which this estimator cannot start."""
+        start = required(self.start, f"{estimator} needs a start pose; set prior.start=tracking")
+        return Gaussian(start.mean.copy(), start.covariance.copy())
+
+    def require_laser(self, name: str, estimator: str) -> Laser:
+        """Laser of a name, without which this estimator cannot start."""
+        return self._required(name, Laser, estimator)
+
+    def require_stereo(self, name: str, estimator: str) -> StereoCamera:
+        """Stereo camera of a name, without which this estimator cannot start."""
+        return self._required(name, StereoCamera, estimator)
+
+    def _required(self, name: str, kind: type[S], estimator: str) -> S:
+        try:
+            return sensor_of(self.sensors, name, kind)
+        except InputError as error:
+            raise InputError(f"{estimator}: {error}") from None
+
+
+@options("estimator")
+class LaserOptions:
+    """Options of a method that reads a laser."""
+
+    laser: str = "laser"
+    """Name of the laser that it reads."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +152,7 @@ class Estimator(Protocol):
     """A localization method. It may also have `finish() -> Estimate`, the revised trajectory.
 
     An estimate of `finish` whose kind is `online` takes the place of the beliefs of the steps; None
-    stands for no trajectory. With `answers_at_finish` its beliefs are no answer of its own.
+    stands for no trajectory. With `answers_at_finish` only `finish` gives its estimate.
     `program_seconds` is the processor time of a program that does the work.
 
     `needs`, if it has that, is the set of its options that name a sensor it cannot do without
@@ -190,8 +220,8 @@ def run(
     """
     journal = Journal(estimator, recording, keep, on_step)
     estimator.reset(prior, rng)
-    instants = ((frame,) for frame in recording.frames())
-    walk(lambda frames: [estimator.step(frames[0])], instants, {0: journal})
+    frames = ((frame,) for frame in recording.frames())
+    walk(lambda instant: [estimator.step(*instant)], frames, {0: journal})
     return journal.estimate()
 
 
@@ -217,11 +247,11 @@ def run_to_the_end(
 
 def revised_by(estimator: Any, n_robots: int) -> Sequence[Estimate | None]:
     """Estimate of each robot that `finish` or `finish_team` gives, or None."""
-    finish = getattr(estimator, "finish", None)
-    if n_robots == 1 and finish is not None:
-        return [finish()]
-    finish_team = getattr(estimator, "finish_team", None)
-    paths: Sequence[Estimate | None] = [None] * n_robots if finish_team is None else finish_team()
+    if n_robots == 1 and hasattr(estimator, "finish"):
+        return [estimator.finish()]
+    paths: Sequence[Estimate | None] = (
+        estimator.finish_team() if hasattr(estimator, "finish_team") else [None] * n_robots
+    )
     return paths
 
 

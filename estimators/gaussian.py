@@ -8,6 +8,7 @@ hold them against those.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -141,6 +142,12 @@ def update(
     left.flat[:: len(mean) + 1] += 1.0
     after = left @ covariance @ left.T + gain @ R @ gain.T
     return mean + gain @ innovation, (after + after.T) / 2.0
+
+
+def stacked(beliefs: Sequence[Gaussian]) -> tuple[Array, Array]:
+    """Means (K, 3) and covariances (K, 3, 3) of K poses or motions."""
+    means, covariances = [each.mean for each in beliefs], [each.covariance for each in beliefs]
+    return np.array(means).reshape(-1, 3), np.array(covariances).reshape(-1, 3, 3)
 
 
 def root(covariance: Array) -> Array:

@@ -7,7 +7,6 @@ import numpy as np
 
 from estimators.base import Belief, Prior
 from estimators.gaussian import Gaussian
-from estimators.options import start_pose
 from estimators.wheels import WheelOptions, WheelPrediction
 from sim import se2
 from sim.arrays import Array
@@ -36,7 +35,7 @@ class Odometry(OdometryOptions):
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Start from the prior's pose; dead reckoning cannot start without one."""
-        self._belief = start_pose(prior, "odometry")
+        self._belief = prior.require_start("odometry")
         self._wheels = WheelPrediction(self, prior.robot.track_m)
 
     def step(self, frame: Frame) -> Belief:

@@ -19,8 +19,7 @@ SCHEMES: tuple[Scheme, ...] = ("systematic", "stratified", "residual", "multinom
 
 def underflowed(log_weights: ArrayLike) -> bool:
     """Whether no particle has any weight left: all are -inf, or some are NaN or +inf."""
-    highest = np.max(np.asarray(log_weights, dtype=np.float64))
-    return not bool(np.isfinite(highest))
+    return not bool(np.isfinite(np.max(np.asarray(log_weights, dtype=np.float64))))
 
 
 def normalize(log_weights: ArrayLike) -> Array:

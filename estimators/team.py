@@ -1,7 +1,5 @@
 """How a team's estimators run: what each knows of the other robots, and when."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 from collections.abc import Callable, Iterator, Sequence
@@ -20,7 +18,7 @@ from estimators.base import (
     run_to_the_end,
     walk,
 )
-from estimators.gaussian import Gaussian
+from estimators.gaussian import Gaussian, stacked
 from estimators.landmarks.sightings import dead_reckoning
 from sim.compiled import processor_s
 from sim.errors import require, required
@@ -47,14 +45,14 @@ class Communication:
 
     def __post_init__(self) -> None:
         for kind, name in (("range", "range_m"), ("delayed", "delay_s")):
-            where, value = f"team.communication.{name}", getattr(self, name)
-            if self.kind == kind:
-                require(value is not None, f"{where} must be a positive number, got {value!r}")
-            else:
-                require(
-                    value is None,
-                    f"{where} has no effect on kind={self.kind}; set it to null",
-                )
+            where, missing = f"team.communication.{name}", getattr(self, name) is None
+            require(
+                not missing or self.kind != kind, f"{where} must be a positive number, got None"
+            )
+            require(
+                missing or self.kind == kind,
+                f"{where} has no effect on kind={self.kind}; set it to null",
+            )
 
 
 def run_team(
@@ -142,14 +140,11 @@ def _heard(
         known = np.array([known[own].max(axis=0) for own in linked])
         for frame in frames:
             robot = frame.robot
-            news = [
-                one
-                for log, have, get in zip(logs, taken[robot], known[robot], strict=True)
-                for one in log[have:get]
-            ]
+            ranges = zip(logs, taken[robot], known[robot], strict=True)
+            unheard = [one for log, have, get in ranges for one in log[have:get]]
             taken[robot] = known[robot]
-            news.sort(key=lambda one: (one.stamp, one.robot))
-            grouped = itertools.groupby(news, key=lambda one: one.stamp)
+            unheard.sort(key=lambda one: (one.stamp, one.robot))
+            grouped = itertools.groupby(unheard, key=lambda one: one.stamp)
             yield robot, [tuple(instant) for _, instant in grouped]
 
 
@@ -159,10 +154,8 @@ def _late(
     """What estimates so late leave: the last one known, carried on by the wheels."""
     frames = list(recording.frames())
     motions = [wheels.predict(frame) for frame in frames]
-    nowhere = np.full(3, np.nan), np.full((3, 3), np.nan)
-    known = prior.mean is not None and prior.covariance is not None
-    start = Gaussian(*((prior.mean, prior.covariance) if known else nowhere))
-    answered, found = -1, []
+    start = prior.start or Gaussian(np.full(3, np.nan), np.full((3, 3), np.nan))
+    answered, beliefs = -1, []
     for row, frame in enumerate(frames):
         while answered + 1 < row and online.stamps[answered + 1] <= frame.stamp - delay_s + 1e-9:
             answered += 1
@@ -171,7 +164,6 @@ def _late(
             belief = Gaussian(online.means[answered], online.covariances[answered])
         for motion in motions[answered + 1 : row + 1]:
             belief = belief.then(motion)
-        found.append(belief)
-    means = np.array([belief.mean for belief in found])
-    covariances = np.array([belief.covariance for belief in found])
+        beliefs.append(belief)
+    means, covariances = stacked(beliefs)
     return dataclasses.replace(online, means=means, covariances=covariances, status="ok")

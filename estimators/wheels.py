@@ -1,11 +1,23 @@
-"""The motion of a Frame as its wheel encoders predict it."""
+"""The motion of a Frame as its wheel encoders predict it.
 
+A filter may also estimate the wheels' gains while the robot drives: a wheel rolls (1 + g_r) or
+(1 + g_l) times what its encoder says, and the wheels are (1 + g_b) times the nominal track apart.
+g = (g_r, g_l, g_b) is a random walk over the way.
+"""
+
+from __future__ import annotations
+
+import dataclasses
 import math
+from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 
-from estimators.gaussian import Gaussian, wheel_motion
+from estimators.gaussian import STILL, Gaussian, compose, wheel_motion
 from sim.arrays import Array
+from sim.errors import require
 from sim.options import NonNegative, options
 from sim.recording import Frame
 from sim.robot.arc import TravelWindow
@@ -50,6 +62,23 @@ class EncoderTickOptions(LateralSlipOptions):
     overstates that of many."""
 
 
+@options("estimator")
+class GainOptions:
+    """What is believed of the gains: deviations at the start, and how far they wander."""
+
+    gain_sigma: Annotated[float, Field(ge=0.0, lt=0.5)] = 0.0
+    """The wheels' gains and the track are states too, of this deviation at the start, a share of
+    them: a random walk over the way; 0: they are known."""
+    gain_wander_m: NonNegative = 0.0
+    """Variance of these states per metre of the way, 1/m."""
+
+    def __post_init__(self) -> None:
+        require(
+            not self.gain_wander_m or self.gain_sigma,
+            "estimator.gain_wander_m has no effect on known gains; set estimator.gain_sigma",
+        )
+
+
 class WheelPrediction:
     """Relative pose of base_link over a Frame, with the covariance of the wheels' slip.
 
@@ -75,13 +104,9 @@ class WheelPrediction:
 
     def __init__(self, believed: WheelOptions, track_m: float) -> None:
         self.kr, self.kl, self.track_m = believed.kr, believed.kl, track_m
-        self.lateral_slip_m = self.forward_slip_m = self.encoder_tick_m = 0.0
-        if isinstance(believed, LateralSlipOptions):
-            self.lateral_slip_m = believed.lateral_slip_m
-        if isinstance(believed, ForwardSlipOptions):
-            self.forward_slip_m = believed.forward_slip_m
-        if isinstance(believed, EncoderTickOptions):
-            self.encoder_tick_m = believed.encoder_tick_m
+        self.lateral_slip_m: float = getattr(believed, "lateral_slip_m", 0.0)
+        self.forward_slip_m: float = getattr(believed, "forward_slip_m", 0.0)
+        self.encoder_tick_m: float = getattr(believed, "encoder_tick_m", 0.0)
         self._window = TravelWindow(believed.window_s)
 
     def slip(self, frame: Frame) -> tuple[Array, Array]:
@@ -97,19 +122,20 @@ class WheelPrediction:
 
     def predict(self, frame: Frame) -> Gaussian:
         """Motion of base_link over the Frame."""
-        return self.predict_with_root(frame)[0]
+        return self.predict_in_full(frame)[0]
 
-    def predict_with_root(self, frame: Frame) -> tuple[Gaussian, Array]:
-        """Motion over the Frame, and the root (3, K) of what the wheels add to its covariance."""
-        motion, _, root = self._predict(frame)
-        return motion, root
+    def predict_in_full(self, frame: Frame) -> tuple[Gaussian, Array, Array]:
+        """Motion over the Frame, its derivative by the wheels, and a root of its covariance.
 
-    def predict_with_derivative(self, frame: Frame) -> tuple[Gaussian, Array]:
-        """Motion over the Frame, and its derivative (3, 2) by the increments."""
-        motion, by_wheels, _ = self._predict(frame)
-        return motion, by_wheels
-
-    def _predict(self, frame: Frame) -> tuple[Gaussian, Array, Array]:
+        Returns
+        -------
+        motion
+            Of base_link.
+        by_wheels
+            (3, 2) its derivative by the increments.
+        root
+            (3, K) of what the wheels add to its covariance.
+        """
         travel_m, variances = self.slip(frame)
         motion, by_wheels = wheel_motion(frame.wheel_increments_m, variances, self.track_m)
         if self.lateral_slip_m:
@@ -120,3 +146,61 @@ class WheelPrediction:
             motion.covariance[:] += np.outer(together, together)
             root = np.column_stack([root, together])
         return motion, by_wheels, root
+
+
+@dataclass(frozen=True)
+class GainedMotion:
+    """A motion by wheels of believed gains.
+
+    Attributes
+    ----------
+    motion
+        With the covariance of the slip alone.
+    by_gains
+        (3, 3) its derivative by the gains.
+    travel_m
+        Mean way of both wheels.
+    """
+
+    motion: Gaussian
+    by_gains: Array
+    travel_m: float
+
+    def then(self, motion: GainedMotion) -> GainedMotion:
+        """Compose with a later motion."""
+        _, by_first, by_second = compose(self.motion.mean, motion.motion.mean)
+        return GainedMotion(
+            self.motion.then(motion.motion),
+            by_first @ self.by_gains + by_second @ motion.by_gains,
+            self.travel_m + motion.travel_m,
+        )
+
+    def applied(self, pose: Array, P: Array, own: slice, gains: slice) -> Array:
+        """Pose (3,) after the motion; the joint covariance P (N, N) is changed in place."""
+        mean, by_pose, by_motion = compose(pose, self.motion.mean)
+        by_gains = by_motion @ self.by_gains
+        rows = by_pose @ P[own] + by_gains @ P[gains]
+        moved = rows[:, own] @ by_pose.T + rows[:, gains] @ by_gains.T
+        moved += by_motion @ self.motion.covariance @ by_motion.T
+        P[own], P[:, own] = rows, rows.T
+        P[own, own] = (moved + moved.T) / 2.0
+        return mean
+
+
+NO_MOTION = GainedMotion(STILL, np.zeros((3, 3)), 0.0)
+
+
+def gained_motion(
+    wheels: WheelPrediction, frame: Frame, gains: Array, nominal_track_m: float
+) -> GainedMotion:
+    """Motion of base_link over a Frame by wheels of gains (3,); takes every Frame once."""
+    logged_m = frame.wheel_increments_m
+    rolled_m = logged_m * (1.0 + gains[:2])
+    wheels.track_m = nominal_track_m * (1.0 + gains[2])
+    motion, by_wheels, _ = wheels.predict_in_full(
+        dataclasses.replace(frame, wheel_increments_m=rolled_m)
+    )
+    # by the turn: a wheel turns the robot by its increment over the track
+    by_track = -(by_wheels[:, 0] - by_wheels[:, 1]) / 2.0 * (rolled_m[0] - rolled_m[1])
+    by_gains = np.column_stack([by_wheels * logged_m, by_track / (1.0 + gains[2])])
+    return GainedMotion(motion, by_gains, float(np.abs(rolled_m).mean()))

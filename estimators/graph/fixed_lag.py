@@ -33,8 +33,6 @@ improving SLAM consistency, ISER 2008 (2009); Kaess et al., iSAM2: incremental s
 using the Bayes tree, IJRR 31, 2012.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -50,7 +48,6 @@ from estimators.landmarks.joint import JointGaussian
 from estimators.landmarks.stereo import StereoModel, StereoOptions
 from estimators.laser.icp import PreparedScan
 from estimators.laser.scan_matching import MatcherOptions, ScanMatcher
-from estimators.options import require_laser, require_stereo, start_pose
 from estimators.wheels import WheelOptions, WheelPrediction
 from sim import se2
 from sim.arrays import Array, Ints
@@ -94,7 +91,7 @@ class FixedLag(FixedLagOptions):
     -----
     The camera and the odometry are believed as `estimators.graph.smoother` does. Landmarks are
     numbered in the order in which they are seen; those of the prior come first. An image without
-    usable observations is no pose of the window.
+    usable observations does not become a pose of the window.
 
     Extras: `status` when an observation could not be used, or an image not be solved for; the
     belief is then the odometry's from the last one.
@@ -104,11 +101,11 @@ class FixedLag(FixedLagOptions):
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Start from the prior's pose, with an empty map."""
-        self._camera = StereoModel.of(require_stereo(prior, self.stereo, "fixed_lag"))
-        self._belief = start_pose(prior, "fixed_lag")
+        self._camera = StereoModel.of(prior.require_stereo(self.stereo, "fixed_lag"))
+        self._belief = prior.require_start("fixed_lag")
         self._wheels = WheelPrediction(self, prior.robot.track_m)
         self._drive = LandmarkDrive(self._camera, self._belief)
-        self._laser = None if self.laser is None else require_laser(prior, self.laser, "fixed_lag")
+        self._laser = None if self.laser is None else prior.require_laser(self.laser, "fixed_lag")
         self._scan: PreparedScan | None = None  # of the last image
         self._matcher = ScanMatcher(MatcherOptions(sigma_range_m=self.sigma_range_m))
         self._rng = rng
@@ -299,8 +296,7 @@ class FixedLag(FixedLagOptions):
 
     def _forget(self, gone: NDArray[np.bool_]) -> None:
         """Drop these (N,) of the prior's landmarks, and number the others without gaps."""
-        of_prior = np.concatenate([np.ones(3, dtype=bool), np.repeat(~gone, 3)])
-        self._prior.keep(of_prior)
+        self._prior.keep(np.concatenate([np.ones(3, dtype=bool), np.repeat(~gone, 3)]))
         kept = np.ones(len(self._landmarks), dtype=bool)
         kept[: len(gone)] = ~gone
         number = np.cumsum(kept) - 1

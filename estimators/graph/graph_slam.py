@@ -19,8 +19,6 @@ Sources: Lu and Milios, Globally consistent range scan alignment for environment
 Robots 4, 1997; Grisetti et al., A tutorial on graph-based SLAM, ITSM 2, 2010.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from dataclasses import dataclass
@@ -30,7 +28,7 @@ import numpy as np
 from pydantic import Field
 
 from estimators.base import Belief, Estimate, Prior
-from estimators.gaussian import STILL, Gaussian
+from estimators.gaussian import STILL, Gaussian, stacked
 from estimators.graph.landmark_drive import FLOOR, loosened
 from estimators.graph.loop_closing import (
     N_QUANTILES,
@@ -49,11 +47,10 @@ from estimators.laser.scan_matching import (
     MatcherOptions,
     ScanMatcher,
 )
-from estimators.options import require_laser, start_pose
 from estimators.wheels import EncoderTickOptions, WheelPrediction
 from sim import se2
 from sim.arrays import Array, Ints
-from sim.errors import InputError
+from sim.errors import require
 from sim.options import Positive, Probability, options
 from sim.recording import Frame
 
@@ -78,7 +75,7 @@ class GraphSlamOptions(EncoderTickOptions, KeyFrameOptions, MatcherOptions, Loop
 
     most_gap_m: Positive | None = 1.5
     """Leave out a line of which no three points in a row lie this near each other, m: door posts
-    far behind one another are no wall. null: all lines are kept."""
+    far behind one another do not make a wall. null: all lines are kept."""
     gate_probability: Probability | None = 1e-9
     """Leave a registration with the key frame out if only this share of all should differ more from
     what the wheels say; null: all are used."""
@@ -100,6 +97,8 @@ class GraphSlam(GraphSlamOptions):
     the newest becomes a key frame. Directions that the scans do not constrain are left to the
     wheels.
 
+    `graph` holds the key frames and closures so far.
+
     Belief extras: `registration_status`, `status` if a scan was not used, `closures`, the number
     believed so far.
     """
@@ -108,12 +107,12 @@ class GraphSlam(GraphSlamOptions):
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Start from the prior's pose; the first scan becomes a key frame."""
-        self._laser, self._rng = require_laser(prior, self.laser, "graph_slam"), rng
+        self._laser, self._rng = prior.require_laser(self.laser, "graph_slam"), rng
         self._matcher = ScanMatcher(self, self.most_gap_m)
         self._search = LoopSearch(self._matcher, self._laser, self)
-        start = start_pose(prior, "graph_slam")
+        start = prior.require_start("graph_slam")
         self._wheels = WheelPrediction(self, prior.robot.track_m)
-        self._graph = PoseGraph(Gaussian(start.mean, start.covariance + FLOOR), self.robust_sigma)
+        self.graph = PoseGraph(Gaussian(start.mean, start.covariance + FLOOR), self.robust_sigma)
         self._scans: list[PreparedScan | None] = [None]  # node 0 is the start
         self._signatures = np.full((1, N_QUANTILES), np.inf)
         self._held: list[Edge] = []  # closures that wait for others
@@ -121,11 +120,6 @@ class GraphSlam(GraphSlamOptions):
         self._failures = 0
         self._path: list[_Placed] = []
         self._stamps, self._now = [math.nan], math.nan
-
-    @property
-    def graph(self) -> PoseGraph:
-        """Key frames and closures so far."""
-        return self._graph
 
     @property
     def node_stamps(self) -> Array:
@@ -144,9 +138,9 @@ class GraphSlam(GraphSlamOptions):
             extras["registration_status"] = status
             if status not in ("first", "ok", "degenerate"):
                 extras["status"] = status
-        extras["closures"] = len(self._graph.closures)
-        self._path.append(_Placed(frame.stamp, len(self._graph) - 1, self._in_key))
-        belief = _symmetric(self._graph.newest.then(self._in_key))
+        extras["closures"] = len(self.graph.closures)
+        self._path.append(_Placed(frame.stamp, len(self.graph) - 1, self._in_key))
+        belief = _symmetric(self.graph.newest.then(self._in_key))
         return Belief(belief.mean, belief.covariance, extras)
 
     def finish(self) -> Estimate:
@@ -155,25 +149,20 @@ class GraphSlam(GraphSlamOptions):
         Raises
         ------
         InputError
-            If there is no Frame yet.
+            Before the first Frame.
         """
-        if not self._path:
-            raise InputError("the estimator has seen no Frame; step before finish")
+        require(self._path, "the estimator has seen no Frame; step before finish")
         for _ in range(self.revisions):
-            found = self._revised_closures()
-            if not found:
+            closures = self._revised_closures()
+            if not closures:
                 break
-            self._graph.close(found)
+            self.graph.close(closures)
         keys = [
-            Gaussian(*key) for key in zip(self._graph.poses, self._graph.marginals(), strict=True)
+            Gaussian(*key) for key in zip(self.graph.poses, self.graph.marginals(), strict=True)
         ]
         path = [_symmetric(keys[placed.node].then(placed.in_key)) for placed in self._path]
-        return Estimate(
-            stamps=np.array([placed.stamp for placed in self._path]),
-            means=np.array([belief.mean for belief in path]),
-            covariances=np.array([belief.covariance for belief in path]),
-            kind="revised",
-        )
+        stamps = np.array([placed.stamp for placed in self._path])
+        return Estimate(stamps, *stacked(path), kind="revised")
 
     def _see(self, scan: PreparedScan | None) -> str:
         """Register a scan with the newest key frame; what came of it."""
@@ -212,7 +201,7 @@ class GraphSlam(GraphSlamOptions):
         measured = [Gaussian(self._by_wheels.mean, self._by_wheels.covariance + FLOOR)]
         if registered is not None:
             measured.append(_scaled(registered, 1.0 - self.shared_noise))
-        self._graph.add(self._in_key.mean, measured)
+        self.graph.add(self._in_key.mean, measured)
         self._scans.append(scan)
         self._stamps.append(self._now)
         self._signatures = np.vstack([self._signatures, signature(scan)])
@@ -222,29 +211,28 @@ class GraphSlam(GraphSlamOptions):
 
     def _close_loops(self) -> None:
         """Hold the newest key frame's closures; believe those that enough others agree with."""
-        oldest = len(self._graph) - _HELD_FRAMES
+        oldest = len(self.graph) - _HELD_FRAMES
         self._held = [edge for edge in self._held if edge.second >= oldest]
         found = self.proposed()
         if not found:
             return
         self._held = [*self._held, *found][-_MOST_HELD:]
-        agreed = self._search.consistent(self._graph, self._held)
-        believed = sum(e.second >= oldest for e in self._graph.closures[-self.loop_support :])
+        agreed = self._search.consistent(self.graph, self._held)
+        believed = sum(e.second >= oldest for e in self.graph.closures[-self.loop_support :])
         if agreed and len(agreed) + believed >= self.loop_support:
             self._held = [edge for edge in self._held if edge not in agreed]
-            self._graph.close(agreed, _ONLINE_TOLERANCE)
+            self.graph.close(agreed, _ONLINE_TOLERANCE)
 
     def proposed(self) -> list[Edge]:
         """Closures of the newest key frame that pass each on its own."""
-        newest = len(self._graph) - 1
-        older = np.arange(newest - 1)
-        motions, covariances = self._graph.newest_from(older, exact=False)
+        newest = len(self.graph) - 1
+        motions, covariances = self.graph.newest_from(np.arange(newest - 1), exact=False)
         nodes = self._candidates(newest, motions, covariances)
-        return self._closures(newest, nodes, *self._graph.newest_from(nodes, exact=True))
+        return self._closures(newest, nodes, *self.graph.newest_from(nodes, exact=True))
 
     def _revised_closures(self) -> list[Edge]:
         """More closures between key frames that the graph shows to be near each other."""
-        graph = self._graph
+        graph = self.graph
         known = {(edge.first, edge.second) for edge in graph.closures}
         graph.marginals()
         found = []
@@ -264,7 +252,7 @@ class GraphSlam(GraphSlamOptions):
 
     def _closures(self, node: int, nodes: Ints, motions: Array, covariances: Array) -> list[Edge]:
         """Register a node with the first few of K others that would teach enough."""
-        typical = self._graph.noise_of(node)
+        typical = self.graph.noise[node]
         worth = [self._search.worthwhile(P, typical) for P in covariances]
         found = [
             self._closure(int(nodes[k]), node, Gaussian(motions[k], covariances[k]))

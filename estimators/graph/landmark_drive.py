@@ -5,8 +5,6 @@ observations (and the first and last) are poses of the problem. Those between ar
 the odometry on both sides, which loses nothing.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import itertools
@@ -16,20 +14,19 @@ from collections.abc import Sequence
 import numpy as np
 
 from estimators.base import Estimate
-from estimators.gaussian import Gaussian, compose, wrap
+from estimators.gaussian import Gaussian, compose, stacked, wrap
 from estimators.graph.least_squares import (
     SQUARES,
     LeastSquaresOptions,
     PoseSightings,
     Problem,
-    Solution,
     solve,
 )
 from estimators.landmarks.sightings import Sightings
 from estimators.landmarks.slam_frontend import screened
 from estimators.landmarks.stereo import StereoModel
 from sim.arrays import Array, Ints
-from sim.errors import InputError
+from sim.errors import require
 from sim.recording import Frame
 
 # What a motion and a start pose are uncertain by at least, so that both can be inverted
@@ -90,56 +87,34 @@ class LandmarkDrive:
         """Add another measurement of the motion between the last two images."""
         self._ties.append((self._images[-2][0], self._images[-1][0], motion))
 
-    def _estimate(
-        self, solution: Solution, poses: Array, joint_covariance: Array, ids: Ints
-    ) -> Estimate:
-        """Estimate of this drive's solved poses; arguments as in `filled_in`."""
-        means, covariances = self.filled_in(poses, joint_covariance)
-        status = "ok" if solution.converged else "not_converged"
-        return Estimate(
-            stamps=self.stamps,
-            means=means,
-            covariances=covariances,
-            kind="revised",
-            map={
-                "ids": ids,
-                "landmarks": solution.landmarks,
-                "landmark_covariances": solution.landmark_covariances,
-            },
-            status=status if len(ids) else "no_landmarks",
-        )
-
     def problem(self) -> tuple[Problem, Array]:
         """The least-squares problem over all Frames so far, and poses (T, 3) to start from."""
         rows = self._rows()
-        return self._problem(rows)[0], self._guessed(rows)
+        return self._problem(rows)[0], np.array([self._guesses[row] for row in rows])
 
     def _rows(self) -> list[int]:
         """Frames that are poses of the problem."""
         seeing = (row for row, _, _ in self._images)
         return sorted({0, *seeing, *self._pinned, len(self._stamps) - 1})
 
-    def _guessed(self, rows: list[int]) -> Array:
-        return np.array([self._guesses[row] for row in rows])
-
     def _problem(self, rows: list[int]) -> tuple[Problem, Ints]:
         """The problem over the Frames of these rows, and the id of each of its landmarks."""
-        merged = [_merged(self._motions[a + 1 : b + 1]) for a, b in itertools.pairwise(rows)]
+        between = (self._motions[a + 1 : b + 1] for a, b in itertools.pairwise(rows))
+        merged = [functools.reduce(Gaussian.then, motions) for motions in between]
         pose_of = {row: pose for pose, row in enumerate(rows)}
         seen = [np.zeros(0, np.int64), *(seen for _, _, seen in self._images)]
         ids, landmark_rows = np.unique(np.concatenate(seen), return_inverse=True)
         tied = [(pose_of[first], pose_of[second]) for first, second, _ in self._ties]
-        merged += [motion for _, _, motion in self._ties]
+        motions, covariances = stacked([*merged, *(motion for _, _, motion in self._ties)])
         steps = [*itertools.pairwise(range(len(rows))), *tied]
         first, second = np.array(steps, np.int64).reshape(-1, 2).T
-        n = len(merged)
         problem = Problem(
             prior_mean=compose(self._start.mean, self._motions[0].mean)[0],
             prior_covariance=self._start.covariance,
             first=first,
             second=second,
-            motions=np.array([motion.mean for motion in merged]).reshape(n, 3),
-            motion_covariances=np.array([motion.covariance for motion in merged]).reshape(n, 3, 3),
+            motions=motions,
+            motion_covariances=covariances,
             camera=self._camera,
             pose_rows=np.array([pose_of[row] for row, p, _ in self._images for _ in p], np.int64),
             landmark_rows=landmark_rows.astype(np.int64),
@@ -199,12 +174,17 @@ def revised(
     Raises
     ------
     InputError
-        If there is no Frame yet.
+        Before the first Frame.
     """
-    if not all(len(drive.stamps) for drive in drives):
-        raise InputError("the estimator has seen no Frame; step before finish")
+    require(
+        all(len(drive.stamps) for drive in drives),
+        "the estimator has seen no Frame; step before finish",
+    )
     rows = [drive._rows() for drive in drives]
-    guesses = [drive._guessed(own) for drive, own in zip(drives, rows, strict=True)]
+    guesses = [
+        np.array([drive._guesses[row] for row in own])
+        for drive, own in zip(drives, rows, strict=True)
+    ]
     parts, ids_of = zip(*map(LandmarkDrive._problem, drives, rows), strict=True)
     if len(drives) == 1:
         problem, ids, ends = parts[0], ids_of[0], np.array([0, len(rows[0])])
@@ -224,18 +204,25 @@ def revised(
                 for pose, row in enumerate(own)
             }
             sightings = PoseSightings(
-                camera.camera,
-                camera.marker_z_m,
+                camera,
                 np.array([pose_of[seeing] for seeing, _, _ in sighted], np.int64),
                 np.array([pose_of[seen_] for _, seen_, _ in sighted], np.int64),
                 np.array([point for _, _, point in sighted]),
             )
             problem = dataclasses.replace(problem, sightings=sightings)
     solution = solve(problem, np.concatenate(guesses), how)
+    known_map = {
+        "ids": ids,
+        "landmarks": solution.landmarks,
+        "landmark_covariances": solution.landmark_covariances,
+    }
+    status = "ok" if solution.converged else "not_converged"
+    status = status if len(ids) else "no_landmarks"
     estimates = []
     for drive, (low, high) in zip(drives, itertools.pairwise(ends), strict=True):
         covariance = solution.covariance[3 * low : 3 * high, 3 * low : 3 * high]
-        estimates.append(drive._estimate(solution, solution.poses[low:high], covariance, ids))
+        path = drive.filled_in(solution.poses[low:high], covariance)
+        estimates.append(Estimate(drive.stamps, *path, "revised", map=known_map, status=status))
     return estimates
 
 
@@ -274,35 +261,22 @@ def observed(
     seen = frame.readings.get(sensor)
     if seen is None or not len(seen["points_in_camera"]):
         return None, ""
-    if "ids" not in seen:
-        raise InputError(
-            f"{estimator} needs to know which landmark is which; set "
-            f"sensors.{sensor}.identifies=true"
-        )
+    require(
+        "ids" in seen,
+        f"{estimator} needs to know which landmark is which; set sensors.{sensor}.identifies=true",
+    )
     used, status = screened(camera, seen["points_in_camera"], seen["ids"])
     return (seen["points_in_camera"][used], seen["ids"][used]) if used.any() else None, status
 
 
 def loosened(motion: Gaussian) -> Gaussian:
     """Motion of a Frame with what least squares needs beside slip: sideways play, and a floor."""
-    return Gaussian(motion.mean, motion.covariance + _sideways(motion) + FLOOR)
-
-
-def _sideways(motion: Gaussian) -> Array:
-    """Covariance (3, 3) that slip adds within a Frame because it is spread along the way.
-
-    The arc takes each wheel to turn evenly. A heading that wanders by the variance s^2 over the
-    way d also leaves it sideways, by d^2 s^2 / 12 beyond what the final heading accounts for.
-    """
+    # The arc takes each wheel to turn evenly. A heading that wanders by the variance s^2 over the
+    # way d also leaves it sideways, by d^2 s^2 / 12 beyond what the final heading accounts for.
     x, y, turn = motion.mean
     normal = np.array([-math.sin(turn / 2.0), math.cos(turn / 2.0), 0.0])
-    added: Array = np.outer(normal, normal) * ((x**2 + y**2) * motion.covariance[2, 2] / 12.0)
-    return added
-
-
-def _merged(motions: list[Gaussian]) -> Gaussian:
-    """Several motions as one."""
-    return functools.reduce(Gaussian.then, motions)
+    sideways = np.outer(normal, normal) * ((x**2 + y**2) * motion.covariance[2, 2] / 12.0)
+    return Gaussian(motion.mean, motion.covariance + sideways + FLOOR)
 
 
 def _between(motions: list[Gaussian], ends: Array, joint: Array) -> list[Gaussian]:

@@ -29,6 +29,7 @@ from estimators.graph.matrices import (
     transposed,
     whitening_of,
 )
+from estimators.landmarks.sightings import Sightings
 from estimators.landmarks.stereo import LEAST_DEPTH_M, StereoModel
 from sim import se2
 from sim.arrays import Array, Ints
@@ -63,32 +64,28 @@ class PoseSightings:
 
     Attributes
     ----------
-    camera
-        What is believed of it.
-    marker_z_m
-        Height of the markers.
+    sensor
+        What is believed of what sees them.
     seeing_rows, seen_rows
         (K,) who sees whom.
     points_in_camera
         (K, 3) m.
     """
 
-    camera: StereoModel
-    marker_z_m: float
+    sensor: Sightings
     seeing_rows: Ints
     seen_rows: Ints
     points_in_camera: Array
 
     def residuals(self, poses: Array, in_image: bool) -> tuple[Array, Array, Array]:
         """Whitened residuals (K, 3), and derivatives (K, 3, 3) by the seeing and seen pose."""
-        seeing, seen = poses[self.seeing_rows], poses[self.seen_rows]
-        markers = np.column_stack([seen[:, :2], np.full(len(seen), self.marker_z_m)])
-        points = self.points_in_camera
-        off, by_seeing, by_marker = residuals_of(self.camera, seeing, markers, points, in_image)
+        camera, seeing = self.sensor.camera, poses[self.seeing_rows]
+        markers, points = self.sensor.markers(poses[self.seen_rows]), self.points_in_camera
+        off, by_seeing, by_marker = residuals_of(camera, seeing, markers, points, in_image)
         whitening = (
-            camera_whitening(self.camera, seeing, markers)
+            camera_whitening(camera, seeing, markers)
             if in_image
-            else whitening_of(self.camera.covariance(points))
+            else whitening_of(camera.covariance(points))
         )
         by_seen = by_marker * np.array([1.0, 1.0, 0.0])  # its heading is not seen
         return times(whitening, off), whitening @ by_seeing, whitening @ by_seen

@@ -13,8 +13,6 @@ Mangelson et al., Pairwise consistent measurement set maximization for robust mu
 merging, ICRA 2018.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Annotated
@@ -49,7 +47,7 @@ class LoopOptions:
     """How loops are looked for and checked."""
 
     loop_reach_m: Positive = 3.0
-    """Two key frames may see the same place if they are no farther apart, m."""
+    """Distance up to which two key frames may see the same place, m."""
     loop_gate_probability: Annotated[float, Field(gt=0.0, le=1.0)] = 1e-3
     """A closure is refused if only this share of all right ones misses the graph by more."""
     loop_least_gain: NonNegative = 2.0

@@ -1,7 +1,5 @@
 """Matrices of least squares: normal equations by blocks, their factors, and stacks of 3 x 3."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import cached_property
 
@@ -108,12 +106,8 @@ class NormalEquations:
                 weighted = weights[:, None, None] * weighted
             np.add.at(self.g, own, times(weighted, e))
             for other, by_other in zip(rows, sides, strict=True):
-                self.add_information(own, other, weighted @ by_other)
-
-    def add_information(self, rows: Ints, columns: Ints, blocks: Array) -> None:
-        """Add K blocks (K, 3, 3); places may come twice."""
-        self._places.append(rows * self._n + columns)
-        self._values.append(blocks)
+                self._places.append(own * self._n + other)  # which may come twice
+                self._values.append(weighted @ by_other)
 
     def matrix(self) -> bsr_array:
         """(3 n, 3 n)."""

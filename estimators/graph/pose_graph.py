@@ -9,13 +9,11 @@ rest of the graph contradicts.
 Source: Yang et al., Graduated non-convexity for robust spatial perception, RA-L 5, 2020.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
 
-from estimators.gaussian import Gaussian, compose
+from estimators.gaussian import Gaussian, compose, stacked
 from estimators.graph.least_squares import LeastSquaresOptions, Problem, information_at, solve
 from estimators.graph.matrices import Factor, inverse, times, transposed, whitening_of
 from sim import se2
@@ -42,13 +40,22 @@ class PoseGraph:
         Pose of node 0; its covariance is positive definite.
     robust_sigma
         Mahalanobis distance from which on a closure counts less.
+
+    Attributes
+    ----------
+    poses
+        (N, 3) m, m, rad in map.
+    noise
+        (3, 3) covariance of each node's last tie to the one before.
+    closures
+        Edges that tie nodes to others than the one before.
     """
 
     def __init__(self, start: Gaussian, robust_sigma: float) -> None:
         self._start, self._robust_sigma = start, robust_sigma
-        self._poses = start.mean[None].copy()
+        self.poses = start.mean[None].copy()
         self._chain: list[Edge] = []
-        self._noise = [start.covariance]  # of the last tie of each
+        self.noise = [start.covariance]
         self.closures: list[Edge] = []
         # Covariances of each node: its own, and with the newest. Own ones may be those of a time
         # with fewer closures, and so too large, unless they are current.
@@ -58,21 +65,12 @@ class PoseGraph:
         self._now: Factor | None = None  # covers all nodes
 
     def __len__(self) -> int:
-        return len(self._poses)
-
-    @property
-    def poses(self) -> Array:
-        """(N, 3) m, m, rad in map."""
-        return self._poses
+        return len(self.poses)
 
     @property
     def newest(self) -> Gaussian:
         """Pose of the last node."""
-        return Gaussian(self._poses[-1], self._own[-1])
-
-    def noise_of(self, node: int) -> Array:
-        """(3, 3) covariance of a node's last tie to the one before."""
-        return self._noise[node]
+        return Gaussian(self.poses[-1], self._own[-1])
 
     def add(self, motion: Array, measured: list[Gaussian]) -> None:
         """Append a node.
@@ -86,12 +84,12 @@ class PoseGraph:
         """
         n = len(self)
         self._chain += [Edge(n - 1, n, one) for one in measured]
-        self._noise.append(measured[-1].covariance)
+        self.noise.append(measured[-1].covariance)
         noise = inverse(np.sum([inverse(one.covariance) for one in measured], axis=0))
-        pose, by_pose, by_motion = compose(self._poses[-1], motion)
+        pose, by_pose, by_motion = compose(self.poses[-1], motion)
         own = by_pose @ self._own[-1] @ by_pose.T + by_motion @ noise @ by_motion.T
         own = (own + own.T) / 2.0
-        self._poses = np.vstack([self._poses, pose])
+        self.poses = np.vstack([self.poses, pose])
         self._cross = np.concatenate([self._cross @ by_pose.T, own[None]])
         self._own = np.concatenate([self._own, own[None]])
         self._current = np.append(self._current, True)
@@ -114,7 +112,7 @@ class PoseGraph:
 
     def _from(self, nodes: Ints, node: int, cross: Array) -> tuple[Array, Array]:
         """As above, with the covariances (K, 3, 3) of the nodes with the one."""
-        first, second = self._poses[nodes], np.tile(self._poses[node], (len(nodes), 1))
+        first, second = self.poses[nodes], np.tile(self.poses[node], (len(nodes), 1))
         by_first, by_second = se2.between_jacobians(first, second)
         mixed = by_first @ cross @ transposed(by_second)
         covariances = by_first @ self._own[nodes] @ transposed(by_first)
@@ -128,14 +126,14 @@ class PoseGraph:
         """
         first, second, measured, noise = _stacked(edges)
         nodes, places = np.unique(np.concatenate([first, second]), return_inverse=True)
-        by_first, by_second = se2.between_jacobians(self._poses[first], self._poses[second])
+        by_first, by_second = se2.between_jacobians(self.poses[first], self.poses[second])
         J = np.zeros((len(edges), 3, len(nodes), 3))
         k = np.arange(len(edges))
         J[k, :, places[: len(edges)]], J[k, :, places[len(edges) :]] = by_first, by_second
         flat = J.reshape(3 * len(edges), -1)
         S = flat @ self._information().joint(nodes) @ flat.T
         S.reshape(len(edges), 3, len(edges), 3)[k, :, k] += noise
-        off = se2.difference(measured, se2.between(self._poses[first], self._poses[second]))
+        off = se2.difference(measured, se2.between(self.poses[first], self.poses[second]))
         return off.ravel(), S
 
     def close(self, edges: list[Edge], tolerance: float = 1e-9) -> None:
@@ -150,8 +148,8 @@ class PoseGraph:
         sigma = max(self._robust_sigma, self._farthest(edges))
         while True:
             how = LeastSquaresOptions(robust="dcs", robust_sigma=sigma)
-            solution = solve(self._problem(), self._poses, how, tolerance=tolerance)
-            self._poses = solution.poses
+            solution = solve(self._problem(), self.poses, how, tolerance=tolerance)
+            self.poses = solution.poses
             if sigma == self._robust_sigma:
                 break
             sigma = max(sigma / _NARROWED, self._robust_sigma)
@@ -159,13 +157,12 @@ class PoseGraph:
         self._solved = self._now = solution.information
         self._cross = self._solved.columns(np.array([n - 1])).reshape(n, 3, 3)
         self._own[-1] = (self._cross[-1] + self._cross[-1].T) / 2.0
-        self._current[:] = False
-        self._current[-1] = True
+        self._current = np.arange(n) == n - 1
 
     def _farthest(self, edges: list[Edge]) -> float:
         """Greatest Mahalanobis distance of closures from the graph, by their own noise."""
         first, second, measured, noise = _stacked(edges)
-        off = se2.difference(measured, se2.between(self._poses[first], self._poses[second]))
+        off = se2.difference(measured, se2.between(self.poses[first], self.poses[second]))
         squared = np.sum(times(whitening_of(noise), off) ** 2, axis=1)
         return float(np.sqrt(squared.max(initial=0.0)))
 
@@ -183,7 +180,7 @@ class PoseGraph:
     def _information(self) -> Factor:
         if self._now is None:
             how = LeastSquaresOptions(robust="dcs", robust_sigma=self._robust_sigma)
-            self._now = information_at(self._problem(), self._poses, how)
+            self._now = information_at(self._problem(), self.poses, how)
         return self._now
 
     def _problem(self) -> Problem:
@@ -202,9 +199,5 @@ class PoseGraph:
 
 def _stacked(edges: list[Edge]) -> tuple[Ints, Ints, Array, Array]:
     """First and second node (E,), motions (E, 3) and covariances (E, 3, 3)."""
-    return (
-        np.array([edge.first for edge in edges], np.int64),
-        np.array([edge.second for edge in edges], np.int64),
-        np.array([edge.motion.mean for edge in edges]).reshape(-1, 3),
-        np.array([edge.motion.covariance for edge in edges]).reshape(-1, 3, 3),
-    )
+    ends = np.array([(edge.first, edge.second) for edge in edges], np.int64).reshape(-1, 2)
+    return ends[:, 0], ends[:, 1], *stacked([edge.motion for edge in edges])

@@ -13,7 +13,6 @@ from estimators.graph.landmark_drive import LandmarkDrive, Sighted, loosened, ob
 from estimators.graph.least_squares import LeastSquaresOptions, Problem
 from estimators.landmarks.sightings import Sightings, dead_reckoning
 from estimators.landmarks.stereo import StereoModel, TeamEyesOptions
-from estimators.options import require_stereo, start_pose
 from estimators.wheels import WheelOptions
 from sim.arrays import Array
 from sim.errors import require
@@ -51,9 +50,9 @@ class Smoother(SmootherOptions, TeamEstimator):
             len(priors) == 1 or all(prior.mean is not None for prior in priors),
             "smoother: the starts of a team must be known; set team.starts=known",
         )
-        self._camera = StereoModel.of(require_stereo(priors[0], self.stereo, "smoother"))
+        self._camera = StereoModel.of(priors[0].require_stereo(self.stereo, "smoother"))
         self._sightings = Sightings.of(priors, self.robots, "smoother")
-        self._beliefs = [start_pose(prior, "smoother") for prior in priors]
+        self._beliefs = [prior.require_start("smoother") for prior in priors]
         self._wheels = dead_reckoning(self, priors)
         self._drives = [LandmarkDrive(self._camera, start) for start in self._beliefs]
         self._sighted: list[Sighted] = []

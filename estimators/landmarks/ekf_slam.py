@@ -18,7 +18,7 @@ from estimators.landmarks.joint import JointGaussian, mahalanobis_squared
 from estimators.landmarks.sightings import Sightings, dead_reckoning, pose_by_points, team_starts
 from estimators.landmarks.slam_frontend import Image, LandmarkSlamOptions, SlamFrontEnd
 from estimators.landmarks.stereo import LEAST_DEPTH_M
-from estimators.landmarks.wheel_gains import NO_MOTION, GainOptions, gained_motion
+from estimators.wheels import NO_MOTION, GainOptions, gained_motion
 from sim.arrays import Array, Ints
 from sim.errors import require
 from sim.options import options
@@ -38,7 +38,7 @@ class EkfSlamOptions(LandmarkSlamOptions, GainOptions):
     """Options of EKF-SLAM."""
 
     errors: Errors = "coordinates"
-    """What the covariance is of. `coordinates`: the differences of headings and positions.
+    """What the covariance describes. `coordinates`: the differences of headings and positions.
     `invariant`: the turn and shift of the whole map about the origin of the map frame, and what is
     left of each landmark: x = R(e_turn) x_hat + e_x for every position x, the robot's too. What is
     seen does not change with the turn, so no update can make the heading of the whole map look
@@ -89,11 +89,11 @@ class EkfSlam(EkfSlamOptions, TeamEstimator):
         n, self.invariant = len(priors), self.errors == "invariant"
         require(
             n == 1 or not self.invariant,
-            "ekf_slam: errors=invariant is of one robot; set estimator.errors=coordinates",
+            "ekf_slam: errors=invariant holds for one robot; set estimator.errors=coordinates",
         )
         require(
             n == 1 or not self.gain_sigma,
-            "ekf_slam: gains of wheels are of one robot; set estimator.gain_sigma=0",
+            "ekf_slam: gains of wheels hold for one robot; set estimator.gain_sigma=0",
         )
         self.front_end = SlamFrontEnd(self, priors[0], "ekf_slam")
         starts = team_starts(priors, self.front_end, "ekf_slam")
@@ -121,13 +121,13 @@ class EkfSlam(EkfSlamOptions, TeamEstimator):
         for frame in frames:
             self._roll(frame)
         extras: list[dict[str, Any]] = [{} for _ in frames]
-        for frame, found in zip(frames, extras, strict=True):
+        for frame, own in zip(frames, extras, strict=True):
             image = self.front_end.read(frame) if self.stereo in frame.readings else None
             if not self._is_placed[frame.robot]:
                 self._place(frame, image, frames)
             if image is not None and self._is_placed[frame.robot]:
                 self._move(frame.robot)
-                found |= self._see(frame, image)
+                own |= self._see(frame, image)
         for frame in frames:
             if self._sightings is not None and self._is_placed[frame.robot]:
                 self._sight(self._sightings, frame, frames)
@@ -247,10 +247,8 @@ class EkfSlam(EkfSlamOptions, TeamEstimator):
         if len(points) == 0 or self._n_landmarks == 0:
             return slots
         predicted = self._camera.predict(self._state.mean[_own(robot)], self._landmarks)[0]
-        near = predicted[:, 2] > LEAST_DEPTH_M
-        candidates = np.flatnonzero(
-            near & (np.linalg.norm(predicted, axis=1) < self.front_end.reach_m)
-        )
+        near = np.linalg.norm(predicted, axis=1) < self.front_end.reach_m
+        candidates = np.flatnonzero((predicted[:, 2] > LEAST_DEPTH_M) & near)
         if len(candidates) == 0:
             return slots
         _, *by = self._predict(robot, self._landmarks[candidates])
@@ -397,7 +395,11 @@ class EkfSlam(EkfSlamOptions, TeamEstimator):
             slots, points = slots[slots >= 0], image.points[slots >= 0]
             in_base.append(self._camera.place(np.zeros(3), points)[..., :2])
             in_map.append(self._landmarks[slots, :2])
-        poses = {f.robot: self._pose_now(f.robot) for f in frames if self._is_placed[f.robot]}
+        poses = {
+            f.robot: compose(self._state.mean[_own(f.robot)], self._motions[f.robot].mean)[0]
+            for f in frames
+            if self._is_placed[f.robot]
+        }
         if self._sightings is not None:
             for seen in self._sightings.of_robot(frame, frames, poses):
                 in_base.append(seen[0])
@@ -422,9 +424,6 @@ class EkfSlam(EkfSlamOptions, TeamEstimator):
             information = np.einsum("kji,kjl->il", weighted, H)
             pose = pose + np.linalg.solve(information, np.einsum("kji,kj->i", weighted, v))
         return pose
-
-    def _pose_now(self, robot: int) -> Array:
-        return compose(self._state.mean[_own(robot)], self._motions[robot].mean)[0]
 
 
 def _own(robot: int) -> slice:

@@ -1,7 +1,5 @@
 """FastSLAM: a particle filter over the robot's path, with an EKF for each landmark (gil2008)."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Annotated, Any, Literal
@@ -20,7 +18,7 @@ from estimators.landmarks.sightings import Sightings, dead_reckoning, team_start
 from estimators.landmarks.slam_frontend import Image, LandmarkSlamOptions, SlamFrontEnd
 from estimators.particles import Scheme, in_place, normalize, resample, underflowed
 from sim.arrays import Array, Ints
-from sim.errors import InputError
+from sim.errors import required
 from sim.options import NonNegative, Positive, options
 from sim.recording import Frame
 
@@ -101,12 +99,11 @@ class FastSLAM(FastSlamOptions, TeamEstimator):
         mount, n_blocks = self.front_end.camera.mount, self._maps.n_blocks
         self._paths = []
         for start, wheels in zip(starts, dead_reckoning(self, priors), strict=True):
-            if start is None:
-                raise InputError("fastslam needs the starts of all robots; ekf_slam does not")
+            start = required(start, "fastslam needs the starts of all robots; ekf_slam does not")
             path = ParticlePath(wheels, self.slip_dof, mount, n, n_blocks)
             path.scatter(start, rng)
             self._paths.append(path)
-        self._log_weights, self._accumulated = np.zeros(n), np.zeros(n)
+        self._log_weights, self._accumulated = np.zeros((2, n))
         for path in self._paths:
             path.settle()
         self._weigh()
@@ -117,11 +114,11 @@ class FastSLAM(FastSlamOptions, TeamEstimator):
         extras: list[dict[str, Any]] = [{"resampled": False} for _ in frames]
         for frame in frames:
             self._paths[frame.robot].roll(frame)
-        for frame, found in zip(frames, extras, strict=True):
+        for frame, own in zip(frames, extras, strict=True):
             path = self._paths[frame.robot]
             if self.stereo in frame.readings:
-                self._see(path, frame, found)
-                informed |= bool(np.any(found["associations"] >= 0))
+                self._see(path, frame, own)
+                informed |= bool(np.any(own["associations"] >= 0))
             elif path.rolled.covariance[2, 2] > _MOST_DRIFT_RAD**2:
                 path.draw(self._rng)
                 self._weigh()
@@ -169,7 +166,9 @@ class FastSLAM(FastSlamOptions, TeamEstimator):
         by_motion = self.proposal == "motion" or len(points) == 0
         poses = path.moved(normals if by_motion else np.zeros_like(normals))
         if not known:
-            spread = np.zeros((3, 3)) if by_motion else self._seen_spread(path)
+            # of the motion not yet drawn, in axes of the camera after it
+            angle = -float(path.rolled.mean[2] + self.front_end.camera.mount[2])
+            spread = np.zeros((3, 3)) if by_motion else rotated(path.rolled.covariance, angle)
             slots = self._associate(path, image, spread)
         if not by_motion:
             gained += self._propose(path, normals, slots, points)
@@ -180,17 +179,17 @@ class FastSLAM(FastSlamOptions, TeamEstimator):
         path.settle()
         if not self._gain(gained):
             extras["status"] = "weights underflowed"
-        landmarks = self._landmarks(slots, self._best)
+        chosen = slots if slots.ndim == 1 else slots[:, self._best]
+        numbers = self._maps.birth_of(np.maximum(chosen, 0), self._best)
+        landmarks = np.where(chosen >= 0, numbers, -1)
         extras["associations"] = self.front_end.associations(image, landmarks)
 
     def _gain(self, gained: Array) -> bool:
         """Add log weights (M,); with False, and equal weights, if all have underflowed."""
         weights = self._log_weights + gained
         lost = underflowed(weights)
-        if lost:
-            weights, gained = np.zeros(self.n_particles), np.zeros(self.n_particles)
-        self._log_weights = weights
-        self._accumulated = self._accumulated + gained
+        self._log_weights = np.zeros(self.n_particles) if lost else weights
+        self._accumulated = self._accumulated + (0.0 if lost else gained)
         self._weigh()
         return not lost
 
@@ -219,7 +218,7 @@ class FastSLAM(FastSlamOptions, TeamEstimator):
         """Path of the lineage of greatest accumulated weight, gil2008, eq. (20).
 
         The covariances are those of all weighted lineages. They are zero where all lineages share
-        one ancestor: a sign of particle depletion, not of a path known exactly.
+        one ancestor: a sign of particle depletion; the path is not known exactly.
         """
         return self.finish_team()[0]
 
@@ -284,11 +283,6 @@ class FastSLAM(FastSlamOptions, TeamEstimator):
         S += of_landmark @ covariances[slots[old]] @ turned
         return self.front_end.passed(image, slots, mahalanobis_squared(v, S), moved.mean)
 
-    def _seen_spread(self, path: ParticlePath) -> Array:
-        """Covariance of the motion not yet drawn, in axes of the camera after it."""
-        angle = -float(path.rolled.mean[2] + self.front_end.camera.mount[2])
-        return rotated(path.rolled.covariance, angle)
-
     def _propose(self, path: ParticlePath, normals: Array, slots: Ints, points: Array) -> Array:
         """Turn normals into draws given the image; their log importance weights (M,).
 
@@ -299,17 +293,23 @@ class FastSLAM(FastSlamOptions, TeamEstimator):
         rows, points = self._maps.rows(slots[old]), points[old]
         inform = ekf.inform if slots.ndim == 1 else ekf.inform_each
         maps, state, camera = self._maps.data, path.state, self._camera
-        start, owed = np.zeros_like(normals), np.empty((2, normals.shape[1]))
+        start, importance = np.zeros_like(normals), np.empty((2, normals.shape[1]))
         if len(rows):
             inform(maps, rows[:_PLACING], points[:_PLACING], state, camera)
             ekf.propose(
-                path.poses, path.root, path.stretch, state, np.zeros_like(normals), start, owed
+                path.poses,
+                path.root,
+                path.stretch,
+                state,
+                np.zeros_like(normals),
+                start,
+                importance,
             )
             path.moved(start)
         inform(maps, rows, points, state, camera)
-        ekf.propose(path.poses, path.root, path.stretch, state, start, normals, owed)
-        log_owed: Array = 0.5 * owed[0] - np.log(owed[1])
-        return log_owed[: self.n_particles]
+        ekf.propose(path.poses, path.root, path.stretch, state, start, normals, importance)
+        log_weights: Array = 0.5 * importance[0] - np.log(importance[1])
+        return log_weights[: self.n_particles]
 
     def _observe(self, path: ParticlePath, slots: Ints, points: Array) -> Array:
         """Update the landmarks seen again; log weights (M,), gil2008, eqs. (13) and (14)."""
@@ -349,11 +349,6 @@ class FastSLAM(FastSlamOptions, TeamEstimator):
             maps.births[at[missing], particle] = len(self.front_end.origins) + row
         self.front_end.start(image, rows)
         maps.counts = maps.counts + missing.sum(axis=0)
-
-    def _landmarks(self, slots: Ints, particle: int) -> Ints:
-        """Number (K,) of each observation's landmark in one particle, -1 for new ones."""
-        chosen = slots if slots.ndim == 1 else slots[:, particle]
-        return np.where(chosen >= 0, self._maps.birth_of(np.maximum(chosen, 0), particle), -1)
 
     def _resample(self) -> None:
         """Draw particles by their weights; survivors keep their place."""

@@ -1,7 +1,5 @@
 """One Gaussian over poses and landmarks with all their correlations, as a filter keeps it."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 

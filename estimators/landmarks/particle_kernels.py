@@ -336,7 +336,7 @@ def propose(
     state: Array,
     start: Array,
     normals: Array,
-    owed: Array,
+    importance: Array,
 ) -> None:
     """Turn standard normal draws (3, lanes) into draws of the motion's noise given the image.
 
@@ -344,7 +344,7 @@ def propose(
     state's information I and i on the pose, taken at x0 = `start` (3, lanes), x given the image is
     N(m, P): P^-1 = 1 + B^T I B, m = P (B^T i + B^T I B x0), B = dpose/dx. A draw's importance
     weight, p(x) / q(x), is
-    exp(owed[0] / 2) / owed[1], `owed` (2, lanes).
+    exp(importance[0] / 2) / importance[1], `importance` (2, lanes).
     """
     for block in range(len(state)):
         S, first = state[block], block * LANES
@@ -376,8 +376,8 @@ def propose(
             y = (r1 + b - u12 * z) / u11
             x = (r0 + a - u01 * y - u02 * z) / u00
             normals[0, lane], normals[1, lane], normals[2, lane] = x, y, z
-            owed[0, lane] = a * a + b * b + c * c - x * x - y * y - z * z
-            owed[1, lane] = u00 * u11 * u22
+            importance[0, lane] = a * a + b * b + c * c - x * x - y * y - z * z
+            importance[1, lane] = u00 * u11 * u22
 
 
 class Candidates(NamedTuple):

@@ -1,13 +1,11 @@
 """The path of one robot as all particles of FastSLAM hold it."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
 
 from estimators.base import Estimate
-from estimators.gaussian import STILL, Gaussian, root, rotated
+from estimators.gaussian import STILL, Gaussian, root, rotated, stacked
 from estimators.landmarks import particle_kernels as ekf
 from estimators.particles import Lineages
 from estimators.wheels import WheelPrediction
@@ -62,7 +60,7 @@ class ParticlePath:
 
     def roll(self, frame: Frame) -> None:
         """Add the Frame's arc to the motion that is not yet drawn."""
-        motion, root_ = self._wheels.predict_with_root(frame)
+        motion, _, root_ = self._wheels.predict_in_full(frame)
         if self.rolled is STILL:
             self.rolled, self.root = motion, root_ if root_.shape[1] < 3 else np.zeros((3, 0))
         else:
@@ -112,7 +110,7 @@ class ParticlePath:
         self.poses[:, : self._n] = np.take(self.poses, ancestors, axis=1)
         self.drawn = self.drawn[ancestors]
 
-    def revised(self, best: int, weights: Array, made: dict[str, Array | Ints]) -> Estimate:
+    def revised(self, best: int, weights: Array, known_map: dict[str, Array | Ints]) -> Estimate:
         """Path of one particle, with the covariances of all weighted ones."""
         n = len(self._lineages)
         drawn: list[Gaussian] = []
@@ -123,13 +121,8 @@ class ParticlePath:
             drawn[n - 1 - draw].then(Gaussian(since, np.zeros((3, 3))))
             for _, draw, since in self._frames
         ]
-        return Estimate(
-            np.array([stamp for stamp, _, _ in self._frames]),
-            np.array([belief.mean for belief in beliefs]),
-            np.array([belief.covariance for belief in beliefs]),
-            kind="revised",
-            map=made,
-        )
+        stamps = np.array([stamp for stamp, _, _ in self._frames])
+        return Estimate(stamps, *stacked(beliefs), kind="revised", map=known_map)
 
 
 def packed_mount(mount: Array) -> Array:

@@ -11,7 +11,6 @@ from estimators.base import Prior
 from estimators.gaussian import Gaussian
 from estimators.landmarks.slam_frontend import SlamFrontEnd
 from estimators.landmarks.stereo import NoiseAt, NoiseModel, StereoModel
-from estimators.options import start_pose
 from estimators.wheels import WheelOptions, WheelPrediction
 from sim import se2
 from sim.arrays import Array, Ints
@@ -39,7 +38,7 @@ def team_starts(
             other.sensors == first.sensors,
             f"{estimator}: the sensors of robot {number} are not those of robot 0",
         )
-    starts = [None if p.mean is None else start_pose(p, estimator) for p in others]
+    starts = [None if p.mean is None else p.require_start(estimator) for p in others]
     require(
         None not in starts or front_end.identified,
         f"{estimator}: a robot of unknown start is placed by landmarks with ids; set "

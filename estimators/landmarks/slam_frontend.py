@@ -17,7 +17,6 @@ from scipy.special import chdtri  # scipy.stats takes half a second to import
 
 from estimators.base import Prior
 from estimators.landmarks.stereo import NoiseAt, NoiseModel, StereoModel, TeamEyesOptions
-from estimators.options import require_stereo, start_pose
 from estimators.wheels import ForwardSlipOptions
 from sim.arrays import Array, Floats, Ints
 from sim.errors import require
@@ -70,7 +69,7 @@ class LandmarkSlamOptions(ForwardSlipOptions, TeamEyesOptions):
     def __post_init__(self) -> None:
         require(
             self.association == "known" or (self.gate_probability is None and self.repeat_s == 0.0),
-            "estimator.gate_probability and repeat_s are of ids; leave them at null and 0 under "
+            "estimator.gate_probability and repeat_s apply to ids; leave them at null and 0 under "
             f"association={self.association}, which has the gate d0",
         )
 
@@ -129,7 +128,7 @@ def screened(
         rows = np.flatnonzero(used)
         first = np.unique(ids[rows], return_index=True)[1]
         if len(first) < len(rows):
-            used, status = np.isin(np.arange(len(used)), rows[first]), "duplicate id rejected"
+            return np.isin(np.arange(len(used)), rows[first]), "duplicate id rejected"
     return used, status
 
 
@@ -137,7 +136,7 @@ class SlamFrontEnd:
     """The believed camera, the usable observations, and where each landmark came from.
 
     Landmarks are numbered in the order in which observations start them. Two unit descriptors of
-    D independent components have a product of N(rho, 1 / D) if they are of one landmark, rho =
+    D independent components have a product of N(rho, 1 / D) if they show one landmark, rho =
     1 / (1 + sigma_descriptor^2), and of N(0, 1 / D) if not; twice the log of the ratio of these
     densities is the evidence for the same landmark.
 
@@ -164,16 +163,15 @@ class SlamFrontEnd:
 
     def __init__(self, believed: LandmarkSlamOptions, prior: Prior, estimator: str) -> None:
         self.believed, self._estimator = believed, estimator
-        camera = require_stereo(prior, believed.stereo, estimator)
-        self.first_pose = start_pose(prior, estimator)
+        camera = prior.require_stereo(believed.stereo, estimator)
+        self.first_pose = prior.require_start(estimator)
         require(
             believed.association != "known" or camera.identifies,
             "the camera does not identify landmarks; set estimator.association=mahalanobis "
             "or descriptor",
         )
-        sigmas = {name: getattr(believed, name) for name in _SIGMAS}
-        given = {name: sigma for name, sigma in sigmas.items() if sigma is not None}
-        camera = dataclasses.replace(camera, **given)
+        believed_sigmas = ((name, getattr(believed, name)) for name in _SIGMAS)
+        camera = dataclasses.replace(camera, **{k: v for k, v in believed_sigmas if v is not None})
         self.camera = StereoModel.of(camera, believed.noise_model, believed.noise_at)
         # a landmark may be predicted beyond dmax and still be the one that was seen
         self.reach_m = 1.5 * camera.max_distance_m + 1.0
@@ -210,10 +208,8 @@ class SlamFrontEnd:
         ids = None if all_ids is None else all_ids[used]
         points = np.ascontiguousarray(all_points[used])
         image = Image(points, numbers, ids, seen["descriptors"][used], used, status)
-        return self._without_repeats(image, frame) if self.believed.repeat_s > 0.0 else image
-
-    def _without_repeats(self, image: Image, frame: Frame) -> Image:
-        """Leave out landmarks that the robot counted less than `repeat_s` ago."""
+        if self.believed.repeat_s == 0.0:
+            return image
         last = [self._last_s.get((frame.robot, i), -math.inf) for i in _listed(image)]
         return image.of(frame.stamp - np.array(last) >= self.believed.repeat_s)
 
@@ -298,14 +294,13 @@ class SlamFrontEnd:
 
         `ids` are the sensor's, and are there under known association only.
         """
-        made: dict[str, Array | Ints] = {
+        ids = {"ids": np.array(list(self._landmark_of_id), dtype=np.int64)}
+        return {
             "landmarks": means,
             "landmark_covariances": covariances,
             "origins": self.origins[landmarks].copy(),
+            **(ids if self.identified else {}),
         }
-        if self.identified:
-            made["ids"] = np.array(list(self._landmark_of_id), dtype=np.int64)
-        return made
 
 
 def _listed(image: Image) -> list[int]:

@@ -241,10 +241,3 @@ class StereoModel:
         x, y, z = np.moveaxis(np.asarray(points_in_camera, dtype=np.float64), -1, 0)
         pixels = [self.focal_px * x / z, self.focal_px * y / z, self.focal_px * self.baseline_m / z]
         return np.stack(pixels, axis=-1)
-
-    def from_image(self, image: ArrayLike) -> Array:
-        """Points (..., 3), m, of column, row and disparity (..., 3) px; NaN unless d > 0."""
-        column, row, disparity = np.moveaxis(np.asarray(image, dtype=np.float64), -1, 0)
-        positive = np.where(disparity > 0.0, disparity, math.nan)
-        rays = np.stack([column, row, np.full_like(row, self.focal_px)], axis=-1)
-        return rays * (self.baseline_m / positive)[..., None]

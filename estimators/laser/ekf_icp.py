@@ -24,7 +24,6 @@ from estimators.laser.scan_matching import (
     MatcherOptions,
     moved_beyond,
 )
-from estimators.options import require_laser, start_pose
 from estimators.wheels import EncoderTickOptions, WheelPrediction
 from sim.arrays import Array
 from sim.errors import require
@@ -98,8 +97,8 @@ class EkfIcp(EkfIcpOptions):
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Start from the prior's pose; the first scan becomes the key frame."""
-        self._laser, self._rng = require_laser(prior, self.laser, "ekf_icp"), rng
-        start = start_pose(prior, "ekf_icp")
+        self._laser, self._rng = prior.require_laser(self.laser, "ekf_icp"), rng
+        start = prior.require_start("ekf_icp")
         self._origin = np.append(np.rint(start.mean[:2] / _ORIGIN_STEP_M) * _ORIGIN_STEP_M, 0.0)
         start = Gaussian(start.mean - self._origin, start.covariance)
         self._wheels = WheelPrediction(self, prior.robot.track_m)
@@ -151,42 +150,36 @@ class EkfIcp(EkfIcpOptions):
         if self._key is None or self._last is None:
             extras["registration_status"] = "first"
             self._insert(self._own_noise(scan))
-            self._keep(scan, scan, (_NEW, _NEW))
-            return
-        references = [(_KEY, self._key)]
-        if self._last is not self._key:
-            references.append((_LAST, self._last))
+            return self._keep(scan, scan, (_NEW, _NEW))
+        references = [(_KEY, self._key), (_LAST, self._last)]
         outside: tuple[Match, slice, PreparedScan] | None = None
-        for place, reference in references:
-            found = self.matcher.match(
-                scan, reference, self._expected(place)[0], self._laser, self._rng
-            )
-            extras["registration_status"] = found.status
-            if found.failed:
+        for place, reference in references[: 1 if self._last is self._key else 2]:
+            expected, _ = self._expected(place)
+            match = self.matcher.match(scan, reference, expected, self._laser, self._rng)
+            extras["registration_status"] = match.status
+            if match.failed:
                 continue
             if place is _KEY:
-                found = self._as_before(found)
-            if self._take_in(found, place, extras):
-                self._go_on(scan, found, place, reference)
-                return
+                match = self._as_before(match)
+            if self._take_in(match, place, extras):
+                return self._go_on(scan, match, place, reference)
             extras["registration_status"] = "gated"
-            outside = found, place, reference
+            outside = match, place, reference
         if outside is not None and self._take_in_after_burst(*outside[:2], extras):
             extras["registration_status"] = outside[0].status
-            self._go_on(scan, *outside)
-            return
+            return self._go_on(scan, *outside)
         extras["status"] = extras["registration_status"]
         self._insert(self._own_noise(scan))
         self._failures += 1
         lost = self._failures >= _PATIENCE
-        self._keep(scan if lost else self._key, scan, (_NEW if lost else _KEY, _NEW))
+        return self._keep(scan if lost else self._key, scan, (_NEW if lost else _KEY, _NEW))
 
     def _go_on(
-        self, scan: PreparedScan, found: Match, place: slice, reference: PreparedScan
+        self, scan: PreparedScan, match: Match, place: slice, reference: PreparedScan
     ) -> None:
         """Keep the reference as key frame, or take the scan, which was registered, for it."""
         self._failures = 0
-        left_key = self.left_key_frame(found.motion.mean)
+        left_key = self.left_key_frame(match.motion.mean)
         key, source = (scan, _NEW) if left_key else (reference, place)
         self._keep(key, scan, (source, _NEW))
 
@@ -203,14 +196,14 @@ class EkfIcp(EkfIcpOptions):
         spread = P[place, place] + P[_POSE, _POSE] - cross - cross.T
         return Gaussian(relative, by_twist @ spread @ by_twist.T), by_twist
 
-    def _take_in(self, found: Match, place: slice, extras: dict[str, Any]) -> bool:
+    def _take_in(self, match: Match, place: slice, extras: dict[str, Any]) -> bool:
         """Append the scan's apparent pose to the state, and correct it by the registration.
 
         Returns False, with the state as before, if the innovation lies outside the gate.
         """
         expected, by_twist = self._expected(place)
-        C, R, share = found.held, found.motion.covariance, self.shared_noise
-        off = found.motion.mean - expected.mean
+        C, R, share = match.held, match.motion.covariance, self.shared_noise
+        off = match.motion.mean - expected.mean
         off[2] = wrap(off[2])
         innovation = C @ off
         extras["registration_covariance"] = R
@@ -220,7 +213,7 @@ class EkfIcp(EkfIcpOptions):
         extras["nis"], extras["nis_dof"] = nis, len(C)
         if nis > self._gates[len(C)]:
             return False
-        self._insert(rotated(share / 2.0 * found.known_covariance, self._mean[place][2]))
+        self._insert(rotated(share / 2.0 * match.known_covariance, self._mean[place][2]))
         H = np.zeros((3, 12))
         H[:, place], H[:, _NEW] = -by_twist, by_twist
         noise = (1.0 - share) * C @ R @ C.T + _TINY * np.eye(len(C))
@@ -229,37 +222,35 @@ class EkfIcp(EkfIcpOptions):
             self._mean[part] = _moved(self._mean[part], twists[part])
         return True
 
-    def _take_in_after_burst(self, found: Match, place: slice, extras: dict[str, Any]) -> bool:
+    def _take_in_after_burst(self, match: Match, place: slice, extras: dict[str, Any]) -> bool:
         """Take a registration in as `_take_in` does, if the wheels slipped since the last scan."""
-        if not self.slip_burst_m or found.status != "ok":
+        if not self.slip_burst_m or match.status != "ok":
             return False
         turn_rad = 2.0 * self.slip_burst_m / self._wheels.track_m
         burst = np.diag(np.square([self.slip_burst_m, self.slip_burst_m, turn_rad]))
         to_twist, before = _from_twist(-self._mean[_POSE]), self._covariance
         self._covariance = before.copy()
         self._covariance[_POSE, _POSE] += to_twist @ burst @ to_twist.T
-        if self._take_in(found, place, extras):
+        if taken := self._take_in(match, place, extras):
             extras["slip_burst"] = True
-            return True
-        self._covariance = before
-        return False
+        else:
+            self._covariance = before
+        return taken
 
-    def _as_before(self, found: Match) -> Match:
+    def _as_before(self, match: Match) -> Match:
         """Give a degenerate match the directions of the key frame's first such match.
 
         Each registration finds slightly different unconstrained directions, and together they
         would seem to constrain them. As twists in the key frame the directions are the same
         wherever the robot is.
         """
-        if found.status != "degenerate":
-            return found
-        x, y, _ = found.motion.mean.tolist()
-        to_motion = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])
-        to_twist = np.array([[1.0, 0.0, y], [0.0, 1.0, -x], [0.0, 0.0, 1.0]])
-        if self._directions is None or len(self._directions[0]) != len(found.held):
-            self._directions = found.held @ to_motion, to_twist @ found.loose @ to_motion
+        if match.status != "degenerate":
+            return match
+        to_motion, to_twist = _from_twist(match.motion.mean), _from_twist(-match.motion.mean)
+        if self._directions is None or len(self._directions[0]) != len(match.held):
+            self._directions = match.held @ to_motion, to_twist @ match.loose @ to_motion
         held, loose = self._directions
-        return dataclasses.replace(found, held=held @ to_twist, loose=to_motion @ loose @ to_twist)
+        return dataclasses.replace(match, held=held @ to_twist, loose=to_motion @ loose @ to_twist)
 
     def _insert(self, noise: Array) -> None:
         """Append the newest scan's apparent pose to the state: that of base_link, and noise.
@@ -285,9 +276,9 @@ class EkfIcp(EkfIcpOptions):
 
     def _own_noise(self, scan: PreparedScan) -> Array:
         """Shared noise (3, 3) in map of a scan that was not registered: from one against itself."""
-        found = self.matcher.match(scan, scan, STILL, self._laser, self._rng)
-        noise = self.shared_noise / 2.0 * found.known_covariance
-        return np.zeros((3, 3)) if found.failed else rotated(noise, self._mean[8])
+        match = self.matcher.match(scan, scan, STILL, self._laser, self._rng)
+        noise = self.shared_noise / 2.0 * match.known_covariance
+        return np.zeros((3, 3)) if match.failed else rotated(noise, self._mean[8])
 
 
 def _from_twist(pose: Array) -> Array:

@@ -13,7 +13,6 @@ from estimators.base import Belief, Prior
 from estimators.gaussian import STILL, Gaussian, update, wrap
 from estimators.laser.icp import Metric, PreparedScan, Rules
 from estimators.laser.scan_matching import Covariance, MatcherOptions
-from estimators.options import require_laser, start_pose
 from estimators.wheels import LateralSlipOptions, WheelPrediction
 from sim.arrays import Array
 from sim.options import NonNegative, options
@@ -65,8 +64,8 @@ class EkfIcpPaper(EkfIcpPaperOptions):
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Start from the prior's pose, with velocities unknown."""
-        self._laser, self._rng = require_laser(prior, self.laser, "ekf_icp_paper"), rng
-        start = start_pose(prior, "ekf_icp_paper")
+        self._laser, self._rng = prior.require_laser(self.laser, "ekf_icp_paper"), rng
+        start = prior.require_start("ekf_icp_paper")
         self._wheels = WheelPrediction(self, prior.robot.track_m)
         self._mean = np.concatenate([start.mean, np.zeros(3)])
         self._covariance = np.zeros((6, 6))
@@ -107,14 +106,14 @@ class EkfIcpPaper(EkfIcpPaperOptions):
         if self._previous is None:
             extras["registration_status"] = "first"
         else:
-            found = self.matcher.match(scan, self._previous, self._rolled, self._laser, self._rng)
-            extras["registration_status"] = found.status
-            if found.failed:
-                extras["status"] = found.status
+            match = self.matcher.match(scan, self._previous, self._rolled, self._laser, self._rng)
+            extras["registration_status"] = match.status
+            if match.failed:
+                extras["status"] = match.status
             else:
-                extras["registration_covariance"] = found.motion.covariance
+                extras["registration_covariance"] = match.motion.covariance
                 if self._since_s > 0.0:
-                    self._measure(found.motion, self._since_s, found.held)
+                    self._measure(match.motion, self._since_s, match.held)
         self._previous, self._rolled, self._since_s = scan, STILL, 0.0
 
     def _measure(self, motion: Gaussian, dt: float, held: Array) -> None:

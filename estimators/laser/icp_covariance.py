@@ -1,6 +1,6 @@
 """Covariances of a registration of two scans, for all metrics of `estimators.laser.icp`.
 
-All are of the three numbers (x, y, heading) of T_target_source. Where the scans do not hold a
+All cover the three numbers (x, y, heading) of T_target_source. Where the scans do not hold a
 direction (a bare corridor, a round room) every method gives it the large variance of not knowing
 (`UNKNOWN_M`, `UNKNOWN_RAD`), and so does a registration that failed in all directions.
 
@@ -224,14 +224,13 @@ def sampling(
     sigmas = [scan.noise_m if sigma_range_m is None else sigma_range_m for scan in (source, target)]
     deviations = np.empty((n_samples, 3))
     for k in range(n_samples):
-        again = [
+        again, other = (
             prepare(ranges + sigma * rng.standard_normal(len(ranges)), scan.bearings_rad)
             for scan, ranges, sigma in zip((source, target), clean, sigmas, strict=True)
-        ]
-        found = register(
-            again[0], again[1], registration.T_target_source, metric=registration.metric, **options
         )
-        deviations[k] = _difference(found.T_target_source, registration.T_target_source)
+        pose = registration.T_target_source
+        found = register(again, other, pose, metric=registration.metric, **options)
+        deviations[k] = _difference(found.T_target_source, pose)
     return _widened(np.cov(deviations.T), registration)
 
 
@@ -250,8 +249,9 @@ def unscented(
     """
     if registration.status in ("empty", "poor_overlap"):
         return _unknown()
-    spread = _spread(registration, source, target, initial_covariance, initial, options)
-    return _widened(spread, registration)
+    return _widened(
+        _spread(registration, source, target, initial_covariance, initial, options), registration
+    )
 
 
 def unscented_censi(
@@ -318,11 +318,10 @@ def _unknown() -> Array:
 
 def _without_noise(scan: PreparedScan) -> Array:
     """Ranges (N,) of all beams, those on a line put onto it; +inf for beams that saw nothing."""
-    ranges = np.full(len(scan.bearings_rad), np.inf)
-    seen = scan.ranges_m.copy()
-    on = scan.line_of_point >= 0
-    seen[on] = 1.0 / np.sum(scan.lines[scan.line_of_point[on]] * scan.rays[on], axis=1)
-    ranges[scan.beams] = seen
+    ranges, on = np.full(len(scan.bearings_rad), np.inf), scan.line_of_point >= 0
+    ranges[scan.beams] = scan.ranges_m
+    inverse = np.sum(scan.lines[scan.line_of_point[on]] * scan.rays[on], axis=1)
+    ranges[scan.beams[on]] = 1.0 / inverse
     return ranges
 
 

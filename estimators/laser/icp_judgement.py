@@ -82,8 +82,8 @@ def confront(
     """Check a scan's points against another scan, and add to two sums of J J^T (3, 3).
 
     Points on a line of the other scan agree. Those that stand well before what the beams on
-    both sides see are denied. The rest is hidden or out of view and counts for neither. J is of
-    the points' own lines, about the target's axes: turned by `turn`, with levers from a point.
+    both sides see are denied. The rest is hidden or out of view and counts for neither. J belongs
+    to the points' own lines, about the target's axes: turned by `turn`, with levers from a point.
     """
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
     c, s = math.cos(turn), math.sin(turn)

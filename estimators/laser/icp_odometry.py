@@ -6,25 +6,18 @@ covariance is composed along.
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from estimators.base import Belief, Prior
 from estimators.gaussian import STILL, Gaussian
 from estimators.laser.icp import PreparedScan, Rules
-from estimators.laser.scan_matching import (
-    FAILED,
-    KeyFrameOptions,
-    MatcherOptions,
-)
-from estimators.options import require_laser, start_pose
+from estimators.laser.scan_matching import KeyFrameOptions, MatcherOptions, Reference
 from estimators.wheels import WheelOptions, WheelPrediction
 from sim import se2
 from sim.options import options
 from sim.recording import Frame
-
-Reference = Literal["previous", "keyframe"]
 
 _HEADING_WINDOW_RAD = math.pi / 6.0  # constant velocity misses the turns: search the headings
 # Constant velocity is not trusted further than to these standard deviations
@@ -70,10 +63,11 @@ class IcpOdometry(IcpOdometryOptions):
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Start from the prior's pose; the first scan becomes the reference."""
-        self._laser, self._rng = require_laser(prior, self.laser, "icp_odometry"), rng
-        self._key = self._last = _Anchor(start_pose(prior, "icp_odometry"), None)
+        self._laser, self._rng = prior.require_laser(self.laser, "icp_odometry"), rng
+        self._key = self._last = _Anchor(prior.require_start("icp_odometry"), None)
         self._key_to_last = STILL
         self._lost = False
+        self._heading_window_rad = 0.0 if self.use_odometry_guess else _HEADING_WINDOW_RAD
         self._wheels = WheelPrediction(self, prior.robot.track_m)
         self._rolled, self._since_s = STILL, 0.0  # since the last scan, by the wheels
         self._velocity = np.zeros(3)  # twist between the last two scans, per second
@@ -96,21 +90,24 @@ class IcpOdometry(IcpOdometryOptions):
             self._rolled, self._since_s = STILL, 0.0
             return _belief(self._last.belief, {"registration_status": "first"})
         extras: dict[str, Any] = {}
-        references = [(self._key, self._key_to_last)]
-        if self._key is not self._last:
-            references.append((self._last, STILL))  # tried if the key frame is lost
-        for anchor, so_far in references:
+        # the last scan is tried if the key frame is lost
+        references = [(self._key, self._key_to_last), (self._last, STILL)]
+        for anchor, so_far in references[: 1 if self._key is self._last else 2]:
             assert anchor.scan is not None
-            motion, status = self._matched(scan, anchor.scan, so_far.then(guess))
-            extras["registration_status"] = status
-            if status not in FAILED:
+            expected = so_far.then(guess)
+            match = self.matcher.match(
+                scan, anchor.scan, expected, self._laser, self._rng, self._heading_window_rad
+            )
+            extras["registration_status"] = match.status
+            if not match.failed:
+                motion = match.completed(expected)
                 extras["registration_covariance"] = motion.covariance
                 belief = anchor.belief.then(motion)
                 self._key, self._key_to_last = anchor, motion
                 break
-        failed = status in FAILED
+        failed = match.failed
         if failed:
-            extras["status"] = status
+            extras["status"] = match.status
             self._key_to_last = self._key_to_last.then(guess)
         if self._since_s > 0.0:
             moved = se2.between(self._last.belief.mean, belief.mean)
@@ -132,20 +129,6 @@ class IcpOdometry(IcpOdometryOptions):
         spread_m = _GUESS_FLOOR_M + _GUESS_SHARE * math.hypot(motion[0], motion[1])
         spread_rad = _GUESS_FLOOR_RAD + _GUESS_SHARE * abs(float(motion[2]))
         return Gaussian(motion, np.diag([spread_m**2, spread_m**2, spread_rad**2]))
-
-    def _matched(
-        self, scan: PreparedScan, reference: PreparedScan, guess: Gaussian
-    ) -> tuple[Gaussian, str]:
-        """Motion of base_link from the reference to the scan, and the registration's status."""
-        found = self.matcher.match(
-            scan,
-            reference,
-            guess,
-            self._laser,
-            self._rng,
-            heading_window_rad=0.0 if self.use_odometry_guess else _HEADING_WINDOW_RAD,
-        )
-        return found.completed(guess), found.status
 
 
 def _belief(belief: Gaussian, extras: dict[str, Any]) -> Belief:

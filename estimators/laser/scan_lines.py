@@ -24,7 +24,7 @@ _LEAST_BENDS = 10  # second differences from which a noise can be told
 _STEEPEST = 0.5  # measured over expected range; below, a beam runs nearly along its line
 _MOST_GROWTH = 0.3  # of 1 / range at a line's end: a wall may go on 3.3 times as far
 _MIN_LINE_POINTS = 3
-_ADJACENT_BEAMS = 3  # lines whose ends are no farther apart may be one wall, or meet in a corner
+_ADJACENT_BEAMS = 3  # up to this far apart, lines may be one wall, or meet in a corner
 _SMOOTH_JOINT_RAD = 0.45  # neighbours that meet at less may be chords of one curve
 # Growing a line
 _FIT_GATE = 3.5  # standard deviations by which the next point may miss its line
@@ -117,7 +117,7 @@ def prepare(
     bearings_rad
         (N,) beam angles in the sensor frame, rising, over at most a full circle.
     max_range_m
-        The laser's; a range that is equal to it is no return.
+        The laser's; a beam of just that range saw nothing.
     """
     ranges = np.ascontiguousarray(ranges_m, dtype=np.float64)
     bearings = np.ascontiguousarray(bearings_rad, dtype=np.float64)
@@ -409,8 +409,7 @@ def _describe(
 
 @njit(error_model="numpy", fastmath={"contract"})
 def _prepare(ranges: Array, bearings: Array, max_range: float, full_circle: bool) -> PreparedScan:
-    seen = (ranges > 0.0) & (ranges < max_range)
-    beams = np.flatnonzero(seen)
+    beams = np.flatnonzero((ranges > 0.0) & (ranges < max_range))
     rays, points = np.empty((len(beams), 2)), np.empty((len(beams), 2))
     for k in range(len(beams)):
         i = beams[k]

@@ -15,6 +15,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from estimators.base import LaserOptions
 from estimators.gaussian import Gaussian
 from estimators.laser import icp_covariance
 from estimators.laser.icp import (
@@ -28,13 +29,13 @@ from estimators.laser.icp import (
     register,
 )
 from estimators.laser.scan_lines import without_sparse_lines
-from estimators.options import LaserOptions
 from sim import se2
 from sim.arrays import Array
 from sim.options import NonNegative, options
 from sim.sensors import Laser
 
 Covariance = Literal["censi", "censi_last", "hessian", "sampling", "unscented_censi"]
+Reference = Literal["previous", "keyframe"]
 
 FAILED = ("empty", "poor_overlap", "not_converged")
 
@@ -72,7 +73,7 @@ class Match:
 
     @property
     def failed(self) -> bool:
-        """Whether the registration is of no use."""
+        """Whether the registration is useless."""
         return self.status in FAILED
 
     @property
@@ -203,17 +204,16 @@ class ScanMatcher:
         motion, to_base = Gaussian(found.T_target_source, R).seen_from(se2.inverse(mount))
         if found.status != "degenerate":
             return Match(motion, found.status, _EVERYTHING, _NOTHING, found.overlap)
-        in_base = [to_base @ part for part in icp_covariance.split_directions(found)]
-        coordinates = np.linalg.inv(np.hstack(in_base))
-        n_held = in_base[0].shape[1]
-        held, loose = coordinates[:n_held], in_base[1] @ coordinates[n_held:]
-        match = Match(motion, found.status, held, loose, found.overlap)
+        directions = icp_covariance.split_directions(found)
+        held_in_base, loose_in_base = (to_base @ part for part in directions)
+        coordinates = np.linalg.inv(np.hstack([held_in_base, loose_in_base]))
+        held, loose = np.split(coordinates, [held_in_base.shape[1]])
+        match = Match(motion, found.status, held, loose_in_base @ loose, found.overlap)
         # The directions themselves are uncertain: along a loose one that is slightly off, the
         # error of the registration and of the guess leaks into the held ones.
-        off = coordinates[n_held:] @ (motion.mean - guess.mean)
-        spread = coordinates[n_held:] @ guess.covariance @ coordinates[n_held:].T
-        _, in_laser_loose = icp_covariance.split_directions(found)
-        spurious = in_laser_loose.T @ found.information_noise @ in_laser_loose
+        off = loose @ (motion.mean - guess.mean)
+        spread = loose @ guess.covariance @ loose.T
+        spurious = directions[1].T @ found.information_noise @ directions[1]
         leak = float(np.trace(spurious @ (np.outer(off, off) + spread)))
         covariance = motion.covariance + leak * match.known_covariance
         return dataclasses.replace(match, motion=Gaussian(motion.mean, covariance))

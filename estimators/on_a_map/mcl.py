@@ -1,7 +1,8 @@
 """Monte Carlo localization in a known map by a laser (the starting point of maximo2024, sec. 2.1).
 
 Particles roll by the wheels, are weighted by a likelihood field, and are resampled. Their number
-follows the spread of the belief (KLD sampling).
+follows the spread of the belief: as many as the bins of pose that they fall into call for (KLD
+sampling; Fox 2003).
 
 The filter may be lost, and two ways back are offered. `average`: when scans fit worse than their
 long-term average, particles are injected over all the floor (augmented MCL), drawn by the scan
@@ -18,16 +19,14 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from estimators.base import Belief, Prior
+from estimators.base import Belief, LaserOptions, Prior
 from estimators.gaussian import STILL, Gaussian, root
-from estimators.on_a_map.kld import BinOptions, Bins
 from estimators.on_a_map.likelihood_field import (
     FieldOptions,
     LikelihoodField,
     beam_ends,
     likelihood_field,
 )
-from estimators.options import LaserOptions, require_laser
 from estimators.particles import (
     Scheme,
     effective_sample_size,
@@ -37,7 +36,7 @@ from estimators.particles import (
 )
 from estimators.wheels import WheelOptions, WheelPrediction
 from sim import se2
-from sim.arrays import Array, Floats
+from sim.arrays import Array, Floats, Ints
 from sim.compiled import njit
 from sim.errors import require
 from sim.options import Count, NonNegative, Positive, options
@@ -51,6 +50,63 @@ _OFF_WALLS = 2.0  # what a beam of a contest loses, in log likelihood, by ending
 _BISECTIONS = 12
 _MOST_PARTICLES, _MOST_TRIES = 10_000_000, 100_000_000  # 0.2 and 2 GB of poses
 _FARTHEST_M, _FARTHEST_RAD = 1.0, 0.5  # of what belongs to one hypothesis
+_MOST_BINS = 250_000_000  # 2 GB
+
+
+@options("estimator")
+class BinOptions:
+    """Bins of pose, and how near to the belief a draw must come."""
+
+    kld_error: Positive = 0.05
+    """KLD sampling: the draw differs from the belief by at most this much."""
+    kld_quantile: NonNegative = 2.33
+    """Standard normal quantile of the probability of that (2.33: 99 %)."""
+    bin_m: Positive = 0.5
+    """Side of the bins that KLD sampling counts, m."""
+    bin_rad: Positive = 0.17
+    """Their size in heading, rad."""
+
+
+class Bins:
+    """Bins of pose over a field.
+
+    Raises
+    ------
+    InputError
+        If there would be too many.
+    """
+
+    def __init__(self, field: LikelihoodField, believed: BinOptions) -> None:
+        self._believed, self._origin_m = believed, field.origin_m
+        sides_m = field.cell_m * np.array(field.table.shape[::-1])
+        sizes = [*sides_m / believed.bin_m, 2.0 * math.pi / believed.bin_rad]
+        with np.errstate(over="ignore"):  # counted in floats, which do not wrap
+            shape = np.ceil(np.array(sizes))
+            n_bins = float(np.prod(shape))
+        require(
+            n_bins <= _MOST_BINS,
+            f"estimator.bin_m={believed.bin_m} and bin_rad={believed.bin_rad} make {n_bins:.3g} "
+            "bins of the map; make them larger",
+        )
+        self._shape: list[int] = shape.astype(int).tolist()
+
+    def of(self, poses: Array) -> Ints:
+        """Number of the bin (M,) of each pose (M, 3); what lies off the map counts to its rim."""
+        columns, rows, n_headings = self._shape
+        x, y = ((poses[:, i] - self._origin_m[i]) / self._believed.bin_m for i in (0, 1))
+        heading = np.floor((poses[:, 2] + math.pi) / self._believed.bin_rad).astype(np.int64)
+        column = np.clip(x.astype(np.int64), 0, columns - 1)
+        row = np.clip(y.astype(np.int64), 0, rows - 1)
+        return np.asarray((row * columns + column) * n_headings + heading % n_headings)
+
+    def needed(self, poses: Array) -> int:
+        """Particles that the number of bins in use by poses (M, 3) calls for."""
+        k = np.count_nonzero(np.bincount(self.of(poses)))
+        if k < 2:
+            return 1
+        a = 2.0 / (9.0 * (k - 1))
+        cube = (1.0 - a + math.sqrt(a) * self._believed.kld_quantile) ** 3
+        return math.ceil((k - 1) / (2.0 * self._believed.kld_error) * cube)
 
 
 @options("estimator")
@@ -146,7 +202,7 @@ class Mcl(MclOptions):
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Draw particles from the prior's pose, or from all the floor if there is none."""
-        self._laser, self._rng = require_laser(prior, self.laser, "mcl"), rng
+        self._laser, self._rng = prior.require_laser(self.laser, "mcl"), rng
         require(
             isinstance(prior.map, self.maps),
             "mcl needs a map of walls; set prior.map=world, or to a grid's .yaml",

@@ -1,9 +1,17 @@
-"""Methods of other projects behind the protocol of `estimators.base`: one thin adapter a file."""
+"""Methods of other projects behind the protocol of `estimators.base`: one thin adapter a file.
+
+They work in three dimensions; poses and scans here are planar.
+"""
 
 import importlib
 from typing import Any
 
+import numpy as np
+
+from sim.arrays import Array
 from sim.errors import InputError
+from sim.recording import Frame
+from sim.sensors import Laser
 
 
 class MissingPackageError(InputError):
@@ -24,3 +32,23 @@ def package(name: str, extra: str) -> Any:
         raise MissingPackageError(
             f"{name} cannot be imported ({error}); pip install 'estima[{extra}]'"
         ) from error
+
+
+def matrix_of(pose: Array) -> Array:
+    """Homogeneous matrix (4, 4) of a planar pose (3,) m, m, rad."""
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    T = np.eye(4)
+    T[:2, :2] = [[cos, -sin], [sin, cos]]
+    T[:2, 3] = pose[:2]
+    return T
+
+
+def pose_of(T: Array) -> Array:
+    """Planar pose (3,) of a homogeneous matrix (4, 4): its height, roll and pitch are dropped."""
+    return np.array([T[0, 3], T[1, 3], np.arctan2(T[1, 0], T[0, 0])])
+
+
+def scan_of(frame: Frame, name: str, laser: Laser) -> Array | None:
+    """Points (N, 2) m in base_link of a Frame's scan; None without one."""
+    reading = frame.readings.get(name)
+    return None if reading is None else laser.points_in_base(reading)

@@ -63,14 +63,14 @@ class GtsamBatch(GtsamBatchOptions):
             if landmark not in known:
                 known.add(landmark)
                 model.add_landmark(values, landmark, camera.place(guess[pose], point))
-        params = package("gtsam", "gtsam").LevenbergMarquardtParams()
+        gtsam = package("gtsam", "gtsam")
+        params = gtsam.LevenbergMarquardtParams()
         params.setMaxIterations(self.max_iterations)
-        optimizer = package("gtsam", "gtsam").LevenbergMarquardtOptimizer(graph, values, params)
-        found = optimizer.optimize()
-        poses = np.array(
-            [model.planar(found.atPose3(model.pose_key(i))) for i in range(len(guess))]
-        )
-        marginals = package("gtsam", "gtsam").Marginals(graph, found)
+        optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, params)
+        solved = optimizer.optimize()
+        keys = map(model.pose_key, range(len(guess)))
+        poses = np.array([model.planar(solved.atPose3(key)) for key in keys])
+        marginals = gtsam.Marginals(graph, solved)
         means, covariances = self._drive.filled_in(poses, self._joint(marginals, poses))
         converged = optimizer.iterations() < self.max_iterations
         return Estimate(

@@ -12,9 +12,7 @@ from estimators.base import Belief, Prior
 from estimators.gaussian import STILL, Gaussian, rotated
 from estimators.graph.landmark_drive import FLOOR, loosened, observed
 from estimators.landmarks.stereo import StereoModel, StereoOptions
-from estimators.options import require_stereo, start_pose
-from estimators.peers import package
-from estimators.peers.planar import matrix_of
+from estimators.peers import matrix_of, package
 from estimators.wheels import WheelOptions, WheelPrediction
 from sim import se2
 from sim.arrays import Array, Ints
@@ -174,8 +172,8 @@ class Isam2:
     def __init__(self, believed: Isam2Options, prior: Prior, estimator: str) -> None:
         gtsam = package("gtsam", "gtsam")
         self._believed, self._estimator = believed, estimator
-        self.camera = StereoModel.of(require_stereo(prior, believed.stereo, estimator))
-        self.model, self.belief = GtsamModel(self.camera), start_pose(prior, estimator)
+        self.camera = StereoModel.of(prior.require_stereo(believed.stereo, estimator))
+        self.model, self.belief = GtsamModel(self.camera), prior.require_start(estimator)
         self._wheels = WheelPrediction(believed, prior.robot.track_m)
         params = gtsam.ISAM2Params()
         params.setRelinearizeThreshold(believed.relinearize_threshold)

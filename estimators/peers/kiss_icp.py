@@ -5,10 +5,8 @@ Vizzo et al., KISS-ICP: in defense of point-to-point ICP, RA-L 8(2), 2023. The w
 
 import numpy as np
 
-from estimators.base import Belief, Prior
-from estimators.options import LaserOptions, require_laser, start_pose
-from estimators.peers import package
-from estimators.peers.planar import pose_of, scan_of
+from estimators.base import Belief, LaserOptions, Prior
+from estimators.peers import package, pose_of, scan_of
 from sim import se2
 from sim.options import Count, Positive, options
 from sim.recording import Frame
@@ -47,8 +45,8 @@ class KissIcp(KissIcpOptions):
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Start from the prior's pose, with an empty map."""
-        self._laser = require_laser(prior, self.laser, "kiss_icp")
-        self._start = self._pose = start_pose(prior, "kiss_icp").mean
+        self._laser = prior.require_laser(self.laser, "kiss_icp")
+        self._start = self._pose = prior.require_start("kiss_icp").mean
         config = package("kiss_icp.config", "peers").KISSConfig(
             data={"max_range": self.max_range_m, "min_range": 0.0, "deskew": False},
             mapping={
@@ -66,11 +64,9 @@ class KissIcp(KissIcpOptions):
     def step(self, frame: Frame) -> Belief:
         """Register the Frame's scan, if it has one."""
         points = scan_of(frame, self.laser, self._laser)
-        status = ""
         if points is not None and len(points):
             cloud = np.column_stack([points, np.zeros(len(points))])
             self._pipeline.register_frame(cloud, np.zeros(len(points)))
             self._pose = se2.compose(self._start, pose_of(self._pipeline.last_pose))
-        elif points is not None:
-            status = "empty"
-        return Belief(self._pose.copy(), np.zeros((3, 3)), {"status": status} if status else {})
+        empty = points is not None and not len(points)
+        return Belief(self._pose.copy(), np.zeros((3, 3)), {"status": "empty"} if empty else {})

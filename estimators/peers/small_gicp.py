@@ -9,13 +9,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from estimators.base import Belief, Prior
+from estimators.base import Belief, LaserOptions, Prior
 from estimators.gaussian import STILL
-from estimators.laser.icp_odometry import Reference
-from estimators.laser.scan_matching import KeyFrameOptions
-from estimators.options import LaserOptions, require_laser, start_pose
-from estimators.peers import package
-from estimators.peers.planar import matrix_of, pose_of, scan_of
+from estimators.laser.scan_matching import KeyFrameOptions, Reference
+from estimators.peers import matrix_of, package, pose_of, scan_of
 from sim import se2
 from sim.arrays import Array
 from sim.options import Count, Positive, options
@@ -64,11 +61,10 @@ class SmallGicp(SmallGicpOptions):
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Start from the prior's pose; the first scan becomes the reference."""
-        self._laser = require_laser(prior, self.laser, "small_gicp")
+        self._laser = prior.require_laser(self.laser, "small_gicp")
         self._track_m = prior.robot.track_m
-        self._pose = start_pose(prior, "small_gicp").mean  # at the last scan
-        self._rolled = STILL.mean.copy()  # since then, by the wheels
-        self._motion = STILL.mean.copy()  # between the last two scans
+        self._pose = prior.require_start("small_gicp").mean  # at the last scan
+        self._rolled = self._motion = STILL.mean  # since then by the wheels; between the last two
         self._key_pose = self._pose
         self._key: tuple[Any, Any] | None = None
 
@@ -121,7 +117,7 @@ class SmallGicp(SmallGicpOptions):
 
     def _moved(self, pose: Array, status: str) -> Belief:
         self._motion = se2.between(self._pose, pose)
-        self._pose, self._rolled = pose, STILL.mean.copy()
+        self._pose, self._rolled = pose, STILL.mean
         return _belief(pose, status)
 
 

@@ -49,7 +49,15 @@ class External(ExternalOptions):
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Start the program, and tell it what is known."""
-        message = reset_message(prior, int(rng.integers(2**32)))
+        message = {
+            "type": "reset",
+            "protocol": PROTOCOL,
+            "seed": int(rng.integers(2**32)),
+            "robot": dataclasses.asdict(prior.robot),
+            "sensors": {name: sensor_settings(one) for name, one in prior.sensors.items()},
+            "prior": prior.start and vars(prior.start),
+            "map": map_message(prior.map),
+        }
         if self._program is not None:
             self._program.close()
         self._program, self._stamps = Program(self.words), list[float]()
@@ -104,7 +112,7 @@ class External(ExternalOptions):
             answer = None
         if not isinstance(answer, dict):
             shown = text[:60].decode(errors="replace")
-            raise self._wrong(f"answered {what} with {shown!r}, which is no JSON object")
+            raise self._wrong(f"answered {what} with {shown!r}, which is not a JSON object")
         if answer.get("error") is not None:
             raise self._wrong(f"answered {what} with the error {str(answer['error'])[:300]}")
         return answer
@@ -138,16 +146,3 @@ class External(ExternalOptions):
         assert self._program is not None
         self._program.close(0.0)
         return ProgramError(f"{self._program.name} {what}")
-
-
-def reset_message(prior: Prior, seed: int) -> dict[str, Any]:
-    """What a program is told before the first Frame."""
-    return {
-        "type": "reset",
-        "protocol": PROTOCOL,
-        "seed": seed,
-        "robot": dataclasses.asdict(prior.robot),
-        "sensors": {name: sensor_settings(sensor) for name, sensor in prior.sensors.items()},
-        "prior": prior.start and vars(prior.start),
-        "map": map_message(prior.map),
-    }

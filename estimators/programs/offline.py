@@ -14,7 +14,6 @@ import numpy as np
 import orjson
 
 from estimators.base import Belief, Estimate, Prior
-from estimators.options import require_laser
 from estimators.programs.program import (
     Program,
     ProgramError,
@@ -91,7 +90,7 @@ class Offline(OfflineOptions):
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Keep what is known at the start."""
         if "laser" in self.needs:
-            self._laser = require_laser(prior, "laser", "estimator.command")
+            self._laser = prior.require_laser("laser", "estimator.command")
         require(
             "map" not in self.needs or isinstance(prior.map, (World, OccupancyGrid)),
             "estimator.command names {map} or {grid}; set prior.map=world or GRID.yaml",
@@ -111,8 +110,7 @@ class Offline(OfflineOptions):
         """Write the log, run the command, and read its trajectory."""
         with tempfile.TemporaryDirectory(prefix="estima-") as name:
             places = self._written(Path(name))
-            words = [_filled(word, places) for word in self.words]
-            program = Program(words)
+            program = Program([_filled(word, places) for word in self.words])
             try:
                 program.wait(self.limit_s)
             finally:

@@ -115,7 +115,7 @@ class Program:
         Raises
         ------
         ProgramError
-            If there is no such answer within the limits.
+            If none comes within the limits.
         """
         deadline = time.monotonic() + limit_s
         self._read_ready(0.0)
@@ -250,7 +250,7 @@ def map_message(known_map: Any) -> dict[str, Any] | None:
     Raises
     ------
     InputError
-        If it is of another kind.
+        For a map of another kind.
     """
     if known_map is None:
         return None

@@ -26,7 +26,7 @@ _GOOD_OVERLAP = 0.8  # no other turn or node is tried after a registration this 
 class Refinement:
     """A pose (3,) of base_link in map with its covariance (3, 3), or None of both.
 
-    The status is `ok`, or why there is no pose: that of the last registration, or `far` if it
+    The status is `ok`, or why a pose is missing: that of the last registration, or `far` if it
     leads farther from the node than two spacings.
     """
 
@@ -74,9 +74,9 @@ class Refiner:
                     best, best_node = found, candidate
                     if best.overlap > _GOOD_OVERLAP:
                         return self._posed(best, source, best_node)
-        return (
-            Refinement(None, None, status) if best is None else self._posed(best, source, best_node)
-        )
+        if best is None:
+            return Refinement(None, None, status)
+        return self._posed(best, source, best_node)
 
     def _target(self, node: int) -> PreparedScan:
         """Return a node's slice, prepared when it is first asked for."""

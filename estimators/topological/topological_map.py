@@ -179,7 +179,7 @@ def from_arrays(
     positions_m, descriptors
         (N, 2) m and (N, D), of any network.
     break_m
-        Successive nodes farther apart than this are no neighbours; None: all are.
+        Successive nodes are neighbours up to this distance; None: all are.
     join_m
         Other nodes within this of each other are neighbours too, where the route meets itself;
         None: none are. Of those, only pairs at least three steps apart along the route count.
@@ -223,7 +223,7 @@ def read_array(path: Path) -> Array:
     Raises
     ------
     InputError
-        If there is no such file or it holds something else.
+        If the file is missing or holds something else.
     """
     require_file(path)
     try:
@@ -296,7 +296,7 @@ def from_recording(
 def level_slice(lidar: Lidar3D, ranges_m: Floats) -> Floats:
     """Horizontal ranges (A,) m of the ring nearest to level, the upper one of two: a planar scan.
 
-    Rings that look down end on the ground, where there is no wall.
+    Rings that look down end on the ground, off the walls.
     """
     elevations = lidar.elevations_rad
     ring = int(np.argmin(np.abs(elevations - 1e-6)))
@@ -326,7 +326,7 @@ def load(path: str | Path) -> TopologicalMap:
     Raises
     ------
     InputError
-        If the file is missing, damaged, or no topological map.
+        If the file is missing, damaged, or does not hold a topological map.
     """
     try:
         archive = read_arrays(Path(path))

@@ -54,7 +54,7 @@ class TopologicalMclOptions:
     place: str = "place"
     """Name of the sensor of place descriptors that it reads."""
     lidar3d: str = "lidar3d"
-    """Name of the 3D lidar whose clouds it describes where there are no descriptors."""
+    """Name of the 3D lidar whose clouds it describes where descriptors are missing."""
     weighting: Weighting = "M2"
     """M1, M2 or M3 of `node_log_weights` (maximo2024, eqs. (1)-(3))."""
     particles_per_node: Count = 4
@@ -168,7 +168,9 @@ class TopologicalMcl(TopologicalMclOptions):
     def step(self, frame: Frame) -> Belief:
         """Move by the wheels; at an observation also weight, resample and, if asked, refine."""
         if self.motion == "odometry":
-            self._roll(frame.wheel_increments_m)
+            if travel_m := float(frame.wheel_increments_m.sum()) / 2.0:
+                self._along_m += travel_m
+                self._cross_nodes(noisy=True)
             self._belief = self._carried(frame.wheel_increments_m)
         descriptor, fault = self._descriptor(frame)
         if descriptor is None:
@@ -272,13 +274,6 @@ class TopologicalMcl(TopologicalMclOptions):
             return self._edge
         past = self._along_m > 0.5 * self._graph.length_m.take(self._edge)
         return np.asarray(self._edge + len(self._graph.tail) * past)
-
-    def _roll(self, wheel_increments_m: Array) -> None:
-        """Move along the edges by the wheels' mean travel."""
-        travel_m = float(wheel_increments_m.sum()) / 2.0
-        if travel_m != 0.0:
-            self._along_m += travel_m
-            self._cross_nodes(noisy=True)
 
     def _cross_nodes(self, *, noisy: bool) -> None:
         """Pass particles that are over an end of their edge on to the next one."""

@@ -68,7 +68,7 @@ class Planted(GraphSlam):
             heading = self.graph.poses[first, 2]
             twin = _TWIN_M * np.array([np.cos(heading), -np.sin(heading), 0.0])
             off = twin if self._chance.random() < 0.5 else anywhere
-            noise = self.graph.noise_of(newest)
+            noise = self.graph.noise[newest]
             self.false.append(Edge(first, newest, Gaussian(expected + off, noise)))
         return [*found, *self.false[len(self.false) - number :]]
 

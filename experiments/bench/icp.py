@@ -22,7 +22,7 @@ import numpy as np
 
 from estimators.laser import icp_covariance
 from estimators.laser.icp import Metric, PreparedScan, Registration, prepare, register
-from estimators.peers.planar import pose_of
+from estimators.peers import pose_of
 from experiments.bench.measure import Measurement, median_time_s
 from experiments.evaluation.scan_bound import cast, fisher_bound
 from sim import se2

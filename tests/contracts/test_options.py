@@ -7,7 +7,6 @@ import pytest
 from omegaconf import OmegaConf
 
 from estimators.base import Prior
-from estimators.options import require_laser, require_stereo, start_pose
 from experiments.runs.paths import packaged
 from sim.errors import InputError
 from sim.options import described, find
@@ -33,27 +32,27 @@ def test_every_option_of_an_estimator_is_documented_and_rejects_what_it_does_not
 def test_a_prior_without_what_an_estimator_needs_names_the_estimator():
     bare = Prior(RobotGeometry(0.05, 0.2), {})
     with pytest.raises(InputError, match=r"^mcl needs a start pose; "):
-        start_pose(bare, "mcl")
-    for require in (require_laser, require_stereo):
+        bare.require_start("mcl")
+    for require in (bare.require_laser, bare.require_stereo):
         with pytest.raises(
             InputError, match=r"^mcl: no sensor named front .there is none.; choose"
         ):
-            require(bare, "front", "mcl")
+            require("front", "mcl")
 
 
 def test_a_sensor_is_found_by_its_name_and_must_be_of_its_kind():
     sensors = {"encoder": Encoder(), "front": Laser(n_beams=3), "rear": Laser(n_beams=5)}
     prior = Prior(RobotGeometry(0.05, 0.2), sensors)
-    assert require_laser(prior, "rear", "mcl") is sensors["rear"]
+    assert prior.require_laser("rear", "mcl") is sensors["rear"]
     with pytest.raises(InputError, match=r"laser \(there is encoder, front, rear\); choose"):
-        require_laser(prior, "laser", "mcl")
+        prior.require_laser("laser", "mcl")
     with pytest.raises(InputError, match=r"^fastslam: sensor front is a Laser, not a StereoCamera"):
-        require_stereo(prior, "front", "fastslam")
+        prior.require_stereo("front", "fastslam")
 
 
 def test_the_start_pose_is_a_copy():
     prior = Prior(RobotGeometry(0.05, 0.2), {}, np.zeros(3), np.eye(3))
-    start = start_pose(prior, "mcl")
+    start = prior.require_start("mcl")
     start.mean[0], start.covariance[0, 0] = 1.0, 2.0
     assert prior.mean[0] == 0.0
     assert prior.covariance[0, 0] == 1.0

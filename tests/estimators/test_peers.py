@@ -9,11 +9,10 @@ import pytest
 from estimators.base import run
 from estimators.graph.fixed_lag import FixedLag
 from estimators.graph.smoother import Smoother
-from estimators.peers import MissingPackageError
+from estimators.peers import MissingPackageError, matrix_of, pose_of
 from estimators.peers.gtsam_batch import GtsamBatch
 from estimators.peers.gtsam_isam2 import GtsamIsam2
 from estimators.peers.kiss_icp import KissIcp
-from estimators.peers.planar import matrix_of, pose_of
 from estimators.peers.small_gicp import SmallGicp
 from estimators.programs.program import PEERS_PROGRAM
 from experiments.runs.evaluate import evaluate

@@ -142,13 +142,13 @@ BAD = {
     "signal": ("import os; os.kill(os.getpid(), 9)", "ended by signal 9"),
     "silence": ("time.sleep(60)", r"no answer within 0\.3 s"),
     "closed": ("import os; os.close(1); time.sleep(60)", "closed its output"),
-    "no_json": ("print('hello', flush=True)", "no JSON object"),
-    "list": ("print('[1, 2]', flush=True)", "no JSON object"),
+    "no_json": ("print('hello', flush=True)", "not a JSON object"),
+    "list": ("print('[1, 2]', flush=True)", "not a JSON object"),
     "no_mean": ("print('{}', flush=True)", "must answer with mean, 3 numbers; got None"),
     "short": ("print('{\"mean\": [1, 2]}', flush=True)", "mean, 3 numbers"),
     "texts": ("print('{\"mean\": [\"1\", \"2\", \"3\"]}', flush=True)", "mean, 3 numbers"),
     "null": ("print('{\"mean\": [1, null, 3]}', flush=True)", "mean, 3 numbers"),
-    "nan": ("print('{\"mean\": [NaN, 0, 0]}', flush=True)", "no JSON object"),
+    "nan": ("print('{\"mean\": [NaN, 0, 0]}', flush=True)", "not a JSON object"),
     "covariance": (
         "print('{\"mean\": [0, 0, 0], \"covariance\": [1, 2, 3]}', flush=True)",
         "covariance, 3 x 3 numbers",
@@ -163,7 +163,7 @@ BAD = {
     "far": ("print('{\"mean\": [1e300, 0, 0]}', flush=True)", r"mean, numbers up to 1e\+12"),
     "half_line": ("print('{\"mean\"', end='', flush=True); time.sleep(60)", "no answer within"),
     "endless_line": ("while True: sys.stdout.write('x' * 65536)", "more than 1048576 bytes"),
-    "binary": ("sys.stdout.buffer.write(b'\\xff\\xfe\\n'); sys.stdout.flush()", "no JSON object"),
+    "binary": ("sys.stdout.buffer.write(b'\\xff\\xfe\\n'); sys.stdout.flush()", "a JSON object"),
 }  # fmt: skip
 
 

@@ -134,9 +134,7 @@ def test_derivatives_of_sightings():
     sightings = Sightings.of([Prior(None, {"robots": eye})], "robots", "test")
     pose, other = np.array([0.3, -0.2, 0.7]), np.array([3.0, 2.5, -1.0])
     _, *by = sightings.predict(pose, other)
-    residuals = PoseSightings(
-        StereoModel.of(eye.camera), eye.marker_z_m, np.array([0]), np.array([1]), np.ones((1, 3))
-    )
+    residuals = PoseSightings(sightings, np.array([0]), np.array([1]), np.ones((1, 3)))
     both = np.array([pose, other])
     _, *whitened = residuals.residuals(both, True)
     for side in (0, 1):

@@ -25,7 +25,7 @@ def frame(right_m, left_m, duration_s=0.1):
 def test_covariance_is_slip_ticks_and_sideways_slip(travel_m):
     believed = EncoderTickOptions(kr=1e-4, kl=3e-4, lateral_slip_m=2e-5, encoder_tick_m=1e-3)
     wheels = WheelPrediction(believed, TRACK_M)
-    motion, root = wheels.predict_with_root(frame(*travel_m))
+    motion, _, root = wheels.predict_in_full(frame(*travel_m))
     travel_m = np.array(travel_m)
     G = arc_increment_jacobian(travel_m, TRACK_M)
     variances = np.abs(travel_m) * [1e-4, 3e-4] + (travel_m != 0.0) * 1e-6 / 6.0
@@ -37,7 +37,7 @@ def test_covariance_is_slip_ticks_and_sideways_slip(travel_m):
 
 def test_what_both_wheels_slip_together_does_not_turn():
     wheels = WheelPrediction(ForwardSlipOptions(forward_slip_m=5e-3), TRACK_M)
-    motion, root = wheels.predict_with_root(frame(0.1, 0.1))
+    motion, _, root = wheels.predict_in_full(frame(0.1, 0.1))
     alone = WheelPrediction(WheelOptions(), TRACK_M)
     more = motion.covariance - alone.predict(frame(0.1, 0.1)).covariance
     np.testing.assert_allclose(more, np.diag([5e-3 * 0.1, 0.0, 0.0]), atol=1e-18)

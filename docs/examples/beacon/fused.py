@@ -5,7 +5,6 @@ import numpy as np
 from estimators.base import Belief
 from estimators.gaussian import STILL, Gaussian, update, wrap
 from estimators.laser.scan_matching import MatcherOptions, ScanMatcher
-from estimators.options import require_laser, start_pose
 from estimators.wheels import WheelOptions, WheelPrediction
 from sim.sensors import sensor_of
 
@@ -25,8 +24,8 @@ class Fused:
 
     def reset(self, prior, rng):
         """Start from the prior's pose."""
-        self.belief, self.rng = start_pose(prior, "fused"), rng
-        self.sensors = {name: require_laser(prior, name, "fused") for name in self.lasers}
+        self.belief, self.rng = prior.require_start("fused"), rng
+        self.sensors = {name: prior.require_laser(name, "fused") for name in self.lasers}
         beacon = sensor_of(prior.sensors, self.beacon)
         self.R = (beacon.sigma_m**2 + beacon.wander_m**2) * np.eye(2)
         self._wheels = WheelPrediction(self.wheels, prior.robot.track_m)

@@ -1,6 +1,7 @@
 """Batch least squares against dense solvers, its covariances against errors, and its edges."""
 
 import dataclasses
+import functools
 import itertools
 
 import numpy as np
@@ -10,7 +11,7 @@ from scipy.optimize import least_squares
 from estimators.base import run
 from estimators.gaussian import Gaussian
 from estimators.graph.fixed_lag import FixedLag
-from estimators.graph.landmark_drive import _between, _merged
+from estimators.graph.landmark_drive import _between
 from estimators.graph.least_squares import LeastSquaresOptions, Problem, solve
 from estimators.graph.smoother import Smoother
 from estimators.landmarks.stereo import LEAST_DEPTH_M, StereoModel
@@ -260,7 +261,7 @@ def test_poses_filled_in_are_those_of_the_whole_problem():
             **none,
         )
 
-    closing = _merged(motions)
+    closing = functools.reduce(Gaussian.then, motions)
     start = [problem.prior_mean]
     for motion in motions:
         start.append(se2.compose(start[-1], motion.mean))

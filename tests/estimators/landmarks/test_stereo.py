@@ -51,7 +51,9 @@ def test_covariance_is_what_the_noisy_image_makes():
     point = np.array([1.0, -0.5, 4.0])
     rng = np.random.default_rng(0)
     noise = rng.standard_normal((200_000, 3)) * np.sqrt(model.variances_px2)
-    seen = model.from_image(model.to_image(point) + noise)
+    column, row, disparity = (model.to_image(point) + noise).T
+    rays = np.column_stack([column, row, np.full(len(row), model.focal_px)])
+    seen = rays * (model.baseline_m / disparity)[:, None]
     assert np.allclose(np.cov(seen.T), model.covariance(point), rtol=0.02, atol=1e-6)
 
 
@@ -84,7 +86,6 @@ def test_useless_measurements_are_refused():
     points = [[0.0, 0.0, 3.0], [0, 0, 0], [1.0, 0.0, -2.0], [math.nan, 0.0, 2.0], [0, 0, 1e5]]
     assert model.usable(points).tolist() == [True, False, False, False, False]
     assert model.usable(np.zeros((0, 3))).tolist() == []
-    assert np.isnan(model.from_image([0.0, 0.0, -1.0])).all()
 
 
 def test_camera_decides_unless_told():

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from estimators.landmarks.ekf_slam import EkfSlam
-from estimators.landmarks.wheel_gains import NO_MOTION, GainOptions, gained_motion
-from estimators.wheels import WheelOptions, WheelPrediction
+from estimators.wheels import NO_MOTION, GainOptions, WheelOptions, WheelPrediction, gained_motion
 from experiments.evaluation.metrics import nees, position_errors_m, rms
 from experiments.gate.conform import check_estimator
 from experiments.runs.experiment import Experiment
