@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.arrays import Array
-from sim.errors import InputError, required
+from sim.errors import InputError, require, required
 from sim.sensors.base import Reading, Schema, Sensor, parted
 
 
@@ -105,16 +105,24 @@ class Log:
             Naming the field that does not fit the schema.
         """
         n, splits = len(self.stamps), self.splits
-        if self.stamps.shape != (n,) or self.stamps.dtype != np.float64:
-            raise InputError(f"{where}.stamps must be float64 of shape (N,)")
-        if any(field.ragged for field in self.schema.values()) != (splits is not None):
-            raise InputError(f"{where}.splits must be there if a field is ragged, and only then")
+        require(
+            self.stamps.shape == (n,) and self.stamps.dtype == np.float64,
+            f"{where}.stamps must be float64 of shape (N,)",
+        )
+        require(
+            any(f.ragged for f in self.schema.values()) == (splits is not None),
+            f"{where}.splits must be there if a field is ragged, and only then",
+        )
         n_rows = 0
         if splits is not None:
-            if splits.shape != (n + 1,) or splits.dtype != np.int64:
-                raise InputError(f"{where}.splits must be int64 of shape ({n + 1},)")
-            if splits[0] != 0 or (np.diff(splits) < 0).any():
-                raise InputError(f"{where}.splits must begin at 0 and not decrease")
+            require(
+                splits.shape == (n + 1,) and splits.dtype == np.int64,
+                f"{where}.splits must be int64 of shape ({n + 1},)",
+            )
+            require(
+                splits[0] == 0 and not (np.diff(splits) < 0).any(),
+                f"{where}.splits must begin at 0 and not decrease",
+            )
             n_rows = int(splits[-1])
         for name, kind in self.schema.items():
             kind.check(self.values[name], n_rows if kind.ragged else n, f"{where}.{name}")
@@ -139,11 +147,11 @@ def joined(schema: Schema, stamps: Array, readings: Sequence[Reading], where: st
         sizes = [len(reading[first]) for reading in readings]
         for name in others:
             for size, reading in zip(sizes, readings, strict=True):
-                if len(reading[name]) != size:
-                    raise InputError(
-                        f"{where}.{name} has {len(reading[name])} rows in a reading, "
-                        f"{where}.{first} {size}; they must be as many"
-                    )
+                require(
+                    len(reading[name]) == size,
+                    f"{where}.{name} has {len(reading[name])} rows in a reading, "
+                    f"{where}.{first} {size}; they must be as many",
+                )
         splits = np.cumsum([0, *sizes]).astype(np.int64)
     log = Log(schema, stamps, values, splits)
     log.check(where)

@@ -277,12 +277,11 @@ def load(path: Path) -> Recording:
     InputError
         If the file is missing, truncated, altered, or not a recording.
     """
-    if not path.is_file():
-        raise InputError(f"{path}: no such recording; make one with `estima record`")
-    if path.suffix != ".npz" and not zipfile.is_zipfile(path):
-        raise InputError(
-            f"{path}: not a recording; make one of a log with `estima convert {path} -o FILE.npz`"
-        )
+    require(path.is_file(), f"{path}: no such recording; make one with `estima record`")
+    require(
+        path.suffix == ".npz" or zipfile.is_zipfile(path),
+        f"{path}: not a recording; make one of a log with `estima convert {path} -o FILE.npz`",
+    )
     with blamed(path, REMEDY):
         stored, meta = checked_arrays(path)
     require(

@@ -179,10 +179,10 @@ def read_topics(path: Path) -> tuple[dict[str, Topic], dict[str, Any]]:
             ]
             messages = enumerate(reader.messages(wanted) if wanted else (), start=1)
             for count, (connection, time, data) in messages:
-                if count > _MOST_MESSAGES:
-                    raise InputError(
-                        f"{path}: more than {_MOST_MESSAGES} messages; cut it in parts"
-                    )
+                require(
+                    count <= _MOST_MESSAGES,
+                    f"{path}: more than {_MOST_MESSAGES} messages; cut it in parts",
+                )
                 topic = topics.setdefault(connection.topic, Topic(connection.msgtype, [], []))
                 if topic.kind == connection.msgtype:
                     topic.times.append(time)

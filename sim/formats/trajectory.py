@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from sim.arrays import Array
-from sim.errors import InputError, require
+from sim.errors import InputError, require, required
 from sim.files import require_file
 from sim.formats.rosbag import Track
 from sim.formats.text import read_bytes
@@ -116,12 +116,11 @@ def _of_bag(path: Path, topic: str | None) -> Track:
     if topic is None:
         own = [name for name in tracks if name not in _OTHERS]
         topic = "estimate" if "estimate" in own or len(own) != 1 else own[0]
-    track = tracks.get(topic.lstrip("/"))
-    if track is None:
-        raise InputError(
-            f"{path}: no nav_msgs/Odometry on {topic}; there is {', '.join(tracks) or 'none'}; "
-            "name one with --topic"
-        )
+    track = required(
+        tracks.get(topic.lstrip("/")),
+        f"{path}: no nav_msgs/Odometry on {topic}; there is {', '.join(tracks) or 'none'}; "
+        "name one of them",
+    )
     covariances = track.covariances.copy()
     unknown = (np.diagonal(covariances, axis1=1, axis2=2) == -1.0).any(axis=1)
     covariances[unknown] = 0.0  # ROS marks by -1 what is not known

@@ -112,8 +112,10 @@ class Field:
         if not fits:
             shape = ", ".join("any" if size is None else str(size) for size in wanted)
             raise InputError(f"{where} must have shape ({shape}), got {values.shape}")
-        if values.dtype != np.dtype(self.dtype):
-            raise InputError(f"{where} must be {self.dtype}, got {values.dtype}")
+        require(
+            values.dtype == np.dtype(self.dtype),
+            f"{where} must be {self.dtype}, got {values.dtype}",
+        )
 
     def joined(self, values: Sequence[Any], where: str) -> NDArray[Any]:
         """Array of many readings: (N, *shape), or all rows of a ragged field, (K, *shape).
@@ -304,13 +306,14 @@ def sensor_of(sensors: Sensors, name: str, kind: type[S] = object) -> S:  # type
         known = ", ".join(sensors) or "none"
         raise InputError(f"no sensor named {name} (there is {known}); choose sensors that have one")
     found = sensors[name]
-    if isinstance(found, RecordedSensor) and not isinstance(found, kind):
-        raise InputError(
-            f"sensor {name} was recorded as {found.target}, whose code a file does not choose; "
-            f"name it again: sensors=PRESET with its _target_ (and --config-dir)"
-        )
-    if not isinstance(found, kind):
-        raise InputError(f"sensor {name} is a {type(found).__name__}, not a {kind.__name__}")
+    require(
+        not isinstance(found, RecordedSensor) or isinstance(found, kind),
+        f"sensor {name} was recorded as {getattr(found, 'target', '')}, whose code a file does not choose; "
+        f"name it again: sensors=PRESET with its _target_ (and --config-dir)",
+    )
+    require(
+        isinstance(found, kind), f"sensor {name} is a {type(found).__name__}, not a {kind.__name__}"
+    )
     return found
 
 
@@ -328,10 +331,10 @@ def sensors_from_config(config: Mapping[str, Any]) -> dict[str, Sensor]:
         where = _place_of(name)
         if settings is None:
             continue
-        if not isinstance(settings, Mapping) or "_target_" not in settings:
-            raise InputError(
-                f"{where} must be a mapping with _target_, such as sim.sensors.laser.Laser"
-            )
+        require(
+            isinstance(settings, Mapping) and "_target_" in settings,
+            f"{where} must be a mapping with _target_, such as sim.sensors.laser.Laser",
+        )
         sensors[name] = _made(find(settings["_target_"], where), settings, where)
     return sensors
 
@@ -380,8 +383,10 @@ def sensors_from_meta(
 
 
 def _made(kind: Any, settings: Mapping[str, Any], where: str) -> Sensor:
-    if not (isinstance(kind, type) and dataclasses.is_dataclass(kind)):
-        raise InputError(f"{where}._target_={settings['_target_']} must be a dataclass")
+    require(
+        isinstance(kind, type) and dataclasses.is_dataclass(kind),
+        f"{where}._target_={settings['_target_']} must be a dataclass",
+    )
     made: Any = build(kind, {k: v for k, v in settings.items() if k != "_target_"}, where)
     with blaming(where):
         for name in ("rate_hz", "schema", "start"):
@@ -407,9 +412,15 @@ def _place_of(name: Any) -> str:
 
 def _check_fields(schema: Schema, where: str) -> None:
     for name in schema:
-        if not _NAME.fullmatch(name) or iskeyword(name) or name in ("stamps", "splits", "header"):
-            raise InputError(f"{where}: {name!r} cannot be the name of a field")
+        require(
+            _NAME.fullmatch(name)
+            and not iskeyword(name)
+            and name not in ("stamps", "splits", "header"),
+            f"{where}: {name!r} cannot be the name of a field",
+        )
     seen, hidden = parted(schema)
     ragged = [any(field.ragged for field in part.values()) for part in (seen, hidden)]
-    if ragged == [False, True]:
-        raise InputError(f"{where}: a ragged field of the truth needs one beside it that is seen")
+    require(
+        ragged != [False, True],
+        f"{where}: a ragged field of the truth needs one beside it that is seen",
+    )

@@ -35,7 +35,7 @@ import yaml
 from PIL import Image
 
 from sim.arrays import Array, Floats
-from sim.errors import InputError
+from sim.errors import InputError, require
 from sim.files import require_file, write_whole
 from sim.worlds.grid import FREE_BELOW, OCCUPIED_ABOVE, OccupancyGrid, check_size
 from sim.yaml_file import read_yaml
@@ -123,8 +123,7 @@ def write_grid(
         If the name does not end in .yaml, or the files cannot be written.
     """
     check_name(path)
-    if mode not in ("trinary", "raw"):
-        raise InputError(f"a grid is written as trinary or raw, got {mode!r}")
+    require(mode in ("trinary", "raw"), f"a grid is written as trinary or raw, got {mode!r}")
     if mode == "raw":
         known = np.isfinite(grid.probability)
         percent = np.rint(100.0 * np.where(known, grid.probability, 0.0))
@@ -152,46 +151,52 @@ def write_grid(
 
 def check_name(path: Path) -> None:
     """Refuse a name that is not one of a grid."""
-    if path.suffix not in SUFFIXES:
-        raise InputError(f"{path}: a grid is a .yaml file, with its image beside it")
+    require(path.suffix in SUFFIXES, f"{path}: a grid is a .yaml file, with its image beside it")
 
 
 def _document(path: Path) -> Mapping[str, Any]:
     document = read_yaml(path, _MOST_BYTES)
-    if not isinstance(document, Mapping):
-        raise InputError(f"{path}: must hold the keys {', '.join(_KEYS)}")
+    require(isinstance(document, Mapping), f"{path}: must hold the keys {', '.join(_KEYS)}")
     return document
 
 
 def _meta(path: Path) -> _Meta:
     document = _document(path)
     for key, usual in _KEYS.items():
-        if document.get(key) is None:
-            raise InputError(f"{path}: {key} is missing; the map server writes {key}: {usual}")
+        require(
+            document.get(key) is not None,
+            f"{path}: {key} is missing; the map server writes {key}: {usual}",
+        )
     image, origin, negate = document["image"], document["origin"], document["negate"]
-    if not isinstance(image, str) or not image:
-        raise InputError(f"{path}: image must be {_KEYS['image']}, got {_shown(image)}")
-    if not isinstance(origin, list) or len(origin) != 3:
-        raise InputError(f"{path}: origin must be [x, y, yaw], got {_shown(origin)}")
-    if negate not in (0, 1):
-        raise InputError(f"{path}: negate must be 0 or 1, got {_shown(negate)}")
+    require(
+        isinstance(image, str) and image,
+        f"{path}: image must be {_KEYS['image']}, got {_shown(image)}",
+    )
+    require(
+        isinstance(origin, list) and len(origin) == 3,
+        f"{path}: origin must be [x, y, yaw], got {_shown(origin)}",
+    )
+    require(negate in (0, 1), f"{path}: negate must be 0 or 1, got {_shown(negate)}")
     mode = document.get("mode", "trinary")
-    if mode not in _MODES:
-        raise InputError(f"{path}: mode must be {', '.join(_MODES)}, got {_shown(mode)}")
+    require(mode in _MODES, f"{path}: mode must be {', '.join(_MODES)}, got {_shown(mode)}")
     numbers = {
         key: _number(document[key], f"{path}: {key}")
         for key in ("resolution", "occupied_thresh", "free_thresh")
     }
-    if numbers["resolution"] <= 0.0:
-        raise InputError(f"{path}: resolution must be positive, got {numbers['resolution']:g}")
+    require(
+        numbers["resolution"] > 0.0,
+        f"{path}: resolution must be positive, got {numbers['resolution']:g}",
+    )
     free, occupied = numbers["free_thresh"], numbers["occupied_thresh"]
     for key in ("occupied_thresh", "free_thresh"):
-        if not 0.0 <= numbers[key] <= 1.0:
-            raise InputError(f"{path}: {key} must lie between 0 and 1, got {numbers[key]:g}")
-    if free >= occupied:
-        raise InputError(
-            f"{path}: free_thresh must be below occupied_thresh, got {free:g} and {occupied:g}"
+        require(
+            0.0 <= numbers[key] <= 1.0,
+            f"{path}: {key} must lie between 0 and 1, got {numbers[key]:g}",
         )
+    require(
+        free < occupied,
+        f"{path}: free_thresh must be below occupied_thresh, got {free:g} and {occupied:g}",
+    )
     pose = [_number(value, f"{path}: origin[{i}]") for i, value in enumerate(origin)]
     return _Meta(
         path.parent / image,
@@ -209,8 +214,7 @@ def _number(value: Any, where: str) -> float:
         number = math.nan if isinstance(value, bool) else float(value)
     except (TypeError, ValueError, OverflowError):
         number = math.nan
-    if not math.isfinite(number):
-        raise InputError(f"{where} must be a finite number, got {_shown(value)}")
+    require(math.isfinite(number), f"{where} must be a finite number, got {_shown(value)}")
     return number
 
 
