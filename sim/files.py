@@ -20,6 +20,22 @@ def require_file(path: Path) -> None:
         require(stat.S_ISREG(mode), f"{path}: not a file; name a file, or remove it")
 
 
+def read_head(path: Path) -> bytes:
+    """First 512 bytes of a file.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read.
+    """
+    require_file(path)
+    try:
+        with path.open("rb") as file:
+            return file.read(512)
+    except OSError as error:
+        raise InputError(f"{path}: cannot read ({error.strerror})") from error
+
+
 @contextmanager
 def write_whole(path: Path, *, durable: bool = True) -> Iterator[Path]:
     """Give a path beside `path` to write to; move it into place if all went well.

@@ -152,9 +152,8 @@ class Words:
 
     def refuse(self, bad: ArrayLike, lines: Rows, reason: str) -> None:
         """Raise the error of the first of the lines that is bad, if one is."""
-        rows = np.flatnonzero(bad)
-        if len(rows):
-            raise self.error(int(lines[rows[0]]), reason)
+        for line in lines[np.flatnonzero(bad)[:1]].tolist():
+            raise self.error(line, reason)
 
     def lines_of(self, keyword: str) -> Rows:
         """Lines whose first word is the keyword."""
@@ -190,13 +189,12 @@ class Words:
 
     def table(self, n_columns: int | Sequence[int], what: str) -> Array:
         """All lines as finite numbers; each must have that many words (one of the choices)."""
-        choices = (n_columns,) if isinstance(n_columns, int) else tuple(n_columns)
+        choices = (n_columns,) if isinstance(n_columns, int) else n_columns
         counts = self.counts
-        width = int(counts[0]) if len(counts) and counts[0] in choices else choices[0]
-        bad = np.flatnonzero(counts != width)
-        if len(bad):
+        width = next((choice for choice in choices if choice in counts[:1]), choices[0])
+        for line in np.flatnonzero(counts != width)[:1].tolist():
             raise self.error(
-                int(bad[0]), f"a line of {what} must be {width} numbers, this has {counts[bad[0]]}"
+                line, f"a line of {what} must be {width} numbers, this has {counts[line]}"
             )
         return self.finite(self.lines, 0, width, what)
 
@@ -247,13 +245,18 @@ def split_words(data: bytes, where: str) -> Words:
     )
 
 
-def read_words(path: Path) -> Words:
-    """`split_words` of a plain, gzip or xz file."""
-    return split_words(read_bytes(path), str(path))
+def read_words(source: Path | Words) -> Words:
+    """`split_words` of a plain, gzip or xz file; words that were read before are handed back."""
+    return source if isinstance(source, Words) else split_words(read_bytes(source), str(source))
 
 
 # Gaps are blanks; "1_0" is 10 to Python, but no number in a log, and no keyword has a "_".
 _PLAIN = bytes.maketrans(b",;_", b"  ?")
+
+
+def reason_of(error: Exception) -> str:
+    """Kind and text of an error, on one short line, for a message."""
+    return " ".join(f"{type(error).__name__}: {error}".split())[:120]
 
 
 def json_number(value: Any) -> float:
