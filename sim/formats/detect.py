@@ -94,8 +94,8 @@ def read_all(paths: Sequence[Path], robot: int | None = None) -> Team:
         team = load(first)
         if robot is None or len(team) == 1:
             return team
-        known = 0 <= robot < len(team)
-        require(known, f"{first}: its robots are 0 to {len(team) - 1}, got {robot}")
+        known = range(len(team))
+        require(robot in known, f"{first}: its robots are 0 to {known[-1]}, got {robot}")
         return Team((team.robots[robot],))
     if kind == "mrclam":
         recording = read_mrclam(first, 1 if robot is None else robot)

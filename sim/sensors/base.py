@@ -306,11 +306,11 @@ def sensor_of(sensors: Sensors, name: str, kind: type[S] = object) -> S:  # type
         known = ", ".join(sensors) or "none"
         raise InputError(f"no sensor named {name} (there is {known}); choose sensors that have one")
     found = sensors[name]
-    require(
-        not isinstance(found, RecordedSensor) or isinstance(found, kind),
-        f"sensor {name} was recorded as {getattr(found, 'target', '')}, whose code a file does not choose; "
-        f"name it again: sensors=PRESET with its _target_ (and --config-dir)",
-    )
+    if isinstance(found, RecordedSensor) and not isinstance(found, kind):
+        raise InputError(
+            f"sensor {name} was recorded as {found.target}, whose code a file does not choose; "
+            "name its class again: sensors=PRESET with its _target_"
+        )
     require(
         isinstance(found, kind), f"sensor {name} is a {type(found).__name__}, not a {kind.__name__}"
     )
