@@ -5,12 +5,10 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sim.arrays import Array
+from sim.arrays import Array, Ints, Values
 from sim.errors import InputError, require, required
 from sim.sensors.base import Reading, Schema, Sensor, parted
 
@@ -46,17 +44,17 @@ class Log:
 
     schema: Schema
     stamps: Array
-    values: Mapping[str, NDArray[Any]]
-    splits: NDArray[np.int64] | None = None
+    values: Mapping[str, Values]
+    splits: Ints | None = None
 
     @classmethod
     def of(
         cls,
         sensor: Sensor,
         stamps: Array,
-        splits: NDArray[np.int64] | None = None,
+        splits: Ints | None = None,
         /,
-        **values: NDArray[Any],
+        **values: Values,
     ) -> Log:
         """Log of a sensor's readings, with the types of its schema.
 
@@ -74,16 +72,16 @@ class Log:
         log.check(type(sensor).__name__)
         return log
 
-    def __getitem__(self, name: str) -> NDArray[Any]:
+    def __getitem__(self, name: str) -> Values:
         """All values of a field."""
         return self.values[name]
 
     @property
-    def known_splits(self) -> NDArray[np.int64]:
+    def known_splits(self) -> Ints:
         """The splits; InputError if no field is ragged."""
         return required(self.splits, "a log without ragged fields has no splits")
 
-    def taken(self, rows: NDArray[np.int64], stamps: Array) -> Log:
+    def taken(self, rows: Ints, stamps: Array) -> Log:
         """Log of these readings, at other stamps; none of its fields may be ragged."""
         values = {name: array[rows] for name, array in self.values.items()}
         return dataclasses.replace(self, stamps=stamps, values=values)

@@ -18,9 +18,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sim.arrays import Array
+from sim.arrays import Array, Ints, Values
 from sim.errors import InputError, require, required
 from sim.files import write_whole
 from sim.log import CommandLog, Log, WheelLog, joined
@@ -69,7 +68,7 @@ class Truth:
     stamps: Array
     poses: Array
     wheel_travel_m: Array = field(default_factory=lambda: np.zeros((0, 2)))
-    readings: Mapping[str, Mapping[str, NDArray[Any]]] = field(default_factory=dict)
+    readings: Mapping[str, Mapping[str, Values]] = field(default_factory=dict)
     world: World | None = None
 
 
@@ -219,8 +218,7 @@ class Recording:
             If the recording has no truth.
         """
         poses, times = self.known_truth.poses, self.known_truth.stamps
-        heading = np.unwrap(poses[:, 2])
-        columns = (poses[:, 0], poses[:, 1], heading)
+        columns = (poses[:, 0], poses[:, 1], np.unwrap(poses[:, 2]))
         x, y, angle = (np.interp(stamps, times, c, left=np.nan, right=np.nan) for c in columns)
         found = np.stack([x, y, np.arctan2(np.sin(angle), np.cos(angle))], axis=1)
         after = np.clip(np.searchsorted(times, stamps), 1, max(len(times) - 1, 1))
@@ -259,7 +257,7 @@ def save(recording: Recording, path: Path, *, durable: bool = True) -> str:
 
 
 def write_arrays(
-    path: Path, arrays: dict[str, NDArray[Any]], meta: dict[str, Any], *, durable: bool = True
+    path: Path, arrays: dict[str, Values], meta: dict[str, Any], *, durable: bool = True
 ) -> str:
     """Write arrays and plain values that describe them, whole; return their checksum."""
     checksum = digest_of(arrays, meta)
@@ -312,13 +310,13 @@ def blamed(path: Path) -> Iterator[None]:
         raise InputError(f"{path}: {str(error).removeprefix(f'{path}: ')}; {REMEDY}") from error
 
 
-def _below(stored: Mapping[str, NDArray[Any]], prefix: str) -> dict[str, NDArray[Any]]:
+def _below(stored: Mapping[str, Values], prefix: str) -> dict[str, Values]:
     """Arrays whose names begin with a prefix and a dot, without it."""
     begin = f"{prefix}."
     return {k.removeprefix(begin): v for k, v in stored.items() if k.startswith(begin)}
 
 
-def checked_arrays(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+def checked_arrays(path: Path) -> tuple[dict[str, Values], dict[str, Any]]:
     """Arrays and plain values of a file, which match its checksum."""
     stored = read_arrays(path)
     require("meta" in stored, "not a recording")
@@ -338,14 +336,14 @@ def _others(parts: Mapping[str, S], name: str) -> dict[str, S]:
     return {key: part for key, part in parts.items() if key != name}
 
 
-def _rows_at(frame_stamps: Array, log: Log) -> NDArray[np.int64]:
+def _rows_at(frame_stamps: Array, log: Log) -> Ints:
     """Row of a sensor's log that each Frame shows, -1 for none; the last of equal stamps wins."""
     rows = np.searchsorted(log.stamps, frame_stamps, side="right") - 1
     shown = np.append(log.stamps, np.nan)[rows] == frame_stamps  # row -1 is the NaN
     return np.where(shown, rows, -1)
 
 
-def arrays_of(recording: Recording) -> dict[str, NDArray[Any]]:
+def arrays_of(recording: Recording) -> dict[str, Values]:
     """Every array of a recording under the name it is saved by."""
     arrays = {"frame_stamps": recording.frame_stamps}
     parts = {
@@ -392,7 +390,7 @@ def described(recording: Recording) -> dict[str, Any]:
     }
 
 
-def digest_of(arrays: dict[str, NDArray[Any]], meta: dict[str, Any]) -> str:
+def digest_of(arrays: dict[str, Values], meta: dict[str, Any]) -> str:
     """SHA-256 of arrays and plain values that describe them, as hex."""
     digest = hashlib.sha256(json.dumps(meta, sort_keys=True).encode())
     for name in sorted(arrays):
@@ -402,10 +400,10 @@ def digest_of(arrays: dict[str, NDArray[Any]], meta: dict[str, Any]) -> str:
     return digest.hexdigest()
 
 
-def assembled(stored: dict[str, NDArray[Any]], meta: dict[str, Any]) -> Recording:
+def assembled(stored: dict[str, Values], meta: dict[str, Any]) -> Recording:
     """Recording of its arrays and plain values, checked."""
 
-    def part(prefix: str) -> dict[str, NDArray[Any]]:
+    def part(prefix: str) -> dict[str, Values]:
         """Arrays directly under a name."""
         return {name: v for name, v in _below(stored, prefix).items() if "." not in name}
 

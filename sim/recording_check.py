@@ -1,13 +1,11 @@
 """What a recording from a file must hold, whoever wrote it. Its logs check themselves."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sim.arrays import Values
 from sim.errors import InputError, require
 from sim.sensors.base import RecordedSensor, parted
 
@@ -70,9 +68,7 @@ def _check_texts(recording: Any) -> None:
         require(isinstance(name, str), f"the world's name must be a text, got {name!r}")
 
 
-def _check_stamps(
-    stamps: NDArray[Any], where: str, *, strictly: bool = False, least: int = 1
-) -> None:
+def _check_stamps(stamps: Values, where: str, *, strictly: bool = False, least: int = 1) -> None:
     _check_numbers(stamps, (len(stamps),) if stamps.ndim == 1 else (0,), where)
     require(len(stamps) >= least, f"{where} is empty")
     steps = np.diff(stamps)
@@ -81,7 +77,7 @@ def _check_stamps(
         raise InputError(f"{where} must {wanted}; {i + 1} is {stamps[i + 1]} after {stamps[i]}")
 
 
-def _check_numbers(values: NDArray[Any], shape: tuple[int, ...], where: str) -> None:
+def _check_numbers(values: Values, shape: tuple[int, ...], where: str) -> None:
     require(values.shape == shape, f"{where} must have shape {shape}, got {values.shape}")
     require(values.dtype == np.float64, f"{where} must be f8, got {values.dtype}")
     for place in np.argwhere(~(np.abs(values) <= LARGEST))[:1].tolist():  # NaN is not below

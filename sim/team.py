@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sim.arrays import Array
+from sim.arrays import Array, Values
 from sim.errors import require
 from sim.recording import (
     FORMAT_VERSION,
@@ -132,7 +131,7 @@ def save(team: Team, path: Path) -> str:
     return write_arrays(path, *_parts(team))
 
 
-def _parts(team: Team) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+def _parts(team: Team) -> tuple[dict[str, Values], dict[str, Any]]:
     """Every array of a team under the name it is saved by, and plain values."""
     if len(team) == 1:
         return arrays_of(team.robots[0]), described(team.robots[0])

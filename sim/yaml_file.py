@@ -1,7 +1,5 @@
 """YAML files that may come from anywhere: read within bounds, and no key twice."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

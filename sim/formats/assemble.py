@@ -18,17 +18,16 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sim import se2
-from sim.arrays import Array
+from sim.arrays import Array, Floats, Ints
 from sim.errors import InputError, require
 from sim.recording import Log, Recording, Truth, WheelLog
 from sim.robot.arc import arc_increment
 from sim.robot.drive import RobotGeometry
 from sim.sensors import Encoder, Laser, Mount
 
-Rows = NDArray[np.int64]
+Rows = Ints
 Notes = dict[str, Any]
 
 LONGEST_HOLD_S = 1.5
@@ -184,7 +183,7 @@ def scanner(
     )
 
 
-def seen_ranges(raw_m: Array, max_range_m: float) -> NDArray[np.float32]:
+def seen_ranges(raw_m: Array, max_range_m: float) -> Floats:
     """Ranges with +inf where nothing was seen: at the maximum or beyond, zero, or no number."""
     return np.where((raw_m > 0.0) & (raw_m < max_range_m), raw_m, np.inf).astype(np.float32)
 

@@ -19,12 +19,10 @@ import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sim.arrays import Array
+from sim.arrays import Array, Ints, Values
 from sim.errors import require
 from sim.formats import assemble
 from sim.formats.text import read_members, split_words
@@ -172,7 +170,7 @@ def read_team(path: Path, camera: StereoCamera = CAMERA) -> Team:
     return Team.on_one_clock(team)
 
 
-def _rows_of(codes: Array, barcodes: Array, subjects: Array) -> NDArray[np.int64]:
+def _rows_of(codes: Array, barcodes: Array, subjects: Array) -> Ints:
     """Row of the subject of each barcode; -1 for other ones and unknown codes."""
     subject_of = {float(code): float(subject) for subject, code in barcodes}
     row_of = {float(subject): row for row, subject in enumerate(subjects)}
@@ -181,10 +179,10 @@ def _rows_of(codes: Array, barcodes: Array, subjects: Array) -> NDArray[np.int64
 
 def _observations(
     measured: Array,
-    ids: NDArray[np.int64],
+    ids: Ints,
     camera: StereoCamera | RobotCamera,
     notes: assemble.Notes,
-) -> tuple[Log, NDArray[np.int64]]:
+) -> tuple[Log, Ints]:
     """Observations by image, in order, and the true ids of their rows."""
     ahead = np.abs(measured[:, 3]) < _MOST_BEARING_RAD
     usable = (ids >= 0) & ahead & (measured[:, 2] > 0.0)
@@ -195,7 +193,7 @@ def _observations(
     depth_m, bearing = measured[:, 2], measured[:, 3]
     points = np.stack([-depth_m * np.tan(bearing), np.zeros_like(depth_m), depth_m], axis=1)
     splits = np.append(first, len(measured)).astype(np.int64)
-    shown: dict[str, NDArray[Any]] = {"ids": ids} if camera.identifies else {}
+    shown: dict[str, Values] = {"ids": ids} if camera.identifies else {}
     if "descriptors" in camera.schema:
         shown["descriptors"] = np.zeros((len(ids), 0), np.float32)
     return Log.of(camera, stamps, splits, points_in_camera=points, **shown), ids

@@ -168,8 +168,7 @@ def read_topics(path: Path) -> tuple[dict[str, Topic], dict[str, Any]]:
         with _reader(path) as (reader, store, deserialize):
             notes = [c for c in reader.connections if (c.topic, c.msgtype) == (ABOUT, STRING)]
             for connection, _, data in reader.messages(notes) if notes else ():
-                message = deserialize(data, connection.msgtype)
-                about = _about(path, message)
+                about = _about(path, deserialize(data, connection.msgtype))
                 break
             kinds = {*READ, *_kinds(about, store)}
             wanted = [

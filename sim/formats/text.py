@@ -18,13 +18,12 @@ from pathlib import Path, PurePosixPath
 from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from sim.arrays import Array
+from sim.arrays import Array, ArrayLike, Bools, Ints
 from sim.errors import InputError, require
 from sim.files import require_file
 
-Rows = NDArray[np.int64]
+Rows = Ints
 
 MOST_BYTES = 1 << 30  # unpacked; a small archive may promise far more
 LARGEST = 1e12  # times in microseconds and beyond are not what the formats hold
@@ -131,7 +130,7 @@ class Words:
 
     where: str
     values: Array
-    is_number: NDArray[np.bool_]
+    is_number: Bools
     first: Rows
     line_numbers: Rows
     lines_by_keyword: dict[bytes, list[int]]

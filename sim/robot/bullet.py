@@ -5,8 +5,6 @@ At zero slip a straight 2 m run ends within 0.1 mm and 0.01 degrees, and the eff
 the nominal one within 0.01 %.
 """
 
-from __future__ import annotations
-
 import contextlib
 import math
 import os

@@ -20,16 +20,15 @@ from keyword import iskeyword
 from typing import Any, ClassVar, Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sim import se2
-from sim.arrays import Array
+from sim.arrays import Array, Bools, Values
 from sim.errors import InputError, blaming, require
 from sim.options import build, find, options
 from sim.worlds.world import World
 
 S = TypeVar("S")
-Reading = Mapping[str, NDArray[Any]]
+Reading = Mapping[str, Values]
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 _DTYPES = ("f8", "f4", "i8", "i4", "u1")
 _TAKEN = ("wheels", "commands", "truth")  # what else a recording holds
@@ -76,7 +75,7 @@ class Field:
         require(sizes, f"a field's shape must be a tuple of sizes and None, got {self.shape!r}")
         require(isinstance(self.unit, str), f"a field's unit must be a text, got {self.unit!r}")
 
-    def taken(self, value: Any, where: str) -> NDArray[Any]:
+    def taken(self, value: Any, where: str) -> Values:
         """Read-only copy of a reading's value, of the field's type.
 
         Raises
@@ -97,7 +96,7 @@ class Field:
         copy.setflags(write=False)
         return copy
 
-    def check(self, values: NDArray[Any], n: int, where: str) -> None:
+    def check(self, values: Values, n: int, where: str) -> None:
         """Check the values of `n` readings, or rows.
 
         Raises
@@ -117,7 +116,7 @@ class Field:
             f"{where} must be {self.dtype}, got {values.dtype}",
         )
 
-    def joined(self, values: Sequence[Any], where: str) -> NDArray[Any]:
+    def joined(self, values: Sequence[Any], where: str) -> Values:
         """Array of many readings: (N, *shape), or all rows of a ragged field, (K, *shape).
 
         Raises
@@ -154,7 +153,7 @@ class Rays(Protocol):
     def cloud(self, lidar: Any, pose: Array) -> Array:
         """Ranges (rings, azimuths) m of a 3D lidar."""
 
-    def sees(self, origin: Array, points: Array) -> NDArray[np.bool_]:
+    def sees(self, origin: Array, points: Array) -> Bools:
         """Whether nothing stands between a point (3,) and each of others (K, 3)."""
 
 
@@ -205,7 +204,7 @@ class View:
         """True ranges (rings, azimuths) m of a lidar like `Lidar3D`; +inf without a return."""
         return self.rays.cloud(lidar, self.pose)
 
-    def sees(self, origin: Array, points: Array) -> NDArray[np.bool_]:
+    def sees(self, origin: Array, points: Array) -> Bools:
         """Whether nothing stands between a point (3,) of map and each of others (K, 3)."""
         return self.rays.sees(origin, points)
 
@@ -311,9 +310,8 @@ def sensor_of(sensors: Sensors, name: str, kind: type[S] = object) -> S:  # type
             f"sensor {name} was recorded as {found.target}, whose code a file does not choose; "
             "name its class again: sensors=PRESET with its _target_"
         )
-    require(
-        isinstance(found, kind), f"sensor {name} is a {type(found).__name__}, not a {kind.__name__}"
-    )
+    if not isinstance(found, kind):
+        raise InputError(f"sensor {name} is a {type(found).__name__}, not a {kind.__name__}")
     return found
 
 

@@ -232,7 +232,7 @@ class Corridor:
 
 def corridors(*, rng: np.random.Generator, n_objects: list[int], **lengths_m: list[float]) -> World:
     """Build a `Corridor` whose sizes are drawn, each between the two ends given."""
-    drawn = {name: rng.uniform(*ends) for name, ends in lengths_m.items()}
+    drawn = {name: rng.uniform(ends[0], ends[1]) for name, ends in lengths_m.items()}
     count = int(rng.integers(n_objects[0], n_objects[1] + 1))
     return build(Corridor, {**drawn, "n_objects": count, "n_landmarks": 0}, "world").build(rng)
 

@@ -8,11 +8,10 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
 from sim import se2
-from sim.arrays import Array, Floats, Ints
+from sim.arrays import Array, ArrayLike, Bools, Floats, Ints
 from sim.errors import require
 from sim.worlds.world import World
 
@@ -60,12 +59,12 @@ class OccupancyGrid:
         )
 
     @property
-    def free(self) -> NDArray[np.bool_]:
+    def free(self) -> Bools:
         """(rows, columns): where nothing stands."""
         return self.probability < FREE_BELOW
 
     @property
-    def occupied(self) -> NDArray[np.bool_]:
+    def occupied(self) -> Bools:
         """(rows, columns): where something stands. What is neither free nor this is unknown."""
         return self.probability > OCCUPIED_ABOVE
 
@@ -105,7 +104,7 @@ class OccupancyGrid:
         return se2.transform(self.origin, ends).reshape(-1, 4)
 
 
-def _runs(mask: NDArray[np.bool_]) -> tuple[Ints, Ints, Ints]:
+def _runs(mask: Bools) -> tuple[Ints, Ints, Ints]:
     """Row, first column and column after the last of each run of True along the rows."""
     steps = np.diff(np.pad(mask.astype(np.int8), ((0, 0), (1, 1))), axis=1)
     row, first = np.nonzero(steps == 1)

@@ -21,8 +21,6 @@ A pixel's shade runs from 0 (black) to 1 (white), and its occupancy is 1 - shade
 Keys that the map server does not know are passed over, as it does.
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -172,7 +170,7 @@ def check_name(path: Path) -> None:
 
 
 def _document(path: Path) -> Mapping[str, Any]:
-    document = read_yaml(path, _MOST_BYTES)
+    document: Mapping[str, Any] = read_yaml(path, _MOST_BYTES)
     require(isinstance(document, Mapping), f"{path}: must hold the keys {', '.join(_KEYS)}")
     return document
 
