@@ -38,7 +38,7 @@ def read_arrays(path: Path) -> dict[str, Values]:
     Raises
     ------
     InputError
-        If it is no file of arrays, damaged, or promises more than it could hold.
+        If it is not a file of arrays, is damaged, or promises more than it could hold.
     """
     require_file(path)
     try:

@@ -295,7 +295,7 @@ def load_robots(path: Path) -> tuple[Recording, ...]:
         require(isinstance(parts, list), "it does not say what its robots are")
         own = [_below(stored, str(number)) for number in range(len(parts))]
         others = len(stored) - sum(map(len, own))
-        require(others == 0, f"{others} arrays are of no robot of its team")
+        require(others == 0, f"{others} arrays belong to none of its robots")
         return tuple(map(assembled, own, parts))
 
 

@@ -34,7 +34,7 @@ Poses = Literal["odometry", "reference"]
 _ODOM, _FLASER, _ROBOTLASER = "ODOM", "FLASER", "ROBOTLASER1"
 _FLASER_MAX_RANGE_M = 80.0
 _MOST_BEAMS = 100_000
-NOMINAL_TRACK_M, NOMINAL_RADIUS_M = 0.33, 0.0975  # a Pioneer 2, which most of these logs are of
+NOMINAL_TRACK_M, NOMINAL_RADIUS_M = 0.33, 0.0975  # of a Pioneer 2, as in most of these logs
 
 
 @dataclass(frozen=True)

@@ -49,7 +49,7 @@ def read_khepera(path: Path, member: str | None = None) -> WheelLaserLog:
     Raises
     ------
     InputError
-        Naming the file and the line that is no such tuple.
+        Naming the file and the line that is not such a tuple.
     """
     if member is None:
         return parse_khepera(read_bytes(path), str(path))

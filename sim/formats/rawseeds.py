@@ -56,7 +56,7 @@ def read_trajectory(source: Path | Words) -> Trajectory:
 def parse_sick(words: Words, resolution_deg: float = 1.0) -> tuple[Array, Array, float, float]:
     """Stamps (N,), ranges (N, n) m, start angle and step (rad) of a SICK file.
 
-    The offset counts quarter degrees from -90 on; steps are of the resolution.
+    The offset counts quarter degrees from -90 on; a step is the resolution.
     """
     step = math.radians(resolution_deg)
     lines = words.lines

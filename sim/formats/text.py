@@ -125,7 +125,7 @@ class Words:
     line_numbers
         (L,) counted from 1.
     lines_by_keyword
-        Lines that begin with each word that is no number.
+        Lines that begin with each word that is not a number.
     """
 
     where: str

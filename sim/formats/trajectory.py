@@ -15,7 +15,7 @@ FARTHEST_M = 1e12  # of a position that can be scored; far beyond, squares overf
 _ROUNDING = 1e-3  # of a covariance, relative; programs write few digits
 _BAGS = (".mcap", ".bag", ".db3")
 _MAGIC = (b"#ROSBAG", b"\x89MCAP", b"SQLite format 3")
-_OTHERS = ("odom", "ground_truth")  # topics that are no estimate unless they are asked for
+_OTHERS = ("odom", "ground_truth")  # topics of estimates only if they are asked for
 
 
 def read_track(path: Path, topic: str | None = None) -> Track:

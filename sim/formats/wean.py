@@ -4,7 +4,7 @@
     L x y theta x_laser y_laser theta_laser r1 .. r180 stamp        cm, rad, s
 
 The map has seven lines of header and 800 x 800 cells of 10 cm: -1 where nothing is known, else a
-probability. What the probability is of, the file does not say: see `Grid.free_is_one`.
+probability. The file does not say whether 1 means free or occupied: see `Grid.free_is_one`.
 """
 
 import math

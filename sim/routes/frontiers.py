@@ -111,7 +111,7 @@ class Ways:
     passable
         (rows, columns).
     cost
-        (R, rows, columns) length in cells, inf where there is no way.
+        (R, rows, columns) length in cells, inf where none leads.
     """
 
     passable: Mask

@@ -321,7 +321,7 @@ def sensors_from_config(config: Mapping[str, Any]) -> dict[str, Sensor]:
     Raises
     ------
     InputError
-        For a name that is no word, a class that cannot be found, an unknown key, or a value that
+        For a name that is not a word, a class that cannot be found, an unknown key, or a value that
         makes no sense.
     """
     sensors = {}

@@ -124,7 +124,7 @@ class Plan:
         Raises
         ------
         InputError
-            If there is no room for so many.
+            If so many do not fit.
         """
         require(count >= 0, f"world: the number of objects must be zero or more, got {count}")
         least, most = np.array(low, float), np.array(high, float)

@@ -135,7 +135,7 @@ def rasterized(world: World, resolution_m: float, z_m: float) -> OccupancyGrid:
     Raises
     ------
     InputError
-        If there is no wall at that height, or nothing to reach, or there are too many cells.
+        If no wall stands at that height, nothing can be reached, or there are too many cells.
     """
     require(
         math.isfinite(resolution_m) and resolution_m > 0.0,
