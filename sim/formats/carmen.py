@@ -53,7 +53,7 @@ class CarmenLog:
         The scanner; its mounting is that of the poses of laser and robot in the log.
     edges
         (M - 1, 3) motion from each scan's vertex to the next by the log's EDGE2 lines, NaN where
-        there is none; (0, 3) if the log is no graph.
+        none is known; (0, 3) if the log is not a graph.
     is_graph
         Whether poses are vertices of an optimised graph, not odometry.
     notes
@@ -80,7 +80,7 @@ def read_carmen(source: Path | Words) -> CarmenLog:
     Raises
     ------
     InputError
-        Naming the file and the line that is not as it should be, or that there are no scans.
+        Naming the file and the line that is not as it should be, or that scans are missing.
     """
     words = read_words(source)
     notes: assemble.Notes = {}
@@ -241,7 +241,7 @@ def write_carmen(path: Path, recording: Recording) -> None:
     """
     require(
         "laser" in recording.logs,
-        f"{path}: a CARMEN log is of a laser, and this recording has none",
+        f"{path}: a CARMEN log needs a laser, and this recording has none",
     )
     laser, log = recording.sensor("laser", Laser), recording.log("laser")
     poses = assemble.rolled(recording.wheels, recording.robot.track_m)

@@ -164,7 +164,7 @@ class Words:
         Raises
         ------
         InputError
-            Naming the first line that has too few words, or a word that is no number.
+            Naming the first line that has too few words, or a word that is not a number.
         """
         begin = self.first[lines] + column
         self.refuse(begin + n_columns > self.first[lines + 1], lines, f"too few words for {what}")
@@ -267,7 +267,7 @@ def json_number(value: Any) -> float:
         If it is none, or not finite, or larger than a log has reason to hold.
     """
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise TypeError(f"{str(value)[:40]!r} is no number")
+        raise TypeError(f"{str(value)[:40]!r} is not a number")
     number = float(value)
     if not abs(number) < LARGEST:
         raise ValueError(f"numbers must be finite, below {LARGEST:g}")

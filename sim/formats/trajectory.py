@@ -39,7 +39,7 @@ def read_track(path: Path, topic: str | None = None) -> Track:
     if path.is_dir() or path.suffix in _BAGS or read_head(path).startswith(_MAGIC):
         track = _of_bag(path, topic)
     else:
-        require(topic is None, f"{path}: a topic is of a bag, and this is not one")
+        require(topic is None, f"{path}: only a bag has topics, and this is not one")
         stamps, means, heights_m, tilts_rad = read_spatial_tum(path)
         require(len(stamps), f"{path}: holds no pose")
         track = Track(

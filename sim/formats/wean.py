@@ -59,7 +59,7 @@ def read_wean(
     track_m: float = NOMINAL_TRACK_M,
     wheel_radius_m: float = NOMINAL_RADIUS_M,
 ) -> Recording:
-    """A Recording of a log; there is no truth.
+    """A Recording of a log, without truth.
 
     Raises
     ------
