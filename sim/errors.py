@@ -56,6 +56,15 @@ def blaming(where: str) -> Iterator[None]:
         raise InputError(f"{where} raised {type(error).__name__}: {reason} ({place})") from error
 
 
+@contextmanager
+def naming(where: object) -> Iterator[None]:
+    """Put a place, such as a file, before the message of an InputError."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from error
+
+
 def required(value: T | None, complaint: str) -> T:
     """Return the value.
 

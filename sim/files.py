@@ -11,13 +11,29 @@ from sim.errors import InputError, require
 
 
 def require_file(path: Path) -> None:
-    """Refuse what is no file: a folder, or a pipe or device, which could be read for ever.
+    """Refuse what is not a file: a folder, or a pipe or device, which could be read without end.
 
     What is not there is left to the reader.
     """
     with suppress(OSError, ValueError):
         mode = path.stat().st_mode
         require(stat.S_ISREG(mode), f"{path}: not a file; name a file, or remove it")
+
+
+def read_head(path: Path) -> bytes:
+    """First 512 bytes of a file.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read.
+    """
+    require_file(path)
+    try:
+        with path.open("rb") as file:
+            return file.read(512)
+    except OSError as error:
+        raise InputError(f"{path}: cannot read ({error.strerror})") from error
 
 
 @contextmanager

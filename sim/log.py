@@ -5,13 +5,11 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sim.arrays import Array
-from sim.errors import InputError, required
+from sim.arrays import Array, Ints, Values
+from sim.errors import InputError, require, required
 from sim.sensors.base import Reading, Schema, Sensor, parted
 
 
@@ -46,17 +44,17 @@ class Log:
 
     schema: Schema
     stamps: Array
-    values: Mapping[str, NDArray[Any]]
-    splits: NDArray[np.int64] | None = None
+    values: Mapping[str, Values]
+    splits: Ints | None = None
 
     @classmethod
     def of(
         cls,
         sensor: Sensor,
         stamps: Array,
-        splits: NDArray[np.int64] | None = None,
+        splits: Ints | None = None,
         /,
-        **values: NDArray[Any],
+        **values: Values,
     ) -> Log:
         """Log of a sensor's readings, with the types of its schema.
 
@@ -74,16 +72,16 @@ class Log:
         log.check(type(sensor).__name__)
         return log
 
-    def __getitem__(self, name: str) -> NDArray[Any]:
+    def __getitem__(self, name: str) -> Values:
         """All values of a field."""
         return self.values[name]
 
     @property
-    def known_splits(self) -> NDArray[np.int64]:
+    def known_splits(self) -> Ints:
         """The splits; InputError if no field is ragged."""
         return required(self.splits, "a log without ragged fields has no splits")
 
-    def taken(self, rows: NDArray[np.int64], stamps: Array) -> Log:
+    def taken(self, rows: Ints, stamps: Array) -> Log:
         """Log of these readings, at other stamps; none of its fields may be ragged."""
         values = {name: array[rows] for name, array in self.values.items()}
         return dataclasses.replace(self, stamps=stamps, values=values)
@@ -105,16 +103,24 @@ class Log:
             Naming the field that does not fit the schema.
         """
         n, splits = len(self.stamps), self.splits
-        if self.stamps.shape != (n,) or self.stamps.dtype != np.float64:
-            raise InputError(f"{where}.stamps must be float64 of shape (N,)")
-        if any(field.ragged for field in self.schema.values()) != (splits is not None):
-            raise InputError(f"{where}.splits must be there if a field is ragged, and only then")
+        require(
+            self.stamps.shape == (n,) and self.stamps.dtype == np.float64,
+            f"{where}.stamps must be float64 of shape (N,)",
+        )
+        require(
+            any(f.ragged for f in self.schema.values()) == (splits is not None),
+            f"{where}.splits must be there if a field is ragged, and only then",
+        )
         n_rows = 0
         if splits is not None:
-            if splits.shape != (n + 1,) or splits.dtype != np.int64:
-                raise InputError(f"{where}.splits must be int64 of shape ({n + 1},)")
-            if splits[0] != 0 or (np.diff(splits) < 0).any():
-                raise InputError(f"{where}.splits must begin at 0 and not decrease")
+            require(
+                splits.shape == (n + 1,) and splits.dtype == np.int64,
+                f"{where}.splits must be int64 of shape ({n + 1},)",
+            )
+            require(
+                splits[0] == 0 and not (np.diff(splits) < 0).any(),
+                f"{where}.splits must begin at 0 and not decrease",
+            )
             n_rows = int(splits[-1])
         for name, kind in self.schema.items():
             kind.check(self.values[name], n_rows if kind.ragged else n, f"{where}.{name}")
@@ -139,11 +145,11 @@ def joined(schema: Schema, stamps: Array, readings: Sequence[Reading], where: st
         sizes = [len(reading[first]) for reading in readings]
         for name in others:
             for size, reading in zip(sizes, readings, strict=True):
-                if len(reading[name]) != size:
-                    raise InputError(
-                        f"{where}.{name} has {len(reading[name])} rows in a reading, "
-                        f"{where}.{first} {size}; they must be as many"
-                    )
+                require(
+                    len(reading[name]) == size,
+                    f"{where}.{name} has {len(reading[name])} rows in a reading, "
+                    f"{where}.{first} {size}; they must be as many",
+                )
         splits = np.cumsum([0, *sizes]).astype(np.int64)
     log = Log(schema, stamps, values, splits)
     log.check(where)

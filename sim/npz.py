@@ -1,17 +1,15 @@
 """Arrays of an `.npz` file that may come from anywhere: no pickles, sizes checked beforehand."""
 
-from __future__ import annotations
-
 import tokenize
 import zipfile
 import zlib
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
 from numpy.lib import format as npy
-from numpy.typing import NDArray
 
+from sim.arrays import Values
 from sim.errors import InputError, require
 from sim.files import require_file
 
@@ -34,13 +32,13 @@ UNREADABLE = (
 )
 
 
-def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
+def read_arrays(path: Path) -> dict[str, Values]:
     """Read all arrays of a file, by name.
 
     Raises
     ------
     InputError
-        If it is no file of arrays, damaged, or promises more than it could hold.
+        If it is not a file of arrays, is damaged, or promises more than it could hold.
     """
     require_file(path)
     try:
@@ -48,7 +46,7 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
             members = archive.infolist()
             size, most = sum(m.file_size for m in members), max(MOST_BYTES, path.stat().st_size)
             require(size <= most, f"{path}: unpacks to {size} bytes; {most} are the most")
-            arrays: dict[str, NDArray[Any]] = {}
+            arrays: dict[str, Values] = {}
             for member in members:
                 name = member.filename.removesuffix(".npy")
                 require(name not in arrays, f"{path}: holds the array {name} twice")
@@ -59,7 +57,7 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
         raise InputError(f"{path}: truncated or no file of arrays ({error})") from error
 
 
-def _array(file: BinaryIO, n_bytes: int) -> NDArray[Any]:
+def _array(file: BinaryIO, n_bytes: int) -> Values:
     """Read one array, which its header must not promise to be longer than the member is."""
     version = npy.read_magic(file)
     read_header = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}

@@ -14,8 +14,6 @@ Options that several methods share stand in a class that theirs inherit. `build`
 or a plain dataclass, from a mapping of a configuration.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import importlib

@@ -18,9 +18,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sim.arrays import Array
+from sim.arrays import Array, Ints, Values
 from sim.errors import InputError, require, required
 from sim.files import write_whole
 from sim.log import CommandLog, Log, WheelLog, joined
@@ -42,10 +41,11 @@ from sim.worlds.world import World
 
 __all__ = [
     "CommandLog", "Frame", "Log", "Recording", "Truth", "WheelLog", "arrays_of", "assembled",
-    "blamed", "checked_arrays", "described", "digest_of", "joined", "load", "save", "write_arrays",
+    "blamed", "described", "digest_of", "joined", "load", "load_robots", "save", "write_arrays",
 ]  # fmt: skip
 FORMAT_VERSION = 2
 REMEDY = "delete it and record again"
+SEVERAL = "it holds a team; run all of its robots by study=teams, or take one of them by its number"
 S = TypeVar("S")
 
 
@@ -68,7 +68,7 @@ class Truth:
     stamps: Array
     poses: Array
     wheel_travel_m: Array = field(default_factory=lambda: np.zeros((0, 2)))
-    readings: Mapping[str, Mapping[str, NDArray[Any]]] = field(default_factory=dict)
+    readings: Mapping[str, Mapping[str, Values]] = field(default_factory=dict)
     world: World | None = None
 
 
@@ -172,13 +172,12 @@ class Recording:
 
     def without(self, name: str) -> Recording:
         """Return the recording without a sensor, its log, and the truth of its readings."""
-        sensors = {key: sensor for key, sensor in self.sensors.items() if key != name}
-        logs = {key: log for key, log in self.logs.items() if key != name}
         truth = self.truth
         if truth is not None:
-            hidden = {key: values for key, values in truth.readings.items() if key != name}
-            truth = dataclasses.replace(truth, readings=hidden)
-        return dataclasses.replace(self, sensors=sensors, logs=logs, truth=truth)
+            truth = dataclasses.replace(truth, readings=_others(truth.readings, name))
+        return dataclasses.replace(
+            self, sensors=_others(self.sensors, name), logs=_others(self.logs, name), truth=truth
+        )
 
     def frames(self, robot: int = 0) -> Iterator[Frame]:
         """Walk through the Frames in order, as those of the robot of this number.
@@ -219,8 +218,7 @@ class Recording:
             If the recording has no truth.
         """
         poses, times = self.known_truth.poses, self.known_truth.stamps
-        heading = np.unwrap(poses[:, 2])
-        columns = (poses[:, 0], poses[:, 1], heading)
+        columns = (poses[:, 0], poses[:, 1], np.unwrap(poses[:, 2]))
         x, y, angle = (np.interp(stamps, times, c, left=np.nan, right=np.nan) for c in columns)
         found = np.stack([x, y, np.arctan2(np.sin(angle), np.cos(angle))], axis=1)
         after = np.clip(np.searchsorted(times, stamps), 1, max(len(times) - 1, 1))
@@ -259,7 +257,7 @@ def save(recording: Recording, path: Path, *, durable: bool = True) -> str:
 
 
 def write_arrays(
-    path: Path, arrays: dict[str, NDArray[Any]], meta: dict[str, Any], *, durable: bool = True
+    path: Path, arrays: dict[str, Values], meta: dict[str, Any], *, durable: bool = True
 ) -> str:
     """Write arrays and plain values that describe them, whole; return their checksum."""
     checksum = digest_of(arrays, meta)
@@ -275,44 +273,56 @@ def load(path: Path) -> Recording:
     Raises
     ------
     InputError
-        If the file is missing, truncated, altered, or not a recording.
+        If the file is missing, truncated, altered, or not a recording of one robot.
     """
-    if not path.is_file():
-        raise InputError(f"{path}: no such recording; make one with `estima record`")
-    if path.suffix != ".npz" and not zipfile.is_zipfile(path):
-        raise InputError(
-            f"{path}: not a recording; make one of a log with `estima convert {path} -o FILE.npz`"
-        )
-    with blamed(path, REMEDY):
-        stored, meta = checked_arrays(path)
+    robots = load_robots(path)
+    require(len(robots) == 1, f"{path}: {SEVERAL}, from 0 to {len(robots) - 1}")
+    return robots[0]
+
+
+def load_robots(path: Path) -> tuple[Recording, ...]:
+    """Read a file of one robot or of a team, as `load`."""
+    require(path.is_file(), f"{path}: no such recording; make one with `estima record`")
     require(
-        "team" not in meta,
-        f"{path}: it holds a team; run all of its robots by study=teams, or take one by "
-        f"`estima convert {path} --robot 0 -o robot_0.npz`",
+        path.suffix == ".npz" or zipfile.is_zipfile(path),
+        f"{path}: not a recording; make one of a log with `estima convert`",
     )
-    with blamed(path, REMEDY):
-        return assembled(stored, meta)
+    with blamed(path):
+        stored, meta = checked_arrays(path)
+        if "team" not in meta:
+            return (assembled(stored, meta),)
+        parts = meta["team"]
+        require(isinstance(parts, list), "it does not say what its robots are")
+        own = [_below(stored, str(number)) for number in range(len(parts))]
+        others = len(stored) - sum(map(len, own))
+        require(others == 0, f"{others} arrays belong to none of its robots")
+        return tuple(map(assembled, own, parts))
 
 
 @contextmanager
-def blamed(path: Path, remedy: str) -> Iterator[None]:
+def blamed(path: Path) -> Iterator[None]:
     """Turn what a file may be wrong in into one line that names it, and the remedy."""
     try:
         yield
     except KeyError as error:
-        raise InputError(f"{path}: {error.args[0]} is missing; {remedy}") from error
+        raise InputError(f"{path}: {error.args[0]} is missing; {REMEDY}") from error
     except (InputError, *UNREADABLE) as error:
-        raise InputError(f"{path}: {str(error).removeprefix(f'{path}: ')}; {remedy}") from error
+        raise InputError(f"{path}: {str(error).removeprefix(f'{path}: ')}; {REMEDY}") from error
 
 
-def checked_arrays(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+def _below(stored: Mapping[str, Values], prefix: str) -> dict[str, Values]:
+    """Arrays whose names begin with a prefix and a dot, without it."""
+    begin = f"{prefix}."
+    return {k.removeprefix(begin): v for k, v in stored.items() if k.startswith(begin)}
+
+
+def checked_arrays(path: Path) -> tuple[dict[str, Values], dict[str, Any]]:
     """Arrays and plain values of a file, which match its checksum."""
     stored = read_arrays(path)
     require("meta" in stored, "not a recording")
     meta = json.loads(stored.pop("meta").tobytes())
     require(isinstance(meta, dict), "not a recording")
-    checksum = meta.pop("checksum", None)
-    version = meta.get("format")
+    checksum, version = meta.pop("checksum", None), meta.get("format")
     require(
         version == FORMAT_VERSION,
         f"recording format {version}, this version reads {FORMAT_VERSION}",
@@ -321,15 +331,19 @@ def checked_arrays(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]
     return stored, meta
 
 
-def _rows_at(frame_stamps: Array, log: Log) -> NDArray[np.int64]:
+def _others(parts: Mapping[str, S], name: str) -> dict[str, S]:
+    """All but the part of a name."""
+    return {key: part for key, part in parts.items() if key != name}
+
+
+def _rows_at(frame_stamps: Array, log: Log) -> Ints:
     """Row of a sensor's log that each Frame shows, -1 for none; the last of equal stamps wins."""
-    if len(log.stamps) == 0:
-        return np.full(len(frame_stamps), -1)
-    found = np.searchsorted(log.stamps, frame_stamps, side="right") - 1
-    return np.where((found >= 0) & (log.stamps[found] == frame_stamps), found, -1)
+    rows = np.searchsorted(log.stamps, frame_stamps, side="right") - 1
+    shown = np.append(log.stamps, np.nan)[rows] == frame_stamps  # row -1 is the NaN
+    return np.where(shown, rows, -1)
 
 
-def arrays_of(recording: Recording) -> dict[str, NDArray[Any]]:
+def arrays_of(recording: Recording) -> dict[str, Values]:
     """Every array of a recording under the name it is saved by."""
     arrays = {"frame_stamps": recording.frame_stamps}
     parts = {
@@ -376,7 +390,7 @@ def described(recording: Recording) -> dict[str, Any]:
     }
 
 
-def digest_of(arrays: dict[str, NDArray[Any]], meta: dict[str, Any]) -> str:
+def digest_of(arrays: dict[str, Values], meta: dict[str, Any]) -> str:
     """SHA-256 of arrays and plain values that describe them, as hex."""
     digest = hashlib.sha256(json.dumps(meta, sort_keys=True).encode())
     for name in sorted(arrays):
@@ -386,20 +400,17 @@ def digest_of(arrays: dict[str, NDArray[Any]], meta: dict[str, Any]) -> str:
     return digest.hexdigest()
 
 
-def assembled(stored: dict[str, NDArray[Any]], meta: dict[str, Any]) -> Recording:
+def assembled(stored: dict[str, Values], meta: dict[str, Any]) -> Recording:
     """Recording of its arrays and plain values, checked."""
 
-    def part(prefix: str) -> dict[str, NDArray[Any]]:
+    def part(prefix: str) -> dict[str, Values]:
         """Arrays directly under a name."""
-        below = {
-            k.removeprefix(f"{prefix}."): v for k, v in stored.items() if k.startswith(f"{prefix}.")
-        }
-        return {name: values for name, values in below.items() if "." not in name}
+        return {name: v for name, v in _below(stored, prefix).items() if "." not in name}
 
     logs, hidden = {}, {}
     schemas = {name: schema_from_meta(fields) for name, fields in meta["schemas"].items()}
-    if unknown := set(schemas) - set(meta["sensors"]):
-        raise InputError(f"readings of sensors that it does not describe: {sorted(unknown)}")
+    unknown = sorted(set(schemas) - set(meta["sensors"]))
+    require(not unknown, f"readings of sensors that it does not describe: {unknown}")
     for name, schema in schemas.items():
         seen, hidden_fields = parted(schema)
         where = f"logs.{name}"
@@ -440,7 +451,7 @@ def assembled(stored: dict[str, NDArray[Any]], meta: dict[str, Any]) -> Recordin
         config=meta["config"],
         status=meta["status"],
     )
-    if unknown := set(stored) - set(arrays_of(recording)):
-        raise InputError(f"arrays that nothing describes: {', '.join(sorted(unknown))}")
+    unknown = sorted(set(stored) - set(arrays_of(recording)))
+    require(not unknown, f"arrays that nothing describes: {', '.join(unknown)}")
     check_recording(recording)
     return recording

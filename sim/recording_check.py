@@ -1,14 +1,12 @@
 """What a recording from a file must hold, whoever wrote it. Its logs check themselves."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sim.errors import require
+from sim.arrays import Values
+from sim.errors import InputError, require
 from sim.sensors.base import RecordedSensor, parted
 
 LARGEST = 1e12  # s, m: nothing that is recorded is beyond
@@ -57,9 +55,11 @@ def _check_texts(recording: Any) -> None:
     slip = robot if isinstance(robot, dict) else {}  # of a log of many robots, the number of one
     for key in ("kr", "kl"):
         value = slip.get(key, 0.0)
-        number = isinstance(value, (int, float)) and not isinstance(value, bool)
         require(
-            number and math.isfinite(value), f"config.robot.{key} must be a number, got {value!r}"
+            isinstance(value, (int, float))
+            and not isinstance(value, bool)
+            and math.isfinite(value),
+            f"config.robot.{key} must be a number, got {value!r}",
         )
     notes = config.get("notes", {})
     require(isinstance(notes, dict), f"config.notes must hold keys, got {notes!r}")
@@ -68,27 +68,22 @@ def _check_texts(recording: Any) -> None:
         require(isinstance(name, str), f"the world's name must be a text, got {name!r}")
 
 
-def _check_stamps(
-    stamps: NDArray[Any], where: str, *, strictly: bool = False, least: int = 1
-) -> None:
+def _check_stamps(stamps: Values, where: str, *, strictly: bool = False, least: int = 1) -> None:
     _check_numbers(stamps, (len(stamps),) if stamps.ndim == 1 else (0,), where)
     require(len(stamps) >= least, f"{where} is empty")
     steps = np.diff(stamps)
-    late = np.flatnonzero(steps <= 0.0 if strictly else steps < 0.0)
-    if len(late):
-        i = int(late[0]) + 1
-        wanted = "increase" if strictly else "not decrease"
-        require(False, f"{where} must {wanted}; {i} is {stamps[i]} after {stamps[i - 1]}")
+    wanted = "increase" if strictly else "not decrease"
+    for i in np.flatnonzero(steps <= 0.0 if strictly else steps < 0.0)[:1]:
+        raise InputError(f"{where} must {wanted}; {i + 1} is {stamps[i + 1]} after {stamps[i]}")
 
 
-def _check_numbers(values: NDArray[Any], shape: tuple[int, ...], where: str) -> None:
+def _check_numbers(values: Values, shape: tuple[int, ...], where: str) -> None:
     require(values.shape == shape, f"{where} must have shape {shape}, got {values.shape}")
     require(values.dtype == np.float64, f"{where} must be f8, got {values.dtype}")
-    sound = np.abs(values) <= LARGEST  # NaN is not
-    if not sound.all():
-        place = tuple(int(i) for i in np.argwhere(~sound)[0])
-        found = f"{where}{list(place)} must be a number below {LARGEST:g}, got {values[place]}"
-        require(False, found)
+    for place in np.argwhere(~(np.abs(values) <= LARGEST))[:1].tolist():  # NaN is not below
+        raise InputError(
+            f"{where}{place} must be a number below {LARGEST:g}, got {values[tuple(place)]}"
+        )
 
 
 def _said(schema: Any) -> str:

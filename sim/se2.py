@@ -5,9 +5,8 @@ All functions broadcast over leading axes.
 """
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from sim.arrays import Array
+from sim.arrays import Array, ArrayLike
 
 _SMALL_ANGLE_RAD = 1e-4  # below it the series are exact to the last bit
 

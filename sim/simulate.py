@@ -4,8 +4,6 @@ Time runs in ticks of 1/300 s. At each tick the wheels are driven, slip, and are
 sensor fires at its own multiple of the tick. The robots of a team advance together, tick by tick.
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import itertools
@@ -16,10 +14,9 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sim import se2
-from sim.arrays import Array
+from sim.arrays import Array, Values
 from sim.errors import require
 from sim.recording import CommandLog, Log, Recording, Truth, WheelLog, joined
 from sim.robot.base import TICK_S, TICKS_PER_S, Robot
@@ -337,7 +334,7 @@ def _assemble(world: World, member: Member, logs: _Logs, status: str) -> Recordi
 
 def _log(
     name: str, sensor: Sensor, stamps: Array, readings: list[Reading]
-) -> tuple[Log, dict[str, NDArray[Any]]]:
+) -> tuple[Log, dict[str, Values]]:
     """Log of a sensor, and what its schema marks as truth."""
     schema = sensor.schema
     log = joined(schema, stamps, readings, f"sensors.{name}")

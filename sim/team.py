@@ -3,31 +3,27 @@
 from __future__ import annotations
 
 import dataclasses
-import zipfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sim.arrays import Array
+from sim.arrays import Array, Values
 from sim.errors import require
 from sim.recording import (
     FORMAT_VERSION,
-    REMEDY,
+    SEVERAL,
     Frame,
     Recording,
     arrays_of,
-    assembled,
     blamed,
-    checked_arrays,
     described,
     digest_of,
+    load_robots,
     write_arrays,
 )
-from sim.recording import load as load_recording
 from sim.sensors import RobotCamera
 
 MOST_ROBOTS = 100
@@ -81,11 +77,7 @@ class Team:
     @property
     def only(self) -> Recording:
         """The recording of a team of one; InputError if there are several robots."""
-        require(
-            len(self) == 1,
-            "it holds a team; run all of its robots by study=teams, or take one by --robot, as "
-            "`estima convert FILE.npz --robot 0 -o robot_0.npz` does",
-        )
+        require(len(self) == 1, f"{SEVERAL}, from 0 to {len(self) - 1}")
         return self.robots[0]
 
     def __len__(self) -> int:
@@ -139,7 +131,7 @@ def save(team: Team, path: Path) -> str:
     return write_arrays(path, *_parts(team))
 
 
-def _parts(team: Team) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+def _parts(team: Team) -> tuple[dict[str, Values], dict[str, Any]]:
     """Every array of a team under the name it is saved by, and plain values."""
     if len(team) == 1:
         return arrays_of(team.robots[0]), described(team.robots[0])
@@ -151,15 +143,6 @@ def _parts(team: Team) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     return arrays, {"format": FORMAT_VERSION, "team": [described(robot) for robot in team.robots]}
 
 
-def is_team(path: Path) -> bool:
-    """Whether a file is a team's, by the names of its arrays."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return "0.frame_stamps.npy" in archive.namelist()
-    except (OSError, zipfile.BadZipFile):
-        return False
-
-
 def load(path: Path) -> Team:
     """Read a team, or a recording as a team of one, and check it against its checksum.
 
@@ -168,23 +151,9 @@ def load(path: Path) -> Team:
     InputError
         If the file is missing, altered, or not a recording.
     """
-    if not is_team(path):
-        return Team((load_recording(path),))
-    with blamed(path, REMEDY):
-        stored, meta = checked_arrays(path)
-        parts = meta["team"]
-        require(isinstance(parts, list), "it does not say what its robots are")
-        own = [
-            {
-                name.removeprefix(f"{number}."): values
-                for name, values in stored.items()
-                if name.startswith(f"{number}.")
-            }
-            for number in range(len(parts))
-        ]
-        others = len(stored) - sum(map(len, own))
-        require(others == 0, f"{others} arrays are of no robot of its team")
-        return Team(tuple(map(assembled, own, parts)))
+    robots = load_robots(path)
+    with blamed(path):
+        return Team(robots)
 
 
 def _among(recording: Recording, size: int) -> Recording:

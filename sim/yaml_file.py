@@ -1,7 +1,6 @@
 """YAML files that may come from anywhere: read within bounds, and no key twice."""
 
-from __future__ import annotations
-
+import math
 from pathlib import Path
 from typing import Any
 
@@ -53,16 +52,40 @@ def read_yaml(path: Path, most_bytes: int = MOST_BYTES) -> Any:
             loader.dispose()
 
 
+def number(value: Any, where: str) -> float:
+    """Return a finite number; YAML 1.1 reads 1e-3, without a point, as text.
+
+    Raises
+    ------
+    InputError
+        If it is not one.
+    """
+    try:
+        found = math.nan if isinstance(value, bool) else float(value)
+    except (TypeError, ValueError, OverflowError):
+        found = math.nan
+    require(math.isfinite(found), f"{where} must be a finite number, got {shown(value)}")
+    return found
+
+
+def shown(value: Any) -> str:
+    """A value for a message; of lists and mappings, which YAML can make endless, their size."""
+    if isinstance(value, (list, dict)):
+        return f"a {type(value).__name__} of {len(value)}"
+    return repr(value)[:80]
+
+
 def _check(root: yaml.Node, path: Path) -> None:
     """Walk through a document as its aliases unfold it, and refuse what is out of bounds."""
-    left, seen = _MOST_NODES, 0
-    nodes = [(root, 0)]
+    seen, nodes = 0, [(root, 0)]
     while nodes:
         node, depth = nodes.pop()
         seen += 1
         line = f"{path}:{node.start_mark.line + 1}"
         require(depth <= _MOST_DEPTH, f"{line}: nested more than {_MOST_DEPTH} deep")
-        require(seen <= left, f"{line}: its aliases (*) stand for more than {left} values")
+        require(
+            seen <= _MOST_NODES, f"{line}: its aliases (*) stand for more than {_MOST_NODES} values"
+        )
         if isinstance(node, yaml.MappingNode):
             keys = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
             if len(set(keys)) < len(keys):

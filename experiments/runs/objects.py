@@ -76,7 +76,8 @@ class Objects:
     def world(self) -> World:
         """Make the world, from its own stream."""
         rng = stream(self.config["world_seed"], "world", key="world_seed")
-        world: World = make(self.config["world"], "world", rng=rng)
+        made = make(self.config["world"], "world", rng=rng)
+        world: World = made if isinstance(made, World) else made.build(rng)
         return world
 
     def robot(self) -> Any:

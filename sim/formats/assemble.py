@@ -12,19 +12,22 @@ The rules for all readers:
   not drawn into one arc.
 """
 
+import dataclasses
+import math
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sim import se2
-from sim.arrays import Array
+from sim.arrays import Array, Floats, Ints
 from sim.errors import InputError, require
-from sim.recording import WheelLog
+from sim.recording import Log, Recording, Truth, WheelLog
 from sim.robot.arc import arc_increment
+from sim.robot.drive import RobotGeometry
+from sim.sensors import Encoder, Laser, Mount
 
-Rows = NDArray[np.int64]
+Rows = Ints
 Notes = dict[str, Any]
 
 LONGEST_HOLD_S = 1.5
@@ -47,11 +50,10 @@ def in_order(stamps: Array, name: str, notes: Notes) -> Rows:
     rows: Rows = np.argsort(stamps, kind="stable").astype(np.int64)
     ordered = stamps[rows]
     last_of_equal = np.append(ordered[1:] > ordered[:-1], True)[: len(rows)]
-    counts = {
-        "backward": int(np.sum(np.diff(stamps) < 0.0)),
-        "repeated": int(len(rows) - np.sum(last_of_equal)),
-    }
-    notes.update({f"{name}_{what}": count for what, count in counts.items() if count})
+    if backward := int(np.sum(np.diff(stamps) < 0.0)):
+        notes[f"{name}_backward"] = backward
+    if repeated := int(np.sum(~last_of_equal)):
+        notes[f"{name}_repeated"] = repeated
     rows = rows[last_of_equal]
     if len(rows) > 1:
         notes[f"{name}_longest_gap_s"] = round(float(np.max(np.diff(stamps[rows]))), 6)
@@ -97,9 +99,8 @@ def wheels_from_poses(stamps: Array, poses: Array, track_m: float, notes: Notes)
     backwards = x < 0.0
     towards = np.arctan2(np.where(backwards, -y, y), np.abs(x))
     drive = np.where(backwards, -1.0, 1.0) * np.hypot(x, y)
-    none = np.zeros_like(drive)
-    forward[in_legs] = np.stack([none, drive, none], axis=1)
-    turn[in_legs] = np.stack([towards, none, se2.wrap(heading - towards)], axis=1)
+    forward[in_legs, :] = drive[:, None] * [0.0, 1.0, 0.0]
+    turn[in_legs] = np.stack([towards, 0.0 * drive, se2.wrap(heading - towards)], axis=1)
     kept = np.ones((len(motion), 3), bool)
     kept[~in_legs, :2] = False  # an arc needs no stamps between
     thirds = np.stack([forward + turn * track_m / 2.0, forward - turn * track_m / 2.0], axis=-1)
@@ -167,6 +168,46 @@ def frame_stamps(
     last_in_cell = np.append((np.diff(cells) != 0.0) | (np.diff(after) != 0), True)
     filler = wheel_stamps[last_in_cell & (room > longest_s)]
     return np.unique(np.concatenate([seen, filler]))
+
+
+def scanner(
+    rate_hz: float, n_beams: int, step_rad: float, max_range_m: float, mount: Mount
+) -> Laser:
+    """A planar laser; the yaw of its mount is that of the middle between its beams, rad."""
+    return Laser(
+        rate_hz=rate_hz,
+        n_beams=n_beams,
+        fov_rad=min(max(step_rad * (n_beams - 1), 1e-9), 2.0 * math.pi),
+        max_range_m=max_range_m,
+        mount=dataclasses.replace(mount, yaw_rad=math.remainder(mount.yaw_rad, 2.0 * math.pi)),
+    )
+
+
+def seen_ranges(raw_m: Array, max_range_m: float) -> Floats:
+    """Ranges with +inf where nothing was seen: at the maximum or beyond, zero, or no number."""
+    return np.where((raw_m > 0.0) & (raw_m < max_range_m), raw_m, np.inf).astype(np.float32)
+
+
+def scan_recording(
+    wheels: WheelLog,
+    scan_stamps: Array,
+    ranges_m: Array,
+    laser: Laser,
+    truth: Truth | None,
+    robot: RobotGeometry,
+    config: Notes,
+) -> Recording:
+    """A Recording of wheels and one laser; of its ranges, `seen_ranges` are kept."""
+    ranges = seen_ranges(ranges_m, laser.max_range_m)
+    return Recording(
+        frame_stamps=frame_stamps(wheels.stamps, [scan_stamps]),
+        wheels=wheels,
+        robot=robot,
+        sensors={"encoder": Encoder(rate_hz=None), "laser": laser},
+        logs={"laser": Log.of(laser, scan_stamps.copy(), ranges_m=ranges)},
+        truth=truth,
+        config=config,
+    )
 
 
 def require_readings(count: int, least: int, where: str, what: str) -> None:

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sim import se2
 from sim.arrays import Array
@@ -26,16 +25,16 @@ from sim.errors import require
 from sim.files import write_text
 from sim.formats import assemble
 from sim.formats.text import Rows, Words, read_words
-from sim.recording import Log, Recording, Truth, WheelLog
+from sim.recording import Recording, Truth
 from sim.robot.drive import RobotGeometry
-from sim.sensors import Encoder, Laser, Mount
+from sim.sensors import Laser, Mount
 
 Poses = Literal["odometry", "reference"]
 
 _ODOM, _FLASER, _ROBOTLASER = "ODOM", "FLASER", "ROBOTLASER1"
 _FLASER_MAX_RANGE_M = 80.0
 _MOST_BEAMS = 100_000
-NOMINAL_TRACK_M, NOMINAL_RADIUS_M = 0.33, 0.0975  # a Pioneer 2, which most of these logs are of
+NOMINAL_TRACK_M, NOMINAL_RADIUS_M = 0.33, 0.0975  # of a Pioneer 2, as in most of these logs
 
 
 @dataclass(frozen=True)
@@ -49,14 +48,12 @@ class CarmenLog:
     scan_stamps, scan_poses
         (M,) s and (M, 3) poses of the robot (not of the laser) with the scans.
     ranges_m
-        (M, n) float32, +inf where nothing was seen.
-    start_angle_rad, resolution_rad, max_range_m
-        Geometry of the scans.
-    T_base_laser
-        (3,) mounting, by the poses of laser and robot in the log.
+        (M, n) m, as logged.
+    laser
+        The scanner; its mounting is that of the poses of laser and robot in the log.
     edges
         (M - 1, 3) motion from each scan's vertex to the next by the log's EDGE2 lines, NaN where
-        there is none; (0, 3) if the log is no graph.
+        none is known; (0, 3) if the log is not a graph.
     is_graph
         Whether poses are vertices of an optimised graph, not odometry.
     notes
@@ -69,45 +66,23 @@ class CarmenLog:
     odometry_poses: Array
     scan_stamps: Array
     scan_poses: Array
-    ranges_m: NDArray[np.float32]
-    start_angle_rad: float
-    resolution_rad: float
-    max_range_m: float
-    T_base_laser: Array
+    ranges_m: Array
+    laser: Laser
     edges: Array = field(default_factory=lambda: np.zeros((0, 3)))
     is_graph: bool = False
     notes: assemble.Notes = field(default_factory=dict)
     where: str = "CARMEN log"
 
-    @property
-    def laser(self) -> Laser:
-        """The scanner as a sensor."""
-        n_beams = self.ranges_m.shape[1]
-        fov = max(self.resolution_rad * (n_beams - 1), 1e-9)
-        middle = self.start_angle_rad + fov / 2.0
-        x, y, yaw = (float(v) for v in self.T_base_laser)
-        return Laser(
-            rate_hz=assemble.rate_hz(self.scan_stamps),
-            n_beams=n_beams,
-            fov_rad=min(fov, 2.0 * math.pi),
-            max_range_m=self.max_range_m,
-            mount=Mount(x_m=x, y_m=y, yaw_rad=float(se2.wrap(yaw + middle))),
-        )
 
-
-def read_carmen(path: Path) -> CarmenLog:
+def read_carmen(source: Path | Words) -> CarmenLog:
     """Read a log, plain or packed.
 
     Raises
     ------
     InputError
-        Naming the file and the line that is not as it should be, or that there are no scans.
+        Naming the file and the line that is not as it should be, or that scans are missing.
     """
-    return parse_carmen(read_words(path))
-
-
-def parse_carmen(words: Words) -> CarmenLog:
-    """The log in a file's words."""
+    words = read_words(source)
     notes: assemble.Notes = {}
     odometry = words.finite(words.lines_of(_ODOM), 1, 7, "ODOM")
     assemble.require_clock(odometry[:, 6], words.where, "ODOM lines")
@@ -125,34 +100,35 @@ def parse_carmen(words: Words) -> CarmenLog:
     if np.any(counts != n_beams):
         notes["scans_of_other_size"] = int(np.sum(counts != n_beams))
         lines = lines[counts == n_beams]
-    raw = words.numbers(lines, count_column + 1, n_beams, "ranges")
+    ranges = words.numbers(lines, count_column + 1, n_beams, "ranges")
     after = count_column + 1 + n_beams
     if count_column == 8:
         remissions = words.whole(lines, after, "the number of remissions", 0, _MOST_BEAMS)
-        first = np.asarray(after + 1 + remissions, np.int64)
-        tail = words.finite(lines, first, 12, "poses and stamp of ROBOTLASER1")
-        stamps, laser_poses, poses = tail[:, 11], tail[:, :3], tail[:, 3:6]
-        geometry = words.finite(lines[:1], 2, 4, "geometry of ROBOTLASER1")[0]
-        start_angle, resolution, max_range = geometry[0], geometry[2], geometry[3]
-        if not (0.0 < resolution * n_beams < 2.1 * math.pi and 0.0 < max_range <= 1e4):
+        tail = words.finite(lines, after + 1 + remissions, 12, "poses and stamp of ROBOTLASER1")
+        start, _, step, max_range = words.finite(lines[:1], 2, 4, "geometry of ROBOTLASER1")[0]
+        if not (0.0 < step * n_beams < 2.1 * math.pi and 0.0 < max_range <= 1e4):
             raise words.error(int(lines[0]), "impossible resolution or maximum range")
     else:
         tail = words.finite(lines, after, 7, "poses and stamp of FLASER")
-        stamps, laser_poses, poses = tail[:, 6], tail[:, :3], tail[:, 3:6]
-        start_angle, max_range = -math.pi / 2.0, _FLASER_MAX_RANGE_M
-        resolution = half_turn_step_rad(n_beams)
+        start, step, max_range = -math.pi / 2.0, half_turn_step_rad(n_beams), _FLASER_MAX_RANGE_M
+    stamps, laser_poses, poses = tail[:, -1], tail[:, :3], tail[:, 3:6]
     assemble.require_clock(stamps, words.where, "scans")
     rows = assemble.in_order(stamps, "scans", notes)
+    x, y, yaw = _mount(poses, laser_poses)
+    middle = float(start) + max(float(step) * (n_beams - 1), 1e-9) / 2.0
     return CarmenLog(
         odometry_stamps=odometry[:, 6].copy(),
         odometry_poses=odometry[:, :3].copy(),
         scan_stamps=stamps[rows],
         scan_poses=poses[rows],
-        ranges_m=seen_ranges(raw[rows], float(max_range)),
-        start_angle_rad=float(start_angle),
-        resolution_rad=float(resolution),
-        max_range_m=float(max_range),
-        T_base_laser=_mount(poses, laser_poses),
+        ranges_m=ranges[rows],
+        laser=assemble.scanner(
+            assemble.rate_hz(stamps[rows]),
+            n_beams,
+            float(step),
+            float(max_range),
+            Mount(x_m=x, y_m=y, yaw_rad=float(se2.wrap(yaw + middle))),
+        ),
         edges=_edges(words, lines[rows]),
         is_graph=bool(len(words.lines_of("VERTEX2"))),
         notes=notes,
@@ -199,43 +175,15 @@ def to_recording(
         wheels = assemble.wheels_from_poses(log.scan_stamps.copy(), chain, track_m, notes)
         notes["wheels_from"] = "edges of the graph" if len(log.edges) else "nothing"
         truth = Truth(log.scan_stamps.copy(), log.scan_poses.copy())
-    return scan_recording(
+    return assemble.scan_recording(
         wheels,
         log.scan_stamps,
         log.ranges_m,
         log.laser,
         truth,
-        track_m,
-        wheel_radius_m,
+        RobotGeometry(wheel_radius_m, track_m),
         {"source": "carmen", "notes": notes},
     )
-
-
-def scan_recording(
-    wheels: WheelLog,
-    scan_stamps: Array,
-    ranges_m: NDArray[np.float32],
-    laser: Laser,
-    truth: Truth | None,
-    track_m: float,
-    wheel_radius_m: float,
-    config: assemble.Notes,
-) -> Recording:
-    """A Recording of wheels and one laser."""
-    return Recording(
-        frame_stamps=assemble.frame_stamps(wheels.stamps, [scan_stamps]),
-        wheels=wheels,
-        robot=RobotGeometry(wheel_radius_m, track_m),
-        sensors={"encoder": Encoder(rate_hz=None), "laser": laser},
-        logs={"laser": Log.of(laser, scan_stamps.copy(), ranges_m=ranges_m.copy())},
-        truth=truth,
-        config=config,
-    )
-
-
-def seen_ranges(raw_m: Array, max_range_m: float) -> NDArray[np.float32]:
-    """Ranges with +inf where nothing was seen: at the maximum or beyond, zero, or no number."""
-    return np.where((raw_m > 0.0) & (raw_m < max_range_m), raw_m, np.inf).astype(np.float32)
 
 
 def half_turn_step_rad(n_beams: int) -> float:
@@ -246,12 +194,12 @@ def half_turn_step_rad(n_beams: int) -> float:
     return math.pi / (n_beams - n_beams % 2) if n_beams > 1 else math.pi
 
 
-def _mount(poses: Array, laser_poses: Array) -> Array:
+def _mount(poses: Array, laser_poses: Array) -> list[float]:
     """Pose of the laser on the robot: the median over the log."""
     mounts = se2.between(poses, laser_poses)
     first = mounts[0, 2]
-    offset = np.median(se2.wrap(mounts[:, 2] - first))
-    return np.array([*np.median(mounts[:, :2], axis=0), float(se2.wrap(first + offset))])
+    yaw = se2.wrap(first + np.median(se2.wrap(mounts[:, 2] - first)))
+    return [*np.median(mounts[:, :2], axis=0).tolist(), float(yaw)]
 
 
 def _edges(words: Words, scan_lines: Rows) -> Array:
@@ -268,8 +216,7 @@ def _edges(words: Words, scan_lines: Rows) -> Array:
     ids = words.finite(vertices, 1, 1, "VERTEX2")[:, 0]
     values = words.finite(edges, 1, 5, "EDGE2")
     motion = {(row[0], row[1]): row[2:] for row in values[::-1]}  # the first of a pair counts
-    unknown = np.full(3, np.nan)
-    steps = np.array([motion.get(pair, unknown) for pair in pairwise(ids)]).reshape(-1, 3)
+    steps = np.array([motion.get(pair, [np.nan] * 3) for pair in pairwise(ids)]).reshape(-1, 3)
     known = np.isfinite(steps).all(axis=1)
     poses = se2.chain(np.where(known[:, None], steps, 0.0))
     gaps = np.concatenate([[0], np.cumsum(~known)])
@@ -294,7 +241,7 @@ def write_carmen(path: Path, recording: Recording) -> None:
     """
     require(
         "laser" in recording.logs,
-        f"{path}: a CARMEN log is of a laser, and this recording has none",
+        f"{path}: a CARMEN log needs a laser, and this recording has none",
     )
     laser, log = recording.sensor("laser", Laser), recording.log("laser")
     poses = assemble.rolled(recording.wheels, recording.robot.track_m)
@@ -309,9 +256,8 @@ def write_carmen(path: Path, recording: Recording) -> None:
     head += f"{laser.max_range_m:.17g} {laser.sigma_range_m:.17g} 0 {n_beams}"
     for t, scan in zip(log.stamps, log["ranges_m"], strict=True):
         at = [np.interp(t, recording.wheels.stamps, c) for c in (*poses[:, :2].T, heading)]
-        of_laser = se2.compose(np.array(at), laser.mount.pose)
         written = np.where(np.isfinite(scan), scan.astype(np.float64), laser.max_range_m)
         numbers = " ".join(f"{r:.9g}" for r in written)
-        both = " ".join(f"{v:.17g}" for v in (*of_laser, *at))
+        both = " ".join(f"{v:.17g}" for v in (*se2.compose(np.array(at), laser.mount.pose), *at))
         lines.append(f"{head} {numbers} 0 {both} 0 0 0 0 0 {t:.17g} estima {t:.17g}")
     write_text(path, "\n".join(lines) + "\n")

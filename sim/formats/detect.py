@@ -3,8 +3,8 @@
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from sim.errors import InputError, require
-from sim.files import require_file
+from sim.errors import InputError, naming, require
+from sim.files import read_head
 from sim.formats import carmen, khepera
 from sim.formats.intel import read_intel
 from sim.formats.lego import read_lego
@@ -31,12 +31,7 @@ def kind_of(path: Path) -> str:
     """
     if path.is_dir():
         return _kind_of_names([p.name for p in path.iterdir()], path)
-    require_file(path)
-    try:
-        with path.open("rb") as file:
-            head = file.read(512)
-    except OSError as error:
-        raise InputError(f"{path}: cannot read ({error.strerror})") from error
+    head = read_head(path)
     if head[:4] == b"PK\x03\x04":
         return "recording"
     if head[:13] == b"#ROSBAG V2.0\n" or head[:5] == b"\x89MCAP" or head[:15] == b"SQLite format 3":
@@ -48,7 +43,7 @@ def kind_of(path: Path) -> str:
 
 
 def _kind_of_names(names: Sequence[str], path: Path) -> str:
-    if any(name.endswith("_Odometry.dat") or name.endswith("_Odometry.dat.gz") for name in names):
+    if any(name.endswith(("_Odometry.dat", "_Odometry.dat.gz")) for name in names):
         return "mrclam"
     if "metadata.yaml" in names:
         return "rosbag"
@@ -73,11 +68,11 @@ def _kind_of_text(head: bytes, path: Path) -> str:
         return "rawseeds"
     raise InputError(
         f"{path}: not a log of a known format; known: {', '.join(KINDS)} "
-        "(see docs/formats.md); a map's .yaml is drawn by `estima view --map`"
+        "(see docs/formats.md); a map's .yaml is none: it is drawn over a recording"
     )
 
 
-def read_all(paths: Sequence[Path], robot: int | None = None, member: str | None = None) -> Team:
+def read_all(paths: Sequence[Path], robot: int | None = None) -> Team:
     """A Team of what a log holds: of one robot, or of all those of a team's file.
 
     Parameters
@@ -87,8 +82,6 @@ def read_all(paths: Sequence[Path], robot: int | None = None, member: str | None
         Rawseeds (odometry, scans, ground truth); Lego (motors, scans, reference, cylinders).
     robot
         Which robot of an MRCLAM set, by default 1; or of a team's file, from 0 on.
-    member
-        Which file of an archive of Khepera tuples.
 
     Raises
     ------
@@ -101,54 +94,49 @@ def read_all(paths: Sequence[Path], robot: int | None = None, member: str | None
         team = load(first)
         if robot is None or len(team) == 1:
             return team
-        known = 0 <= robot < len(team)
-        require(known, f"{first}: its robots are 0 to {len(team) - 1}, got {robot}")
+        known = range(len(team))
+        require(robot in known, f"{first}: its robots are 0 to {known[-1]}, got {robot}")
         return Team((team.robots[robot],))
-    recording = _read(paths, kind, robot, member)
-    try:
+    if kind == "mrclam":
+        recording = read_mrclam(first, 1 if robot is None else robot)
+    else:
+        recording = _READERS[kind](*paths)
+    with naming(first):
         check_recording(recording)
-    except InputError as error:
-        raise InputError(f"{first}: {error}") from error
     return Team((recording,))
 
 
-def read_any(
-    paths: Sequence[Path], robot: int | None = None, member: str | None = None
-) -> Recording:
+def read_any(paths: Sequence[Path], robot: int | None = None) -> Recording:
     """The recording of one robot, as `read_all` reads it; InputError if there are several."""
-    team = read_all(paths, robot, member)
-    try:
+    team = read_all(paths, robot)
+    with naming(paths[0]):
         return team.only
-    except InputError as error:
-        raise InputError(f"{paths[0]}: {error}") from error
 
 
 def _check_count(paths: Sequence[Path], kind: str) -> None:
     least, most = {"intel": (1, 2), "rawseeds": (2, 3), "lego": (2, 4)}.get(kind, (1, 1))
-    if not least <= len(paths) <= most:
-        wanted = f"{least} to {most} files" if most > 1 else "one file"
-        raise InputError(f"{paths[0]}: a {kind} log is {wanted}, got {len(paths)}")
+    wanted = f"{least} to {most} files" if most > 1 else "one file"
+    require(least <= len(paths) <= most, f"{paths[0]}: a {kind} log is {wanted}, got {len(paths)}")
 
 
-def _read(paths: Sequence[Path], kind: str, robot: int | None, member: str | None) -> Recording:
-    first, rest = paths[0], paths[1:]
-    if kind == "mrclam":
-        return read_mrclam(first, 1 if robot is None else robot)
-    if kind == "carmen":
-        return carmen.to_recording(carmen.read_carmen(first))
-    if kind == "khepera":
-        if member is None and (first.is_dir() or _is_archive(read_bytes(first))):
-            tuples = [name for name in read_members(first) if name.endswith(".tuple")]
-            member = min(tuples, key=lambda name: (len(name), name))
-        return khepera.to_recording(khepera.read_khepera(first, member))
-    readers: dict[str, Callable[..., Recording]] = {
-        "rosbag": read_bag,
-        "intel": read_intel,
-        "lego": read_lego,
-        "rawseeds": read_rawseeds,
-        "wean": read_wean,
-    }
-    return readers[kind](first, *rest)
+def _read_khepera(path: Path) -> Recording:
+    """Recording of a file of tuples, or of the first of an archive or a folder."""
+    member = None
+    if path.is_dir() or _is_archive(read_bytes(path)):
+        tuples = [name for name in read_members(path) if name.endswith(".tuple")]
+        member = min(tuples, key=lambda name: (len(name), name))
+    return khepera.to_recording(khepera.read_khepera(path, member))
+
+
+_READERS: dict[str, Callable[..., Recording]] = {
+    "rosbag": read_bag,
+    "carmen": lambda path: carmen.to_recording(carmen.read_carmen(path)),
+    "intel": read_intel,
+    "khepera": _read_khepera,
+    "lego": read_lego,
+    "rawseeds": read_rawseeds,
+    "wean": read_wean,
+}
 
 
 def _is_archive(data: bytes) -> bool:

@@ -13,15 +13,10 @@ import numpy as np
 from sim.arrays import Array
 from sim.errors import InputError, require
 from sim.formats import assemble
-from sim.formats.carmen import (
-    NOMINAL_RADIUS_M,
-    NOMINAL_TRACK_M,
-    half_turn_step_rad,
-    scan_recording,
-    seen_ranges,
-)
-from sim.formats.text import json_number, read_bytes, read_words
+from sim.formats.carmen import NOMINAL_RADIUS_M, NOMINAL_TRACK_M, half_turn_step_rad
+from sim.formats.text import json_number, read_bytes, read_words, reason_of
 from sim.recording import Recording, Truth
+from sim.robot.drive import RobotGeometry
 from sim.sensors import Laser, Mount
 
 _NO_RETURN_M = 81.83  # what the log writes where nothing was seen
@@ -41,8 +36,9 @@ def parse_intel(data: bytes, where: str) -> tuple[Array, Array, Array]:
     except json.JSONDecodeError as error:
         raise InputError(f"{where}:{error.lineno}: not JSON ({error.msg})") from None
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        reason = f"{type(error).__name__}: {error}"[:120]
-        raise InputError(f'{where}:1: no {{"map": {{stamp: scan}}}} in it ({reason})') from None
+        raise InputError(
+            f'{where}:1: no {{"map": {{stamp: scan}}}} in it ({reason_of(error)})'
+        ) from None
     stamps, poses, ranges = [], [], []
     for stamp, entry in entries:
         try:
@@ -53,15 +49,14 @@ def parse_intel(data: bytes, where: str) -> tuple[Array, Array, Array]:
                 raise ValueError(f"{len(ranges[-1])} beams, the first scan has {len(ranges[0])}")
         except (ValueError, KeyError, TypeError, IndexError, OverflowError) as error:
             line = data[: max(data.find(json.dumps(stamp).encode()), 0)].count(b"\n") + 1
-            reason = f"{type(error).__name__}: {error}"[:120]
-            raise InputError(f"{where}:{line}: the scan at {stamp[:40]} is wrong ({reason})") from (
-                None
-            )
-    n_beams = len(ranges[0]) if ranges else 0
+            raise InputError(
+                f"{where}:{line}: the scan at {stamp[:40]} is wrong ({reason_of(error)})"
+            ) from None
+    shape = len(stamps), len(ranges[0]) if ranges else 0
     return (
         np.array(stamps, float),
         np.array(poses, float).reshape(-1, 3),
-        np.array(ranges, float).reshape(len(stamps), n_beams),
+        np.array(ranges, float).reshape(shape),
     )
 
 
@@ -90,14 +85,13 @@ def read_intel(
         order = assemble.in_order(times, "reference", {})
         truth = Truth(times[order], corrected[order])
     wheels = assemble.wheels_from_poses(stamps, poses, track_m, notes)
-    return scan_recording(
+    return assemble.scan_recording(
         wheels,
         stamps,
-        seen_ranges(ranges, _NO_RETURN_M),
+        ranges,
         _scanner(assemble.rate_hz(stamps), n_beams, _NO_RETURN_M),
         truth,
-        track_m,
-        wheel_radius_m,
+        RobotGeometry(wheel_radius_m, track_m),
         {"source": "intel", "notes": notes},
     )
 
@@ -144,27 +138,24 @@ def read_thinned_intel(
     ranges = ranges[: len(busy_s)]
     known: list[tuple[int, float]] = []
     for number, time in sorted(zip(numbers.tolist(), times.tolist(), strict=True)):
-        if number >= len(busy_s):
-            continue
-        if known:
-            before, then = known[-1]
-            if number <= before or time - then <= 0.3 * (busy_s[number] - busy_s[before]):
-                continue
-        known.append((number, time))
+        before, then = known[-1] if known else (-1, -math.inf)
+        if before < number < len(busy_s) and (
+            time - then > 0.3 * (busy_s[number] - busy_s[before])
+        ):
+            known.append((number, time))
     rows, clock = np.array([k[0] for k in known]), np.array([k[1] for k in known])
     stamps = np.interp(busy_s, busy_s[rows], clock)
     stamps[: rows[0]] = clock[0] - (busy_s[rows[0]] - busy_s[: rows[0]])
     stamps[rows[-1] :] = clock[-1] + (busy_s[rows[-1] :] - busy_s[rows[-1]])
     notes: assemble.Notes = {"matches_left_out": len(numbers) - len(known)}
     wheels = assemble.wheels_from_poses(stamps, assemble.chained(steps), track_m, notes)
-    recording = scan_recording(
+    recording = assemble.scan_recording(
         wheels,
         stamps,
-        seen_ranges(ranges, _THINNED_MAX_RANGE_M),
-        _scanner(1.0, ranges.shape[1], _THINNED_MAX_RANGE_M),
+        ranges,
+        _scanner(1.0, _N_THINNED_BEAMS, _THINNED_MAX_RANGE_M),
         None,
-        track_m,
-        wheel_radius_m,
+        RobotGeometry(wheel_radius_m, track_m),
         {"source": "intel, thinned", "notes": notes},
     )
     return recording, rows.astype(np.int64)
@@ -173,10 +164,5 @@ def read_thinned_intel(
 def _scanner(rate_hz: float, n_beams: int, max_range_m: float) -> Laser:
     """A laser whose beams start at -90 degrees, `half_turn_step_rad` apart."""
     step = half_turn_step_rad(n_beams)
-    return Laser(
-        rate_hz=rate_hz,
-        n_beams=n_beams,
-        fov_rad=step * (n_beams - 1),
-        max_range_m=max_range_m,
-        mount=Mount(yaw_rad=(step * (n_beams - 1) - math.pi) / 2.0),
-    )
+    mount = Mount(yaw_rad=(step * (n_beams - 1) - math.pi) / 2.0)
+    return assemble.scanner(rate_hz, n_beams, step, max_range_m, mount)

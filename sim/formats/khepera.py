@@ -15,7 +15,7 @@ from sim import se2
 from sim.arrays import Array
 from sim.errors import InputError, require
 from sim.formats.assemble import chained
-from sim.formats.text import json_number, read_bytes, read_members
+from sim.formats.text import json_number, read_bytes, read_members, reason_of
 from sim.recording import Recording, Truth, WheelLog
 from sim.robot.drive import RobotGeometry
 from sim.sensors import Encoder
@@ -49,7 +49,7 @@ def read_khepera(path: Path, member: str | None = None) -> WheelLaserLog:
     Raises
     ------
     InputError
-        Naming the file and the line that is no such tuple.
+        Naming the file and the line that is not such a tuple.
     """
     if member is None:
         return parse_khepera(read_bytes(path), str(path))
@@ -69,31 +69,27 @@ def parse_khepera(data: bytes, where: str) -> WheelLaserLog:
         raise InputError(f"{where}:{line}: not ASCII text, so not a log of tuples") from None
     decoder = json.JSONDecoder()
     rows: list[tuple[float, ...]] = []
-    at, line, counted = 0, 1, 0
-    while True:
-        while at < len(text) and text[at].isspace():
-            at += 1
-        line += text.count("\n", counted, at)
-        counted = at
-        if at == len(text):
-            break
+    at = len(text) - len(text.lstrip())
+    while at < len(text):
         try:
-            entry, at = decoder.raw_decode(text, at)
+            entry, end = decoder.raw_decode(text, at)
             rows.append(_row(entry))
         except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
-            reason = f"{type(error).__name__}: {error}".splitlines()[0][:120]
+            line = text.count("\n", 0, at) + 1
             raise InputError(
-                f"{where}:{line}: not a tuple of T, phi_l, phi_r, sm ({reason})"
-            ) from (None)
+                f"{where}:{line}: not a tuple of T, phi_l, phi_r, sm ({reason_of(error)})"
+            ) from None
+        while text[end : end + 1].isspace():
+            end += 1
+        at = end
     values = np.array(rows, float).reshape(-1, 6)
-    durations = values[:, 0]
-    return WheelLaserLog(durations, values[:, 1:3] * durations[:, None], values[:, 3:])
+    return WheelLaserLog(values[:, 0], values[:, 1:3] * values[:, :1], values[:, 3:])
 
 
 def _row(entry: Any) -> tuple[float, ...]:
     x, y, turn = entry["sm"]
     row = (entry["T"], entry["phi_r"], entry["phi_l"], x, y, turn)
-    numbers = tuple(json_number(value) for value in row)
+    numbers = tuple(map(json_number, row))
     if numbers[0] <= 0.0:
         raise ValueError("T must be positive")
     return numbers

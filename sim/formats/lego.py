@@ -6,19 +6,17 @@ P stamp_ms x y                                                     mm, of the sc
 L C x y diameter                                                   mm
 """
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sim.arrays import Array
 from sim.formats import assemble
-from sim.formats.carmen import scan_recording, seen_ranges
 from sim.formats.text import Words, read_words
 from sim.recording import Recording, Truth, WheelLog
-from sim.sensors import Laser, Mount
+from sim.robot.drive import RobotGeometry
+from sim.sensors import Mount
 from sim.worlds.world import World
 
 # The lecture's constants: geometric width of the tracks, effective one, length of a tick, the
@@ -57,8 +55,8 @@ def parse_motors(words: Words) -> TickLog:
     return TickLog(stamps[rows], values[rows][:, [5, 1]])
 
 
-def parse_scans(words: Words) -> tuple[Array, NDArray[np.float32]]:
-    """Stamps (N,) s and ranges (N, n) m of the S lines; +inf where nothing was seen."""
+def parse_scans(words: Words) -> tuple[Array, Array]:
+    """Stamps (N,) s and ranges (N, n) m of the S lines."""
     lines = words.lines_of("S")
     assemble.require_readings(len(lines), 1, words.where, "S lines")
     counts = words.whole(lines, 2, "the number of beams", 1, _MOST_BEAMS)
@@ -67,7 +65,7 @@ def parse_scans(words: Words) -> tuple[Array, NDArray[np.float32]]:
     ranges = words.numbers(lines, 3, int(counts[0]), "ranges") / 1000.0
     assemble.require_clock(stamps, words.where, "S lines")
     rows = assemble.in_order(stamps, "scans", {})
-    return stamps[rows], seen_ranges(ranges, _MAX_RANGE_M)[rows]
+    return stamps[rows], ranges[rows]
 
 
 def parse_reference(words: Words) -> tuple[Array, Array]:
@@ -77,11 +75,6 @@ def parse_reference(words: Words) -> tuple[Array, Array]:
     values = words.finite(lines, 1, 3, "a P line")
     rows = assemble.in_order(values[:, 0] / 1000.0, "reference", {})
     return values[rows, 0] / 1000.0, values[rows, 1:] / 1000.0
-
-
-def parse_cylinders(words: Words) -> Array:
-    """Positions and diameters (N, 3), m, of the L lines."""
-    return words.finite(words.lines_of("L"), 2, 3, "an L line") / 1000.0
 
 
 def read_lego(
@@ -104,16 +97,8 @@ def read_lego(
     stamps, ranges = parse_scans(read_words(scans))
     n_beams = ranges.shape[1]
     middle = (n_beams - 1) / 2.0 - _MIDDLE_BEAM
-    laser = Laser(
-        rate_hz=5.0,
-        n_beams=n_beams,
-        fov_rad=min(max(_BEAM_STEP_RAD * (n_beams - 1), 1e-9), 2.0 * math.pi),
-        max_range_m=_MAX_RANGE_M,
-        mount=Mount(
-            x_m=SCANNER_AHEAD_M,
-            yaw_rad=math.remainder(middle * _BEAM_STEP_RAD + _BEAM_OFFSET_RAD, 7.0),
-        ),
-    )
+    mount = Mount(x_m=SCANNER_AHEAD_M, yaw_rad=middle * _BEAM_STEP_RAD + _BEAM_OFFSET_RAD)
+    laser = assemble.scanner(5.0, n_beams, _BEAM_STEP_RAD, _MAX_RANGE_M, mount)
     truth = None
     if reference is not None:
         times, positions = parse_reference(read_words(reference))
@@ -121,13 +106,13 @@ def read_lego(
         ahead = SCANNER_AHEAD_M * np.stack([np.cos(heading), np.sin(heading)], axis=1)
         world = None
         if cylinders is not None:
-            found = parse_cylinders(read_words(cylinders))
-            middles = np.column_stack([found[:, :2], np.zeros(len(found))])
+            words = read_words(cylinders)
+            middles = words.finite(words.lines_of("L"), 2, 3, "an L line") / 1000.0
+            middles[:, 2] = 0.0  # the diameter
             world = World("arena", np.zeros((0, 4)), np.zeros((0, 2)), landmarks=middles)
         truth = Truth(times, np.column_stack([positions - ahead, heading]), world=world)
-    return scan_recording(
-        wheels, stamps, ranges, laser, truth, track_m, _WHEEL_RADIUS_M, {"source": "lego"}
-    )
+    robot = RobotGeometry(_WHEEL_RADIUS_M, track_m)
+    return assemble.scan_recording(wheels, stamps, ranges, laser, truth, robot, {"source": "lego"})
 
 
 def _headings(stamps: Array, positions: Array) -> Array:

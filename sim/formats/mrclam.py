@@ -19,15 +19,13 @@ import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sim.arrays import Array
-from sim.errors import InputError
+from sim.arrays import Array, Ints, Values
+from sim.errors import require
 from sim.formats import assemble
-from sim.formats.text import Words, read_members, split_words
+from sim.formats.text import read_members, split_words
 from sim.recording import Log, Recording, Truth
 from sim.robot.drive import RobotGeometry
 from sim.sensors import Encoder, Mount, RobotCamera, StereoCamera
@@ -53,7 +51,12 @@ CAMERA = StereoCamera(
 
 
 def read_mrclam(
-    path: Path, robot: int = 1, identifies: bool = True, camera: StereoCamera = CAMERA
+    path: Path,
+    robot: int = 1,
+    identifies: bool = True,
+    camera: StereoCamera = CAMERA,
+    *,
+    members: Mapping[str, bytes] | None = None,
 ) -> Recording:
     """A Recording of one robot of a data set.
 
@@ -67,13 +70,65 @@ def read_mrclam(
         Whether the observations carry the landmark's number (row of the landmark file).
     camera
         The believed noise of the observations.
+    members
+        Contents of the files by their names, where they were read before.
 
     Raises
     ------
     InputError
         Naming the file and the line, or the file that is missing.
     """
-    return parse_mrclam(read_members(path), str(path), robot, identifies, camera)
+    members = read_members(path) if members is None else members
+    odometry, measured, truth, landmarks, barcodes = (
+        _table(members, path, name, n_columns)
+        for name, n_columns in (
+            (f"Robot{robot}_Odometry", 3),
+            (f"Robot{robot}_Measurement", 4),
+            (f"Robot{robot}_Groundtruth", 4),
+            ("Landmark_Groundtruth", 5),
+            ("Barcodes", 2),
+        )
+    )
+    notes: assemble.Notes = {}
+    odometry = odometry[assemble.in_order(odometry[:, 0], "odometry", notes)]
+    truth = truth[assemble.in_order(truth[:, 0], "truth", notes)]
+    assemble.require_readings(len(odometry), 2, str(path), "odometry readings")
+    assemble.require_readings(len(truth), 2, str(path), "ground truth poses")
+    wheels = assemble.wheels_from_velocities(odometry[:, 0].copy(), odometry[:, 1:], TRACK_M)
+    ids = _rows_of(measured[:, 1], barcodes, landmarks[:, 0])
+    n_unknown = int(np.sum(~np.isin(measured[:, 1], barcodes[:, 1])))
+    notes["unknown_barcodes"] = n_unknown
+    notes["observations_of_robots"] = int(np.sum(ids < 0)) - n_unknown
+    camera = dataclasses.replace(camera, identifies=identifies)
+    log, true_ids = _observations(measured, ids, camera, notes)
+    world = World(
+        "mrclam",
+        walls=np.zeros((0, 4)),
+        wall_z_m=np.zeros((0, 2)),
+        landmarks=np.column_stack([landmarks[:, 1:3], np.full(len(landmarks), camera.mount.z_m)]),
+    )
+    hidden = {"stereo": {"true_ids": true_ids}}
+    return Recording(
+        frame_stamps=assemble.frame_stamps(wheels.stamps, [log.stamps]),
+        wheels=wheels,
+        robot=RobotGeometry(WHEEL_RADIUS_M, TRACK_M),
+        sensors={"encoder": Encoder(rate_hz=None), "stereo": camera},
+        logs={"stereo": log},
+        truth=Truth(truth[:, 0].copy(), truth[:, 1:].copy(), readings=hidden, world=world),
+        config={"source": "mrclam", "robot": robot, "notes": notes},
+    )
+
+
+def _table(members: Mapping[str, bytes], path: Path, name: str, n_columns: int) -> Array:
+    """Table of a file of the set."""
+    robots = sorted(m[5:-13] for m in members if m.endswith("_Odometry.dat"))
+    known = ", ".join(robots[:10]).encode("unicode_escape").decode()
+    require(
+        f"{name}.dat" in members,
+        f"{path}: holds no {name}.dat; robots with odometry: {known}",
+    )
+    what = name.rpartition("_")[2].lower()
+    return split_words(members[f"{name}.dat"], f"{path}/{name}.dat").table(n_columns, what)
 
 
 def read_team(path: Path, camera: StereoCamera = CAMERA) -> Team:
@@ -87,7 +142,7 @@ def read_team(path: Path, camera: StereoCamera = CAMERA) -> Team:
     InputError
         As for `read_mrclam`.
     """
-    members, where = read_members(path), str(path)
+    members = read_members(path)
     found = (re.fullmatch(r"Robot(\d+)_Odometry\.dat", name) for name in members)
     robots = sorted(int(match[1]) for match in found if match)
     sensor = RobotCamera(
@@ -97,89 +152,25 @@ def read_team(path: Path, camera: StereoCamera = CAMERA) -> Team:
     )
     team = []
     for robot in robots:
-        recording = parse_mrclam(members, where, robot, camera.identifies, camera)
-        name = f"Robot{robot}_Measurement.dat"
-        measured = split_words(members[name], f"{where}/{name}").table(4, "measurements")
-        barcodes = split_words(members["Barcodes.dat"], f"{where}/Barcodes.dat")
-        codes, notes = barcodes.table(2, "barcodes"), dict(recording.config["notes"])
+        recording = read_mrclam(path, robot, camera.identifies, camera, members=members)
+        measured = _table(members, path, f"Robot{robot}_Measurement", 4)
+        codes, notes = _table(members, path, "Barcodes", 2), dict(recording.config["notes"])
         # subject N is robot N
         ids = _rows_of(measured[:, 1], codes, np.array(robots, float))
         log, true_ids = _observations(measured, ids, sensor, notes)
         notes["sightings_of_robots"] = len(true_ids)
         hidden = {**recording.known_truth.readings, "robots": {"true_ids": true_ids}}
-        truth = dataclasses.replace(recording.known_truth, readings=hidden)
-        config = {**recording.config, "notes": notes}
-        recording = recording.with_log("robots", log, sensor)
-        team.append(dataclasses.replace(recording, truth=truth, config=config))
+        team.append(
+            dataclasses.replace(
+                recording.with_log("robots", log, sensor),
+                truth=dataclasses.replace(recording.known_truth, readings=hidden),
+                config={**recording.config, "notes": notes},
+            )
+        )
     return Team.on_one_clock(team)
 
 
-def parse_mrclam(
-    members: Mapping[str, bytes],
-    where: str,
-    robot: int = 1,
-    identifies: bool = True,
-    camera: StereoCamera = CAMERA,
-) -> Recording:
-    """As `read_mrclam`, of the files' contents by their names."""
-
-    def words(name: str) -> Words:
-        if name not in members:
-            robots = sorted(m[5:-13] for m in members if m.endswith("_Odometry.dat"))
-            known = ", ".join(robots[:10]).encode("unicode_escape").decode()
-            raise InputError(f"{where}: holds no {name}; robots with odometry: {known}")
-        return split_words(members[name], f"{where}/{name}")
-
-    odometry = words(f"Robot{robot}_Odometry.dat").table(3, "odometry")
-    measured = words(f"Robot{robot}_Measurement.dat").table(4, "measurements")
-    truth = words(f"Robot{robot}_Groundtruth.dat").table(4, "ground truth")
-    landmarks = words("Landmark_Groundtruth.dat").table(5, "landmarks")
-    barcodes = words("Barcodes.dat").table(2, "barcodes")
-
-    notes: assemble.Notes = {}
-    odometry = odometry[assemble.in_order(odometry[:, 0], "odometry", notes)]
-    truth = truth[assemble.in_order(truth[:, 0], "truth", notes)]
-    assemble.require_readings(len(odometry), 2, where, "odometry readings")
-    assemble.require_readings(len(truth), 2, where, "ground truth poses")
-    wheels = assemble.wheels_from_velocities(odometry[:, 0].copy(), odometry[:, 1:], TRACK_M)
-    ids = _landmark_rows(measured[:, 1], barcodes, landmarks[:, 0], notes)
-    camera = dataclasses.replace(camera, identifies=identifies)
-    log, true_ids = _observations(measured, ids, camera, notes)
-    world = World(
-        "mrclam",
-        walls=np.zeros((0, 4)),
-        wall_z_m=np.zeros((0, 2)),
-        landmarks=np.column_stack([landmarks[:, 1:3], np.full(len(landmarks), camera.mount.z_m)]),
-    )
-    return Recording(
-        frame_stamps=assemble.frame_stamps(wheels.stamps, [log.stamps]),
-        wheels=wheels,
-        robot=RobotGeometry(WHEEL_RADIUS_M, TRACK_M),
-        sensors={"encoder": Encoder(rate_hz=None), "stereo": camera},
-        logs={"stereo": log},
-        truth=Truth(
-            truth[:, 0].copy(),
-            truth[:, 1:].copy(),
-            readings={"stereo": {"true_ids": true_ids}},
-            world=world,
-        ),
-        config={"source": "mrclam", "robot": robot, "notes": notes},
-    )
-
-
-def _landmark_rows(
-    codes: Array, barcodes: Array, subjects: Array, notes: assemble.Notes
-) -> NDArray[np.int64]:
-    """Row of the landmark of each barcode; -1 for other robots and unknown codes."""
-    rows = _rows_of(codes, barcodes, subjects)
-    known = {float(code) for _, code in barcodes}
-    unknown = sum(float(c) not in known for c in codes)
-    notes["unknown_barcodes"] = int(unknown)
-    notes["observations_of_robots"] = int(np.sum(rows < 0)) - int(unknown)
-    return rows
-
-
-def _rows_of(codes: Array, barcodes: Array, subjects: Array) -> NDArray[np.int64]:
+def _rows_of(codes: Array, barcodes: Array, subjects: Array) -> Ints:
     """Row of the subject of each barcode; -1 for other ones and unknown codes."""
     subject_of = {float(code): float(subject) for subject, code in barcodes}
     row_of = {float(subject): row for row, subject in enumerate(subjects)}
@@ -188,22 +179,21 @@ def _rows_of(codes: Array, barcodes: Array, subjects: Array) -> NDArray[np.int64
 
 def _observations(
     measured: Array,
-    ids: NDArray[np.int64],
+    ids: Ints,
     camera: StereoCamera | RobotCamera,
     notes: assemble.Notes,
-) -> tuple[Log, NDArray[np.int64]]:
+) -> tuple[Log, Ints]:
     """Observations by image, in order, and the true ids of their rows."""
     ahead = np.abs(measured[:, 3]) < _MOST_BEARING_RAD
     usable = (ids >= 0) & ahead & (measured[:, 2] > 0.0)
     notes["observations_behind"] = int(np.sum((ids >= 0) & ~usable))
-    measured, ids = measured[usable], ids[usable]
-    order = np.argsort(measured[:, 0], kind="stable")
+    order = np.flatnonzero(usable)[np.argsort(measured[usable, 0], kind="stable")]
     measured, ids = measured[order], ids[order]
     stamps, first = np.unique(measured[:, 0], return_index=True)
     depth_m, bearing = measured[:, 2], measured[:, 3]
     points = np.stack([-depth_m * np.tan(bearing), np.zeros_like(depth_m), depth_m], axis=1)
     splits = np.append(first, len(measured)).astype(np.int64)
-    shown: dict[str, NDArray[Any]] = {"ids": ids} if camera.identifies else {}
+    shown: dict[str, Values] = {"ids": ids} if camera.identifies else {}
     if "descriptors" in camera.schema:
         shown["descriptors"] = np.zeros((len(ids), 0), np.float32)
     return Log.of(camera, stamps, splits, points_in_camera=points, **shown), ids

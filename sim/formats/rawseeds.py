@@ -6,6 +6,7 @@ GROUNDTRUTH    stamp, x, y, theta, and the 3 x 3 covariance row by row
 trajectories   stamp, x, y, theta
 """
 
+import dataclasses
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,10 +16,10 @@ import numpy as np
 from sim.arrays import Array
 from sim.errors import require
 from sim.formats import assemble
-from sim.formats.carmen import scan_recording, seen_ranges
 from sim.formats.text import Words, read_words
 from sim.recording import Recording, Truth, WheelLog
-from sim.sensors import Laser, Mount
+from sim.robot.drive import RobotGeometry
+from sim.sensors import Mount
 
 TRACK_M, WHEEL_RADIUS_M = 0.48, 0.095  # of the Robocom the sets were recorded with, nominal
 FRONT_SICK = Mount(x_m=0.08, y_m=0.0, z_m=0.45)
@@ -36,41 +37,26 @@ class Trajectory:
     covariances: Array
 
 
-def read_trajectory(path: Path) -> Trajectory:
+def read_trajectory(source: Path | Words) -> Trajectory:
     """Ground truth (13 columns) or a trajectory (4 columns).
+
+    It is sorted by stamp; of equal stamps the last one counts.
 
     Raises
     ------
     InputError
         Naming the file and the line.
     """
-    return parse_trajectory(read_words(path))
-
-
-def parse_trajectory(words: Words) -> Trajectory:
-    """The trajectory in a file's words; sorted by stamp, the last of equal stamps kept."""
-    table = words.table((4, 13), "a Rawseeds trajectory")
+    table = read_words(source).table((4, 13), "a Rawseeds trajectory")
     table = table[assemble.in_order(table[:, 0], "poses", {})]
     covariances = table[:, 4:].reshape(-1, 3, 3) if table.shape[1] == 13 else np.zeros((0, 3, 3))
     return Trajectory(table[:, 0].copy(), table[:, 1:4].copy(), covariances)
 
 
-def parse_odometry(words: Words) -> tuple[Array, Array]:
-    """Stamps (N,) s and poses (N, 3) of ODOMETRY_XYT, as they stand."""
-    stamps, _, poses = _odometry(words)
-    return stamps, poses
-
-
-def _odometry(words: Words) -> tuple[Array, Array, Array]:
-    """Stamps (N,) s, ticks (N, 2) of the right and left wheel, poses (N, 3), as they stand."""
-    table = words.table(7, "Rawseeds odometry")
-    return table[:, 0].copy(), table[:, 2:4].copy(), table[:, 4:].copy()
-
-
 def parse_sick(words: Words, resolution_deg: float = 1.0) -> tuple[Array, Array, float, float]:
     """Stamps (N,), ranges (N, n) m, start angle and step (rad) of a SICK file.
 
-    The offset counts quarter degrees from -90 on; steps are of the resolution.
+    The offset counts quarter degrees from -90 on; a step is the resolution.
     """
     step = math.radians(resolution_deg)
     lines = words.lines
@@ -114,44 +100,36 @@ def read_rawseeds(
         the wheels from the logged poses.
     """
     notes: assemble.Notes = {}
-    stamps, ticks, poses = _odometry(read_words(odometry))
-    assemble.require_clock(stamps, str(odometry), "odometry readings")
-    rows = assemble.in_order(stamps, "odometry", notes)
+    table = read_words(odometry).table(7, "Rawseeds odometry")
+    assemble.require_clock(table[:, 0], str(odometry), "odometry readings")
+    rows = assemble.in_order(table[:, 0], "odometry", notes)
     assemble.require_readings(len(rows), 2, str(odometry), "odometry readings")
+    stamps = table[rows, 0]
     if m_per_tick is None:
-        wheels = assemble.wheels_from_poses(stamps[rows], poses[rows], track_m, notes)
+        wheels = assemble.wheels_from_poses(stamps, table[rows, 4:], track_m, notes)
     else:
         require(
             math.isfinite(m_per_tick) and m_per_tick != 0.0,
             f"m_per_tick must be a number other than zero, got {m_per_tick}",
         )
-        wheels = WheelLog(stamps[rows], m_per_tick * np.cumsum(ticks, axis=0)[rows])
+        wheels = WheelLog(stamps, m_per_tick * np.cumsum(table[:, 2:4], axis=0)[rows])
     times, ranges, start, step = parse_sick(read_words(scans), resolution_deg)
     assemble.require_clock(times, str(scans), "scans")
     rows = assemble.in_order(times, "scans", notes)
-    times, ranges = times[rows], ranges[rows]
-    fov = max(step * (ranges.shape[1] - 1), 1e-9)
-    yaw = mount.yaw_rad + start + fov / 2.0
-    laser = Laser(
-        rate_hz=75.0,
-        n_beams=ranges.shape[1],
-        fov_rad=fov,
-        max_range_m=_MAX_RANGE_M,
-        mount=Mount(
-            x_m=mount.x_m, y_m=mount.y_m, z_m=mount.z_m, yaw_rad=math.remainder(yaw, 2.0 * math.pi)
-        ),
-    )
+    n_beams = ranges.shape[1]
+    yaw = mount.yaw_rad + start + max(step * (n_beams - 1), 1e-9) / 2.0
     reference = None
     if truth is not None:
-        found = read_trajectory(truth)
-        reference = Truth(found.stamps, found.poses)
-    return scan_recording(
+        trajectory = read_trajectory(truth)
+        reference = Truth(trajectory.stamps, trajectory.poses)
+    return assemble.scan_recording(
         wheels,
-        times,
-        seen_ranges(ranges, _MAX_RANGE_M),
-        laser,
+        times[rows],
+        ranges[rows],
+        assemble.scanner(
+            75.0, n_beams, step, _MAX_RANGE_M, dataclasses.replace(mount, yaw_rad=yaw)
+        ),
         reference,
-        track_m,
-        wheel_radius_m,
+        RobotGeometry(wheel_radius_m, track_m),
         {"source": "rawseeds", "notes": notes},
     )

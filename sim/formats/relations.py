@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from sim.arrays import Array
-from sim.files import write_text
+from sim.files import write_whole
 from sim.formats.text import Words, read_words
 
 
@@ -22,7 +22,7 @@ class Relations:
     motion: Array
 
 
-def read_relations(path: Path) -> Relations:
+def read_relations(source: Path | Words) -> Relations:
     """Read relations, plain or packed; height, roll and pitch are dropped.
 
     Raises
@@ -30,12 +30,7 @@ def read_relations(path: Path) -> Relations:
     InputError
         Naming the file and the line that is not eight finite numbers.
     """
-    return parse_relations(read_words(path))
-
-
-def parse_relations(words: Words) -> Relations:
-    """The relations in a file's words."""
-    table = words.table(8, "relations")
+    table = read_words(source).table(8, "relations")
     return Relations(table[:, :2].copy(), table[:, [2, 3, 7]])
 
 
@@ -43,5 +38,5 @@ def write_relations(path: Path, relations: Relations) -> None:
     """Write relations, all digits kept."""
     rows = np.zeros((len(relations.stamps), 8))
     rows[:, :2], rows[:, [2, 3, 7]] = relations.stamps, relations.motion
-    lines = [" ".join(f"{value:.17g}" for value in row) + "\n" for row in rows]
-    write_text(path, "".join(lines))
+    with write_whole(path) as part:
+        np.savetxt(part, rows, "%.17g")

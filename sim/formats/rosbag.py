@@ -32,9 +32,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sim.arrays import Array
+from sim.arrays import Array, Ints
 from sim.errors import InputError
 from sim.sensors.base import Field, Reading, Schema, Sensors
 
@@ -165,6 +164,6 @@ def nanoseconds(stamp: float) -> int:
     return whole * 10**9 + round((float(stamp) - whole) * 1e9)
 
 
-def seconds(counts: NDArray[np.int64]) -> Array:
+def seconds(counts: Ints) -> Array:
     """Seconds of nanoseconds."""
     return (counts // 10**9) + (counts % 10**9) / 1e9

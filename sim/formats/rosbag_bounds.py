@@ -43,18 +43,15 @@ def _unpacked_size(path: Path, chunks: Iterator[tuple[str, bytes]], most: int) -
 
 def _length(kind: str, data: bytes, most: int) -> int:
     """Length of packed data, or `most` if it is at least that; unpacked in small steps."""
-    if kind == "zstd":
-        from backports import zstd
+    from backports import zstd
+    from lz4.frame import LZ4FrameDecompressor
 
-        unpack: Any = zstd.ZstdDecompressor()
-    elif kind == "bz2":
-        unpack = bz2.BZ2Decompressor()
-    elif kind == "lz4":
-        from lz4.frame import LZ4FrameDecompressor
-
-        unpack = LZ4FrameDecompressor()
-    else:
-        raise ValueError(f"unknown packing {kind[:20]!r}")
+    decompressors: dict[str, Any] = {
+        "zstd": zstd.ZstdDecompressor,
+        "bz2": bz2.BZ2Decompressor,
+        "lz4": LZ4FrameDecompressor,
+    }
+    unpack = decompressors[kind]()
     length = 0
     while not unpack.eof and length < most:
         part = unpack.decompress(data, 1 << 20)
@@ -111,5 +108,5 @@ def _check_tables(path: Path) -> None:
     for kind, sql in kinds:
         require(
             kind in ("table", "index") and "virtual" not in str(sql).lower(),
-            f"{path}: a database with a {kind} of its own is no bag",
+            f"{path}: a database with a {kind} of its own is not a bag",
         )

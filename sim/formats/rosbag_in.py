@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sim.arrays import Array
+from sim.arrays import Array, Values
 from sim.errors import InputError, require
 from sim.formats import assemble
 from sim.formats.rosbag import (
@@ -131,7 +130,7 @@ def _recording(
     wheels = _wheels(path, topics, wanted[0], track_m, notes)
     sensors: Mapping[str, Sensor] = about.get("sensors", {"encoder": Encoder(rate_hz=None)})
     logs: dict[str, Log] = {}
-    hidden: dict[str, dict[str, NDArray[Any]]] = {}
+    hidden: dict[str, dict[str, Values]] = {}
     for name in about.get("topics", {}):
         logs[name], hidden[name] = _sensor_log(topics, about, name)
         camera = sensors[name]
@@ -172,7 +171,7 @@ def _recording(
 
 def _sensor_log(
     topics: dict[str, Topic], about: dict[str, Any], name: str
-) -> tuple[Log, dict[str, NDArray[Any]]]:
+) -> tuple[Log, dict[str, Values]]:
     """Log of a sensor of ours, and what its schema marks as truth."""
     sensor, topic = about["sensors"][name], topics.get(about["topics"][name], Topic("", [], []))
     seen, hidden = parted(about["schemas"][name])

@@ -168,8 +168,7 @@ def read_topics(path: Path) -> tuple[dict[str, Topic], dict[str, Any]]:
         with _reader(path) as (reader, store, deserialize):
             notes = [c for c in reader.connections if (c.topic, c.msgtype) == (ABOUT, STRING)]
             for connection, _, data in reader.messages(notes) if notes else ():
-                message = deserialize(data, connection.msgtype)
-                about = _about(path, message)
+                about = _about(path, deserialize(data, connection.msgtype))
                 break
             kinds = {*READ, *_kinds(about, store)}
             wanted = [
@@ -179,10 +178,10 @@ def read_topics(path: Path) -> tuple[dict[str, Topic], dict[str, Any]]:
             ]
             messages = enumerate(reader.messages(wanted) if wanted else (), start=1)
             for count, (connection, time, data) in messages:
-                if count > _MOST_MESSAGES:
-                    raise InputError(
-                        f"{path}: more than {_MOST_MESSAGES} messages; cut it in parts"
-                    )
+                require(
+                    count <= _MOST_MESSAGES,
+                    f"{path}: more than {_MOST_MESSAGES} messages; cut it in parts",
+                )
                 topic = topics.setdefault(connection.topic, Topic(connection.msgtype, [], []))
                 if topic.kind == connection.msgtype:
                     topic.times.append(time)

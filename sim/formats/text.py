@@ -18,13 +18,12 @@ from pathlib import Path, PurePosixPath
 from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from sim.arrays import Array
+from sim.arrays import Array, ArrayLike, Bools, Ints
 from sim.errors import InputError, require
 from sim.files import require_file
 
-Rows = NDArray[np.int64]
+Rows = Ints
 
 MOST_BYTES = 1 << 30  # unpacked; a small archive may promise far more
 LARGEST = 1e12  # times in microseconds and beyond are not what the formats hold
@@ -126,12 +125,12 @@ class Words:
     line_numbers
         (L,) counted from 1.
     lines_by_keyword
-        Lines that begin with each word that is no number.
+        Lines that begin with each word that is not a number.
     """
 
     where: str
     values: Array
-    is_number: NDArray[np.bool_]
+    is_number: Bools
     first: Rows
     line_numbers: Rows
     lines_by_keyword: dict[bytes, list[int]]
@@ -152,9 +151,8 @@ class Words:
 
     def refuse(self, bad: ArrayLike, lines: Rows, reason: str) -> None:
         """Raise the error of the first of the lines that is bad, if one is."""
-        rows = np.flatnonzero(bad)
-        if len(rows):
-            raise self.error(int(lines[rows[0]]), reason)
+        for line in lines[np.flatnonzero(bad)[:1]].tolist():
+            raise self.error(line, reason)
 
     def lines_of(self, keyword: str) -> Rows:
         """Lines whose first word is the keyword."""
@@ -166,7 +164,7 @@ class Words:
         Raises
         ------
         InputError
-            Naming the first line that has too few words, or a word that is no number.
+            Naming the first line that has too few words, or a word that is not a number.
         """
         begin = self.first[lines] + column
         self.refuse(begin + n_columns > self.first[lines + 1], lines, f"too few words for {what}")
@@ -190,13 +188,12 @@ class Words:
 
     def table(self, n_columns: int | Sequence[int], what: str) -> Array:
         """All lines as finite numbers; each must have that many words (one of the choices)."""
-        choices = (n_columns,) if isinstance(n_columns, int) else tuple(n_columns)
+        choices = (n_columns,) if isinstance(n_columns, int) else n_columns
         counts = self.counts
-        width = int(counts[0]) if len(counts) and counts[0] in choices else choices[0]
-        bad = np.flatnonzero(counts != width)
-        if len(bad):
+        width = next((choice for choice in choices if choice in counts[:1]), choices[0])
+        for line in np.flatnonzero(counts != width)[:1].tolist():
             raise self.error(
-                int(bad[0]), f"a line of {what} must be {width} numbers, this has {counts[bad[0]]}"
+                line, f"a line of {what} must be {width} numbers, this has {counts[line]}"
             )
         return self.finite(self.lines, 0, width, what)
 
@@ -247,13 +244,18 @@ def split_words(data: bytes, where: str) -> Words:
     )
 
 
-def read_words(path: Path) -> Words:
-    """`split_words` of a plain, gzip or xz file."""
-    return split_words(read_bytes(path), str(path))
+def read_words(source: Path | Words) -> Words:
+    """`split_words` of a plain, gzip or xz file; words that were read before are handed back."""
+    return source if isinstance(source, Words) else split_words(read_bytes(source), str(source))
 
 
 # Gaps are blanks; "1_0" is 10 to Python, but no number in a log, and no keyword has a "_".
 _PLAIN = bytes.maketrans(b",;_", b"  ?")
+
+
+def reason_of(error: Exception) -> str:
+    """Kind and text of an error, on one short line, for a message."""
+    return " ".join(f"{type(error).__name__}: {error}".split())[:120]
 
 
 def json_number(value: Any) -> float:
@@ -265,7 +267,7 @@ def json_number(value: Any) -> float:
         If it is none, or not finite, or larger than a log has reason to hold.
     """
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise TypeError(f"{str(value)[:40]!r} is no number")
+        raise TypeError(f"{str(value)[:40]!r} is not a number")
     number = float(value)
     if not abs(number) < LARGEST:
         raise ValueError(f"numbers must be finite, below {LARGEST:g}")

@@ -6,17 +6,16 @@ from pathlib import Path
 import numpy as np
 
 from sim.arrays import Array
-from sim.errors import InputError, require
-from sim.files import require_file
+from sim.errors import InputError, require, required
+from sim.files import read_head
 from sim.formats.rosbag import Track
-from sim.formats.text import read_bytes
-from sim.formats.tum import parse_spatial_tum
+from sim.formats.tum import read_spatial_tum
 
 FARTHEST_M = 1e12  # of a position that can be scored; far beyond, squares overflow
 _ROUNDING = 1e-3  # of a covariance, relative; programs write few digits
 _BAGS = (".mcap", ".bag", ".db3")
 _MAGIC = (b"#ROSBAG", b"\x89MCAP", b"SQLite format 3")
-_OTHERS = ("odom", "ground_truth")  # topics that are no estimate unless they are asked for
+_OTHERS = ("odom", "ground_truth")  # topics of estimates only if they are asked for
 
 
 def read_track(path: Path, topic: str | None = None) -> Track:
@@ -37,15 +36,19 @@ def read_track(path: Path, topic: str | None = None) -> Track:
         not path.is_dir() or (path / "metadata.yaml").exists(),
         f"{path}: is a folder, and not that of a ROS 2 bag; name a file",
     )
-    if path.is_dir() or path.suffix in _BAGS or _head(path).startswith(_MAGIC):
+    if path.is_dir() or path.suffix in _BAGS or read_head(path).startswith(_MAGIC):
         track = _of_bag(path, topic)
     else:
-        require(topic is None, f"{path}: a topic is of a bag, and this is none")
-        stamps, means, heights_m, tilts_rad = parse_spatial_tum(read_bytes(path), str(path))
+        require(topic is None, f"{path}: only a bag has topics, and this is not one")
+        stamps, means, heights_m, tilts_rad = read_spatial_tum(path)
         require(len(stamps), f"{path}: holds no pose")
-        tilt_rad, height_m = float(tilts_rad.max()), float(np.ptp(heights_m))
-        zeros = np.zeros((len(stamps), 3, 3))
-        track = Track(stamps, means, zeros, tilt_rad=tilt_rad, height_m=height_m)
+        track = Track(
+            stamps,
+            means,
+            np.zeros((len(stamps), 3, 3)),
+            tilt_rad=float(tilts_rad.max()),
+            height_m=float(np.ptp(heights_m)),
+        )
     check_track(track, path)
     return track
 
@@ -59,22 +62,17 @@ def check_track(track: Track, path: Path) -> None:
         Naming the file and the pose.
     """
     require(len(track.stamps), f"{path}: holds no pose")
-    sound = np.isfinite(track.stamps) & np.isfinite(track.means).all(axis=1)
-    require(sound.all(), f"{path}: pose {int(np.argmin(sound)) + 1} is not finite")
-    near = np.abs(track.means[:, :2]).max(axis=1) <= FARTHEST_M
-    require(
-        near.all(),
-        f"{path}: pose {int(np.argmin(near)) + 1} is farther away than {FARTHEST_M:g} m",
-    )
-    fit = sound_covariances(track.covariances)
-    require(
-        fit.all(),
-        f"{path}: the covariance of pose {int(np.argmin(fit)) + 1} is none: it must be finite and "
-        "symmetric, without a negative variance; write zeros where it is not known",
-    )
-    rising = np.diff(track.stamps) > 0.0
-    if not rising.all():
-        row = int(np.argmin(rising))
+    checks = {
+        "pose {} is not finite": np.isfinite(track.stamps) & np.isfinite(track.means).all(axis=1),
+        f"pose {{}} is farther away than {FARTHEST_M:g} m": (
+            np.abs(track.means[:, :2]).max(axis=1) <= FARTHEST_M
+        ),
+        "the covariance of pose {} is none: it must be finite and symmetric, without a negative "
+        "variance; write zeros where it is not known": sound_covariances(track.covariances),
+    }
+    for complaint, sound in checks.items():
+        require(sound.all(), f"{path}: {complaint.format(int(np.argmin(sound)) + 1)}")
+    for row in np.flatnonzero(np.diff(track.stamps) <= 0.0)[:1]:
         before, after = track.stamps[row : row + 2]
         raise InputError(
             f"{path}: stamps must increase; pose {row + 2} at {after:.13g} s follows one at "
@@ -100,15 +98,6 @@ def sound_covariances(covariances: Array) -> Array:
     return found
 
 
-def _head(path: Path) -> bytes:
-    require_file(path)
-    try:
-        with path.open("rb") as file:
-            return file.read(16)
-    except OSError as error:
-        raise InputError(f"{path}: cannot read ({error.strerror})") from error
-
-
 def _of_bag(path: Path, topic: str | None) -> Track:
     from sim.formats.rosbag_in import read_tracks
 
@@ -116,12 +105,11 @@ def _of_bag(path: Path, topic: str | None) -> Track:
     if topic is None:
         own = [name for name in tracks if name not in _OTHERS]
         topic = "estimate" if "estimate" in own or len(own) != 1 else own[0]
-    track = tracks.get(topic.lstrip("/"))
-    if track is None:
-        raise InputError(
-            f"{path}: no nav_msgs/Odometry on {topic}; there is {', '.join(tracks) or 'none'}; "
-            "name one with --topic"
-        )
+    track = required(
+        tracks.get(topic.lstrip("/")),
+        f"{path}: no nav_msgs/Odometry on {topic}; there is {', '.join(tracks) or 'none'}; "
+        "name one of them",
+    )
     covariances = track.covariances.copy()
     unknown = (np.diagonal(covariances, axis1=1, axis2=2) == -1.0).any(axis=1)
     covariances[unknown] = 0.0  # ROS marks by -1 what is not known

@@ -3,14 +3,11 @@
 Wheel quantities come in pairs in the order (right, left), in metres along the ground.
 """
 
-from __future__ import annotations
-
 from collections import deque
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from sim.arrays import Array
+from sim.arrays import Array, ArrayLike
 
 SMALL_ANGLE_RAD = 1e-4
 

@@ -1,16 +1,13 @@
 """What the simulator asks of a robot; one of another kind is a class like `sim.robot.drive`'s."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from sim.arrays import Array
+from sim.arrays import Array, ArrayLike
 from sim.errors import require
 from sim.options import build, find
 from sim.robot.slip import SlipLaw

@@ -5,8 +5,6 @@ At zero slip a straight 2 m run ends within 0.1 mm and 0.01 degrees, and the eff
 the nominal one within 0.01 %.
 """
 
-from __future__ import annotations
-
 import contextlib
 import math
 import os
@@ -16,7 +14,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from sim.arrays import Array
-from sim.errors import InputError, require
+from sim.errors import require
 from sim.robot.base import TICK_S, Robot
 from sim.worlds.world import World
 
@@ -64,8 +62,9 @@ class BulletBody(contextlib.AbstractContextManager["BulletBody"]):
     def __init__(self, world: World, robot: Robot, pose: Array) -> None:
         self._radius_m = robot.wheel_radius_m
         self._client = pybullet.connect(pybullet.DIRECT)
-        if self._client < 0:
-            raise InputError("the physics engine would not start; too many recordings at once?")
+        require(
+            self._client >= 0, "the physics engine would not start; too many recordings at once?"
+        )
         c = self._client
         pybullet.setGravity(0, 0, -9.81, physicsClientId=c)
         pybullet.setPhysicsEngineParameter(

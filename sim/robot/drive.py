@@ -3,16 +3,13 @@
 Wheel quantities come in pairs in the order (right, left), in metres along the ground.
 """
 
-from __future__ import annotations
-
 import math
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike
 from pydantic import NonNegativeInt
 
-from sim.arrays import Array
+from sim.arrays import Array, ArrayLike
 from sim.errors import require
 from sim.options import NonNegative, Positive, options
 from sim.robot.base import RobotGeometry

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from sim.arrays import Array
+from sim.arrays import Array, ArrayLike
 from sim.compiled import njit
 from sim.errors import require
 from sim.robot.arc import SMALL_ANGLE_RAD

@@ -5,16 +5,13 @@ decristoforis2020, eq. (2)), so their unit is the metre. The simulator, the batc
 `sim.robot.kinematic`, and estimators' beliefs take the law from here.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from sim.arrays import Array
+from sim.arrays import Array, ArrayLike
 from sim.errors import require
 from sim.options import NonNegative, options
 from sim.robot.arc import TravelWindow
@@ -145,8 +142,7 @@ class WheelSlip:
         self._forward = _normals(rng.spawn(1)[0])
         self._share = 0.0
         if self._length_m:
-            spread = math.sqrt(self._q_m / (2.0 * self._length_m))
-            self._share = spread * next(self._forward)[0]
+            self._share = math.sqrt(self._q_m / (2.0 * self._length_m)) * next(self._forward)[0]
 
     @property
     def correction_mps(self) -> _Wheels:

@@ -11,7 +11,7 @@ import numpy as np
 
 from sim import se2
 from sim.arrays import Array
-from sim.errors import InputError, blaming, require
+from sim.errors import blaming, require, required
 from sim.recording import Frame
 from sim.robot.arc import arc_increment
 from sim.robot.base import Robot, RobotGeometry
@@ -148,11 +148,11 @@ def check_feedback(wanted: object) -> None:
         If it is neither `truth`, nor `odometry`, nor a mapping that names an estimator.
     """
     named = isinstance(wanted, Mapping) and "_target_" in wanted
-    if not named and wanted not in _FEEDBACKS:
-        raise InputError(
-            f"route.feedback must be {', '.join(_FEEDBACKS)} or a mapping with the _target_ of an "
-            f"estimator, got {wanted!r}"
-        )
+    require(
+        named or wanted in _FEEDBACKS,
+        f"route.feedback must be {', '.join(_FEEDBACKS)} or a mapping with the _target_ of an "
+        f"estimator, got {wanted!r}",
+    )
 
 
 def feedback_of(
@@ -170,7 +170,6 @@ def feedback_of(
         return TruthFeedback()
     if wanted == "odometry":
         return OdometryFeedback(robot, start)
-    if onboard is None:
-        raise InputError("route.feedback names an estimator, but none was started")
+    onboard = required(onboard, "route.feedback names an estimator, but none was started")
     schemas = {name: parted(sensor.schema)[0] for name, sensor in sensors.items() if sensor.schema}
     return EstimatorFeedback(robot, start, onboard(world, robot.nominal, sensors, start), schemas)

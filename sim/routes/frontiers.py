@@ -10,14 +10,13 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage, sparse
 from scipy.sparse.csgraph import dijkstra
 
-from sim.arrays import Array, Ints
+from sim.arrays import Array, Bools, Ints
 from sim.compiled import njit
 
-Mask = NDArray[np.bool_]
+Mask = Bools
 
 _N_RAYS = 120  # that look for unknown cells
 _ALONG = 0.5  # step along them, in cells
@@ -33,29 +32,25 @@ def frontiers(free: Mask, unknown: Mask, least_cells: int) -> list[Ints]:
 
 def adjacent(mask: Mask) -> Mask:
     """Cells of a mask, and those that share a side with one."""
-    grown: Mask = ndimage.binary_dilation(mask)
-    return grown
+    return np.asarray(ndimage.binary_dilation(mask))
 
 
 def clearance(occupied: Mask) -> Array:
     """Distance of each cell to the nearest occupied one, in cells; inf if there is none."""
     if not occupied.any():
         return np.full(occupied.shape, np.inf)
-    distance: Array = ndimage.distance_transform_edt(~occupied)
-    return distance
+    return np.asarray(ndimage.distance_transform_edt(~occupied))
 
 
 def disc(shape: tuple[int, ...], at: Ints, radius: float) -> Mask:
     """Cells within a radius of one (2,)."""
     rows, columns = np.ogrid[: shape[0], : shape[1]]
-    near: Mask = (rows - at[0]) ** 2 + (columns - at[1]) ** 2 <= radius**2
-    return near
+    return np.asarray((rows - at[0]) ** 2 + (columns - at[1]) ** 2 <= radius**2)
 
 
 def middle_of(cells: Ints) -> Ints:
     """Of cells (N, 2), the one (2,) nearest to their mean."""
-    middle: Ints = cells[np.argmin(np.sum((cells - cells.mean(axis=0)) ** 2, axis=1))]
-    return middle
+    return np.asarray(cells[np.argmin(np.sum((cells - cells.mean(axis=0)) ** 2, axis=1))])
 
 
 @njit()
@@ -116,7 +111,7 @@ class Ways:
     passable
         (rows, columns).
     cost
-        (R, rows, columns) length in cells, inf where there is no way.
+        (R, rows, columns) length in cells, inf where none leads.
     """
 
     passable: Mask
@@ -163,5 +158,4 @@ class Ways:
 def nearest(mask: Mask, cells: Ints) -> Ints:
     """For each of the cells (N, 2), the nearest (N, 2) that is in the mask."""
     indices = ndimage.distance_transform_edt(~mask, return_distances=False, return_indices=True)
-    found: Ints = indices[:, cells[:, 0], cells[:, 1]].T
-    return found
+    return np.asarray(indices[:, cells[:, 0], cells[:, 1]].T)

@@ -11,10 +11,9 @@ from dataclasses import dataclass
 from typing import Annotated, Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 from pydantic import Strict
 
-from sim.arrays import Array
+from sim.arrays import Array, ArrayLike
 from sim.errors import require
 from sim.options import NonNegative, Points, Positive, options
 from sim.robot.arc import arc_increment

@@ -20,16 +20,15 @@ from keyword import iskeyword
 from typing import Any, ClassVar, Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sim import se2
-from sim.arrays import Array
+from sim.arrays import Array, Bools, Values
 from sim.errors import InputError, blaming, require
 from sim.options import build, find, options
 from sim.worlds.world import World
 
 S = TypeVar("S")
-Reading = Mapping[str, NDArray[Any]]
+Reading = Mapping[str, Values]
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 _DTYPES = ("f8", "f4", "i8", "i4", "u1")
 _TAKEN = ("wheels", "commands", "truth")  # what else a recording holds
@@ -76,7 +75,7 @@ class Field:
         require(sizes, f"a field's shape must be a tuple of sizes and None, got {self.shape!r}")
         require(isinstance(self.unit, str), f"a field's unit must be a text, got {self.unit!r}")
 
-    def taken(self, value: Any, where: str) -> NDArray[Any]:
+    def taken(self, value: Any, where: str) -> Values:
         """Read-only copy of a reading's value, of the field's type.
 
         Raises
@@ -97,7 +96,7 @@ class Field:
         copy.setflags(write=False)
         return copy
 
-    def check(self, values: NDArray[Any], n: int, where: str) -> None:
+    def check(self, values: Values, n: int, where: str) -> None:
         """Check the values of `n` readings, or rows.
 
         Raises
@@ -112,10 +111,12 @@ class Field:
         if not fits:
             shape = ", ".join("any" if size is None else str(size) for size in wanted)
             raise InputError(f"{where} must have shape ({shape}), got {values.shape}")
-        if values.dtype != np.dtype(self.dtype):
-            raise InputError(f"{where} must be {self.dtype}, got {values.dtype}")
+        require(
+            values.dtype == np.dtype(self.dtype),
+            f"{where} must be {self.dtype}, got {values.dtype}",
+        )
 
-    def joined(self, values: Sequence[Any], where: str) -> NDArray[Any]:
+    def joined(self, values: Sequence[Any], where: str) -> Values:
         """Array of many readings: (N, *shape), or all rows of a ragged field, (K, *shape).
 
         Raises
@@ -152,7 +153,7 @@ class Rays(Protocol):
     def cloud(self, lidar: Any, pose: Array) -> Array:
         """Ranges (rings, azimuths) m of a 3D lidar."""
 
-    def sees(self, origin: Array, points: Array) -> NDArray[np.bool_]:
+    def sees(self, origin: Array, points: Array) -> Bools:
         """Whether nothing stands between a point (3,) and each of others (K, 3)."""
 
 
@@ -203,7 +204,7 @@ class View:
         """True ranges (rings, azimuths) m of a lidar like `Lidar3D`; +inf without a return."""
         return self.rays.cloud(lidar, self.pose)
 
-    def sees(self, origin: Array, points: Array) -> NDArray[np.bool_]:
+    def sees(self, origin: Array, points: Array) -> Bools:
         """Whether nothing stands between a point (3,) of map and each of others (K, 3)."""
         return self.rays.sees(origin, points)
 
@@ -307,7 +308,7 @@ def sensor_of(sensors: Sensors, name: str, kind: type[S] = object) -> S:  # type
     if isinstance(found, RecordedSensor) and not isinstance(found, kind):
         raise InputError(
             f"sensor {name} was recorded as {found.target}, whose code a file does not choose; "
-            f"name it again: sensors=PRESET with its _target_ (and --config-dir)"
+            "name its class again: sensors=PRESET with its _target_"
         )
     if not isinstance(found, kind):
         raise InputError(f"sensor {name} is a {type(found).__name__}, not a {kind.__name__}")
@@ -320,7 +321,7 @@ def sensors_from_config(config: Mapping[str, Any]) -> dict[str, Sensor]:
     Raises
     ------
     InputError
-        For a name that is no word, a class that cannot be found, an unknown key, or a value that
+        For a name that is not a word, a class that cannot be found, an unknown key, or a value that
         makes no sense.
     """
     sensors = {}
@@ -328,10 +329,10 @@ def sensors_from_config(config: Mapping[str, Any]) -> dict[str, Sensor]:
         where = _place_of(name)
         if settings is None:
             continue
-        if not isinstance(settings, Mapping) or "_target_" not in settings:
-            raise InputError(
-                f"{where} must be a mapping with _target_, such as sim.sensors.laser.Laser"
-            )
+        require(
+            isinstance(settings, Mapping) and "_target_" in settings,
+            f"{where} must be a mapping with _target_, such as sim.sensors.laser.Laser",
+        )
         sensors[name] = _made(find(settings["_target_"], where), settings, where)
     return sensors
 
@@ -380,8 +381,10 @@ def sensors_from_meta(
 
 
 def _made(kind: Any, settings: Mapping[str, Any], where: str) -> Sensor:
-    if not (isinstance(kind, type) and dataclasses.is_dataclass(kind)):
-        raise InputError(f"{where}._target_={settings['_target_']} must be a dataclass")
+    require(
+        isinstance(kind, type) and dataclasses.is_dataclass(kind),
+        f"{where}._target_={settings['_target_']} must be a dataclass",
+    )
     made: Any = build(kind, {k: v for k, v in settings.items() if k != "_target_"}, where)
     with blaming(where):
         for name in ("rate_hz", "schema", "start"):
@@ -407,9 +410,15 @@ def _place_of(name: Any) -> str:
 
 def _check_fields(schema: Schema, where: str) -> None:
     for name in schema:
-        if not _NAME.fullmatch(name) or iskeyword(name) or name in ("stamps", "splits", "header"):
-            raise InputError(f"{where}: {name!r} cannot be the name of a field")
+        require(
+            _NAME.fullmatch(name)
+            and not iskeyword(name)
+            and name not in ("stamps", "splits", "header"),
+            f"{where}: {name!r} cannot be the name of a field",
+        )
     seen, hidden = parted(schema)
     ragged = [any(field.ragged for field in part.values()) for part in (seen, hidden)]
-    if ragged == [False, True]:
-        raise InputError(f"{where}: a ragged field of the truth needs one beside it that is seen")
+    require(
+        ragged != [False, True],
+        f"{where}: a ragged field of the truth needs one beside it that is seen",
+    )

@@ -13,9 +13,8 @@ range 0 on all beams. In the kernels bearings are counted in beams from the firs
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from sim.arrays import Array
+from sim.arrays import Array, ArrayLike, Bools, Ints
 from sim.compiled import njit
 from sim.sensors import Laser, Lidar3D
 from sim.worlds.world import World
@@ -101,9 +100,7 @@ def cast_lidar(world: World, lidar: Lidar3D, T_world_sensor: ArrayLike) -> Array
     return ranges
 
 
-def visible(
-    world: World, origin_in_world: ArrayLike, points_in_world: ArrayLike
-) -> NDArray[np.bool_]:
+def visible(world: World, origin_in_world: ArrayLike, points_in_world: ArrayLike) -> Bools:
     """Whether no face of the World stands between an origin and each point.
 
     Parameters
@@ -119,7 +116,7 @@ def visible(
 
     Returns
     -------
-    NDArray[np.bool_]
+    Bools
         (N,).
     """
     return _visible(
@@ -223,7 +220,7 @@ def _cast(
 @njit(error_model="numpy", fastmath={"contract"})
 def _faces_in_view(
     x: float, y: float, cos: float, sin: float, forward: bool, chains: Array
-) -> NDArray[np.int64]:
+) -> Ints:
     """Faces that may cover a beam.
 
     Hidden are the backs of convex chains and, if all beams point forward, what lies behind.
@@ -372,7 +369,7 @@ def _cast_lidar(
 
 
 @njit(error_model="numpy")
-def _visible(origin: Array, points: Array, walls: Array, wall_z: Array) -> NDArray[np.bool_]:
+def _visible(origin: Array, points: Array, walls: Array, wall_z: Array) -> Bools:
     """See `visible`; walls (4, W) and wall_z (2, W).
 
     The sight line origin + s p crosses a face a + t (b - a) at s = c / (n . p) and

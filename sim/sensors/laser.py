@@ -4,10 +4,9 @@ import math
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 from pydantic import Field as Bound
 
-from sim.arrays import Array
+from sim.arrays import Array, ArrayLike, Bools, Floats
 from sim.options import NonNegative, Positive, options
 from sim.sensors.base import Field, Mount, Probe, Reading, Schema
 
@@ -52,11 +51,11 @@ class Laser:
         """Probe that casts the beams and adds the noise."""
         return lambda view: {"ranges_m": self.measure(view.scan(self), rng)}
 
-    def measure(self, true_ranges_m: ArrayLike, rng: np.random.Generator) -> NDArray[np.float32]:
+    def measure(self, true_ranges_m: ArrayLike, rng: np.random.Generator) -> Floats:
         """Noisy ranges (..., n_beams), float32; +inf where nothing is in range."""
         return noisy_ranges(self, true_ranges_m, rng)
 
-    def returned(self, ranges_m: ArrayLike) -> NDArray[np.bool_]:
+    def returned(self, ranges_m: ArrayLike) -> Bools:
         """Whether each beam saw something: ranges at the limits or beyond, and NaN, are none.
 
         A range of 32 bits at the maximum may be read as just below it.
@@ -91,9 +90,7 @@ class Laser:
         return {"ranges_m": np.asarray(message.ranges, np.float32)}
 
 
-def noisy_ranges(
-    sensor: Any, true_ranges_m: ArrayLike, rng: np.random.Generator
-) -> NDArray[np.float32]:
+def noisy_ranges(sensor: Any, true_ranges_m: ArrayLike, rng: np.random.Generator) -> Floats:
     """Ranges with Gaussian noise, float32; +inf outside the sensor's limits."""
     ranges = np.asarray(true_ranges_m, float)
     noisy = np.maximum(ranges + sensor.sigma_range_m * rng.standard_normal(ranges.shape), 0.0)

@@ -4,10 +4,9 @@ import math
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 import sim.sensors.point_cloud as point_cloud
-from sim.arrays import Array
+from sim.arrays import Array, ArrayLike, Floats
 from sim.errors import require
 from sim.options import NonNegative, Positive, options
 from sim.sensors.base import Field, Mount, Probe, Reading, Schema
@@ -62,7 +61,7 @@ class Lidar3D:
         """Probe that casts a turn and adds the noise."""
         return lambda view: {"ranges_m": self.measure(view.cloud(self), rng)}
 
-    def measure(self, true_ranges_m: ArrayLike, rng: np.random.Generator) -> NDArray[np.float32]:
+    def measure(self, true_ranges_m: ArrayLike, rng: np.random.Generator) -> Floats:
         """Noisy ranges (n_rings, n_azimuths), float32; +inf where nothing is in range."""
         return noisy_ranges(self, true_ranges_m, rng)
 

@@ -4,14 +4,15 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+
+from sim.arrays import Values
 
 MESSAGE = "sensor_msgs/msg/PointCloud2"
 _CODES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
 _KINDS = {code: kind for kind, code in _CODES.items()}
 
 
-def fields(parts: Mapping[str, NDArray[Any]], height: int = 1) -> dict[str, Any]:
+def fields(parts: Mapping[str, Values], height: int = 1) -> dict[str, Any]:
     """Fields of the message of named columns (N,), but for its header."""
     dtype = np.dtype([(name, values.dtype) for name, values in parts.items()])
     table = np.zeros(len(next(iter(parts.values()))), dtype)
@@ -33,7 +34,7 @@ def fields(parts: Mapping[str, NDArray[Any]], height: int = 1) -> dict[str, Any]
     }
 
 
-def columns(message: Any) -> NDArray[Any]:
+def columns(message: Any) -> Values:
     """Points of a message as a structured array (N,).
 
     Raises

@@ -4,9 +4,8 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sim.arrays import Array
+from sim.arrays import Array, Bools
 from sim.robot.base import Robot
 from sim.se2 import transform
 from sim.sensors.base import Rays
@@ -36,7 +35,7 @@ class ExactRays:
 
         return cast_lidar(self._world, lidar, lidar.mount.in_map(pose))
 
-    def sees(self, origin: Array, points: Array) -> NDArray[np.bool_]:
+    def sees(self, origin: Array, points: Array) -> Bools:
         """Whether nothing stands between a point (3,) and each of others (K, 3)."""
         from sim.sensors.casting import visible
 
@@ -71,7 +70,7 @@ class AmongRobots:
         """Ranges (rings, azimuths) m of a lidar on the robot at a pose (3,)."""
         return np.minimum(self._rays.cloud(lidar, pose), self._boxes().cloud(lidar, pose))
 
-    def sees(self, origin: Array, points: Array) -> NDArray[np.bool_]:
+    def sees(self, origin: Array, points: Array) -> Bools:
         """Whether nothing stands between a point (3,) and each of others (K, 3)."""
         return self._rays.sees(origin, points) & self._boxes().sees(origin, points)
 
@@ -108,7 +107,7 @@ class BulletRays:
         ranges = self._ranges(starts, way, lidar.max_range_m, ground=True)
         return ranges.reshape(lidar.n_rings, lidar.n_azimuths)
 
-    def sees(self, origin: Array, points: Array) -> NDArray[np.bool_]:
+    def sees(self, origin: Array, points: Array) -> Bools:
         """Whether nothing stands between a point (3,) and each of others (K, 3)."""
         if len(points) == 0:
             return np.zeros(0, bool)

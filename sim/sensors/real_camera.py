@@ -1,12 +1,10 @@
 """A camera of landmarks as real detectors are: it misses, misreads, and errs alike for a while."""
 
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sim.arrays import Array, Ints
+from sim.arrays import Array, Floats, Ints, Values
 from sim.options import NonNegative, Positive, Share, options
 from sim.sensors.base import Reading, View
 from sim.sensors.stereo import StereoCamera, in_field_of_view, points_in_camera
@@ -64,7 +62,7 @@ class DetectingEye:
         ids = ids[view.sees(origin, world.landmarks[ids])]
         if not len(ids):
             return None
-        reading: dict[str, NDArray[Any]] = {
+        reading: dict[str, Values] = {
             "points_in_camera": self._observed(inside[ids], ids),
             "descriptors": self._descriptors(world)[ids],
             "true_ids": ids.astype(np.int64),
@@ -75,7 +73,7 @@ class DetectingEye:
             reading["ids"] = np.where(misread, other, ids).astype(np.int64)
         return reading
 
-    def _descriptors(self, world: World) -> NDArray[np.float32]:
+    def _descriptors(self, world: World) -> Floats:
         """Those of the world (L, D), without noise; of no components if it has none."""
         n = len(world.landmarks)
         return world.descriptors if len(world.descriptors) else np.zeros((n, 0), np.float32)

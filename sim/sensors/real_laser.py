@@ -3,10 +3,9 @@
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, Strict
 
-from sim.arrays import Array, Ints
+from sim.arrays import Array, Bools, Ints
 from sim.errors import require
 from sim.options import Share, options
 from sim.sensors.base import Probe, Reading, View
@@ -61,9 +60,7 @@ class RealLaser(Laser):
         return np.where(short & np.isfinite(true_m), obstacle_m, ends_m)
 
 
-def _settled(
-    n: int, share: float, together: float, rng: np.random.Generator
-) -> tuple[NDArray[np.bool_], Ints]:
+def _settled(n: int, share: float, together: float, rng: np.random.Generator) -> tuple[Bools, Ints]:
     """Whether each of n beams fails, and the first of its group of neighbours, which fail alike."""
     begins = rng.random(n) < 1.0 / together
     begins[0] = True

@@ -1,7 +1,5 @@
 """A stereo camera that sees the other robots of a team."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

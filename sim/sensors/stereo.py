@@ -6,11 +6,10 @@ import math
 from typing import Any, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 from pydantic import NonNegativeInt
 
 import sim.sensors.point_cloud as point_cloud
-from sim.arrays import Array
+from sim.arrays import Array, ArrayLike, Bools, Floats, Ints, Values
 from sim.options import Acute, NonNegative, Positive, options
 from sim.sensors.base import Field, Mount, Reading, Schema, View
 from sim.worlds.world import World
@@ -160,7 +159,7 @@ def points_in_camera(camera: StereoCamera, pose: Array, points_in_world: Array) 
     return np.stack([-left, -offset[:, 2], forward], axis=-1)
 
 
-def in_field_of_view(camera: StereoCamera, points: Array) -> NDArray[np.bool_]:
+def in_field_of_view(camera: StereoCamera, points: Array) -> Bools:
     """Which points (N, 3) of the camera frame are within its angles and its greatest distance."""
     x, y, z = points.T
     return np.asarray(
@@ -197,14 +196,14 @@ class LandmarkEye:
         observed = camera.measure(inside[ids], self._rng)
         descriptors = self._describe(view.world, ids, origin)
         whole = np.isfinite(observed).all(axis=1)
-        reading: dict[str, NDArray[Any]] = {
+        reading: dict[str, Values] = {
             "points_in_camera": observed[whole],
             "descriptors": descriptors[whole],
             "true_ids": ids[whole].astype(np.int64),
         }
         return reading | ({"ids": reading["true_ids"]} if camera.identifies else {})
 
-    def _choose(self, ids: NDArray[np.int64], inside: Array) -> NDArray[np.int64]:
+    def _choose(self, ids: Ints, inside: Array) -> Ints:
         """At most B of the visible landmarks, by the camera's rule."""
         camera = self._camera
         most = camera.max_observations
@@ -225,7 +224,7 @@ class LandmarkEye:
             gap = np.minimum(gap, np.linalg.norm(pixels - pixels[taken[-1]], axis=1))
         return ids[taken]
 
-    def _describe(self, world: World, ids: NDArray[np.int64], origin: Array) -> NDArray[np.float32]:
+    def _describe(self, world: World, ids: Ints, origin: Array) -> Floats:
         """Noisy descriptors: white noise, and a drift with the change of the viewing angle."""
         camera = self._camera
         if world.descriptors.size == 0:
@@ -242,7 +241,5 @@ class LandmarkEye:
             + camera.sigma_descriptor * white
             + camera.sigma_view_descriptor * change[:, None] * self._view_axes[ids]
         )
-        unit: NDArray[np.float32] = (noisy / np.linalg.norm(noisy, axis=1, keepdims=True)).astype(
-            np.float32
-        )
+        unit: Floats = (noisy / np.linalg.norm(noisy, axis=1, keepdims=True)).astype(np.float32)
         return unit

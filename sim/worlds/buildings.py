@@ -1,7 +1,7 @@
 """Worlds from a few parameters and a random stream.
 
-Each builder is a function `name(*, rng, ...) -> World`; its parameters are the options of a world,
-and their defaults stand here.
+Each builder is a function `name(*, rng, ...) -> World`, whose parameters are the options of a
+world, or a class of options with a method `build(rng) -> World`.
 """
 
 import math
@@ -11,9 +11,11 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
+from pydantic import NonNegativeInt
 
 from sim.arrays import Array
 from sim.errors import InputError, require, required
+from sim.options import Count, NonNegative, Positive, Share, build, options
 from sim.worlds.floor_plan import WALL_HEIGHT_M, Plan, box_corners, check_margins, rectangle_corners
 from sim.worlds.grid_file import read_grid
 from sim.worlds.town import lawn, terrace, town
@@ -108,113 +110,131 @@ def boxes(
     return plan.world("boxes", rng, n_landmarks=n_landmarks, look_alike_share=look_alike_share)
 
 
-def rooms(
-    *,
-    rng: np.random.Generator,
-    n_x: int = 3,
-    n_y: int = 2,
-    room_m: float = 6.0,
-    door_m: float = 1.2,
-    objects_per_room: int = 3,
-    n_landmarks: int = 200,
-    on_walls_share: float = 0.7,
-    look_alike_share: float = 0.0,
-) -> World:
-    """Build n_x by n_y square rooms with a door between all neighbours.
+@options("world")
+class Rooms:
+    """n_x by n_y square rooms with a door between all neighbours.
 
     The tour goes from room to room: round the outer ring, then, where there is one, round the
     ring inside it, and back.
     """
-    require(
-        n_x >= 1 and n_y >= 1 and n_x * n_y >= 2,
-        f"world.n_x and n_y must make at least two rooms, got {n_x} x {n_y}",
-    )
-    check_margins(room_m=room_m - 2.0, door_m=door_m - 0.7, wall=room_m - door_m)
-    plan = Plan()
-    plan.rectangle((0, 0), (n_x * room_m, n_y * room_m))
-    door = [(room_m / 2, door_m)]
-    corners = [(i * room_m, j * room_m) for i in range(n_x) for j in range(n_y)]
-    for x, y in corners:
-        plan.place("room", x, y, x + room_m, y + room_m)
-        if x < (n_x - 1) * room_m:
-            plan.wall((x + room_m, y), (x + room_m, y + room_m), gaps=door)
-            plan.door((x + room_m, y + room_m / 2), (1, 0))
-        if y < (n_y - 1) * room_m:
-            plan.wall((x, y + room_m), (x + room_m, y + room_m), gaps=door)
-            plan.door((x + room_m / 2, y + room_m), (0, 1))
-    plan.tour = [((i + 0.5) * room_m, (j + 0.5) * room_m) for i, j in _grid_tour(n_x, n_y)]
-    for low in corners:
-        plan.furnish(rng, low, np.add(low, room_m).tolist(), objects_per_room)
-    return plan.world(
-        "rooms",
-        rng,
-        n_landmarks=n_landmarks,
-        on_walls_share=on_walls_share,
-        look_alike_share=look_alike_share,
-    )
+
+    n_x: Count = 3
+    n_y: Count = 2
+    room_m: Positive = 6.0
+    door_m: Positive = 1.2
+    objects_per_room: NonNegativeInt = 3
+    n_landmarks: NonNegativeInt = 200
+    on_walls_share: Share = 0.7
+    """Share of the landmarks on walls; the others are on objects."""
+    look_alike_share: Share = 0.0
+    """Share of the landmarks that look like another one."""
+
+    def __post_init__(self) -> None:
+        require(
+            self.n_x * self.n_y >= 2,
+            f"world.n_x and n_y must make at least two rooms, got {self.n_x} x {self.n_y}",
+        )
+        room_m, door_m = self.room_m, self.door_m
+        check_margins(room_m=room_m - 2.0, door_m=door_m - 0.7, wall=room_m - door_m)
+
+    def build(self, rng: np.random.Generator) -> World:
+        """Build the world."""
+        n_x, n_y, room_m, plan = self.n_x, self.n_y, self.room_m, Plan()
+        plan.rectangle((0, 0), (n_x * room_m, n_y * room_m))
+        door = [(room_m / 2, self.door_m)]
+        corners = [(i * room_m, j * room_m) for i in range(n_x) for j in range(n_y)]
+        for x, y in corners:
+            plan.place("room", x, y, x + room_m, y + room_m)
+            if x < (n_x - 1) * room_m:
+                plan.wall((x + room_m, y), (x + room_m, y + room_m), gaps=door)
+                plan.door((x + room_m, y + room_m / 2), (1, 0))
+            if y < (n_y - 1) * room_m:
+                plan.wall((x, y + room_m), (x + room_m, y + room_m), gaps=door)
+                plan.door((x + room_m / 2, y + room_m), (0, 1))
+        plan.tour = [((i + 0.5) * room_m, (j + 0.5) * room_m) for i, j in _grid_tour(n_x, n_y)]
+        for low in corners:
+            plan.furnish(rng, low, np.add(low, room_m).tolist(), self.objects_per_room)
+        return plan.world(
+            "rooms",
+            rng,
+            n_landmarks=self.n_landmarks,
+            on_walls_share=self.on_walls_share,
+            look_alike_share=self.look_alike_share,
+        )
 
 
-def corridor(
-    *,
-    rng: np.random.Generator,
-    bare_m: float = 30.0,
-    objects_m: float = 15.0,
-    bare_after_m: float = 0.0,
-    second_leg_m: float = 12.0,
-    curve_radius_m: float = 4.0,
-    third_leg_m: float = 10.0,
-    width_m: float = 2.2,
-    n_objects: int = 8,
-    n_landmarks: int = 80,
-    look_alike_share: float = 0.0,
-) -> World:
-    """Build a bare stretch, objects, a bare stretch, a sharp bend, a leg, a round curve, a leg.
+@options("world")
+class Corridor:
+    """A bare stretch, objects, a bare stretch, a sharp bend, a leg, a round curve, a leg.
 
     Both turn left. The place `corridor_bare` stops 3 m short of the end wall and of the objects,
     and so do `leg_1` to `leg_3`, the bare stretches before, between and after the bends, where they
-    are longer than that; the radius is that of the middle of the corridor.
+    are longer than that.
     """
-    check_margins(
-        bare_m=bare_m - 6.0,
-        objects_m=objects_m,
-        second_leg_m=second_leg_m,
-        third_leg_m=third_leg_m - 1.0,
-        width_m=width_m - 1.8,
-        curve_radius_m=curve_radius_m - width_m / 2 - 0.2,
-    )
-    plan, w, r = Plan(), width_m, curve_radius_m
-    x1, x2 = bare_m, bare_m + objects_m + bare_after_m
-    end, top, xc = x1 + objects_m, w + second_leg_m, x2 + w / 2
-    far = xc - r - third_leg_m
-    angle = np.linspace(0.0, math.pi / 2, 13)
-    arc = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    centre = np.array([xc - r, top])
-    outer, inner = centre + (r + w / 2) * arc, centre + (r - w / 2) * arc[::-1]
-    ends = [(far, top + r + w / 2), (far, top + r - w / 2)]
-    plan.enclosure([(0, 0), (x2 + w, 0), *outer, *ends, *inner, (x2, w), (0, w)])
-    plan.place("corridor_bare", 3.0, 0, x1 - 3.0, w)
-    plan.place("corridor_objects", x1, 0, end, w)
-    plan.place("corner", x2, 0, x2 + w, w)
-    legs = (
-        (bare_after_m, (end + 3.0, 0, x2 - 3.0, w)),
-        (second_leg_m, (x2, w + 3.0, x2 + w, top - 3.0)),
-        (third_leg_m, (far + 3.0, top + r - w / 2, xc - r - 3.0, top + r + w / 2)),
-    )
-    for number, (length, area) in enumerate(legs, 1):
-        if length > 6.0:
-            plan.place(f"leg_{number}", *area)
-    plan.place("curve", xc - r, top, x2 + w, top + r + w / 2)
-    middle = [(float(x), float(y)) for x, y in centre + r * arc]
-    plan.tour = [(1.0, w / 2), (xc, w / 2), *middle, (far + 1.0, top + r)]
-    _line_up(plan, rng, (x1, 0), (end, w), n_objects)
-    return plan.world("corridor", rng, n_landmarks=n_landmarks, look_alike_share=look_alike_share)
+
+    bare_m: float = 30.0
+    objects_m: float = 15.0
+    bare_after_m: NonNegative = 0.0
+    second_leg_m: float = 12.0
+    curve_radius_m: float = 4.0
+    """Radius of the middle of the corridor."""
+    third_leg_m: float = 10.0
+    width_m: float = 2.2
+    n_objects: NonNegativeInt = 8
+    n_landmarks: NonNegativeInt = 80
+    look_alike_share: Share = 0.0
+    """Share of the landmarks that look like another one."""
+
+    def __post_init__(self) -> None:
+        check_margins(
+            bare_m=self.bare_m - 6.0,
+            objects_m=self.objects_m,
+            second_leg_m=self.second_leg_m,
+            third_leg_m=self.third_leg_m - 1.0,
+            width_m=self.width_m - 1.8,
+            curve_radius_m=self.curve_radius_m - self.width_m / 2 - 0.2,
+        )
+
+    def build(self, rng: np.random.Generator) -> World:
+        """Build the world."""
+        plan, w, r = Plan(), self.width_m, self.curve_radius_m
+        x1, x2 = self.bare_m, self.bare_m + self.objects_m + self.bare_after_m
+        end, top, xc = x1 + self.objects_m, w + self.second_leg_m, x2 + w / 2
+        far = xc - r - self.third_leg_m
+        angle = np.linspace(0.0, math.pi / 2, 13)
+        arc = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        centre = np.array([xc - r, top])
+        outer, inner = centre + (r + w / 2) * arc, centre + (r - w / 2) * arc[::-1]
+        ends = [(far, top + r + w / 2), (far, top + r - w / 2)]
+        plan.enclosure([(0, 0), (x2 + w, 0), *outer, *ends, *inner, (x2, w), (0, w)])
+        plan.place("corridor_bare", 3.0, 0, x1 - 3.0, w)
+        plan.place("corridor_objects", x1, 0, end, w)
+        plan.place("corner", x2, 0, x2 + w, w)
+        legs = (
+            (self.bare_after_m, (end + 3.0, 0, x2 - 3.0, w)),
+            (self.second_leg_m, (x2, w + 3.0, x2 + w, top - 3.0)),
+            (self.third_leg_m, (far + 3.0, top + r - w / 2, xc - r - 3.0, top + r + w / 2)),
+        )
+        for number, (length, area) in enumerate(legs, 1):
+            if length > 6.0:
+                plan.place(f"leg_{number}", *area)
+        plan.place("curve", xc - r, top, x2 + w, top + r + w / 2)
+        middle = [(float(x), float(y)) for x, y in centre + r * arc]
+        plan.tour = [(1.0, w / 2), (xc, w / 2), *middle, (far + 1.0, top + r)]
+        _line_up(plan, rng, (x1, 0), (end, w), self.n_objects)
+        return plan.world(
+            "corridor",
+            rng,
+            n_landmarks=self.n_landmarks,
+            look_alike_share=self.look_alike_share,
+        )
 
 
 def corridors(*, rng: np.random.Generator, n_objects: list[int], **lengths_m: list[float]) -> World:
-    """Build a corridor whose sizes are drawn, each between the two ends given."""
+    """Build a `Corridor` whose sizes are drawn, each between the two ends given."""
     drawn = {name: rng.uniform(ends[0], ends[1]) for name, ends in lengths_m.items()}
     count = int(rng.integers(n_objects[0], n_objects[1] + 1))
-    return corridor(rng=rng, n_objects=count, n_landmarks=0, look_alike_share=0.0, **drawn)
+    return build(Corridor, {**drawn, "n_objects": count, "n_landmarks": 0}, "world").build(rng)
 
 
 def office(

@@ -5,9 +5,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from sim.arrays import Array
+from sim.arrays import Array, ArrayLike, Bools, Floats
 from sim.errors import InputError, require
 from sim.worlds.world import World, facing_second
 
@@ -125,7 +124,7 @@ class Plan:
         Raises
         ------
         InputError
-            If there is no room for so many.
+            If so many do not fit.
         """
         require(count >= 0, f"world: the number of objects must be zero or more, got {count}")
         least, most = np.array(low, float), np.array(high, float)
@@ -221,7 +220,7 @@ class Plan:
             ]
         )
 
-    def _scatter(self, rng: np.random.Generator, count: int, on: NDArray[np.bool_]) -> Array:
+    def _scatter(self, rng: np.random.Generator, count: int, on: Bools) -> Array:
         """Landmarks (count, 3) just off the faces `on`, where one can stand and see them.
 
         A point that comes to lie behind an outer wall or in an object is drawn again.
@@ -243,7 +242,7 @@ class Plan:
             found = np.concatenate([found, points[self._open(points)]])
         return found[:count]
 
-    def _open(self, points: Array) -> NDArray[np.bool_]:
+    def _open(self, points: Array) -> Bools:
         """Whether points (N, 3) lie over a floor, and not in an object."""
         free = np.full(len(points), not self.floors)
         for ring in self.floors:
@@ -258,7 +257,7 @@ def rectangle_corners(low: Sequence[float], high: Sequence[float]) -> Array:
     return np.array([(low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])])
 
 
-def inside(points: Array, ring: Array) -> NDArray[np.bool_]:
+def inside(points: Array, ring: Array) -> Bools:
     """Whether points (N, 2) lie inside the outline with corners (K, 2), by parity of crossings."""
     within = np.zeros(len(points), bool)
     near = np.all((points >= ring.min(axis=0)) & (points <= ring.max(axis=0)), axis=1)
@@ -328,7 +327,7 @@ def regular(centre: Sequence[float], radius_m: float, sides: int) -> Array:
 
 def make_descriptors(
     rng: np.random.Generator, count: int, look_alike_share: float
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+) -> tuple[Floats, Bools]:
     """SIFT-like descriptors (count, 128): sparse, non-negative, of unit length.
 
     `look_alike_share` of the landmarks share theirs with another one, in pairs (the last three

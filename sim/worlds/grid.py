@@ -8,12 +8,11 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
 from sim import se2
-from sim.arrays import Array, Floats, Ints
-from sim.errors import InputError
+from sim.arrays import Array, ArrayLike, Bools, Floats, Ints
+from sim.errors import require
 from sim.worlds.world import World
 
 if TYPE_CHECKING:
@@ -42,26 +41,30 @@ class OccupancyGrid:
     origin: Array = field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self) -> None:
-        if self.probability.ndim != 2 or self.probability.size == 0:
-            raise InputError(f"a grid has rows and columns, got shape {self.probability.shape}")
-        if np.any(self.probability < 0.0) or np.any(self.probability > 1.0):
-            raise InputError("a grid's probabilities lie in [0, 1], or are NaN where unknown")
-        if not 1e-4 <= self.resolution_m <= 100.0:
-            raise InputError(
-                f"a grid's resolution must lie between 0.1 mm and 100 m, got {self.resolution_m}"
-            )
-        if np.shape(self.origin) != (3,) or not np.all(np.abs(self.origin) <= 1e7):
-            raise InputError(
-                f"a grid's origin is x, y, yaw, within 10,000 km of map's, got {self.origin}"
-            )
+        require(
+            self.probability.ndim == 2 and self.probability.size > 0,
+            f"a grid has rows and columns, got shape {self.probability.shape}",
+        )
+        require(
+            not np.any((self.probability < 0.0) | (self.probability > 1.0)),
+            "a grid's probabilities lie in [0, 1], or are NaN where unknown",
+        )
+        require(
+            1e-4 <= self.resolution_m <= 100.0,
+            f"a grid's resolution must lie between 0.1 mm and 100 m, got {self.resolution_m}",
+        )
+        require(
+            np.shape(self.origin) == (3,) and np.all(np.abs(self.origin) <= 1e7),
+            f"a grid's origin is x, y, yaw, within 10,000 km of map's, got {self.origin}",
+        )
 
     @property
-    def free(self) -> NDArray[np.bool_]:
+    def free(self) -> Bools:
         """(rows, columns): where nothing stands."""
         return self.probability < FREE_BELOW
 
     @property
-    def occupied(self) -> NDArray[np.bool_]:
+    def occupied(self) -> Bools:
         """(rows, columns): where something stands. What is neither free nor this is unknown."""
         return self.probability > OCCUPIED_ABOVE
 
@@ -101,7 +104,7 @@ class OccupancyGrid:
         return se2.transform(self.origin, ends).reshape(-1, 4)
 
 
-def _runs(mask: NDArray[np.bool_]) -> tuple[Ints, Ints, Ints]:
+def _runs(mask: Bools) -> tuple[Ints, Ints, Ints]:
     """Row, first column and column after the last of each run of True along the rows."""
     steps = np.diff(np.pad(mask.astype(np.int8), ((0, 0), (1, 1))), axis=1)
     row, first = np.nonzero(steps == 1)
@@ -110,10 +113,10 @@ def _runs(mask: NDArray[np.bool_]) -> tuple[Ints, Ints, Ints]:
 
 def check_size(rows: float, columns: float, what: str, remedy: str) -> None:
     """Refuse a grid of too many cells before memory is taken for it."""
-    if not rows * columns <= MOST_CELLS:
-        raise InputError(
-            f"{what}: {columns:.0f} x {rows:.0f} cells, and {MOST_CELLS} are the most; {remedy}"
-        )
+    require(
+        rows * columns <= MOST_CELLS,
+        f"{what}: {columns:.0f} x {rows:.0f} cells, and {MOST_CELLS} are the most; {remedy}",
+    )
 
 
 def of_world(recording: Recording, resolution_m: float, z_m: float) -> OccupancyGrid:
@@ -132,14 +135,15 @@ def rasterized(world: World, resolution_m: float, z_m: float) -> OccupancyGrid:
     Raises
     ------
     InputError
-        If there is no wall at that height, or nothing to reach, or there are too many cells.
+        If no wall stands at that height, nothing can be reached, or there are too many cells.
     """
-    if not (math.isfinite(resolution_m) and resolution_m > 0.0):
-        raise InputError(f"resolution_m must be a positive number, got {resolution_m}")
+    require(
+        math.isfinite(resolution_m) and resolution_m > 0.0,
+        f"resolution_m must be a positive number, got {resolution_m}",
+    )
     low, high = world.wall_z_m.T
     walls = world.walls[(low <= z_m) & (z_m <= high)]
-    if len(walls) == 0:
-        raise InputError(f"world {world.name} has no wall at a height of {z_m} m")
+    require(len(walls) > 0, f"world {world.name} has no wall at a height of {z_m} m")
     ends = walls.reshape(-1, 2)
     corner = (np.floor(ends.min(axis=0) / resolution_m) - 2.0) * resolution_m
     columns, rows = np.ceil((ends.max(axis=0) - corner) / resolution_m) + 2.0
@@ -156,8 +160,9 @@ def rasterized(world: World, resolution_m: float, z_m: float) -> OccupancyGrid:
     places = np.floor((starts - corner) / resolution_m).astype(np.int64)
     places = places[np.all((places >= 0) & (places < [columns, rows]), axis=1)]
     reached = np.setdiff1d(floors[places[:, 1], places[:, 0]], [0])
-    if len(reached) == 0:
-        raise InputError(f"world {world.name}: start pose and way-points lie in walls or outside")
+    require(
+        len(reached) > 0, f"world {world.name}: start pose and way-points lie in walls or outside"
+    )
     probability = np.full(occupied.shape, np.nan, np.float32)
     probability[np.isin(floors, reached)] = 0.0
     probability[occupied] = 1.0

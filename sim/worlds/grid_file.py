@@ -21,12 +21,8 @@ A pixel's shade runs from 0 (black) to 1 (white), and its occupancy is 1 - shade
 Keys that the map server does not know are passed over, as it does.
 """
 
-from __future__ import annotations
-
-import math
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -34,11 +30,11 @@ import numpy as np
 import yaml
 from PIL import Image
 
-from sim.arrays import Array, Floats
-from sim.errors import InputError
+from sim.arrays import Floats
+from sim.errors import InputError, require
 from sim.files import require_file, write_whole
 from sim.worlds.grid import FREE_BELOW, OCCUPIED_ABOVE, OccupancyGrid, check_size
-from sim.yaml_file import read_yaml
+from sim.yaml_file import number, read_yaml, shown
 
 SUFFIXES = (".yaml", ".yml")
 _KEYS = {  # of a complete file, with what the map server writes
@@ -65,17 +61,6 @@ _UNREADABLE = (
 )
 
 
-@dataclass(frozen=True)
-class _Meta:
-    image: Path
-    resolution_m: float
-    origin: Array
-    negate: bool
-    occupied_thresh: float
-    free_thresh: float
-    mode: str
-
-
 def read_grid(path: str | Path) -> OccupancyGrid:
     """Read a grid.
 
@@ -90,8 +75,38 @@ def read_grid(path: str | Path) -> OccupancyGrid:
     InputError
         Naming the file, the key and what it must be.
     """
-    meta = _meta(Path(path))
-    return OccupancyGrid(_probability(meta), meta.resolution_m, meta.origin)
+    path = Path(path)
+    document = _document(path)
+    for key, usual in _KEYS.items():
+        require(
+            document.get(key) is not None,
+            f"{path}: {key} is missing; the map server writes {key}: {usual}",
+        )
+    image, origin, negate = document["image"], document["origin"], document["negate"]
+    mode = document.get("mode", "trinary")
+    checks = {
+        f"image must be {_KEYS['image']}, got {shown(image)}": isinstance(image, str) and image,
+        f"origin must be [x, y, yaw], got {shown(origin)}": (
+            isinstance(origin, list) and len(origin) == 3
+        ),
+        f"negate must be 0 or 1, got {shown(negate)}": negate in (0, 1),
+        f"mode must be {', '.join(_MODES)}, got {shown(mode)}": mode in _MODES,
+    }
+    for complaint, holds in checks.items():
+        require(holds, f"{path}: {complaint}")
+    resolution_m, occupied, free = (
+        number(document[key], f"{path}: {key}")
+        for key in ("resolution", "occupied_thresh", "free_thresh")
+    )
+    require(resolution_m > 0.0, f"{path}: resolution must be positive, got {resolution_m:g}")
+    require(
+        0.0 <= free < occupied <= 1.0,
+        f"{path}: free_thresh must be below occupied_thresh, both between 0 and 1, got {free:g} "
+        f"and {occupied:g}",
+    )
+    pose = [number(value, f"{path}: origin[{i}]") for i, value in enumerate(origin)]
+    probability = _probability(path.parent / image, mode, bool(negate), (free, occupied))
+    return OccupancyGrid(probability, resolution_m, np.array(pose))
 
 
 def image_of(path: Path) -> Path | None:
@@ -123,8 +138,7 @@ def write_grid(
         If the name does not end in .yaml, or the files cannot be written.
     """
     check_name(path)
-    if mode not in ("trinary", "raw"):
-        raise InputError(f"a grid is written as trinary or raw, got {mode!r}")
+    require(mode in ("trinary", "raw"), f"a grid is written as trinary or raw, got {mode!r}")
     if mode == "raw":
         known = np.isfinite(grid.probability)
         percent = np.rint(100.0 * np.where(known, grid.probability, 0.0))
@@ -152,93 +166,31 @@ def write_grid(
 
 def check_name(path: Path) -> None:
     """Refuse a name that is not one of a grid."""
-    if path.suffix not in SUFFIXES:
-        raise InputError(f"{path}: a grid is a .yaml file, with its image beside it")
+    require(path.suffix in SUFFIXES, f"{path}: a grid is a .yaml file, with its image beside it")
 
 
 def _document(path: Path) -> Mapping[str, Any]:
-    document = read_yaml(path, _MOST_BYTES)
-    if not isinstance(document, Mapping):
-        raise InputError(f"{path}: must hold the keys {', '.join(_KEYS)}")
+    document: Mapping[str, Any] = read_yaml(path, _MOST_BYTES)
+    require(isinstance(document, Mapping), f"{path}: must hold the keys {', '.join(_KEYS)}")
     return document
 
 
-def _meta(path: Path) -> _Meta:
-    document = _document(path)
-    for key, usual in _KEYS.items():
-        if document.get(key) is None:
-            raise InputError(f"{path}: {key} is missing; the map server writes {key}: {usual}")
-    image, origin, negate = document["image"], document["origin"], document["negate"]
-    if not isinstance(image, str) or not image:
-        raise InputError(f"{path}: image must be {_KEYS['image']}, got {_shown(image)}")
-    if not isinstance(origin, list) or len(origin) != 3:
-        raise InputError(f"{path}: origin must be [x, y, yaw], got {_shown(origin)}")
-    if negate not in (0, 1):
-        raise InputError(f"{path}: negate must be 0 or 1, got {_shown(negate)}")
-    mode = document.get("mode", "trinary")
-    if mode not in _MODES:
-        raise InputError(f"{path}: mode must be {', '.join(_MODES)}, got {_shown(mode)}")
-    numbers = {
-        key: _number(document[key], f"{path}: {key}")
-        for key in ("resolution", "occupied_thresh", "free_thresh")
-    }
-    if numbers["resolution"] <= 0.0:
-        raise InputError(f"{path}: resolution must be positive, got {numbers['resolution']:g}")
-    free, occupied = numbers["free_thresh"], numbers["occupied_thresh"]
-    for key in ("occupied_thresh", "free_thresh"):
-        if not 0.0 <= numbers[key] <= 1.0:
-            raise InputError(f"{path}: {key} must lie between 0 and 1, got {numbers[key]:g}")
-    if free >= occupied:
-        raise InputError(
-            f"{path}: free_thresh must be below occupied_thresh, got {free:g} and {occupied:g}"
-        )
-    pose = [_number(value, f"{path}: origin[{i}]") for i, value in enumerate(origin)]
-    return _Meta(
-        path.parent / image,
-        numbers["resolution"],
-        np.array(pose),
-        bool(negate),
-        occupied,
-        free,
-        mode,
-    )
-
-
-def _number(value: Any, where: str) -> float:
-    try:  # YAML 1.1 reads 5e-2, without a point, as text
-        number = math.nan if isinstance(value, bool) else float(value)
-    except (TypeError, ValueError, OverflowError):
-        number = math.nan
-    if not math.isfinite(number):
-        raise InputError(f"{where} must be a finite number, got {_shown(value)}")
-    return number
-
-
-def _shown(value: Any) -> str:
-    """A value for a message; of lists and mappings, which YAML can make endless, their size."""
-    if isinstance(value, (list, dict)):
-        return f"a {type(value).__name__} of {len(value)}"
-    return repr(value)[:80]
-
-
-def _probability(meta: _Meta) -> Floats:
+def _probability(image: Path, mode: str, negate: bool, thresholds: tuple[float, float]) -> Floats:
     """Probability (rows, columns), its first row at the bottom; NaN where unknown."""
-    colours, opacity = _shades(meta.image)
-    shade = colours
-    if meta.mode == "trinary" and opacity is not None:
-        shade = (3.0 * colours + opacity) / 4.0
-    occupancy = shade if meta.negate else np.float32(1.0) - shade
-    if meta.mode == "raw":
+    shade, opacity = _shades(image)
+    if mode == "trinary" and opacity is not None:
+        shade = (3.0 * shade + opacity) / 4.0
+    if mode == "raw":
         percent = np.rint(255.0 * shade)
         return np.where(percent <= 100.0, percent / 100.0, np.nan).astype(np.float32)[::-1]
-    occupied, free = occupancy > meta.occupied_thresh, occupancy < meta.free_thresh
-    if meta.mode == "scale":
-        span = meta.occupied_thresh - meta.free_thresh
-        between = np.clip((occupancy - meta.free_thresh) / span, 0.0, 1.0)
-        unknown = np.zeros(shade.shape, bool) if opacity is None else opacity < 1.0
-    else:
-        between, unknown = np.full(shade.shape, np.nan), np.zeros(shade.shape, bool)
-    out = np.select([unknown, occupied, free], [np.nan, 1.0, 0.0], between)
+    occupancy = shade if negate else np.float32(1.0) - shade
+    free, occupied = thresholds
+    between, unknown = np.full(shade.shape, np.nan), np.zeros(shade.shape, bool)
+    if mode == "scale":
+        between = np.clip((occupancy - free) / (occupied - free), 0.0, 1.0)
+        unknown |= opacity is not None and opacity < 1.0
+    sure = [unknown, occupancy > occupied, occupancy < free]
+    out = np.select(sure, [np.nan, 1.0, 0.0], between)
     return np.ascontiguousarray(out[::-1], dtype=np.float32)
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.arrays import Array
+from sim.arrays import Array, Bools, Floats
 from sim.errors import InputError, require
 
 
@@ -49,8 +49,8 @@ class World:
     walls: Array
     wall_z_m: Array
     landmarks: Array = field(default_factory=lambda: np.zeros((0, 3)))
-    descriptors: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 0), np.float32))
-    look_alike: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))
+    descriptors: Floats = field(default_factory=lambda: np.zeros((0, 0), np.float32))
+    look_alike: Bools = field(default_factory=lambda: np.zeros(0, bool))
     places: dict[str, Array] = field(default_factory=dict)
     start_pose: Array = field(default_factory=lambda: np.zeros(3))
     waypoints: Array = field(default_factory=lambda: np.zeros((0, 2)))

@@ -24,7 +24,7 @@ import numpy as np
 from sim.errors import InputError, require
 from sim.worlds.floor_plan import WALL_HEIGHT_M, box_corners, gaps_m, make_descriptors
 from sim.worlds.world import World, facing_second
-from sim.yaml_file import read_yaml
+from sim.yaml_file import number, read_yaml
 
 _KEYS = ("name", "walls", "boxes", "landmarks", "places", "waypoints", "start_pose")
 _BOX_KEYS = ("x", "y", "length", "width", "heading_deg", "height")
@@ -103,10 +103,7 @@ def _wall(entry: Any, where: str) -> tuple[list[float], list[float]]:
     if isinstance(entry, Mapping):
         _check_keys(entry, ("from", "to", "z"), where)
         require("from" in entry and "to" in entry, f"{where} must have from: [x, y] and to: [x, y]")
-        ends = [
-            *_numbers(entry["from"], 2, f"{where}.from", "x, y"),
-            *_numbers(entry["to"], 2, f"{where}.to", "x, y"),
-        ]
+        ends = [v for k in ("from", "to") for v in _numbers(entry[k], 2, f"{where}.{k}", "x, y")]
         if "z" in entry:
             z = _numbers(entry["z"], 2, f"{where}.z", "bottom, top")
     else:
@@ -125,19 +122,17 @@ def _box(entry: Any, where: str) -> list[tuple[list[float], list[float]]]:
         f"{where} must be a mapping of {', '.join(_BOX_KEYS)}, got {entry!r}",
     )
     _check_keys(entry, _BOX_KEYS, where)
-    for key in ("x", "y", "length", "width"):
-        require(key in entry, f"{where}.{key} is missing")
     values = {"heading_deg": 0.0, "height": WALL_HEIGHT_M, **entry}
-    numbers = {k: _number(v, f"{where}.{k}") for k, v in values.items()}
-    for key in ("length", "width", "height"):
-        require(numbers[key] > 0.0, f"{where}.{key} must be positive, got {numbers[key]:g}")
-    corners = box_corners(
-        (numbers["x"], numbers["y"]),
-        (numbers["length"], numbers["width"]),
-        math.radians(numbers["heading_deg"]),
+    for key in _BOX_KEYS:
+        require(key in values, f"{where}.{key} is missing")
+    x, y, length, width, heading_deg, height = (
+        number(values[key], f"{where}.{key}") for key in _BOX_KEYS
     )
+    for key, side in (("length", length), ("width", width), ("height", height)):
+        require(side > 0.0, f"{where}.{key} must be positive, got {side:g}")
+    corners = box_corners((x, y), (length, width), math.radians(heading_deg))
     return [
-        ([*a, *b], [0.0, numbers["height"]])
+        ([*a, *b], [0.0, height])
         for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)
     ]
 
@@ -167,13 +162,4 @@ def _numbers(entry: Any, count: int, where: str, names: str) -> list[float]:
         isinstance(entry, list) and len(entry) == count,
         f"{where} must be {count} numbers {names}, got {entry!r}",
     )
-    return [_number(value, where) for value in entry]
-
-
-def _number(value: Any, where: str) -> float:
-    try:  # YAML 1.1 reads 1e-3, without a point, as text
-        number = math.nan if isinstance(value, bool) else float(value)
-    except (TypeError, ValueError):
-        number = math.nan
-    require(math.isfinite(number), f"{where}: {value!r} is not a finite number")
-    return number
+    return [number(value, where) for value in entry]

@@ -147,7 +147,7 @@ def test_files_of_teams(tmp_path):
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [
-        (lambda arrays, meta: meta.update(team=meta["team"][:1]), "of no robot of its team"),
+        (lambda arrays, meta: meta.update(team=meta["team"][:1]), "belong to none of its robots"),
         (lambda arrays, meta: meta.update(team=[3, 4]), "not"),
         (lambda arrays, meta: arrays.pop("1.frame_stamps"), "frame_stamps is missing"),
         (lambda arrays, meta: arrays.update({"1.frame_stamps": np.zeros(0)}), "is empty"),

@@ -114,7 +114,7 @@ def rawseeds_ate() -> pd.DataFrame:
         folder = f"Bicocca_2009-02-{session}"
         names = (f"{folder}/{name}.csv", f"{folder}/{folder}-{name}.csv")
         member = next(n for n in names if n in members)
-        found = rawseeds.parse_trajectory(split_words(members[member], member))
+        found = rawseeds.read_trajectory(split_words(members[member], member))
         return found.stamps, found.poses
 
     rows = [

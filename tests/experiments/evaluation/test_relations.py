@@ -7,7 +7,7 @@ from experiments.evaluation.relations import relation_errors
 from experiments.evaluation.time_sync import aligned_ate_m, interpolate, nearest
 from sim import se2
 from sim.errors import InputError
-from sim.formats.rawseeds import parse_trajectory
+from sim.formats.rawseeds import read_trajectory
 from sim.formats.relations import Relations, read_relations
 from sim.formats.text import read_members, split_words
 from tests.fixtures.log_samples import DATA
@@ -109,7 +109,7 @@ def test_rawseeds_reference_figures_to_the_printed_digit():
             for prefix in ("", f"{folder}-"):
                 member = f"{folder}/{prefix}{name}.csv"
                 if member in members:
-                    return parse_trajectory(split_words(members[member], member))
+                    return read_trajectory(split_words(members[member], member))
             raise AssertionError(name)
 
         truth = trajectory("GROUNDTRUTH")

@@ -58,7 +58,7 @@ def test_intel_refused(change, where):
 
 
 def test_relations(tmp_path):
-    found = relations.parse_relations(words(samples.relations()))
+    found = relations.read_relations(words(samples.relations()))
     np.testing.assert_allclose(found.stamps, [[1, 2], [2, 3]])
     np.testing.assert_allclose(found.motion, [[0.5, 0.1, 0.2], [0.4, -0.1, -0.1]])
     path = tmp_path / "out.relations"
@@ -66,7 +66,7 @@ def test_relations(tmp_path):
     again = relations.read_relations(path)
     np.testing.assert_array_equal(again.motion, found.motion)
     with pytest.raises(InputError, match=r"log:2: .* 8 numbers, this has 3"):
-        relations.parse_relations(words(b"1 2 3 4 5 6 7 8\n1 2 3\n"))
+        relations.read_relations(words(b"1 2 3 4 5 6 7 8\n1 2 3\n"))
 
 
 def mrclam_folder(tmp_path, **changes):
@@ -161,12 +161,12 @@ def test_lego(tmp_path):
 
 
 def test_wean():
-    recording = wean.parse_wean(words(samples.wean_log()))
+    recording = wean.read_wean(words(samples.wean_log()))
     assert recording.log("laser")["ranges_m"].shape == (2, 180)
     assert np.isinf(recording.log("laser")["ranges_m"][0, 179])
     assert recording.sensors["laser"].mount.x_m == pytest.approx(0.25)
     np.testing.assert_allclose(recording.wheels.position_m[-1], [0.1, 0.1])
-    grid = wean.parse_grid(samples.wean_map(), "map")
+    grid = wean.read_grid(words(samples.wean_map()))
     np.testing.assert_array_equal(grid.values, [[np.nan, 0.5, 1.0], [0.0, 0.25, np.nan]])
     assert grid.cell_m == pytest.approx(0.1)
     assert grid.occupancy[1, 0] == 1.0
@@ -178,14 +178,14 @@ def test_wean():
         (b"global_map[0]: 800000000 800000000\n1", "map:1: no "),
         (b"global_map[0]: 3 3\n1 1 1 1\n", "map:1: 3 x 3 cells are promised, 4 are there"),
         (b"global_map[0]: 1 2\n1\nx\n", "map:3: a cell must be"),
-        (b"global_map[0]: 1\n", "map:1: a number is missing"),
+        (b"global_map[0]: 1\n", "map:1: too few words for the map's size"),
         (b"", "map:1: no "),
         (b"global_map[0]: 1 1\n7\n", "map:2: a cell must be"),
     ],
 )
 def test_wean_map_refused(data, reason):
     with pytest.raises(InputError, match=reason):
-        wean.parse_grid(data, "map")
+        wean.read_grid(split_words(data, "map"))
 
 
 @needs_data

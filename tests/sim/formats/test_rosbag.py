@@ -272,5 +272,5 @@ def test_a_database_that_brings_a_program(tmp_path):
             "CREATE VIEW messages AS WITH RECURSIVE n(i) AS "
             "(SELECT 1 UNION ALL SELECT i FROM n) SELECT i FROM n"
         )
-    with pytest.raises(InputError, match="a database with a view of its own is no bag"):
+    with pytest.raises(InputError, match="a database with a view of its own is not a bag"):
         read_bag(path)

@@ -11,7 +11,7 @@ from sim.routes.explore import Explore
 from sim.routes.frontiers import Ways, frontiers, in_sight, middle_of, nearest, unknown_in_sight
 from sim.sensors import Encoder, Laser
 from sim.simulate import Member, record_team
-from sim.worlds.buildings import rooms
+from sim.worlds.buildings import Rooms
 
 ROBOT = DifferentialDrive(
     wheel_radius_m=0.1, track_m=0.4, kr=0.0, kl=0.0, body_length_m=0.4, body_width_m=0.32
@@ -107,10 +107,10 @@ def test_the_nearest_cell_of_a_mask():
 
 
 def world():
-    return rooms(
-        rng=np.random.default_rng(0), n_x=2, n_y=2, room_m=4.0, door_m=1.6, objects_per_room=0,
-        n_landmarks=0, on_walls_share=1.0, look_alike_share=0.0,
-    )  # fmt: skip
+    options = Rooms(
+        n_x=2, n_y=2, room_m=4.0, door_m=1.6, objects_per_room=0, n_landmarks=0, on_walls_share=1.0
+    )
+    return options.build(np.random.default_rng(0))
 
 
 def explored(strategy, n_robots=2, distance_m=12.0, **changes):
