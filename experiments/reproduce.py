@@ -137,8 +137,7 @@ def _write(
     command = f"estima reproduce --paper {paper}{' --full' * (profile is Profile.FULL)}"
     write_claims(claims, place / "claims.csv", paper=paper, profile=profile, command=command)
     says = findings(paper)["claims"]
-    path = place / "verdicts.csv"
-    write_verdicts(conclusions, path, paper=paper, says=says, profile=profile)
+    write_verdicts(conclusions, place / "verdicts.csv", paper=paper, says=says, profile=profile)
 
 
 def _draw(made: Results) -> None:

@@ -188,8 +188,7 @@ def more_by_p(n: int, p: float, limit: float) -> int:
 
     P = 0.01 is 2.33 standard errors away, and p = 0.05 1.64.
     """
-    more = (stats.norm.isf(limit) / max(stats.norm.isf(p), 0.1)) ** 2
-    return math.ceil(n * float(more)) - n
+    return math.ceil(n * float((stats.norm.isf(limit) / max(stats.norm.isf(p), 0.1)) ** 2)) - n
 
 
 def equivalent(

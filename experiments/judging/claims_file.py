@@ -88,8 +88,7 @@ def write_verdicts(
         }
         for each in conclusions
     ]
-    new = pd.DataFrame(rows, columns=list(VERDICT_COLUMNS))
-    _replace(new, read_verdicts(path), path, paper)
+    _replace(pd.DataFrame(rows, columns=list(VERDICT_COLUMNS)), read_verdicts(path), path, paper)
 
 
 def _replace(new: pd.DataFrame, old: pd.DataFrame, path: Path, paper: str) -> None:

@@ -189,8 +189,7 @@ def dc5(metrics: pd.DataFrame) -> Iterator[Claim]:
                 ratio, n = log_ratio_interval(*pairs), len(wide.loc[kind])
                 label = f"{what}, point to {better} over point to point, {kind}"
                 about = Subject("DC5", what, metric=f"point_to_{better}", place=kind)
-                claim = banded(about, label, ratio, at_most=at_most, n=n)
-                yield beside(claim, better == "line")
+                yield beside(banded(about, label, ratio, at_most=at_most, n=n), better == "line")
 
 
 def dc6(runs: pd.DataFrame) -> list[Claim]:

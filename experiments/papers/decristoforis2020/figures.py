@@ -288,8 +288,7 @@ def covariances(table: pd.DataFrame) -> Figure:
                 found["value"], heights, fmt="o", ms=4, color=color, label=place,
                 xerr=[found["value"] - low, found["high"] - found["value"]],
             )  # fmt: skip
-        words = metric.replace("_", " ")
-        ax.set(xscale="log", xlabel="NEES / degrees of freedom", title=words)
+        ax.set(xscale="log", xlabel="NEES / degrees of freedom", title=metric.replace("_", " "))
     times = table.groupby(["metric", "method"])["time_us"].median().unstack("metric")
     for metric, marker, color in zip(METRICS, "os^", (BLUE, TRUTH, ORANGE), strict=True):
         times_axes.plot(

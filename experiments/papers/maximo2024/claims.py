@@ -126,8 +126,7 @@ def mx3(dispersion: pd.DataFrame, quality: pd.DataFrame) -> Iterator[Claim]:
     decisive = headlines(at_10["geometry"])
     for compare in (_m2_dispersion, _m3_dispersion):
         for name in geometries(at_10):
-            worlds = _by_world(at_10[at_10["geometry"] == name], "dispersion_m")
-            claim = compare(name, worlds)
+            claim = compare(name, _by_world(at_10[at_10["geometry"] == name], "dispersion_m"))
             yield beside(_where(claim, compare, quality, name), name not in decisive)
 
 
@@ -164,8 +163,7 @@ def judged_map(quality: pd.DataFrame, name: str, compare: Compare) -> pd.DataFra
         claim = compare(name, _by_world(cell, COMPARISONS[compare]))
         if claim is not None:
             rows.append((*key, claim.about, claim.found.value, claim.verdict))
-    columns = ["noise_weight", "n_nearest", "about", "value", "verdict"]
-    return pd.DataFrame(rows, columns=columns)
+    return pd.DataFrame(rows, columns=["noise_weight", "n_nearest", "about", "value", "verdict"])
 
 
 def _where(claim: Claim, compare: Compare, quality: pd.DataFrame, name: str) -> Claim:

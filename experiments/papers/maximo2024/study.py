@@ -108,18 +108,16 @@ Job = tuple[str, str, int, Profile]  # what to run, in which world
 def _jobs(profile: Profile) -> list[tuple[Job, float]]:
     """All jobs and how long they take, the longest first."""
     decisive = sorted(headlines(routes()))
-    controls = [*CONTROLS, *(set(routes()) - set(decisive))]
-    sizes = {
-        "campus": (["campus"], N_CAMPUSES, 10.0),
-        "runs": (["oxford_runs"] * POSITIONS.is_file(), N_RUN_SEEDS, 10.0),
-        "route": (routes(), N_WORLDS, 6.0),
-        "weighting": (decisive, N_WEIGHTED, 3.0),
-        "control": (controls, N_WORLDS, 3.0),
-        "quality": (decisive, N_QUALITY_WORLDS, 3.0),
-    }
     return [
         ((what, name, JUDGED_SEED + i, profile), cost)
-        for what, (names, n, cost) in sizes.items()
+        for what, (names, n, cost) in {
+            "campus": (["campus"], N_CAMPUSES, 10.0),
+            "runs": (["oxford_runs"] * POSITIONS.is_file(), N_RUN_SEEDS, 10.0),
+            "route": (routes(), N_WORLDS, 6.0),
+            "weighting": (decisive, N_WEIGHTED, 3.0),
+            "control": ([*CONTROLS, *(set(routes()) - set(decisive))], N_WORLDS, 3.0),
+            "quality": (decisive, N_QUALITY_WORLDS, 3.0),
+        }.items()
         for i in range(n[profile])
         for name in names
     ]
@@ -137,8 +135,7 @@ def _rows(what: str, name: str, seed: int, profile: Profile) -> dict[str, Rows]:
     """All rows of a job, by table."""
     n_repeats = N_REPEATS[profile]
     if what == "campus":
-        with_clusters = seed < JUDGED_SEED + N_CLUSTERED_CAMPUSES
-        return campus_rows(seed, profile, with_clusters=with_clusters)
+        return campus_rows(seed, profile, with_clusters=seed < JUDGED_SEED + N_CLUSTERED_CAMPUSES)
     if what == "quality":
         return {"quality": list(quality_rows(name, seed))}
     if what == "runs":
@@ -268,8 +265,7 @@ def campus_arrays() -> Arrays:
     """
     experiments = campus_runs(JUDGED_SEED)
     mapping, taking = (experiment.recording() for experiment in experiments)
-    spacing_m = experiments[0].map_options["spacing_m"]
-    known = from_recording(mapping, DRAWN_DESCRIPTOR, spacing_m)
+    known = from_recording(mapping, DRAWN_DESCRIPTOR, experiments[0].map_options["spacing_m"])
     # where most is seen within 40 m
     seen = np.convolve(np.sum(known.slices_m < 40.0, axis=1), np.ones(4), "valid")
     nodes = known.positions_m[np.argmax(seen) + np.arange(4)]

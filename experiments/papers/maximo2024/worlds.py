@@ -339,8 +339,7 @@ def campus_rows(seed: int, profile: Profile, *, with_clusters: bool) -> dict[str
     known = from_recording(mapped, settings["descriptor"], settings["spacing_m"])
     queries = described(taken, describers.kind(settings["descriptor"]).describe)
     case = Case("campus", seed, taking, known, queries)
-    travel_m = np.median(np.abs(np.diff(taken.wheels.position_m[:, 0])))
-    per_node = float(known.spacing_m / travel_m)
+    per_node = float(known.spacing_m / np.median(np.abs(np.diff(taken.wheels.position_m[:, 0]))))
     places = {"place": case.recording.log("place")}  # without the clouds
     bare = replace(case, recording=replace(case.recording, logs=places))
     n_trials, n_after = N_KIDNAPPINGS[profile], 4 * RECOVERED_WITHIN

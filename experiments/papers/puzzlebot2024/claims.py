@@ -205,6 +205,5 @@ def _clustered_share(hits: pd.Series[bool], seeds: pd.Series[int]) -> Interval:
     """
     share, by_seed = float(hits.mean()), hits.groupby(seeds).mean()
     alone = share * (1.0 - share) * len(by_seed) / len(hits)
-    together = max(1.0, float(by_seed.var()) / alone) if alone > 0.0 else 1.0
-    trials = round(len(hits) / together)
+    trials = round(len(hits) / (max(1.0, float(by_seed.var()) / alone) if alone > 0.0 else 1.0))
     return dataclasses.replace(share_interval(round(share * trials), trials), value=share)

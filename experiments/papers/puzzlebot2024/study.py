@@ -129,8 +129,7 @@ def ideal(route: OpenLoop, kr: float, kl: float) -> Estimate:
 def dead_reckoning(batch: BatchRuns, kr: float, kl: float) -> Estimate:
     """Odometry from the origin over the first run, with the nominal geometry."""
     geometry = RobotGeometry(NOMINAL.wheel_radius_m, NOMINAL.track_m)
-    wheels = WheelLog(batch.stamps, batch.encoder_m[0])
-    recording = Recording(batch.stamps, wheels, geometry)
+    recording = Recording(batch.stamps, WheelLog(batch.stamps, batch.encoder_m[0]), geometry)
     prior = Prior(geometry, mean=np.zeros(3), covariance=np.zeros((3, 3)))
     return run_over(recording, Odometry(kr=kr, kl=kl), prior, np.random.default_rng(0))[0]
 

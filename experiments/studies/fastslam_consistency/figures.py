@@ -50,5 +50,4 @@ def by_distance(table: pd.DataFrame) -> Figure:
 def _line(ax: Axes, part: pd.DataFrame, label: str, **style: object) -> None:
     """Median of worlds at each distance, / 3."""
     median = part.groupby("distance_m")["nees"].median() / 3.0
-    options = {"lw": 1.2, "ms": 3.5, **style}
-    ax.plot(median.index, median, label=label, **options)  # type: ignore[arg-type]
+    ax.plot(median.index, median, label=label, **{"lw": 1.2, "ms": 3.5, **style})  # type: ignore[arg-type]

@@ -65,14 +65,13 @@ def _label(name: str, answer: str) -> str:
 
 def _legend() -> list[Line2D]:
     """One entry a colour, a filling and a world."""
-    entries = [
-        ("ours", BLUE, BLUE, "o", 7),
-        ("of another project", ORANGE, ORANGE, "o", 7),
-        ("default", "black", "white", "o", 7),
-        ("tuned", "black", "black", "o", 7),
-        *((world, WALL, WALL, shape, 4) for world, shape in _WORLDS.items()),
-    ]
     return [
         Line2D([], [], color=color, mfc=filled, ls="", marker=shape, ms=size, label=label)
-        for label, color, filled, shape, size in entries
+        for label, color, filled, shape, size in [
+            ("ours", BLUE, BLUE, "o", 7),
+            ("of another project", ORANGE, ORANGE, "o", 7),
+            ("default", "black", "white", "o", 7),
+            ("tuned", "black", "black", "o", 7),
+            *((world, WALL, WALL, shape, 4) for world, shape in _WORLDS.items()),
+        ]
     ]
