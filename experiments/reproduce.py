@@ -10,7 +10,7 @@ from collections import Counter
 from pathlib import Path
 from types import ModuleType
 
-from experiments.judging.claim import Claim
+from experiments.judging.claim import Claim, Verdict
 from experiments.judging.claims_file import (
     note_provenance,
     read_claims,
@@ -20,9 +20,8 @@ from experiments.judging.claims_file import (
 )
 from experiments.judging.folders import code_folder, findings
 from experiments.judging.logs import missing
-from experiments.judging.results import Results
+from experiments.judging.results import Profile, Results
 from experiments.judging.sentences import Conclusion, conclude
-from experiments.judging.verdict import Profile, Verdict
 from experiments.report.page import write_report
 from experiments.runs.console import progress
 from experiments.runs.paths import results, short

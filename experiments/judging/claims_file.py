@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from experiments.judging.claim import Claim
+from experiments.judging.claim import Claim, Role, Verdict
+from experiments.judging.results import Profile
 from experiments.judging.sentences import Conclusion
-from experiments.judging.verdict import Profile, Role, Verdict
 from experiments.runs.row import read_rows, write_frame
 from experiments.runs.version import code_version, machine
 from sim.errors import InputError

@@ -13,8 +13,7 @@ from typing import Any
 from jinja2 import Environment, StrictUndefined
 
 from experiments.evaluation.statistics import Interval
-from experiments.judging.claim import Claim, select, select_all
-from experiments.judging.verdict import Role, Verdict, headline_verdict
+from experiments.judging.claim import Claim, Role, Verdict, headline_verdict, select, select_all
 
 
 @dataclass(frozen=True)

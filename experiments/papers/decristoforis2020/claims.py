@@ -9,9 +9,8 @@ import pandas as pd
 
 from experiments.evaluation.registration_errors import METRICS
 from experiments.evaluation.statistics import Interval, log_ratio_interval, mean_interval
-from experiments.judging.claim import Claim, Subject, banded, beside, lower, shown
+from experiments.judging.claim import Claim, Subject, Verdict, banded, beside, lower, shown
 from experiments.judging.results import Results
-from experiments.judging.verdict import Verdict
 from experiments.papers.decristoforis2020.settings import CONSISTENT, PLACES, RATE_HZ
 from sim.arrays import Array
 

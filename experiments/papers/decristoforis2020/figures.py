@@ -9,11 +9,10 @@ from matplotlib.axes import Axes
 from matplotlib.colors import TwoSlopeNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
-from numpy.typing import NDArray
 
 from experiments.evaluation.registration_errors import METRICS
 from experiments.evaluation.statistics import log_ratio_interval
-from experiments.judging.results import Results
+from experiments.judging.results import Arrays, Results
 from experiments.papers.decristoforis2020.claims import judged_runs, nees_intervals
 from experiments.papers.decristoforis2020.settings import CONSISTENT, PAPERS_OWN, PLACES
 from experiments.viewing.plotting import (
@@ -38,8 +37,6 @@ from experiments.viewing.style import (
     subplots,
 )
 from experiments.viewing.world import draw_walls
-
-Arrays = dict[str, NDArray[Any]]
 
 COLORS = {
     "truth": TRUTH,

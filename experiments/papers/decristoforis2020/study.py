@@ -26,10 +26,9 @@ from experiments.evaluation.metrics import (
     position_errors_m,
 )
 from experiments.evaluation.registration_errors import METRICS, measured, scenes
-from experiments.judging.jobs import Tables, grouped, tables_of
+from experiments.judging.jobs import Progress, Tables, grouped, tables_of
 from experiments.judging.logs import DATA
-from experiments.judging.results import Results
-from experiments.judging.verdict import Profile
+from experiments.judging.results import Profile, Results
 from experiments.papers.decristoforis2020.claims import judged_runs
 from experiments.papers.decristoforis2020.settings import (
     CHECKED,
@@ -74,7 +73,7 @@ _NOISE = {
 }
 
 
-def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) -> None:
+def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     """Run all studies of the paper, and write their tables and what its figures draw.
 
     Parameters

@@ -22,17 +22,19 @@ from experiments.evaluation.statistics import (
 )
 from experiments.judging.claim import (
     Claim,
+    Role,
     Subject,
+    Verdict,
     banded,
     beside,
     equivalent,
+    holds,
     more_by_p,
     remarked,
     shown,
 )
 from experiments.judging.results import Results
 from experiments.judging.sentences import percent
-from experiments.judging.verdict import Role, Verdict, holds
 from experiments.papers.gil2008.settings import P0
 from sim.arrays import Array
 

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from experiments.evaluation.metrics import rms
-from experiments.judging.results import Results
+from experiments.judging.results import Arrays, Results
 from experiments.papers.gil2008.claims import pooled
 from experiments.papers.gil2008.settings import CELL_M
 from experiments.viewing.grid import UNKNOWN, draw_grid
@@ -41,8 +41,6 @@ from experiments.viewing.world import draw_walls
 from sim import se2
 from sim.arrays import Array
 from sim.worlds.grid import OccupancyGrid
-
-Arrays = dict[str, Any]
 
 _FILTERS = {
     "paper": (RED, "o", "as printed"),
@@ -84,7 +82,7 @@ def maps(run: Arrays) -> Figure:
     """Figure 1: occupancy grid of the rooms, and landmarks as the best particles map them."""
     page, (left, *others) = subplots(13.0, 4.9, 1, 3, sharex=True, sharey=True)
     draw_grid(left, _grid(run, "truth"))
-    limits = {"xlim": (-2.5, 32.5), "ylim": (-2.5, 32.5), "facecolor": UNKNOWN}
+    limits: dict[str, Any] = {"xlim": (-2.5, 32.5), "ylim": (-2.5, 32.5), "facecolor": UNKNOWN}
     set_axes(left, title="occupancy grid, along the true path", **_LEFT, **limits)
     for ax, name in zip(others, _SHOWN, strict=True):
         colour, _, words = _FILTERS[name]
@@ -261,7 +259,7 @@ def by_particles(repeats: pd.DataFrame, bound: pd.DataFrame) -> Figure:
                     marker=marker, color=colour, label=words, capsize=2.5, lw=1.0, ms=4,
                 )  # fmt: skip
             ax.axhline(float(best[column].iloc[0]), color=_BATCH, ls=":", label="batch bound")
-            scale = {"xscale": "log", "ylabel": label, "ylim": (0.0, None)}
+            scale: dict[str, Any] = {"xscale": "log", "ylabel": label, "ylim": (0.0, None)}
             set_axes(ax, ticks=repeats["n_particles"], title=design, **_LEFT, **scale)
     set_axes(grid[-1], xlabel="particles M")
     n_runs = len(repeats[drawn]) // repeats.groupby(["filter", "n_particles"]).ngroups

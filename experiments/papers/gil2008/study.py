@@ -6,7 +6,7 @@ recording.
 
 import dataclasses
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import accumulate
 
 import numpy as np
@@ -14,9 +14,8 @@ import numpy as np
 from estimators.odometry import Odometry
 from experiments.bench.fastslam import cost_by_landmarks
 from experiments.evaluation.metrics import position_errors_m, rms, travelled_m
-from experiments.judging.jobs import Tables, grouped, tables_of
-from experiments.judging.results import Results
-from experiments.judging.verdict import Profile
+from experiments.judging.jobs import Progress, Tables, grouped, tables_of
+from experiments.judging.results import Profile, Results
 from experiments.papers.gil2008 import scores, settings
 from experiments.papers.gil2008.recordings import Scene, landmark_distances_m, thinned, whole
 from experiments.runs.evaluate import run_over, scored, status_of
@@ -48,7 +47,7 @@ _SCORES = (
 _RUNS_PER_JOB = 40
 
 
-def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) -> None:
+def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     """Run all studies of the paper, and write their tables and the arrays of the figures.
 
     Parameters

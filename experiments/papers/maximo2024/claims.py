@@ -19,15 +19,16 @@ from experiments.evaluation.statistics import (
 from experiments.judging.claim import (
     Claim,
     Subject,
+    Verdict,
     banded,
     beside,
     equivalent,
     lower,
+    overall,
     remarked,
     shown,
 )
 from experiments.judging.results import Results
-from experiments.judging.verdict import Verdict, overall
 from experiments.papers.maximo2024.settings import (
     BETWEEN_NODES_S,
     JUDGED_QUALITY,

@@ -10,11 +10,10 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
-from numpy.typing import NDArray
 
 from estimators.topological import descriptors as describers
-from experiments.judging.results import Results
-from experiments.judging.verdict import Verdict
+from experiments.judging.claim import Verdict
+from experiments.judging.results import Arrays, Results
 from experiments.papers.maximo2024.claims import COMPARISONS, geometries, headlines, judged_map
 from experiments.papers.maximo2024.settings import (
     CONTROLS,
@@ -33,8 +32,6 @@ from experiments.viewing.plotting import (
     with_legend,
 )
 from experiments.viewing.style import BLACK, BLUE, CYCLE, GREEN, ORANGE, RED, SKY, WALL, subplots
-
-Arrays = dict[str, NDArray[Any]]
 
 _COLOUR = {"M1": ORANGE, "M2": BLUE, "M3": GREEN}
 _FLOOR_M = {"oxford": 1.0, "umh": 0.03, "campus": 0.1}

@@ -7,7 +7,6 @@ on seeds from 1000 on.
 
 import itertools
 import math
-from collections.abc import Callable
 
 import numpy as np
 import pandas as pd
@@ -15,9 +14,8 @@ from numpy.typing import NDArray
 
 from estimators.topological.topological_map import from_recording
 from experiments.bench import topological
-from experiments.judging.jobs import Tables, tables_of
-from experiments.judging.results import Results
-from experiments.judging.verdict import Profile
+from experiments.judging.jobs import Progress, Tables, tables_of
+from experiments.judging.results import Arrays, Profile, Results
 from experiments.papers.maximo2024.claims import headlines
 from experiments.papers.maximo2024.places import oxford_runs, resequenced
 from experiments.papers.maximo2024.settings import (
@@ -68,14 +66,12 @@ from sim.arrays import Array
 from sim.recording import Recording
 from sim.sensors import Lidar3D
 
-Arrays = dict[str, NDArray[np.generic]]
-
 _TUNED_BY = ("geometry", "sigma_l", "sigma_m", "n_nearest")
 _REACH_M = 65.0  # of the clouds kept, from the middle of the nodes drawn
 _CLOUD_GRID_M = 0.05
 
 
-def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) -> None:
+def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     """Run all studies of the paper; write their tables, and what the figures draw.
 
     Parameters

@@ -17,7 +17,7 @@ from estimators.base import Estimate, Prior
 from estimators.topological import descriptors as describers
 from estimators.topological.topological_map import TopologicalMap, from_recording
 from experiments.evaluation.metrics import position_errors_m, rms, travelled_m
-from experiments.judging.verdict import Profile
+from experiments.judging.results import Profile
 from experiments.papers.maximo2024.places import N_STRETCHES, UMH, described, gaps_m, resequenced
 from experiments.papers.maximo2024.settings import (
     CAMPUS_SHIFT_M,

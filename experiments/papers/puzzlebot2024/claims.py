@@ -10,9 +10,20 @@ import numpy as np
 import pandas as pd
 
 from experiments.evaluation.statistics import Interval, mean_interval, share_interval
-from experiments.judging.claim import Claim, Subject, banded, beside, shown
+from experiments.judging.claim import (
+    Claim,
+    Role,
+    Subject,
+    Verdict,
+    banded,
+    beside,
+    holds,
+    judged,
+    more_to_settle,
+    overall,
+    shown,
+)
 from experiments.judging.results import Results
-from experiments.judging.verdict import Role, Verdict, holds, judged, more_to_settle, overall
 from experiments.papers.puzzlebot2024.settings import NOMINAL, REPORTED_TURN_RATIO
 from sim.arrays import Array
 

@@ -1,15 +1,13 @@
 """The figures of puzzlebot2024."""
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
-from experiments.judging.results import Results
+from experiments.judging.results import Arrays, Results
 from experiments.papers.puzzlebot2024.settings import (
     CALIBRATION_RUNS,
     NOMINAL,
@@ -25,8 +23,6 @@ from experiments.viewing.plotting import (
     with_legend,
 )
 from experiments.viewing.style import BLACK, BLUE, CYCLE, ORANGE, subplots
-
-Arrays = Mapping[str, NDArray[Any]]
 
 _METHODS = {
     "wheel_truth": "wheel truth",

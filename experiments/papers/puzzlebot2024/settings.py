@@ -2,7 +2,7 @@
 
 import math
 
-from experiments.judging.verdict import Profile
+from experiments.judging.results import Profile
 from sim.robot.drive import DifferentialDrive
 from sim.routes.route import OpenLoop
 

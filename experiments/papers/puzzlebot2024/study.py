@@ -7,7 +7,7 @@ are driven by PyBullet too, and both are compared.
 import dataclasses
 import itertools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,9 +22,8 @@ from experiments.calibration.end_poses import Manoeuvre, from_end_poses
 from experiments.calibration.result import CalibrationResult
 from experiments.calibration.wheel_truth import from_wheel_truth
 from experiments.evaluation.metrics import ellipse_area_m2, travelled_m
-from experiments.judging.jobs import Tables, tables_of
-from experiments.judging.results import Results
-from experiments.judging.verdict import Profile
+from experiments.judging.jobs import Progress, Tables, tables_of
+from experiments.judging.results import Profile, Results
 from experiments.papers.puzzlebot2024.descent import convergence, gradient_descent
 from experiments.papers.puzzlebot2024.settings import (
     AREA_K_M,
@@ -55,7 +54,7 @@ Routes = Mapping[str, OpenLoop]
 Driven = dict[tuple[str, str, int], Recording]  # keyed by physics, case and seed
 
 
-def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) -> None:
+def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     """Run all studies of the paper, and write their tables and arrays.
 
     Parameters
@@ -265,9 +264,7 @@ def from_batches(batches: list[BatchRuns], *, geometry: bool) -> CalibrationResu
     return from_wheel_truth(encoder, ground, turns, interval_s=0.05, geometry=geometry)
 
 
-def calibration(
-    robots: list[Arm], n_repetitions: int, on_progress: Callable[[float], None]
-) -> pd.DataFrame:
+def calibration(robots: list[Arm], n_repetitions: int, on_progress: Progress) -> pd.DataFrame:
     """Repeat the calibration of each robot, on all cores."""
     repeated = [
         [dataclasses.replace(arm, seed=arm.seed + repetition)]

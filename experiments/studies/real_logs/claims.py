@@ -8,9 +8,17 @@ import numpy as np
 import pandas as pd
 
 from experiments.evaluation.statistics import Interval
-from experiments.judging.claim import Claim, Subject, banded, beside, remarked, shown
+from experiments.judging.claim import (
+    Claim,
+    Subject,
+    Verdict,
+    banded,
+    beside,
+    holds,
+    remarked,
+    shown,
+)
 from experiments.judging.results import Results
-from experiments.judging.verdict import Verdict, holds
 from experiments.studies.real_logs.settings import (
     FUSION,
     INTEL,

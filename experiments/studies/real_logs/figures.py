@@ -1,15 +1,12 @@
 """Figures of the real logs."""
 
 import math
-from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
-from experiments.judging.results import Results
+from experiments.judging.results import Arrays, Results
 from experiments.studies.real_logs.settings import (
     GMAPPING,
     INTEL_DRAWN,
@@ -21,8 +18,6 @@ from experiments.viewing.grid import draw_grid
 from experiments.viewing.plotting import plan_axes
 from experiments.viewing.style import BLACK, CYCLE, subplots
 from sim.worlds.grid import OccupancyGrid
-
-Arrays = Mapping[str, NDArray[Any]]
 
 
 def draw(made: Results) -> dict[str, Figure]:

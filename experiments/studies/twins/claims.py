@@ -7,9 +7,8 @@ import pandas as pd
 from scipy import stats
 
 from experiments.evaluation.statistics import Interval, mean_interval, share_interval
-from experiments.judging.claim import Claim, Subject, banded, shown
+from experiments.judging.claim import Claim, Subject, banded, holds, shown
 from experiments.judging.results import Results
-from experiments.judging.verdict import holds
 from experiments.studies.twins.settings import LEAST_SHARE, SHOWN
 
 

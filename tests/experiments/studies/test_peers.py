@@ -8,8 +8,7 @@ import pytest
 from scipy import stats
 
 from experiments import reproduce
-from experiments.judging.results import Results
-from experiments.judging.verdict import Profile
+from experiments.judging.results import Profile, Results
 from experiments.runs.experiment import Experiment
 from experiments.studies.peers import figures, study
 
