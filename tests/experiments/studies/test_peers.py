@@ -90,7 +90,7 @@ def test_its_figure(tmp_path):
 
 
 def test_what_is_missing_is_told(tmp_path, monkeypatch):
-    absent = Experiment.compose(["estimator=mrpt_icp", "sensors=hokuyo"])
+    absent = Experiment.compose(["estimator=peers/mrpt_icp", "sensors=hokuyo"])
     monkeypatch.chdir(tmp_path)
     assert "make peers" in study.missing(absent)
     assert study.missing(Experiment.compose(["estimator=odometry"])) == ""
