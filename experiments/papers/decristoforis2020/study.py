@@ -80,8 +80,6 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     ----------
     profile
         `quick`: few and short recordings; `full`: those that the claims are judged on.
-    on_progress
-        Called with the share of the work done.
     """
     costs, functions, arguments = zip(*_jobs(profile is Profile.FULL, out), strict=True)
     calls = [(function, *given) for function, given in zip(functions, arguments, strict=True)]

@@ -56,8 +56,6 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
         `quick`: the same runs over fewer worlds, with fewer repeats.
     out
         Where tables and arrays go.
-    on_progress
-        Called with the share of the work done.
     """
     jobs = [
         [part[low : low + _RUNS_PER_JOB]]

@@ -80,8 +80,6 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
         `quick`: few worlds and repeats; `full`: those that the claims are judged on.
     out
         Where tables and arrays go.
-    on_progress
-        Called with the share of the work done.
     """
     jobs, costs = zip(*_jobs(profile), strict=True)
     tables = tables_of(_labelled, jobs, on_progress, costs)

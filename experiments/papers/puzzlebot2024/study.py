@@ -61,8 +61,6 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     ----------
     profile
         `quick`: few repetitions; `full`: those that the claims are judged on.
-    on_progress
-        Called with the share of the work done.
     """
     out.write_tables(areas=areas(), crossover=crossover(), gradient_descent=gradient_descent())
     out.write_tables(convergence=convergence())

@@ -37,8 +37,6 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     ----------
     profile
         `quick`: two worlds.
-    on_progress
-        Called with the share of the work done.
     """
     jobs = [
         (settings.FIRST_SEED + i, strategy)

@@ -27,8 +27,6 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     ----------
     profile
         `quick`: up to 1000 particles in four worlds; `full`: up to 10,000 in twenty.
-    on_progress
-        Called with the share of the work done.
     """
     jobs = [[part] for part in grouped(plan(profile), lambda one: one.seed)]
     out.write_tables(**tables_of(rows_of, jobs, on_progress))

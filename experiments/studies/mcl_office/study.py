@@ -33,8 +33,6 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     ----------
     profile
         `quick`: 3 starts in each of 4 offices; `full`: 20 in each of 10.
-    on_progress
-        Called with the share of the work done.
     """
     n_starts, fewer = (20, []) if profile is Profile.FULL else (3, ["seed=range(1000,1004)"])
     jobs = [(office, n_starts) for office in planned(["study=mcl_office", *fewer])]

@@ -28,8 +28,6 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     ----------
     profile
         `quick`: one recording of each world; `full`: five.
-    on_progress
-        Called with the share of the work done.
     """
     fewer = [] if profile is Profile.FULL else ["seed=1000"]
     experiments = list(planned(["study=peers", *fewer]))

@@ -76,8 +76,6 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     ----------
     profile
         `quick`: fewer robots, seeds and hypotheses.
-    on_progress
-        Called with the share of the work done.
     """
     out.write_tables(ate=rawseeds_ate(), wheels=wheels(), lego=lego_errors())
     on_progress(0.1)

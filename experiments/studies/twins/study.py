@@ -39,8 +39,6 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     ----------
     profile
         `quick`: 4 simulations of each log in place of 50.
-    on_progress
-        Called with the share of the work done.
     """
     runs = {
         kind: dict(zip(names, planned([f"study=twins/{kind}"]), strict=True))
