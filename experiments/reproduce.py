@@ -62,8 +62,13 @@ def reproduce(*, full: bool = False, only: str | None = None) -> None:
             print(f"{paper}: left out, {why}", file=sys.stderr)
             continue
         conclusions = reproduce_paper(paper, profile)
-        _print(conclusions)
-        lines.append(f"{paper}: {_counts(conclusions)} ({time.monotonic() - begun:.0f} s)")
+        for each in conclusions:
+            print(f"{each.id:<4} {each.verdict.label:<15} {first_sentence(each.sentence)}")
+        counts = Counter(each.verdict for each in conclusions)
+        ruled = ", ".join(
+            f"{counts[verdict]} {verdict.label}" for verdict in Verdict if verdict in counts
+        )
+        lines.append(f"{paper}: {ruled or 'judges no claim'} ({time.monotonic() - begun:.0f} s)")
     page = write_report(place)
     print("\n".join(["", *lines]))
     print(f"{short(page)} has the figures and tables behind them; open it in a browser")
@@ -173,17 +178,6 @@ def _part(paper: str, name: str) -> ModuleType:
     return importlib.import_module(f"experiments.{room}.{paper}.{name}")
 
 
-def _print(conclusions: list[Conclusion]) -> None:
-    for each in conclusions:
-        print(f"{each.id:<4} {each.verdict.label:<15} {first_sentence(each.sentence)}")
-
-
 def first_sentence(text: str) -> str:
     """Return the text up to its first full stop that ends a sentence."""
     return re.split(r"(?<=[a-z0-9)%]\.) (?=[A-Z])", text, maxsplit=1)[0]
-
-
-def _counts(conclusions: list[Conclusion]) -> str:
-    """Say how many claims have which verdict, as in "3 reproduced, 1 undecided"."""
-    counts = Counter(each.verdict for each in conclusions)
-    return ", ".join(f"{counts[v]} {v.label}" for v in Verdict if v in counts) or "judges no claim"

@@ -5,7 +5,7 @@ A study's `judge` makes claims; they are found again by their fields, never by t
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass, field, fields, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from enum import StrEnum
 from typing import Any
 
@@ -112,16 +112,10 @@ class Claim:
         return self.about.claim
 
 
-_SUBJECT = {each.name for each in fields(Subject)}
-
-
 def select_all(claims: Sequence[Claim], **wanted: Any) -> list[Claim]:
     """Claims whose fields, or those of their subjects, have these values, in their order."""
-
-    def value(claim: Claim, name: str) -> Any:
-        return getattr(claim.about if name in _SUBJECT else claim, name)
-
-    return [c for c in claims if all(value(c, name) == wanted[name] for name in wanted)]
+    known = [(claim, {**vars(claim), **vars(claim.about)}) for claim in claims]
+    return [c for c, own in known if all(own[name] == value for name, value in wanted.items())]
 
 
 def select(claims: Sequence[Claim], **wanted: Any) -> Claim:
@@ -193,10 +187,8 @@ def headline_verdict(statistics: Sequence[tuple[Role, Verdict]]) -> Verdict:
 
 def shown(about: Subject, statistic: str, found: Interval, reason: str = "", **facts: Any) -> Claim:
     """State a statistic that accompanies a claim and has no criterion."""
-    criterion = "shown, not judged"
-    return Claim(
-        about, statistic, found, criterion, Verdict.SHOWN, reason, Role.BESIDE, facts=facts
-    )
+    ruling = ("shown, not judged", Verdict.SHOWN, reason, Role.BESIDE)
+    return Claim(about, statistic, found, *ruling, facts=facts)
 
 
 def beside(claim: Claim, is_beside: bool = True) -> Claim:

@@ -65,9 +65,9 @@ class Results:
             raise InputError(f"{short(path)}: damaged (no rows); {self._remedy}")
         return table
 
-    def has_table(self, name: str) -> bool:
-        """Whether the study left this table: some need data that is not part of the project."""
-        return self._path("tables", f"{name}.csv").exists()
+    def optional_table(self, name: str) -> pd.DataFrame | None:
+        """Read a table that needs data which is not part of the project; None without it."""
+        return self.table(name) if self._path("tables", f"{name}.csv").exists() else None
 
     def write_arrays(self, name: str, **arrays: NDArray[np.generic]) -> None:
         """Write named arrays to one file, compressed."""

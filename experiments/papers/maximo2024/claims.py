@@ -44,9 +44,8 @@ _LEAST_M = 1e-3  # added to dispersions that may be zero, before a logarithm
 def judge(made: Results) -> list[Claim]:
     """Judge MX1-MX8 by the tables."""
     quality = made.table("quality")
-    runs = made.table("runs") if made.has_table("runs") else None
     return [
-        *mx1(made.table("weighting"), quality, runs),
+        *mx1(made.table("weighting"), quality, made.optional_table("runs")),
         *mx2(made.table("particles"), made.table("times")),
         *mx3(made.table("dispersion"), quality),
         *mx4(made.table("starts")),

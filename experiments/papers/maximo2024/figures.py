@@ -53,7 +53,7 @@ def draw(made: Results) -> dict[str, Figure]:
     """All figures, by file name; the Oxford route is the real one where its positions are."""
     oxford = "oxford_real" if made.has_arrays("oxford_real") else "oxford"
     drawn: dict[str, Arrays] = {name: made.arrays(name) for name in (oxford, "umh", "campus")}
-    runs = {"maximo2024_runs": oxford_runs(made.table("runs"))} if made.has_table("runs") else {}
+    runs = made.optional_table("runs")
     return {
         "maximo2024_data": data(drawn["campus"]),
         "maximo2024_clusters": clusters(drawn),
@@ -68,7 +68,7 @@ def draw(made: Results) -> dict[str, Figure]:
         "maximo2024_quality": quality(made.table("quality")),
         "maximo2024_kidnapping": kidnapping(made.table("kidnapping")),
         "maximo2024_campus": campus_errors(made.table("campus_starts"), made.table("clusters")),
-        **runs,
+        **({} if runs is None else {"maximo2024_runs": oxford_runs(runs)}),
     }
 
 

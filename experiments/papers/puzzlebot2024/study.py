@@ -133,18 +133,20 @@ def dead_reckoning(batch: BatchRuns, kr: float, kl: float) -> Estimate:
 
 def areas() -> pd.DataFrame:
     """Area of the 95 % ellipse against the distance rolled, on each loop and each k."""
-    parts = []
-    for k, (name, route) in itertools.product(AREA_K_M, LOOPS.items()):
-        promised = ideal(route, k, k)
-        columns = {
-            "manoeuvre": name,
-            "k_m": k,
-            "stamp_s": promised.stamps,
-            "distance_m": travelled_m(promised.means),
-            "area_m2": ellipse_area_m2(promised.covariances),
-        }
-        parts.append(pd.DataFrame(columns))
-    return pd.concat(parts, ignore_index=True)
+
+    def table(name: str, k: float) -> pd.DataFrame:
+        promised = ideal(LOOPS[name], k, k)
+        return pd.DataFrame(
+            {
+                "manoeuvre": name,
+                "k_m": k,
+                "stamp_s": promised.stamps,
+                "distance_m": travelled_m(promised.means),
+                "area_m2": ellipse_area_m2(promised.covariances),
+            }
+        )
+
+    return pd.concat([table(name, k) for k in AREA_K_M for name in LOOPS], ignore_index=True)
 
 
 def crossover(*overrides: str) -> pd.DataFrame:
@@ -273,20 +275,20 @@ def calibration(robots: list[Arm], n_repetitions: int, on_progress: Progress) ->
 
 
 def _calibration_rows(arm: Arm) -> Tables:
-    rows: list[Row] = [
-        {
-            "k_m": arm.k_m,
-            "joint": arm.joint,
-            "seed": arm.seed,
-            "method": result.method,
-            "parameter": name,
-            "truth": getattr(arm.robot, name),
-            **dataclasses.asdict(interval),
-        }
-        for result in calibrate_once(arm)
+    run: Row = {"k_m": arm.k_m, "joint": arm.joint, "seed": arm.seed}
+    results = calibrate_once(arm)
+    parts = [
+        {**run, "method": one.method, **row} for one in results for row in _found(one, arm.robot)
+    ]
+    return {"calibration": parts}
+
+
+def _found(result: CalibrationResult, robot: DifferentialDrive) -> list[Row]:
+    """A row for each parameter that was found: its truth, value and interval."""
+    return [
+        {"parameter": name, "truth": getattr(robot, name), **dataclasses.asdict(interval)}
         for name, interval in result.found.items()
     ]
-    return {"calibration": rows}
 
 
 def table_1(arm: Arm) -> pd.DataFrame:
@@ -295,19 +297,13 @@ def table_1(arm: Arm) -> pd.DataFrame:
     rows = []
     for name, route in arm.routes.items():
         batch = run_batch(arm.robot, route, CALIBRATION_RUNS, rng)
-        found = from_batches([batch], geometry=False)
-        rows.append(
-            {
-                **_case(name, route),
-                **_spread("real", batch.end_poses),
-                "kr_m": found.kr.value,
-                "kr_low_m": found.kr.low,
-                "kr_high_m": found.kr.high,
-                "kl_m": found.kl.value,
-                "kl_low_m": found.kl.low,
-                "kl_high_m": found.kl.high,
-            }
-        )
+        found = from_batches([batch], geometry=False).found
+        gains = {
+            f"{wheel}{end and '_' + end}_m": getattr(found[wheel], end or "value")
+            for wheel in ("kr", "kl")
+            for end in ("", "low", "high")
+        }
+        rows.append(_case(name, route) | _spread("real", batch.end_poses) | gains)
     return pd.DataFrame(rows)
 
 
@@ -342,16 +338,9 @@ def short_turns(arm: Arm) -> tuple[pd.DataFrame, pd.DataFrame]:
         }
         for name, route in arm.routes.items()
     ]
-    found = [
-        {
-            "parameter": name,
-            "truth": getattr(robot, name),
-            "nominal": getattr(nominal, name),
-            **dataclasses.asdict(interval),
-        }
-        for name, interval in result.found.items()
-    ]
-    return pd.DataFrame(ends), pd.DataFrame(found)
+    found = pd.DataFrame(_found(result, robot))
+    found.insert(2, "nominal", [getattr(nominal, name) for name in result.found])
+    return pd.DataFrame(ends), found
 
 
 def _case(name: str, route: OpenLoop) -> Row:
@@ -442,9 +431,4 @@ def engine_k(driven: Driven) -> pd.DataFrame:
     runs = [recording for (physics, *_), recording in driven.items() if physics == "bullet"]
     found = calibrate_recordings(runs, geometry=False, interval_s=0.02)
     robot = Experiment.compose(["study=puzzlebot2024/engine"]).robot()
-    rows = [
-        {"k_m": 2.0 * robot.kl, "parameter": name, "truth": getattr(robot, name)}
-        | dataclasses.asdict(interval)
-        for name, interval in found.found.items()
-    ]
-    return pd.DataFrame(rows)
+    return pd.DataFrame([{"k_m": 2.0 * robot.kl, **row} for row in _found(found, robot)])

@@ -19,8 +19,7 @@ _ERROR = "ate_rmse_m"
 
 def judge(made: Results) -> list[Claim]:
     """Judge GI9 by the tables; the log's is there only where the log is."""
-    log = made.table("mrclam") if made.has_table("mrclam") else None
-    return [*gi9(made.table("errors")), *on_the_log(log)]
+    return [*gi9(made.table("errors")), *on_the_log(made.optional_table("mrclam"))]
 
 
 def gi9(errors: pd.DataFrame) -> Iterator[Claim]:
