@@ -68,7 +68,7 @@ def more_needed(rows: Sequence[Claim], unit: str) -> str:
 
 def plain(number: float | Interval, digits: int = 2) -> str:
     """Write a number, or an interval's value, with so many significant digits."""
-    value = float(getattr(number, "value", number))
+    value = number.value if isinstance(number, Interval) else number
     if not math.isfinite(value):
         return "unknown"
     short = f"{value:.{digits}g}"
@@ -79,7 +79,7 @@ def plain(number: float | Interval, digits: int = 2) -> str:
 
 def percent(share: float | Interval) -> str:
     """Write a share, or an interval's value, in percent."""
-    value = float(getattr(share, "value", share))
+    value = share.value if isinstance(share, Interval) else share
     return f"{100.0 * value:.0f} %" if math.isfinite(value) else "an unknown share"
 
 

@@ -38,15 +38,15 @@ _PRINTED = ("hessian_points", "sampling", "censi_last")
 _COVARIANCES = (*_PRINTED, "hessian", "censi", "censi_sliding")
 
 
-def judge(made: Results) -> list[Claim]:
+def judge(results: Results) -> list[Claim]:
     """Judge DC1-DC6 by the tables."""
-    runs, ellipses = made.table("runs"), made.table("ellipses")
+    runs, ellipses = results.table("runs"), results.table("ellipses")
     return [
-        *dc1(runs, made.table("ordering")),
+        *dc1(runs, results.table("ordering")),
         *dc2(ellipses),
         *dc3(ellipses),
-        *dc4(made.table("covariances")),
-        *dc5(made.table("metrics")),
+        *dc4(results.table("covariances")),
+        *dc5(results.table("metrics")),
         *dc6(runs),
     ]
 

@@ -66,24 +66,24 @@ _METHODS = {
 }
 
 
-def draw(made: Results) -> dict[str, Figure]:
+def draw(results: Results) -> dict[str, Figure]:
     """Draw all figures, by file name."""
-    office, table, drawn = made.arrays("office"), made.table("runs"), made.table("drawn")
+    office, table, drawn = results.arrays("office"), results.table("runs"), results.table("drawn")
     pages = {
         "1_route": route(office),
-        "2_ellipses": ellipses(office, made.table("areas"), made.table("ellipse_path")),
+        "2_ellipses": ellipses(office, results.table("areas"), results.table("ellipse_path")),
         "3_trajectories": trajectories(office, drawn),
-        "4_errors": boxes(made.table("boxes")),
+        "4_errors": boxes(results.table("boxes")),
         "5_maps": maps(office, drawn),
         "runs": runs(table),
-        "covariances": covariances(made.table("covariances")),
-        "beliefs": beliefs(made.table("beliefs")),
-        "ordering": ordering(made.table("ordering")),
-        "steps": steps(made.table("steps")),
+        "covariances": covariances(results.table("covariances")),
+        "beliefs": beliefs(results.table("beliefs")),
+        "ordering": ordering(results.table("ordering")),
+        "steps": steps(results.table("steps")),
     }
-    if made.has_arrays("log"):  # which is written where the log is
-        pages["log"] = real_log(made.arrays("log"), made.table("log_boxes"))
-    return {f"{made.paper}_{name}": page for name, page in pages.items()}
+    if results.has_arrays("log"):  # which is written where the log is
+        pages["log"] = real_log(results.arrays("log"), results.table("log_boxes"))
+    return {f"{results.paper}_{name}": page for name, page in pages.items()}
 
 
 def route(office: Arrays) -> Figure:

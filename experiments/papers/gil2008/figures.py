@@ -57,24 +57,24 @@ _LEFT: dict[str, Any] = {"title_style": {"loc": "left"}}
 _BOTH = ((_PATH, "RMS of the path, m"), (_MAP, "RMS of the map, m"))
 
 
-def draw(made: Results) -> dict[str, Figure]:
+def draw(results: Results) -> dict[str, Figure]:
     """Draw every figure, by file name."""
-    run, bound = made.arrays("path"), made.table("bound")
+    run, bound = results.arrays("path"), results.table("bound")
     return {
         "gil2008_1_maps": maps(run),
         "gil2008_2_corrected": corrected(run),
-        "gil2008_3_particles": particles_along_a_motion(made.arrays("motion")),
+        "gil2008_3_particles": particles_along_a_motion(results.arrays("motion")),
         "gil2008_4_association": association_ellipses(),
         "gil2008_5_world": world_3d(run),
         "gil2008_6_path": path(run),
         "gil2008_7_components": components(run),
-        "gil2008_8_particles": by_particles(made.table("repeats"), bound),
-        "gil2008_8_worlds": by_particles_over_worlds(made.table("particles"), bound),
-        "gil2008_9_distance": by_distance(made.table("distance")),
-        "gil2008_observations": by_observations(made.table("observations")),
-        "gil2008_association": by_association(made.table("association")),
-        "gil2008_cost": cost(made.table("cost")),
-        "gil2008_settings": by_settings(made.table("resampling"), made.table("noise")),
+        "gil2008_8_particles": by_particles(results.table("repeats"), bound),
+        "gil2008_8_worlds": by_particles_over_worlds(results.table("particles"), bound),
+        "gil2008_9_distance": by_distance(results.table("distance")),
+        "gil2008_observations": by_observations(results.table("observations")),
+        "gil2008_association": by_association(results.table("association")),
+        "gil2008_cost": cost(results.table("cost")),
+        "gil2008_settings": by_settings(results.table("resampling"), results.table("noise")),
     }
 
 

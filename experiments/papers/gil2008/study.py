@@ -57,9 +57,13 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     out
         Where tables and arrays go.
     """
+
+    def drawn_from(run: TableRun) -> tuple[Scene, str]:
+        return Scene.of(run[1].config), json.dumps(run[1].route_options)
+
     jobs = [
         [part[low : low + _RUNS_PER_JOB]]
-        for part in grouped(plan(profile), _drawn_from)
+        for part in grouped(plan(profile), drawn_from)
         for low in range(0, len(part), _RUNS_PER_JOB)
     ]
     tables = tables_of(rows_of, jobs, lambda share: on_progress(0.95 * share))
@@ -77,11 +81,6 @@ def plan(profile: Profile) -> Iterator[TableRun]:
             drawn = one.recording_options
             if drawn["draw"] < n_draws and drawn["image_draw"] <= n_repeats:
                 yield table, one.replaced(repeats=min(one.repeats, n_repeats))
-
-
-def _drawn_from(run: TableRun) -> tuple[Scene, str]:
-    """What runs over one recording have in common."""
-    return Scene.of(run[1].config), json.dumps(run[1].route_options)
 
 
 def rows_of(runs: Sequence[TableRun]) -> Tables:

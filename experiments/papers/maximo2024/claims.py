@@ -41,18 +41,18 @@ _PAPERS, _BETWEEN = "the paper's", f"{BETWEEN_NODES_S:g} s between nodes"
 _LEAST_M = 1e-3  # added to dispersions that may be zero, before a logarithm
 
 
-def judge(made: Results) -> list[Claim]:
+def judge(results: Results) -> list[Claim]:
     """Judge MX1-MX8 by the tables."""
-    quality = made.table("quality")
+    quality = results.table("quality")
     return [
-        *mx1(made.table("weighting"), quality, made.optional_table("runs")),
-        *mx2(made.table("particles"), made.table("times")),
-        *mx3(made.table("dispersion"), quality),
-        *mx4(made.table("starts")),
-        *mx5(made.table("clusters")),
-        mx6(made.table("campus_starts")),
-        mx7(made.table("campus_starts")),
-        *mx8(made.table("kidnapping")),
+        *mx1(results.table("weighting"), quality, results.optional_table("runs")),
+        *mx2(results.table("particles"), results.table("times")),
+        *mx3(results.table("dispersion"), quality),
+        *mx4(results.table("starts")),
+        *mx5(results.table("clusters")),
+        mx6(results.table("campus_starts")),
+        mx7(results.table("campus_starts")),
+        *mx8(results.table("kidnapping")),
     ]
 
 

@@ -49,25 +49,27 @@ _COMPARED = {  # what a comparison of weightings is about, by its quantity
 _RECALL = {"recall_at_1": "recall@1", "recall_at_1_percent": "recall@1 %"}
 
 
-def draw(made: Results) -> dict[str, Figure]:
+def draw(results: Results) -> dict[str, Figure]:
     """All figures, by file name; the Oxford route is the real one where its positions are."""
-    oxford = "oxford_real" if made.has_arrays("oxford_real") else "oxford"
-    drawn: dict[str, Arrays] = {name: made.arrays(name) for name in (oxford, "umh", "campus")}
-    runs = made.optional_table("runs")
+    oxford = "oxford_real" if results.has_arrays("oxford_real") else "oxford"
+    drawn: dict[str, Arrays] = {name: results.arrays(name) for name in (oxford, "umh", "campus")}
+    runs = results.optional_table("runs")
     return {
         "maximo2024_data": data(drawn["campus"]),
         "maximo2024_clusters": clusters(drawn),
         "maximo2024_map_and_route": map_and_route(drawn),
-        "maximo2024_dispersion": dispersion(_without_controls(made.table("dispersion"))),
+        "maximo2024_dispersion": dispersion(_without_controls(results.table("dispersion"))),
         "maximo2024_starts": starts({name: drawn[name] for name in (oxford, "umh")}),
         "maximo2024_particles": particles(drawn[oxford]),
         "maximo2024_table_1": table_1(
-            _without_controls(made.table("table_1")), made.table("weighting")
+            _without_controls(results.table("table_1")), results.table("weighting")
         ),
-        "maximo2024_table_2": table_2(made.table("table_2")),
-        "maximo2024_quality": quality(made.table("quality")),
-        "maximo2024_kidnapping": kidnapping(made.table("kidnapping")),
-        "maximo2024_campus": campus_errors(made.table("campus_starts"), made.table("clusters")),
+        "maximo2024_table_2": table_2(results.table("table_2")),
+        "maximo2024_quality": quality(results.table("quality")),
+        "maximo2024_kidnapping": kidnapping(results.table("kidnapping")),
+        "maximo2024_campus": campus_errors(
+            results.table("campus_starts"), results.table("clusters")
+        ),
         **({} if runs is None else {"maximo2024_runs": oxford_runs(runs)}),
     }
 

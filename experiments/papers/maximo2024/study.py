@@ -133,12 +133,8 @@ def _rows(what: str, name: str, seed: int, profile: Profile) -> dict[str, Rows]:
     if what == "quality":
         return {"quality": list(quality_rows(name, seed))}
     if what == "runs":
-        found = [
-            {"run": run, **row}
-            for run in oxford_runs(POSITIONS)
-            for row in run_rows(run, seed, max(n_repeats // 5, 1))
-        ]
-        return {"runs": found}
+        names, n_fewer = oxford_runs(POSITIONS), max(n_repeats // 5, 1)
+        return {"runs": [{"run": n, **row} for n in names for row in run_rows(n, seed, n_fewer)]}
     case = case_of(name, seed)
     if what in ("weighting", "control"):
         return weighting_rows(case, n_repeats)

@@ -181,7 +181,7 @@ def run_rows(positions_run: str, seed: int, n_repeats: int) -> Iterator[Row]:
     label = {"nodes": len(case.known_map), "nearest_node_m": _nearest_node_m(case)}
     for method in METHODS:
         walks = _repeated(case, options(case, method), "estimator/topological_mcl", n_repeats)
-        yield from ({"method": method} | label | row for row in _errors(walks))
+        yield from ({"method": method, **label, **row} for row in _errors(walks))
 
 
 def particle_rows(case: Case, n_repeats: int) -> Iterator[Row]:

@@ -40,14 +40,18 @@ _OUT_AND_BACK = "out and back"
 _HEADLINE_METHODS = ("wheel_truth", "sampled")
 
 
-def judge(made: Results) -> list[Claim]:
+def judge(results: Results) -> list[Claim]:
     """Judge PB1-PB4 by the tables."""
     return [
         *pb1(),
-        *pb2(made.table("areas"), made.table("crossover"), NOMINAL.track_m),
-        *pb3(made.table("calibration"), made.table("gradient_descent"), made.table("engine_k")),
-        *pb3_short_turns(made.table("short_turns"), made.table("short_turns_found")),
-        *pb4(made.table("coverage"), made.table("engine"), made.table("table_1")),
+        *pb2(results.table("areas"), results.table("crossover"), NOMINAL.track_m),
+        *pb3(
+            results.table("calibration"),
+            results.table("gradient_descent"),
+            results.table("engine_k"),
+        ),
+        *pb3_short_turns(results.table("short_turns"), results.table("short_turns_found")),
+        *pb4(results.table("coverage"), results.table("engine"), results.table("table_1")),
     ]
 
 

@@ -37,25 +37,25 @@ _FEEDBACKS = {"truth": "steered by the true pose", "odometry": "steered by odome
 _PARAMETERS = {"kr": "$k_r$", "kl": "$k_l$"}
 
 
-def draw(made: Results) -> dict[str, Figure]:
+def draw(results: Results) -> dict[str, Figure]:
     """Draw all figures of the paper, by file name."""
-    drawn = made.arrays("drawn")
+    drawn = results.arrays("drawn")
     return {
         "puzzlebot2024_ideal_and_real": ideal_and_real(drawn),
         "puzzlebot2024_square_feedback": square_feedback(
-            made.table("square_feedback"), made.arrays("square_feedback")
+            results.table("square_feedback"), results.arrays("square_feedback")
         ),
         "puzzlebot2024_ellipse_area": ellipse_area(
-            made.table("areas"), made.table("crossover"), drawn
+            results.table("areas"), results.table("crossover"), drawn
         ),
-        "puzzlebot2024_calibration": calibration(made.table("calibration")),
-        "puzzlebot2024_table_1": table_1(made.table("table_1")),
-        "puzzlebot2024_table_1_short_turns": table_1_short_turns(made.table("short_turns")),
+        "puzzlebot2024_calibration": calibration(results.table("calibration")),
+        "puzzlebot2024_table_1": table_1(results.table("table_1")),
+        "puzzlebot2024_table_1_short_turns": table_1_short_turns(results.table("short_turns")),
         "puzzlebot2024_short_turns": short_turns(
-            made.table("short_turns"), made.table("short_turns_found")
+            results.table("short_turns"), results.table("short_turns_found")
         ),
-        "puzzlebot2024_convergence": convergence(made.table("convergence")),
-        "puzzlebot2024_coverage": coverage(made.table("coverage")),
+        "puzzlebot2024_convergence": convergence(results.table("convergence")),
+        "puzzlebot2024_coverage": coverage(results.table("coverage")),
     }
 
 

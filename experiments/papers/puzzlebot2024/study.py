@@ -31,8 +31,7 @@ from experiments.papers.puzzlebot2024.settings import (
     CALIBRATIONS,
     CLOSE_K_M,
     COVERAGE_RUNS,
-    ENGINE_OVERRIDES,
-    FEEDBACK_OVERRIDES,
+    FEW_SEEDS,
     LOOPS,
     NOMINAL,
     SQUARE_RUNS,
@@ -75,11 +74,11 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     out.write_tables(short_turns=ends, short_turns_found=found)
     out.write_tables(coverage=coverage(covered, COVERAGE_RUNS[profile]))
     on_progress(0.8)
-    ends, paths = square_feedback(*FEEDBACK_OVERRIDES[profile])
+    ends, paths = square_feedback(*FEW_SEEDS[profile])
     out.write_tables(square_feedback=ends)
     out.write_arrays("square_feedback", **paths)
     on_progress(0.9)
-    driven = engine_recordings(*ENGINE_OVERRIDES[profile])
+    driven = engine_recordings(*FEW_SEEDS[profile])
     out.write_tables(engine=engine_ends(driven), engine_k=engine_k(driven))
     on_progress(1.0)
 

@@ -20,13 +20,13 @@ _STRATEGIES = {
 }
 
 
-def draw(made: Results) -> dict[str, Figure]:
+def draw(results: Results) -> dict[str, Figure]:
     """Draw every figure, by file name."""
     return {
         "exploration_drive": drives(
-            {name: made.arrays(f"drive_{name}") for name in (BASE, JUDGED)}
+            {name: results.arrays(f"drive_{name}") for name in (BASE, JUDGED)}
         ),
-        "exploration_coverage": by_distance(made.table("coverage")),
+        "exploration_coverage": by_distance(results.table("coverage")),
     }
 
 

@@ -13,9 +13,9 @@ _CONSISTENT = 0.79  # median of chi-squared of 3 degrees of freedom, / 3
 _NAMES = {"fastslam1": "FastSLAM 1.0", "fastslam2": "FastSLAM 2.0"}
 
 
-def draw(made: Results) -> dict[str, Figure]:
+def draw(results: Results) -> dict[str, Figure]:
     """Draw the study's figure."""
-    return {"fastslam_consistency_nees": by_distance(made.table("nees"))}
+    return {"fastslam_consistency_nees": by_distance(results.table("nees"))}
 
 
 def by_distance(table: pd.DataFrame) -> Figure:

@@ -13,9 +13,9 @@ from experiments.viewing.style import BLUE, ORANGE, WALL, subplots
 _WORLDS = {"room": "s", "rooms": "^", "office": "D"}
 
 
-def draw(made: Results) -> dict[str, Figure]:
+def draw(results: Results) -> dict[str, Figure]:
     """Draw the study's figure."""
-    return {"peers_errors": errors(made.table("methods"))}
+    return {"peers_errors": errors(results.table("methods"))}
 
 
 def errors(methods: pd.DataFrame) -> Figure:

@@ -40,7 +40,7 @@ from sim.sensors import Laser
 
 _TOLERANCE_S = 0.05
 _ORIGIN = np.zeros(3)
-# Walls are no lines and people walk by: what the scans believe is ten times the laser's noise.
+# Ten times the laser's noise is believed of scans, since walls are not straight and people walk by.
 # Chosen when no line was left out yet.
 _OPTIONS: dict[str, Any] = {
     "sigma_range_m": 0.1,

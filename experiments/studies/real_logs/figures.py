@@ -20,14 +20,14 @@ from experiments.viewing.style import BLACK, CYCLE, subplots
 from sim.worlds.grid import OccupancyGrid
 
 
-def draw(made: Results) -> dict[str, Figure]:
+def draw(results: Results) -> dict[str, Figure]:
     """Draw all figures of the study, by file name."""
     return {
-        "real_logs_intel": intel(made.table("relations"), made.arrays("intel")),
-        "real_logs_building": building(made.arrays("building")),
-        "real_logs_mrclam": mrclam(made.table("mrclam"), made.arrays("mrclam")),
-        "real_logs_wheels": wheels(made.table("wheels")),
-        "real_logs_wean": wean(made.table("wean"), made.arrays("wean")),
+        "real_logs_intel": intel(results.table("relations"), results.arrays("intel")),
+        "real_logs_building": building(results.arrays("building")),
+        "real_logs_mrclam": mrclam(results.table("mrclam"), results.arrays("mrclam")),
+        "real_logs_wheels": wheels(results.table("wheels")),
+        "real_logs_wean": wean(results.table("wean"), results.arrays("wean")),
     }
 
 

@@ -17,11 +17,11 @@ from experiments.viewing.team_figure import draw_paths, draw_sightings
 _FILTERS = {"fastslam": (BLUE, "s"), "ekf_slam": (BLACK, "o"), "smoother": (PURPLE, "^")}
 
 
-def draw(made: Results) -> dict[str, Figure]:
+def draw(results: Results) -> dict[str, Figure]:
     """Draw every figure, by file name."""
-    errors = made.table("errors")
+    errors = results.table("errors")
     return {
-        "teams_drive": drive(made.arrays("drive")),
+        "teams_drive": drive(results.arrays("drive")),
         "teams_errors": by_size(errors),
         "teams_links": by_link(errors),
     }

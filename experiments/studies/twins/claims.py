@@ -12,10 +12,10 @@ from experiments.judging.results import Results
 from experiments.studies.twins.settings import LEAST_SHARE, SHOWN
 
 
-def judge(made: Results) -> list[Claim]:
+def judge(results: Results) -> list[Claim]:
     """Judge TW1 and TW2 by the tables."""
-    pairs = made.table("pairs")
-    return [*tw1(pairs, made.table("others")), *tw2(pairs)]
+    pairs = results.table("pairs")
+    return [*tw1(pairs, results.table("others")), *tw2(pairs)]
 
 
 def tw1(pairs: pd.DataFrame, others: pd.DataFrame) -> Iterator[Claim]:

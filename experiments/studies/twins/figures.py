@@ -9,9 +9,9 @@ from experiments.viewing.plotting import plain_log, with_legend
 from experiments.viewing.style import BLACK, RED, SKY, subplots
 
 
-def draw(made: Results) -> dict[str, Figure]:
+def draw(results: Results) -> dict[str, Figure]:
     """Draw the study's figure."""
-    return {"twins_errors": errors(made.table("pairs"))}
+    return {"twins_errors": errors(results.table("pairs"))}
 
 
 def errors(pairs: pd.DataFrame) -> Figure:
