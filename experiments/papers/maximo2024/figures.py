@@ -29,6 +29,7 @@ from experiments.viewing.plotting import (
     draw_dots,
     plain_log,
     plan_axes,
+    set_axes,
     with_legend,
 )
 from experiments.viewing.style import BLACK, BLUE, CYCLE, GREEN, ORANGE, RED, SKY, WALL, subplots
@@ -262,8 +263,7 @@ def oxford_runs(table: pd.DataFrame) -> Figure:
     label = "distance to the nearest node"
     ax.plot(np.arange(len(errors)), nearest, "_", color=WALL, ms=14, label=label)
     ax.set_xticks(range(len(errors)), [run[:10] for run in errors.index], rotation=60, ha="right")
-    ax.set(ylabel="mean error over the route, m", xlabel="Oxford run", yscale="log")
-    plain_log(ax.yaxis)
+    set_axes(ax, ylabel="mean error over the route, m", xlabel="Oxford run", plain="y")
     return with_legend(page, ncols=4)
 
 

@@ -20,6 +20,7 @@ from experiments.viewing.plotting import (
     draw_table,
     plain_ticks,
     plan_axes,
+    set_axes,
     with_legend,
 )
 from experiments.viewing.style import BLACK, BLUE, CYCLE, ORANGE, subplots
@@ -97,8 +98,8 @@ def square_feedback(table: pd.DataFrame, paths: Arrays) -> Figure:
                 ax.plot(*ways[:, -1].T, ".", color=color, ms=5)
             end_m = table.loc[chosen, "true_end_m"].median()
             title = f"{its}, {steered}\nmedian end {end_m:.2f} m from the target"
+            plan_axes(ax)
             ax.set_title(title, fontsize="medium")
-            ax.set(xlabel="x, m", ylabel="y, m", aspect="equal")
     return with_legend(page, ncols=3)
 
 
@@ -265,8 +266,8 @@ def short_turns(ends: pd.DataFrame, found: pd.DataFrame) -> Figure:
         )
     case_4 = float(ends.set_index("case").loc["angular_4", "ideal_heading_rad"])
     left.plot(case_4, REPORTED_ENDS["angular_4"], "x", color=BLACK, label="the report's example")
-    left.set(xlabel="turn commanded, rad", ylabel="turn driven, rad")
-    left.legend(loc="upper left")
+    legend = {"loc": "upper left"}
+    set_axes(left, xlabel="turn commanded, rad", ylabel="turn driven, rad", legend=legend)
     for i, row in enumerate(found.itertuples()):
         is_gain = row.parameter.startswith("bias")
         truth, *values = (
@@ -280,14 +281,15 @@ def short_turns(ends: pd.DataFrame, found: pd.DataFrame) -> Figure:
             named = {"label": "what the controller takes"} if row.parameter == "track_m" else {}
             right.plot(nominal, i + 0.18, "v", color=ORANGE, **named)
     right.axvline(1.0, color=BLACK, lw=0.8)
-    right.set(
+    set_axes(
+        right,
         xlabel="over the truth",
         yticks=range(len(found)),
         yticklabels=[_FOUND[name] for name in found["parameter"]],
         ylim=(len(found) - 0.5, -0.6),
         title="by end poses alone",
+        legend={"loc": "center left"},
     )
-    right.legend(loc="center left")
     return page
 
 

@@ -7,7 +7,7 @@ from matplotlib.lines import Line2D
 
 from experiments.judging.results import Results
 from experiments.studies.peers.settings import LASER, MAP, STEREO, TUNED
-from experiments.viewing.plotting import plain_log
+from experiments.viewing.plotting import set_axes
 from experiments.viewing.style import BLUE, ORANGE, WALL, subplots
 
 _WORLDS = {"room": "s", "rooms": "^", "office": "D"}
@@ -44,11 +44,9 @@ def errors(methods: pd.DataFrame) -> Figure:
             left.plot(method["ate_rmse_m"], place, "o", ms=8, **mark)
             right.plot(method["cpu_time_us"], place, "o", ms=8, **mark)
         for axes, label in ((left, "RMS position error, m"), (right, "processor time a Frame, µs")):
-            axes.set(xscale="log", xlabel=label, ylim=(-0.7, len(names) - 0.3))
+            set_axes(axes, plain="x", xlabel=label, ylim=(-0.7, len(names) - 0.3))
             axes.grid(axis="y", color="0.92")
         right.tick_params(axis="y", length=0)
-        plain_log(left.xaxis)
-        plain_log(right.xaxis)
         left.set_yticks(places, list(map(_label, names, part["answer"])))
         right.set_yticks(places, [""] * len(names))
         left.set_title(f"{sensor} and wheels", fontsize=9, loc="left")

@@ -15,7 +15,7 @@ from experiments.studies.real_logs.settings import (
     RESOLUTION_M,
 )
 from experiments.viewing.grid import draw_grid
-from experiments.viewing.plotting import plan_axes
+from experiments.viewing.plotting import plan_axes, set_axes, with_legend
 from experiments.viewing.style import BLACK, CYCLE, subplots
 from sim.worlds.grid import OccupancyGrid
 
@@ -109,14 +109,16 @@ def wheels(found: pd.DataFrame) -> Figure:
             at, rows.value, spread, color=color, marker="o", ms=3, capsize=2,
             label=f"${quantity[0]}_{quantity[1]}$, run {log}",
         )  # fmt: skip
-    ax.set(
+    set_axes(
+        ax,
         xscale="log",
         yscale="log",
         xlabel="intervals of 0.8 s in a block",
         ylabel="$k_r$ and $k_l$ with 95 % intervals, m",
+        xticks=[1, 2, 4, 8, 16],
+        xticklabels=["1", "2", "4", "8", "16"],
+        legend={},
     )
-    ax.set_xticks([1, 2, 4, 8, 16], ["1", "2", "4", "8", "16"])
-    ax.legend()
     return page
 
 
@@ -140,5 +142,4 @@ def wean(fits: pd.DataFrame, drawn: Arrays) -> Figure:
             title=f"Wean Hall, log {row.log}: fit {row.score:.2f}, "
             f"start {math.degrees(row.yaw_rad):.0f}°",
         )
-    page.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=2, markerscale=6)
-    return page
+    return with_legend(page, ncols=2, of=ax, markerscale=6)
