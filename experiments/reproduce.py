@@ -10,7 +10,7 @@ from collections import Counter
 from pathlib import Path
 from types import ModuleType
 
-from experiments.judging.claim import Claim
+from experiments.judging.claim import Claim, Verdict
 from experiments.judging.claims_file import (
     note_provenance,
     read_claims,
@@ -20,9 +20,8 @@ from experiments.judging.claims_file import (
 )
 from experiments.judging.folders import code_folder, findings
 from experiments.judging.logs import missing
-from experiments.judging.results import Results
+from experiments.judging.results import Profile, Results
 from experiments.judging.sentences import Conclusion, conclude
-from experiments.judging.verdict import Profile, Verdict
 from experiments.report.page import write_report
 from experiments.runs.console import progress
 from experiments.runs.paths import results, short
@@ -63,8 +62,13 @@ def reproduce(*, full: bool = False, only: str | None = None) -> None:
             print(f"{paper}: left out, {why}", file=sys.stderr)
             continue
         conclusions = reproduce_paper(paper, profile)
-        _print(conclusions)
-        lines.append(f"{paper}: {_counts(conclusions)} ({time.monotonic() - begun:.0f} s)")
+        for each in conclusions:
+            print(f"{each.id:<4} {each.verdict.label:<15} {first_sentence(each.sentence)}")
+        counts = Counter(each.verdict for each in conclusions)
+        ruled = ", ".join(
+            f"{counts[verdict]} {verdict.label}" for verdict in Verdict if verdict in counts
+        )
+        lines.append(f"{paper}: {ruled or 'judges no claim'} ({time.monotonic() - begun:.0f} s)")
     page = write_report(place)
     print("\n".join(["", *lines]))
     print(f"{short(page)} has the figures and tables behind them; open it in a browser")
@@ -137,8 +141,7 @@ def _write(
     command = f"estima reproduce --paper {paper}{' --full' * (profile is Profile.FULL)}"
     write_claims(claims, place / "claims.csv", paper=paper, profile=profile, command=command)
     says = findings(paper)["claims"]
-    path = place / "verdicts.csv"
-    write_verdicts(conclusions, path, paper=paper, says=says, profile=profile)
+    write_verdicts(conclusions, place / "verdicts.csv", paper=paper, says=says, profile=profile)
 
 
 def _draw(made: Results) -> None:
@@ -175,17 +178,6 @@ def _part(paper: str, name: str) -> ModuleType:
     return importlib.import_module(f"experiments.{room}.{paper}.{name}")
 
 
-def _print(conclusions: list[Conclusion]) -> None:
-    for each in conclusions:
-        print(f"{each.id:<4} {each.verdict.label:<15} {first_sentence(each.sentence)}")
-
-
 def first_sentence(text: str) -> str:
     """Return the text up to its first full stop that ends a sentence."""
     return re.split(r"(?<=[a-z0-9)%]\.) (?=[A-Z])", text, maxsplit=1)[0]
-
-
-def _counts(conclusions: list[Conclusion]) -> str:
-    """Say how many claims have which verdict, as in "3 reproduced, 1 undecided"."""
-    counts = Counter(each.verdict for each in conclusions)
-    return ", ".join(f"{counts[v]} {v.label}" for v in Verdict if v in counts) or "judges no claim"

@@ -5,7 +5,8 @@ A study's `judge` makes claims; they are found again by their fields, never by t
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass, field, fields, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
+from enum import StrEnum
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,30 @@ from numpy.typing import ArrayLike
 from scipy import stats
 
 from experiments.evaluation.statistics import Interval, log_ratio_interval, wilcoxon_p
-from experiments.judging.verdict import Role, Verdict, judged, more_to_settle
+
+
+class Verdict(StrEnum):
+    """Whether an interval meets a criterion."""
+
+    REPRODUCED = "reproduced"
+    NOT_REPRODUCED = "not_reproduced"
+    UNDECIDED = "undecided"  # the interval spans the criterion, or the data are too few
+    SHOWN = "shown"  # without a criterion
+
+    @property
+    def label(self) -> str:
+        """The verdict in words."""
+        return self.value.replace("_", " ")
+
+
+class Role(StrEnum):
+    """Whether a statistic decides its claim's verdict, or only accompanies it.
+
+    Headlines say what the paper says, with the paper's own method.
+    """
+
+    HEADLINE = "headline"
+    BESIDE = "beside"
 
 
 @dataclass(frozen=True)
@@ -88,16 +112,10 @@ class Claim:
         return self.about.claim
 
 
-_SUBJECT = {each.name for each in fields(Subject)}
-
-
 def select_all(claims: Sequence[Claim], **wanted: Any) -> list[Claim]:
     """Claims whose fields, or those of their subjects, have these values, in their order."""
-
-    def value(claim: Claim, name: str) -> Any:
-        return getattr(claim.about if name in _SUBJECT else claim, name)
-
-    return [c for c in claims if all(value(c, name) == wanted[name] for name in wanted)]
+    known = [(claim, {**vars(claim), **vars(claim.about)}) for claim in claims]
+    return [c for c, own in known if all(own[name] == value for name, value in wanted.items())]
 
 
 def select(claims: Sequence[Claim], **wanted: Any) -> Claim:
@@ -114,12 +132,63 @@ def select(claims: Sequence[Claim], **wanted: Any) -> Claim:
     return found[0]
 
 
+def judged(interval: Interval, at_least: float = -math.inf, at_most: float = math.inf) -> Verdict:
+    """Judge an interval against [at_least, at_most]: inside, wholly outside, or spanning an end.
+
+    An interval without bounds, for lack of data, leaves the claim undecided.
+    """
+    if not (math.isfinite(interval.low) and math.isfinite(interval.high)):
+        return Verdict.UNDECIDED
+    if interval.low >= at_least and interval.high <= at_most:
+        return Verdict.REPRODUCED
+    outside = interval.high < at_least or interval.low > at_most
+    return Verdict.NOT_REPRODUCED if outside else Verdict.UNDECIDED
+
+
+def more_to_settle(
+    found: Interval, n: int, at_least: float = -math.inf, at_most: float = math.inf
+) -> int:
+    """How many more recordings would settle an interval from n of them; 0: none, or unknown.
+
+    The value is taken to stay, and the interval to shrink with the square root of their number. A
+    positive interval is measured in logs.
+    """
+    spanned = [limit for limit in (at_least, at_most) if found.low < limit < found.high]
+    if n < 2 or not spanned or found.value in spanned:
+        return 0
+    if found.value < at_least or found.value > at_most:  # only the nearest limit has to be cleared
+        spanned = [min(spanned, key=lambda limit: abs(limit - found.value))]
+    scale = math.log if min(found.low, *spanned) > 0.0 else float
+    factors = [
+        (scale(found.high if limit > found.value else found.low) - scale(found.value))
+        / (scale(limit) - scale(found.value))
+        for limit in spanned
+    ]
+    return math.ceil(round(n * max(factors) ** 2, 6)) - n
+
+
+def holds(condition: bool) -> Verdict:
+    """Judge a statistic without an interval."""
+    return Verdict.REPRODUCED if condition else Verdict.NOT_REPRODUCED
+
+
+def overall(parts: Sequence[Verdict]) -> Verdict:
+    """Return the verdict on a claim whose parts must all hold."""
+    if set(parts) == {Verdict.REPRODUCED}:
+        return Verdict.REPRODUCED
+    return Verdict.NOT_REPRODUCED if Verdict.NOT_REPRODUCED in parts else Verdict.UNDECIDED
+
+
+def headline_verdict(statistics: Sequence[tuple[Role, Verdict]]) -> Verdict:
+    """Verdict on a claim by the roles and verdicts of its statistics."""
+    parts = [verdict for role, verdict in statistics if role is Role.HEADLINE]
+    return overall(parts) if parts else Verdict.SHOWN
+
+
 def shown(about: Subject, statistic: str, found: Interval, reason: str = "", **facts: Any) -> Claim:
     """State a statistic that accompanies a claim and has no criterion."""
-    criterion = "shown, not judged"
-    return Claim(
-        about, statistic, found, criterion, Verdict.SHOWN, reason, Role.BESIDE, facts=facts
-    )
+    ruling = ("shown, not judged", Verdict.SHOWN, reason, Role.BESIDE)
+    return Claim(about, statistic, found, *ruling, facts=facts)
 
 
 def beside(claim: Claim, is_beside: bool = True) -> Claim:
@@ -188,8 +257,7 @@ def more_by_p(n: int, p: float, limit: float) -> int:
 
     P = 0.01 is 2.33 standard errors away, and p = 0.05 1.64.
     """
-    more = (stats.norm.isf(limit) / max(stats.norm.isf(p), 0.1)) ** 2
-    return math.ceil(n * float(more)) - n
+    return math.ceil(n * float((stats.norm.isf(limit) / max(stats.norm.isf(p), 0.1)) ** 2)) - n
 
 
 def equivalent(

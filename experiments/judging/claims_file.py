@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from experiments.judging.claim import Claim
+from experiments.judging.claim import Claim, Role, Verdict
+from experiments.judging.results import Profile
 from experiments.judging.sentences import Conclusion
-from experiments.judging.verdict import Profile, Role, Verdict
 from experiments.runs.row import read_rows, write_frame
 from experiments.runs.version import code_version, machine
-from sim.errors import InputError
+from sim.errors import InputError, require
 from sim.files import require_file, write_whole
 
 VERDICT_COLUMNS = ("id", "paper", "says", "verdict", "sentence")
@@ -88,8 +88,7 @@ def write_verdicts(
         }
         for each in conclusions
     ]
-    new = pd.DataFrame(rows, columns=list(VERDICT_COLUMNS))
-    _replace(new, read_verdicts(path), path, paper)
+    _replace(pd.DataFrame(rows, columns=list(VERDICT_COLUMNS)), read_verdicts(path), path, paper)
 
 
 def _replace(new: pd.DataFrame, old: pd.DataFrame, path: Path, paper: str) -> None:
@@ -131,17 +130,22 @@ def _read(path: Path, columns: Sequence[str], key: list[str]) -> pd.DataFrame:
         table = read_rows(path, texts=[name for name in columns if name not in _NUMBERS])
     except InputError as error:
         raise InputError(f"{path}: cannot read the {path.stem}; {_REMEDY}") from error
-    for name in [name for name in columns if name not in table]:
-        raise InputError(f"{path}: no column {name}; {_REMEDY}")
-    for name in [name for name in (*_TEXTS, *_NUMBERS) if name in columns]:
-        pattern, wanted = _TEXTS.get(name, ("", "a number"))
-        cells = table[name]
-        if pattern:
-            good = cells.astype("str").str.fullmatch(pattern, na=False)
-        else:
-            good = cells.isna() | pd.to_numeric(cells, errors="coerce").notna()
-        for row in np.flatnonzero(~good):
-            cell = f"{name} is {cells.tolist()[row]!r}, not {wanted}"
+    absent = [name for name in columns if name not in table]
+    require(not absent, f"{path}: no column {', '.join(absent)}; {_REMEDY}")
+    bad = {
+        name: ~table[name].astype("str").str.fullmatch(_TEXTS[name][0], na=False)
+        for name in _TEXTS
+        if name in columns
+    }
+    bad |= {
+        name: table[name].notna() & pd.to_numeric(table[name], errors="coerce").isna()
+        for name in _NUMBERS
+        if name in columns
+    }
+    for name, rows in bad.items():
+        for row in np.flatnonzero(rows):
+            wanted = _TEXTS.get(name, ("", "a number"))[1]
+            cell = f"{name} is {table[name].tolist()[row]!r}, not {wanted}"
             raise InputError(f"{path}, row {row + 2}: {cell}; {_REMEDY}")
     for row in np.flatnonzero(table.duplicated(key)):
         raise InputError(f"{path}, row {row + 2}: a duplicate; {_REMEDY}")
@@ -177,13 +181,11 @@ def read_provenance(results: Path) -> dict[str, dict[str, Any]]:
         return {}
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{path}: cannot read ({error}); {_REMEDY}") from error
-    if not isinstance(made, dict):
-        raise InputError(f"{path}: must hold an object by paper; {_REMEDY}")
+    require(isinstance(made, dict), f"{path}: must hold an object by paper; {_REMEDY}")
     for paper, how in made.items():
         missing = [key for key in _ORIGIN if not isinstance(how, dict) or key not in how]
-        if missing:
-            raise InputError(f"{path}: {paper} does not say its {', '.join(missing)}; {_REMEDY}")
-        for key, value in how.items():
-            if isinstance(value, (list, dict)):
-                raise InputError(f"{path}: {paper}.{key} must be a text or a number; {_REMEDY}")
+        require(not missing, f"{path}: {paper} does not say its {', '.join(missing)}; {_REMEDY}")
+        nested = [key for key, value in how.items() if isinstance(value, (list, dict))]
+        words = f"{path}: {paper}.{', '.join(nested)} must be a text or a number"
+        require(not nested, f"{words}; {_REMEDY}")
     return made

@@ -23,5 +23,4 @@ def findings(study: str) -> dict[str, Any]:
     """
     path = code_folder(study) / "findings.yaml"
     found = read_yaml(path) if path.exists() else {}
-    empty = {"title": study, "about": "", "claims": {}, "sentences": {}, "figures": {}}
-    return {**empty, **found}
+    return {**{"title": study, "about": "", "claims": {}, "sentences": {}, "figures": {}}, **found}

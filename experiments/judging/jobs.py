@@ -16,13 +16,14 @@ from experiments.sweeps.collect import with_answers
 from sim.team import Team
 
 T = TypeVar("T")
+Progress = Callable[[float], None]  # called with the share done
 Tables = Mapping[str, Sequence[Row] | pd.DataFrame]  # rows by the table's name
 
 
 def in_parallel(
     function: Callable[..., T],
     jobs: Sequence[Sequence[Any]],
-    on_progress: Callable[[float], None] = lambda _: None,
+    on_progress: Progress = lambda _: None,
     costs: ArrayLike | None = None,
 ) -> Iterator[T]:
     """Yield `function(*job)` for every job, in order, computed on all cores.
@@ -44,7 +45,7 @@ def in_parallel(
 def tables_of(
     function: Callable[..., Tables],
     jobs: Sequence[Sequence[Any]],
-    on_progress: Callable[[float], None] = lambda _: None,
+    on_progress: Progress = lambda _: None,
     costs: ArrayLike | None = None,
 ) -> dict[str, pd.DataFrame]:
     """Run jobs by `in_parallel` and join the rows that they give, by table, in their order."""

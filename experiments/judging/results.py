@@ -1,9 +1,11 @@
-"""What a study writes for its claims and figures: tables and arrays."""
+"""What a study writes for its claims and figures, by its size: tables and arrays."""
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from enum import StrEnum
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -15,6 +17,7 @@ from sim.errors import InputError
 from sim.files import write_whole
 from sim.npz import read_arrays
 
+Arrays = dict[str, NDArray[Any]]
 # Errors of a table or array without its content; a query for a missing column is a NameError
 _MISFITS = (
     LookupError,
@@ -24,6 +27,13 @@ _MISFITS = (
     pd.errors.UndefinedVariableError,
     EOFError,
 )
+
+
+class Profile(StrEnum):
+    """The size of a study: `quick` makes every table and figure from few repeats."""
+
+    FULL = "full"
+    QUICK = "quick"
 
 
 @dataclass(frozen=True)
@@ -55,16 +65,16 @@ class Results:
             raise InputError(f"{short(path)}: damaged (no rows); {self._remedy}")
         return table
 
-    def has_table(self, name: str) -> bool:
-        """Whether the study left this table: some need data that is not part of the project."""
-        return self._path("tables", f"{name}.csv").exists()
+    def optional_table(self, name: str) -> pd.DataFrame | None:
+        """Read a table that needs data which is not part of the project; None without it."""
+        return self.table(name) if self._path("tables", f"{name}.csv").exists() else None
 
     def write_arrays(self, name: str, **arrays: NDArray[np.generic]) -> None:
         """Write named arrays to one file, compressed."""
         with write_whole(self._path("arrays", f"{name}.npz")) as part, part.open("wb") as file:
             np.savez_compressed(file, allow_pickle=False, **arrays)
 
-    def arrays(self, name: str) -> dict[str, NDArray[np.generic]]:
+    def arrays(self, name: str) -> Arrays:
         """Read named arrays.
 
         Raises
@@ -114,14 +124,14 @@ class Results:
         return f"run `estima reproduce {full}--paper {self.paper}`"
 
 
-class _Arrays(dict[str, NDArray[np.generic]]):
+class _Arrays(Arrays):
     """Arrays of a file, which is named if one is asked for that it lacks."""
 
-    def __init__(self, arrays: Mapping[str, NDArray[np.generic]], file: str, remedy: str) -> None:
+    def __init__(self, arrays: Mapping[str, NDArray[Any]], file: str, remedy: str) -> None:
         super().__init__(arrays)
         self._file, self._remedy = file, remedy
 
-    def __missing__(self, name: str) -> NDArray[np.generic]:
+    def __missing__(self, name: str) -> NDArray[Any]:
         raise InputError(
             f"{self._file}: damaged or of another version ({name!r} missing); {self._remedy}"
         )

@@ -13,8 +13,7 @@ from typing import Any
 from jinja2 import Environment, StrictUndefined
 
 from experiments.evaluation.statistics import Interval
-from experiments.judging.claim import Claim, select, select_all
-from experiments.judging.verdict import Role, Verdict, headline_verdict
+from experiments.judging.claim import Claim, Role, Verdict, headline_verdict, select, select_all
 
 
 @dataclass(frozen=True)
@@ -53,7 +52,7 @@ def conclude(claims: Iterable[Claim], findings: Mapping[str, Any]) -> list[Concl
 def sentence(template: str, rows: Sequence[Claim]) -> str:
     """Fill a claim's template with its statistics."""
     names = {"select": partial(select, rows), "select_all": partial(select_all, rows), "rows": rows}
-    return " ".join(_environment().from_string(template).render(names).split())
+    return " ".join(_ENVIRONMENT.from_string(template).render(names).split())
 
 
 def more_needed(rows: Sequence[Claim], unit: str) -> str:
@@ -69,7 +68,7 @@ def more_needed(rows: Sequence[Claim], unit: str) -> str:
 
 def plain(number: float | Interval, digits: int = 2) -> str:
     """Write a number, or an interval's value, with so many significant digits."""
-    value = _value(number)
+    value = number.value if isinstance(number, Interval) else number
     if not math.isfinite(value):
         return "unknown"
     short = f"{value:.{digits}g}"
@@ -80,7 +79,7 @@ def plain(number: float | Interval, digits: int = 2) -> str:
 
 def percent(share: float | Interval) -> str:
     """Write a share, or an interval's value, in percent."""
-    value = _value(share)
+    value = share.value if isinstance(share, Interval) else share
     return f"{100.0 * value:.0f} %" if math.isfinite(value) else "an unknown share"
 
 
@@ -100,14 +99,8 @@ def span(claims: Sequence[Claim]) -> str:
     return f"{plain(min(values))} to {plain(max(values))}"
 
 
-def _environment() -> Environment:
-    environment = Environment(undefined=StrictUndefined, autoescape=False)
-    environment.filters |= {each.__name__: each for each in (plain, percent, bracketed, ends, span)}
-    return environment
-
-
-def _value(number: float | Interval) -> float:
-    return number.value if isinstance(number, Interval) else number
+_ENVIRONMENT = Environment(undefined=StrictUndefined, autoescape=False)
+_ENVIRONMENT.filters |= {each.__name__: each for each in (plain, percent, bracketed, ends, span)}
 
 
 def _rounded(number: int) -> int:

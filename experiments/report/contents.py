@@ -13,9 +13,10 @@ from typing import Any
 import pandas as pd
 from PIL import Image, UnidentifiedImageError
 
+from experiments.judging.claim import Role, Verdict, headline_verdict
 from experiments.judging.claims_file import read_claims, read_provenance, read_verdicts, this_code
 from experiments.judging.folders import code_folder, findings
-from experiments.judging.verdict import Profile, Role, Verdict, headline_verdict
+from experiments.judging.results import Profile
 from experiments.report.export import as_text, folded, numeric, plain
 from experiments.report.leaderboard import by_world, on_lasers
 from experiments.runs.paths import CONF

@@ -15,7 +15,7 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
-from experiments.judging.verdict import Profile
+from experiments.judging.results import Profile
 from experiments.report.contents import contents
 from experiments.report.export import plain, significant
 from sim.errors import printable

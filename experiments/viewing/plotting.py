@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -49,6 +50,48 @@ def plain_ticks(ax: Axes, values: Iterable[float], **text: Any) -> None:
     ticks = sorted(set(values))
     ax.set_xticks(ticks, [f"{tick:g}" for tick in ticks], **text)
     ax.minorticks_off()
+
+
+def set_axes(
+    axes: Any,
+    *,
+    plain: str = "",
+    ticks: Iterable[float] = (),
+    title: str = "",
+    title_style: Mapping[str, Any] = MappingProxyType({}),
+    legend: Mapping[str, Any] | None = None,
+    **settings: Any,
+) -> None:
+    """Set the properties of one axes or of an array of them, as `Axes.set` does.
+
+    Parameters
+    ----------
+    plain
+        Axes that are logarithmic with plain numbers: `x`, `y` or `xy`.
+    ticks
+        Plain ticks of a logarithmic x axis; they are small.
+    title, title_style
+        Title, and how it is written, such as `{"loc": "left"}`.
+    legend
+        How the legend is placed; None: without one.
+    """
+    settings = dict.fromkeys((f"{name}scale" for name in plain), "log") | settings
+    for ax in np.ravel(axes):
+        ax.set(**settings)
+        if title:
+            ax.set_title(title, **title_style)
+        if any(ticks):
+            plain_ticks(ax, ticks, fontsize=8)
+        for name in plain:
+            plain_log(getattr(ax, f"{name}axis"))
+        if legend is not None:
+            ax.legend(**legend)
+
+
+def draw_series(ax: Axes, *series: Sequence[Any]) -> None:
+    """Plot several series: of each, the arguments of `Axes.plot`, and last a dict of its style."""
+    for *arguments, style in series:
+        ax.plot(*arguments, **style)
 
 
 def plain_log(axis: Axis, multiples: Sequence[float] = (1.0, 2.0, 5.0)) -> None:

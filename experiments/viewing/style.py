@@ -41,10 +41,21 @@ def figure(width_in: float, height_in: float, font_pt: float = 9.0) -> Figure:
 
 
 def subplots(
-    width_in: float, height_in: float, n_rows: int = 1, n_cols: int = 1, **options: Any
+    width_in: float,
+    height_in: float,
+    n_rows: int = 1,
+    n_cols: int = 1,
+    *,
+    suptitle: str = "",
+    **options: Any,
 ) -> tuple[Figure, Any]:
-    """Page in the house style and its axes, as `matplotlib.pyplot.subplots` gives them."""
+    """Page in the house style and its axes, as `matplotlib.pyplot.subplots` gives them.
+
+    The title above them is small.
+    """
     page = figure(width_in, height_in)
+    if suptitle:
+        page.suptitle(suptitle, size=9)
     return page, page.subplots(n_rows, n_cols, **options)
 
 

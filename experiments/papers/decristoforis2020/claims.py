@@ -9,9 +9,8 @@ import pandas as pd
 
 from experiments.evaluation.registration_errors import METRICS
 from experiments.evaluation.statistics import Interval, log_ratio_interval, mean_interval
-from experiments.judging.claim import Claim, Subject, banded, beside, lower, shown
+from experiments.judging.claim import Claim, Subject, Verdict, banded, beside, lower, shown
 from experiments.judging.results import Results
-from experiments.judging.verdict import Verdict
 from experiments.papers.decristoforis2020.settings import CONSISTENT, PLACES, RATE_HZ
 from sim.arrays import Array
 
@@ -39,15 +38,15 @@ _PRINTED = ("hessian_points", "sampling", "censi_last")
 _COVARIANCES = (*_PRINTED, "hessian", "censi", "censi_sliding")
 
 
-def judge(made: Results) -> list[Claim]:
+def judge(results: Results) -> list[Claim]:
     """Judge DC1-DC6 by the tables."""
-    runs, ellipses = made.table("runs"), made.table("ellipses")
+    runs, ellipses = results.table("runs"), results.table("ellipses")
     return [
-        *dc1(runs, made.table("ordering")),
+        *dc1(runs, results.table("ordering")),
         *dc2(ellipses),
         *dc3(ellipses),
-        *dc4(made.table("covariances")),
-        *dc5(made.table("metrics")),
+        *dc4(results.table("covariances")),
+        *dc5(results.table("metrics")),
         *dc6(runs),
     ]
 
@@ -189,8 +188,7 @@ def dc5(metrics: pd.DataFrame) -> Iterator[Claim]:
                 ratio, n = log_ratio_interval(*pairs), len(wide.loc[kind])
                 label = f"{what}, point to {better} over point to point, {kind}"
                 about = Subject("DC5", what, metric=f"point_to_{better}", place=kind)
-                claim = banded(about, label, ratio, at_most=at_most, n=n)
-                yield beside(claim, better == "line")
+                yield beside(banded(about, label, ratio, at_most=at_most, n=n), better == "line")
 
 
 def dc6(runs: pd.DataFrame) -> list[Claim]:

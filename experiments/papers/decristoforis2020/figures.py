@@ -9,11 +9,10 @@ from matplotlib.axes import Axes
 from matplotlib.colors import TwoSlopeNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
-from numpy.typing import NDArray
 
 from experiments.evaluation.registration_errors import METRICS
 from experiments.evaluation.statistics import log_ratio_interval
-from experiments.judging.results import Results
+from experiments.judging.results import Arrays, Results
 from experiments.papers.decristoforis2020.claims import judged_runs, nees_intervals
 from experiments.papers.decristoforis2020.settings import CONSISTENT, PAPERS_OWN, PLACES
 from experiments.viewing.plotting import (
@@ -38,8 +37,6 @@ from experiments.viewing.style import (
     subplots,
 )
 from experiments.viewing.world import draw_walls
-
-Arrays = dict[str, NDArray[Any]]
 
 COLORS = {
     "truth": TRUTH,
@@ -69,24 +66,24 @@ _METHODS = {
 }
 
 
-def draw(made: Results) -> dict[str, Figure]:
+def draw(results: Results) -> dict[str, Figure]:
     """Draw all figures, by file name."""
-    office, table, drawn = made.arrays("office"), made.table("runs"), made.table("drawn")
+    office, table, drawn = results.arrays("office"), results.table("runs"), results.table("drawn")
     pages = {
         "1_route": route(office),
-        "2_ellipses": ellipses(office, made.table("areas"), made.table("ellipse_path")),
+        "2_ellipses": ellipses(office, results.table("areas"), results.table("ellipse_path")),
         "3_trajectories": trajectories(office, drawn),
-        "4_errors": boxes(made.table("boxes")),
+        "4_errors": boxes(results.table("boxes")),
         "5_maps": maps(office, drawn),
         "runs": runs(table),
-        "covariances": covariances(made.table("covariances")),
-        "beliefs": beliefs(made.table("beliefs")),
-        "ordering": ordering(made.table("ordering")),
-        "steps": steps(made.table("steps")),
+        "covariances": covariances(results.table("covariances")),
+        "beliefs": beliefs(results.table("beliefs")),
+        "ordering": ordering(results.table("ordering")),
+        "steps": steps(results.table("steps")),
     }
-    if made.has_arrays("log"):  # which is written where the log is
-        pages["log"] = real_log(made.arrays("log"), made.table("log_boxes"))
-    return {f"{made.paper}_{name}": page for name, page in pages.items()}
+    if results.has_arrays("log"):  # which is written where the log is
+        pages["log"] = real_log(results.arrays("log"), results.table("log_boxes"))
+    return {f"{results.paper}_{name}": page for name, page in pages.items()}
 
 
 def route(office: Arrays) -> Figure:
@@ -288,8 +285,7 @@ def covariances(table: pd.DataFrame) -> Figure:
                 found["value"], heights, fmt="o", ms=4, color=color, label=place,
                 xerr=[found["value"] - low, found["high"] - found["value"]],
             )  # fmt: skip
-        words = metric.replace("_", " ")
-        ax.set(xscale="log", xlabel="NEES / degrees of freedom", title=words)
+        ax.set(xscale="log", xlabel="NEES / degrees of freedom", title=metric.replace("_", " "))
     times = table.groupby(["metric", "method"])["time_us"].median().unstack("metric")
     for metric, marker, color in zip(METRICS, "os^", (BLUE, TRUTH, ORANGE), strict=True):
         times_axes.plot(

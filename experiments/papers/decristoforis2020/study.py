@@ -26,10 +26,9 @@ from experiments.evaluation.metrics import (
     position_errors_m,
 )
 from experiments.evaluation.registration_errors import METRICS, measured, scenes
-from experiments.judging.jobs import Tables, grouped, tables_of
+from experiments.judging.jobs import Progress, Tables, grouped, tables_of
 from experiments.judging.logs import DATA
-from experiments.judging.results import Results
-from experiments.judging.verdict import Profile
+from experiments.judging.results import Profile, Results
 from experiments.papers.decristoforis2020.claims import judged_runs
 from experiments.papers.decristoforis2020.settings import (
     CHECKED,
@@ -74,15 +73,13 @@ _NOISE = {
 }
 
 
-def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) -> None:
+def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     """Run all studies of the paper, and write their tables and what its figures draw.
 
     Parameters
     ----------
     profile
         `quick`: few and short recordings; `full`: those that the claims are judged on.
-    on_progress
-        Called with the share of the work done.
     """
     costs, functions, arguments = zip(*_jobs(profile is Profile.FULL, out), strict=True)
     calls = [(function, *given) for function, given in zip(functions, arguments, strict=True)]

@@ -22,17 +22,19 @@ from experiments.evaluation.statistics import (
 )
 from experiments.judging.claim import (
     Claim,
+    Role,
     Subject,
+    Verdict,
     banded,
     beside,
     equivalent,
+    holds,
     more_by_p,
     remarked,
     shown,
 )
 from experiments.judging.results import Results
 from experiments.judging.sentences import percent
-from experiments.judging.verdict import Role, Verdict, holds
 from experiments.papers.gil2008.settings import P0
 from sim.arrays import Array
 
@@ -54,18 +56,18 @@ NOT_WORSE = 1.3  # 10 m against 20 m
 _DESCRIPTORS = 0.9  # their noise in the headline of GI7
 
 
-def judge(made: Results) -> list[Claim]:
+def judge(results: Results) -> list[Claim]:
     """Judge GI1-GI8 by the tables."""
-    particles, distance = made.table("particles"), made.table("distance")
+    particles, distance = results.table("particles"), results.table("distance")
     return [
-        *gi1(particles, made.table("laps")),
-        *gi2(particles, made.table("bound")),
+        *gi1(particles, results.table("laps")),
+        *gi2(particles, results.table("bound")),
         *gi3(particles),
         *gi4(distance),
         *gi5(distance),
-        *gi6(made.table("observations")),
-        *gi7(made.table("association")),
-        *gi8(made.table("cost")),
+        *gi6(results.table("observations")),
+        *gi7(results.table("association")),
+        *gi8(results.table("cost")),
     ]
 
 
@@ -212,7 +214,8 @@ def gi7(association: pd.DataFrame) -> Iterator[Claim]:
     Headlines are the printed filter, or FastSLAM 2.0 in tables without it, at the paper's noise.
     """
     printed = "paper" if "paper" in set(association["filter"]) else "fastslam2"
-    for (noise, name), table in _particle_filters(association):
+    ours = association[(association["filter"] != "ekf_slam") & np.isclose(association["p0"], P0)]
+    for (noise, name), table in ours.groupby(["noise", "filter"], sort=False):
         where, is_beside = f"{NAMES[name]}, {NOISE[noise]}", (noise, name) != ("paper", printed)
         known = table[table["association"] == "known"].set_index("seed")[POSITION]
         for sigma, part in table[table["association"] == "descriptor"].groupby("sigma_descriptor"):
@@ -224,10 +227,8 @@ def gi7(association: pd.DataFrame) -> Iterator[Claim]:
             both = pd.concat([part.set_index("seed")[POSITION], known], axis=1, join="inner")
             about = Subject("GI7", "descriptor", method=name, noise=noise, setting=sigma)
             claim = equivalent(about, label, both.iloc[:, 0], both.iloc[:, 1], 0.5)
-            remark = (
-                f"descriptors alone match {percent(alone)}, together {percent(right)} are right"
-            )
-            yield beside(remarked(claim, remark), is_beside or sigma != _DESCRIPTORS)
+            words = f"descriptors alone match {percent(alone)}, together {percent(right)} are right"
+            yield beside(remarked(claim, words), is_beside or sigma != _DESCRIPTORS)
         guessed = table[table["association"] == "mahalanobis"].set_index("seed")
         single = association[
             (association["filter"] == "ekf_slam") & (association["noise"] == noise)
@@ -238,20 +239,12 @@ def gi7(association: pd.DataFrame) -> Iterator[Claim]:
         if guessed.empty:
             continue
         relative = [p["ate_rmse_m"] / p["odometry_rmse_m"] for p in (single, guessed)]
-        ekf, ours = pd.concat(relative, axis=1, join="inner").to_numpy().T
+        ekf, particles = pd.concat(relative, axis=1, join="inner").to_numpy().T
         about = Subject("GI7", "divergence", method=name, noise=noise)
-        yield beside(_divergence(about, ekf > 0.5, ours > 0.5, where), is_beside)
+        yield beside(_divergence(about, ekf > 0.5, particles > 0.5, where), is_beside)
         label = f"error of EKF-SLAM over FastSLAM's, both by Mahalanobis distance: {where}"
         about = replace(about, quantity="EKF-SLAM over FastSLAM")
-        yield beside(banded(about, label, log_ratio_interval(ekf, ours), 1.0, n=len(ekf)))
-
-
-def _particle_filters(
-    association: pd.DataFrame,
-) -> Iterator[tuple[tuple[str, str], pd.DataFrame]]:
-    """Rows of each noise and particle filter, at the default p0."""
-    ours = association[association["filter"] != "ekf_slam"]
-    yield from ours[np.isclose(ours["p0"], P0)].groupby(["noise", "filter"], sort=False)
+        yield beside(banded(about, label, log_ratio_interval(ekf, particles), 1.0, n=len(ekf)))
 
 
 def _divergence(

@@ -11,16 +11,16 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from experiments.evaluation.metrics import rms
-from experiments.judging.results import Results
+from experiments.judging.results import Arrays, Results
 from experiments.papers.gil2008.claims import pooled
 from experiments.papers.gil2008.settings import CELL_M
 from experiments.viewing.grid import UNKNOWN, draw_grid
 from experiments.viewing.plotting import (
     draw_band,
     draw_ellipses,
-    plain_log,
-    plain_ticks,
+    draw_series,
     plan_axes,
+    set_axes,
     with_legend,
 )
 from experiments.viewing.style import (
@@ -42,8 +42,6 @@ from sim import se2
 from sim.arrays import Array
 from sim.worlds.grid import OccupancyGrid
 
-Arrays = dict[str, Any]
-
 _FILTERS = {
     "paper": (RED, "o", "as printed"),
     "fastslam1": (GREEN, "^", "FastSLAM 1.0"),
@@ -55,27 +53,28 @@ _NOISE = {"paper": "10 px", "pixel": "1 px"}
 _CHI_95_3D = 2.7955
 _PATH, _MAP = "revised_ate_rmse_m", "map_rmse_m"
 _INTERVALS = "geometric means over worlds, 95 % intervals"
+_LEFT: dict[str, Any] = {"title_style": {"loc": "left"}}
 _BOTH = ((_PATH, "RMS of the path, m"), (_MAP, "RMS of the map, m"))
 
 
-def draw(made: Results) -> dict[str, Figure]:
+def draw(results: Results) -> dict[str, Figure]:
     """Draw every figure, by file name."""
-    run, bound = made.arrays("path"), made.table("bound")
+    run, bound = results.arrays("path"), results.table("bound")
     return {
         "gil2008_1_maps": maps(run),
         "gil2008_2_corrected": corrected(run),
-        "gil2008_3_particles": particles_along_a_motion(made.arrays("motion")),
+        "gil2008_3_particles": particles_along_a_motion(results.arrays("motion")),
         "gil2008_4_association": association_ellipses(),
         "gil2008_5_world": world_3d(run),
         "gil2008_6_path": path(run),
         "gil2008_7_components": components(run),
-        "gil2008_8_particles": by_particles(made.table("repeats"), bound),
-        "gil2008_8_worlds": by_particles_over_worlds(made.table("particles"), bound),
-        "gil2008_9_distance": by_distance(made.table("distance")),
-        "gil2008_observations": by_observations(made.table("observations")),
-        "gil2008_association": by_association(made.table("association")),
-        "gil2008_cost": cost(made.table("cost")),
-        "gil2008_settings": by_settings(made.table("resampling"), made.table("noise")),
+        "gil2008_8_particles": by_particles(results.table("repeats"), bound),
+        "gil2008_8_worlds": by_particles_over_worlds(results.table("particles"), bound),
+        "gil2008_9_distance": by_distance(results.table("distance")),
+        "gil2008_observations": by_observations(results.table("observations")),
+        "gil2008_association": by_association(results.table("association")),
+        "gil2008_cost": cost(results.table("cost")),
+        "gil2008_settings": by_settings(results.table("resampling"), results.table("noise")),
     }
 
 
@@ -83,15 +82,15 @@ def maps(run: Arrays) -> Figure:
     """Figure 1: occupancy grid of the rooms, and landmarks as the best particles map them."""
     page, (left, *others) = subplots(13.0, 4.9, 1, 3, sharex=True, sharey=True)
     draw_grid(left, _grid(run, "truth"))
-    left.set(xlim=(-2.5, 32.5), ylim=(-2.5, 32.5), facecolor=UNKNOWN)
-    left.set_title("occupancy grid, along the true path", loc="left")
+    limits: dict[str, Any] = {"xlim": (-2.5, 32.5), "ylim": (-2.5, 32.5), "facecolor": UNKNOWN}
+    set_axes(left, title="occupancy grid, along the true path", **_LEFT, **limits)
     for ax, name in zip(others, _SHOWN, strict=True):
         colour, _, words = _FILTERS[name]
-        means, covariances = run[f"{name}_landmarks"], run[f"{name}_covariances"]
-        draw_ellipses(ax, means, covariances, color=colour, alpha=0.2, lw=0)
+        means = run[f"{name}_landmarks"]
+        draw_ellipses(ax, means, run[f"{name}_covariances"], color=colour, alpha=0.2, lw=0)
         ax.plot(*means[:, :2].T, ".", color=colour, ms=3)
         plan_axes(ax)
-        ax.set_title(f"landmarks with 95 % ellipses, {words}", loc="left")
+        set_axes(ax, title=f"landmarks with 95 % ellipses, {words}", **_LEFT)
     return page
 
 
@@ -100,20 +99,22 @@ def corrected(run: Arrays) -> Figure:
     page, axes = subplots(13.0, 4.9, 1, 3, sharex=True, sharey=True)
     titles = {"odometry": "along odometry"} | {n: f"along SLAM, {_FILTERS[n][2]}" for n in _SHOWN}
     corners = np.concatenate([_grid(run, name).corners_m for name in titles])
-    (x1, y1), (x2, y2) = corners.min(axis=0), corners.max(axis=0)
+    xlim, ylim = zip(corners.min(axis=0), corners.max(axis=0), strict=True)
     for ax, (name, title) in zip(axes, titles.items(), strict=True):
         draw_grid(ax, _grid(run, name))
-        ax.set_title(title, loc="left")
-        ax.set(xlim=(x1, x2), ylim=(y1, y2), facecolor=UNKNOWN)
+        set_axes(ax, title=title, **_LEFT, xlim=xlim, ylim=ylim, facecolor=UNKNOWN)
     return page
 
 
 def particles_along_a_motion(motion: Arrays) -> Figure:
     """Figure 3: particles drawn along a motion; the noise is ten times the study's."""
     page, ax = subplots(6.0, 4.0)
-    ax.plot(*motion["particles"][..., :2].T, ".", color=BLUE, ms=1.5)
-    ax.plot(*motion["line"][:, :2].T, color=BLACK, label="odometry")
-    ax.plot([], [], ".", color=BLUE, label="particles")
+    draw_series(
+        ax,
+        (*motion["particles"][..., :2].T, ".", {"color": BLUE, "ms": 1.5}),
+        (*motion["line"][:, :2].T, {"color": BLACK, "label": "odometry"}),
+        ([], [], ".", {"color": BLUE, "label": "particles"}),
+    )
     plan_axes(ax)
     ax.legend()
     return page
@@ -144,16 +145,17 @@ def world_3d(run: Arrays) -> Figure:
         ax: Any = page.add_subplot(1, 2, i + 1, projection="3d")
         _draw_3d(ax, run, name)
         ax.set_title(_FILTERS[name][2], loc="left")
-    handles = [
-        Line2D([], [], color=BLACK, label="estimated path"),
-        Line2D([], [], color=WALL, label="walls"),
-        Line2D([], [], color=SKY, label="sight of a landmark in the image"),
-        Line2D([], [], color=GREEN, label="95 % ellipsoid of such a landmark"),
-        *(
-            Line2D([], [], color=colour, marker=".", ls="", label=f"landmarks, {words}")
+    styles: dict[str, dict[str, Any]] = {
+        "estimated path": {"color": BLACK},
+        "walls": {"color": WALL},
+        "sight of a landmark in the image": {"color": SKY},
+        "95 % ellipsoid of such a landmark": {"color": GREEN},
+        **{
+            f"landmarks, {words}": {"color": colour, "marker": ".", "ls": ""}
             for colour, _, words in map(_FILTERS.__getitem__, _SHOWN)
-        ),
-    ]
+        },
+    }
+    handles = [Line2D([], [], label=label, **style) for label, style in styles.items()]
     page.legend(handles=handles, loc="outside lower center", ncols=3)
     return page
 
@@ -165,16 +167,14 @@ def _draw_3d(ax: Any, run: Arrays, name: str) -> None:
     def near(points: Array) -> Any:
         return np.all(np.abs(points[..., :2] - pose[:2]) < reach, axis=-1)
 
-    inside = near(run["walls"].reshape(-1, 2, 2)).all(axis=1)
-    for (x1, y1, x2, y2), (bottom, top) in zip(
-        run["walls"][inside], run["wall_z_m"][inside], strict=True
-    ):
-        ring = np.array([[x1, y1, bottom], [x2, y2, bottom], [x2, y2, top], [x1, y1, top]])
-        ax.plot(*np.vstack([ring, ring[:1]]).T, color=WALL, lw=0.5)
+    walls = zip(run["walls"].reshape(-1, 2, 2), run["wall_z_m"], strict=True)
+    for (first, last), (bottom, top) in (wall for wall in walls if near(wall[0]).all()):
+        corners = [(first, bottom), (last, bottom), (last, top), (first, top), (first, bottom)]
+        ax.plot(*np.array([[*xy, z] for xy, z in corners]).T, color=WALL, lw=0.5)
     ax.plot(*np.where(near(run[name]), run[name][:, :2].T, np.nan), 0.0, color=BLACK, lw=1.0)
     pictured = (run[f"{name}_in_image"] > 0) & near(landmarks)
-    covariances = run[f"{name}_covariances"][pictured]
-    for mean, covariance in zip(landmarks[pictured], covariances, strict=True):
+    seen = zip(landmarks[pictured], run[f"{name}_covariances"][pictured], strict=True)
+    for mean, covariance in seen:
         ax.plot(*_ellipsoid(mean, covariance), color=GREEN, lw=0.3)
         ax.plot(*np.array([eye, mean]).T, color=SKY, lw=0.5)
     ax.plot(*landmarks[near(landmarks)].T, ".", color=_FILTERS[name][0], ms=2)
@@ -195,12 +195,15 @@ def path(run: Arrays) -> Figure:
     """Figure 6: true path, odometry and the best particles' paths."""
     page, ax = subplots(6.6, 6.6)
     draw_walls(ax, run["walls"], run["wall_z_m"])
-    ax.plot(*run["truth"][:, :2].T, color=TRUTH, lw=1.2, label="truth")
-    ax.plot(*run["odometry"][:, :2].T, "--", color=ODOMETRY, lw=1.2, label="odometry")
+    draw_series(
+        ax,
+        (*run["truth"][:, :2].T, {"color": TRUTH, "lw": 1.2, "label": "truth"}),
+        (*run["odometry"][:, :2].T, "--", {"color": ODOMETRY, "lw": 1.2, "label": "odometry"}),
+    )
     for name in _SHOWN:
         colour, marker, words = _FILTERS[name]
-        best, label = run[name][::12], f"{words}, M = 200"
-        ax.plot(*best[:, :2].T, marker, color=colour, ms=3, mfc="none", label=label)
+        style = {"color": colour, "ms": 3, "mfc": "none", "label": f"{words}, M = 200"}
+        ax.plot(*run[name][::12, :2].T, marker, **style)
     return with_legend(page, ncols=2, loc="outside upper center")
 
 
@@ -208,28 +211,27 @@ def components(run: Arrays) -> Figure:
     """Figure 7: the pose's components by distance, and their errors."""
     page, axes = subplots(10.0, 6.5, 3, 2, sharex=True)
     truth, along = run["truth"], run["travelled_m"]
-    names = ("x, m", "y, m", "heading, rad")
     drawn = {
         "odometry": (ODOMETRY, "odometry"),
         **{name: (_FILTERS[name][0], f"{_FILTERS[name][2]}, M = 200") for name in _SHOWN},
         "batch": (_BATCH, "batch"),
     }
-    for i, (label_of_row, (left, right)) in enumerate(zip(names, axes, strict=True)):
+    rows = zip(("x, m", "y, m", "heading, rad"), axes, strict=True)
+    for i, (component, (left, right)) in enumerate(rows):
         straighten, wrap = (np.unwrap, se2.wrap) if i == 2 else (np.asarray, np.asarray)
         for key, (colour, label) in drawn.items():
             if key != "batch":
                 left.plot(along, straighten(run[key][:, i]), color=colour, lw=1.0)
             right.plot(along, wrap(run[key][:, i] - truth[:, i]), color=colour, lw=1.0, label=label)
         left.plot(along, straighten(truth[:, i]), color=TRUTH, lw=1.0, label="truth")
-        low, high = right.get_ylim()
+        ylim = right.get_ylim()
         right.fill_between(
-            along[::4], low, high, where=run["revisited"], color=SKY, alpha=0.2, lw=0,
+            along[::4], *ylim, where=run["revisited"], color=SKY, alpha=0.2, lw=0,
             label="revisited ground",
         )  # fmt: skip
-        left.set(ylabel=label_of_row)
-        right.set(ylabel=f"error of {label_of_row}", ylim=(low, high))
-    for ax in axes[-1]:
-        ax.set_xlabel("path travelled, m")
+        left.set(ylabel=component)
+        right.set(ylabel=f"error of {component}", ylim=ylim)
+    set_axes(axes[-1], xlabel="path travelled, m")
     handles = [handle for ax in axes[0] for handle in ax.get_legend_handles_labels()[0]]
     page.legend(handles=handles, loc="outside upper center", ncols=3)
     return page
@@ -257,11 +259,9 @@ def by_particles(repeats: pd.DataFrame, bound: pd.DataFrame) -> Figure:
                     marker=marker, color=colour, label=words, capsize=2.5, lw=1.0, ms=4,
                 )  # fmt: skip
             ax.axhline(float(best[column].iloc[0]), color=_BATCH, ls=":", label="batch bound")
-            ax.set(xscale="log", ylabel=label, ylim=(0.0, None))
-            ax.set_title(design, loc="left")
-            plain_ticks(ax, repeats["n_particles"], fontsize=8)
-    for ax in grid[-1]:
-        ax.set_xlabel("particles M")
+            scale: dict[str, Any] = {"xscale": "log", "ylabel": label, "ylim": (0.0, None)}
+            set_axes(ax, ticks=repeats["n_particles"], title=design, **_LEFT, **scale)
+    set_axes(grid[-1], xlabel="particles M")
     n_runs = len(repeats[drawn]) // repeats.groupby(["filter", "n_particles"]).ngroups
     page.suptitle(
         f"one drive, {n_runs} runs each, bars of two standard deviations; "
@@ -282,21 +282,19 @@ def by_particles_over_worlds(particles: pd.DataFrame, bound: pd.DataFrame) -> Fi
         _MAP: "map",
         "map_aligned_rmse_m": "map, aligned",
     }
-    size = (11.0, 3.2 * len(by_noise) + 0.6, len(by_noise), 4)
-    page, grid = subplots(*size, squeeze=False, sharex=True)
+    page, grid = subplots(
+        11.0, 3.2 * len(by_noise) + 0.6, len(by_noise), 4, squeeze=False, sharex=True,
+        suptitle=f"by image noise; aligned: fitted to the truth; {_INTERVALS}",
+    )  # fmt: skip
     for (noise, table), row in zip(by_noise, grid, strict=True):
         best = np.log(bound[bound["noise"] == noise][list(columns)]).mean()
         for ax, (column, label) in zip(row, columns.items(), strict=True):
             _by_filter(ax, table, "n_particles", column)
             ax.axhline(np.exp(best[column]), color=_BATCH, ls=":", label="batch bound")
-            ax.set(xscale="log", yscale="log")
-            ax.set_title(f"{label}, {_NOISE[noise]}", loc="left")
-            plain_ticks(ax, [10, 50, 200, 1000], fontsize=8)
-            plain_log(ax.yaxis)
+            title = f"{label}, {_NOISE[noise]}"
+            set_axes(ax, xscale="log", plain="y", ticks=[10, 50, 200, 1000], title=title, **_LEFT)
         row[0].set_ylabel("RMS error, m")
-    for ax in grid[-1]:
-        ax.set_xlabel("particles M")
-    page.suptitle(f"by image noise; aligned: fitted to the truth; {_INTERVALS}", size=9)
+    set_axes(grid[-1], xlabel="particles M")
     # the noise that most filters ran on
     fullest = max(grid[:, 0], key=lambda ax: len(ax.get_legend_handles_labels()[0]))
     return with_legend(page, ncols=4, of=fullest)
@@ -304,7 +302,7 @@ def by_particles_over_worlds(particles: pd.DataFrame, bound: pd.DataFrame) -> Fi
 
 def by_distance(distance: pd.DataFrame) -> Figure:
     """Figure 9: dmax, by filter, choice of observations, walls and noise."""
-    page, axes = subplots(11.5, 4.4, 1, 2, sharex=True)
+    page, axes = subplots(11.5, 4.4, 1, 2, sharex=True, suptitle=_INTERVALS)
     kinds = {
         ("paper", True, "paper", 0, "random"): (RED, "-", "as printed, all visible"),
         ("paper", False, "paper", 0, "random"): (RED, "--", "as printed, no walls"),
@@ -324,21 +322,18 @@ def by_distance(distance: pd.DataFrame) -> Figure:
                 style = {"ls": line, "marker": "o", "ms": 3.5, "color": colour, "label": words}
                 draw_band(ax, middle, (middle - bars[0], middle + bars[1]), 0.08, **style)
         ax.axvline(10.0, color=BLACK, lw=0.6, ls=":")
-        ax.set(xlabel="farthest distance of an observation (dmax), m", ylabel=label, yscale="log")
-        plain_log(ax.yaxis)
-    page.suptitle(_INTERVALS, size=9)
+        words = "farthest distance of an observation (dmax), m"
+        set_axes(ax, xlabel=words, ylabel=label, plain="y")
     return with_legend(page, ncols=1, loc="outside right center")
 
 
 def by_observations(observations: pd.DataFrame) -> Figure:
     """Error against the maximum number of observations per image."""
-    page, axes = subplots(9.0, 3.8, 1, 2)
+    page, axes = subplots(9.0, 3.8, 1, 2, suptitle=_INTERVALS)
     for ax, (column, label) in zip(axes, _BOTH, strict=True):
         _by_filter(ax, observations, "n_seen", column)
-        ax.set(xscale="log", yscale="log", xlabel="most observations of an image (B)", ylabel=label)
-        plain_ticks(ax, observations["n_seen"], fontsize=8)
-        plain_log(ax.yaxis)
-    page.suptitle(_INTERVALS, size=9)
+        scale = {"xscale": "log", "plain": "y", "ticks": observations["n_seen"]}
+        set_axes(ax, xlabel="most observations of an image (B)", ylabel=label, **scale)
     return with_legend(page, ncols=2)
 
 
@@ -373,15 +368,16 @@ def by_association(association: pd.DataFrame) -> Figure:
             left.plot(rms(ratio.to_numpy()), i, "D", color=colour, ms=5)
             right.barh(i, part["right_share"].mean(), color=colour, height=0.6)
         left.axvline(0.5, color=BLACK, lw=0.6, ls=":")
-        left.set(
+        name = next(name for name in table["filter"] if name in _FILTERS)
+        set_axes(
+            left,
             yticks=range(len(labels)),
             yticklabels=labels,
             ylim=(len(labels) - 0.4, -0.6),  # the first on top; both sides share the heights
-            xscale="log",
+            plain="x",
+            title=f"{_FILTERS[name][2]}, noise of {_NOISE[noise]}",
+            **_LEFT,
         )
-        name = next(name for name in table["filter"] if name in _FILTERS)
-        left.set_title(f"{_FILTERS[name][2]}, noise of {_NOISE[noise]}", loc="left")
-        plain_log(left.xaxis)
         right.set(xlim=(0.0, 1.0))
         right.tick_params(axis="y", left=False, labelleft=False)
     left.set(xlabel="path error over odometry's (tick: a world;\ndiamond: RMS; dotted: a half)")
@@ -391,39 +387,38 @@ def by_association(association: pd.DataFrame) -> Figure:
 
 def by_settings(resampling: pd.DataFrame, noise: pd.DataFrame) -> Figure:
     """Resampling schemes, and where R is taken, by noise."""
-    page, (left, right) = subplots(10.0, 3.8, 1, 2)
-    for j, (share, words) in enumerate(((1.0, "at every image"), (0.5, "when ESS < M / 2"))):
+    page, (left, right) = subplots(10.0, 3.8, 1, 2, suptitle=_INTERVALS)
+    schemes = ((1.0, "at every image", ORANGE, "o"), (0.5, "when ESS < M / 2", BLUE, "s"))
+    for j, (share, words, colour, marker) in enumerate(schemes):
         part = resampling[resampling["ess_share"] == share]
         middle, bars = _intervals(part, "resampling", "revised_ate_aligned_rmse_m")
-        left.errorbar(
-            np.arange(len(middle)) + 0.2 * j - 0.1, middle, bars, marker="os"[j],
-            color=(ORANGE, BLUE)[j], ls="none", capsize=3, label=words,
-        )  # fmt: skip
-    left.set(
+        style = {"marker": marker, "color": colour, "ls": "none", "capsize": 3, "label": words}
+        left.errorbar(np.arange(len(middle)) + 0.2 * j - 0.1, middle, bars, **style)
+    set_axes(
+        left,
         xticks=range(len(middle)),
         xticklabels=middle.index,
         ylabel="RMS of the path, aligned, m",
         ylim=(0.0, None),
+        title="FastSLAM 1.0, M = 200",
+        legend={},
+        **_LEFT,
     )
-    left.set_title("FastSLAM 1.0, M = 200", loc="left")
-    left.legend()
     for at, colour in (("predicted", BLUE), ("measured", RED)):
         middle, bars = _intervals(noise[noise["noise_at"] == at], "sigma_px", _PATH)
-        right.errorbar(
-            middle.index, middle, bars, marker="o", color=colour, capsize=3,
-            label=f"R at the {at} point",
-        )  # fmt: skip
-    right.set(
+        style = {"marker": "o", "color": colour, "capsize": 3, "label": f"R at the {at} point"}
+        right.errorbar(middle.index, middle, bars, **style)
+    set_axes(
+        right,
         xscale="log",
-        yscale="log",
+        plain="y",
+        ticks=noise["sigma_px"],
         xlabel="noise of column and row, px",
         ylabel="RMS of the path, m",
+        title="FastSLAM 2.0, M = 200",
+        legend={},
+        **_LEFT,
     )
-    right.set_title("FastSLAM 2.0, M = 200", loc="left")
-    plain_ticks(right, noise["sigma_px"], fontsize=8)
-    plain_log(right.yaxis)
-    right.legend()
-    page.suptitle(_INTERVALS, size=9)
     return page
 
 
@@ -433,17 +428,20 @@ def cost(table: pd.DataFrame) -> Figure:
     for maps_kind, part in table.groupby("maps", sort=False):
         colour, words = (BLUE, "shared") if maps_kind == "shared" else (ORANGE, "copied")
         wide = part.groupby("n_landmarks")["step_ms"]
-        style = {
-            "marker": "o",
-            "color": colour,
-            "label": f"{words} maps: median, least to greatest",
-        }
+        label = f"{words} maps: median, least to greatest"
+        style = {"marker": "o", "color": colour, "label": label}
         draw_band(ax, wide.median(), (wide.min(), wide.max()), 0.2, **style)
-    ax.set(xscale="log", yscale="log", xlabel="landmarks N", ylabel="time of a step, ms")
-    ax.set_title("M = 1000, B = 20, resampling at every image", loc="left")
-    plain_ticks(ax, table["n_landmarks"], fontsize=8)
-    plain_log(ax.yaxis)
-    ax.legend()
+    set_axes(
+        ax,
+        xscale="log",
+        plain="y",
+        ticks=table["n_landmarks"],
+        xlabel="landmarks N",
+        ylabel="time of a step, ms",
+        title="M = 1000, B = 20, resampling at every image",
+        legend={},
+        **_LEFT,
+    )
     return page
 
 

@@ -1,6 +1,6 @@
 """Constants of the gil2008 studies; the configuration is in conf/study/gil2008*.yaml."""
 
-from experiments.judging.verdict import Profile
+from experiments.judging.results import Profile
 
 # Each study's table, and the estimator's keys that name its rows
 LABELS: dict[str, tuple[str, ...]] = {

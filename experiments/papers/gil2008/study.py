@@ -6,7 +6,7 @@ recording.
 
 import dataclasses
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import accumulate
 
 import numpy as np
@@ -14,9 +14,8 @@ import numpy as np
 from estimators.odometry import Odometry
 from experiments.bench.fastslam import cost_by_landmarks
 from experiments.evaluation.metrics import position_errors_m, rms, travelled_m
-from experiments.judging.jobs import Tables, grouped, tables_of
-from experiments.judging.results import Results
-from experiments.judging.verdict import Profile
+from experiments.judging.jobs import Progress, Tables, grouped, tables_of
+from experiments.judging.results import Profile, Results
 from experiments.papers.gil2008 import scores, settings
 from experiments.papers.gil2008.recordings import Scene, landmark_distances_m, thinned, whole
 from experiments.runs.evaluate import run_over, scored, status_of
@@ -48,7 +47,7 @@ _SCORES = (
 _RUNS_PER_JOB = 40
 
 
-def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) -> None:
+def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     """Run all studies of the paper, and write their tables and the arrays of the figures.
 
     Parameters
@@ -57,12 +56,14 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
         `quick`: the same runs over fewer worlds, with fewer repeats.
     out
         Where tables and arrays go.
-    on_progress
-        Called with the share of the work done.
     """
+
+    def drawn_from(run: TableRun) -> tuple[Scene, str]:
+        return Scene.of(run[1].config), json.dumps(run[1].route_options)
+
     jobs = [
         [part[low : low + _RUNS_PER_JOB]]
-        for part in grouped(plan(profile), _drawn_from)
+        for part in grouped(plan(profile), drawn_from)
         for low in range(0, len(part), _RUNS_PER_JOB)
     ]
     tables = tables_of(rows_of, jobs, lambda share: on_progress(0.95 * share))
@@ -80,11 +81,6 @@ def plan(profile: Profile) -> Iterator[TableRun]:
             drawn = one.options_of("recording")
             if drawn["draw"] < n_draws and drawn["image_draw"] <= n_repeats:
                 yield table, one.replaced(repeats=min(one.repeats, n_repeats))
-
-
-def _drawn_from(run: TableRun) -> tuple[Scene, str]:
-    """What runs over one recording have in common."""
-    return Scene.of(run[1].config), json.dumps(run[1].options_of("route"))
 
 
 def rows_of(runs: Sequence[TableRun]) -> Tables:

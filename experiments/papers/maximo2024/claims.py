@@ -19,15 +19,16 @@ from experiments.evaluation.statistics import (
 from experiments.judging.claim import (
     Claim,
     Subject,
+    Verdict,
     banded,
     beside,
     equivalent,
     lower,
+    overall,
     remarked,
     shown,
 )
 from experiments.judging.results import Results
-from experiments.judging.verdict import Verdict, overall
 from experiments.papers.maximo2024.settings import (
     BETWEEN_NODES_S,
     JUDGED_QUALITY,
@@ -40,19 +41,18 @@ _PAPERS, _BETWEEN = "the paper's", f"{BETWEEN_NODES_S:g} s between nodes"
 _LEAST_M = 1e-3  # added to dispersions that may be zero, before a logarithm
 
 
-def judge(made: Results) -> list[Claim]:
+def judge(results: Results) -> list[Claim]:
     """Judge MX1-MX8 by the tables."""
-    quality = made.table("quality")
-    runs = made.table("runs") if made.has_table("runs") else None
+    quality = results.table("quality")
     return [
-        *mx1(made.table("weighting"), quality, runs),
-        *mx2(made.table("particles"), made.table("times")),
-        *mx3(made.table("dispersion"), quality),
-        *mx4(made.table("starts")),
-        *mx5(made.table("clusters")),
-        mx6(made.table("campus_starts")),
-        mx7(made.table("campus_starts")),
-        *mx8(made.table("kidnapping")),
+        *mx1(results.table("weighting"), quality, results.optional_table("runs")),
+        *mx2(results.table("particles"), results.table("times")),
+        *mx3(results.table("dispersion"), quality),
+        *mx4(results.table("starts")),
+        *mx5(results.table("clusters")),
+        mx6(results.table("campus_starts")),
+        mx7(results.table("campus_starts")),
+        *mx8(results.table("kidnapping")),
     ]
 
 
@@ -126,8 +126,7 @@ def mx3(dispersion: pd.DataFrame, quality: pd.DataFrame) -> Iterator[Claim]:
     decisive = headlines(at_10["geometry"])
     for compare in (_m2_dispersion, _m3_dispersion):
         for name in geometries(at_10):
-            worlds = _by_world(at_10[at_10["geometry"] == name], "dispersion_m")
-            claim = compare(name, worlds)
+            claim = compare(name, _by_world(at_10[at_10["geometry"] == name], "dispersion_m"))
             yield beside(_where(claim, compare, quality, name), name not in decisive)
 
 
@@ -164,8 +163,7 @@ def judged_map(quality: pd.DataFrame, name: str, compare: Compare) -> pd.DataFra
         claim = compare(name, _by_world(cell, COMPARISONS[compare]))
         if claim is not None:
             rows.append((*key, claim.about, claim.found.value, claim.verdict))
-    columns = ["noise_weight", "n_nearest", "about", "value", "verdict"]
-    return pd.DataFrame(rows, columns=columns)
+    return pd.DataFrame(rows, columns=["noise_weight", "n_nearest", "about", "value", "verdict"])
 
 
 def _where(claim: Claim, compare: Compare, quality: pd.DataFrame, name: str) -> Claim:

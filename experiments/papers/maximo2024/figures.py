@@ -10,11 +10,10 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
-from numpy.typing import NDArray
 
 from estimators.topological import descriptors as describers
-from experiments.judging.results import Results
-from experiments.judging.verdict import Verdict
+from experiments.judging.claim import Verdict
+from experiments.judging.results import Arrays, Results
 from experiments.papers.maximo2024.claims import COMPARISONS, geometries, headlines, judged_map
 from experiments.papers.maximo2024.settings import (
     CONTROLS,
@@ -30,11 +29,10 @@ from experiments.viewing.plotting import (
     draw_dots,
     plain_log,
     plan_axes,
+    set_axes,
     with_legend,
 )
 from experiments.viewing.style import BLACK, BLUE, CYCLE, GREEN, ORANGE, RED, SKY, WALL, subplots
-
-Arrays = dict[str, NDArray[Any]]
 
 _COLOUR = {"M1": ORANGE, "M2": BLUE, "M3": GREEN}
 _FLOOR_M = {"oxford": 1.0, "umh": 0.03, "campus": 0.1}
@@ -52,26 +50,28 @@ _COMPARED = {  # what a comparison of weightings is about, by its quantity
 _RECALL = {"recall_at_1": "recall@1", "recall_at_1_percent": "recall@1 %"}
 
 
-def draw(made: Results) -> dict[str, Figure]:
+def draw(results: Results) -> dict[str, Figure]:
     """All figures, by file name; the Oxford route is the real one where its positions are."""
-    oxford = "oxford_real" if made.has_arrays("oxford_real") else "oxford"
-    drawn: dict[str, Arrays] = {name: made.arrays(name) for name in (oxford, "umh", "campus")}
-    runs = {"maximo2024_runs": oxford_runs(made.table("runs"))} if made.has_table("runs") else {}
+    oxford = "oxford_real" if results.has_arrays("oxford_real") else "oxford"
+    drawn: dict[str, Arrays] = {name: results.arrays(name) for name in (oxford, "umh", "campus")}
+    runs = results.optional_table("runs")
     return {
         "maximo2024_data": data(drawn["campus"]),
         "maximo2024_clusters": clusters(drawn),
         "maximo2024_map_and_route": map_and_route(drawn),
-        "maximo2024_dispersion": dispersion(_without_controls(made.table("dispersion"))),
+        "maximo2024_dispersion": dispersion(_without_controls(results.table("dispersion"))),
         "maximo2024_starts": starts({name: drawn[name] for name in (oxford, "umh")}),
         "maximo2024_particles": particles(drawn[oxford]),
         "maximo2024_table_1": table_1(
-            _without_controls(made.table("table_1")), made.table("weighting")
+            _without_controls(results.table("table_1")), results.table("weighting")
         ),
-        "maximo2024_table_2": table_2(made.table("table_2")),
-        "maximo2024_quality": quality(made.table("quality")),
-        "maximo2024_kidnapping": kidnapping(made.table("kidnapping")),
-        "maximo2024_campus": campus_errors(made.table("campus_starts"), made.table("clusters")),
-        **runs,
+        "maximo2024_table_2": table_2(results.table("table_2")),
+        "maximo2024_quality": quality(results.table("quality")),
+        "maximo2024_kidnapping": kidnapping(results.table("kidnapping")),
+        "maximo2024_campus": campus_errors(
+            results.table("campus_starts"), results.table("clusters")
+        ),
+        **({} if runs is None else {"maximo2024_runs": oxford_runs(runs)}),
     }
 
 
@@ -263,8 +263,7 @@ def oxford_runs(table: pd.DataFrame) -> Figure:
     label = "distance to the nearest node"
     ax.plot(np.arange(len(errors)), nearest, "_", color=WALL, ms=14, label=label)
     ax.set_xticks(range(len(errors)), [run[:10] for run in errors.index], rotation=60, ha="right")
-    ax.set(ylabel="mean error over the route, m", xlabel="Oxford run", yscale="log")
-    plain_log(ax.yaxis)
+    set_axes(ax, ylabel="mean error over the route, m", xlabel="Oxford run", plain="y")
     return with_legend(page, ncols=4)
 
 

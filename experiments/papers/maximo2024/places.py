@@ -442,8 +442,7 @@ def described_run(config: dict[str, Any], network: dict[str, Any]) -> Recording:
         a descriptor (D,); other keys go to it too. Or a class: they make an object, which is
         called with the points.
     """
-    made = Experiment(config).replaced(recording=None).recording()
-    return described(made, _by_network(network))
+    return described(Experiment(config).replaced(recording=None).recording(), _by_network(network))
 
 
 def _by_network(settings: dict[str, Any]) -> Callable[[Lidar3D, Floats], Floats]:

@@ -1,6 +1,6 @@
 """Constants of the study of maximo2024: sizes, seeds, chosen parameters, what the paper prints."""
 
-from experiments.judging.verdict import Profile
+from experiments.judging.results import Profile
 from experiments.runs.paths import SOURCE
 
 # The Oxford positions of the paper, if available

@@ -7,7 +7,6 @@ on seeds from 1000 on.
 
 import itertools
 import math
-from collections.abc import Callable
 
 import numpy as np
 import pandas as pd
@@ -15,9 +14,8 @@ from numpy.typing import NDArray
 
 from estimators.topological.topological_map import from_recording
 from experiments.bench import topological
-from experiments.judging.jobs import Tables, tables_of
-from experiments.judging.results import Results
-from experiments.judging.verdict import Profile
+from experiments.judging.jobs import Progress, Tables, tables_of
+from experiments.judging.results import Arrays, Profile, Results
 from experiments.papers.maximo2024.claims import headlines
 from experiments.papers.maximo2024.places import oxford_runs, resequenced
 from experiments.papers.maximo2024.settings import (
@@ -68,14 +66,12 @@ from sim.arrays import Array
 from sim.recording import Recording
 from sim.sensors import Lidar3D
 
-Arrays = dict[str, NDArray[np.generic]]
-
 _TUNED_BY = ("geometry", "sigma_l", "sigma_m", "n_nearest")
 _REACH_M = 65.0  # of the clouds kept, from the middle of the nodes drawn
 _CLOUD_GRID_M = 0.05
 
 
-def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) -> None:
+def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     """Run all studies of the paper; write their tables, and what the figures draw.
 
     Parameters
@@ -84,8 +80,6 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
         `quick`: few worlds and repeats; `full`: those that the claims are judged on.
     out
         Where tables and arrays go.
-    on_progress
-        Called with the share of the work done.
     """
     jobs, costs = zip(*_jobs(profile), strict=True)
     tables = tables_of(_labelled, jobs, on_progress, costs)
@@ -108,18 +102,16 @@ Job = tuple[str, str, int, Profile]  # what to run, in which world
 def _jobs(profile: Profile) -> list[tuple[Job, float]]:
     """All jobs and how long they take, the longest first."""
     decisive = sorted(headlines(routes()))
-    controls = [*CONTROLS, *(set(routes()) - set(decisive))]
-    sizes = {
-        "campus": (["campus"], N_CAMPUSES, 10.0),
-        "runs": (["oxford_runs"] * POSITIONS.is_file(), N_RUN_SEEDS, 10.0),
-        "route": (routes(), N_WORLDS, 6.0),
-        "weighting": (decisive, N_WEIGHTED, 3.0),
-        "control": (controls, N_WORLDS, 3.0),
-        "quality": (decisive, N_QUALITY_WORLDS, 3.0),
-    }
     return [
         ((what, name, JUDGED_SEED + i, profile), cost)
-        for what, (names, n, cost) in sizes.items()
+        for what, (names, n, cost) in {
+            "campus": (["campus"], N_CAMPUSES, 10.0),
+            "runs": (["oxford_runs"] * POSITIONS.is_file(), N_RUN_SEEDS, 10.0),
+            "route": (routes(), N_WORLDS, 6.0),
+            "weighting": (decisive, N_WEIGHTED, 3.0),
+            "control": ([*CONTROLS, *(set(routes()) - set(decisive))], N_WORLDS, 3.0),
+            "quality": (decisive, N_QUALITY_WORLDS, 3.0),
+        }.items()
         for i in range(n[profile])
         for name in names
     ]
@@ -137,17 +129,12 @@ def _rows(what: str, name: str, seed: int, profile: Profile) -> dict[str, Rows]:
     """All rows of a job, by table."""
     n_repeats = N_REPEATS[profile]
     if what == "campus":
-        with_clusters = seed < JUDGED_SEED + N_CLUSTERED_CAMPUSES
-        return campus_rows(seed, profile, with_clusters=with_clusters)
+        return campus_rows(seed, profile, with_clusters=seed < JUDGED_SEED + N_CLUSTERED_CAMPUSES)
     if what == "quality":
         return {"quality": list(quality_rows(name, seed))}
     if what == "runs":
-        found = [
-            {"run": run, **row}
-            for run in oxford_runs(POSITIONS)
-            for row in run_rows(run, seed, max(n_repeats // 5, 1))
-        ]
-        return {"runs": found}
+        names, n_fewer = oxford_runs(POSITIONS), max(n_repeats // 5, 1)
+        return {"runs": [{"run": n, **row} for n in names for row in run_rows(n, seed, n_fewer)]}
     case = case_of(name, seed)
     if what in ("weighting", "control"):
         return weighting_rows(case, n_repeats)

@@ -17,7 +17,7 @@ from estimators.base import Estimate, Prior
 from estimators.topological import descriptors as describers
 from estimators.topological.topological_map import TopologicalMap, from_recording
 from experiments.evaluation.metrics import position_errors_m, rms, travelled_m
-from experiments.judging.verdict import Profile
+from experiments.judging.results import Profile
 from experiments.papers.maximo2024.places import N_STRETCHES, UMH, described, gaps_m, resequenced
 from experiments.papers.maximo2024.settings import (
     CAMPUS_SHIFT_M,
@@ -339,8 +339,7 @@ def campus_rows(seed: int, profile: Profile, *, with_clusters: bool) -> dict[str
     known = from_recording(mapped, settings["descriptor"], settings["spacing_m"])
     queries = described(taken, describers.kind(settings["descriptor"]).describe)
     case = Case("campus", seed, taking, known, queries)
-    travel_m = np.median(np.abs(np.diff(taken.wheels.position_m[:, 0])))
-    per_node = float(known.spacing_m / travel_m)
+    per_node = float(known.spacing_m / np.median(np.abs(np.diff(taken.wheels.position_m[:, 0]))))
     places = {"place": case.recording.log("place")}  # without the clouds
     bare = replace(case, recording=replace(case.recording, logs=places))
     n_trials, n_after = N_KIDNAPPINGS[profile], 4 * RECOVERED_WITHIN

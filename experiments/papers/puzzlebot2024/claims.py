@@ -10,9 +10,20 @@ import numpy as np
 import pandas as pd
 
 from experiments.evaluation.statistics import Interval, mean_interval, share_interval
-from experiments.judging.claim import Claim, Subject, banded, beside, shown
+from experiments.judging.claim import (
+    Claim,
+    Role,
+    Subject,
+    Verdict,
+    banded,
+    beside,
+    holds,
+    judged,
+    more_to_settle,
+    overall,
+    shown,
+)
 from experiments.judging.results import Results
-from experiments.judging.verdict import Role, Verdict, holds, judged, more_to_settle, overall
 from experiments.papers.puzzlebot2024.settings import NOMINAL, REPORTED_TURN_RATIO
 from sim.arrays import Array
 
@@ -29,14 +40,18 @@ _OUT_AND_BACK = "out and back"
 _HEADLINE_METHODS = ("wheel_truth", "sampled")
 
 
-def judge(made: Results) -> list[Claim]:
+def judge(results: Results) -> list[Claim]:
     """Judge PB1-PB4 by the tables."""
     return [
         *pb1(),
-        *pb2(made.table("areas"), made.table("crossover"), NOMINAL.track_m),
-        *pb3(made.table("calibration"), made.table("gradient_descent"), made.table("engine_k")),
-        *pb3_short_turns(made.table("short_turns"), made.table("short_turns_found")),
-        *pb4(made.table("coverage"), made.table("engine"), made.table("table_1")),
+        *pb2(results.table("areas"), results.table("crossover"), NOMINAL.track_m),
+        *pb3(
+            results.table("calibration"),
+            results.table("gradient_descent"),
+            results.table("engine_k"),
+        ),
+        *pb3_short_turns(results.table("short_turns"), results.table("short_turns_found")),
+        *pb4(results.table("coverage"), results.table("engine"), results.table("table_1")),
     ]
 
 
@@ -205,6 +220,5 @@ def _clustered_share(hits: pd.Series[bool], seeds: pd.Series[int]) -> Interval:
     """
     share, by_seed = float(hits.mean()), hits.groupby(seeds).mean()
     alone = share * (1.0 - share) * len(by_seed) / len(hits)
-    together = max(1.0, float(by_seed.var()) / alone) if alone > 0.0 else 1.0
-    trials = round(len(hits) / together)
+    trials = round(len(hits) / (max(1.0, float(by_seed.var()) / alone) if alone > 0.0 else 1.0))
     return dataclasses.replace(share_interval(round(share * trials), trials), value=share)

@@ -1,15 +1,13 @@
 """The figures of puzzlebot2024."""
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
-from experiments.judging.results import Results
+from experiments.judging.results import Arrays, Results
 from experiments.papers.puzzlebot2024.settings import (
     CALIBRATION_RUNS,
     NOMINAL,
@@ -22,11 +20,10 @@ from experiments.viewing.plotting import (
     draw_table,
     plain_ticks,
     plan_axes,
+    set_axes,
     with_legend,
 )
 from experiments.viewing.style import BLACK, BLUE, CYCLE, ORANGE, subplots
-
-Arrays = Mapping[str, NDArray[Any]]
 
 _METHODS = {
     "wheel_truth": "wheel truth",
@@ -41,25 +38,25 @@ _FEEDBACKS = {"truth": "steered by the true pose", "odometry": "steered by odome
 _PARAMETERS = {"kr": "$k_r$", "kl": "$k_l$"}
 
 
-def draw(made: Results) -> dict[str, Figure]:
+def draw(results: Results) -> dict[str, Figure]:
     """Draw all figures of the paper, by file name."""
-    drawn = made.arrays("drawn")
+    drawn = results.arrays("drawn")
     return {
         "puzzlebot2024_ideal_and_real": ideal_and_real(drawn),
         "puzzlebot2024_square_feedback": square_feedback(
-            made.table("square_feedback"), made.arrays("square_feedback")
+            results.table("square_feedback"), results.arrays("square_feedback")
         ),
         "puzzlebot2024_ellipse_area": ellipse_area(
-            made.table("areas"), made.table("crossover"), drawn
+            results.table("areas"), results.table("crossover"), drawn
         ),
-        "puzzlebot2024_calibration": calibration(made.table("calibration")),
-        "puzzlebot2024_table_1": table_1(made.table("table_1")),
-        "puzzlebot2024_table_1_short_turns": table_1_short_turns(made.table("short_turns")),
+        "puzzlebot2024_calibration": calibration(results.table("calibration")),
+        "puzzlebot2024_table_1": table_1(results.table("table_1")),
+        "puzzlebot2024_table_1_short_turns": table_1_short_turns(results.table("short_turns")),
         "puzzlebot2024_short_turns": short_turns(
-            made.table("short_turns"), made.table("short_turns_found")
+            results.table("short_turns"), results.table("short_turns_found")
         ),
-        "puzzlebot2024_convergence": convergence(made.table("convergence")),
-        "puzzlebot2024_coverage": coverage(made.table("coverage")),
+        "puzzlebot2024_convergence": convergence(results.table("convergence")),
+        "puzzlebot2024_coverage": coverage(results.table("coverage")),
     }
 
 
@@ -101,8 +98,8 @@ def square_feedback(table: pd.DataFrame, paths: Arrays) -> Figure:
                 ax.plot(*ways[:, -1].T, ".", color=color, ms=5)
             end_m = table.loc[chosen, "true_end_m"].median()
             title = f"{its}, {steered}\nmedian end {end_m:.2f} m from the target"
+            plan_axes(ax)
             ax.set_title(title, fontsize="medium")
-            ax.set(xlabel="x, m", ylabel="y, m", aspect="equal")
     return with_legend(page, ncols=3)
 
 
@@ -269,8 +266,8 @@ def short_turns(ends: pd.DataFrame, found: pd.DataFrame) -> Figure:
         )
     case_4 = float(ends.set_index("case").loc["angular_4", "ideal_heading_rad"])
     left.plot(case_4, REPORTED_ENDS["angular_4"], "x", color=BLACK, label="the report's example")
-    left.set(xlabel="turn commanded, rad", ylabel="turn driven, rad")
-    left.legend(loc="upper left")
+    legend = {"loc": "upper left"}
+    set_axes(left, xlabel="turn commanded, rad", ylabel="turn driven, rad", legend=legend)
     for i, row in enumerate(found.itertuples()):
         is_gain = row.parameter.startswith("bias")
         truth, *values = (
@@ -284,14 +281,15 @@ def short_turns(ends: pd.DataFrame, found: pd.DataFrame) -> Figure:
             named = {"label": "what the controller takes"} if row.parameter == "track_m" else {}
             right.plot(nominal, i + 0.18, "v", color=ORANGE, **named)
     right.axvline(1.0, color=BLACK, lw=0.8)
-    right.set(
+    set_axes(
+        right,
         xlabel="over the truth",
         yticks=range(len(found)),
         yticklabels=[_FOUND[name] for name in found["parameter"]],
         ylim=(len(found) - 0.5, -0.6),
         title="by end poses alone",
+        legend={"loc": "center left"},
     )
-    right.legend(loc="center left")
     return page
 
 

@@ -2,7 +2,7 @@
 
 import math
 
-from experiments.judging.verdict import Profile
+from experiments.judging.results import Profile
 from sim.robot.drive import DifferentialDrive
 from sim.routes.route import OpenLoop
 
@@ -10,8 +10,7 @@ NOMINAL = DifferentialDrive(wheel_radius_m=0.05, track_m=0.19)  # conf/robot/puz
 CALIBRATIONS = {Profile.QUICK: 5, Profile.FULL: 200}  # of each robot, from its seed on
 COVERAGE_RUNS = {Profile.QUICK: 400, Profile.FULL: 10_000}
 CLOSE_K_M = 1e-5  # the coverage is close to its bound: ten times the runs
-ENGINE_OVERRIDES = {Profile.QUICK: ["seed=range(1000,1004)"], Profile.FULL: []}
-FEEDBACK_OVERRIDES = {Profile.QUICK: ["seed=range(1000,1004)"], Profile.FULL: []}
+FEW_SEEDS = {Profile.QUICK: ["seed=range(1000,1004)"], Profile.FULL: []}  # of driven robots
 CALIBRATION_RUNS = 20  # repetitions of each of the nine manoeuvres in one calibration
 SQUARE_RUNS = 40
 SQUARE_SAMPLES = 200  # of each path that is drawn

@@ -7,7 +7,7 @@ are driven by PyBullet too, and both are compared.
 import dataclasses
 import itertools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,9 +22,8 @@ from experiments.calibration.end_poses import Manoeuvre, from_end_poses
 from experiments.calibration.result import CalibrationResult
 from experiments.calibration.wheel_truth import from_wheel_truth
 from experiments.evaluation.metrics import ellipse_area_m2, travelled_m
-from experiments.judging.jobs import Tables, tables_of
-from experiments.judging.results import Results
-from experiments.judging.verdict import Profile
+from experiments.judging.jobs import Progress, Tables, tables_of
+from experiments.judging.results import Profile, Results
 from experiments.papers.puzzlebot2024.descent import convergence, gradient_descent
 from experiments.papers.puzzlebot2024.settings import (
     AREA_K_M,
@@ -32,8 +31,7 @@ from experiments.papers.puzzlebot2024.settings import (
     CALIBRATIONS,
     CLOSE_K_M,
     COVERAGE_RUNS,
-    ENGINE_OVERRIDES,
-    FEEDBACK_OVERRIDES,
+    FEW_SEEDS,
     LOOPS,
     NOMINAL,
     SQUARE_RUNS,
@@ -55,15 +53,13 @@ Routes = Mapping[str, OpenLoop]
 Driven = dict[tuple[str, str, int], Recording]  # keyed by physics, case and seed
 
 
-def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) -> None:
+def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     """Run all studies of the paper, and write their tables and arrays.
 
     Parameters
     ----------
     profile
         `quick`: few repetitions; `full`: those that the claims are judged on.
-    on_progress
-        Called with the share of the work done.
     """
     out.write_tables(areas=areas(), crossover=crossover(), gradient_descent=gradient_descent())
     out.write_tables(convergence=convergence())
@@ -78,11 +74,11 @@ def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) ->
     out.write_tables(short_turns=ends, short_turns_found=found)
     out.write_tables(coverage=coverage(covered, COVERAGE_RUNS[profile]))
     on_progress(0.8)
-    ends, paths = square_feedback(*FEEDBACK_OVERRIDES[profile])
+    ends, paths = square_feedback(*FEW_SEEDS[profile])
     out.write_tables(square_feedback=ends)
     out.write_arrays("square_feedback", **paths)
     on_progress(0.9)
-    driven = engine_recordings(*ENGINE_OVERRIDES[profile])
+    driven = engine_recordings(*FEW_SEEDS[profile])
     out.write_tables(engine=engine_ends(driven), engine_k=engine_k(driven))
     on_progress(1.0)
 
@@ -129,26 +125,27 @@ def ideal(route: OpenLoop, kr: float, kl: float) -> Estimate:
 def dead_reckoning(batch: BatchRuns, kr: float, kl: float) -> Estimate:
     """Odometry from the origin over the first run, with the nominal geometry."""
     geometry = RobotGeometry(NOMINAL.wheel_radius_m, NOMINAL.track_m)
-    wheels = WheelLog(batch.stamps, batch.encoder_m[0])
-    recording = Recording(batch.stamps, wheels, geometry)
+    recording = Recording(batch.stamps, WheelLog(batch.stamps, batch.encoder_m[0]), geometry)
     prior = Prior(geometry, mean=np.zeros(3), covariance=np.zeros((3, 3)))
     return run_over(recording, Odometry(kr=kr, kl=kl), prior, np.random.default_rng(0))[0]
 
 
 def areas() -> pd.DataFrame:
     """Area of the 95 % ellipse against the distance rolled, on each loop and each k."""
-    parts = []
-    for k, (name, route) in itertools.product(AREA_K_M, LOOPS.items()):
-        promised = ideal(route, k, k)
-        columns = {
-            "manoeuvre": name,
-            "k_m": k,
-            "stamp_s": promised.stamps,
-            "distance_m": travelled_m(promised.means),
-            "area_m2": ellipse_area_m2(promised.covariances),
-        }
-        parts.append(pd.DataFrame(columns))
-    return pd.concat(parts, ignore_index=True)
+
+    def table(name: str, k: float) -> pd.DataFrame:
+        promised = ideal(LOOPS[name], k, k)
+        return pd.DataFrame(
+            {
+                "manoeuvre": name,
+                "k_m": k,
+                "stamp_s": promised.stamps,
+                "distance_m": travelled_m(promised.means),
+                "area_m2": ellipse_area_m2(promised.covariances),
+            }
+        )
+
+    return pd.concat([table(name, k) for k in AREA_K_M for name in LOOPS], ignore_index=True)
 
 
 def crossover(*overrides: str) -> pd.DataFrame:
@@ -266,9 +263,7 @@ def from_batches(batches: list[BatchRuns], *, geometry: bool) -> CalibrationResu
     return from_wheel_truth(encoder, ground, turns, interval_s=0.05, geometry=geometry)
 
 
-def calibration(
-    robots: list[Arm], n_repetitions: int, on_progress: Callable[[float], None]
-) -> pd.DataFrame:
+def calibration(robots: list[Arm], n_repetitions: int, on_progress: Progress) -> pd.DataFrame:
     """Repeat the calibration of each robot, on all cores."""
     repeated = [
         [dataclasses.replace(arm, seed=arm.seed + repetition)]
@@ -279,20 +274,20 @@ def calibration(
 
 
 def _calibration_rows(arm: Arm) -> Tables:
-    rows: list[Row] = [
-        {
-            "k_m": arm.k_m,
-            "joint": arm.joint,
-            "seed": arm.seed,
-            "method": result.method,
-            "parameter": name,
-            "truth": getattr(arm.robot, name),
-            **dataclasses.asdict(interval),
-        }
-        for result in calibrate_once(arm)
+    run: Row = {"k_m": arm.k_m, "joint": arm.joint, "seed": arm.seed}
+    results = calibrate_once(arm)
+    parts = [
+        {**run, "method": one.method, **row} for one in results for row in _found(one, arm.robot)
+    ]
+    return {"calibration": parts}
+
+
+def _found(result: CalibrationResult, robot: DifferentialDrive) -> list[Row]:
+    """A row for each parameter that was found: its truth, value and interval."""
+    return [
+        {"parameter": name, "truth": getattr(robot, name), **dataclasses.asdict(interval)}
         for name, interval in result.found.items()
     ]
-    return {"calibration": rows}
 
 
 def table_1(arm: Arm) -> pd.DataFrame:
@@ -301,19 +296,13 @@ def table_1(arm: Arm) -> pd.DataFrame:
     rows = []
     for name, route in arm.routes.items():
         batch = run_batch(arm.robot, route, CALIBRATION_RUNS, rng)
-        found = from_batches([batch], geometry=False)
-        rows.append(
-            {
-                **_case(name, route),
-                **_spread("real", batch.end_poses),
-                "kr_m": found.kr.value,
-                "kr_low_m": found.kr.low,
-                "kr_high_m": found.kr.high,
-                "kl_m": found.kl.value,
-                "kl_low_m": found.kl.low,
-                "kl_high_m": found.kl.high,
-            }
-        )
+        found = from_batches([batch], geometry=False).found
+        gains = {
+            f"{wheel}{end and '_' + end}_m": getattr(found[wheel], end or "value")
+            for wheel in ("kr", "kl")
+            for end in ("", "low", "high")
+        }
+        rows.append(_case(name, route) | _spread("real", batch.end_poses) | gains)
     return pd.DataFrame(rows)
 
 
@@ -348,16 +337,9 @@ def short_turns(arm: Arm) -> tuple[pd.DataFrame, pd.DataFrame]:
         }
         for name, route in arm.routes.items()
     ]
-    found = [
-        {
-            "parameter": name,
-            "truth": getattr(robot, name),
-            "nominal": getattr(nominal, name),
-            **dataclasses.asdict(interval),
-        }
-        for name, interval in result.found.items()
-    ]
-    return pd.DataFrame(ends), pd.DataFrame(found)
+    found = pd.DataFrame(_found(result, robot))
+    found.insert(2, "nominal", [getattr(nominal, name) for name in result.found])
+    return pd.DataFrame(ends), found
 
 
 def _case(name: str, route: OpenLoop) -> Row:
@@ -448,9 +430,4 @@ def engine_k(driven: Driven) -> pd.DataFrame:
     runs = [recording for (physics, *_), recording in driven.items() if physics == "bullet"]
     found = calibrate_recordings(runs, geometry=False, interval_s=0.02)
     robot = Experiment.compose(["study=puzzlebot2024/engine"]).robot()
-    rows = [
-        {"k_m": 2.0 * robot.kl, "parameter": name, "truth": getattr(robot, name)}
-        | dataclasses.asdict(interval)
-        for name, interval in found.found.items()
-    ]
-    return pd.DataFrame(rows)
+    return pd.DataFrame([{"k_m": 2.0 * robot.kl, **row} for row in _found(found, robot)])

@@ -24,9 +24,9 @@ from experiments.studies.exploration.settings import (
 )
 
 
-def judge(made: Results) -> list[Claim]:
+def judge(results: Results) -> list[Claim]:
     """Judge GI10 by the tables."""
-    return [*gi10(made.table("runs"))]
+    return [*gi10(results.table("runs"))]
 
 
 def gi10(runs: pd.DataFrame) -> Iterator[Claim]:

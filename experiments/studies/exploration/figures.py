@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 
 from experiments.judging.results import Results
 from experiments.studies.exploration.settings import AFTER_M, BASE, JUDGED, NAMES
-from experiments.viewing.plotting import with_legend
+from experiments.viewing.plotting import draw_band, with_legend
 from experiments.viewing.style import BLACK, BLUE, GREEN, ORANGE, PURPLE, RED, WALL, subplots
 from experiments.viewing.team_figure import draw_paths
 
@@ -20,13 +20,13 @@ _STRATEGIES = {
 }
 
 
-def draw(made: Results) -> dict[str, Figure]:
+def draw(results: Results) -> dict[str, Figure]:
     """Draw every figure, by file name."""
     return {
         "exploration_drive": drives(
-            {name: made.arrays(f"drive_{name}") for name in (BASE, JUDGED)}
+            {name: results.arrays(f"drive_{name}") for name in (BASE, JUDGED)}
         ),
-        "exploration_coverage": by_distance(made.table("coverage")),
+        "exploration_coverage": by_distance(results.table("coverage")),
     }
 
 
@@ -36,9 +36,7 @@ def drives(runs: dict[str, dict[str, Any]]) -> Figure:
     for ax, (strategy, run) in zip(panels, runs.items(), strict=True):
         draw_paths(ax, run)
         ax.set_title(f"{NAMES[strategy]}, {AFTER_M:g} m a robot")
-    handles, labels = panels[0].get_legend_handles_labels()
-    page.legend(handles, labels, loc="outside lower center", ncols=4)
-    return page
+    return with_legend(page, ncols=4)
 
 
 def by_distance(coverage: pd.DataFrame) -> Figure:
@@ -50,8 +48,8 @@ def by_distance(coverage: pd.DataFrame) -> Figure:
         wide = part.pivot_table(index="driven_m", columns="seed", values="area_m2").ffill()
         wide = wide[wide.index <= longest_m]
         low, middle, high = (wide.quantile(q, axis=1) for q in (0.25, 0.5, 0.75))
-        ax.plot(middle.index, middle, ls=line, color=colour, lw=1.8, label=NAMES[strategy])
-        ax.fill_between(middle.index, low, high, color=colour, alpha=0.15, lw=0)
+        style = {"ls": line, "color": colour, "lw": 1.8, "label": NAMES[strategy]}
+        draw_band(ax, middle, (low, high), 0.15, **style)
     ax.axvline(AFTER_M, color=BLACK, lw=0.8)
     ax.fill_between([], [], color=WALL, alpha=0.15, lw=0, label="quartiles of worlds")
     ax.annotate(f"judged at {AFTER_M:g} m", (AFTER_M, 0.02), (-4, 0), ha="right",

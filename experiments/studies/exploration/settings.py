@@ -1,6 +1,6 @@
 """Constants of the study of exploration; the configuration is in conf/study/exploration.yaml."""
 
-from experiments.judging.verdict import Profile
+from experiments.judging.results import Profile
 
 BASE, JUDGED = "nearest_frontier", "coordinated"
 SHARED, GAIN = "shared_frontiers", "information_gain"  # each with one half of what is judged

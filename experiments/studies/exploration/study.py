@@ -6,17 +6,14 @@ the truth: floor that a beam has crossed, from where the robots were.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import pandas as pd
 
 from estimators.base import Estimate
 from experiments.evaluation.map_quality import landmark_errors
 from experiments.evaluation.metrics import travelled_m
-from experiments.judging.jobs import Tables, tables_of
-from experiments.judging.results import Results
-from experiments.judging.verdict import Profile
+from experiments.judging.jobs import Progress, Tables, tables_of
+from experiments.judging.results import Profile, Results
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
@@ -33,15 +30,13 @@ _EVERY_S = 1.0  # the area is counted
 _EVERY_M = 0.5  # of the curves that are kept
 
 
-def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) -> None:
+def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     """Run the study; write its tables, and two drives through one world for the figure.
 
     Parameters
     ----------
     profile
         `quick`: two worlds.
-    on_progress
-        Called with the share of the work done.
     """
     jobs = [
         (settings.FIRST_SEED + i, strategy)

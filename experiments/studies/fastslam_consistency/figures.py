@@ -13,9 +13,9 @@ _CONSISTENT = 0.79  # median of chi-squared of 3 degrees of freedom, / 3
 _NAMES = {"fastslam1": "FastSLAM 1.0", "fastslam2": "FastSLAM 2.0"}
 
 
-def draw(made: Results) -> dict[str, Figure]:
+def draw(results: Results) -> dict[str, Figure]:
     """Draw the study's figure."""
-    return {"fastslam_consistency_nees": by_distance(made.table("nees"))}
+    return {"fastslam_consistency_nees": by_distance(results.table("nees"))}
 
 
 def by_distance(table: pd.DataFrame) -> Figure:
@@ -50,5 +50,4 @@ def by_distance(table: pd.DataFrame) -> Figure:
 def _line(ax: Axes, part: pd.DataFrame, label: str, **style: object) -> None:
     """Median of worlds at each distance, / 3."""
     median = part.groupby("distance_m")["nees"].median() / 3.0
-    options = {"lw": 1.2, "ms": 3.5, **style}
-    ax.plot(median.index, median, label=label, **options)  # type: ignore[arg-type]
+    ax.plot(median.index, median, label=label, **{"lw": 1.2, "ms": 3.5, **style})  # type: ignore[arg-type]

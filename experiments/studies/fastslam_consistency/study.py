@@ -3,14 +3,13 @@
 All estimators run over the same recordings, whose noise is the one that they believe.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from experiments.evaluation.metrics import nees_at_distances
-from experiments.judging.jobs import Tables, grouped, tables_of
-from experiments.judging.results import Results
-from experiments.judging.verdict import Profile
+from experiments.judging.jobs import Progress, Tables, grouped, tables_of
+from experiments.judging.results import Profile, Results
 from experiments.runs.evaluate import run_over
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
@@ -21,15 +20,13 @@ DISTANCES_M = (10.0, 20.0, 30.0, 40.0, 50.0, 60.0, 70.0, 80.0, 90.0)
 MAX_QUICK = 1000  # particles
 
 
-def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) -> None:
+def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     """Run the study and write its table.
 
     Parameters
     ----------
     profile
         `quick`: up to 1000 particles in four worlds; `full`: up to 10,000 in twenty.
-    on_progress
-        Called with the share of the work done.
     """
     jobs = [[part] for part in grouped(plan(profile), lambda one: one.seed)]
     out.write_tables(**tables_of(rows_of, jobs, on_progress))

@@ -9,9 +9,9 @@ from experiments.studies.mcl_office.settings import WITHIN_M
 from experiments.viewing.style import BLUE, RED, WALL, subplots
 
 
-def draw(made: Results) -> dict[str, Figure]:
+def draw(results: Results) -> dict[str, Figure]:
     """Draw the study's figure."""
-    return {"mcl_office_found": found_by(made.table("starts"))}
+    return {"mcl_office_found": found_by(results.table("starts"))}
 
 
 def found_by(starts: pd.DataFrame) -> Figure:

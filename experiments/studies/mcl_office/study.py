@@ -6,7 +6,6 @@ filter begins without a pose and is judged over the next 40 m.
 
 import dataclasses
 import math
-from collections.abc import Callable
 
 import numpy as np
 import pandas as pd
@@ -14,9 +13,8 @@ from numpy.typing import NDArray
 
 from experiments.evaluation.metrics import heading_errors_rad, position_errors_m, travelled_m
 from experiments.evaluation.statistics import bootstrap_interval, share_interval
-from experiments.judging.jobs import Tables, tables_of
-from experiments.judging.results import Results
-from experiments.judging.verdict import Profile
+from experiments.judging.jobs import Progress, Tables, tables_of
+from experiments.judging.results import Profile, Results
 from experiments.runs.console import RunFailedError
 from experiments.runs.evaluate import run_over
 from experiments.runs.experiment import Experiment
@@ -28,15 +26,13 @@ from sim.arrays import Array
 from sim.recording import Recording
 
 
-def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) -> None:
+def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     """Run the study and write its tables: the starts, and the share of them localised.
 
     Parameters
     ----------
     profile
         `quick`: 3 starts in each of 4 offices; `full`: 20 in each of 10.
-    on_progress
-        Called with the share of the work done.
     """
     n_starts, fewer = (20, []) if profile is Profile.FULL else (3, ["seed=range(1000,1004)"])
     jobs = [(office, n_starts) for office in planned(["study=mcl_office", *fewer])]

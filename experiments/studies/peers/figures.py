@@ -7,15 +7,15 @@ from matplotlib.lines import Line2D
 
 from experiments.judging.results import Results
 from experiments.studies.peers.settings import LASER, MAP, STEREO, TUNED
-from experiments.viewing.plotting import plain_log
+from experiments.viewing.plotting import set_axes
 from experiments.viewing.style import BLUE, ORANGE, WALL, subplots
 
 _WORLDS = {"room": "s", "rooms": "^", "office": "D"}
 
 
-def draw(made: Results) -> dict[str, Figure]:
+def draw(results: Results) -> dict[str, Figure]:
     """Draw the study's figure."""
-    return {"peers_errors": errors(made.table("methods"))}
+    return {"peers_errors": errors(results.table("methods"))}
 
 
 def errors(methods: pd.DataFrame) -> Figure:
@@ -44,11 +44,9 @@ def errors(methods: pd.DataFrame) -> Figure:
             left.plot(method["ate_rmse_m"], place, "o", ms=8, **mark)
             right.plot(method["cpu_time_us"], place, "o", ms=8, **mark)
         for axes, label in ((left, "RMS position error, m"), (right, "processor time a Frame, µs")):
-            axes.set(xscale="log", xlabel=label, ylim=(-0.7, len(names) - 0.3))
+            set_axes(axes, plain="x", xlabel=label, ylim=(-0.7, len(names) - 0.3))
             axes.grid(axis="y", color="0.92")
         right.tick_params(axis="y", length=0)
-        plain_log(left.xaxis)
-        plain_log(right.xaxis)
         left.set_yticks(places, list(map(_label, names, part["answer"])))
         right.set_yticks(places, [""] * len(names))
         left.set_title(f"{sensor} and wheels", fontsize=9, loc="left")
@@ -65,14 +63,13 @@ def _label(name: str, answer: str) -> str:
 
 def _legend() -> list[Line2D]:
     """One entry a colour, a filling and a world."""
-    entries = [
-        ("ours", BLUE, BLUE, "o", 7),
-        ("of another project", ORANGE, ORANGE, "o", 7),
-        ("default", "black", "white", "o", 7),
-        ("tuned", "black", "black", "o", 7),
-        *((world, WALL, WALL, shape, 4) for world, shape in _WORLDS.items()),
-    ]
     return [
         Line2D([], [], color=color, mfc=filled, ls="", marker=shape, ms=size, label=label)
-        for label, color, filled, shape, size in entries
+        for label, color, filled, shape, size in [
+            ("ours", BLUE, BLUE, "o", 7),
+            ("of another project", ORANGE, ORANGE, "o", 7),
+            ("default", "black", "white", "o", 7),
+            ("tuned", "black", "black", "o", 7),
+            *((world, WALL, WALL, shape, 4) for world, shape in _WORLDS.items()),
+        ]
     ]

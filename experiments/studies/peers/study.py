@@ -3,16 +3,14 @@
 import importlib.metadata
 import subprocess
 import sys
-from collections.abc import Callable
 
 import numpy as np
 import pandas as pd
 
 from estimators.peers import MissingPackageError
 from experiments.evaluation.statistics import log_ratio_interval
-from experiments.judging.jobs import Tables, answer_of, grouped, tables_of
-from experiments.judging.results import Results
-from experiments.judging.verdict import Profile
+from experiments.judging.jobs import Progress, Tables, answer_of, grouped, tables_of
+from experiments.judging.results import Profile, Results
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome, Row
 from experiments.studies.peers.settings import LASER, PACKAGES, READS, TUNED
@@ -23,15 +21,13 @@ _ERROR = "answer_ate_rmse_m"
 _KEPT = ("status", "answer", _ERROR, "answer_heading_rmse_rad", "cpu_time_us")
 
 
-def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) -> None:
+def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     """Run the study and write its tables: the runs, the methods, and those that are missing.
 
     Parameters
     ----------
     profile
         `quick`: one recording of each world; `full`: five.
-    on_progress
-        Called with the share of the work done.
     """
     fewer = [] if profile is Profile.FULL else ["seed=1000"]
     experiments = list(planned(["study=peers", *fewer]))

@@ -40,7 +40,7 @@ from sim.sensors import Laser
 
 _TOLERANCE_S = 0.05
 _ORIGIN = np.zeros(3)
-# Walls are no lines and people walk by: what the scans believe is ten times the laser's noise.
+# Ten times the laser's noise is believed of scans, since walls are not straight and people walk by.
 # Chosen when no line was left out yet.
 _OPTIONS: dict[str, Any] = {
     "sigma_range_m": 0.1,
@@ -82,11 +82,6 @@ def scored(
     online, revised = tracked(GraphSlam(**_OPTIONS | options), recording)
     assert revised is not None
     at_scans = np.searchsorted(online.stamps, scans)
-    paths = {
-        "graph_slam, online": (scans, se2.compose(online.means[at_scans], T_base_judged)),
-        "graph_slam, revised": (scans, se2.compose(revised.means[at_scans], T_base_judged)),
-        "FLIRT poses": (graph.scan_stamps, graph.scan_poses),
-    }
     rows: list[Row] = [
         {
             "log": name,
@@ -94,7 +89,11 @@ def scored(
             "method": method,
             **relation_errors(judged, *path).summary(),
         }
-        for method, path in paths.items()
+        for method, path in {
+            "graph_slam, online": (scans, se2.compose(online.means[at_scans], T_base_judged)),
+            "graph_slam, revised": (scans, se2.compose(revised.means[at_scans], T_base_judged)),
+            "FLIRT poses": (graph.scan_stamps, graph.scan_poses),
+        }.items()
     ]
     mean_m = KUEMMERLE[name]["graph"][0]
     rows.append({"log": name, "method": "graph (printed)", "translation_mean_m": mean_m})

@@ -8,9 +8,17 @@ import numpy as np
 import pandas as pd
 
 from experiments.evaluation.statistics import Interval
-from experiments.judging.claim import Claim, Subject, banded, beside, remarked, shown
+from experiments.judging.claim import (
+    Claim,
+    Subject,
+    Verdict,
+    banded,
+    beside,
+    holds,
+    remarked,
+    shown,
+)
 from experiments.judging.results import Results
-from experiments.judging.verdict import Verdict, holds
 from experiments.studies.real_logs.settings import (
     FUSION,
     INTEL,
@@ -21,14 +29,14 @@ from experiments.studies.real_logs.settings import (
 )
 
 
-def judge(made: Results) -> list[Claim]:
+def judge(results: Results) -> list[Claim]:
     """Judge RL1 to RL5 by the tables."""
     return [
-        rl1(made.table("ate")),
-        *rl2(made.table("relations")),
-        *rl3(made.table("mrclam")),
-        *rl4(made.table("wheels"), made.table("lego")),
-        rl5(made.table("wean")),
+        rl1(results.table("ate")),
+        *rl2(results.table("relations")),
+        *rl3(results.table("mrclam")),
+        *rl4(results.table("wheels"), results.table("lego")),
+        rl5(results.table("wean")),
     ]
 
 

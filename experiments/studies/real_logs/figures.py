@@ -1,15 +1,12 @@
 """Figures of the real logs."""
 
 import math
-from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
-from experiments.judging.results import Results
+from experiments.judging.results import Arrays, Results
 from experiments.studies.real_logs.settings import (
     GMAPPING,
     INTEL_DRAWN,
@@ -18,21 +15,19 @@ from experiments.studies.real_logs.settings import (
     RESOLUTION_M,
 )
 from experiments.viewing.grid import draw_grid
-from experiments.viewing.plotting import plan_axes
+from experiments.viewing.plotting import plan_axes, set_axes, with_legend
 from experiments.viewing.style import BLACK, CYCLE, subplots
 from sim.worlds.grid import OccupancyGrid
 
-Arrays = Mapping[str, NDArray[Any]]
 
-
-def draw(made: Results) -> dict[str, Figure]:
+def draw(results: Results) -> dict[str, Figure]:
     """Draw all figures of the study, by file name."""
     return {
-        "real_logs_intel": intel(made.table("relations"), made.arrays("intel")),
-        "real_logs_building": building(made.arrays("building")),
-        "real_logs_mrclam": mrclam(made.table("mrclam"), made.arrays("mrclam")),
-        "real_logs_wheels": wheels(made.table("wheels")),
-        "real_logs_wean": wean(made.table("wean"), made.arrays("wean")),
+        "real_logs_intel": intel(results.table("relations"), results.arrays("intel")),
+        "real_logs_building": building(results.arrays("building")),
+        "real_logs_mrclam": mrclam(results.table("mrclam"), results.arrays("mrclam")),
+        "real_logs_wheels": wheels(results.table("wheels")),
+        "real_logs_wean": wean(results.table("wean"), results.arrays("wean")),
     }
 
 
@@ -114,14 +109,16 @@ def wheels(found: pd.DataFrame) -> Figure:
             at, rows.value, spread, color=color, marker="o", ms=3, capsize=2,
             label=f"${quantity[0]}_{quantity[1]}$, run {log}",
         )  # fmt: skip
-    ax.set(
+    set_axes(
+        ax,
         xscale="log",
         yscale="log",
         xlabel="intervals of 0.8 s in a block",
         ylabel="$k_r$ and $k_l$ with 95 % intervals, m",
+        xticks=[1, 2, 4, 8, 16],
+        xticklabels=["1", "2", "4", "8", "16"],
+        legend={},
     )
-    ax.set_xticks([1, 2, 4, 8, 16], ["1", "2", "4", "8", "16"])
-    ax.legend()
     return page
 
 
@@ -145,5 +142,4 @@ def wean(fits: pd.DataFrame, drawn: Arrays) -> Figure:
             title=f"Wean Hall, log {row.log}: fit {row.score:.2f}, "
             f"start {math.degrees(row.yaw_rad):.0f}°",
         )
-    page.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=2, markerscale=6)
-    return page
+    return with_legend(page, ncols=2, of=ax, markerscale=6)

@@ -2,7 +2,7 @@
 
 import math
 
-from experiments.judging.verdict import Profile
+from experiments.judging.results import Profile
 
 RAWSEEDS = {  # printed with the logs: SE(2)-aligned ATE by session, m
     "25a": {

@@ -3,7 +3,7 @@
 import dataclasses
 import itertools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ from experiments.calibration.logs import (
 from experiments.evaluation.metrics import score, travelled_m
 from experiments.evaluation.relations import relation_errors
 from experiments.evaluation.time_sync import aligned_ate_m
-from experiments.judging.jobs import in_parallel
+from experiments.judging.jobs import Progress, in_parallel
 from experiments.judging.logs import (
     CALIBRATED_S,
     DATA,
@@ -30,8 +30,7 @@ from experiments.judging.logs import (
     tracked,
     tuned_until_s,
 )
-from experiments.judging.results import Results
-from experiments.judging.verdict import Profile
+from experiments.judging.results import Profile, Results
 from experiments.runs.evaluate import run_over
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
@@ -70,15 +69,13 @@ Paths = dict[str, NDArray[np.float32]]  # (T, 2) m, by name
 _SCORES = ("ate_rmse_m", "ate_aligned_rmse_m", "heading_rmse_rad", "nees_mean", "step_time_us")
 
 
-def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) -> None:
+def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     """Run all studies, and write their tables and the paths that are drawn.
 
     Parameters
     ----------
     profile
         `quick`: fewer robots, seeds and hypotheses.
-    on_progress
-        Called with the share of the work done.
     """
     out.write_tables(ate=rawseeds_ate(), wheels=wheels(), lego=lego_errors())
     on_progress(0.1)
@@ -219,9 +216,7 @@ def _path(poses: Array) -> NDArray[np.float32]:
 # --- MRCLAM --------------------------------------------------------------------------------------
 
 
-def landmark_slam(
-    profile: Profile, on_progress: Callable[[float], None]
-) -> tuple[pd.DataFrame, Paths]:
+def landmark_slam(profile: Profile, on_progress: Progress) -> tuple[pd.DataFrame, Paths]:
     """Errors of dead reckoning, FastSLAM and EKF-SLAM against motion capture; and some paths."""
     study = "study=real_logs/mrclam"
     runs = {

@@ -17,10 +17,9 @@ NAMES = {"fastslam": "FastSLAM 2.0", "ekf_slam": "EKF-SLAM", "smoother": "batch"
 _ERROR = "ate_rmse_m"
 
 
-def judge(made: Results) -> list[Claim]:
+def judge(results: Results) -> list[Claim]:
     """Judge GI9 by the tables; the log's is there only where the log is."""
-    log = made.table("mrclam") if made.has_table("mrclam") else None
-    return [*gi9(made.table("errors")), *on_the_log(log)]
+    return [*gi9(results.table("errors")), *on_the_log(results.optional_table("mrclam"))]
 
 
 def gi9(errors: pd.DataFrame) -> Iterator[Claim]:

@@ -10,18 +10,18 @@ from experiments.evaluation.statistics import log_ratio_interval
 from experiments.judging.results import Results
 from experiments.studies.teams.claims import NAMES
 from experiments.studies.teams.settings import ALWAYS
-from experiments.viewing.plotting import draw_interval, plain_log, with_legend
+from experiments.viewing.plotting import draw_interval, set_axes, with_legend
 from experiments.viewing.style import BLACK, BLUE, PURPLE, SKY, WALL, subplots
 from experiments.viewing.team_figure import draw_paths, draw_sightings
 
 _FILTERS = {"fastslam": (BLUE, "s"), "ekf_slam": (BLACK, "o"), "smoother": (PURPLE, "^")}
 
 
-def draw(made: Results) -> dict[str, Figure]:
+def draw(results: Results) -> dict[str, Figure]:
     """Draw every figure, by file name."""
-    errors = made.table("errors")
+    errors = results.table("errors")
     return {
-        "teams_drive": drive(made.arrays("drive")),
+        "teams_drive": drive(results.arrays("drive")),
         "teams_errors": by_size(errors),
         "teams_links": by_link(errors),
     }
@@ -45,22 +45,20 @@ def by_size(errors: pd.DataFrame) -> Figure:
         colour, marker = _FILTERS[name]
         wide = part.pivot_table(index=["size", "seed"], columns="sightings", values="ate_rmse_m")
         medians = wide.groupby("size").median()
+        style = {"marker": marker, "color": colour, "ms": 4.5, "lw": 1.4}
         for seen, line, words in (
             (False, "--", "without sightings"),
             (True, "-", "with sightings"),
         ):
-            style = {"marker": marker, "color": colour, "ms": 4.5, "lw": 1.4}
             left.plot(medians.index, medians[seen], line, label=f"{NAMES[name]}, {words}", **style)
-        ratios = {size: log_ratio_interval(w[True], w[False]) for size, w in wide.groupby("size")}
-        for size, ratio in ratios.items():
+        for size, worlds in wide.groupby("size"):
+            ratio = log_ratio_interval(worlds[True], worlds[False])
             draw_interval(right, size + 0.06 * (k - 1), ratio, marker=marker, color=colour, ms=6)
     right.axhline(1.0, color=WALL, lw=0.8)
-    left.set(ylabel="median RMS position error of the team, m", yscale="log")
-    right.set(ylabel="error with sightings over without, 95 % interval", yscale="log")
-    for ax in (left, right):
-        ax.set_xlabel("robots in the team")
-        ax.set_xticks(sorted(errors["size"].unique()))
-        plain_log(ax.yaxis)
+    sizes = sorted(errors["size"].unique())
+    set_axes([left, right], xlabel="robots in the team", xticks=sizes, plain="y")
+    left.set(ylabel="median RMS position error of the team, m")
+    right.set(ylabel="error with sightings over without, 95 % interval")
     return with_legend(page, ncols=3)
 
 
@@ -76,8 +74,7 @@ def by_link(errors: pd.DataFrame) -> Figure:
         ax.plot(at, np.median(values), "_", color=BLACK, ms=24, mew=2.0)
         ax.annotate(str(link), (at, 0.0), (0, -8), ha="center", va="top",
                     xycoords=("data", "axes fraction"), textcoords="offset points")  # fmt: skip
-    ax.set(ylabel=f"RMS position error of {size} robots, m", yscale="log", xlim=(-0.5, at + 0.5))
-    ax.set_xticks([])
+    words = f"RMS position error of {size} robots, m"
+    set_axes(ax, ylabel=words, plain="y", xlim=(-0.5, at + 0.5), xticks=[])
     ax.set_xlabel("communication (dot: a world; bar: median)", labelpad=20)
-    plain_log(ax.yaxis)
     return page

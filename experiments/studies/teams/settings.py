@@ -3,7 +3,7 @@
 from typing import Any
 
 from estimators.team import Kind
-from experiments.judging.verdict import Profile
+from experiments.judging.results import Profile
 
 SIZES = (2, 3, 4, 5)
 FIRST_SEED = 1000  # of the judged worlds

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +19,9 @@ import pandas as pd
 from estimators.landmarks.ekf_slam import EkfSlam
 from estimators.team import Communication, run_team
 from experiments.evaluation.metrics import score
-from experiments.judging.jobs import Tables, answer_of, tables_of
+from experiments.judging.jobs import Progress, Tables, answer_of, tables_of
 from experiments.judging.logs import CALIBRATED_S, MRCLAM_6, calibration_by_truth, known_start
-from experiments.judging.results import Results
-from experiments.judging.verdict import Profile
+from experiments.judging.results import Profile, Results
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
 from experiments.studies.teams import settings
@@ -45,15 +44,13 @@ _KEPT = {  # columns of a run's row, and what the study's table calls them
 }
 
 
-def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) -> None:
+def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     """Run the study; write its tables, and the drive that the figure shows.
 
     Parameters
     ----------
     profile
         `quick`: two worlds.
-    on_progress
-        Called with the share of the work done.
     """
     jobs = [
         (seed, option)

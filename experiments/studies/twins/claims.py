@@ -7,16 +7,15 @@ import pandas as pd
 from scipy import stats
 
 from experiments.evaluation.statistics import Interval, mean_interval, share_interval
-from experiments.judging.claim import Claim, Subject, banded, shown
+from experiments.judging.claim import Claim, Subject, banded, holds, shown
 from experiments.judging.results import Results
-from experiments.judging.verdict import holds
 from experiments.studies.twins.settings import LEAST_SHARE, SHOWN
 
 
-def judge(made: Results) -> list[Claim]:
+def judge(results: Results) -> list[Claim]:
     """Judge TW1 and TW2 by the tables."""
-    pairs = made.table("pairs")
-    return [*tw1(pairs, made.table("others")), *tw2(pairs)]
+    pairs = results.table("pairs")
+    return [*tw1(pairs, results.table("others")), *tw2(pairs)]
 
 
 def tw1(pairs: pd.DataFrame, others: pd.DataFrame) -> Iterator[Claim]:

@@ -9,9 +9,9 @@ from experiments.viewing.plotting import plain_log, with_legend
 from experiments.viewing.style import BLACK, RED, SKY, subplots
 
 
-def draw(made: Results) -> dict[str, Figure]:
+def draw(results: Results) -> dict[str, Figure]:
     """Draw the study's figure."""
-    return {"twins_errors": errors(made.table("pairs"))}
+    return {"twins_errors": errors(results.table("pairs"))}
 
 
 def errors(pairs: pd.DataFrame) -> Figure:
@@ -28,9 +28,13 @@ def errors(pairs: pd.DataFrame) -> Figure:
         ax.plot(chosen.error_m, at, "D", color=RED, ms=5, label="on the log")
         ax.plot(chosen.median_m, at, "|", color=BLACK, ms=11)
         ax.set(
-            xscale="log", title=log, yticks=at, yticklabels=chosen.method, ylim=(-0.6, at[0] + 0.6)
+            xscale="log",
+            xlabel="RMS position error, m",
+            title=log,
+            yticks=at,
+            yticklabels=chosen.method,
+            ylim=(-0.6, at[0] + 0.6),
         )
-        ax.set_xlabel("RMS position error, m")
         ax.tick_params(axis="y", labelsize=7)
         plain_log(ax.xaxis, (1.0,))
     for ax in list(axes.flat)[len(logs) :]:

@@ -1,7 +1,7 @@
 """Constants of the study of twins; the estimators' configuration is in conf/study/twins/*.yaml."""
 
 from experiments.judging.logs import GRAPHS, INTEL_910, MRCLAM_6
-from experiments.judging.verdict import Profile
+from experiments.judging.results import Profile
 
 LOGS = {  # name: files, and the number of the robot in them
     **{f"MRCLAM 6, robot {robot}": ((MRCLAM_6,), robot) for robot in range(1, 6)},

@@ -2,16 +2,14 @@
 
 import functools
 import math
-from collections.abc import Callable
 
 import numpy as np
 import pandas as pd
 
 from experiments.evaluation.metrics import score
-from experiments.judging.jobs import Tables, tables_of
+from experiments.judging.jobs import Progress, Tables, tables_of
 from experiments.judging.logs import known_start
-from experiments.judging.results import Results
-from experiments.judging.verdict import Profile
+from experiments.judging.results import Profile, Results
 from experiments.runs.evaluate import run_over
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
@@ -34,15 +32,13 @@ from sim.recording import Recording
 _SCORES = ("ate_rmse_m", "heading_rmse_rad", "nees_mean")
 
 
-def run(profile: Profile, out: Results, on_progress: Callable[[float], None]) -> None:
+def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     """Make a twin of each log, run all estimators over both, and write the tables.
 
     Parameters
     ----------
     profile
         `quick`: 4 simulations of each log in place of 50.
-    on_progress
-        Called with the share of the work done.
     """
     runs = {
         kind: dict(zip(names, planned([f"study=twins/{kind}"]), strict=True))

@@ -3,8 +3,7 @@ import pytest
 
 from experiments.evaluation import statistics
 from experiments.evaluation.statistics import Interval
-from experiments.judging.claim import Subject, equivalent
-from experiments.judging.verdict import judged
+from experiments.judging.claim import Subject, equivalent, judged
 from sim.errors import InputError
 
 ABOUT = Subject("X1", "a ratio")

@@ -7,9 +7,9 @@ import pandas as pd
 import pytest
 
 from experiments.evaluation.statistics import Interval
-from experiments.judging.claim import Subject, lower, select, select_all
+from experiments.judging.claim import Subject, Verdict, lower, select, select_all
 from experiments.judging.claims_file import COLUMNS, read_claims, write_claims
-from experiments.judging.verdict import Profile, Verdict
+from experiments.judging.results import Profile
 from experiments.papers.gil2008 import claims as gil2008
 from experiments.papers.maximo2024 import claims as maximo2024
 from experiments.papers.puzzlebot2024 import claims, study

@@ -9,10 +9,9 @@ import pytest
 
 from experiments import reproduce as module
 from experiments.evaluation.statistics import Interval
-from experiments.judging.claim import Claim, Subject
+from experiments.judging.claim import Claim, Subject, Verdict
 from experiments.judging.claims_file import read_claims, read_verdicts
 from experiments.judging.folders import findings
-from experiments.judging.verdict import Verdict
 from experiments.runs.row import write_frame
 from experiments.viewing.style import figure
 from sim.errors import InputError

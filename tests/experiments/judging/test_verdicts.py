@@ -9,7 +9,19 @@ import pytest
 from jinja2 import UndefinedError
 
 from experiments.evaluation.statistics import Interval, mean_interval
-from experiments.judging.claim import Claim, Subject, banded, beside, select, select_all, shown
+from experiments.judging.claim import (
+    Claim,
+    Role,
+    Subject,
+    Verdict,
+    banded,
+    beside,
+    headline_verdict,
+    more_to_settle,
+    select,
+    select_all,
+    shown,
+)
 from experiments.judging.claims_file import (
     VERDICT_COLUMNS,
     read_claims,
@@ -19,7 +31,7 @@ from experiments.judging.claims_file import (
     write_verdicts,
 )
 from experiments.judging.folders import findings
-from experiments.judging.results import Results
+from experiments.judging.results import Profile, Results
 from experiments.judging.sentences import (
     Conclusion,
     conclude,
@@ -27,7 +39,6 @@ from experiments.judging.sentences import (
     plain,
     sentence,
 )
-from experiments.judging.verdict import Profile, Role, Verdict, headline_verdict, more_to_settle
 from experiments.reproduce import LOGS, NAMED, PAPERS, judgement
 from experiments.runs.paths import SOURCE
 from sim.errors import InputError

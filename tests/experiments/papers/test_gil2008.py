@@ -11,8 +11,8 @@ from joblib import Parallel, delayed
 
 from estimators.landmarks.fastslam import FastSLAM
 from experiments.gate.conform import walk
-from experiments.judging.claim import select, select_all
-from experiments.judging.verdict import Profile, Role, Verdict
+from experiments.judging.claim import Role, Verdict, select, select_all
+from experiments.judging.results import Profile
 from experiments.papers.gil2008 import claims as judge
 from experiments.papers.gil2008 import recordings, scores, settings, study
 from experiments.runs.experiment import Experiment

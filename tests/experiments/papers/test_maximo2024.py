@@ -6,9 +6,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments.judging.claim import select, select_all
-from experiments.judging.results import Results
-from experiments.judging.verdict import Profile, Role
+from experiments.judging.claim import Role, select, select_all
+from experiments.judging.results import Profile, Results
 from experiments.papers.maximo2024 import claims, figures, places, settings, study, worlds
 from experiments.runs.paths import SOURCE
 from experiments.runs.seeds import stream

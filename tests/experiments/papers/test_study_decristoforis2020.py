@@ -5,8 +5,7 @@ import functools
 import joblib
 import pytest
 
-from experiments.judging.results import Results
-from experiments.judging.verdict import Profile
+from experiments.judging.results import Profile, Results
 from experiments.papers.decristoforis2020 import claims, figures, study
 from experiments.papers.decristoforis2020.settings import CHECKED, JUDGED_SEED, PAPERS_OWN, PLACES
 

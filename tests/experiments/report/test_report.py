@@ -12,15 +12,15 @@ import pytest
 from matplotlib.figure import Figure
 
 from experiments.evaluation.statistics import Interval
-from experiments.judging.claim import Claim, Subject, beside
+from experiments.judging.claim import Claim, Subject, Verdict, beside
 from experiments.judging.claims_file import (
     note_provenance,
     read_claims,
     write_claims,
     write_verdicts,
 )
+from experiments.judging.results import Profile
 from experiments.judging.sentences import Conclusion
-from experiments.judging.verdict import Profile, Verdict
 from experiments.report import contents, leaderboard
 from experiments.report import page as report
 from experiments.runs.row import write_frame

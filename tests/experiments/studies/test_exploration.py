@@ -3,11 +3,10 @@
 import numpy as np
 import pandas as pd
 
-from experiments.judging.claim import select
+from experiments.judging.claim import Role, Verdict, select
 from experiments.judging.folders import findings
 from experiments.judging.results import Results
 from experiments.judging.sentences import conclude
-from experiments.judging.verdict import Role, Verdict
 from experiments.studies.exploration import claims, figures, settings
 
 

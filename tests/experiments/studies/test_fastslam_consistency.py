@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 from experiments import reproduce
-from experiments.judging.verdict import Profile
+from experiments.judging.results import Profile
 from experiments.runs.experiment import Experiment
 from experiments.studies.fastslam_consistency import figures, study
 from tests.fixtures.fakes import circle

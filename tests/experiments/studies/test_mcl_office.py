@@ -7,8 +7,7 @@ import pandas as pd
 import pytest
 
 from experiments import reproduce
-from experiments.judging.results import Results
-from experiments.judging.verdict import Profile
+from experiments.judging.results import Profile, Results
 from experiments.runs.experiment import Experiment
 from experiments.studies.mcl_office.figures import draw, found_by
 from experiments.studies.mcl_office.study import found_after_m, localised_share, starts

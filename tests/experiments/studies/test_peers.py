@@ -8,8 +8,7 @@ import pytest
 from scipy import stats
 
 from experiments import reproduce
-from experiments.judging.results import Results
-from experiments.judging.verdict import Profile
+from experiments.judging.results import Profile, Results
 from experiments.runs.experiment import Experiment
 from experiments.studies.peers import figures, study
 
@@ -91,7 +90,7 @@ def test_its_figure(tmp_path):
 
 
 def test_what_is_missing_is_told(tmp_path, monkeypatch):
-    absent = Experiment.compose(["estimator=mrpt_icp", "sensors=hokuyo"])
+    absent = Experiment.compose(["estimator=peers/mrpt_icp", "sensors=hokuyo"])
     monkeypatch.chdir(tmp_path)
     assert "make peers" in study.missing(absent)
     assert study.missing(Experiment.compose(["estimator=odometry"])) == ""

@@ -6,9 +6,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments.judging.claim import select_all
+from experiments.judging.claim import Role, Verdict, select_all
 from experiments.judging.results import Results
-from experiments.judging.verdict import Role, Verdict
 from experiments.studies.teams import claims, figures, settings
 from tests.fixtures.claims import concluded
 

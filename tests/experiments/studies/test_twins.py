@@ -4,9 +4,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from experiments.judging.claim import Role, Verdict
 from experiments.judging.folders import findings
 from experiments.judging.sentences import conclude
-from experiments.judging.verdict import Role, Verdict
 from experiments.studies.twins import claims, figures, study
 from experiments.studies.twins.settings import LOGS, METHODS, SHOWN
 
