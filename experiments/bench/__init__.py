@@ -8,7 +8,7 @@ from sim.errors import require
 
 # name -> modules of this package, each with `run()`
 SUITES = {
-    "sim": ("recording", "casting"),
+    "sim": ("simulation",),
     "sweep": ("sweep",),
     "sweep_scale": ("sweep_scale",),
     "icp": ("icp", "ekf_icp"),

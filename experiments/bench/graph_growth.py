@@ -39,11 +39,10 @@ def run() -> Iterator[Measurement]:
     solved; the memory is that of the graph and of the scans of its key frames.
     """
     with limited_blas():
-        yield from _grown()
+        yield from _grow(stream(0, "bench"))
 
 
-def _grown() -> Iterator[Measurement]:
-    rng = stream(0, "bench")
+def _grow(rng: np.random.Generator) -> Iterator[Measurement]:
     graph = PoseGraph(Gaussian(np.zeros(3), 1e-6 * np.eye(3)), robust_sigma=5.0)
     search = LoopSearch(ScanMatcher(MatcherOptions()), _LASER, LoopOptions())
     scans = [_scan(rng)]
@@ -66,13 +65,12 @@ def _grown() -> Iterator[Measurement]:
         closing = [
             time_s(graph.close, [_closure(n - 1)], 1e-4, clock=time.process_time) for _ in range(3)
         ]
-        name = f"graph_slam.at_{length_m}_m"
-        key_frame_ms, closure_ms = 1e3 * statistics.median(seconds), 1e3 * min(closing)
-        note = f"{n} key frames, {len(graph.closures)} closures"
-        yield Measurement(f"{name}.key_frame_ms", key_frame_ms, "ms", note=note)
-        yield Measurement(f"{name}.closure_ms", closure_ms, "ms", note="its solution too")
-        memory_mib = resident_mib() - before_mib
-        yield Measurement(f"{name}.memory_mib", memory_mib, "MiB", note="with the scans")
+        for what, value, unit, note in (
+            ("key_frame_ms", 1e3 * statistics.median(seconds), "ms", f"{n} key frames"),
+            ("closure_ms", 1e3 * min(closing), "ms", f"the solution too, of {len(graph.closures)}"),
+            ("memory_mib", resident_mib() - before_mib, "MiB", "with the scans"),
+        ):
+            yield Measurement(f"graph_slam.at_{length_m}_m.{what}", value, unit, note=note)
 
 
 def _closure(second: int) -> Edge:

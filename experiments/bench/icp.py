@@ -67,7 +67,7 @@ def run() -> Iterator[Measurement]:
     for name, match in matchers.items():
         for kind, pairs in classes.items():
             chosen = pairs[:60] if name.startswith("peer") else pairs
-            yield from _measured(f"icp.{name}.{kind}", match, chosen)
+            yield from _measure(f"icp.{name}.{kind}", match, chosen)
 
 
 def pair(place: str, size: str, seed: int) -> Pair:
@@ -101,7 +101,7 @@ def _match(metric: Metric, target_m: Array, source_m: Array) -> Array:
     return register(source, target, metric=metric).T_target_source
 
 
-def _measured(row: str, match: Matcher, pairs: list[Pair]) -> list[Measurement]:
+def _measure(row: str, match: Matcher, pairs: list[Pair]) -> list[Measurement]:
     """Time from ranges to pose, and the errors, of one way to register over one class."""
     mine, in_room = "point_to_line" in row, "room" in row
     errors = np.array([match(p.target_m, p.source_m) - p.T_target_source for p in pairs])
@@ -113,23 +113,17 @@ def _measured(row: str, match: Matcher, pairs: list[Pair]) -> list[Measurement]:
     ratio = math.sqrt(np.median(squares) / _MEDIAN_CHI2_3)
     ms = 1e3 * median_time_s(match, [(p.target_m, p.source_m) for p in pairs], repeats=1)
     goal_ms, goal_ratio = (_GOAL_MS, _GOAL_RATIO) if mine and in_room else (None, None)
+    error_mm, error_deg = 1e3 * float(np.median(off_m)), math.degrees(np.median(off_rad))
+    share, goal_share = float(np.mean(failed)), 0.0 if mine else None
     return [
-        Measurement(f"{row}.ms", ms, "ms", goal_ms, note="two raw scans to pose"),
-        Measurement(
-            f"{row}.error_mm",
-            1e3 * float(np.median(off_m)),
-            "mm",
-            note=f"median; bound {1e3 * bound_m:.2f}",
-        ),
-        Measurement(f"{row}.error_deg", math.degrees(np.median(off_rad)), "deg", note="median"),
-        Measurement(f"{row}.fisher_ratio", ratio, "1", goal_ratio),
-        Measurement(
-            f"{row}.fail_share",
-            float(np.mean(failed)),
-            "1",
-            0.0 if mine else None,
-            note=f"of {len(pairs)} pairs",
-        ),
+        Measurement(f"{row}.{name}", value, unit, goal, note=note)
+        for name, value, unit, goal, note in (
+            ("ms", ms, "ms", goal_ms, "two raw scans to pose"),
+            ("error_mm", error_mm, "mm", None, f"median; bound {1e3 * bound_m:.2f}"),
+            ("error_deg", error_deg, "deg", None, "median"),
+            ("fisher_ratio", ratio, "1", goal_ratio, ""),
+            ("fail_share", share, "1", goal_share, f"of {len(pairs)} pairs"),
+        )
     ]
 
 
@@ -235,8 +229,8 @@ def _points(ranges_m: Array) -> Array:
 
 
 def _two_layers(ranges_m: Array) -> Array:
-    flat = _points(ranges_m)
-    return np.concatenate([np.column_stack([flat, np.full(len(flat), z)]) for z in (0.0, 0.02)])
+    points = np.pad(_points(ranges_m), ((0, 0), (0, 1)))
+    return np.concatenate([points, points + np.array([0.0, 0.0, 0.02])])
 
 
 def _room(rng: np.random.Generator) -> tuple[Array, tuple[float, float, float, float]]:

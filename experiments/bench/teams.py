@@ -31,10 +31,10 @@ _ARMS = {
 def run() -> list[Measurement]:
     """Median and 99th percentile of an instant, of each estimator and size."""
     whole = Experiment.compose(_DRIVE).recordings()
-    return [found for name in _ARMS for size in _SIZES for found in _measured(name, size, whole)]
+    return [row for name in _ARMS for size in _SIZES for row in _measure(name, size, whole)]
 
 
-def _measured(name: str, size: int, whole: Team) -> Iterator[Measurement]:
+def _measure(name: str, size: int, whole: Team) -> Iterator[Measurement]:
     experiment = Experiment.compose([*_DRIVE, *_ARMS[name], f"team.size={size}"])
     team = whole.first(size)
     with limited_blas():

@@ -9,9 +9,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from estimators.base import Estimator, Prior
+from estimators.base import run as run_estimator
 from estimators.topological.topological_mcl import TopologicalMcl
 from experiments.bench.measure import Measurement
-from experiments.runs.evaluate import run_over
 from experiments.runs.experiment import Experiment
 from sim.recording import Recording
 
@@ -58,5 +58,5 @@ def _filter(experiment: Experiment, per_node: int) -> Estimator:
 def _median_step_s(estimator: Estimator, recording: Recording, prior: Prior) -> float:
     """Median time of a step over two runs of the route, after a first one that compiles."""
     rngs = map(np.random.default_rng, range(3))
-    runs = [run_over(recording, estimator, prior, rng)[0].step_seconds for rng in rngs]
+    runs = [run_estimator(estimator, recording, prior, rng).step_seconds for rng in rngs]
     return float(np.median(runs[1:]))
