@@ -1,12 +1,18 @@
-"""Graph SLAM among look-alike rooms: false closures, consistency and speed.
+"""Graph SLAM: false closures among look-alike rooms, and its cost after up to 5 km.
 
 The rooms are all alike: 42 squares without furniture. A closure is false if it is off the true
 motion by more than `FALSE_M` or `FALSE_RAD`. Of planted closures half lie anywhere; half are moved
 by the same 0.5 m, as if each place had a twin there.
+
+The cost is that of laps of 100 m with a key frame each 0.5 m, every third of which closes the lap.
+The graph and its scans are real, the drive is not: registrations cost the same at any length, and
+are left out.
 """
 
 from __future__ import annotations
 
+import math
+import statistics
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -17,14 +23,19 @@ import pandas as pd
 from estimators.base import run as run_estimator
 from estimators.gaussian import Gaussian
 from estimators.graph.graph_slam import GraphSlam
-from estimators.graph.pose_graph import Edge
-from experiments.bench.measure import Measurement
+from estimators.graph.loop_closing import LoopOptions, LoopSearch, look_alike, signature
+from estimators.graph.pose_graph import Edge, PoseGraph
+from estimators.laser.icp import PreparedScan, prepare
+from estimators.laser.scan_matching import MatcherOptions, ScanMatcher
+from experiments.bench.growth import resident_mib
+from experiments.bench.measure import Measurement, time_s
 from experiments.evaluation.metrics import score, travelled_m
 from experiments.runs.evaluate import limited_blas
 from experiments.runs.experiment import Experiment
 from experiments.runs.seeds import stream
 from sim import se2
 from sim.recording import Recording
+from sim.sensors import Laser
 
 FALSE_M, FALSE_RAD = 0.1, 0.03
 _NEAR_M, _NEAR_RAD, _APART_M = 2.0, 0.8, 10.0  # of a revisit: to an old key frame; and path between
@@ -45,6 +56,12 @@ _ROOMS = (
     "prior.sigma_position_m=1e-3",
     "prior.sigma_heading_rad=1e-4",
 )
+LENGTHS_M = (250, 500, 1000, 2000, 3500, 5000)
+_KEY_FRAME_M, _LAP = 0.5, 200  # key frames of a lap
+_TIMED = 20  # key frames before each length
+_STEP = np.array([_KEY_FRAME_M, 0.0, 2.0 * math.pi / _LAP])
+_NOISE = np.diag([1e-5, 1e-5, 1e-6])
+_LASER = Laser(n_beams=181, fov_rad=math.pi)
 _JUDGED = range(1100, 1120)  # seeds 1000 to 1012 have been looked at
 
 
@@ -74,7 +91,7 @@ class Planted(GraphSlam):
 
 
 def run() -> Iterator[Measurement]:
-    """Twenty judged drives of 300 m, five of them again with planted closures."""
+    """Twenty judged drives of 300 m, five of them again with planted closures; then the growth."""
     drives = pd.DataFrame([run_rooms(seed) for seed in _JUDGED])
     total, worst, mean = drives.sum(), drives.max(), drives.mean()
     recall, of = total["closed"] / total["revisits"], f"of {total['revisits']:g}"
@@ -94,6 +111,8 @@ def run() -> Iterator[Measurement]:
         note = f"of {total['planted']:g}; false candidates are {share:.0%} of all"
         name = f"graph_slam.false_of_planted_{share:.0%}"
         yield Measurement(name, total["false"], "", 0, note=note)
+    with limited_blas():
+        yield from _grow(stream(0, "bench"))
 
 
 def run_rooms(seed: int, planted: float = 0.0) -> dict[str, float]:
@@ -148,3 +167,46 @@ def _judge_closures(estimator: Planted, recording: Recording) -> dict[str, int]:
         "revisits": len(revisits),
         "closed": int((apart_m < 5.0).any(axis=1).sum()),
     }
+
+
+def _grow(rng: np.random.Generator) -> Iterator[Measurement]:
+    """Costs on one graph that grows: of a key frame with its candidates, and of a closure."""
+    graph = PoseGraph(Gaussian(np.zeros(3), 1e-6 * np.eye(3)), robust_sigma=5.0)
+    search = LoopSearch(ScanMatcher(MatcherOptions()), _LASER, LoopOptions())
+    scans = [_scan(rng)]
+    marks = np.tile(signature(scans[0]), (1, 1))
+    before_mib = resident_mib()  # with the compiled code
+    for length_m in LENGTHS_M:
+        n, before, seconds = round(length_m / _KEY_FRAME_M), len(graph), []
+        while len(graph) < n:
+            scan, begun = _scan(rng), time.process_time()
+            motion = _STEP + rng.standard_normal(3) * np.sqrt(np.diag(_NOISE))
+            graph.add(motion, [Gaussian(motion, _NOISE)])
+            marks = np.vstack([marks, signature(scan)])
+            scans.append(scan)
+            if n - len(graph) < _TIMED:
+                older = np.arange(len(graph) - 1)
+                motions, covariances = graph.newest_from(older, exact=False)
+                search.candidates(motions, covariances, look_alike(marks[-1], marks[:-1]))
+                seconds.append(time.process_time() - begun)
+        graph.close([_closure(k) for k in range(max(before, _LAP), n, 3)])
+        closing = [
+            time_s(graph.close, [_closure(n - 1)], 1e-4, clock=time.process_time) for _ in range(3)
+        ]
+        for what, value, unit, note in (
+            ("key_frame_ms", 1e3 * statistics.median(seconds), "ms", f"{n} key frames"),
+            ("closure_ms", 1e3 * min(closing), "ms", f"the solution too, of {len(graph.closures)}"),
+            ("memory_mib", resident_mib() - before_mib, "MiB", "with the scans"),
+        ):
+            yield Measurement(f"graph_slam.at_{length_m}_m.{what}", value, unit, note=note)
+
+
+def _closure(second: int) -> Edge:
+    return Edge(second - _LAP, second, Gaussian(np.zeros(3), _NOISE))
+
+
+def _scan(rng: np.random.Generator) -> PreparedScan:
+    """A square room of 6 m, seen from its middle."""
+    bearings = _LASER.bearings_rad
+    walls_m = 3.0 / np.maximum(np.abs(np.cos(bearings)), np.abs(np.sin(bearings)))
+    return prepare(walls_m + 0.01 * rng.standard_normal(len(bearings)), bearings)
