@@ -10,6 +10,7 @@ import yaml
 from experiments.twin.make import Twin
 from sim.errors import require
 from sim.files import write_text
+from sim.formats.tum import write_tum
 from sim.recording import save
 from sim.sensors.base import sensor_settings
 from sim.worlds.grid_file import write_grid
@@ -44,7 +45,7 @@ def write_twin(twin: Twin, out: Path) -> list[Path]:
         write_text(world, yaml.safe_dump(document, sort_keys=False, default_flow_style=None))
     else:
         write_grid(twin.grid, world)
-
+    write_tum(way, twin.stamps, twin.way)
     save(twin.rest, log)
     kind = "from_file" if twin.grid is None else "from_grid"
     options = {"world": kind, "robot": "puzzlebot", "sensors": "encoder", "route": "timetable"}
