@@ -14,7 +14,7 @@ from estimators.base import Prior
 from estimators.graph.graph_slam import GraphSlam
 from estimators.graph.smoother import Smoother
 from experiments.calibration.from_log import Found, calibrate_log
-from experiments.calibration.reference import spaced_rows
+from experiments.calibration.reference import names_of, spaced_rows
 from experiments.runs.calibration import Slip
 from experiments.runs.evaluate import run_over
 from experiments.runs.seeds import stream
@@ -22,7 +22,7 @@ from experiments.twin.sensors import poses_at, real_camera, real_laser
 from experiments.viewing.map import grid_along
 from sim import se2
 from sim.arrays import Array
-from sim.errors import InputError, require
+from sim.errors import require
 from sim.recording import Recording
 from sim.robot.arc import arc_increment
 from sim.robot.drive import DifferentialDrive
@@ -173,7 +173,9 @@ def make_twin(log: Recording, split_s: float | None = None) -> Twin:
         grid, _ = grid_along(right, known, poses, resolution_m=CELL_M, laser=name)
         grid = _cleared(grid, way, robot)
     else:
-        landmarks = _landmarks(right)
+        landmarks = np.zeros((0, 3)) if right.world is None else right.world.landmarks
+        missing = "a twin of a camera needs a log that knows its landmarks' places"
+        require(len(landmarks), missing)
     driven = late & (stamps > begin)
     twin = Twin(
         found,
@@ -202,14 +204,6 @@ def _first_frame(recording: Recording, stamps: Array, split: float) -> float:
         frames = frames[np.isfinite(recording.truth_at(frames, 0.25)).all(axis=1)]
     require(len(frames) >= 2, "no Frame after the split has a known pose; split the log earlier")
     return float(frames[0])
-
-
-def _landmarks(recording: Recording) -> Array:
-    require(
-        recording.world is not None and len(recording.known_world.landmarks),
-        "a twin of a camera needs a log that knows its landmarks' places",
-    )
-    return recording.known_world.landmarks
 
 
 def _cleared(grid: OccupancyGrid, way: Array, robot: DifferentialDrive) -> OccupancyGrid:
@@ -243,11 +237,10 @@ def observer(recording: Recording) -> tuple[str, Laser | StereoCamera]:
     InputError
         If the log has neither.
     """
-    for name in recording.logs:
-        sensor = recording.sensors[name]
-        if isinstance(sensor, (Laser, StereoCamera)):
-            return name, sensor
-    raise InputError("a twin needs a laser or a camera of landmarks, and the log has neither")
+    names = names_of(recording, Laser, StereoCamera)
+    require(names, "a twin needs a laser or a camera of landmarks, and the log has neither")
+    sensor: Any = recording.sensors[names[0]]
+    return names[0], sensor
 
 
 def best_poses(recording: Recording, slip: Slip) -> tuple[Array, Array]:
