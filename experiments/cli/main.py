@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
@@ -57,7 +58,7 @@ def options_of_all(
         os.environ["ESTIMA_RESULTS"] = str(results.absolute())
 
 
-_COMMANDS = {  # as `estima --help` lists them
+_COMMANDS: dict[str, Callable[..., None]] = {  # as `estima --help` lists them
     "run": run.run,
     "record": run.record,
     "info": logs.info,

@@ -242,7 +242,7 @@ def bounds(run: Playback) -> Bounds:
     A diverging estimate is followed to twice the size of all else.
     """
     low, high = np.transpose([_bounds(own, run) for own in run.robots], (1, 0, 2))
-    x1, y1, x2, y2 = *low.min(axis=0).tolist(), *high.max(axis=0).tolist()
+    (x1, y1), (x2, y2) = low.min(axis=0).tolist(), high.max(axis=0).tolist()
     return x1, y1, x2, y2
 
 

@@ -140,8 +140,7 @@ def _team_figure(found: Sequence[tuple[Recording, Estimate]], name: str) -> Figu
         plan.plot(*estimate.means[:1, :2].T, "o", ms=5, **colour)
     plan_axes(plan)
     plan.autoscale_view()
-    errors.set(xlabel="time, s", ylabel="position error, m")
-    errors.set_ylim(bottom=0.0)
+    errors.set(xlabel="time, s", ylabel="position error, m", ylim=(0.0, None))
     errors.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=5, fontsize="small")
     lines = [
         Line2D([], [], color=TRUTH, lw=1.6, label="truth, a colour a robot"),
