@@ -110,11 +110,16 @@ def unwrapped(headings: Sequence[Array], turns: Sequence[float]) -> list[Array]:
         h / turn for h, turn in zip(headings, turns, strict=True) if 1e-6 < abs(turn) < math.pi
     ]
     ratio = float(np.median(np.concatenate(short))) if short else 1.0
-    found = []
-    for heading, turn in zip(headings, turns, strict=True):
-        missing = 2.0 * math.pi * np.round((ratio * turn - heading) / (2.0 * math.pi))
-        found.append(heading + np.where(np.abs(heading) <= math.pi, missing, 0.0))
-    return found
+    whole_turn = 2.0 * math.pi
+    return [
+        heading
+        + np.where(
+            np.abs(heading) <= math.pi,
+            whole_turn * np.round((ratio * turn - heading) / whole_turn),
+            0.0,
+        )
+        for heading, turn in zip(headings, turns, strict=True)
+    ]
 
 
 def write_sheet(
@@ -122,11 +127,16 @@ def write_sheet(
 ) -> None:
     """Write a sheet that `read_sheet` reads, to 0.1 mm and 0.1 mrad."""
     with write_whole(path) as part, part.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(COLUMNS)
-        for case, poses in ends.items():
-            for pose in poses:
-                writer.writerow([case, *commands[case], *(f"{value:.4f}" for value in pose)])
+        csv.writer(file).writerows(
+            [
+                COLUMNS,
+                *(
+                    [case, *commands[case], *(f"{value:.4f}" for value in pose)]
+                    for case, poses in ends.items()
+                    for pose in poses
+                ),
+            ]
+        )
 
 
 def _rows(path: Path) -> Iterator[tuple[int, dict[str, str | None]]]:

@@ -11,7 +11,7 @@ from experiments.cli import completion
 from experiments.cli.flags import ConfigDir
 from experiments.runs import columns, paths
 from experiments.runs.console import show
-from sim.errors import InputError, require
+from sim.errors import require
 
 
 def options(
@@ -158,9 +158,8 @@ def view(
             else play.draw_map(grid, out or Path("map.png"))
         )
         return
-    if not what or "=" in what[0]:
-        raise InputError("name a recording to view, such as run.npz, or say --world")
-    first, *overrides = what
+    first, *overrides = what or ["="]
+    require("=" not in first, "name a recording to view, such as run.npz, or say --world")
     how = play.Showing(out, seconds, grid)
     if not Path(first).exists() and (row := row_of(first)) is not None:
         own = "a run of a sweep has its estimator and its settings; leave out others"
