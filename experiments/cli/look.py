@@ -158,8 +158,8 @@ def view(
             else play.draw_map(grid, out or Path("map.png"))
         )
         return
-    first, *overrides = what or ["="]
-    require("=" not in first, "name a recording to view, such as run.npz, or say --world")
+    first, *overrides = what or [""]
+    require(first and "=" not in first, "name a recording to view, such as run.npz, or say --world")
     how = play.Showing(out, seconds, grid)
     if not Path(first).exists() and (row := row_of(first)) is not None:
         own = "a run of a sweep has its estimator and its settings; leave out others"
