@@ -15,7 +15,6 @@ from experiments.calibration.end_poses import Manoeuvre, from_end_poses
 from experiments.calibration.result import CalibrationResult
 from sim.arrays import Array
 from sim.errors import InputError, require
-from sim.files import write_whole
 from sim.formats.text import LARGEST
 from sim.robot.drive import DifferentialDrive
 from sim.routes.route import OpenLoop
@@ -120,23 +119,6 @@ def unwrapped(headings: Sequence[Array], turns: Sequence[float]) -> list[Array]:
         )
         for heading, turn in zip(headings, turns, strict=True)
     ]
-
-
-def write_sheet(
-    path: Path, commands: dict[str, tuple[float, float, float]], ends: dict[str, Array]
-) -> None:
-    """Write a sheet that `read_sheet` reads, to 0.1 mm and 0.1 mrad."""
-    with write_whole(path) as part, part.open("w", newline="") as file:
-        csv.writer(file).writerows(
-            [
-                COLUMNS,
-                *(
-                    [case, *commands[case], *(f"{value:.4f}" for value in pose)]
-                    for case, poses in ends.items()
-                    for pose in poses
-                ),
-            ]
-        )
 
 
 def _rows(path: Path) -> Iterator[tuple[int, dict[str, str | None]]]:

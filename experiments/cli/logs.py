@@ -163,7 +163,11 @@ def calibrate(
     from experiments.calibration.files import calibrate_log_file as calibrate_log
 
     if real.out is not None:
-        flags = {"--sheet": by.sheet, "--method": by.method, "--config-dir": config_dir}
+        flags: dict[str, object] = {
+            "--sheet": by.sheet,
+            "--method": by.method,
+            "--config-dir": config_dir,
+        }
         flags |= {"--joint": joint or None, "--json": as_json or None}
         wrong = next((name for name, value in flags.items() if value is not None), None)
         require(wrong is None, f"{wrong} does not go with a real log; leave it or -o out")
