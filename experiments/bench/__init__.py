@@ -8,17 +8,17 @@ from sim.errors import require
 
 # name -> modules of this package, each with `run()`
 SUITES = {
-    "sim": ("recording", "casting"),
+    "sim": ("simulation",),
     "sweep": ("sweep",),
     "sweep_scale": ("sweep_scale",),
-    "icp": ("icp", "ekf_icp"),
+    "icp": ("icp",),
     "fastslam": ("fastslam",),
     "teams": ("teams",),
     "topological": ("topological",),
     "mcl": ("mcl",),
     "formats": ("formats",),
     "smoothing": ("smoothing",),
-    "graph_slam": ("graph_slam", "graph_growth"),
+    "graph_slam": ("graph_slam",),
     "compile": ("compile",),
     "growth": ("growth",),
     "external": ("external",),

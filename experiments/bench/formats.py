@@ -1,12 +1,14 @@
 """Speed of reading logs."""
 
+import functools
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
-from experiments.bench.measure import Measurement
+from experiments.bench.measure import Measurement, median_time_s
 from sim.formats.carmen import read_carmen, to_recording
 
 
@@ -25,28 +27,22 @@ def carmen_log(path: Path, megabytes: float) -> None:
             log.write(f"FLASER 180 {ranges} {pose} {pose} {logged}\n")
 
 
-def run() -> list[Measurement]:
-    """Read 100 MB of CARMEN log into a recording.
+def run(megabytes: float = 100.0) -> Iterator[Measurement]:
+    """Read a large CARMEN log into a recording.
 
     Processor time of the one thread that reads, so that other programs do not count.
     """
-    seconds = []
+    median_s = functools.partial(median_time_s, at_least_s=0.0, repeats=3, clock=time.process_time)
     with tempfile.TemporaryDirectory() as folder:
         large = Path(folder) / "large.log"
-        carmen_log(large, 100)
+        carmen_log(large, megabytes)
         size = large.stat().st_size / 1e6
-        for _ in range(3):
-            begun = time.process_time()
-            log = read_carmen(large)
-            parsed = time.process_time()
-            to_recording(log)
-            seconds.append((parsed - begun, time.process_time() - begun))
-    parse_s, whole_s = np.median(seconds, axis=0).tolist()
-    lines = f"{size:.0f} MB of ODOM and FLASER lines, one core"
-    return [
-        Measurement(name, size / taken_s, "MB/s", 15.0, "higher", note)
-        for name, taken_s, note in (
-            ("formats.carmen_mb_per_s", parse_s, lines),
-            ("formats.carmen_recording_mb_per_s", whole_s, "the same, into a recording"),
+        parse_s = median_s(read_carmen, [(large,)])
+        whole_s = parse_s + median_s(to_recording, [(read_carmen(large),)])
+    for name, seconds, note in (
+        ("", parse_s, f"{size:.0f} MB of ODOM and FLASER lines, one core"),
+        ("recording_", whole_s, "the same, into a recording"),
+    ):
+        yield Measurement(
+            f"formats.carmen_{name}mb_per_s", size / seconds, "MB/s", 15.0, "higher", note
         )
-    ]

@@ -1,30 +1,41 @@
-"""Graph SLAM among look-alike rooms: false closures, consistency and speed.
+"""Graph SLAM: false closures among look-alike rooms, and its cost after up to 5 km.
 
 The rooms are all alike: 42 squares without furniture. A closure is false if it is off the true
 motion by more than `FALSE_M` or `FALSE_RAD`. Of planted closures half lie anywhere; half are moved
 by the same 0.5 m, as if each place had a twin there.
+
+The cost is that of laps of 100 m with a key frame each 0.5 m, every third of which closes the lap.
+The graph and its scans are real, the drive is not: registrations cost the same at any length, and
+are left out.
 """
 
 from __future__ import annotations
 
+import math
+import statistics
+import time
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
-from estimators.base import Estimate
+from estimators.base import run as run_estimator
 from estimators.gaussian import Gaussian
 from estimators.graph.graph_slam import GraphSlam
-from estimators.graph.pose_graph import Edge
-from experiments.bench.measure import Measurement
-from experiments.evaluation.metrics import nees, position_errors_m
-from experiments.runs.evaluate import run_over
+from estimators.graph.loop_closing import LoopOptions, LoopSearch, look_alike, signature
+from estimators.graph.pose_graph import Edge, PoseGraph
+from estimators.laser.icp import PreparedScan, prepare
+from estimators.laser.scan_matching import MatcherOptions, ScanMatcher
+from experiments.bench.growth import resident_mib
+from experiments.bench.measure import Measurement, time_s
+from experiments.evaluation.metrics import score, travelled_m
+from experiments.runs.evaluate import limited_blas
 from experiments.runs.experiment import Experiment
 from experiments.runs.seeds import stream
 from sim import se2
-from sim.arrays import Array
 from sim.recording import Recording
+from sim.sensors import Laser
 
 FALSE_M, FALSE_RAD = 0.1, 0.03
 _NEAR_M, _NEAR_RAD, _APART_M = 2.0, 0.8, 10.0  # of a revisit: to an old key frame; and path between
@@ -45,6 +56,12 @@ _ROOMS = (
     "prior.sigma_position_m=1e-3",
     "prior.sigma_heading_rad=1e-4",
 )
+LENGTHS_M = (250, 500, 1000, 2000, 3500, 5000)
+_KEY_FRAME_M, _LAP = 0.5, 200  # key frames of a lap
+_TIMED = 20  # key frames before each length
+_STEP = np.array([_KEY_FRAME_M, 0.0, 2.0 * math.pi / _LAP])
+_NOISE = np.diag([1e-5, 1e-5, 1e-6])
+_LASER = Laser(n_beams=181, fov_rad=math.pi)
 _JUDGED = range(1100, 1120)  # seeds 1000 to 1012 have been looked at
 
 
@@ -73,104 +90,123 @@ class Planted(GraphSlam):
         return [*found, *self.false[len(self.false) - number :]]
 
 
-@dataclass(frozen=True)
-class RoomRun:
-    """A drive through look-alike rooms.
+def run() -> Iterator[Measurement]:
+    """Twenty judged drives of 300 m, five of them again with planted closures; then the growth."""
+    drives = pd.DataFrame([run_rooms(seed) for seed in _JUDGED])
+    total, worst, mean = drives.sum(), drives.max(), drives.mean()
+    recall, of = total["closed"] / total["revisits"], f"of {total['revisits']:g}"
+    note = "20 drives of 300 m through look-alike rooms"
+    factor = drives["realtime_factor"].min()
+    yield from (
+        Measurement("graph_slam.false_closures", total["false"], "", 0, note=note),
+        Measurement("graph_slam.closures", total["closures"], ""),
+        Measurement("graph_slam.revisits_closed", recall, "", note=of),
+        Measurement("graph_slam.end_error_m", worst["end_m"], "m", 0.3, note="the worst, online"),
+        Measurement("graph_slam.nees_3", mean["nees"], "", 1.5, note="online"),
+        Measurement("graph_slam.revised_nees_3", mean["revised_nees"], "", 1.5),
+        Measurement("graph_slam.realtime_factor_10hz", factor, "", 10, "higher", "the least"),
+    )
+    for share in (0.1, 0.25, 0.5):
+        total = pd.DataFrame([run_rooms(seed, share) for seed in _JUDGED[:5]]).sum()
+        note = f"of {total['planted']:g}; false candidates are {share:.0%} of all"
+        name = f"graph_slam.false_of_planted_{share:.0%}"
+        yield Measurement(name, total["false"], "", 0, note=note)
+    with limited_blas():
+        yield from _grow(stream(0, "bench"))
 
-    Attributes
-    ----------
-    closures, false, planted
-        Closures believed by the end, those of them that are false, and false ones planted.
-    revisits, closed
-        Key frames near an old one, and those of them within 5 m of travel of a closure.
-    end_m
-        Error of position at the end, online.
-    nees, revised_nees
-        Mean NEES / 3.
-    realtime_factor
-        Duration of the recording over processor time of all steps.
+
+def run_rooms(seed: int, planted: float = 0.0) -> dict[str, float]:
+    """Drive 300 m through look-alike rooms, with this share of false candidates.
+
+    Returns
+    -------
+    dict
+        `closures` believed by the end, those of them that are `false`, and false ones `planted`;
+        `revisits`, key frames near an old one, and those of them `closed` within 5 m of travel;
+        `end_m`, the error of the online position at the end; `nees` and `revised_nees`, means over
+        3; `realtime_factor`, the duration over the processor time of all steps.
     """
-
-    closures: int
-    false: int
-    planted: int
-    revisits: int
-    closed: int
-    end_m: float
-    nees: float
-    revised_nees: float
-    realtime_factor: float
-
-
-def run_rooms(seed: int, planted: float = 0.0) -> RoomRun:
-    """Drive 300 m through look-alike rooms, with this share of false candidates."""
     experiment = Experiment.compose([*_ROOMS, f"seed={seed}"])
     recording, robot = experiment.recording(), experiment.robot()
     estimator = Planted(planted, stream(seed, "bench"), kr=robot.kr, kl=robot.kl)
-    rng = stream(seed, "estimator/graph_slam")
-    online, revised = run_over(recording, estimator, experiment.prior(recording), rng)
-    assert revised is not None
-    return RoomRun(
-        *_judged_closures(estimator, recording),
-        end_m=float(_errors_m(recording, online)[-1]),
-        nees=_nees(recording, online),
-        revised_nees=_nees(recording, revised),
-        realtime_factor=recording.duration_s / float(online.step_seconds.sum()),
-    )
+    prior, rng = experiment.prior(recording), stream(seed, "estimator/graph_slam")
+    with limited_blas():
+        begun = time.process_time()
+        online = run_estimator(estimator, recording, prior, rng)
+        seconds = time.process_time() - begun
+        revised = score(recording, estimator.finish())
+    scores = score(recording, online)
+    return {
+        **_judge_closures(estimator, recording),
+        "end_m": scores["final_position_error_m"],
+        "nees": scores["nees_mean"] / 3.0,
+        "revised_nees": revised["nees_mean"] / 3.0,
+        "realtime_factor": recording.duration_s / seconds,
+    }
 
 
-def _judged_closures(estimator: Planted, recording: Recording) -> tuple[int, int, int, int, int]:
-    """Closures, false ones, planted ones, revisits and those closed; see `RoomRun`."""
+def _judge_closures(estimator: Planted, recording: Recording) -> dict[str, int]:
     closures = estimator.graph.closures
     stamps = np.nan_to_num(estimator.node_stamps, nan=recording.frame_stamps[0])
     truth = recording.truth_at(stamps)
-    false, closed_at = 0, []
-    for edge in closures:
-        off = se2.between(se2.between(truth[edge.first], truth[edge.second]), edge.motion.mean)
-        false += bool(np.hypot(off[0], off[1]) > FALSE_M or abs(off[2]) > FALSE_RAD)
-        closed_at.append(edge.second)
-    moved = np.hypot(*np.diff(truth[:, :2], axis=0).T)
-    travelled = np.concatenate([[0.0], np.cumsum(moved)])
-    revisits = []
+    first, second = np.array([(e.first, e.second) for e in closures], int).reshape(-1, 2).T
+    motions = np.reshape([edge.motion.mean for edge in closures], (-1, 3))
+    off = np.abs(se2.between(se2.between(truth[first], truth[second]), motions))
+    false = (np.hypot(off[:, 0], off[:, 1]) > FALSE_M) | (off[:, 2] > FALSE_RAD)
+    driven_m, revisits = travelled_m(truth), []
     for node in range(1, len(truth)):
-        old = truth[1:node][travelled[node] - travelled[1:node] > _APART_M]
-        off = se2.between(old, truth[node])
-        near = np.hypot(off[:, 0], off[:, 1]) < _NEAR_M
-        if np.any(near & (np.abs(off[:, 2]) < _NEAR_RAD)):
+        old = truth[1:node][driven_m[node] - driven_m[1:node] > _APART_M]
+        off = np.abs(se2.between(old, truth[node]))
+        if np.any((np.hypot(off[:, 0], off[:, 1]) < _NEAR_M) & (off[:, 2] < _NEAR_RAD)):
             revisits.append(node)
-    at_m = travelled[np.array(closed_at, int)]
-    closed = sum(bool(np.any(np.abs(at_m - travelled[node]) < 5.0)) for node in revisits)
-    return len(closures), false, len(estimator.false), len(revisits), closed
+    apart_m = np.abs(driven_m[second] - driven_m[revisits, None])
+    return {
+        "closures": len(closures),
+        "false": int(false.sum()),
+        "planted": len(estimator.false),
+        "revisits": len(revisits),
+        "closed": int((apart_m < 5.0).any(axis=1).sum()),
+    }
 
 
-def _errors_m(recording: Recording, estimate: Estimate) -> Array:
-    return position_errors_m(recording.truth_at(estimate.stamps), estimate.means)
+def _grow(rng: np.random.Generator) -> Iterator[Measurement]:
+    """Costs on one graph that grows: of a key frame with its candidates, and of a closure."""
+    graph = PoseGraph(Gaussian(np.zeros(3), 1e-6 * np.eye(3)), robust_sigma=5.0)
+    search = LoopSearch(ScanMatcher(MatcherOptions()), _LASER, LoopOptions())
+    scans = [_scan(rng)]
+    marks = np.tile(signature(scans[0]), (1, 1))
+    before_mib = resident_mib()  # with the compiled code
+    for length_m in LENGTHS_M:
+        n, before, seconds = round(length_m / _KEY_FRAME_M), len(graph), []
+        while len(graph) < n:
+            scan, begun = _scan(rng), time.process_time()
+            motion = _STEP + rng.standard_normal(3) * np.sqrt(np.diag(_NOISE))
+            graph.add(motion, [Gaussian(motion, _NOISE)])
+            marks = np.vstack([marks, signature(scan)])
+            scans.append(scan)
+            if n - len(graph) < _TIMED:
+                older = np.arange(len(graph) - 1)
+                motions, covariances = graph.newest_from(older, exact=False)
+                search.candidates(motions, covariances, look_alike(marks[-1], marks[:-1]))
+                seconds.append(time.process_time() - begun)
+        graph.close([_closure(k) for k in range(max(before, _LAP), n, 3)])
+        closing = [
+            time_s(graph.close, [_closure(n - 1)], 1e-4, clock=time.process_time) for _ in range(3)
+        ]
+        for what, value, unit, note in (
+            ("key_frame_ms", 1e3 * statistics.median(seconds), "ms", f"{n} key frames"),
+            ("closure_ms", 1e3 * min(closing), "ms", f"the solution too, of {len(graph.closures)}"),
+            ("memory_mib", resident_mib() - before_mib, "MiB", "with the scans"),
+        ):
+            yield Measurement(f"graph_slam.at_{length_m}_m.{what}", value, unit, note=note)
 
 
-def _nees(recording: Recording, estimate: Estimate) -> float:
-    truth = recording.truth_at(estimate.stamps)
-    return float(np.nanmean(nees(truth, estimate.means, estimate.covariances)) / 3.0)
+def _closure(second: int) -> Edge:
+    return Edge(second - _LAP, second, Gaussian(np.zeros(3), _NOISE))
 
 
-def run() -> Iterator[Measurement]:
-    """Twenty judged drives of 300 m, five of them again with planted closures."""
-    runs = [run_rooms(seed) for seed in _JUDGED]
-    note = "20 drives of 300 m through look-alike rooms"
-    n_revisits = sum(r.revisits for r in runs)
-    yield Measurement("graph_slam.false_closures", sum(r.false for r in runs), "", 0, note=note)
-    yield Measurement("graph_slam.closures", sum(r.closures for r in runs), "")
-    recall = sum(r.closed for r in runs) / n_revisits
-    yield Measurement("graph_slam.revisits_closed", recall, "", note=f"of {n_revisits}")
-    end_m = max(r.end_m for r in runs)
-    yield Measurement("graph_slam.end_error_m", end_m, "m", 0.3, note="the worst, online")
-    mean = float(np.mean([r.nees for r in runs]))
-    yield Measurement("graph_slam.nees_3", mean, "", 1.5, note="online")
-    mean = float(np.mean([r.revised_nees for r in runs]))
-    yield Measurement("graph_slam.revised_nees_3", mean, "", 1.5)
-    factor = min(r.realtime_factor for r in runs)
-    yield Measurement("graph_slam.realtime_factor_10hz", factor, "", 10, "higher", "the least")
-    for share in (0.1, 0.25, 0.5):
-        found = [run_rooms(seed, share) for seed in _JUDGED[:5]]
-        note = f"of {sum(r.planted for r in found)}; false candidates are {share:.0%} of all"
-        bent = sum(r.false for r in found)
-        yield Measurement(f"graph_slam.false_of_planted_{share:.0%}", bent, "", 0, note=note)
+def _scan(rng: np.random.Generator) -> PreparedScan:
+    """A square room of 6 m, seen from its middle."""
+    bearings = _LASER.bearings_rad
+    walls_m = 3.0 / np.maximum(np.abs(np.cos(bearings)), np.abs(np.sin(bearings)))
+    return prepare(walls_m + 0.01 * rng.standard_normal(len(bearings)), bearings)

@@ -59,49 +59,44 @@ def run() -> Iterator[Measurement]:
     """Step and memory at the end of the drive beside those at its beginning; times of `finish`."""
     for name in (*_IN_ROOMS, *_ON_CAMPUS):
         step_us, memory_mib = alone(driven, name)[0]
-        first, last = step_us[_SETTLED : _SETTLED + 3], step_us[-3:]
-        early, middle, late = (statistics.median(t) for t in (step_us[1:4], first, last))
-        yield Measurement(
-            f"growth.{name}.step_us",
-            late,
-            "µs",
-            note=f"at the end; {early:.0f} in minutes 2-4, {middle:.0f} in 7-9",
-        )
-        yield Measurement(
-            f"growth.{name}.memory_mib",
-            memory_mib[-1] - memory_mib[_SETTLED],
-            "MiB",
-            note="at the end, beyond that after minute 7",
-        )
+        parts = step_us[1:4], step_us[_SETTLED : _SETTLED + 3], step_us[-3:]
+        early, middle, late = map(statistics.median, parts)
+        note = f"at the end; {early:.0f} in minutes 2-4, {middle:.0f} in 7-9"
+        yield Measurement(f"growth.{name}.step_us", late, "µs", note=note)
+        grown_mib, note = memory_mib[-1] - memory_mib[_SETTLED], "since the end of minute 7"
+        yield Measurement(f"growth.{name}.memory_mib", grown_mib, "MiB", note=note)
     for name in _WITH_FINISH:
-        for minutes, (seconds, most_mib) in alone(finished, name)[0].items():
-            note = f"peak {most_mib:.0f} MiB"
+        for minutes, (seconds, peak) in alone(finished, name)[0].items():
+            note = f"peak {peak:.0f} MiB"
             yield Measurement(f"growth.{name}.finish_{minutes}min_s", seconds, "s", note=note)
 
 
 def driven(name: str) -> tuple[list[float], list[float]]:
     """Mean processor time of a step in each minute, µs, and memory after it, MiB."""
-    step_us, memory_mib = [], []
-    for _, steps in _minutes(name):
-        step_us.append(1e6 * statistics.fmean(seconds for seconds, _ in steps))
-        memory_mib.append(resident_mib())
+    minutes = [
+        (1e6 * statistics.fmean(seconds for seconds, _ in steps), resident_mib())
+        for _, steps in _minutes(name)
+    ]
+    step_us, memory_mib = map(list, zip(*minutes, strict=True))
     return step_us, memory_mib
 
 
 def finished(name: str) -> dict[int, tuple[float, float]]:
     """Processor time of `finish`, s, and the most memory so far, MiB, by the minutes driven."""
-    found = {}
+    costs = {}
     for minute, (estimator, steps) in enumerate(_minutes(name), start=1):
         collections.deque(steps, maxlen=0)
         if minute in _FINISHED:
-            seconds = time_s(estimator.finish, clock=time.process_time)
-            found[minute] = seconds, peak_mib()
-    return found
+            costs[minute] = time_s(estimator.finish, clock=time.process_time), peak_mib()
+    return costs
 
 
 def _minutes(name: str) -> Iterator[tuple[Any, Iterator[tuple[float, Belief]]]]:
-    """An estimator, and what `timed_steps` gives of each minute of its drive."""
-    experiment = _experiment(name)
+    """An estimator, and what `timed_steps` gives of each minute of the drive of its kind."""
+    drive, speed_mps = (_CAMPUS, 1.5) if name in _ON_CAMPUS else (_ROOMS, 0.5)
+    length = f"route.distance_m={60 * _MINUTES * speed_mps:g}"
+    prior_map = ["prior.map=world"] if name == "mcl" else []
+    experiment = Experiment.compose([*drive, length, f"estimator={name}", *prior_map])
     recording = experiment.recording()
     prior, estimator = experiment.prior(recording), experiment.estimator()
     estimator.reset(prior, stream(0, "bench"))
@@ -109,14 +104,6 @@ def _minutes(name: str) -> Iterator[tuple[Any, Iterator[tuple[float, Belief]]]]:
     with limited_blas():
         for _, frames in itertools.islice(by_minute, _MINUTES):
             yield estimator, timed_steps(estimator, frames)
-
-
-def _experiment(name: str) -> Experiment:
-    """An estimator over the drive of its kind, of half an hour."""
-    drive, speed_mps = (_CAMPUS, 1.5) if name in _ON_CAMPUS else (_ROOMS, 0.5)
-    length = f"route.distance_m={60 * _MINUTES * speed_mps:g}"
-    known = ["prior.map=world"] if name == "mcl" else []
-    return Experiment.compose([*drive, length, f"estimator={name}", *known])
 
 
 def resident_mib() -> float:

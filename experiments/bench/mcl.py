@@ -50,16 +50,12 @@ def run() -> Iterator[Measurement]:
     per_update = _N_PARTICLES * _LASER.n_beams
     update_s, resampled = _updates(world, poses, frames)
     size = f"{_LASER.n_beams} beams x {_N_PARTICLES} particles"
-    whole = f"{size}; motion, weights, belief, resampling ({resampled:.0%} of updates)"
+    note = f"{size}; motion, weights, belief, resampling ({resampled:.0%} of updates)"
     rate = per_update / update_s
-    yield from (
-        Measurement("mcl.particle_beams_per_s", rate, "1/s", 400e6, "higher", whole),
-        Measurement("mcl.update_ms", update_s * 1e3, "ms", note=whole),
-    )
-    field, rng = (
-        likelihood_field(world, _LASER, FieldOptions(sigma_m=0.1)),
-        np.random.default_rng(0),
-    )
+    yield Measurement("mcl.particle_beams_per_s", rate, "1/s", 400e6, "higher", note)
+    yield Measurement("mcl.update_ms", update_s * 1e3, "ms", note=note)
+    field = likelihood_field(world, _LASER, FieldOptions(sigma_m=0.1))
+    rng = np.random.default_rng(0)
     ends = [beam_ends(scan, _LASER, _LASER.n_beams) for scan in scans[::24]]
     spread = [0.1, 0.1, 0.03]
     near = [pose + rng.standard_normal((_N_PARTICLES, 3)) * spread for pose in poses[::24]]

@@ -1,15 +1,15 @@
 """Landmark methods over one drive through rooms: batch, EKF-SLAM and the fixed-lag smoother."""
 
-import statistics
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
+from estimators.base import run as run_estimator
 from estimators.graph.least_squares import solve
 from estimators.graph.smoother import Smoother
-from experiments.bench.measure import Measurement, time_s
-from experiments.runs.evaluate import limited_blas, run_over
+from experiments.bench.measure import Measurement, median_time_s
+from experiments.runs.evaluate import limited_blas
 from experiments.runs.experiment import Experiment
 from experiments.runs.seeds import stream
 
@@ -28,23 +28,22 @@ def run() -> Iterator[Measurement]:
     recording = experiment.simulate()
     prior = experiment.prior(recording)
     batch = Smoother(kr=experiment.robot().kr, kl=experiment.robot().kl)
-    batch.reset(prior, stream(0, "bench"))
-    for frame in recording.frames():
-        batch.step(frame)
+    run_estimator(batch, recording, prior, stream(0, "bench"))
     problem, start = batch.problem()
-    note = f"{len(start)} poses, {len(np.unique(problem.landmark_rows))} landmarks"
-    with limited_blas():
-        solved, whole = (
-            statistics.median(time_s(call, clock=time.process_time) for _ in range(5))
-            for call in (lambda: solve(problem, start), batch.finish)
-        )
-    yield Measurement("smoother.solve_s", solved, "s", 0.15, note=note)
-    yield Measurement("smoother.covariances_s", whole, "s", 0.3, note=f"{note}, and every Frame")
-    for name, goal in (("ekf_slam", 0.35), ("fixed_lag", 0.3)):
+    size = f"{len(start)} poses, {len(np.unique(problem.landmark_rows))} landmarks"
+
+    def steps(name: str) -> Callable[[], object]:
         online = Experiment.compose([*_DRIVE, f"estimator={name}"]).estimator()
-        seconds = [
-            float(run_over(recording, online, prior, stream(0, "bench"))[0].step_seconds.sum())
-            for _ in range(4)
-        ]
-        note = "all steps, one BLAS thread"
-        yield Measurement(f"{name}.run_s", statistics.median(seconds[1:]), "s", goal, note=note)
+        return lambda: run_estimator(online, recording, prior, stream(0, "bench"))
+
+    whole = "all steps, one BLAS thread"
+    timed: tuple[tuple[str, Callable[[], object], int, float, str], ...] = (
+        ("smoother.solve_s", lambda: solve(problem, start), 5, 0.15, size),
+        ("smoother.covariances_s", batch.finish, 5, 0.3, f"{size}, and every Frame"),
+        ("ekf_slam.run_s", steps("ekf_slam"), 3, 0.35, whole),
+        ("fixed_lag.run_s", steps("fixed_lag"), 3, 0.3, whole),
+    )
+    with limited_blas():
+        for name, call, repeats, goal, note in timed:
+            seconds = median_time_s(call, at_least_s=0.0, repeats=repeats, clock=time.process_time)
+            yield Measurement(name, seconds, "s", goal, note=note)

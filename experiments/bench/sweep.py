@@ -5,11 +5,11 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
+from estimators.base import run as run_estimator
 from experiments.bench.measure import Measurement, median_time_s, time_s
 from experiments.runs import paths, store
-from experiments.runs.evaluate import run_over
 from experiments.runs.experiment import Experiment
 from experiments.runs.seeds import stream
 from experiments.sweeps.work import run_and_record
@@ -30,36 +30,28 @@ _LONG = [
 _FEW, _MANY = 10, 60
 
 
-def run() -> list[Measurement]:
+def run() -> Iterator[Measurement]:
     """Overheads per run and per job, the gain of two workers, and the time of `estima --help`."""
     try:
-        return [
-            *_overheads(),
-            Measurement(
-                "sweep.cheapest_run_ms",
-                _cheapest_run_ms(),
-                "ms",
-                8.0,
-                note="odometry, encoder, an empty hall, 1 s, kinematic; recording included",
-            ),
-            _speedup(24, None),  # too short to make up for the workers' start-up
-            _speedup(200, 1.8),
-            Measurement(
-                "cli.help_s", statistics.median(_cli_s("--help") for _ in range(7)), "s", 0.4
-            ),
-        ]
+        yield from _overheads()
+        note = "odometry, encoder, an empty hall, 1 s, kinematic; recording included"
+        yield Measurement("sweep.cheapest_run_ms", _cheapest_run_ms(), "ms", 8.0, note=note)
+        yield _speedup(24, None)  # too short to make up for the workers' start-up
+        yield _speedup(200, 1.8)
+        help_s = statistics.median(_cli_s("--help") for _ in range(7))
+        yield Measurement("cli.help_s", help_s, "s", 0.4)
     finally:
         shutil.rmtree(paths.results() / "runs" / _NAME, ignore_errors=True)
 
 
-def _overheads() -> list[Measurement]:
+def _overheads() -> Iterator[Measurement]:
     experiment = Experiment.compose([*_SHORT, f"name={_NAME}", "picture=false"])
     read = experiment.recordings()
     recording = read.only
     _packed_s([experiment], {experiment.recording_key: read})
     prior, estimator = experiment.prior(recording), experiment.estimator()
     own_s = median_time_s(
-        lambda: run_over(recording, estimator, prior, stream(0, "bench")),
+        lambda: run_estimator(estimator, recording, prior, stream(0, "bench")),
         clock=time.process_time,
     )
 
@@ -77,12 +69,10 @@ def _overheads() -> list[Measurement]:
         slopes = [(seconds(_MANY) - seconds(_FEW)) / (_MANY - _FEW) - own_s for _ in range(3)]
         return 1e3 * statistics.median(slopes)
 
-    packed = "processor time of a repeat beyond the estimator's own"
-    job = "wall time of a run of its own, from the command line, one after another"
-    return [
-        Measurement("sweep.overhead_packed_ms", overhead_ms(packed_s), "ms", 10.0, note=packed),
-        Measurement("sweep.overhead_job_ms", overhead_ms(swept_s), "ms", 60.0, note=job),
-    ]
+    note = "processor time of a repeat beyond the estimator's own"
+    yield Measurement("sweep.overhead_packed_ms", overhead_ms(packed_s), "ms", 10.0, note=note)
+    note = "wall time of a run of its own, from the command line, one after another"
+    yield Measurement("sweep.overhead_job_ms", overhead_ms(swept_s), "ms", 60.0, note=note)
 
 
 def _cheapest_run_ms() -> float:

@@ -103,9 +103,8 @@ def from_end_poses(
     ]
     seen = [model.coordinates(m.end_poses) for model, m in zip(models, manoeuvres, strict=True)]
     means = np.array([y.mean(axis=0) for y in seen])
-    scatters = np.array(
-        [(y - mean).T @ (y - mean) / len(y) for y, mean in zip(seen, means, strict=True)]
-    )
+    off = [y - mean for y, mean in zip(seen, means, strict=True)]
+    scatters = np.array([part.T @ part / len(part) for part in off])
 
     def moments(unknowns: Array) -> Moments:
         bias = unknowns[2:4] if geometry else np.zeros(2)

@@ -16,7 +16,7 @@ from experiments.calibration.reference import (
     INTERVAL_S,
     Reference,
     Source,
-    first_of,
+    names_of,
     reference_of,
     registered,
     spaced_rows,
@@ -142,7 +142,7 @@ def calibrate_against(reference: Reference, part: Recording) -> Found:
     )
     sensors: dict[str, SensorBelief] = {}
     left = [np.zeros(0)] * 4
-    lasers = [name for name in part.logs if isinstance(part.sensors[name], Laser)]
+    lasers, cameras = names_of(part, Laser), names_of(part, StereoCamera)
     if lasers and reference.source is not Source.LANDMARKS:
         name, laser = lasers[0], part.sensor(lasers[0], Laser)
         found, by_scans = SensorBelief(), reference.source is Source.SCANS
@@ -160,12 +160,9 @@ def calibrate_against(reference: Reference, part: Recording) -> Found:
         noise, share, left = laser_noise(part, name, scans)
         sensors[name] = dataclasses.replace(found, sigma_range_m=noise.value)
         intervals |= {f"sensors.{name}.sigma_range_m": noise, f"{name}: outliers": share}
-    if part.world is not None and any(
-        isinstance(sensor, StereoCamera) and sensor.identifies for sensor in part.sensors.values()
-    ):
-        name, camera = first_of(part, StereoCamera)
-        belief, of_camera, left = camera_noise(part, name, camera, reference)
-        sensors[name] = belief
+    if part.world is not None and any(part.sensor(n, StereoCamera).identifies for n in cameras):
+        name = cameras[0]
+        sensors[name], of_camera, left = camera_noise(part, name, reference)
         intervals |= of_camera
     return Found(
         reference.source,

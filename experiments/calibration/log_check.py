@@ -1,13 +1,11 @@
 """What is odd about a log: clocks, gaps, and sensors that do not agree with the motion."""
 
 import math
-from collections.abc import Mapping
 
 import numpy as np
 
 from experiments.calibration.from_log import calibrate_against
-from experiments.calibration.reference import Reference, reference_of, wheel_delay_s
-from experiments.evaluation.statistics import Interval
+from experiments.calibration.reference import reference_of, wheel_delay_s
 from sim.arrays import Array
 from sim.errors import InputError
 from sim.recording import Recording
@@ -49,11 +47,11 @@ def _clock(name: str, stamps: Array) -> list[str]:
     gaps = np.diff(stamps)
     if len(gaps) < 3:
         return []
-    found, usual = [], float(np.median(gaps))
+    warnings, usual = [], float(np.median(gaps))
     longest = int(np.argmax(gaps))
     if gaps[longest] > max(_LONG_GAP * usual, 0.5):
         n = int(np.sum(gaps > max(_LONG_GAP * usual, 0.5)))
-        found.append(
+        warnings.append(
             f"{name}: {n} gap{'s' * (n > 1)}, the longest {gaps[longest]:.3g} s at "
             f"{stamps[longest] - stamps[0]:.1f} s (usually {usual:.3g} s apart)"
         )
@@ -62,34 +60,35 @@ def _clock(name: str, stamps: Array) -> list[str]:
         off = np.abs(stamps / step - np.round(stamps / step)).max()
         if off < 1e-9 * max(1.0, float(np.abs(stamps).max()) / step):
             if step > 0.1 * usual:
-                found.append(
+                warnings.append(
                     f"{name}: stamps are whole steps of {step:g} s, which is coarse for readings "
                     f"{usual:.3g} s apart"
                 )
             break
-    return found
+    return warnings
 
 
 def _motion(recording: Recording) -> list[str]:
     """Compare the wheels and the sensors with the best that the log has."""
     try:
         reference = reference_of(recording)
+        delay_s = wheel_delay_s(recording.wheels, reference).value
     except InputError as error:
-        return [_not_compared(error)]
+        return [f"wheels and sensors are not compared: {error}"]
+    warnings, against = [], f"against the {reference.source}"
+    if abs(delay_s) >= DELAY_S:
+        side = "ahead" if delay_s > 0.0 else "behind"
+        warnings.append(f"wheels: their stamps are {abs(delay_s):.2f} s {side}, {against}")
     try:
         found = calibrate_against(reference, recording)
-    except InputError as error:
-        return _delay_alone(recording, reference, error)
-    wheels, warnings = found.calibration.wheels, []
-    against = f"against the {found.source}"
-    if (told := _told_delay(wheels.delay_s, against)) is not None:
-        warnings.append(told)
+    except InputError:
+        return warnings
+    wheels, track_m = found.calibration.wheels, recording.robot.track_m
     for side, gain in (("right", wheels.gain_right), ("left", wheels.gain_left)):
         if abs(gain - 1.0) > GAIN:
             warnings.append(
                 f"wheels: the {side} one travels {gain:.3f} m a logged metre, {against}"
             )
-    track_m = recording.robot.track_m
     if abs(wheels.track_m / track_m - 1.0) > TURN:
         warnings.append(
             f"wheels: they turn the robot as {wheels.track_m:.3f} m apart do, not {track_m:.3f} m"
@@ -101,15 +100,10 @@ def _motion(recording: Recording) -> list[str]:
     left = found.residuals
     if len(left.bearing_rad):
         warnings += _by_bearing(left.range_m, left.range_error_m, np.abs(left.bearing_rad))
-    return [*warnings, *_outliers(found.intervals)]
-
-
-def _outliers(intervals: Mapping[str, Interval]) -> list[str]:
-    """Tell shares of outliers that are above zero."""
-    return [
-        f"{name.partition(':')[0]}: {100.0 * found.value:.2g} % of its readings are outliers"
-        for name, found in intervals.items()
-        if name.endswith(": outliers") and found.low > 0.0
+    return warnings + [
+        f"{name.partition(':')[0]}: {100.0 * share.value:.2g} % of its readings are outliers"
+        for name, share in found.intervals.items()
+        if name.endswith(": outliers") and share.low > 0.0
     ]
 
 
@@ -118,33 +112,11 @@ def _by_bearing(depth_m: Array, error_m: Array, bearing_rad: Array) -> list[str]
     inner, outer = np.quantile(bearing_rad, [0.3, 0.8])
     share = error_m / depth_m
     near, far = share[bearing_rad < inner], share[bearing_rad > outer]
-    if min(len(near), len(far)) < 20:
-        return []
-    change = float(np.median(far) - np.median(near))
+    enough = min(len(near), len(far)) >= 20
+    change = float(np.median(far) - np.median(near)) if enough else 0.0
     if abs(change) < GAIN:
         return []
     return [
         f"landmarks: relative depth errors change by {100.0 * change:+.1f} % from the image's "
         f"middle to {math.degrees(outer):.0f} degrees off it; are they ranges?"
     ]
-
-
-def _delay_alone(recording: Recording, reference: Reference, complaint: InputError) -> list[str]:
-    """What can be said of a log that cannot be calibrated."""
-    try:
-        delay = wheel_delay_s(recording.wheels, reference)
-    except InputError:
-        return [_not_compared(complaint)]
-    told = _told_delay(delay.value, f"against the {reference.source}")
-    return [told] if told is not None else []
-
-
-def _not_compared(complaint: InputError) -> str:
-    return f"wheels and sensors are not compared: {complaint}"
-
-
-def _told_delay(delay_s: float, against: str) -> str | None:
-    if abs(delay_s) < DELAY_S:
-        return None
-    where = "ahead" if delay_s > 0.0 else "behind"
-    return f"wheels: their stamps are {abs(delay_s):.2f} s {where}, {against}"

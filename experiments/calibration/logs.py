@@ -96,20 +96,24 @@ def calibrate_wheels(
         kept = np.sqrt(np.sum((residual / spread) ** 2, axis=1)) < 6.0
         fit = _fit(log, fit.x, 1.0 / spread, kept, scale)
     values = np.append(fit.x[:5], se2.wrap(fit.x[5]))
-    right, left, axle, x, y, yaw = _intervals(values, fit)
+    right, left, axle, x, y, yaw = fit_intervals(values, fit)
     travel, turns = log.rolled_rad * values[:2] / 2.0, _residual(log, values)[:, 2]
     return WheelCalibration(right, left, axle, x, y, yaw, kept, travel, turns)
 
 
-def _intervals(
-    values: Array, fit: optimize.OptimizeResult, alike: float = 1.0, unit: Array | float = 1.0
+def fit_intervals(
+    values: Array,
+    fit: optimize.OptimizeResult,
+    alike: float = 1.0,
+    unit: Array | float = 1.0,
+    z: float = float(stats.norm.ppf(0.975)),
 ) -> list[Interval]:
     """Parameters (P,) of a least-squares fit with 95 % intervals, times their units.
 
-    So many neighbouring residuals as `alike` count as one.
+    So many neighbouring residuals as `alike` count as one; `z` standard deviations either side.
     """
     covariance = np.linalg.inv(fit.jac.T @ fit.jac) * np.mean(fit.fun**2) * alike
-    half = stats.norm.ppf(0.975) * np.sqrt(np.diag(covariance))
+    half = z * np.sqrt(np.diag(covariance))
     bounds = np.stack([values, values - half, values + half]) * unit
     return [Interval(*map(float, column)) for column in bounds.T]
 
@@ -274,6 +278,6 @@ def calibrate_track(
         return _off_reference(log, stamps, positions, tick, track, start).ravel()
 
     fit = optimize.least_squares(residual, np.array([1.0, 1.0, heading_rad]))
-    tick, track, _ = _intervals(fit.x, fit, 20.0, np.array([tick_m, track_m, 1.0]))
+    tick, track, _ = fit_intervals(fit.x, fit, 20.0, np.array([tick_m, track_m, 1.0]))
     rms_m = float(np.sqrt(2.0 * np.mean(fit.fun**2)))
     return TrackCalibration(tick, track, axle_at(positions[0], fit.x[2]), rms_m)

@@ -4,7 +4,6 @@ import math
 from dataclasses import dataclass
 from enum import StrEnum
 from itertools import pairwise
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +15,7 @@ from estimators.laser.scan_matching import FAILED
 from experiments.evaluation.statistics import Interval, mean_interval
 from experiments.runs.evaluate import run_over
 from sim.arrays import Array, Ints
-from sim.errors import InputError, require
+from sim.errors import require
 from sim.recording import Recording, WheelLog
 from sim.sensors import Laser, StereoCamera
 
@@ -25,7 +24,6 @@ LARGEST_DELAY_S, _DELAY_STEP_S = 1.0, 0.01
 N_PARTS = 8  # of the log, for the spread of a delay or of a noise
 _LONGEST_GAP_S = 1.0  # of the truth
 _START = np.diag([1e-6] * 3)  # covariance of a known start
-S = TypeVar("S")
 
 
 class Source(StrEnum):
@@ -52,13 +50,9 @@ class Reference:
     joined: NDArray[np.bool_]
 
 
-def first_of(recording: Recording, kind: type[S]) -> tuple[str, S]:
-    """Name and sensor of the first sensor of a class that has readings."""
-    for name in recording.logs:
-        sensor = recording.sensors[name]
-        if isinstance(sensor, kind):
-            return name, sensor
-    raise InputError(f"the log has no readings of a {kind.__name__}")
+def names_of(recording: Recording, *kinds: type) -> list[str]:
+    """Names of the sensors of these classes that have readings."""
+    return [name for name in recording.logs if isinstance(recording.sensors[name], kinds)]
 
 
 def reference_of(recording: Recording) -> Reference:
@@ -69,24 +63,18 @@ def reference_of(recording: Recording) -> Reference:
     InputError
         If the log has none of them.
     """
-    has_laser, has_camera = (
-        any(isinstance(recording.sensors[name], kind) for name in recording.logs)
-        for kind in (Laser, StereoCamera)
-    )
+    lasers, cameras = names_of(recording, Laser), names_of(recording, StereoCamera)
     if recording.truth is not None and len(recording.truth.stamps) > 2:
         stamps, poses = recording.truth.stamps, recording.truth.poses
         inside = (stamps >= recording.frame_stamps[0]) & (stamps <= recording.frame_stamps[-1])
         stamps, poses = stamps[inside], poses[inside]
         dense = len(stamps) > 2 and float(np.median(np.diff(stamps))) <= _LONGEST_GAP_S
-        if dense or not has_laser:
+        if dense or not lasers:
             return Reference(Source.TRUTH, stamps, poses, np.diff(stamps) <= _LONGEST_GAP_S)
-    if has_laser:
-        return registered(recording, first_of(recording, Laser)[0])
-    require(
-        has_camera,
-        "the log has no truth, no scans and no landmarks to compare its wheels with",
-    )
-    name, _ = first_of(recording, StereoCamera)
+    if lasers:
+        return registered(recording, lasers[0])
+    require(cameras, "the log has no truth, no scans and no landmarks to compare its wheels with")
+    name = cameras[0]
     prior = Prior(recording.robot, recording.sensors, np.zeros(3), _START)
     # online, and gated: a batch that starts from wrong wheels and misread landmarks ends anywhere
     mapper = EkfSlam(kr=3e-3, kl=3e-3, errors="invariant", gate_probability=1e-6, stereo=name)

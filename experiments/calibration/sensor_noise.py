@@ -5,6 +5,7 @@ import math
 import numpy as np
 from scipy import optimize
 
+from experiments.calibration.logs import Mask, fit_intervals
 from experiments.calibration.reference import LARGEST_DELAY_S, N_PARTS, Reference, Source
 from experiments.evaluation.statistics import Interval, mean_interval, share_interval
 from experiments.runs.calibration import SensorBelief
@@ -28,32 +29,27 @@ def sightings(recording: Recording, name: str, world: World) -> tuple[Array, Int
 
 
 def camera_noise(
-    recording: Recording, name: str, camera: StereoCamera, reference: Reference
+    recording: Recording, name: str, reference: Reference
 ) -> tuple[SensorBelief, dict[str, Interval], list[Array]]:
     """Scale, mount, delay and noise of a camera among known landmarks; only from a truth."""
     if reference.source is not Source.TRUTH or recording.world is None:
         return SensorBelief(), {}, [np.zeros(0)] * 4
+    camera = recording.sensor(name, StereoCamera)
     stamps, ids, points = sightings(recording, name, recording.world)
     inside = (stamps > reference.stamps[0] + LARGEST_DELAY_S) & (
         stamps < reference.stamps[-1] - LARGEST_DELAY_S
     )
-    stamps, points, placed = (
-        stamps[inside],
-        points[inside],
-        recording.world.landmarks[ids[inside], :2],
-    )
+    stamps, points = stamps[inside], points[inside]
+    placed = np.pad(recording.world.landmarks[ids[inside], :2], ((0, 0), (0, 1)))
     require(
         len(stamps) >= 30, f"only {len(stamps)} sightings of known landmarks; give more of the log"
     )
-    bearing = np.arctan2(-points[:, 0], points[:, 2])
-    depth = points[:, 2]
+    bearing, depth = np.arctan2(-points[:, 0], points[:, 2]), points[:, 2]
 
     def ahead(delay_s: float) -> Array:
         """Landmarks (K, 2) in base_link, when the camera is this late."""
         poses = recording.truth_at(stamps + delay_s)
-        turned = np.column_stack([placed, np.zeros(len(placed))])
-        inverse: Array = se2.compose(se2.inverse(poses), turned)
-        return inverse[:, :2]
+        return np.asarray(se2.compose(se2.inverse(poses), placed)[:, :2])
 
     def off(delay_s: float) -> float:
         x, y = ahead(delay_s).T
@@ -74,22 +70,19 @@ def camera_noise(
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.stack([depth / (scale * z) - 1.0, se2.wrap(bearing - np.arctan2(left, z))])
 
+    def weighted(unknowns: Array, near: Mask, spread: Array) -> Array:
+        return np.asarray(errors(unknowns)[:, near] / spread[:, None]).ravel()
+
     start = np.array([np.median(depth[near] / seen[near, 0]), 0.0, 0.0, 0.0])
     spread = np.array([0.02, 0.02])
     for _ in range(3):
-
-        def weighted(unknowns: Array) -> Array:
-            flat: Array = (errors(unknowns)[:, near] / spread[:, None]).ravel()  # noqa: B023
-            return flat
-
-        fit = optimize.least_squares(weighted, start, loss="soft_l1", x_scale=[0.01] * 4)
+        fit = optimize.least_squares(
+            weighted, start, loss="soft_l1", x_scale=[0.01] * 4, args=(near, spread)
+        )
         found = errors(fit.x)
         spread = MAD * np.median(np.abs(found[:, near]), axis=1) + 1e-6
         near = finite & np.all(np.abs(found) < _OUTLIER * spread[:, None], axis=0)
         start = fit.x
-    # neighbouring sightings err together: twenty count as one
-    covariance = np.linalg.inv(fit.jac.T @ fit.jac) * np.mean(fit.fun**2) * 20.0
-    half = 1.96 * np.sqrt(np.diag(covariance))
     sigma_px = camera.focal_px * spread[1]
     # of the depth's error, which grows with the depth here, the disparity that explains its median
     by_square = MAD * np.median(np.abs(found[0, near] / depth[near]))
@@ -104,19 +97,16 @@ def camera_noise(
         sigma_column_px=float(sigma_px),
         sigma_disparity_px=float(disparity_px),
     )
-    n_out = int(np.sum(finite & ~near))
-    names = ("scale", "x_m", "y_m", "yaw_rad")
-    intervals = {
-        f"sensors.{name}.{key}": Interval(float(v), float(v - h), float(v + h))
-        for key, v, h in zip(names, fit.x, half, strict=True)
-    }
+    # neighbouring sightings err together: twenty count as one
+    bounds = fit_intervals(fit.x, fit, alike=20.0, z=1.96)
+    keys = (f"sensors.{name}.{key}" for key in ("scale", "x_m", "y_m", "yaw_rad"))
+    intervals = dict(zip(keys, bounds, strict=True))
     intervals[f"sensors.{name}.delay_s"] = Interval(delay_s, delay_s - 0.02, delay_s + 0.02)
     for label, value, errors_near in zip(
         ("depth error, share", "bearing error, rad"), spread, found[:, near], strict=True
     ):
-        parts = [MAD * np.median(np.abs(part)) for part in np.array_split(errors_near, N_PARTS)]
-        known = mean_interval(parts)
-        intervals[f"{name}: {label}"] = Interval(float(value), known.low, known.high)
+        intervals[f"{name}: {label}"] = _by_parts(float(value), errors_near)
+    n_out = int(np.sum(finite & ~near))
     intervals[f"{name}: outliers"] = share_interval(n_out, int(finite.sum()))
     left = [depth[near], found[0, near] * depth[near], bearing[near], found[1, near]]
     return belief, intervals, left
@@ -135,6 +125,7 @@ def laser_noise(
     rows = np.searchsorted(recording.log(name).stamps, reference.stamps)
     pairs = np.flatnonzero(reference.joined)[:: max(1, len(reference.joined) // 300)]
     mount, bearings = laser.mount.pose, laser.bearings_rad
+    directions = np.stack([np.cos(bearings), np.sin(bearings)], axis=1)
     step = float(bearings[1] - bearings[0]) if len(bearings) > 1 else 1.0
     errors, distances = [], []
     for i in pairs:
@@ -142,9 +133,8 @@ def laser_noise(
         motion = se2.between(
             se2.compose(reference.poses[i], mount), se2.compose(reference.poses[i + 1], mount)
         )
-        seen_again = np.isfinite(after)
-        directions = np.stack([np.cos(bearings), np.sin(bearings)], axis=1)[seen_again]
-        ends = se2.transform(motion, after[seen_again, None] * directions)
+        again = np.isfinite(after)
+        ends = se2.transform(motion, after[again, None] * directions[again])
         place = (np.arctan2(ends[:, 1], ends[:, 0]) - bearings[0]) / step
         inside = (place >= 0.0) & (place < len(bearings) - 1)
         ends, place = ends[inside], place[inside]
@@ -163,12 +153,13 @@ def laser_noise(
     fits = np.abs(error) < _OUTLIER * spread
     # a beam, and the mean of two about half of the time
     per_beam = math.sqrt(1.0 + 2.0 / 3.0)
-    parts = [MAD * np.median(np.abs(e)) / per_beam for e in np.array_split(error, N_PARTS)]
-    known = mean_interval(parts)
-    noise = Interval(spread / per_beam, known.low, known.high)
-    empty = np.zeros(0)
-    return (
-        noise,
-        share_interval(int(np.sum(~fits)), len(fits)),
-        [distance[fits], error[fits], empty, empty],
-    )
+    noise = _by_parts(spread / per_beam, error, per_beam)
+    outliers = share_interval(int(np.sum(~fits)), len(fits))
+    return noise, outliers, [distance[fits], error[fits], np.zeros(0), np.zeros(0)]
+
+
+def _by_parts(value: float, errors: Array, unit: float = 1.0) -> Interval:
+    """A robust deviation, in a unit, with the interval that parts of the errors (K,) show."""
+    parts = [MAD * np.median(np.abs(part)) / unit for part in np.array_split(errors, N_PARTS)]
+    spread = mean_interval(parts)
+    return Interval(value, spread.low, spread.high)

@@ -15,7 +15,6 @@ from experiments.calibration.end_poses import Manoeuvre, from_end_poses
 from experiments.calibration.result import CalibrationResult
 from sim.arrays import Array
 from sim.errors import InputError, require
-from sim.files import write_whole
 from sim.formats.text import LARGEST
 from sim.robot.drive import DifferentialDrive
 from sim.routes.route import OpenLoop
@@ -110,23 +109,16 @@ def unwrapped(headings: Sequence[Array], turns: Sequence[float]) -> list[Array]:
         h / turn for h, turn in zip(headings, turns, strict=True) if 1e-6 < abs(turn) < math.pi
     ]
     ratio = float(np.median(np.concatenate(short))) if short else 1.0
-    found = []
-    for heading, turn in zip(headings, turns, strict=True):
-        missing = 2.0 * math.pi * np.round((ratio * turn - heading) / (2.0 * math.pi))
-        found.append(heading + np.where(np.abs(heading) <= math.pi, missing, 0.0))
-    return found
-
-
-def write_sheet(
-    path: Path, commands: dict[str, tuple[float, float, float]], ends: dict[str, Array]
-) -> None:
-    """Write a sheet that `read_sheet` reads, to 0.1 mm and 0.1 mrad."""
-    with write_whole(path) as part, part.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(COLUMNS)
-        for case, poses in ends.items():
-            for pose in poses:
-                writer.writerow([case, *commands[case], *(f"{value:.4f}" for value in pose)])
+    whole_turn = 2.0 * math.pi
+    return [
+        heading
+        + np.where(
+            np.abs(heading) <= math.pi,
+            whole_turn * np.round((ratio * turn - heading) / whole_turn),
+            0.0,
+        )
+        for heading, turn in zip(headings, turns, strict=True)
+    ]
 
 
 def _rows(path: Path) -> Iterator[tuple[int, dict[str, str | None]]]:

@@ -44,8 +44,8 @@ def slip_of_blocks(
     picks = rng.integers(n, size=(N_RESAMPLES, n))
     apart = np.array([law(pick) for pick in picks])
     difference = np.quantile(apart[:, 0] - apart[:, 1], [0.025, 0.975])
-    none_at_zero = float(law(every)[:2].min()) > _NO_SLIP_M
-    together = bool(difference[0] <= 0.0 <= difference[1]) or not none_at_zero
+    at_zero = float(law(every)[:2].min()) <= _NO_SLIP_M
+    together = bool(difference[0] <= 0.0 <= difference[1]) or at_zero
     spread = np.array([law(pick, True) for pick in picks]) if together else apart
     lasts = float(np.quantile(spread[:, 3], 0.025)) > 0.0
     block_m = float(np.mean(travel_m))
@@ -56,18 +56,17 @@ def slip_of_blocks(
         return np.array([*values[:2], values[2] / share, blocks * block_m])
 
     lengths = [lasting_blocks(values[3]) for values in spread]
-    found_of = [named(v, a if lasts else 0.0) for v, a in zip(spread, lengths, strict=True)]
-    low, high = np.quantile(found_of, [0.025, 0.975], axis=0)
+    drawn = [named(v, a if lasts else 0.0) for v, a in zip(spread, lengths, strict=True)]
+    low, high = np.quantile(drawn, [0.025, 0.975], axis=0)
     if not lasts:
         high[3] = np.quantile(lengths, 0.975) * block_m
     whole = law(every, together)
     values = named(whole, lasting_blocks(whole[3]) if lasts else 0.0)
     names = ("kr", "kl", "forward_slip_m", "forward_slip_length_m")
-    found = {
+    return Slip(**dict(zip(names, map(float, values), strict=True))), {
         f"slip.{name}": Interval(float(v), float(a), float(b))
         for name, v, a, b in zip(names, values, low, high, strict=True)
     }
-    return Slip(**dict(zip(names, map(float, values), strict=True))), found
 
 
 def lasting_blocks(alike: float) -> float:

@@ -22,20 +22,18 @@ _CHOICES = {
 
 def overrides(incomplete: str) -> list[str]:
     """Hydra overrides: groups and their options, keys, and values of some keys."""
-    start = re.match(r"[+~]*", incomplete)
-    prefix = start[0] if start else ""
-    word = incomplete.removeprefix(prefix)
+    word = incomplete.lstrip("+~")
+    prefix = incomplete.removesuffix(word)
     key, equals, _ = word.partition("=")
     if equals:
-        known: Iterable[str] = options(key) if key in GROUPS else _CHOICES.get(key, ())
-        found = [f"{key}={value}" for value in known]
+        values: Iterable[str] = options(key) if key in GROUPS else _CHOICES.get(key, ())
+        words = [f"{key}={value}" for value in values]
     else:
         group = word.partition(".")[0]
         files = (paths.CONF / group).glob("*.yaml") if "." in word and group in GROUPS else ()
-        inside = {name for path in files for name in _keys(path)}
-        found = [f"{name}=" for name in (*GROUPS, *_keys(paths.CONF / "config.yaml"))]
-        found += [f"{group}.{name}=" for name in inside]
-    return sorted({prefix + text for text in found if text.startswith(word)})
+        words = [f"{name}=" for name in (*GROUPS, *_keys(paths.CONF / "config.yaml"))]
+        words += [f"{group}.{name}=" for path in files for name in _keys(path)]
+    return sorted({prefix + text for text in words if text.startswith(word)})
 
 
 def options(group: str, config_dir: Path | None = None) -> list[str]:
@@ -46,11 +44,7 @@ def options(group: str, config_dir: Path | None = None) -> list[str]:
 
 def _offering(names: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
     """Completion by names of which a word is the beginning."""
-
-    def offered(incomplete: str) -> list[str]:
-        return [name for name in names() if name.startswith(incomplete)]
-
-    return offered
+    return lambda incomplete: [name for name in names() if name.startswith(incomplete)]
 
 
 def _in_results() -> list[str]:
@@ -68,17 +62,17 @@ metrics = _offering(lambda: columns.COLUMNS)
 
 def settings(incomplete: str) -> list[str]:
     """Columns that state a setting: choices and keys."""
-    found = {f"choice.{group}" for group in GROUPS if group != "study"}
-    found |= {text.removesuffix("=") for text in overrides(incomplete)} - set(GROUPS)
-    return sorted(name for name in found if name.startswith(incomplete))
+    names = {f"choice.{group}" for group in GROUPS if group != "study"}
+    names |= {text.removesuffix("=") for text in overrides(incomplete)} - set(GROUPS)
+    return sorted(name for name in names if name.startswith(incomplete))
 
 
 def _keys(path: Path) -> list[str]:
     """Dotted keys of a YAML file of mappings that are indented by two."""
     places: list[str] = []
-    found = []
+    keys = []
     for indent, name in _KEY.findall(path.read_text(encoding="utf-8")):
         places[len(indent) // 2 :] = [name]
-        found.append(".".join(places))
-    passed = ("defaults", "hydra", "sweeps", "tune")
-    return [name for name in found if name.partition(".")[0] not in passed]
+        if places[0] not in ("defaults", "hydra", "sweeps", "tune"):
+            keys.append(".".join(places))
+    return keys

@@ -11,7 +11,7 @@ import typer
 from experiments.cli.flags import ConfigDir, Log, WhichRobot, gathered
 from experiments.runs import paths
 from experiments.runs.console import show
-from sim.errors import InputError, require
+from sim.errors import require
 
 
 def info(
@@ -163,23 +163,32 @@ def calibrate(
     from experiments.calibration.files import calibrate_log_file as calibrate_log
 
     if real.out is not None:
-        others = {"--sheet": by.sheet, "--method": by.method, "--config-dir": config_dir}
-        given = {**others, "--joint": joint or None, "--json": as_json or None}
-        for option in (name for name, value in given.items() if value is not None):
-            raise InputError(f"{option} does not go with a real log; leave it or -o out")
+        flags: dict[str, object] = {
+            "--sheet": by.sheet,
+            "--method": by.method,
+            "--config-dir": config_dir,
+        }
+        flags |= {"--joint": joint or None, "--json": as_json or None}
+        wrong = next((name for name, value in flags.items() if value is not None), None)
+        require(wrong is None, f"{wrong} does not go with a real log; leave it or -o out")
         show(calibrate_log([Path(path) for path in what or []], real.out, real.robot, real.until_s))
         return
-    alone = real.robot is None and real.until_s is None
-    require(alone, "--robot and --until go with a real log; give -o too")
-    known = by.method in (None, *METHODS)
-    require(known, f"--method must be {' or '.join(METHODS)}, got {by.method!r}")
+    require(
+        real.robot is None and real.until_s is None,
+        "--robot and --until go with a real log; give -o too",
+    )
+    require(
+        by.method in (None, *METHODS),
+        f"--method must be {' or '.join(METHODS)}, got {by.method!r}",
+    )
     if by.sheet is not None:
-        ends = by.method != "wheel-truth"
-        require(ends, "--sheet holds end poses only; leave out --method wheel-truth")
+        require(
+            by.method != "wheel-truth",
+            "--sheet holds end poses only; leave out --method wheel-truth",
+        )
         result = calibrate_sheet_file(by.sheet, what or [], config_dir, joint)
     else:
-        robot = config_dir is None
-        require(robot, "--config-dir is for the robot of a --sheet; leave it out")
+        require(config_dir is None, "--config-dir is for the robot of a --sheet; leave it out")
         result = calibrate_files(what or [], by.method or METHODS[0], joint)
     print(result.as_json() if as_json else result.as_text())
 

@@ -11,7 +11,7 @@ from experiments.cli import completion
 from experiments.cli.flags import ConfigDir
 from experiments.runs import columns, paths
 from experiments.runs.console import show
-from sim.errors import InputError, require
+from sim.errors import require
 
 
 def options(
@@ -37,46 +37,59 @@ def options(
 
       estima options ekf_slam
 
+      estima options laser (a sensor; or that of a preset: lms291.laser)
+
       estima options metrics
     """
     if group == "metrics":
         require(name is None, f"{name}: metrics have no options of their own")
         show(columns.as_text())
         return
-    groups = completion.GROUPS
     require(
         config_dir is None or config_dir.is_dir(),
         f"--config-dir must name a folder, got {config_dir}",
     )
-    if group is not None and name is None and group not in groups:
-        group, name = _group_of(group), group
+    if group is not None and name is None and group not in completion.GROUPS:
+        group, name = _group_of(group, config_dir), group
     if group is not None and name is not None:
-        _describe(group, name)
+        _describe(group, name, config_dir)
         return
-    for one in groups if group is None else (group,):
+    for one in completion.GROUPS if group is None else (group,):
         print(f"{one:>10}: {', '.join(completion.options(one, config_dir))}")
 
 
-def _describe(group: str, name: str) -> None:
+def _describe(group: str, name: str, config_dir: Path | None) -> None:
     """Print an option's keys; a study states its own."""
+    from experiments.runs.compose import searched
     from experiments.runs.schema import describe_option
 
-    names = completion.options(group)
-    require(name in names, f"no {group} named {name}; there are: {', '.join(names)}")
+    names = completion.options(group, config_dir)
+    known = f"no {group} named {name}; there are: {', '.join(names)}"
+    require(name in names or group in _groups_of(name, config_dir), known)
     if group == "study":
-        show((paths.CONF / group / f"{name}.yaml").read_text(encoding="utf-8").rstrip())
+        files = (folder / group / f"{name}.yaml" for folder in (config_dir, paths.CONF) if folder)
+        path = next(file for file in files if file.exists())
+        show(path.read_text(encoding="utf-8").rstrip())
     else:
-        show(describe_option(group, name))
+        show(describe_option(group, name, searched(config_dir)))
 
 
-def _group_of(name: str) -> str:
-    """Group of an option that is called by its name alone."""
-    found = [group for group in completion.GROUPS if name in completion.options(group)]
-    known = ", ".join(completion.GROUPS)
-    require(found, f"no group or option {name}; the groups are: {known}, metrics")
-    several = " or ".join(f"`estima options {group} {name}`" for group in found)
-    require(len(found) == 1, f"{name} is an option of several groups: {several}")
-    return found[0]
+def _groups_of(name: str, config_dir: Path | None) -> list[str]:
+    """Groups of an option that is called by its name alone, or of a sensor."""
+    from experiments.runs.schema import sensor_class
+
+    groups = [g for g in completion.GROUPS if name in completion.options(g, config_dir)]
+    preset = name.rpartition(".")[0] in completion.options("sensors", config_dir)
+    return groups or ["sensors"] * (preset or sensor_class(name) is not None)
+
+
+def _group_of(name: str, config_dir: Path | None) -> str:
+    """The one group of an option or a sensor that is called by its name alone."""
+    groups, known = _groups_of(name, config_dir), ", ".join(completion.GROUPS)
+    require(groups, f"no group or option {name}; the groups are: {known}, metrics")
+    several = " or ".join(f"`estima options {group} {name}`" for group in groups)
+    require(len(groups) == 1, f"{name} is an option of several groups: {several}")
+    return groups[0]
 
 
 def view(
@@ -145,9 +158,8 @@ def view(
             else play.draw_map(grid, out or Path("map.png"))
         )
         return
-    if not what or "=" in what[0]:
-        raise InputError("name a recording to view, such as run.npz, or say --world")
-    first, *overrides = what
+    first, *overrides = what or [""]
+    require(first and "=" not in first, "name a recording to view, such as run.npz, or say --world")
     how = play.Showing(out, seconds, grid)
     if not Path(first).exists() and (row := row_of(first)) is not None:
         own = "a run of a sweep has its estimator and its settings; leave out others"

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from experiments.cli import gate, logs, look, project, run, score, tables
+from experiments.cli import logs, look, project, run, score, tables
 from experiments.cli.flags import PASS_ON
 from experiments.runs.console import end
 from experiments.runs.version import code_version
@@ -57,27 +58,31 @@ def options_of_all(
         os.environ["ESTIMA_RESULTS"] = str(results.absolute())
 
 
-app.command(context_settings=PASS_ON)(run.run)
-app.command()(run.record)
-app.command()(logs.info)
-app.command()(logs.convert)
-app.command()(look.options)
-app.command()(look.view)
-app.command("map")(look.build_map)
-app.command()(score.score)
-app.command()(score.compare)
-app.command()(logs.calibrate)
-app.command()(logs.twin)
-app.command()(run.tune)
-app.command()(score.conform)
-app.command()(gate.check)
-app.command()(project.bench)
-app.command()(tables.table)
-app.command()(tables.plot)
-app.command()(project.reproduce)
-app.command()(tables.report)
-app.command()(project.cache)
-app.command("export-table")(tables.export_table)
+_COMMANDS: dict[str, Callable[..., None]] = {  # as `estima --help` lists them
+    "run": run.run,
+    "record": run.record,
+    "info": logs.info,
+    "convert": logs.convert,
+    "options": look.options,
+    "view": look.view,
+    "map": look.build_map,
+    "score": score.score,
+    "compare": score.compare,
+    "calibrate": logs.calibrate,
+    "twin": logs.twin,
+    "tune": run.tune,
+    "conform": score.conform,
+    "check": project.check,
+    "bench": project.bench,
+    "table": tables.table,
+    "plot": tables.plot,
+    "reproduce": project.reproduce,
+    "report": tables.report,
+    "cache": project.cache,
+    "export-table": tables.export_table,
+}
+for _name, _command in _COMMANDS.items():
+    app.command(_name, context_settings=PASS_ON if _name == "run" else None)(_command)
 
 
 def main() -> None:

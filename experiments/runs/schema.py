@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from enum import Enum
 from typing import Any, Literal
@@ -15,6 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from estimators.team import Communication
 from experiments.runs.paths import CONF
+from sim import sensors
 from sim.errors import InputError, require
 from sim.options import Count, NonNegative, Option, Positive, described, find, options
 from sim.robot.drive import DifferentialDrive
@@ -225,24 +226,48 @@ def _plain(value: Any) -> Any:
     return value if scalar and not _holds_nan(value) else _UNSET
 
 
-def describe_option(group: str, name: str) -> str:
+def sensor_class(name: str) -> type | None:
+    """Class of a sensor by its name, in any case; None if there is none."""
+    classes = {
+        each: kind
+        for each, kind in vars(sensors).items()
+        if hasattr(kind, "start") and each != "Sensor"
+    }
+    return next((kind for each, kind in classes.items() if each.lower() == name.lower()), None)
+
+
+def describe_option(group: str, name: str, searched: Sequence[str] = ()) -> str:
     """Say what an option's keys are: default, what each accepts, and what it means.
 
     Parameters
     ----------
     group, name
-        Such as `estimator` and `ekf_slam`.
+        Such as `estimator` and `ekf_slam`. Of one sensor: `sensors` and `lms291.laser`, or the name
+        of its class.
+    searched
+        Overrides by which Hydra finds options in other folders.
 
     Raises
     ------
     InputError
-        If the group is unknown, or what the option names cannot be found.
+        If the group or sensor is unknown, or what the option names cannot be found.
     """
     require(group in GROUPS, f"no group {group}; there are: {', '.join(GROUPS)}")
+    kind = sensor_class(name) if group == "sensors" else None
+    if kind is not None:
+        return "\n".join([f"{kind.__module__}.{kind.__qualname__}", *_said(kind, {})])
+    option, _, only = name.partition(".")
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        cfg = compose("config", overrides=[f"{group}={name}"])
+        cfg = compose("config", overrides=[*searched, f"{group}={option}"])
+    places = []
+    if only:
+        require(
+            group == "sensors" and only in cfg.sensors,
+            f"no sensor {only} in {option}; there are: {', '.join(cfg.sensors)}",
+        )
+        places = [f"{group}.{only}"]
     parts = []
-    for place in _places(cfg, [group]):
+    for place in places or _places(cfg, [group]):
         if (settings := select(cfg, place)) is not None:
             stated: Config = OmegaConf.to_container(settings)  # type: ignore[assignment]
             title = f"{place}: {stated['_target_']}" if "_target_" in stated else place

@@ -5,9 +5,7 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib.artist import Artist
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from experiments.evaluation.metrics import CHI2_95_2DOF
@@ -28,7 +26,7 @@ from experiments.viewing.style import (
     subplots,
 )
 from experiments.viewing.team_figure import colour_of, sightings
-from experiments.viewing.world import draw_world, sees_landmarks
+from experiments.viewing.world import draw_world, drawable, points_in_base, sees_landmarks
 from sim import se2
 from sim.arrays import Array
 from sim.errors import require
@@ -82,40 +80,33 @@ def pictures(run: Playback) -> Iterator[Picture]:
     page.legend(handles, labels, loc="outside lower center", ncols=4, fontsize="small")
     ax.set_title(" ")  # reserves the room
 
-    def drawn() -> Iterator[list[Artist]]:
-        for points, words in _instants(run, around):
-            for name, line in moving.items():
-                line.set_data(*points.get(name, _NONE).T)
-            title.set_text(words)
-            yield [*moving.values(), title]
-
-    yield from _rendered(page, drawn())
-
-
-def _rendered(page: Figure, drawn: Iterator[list[Artist]]) -> Iterator[Picture]:
-    """Pictures of a page, on which these artists change."""
     canvas: Any = FigureCanvasAgg(page)
     canvas.draw()
     page.set_layout_engine("none")
     background = canvas.copy_from_bbox(page.bbox)
-    for artists in drawn:
+    for points, words in _instants(run, around):
         canvas.restore_region(background)
-        for artist in artists:
-            page.axes[0].draw_artist(artist)
+        for name, line in moving.items():
+            line.set_data(*points.get(name, _NONE).T)
+            ax.draw_artist(line)
+        title.set_text(words)
+        ax.draw_artist(title)
         image = np.asarray(canvas.buffer_rgba())[..., :3]
         yield image[: image.shape[0] // 2 * 2, : image.shape[1] // 2 * 2].copy()
 
 
 def _layers(run: Playback) -> dict[str, Layer]:
     """What moves, from the lowest layer up; of several robots each has its colour."""
-    layers: dict[str, Layer] = {}
     if len(run.robots) == 1:
         return _layers_alone(run.robots[0], literal(run.name))
+    layers: dict[str, Layer] = {}
     for n, own in enumerate(run.robots):
         colour, label = colour_of(n), f"{literal(run.name)} and 95 % ellipse" if n == 0 else ""
-        layers[f"{n} seen"] = Layer("-", colour, "", width=0.7, alpha=0.6)
-        layers[f"{n} truth"] = Layer("-", colour, f"robot {n}", width=1.6)
-        layers[f"{n} robot"] = Layer("-", colour, "")
+        layers |= {
+            f"{n} seen": Layer("-", colour, "", width=0.7, alpha=0.6),
+            f"{n} truth": Layer("-", colour, f"robot {n}", width=1.6),
+            f"{n} robot": Layer("-", colour, ""),
+        }
         if own.estimate is not None:
             layers[f"{n} estimate"] = Layer("--", BLACK, label, width=1.0)
             layers[f"{n} ellipse"] = Layer("-", BLACK, "", width=0.8)
@@ -124,28 +115,28 @@ def _layers(run: Playback) -> dict[str, Layer]:
 
 def _layers_alone(own: Shown, name: str) -> dict[str, Layer]:
     """What moves of a robot alone: its sensors' readings, particles and landmarks too."""
-    layers: dict[str, Layer] = {}
     extras = {} if own.estimate is None else own.estimate.extras
     particles, mapped = (
         any(value is not None and len(value) for value in extras.get(extra, []))
         for extra in ("particles", "landmarks")
     )
-    if particles:
-        layers["0 particles"] = Layer(".", SKY, "particles", size=3, alpha=0.6)
+    readings = {}
     colours = itertools.cycle((RED, ORANGE, PURPLE, BLUE, YELLOW))
-    for sensor, colour in zip(_drawable(own.recording), colours, strict=False):
+    for sensor, colour in zip(drawable(own.recording), colours, strict=False):
         few = own.recording.logs[sensor].splits is not None
-        layers[f"0 {sensor}"] = Layer("x" if few else ".", colour, sensor, size=5 if few else 2)
-    if mapped:
-        layers["0 landmarks"] = Layer("-", GREEN, "landmarks, 95 %", width=0.8)
-    if own.recording.truth is not None:
-        layers["0 truth"] = Layer("-", TRUTH, "truth", width=1.6)
-        layers["0 robot"] = Layer("-", TRUTH, "")
-    if own.estimate is not None:
-        layers["0 estimate"] = Layer("--", ESTIMATE, name, width=1.3)
-        layers["0 believed robot"] = Layer("-", ESTIMATE, "")
-        layers["0 ellipse"] = Layer("-", ESTIMATE, "its 95 % ellipse", width=0.9)
-    return layers
+        readings[sensor] = Layer("x" if few else ".", colour, sensor, size=5 if few else 2)
+    true, estimated = own.recording.truth is not None, own.estimate is not None
+    layers = {
+        "particles": particles and Layer(".", SKY, "particles", size=3, alpha=0.6),
+        **readings,
+        "landmarks": mapped and Layer("-", GREEN, "landmarks, 95 %", width=0.8),
+        "truth": true and Layer("-", TRUTH, "truth", width=1.6),
+        "robot": true and Layer("-", TRUTH, ""),
+        "estimate": estimated and Layer("--", ESTIMATE, name, width=1.3),
+        "believed robot": estimated and Layer("-", ESTIMATE, ""),
+        "ellipse": estimated and Layer("-", ESTIMATE, "its 95 % ellipse", width=0.9),
+    }
+    return {f"0 {name}": layer for name, layer in layers.items() if layer}
 
 
 def _instants(run: Playback, around: Bounds) -> Iterator[tuple[Points, str]]:
@@ -166,7 +157,7 @@ def _instants(run: Playback, around: Bounds) -> Iterator[tuple[Points, str]]:
                 found["robot"] = robot_outline(own.truth_at(np.array([at]))[0], glyph_m)
             found |= _believed(own, at, glyph_m)
             if len(run.robots) == 1:
-                found |= {name: seen_points(own, name, at) for name in _drawable(own.recording)}
+                found |= {name: seen_points(own, name, at) for name in drawable(own.recording)}
             now = (when <= stamp + 1e-9) & (when > stamp - _SEEN_S)
             gaps = np.full((int(now.sum()), 1, 2), np.nan)
             found["seen"] = np.concatenate([lines[now], gaps], axis=1).reshape(-1, 2)
@@ -205,26 +196,20 @@ def _believed(own: Shown, stamp: float, glyph_m: float) -> Points:
     return points
 
 
-def _drawable(recording: Recording) -> list[str]:
-    """Sensors whose readings can be drawn: dots of scans, crosses of landmarks."""
-    return [n for n in recording.logs if hasattr(recording.sensors[n], "points_in_base")]
-
-
 def seen_points(own: Shown, name: str, stamp: float) -> Array:
     """Points (N, 2) in map of a sensor's last reading up to a time."""
-    log, sensor = own.recording.logs[name], own.recording.sensors[name]
-    row = last_row(log.stamps, stamp)
-    pose = own.pose_at(float(log.stamps[row])) if row >= 0 else np.full(3, np.nan)
+    stamps = own.recording.logs[name].stamps
+    row = last_row(stamps, stamp)
+    pose = own.pose_at(float(stamps[row])) if row >= 0 else np.full(3, np.nan)
     if not np.isfinite(pose).all():
         return _NONE
-    drawn: Any = getattr(sensor, "points_in_base")(log.reading(row))  # noqa: B009
-    return se2.transform(pose, drawn[:, :2])
+    return se2.transform(pose, points_in_base(own.recording, name, row))
 
 
 def seen(own: Shown, stamp: float) -> Array:
     """Points (N, 2) in map of all sensors' last readings up to a time."""
-    names = _drawable(own.recording)
-    return np.concatenate([_NONE, *(seen_points(own, name, stamp) for name in names)])
+    shown = (seen_points(own, name, stamp) for name in drawable(own.recording))
+    return np.concatenate([_NONE, *shown])
 
 
 def _true_path(recording: Recording) -> Array:
@@ -256,12 +241,13 @@ def bounds(run: Playback) -> Bounds:
 
     A diverging estimate is followed to twice the size of all else.
     """
-    sides = np.array([_bounds(own, run) for own in run.robots])
-    (x1, y1), (x2, y2) = sides[:, :2].min(axis=0).tolist(), sides[:, 2:].max(axis=0).tolist()
+    low, high = np.transpose([_bounds(own, run) for own in run.robots], (1, 0, 2))
+    (x1, y1), (x2, y2) = low.min(axis=0).tolist(), high.max(axis=0).tolist()
     return x1, y1, x2, y2
 
 
-def _bounds(own: Shown, run: Playback) -> list[float]:
+def _bounds(own: Shown, run: Playback) -> tuple[Array, Array]:
+    """Lower left and upper right corner, (2,) m."""
     world = own.recording.world
     known = np.concatenate(
         [
@@ -280,4 +266,4 @@ def _bounds(own: Shown, run: Playback) -> list[float]:
     require(len(corners), "this log has no truth to show; give an estimate of its path")
     low, high = corners.min(axis=0), corners.max(axis=0)
     margin = 0.05 * max((high - low).max(), 1.0) + own.recording.robot.track_m
-    return [*(low - margin), *(high + margin)]
+    return low - margin, high + margin

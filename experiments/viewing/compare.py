@@ -25,9 +25,8 @@ _STYLES = ("-", "--", ":", "-.")
 
 def reference_of(first: Estimate) -> Recording:
     """Recording whose truth is a trajectory, so that others can be compared with it."""
-    stamps = first.stamps
+    stamps, truth = first.stamps, Truth(first.stamps, first.means)
     wheels = WheelLog(stamps, np.zeros((len(stamps), 2)))
-    truth = Truth(stamps, first.means)
     return Recording(stamps.copy(), wheels, RobotGeometry(0.1, 0.3), truth=truth)
 
 
@@ -60,11 +59,16 @@ def compare_table(found: Mapping[str, Scored]) -> pd.DataFrame:
     rows = []
     for name, scored in found.items():
         errors = error_table(scored)
-        row: dict[str, object] = {"trajectory": name}
-        row |= {error: values["rmse"] for error, values in errors.items()}
-        row["greatest position error, m"] = errors["position error, m"]["max"]
-        row |= {"scored": len(scored.truth), "left out": scored.n_left_out}
-        rows.append({**row, "longest gap, s": scored.longest_gap_s})
+        rows.append(
+            {
+                "trajectory": name,
+                **{error: values["rmse"] for error, values in errors.items()},
+                "greatest position error, m": errors["position error, m"]["max"],
+                "scored": len(scored.truth),
+                "left out": scored.n_left_out,
+                "longest gap, s": scored.longest_gap_s,
+            }
+        )
     return pd.DataFrame(rows)
 
 
@@ -91,11 +95,8 @@ def compare_figure(recording: Recording, found: Mapping[str, Scored], reference:
         off = np.degrees(np.abs(heading_errors_rad(truth, estimate.means)))
         below.plot(estimate.stamps, off, **style)
     plan_axes(ax)
-    above.set_ylabel("position error, m")
-    below.set_ylabel("heading error, deg")
-    below.set_xlabel("time, s")
-    for axes in (above, below):
-        axes.set_ylim(bottom=0.0)
+    above.set(ylabel="position error, m", ylim=(0.0, None))
+    below.set(ylabel="heading error, deg", xlabel="time, s", ylim=(0.0, None))
     above.set_title(f"difference from {reference}", fontsize="medium")
     ncols = 3 if max(map(len, found)) < 16 else 1
     ax.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=ncols, fontsize="small")

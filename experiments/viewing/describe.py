@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from experiments.evaluation.metrics import travelled_m
 from sim.arrays import Array
 from sim.errors import printable
 from sim.recording import Log, Recording
@@ -9,30 +10,28 @@ from sim.recording import Log, Recording
 
 def describe(recording: Recording) -> str:
     """Describe what a recording holds, in lines of text."""
+    truth, config = recording.truth, recording.config
     lines = [
         f"status      {recording.status}",
         f"frames      {len(recording.frame_stamps)} over {recording.duration_s:.2f} s",
         f"robot       wheel radius {recording.robot.wheel_radius_m} m, "
         f"track {recording.robot.track_m} m",
+        _line("wheels", recording.wheels.stamps),
     ]
-    lines.append(_line("wheels", recording.wheels.stamps))
     for name, log in recording.logs.items():
-        lines.append(_line(name, log.stamps))
-        lines += [f"            {_field(log, field)}" for field in log.values]
+        fields = (f"            {_field(log, field)}" for field in log.values)
+        lines += [_line(name, log.stamps), *fields]
     if recording.commands is not None:
         lines.append(_line("commands", recording.commands.stamps))
-    if recording.truth is None:
-        lines.append("truth       none")
-    else:
-        steps = np.diff(recording.truth.poses[:, :2], axis=0)
-        where = f" in world {recording.world.name}" if recording.world else ""
-        lines.append(f"truth       {np.hypot(*steps.T).sum():.2f} m travelled{where}")
-    if "source" in recording.config:
-        lines.append(f"source      {recording.config['source']}")
-        notes = recording.config.get("notes", {})
-        lines += [f"            {key.replace('_', ' ')}: {note}" for key, note in notes.items()]
-    if "seed" in recording.config:
-        lines.append(f"seed        {recording.config['seed']}")
+    where = f" in world {recording.world.name}" if recording.world else ""
+    driven = "none" if truth is None else f"{travelled_m(truth.poses)[-1]:.2f} m travelled{where}"
+    lines.append(f"truth       {driven}")
+    if "source" in config:
+        notes = config.get("notes", {}).items()
+        lines.append(f"source      {config['source']}")
+        lines += [f"            {key.replace('_', ' ')}: {note}" for key, note in notes]
+    if "seed" in config:
+        lines.append(f"seed        {config['seed']}")
     lines.append(f"checksum    {recording.checksum}")
     return "\n".join(printable(" ".join(line.splitlines())) for line in lines)
 

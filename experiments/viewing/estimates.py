@@ -16,7 +16,7 @@ from experiments.trajectories.odometry import read_odometry_csv
 from experiments.trajectories.read import SUFFIXES as TRAJECTORIES
 from experiments.trajectories.read import read_trajectory
 from experiments.viewing.playback import Playback
-from sim.errors import InputError, require
+from sim.errors import require
 from sim.recording import Frame, Recording
 from sim.team import Team
 
@@ -38,8 +38,7 @@ def with_estimates(
         Hydra overrides for that estimator.
     """
     team, path = Team(tuple(own.recording for own in shown.robots)), Path(source)
-    if is_file_of_estimate(path):
-        check_no_overrides(overrides)
+    if _is_file(path, overrides):
         return shown.believing(_read_all(team, path), "estimate")
     experiment = experiment_over(team.robots[0], source, overrides)
     if len(team) == 1:
@@ -80,9 +79,7 @@ def estimate_along(
     recording: Recording, source: str, overrides: Sequence[str], on_step: OnStep
 ) -> Estimate:
     """Read a trajectory, or the best one of an estimator: its revised path if it has one."""
-    path = Path(source)
-    if is_file_of_estimate(path):
-        check_no_overrides(overrides)
+    if _is_file(path := Path(source), overrides):
         return read_estimate(recording, path)
     experiment = experiment_over(recording, source, overrides)
     rng = stream(experiment.seed, f"estimator/{source}", 0)
@@ -93,14 +90,15 @@ def estimate_along(
 
 def check_no_overrides(overrides: Sequence[str]) -> None:
     """Refuse overrides where no estimator runs."""
-    for override in overrides:
-        raise InputError(f"{override}: overrides are for estimators that run now")
+    require(not overrides, f"{[*overrides, ''][0]}: overrides are for estimators that run now")
 
 
-def is_file_of_estimate(path: Path) -> bool:
-    """Whether a word is a trajectory's file or a run's folder, not an estimator's name."""
+def _is_file(path: Path, overrides: Sequence[str]) -> bool:
+    """Whether a word is a trajectory's file or a run's folder, which takes no overrides."""
     of_run = path.is_dir() and (len(path.parts) > 1 or any(path.glob("estimate*.csv")))
-    return path.suffix in TRAJECTORIES or of_run
+    is_file = path.suffix in TRAJECTORIES or of_run
+    check_no_overrides(overrides if is_file else ())
+    return is_file
 
 
 def _read_all(team: Team, path: Path) -> list[Estimate]:

@@ -87,26 +87,25 @@ def _play(engine: Any, run: Playback, seconds: float | None) -> None:
     if recording.world is not None and len(recording.world.walls):
         _build_walls(engine, recording.world)
     truth = own.truth_at(stamps)
-    _aim(engine, run)
+    x1, y1, x2, y2 = bounds(run)  # the world and the whole path, from above
+    distance_m = 1.2 * math.hypot(x2 - x1, y2 - y1) + 2.0
+    engine.resetDebugVisualizerCamera(distance_m, 0, -65, [(x1 + x2) / 2.0, (y1 + y2) / 2.0, 0.0])
     radius = max(recording.robot.track_m / 2.0, 0.1)
-    bodies = {}
+    bodies, colours = {}, {"truth": _BLACK, "estimate": _BLUE}
     if recording.truth is not None:
         bodies["truth"] = _body(engine, radius, _BLACK, 1.0)
     if own.estimate is not None:
         bodies["estimate"] = _body(engine, 1.1 * radius, _BLUE, 0.5)
-    colours = {"truth": _BLACK, "estimate": _BLUE}
     trails: dict[str, Array] = {}
     replaced: dict[str, int] = {}  # the scan drawn last, once there is one
     speed = 1.0 if seconds is None else max(stamps[-1] - stamps[0], 1e-9) / seconds
     begun = time.monotonic()
     for i, stamp in enumerate(stamps):
         time.sleep(max(0.0, (stamp - stamps[0]) / speed - (time.monotonic() - begun)))
-        belief = own.belief_row(float(stamp))
-        poses = {"truth": truth[i]}
-        if own.estimate is not None and belief >= 0:
-            poses["estimate"] = own.estimate.means[belief]
+        known = own.belief_row(float(stamp)) >= 0
+        poses = {"truth": truth[i], "estimate": own.pose_at(stamp) if known else _UNKNOWN}
         for name, body in bodies.items():
-            pose = poses.get(name, _UNKNOWN)
+            pose = poses[name]
             if not np.isfinite(pose).all():
                 continue
             turned = engine.getQuaternionFromEuler([0, 0, float(pose[2])])
@@ -121,13 +120,6 @@ def _play(engine: Any, run: Playback, seconds: float | None) -> None:
             scan = engine.addUserDebugPoints(raised, [_RED] * len(points), 3, **replaced)
             replaced = {"replaceItemUniqueId": scan}
         engine.stepSimulation()  # lets the window respond
-
-
-def _aim(engine: Any, run: Playback) -> None:
-    """Look at the world and the whole path from above."""
-    x1, y1, x2, y2 = bounds(run)
-    distance_m = 1.2 * math.hypot(x2 - x1, y2 - y1) + 2.0
-    engine.resetDebugVisualizerCamera(distance_m, 0, -65, [(x1 + x2) / 2.0, (y1 + y2) / 2.0, 0.0])
 
 
 def _build_walls(engine: Any, world: World) -> None:

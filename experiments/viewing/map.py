@@ -12,7 +12,7 @@ from experiments.evaluation.time_sync import interpolate
 from experiments.runs.console import progress
 from experiments.viewing.estimates import check_no_overrides, estimate_along
 from experiments.viewing.grid import described
-from sim.arrays import Array, Floats
+from sim.arrays import Array
 from sim.errors import require, required
 from sim.formats.detect import read_any
 from sim.recording import Recording
@@ -22,12 +22,6 @@ from sim.worlds.grid_file import check_name, write_grid
 from sim.worlds.grid_mapping import map_scans
 
 _LONGEST_GAP_S = 3.0  # between poses; scans in longer ones are left out
-
-
-def laser_scans(recording: Recording, name: str = "laser") -> tuple[Array, Floats, Laser]:
-    """Stamps (N,) s and ranges (N, beams) m of the scans, and their laser; InputError if none."""
-    log = recording.log(name)
-    return log.stamps, log["ranges_m"], recording.sensor(name, Laser)
 
 
 def path_of(
@@ -88,7 +82,7 @@ def map_file(log: str, source: str, overrides: Sequence[str], out: Path, how: Gr
     check_name(out)
     require("=" not in log, f"{log}: name a recording first, such as run.npz")
     recording = read_any([Path(log)])
-    n_all = len(laser_scans(recording, how.laser)[0])
+    n_all = len(recording.log(how.laser).stamps)
     with progress(source, len(recording.frame_stamps)) as on_step:
         path = path_of(recording, source, overrides, on_step)
     with progress("mapping", n_all, "scans") as on_progress:
@@ -119,14 +113,14 @@ def grid_along(
     Poses (T, 3) are interpolated at the scans' stamps; scans before the first, after the last or
     in gaps of more than 3 s are left out.
     """
-    scan_stamps, ranges_m, sensor = laser_scans(recording, laser)
+    log, sensor = recording.log(laser), recording.sensor(laser, Laser)
     require(len(stamps) >= 2, "a map needs a path of two poses or more")
-    at_scans = interpolate(stamps, poses, scan_stamps, _LONGEST_GAP_S)
+    at_scans = interpolate(stamps, poses, log.stamps, _LONGEST_GAP_S)
     placed = np.isfinite(at_scans).all(axis=1)
     require(placed.any(), "no scan lies within the time span of the path")
     grid = map_scans(
         at_scans[placed],
-        ranges_m[placed],
+        log["ranges_m"][placed],
         sensor,
         resolution_m=resolution_m,
         max_range_m=max_range_m,

@@ -51,7 +51,10 @@ def panels(page: Figure, scale: float = 1.0) -> str:
     hosts: dict[Axes, list[Axes]] = {}
     for ax in page.axes:
         hosts.setdefault(_host(ax, list(hosts)), []).append(ax)
-    parts = {host: Bbox.union([_inked(ax) for ax in own]) for host, own in hosts.items()}
+    parts = {
+        host: Bbox.union([ax.get_tightbbox() or ax.bbox for ax in own])
+        for host, own in hosts.items()
+    }
     for host in list(parts):
         below = [ax for ax in _labelled(host, "x") if ax in parts]
         if below and host not in below:
@@ -85,26 +88,19 @@ def _host(ax: Axes, others: list[Axes]) -> Axes:
     """The axes that a colour bar or a second axis belongs to; else those themselves."""
     bar = getattr(ax, "_colorbar", None)
     if bar is not None and bar.mappable.axes in others:
-        host: Axes = bar.mappable.axes
-        return host
+        return bar.mappable.axes  # type: ignore[no-any-return]
     return next((other for other in others if other.bbox.bounds == ax.bbox.bounds), ax)
 
 
 def _labelled(ax: Axes, name: str) -> list[Axes]:
     """Axes in the same column or row that share the x or y axis and have its labels."""
-    across = name == "x"
-    shared = (ax.get_shared_x_axes() if across else ax.get_shared_y_axes()).get_siblings(ax)
-    start, key = ("x0", "labelbottom") if across else ("y0", "labelleft")
+    start, key = ("x0", "labelbottom") if name == "x" else ("y0", "labelleft")
     return [
         other
-        for other in shared
+        for other in getattr(ax, f"get_shared_{name}_axes")().get_siblings(ax)
         if abs(getattr(other.bbox, start) - getattr(ax.bbox, start)) < 1.0
-        and (other.xaxis if across else other.yaxis).get_tick_params()[key]
+        and getattr(other, f"{name}axis").get_tick_params()[key]
     ]
-
-
-def _inked(ax: Axes) -> Bbox:
-    return ax.get_tightbbox() or ax.bbox
 
 
 def _pixels(box: Bbox, height: float, scale: float) -> str:

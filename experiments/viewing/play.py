@@ -102,13 +102,12 @@ def play(
     if how.out is None:
         live.watch(shown, how.seconds)
         return ""
-    length_s = how.length_s(team.duration_s)
-    shown = replace(shown, grid=grid, seconds=length_s)
+    shown = replace(shown, grid=grid, seconds=how.length_s(team.duration_s))
     title = called if name is None else f"{Path(name).name}: {called}"
     with progress(f"drawing {how.out.name}", 1.0) as on_progress:
         movie.save(shown, how.out, on_progress, title)
-    said = f"{len(shown.stamps)} pictures, {length_s:.1f} s, {shown.speed}"
-    return f"{paths.short(how.out)}: {said}"
+    size = f"{len(shown.stamps)} pictures, {shown.seconds:.1f} s"
+    return f"{paths.short(how.out)}: {size}, {shown.speed}"
 
 
 def play_file(log: Path, source: str | None, overrides: Sequence[str], how: Showing) -> str:
@@ -119,11 +118,13 @@ def play_file(log: Path, source: str | None, overrides: Sequence[str], how: Show
     source, overrides
         As for `viewing.estimates.with_estimates`.
     """
-
-    def estimated(shown: Playback, on_step: OnStep) -> Playback:
-        return with_estimates(shown, str(source), overrides, on_step)
-
-    return play(read_all([log]), how, log.name, source, estimated)
+    return play(
+        read_all([log]),
+        how,
+        log.name,
+        source,
+        lambda shown, on_step: with_estimates(shown, str(source), overrides, on_step),
+    )
 
 
 def draw_world(overrides: Sequence[str], out: Path) -> Path:

@@ -90,8 +90,8 @@ class Playback:
     def believing(self, estimates: Sequence[Estimate], name: str) -> "Playback":
         """Show an estimate of each robot too."""
         robots = zip(self.robots, estimates, strict=True)
-        shown = tuple(replace(own, estimate=estimate) for own, estimate in robots)
-        return replace(self, robots=shown, name=name)
+        shown = (replace(own, estimate=estimate) for own, estimate in robots)
+        return replace(self, robots=tuple(shown), name=name)
 
     def clock(self, stamp: float) -> str:
         """Time since the start, and the whole time."""

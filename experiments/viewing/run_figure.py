@@ -9,13 +9,12 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from estimators.base import Estimate
-from experiments.evaluation.metrics import position_errors_m
+from experiments.evaluation.metrics import position_errors_m, travelled_m
 from experiments.runs.experiment import Experiment
 from experiments.trajectories.convert import write_estimate
 from experiments.viewing.plotting import draw_ellipses, literal, plan_axes
 from experiments.viewing.style import (
     ESTIMATE,
-    GREEN,
     ORANGE,
     TRUTH,
     figure,
@@ -28,7 +27,7 @@ from experiments.viewing.team_figure import (
     path_width,
     sightings,
 )
-from experiments.viewing.world import draw_world, sees_landmarks
+from experiments.viewing.world import draw_world, drawable, points_in_base, sees_landmarks
 from sim import se2
 from sim.arrays import Array
 from sim.recording import Recording
@@ -80,11 +79,15 @@ def _figure_alone(recording: Recording, estimate: Estimate, name: str) -> Figure
     means = estimate.means
     shown = truth[:, :2] if recording.truth is not None else means[:, :2]
     low, high = shown.min(axis=0) - _AROUND_M, shown.max(axis=0) + _AROUND_M
-    for name_of, color in zip(_seen(recording), (ORANGE, GREEN), strict=False):
-        points = _points(recording, estimate, name_of)
-        map_axes.plot(*points.T, ".", color=color, ms=1.5, alpha=0.6, label=f"{name_of} as placed")
+    names = drawable(recording)
+    scans = [n for n in names if "ranges_m" in recording.logs[n].values]
+    for sensor in (scans or names)[:1]:
+        points = _points(recording, estimate, sensor)
+        map_axes.plot(*points.T, ".", color=ORANGE, ms=1.5, alpha=0.6, label=f"{sensor} as placed")
     map_axes.plot(*means[:, :2].T, color=ESTIMATE, lw=1.2, ls="--", label=literal(name))
-    some = _spread(means, _N_ELLIPSES)
+    along = travelled_m(means)
+    some = np.searchsorted(along, np.linspace(0.0, along[-1], _N_ELLIPSES + 1)[1:])
+    some = np.unique(np.minimum(some, len(means) - 1))
     draw_ellipses(
         map_axes, means[some], estimate.covariances[some], "95 % ellipse",
         ec=ESTIMATE, fc=ESTIMATE, alpha=0.35, lw=0.8, zorder=3,
@@ -96,29 +99,12 @@ def _figure_alone(recording: Recording, estimate: Estimate, name: str) -> Figure
     return page
 
 
-def _spread(means: Array, count: int) -> Array:
-    """Rows that are spread evenly along a path, without its first."""
-    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(means[:, :2], axis=0).T))])
-    rows = np.searchsorted(along, np.linspace(0.0, along[-1], count + 1)[1:])
-    return np.unique(np.minimum(rows, len(means) - 1))
-
-
-def _seen(recording: Recording) -> list[str]:
-    """The sensor to draw: a laser, else what sees landmarks; none if nothing can be drawn."""
-    drawn = [n for n in recording.logs if hasattr(recording.sensors[n], "points_in_base")]
-    flat = [n for n in drawn if "ranges_m" in recording.logs[n].values]
-    return (flat or drawn)[:1]
-
-
 def _points(recording: Recording, estimate: Estimate, name: str) -> Array:
     """Points (N, 2) in map of some readings of a sensor, placed by the estimate."""
-    log, sensor = recording.logs[name], recording.sensors[name]
-    points = [np.zeros((0, 2))]
-    for row in np.unique(np.linspace(0, len(log.stamps) - 1, _N_READINGS).astype(int)):
-        at = int(np.searchsorted(estimate.stamps, log.stamps[row]))
-        seen: Any = getattr(sensor, "points_in_base")(log.reading(row))  # noqa: B009
-        pose = estimate.means[min(at, len(estimate.means) - 1)]
-        points.append(se2.transform(pose, seen[:, :2]))
+    stamps, points = recording.logs[name].stamps, [np.zeros((0, 2))]
+    for row in np.unique(np.linspace(0, len(stamps) - 1, _N_READINGS).astype(int)):
+        at = min(int(np.searchsorted(estimate.stamps, stamps[row])), len(estimate.means) - 1)
+        points.append(se2.transform(estimate.means[at], points_in_base(recording, name, row)))
     return np.concatenate(points)[:: max(1, sum(map(len, points)) // _MOST_POINTS)]
 
 
@@ -145,18 +131,16 @@ def _team_figure(found: Sequence[tuple[Recording, Estimate]], name: str) -> Figu
     for number, (recording, estimate) in enumerate(found):
         colour: Any = {"color": colour_of(number)}
         if recording.truth is not None:
-            truth = recording.truth_at(estimate.stamps)
             lw = path_width(number, len(found))
             plan.plot(*recording.truth.poses[:, :2].T, lw=lw, **colour)
             draw_sightings(plan, sightings(robots, number)[1], number)
-            off_m = position_errors_m(truth, estimate.means)
+            off_m = position_errors_m(recording.truth_at(estimate.stamps), estimate.means)
             errors.plot(estimate.stamps, off_m, lw=1.2, label=f"robot {number}", **colour)
         plan.plot(*estimate.means[:, :2].T, "--", color=TRUTH, lw=0.8)
         plan.plot(*estimate.means[:1, :2].T, "o", ms=5, **colour)
     plan_axes(plan)
     plan.autoscale_view()
-    errors.set(xlabel="time, s", ylabel="position error, m")
-    errors.set_ylim(bottom=0.0)
+    errors.set(xlabel="time, s", ylabel="position error, m", ylim=(0.0, None))
     errors.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=5, fontsize="small")
     lines = [
         Line2D([], [], color=TRUTH, lw=1.6, label="truth, a colour a robot"),

@@ -41,6 +41,18 @@ def sees_landmarks(recording: Recording) -> bool:
     return any(log.splits is not None for log in recording.logs.values())
 
 
+def drawable(recording: Recording) -> list[str]:
+    """Sensors whose readings can be drawn: dots of scans, crosses of landmarks."""
+    return [n for n in recording.logs if hasattr(recording.sensors[n], "points_in_base")]
+
+
+def points_in_base(recording: Recording, name: str, row: int) -> Array:
+    """Points (N, 2) in base_link of one reading of a drawable sensor."""
+    sensor: Any = recording.sensors[name]
+    points: Array = sensor.points_in_base(recording.logs[name].reading(row))
+    return points[:, :2]
+
+
 def draw_world(
     ax: Axes, world: World, *, landmarks: bool = True, places: bool = False, tour: bool = False
 ) -> None:

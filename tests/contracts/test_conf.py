@@ -108,10 +108,10 @@ def test_what_a_file_does_not_state_is_the_default_of_what_it_names(tmp_path):
         "_target_: estimators.landmarks.ekf_slam.EkfSlam\nkr: ${robot.kr}\nkl: ${estimator.d0}\n"
     )
     own = [*searched(tmp_path), "estimator=bare"]
-    found = Experiment.compose([*own, "estimator.d0=3.0"]).estimator_options
-    whole = Experiment.compose(["estimator=ekf_slam"]).estimator_options
+    found = Experiment.compose([*own, "estimator.d0=3.0"]).options_of("estimator")
+    whole = Experiment.compose(["estimator=ekf_slam"]).options_of("estimator")
     assert found == {**whole, "d0": 3.0, "kl": 3.0}
-    swept = [run.estimator_options["d0"] for run in planned([*own, "estimator.d0=1.0,2.0"])]
+    swept = [run.options_of("estimator")["d0"] for run in planned([*own, "estimator.d0=1.0,2.0"])]
     assert swept == [1.0, 2.0]
     with pytest.raises(InputError, match=r"unknown key estimator\.d1; known: estimator\.d0, "):
         Experiment.compose([*own, "estimator.d1=3.0"])
@@ -121,5 +121,5 @@ def test_what_a_file_does_not_state_is_the_default_of_what_it_names(tmp_path):
 def test_an_option_of_a_folder_is_called_by_its_last_part():
     experiment = Experiment.compose(["estimator=peers/kiss_icp_tuned"])
     assert experiment.estimator_name == "kiss_icp_tuned"
-    assert experiment.estimator_options["voxel_size_m"] == 0.2
+    assert experiment.options_of("estimator")["voxel_size_m"] == 0.2
     assert option_called("estimator", "kiss_icp") == "peers/kiss_icp"

@@ -59,7 +59,7 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     """
 
     def drawn_from(run: TableRun) -> tuple[Scene, str]:
-        return Scene.of(run[1].config), json.dumps(run[1].route_options)
+        return Scene.of(run[1].config), json.dumps(run[1].options_of("route"))
 
     jobs = [
         [part[low : low + _RUNS_PER_JOB]]

@@ -17,10 +17,9 @@ from scipy import stats
 
 from estimators.base import Estimate, Prior
 from estimators.odometry import Odometry
-from experiments.calibration.calibrate import calibrate_recordings, end_pose
+from experiments.calibration.calibrate import calibrate_recordings, end_pose, from_wheel_truth
 from experiments.calibration.end_poses import Manoeuvre, from_end_poses
 from experiments.calibration.result import CalibrationResult
-from experiments.calibration.wheel_truth import from_wheel_truth
 from experiments.evaluation.metrics import ellipse_area_m2, travelled_m
 from experiments.judging.jobs import Progress, Tables, tables_of
 from experiments.judging.results import Profile, Results

@@ -5,10 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from experiments.calibration.calibrate import calibrate_recordings
+from experiments.calibration.calibrate import calibrate_recordings, from_wheel_truth
 from experiments.calibration.end_pose_model import EndPoseModel, knots
 from experiments.calibration.end_poses import Manoeuvre, from_end_poses
-from experiments.calibration.wheel_truth import from_wheel_truth
 from experiments.papers.puzzlebot2024.descent import convergence, report_gradient_descent
 from experiments.papers.puzzlebot2024.settings import NOMINAL
 from experiments.papers.puzzlebot2024.study import (

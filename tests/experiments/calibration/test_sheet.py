@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.calibration.sheet import calibrate_sheet, read_sheet, unwrapped, write_sheet
+from experiments.calibration.sheet import COLUMNS, calibrate_sheet, read_sheet, unwrapped
 from sim import se2
 from sim.errors import InputError
 from sim.robot.drive import DifferentialDrive
@@ -26,6 +26,15 @@ TRUE = DifferentialDrive(
 )
 HEAD = "case,v_mps,omega_radps,duration_s,x_m,y_m,heading_rad\n"
 COMMANDS = {name: route.segments[0] for name, route in TABLE_1.items()}
+
+
+def write_sheet(path, commands, ends):
+    rows = [
+        [case, *commands[case], *(f"{value:.4f}" for value in pose)]
+        for case, poses in ends.items()
+        for pose in poses
+    ]
+    path.write_text("\n".join(",".join(map(str, row)) for row in [COLUMNS, *rows]) + "\n")
 
 
 def rng():

@@ -85,6 +85,29 @@ def test_options_shows_the_keys_of_one_option():
     refused(called("options", "estimator", "nosuch"), "no estimator named nosuch", "ekf_slam")
 
 
+def test_options_describes_a_sensor_by_its_class_or_in_its_preset():
+    of_class = called("options", "laser").stdout
+    assert of_class == called("options", "sensors", "Laser").stdout
+    assert "rate_hz: 10.0" in of_class
+    of_preset = called("options", "lms291.laser").stdout
+    assert "rate_hz: 75.0" in of_preset
+    assert "Encoder" not in of_preset
+    refused(called("options", "lms291.stereo"), "no sensor stereo in lms291", "encoder, laser")
+
+
+def test_options_describes_an_option_of_ones_own_folder(tmp_path):
+    for group, text in (
+        ("estimator", "_target_: estimators.odometry.Odometry\nkr: 7e-5\n"),
+        ("study", "seed: 7\n"),
+    ):
+        (tmp_path / group).mkdir()
+        (tmp_path / group / f"my_{group}.yaml").write_text(text)
+    place = ("--config-dir", str(tmp_path))
+    assert "kr: 7e-05" in called("options", "my_estimator", *place).stdout
+    assert called("options", "my_study", *place).stdout == "seed: 7\n"
+    refused(called("options", "my_estimator"), "no group or option my_estimator")
+
+
 def test_a_run_prints_its_errors_and_leaves_a_row(tmp_path):
     place = {"ESTIMA_RESULTS": str(tmp_path / "mine")}
     done = estima("run", *QUICK, "seed=12", "name=test_cli", cwd=tmp_path, **place)

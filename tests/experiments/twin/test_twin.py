@@ -11,8 +11,7 @@ from estimators.odometry import Odometry
 from experiments.cli.main import app
 from experiments.evaluation.metrics import position_errors_m, rms
 from experiments.runs.experiment import Experiment
-from experiments.twin.make import make_twin
-from experiments.twin.way import way_of
+from experiments.twin.make import make_twin, way_of
 from sim import se2
 from sim.errors import InputError
 from sim.formats.tum import write_tum
