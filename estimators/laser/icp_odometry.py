@@ -6,7 +6,7 @@ covariance is composed along.
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -17,14 +17,13 @@ from estimators.laser.scan_matching import (
     FAILED,
     KeyFrameOptions,
     MatcherOptions,
+    Reference,
 )
 from estimators.options import require_laser, start_pose
 from estimators.wheels import WheelOptions, WheelPrediction
 from sim import se2
 from sim.options import options
 from sim.recording import Frame
-
-Reference = Literal["previous", "keyframe"]
 
 _HEADING_WINDOW_RAD = math.pi / 6.0  # constant velocity misses the turns: search the headings
 # Constant velocity is not trusted further than to these standard deviations

@@ -35,6 +35,7 @@ from sim.options import NonNegative, options
 from sim.sensors import Laser
 
 Covariance = Literal["censi", "censi_last", "hessian", "sampling", "unscented_censi"]
+Reference = Literal["previous", "keyframe"]
 
 FAILED = ("empty", "poor_overlap", "not_converged")
 

@@ -11,8 +11,7 @@ import numpy as np
 
 from estimators.base import Belief, Prior
 from estimators.gaussian import STILL
-from estimators.laser.icp_odometry import Reference
-from estimators.laser.scan_matching import KeyFrameOptions
+from estimators.laser.scan_matching import KeyFrameOptions, Reference
 from estimators.options import LaserOptions, require_laser, start_pose
 from estimators.peers import package
 from estimators.peers.planar import matrix_of, pose_of, scan_of
