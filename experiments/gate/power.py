@@ -374,7 +374,8 @@ def measured_text(
         f"drawn from the pool ({power['checks'].iloc[0]} each):",
         "",
         to_markdown(pd.DataFrame([_fault(row) for row in power.to_dict("records")])),
-        "![The worsening that 95 % of checks find, of each estimator and fault](regression.png)",
+        "![The worsening that 95 % of checks find, of each estimator and fault]"
+        "(figures/regression.png)",
         "",
         f"All faults together: {100 * overall.value:.1f} % found (95 %: {100 * overall.low:.1f} to "
         f"{100 * overall.high:.1f}); {(power['found'] >= 0.95).sum()} of {len(power)} faults reach "
@@ -463,7 +464,7 @@ def main() -> None:
     print(f"{hits} false alarms in {n_null} checks")
     print(power.to_string(index=False))
     write_frame(power, baseline_folder() / "power.csv")
-    save_figure(detectable(power, TARGET), SOURCE / "docs" / "regression.png")
+    save_figure(detectable(power, TARGET), SOURCE / "docs" / "figures" / "regression.png")
     page = SOURCE / "docs" / "regression.md"
     _write_measured(page, measured_text(pool, (hits, n_null), power, []))
     with progress("other conditions", 1.0) as on_progress:

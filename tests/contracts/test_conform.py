@@ -34,7 +34,7 @@ def test_dead_reckoning_conforms(case):
 
 class Base(Odometry):
     def __init__(self):
-        super().__init__(1e-5, 1e-5)
+        super().__init__(kr=1e-5, kl=1e-5)
 
 
 class NotFinite(Base):
@@ -247,7 +247,7 @@ def test_targets_by_name():
     with pytest.raises(InputError, match="PYTHONPATH"):
         conform_target("nowhere.to:Be", [])
     with pytest.raises(InputError, match="key=value"):
-        conform_target("estimators.odometry:Odometry", [])
+        conform_target("estimators.odometry:Odometry", ["kr"])
 
 
 def test_the_sensors_can_be_chosen():

@@ -21,19 +21,21 @@ from sim.npz import read_arrays
 from sim.recording import load
 from sim.yaml_file import read_yaml
 from tests.experiments.runs.test_store import row
-from tests.fixtures import attack
+from tests.fixtures.attack import attack_all
+from tests.fixtures.attacks.base import Attack
+from tests.fixtures.attacks.settings import BOMB
 
 EVIL = "a\x1b[31m\r\nb\u202e<i>"
 
 
 @pytest.mark.parametrize("kind", ["recordings", "estimates"])
 def test_the_attacks_that_are_fast(kind):
-    found = attack.attack_all(only=[kind])
+    found = attack_all(only=[kind])
     assert not found.failures, "\n".join(found.failures)
 
 
 def test_an_attack_that_comes_through_is_a_failure():
-    found = attack.Attack()
+    found = Attack()
     found("x", "wrong", lambda: 2, right=1)
     found("x", "read", lambda: 1, refuse=True)
     found("x", "trace", lambda: 1 / 0)
@@ -74,7 +76,7 @@ def test_cells_cannot_become_markup():
         ("a: 1\nb: {c: 1, c: 2}\n", r"x\.yaml:2: the key c is there twice"),
         ("a: " + "[" * 5000 + "]" * 5000, r"nested more than 50 deep"),
         ("a: &a [*a]\n", r"nested more than 50 deep"),
-        (attack.BOMB, r"aliases \(\*\) stand for more than 1000000 values"),
+        (BOMB, r"aliases \(\*\) stand for more than 1000000 values"),
         ("a: " + "9" * 5000, r"not valid YAML"),
         ("a: !!bool x", r"not valid YAML"),
     ],
