@@ -38,20 +38,17 @@ def write_recordings(
     groups = [g for g in named if Experiment.compose(suite.overrides[g]).team is None]
     total = sum(suite.counts[group] for group in groups)
     bags = importlib.util.find_spec("rosbags") is not None
-    done = 0
-    for group in groups:
-        for seed, experiment, team in _recordings(suite, group):
-            recording = team.only
-            prior = experiment.prior(recording)
-            copy = recording_of(list(recording.frames()), prior)
-            stem = folder / f"{group}_{seed}"
-            if bags:
-                write_bag(stem.with_suffix(".mcap"), copy)
-            if "laser" in copy.logs:
-                write_carmen(stem.with_suffix(".log"), copy)
-            write_text(stem.with_suffix(".start.txt"), start_text(prior))
-            done += 1
-            on_progress(done / total)
+    runs = ((group, *run) for group in groups for run in _recordings(suite, group))
+    for done, (group, seed, experiment, team) in enumerate(runs, start=1):
+        prior = experiment.prior(team.only)
+        copy = recording_of(list(team.only.frames()), prior)
+        stem = folder / f"{group}_{seed}"
+        if bags:
+            write_bag(stem.with_suffix(".mcap"), copy)
+        if "laser" in copy.logs:
+            write_carmen(stem.with_suffix(".log"), copy)
+        write_text(stem.with_suffix(".start.txt"), start_text(prior))
+        on_progress(done / total)
     return total
 
 

@@ -37,7 +37,6 @@ from experiments.gate.baseline import (
     baseline_folder,
     baseline_paths,
     read_baseline,
-    repeats_of,
 )
 from experiments.gate.compare import (
     ALPHA_GENERAL,
@@ -302,7 +301,7 @@ def power_table(pool: Pool, n_checks: int, on_progress: Callable[[float], None])
 
 def run_variant(name: str, suite: Suite) -> pd.DataFrame:
     """Run a whole suite under one of VARIANTS, in this process's environment."""
-    repeats = repeats_of(suite, of_baseline=False)
+    repeats = {entry.name: entry.repeats[1] for entry in suite.estimators}
     planted = dict.fromkeys(repeats, reordered) if VARIANTS[name][1] else None
     return run_suite(suite, repeats, reseed=10 + list(VARIANTS).index(name), planted=planted)
 

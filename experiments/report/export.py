@@ -284,7 +284,7 @@ def export(paths: Sequence[Path], form: str, out: Path | None, digits: int) -> N
         If a table cannot be read or shown, or two would become one file.
     """
     if form not in FORMATS:
-        raise InputError(f"--format must be {' or '.join(FORMATS)}, got {form!r}")
+        raise InputError(f"the format must be {' or '.join(FORMATS)}, got {form!r}")
     as_form, suffix = FORMATS[form]
     if out is None:
         for path in paths:

@@ -88,7 +88,7 @@ def sweep_figure(
         pool what differs in more than its seeds.
     """
     if row is not None and row == col:
-        raise InputError(f"--row and --col are both {row}; one panel a value needs one of them")
+        raise InputError(f"rows and columns of panels are both {row}; one panel a value needs one of them")
     facets = [name for name in (row, col) if name is not None]
     by = [name for name in ([by] if isinstance(by, str) else by or []) if name not in facets]
     if y.startswith(ANSWER):
@@ -108,8 +108,8 @@ def sweep_figure(
     lines = _labels(means, by, texts)
     if len(lines) > len(SERIES):
         raise InputError(
-            f"--by gives {len(lines)} lines; at most {len(SERIES)} differ in colour: keep some "
-            "with --where, or give panels their own with --row or --col"
+            f"{len(lines)} lines; at most {len(SERIES)} differ in colour: keep some "
+            "by a condition, or draw rows or columns of panels"
         )
     across, down = (_values(means, name) for name in (col, row))
     chosen = Size(size)
@@ -201,9 +201,8 @@ def _check_points(table: pd.DataFrame, groups: Sequence[str]) -> None:
         if points[column].nunique().max() > 1:
             there = ", ".join(map(str, sorted(table[column].dropna().unique())[:8]))
             raise InputError(
-                f"a point would pool different values of {column} ({there}); draw a line for each "
-                f"with --by {column} or a panel with --col {column}, keep one with "
-                f"--where {column}=..., or average with --pool"
+                f"a point would pool different values of {column} ({there}); draw a line or a "
+                f"panel for each {column}, keep one of them, or pool them"
             )
 
 

@@ -72,7 +72,7 @@ def write_sweep_page(
     """
     require(
         len(table) <= MOST_RUNS,
-        f"{name}: {len(table)} runs; a page holds {MOST_RUNS}: keep some with --where",
+        f"{name}: {len(table)} runs; a page holds {MOST_RUNS}: keep some by a condition",
     )
     every = with_answers(table, [column for column in COLUMNS if column.startswith(ANSWER)])
     metrics = [c for c in COLUMNS if c in measured(every) and every[c].notna().any()]

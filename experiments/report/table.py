@@ -48,10 +48,10 @@ _MOST_REMARKS = 12
 def check_name(path: Path | None, size: str | None) -> None:
     """Check that a table's file has an ending that names its format, and a LaTeX one's size."""
     if path is not None:
-        require(path.suffix in FORMATS, f"-o {path}: a table is {', '.join(FORMATS)}")
+        require(path.suffix in FORMATS, f"{path}: a table is {', '.join(FORMATS)}")
     if size is not None:
-        require(size in WIDTHS_PT, f"--size must be {', '.join(WIDTHS_PT)}, got {size}")
-        require(path is not None and path.suffix == ".tex", f"--size {size} is for -o x.tex")
+        require(size in WIDTHS_PT, f"the size must be {', '.join(WIDTHS_PT)}, got {size}")
+        require(path is not None and path.suffix == ".tex", f"size {size} is for a file such as x.tex")
 
 
 _TESTED = 6  # runs below which a paired test finds next to nothing

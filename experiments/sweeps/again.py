@@ -119,7 +119,7 @@ def run_again(
     except MissingConfigException as error:
         was = f" (the sweep's was {noted})" if noted is not None else ""
         raise InputError(
-            f"{error.missing_cfg_file} is no option here; add --config-dir with its folder{was}"
+            f"{error.missing_cfg_file} is not an option here; name its folder of options{was}"
         ) from error
     except HydraException as error:
         raise InputError(f"{', '.join(choices)}: {str(error).splitlines()[0]}") from error

@@ -66,12 +66,12 @@ def collect(name: str, *, all_versions: bool = False, times: bool = False) -> pd
         if not mine.any():
             raise InputError(
                 f"{path}: all rows are of other versions of the code; run the sweep again, or see "
-                "them as they are with --all-versions"
+                "them with those of all versions"
             )
         if not mine.all():
             left_out = counted((~mine).sum(), "row")
             print(
-                f"left out {left_out} of other versions of the code; --all-versions keeps them",
+                f"left out {left_out} of other versions of the code",
                 file=sys.stderr,
             )
         table = table[mine]
@@ -159,14 +159,14 @@ def where(table: pd.DataFrame, conditions: Sequence[str]) -> pd.DataFrame:
         column, equals, wanted = condition.partition("=")
         if not equals:
             there = dozen([*map(str, table)])
-            raise InputError(f"--where {condition}: give COLUMN=VALUE; columns: {there}")
+            raise InputError(f"condition {condition}: give COLUMN=VALUE; columns: {there}")
         if column not in table:
-            raise InputError(f"--where {condition}: {no_column(table, column, metric=False)}")
+            raise InputError(f"condition {condition}: {no_column(table, column, metric=False)}")
         numbers, number = (pd.to_numeric(v, errors="coerce") for v in (table[column], wanted))
         meets = (table[column].astype(str) == wanted) | (numbers == number)
         if not meets.any():
             there = ", ".join(map(str, sorted(table[column].dropna().unique())[:8]))
-            raise InputError(f"--where {condition}: no such row; there are {there or 'no values'}")
+            raise InputError(f"condition {condition}: no such row; there are {there or 'no values'}")
         table = table[meets]
     return table
 
@@ -192,7 +192,7 @@ def _of_this_code(table: pd.DataFrame) -> pd.Series[bool]:
         elif rows["code_version"].nunique() > 1:
             raise InputError(
                 f"rows of several versions of one of {', '.join(given)}, whose source is not "
-                "found; set PYTHONPATH to it, or see all with --all-versions"
+                "found; set PYTHONPATH to it, or keep all versions"
             )
     return mine
 

@@ -47,7 +47,7 @@ OnDone = Callable[[Path, int], None]
 def sweep_arguments(arguments: Sequence[str], on_done: OnDone) -> None:
     """Sweep by a command line's arguments: overrides, and `--config-dir` with its folder."""
     line = CommandLine.of(arguments)
-    require(not line.shown, "--cfg shows one configuration; leave out -m and the lists")
+    require(not line.shown, "one configuration can be shown, not a sweep; leave out the lists")
     signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGINT))  # end as by Ctrl-C
     sweep(line.overrides, line.config_dir, on_done)
 

@@ -64,7 +64,7 @@ def summary(
         if column not in table:
             raise no_column(table, column, metric=True)
         if not pd.api.types.is_numeric_dtype(table[column]):
-            raise InputError(f"column {column} holds no numbers in some rows; see --where")
+            raise InputError(f"column {column} holds no numbers in some rows; leave those out")
     groups = table.groupby(by or (lambda _: "all runs"), dropna=False)
     table = table.assign(**{_GROUP: groups.ngroup()})
     unit = unit_of(table, [_GROUP])

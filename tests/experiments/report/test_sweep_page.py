@@ -84,7 +84,7 @@ def test_a_sweep_without_a_sound_run_says_why_and_proposes_what_works(
 
 def test_a_page_too_large_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(sweep_page, "MOST_RUNS", 10)
-    with pytest.raises(InputError, match=r"54 runs; a page holds 10.*--where"):
+    with pytest.raises(InputError, match=r"54 runs; a page holds 10.*condition"):
         write_sweep_page(rows(), "mine", tmp_path, tmp_path / "page.html")
     assert not (tmp_path / "page.html").exists()
 

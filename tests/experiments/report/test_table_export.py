@@ -115,4 +115,4 @@ def test_export_from_the_command_line(tmp_path):
     )
     assert (out / "t.tex").read_text().startswith(r"\begin{tabular}{r}")
     wrong = CliRunner().invoke(app, ["export-table", str(tmp_path / "t.csv"), "--format", "x"])
-    assert "--format must be markdown or latex" in str(wrong.exception)
+    assert "the format must be markdown or latex" in str(wrong.exception)
