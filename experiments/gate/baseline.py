@@ -197,9 +197,7 @@ def accept(
     With `only`, the other estimators keep their baselines. The release baseline stays as it is,
     unless there is none, or `release` pins it to this too.
     """
-    require(
-        reason.strip(), "accepting needs a reason, such as 'faster matching, 2 % worse'"
-    )
+    require(reason.strip(), "accepting needs a reason, such as 'faster matching, 2 % worse'")
     whole = read_suite(suite_path(suite_name))
     suite = whole.of(only).made(elsewhere=candidate is not None)
     names = [entry.name for entry in suite.estimators]
@@ -248,4 +246,3 @@ def _compared(baseline: dict[str, pd.DataFrame], rows: pd.DataFrame) -> list[Fin
         with contextlib.suppress(InputError):  # new, or on other recordings
             findings += compare(baseline, of_one)
     return findings
-

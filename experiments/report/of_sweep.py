@@ -108,17 +108,7 @@ def plot_of(rows: pd.DataFrame, name: str, panels: Panels, out: Path) -> str:
         words = [f"--x {x}", *(f"--by {each}" for each in panels.by)]
         words += [f"--col {panels.col}"] if panels.col else []
         chosen = f"drawn with {' '.join(words)}"
-    page = sweep_figure(
-        rows,
-        str(panels.x),
-        panels.y,
-        panels.by or None,
-        row=panels.row,
-        col=panels.col,
-        size=panels.size,
-        pool=panels.pool,
-    )
-    save_figure(page, out)
+    save_figure(sweep_figure(rows, **vars(panels)), out)
     return chosen
 
 

@@ -88,7 +88,9 @@ def sweep_figure(
         pool what differs in more than its seeds.
     """
     if row is not None and row == col:
-        raise InputError(f"rows and columns of panels are both {row}; one panel a value needs one of them")
+        raise InputError(
+            f"rows and columns of panels are both {row}; one panel a value needs one of them"
+        )
     facets = [name for name in (row, col) if name is not None]
     by = [name for name in ([by] if isinstance(by, str) else by or []) if name not in facets]
     if y.startswith(ANSWER):
@@ -98,7 +100,8 @@ def sweep_figure(
     table, left_out = _complete(table, y, groups)
     if not pool:
         _check_points(table, groups)
-    table = table.assign(**{c: table[c].map(literal) for c in groups if _holds_words(table[c])})
+    words_in = [c for c in groups if table[c].map(lambda value: isinstance(value, str)).all()]
+    table = table.assign(**{c: table[c].map(literal) for c in words_in})
     unit = unit_of(table, groups)
     over = [c for c in telling(table) if c not in (*groups, *DRAWN)]
     means = averages(table, groups, unit, y, over).reset_index()
@@ -111,39 +114,32 @@ def sweep_figure(
             f"{len(lines)} lines; at most {len(SERIES)} differ in colour: keep some "
             "by a condition, or draw rows or columns of panels"
         )
-    across, down = (_values(means, name) for name in (col, row))
+    across, down = (
+        [None] if name is None else sorted(means[name].dropna().unique()) for name in (col, row)
+    )
     chosen = Size(size)
     page, axes = _panels(chosen, len(down), len(across))
     numeric = means[x].dtype.kind in "fi"
     shown = _Across(sorted(means[x].unique()), numeric, numeric and x not in (*DRAWN, REPEAT))
     for (i, above), (j, left) in itertools.product(enumerate(down), enumerate(across)):
         ax = axes[i, j]
-        panel = _within(_within(means, row, above), col, left)
+        panel = {name: value for name, value in ((row, above), (col, left)) if name is not None}
         for k, (label, line) in enumerate(lines.items()):
-            points = _on_line(panel, by, line)
+            points, alone = (_rows_of(frame, {**panel, **line}) for frame in (means, dots))
             if points.empty:
                 continue
-            at = shown.places(points[x], k, len(lines))
             value, low, high = points[["value", "low", "high"]].to_numpy(float).T
             colour, marker = SERIES[k]
             ax.errorbar(
-                at, value, yerr=(value - low, high - value), color=colour, marker=marker, ms=4,
-                capsize=2, lw=1.2, ls="-" if shown.joined else "none", label=label,
+                shown.places(points[x], k, len(lines)), value, yerr=(value - low, high - value),
+                color=colour, marker=marker, ms=4, capsize=2, lw=1.2,
+                ls="-" if shown.joined else "none", label=label,
             )  # fmt: skip
-            alone = _on_line(_within(_within(dots, row, above), col, left), by, line)
             at = shown.places(alone[x], k, len(lines))
             ax.plot(at, alone[y], ".", color=colour, ms=4, alpha=0.5)
-        words = [
-            _named(name, value, texts[name]) for name, value in ((row, above), (col, left)) if name
-        ]
+        words = (_named(name, value, texts[name]) for name, value in panel.items())
         ax.set_title("; ".join(words), fontsize="medium")
-    _scale(
-        axes,
-        texts[x],
-        means,
-        shown,
-        log=_is_log(y, means[["value", "low", "high"]].stack()),
-    )
+    _scale(axes, texts[x], means, shown, log=_is_log(y, means[["value", "low", "high"]].stack()))
     for ax in axes[-1]:
         ax.set_xlabel(literal(title(x)))
     least_in = _AXES_SHARE * page.get_figheight()
@@ -206,12 +202,9 @@ def _check_points(table: pd.DataFrame, groups: Sequence[str]) -> None:
             )
 
 
-def _values(means: pd.DataFrame, name: str | None) -> list[Any]:
-    return [None] if name is None else sorted(means[name].dropna().unique())
-
-
-def _on_line(means: pd.DataFrame, by: Sequence[str], line: tuple[Any, ...]) -> pd.DataFrame:
-    return means[(means[list(by)] == list(line)).all(axis=1)] if by else means
+def _rows_of(frame: pd.DataFrame, values: Mapping[str, Any]) -> pd.DataFrame:
+    """Rows of one line of one panel."""
+    return frame[(frame[list(values)] == list(values.values())).all(axis=1)] if values else frame
 
 
 @dataclass(frozen=True)
@@ -240,14 +233,6 @@ class _Across:
         return at + beside * apart * min(_BESIDE_WORD, _MOST_BESIDE / n_lines)
 
 
-def _within(means: pd.DataFrame, name: str | None, value: Any) -> pd.DataFrame:
-    return means if name is None else means[means[name] == value]
-
-
-def _holds_words(column: pd.Series[Any]) -> bool:
-    return all(isinstance(value, str) for value in column)
-
-
 def _texts(column: pd.Series[Any]) -> dict[Any, str]:
     """What the values of a setting are called, in their order."""
     values = column.drop_duplicates().sort_values()
@@ -264,16 +249,17 @@ def _named(name: str, value: Any, texts: Mapping[Any, str]) -> str:
 
 def _labels(
     means: pd.DataFrame, by: Sequence[str], texts: Mapping[str, Mapping[Any, str]]
-) -> dict[str, tuple[Any, ...]]:
-    """The lines by what they are called; the legend's title names a single setting."""
+) -> dict[str, dict[str, Any]]:
+    """Settings of the lines by what they are called; a legend's title names a single setting."""
     if not by:
-        return {"": ()}
-    lines = means[list(by)].drop_duplicates().sort_values(list(by))
+        return {"": {}}
+    lines = means[list(by)].drop_duplicates().sort_values(list(by)).itertuples(index=False)
     if len(by) == 1:
-        return {texts[by[0]][value]: (value,) for value in lines[by[0]]}
-    each = lines.itertuples(index=False, name=None)
+        return {texts[by[0]][value]: {by[0]: value} for (value,) in lines}
     own = [texts[name] for name in by]
-    return {", ".join(map(_named, by, line, own)): line for line in each}
+    return {
+        ", ".join(map(_named, by, line, own)): dict(zip(by, line, strict=True)) for line in lines
+    }
 
 
 def _panels(size: Size, n_rows: int, n_cols: int) -> tuple[Figure, Any]:

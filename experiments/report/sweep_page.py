@@ -37,7 +37,7 @@ from experiments.sweeps.collect import (
 )
 from experiments.sweeps.summary import ERROR, summary
 from sim.errors import InputError, printable, require
-from sim.files import write_whole
+from sim.files import write_text
 from sim.yaml_file import read_yaml
 
 Entry = Mapping[str, Any]
@@ -139,8 +139,7 @@ def write_sweep_page(
         options=options,
         constant=_constant(table),
     )
-    with write_whole(out) as part:
-        part.write_text(text, encoding="utf-8")
+    write_text(out, text)
 
 
 def _controls(

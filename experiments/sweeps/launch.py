@@ -36,7 +36,7 @@ from experiments.sweeps.plan import Numbers, Plan, packed, plan_of
 from experiments.sweeps.work import compiling_file, end_with, failure, is_there, run_share, share_of
 from sim.compiled import ANNOUNCED, note_compiling
 from sim.errors import InputError, require
-from sim.files import require_file, write_whole
+from sim.files import require_file, write_text
 
 _JOBS_PER_CORE = 4  # enough to keep all busy to the end, few enough to cost little
 # What launchers raise when a process of theirs has died; Ray and submitit are extras
@@ -104,8 +104,7 @@ def sweep(
         unfinished.unlink(missing_ok=True)
         on_done(folder, len(keys))
         return
-    with write_whole(unfinished) as part:
-        part.write_text(f"{len(keys)} {command}\n", encoding="utf-8")
+    write_text(unfinished, f"{len(keys)} {command}\n")
     try:
         _launch_all(plan, runs, Jobs(folder, n_jobs), launching)
     except KeyboardInterrupt:
@@ -144,8 +143,7 @@ def _note_command(folder: Path, arguments: Sequence[str], config_dir: str | None
     command = " ".join(shlex.join(["estima", "run", "-m", *given]).splitlines())
     noted = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
     if command not in noted:
-        with write_whole(path) as part:
-            part.write_text("\n".join([*noted, command]) + "\n", encoding="utf-8")
+        write_text(path, "\n".join([*noted, command]) + "\n")
     return command
 
 
@@ -208,8 +206,7 @@ class Jobs:
             "journal": str(journal),
             "families": plan.as_json(runs),
         }
-        with write_whole(share_of(self.plan, number)) as part:
-            part.write_text(json.dumps(share))
+        write_text(share_of(self.plan, number), json.dumps(share))
         return str(number)
 
 
@@ -220,8 +217,7 @@ def _plan_of(folder: Path, journal: str) -> Path:
 
 def _launch_all(plan: Plan, runs: Numbers, jobs: Jobs, launching: Sequence[str]) -> None:
     """Start the runs; find those at which a worker of joblib's died, and go on with the rest."""
-    with write_whole(jobs.plan) as part:
-        part.write_text(json.dumps({"planner": [platform.node(), os.getpid()]}))
+    write_text(jobs.plan, json.dumps({"planner": [platform.node(), os.getpid()]}))
     try:
         with _watched(jobs, len(runs)):
             left = runs
