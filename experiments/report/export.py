@@ -280,8 +280,7 @@ def export(paths: Sequence[Path], form: str, out: Path | None, digits: int) -> N
     InputError
         If a table cannot be read or shown, or two would become one file.
     """
-    if form not in FORMATS:
-        raise InputError(f"the format must be {' or '.join(FORMATS)}, got {form!r}")
+    require(form in FORMATS, f"the format must be {' or '.join(FORMATS)}, got {form!r}")
     as_form, suffix = FORMATS[form]
     names = [path.stem for path in paths] if out else []
     for i, path in enumerate(paths[: len(names)]):

@@ -21,7 +21,7 @@ from experiments.sweeps.averages import averages, pooled, rule, unit_of
 from experiments.sweeps.collect import DRAWN, dozen, measured, no_column, telling, with_answers
 from experiments.viewing.plotting import literal, plain_log
 from experiments.viewing.style import SERIES, figure
-from sim.errors import InputError
+from sim.errors import InputError, require
 
 _FEW = 8  # values that are ticks of their own
 _DECADES = 100.0  # factor below which a logarithmic axis has plain numbers
@@ -87,10 +87,10 @@ def sweep_figure(
         If a column is not in the table, y has no numbers, no run has all columns, or a point would
         pool what differs in more than its seeds.
     """
-    if row is not None and row == col:
-        raise InputError(
-            f"rows and columns of panels are both {row}; one panel a value needs one of them"
-        )
+    require(
+        row is None or row != col,
+        f"rows and columns of panels are both {row}; one panel a value needs one of them",
+    )
     facets = [name for name in (row, col) if name is not None]
     by = [name for name in ([by] if isinstance(by, str) else by or []) if name not in facets]
     if y.startswith(ANSWER):
@@ -109,11 +109,11 @@ def sweep_figure(
     dots = pooled(table, [*groups, unit], y, over).reset_index().merge(unbounded, on=groups)
     texts = {name: _texts(means[name]) for name in groups}
     lines = _labels(means, by, texts)
-    if len(lines) > len(SERIES):
-        raise InputError(
-            f"{len(lines)} lines; at most {len(SERIES)} differ in colour: keep some "
-            "by a condition, or draw rows or columns of panels"
-        )
+    require(
+        len(lines) <= len(SERIES),
+        f"{len(lines)} lines; at most {len(SERIES)} differ in colour: keep some "
+        "by a condition, or draw rows or columns of panels",
+    )
     across, down = (
         [None] if name is None else sorted(means[name].dropna().unique()) for name in (col, row)
     )
@@ -166,15 +166,16 @@ def sweep_figure(
 
 def _check(table: pd.DataFrame, y: str, groups: Sequence[str]) -> None:
     """Check that the columns are there and that y has numbers."""
-    if y in groups:
-        raise InputError(f"{y} is drawn against itself; estima options metrics lists the results")
+    require(
+        y not in groups, f"{y} is drawn against itself; estima options metrics lists the results"
+    )
     for column in (y, *groups):
         if column not in table:
             raise no_column(table, column, metric=column == y)
-    if table[y].dtype.kind not in "fi":
-        raise InputError(
-            f"column {y} holds no numbers; there are {dozen(measured(table)) or 'none'}"
-        )
+    require(
+        table[y].dtype.kind in "fi",
+        f"column {y} holds no numbers; there are {dozen(measured(table)) or 'none'}",
+    )
 
 
 def _complete(table: pd.DataFrame, y: str, groups: Sequence[str]) -> tuple[pd.DataFrame, str]:
@@ -183,8 +184,7 @@ def _complete(table: pd.DataFrame, y: str, groups: Sequence[str]) -> tuple[pd.Da
     columns = with_y[[y, *groups]]
     lacking = columns.isna() | columns.isin([np.inf, -np.inf])
     out = lacking.any(axis=1)
-    if out.all():
-        raise InputError(f"no run has all of {', '.join([*groups, y])}")
+    require(not (out.all()), f"no run has all of {', '.join([*groups, y])}")
     without = " or ".join(title(str(name)) for name in columns.columns[lacking.any()])
     words = f"{out.sum()} of {len(out)} runs left out: no finite {without}" if out.any() else ""
     return with_y[~out], words

@@ -36,7 +36,7 @@ from experiments.sweeps.collect import (
     with_answers,
 )
 from experiments.sweeps.summary import ERROR, summary
-from sim.errors import InputError, printable, require
+from sim.errors import printable, require
 from sim.files import write_text
 from sim.yaml_file import read_yaml
 
@@ -76,10 +76,9 @@ def write_sweep_page(
     )
     every = with_answers(table, [column for column in COLUMNS if column.startswith(ANSWER)])
     metrics = [c for c in COLUMNS if c in measured(every) and every[c].notna().any()]
-    if not metrics:
-        raise InputError(
-            f"{name}: no run has a result to show; `estima table {name}` says how they ended"
-        )
+    require(
+        metrics, f"{name}: no run has a result to show; `estima table {name}` says how they ended"
+    )
     telling_apart = telling(table)
     named = [c for c in telling_apart if c != "choice.estimator"]
     pictures = {

@@ -83,12 +83,13 @@ def sweep(
     n_jobs = _n_jobs(launching)
     own = [a for a in arguments if a not in launching]
     plan = plan_of(own, config_dir)
-    if not len(plan.keys):
-        raise InputError(f"no runs: a value of {' '.join(own)} is an empty range or list")
+    require(len(plan.keys), f"no runs: a value of {' '.join(own)} is an empty range or list")
     plan = plan.called(_name(plan, own, config_dir))
     folder = plan.experiment(0).rows_folder
-    if not folder.is_dir() and folder.exists():
-        raise InputError(f"{folder}: not a folder; remove it, or choose another name")
+    require(
+        folder.is_dir() or not folder.exists(),
+        f"{folder}: not a folder; remove it, or choose another name",
+    )
     prepare(folder)
     keys, first = np.unique(plan.keys, return_index=True)
     done = np.isin(keys, store.ended(folder, damaged=_drop).done)
@@ -333,8 +334,10 @@ _EXTRAS = {"submitit": "slurm", "ray": "ray"}
 def _check_launcher(launching: Sequence[str]) -> None:
     """Check that the launcher is installed, where Hydra would only say that it knows none."""
     for argument in launching:
-        if re.fullmatch(r"\+*hydra\.launcher\.n_jobs=[+-]?0+", argument):
-            raise InputError(f"{argument}: give the number of processes, or -1 for all cores")
+        require(
+            not (re.fullmatch(r"\+*hydra\.launcher\.n_jobs=[+-]?0+", argument)),
+            f"{argument}: give the number of processes, or -1 for all cores",
+        )
         name = argument.partition("=")[2]
         plugin = name.partition("_")[0]
         chosen = argument.lstrip("+").startswith("hydra/launcher=") and plugin in _EXTRAS
@@ -350,8 +353,10 @@ def _n_jobs(launching: Sequence[str]) -> int:
     given = [a.partition("=")[2] for a in launching if a.lstrip("+~").startswith("jobs=")]
     if given in ([], ["null"]):
         return _JOBS_PER_CORE * (os.cpu_count() or 1)
-    if len(given) > 1 or not given[0].isdecimal() or not int(given[0]):
-        raise InputError(f"jobs={','.join(given)}: give one whole number, 1 or more")
+    require(
+        len(given) == 1 and given[0].isdecimal() and int(given[0]),
+        f"jobs={','.join(given)}: give one whole number, 1 or more",
+    )
     return int(given[0])
 
 

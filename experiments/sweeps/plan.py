@@ -191,8 +191,10 @@ class Plan:
         """
         names = {f.first.name for f in self.families}
         swept_ = any(("name",) in axis.leaves for f in self.families for axis in f.axes)
-        if len(names) > 1 or swept_:
-            raise InputError("name is the folder of all the rows; a sweep has one, not several")
+        require(
+            len(names) == 1 and not swept_,
+            "name is the folder of all the rows; a sweep has one, not several",
+        )
         if name is None:
             return self
         families = [replace(f, first=f.first.replaced(name=name)) for f in self.families]

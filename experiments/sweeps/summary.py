@@ -12,7 +12,7 @@ from experiments.runs.columns import COLUMNS, PATH, RELATIVE
 from experiments.runs.row import GAP, Outcome
 from experiments.sweeps.averages import RECORDING, averages, difference_p, pooled, rule, unit_of
 from experiments.sweeps.collect import DRAWN, no_column, telling, with_answers
-from sim.errors import InputError
+from sim.errors import InputError, require
 
 ERROR = "answer_ate_rmse_m"
 _MAIN = (
@@ -63,8 +63,10 @@ def summary(
     for column in shown:
         if column not in table:
             raise no_column(table, column, metric=True)
-        if not pd.api.types.is_numeric_dtype(table[column]):
-            raise InputError(f"column {column} holds no numbers in some rows; leave those out")
+        require(
+            pd.api.types.is_numeric_dtype(table[column]),
+            f"column {column} holds no numbers in some rows; leave those out",
+        )
     groups = table.groupby(by or (lambda _: "all runs"), dropna=False)
     table = table.assign(**{_GROUP: groups.ngroup()})
     unit = unit_of(table, [_GROUP])

@@ -157,7 +157,9 @@ def test_plots_name_a_missing_column_and_average_recordings():
     np.testing.assert_allclose(lines[0].get_ydata(), expected)
     assert page.get_suptitle().startswith("Geometric mean over recordings")
     assert "estimator" not in page.get_suptitle()
-    with pytest.raises(InputError, match=r"different values of choice\.estimator \(a, b\).*pool them"):
+    with pytest.raises(
+        InputError, match=r"different values of choice\.estimator \(a, b\).*pool them"
+    ):
         sweep_figure(rows(), "robot.kr", "ate_rmse_m")
     pooled = sweep_figure(rows(), "robot.kr", "ate_rmse_m", pool=True)
     assert "estimator" in pooled.get_suptitle()
