@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -68,23 +69,19 @@ def row_of(word: str) -> pd.Series[Any] | None:
     key, _, repeat = path.name.partition(".")
     if not key or not {"run_key", REPEAT} <= set(rows):
         return None
-    found = rows[
-        rows["run_key"].str.startswith(key) & (rows[REPEAT].astype(str) == (repeat or "0"))
-    ]
-    require(len(found) > 0, f"{word}: the sweep {path.parent} has no such run")
-    require(len(found) == 1, f"{word}: {len(found)} runs have keys that begin so; give more digits")
-    return found.iloc[0]
+    same = rows["run_key"].str.startswith(key) & (rows[REPEAT].astype(str) == (repeat or "0"))
+    require(same.any(), f"{word}: the sweep {path.parent} has no such run")
+    require(same.sum() == 1, f"{word}: {same.sum()} runs have keys that begin so; give more digits")
+    return rows[same].iloc[0]
 
 
 def noted_config_dir(folder: Path) -> str | None:
     """The folder of options that the last sweep into a folder of rows named, if any did."""
     for command in reversed(commands(folder)):
-        try:
+        with suppress(ValueError):  # edited by hand
             words = shlex.split(command)
-        except ValueError:  # edited by hand
-            continue
-        if "--config-dir" in words[:-1]:
-            return words[words.index("--config-dir") + 1]
+            if "--config-dir" in words[:-1]:
+                return words[words.index("--config-dir") + 1]
     return None
 
 

@@ -31,7 +31,7 @@ from experiments.runs.compose import CommandLine, check_hydra
 from experiments.runs.console import RunFailedError, counted, progress
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome, Status
-from experiments.sweeps.collect import COMMAND, UNFINISHED
+from experiments.sweeps.collect import COMMAND, UNFINISHED, commands
 from experiments.sweeps.plan import Numbers, Plan, packed, plan_of
 from experiments.sweeps.work import compiling_file, end_with, failure, is_there, run_share, share_of
 from sim.compiled import ANNOUNCED, note_compiling
@@ -140,10 +140,9 @@ def _note_command(folder: Path, arguments: Sequence[str], config_dir: str | None
     """Keep the command beside the rows, for pages that show them, and return it."""
     path = folder / COMMAND
     require_file(path)
-    given = [*(["--config-dir", config_dir] if config_dir else []), *arguments]
-    command = " ".join(shlex.join(["estima", "run", "-m", *given]).splitlines())
-    noted = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
-    if command not in noted:
+    options = ["--config-dir", config_dir] if config_dir else []
+    command = " ".join(shlex.join(["estima", "run", "-m", *options, *arguments]).splitlines())
+    if command not in (noted := commands(folder)):
         write_text(path, "\n".join([*noted, command]) + "\n")
     return command
 
@@ -209,11 +208,6 @@ class Jobs:
         }
         write_text(share_of(self.plan, number), json.dumps(share))
         return str(number)
-
-
-def _plan_of(folder: Path, journal: str) -> Path:
-    """The plan that a journal belongs to."""
-    return folder / f"plan-{journal.removeprefix('rows-').rpartition('-')[0]}.json"
 
 
 def _launch_all(plan: Plan, runs: Numbers, jobs: Jobs, launching: Sequence[str]) -> None:
@@ -303,17 +297,7 @@ def prepare(folder: Path) -> None:
     InputError
         If a plan or a journal is no file, or cannot be read.
     """
-    _clear_plans(folder)
-    _tidy(folder)
-
-
-def _tidy(folder: Path) -> None:
-    store.tidy(folder, lambda journal: _plan_of(folder, journal).exists())
-
-
-def _clear_plans(folder: Path) -> None:
-    """Remove the plans of sweeps on this machine that were killed, and what they were writing."""
-    for plan in folder.glob("plan-*.json"):
+    for plan in folder.glob("plan-*.json"):  # of this machine, with what they were writing
         require_file(plan)
         try:
             node, planner = json.loads(plan.read_text())["planner"]
@@ -324,6 +308,15 @@ def _clear_plans(folder: Path) -> None:
         _remove(plan)
         for part in folder.glob(f".rows-{plan.stem.removeprefix('plan-')}*.part*"):
             part.unlink(missing_ok=True)
+    _tidy(folder)
+
+
+def _tidy(folder: Path) -> None:
+    def is_running(journal: str) -> bool:
+        name = journal.removeprefix("rows-").rpartition("-")[0]
+        return (folder / f"plan-{name}.json").exists()
+
+    store.tidy(folder, is_running)
 
 
 _UNNAMED = "run"  # the default of conf/config.yaml
@@ -394,12 +387,12 @@ def _watched(jobs: Jobs, n_runs: int) -> Iterator[None]:
 
     def watch() -> None:
         counts: dict[Path, tuple[int, int, int]] = {}
-        compiled_ns, done_then, shown = 0, 0, 0
+        compiled_ns, done_then, shown, over = 0, 0, 0, False
+        note = compiling_file(jobs.plan)
         with progress("", n_runs, "runs", summary=True) as on_progress:
-            over = False
             while not over:
                 over = ended.wait(0.5)
-                noted_ns = _touched_ns(compiling_file(jobs.plan))
+                noted_ns = note.stat().st_mtime_ns if note.exists() else 0
                 if noted_ns and not compiled_ns:
                     print(ANNOUNCED, file=sys.stderr, flush=True)
                 for journal in list(jobs.sizes):
@@ -422,14 +415,6 @@ def _watched(jobs: Jobs, n_runs: int) -> Iterator[None]:
     finally:
         ended.set()
         thread.join()
-
-
-def _touched_ns(path: Path) -> int:
-    """When a file was last touched; 0 if it is not there."""
-    try:
-        return path.stat().st_mtime_ns
-    except OSError:
-        return 0
 
 
 def _counted(
