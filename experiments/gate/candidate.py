@@ -70,12 +70,12 @@ def candidate_rows(
     The files are GROUP_SEED.tum (or .csv, .mcap, .bag), of several repeats GROUP_SEED.0.tum and so
     on; in a folder of its own, called by the entry, for each of several entries. A trajectory that
     is missing, cannot be read, or has a gap of more than a second is a run that failed. Files of
-    trajectories that are of no run are left out, and named.
+    trajectories that belong to no run are left out, and named.
 
     Raises
     ------
     InputError
-        If there is no trajectory at all.
+        If there are none.
     """
     rows: list[dict[str, Any]] = []
     for place, entry in enumerate(suite.estimators):
@@ -101,7 +101,7 @@ def candidate_rows(
 
 
 def _tell_of_others(folder: Path, read: set[Path | None]) -> None:
-    """Name the trajectories of a folder that are of no run."""
+    """Name the trajectories of a folder that belong to no run."""
     others = sorted(p.name for p in folder.iterdir() if p.suffix in SUFFIXES and p not in read)
     if others:
         more = f" and {len(others) - 5} more" if len(others) > 5 else ""

@@ -124,7 +124,7 @@ def exchange_p(
 
 
 def _exchanged_sums(runs: Array, n_now: int, rng: np.random.Generator) -> Array:
-    """Sums of n_now of each recording's (n, B) runs, (n, ways); the first is of those seen."""
+    """Sums of n_now of each recording's (n, B) runs, (n, ways); the first is that of those seen."""
     if math.comb(runs.shape[1], n_now) <= _MOST_WAYS:
         picks = np.array(list(itertools.combinations(range(runs.shape[1]), n_now)))
         return np.asarray(runs[:, picks].sum(axis=2))

@@ -298,7 +298,7 @@ def _run_recording(
                 not entry.revised or row["status"] != Outcome.OK or "revised_ate_rmse_m" in row,
                 f"{entry.name} has no finish; drop `revised` from the suite",
             )
-            # a collision is no fault of the estimator
+            # the estimator is not to blame for a collision
             at_fault = row["status"] == Outcome.FAILED and row["status_code"] != "recording"
             why = printable(f"{row['status_code']}: {row['status_detail']}") if at_fault else "ok"
             which = {"estimator": entry.name, "recording": seed, "repeat": row["repeat"]}

@@ -143,7 +143,7 @@ def sweep_figure(
     for ax in axes[-1]:
         ax.set_xlabel(literal(title(x)))
     least_in = _AXES_SHARE * page.get_figheight()
-    whole = "\u00a0".join(literal(title(y)).rsplit(" ", 1))  # a unit is no line of its own
+    whole = "\u00a0".join(literal(title(y)).rsplit(" ", 1))  # a unit has no line of its own
     of_y = textwrap.fill(whole, _characters(1.2 * least_in, _FONT[chosen])).replace("\u00a0", " ")
     if len(down) > 1:  # one label beside all, as one each would collide on a column's width
         page.supylabel(of_y, fontsize=_FONT[chosen])

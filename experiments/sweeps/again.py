@@ -54,7 +54,7 @@ def short_key(row: pd.Series[Any]) -> str:
 
 
 def row_of(word: str) -> pd.Series[Any] | None:
-    """Row of a run that is called NAME/KEY or NAME/KEY.REPEAT; None if there is no sweep NAME.
+    """Row of a run that is called NAME/KEY or NAME/KEY.REPEAT; None without a sweep NAME.
 
     Raises
     ------
@@ -137,7 +137,7 @@ def run_again(
     again.check_estimator()  # without its module its version is another
     require(
         made["code_version"] == row["code_version"],
-        f"the run is of another version of the code, {row['code_version']}; run the sweep again",
+        f"the run comes from another version of the code, {row['code_version']}; run the sweep again",
     )
     return Again(again, int(row[REPEAT]), str(row["recording_checksum"]))
 

@@ -1,7 +1,7 @@
 """The one rule by which tables, plots and pages average runs.
 
 The recording is the unit of inference. Repeats over one recording are averaged first: errors by
-their squares, all else arithmetically. Runs of other settings over one recording are no repeats;
+their squares, all else arithmetically. Runs of other settings over one recording are not repeats;
 they, then recordings, are averaged geometrically, with the t interval of the logs, where a metric
 is spread by factors, else arithmetically: `runs.columns.Average`.
 """

@@ -50,7 +50,7 @@ def collect(name: str, *, all_versions: bool = False, times: bool = False) -> pd
     Raises
     ------
     InputError
-        If there are no rows, or none of this version of the code; or if runs of different keys
+        Without rows, or without any of this version of the code; or if runs of different keys
         have equal settings, because a file was edited between them, say.
     """
     path = folder_of(name)
@@ -64,7 +64,7 @@ def collect(name: str, *, all_versions: bool = False, times: bool = False) -> pd
         mine = _of_this_code(table)
         require(
             mine.any(),
-            f"{path}: all rows are of other versions of the code; run the sweep again, or see "
+            f"{path}: all rows come from other versions of the code; run the sweep again, or see "
             "them with those of all versions",
         )
         if not mine.all():
@@ -115,7 +115,7 @@ def commands(folder: Path) -> list[str]:
 
 
 def _check_distinct(table: pd.DataFrame, settings: list[str], path: Path) -> None:
-    """Check that rows of equal settings are of one run; `settings` are those that differ.
+    """Check that rows of equal settings belong to one run; `settings` are those that differ.
 
     Over a recording from a file, a setting that only a simulation reads has no column. Runs that
     differ in nothing else have equal results, and are let pass.
@@ -160,7 +160,7 @@ def where(table: pd.DataFrame, conditions: Sequence[str]) -> pd.DataFrame:
 
 
 def _of_this_code(table: pd.DataFrame) -> pd.Series[bool]:
-    """Which rows are of this version of the code, and of estimators from elsewhere.
+    """Which rows come from this version of the code, and of estimators from elsewhere.
 
     Raises
     ------

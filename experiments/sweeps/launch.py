@@ -295,7 +295,7 @@ def prepare(folder: Path) -> None:
     Raises
     ------
     InputError
-        If a plan or a journal is no file, or cannot be read.
+        If a plan or a journal is not a file, or cannot be read.
     """
     for plan in folder.glob("plan-*.json"):  # of this machine, with what they were writing
         require_file(plan)

@@ -309,7 +309,7 @@ def _grid(
     ]
     outer = [key for key in choices if key not in inner]
     texts = {key: [_text(key, value) for value in choices[key]] for key in outer}
-    for combination in itertools.product(*texts.values()):  # what is no axis in one is in none
+    for combination in itertools.product(*texts.values()):  # an axis is one in all
         _, axes = _composed(composer, combination, {key: choices[key] for key in inner})
         for key in [key for key in inner if key not in axes]:
             inner.remove(key)

@@ -76,7 +76,7 @@ def run_and_record(experiment: Experiment, held: dict[str, Team], journal: store
         Takes the rows.
     """
     journal.begin(experiment.key)
-    with held_interrupts() as on_step:  # what one causes is no result
+    with held_interrupts() as on_step:  # what one causes is not a result
         try:
             rows = evaluate(
                 experiment,
