@@ -217,8 +217,8 @@ def _differ(first: Array, second: Array) -> str:
     """
     # Headings count from the common direction, so that none lies at the seam.
     headings = np.concatenate([first[:, 2], second[:, 2]])
-    middle = np.array([0.0, 0.0, np.arctan2(np.sin(headings).sum(), np.cos(headings).sum())])
-    samples = [np.column_stack([p[:, :2], se2.wrap(p[:, 2] - middle[2])]) for p in (first, second)]
+    middle = np.arctan2(np.sin(headings).sum(), np.cos(headings).sum())
+    samples = [np.column_stack([p[:, :2], se2.wrap(p[:, 2] - middle)]) for p in (first, second)]
     means, sigmas = (np.array([f(s, axis=0) for s in samples]) for f in (np.mean, np.std))
     gap, allowed = np.abs(means[1] - means[0]), _GRAIN + 4 * np.hypot(*sigmas) / len(first) ** 0.5
     for i, name in enumerate(("x, m", "y, m", "heading, rad")):

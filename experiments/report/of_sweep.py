@@ -38,15 +38,16 @@ def after_sweep(folder: Path, n_runs: int) -> None:
             show(f"{often if len(rows) > 1 else 'The run failed'}: {reason}")
             print(f"\nNext: estima table {folder.name} --rows -o rows.csv  (how each run ended)")
             return
-        found = summary(rows, metrics=[ERROR] if "ate_rmse_m" in rows else [])
-        if len(found) <= _FEW_LINES:
-            show(as_lines(found, notes(found, None)))
-        sound = rows[rows["status"] != Outcome.FAILED]
-        estimators = sound["choice.estimator"].unique()
+        means = summary(rows, metrics=[ERROR] if "ate_rmse_m" in rows else [])
+        if len(means) <= _FEW_LINES:
+            show(as_lines(means, notes(means, None)))
+        estimators = rows.loc[rows["status"] != Outcome.FAILED, "choice.estimator"].unique()
         against = f" --against {estimators[0]}" if len(estimators) > 1 else ""
-    print(f"\nNext: estima table {folder.name}{against} -o table.tex")
-    print(f"      estima plot {folder.name}")
-    print(f"      estima report {folder.name}")
+    name = folder.name
+    print(
+        f"\nNext: estima table {name}{against} -o table.tex\n      estima plot {name}\n"
+        f"      estima report {name}"
+    )
 
 
 def write_rows(rows: pd.DataFrame, out: Path) -> str:

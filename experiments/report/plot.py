@@ -139,7 +139,10 @@ def sweep_figure(
             ax.plot(at, alone[y], ".", color=colour, ms=4, alpha=0.5)
         words = (_named(name, value, texts[name]) for name, value in panel.items())
         ax.set_title("; ".join(words), fontsize="medium")
-    _scale(axes, texts[x], means, shown, log=_is_log(y, means[["value", "low", "high"]].stack()))
+    low, high = (means[side].fillna(means["value"]) for side in ("low", "high"))
+    by_decades = low.min() > 0.0 and high.max() >= _WIDE * low.min()
+    log = by_decades and (y not in COLUMNS or COLUMNS[y].scale == "log")
+    _scale(axes, texts[x], shown, (low.min(), high.max()) if log else None)
     for ax in axes[-1]:
         ax.set_xlabel(literal(title(x)))
     least_in = _AXES_SHARE * page.get_figheight()
@@ -273,14 +276,17 @@ def _panels(size: Size, n_rows: int, n_cols: int) -> tuple[Figure, Any]:
 
 
 def _scale(
-    axes: Any,
-    names: Mapping[Any, str],
-    means: pd.DataFrame,
-    across: _Across,
-    *,
-    log: bool,
+    axes: Any, names: Mapping[Any, str], across: _Across, log: tuple[float, float] | None
 ) -> None:
-    """Choose the axes' scales and ticks; all panels share them. `names` are the values' texts."""
+    """Choose the axes' scales and ticks, which all panels share.
+
+    Parameters
+    ----------
+    names
+        Texts of the values of x.
+    log
+        Range of y on a logarithmic axis.
+    """
     ax = axes[0, 0]
     ax.margins(x=0.08)
     if across.wide:
@@ -294,14 +300,12 @@ def _scale(
         for each in axes[-1]:
             each.set_xticks(range(len(names)), list(names.values()), rotation=25, ha="right")
             each.set_xlim(-0.6, len(names) - 0.4)
-    if log:
+    if log is not None:
+        low, high = map(float, log)
         ax.set_yscale("log")
-        low, high = means["low"].fillna(means["value"]), means["high"].fillna(means["value"])
-        positive = low[low > 0.0]
-        if len(positive) and high.max() < _DECADES * positive.min():
+        if high < _DECADES * low:
             plain_log(ax.yaxis)
-            least = float(positive.min())
-            ax.yaxis.set_major_formatter(lambda value, _: alike([value, least])[0])
+            ax.yaxis.set_major_formatter(lambda value, _: alike([value, low])[0])
 
 
 def _name_lines(page: Figure, axes: Any, heading: str, size: Size, *, direct: bool) -> None:
@@ -352,12 +356,6 @@ def _fits(page: Figure, handles: Mapping[str, Any]) -> bool:
     apart = np.diff(np.sort(ends[:, 1])) * 72.0 / page.dpi
     wide = np.ptp(ends[:, 0]) < 0.1 * lines[0].axes.bbox.width
     return bool(wide and (apart > 1.2 * lines[0].axes.xaxis.label.get_size()).all())
-
-
-def _is_log(y: str, values: pd.Series[float]) -> bool:
-    """Whether a metric is drawn on a logarithmic axis."""
-    scale = COLUMNS[y].scale if y in COLUMNS else "log"
-    return scale == "log" and values.min() > 0.0 and values.max() >= _WIDE * values.min()
 
 
 def by_factors(values: Sequence[float]) -> bool:

@@ -137,7 +137,7 @@ def run_again(
     again.check_estimator()  # without its module its version is another
     require(
         made["code_version"] == row["code_version"],
-        f"the run comes from another version of the code, {row['code_version']}; run the sweep again",
+        f"it comes from another version of the code, {row['code_version']}; run the sweep again",
     )
     return Again(again, int(row[REPEAT]), str(row["recording_checksum"]))
 
