@@ -349,7 +349,7 @@ def example(sensors: Sequence[str] = (), *, places: bool = False) -> tuple[Recor
     places
         A route of place descriptors, instead of a room seen by all other sensors but the 3D lidar.
     """
-    usual = _PLACES if places else _ROOM
+    usual: tuple[str, ...] = _PLACES if places else _ROOM
     if any(override.startswith("sensors=") for override in sensors):
         usual = tuple(override for override in usual if not override.startswith("sensors"))
     experiment = Experiment.compose([*usual, *sensors])

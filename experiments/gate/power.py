@@ -48,9 +48,9 @@ from experiments.gate.compare import (
     examine,
     judge,
 )
-from experiments.gate.faults import FAULTS, Fault, Planted
+from experiments.gate.faults import FAULTS, Fault
 from experiments.gate.report import LABELS
-from experiments.gate.suite import ERRORS, Suite, read_suite, run_suite, suite_path
+from experiments.gate.suite import ERRORS, Planted, Suite, read_suite, run_suite, suite_path
 from experiments.report.export import to_markdown
 from experiments.runs.console import progress
 from experiments.runs.paths import SOURCE, results

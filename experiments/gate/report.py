@@ -106,7 +106,8 @@ def smallest_found() -> dict[str, float]:
         return {}
     try:
         table = pd.read_csv(power, comment="#")
-        return table.groupby("estimator")["smallest"].max().astype(float).to_dict()
+        smallest: pd.Series[float] = table.groupby("estimator")["smallest"].max().astype(float)
+        return {str(name): share for name, share in smallest.items()}
     except (OSError, ValueError, TypeError, KeyError) as error:
         why = str(error).splitlines()[0]
         raise InputError(

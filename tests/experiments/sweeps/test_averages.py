@@ -270,5 +270,6 @@ def test_the_command_refuses_other_endings_before_it_reads(tmp_path):
         done = CliRunner().invoke(app, ["table", str(tmp_path / "none"), *arguments])
         assert isinstance(done.exception, InputError)
         assert re.search(
-            r"a table is \.tex|name the file|no sweep|the size|size column", str(done.exception)
+            r"a table is \.tex|name the file|no sweep|the size|size page|with --rows",
+            str(done.exception),
         )
