@@ -211,7 +211,7 @@ def test_the_last_value_of_a_key_decides_a_sweeps_own_name():
         (["-m", "robot.kr=interval(0,1)"], ["interval(0,1)", "range(0,1,0.1)"]),
         (["-m", "route=glob(nothing*)"], ["empty range or list"]),
         (["-m", "--info"], ["--info", "--config-dir"]),
-        (["-m", "--cfg", "job"], ["--cfg", "leave out -m"]),
+        (["-m", "--cfg", "job"], ["one configuration", "leave out the lists"]),
     ],
 )
 def test_what_hydra_would_ignore_is_refused(arguments, words):
