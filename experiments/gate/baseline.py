@@ -20,6 +20,7 @@ from sim.files import write_text
 
 _COUNT = re.compile(r"(\d+) rows")  # in a baseline's first line, to recognise one cut short
 _COLUMNS = (*WHICH, "checksum", "fingerprint", *ERRORS, "status")
+_TEXTS = ("estimator", "checksum", "status")
 
 
 @dataclass(frozen=True)
@@ -66,11 +67,10 @@ def read_baseline(path: Path) -> Baseline:
     restore = f"restore it, e.g. git checkout -- {path}"
     try:
         text = path.read_text(encoding="utf-8")
-        texts = dict.fromkeys(("estimator", "checksum", "status"), "str")
-        rows = pd.read_csv(path, comment="#", dtype=texts, low_memory=False)
+        rows = pd.read_csv(path, comment="#", dtype=dict.fromkeys(_TEXTS, "str"), low_memory=False)
     except FileNotFoundError as error:
         raise InputError(
-            f"{path}: no baseline yet; check with --accept REASON to make one"
+            f"{path}: no baseline yet; accept a check with a reason to make one"
         ) from error
     except OSError as error:
         raise InputError(f"{path}: cannot read this baseline ({error.strerror})") from error
@@ -85,26 +85,23 @@ def read_baseline(path: Path) -> Baseline:
 
 def _damage(text: str, rows: pd.DataFrame) -> str:
     """What is wrong with a baseline; empty if it is sound."""
-    for name in _COLUMNS:
-        if name not in rows:
-            return f"no column {name}"
+    if missing := [name for name in _COLUMNS if name not in rows]:
+        return f"no column {missing[0]}"
     count = _COUNT.fullmatch(text.partition("\n")[0].removeprefix("# "))
     if not text.endswith("\n") or (count and int(count[1]) != len(rows)):
         return f"cut short at {len(rows)} rows"
-    for name in ("recording", "repeat", "fingerprint", *ERRORS):
-        numbers = pd.to_numeric(rows[name], errors="coerce")
-        wrong = numbers.isna() & rows[name].notna()
-        if wrong.any():
-            return f"{name} {rows.loc[wrong, name].iloc[0]!r} is no number"
-        if name not in ERRORS and not np.isfinite(numbers.to_numpy(np.float64)).all():
+    for name in _COLUMNS:
+        cells = rows[name]
+        if name not in _TEXTS:
+            numbers = pd.to_numeric(cells, errors="coerce")
+            if len(wrong := cells[numbers.isna() & cells.notna()]):
+                return f"{name} {wrong.iloc[0]!r} is not a number"
+            cells = numbers.replace([np.inf, -np.inf], np.nan)
+        if name not in ERRORS and cells.isna().any():
             return f"a row without {name}"
-    for name in ("estimator", "checksum", "status"):
-        if rows[name].isna().any():
-            return f"a row without {name}"
-    twice = rows.duplicated(list(WHICH))
-    if twice.any():
-        which = rows.loc[twice, list(WHICH)].iloc[0]
-        return "two rows of {}, recording {}, repeat {}".format(*which)
+    twice = rows[rows.duplicated(list(WHICH))]
+    if len(twice):
+        return "two rows of {}, recording {}, repeat {}".format(*twice.iloc[0][list(WHICH)])
     runs = rows.groupby(["estimator", "recording"]).size().groupby("estimator").nunique()
     if (runs > 1).any():
         return f"rows of {runs.idxmax()} are missing"
@@ -178,12 +175,12 @@ def check(
         If the suite or a baseline cannot be used.
     """
     suite = read_suite(suite_path(suite_name)).of(only).made(elsewhere=candidate is not None)
-    paths = baseline_paths(suite_name)
-    if not paths["release"].exists():
-        del paths["release"]
-    baselines = {key: read_baseline(path).rows for key, path in paths.items()}
-    rows = _rows(suite, repeats_of(suite, of_baseline=False), candidate, on_progress)
-    return compare(baselines, rows)
+    baselines = {
+        key: read_baseline(path).rows
+        for key, path in baseline_paths(suite_name).items()
+        if key == "accepted" or path.exists()
+    }
+    return compare(baselines, _rows(suite, 1, candidate, on_progress))
 
 
 def accept(
@@ -200,31 +197,27 @@ def accept(
     With `only`, the other estimators keep their baselines. The release baseline stays as it is,
     unless there is none, or `release` pins it to this too.
     """
-    require(
-        reason.strip(), '--accept needs a reason, such as --accept "faster matching, 2 % worse"'
-    )
+    require(reason.strip(), "accepting needs a reason, such as 'faster matching, 2 % worse'")
     whole = read_suite(suite_path(suite_name))
     suite = whole.of(only).made(elsewhere=candidate is not None)
     names = [entry.name for entry in suite.estimators]
-    known = [entry.name for entry in whole.estimators]
     paths = baseline_paths(suite_name)
-    alike = [e for e in whole.estimators if e.elsewhere == (candidate is not None)]
+    n_alike = sum(e.elsewhere == (candidate is not None) for e in whole.estimators)
     old = {key: read_baseline(path) for key, path in paths.items() if path.exists()}
     for key, path in paths.items():
         require(
-            key in old or len(names) >= len(alike),
+            key in old or len(names) >= n_alike,
             f"{path}: no baseline yet, and one of {', '.join(names)} alone would not do; "
-            "accept the whole suite, without --only",
+            "accept the whole suite",
         )
-    rows = _rows(suite, repeats_of(suite, of_baseline=True), candidate, on_progress)
-    bad = rows[failed(rows)]
-    if len(bad):
-        first = bad.iloc[0]
+    rows = _rows(suite, 0, candidate, on_progress)
+    for _, first in rows[failed(rows)].head(1).iterrows():
         raise InputError(
             f"{first['estimator']} fails on recording {first['recording']} ({how(first)}); a "
             "baseline of failures guards nothing"
         )
     findings = [f for key in old for f in _compared({key: old[key].rows}, rows)]
+    known = [entry.name for entry in whole.estimators]
     written, copied = [], []
     for key, path in baseline_paths(suite_name, own=True).items():
         if key == "accepted" or release or key not in old:
@@ -237,11 +230,10 @@ def accept(
 
 
 def _rows(
-    suite: Suite,
-    repeats: dict[str, int],
-    candidate: Path | None,
-    on_progress: Callable[[float], None],
+    suite: Suite, side: int, candidate: Path | None, on_progress: Callable[[float], None]
 ) -> pd.DataFrame:
+    """Rows of a baseline (side 0) or of a check (1)."""
+    repeats = {entry.name: entry.repeats[side] for entry in suite.estimators}
     if candidate is not None:
         return candidate_rows(suite, candidate, repeats, on_progress)
     return run_suite(suite, repeats, on_progress=on_progress)
@@ -254,8 +246,3 @@ def _compared(baseline: dict[str, pd.DataFrame], rows: pd.DataFrame) -> list[Fin
         with contextlib.suppress(InputError):  # new, or on other recordings
             findings += compare(baseline, of_one)
     return findings
-
-
-def repeats_of(suite: Suite, *, of_baseline: bool) -> dict[str, int]:
-    """Runs of each estimator on each recording."""
-    return {entry.name: entry.repeats[0 if of_baseline else 1] for entry in suite.estimators}

@@ -38,20 +38,17 @@ def write_recordings(
     groups = [g for g in named if Experiment.compose(suite.overrides[g]).team is None]
     total = sum(suite.counts[group] for group in groups)
     bags = importlib.util.find_spec("rosbags") is not None
-    done = 0
-    for group in groups:
-        for seed, experiment, team in _recordings(suite, group):
-            recording = team.only
-            prior = experiment.prior(recording)
-            copy = recording_of(list(recording.frames()), prior)
-            stem = folder / f"{group}_{seed}"
-            if bags:
-                write_bag(stem.with_suffix(".mcap"), copy)
-            if "laser" in copy.logs:
-                write_carmen(stem.with_suffix(".log"), copy)
-            write_text(stem.with_suffix(".start.txt"), start_text(prior))
-            done += 1
-            on_progress(done / total)
+    runs = ((group, *run) for group in groups for run in _recordings(suite, group))
+    for done, (group, seed, experiment, team) in enumerate(runs, start=1):
+        prior = experiment.prior(team.only)
+        copy = recording_of(list(team.only.frames()), prior)
+        stem = folder / f"{group}_{seed}"
+        if bags:
+            write_bag(stem.with_suffix(".mcap"), copy)
+        if "laser" in copy.logs:
+            write_carmen(stem.with_suffix(".log"), copy)
+        write_text(stem.with_suffix(".start.txt"), start_text(prior))
+        on_progress(done / total)
     return total
 
 
@@ -73,12 +70,12 @@ def candidate_rows(
     The files are GROUP_SEED.tum (or .csv, .mcap, .bag), of several repeats GROUP_SEED.0.tum and so
     on; in a folder of its own, called by the entry, for each of several entries. A trajectory that
     is missing, cannot be read, or has a gap of more than a second is a run that failed. Files of
-    trajectories that are of no run are left out, and named.
+    trajectories that belong to no run are left out, and named.
 
     Raises
     ------
     InputError
-        If there is no trajectory at all.
+        If there are none.
     """
     rows: list[dict[str, Any]] = []
     for place, entry in enumerate(suite.estimators):
@@ -104,7 +101,7 @@ def candidate_rows(
 
 
 def _tell_of_others(folder: Path, read: set[Path | None]) -> None:
-    """Name the trajectories of a folder that are of no run."""
+    """Name the trajectories of a folder that belong to no run."""
     others = sorted(p.name for p in folder.iterdir() if p.suffix in SUFFIXES and p not in read)
     if others:
         more = f" and {len(others) - 5} more" if len(others) > 5 else ""

@@ -108,8 +108,8 @@ def exchange_p(
     then, now
         (n, B) and (n, C) logs of errors.
     """
-    runs, n_now = np.concatenate([now, then], axis=1), now.shape[1]
-    sums = _exchanged_sums(runs - runs.mean(axis=1, keepdims=True), n_now, rng)
+    runs = np.concatenate([now, then], axis=1)
+    sums = _exchanged_sums(runs - runs.mean(axis=1, keepdims=True), now.shape[1], rng)
     seen = float(sums[:, 0].sum())
     spread = math.sqrt(float(sums.var(axis=1).sum()))
     if abs(seen) <= _PLAIN * spread:  # nothing there: the normal distribution will do
@@ -124,7 +124,7 @@ def exchange_p(
 
 
 def _exchanged_sums(runs: Array, n_now: int, rng: np.random.Generator) -> Array:
-    """Sums of n_now of each recording's (n, B) runs, (n, ways); the first is of those seen."""
+    """Sums of n_now of each recording's (n, B) runs, (n, ways); the first is that of those seen."""
     if math.comb(runs.shape[1], n_now) <= _MOST_WAYS:
         picks = np.array(list(itertools.combinations(range(runs.shape[1]), n_now)))
         return np.asarray(runs[:, picks].sum(axis=2))
@@ -141,7 +141,7 @@ def general_p(differences: Array) -> tuple[float, float]:
     n, mean = len(differences), float(differences.mean())
     spread = float(differences.std(ddof=1)) / math.sqrt(n)
     if spread == 0.0:
-        return (0.0 if mean > 0.0 else 1.0), (0.0 if mean < 0.0 else 1.0)
+        return float(mean <= 0.0), float(mean >= 0.0)
     above = float(stats.t.sf(mean / spread, n - 1))
     return above, 1.0 - above
 
@@ -225,7 +225,6 @@ def compare(
             then = baseline[baseline["estimator"] == estimator]
             _same_recordings(str(estimator), name, then, now)
             failing = _newly_failing(then, now)
-            failure = failing[1] if failing else ""
             for error in ERRORS:
                 finding = examine(
                     (str(estimator), error, name),
@@ -233,7 +232,7 @@ def compare(
                     by_repeat(now, error),
                     stream(0, f"exchange/{estimator}/{error}"),
                     n_draws,
-                    failure,
+                    failing[1] if failing else "",
                     sorted(then["recording"].unique()),
                 )
                 if failing:
@@ -249,7 +248,7 @@ def by_repeat(rows: pd.DataFrame, error: str) -> Array:
 
 
 def _same_recordings(estimator: str, name: str, then: pd.DataFrame, now: pd.DataFrame) -> None:
-    remedy = "; check with --accept REASON to start a new baseline"
+    remedy = "; accept a check with a reason to start a new baseline"
     require(not then.empty, f"the {name} baseline does not know {estimator}{remedy}")
     before, after = (
         rows.drop_duplicates("recording").set_index("recording") for rows in (then, now)
@@ -284,8 +283,7 @@ def _newly_failing(then: pd.DataFrame, now: pd.DataFrame) -> tuple[int, str] | N
     """First recording where runs fail and none of the baseline's did, and how; None: no such."""
     bad = now[failed(now)]
     new = bad[~bad["recording"].isin(then.loc[failed(then), "recording"])]
-    if new.empty:
-        return None
-    first = new.iloc[0]
-    line = f"{len(bad)} of {len(now)} runs fail; recording {first['recording']}: {how(first)}"
-    return int(first["recording"]), line
+    for _, first in new.head(1).iterrows():
+        line = f"{len(bad)} of {len(now)} runs fail; recording {first['recording']}: {how(first)}"
+        return int(first["recording"]), line
+    return None

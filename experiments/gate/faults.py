@@ -8,6 +8,7 @@ import dataclasses
 import math
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from functools import partial
 from typing import Any
 from unittest import mock
 
@@ -19,31 +20,13 @@ from estimators.gaussian import Gaussian
 from estimators.landmarks.stereo import StereoModel
 from estimators.laser import ekf_icp, ekf_icp_paper
 from estimators.laser.scan_matching import Match, ScanMatcher
+from experiments.gate.suite import Planted
 from sim.arrays import Array
 from sim.recording import Frame
 from sim.robot.slip import wheel_errors
 from sim.sensors import Laser, Reading, sensor_of
 
-Planted = Callable[[Estimator, np.random.Generator], AbstractContextManager[object]]
 Fault = Callable[[float], Planted]  # of a size
-
-
-def _planted(owner_of: Callable[[Estimator], Any], name: str, wrong: Callable[..., Any]) -> Fault:
-    """Fault that puts `wrong(sound, size, rng, *arguments)` in place of an attribute."""
-
-    def fault(size: float) -> Planted:
-        def plant(estimator: Estimator, rng: np.random.Generator) -> AbstractContextManager[object]:
-            owner = owner_of(estimator)
-            sound = getattr(owner, name)
-
-            def faulty(*arguments: Any, **keywords: Any) -> Any:
-                return wrong(sound, size, rng, *arguments, **keywords)
-
-            return mock.patch.object(owner, name, faulty)
-
-        return plant
-
-    return fault
 
 
 def in_argument_of(
@@ -55,11 +38,15 @@ def in_argument_of(
     """
 
     def decorate(change: Callable[[Any, float, np.random.Generator], Any]) -> Fault:
-        return _planted(
-            lambda estimator: estimator,
-            method,
-            lambda sound, size, rng, first, *others: sound(change(first, size, rng), *others),
-        )
+        def plant(
+            size: float, estimator: Estimator, rng: np.random.Generator
+        ) -> AbstractContextManager[object]:
+            sound = getattr(estimator, method)
+            return mock.patch.object(
+                estimator, method, lambda first, *rest: sound(change(first, size, rng), *rest)
+            )
+
+        return lambda size: partial(plant, size)
 
     return decorate
 
@@ -71,13 +58,11 @@ def in_place_of(owner: Any, name: str) -> Callable[[Callable[..., Any]], Fault]:
     """
 
     def decorate(wrong: Callable[..., Any]) -> Fault:
-        return _planted(
-            lambda _: owner,
-            name,
-            lambda sound, size, _, *arguments, **keywords: wrong(
-                sound, size, *arguments, **keywords
-            ),
-        )
+        def plant(size: float, *_: object) -> AbstractContextManager[object]:
+            sound = getattr(owner, name)
+            return mock.patch.object(owner, name, lambda *a, **k: wrong(sound, size, *a, **k))
+
+        return lambda size: partial(plant, size)
 
     return decorate
 

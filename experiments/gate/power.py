@@ -37,7 +37,6 @@ from experiments.gate.baseline import (
     baseline_folder,
     baseline_paths,
     read_baseline,
-    repeats_of,
 )
 from experiments.gate.compare import (
     ALPHA_GENERAL,
@@ -49,9 +48,9 @@ from experiments.gate.compare import (
     examine,
     judge,
 )
-from experiments.gate.faults import FAULTS, Fault, Planted
+from experiments.gate.faults import FAULTS, Fault
 from experiments.gate.report import LABELS
-from experiments.gate.suite import ERRORS, Suite, read_suite, run_suite, suite_path
+from experiments.gate.suite import ERRORS, Planted, Suite, read_suite, run_suite, suite_path
 from experiments.report.export import to_markdown
 from experiments.runs.console import progress
 from experiments.runs.paths import SOURCE, results
@@ -176,12 +175,13 @@ def fill_pool(
             write_frame(make(), path)
         return pd.read_parquet(path)
 
-    def graded(name: str, fault: Fault, start: float) -> pd.DataFrame:
-        def measure(planted: Planted) -> pd.DataFrame:
-            runs = {name: _FAULTY_RANDOM if name in random else 1}
-            return run_suite(pooled, runs, reseed=2, planted={name: planted})
+    def measure(name: str, planted: Planted) -> pd.DataFrame:
+        runs = {name: _FAULTY_RANDOM if name in random else 1}
+        return run_suite(pooled, runs, reseed=2, planted={name: planted})
 
-        size, rows = grade(fault, start, measure, sound[name, "ate_rmse_m"], name)
+    def graded(name: str, fault: Fault, start: float) -> pd.DataFrame:
+        position = sound[name, "ate_rmse_m"]
+        size, rows = grade(fault, start, partial(measure, name), position, name)
         return rows.assign(size=size)
 
     n_runs = {entry.name: _RANDOM if entry.name in random else 1 for entry in suite.estimators}
@@ -302,44 +302,50 @@ def power_table(pool: Pool, n_checks: int, on_progress: Callable[[float], None])
 
 def run_variant(name: str, suite: Suite) -> pd.DataFrame:
     """Run a whole suite under one of VARIANTS, in this process's environment."""
-    repeats = repeats_of(suite, of_baseline=False)
+    repeats = {entry.name: entry.repeats[1] for entry in suite.estimators}
     planted = dict.fromkeys(repeats, reordered) if VARIANTS[name][1] else None
     return run_suite(suite, repeats, reseed=10 + list(VARIANTS).index(name), planted=planted)
 
 
 def variants(
     suite_name: str, share: float, folder: Path, on_progress: Callable[[float], None]
-) -> list[dict[str, Any]]:
-    """Check the same code under each of VARIANTS, each in a process of its own."""
+) -> list[dict[str, str]]:
+    """Check the same code under each of VARIANTS, each in a process of its own; in words."""
     rows = []
     then = {key: read_baseline(path).rows for key, path in baseline_paths(suite_name).items()}
     for done, (name, (environment, _)) in enumerate(VARIANTS.items(), start=1):
         path = folder / f"variant_{done}.parquet"
         if not path.exists():
             given = ("--variant", name, "--share", str(share), "--suite", suite_name)
-            files = ("--folder", str(folder), "--out", str(path))
-            own = {**os.environ, **environment}
-            if "NUMBA_CPU_NAME" in environment:
-                own["NUMBA_CACHE_DIR"] = str(folder / f"compiled_{done}")
+            own = {}
             if environment:  # the last bits of recordings change too
-                own["ESTIMA_RESULTS"] = str(folder / f"results_{done}")
-            subprocess.run([*_COMMAND, *given, *files], check=True, env=own)
+                own = {
+                    "NUMBA_CACHE_DIR": str(folder / f"compiled_{done}"),
+                    "ESTIMA_RESULTS": str(folder / f"results_{done}"),
+                }
+            subprocess.run(
+                [*_COMMAND, *given, "--out", str(path)],
+                check=True,
+                env={**os.environ, **environment, **own},
+            )
         rows_now = pd.read_parquet(path)
         known = rows_now["recording"].groupby(rows_now["estimator"]).max()
         of_pool = {  # the pool may hold fewer recordings
             key: rows_then[rows_then["recording"] <= rows_then["estimator"].map(known)]
             for key, rows_then in then.items()
         }
-        found = compare(of_pool, rows_now)
-        fixed = [f for f in found if f.verdict is Change.IDENTICAL]
+        findings = compare(of_pool, rows_now)
+        fixed = [f for f in findings if f.verdict is Change.IDENTICAL]
+        largest = max((abs(f.ratio - 1.0) for f in fixed), default=0.0)
+        least_p = min((f.p_real[0] for f in findings if f not in fixed), default=1.0)
         rows.append(
             {
-                "variant": name,
-                "tests": len(found),
-                "identical": len(fixed),
-                "largest_change": max((abs(f.ratio - 1.0) for f in fixed), default=0.0),
-                "least_p": min((f.p_real[0] for f in found if f not in fixed), default=1.0),
-                "alarms": sum(f.alarms for f in found),
+                "condition": name,
+                "tests": str(len(findings)),
+                "equal to rounding": str(len(fixed)),
+                "largest change of those": f"{largest:.1g}",
+                "least p of the others": f"{least_p:.2g}",
+                "alarms": str(sum(f.alarms for f in findings)),
             }
         )
         on_progress(done / len(VARIANTS))
@@ -347,7 +353,7 @@ def variants(
 
 
 def measured_text(
-    pool: Pool, null: tuple[int, int], power: pd.DataFrame, equal: list[dict[str, Any]]
+    pool: Pool, null: tuple[int, int], power: pd.DataFrame, equal: list[dict[str, str]]
 ) -> str:
     """Markdown of what was measured, for docs/regression.md."""
     hits, n_checks = null
@@ -358,7 +364,7 @@ def measured_text(
     )
     n_found = (power["found"] * power["checks"]).sum()
     overall = share_interval(round(n_found), int(power["checks"].sum()))
-    lines = [
+    lines = (
         f"Pool: {counts} recordings; {_RANDOM} sound seedings of each estimator that draws at "
         f"random, and {_FAULTY_RANDOM} of each of its faults.",
         "",
@@ -369,7 +375,7 @@ def measured_text(
         "Whole checks of the same code under other conditions, against the tracked baselines "
         "(every estimator reseeded, recordings simulated again where the processor changes):",
         "",
-        to_markdown(pd.DataFrame([_condition(row) for row in equal])),
+        to_markdown(pd.DataFrame(equal)),
         "**Power** at faults graded to a rise of the position error by 10 %, in whole checks "
         f"drawn from the pool ({power['checks'].iloc[0]} each):",
         "",
@@ -380,19 +386,8 @@ def measured_text(
         f"All faults together: {100 * overall.value:.1f} % found (95 %: {100 * overall.low:.1f} to "
         f"{100 * overall.high:.1f}); {(power['found'] >= 0.95).sum()} of {len(power)} faults reach "
         "95 %.",
-    ]
+    )
     return "\n".join(lines)
-
-
-def _condition(row: dict[str, Any]) -> dict[str, str]:
-    return {
-        "condition": row["variant"],
-        "tests": str(row["tests"]),
-        "equal to rounding": str(row["identical"]),
-        "largest change of those": f"{row['largest_change']:.1g}",
-        "least p of the others": f"{row['least_p']:.2g}",
-        "alarms": str(row["alarms"]),
-    }
 
 
 def _fault(row: dict[str, Any]) -> dict[str, str]:

@@ -52,10 +52,9 @@ def run_check(
             print(f"copied, unchanged: {short(path)}")
         left = [f for f in accepted.findings if f.alarms and f.baseline == "release"]
         if left and not release:
-            again = _options(suite, left)
             print(
-                f"worse than the release baseline, and checks will say so until you pin it again: "
-                f'estima check{again} --accept "REASON" --release'
+                "worse than the release baseline, and checks will say so until you pin it again: "
+                f'estima check{_options(suite, left)} --accept "REASON" --release'
             )
         return False
     require(not release, "--release goes with --accept REASON")
@@ -107,7 +106,8 @@ def smallest_found() -> dict[str, float]:
         return {}
     try:
         table = pd.read_csv(power, comment="#")
-        return {str(k): float(v) for k, v in table.groupby("estimator")["smallest"].max().items()}
+        smallest: pd.Series[float] = table.groupby("estimator")["smallest"].max().astype(float)
+        return {str(name): share for name, share in smallest.items()}
     except (OSError, ValueError, TypeError, KeyError) as error:
         why = str(error).splitlines()[0]
         raise InputError(
@@ -124,8 +124,8 @@ def _options(suite: str, findings: Sequence[Finding]) -> str:
 
 def _hint(suite: str, findings: Sequence[Finding]) -> str:
     """Command that accepts what is worse."""
-    worse = [finding for finding in findings if finding.alarms]
-    return f'if it is intended: estima check{_options(suite, worse)} --accept "REASON"'
+    options = _options(suite, [finding for finding in findings if finding.alarms])
+    return f'if it is intended: estima check{options} --accept "REASON"'
 
 
 def _where_to_look(suite: str, findings: Sequence[Finding]) -> str:
@@ -248,13 +248,12 @@ def as_junit(findings: Sequence[Finding]) -> str:
             case = ET.SubElement(
                 suite, "testcase", classname=f"{baseline}.{finding.estimator}", name=finding.error
             )
+            words = sentence(finding)
             if finding.alarms:
-                failure = ET.SubElement(
-                    case, "failure", message=sentence(finding), type=finding.verdict
-                )
+                failure = ET.SubElement(case, "failure", message=words, type=finding.verdict)
                 failure.text = f"p real {finding.p_real[0]:.2g}, p {finding.p_general[0]:.2g}"
             else:
-                ET.SubElement(case, "system-out").text = sentence(finding)
+                ET.SubElement(case, "system-out").text = words
     ET.indent(root)
     return '<?xml version="1.0" encoding="utf-8"?>\n' + ET.tostring(root, encoding="unicode") + "\n"
 

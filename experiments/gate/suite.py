@@ -11,13 +11,15 @@ import math
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import pandas as pd
+from joblib import Parallel, delayed
+from pydantic import Field, Strict
 
 from estimators.base import Estimate, Estimator
 from experiments.runs import paths
@@ -28,6 +30,7 @@ from experiments.runs.seeds import stream
 from experiments.viewing.run_figure import run_figure
 from experiments.viewing.style import save_figure
 from sim.errors import InputError, printable, require
+from sim.options import build, options
 from sim.recording import Recording
 from sim.team import Team
 from sim.yaml_file import read_yaml
@@ -37,7 +40,19 @@ _RESEEDED = 1000  # streams of one seeding; repeats of the next start beyond the
 _GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
 
 
-@dataclass(frozen=True)
+_Overrides = Annotated[tuple[str, ...], Strict(False), "a list of texts"]
+_Repeats = Annotated[int, Field(ge=1, le=_RESEEDED)]
+
+
+@options("group")
+class _Group:
+    """Recordings of a suite: how many, and the Hydra overrides that make them."""
+
+    count: Annotated[int, Field(ge=2)]
+    overrides: _Overrides
+
+
+@options("entry")
 class Entry:
     """An estimator of a suite.
 
@@ -45,27 +60,46 @@ class Entry:
     ----------
     name
         What its rows and its streams are called.
-    estimator
-        Option of conf/estimator.
     recordings
         Name of the group of recordings that it reads.
     repeats
         Runs with streams of their own on each recording: of the baseline, and of a check.
+    estimator
+        Option of conf/estimator; its name by default.
     overrides
         Hydra overrides beside those of the recordings.
     revised
         Whether the trajectory of `finish` is judged, and not the online one.
     elsewhere
-        Whether its trajectories are made elsewhere, and checked by `--candidate`.
+        Whether its trajectories are made elsewhere, and checked as a candidate's.
     """
 
     name: str
-    estimator: str
     recordings: str
-    repeats: tuple[int, int]
-    overrides: tuple[str, ...] = ()
+    repeats: Annotated[
+        tuple[_Repeats, _Repeats], Strict(False), f"two whole numbers from 1 to {_RESEEDED}"
+    ]
+    estimator: str = ""
+    overrides: _Overrides = ()
     revised: bool = False
     elsewhere: bool = False
+
+    def __post_init__(self) -> None:
+        require(
+            not (self.elsewhere and (self.estimator or self.overrides)),
+            "entry.elsewhere: what is made elsewhere has neither estimator nor overrides here",
+        )
+
+
+@options("suite")
+class _File:
+    """A suite's YAML."""
+
+    first_seed: Annotated[int, Field(ge=0)]
+    recordings: dict[str, Any]
+    estimators: Annotated[
+        dict[str, Any], Field(min_length=1), "a mapping of names to entries, at least one"
+    ]
 
 
 @dataclass(frozen=True)
@@ -85,7 +119,7 @@ class Suite:
     first_seed: int
     counts: Mapping[str, int]
     overrides: Mapping[str, tuple[str, ...]]
-    estimators: tuple[Entry, ...] = field(default_factory=tuple)
+    estimators: tuple[Entry, ...]
 
     def cut(self, share: float) -> Suite:
         """Return the same suite with this share of its recordings."""
@@ -110,13 +144,9 @@ class Suite:
         """
         chosen = tuple(entry for entry in self.estimators if entry.elsewhere == elsewhere)
         names = ", ".join(entry.name for entry in self.estimators)
-        require(
-            chosen,
-            f"no estimator of {names} is marked `elsewhere: true` in the suite; --candidate judges "
-            "those"
-            if elsewhere
-            else f"{names}: made elsewhere; check by --candidate DIR",
-        )
+        lacking = f"no estimator of {names} is marked `elsewhere: true` in the suite"
+        candidate = f"{names}: made elsewhere; check a candidate's trajectories"
+        require(chosen, lacking if elsewhere else candidate)
         return dataclasses.replace(self, estimators=chosen)
 
 
@@ -133,77 +163,33 @@ def read_suite(path: Path) -> Suite:
     """
     content = read_yaml(path)
     try:
-        groups = content["recordings"]
-        suite = Suite(
-            content["first_seed"],
-            {name: group["count"] for name, group in groups.items()},
-            {name: _overrides(group["overrides"]) for name, group in groups.items()},
-            tuple(_entry(name, given) for name, given in content["estimators"].items()),
+        return _suite(build(_File, content, "suite"))
+    except InputError as error:
+        raise InputError(f"{path}: {error}; conf/suite/check.yaml is an example") from error
+
+
+def _suite(file: _File) -> Suite:
+    groups = {
+        name: build(_Group, settings, f"recordings.{name}")
+        for name, settings in file.recordings.items()
+    }
+    entries = []
+    for name, settings in file.estimators.items():
+        where = f"estimators.{name}"
+        require(isinstance(settings, Mapping), f"{where} must be a mapping, got {settings!r}")
+        entry = build(Entry, {**settings, "name": name}, where)
+        known = ", ".join(groups)
+        require(
+            entry.recordings in groups, f"{where}.recordings={entry.recordings!r}; known: {known}"
         )
-    except (KeyError, TypeError, AttributeError, ValueError) as error:
-        raise InputError(
-            f"{path}: a suite holds first_seed, recordings (count, overrides) and estimators "
-            "(estimator, recordings, repeats, overrides, revised), as conf/suite/check.yaml does "
-            f"({error!r})"
-        ) from error
-    checks = [
-        (
-            _is_whole(suite.first_seed, 0),
-            f"first_seed must be a whole number, zero or more, got {suite.first_seed!r}",
-        ),
-        (suite.estimators, "estimators is empty; name at least one of conf/estimator"),
-        *(
-            (_is_whole(n, 2), f"recordings.{group}.count must be 2 or more, got {n!r}")
-            for group, n in suite.counts.items()
-        ),
-        *(
-            (
-                entry.recordings in suite.counts,
-                f"estimators.{entry.name}.recordings={entry.recordings!r}; known: "
-                f"{', '.join(map(str, suite.counts))}",
-            )
-            for entry in suite.estimators
-        ),
-        *(
-            (
-                all(_is_whole(n, 1, _RESEEDED) for n in entry.repeats),
-                f"estimators.{entry.name}.repeats must lie in 1..{_RESEEDED}, got "
-                f"{list(entry.repeats)}",
-            )
-            for entry in suite.estimators
-        ),
-    ]
-    for sound, complaint in checks:
-        require(sound, f"{path}: {complaint}")
-    return suite
-
-
-def _is_whole(value: Any, least: int, most: float = math.inf) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and least <= value <= most
-
-
-def _overrides(given: Any) -> tuple[str, ...]:
-    if not (isinstance(given, list) and all(isinstance(override, str) for override in given)):
-        raise TypeError(f"overrides must be a list of texts, got {given!r}")
-    return tuple(given)
-
-
-def _entry(name: Any, given: dict[str, Any]) -> Entry:
-    baseline, check = given["repeats"]
-    known = ("estimator", "recordings", "repeats", "overrides", "revised", "elsewhere")
-    unknown = set(given) - set(known)
-    if unknown:
-        raise KeyError(f"{name}.{sorted(map(str, unknown))[0]}")
-    texts = name, option, group = name, given.get("estimator", name), given["recordings"]
-    flags = revised, elsewhere = given.get("revised", False), given.get("elsewhere", False)
-    if not (all(isinstance(t, str) for t in texts) and all(isinstance(f, bool) for f in flags)):
-        raise TypeError(
-            f"{name}: names and recordings must be texts, revised and elsewhere true or false"
-        )
-    overrides = _overrides(given.get("overrides") or [])
-    if elsewhere and (overrides or "estimator" in given):
-        raise TypeError(f"{name}: what is made elsewhere has neither estimator nor overrides here")
-    return Entry(name, option, group, (baseline, check), overrides, revised, elsewhere)
+        runs = "" if entry.elsewhere else entry.estimator or name
+        entries.append(dataclasses.replace(entry, estimator=runs))
+    return Suite(
+        file.first_seed,
+        {name: group.count for name, group in groups.items()},
+        {name: group.overrides for name, group in groups.items()},
+        tuple(entries),
+    )
 
 
 def suite_path(name: str) -> Path:
@@ -239,67 +225,58 @@ def run_suite(
         Also: `checksum`, the first digits of the recording's; `fingerprint`, a number that
         rounding hardly moves; and `status`, `ok` or the exception that ended the run.
     """
-    from joblib import Parallel, delayed
-
     jobs = []
     for group, count in suite.counts.items():
         runs = [
-            (entry, _experiment(suite, entry, repeats), (planted or {}).get(entry.name))
+            (
+                entry,
+                Experiment.compose(_overrides(suite, entry)).replaced(repeats=repeats[entry.name]),
+                (planted or {}).get(entry.name),
+            )
             for entry in suite.estimators
             if entry.recordings == group and entry.name in repeats
         ]
         if runs:
             jobs += [(suite.first_seed + i, runs, reseed) for i in range(count)]
     rows: list[dict[str, Any]] = []
-    done = Parallel(n_jobs=n_jobs, return_as="generator")(
+    parts = Parallel(n_jobs=n_jobs, return_as="generator")(
         delayed(_run_recording)(*job) for job in jobs
     )
-    for i, part in enumerate(done, start=1):
-        rows.extend(part)
-        on_progress(i / len(jobs))
+    for done, part in enumerate(parts, start=1):
+        rows += part
+        on_progress(done / len(jobs))
     return pd.DataFrame(rows)
 
 
 def draw_run(suite: Suite, estimator: str, recording: int, path: Path) -> bool:
     """Draw the first run of an estimator over a recording of a suite; False if it fails."""
     (entry,) = suite.of([estimator]).estimators
+    estimates: list[tuple[Recording, Estimate]] = []
 
-    found: list[tuple[Recording, Estimate]] = []
+    def keep(read: Recording, _: int, online: Estimate, revised: Estimate | None) -> None:
+        estimates.append((read, revised if entry.revised and revised is not None else online))
 
-    def keep(made: Recording, _: int, online: Estimate, revised: Estimate | None) -> None:
-        found.append((made, revised if entry.revised and revised is not None else online))
-
-    rows = evaluate(
-        _experiment(suite, entry, {estimator: 1}).replaced(seed=recording, world_seed=recording),
+    (row, *_) = evaluate(
+        Experiment.compose(_overrides(suite, entry, recording)).replaced(repeats=1),
         streams=partial(_stream, f"estimator/{estimator}", recording, 0),
         on_estimate=keep,
     )
-    if found:
-        save_figure(run_figure(found, estimator), path)
-    return rows[0]["status"] != Outcome.FAILED
+    if estimates:
+        save_figure(run_figure(estimates, estimator), path)
+    return row["status"] != Outcome.FAILED
 
 
 def command_of(suite: Suite, estimator: str, recording: int) -> str:
     """Return the command that runs one estimator over one recording of a suite, and draws it."""
     (entry,) = suite.of([estimator]).estimators
-    overrides = [
-        *suite.overrides[entry.recordings],
-        f"estimator={entry.estimator}",
-        *entry.overrides,
-        f"seed={recording}",
-        f"world_seed={recording}",
-    ]
-    return shlex.join(["estima", "run", *overrides])
+    return shlex.join(["estima", "run", *_overrides(suite, entry, recording)])
 
 
-def _experiment(suite: Suite, entry: Entry, repeats: Mapping[str, int]) -> Experiment:
-    """An estimator over its recordings, whatever their seed."""
-    overrides = [
-        *suite.overrides[entry.recordings],
-        f"estimator={entry.estimator}",
-        *entry.overrides,
-    ]
-    return Experiment.compose(overrides).replaced(repeats=repeats[entry.name])
+def _overrides(suite: Suite, entry: Entry, seed: int | None = None) -> list[str]:
+    """Overrides of an estimator over its recordings, or over the one of a seed."""
+    seeds = [] if seed is None else [f"seed={seed}", f"world_seed={seed}"]
+    of_group = suite.overrides[entry.recordings]
+    return [*of_group, f"estimator={entry.estimator}", *entry.overrides, *seeds]
 
 
 def _run_recording(
@@ -314,14 +291,14 @@ def _run_recording(
             experiment.replaced(seed=seed, world_seed=seed),
             lambda: recording,
             streams=partial(_stream, f"estimator/{entry.name}", seed, reseed),
-            planted=None if planted is None else _plant(planted, seed, reseed),
+            planted=planted and partial(_plant, planted, seed, reseed),
         ):
             prefix = "revised_" if entry.revised else ""
             require(
                 not entry.revised or row["status"] != Outcome.OK or "revised_ate_rmse_m" in row,
                 f"{entry.name} has no finish; drop `revised` from the suite",
             )
-            # a collision is no fault of the estimator
+            # the estimator is not to blame for a collision
             at_fault = row["status"] == Outcome.FAILED and row["status_code"] != "recording"
             why = printable(f"{row['status_code']}: {row['status_detail']}") if at_fault else "ok"
             which = {"estimator": entry.name, "recording": seed, "repeat": row["repeat"]}
@@ -335,9 +312,9 @@ def _stream(axis: str, seed: int, reseed: int, repeat: int) -> np.random.Generat
 
 
 def _plant(
-    planted: Planted, seed: int, reseed: int
-) -> Callable[[Estimator, int], AbstractContextManager[object]]:
-    return lambda estimator, repeat: planted(estimator, _stream("fault", seed, reseed, repeat))
+    planted: Planted, seed: int, reseed: int, estimator: Estimator, repeat: int
+) -> AbstractContextManager[object]:
+    return planted(estimator, _stream("fault", seed, reseed, repeat))
 
 
 def fingerprint(read: Team) -> float:

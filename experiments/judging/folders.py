@@ -18,9 +18,11 @@ def code_folder(study: str) -> Path:
 def findings(study: str) -> dict[str, Any]:
     """A study's findings in our words.
 
-    They are its `title`, `about`, `claims` and `sentences` by id, the `unit` that intervals narrow
+    They are its `title`, `about`, `claims` and `sentences` by id, those claims that are our `own`
+    rather than the paper's, the `unit` that intervals narrow
     with, and `figures` by file name.
     """
     path = code_folder(study) / "findings.yaml"
     found = read_yaml(path) if path.exists() else {}
-    return {**{"title": study, "about": "", "claims": {}, "sentences": {}, "figures": {}}, **found}
+    empty = {"title": study, "about": "", "claims": {}, "own": [], "sentences": {}, "figures": {}}
+    return {**empty, **found}

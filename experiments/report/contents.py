@@ -23,12 +23,12 @@ from experiments.runs.paths import CONF
 from experiments.runs.row import read_rows
 from experiments.sweeps.summary import COUNT_WORDS
 from experiments.viewing.panels import noted_panels
-from sim.errors import InputError
+from sim.errors import InputError, require
 from sim.files import require_file
 
 Entry = Mapping[str, Any]
 PAPERS = ("puzzlebot2024", "decristoforis2020", "gil2008", "maximo2024")
-OUR_CLAIM = "(Our own"  # begins, in a paper's findings, what we ask and the paper does not claim
+
 # What belongs to no paper, by the prefix of its files' names, and the commands that make it.
 OWN = {
     "leaderboard": [
@@ -114,13 +114,13 @@ def holding_best(
     tallies: Mapping[str, Sequence[tuple[Verdict, int]]],
 ) -> list[tuple[str, int, int]]:
     """The papers of the greatest share of reproduced claims, with their number and that of all."""
-    found = [
+    papers = [
         (name, dict(counts).get(Verdict.REPRODUCED, 0), sum(n for _, n in counts))
         for name, counts in tallies.items()
         if counts
     ]
-    best = max((held / of for _, held, of in found), default=0.0)
-    return [entry for entry in found if best and entry[1] / entry[2] == best]
+    best = max((held / n for _, held, n in papers), default=0.0)
+    return [entry for entry in papers if best and entry[1] / entry[2] == best]
 
 
 def tally(claims: Iterable[Entry]) -> list[tuple[Verdict, int]]:
@@ -139,17 +139,17 @@ def judged_claims(
     (`verdict`) with a `style`; and the `sentence` on what came out.
     """
     says = {key: text for page in about.values() for key, text in page["claims"].items()}
+    own = {key for page in about.values() for key in page["own"]}
     rows: dict[str, list[Entry]] = {key: [] for key in says}
-    for row in table.sort_values(["id", "role"], ascending=[True, False], kind="stable").to_dict(
-        "records"
-    ):
+    ordered = table.sort_values(["id", "role"], ascending=[True, False], kind="stable")
+    for row in ordered.to_dict("records"):
         typed = {"verdict": Verdict(row["verdict"]), "role": Role(row["role"])}
         rows.setdefault(row["id"], []).append({**row, **typed})
     return {
         key: {
             "id": key,
             "says": says.get(key, ""),
-            "own": says.get(key, "").startswith(OUR_CLAIM),
+            "own": key in own,
             "sentence": sentences.get(key, ""),
             "paper": statistics[0]["paper"] if statistics else "",
             "statistics": statistics,
@@ -172,7 +172,7 @@ def verdict_on(statistics: Sequence[Entry]) -> Entry:
 def study(results: Path, name: str, about: Entry, claims: Mapping[str, Entry]) -> Entry:
     """Read a study's figures in the order of its findings, its tables and its settings."""
     there = {path.stem: path for path in sorted((results / "figures").glob(f"{name}_*.png"))}
-    described = [figure for figure in about["figures"] if figure in there]
+    figures = {figure: about["figures"].get(figure, {}) for figure in [*about["figures"], *there]}
     settings = [
         *sorted((CONF / "study").glob(f"{name}*.yaml")),
         *sorted((CONF / "study" / name).glob("*.yaml")),
@@ -184,10 +184,11 @@ def study(results: Path, name: str, about: Entry, claims: Mapping[str, Entry]) -
         "about": about,
         "figures": [
             {
-                **picture(there[figure], about["figures"].get(figure, {}), claims),
-                "table": tables.get(about["figures"].get(figure, {}).get("table", "")),
+                **picture(there[figure], words, claims),
+                "table": tables.get(words.get("table", "")),
             }
-            for figure in dict.fromkeys([*described, *there])
+            for figure, words in figures.items()
+            if figure in there
         ],
         "missing": [figure for figure in about["figures"] if figure not in there],
         "tables": list(tables.values()),
@@ -210,15 +211,13 @@ def picture(path: Path, about: Entry, claims: Mapping[str, Entry]) -> Entry:
     require_file(path)
     try:
         data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot read ({error.strerror}); {_REMEDY}") from error
-    try:
         with Image.open(BytesIO(data), formats=["PNG"]) as image:
             width, height, parts = *image.size, noted_panels(image)
     except UnidentifiedImageError as error:
         raise InputError(f"{path}: not a PNG; {_REMEDY}") from error
-    if data[-8:] != b"IEND\xaeB`\x82":
-        raise InputError(f"{path}: the picture is cut off; {_REMEDY}")
+    except OSError as error:
+        raise InputError(f"{path}: cannot read ({error.strerror}); {_REMEDY}") from error
+    require(data[-8:] == b"IEND\xaeB`\x82", f"{path}: the picture is cut off; {_REMEDY}")
     words = path.stem.split("_", 1)[-1].replace("_", " ")
     return {
         "title": words,

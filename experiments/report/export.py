@@ -14,8 +14,8 @@ import pandas as pd
 from experiments.runs.columns import alike, is_setting, title
 from experiments.runs.row import read_rows
 from experiments.sweeps.summary import MARKS, SUFFIXES
-from sim.errors import InputError, printable
-from sim.files import write_whole
+from sim.errors import InputError, printable, require
+from sim.files import write_text
 
 _LATEX = str.maketrans(
     {
@@ -49,12 +49,9 @@ def read_table(path: Path) -> pd.DataFrame:
     """
     try:
         frame = read_rows(path)
-        as_csv = path.suffix == ".csv"
-        written = (
-            pd.read_csv(path, dtype="str", keep_default_na=False, index_col=False)
-            if as_csv
-            else frame
-        )
+        written = frame
+        if path.suffix == ".csv":
+            written = pd.read_csv(path, dtype="str", keep_default_na=False, index_col=False)
     except (InputError, ValueError, OverflowError) as error:
         why = [*str(error.__cause__ or "no table there").splitlines(), "unreadable"][0].rstrip(".")
         raise InputError(f"{path}: {why}; export-table needs a CSV or Parquet table") from error
@@ -283,27 +280,25 @@ def export(paths: Sequence[Path], form: str, out: Path | None, digits: int) -> N
     InputError
         If a table cannot be read or shown, or two would become one file.
     """
-    if form not in FORMATS:
-        raise InputError(f"--format must be {' or '.join(FORMATS)}, got {form!r}")
+    require(form in FORMATS, f"the format must be {' or '.join(FORMATS)}, got {form!r}")
     as_form, suffix = FORMATS[form]
-    if out is None:
-        for path in paths:
-            text = as_form(folded(read_table(path)), digits)
-            try:
-                print(text)
-            except UnicodeEncodeError as error:
-                raise InputError(
-                    f"{path}: the output's encoding, {error.encoding}, lacks "
-                    f"{text[error.start]!a}; write files with -o, or set PYTHONIOENCODING=utf-8"
-                ) from error
-        return
-    sources: dict[Path, Path] = {}
+    names = [path.stem for path in paths] if out else []
+    for i, path in enumerate(paths[: len(names)]):
+        first = names.index(path.stem)
+        require(
+            first == i, f"{paths[first]} and {path} would both become {out}/{path.stem}{suffix}"
+        )
     for path in paths:
-        target = out / f"{path.stem}{suffix}"
-        if target in sources:
-            raise InputError(f"{sources[target]} and {path} would both become {target}")
-        sources[target] = path
-    for target, path in sources.items():
-        with write_whole(target) as part:
-            part.write_text(as_form(folded(read_table(path)), digits), encoding="utf-8")
-    print(f"{out}: {len(paths)} tables")
+        text = as_form(folded(read_table(path)), digits)
+        if out is not None:
+            write_text(out / f"{path.stem}{suffix}", text)
+            continue
+        try:
+            print(text)
+        except UnicodeEncodeError as error:
+            raise InputError(
+                f"{path}: the output's encoding, {error.encoding}, lacks {text[error.start]!a}; "
+                "write files, or set PYTHONIOENCODING=utf-8"
+            ) from error
+    if out is not None:
+        print(f"{out}: {len(paths)} tables")

@@ -22,7 +22,7 @@ def by_world(path: Path) -> dict[str, Any]:
     -------
     dict
         `worlds`; `rows` of the method and a cell (error, whether it is the least) for each world,
-        the best method first, at most `MOST`; `n_methods`. Empty if there is no such table.
+        the best method first, at most `MOST`; `n_methods`. Empty without such a table.
     """
     columns = ["choice.world", "choice.estimator"]
     found = read_rows(path) if path.exists() else pd.DataFrame()
@@ -58,7 +58,7 @@ def on_lasers(path: Path) -> dict[str, Any]:
         `rows`, the best method first, at most `MOST`, each with its `method`, `project`, `error`,
         whether it is `ours` and `level` with the first, and the `ratio` of its error to the first's
         in words (empty for the first); `n_methods`, `runs` and `others`, the best row of another
-        project (or None). Empty if there is no such table.
+        project (or None). Empty without such a table.
     """
     found = read_rows(path) if path.exists() else pd.DataFrame()
     if not {"sensor", "estimator", "project", "runs", "ate_rmse_m"} <= {*found}:

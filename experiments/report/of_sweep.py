@@ -38,15 +38,16 @@ def after_sweep(folder: Path, n_runs: int) -> None:
             show(f"{often if len(rows) > 1 else 'The run failed'}: {reason}")
             print(f"\nNext: estima table {folder.name} --rows -o rows.csv  (how each run ended)")
             return
-        found = summary(rows, metrics=[ERROR] if "ate_rmse_m" in rows else [])
-        if len(found) <= _FEW_LINES:
-            show(as_lines(found, notes(found, None)))
-        sound = rows[rows["status"] != Outcome.FAILED]
-        estimators = sound["choice.estimator"].unique()
+        means = summary(rows, metrics=[ERROR] if "ate_rmse_m" in rows else [])
+        if len(means) <= _FEW_LINES:
+            show(as_lines(means, notes(means, None)))
+        estimators = rows.loc[rows["status"] != Outcome.FAILED, "choice.estimator"].unique()
         against = f" --against {estimators[0]}" if len(estimators) > 1 else ""
-    print(f"\nNext: estima table {folder.name}{against} -o table.tex")
-    print(f"      estima plot {folder.name}")
-    print(f"      estima report {folder.name}")
+    name = folder.name
+    print(
+        f"\nNext: estima table {name}{against} -o table.tex\n      estima plot {name}\n"
+        f"      estima report {name}"
+    )
 
 
 def write_rows(rows: pd.DataFrame, out: Path) -> str:
@@ -108,17 +109,7 @@ def plot_of(rows: pd.DataFrame, name: str, panels: Panels, out: Path) -> str:
         words = [f"--x {x}", *(f"--by {each}" for each in panels.by)]
         words += [f"--col {panels.col}"] if panels.col else []
         chosen = f"drawn with {' '.join(words)}"
-    page = sweep_figure(
-        rows,
-        str(panels.x),
-        panels.y,
-        panels.by or None,
-        row=panels.row,
-        col=panels.col,
-        size=panels.size,
-        pool=panels.pool,
-    )
-    save_figure(page, out)
+    save_figure(sweep_figure(rows, **vars(panels)), out)
     return chosen
 
 

@@ -19,7 +19,7 @@ from experiments.judging.results import Profile
 from experiments.report.contents import contents
 from experiments.report.export import plain, significant
 from sim.errors import printable
-from sim.files import write_whole
+from sim.files import write_text
 
 TEMPLATES = Path(__file__).parent / "templates"
 
@@ -42,8 +42,7 @@ def write_report(results: Path, on_progress: Callable[[float], None] = lambda _:
             file=sys.stderr,
         )
     path = results / "report.html"
-    with write_whole(path) as part:
-        part.write_text(render("page.html", **found), encoding="utf-8")
+    write_text(path, render("page.html", **found))
     return path
 
 

@@ -21,7 +21,7 @@ from experiments.sweeps.averages import averages, pooled, rule, unit_of
 from experiments.sweeps.collect import DRAWN, dozen, measured, no_column, telling, with_answers
 from experiments.viewing.plotting import literal, plain_log
 from experiments.viewing.style import SERIES, figure
-from sim.errors import InputError
+from sim.errors import InputError, require
 
 _FEW = 8  # values that are ticks of their own
 _DECADES = 100.0  # factor below which a logarithmic axis has plain numbers
@@ -87,8 +87,10 @@ def sweep_figure(
         If a column is not in the table, y has no numbers, no run has all columns, or a point would
         pool what differs in more than its seeds.
     """
-    if row is not None and row == col:
-        raise InputError(f"--row and --col are both {row}; one panel a value needs one of them")
+    require(
+        row is None or row != col,
+        f"rows and columns of panels are both {row}; one panel a value needs one of them",
+    )
     facets = [name for name in (row, col) if name is not None]
     by = [name for name in ([by] if isinstance(by, str) else by or []) if name not in facets]
     if y.startswith(ANSWER):
@@ -98,7 +100,8 @@ def sweep_figure(
     table, left_out = _complete(table, y, groups)
     if not pool:
         _check_points(table, groups)
-    table = table.assign(**{c: table[c].map(literal) for c in groups if _holds_words(table[c])})
+    words_in = [c for c in groups if table[c].map(lambda value: isinstance(value, str)).all()]
+    table = table.assign(**{c: table[c].map(literal) for c in words_in})
     unit = unit_of(table, groups)
     over = [c for c in telling(table) if c not in (*groups, *DRAWN)]
     means = averages(table, groups, unit, y, over).reset_index()
@@ -106,48 +109,44 @@ def sweep_figure(
     dots = pooled(table, [*groups, unit], y, over).reset_index().merge(unbounded, on=groups)
     texts = {name: _texts(means[name]) for name in groups}
     lines = _labels(means, by, texts)
-    if len(lines) > len(SERIES):
-        raise InputError(
-            f"--by gives {len(lines)} lines; at most {len(SERIES)} differ in colour: keep some "
-            "with --where, or give panels their own with --row or --col"
-        )
-    across, down = (_values(means, name) for name in (col, row))
+    require(
+        len(lines) <= len(SERIES),
+        f"{len(lines)} lines; at most {len(SERIES)} differ in colour: keep some "
+        "by a condition, or draw rows or columns of panels",
+    )
+    across, down = (
+        [None] if name is None else sorted(means[name].dropna().unique()) for name in (col, row)
+    )
     chosen = Size(size)
     page, axes = _panels(chosen, len(down), len(across))
     numeric = means[x].dtype.kind in "fi"
     shown = _Across(sorted(means[x].unique()), numeric, numeric and x not in (*DRAWN, REPEAT))
     for (i, above), (j, left) in itertools.product(enumerate(down), enumerate(across)):
         ax = axes[i, j]
-        panel = _within(_within(means, row, above), col, left)
+        panel = {name: value for name, value in ((row, above), (col, left)) if name is not None}
         for k, (label, line) in enumerate(lines.items()):
-            points = _on_line(panel, by, line)
+            points, alone = (_rows_of(frame, {**panel, **line}) for frame in (means, dots))
             if points.empty:
                 continue
-            at = shown.places(points[x], k, len(lines))
             value, low, high = points[["value", "low", "high"]].to_numpy(float).T
             colour, marker = SERIES[k]
             ax.errorbar(
-                at, value, yerr=(value - low, high - value), color=colour, marker=marker, ms=4,
-                capsize=2, lw=1.2, ls="-" if shown.joined else "none", label=label,
+                shown.places(points[x], k, len(lines)), value, yerr=(value - low, high - value),
+                color=colour, marker=marker, ms=4, capsize=2, lw=1.2,
+                ls="-" if shown.joined else "none", label=label,
             )  # fmt: skip
-            alone = _on_line(_within(_within(dots, row, above), col, left), by, line)
             at = shown.places(alone[x], k, len(lines))
             ax.plot(at, alone[y], ".", color=colour, ms=4, alpha=0.5)
-        words = [
-            _named(name, value, texts[name]) for name, value in ((row, above), (col, left)) if name
-        ]
+        words = (_named(name, value, texts[name]) for name, value in panel.items())
         ax.set_title("; ".join(words), fontsize="medium")
-    _scale(
-        axes,
-        texts[x],
-        means,
-        shown,
-        log=_is_log(y, means[["value", "low", "high"]].stack()),
-    )
+    low, high = (means[side].fillna(means["value"]) for side in ("low", "high"))
+    by_decades = low.min() > 0.0 and high.max() >= _WIDE * low.min()
+    log = by_decades and (y not in COLUMNS or COLUMNS[y].scale == "log")
+    _scale(axes, texts[x], shown, (low.min(), high.max()) if log else None)
     for ax in axes[-1]:
         ax.set_xlabel(literal(title(x)))
     least_in = _AXES_SHARE * page.get_figheight()
-    whole = "\u00a0".join(literal(title(y)).rsplit(" ", 1))  # a unit is no line of its own
+    whole = "\u00a0".join(literal(title(y)).rsplit(" ", 1))  # a unit has no line of its own
     of_y = textwrap.fill(whole, _characters(1.2 * least_in, _FONT[chosen])).replace("\u00a0", " ")
     if len(down) > 1:  # one label beside all, as one each would collide on a column's width
         page.supylabel(of_y, fontsize=_FONT[chosen])
@@ -170,15 +169,16 @@ def sweep_figure(
 
 def _check(table: pd.DataFrame, y: str, groups: Sequence[str]) -> None:
     """Check that the columns are there and that y has numbers."""
-    if y in groups:
-        raise InputError(f"{y} is drawn against itself; estima options metrics lists the results")
+    require(
+        y not in groups, f"{y} is drawn against itself; estima options metrics lists the results"
+    )
     for column in (y, *groups):
         if column not in table:
             raise no_column(table, column, metric=column == y)
-    if table[y].dtype.kind not in "fi":
-        raise InputError(
-            f"column {y} holds no numbers; there are {dozen(measured(table)) or 'none'}"
-        )
+    require(
+        table[y].dtype.kind in "fi",
+        f"column {y} holds no numbers; there are {dozen(measured(table)) or 'none'}",
+    )
 
 
 def _complete(table: pd.DataFrame, y: str, groups: Sequence[str]) -> tuple[pd.DataFrame, str]:
@@ -187,8 +187,7 @@ def _complete(table: pd.DataFrame, y: str, groups: Sequence[str]) -> tuple[pd.Da
     columns = with_y[[y, *groups]]
     lacking = columns.isna() | columns.isin([np.inf, -np.inf])
     out = lacking.any(axis=1)
-    if out.all():
-        raise InputError(f"no run has all of {', '.join([*groups, y])}")
+    require(not (out.all()), f"no run has all of {', '.join([*groups, y])}")
     without = " or ".join(title(str(name)) for name in columns.columns[lacking.any()])
     words = f"{out.sum()} of {len(out)} runs left out: no finite {without}" if out.any() else ""
     return with_y[~out], words
@@ -201,18 +200,14 @@ def _check_points(table: pd.DataFrame, groups: Sequence[str]) -> None:
         if points[column].nunique().max() > 1:
             there = ", ".join(map(str, sorted(table[column].dropna().unique())[:8]))
             raise InputError(
-                f"a point would pool different values of {column} ({there}); draw a line for each "
-                f"with --by {column} or a panel with --col {column}, keep one with "
-                f"--where {column}=..., or average with --pool"
+                f"a point would pool different values of {column} ({there}); draw a line or a "
+                f"panel for each {column}, keep one of them, or pool them"
             )
 
 
-def _values(means: pd.DataFrame, name: str | None) -> list[Any]:
-    return [None] if name is None else sorted(means[name].dropna().unique())
-
-
-def _on_line(means: pd.DataFrame, by: Sequence[str], line: tuple[Any, ...]) -> pd.DataFrame:
-    return means[(means[list(by)] == list(line)).all(axis=1)] if by else means
+def _rows_of(frame: pd.DataFrame, values: Mapping[str, Any]) -> pd.DataFrame:
+    """Rows of one line of one panel."""
+    return frame[(frame[list(values)] == list(values.values())).all(axis=1)] if values else frame
 
 
 @dataclass(frozen=True)
@@ -241,14 +236,6 @@ class _Across:
         return at + beside * apart * min(_BESIDE_WORD, _MOST_BESIDE / n_lines)
 
 
-def _within(means: pd.DataFrame, name: str | None, value: Any) -> pd.DataFrame:
-    return means if name is None else means[means[name] == value]
-
-
-def _holds_words(column: pd.Series[Any]) -> bool:
-    return all(isinstance(value, str) for value in column)
-
-
 def _texts(column: pd.Series[Any]) -> dict[Any, str]:
     """What the values of a setting are called, in their order."""
     values = column.drop_duplicates().sort_values()
@@ -265,16 +252,17 @@ def _named(name: str, value: Any, texts: Mapping[Any, str]) -> str:
 
 def _labels(
     means: pd.DataFrame, by: Sequence[str], texts: Mapping[str, Mapping[Any, str]]
-) -> dict[str, tuple[Any, ...]]:
-    """The lines by what they are called; the legend's title names a single setting."""
+) -> dict[str, dict[str, Any]]:
+    """Settings of the lines by what they are called; a legend's title names a single setting."""
     if not by:
-        return {"": ()}
-    lines = means[list(by)].drop_duplicates().sort_values(list(by))
+        return {"": {}}
+    lines = means[list(by)].drop_duplicates().sort_values(list(by)).itertuples(index=False)
     if len(by) == 1:
-        return {texts[by[0]][value]: (value,) for value in lines[by[0]]}
-    each = lines.itertuples(index=False, name=None)
+        return {texts[by[0]][value]: {by[0]: value} for (value,) in lines}
     own = [texts[name] for name in by]
-    return {", ".join(map(_named, by, line, own)): line for line in each}
+    return {
+        ", ".join(map(_named, by, line, own)): dict(zip(by, line, strict=True)) for line in lines
+    }
 
 
 def _panels(size: Size, n_rows: int, n_cols: int) -> tuple[Figure, Any]:
@@ -288,14 +276,17 @@ def _panels(size: Size, n_rows: int, n_cols: int) -> tuple[Figure, Any]:
 
 
 def _scale(
-    axes: Any,
-    names: Mapping[Any, str],
-    means: pd.DataFrame,
-    across: _Across,
-    *,
-    log: bool,
+    axes: Any, names: Mapping[Any, str], across: _Across, log: tuple[float, float] | None
 ) -> None:
-    """Choose the axes' scales and ticks; all panels share them. `names` are the values' texts."""
+    """Choose the axes' scales and ticks, which all panels share.
+
+    Parameters
+    ----------
+    names
+        Texts of the values of x.
+    log
+        Range of y on a logarithmic axis.
+    """
     ax = axes[0, 0]
     ax.margins(x=0.08)
     if across.wide:
@@ -309,14 +300,12 @@ def _scale(
         for each in axes[-1]:
             each.set_xticks(range(len(names)), list(names.values()), rotation=25, ha="right")
             each.set_xlim(-0.6, len(names) - 0.4)
-    if log:
+    if log is not None:
+        low, high = map(float, log)
         ax.set_yscale("log")
-        low, high = means["low"].fillna(means["value"]), means["high"].fillna(means["value"])
-        positive = low[low > 0.0]
-        if len(positive) and high.max() < _DECADES * positive.min():
+        if high < _DECADES * low:
             plain_log(ax.yaxis)
-            least = float(positive.min())
-            ax.yaxis.set_major_formatter(lambda value, _: alike([value, least])[0])
+            ax.yaxis.set_major_formatter(lambda value, _: alike([value, low])[0])
 
 
 def _name_lines(page: Figure, axes: Any, heading: str, size: Size, *, direct: bool) -> None:
@@ -367,12 +356,6 @@ def _fits(page: Figure, handles: Mapping[str, Any]) -> bool:
     apart = np.diff(np.sort(ends[:, 1])) * 72.0 / page.dpi
     wide = np.ptp(ends[:, 0]) < 0.1 * lines[0].axes.bbox.width
     return bool(wide and (apart > 1.2 * lines[0].axes.xaxis.label.get_size()).all())
-
-
-def _is_log(y: str, values: pd.Series[float]) -> bool:
-    """Whether a metric is drawn on a logarithmic axis."""
-    scale = COLUMNS[y].scale if y in COLUMNS else "log"
-    return scale == "log" and values.min() > 0.0 and values.max() >= _WIDE * values.min()
 
 
 def by_factors(values: Sequence[float]) -> bool:

@@ -36,8 +36,8 @@ from experiments.sweeps.collect import (
     with_answers,
 )
 from experiments.sweeps.summary import ERROR, summary
-from sim.errors import InputError, printable, require
-from sim.files import write_whole
+from sim.errors import printable, require
+from sim.files import write_text
 from sim.yaml_file import read_yaml
 
 Entry = Mapping[str, Any]
@@ -72,14 +72,13 @@ def write_sweep_page(
     """
     require(
         len(table) <= MOST_RUNS,
-        f"{name}: {len(table)} runs; a page holds {MOST_RUNS}: keep some with --where",
+        f"{name}: {len(table)} runs; a page holds {MOST_RUNS}: keep some by a condition",
     )
     every = with_answers(table, [column for column in COLUMNS if column.startswith(ANSWER)])
     metrics = [c for c in COLUMNS if c in measured(every) and every[c].notna().any()]
-    if not metrics:
-        raise InputError(
-            f"{name}: no run has a result to show; `estima table {name}` says how they ended"
-        )
+    require(
+        metrics, f"{name}: no run has a result to show; `estima table {name}` says how they ended"
+    )
     telling_apart = telling(table)
     named = [c for c in telling_apart if c != "choice.estimator"]
     pictures = {
@@ -139,8 +138,7 @@ def write_sweep_page(
         options=options,
         constant=_constant(table),
     )
-    with write_whole(out) as part:
-        part.write_text(text, encoding="utf-8")
+    write_text(out, text)
 
 
 def _controls(

@@ -23,7 +23,7 @@ from experiments.runs.columns import PATH
 from experiments.runs.row import Outcome, write_frame
 from experiments.sweeps.summary import COUNT_WORDS, COUNTS, MARKS
 from sim.errors import require
-from sim.files import write_whole
+from sim.files import write_text
 
 DIGITS = 3
 FORMATS = (".tex", ".md", ".html", ".csv", ".parquet")
@@ -48,10 +48,10 @@ _MOST_REMARKS = 12
 def check_name(path: Path | None, size: str | None) -> None:
     """Check that a table's file has an ending that names its format, and a LaTeX one's size."""
     if path is not None:
-        require(path.suffix in FORMATS, f"-o {path}: a table is {', '.join(FORMATS)}")
+        require(path.suffix in FORMATS, f"{path}: a table is {', '.join(FORMATS)}")
     if size is not None:
-        require(size in WIDTHS_PT, f"--size must be {', '.join(WIDTHS_PT)}, got {size}")
-        require(path is not None and path.suffix == ".tex", f"--size {size} is for -o x.tex")
+        require(size in WIDTHS_PT, f"the size must be {', '.join(WIDTHS_PT)}, got {size}")
+        require(path and path.suffix == ".tex", f"size {size} is for a file such as x.tex")
 
 
 _TESTED = 6  # runs below which a paired test finds next to nothing
@@ -120,8 +120,7 @@ def write_table(
             numeric=numeric(frame),
             rows=[[Markup(cell) for cell in row] for row in cells.to_numpy()],
         )
-    with write_whole(path) as part:
-        part.write_text(text, encoding="utf-8")
+    write_text(path, text)
 
 
 def statuses(table: pd.DataFrame) -> list[tuple[str, int]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -53,7 +54,7 @@ def short_key(row: pd.Series[Any]) -> str:
 
 
 def row_of(word: str) -> pd.Series[Any] | None:
-    """Row of a run that is called NAME/KEY or NAME/KEY.REPEAT; None if there is no sweep NAME.
+    """Row of a run that is called NAME/KEY or NAME/KEY.REPEAT; None without a sweep NAME.
 
     Raises
     ------
@@ -68,23 +69,19 @@ def row_of(word: str) -> pd.Series[Any] | None:
     key, _, repeat = path.name.partition(".")
     if not key or not {"run_key", REPEAT} <= set(rows):
         return None
-    found = rows[
-        rows["run_key"].str.startswith(key) & (rows[REPEAT].astype(str) == (repeat or "0"))
-    ]
-    require(len(found) > 0, f"{word}: the sweep {path.parent} has no such run")
-    require(len(found) == 1, f"{word}: {len(found)} runs have keys that begin so; give more digits")
-    return found.iloc[0]
+    same = rows["run_key"].str.startswith(key) & (rows[REPEAT].astype(str) == (repeat or "0"))
+    require(same.any(), f"{word}: the sweep {path.parent} has no such run")
+    require(same.sum() == 1, f"{word}: {same.sum()} runs have keys that begin so; give more digits")
+    return rows[same].iloc[0]
 
 
 def noted_config_dir(folder: Path) -> str | None:
     """The folder of options that the last sweep into a folder of rows named, if any did."""
     for command in reversed(commands(folder)):
-        try:
+        with suppress(ValueError):  # edited by hand
             words = shlex.split(command)
-        except ValueError:  # edited by hand
-            continue
-        if "--config-dir" in words[:-1]:
-            return words[words.index("--config-dir") + 1]
+            if "--config-dir" in words[:-1]:
+                return words[words.index("--config-dir") + 1]
     return None
 
 
@@ -119,7 +116,7 @@ def run_again(
     except MissingConfigException as error:
         was = f" (the sweep's was {noted})" if noted is not None else ""
         raise InputError(
-            f"{error.missing_cfg_file} is no option here; add --config-dir with its folder{was}"
+            f"{error.missing_cfg_file} is not an option here; name its folder of options{was}"
         ) from error
     except HydraException as error:
         raise InputError(f"{', '.join(choices)}: {str(error).splitlines()[0]}") from error
@@ -140,7 +137,7 @@ def run_again(
     again.check_estimator()  # without its module its version is another
     require(
         made["code_version"] == row["code_version"],
-        f"the run is of another version of the code, {row['code_version']}; run the sweep again",
+        f"it comes from another version of the code, {row['code_version']}; run the sweep again",
     )
     return Again(again, int(row[REPEAT]), str(row["recording_checksum"]))
 

@@ -1,7 +1,7 @@
 """The one rule by which tables, plots and pages average runs.
 
 The recording is the unit of inference. Repeats over one recording are averaged first: errors by
-their squares, all else arithmetically. Runs of other settings over one recording are no repeats;
+their squares, all else arithmetically. Runs of other settings over one recording are not repeats;
 they, then recordings, are averaged geometrically, with the t interval of the logs, where a metric
 is spread by factors, else arithmetically: `runs.columns.Average`.
 """
@@ -67,18 +67,16 @@ def pooled(
     Repeats are rows that are equal in `settings` too.
     """
     known = table[table[name].notna()].astype({name: float})
-    kind, levels = average_of(name), list(range(len(by)))
-    if kind is Average.ERROR:
-        squares = known.assign(**{name: known[name] ** 2})
-        values = np.sqrt(squares.groupby([*by, *settings], dropna=False)[name].mean())
-    else:
-        values = known.groupby([*by, *settings], dropna=False)[name].mean()
+    kind, power = average_of(name), 2.0 if average_of(name) is Average.ERROR else 1.0
+    powers = known.assign(**{name: known[name] ** power})
+    values = powers.groupby([*by, *settings], dropna=False)[name].mean()
+    values = np.sqrt(values) if kind is Average.ERROR else values
     if not settings:
         return values
-    if kind is Average.PLAIN:
-        return values.groupby(level=levels, dropna=False).mean()
     with np.errstate(divide="ignore"):
-        return np.exp(np.log(values).groupby(level=levels, dropna=False).mean())
+        logs = values if kind is Average.PLAIN else np.log(values)
+        means = logs.groupby(level=list(range(len(by))), dropna=False).mean()
+    return means if kind is Average.PLAIN else np.exp(means)
 
 
 def averages(
@@ -104,10 +102,10 @@ def averages(
         groups = (np.log(values) if geometric else values).groupby(level=list(range(len(by))))
         mean, n = groups.mean(), groups.size()
         half = stats.t.ppf(0.975, n - 1) * groups.std() / np.sqrt(n.where(n >= LEAST))
-    found = pd.DataFrame({"value": mean, "low": mean - half, "high": mean + half})
+    means = pd.DataFrame({"value": mean, "low": mean - half, "high": mean + half})
     if geometric:
-        return np.exp(found)
-    return found.assign(low=found["low"].clip(lower=0.0)) if (values >= 0.0).all() else found
+        return np.exp(means)
+    return means.assign(low=means["low"].clip(lower=0.0)) if (values >= 0.0).all() else means
 
 
 def difference_p(ours: pd.Series[float], theirs: pd.Series[float], name: str) -> float:

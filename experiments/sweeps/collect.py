@@ -24,7 +24,7 @@ from experiments.runs.console import counted
 from experiments.runs.paths import results
 from experiments.runs.store import read_runs
 from experiments.runs.version import code_version, version_with
-from sim.errors import InputError, printable
+from sim.errors import InputError, printable, require
 
 FEW = 12  # colours, and panels
 _TIMES = ["step_time_us", "cpu_time_us"]  # they differ from run to run
@@ -50,32 +50,31 @@ def collect(name: str, *, all_versions: bool = False, times: bool = False) -> pd
     Raises
     ------
     InputError
-        If there are no rows, or none of this version of the code; or if runs of different keys
+        Without rows, or without any of this version of the code; or if runs of different keys
         have equal settings, because a file was edited between them, say.
     """
     path = folder_of(name)
     table = read_runs(path).copy()  # in one piece; else pandas warns
     for column in ("status", REPEAT, *ORIGIN):
-        if column not in table:
-            raise InputError(f"{path}: not rows of runs, column {column} is missing")
+        require(column in table, f"{path}: not rows of runs, column {column} is missing")
     for column in (*STATUS, *ORIGIN):
-        if column in table and not pd.api.types.is_string_dtype(table[column]):
-            raise InputError(f"{path}: not rows of runs, column {column} holds no texts")
+        sound = column not in table or pd.api.types.is_string_dtype(table[column])
+        require(sound, f"{path}: not rows of runs, column {column} holds no texts")
     if not all_versions:
         mine = _of_this_code(table)
-        if not mine.any():
-            raise InputError(
-                f"{path}: all rows are of other versions of the code; run the sweep again, or see "
-                "them as they are with --all-versions"
-            )
+        require(
+            mine.any(),
+            f"{path}: all rows come from other versions of the code; run the sweep again, or see "
+            "them with those of all versions",
+        )
         if not mine.all():
             left_out = counted((~mine).sum(), "row")
-            print(
-                f"left out {left_out} of other versions of the code; --all-versions keeps them",
-                file=sys.stderr,
-            )
+            print(f"left out {left_out} of other versions of the code", file=sys.stderr)
         table = table[mine]
-    _say_unfinished(path, table)
+    for n_runs, command in unfinished(path):
+        here = counted(table["run_key"].nunique(), "run")
+        words = f"{here} so far: the sweep of {n_runs} is unfinished; to go on: {command}"
+        print(printable(words), file=sys.stderr)
     settings = swept(table)
     _check_distinct(table, settings, path)
     if not times:
@@ -93,14 +92,6 @@ def unfinished(folder: Path) -> list[tuple[str, str]]:
     return [(n_runs, command.rstrip()) for n_runs, _, command in parts]
 
 
-def _say_unfinished(folder: Path, table: pd.DataFrame) -> None:
-    """Say which sweeps of a folder have not ended."""
-    for n_runs, command in unfinished(folder):
-        here = counted(table["run_key"].nunique(), "run")
-        words = f"{here} so far: the sweep of {n_runs} is unfinished; to go on: {command}"
-        print(printable(words), file=sys.stderr)
-
-
 def folder_of(name: str) -> Path:
     """Path of a sweep's rows, by its name or path.
 
@@ -110,11 +101,11 @@ def folder_of(name: str) -> Path:
         If there is none.
     """
     runs = results() / "runs"
-    path = next((p for p in (runs / name, Path(name)) if p.exists()), None)
-    if path is None:
-        there = sorted(p.name for p in runs.glob("*") if p.is_dir())
-        raise InputError(f"no sweep named {name}; there are: {', '.join(there) or 'none'}")
-    return path
+    for path in (runs / name, Path(name)):
+        if path.exists():
+            return path
+    there = sorted(p.name for p in runs.glob("*") if p.is_dir())
+    raise InputError(f"no sweep named {name}; there are: {', '.join(there) or 'none'}")
 
 
 def commands(folder: Path) -> list[str]:
@@ -124,7 +115,7 @@ def commands(folder: Path) -> list[str]:
 
 
 def _check_distinct(table: pd.DataFrame, settings: list[str], path: Path) -> None:
-    """Check that rows of equal settings are of one run; `settings` are those that differ.
+    """Check that rows of equal settings belong to one run; `settings` are those that differ.
 
     Over a recording from a file, a setting that only a simulation reads has no column. Runs that
     differ in nothing else have equal results, and are let pass.
@@ -132,10 +123,7 @@ def _check_distinct(table: pd.DataFrame, settings: list[str], path: Path) -> Non
     by = [*settings, REPEAT, "code_version"]
     twins = table[table.duplicated(by, keep=False)]
     twins = twins[~twins.duplicated(["run_key", REPEAT, "code_version"])]
-    if "simulation.physics" in twins:
-        simulated = twins["simulation.physics"].notna()
-    else:
-        simulated = pd.Series(False, twins.index)
+    simulated = twins.get("simulation.physics", pd.Series(None, twins.index)).notna()
     same = twins.drop(columns=["run_key", *_TIMES], errors="ignore").duplicated()
     again = twins.duplicated(by) & (simulated | ~same)
     if again.any():
@@ -159,20 +147,20 @@ def where(table: pd.DataFrame, conditions: Sequence[str]) -> pd.DataFrame:
         column, equals, wanted = condition.partition("=")
         if not equals:
             there = dozen([*map(str, table)])
-            raise InputError(f"--where {condition}: give COLUMN=VALUE; columns: {there}")
+            raise InputError(f"condition {condition}: give COLUMN=VALUE; columns: {there}")
         if column not in table:
-            raise InputError(f"--where {condition}: {no_column(table, column, metric=False)}")
+            raise InputError(f"condition {condition}: {no_column(table, column, metric=False)}")
         numbers, number = (pd.to_numeric(v, errors="coerce") for v in (table[column], wanted))
         meets = (table[column].astype(str) == wanted) | (numbers == number)
         if not meets.any():
-            there = ", ".join(map(str, sorted(table[column].dropna().unique())[:8]))
-            raise InputError(f"--where {condition}: no such row; there are {there or 'no values'}")
+            there = ", ".join(map(str, sorted(table[column].dropna().unique())[:8])) or "no values"
+            raise InputError(f"condition {condition}: no such row; there are {there}")
         table = table[meets]
     return table
 
 
 def _of_this_code(table: pd.DataFrame) -> pd.Series[bool]:
-    """Which rows are of this version of the code, and of estimators from elsewhere.
+    """Which rows come from this version of the code, and of estimators from elsewhere.
 
     Raises
     ------
@@ -192,7 +180,7 @@ def _of_this_code(table: pd.DataFrame) -> pd.Series[bool]:
         elif rows["code_version"].nunique() > 1:
             raise InputError(
                 f"rows of several versions of one of {', '.join(given)}, whose source is not "
-                "found; set PYTHONPATH to it, or see all with --all-versions"
+                "found; set PYTHONPATH to it, or keep all versions"
             )
     return mine
 
@@ -242,9 +230,9 @@ def measured(table: pd.DataFrame) -> list[str]:
 
 def no_column(table: pd.DataFrame, wanted: str, *, metric: bool) -> InputError:
     """Say that a column, or a result, is not there, and which are, those like it first."""
-    found = measured(table)
-    answers = [f"{ANSWER}{name}" for name in found if f"{ANSWER}{name}" in COLUMNS]
-    known = [*answers, *found] if metric else [*telling(table), *found, *table]
+    results_ = measured(table)
+    answers = [f"{ANSWER}{name}" for name in results_ if f"{ANSWER}{name}" in COLUMNS]
+    known = [*answers, *results_] if metric else [*telling(table), *results_, *table]
     near = [name for name in known if wanted.rpartition(".")[2].lower() in name]
     near += get_close_matches(wanted, known, n=5)
     meant = f"did you mean {near[0]}? " if near else ""

@@ -31,12 +31,12 @@ from experiments.runs.compose import CommandLine, check_hydra
 from experiments.runs.console import RunFailedError, counted, progress
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome, Status
-from experiments.sweeps.collect import COMMAND, UNFINISHED
+from experiments.sweeps.collect import COMMAND, UNFINISHED, commands
 from experiments.sweeps.plan import Numbers, Plan, packed, plan_of
 from experiments.sweeps.work import compiling_file, end_with, failure, is_there, run_share, share_of
 from sim.compiled import ANNOUNCED, note_compiling
 from sim.errors import InputError, require
-from sim.files import require_file, write_whole
+from sim.files import require_file, write_text
 
 _JOBS_PER_CORE = 4  # enough to keep all busy to the end, few enough to cost little
 # What launchers raise when a process of theirs has died; Ray and submitit are extras
@@ -47,7 +47,7 @@ OnDone = Callable[[Path, int], None]
 def sweep_arguments(arguments: Sequence[str], on_done: OnDone) -> None:
     """Sweep by a command line's arguments: overrides, and `--config-dir` with its folder."""
     line = CommandLine.of(arguments)
-    require(not line.shown, "--cfg shows one configuration; leave out -m and the lists")
+    require(not line.shown, "one configuration can be shown, not a sweep; leave out the lists")
     signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGINT))  # end as by Ctrl-C
     sweep(line.overrides, line.config_dir, on_done)
 
@@ -83,12 +83,13 @@ def sweep(
     n_jobs = _n_jobs(launching)
     own = [a for a in arguments if a not in launching]
     plan = plan_of(own, config_dir)
-    if not len(plan.keys):
-        raise InputError(f"no runs: a value of {' '.join(own)} is an empty range or list")
+    require(len(plan.keys), f"no runs: a value of {' '.join(own)} is an empty range or list")
     plan = plan.called(_name(plan, own, config_dir))
     folder = plan.experiment(0).rows_folder
-    if not folder.is_dir() and folder.exists():
-        raise InputError(f"{folder}: not a folder; remove it, or choose another name")
+    require(
+        folder.is_dir() or not folder.exists(),
+        f"{folder}: not a folder; remove it, or choose another name",
+    )
     prepare(folder)
     keys, first = np.unique(plan.keys, return_index=True)
     done = np.isin(keys, store.ended(folder, damaged=_drop).done)
@@ -104,8 +105,7 @@ def sweep(
         unfinished.unlink(missing_ok=True)
         on_done(folder, len(keys))
         return
-    with write_whole(unfinished) as part:
-        part.write_text(f"{len(keys)} {command}\n", encoding="utf-8")
+    write_text(unfinished, f"{len(keys)} {command}\n")
     try:
         _launch_all(plan, runs, Jobs(folder, n_jobs), launching)
     except KeyboardInterrupt:
@@ -140,12 +140,10 @@ def _note_command(folder: Path, arguments: Sequence[str], config_dir: str | None
     """Keep the command beside the rows, for pages that show them, and return it."""
     path = folder / COMMAND
     require_file(path)
-    given = [*(["--config-dir", config_dir] if config_dir else []), *arguments]
-    command = " ".join(shlex.join(["estima", "run", "-m", *given]).splitlines())
-    noted = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
-    if command not in noted:
-        with write_whole(path) as part:
-            part.write_text("\n".join([*noted, command]) + "\n", encoding="utf-8")
+    options = ["--config-dir", config_dir] if config_dir else []
+    command = " ".join(shlex.join(["estima", "run", "-m", *options, *arguments]).splitlines())
+    if command not in (noted := commands(folder)):
+        write_text(path, "\n".join([*noted, command]) + "\n")
     return command
 
 
@@ -208,20 +206,13 @@ class Jobs:
             "journal": str(journal),
             "families": plan.as_json(runs),
         }
-        with write_whole(share_of(self.plan, number)) as part:
-            part.write_text(json.dumps(share))
+        write_text(share_of(self.plan, number), json.dumps(share))
         return str(number)
-
-
-def _plan_of(folder: Path, journal: str) -> Path:
-    """The plan that a journal belongs to."""
-    return folder / f"plan-{journal.removeprefix('rows-').rpartition('-')[0]}.json"
 
 
 def _launch_all(plan: Plan, runs: Numbers, jobs: Jobs, launching: Sequence[str]) -> None:
     """Start the runs; find those at which a worker of joblib's died, and go on with the rest."""
-    with write_whole(jobs.plan) as part:
-        part.write_text(json.dumps({"planner": [platform.node(), os.getpid()]}))
+    write_text(jobs.plan, json.dumps({"planner": [platform.node(), os.getpid()]}))
     try:
         with _watched(jobs, len(runs)):
             left = runs
@@ -304,19 +295,9 @@ def prepare(folder: Path) -> None:
     Raises
     ------
     InputError
-        If a plan or a journal is no file, or cannot be read.
+        If a plan or a journal is not a file, or cannot be read.
     """
-    _clear_plans(folder)
-    _tidy(folder)
-
-
-def _tidy(folder: Path) -> None:
-    store.tidy(folder, lambda journal: _plan_of(folder, journal).exists())
-
-
-def _clear_plans(folder: Path) -> None:
-    """Remove the plans of sweeps on this machine that were killed, and what they were writing."""
-    for plan in folder.glob("plan-*.json"):
+    for plan in folder.glob("plan-*.json"):  # of this machine, with what they were writing
         require_file(plan)
         try:
             node, planner = json.loads(plan.read_text())["planner"]
@@ -327,6 +308,15 @@ def _clear_plans(folder: Path) -> None:
         _remove(plan)
         for part in folder.glob(f".rows-{plan.stem.removeprefix('plan-')}*.part*"):
             part.unlink(missing_ok=True)
+    _tidy(folder)
+
+
+def _tidy(folder: Path) -> None:
+    def is_running(journal: str) -> bool:
+        name = journal.removeprefix("rows-").rpartition("-")[0]
+        return (folder / f"plan-{name}.json").exists()
+
+    store.tidy(folder, is_running)
 
 
 _UNNAMED = "run"  # the default of conf/config.yaml
@@ -337,8 +327,10 @@ _EXTRAS = {"submitit": "slurm", "ray": "ray"}
 def _check_launcher(launching: Sequence[str]) -> None:
     """Check that the launcher is installed, where Hydra would only say that it knows none."""
     for argument in launching:
-        if re.fullmatch(r"\+*hydra\.launcher\.n_jobs=[+-]?0+", argument):
-            raise InputError(f"{argument}: give the number of processes, or -1 for all cores")
+        require(
+            not (re.fullmatch(r"\+*hydra\.launcher\.n_jobs=[+-]?0+", argument)),
+            f"{argument}: give the number of processes, or -1 for all cores",
+        )
         name = argument.partition("=")[2]
         plugin = name.partition("_")[0]
         chosen = argument.lstrip("+").startswith("hydra/launcher=") and plugin in _EXTRAS
@@ -354,8 +346,10 @@ def _n_jobs(launching: Sequence[str]) -> int:
     given = [a.partition("=")[2] for a in launching if a.lstrip("+~").startswith("jobs=")]
     if given in ([], ["null"]):
         return _JOBS_PER_CORE * (os.cpu_count() or 1)
-    if len(given) > 1 or not given[0].isdecimal() or not int(given[0]):
-        raise InputError(f"jobs={','.join(given)}: give one whole number, 1 or more")
+    require(
+        len(given) == 1 and given[0].isdecimal() and int(given[0]),
+        f"jobs={','.join(given)}: give one whole number, 1 or more",
+    )
     return int(given[0])
 
 
@@ -393,12 +387,12 @@ def _watched(jobs: Jobs, n_runs: int) -> Iterator[None]:
 
     def watch() -> None:
         counts: dict[Path, tuple[int, int, int]] = {}
-        compiled_ns, done_then, shown = 0, 0, 0
+        compiled_ns, done_then, shown, over = 0, 0, 0, False
+        note = compiling_file(jobs.plan)
         with progress("", n_runs, "runs", summary=True) as on_progress:
-            over = False
             while not over:
                 over = ended.wait(0.5)
-                noted_ns = _touched_ns(compiling_file(jobs.plan))
+                noted_ns = note.stat().st_mtime_ns if note.exists() else 0
                 if noted_ns and not compiled_ns:
                     print(ANNOUNCED, file=sys.stderr, flush=True)
                 for journal in list(jobs.sizes):
@@ -421,14 +415,6 @@ def _watched(jobs: Jobs, n_runs: int) -> Iterator[None]:
     finally:
         ended.set()
         thread.join()
-
-
-def _touched_ns(path: Path) -> int:
-    """When a file was last touched; 0 if it is not there."""
-    try:
-        return path.stat().st_mtime_ns
-    except OSError:
-        return 0
 
 
 def _counted(

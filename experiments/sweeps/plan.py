@@ -190,8 +190,10 @@ class Plan:
         """
         names = {f.first.name for f in self.families}
         swept_ = any(("name",) in axis.leaves for f in self.families for axis in f.axes)
-        if len(names) > 1 or swept_:
-            raise InputError("name is the folder of all the rows; a sweep has one, not several")
+        require(
+            len(names) == 1 and not swept_,
+            "name is the folder of all the rows; a sweep has one, not several",
+        )
         if name is None:
             return self
         families = [replace(f, first=f.first.replaced(name=name)) for f in self.families]
@@ -306,7 +308,7 @@ def _grid(
     ]
     outer = [key for key in choices if key not in inner]
     texts = {key: [_text(key, value) for value in choices[key]] for key in outer}
-    for combination in itertools.product(*texts.values()):  # what is no axis in one is in none
+    for combination in itertools.product(*texts.values()):  # an axis is one in all
         _, axes = _composed(composer, combination, {key: choices[key] for key in inner})
         for key in [key for key in inner if key not in axes]:
             inner.remove(key)

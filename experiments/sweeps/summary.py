@@ -12,7 +12,7 @@ from experiments.runs.columns import COLUMNS, PATH, RELATIVE
 from experiments.runs.row import GAP, Outcome
 from experiments.sweeps.averages import RECORDING, averages, difference_p, pooled, rule, unit_of
 from experiments.sweeps.collect import DRAWN, no_column, telling, with_answers
-from sim.errors import InputError
+from sim.errors import InputError, require
 
 ERROR = "answer_ate_rmse_m"
 _MAIN = (
@@ -63,8 +63,10 @@ def summary(
     for column in shown:
         if column not in table:
             raise no_column(table, column, metric=True)
-        if not pd.api.types.is_numeric_dtype(table[column]):
-            raise InputError(f"column {column} holds no numbers in some rows; see --where")
+        require(
+            pd.api.types.is_numeric_dtype(table[column]),
+            f"column {column} holds no numbers in some rows; leave those out",
+        )
     groups = table.groupby(by or (lambda _: "all runs"), dropna=False)
     table = table.assign(**{_GROUP: groups.ngroup()})
     unit = unit_of(table, [_GROUP])
@@ -84,17 +86,16 @@ def summary(
 
 def _counted(table: pd.DataFrame) -> pd.DataFrame:
     """How many runs a group has, which path answers, and how many of each kind of `COUNTS`."""
-    groups = table.groupby(_GROUP)
-    found = {
-        "runs": groups.size(),
-        PATH: groups[PATH].agg(lambda s: "/".join(sorted(set(map(str, s))))),
-    }
-    remarked = table["status"] == Outcome.REMARK
-    gap = table["status_code"] == GAP if "status_code" in table else remarked & False
-    kinds = (table["status"] == Outcome.FAILED, remarked, remarked & gap)
-    for name, is_so in zip(COUNTS, kinds, strict=True):
-        found[name] = is_so.groupby(table[_GROUP]).sum()
-    return pd.DataFrame(found)
+    groups, status = table.groupby(_GROUP), table["status"]
+    gap = (status == Outcome.REMARK) & (table.get("status_code", status) == GAP)
+    kinds = (status == Outcome.FAILED, status == Outcome.REMARK, gap)
+    return pd.DataFrame(
+        {
+            "runs": groups.size(),
+            PATH: groups[PATH].agg(lambda s: "/".join(sorted(set(map(str, s))))),
+            **{n: k.groupby(table[_GROUP]).sum() for n, k in zip(COUNTS, kinds, strict=True)},
+        }
+    )
 
 
 def _add(found: pd.DataFrame, name: str, means: pd.DataFrame) -> None:
@@ -141,11 +142,10 @@ def _compare(
         theirs = pooled(reference, [RECORDING], name, own)
         for group, ours in pooled(table, [_GROUP, RECORDING], name).groupby(level=0):
             p[group, name] = difference_p(ours.droplevel(0), theirs, name)
-    tested = [pair for pair, value in p.items() if value < 1.0]  # not NaN, nor with itself
-    real = holm([p[pair] for pair in tested], _LEVEL)
-    differs = {pair for pair, is_real in zip(tested, real, strict=True) if is_real}
+    tested = {pair: value for pair, value in p.items() if value < 1.0}  # not NaN, nor with itself
+    differs = dict(zip(tested, holm(list(tested.values()), _LEVEL), strict=True))
     for name in names:
-        found[f"{name}_differs"] = [(group, name) in differs for group in found.index]
+        found[f"{name}_differs"] = [differs.get((group, name), False) for group in found.index]
     if ERROR in names:
         each = pooled(table, [_GROUP, RECORDING], ERROR)
         theirs = pooled(reference, [RECORDING], ERROR, own)

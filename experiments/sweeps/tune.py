@@ -42,6 +42,7 @@ from experiments.viewing.plotting import plain_log
 from experiments.viewing.style import SERIES, save_figure, subplots
 from sim.errors import InputError, require
 from sim.files import write_text
+from sim.options import build
 
 FAILED_M = 100.0  # what a run that failed counts as
 _ERROR = "ate_rmse_m"
@@ -81,7 +82,8 @@ class Tuned:
 def tuning_of(study: str, config_dir: str | None = None) -> Tuning:
     """The `tune` of a study's YAML."""
     cfg = composed_options([*searched(config_dir), f"study={study}"])
-    return Tuning.of(study, OmegaConf.to_container(cfg).get("tune"))  # type: ignore[union-attr]
+    settings: Any = OmegaConf.to_container(cfg)
+    return build(Tuning, settings.get("tune"), f"study={study}: tune")
 
 
 def tune(
@@ -111,16 +113,16 @@ def tune(
     InputError
         If the study has no `tune`, or Optuna or a method's package is not installed.
     """
-    require(jobs >= 1, f"--jobs must be at least 1, got {jobs}")
+    require(jobs >= 1, f"the number of jobs must be at least 1, got {jobs}")
     _optuna()
     tuning = tuning_of(study, config_dir)
-    for name in only:
+    names = list(only) or list(tuning.estimators)
+    for name in names:
         known = ", ".join(tuning.estimators)
         require(name in tuning.estimators, f"study={study} does not tune {name}; it has {known}")
-    names = list(only) or list(tuning.estimators)
-    plans = {name: _plan(study, name, tuning, config_dir) for name in names}  # wrong keys end here
-    for done, (name, (drives, judged)) in enumerate(plans.items(), start=1):
-        yield _tuned(study, name, tuning, drives, judged, jobs)
+    problems = [_problem(study, name, tuning, config_dir) for name in names]  # wrong keys end here
+    for done, problem in enumerate(problems, start=1):
+        yield _tuned(problem, paths.results() / "tune" / study / f"{problem.name}.journal", jobs)
         on_progress(done / len(names))
 
 
@@ -138,45 +140,41 @@ def tune_study(
     folder
         Where the options go; by default results/tuned/estimator.
     """
-    plan, place = tuning_of(study, config_dir), paths.results()
-    found, written = [], []
+    tuning, place = tuning_of(study, config_dir), paths.results()
+    results, written = [], []
     with progress(f"tune {study}", 1.0) as on_progress:
         for tuned in tune(study, only, jobs=jobs, config_dir=config_dir, on_progress=on_progress):
-            found.append(tuned)
-            written.append(write(tuned, study, plan, folder or place / "tuned" / "estimator"))
-    tables = place / "tables"
-    trials = written_beside(trials_table(found), tables / f"{study}_trials_tuning.csv", plan)
-    gains = written_beside(gains_table(found), tables / f"{study}_tuning.csv", plan)
+            results.append(tuned)
+            written.append(write(tuned, study, tuning, folder or place / "tuned" / "estimator"))
+    stem, order = str(place / "tables" / study), list(tuning.estimators)
+    trials = merge_into(Path(f"{stem}_trials_tuning.csv"), trials_table(results), order)
+    gains = merge_into(Path(f"{stem}_tuning.csv"), gains_table(results), order)
     save_figure(curves(trials, gains), place / "figures" / f"{study}_tuning.png")
     text = gains.to_string(index=False, float_format=lambda v: f"{v:.4g}")
     return "\n".join([text, *map(paths.short, written)])
 
 
-def yaml_of(tuned: Tuned, study: str, tuning: Tuning) -> str:
-    """An option of conf/estimator: the default with the winner's values."""
+def write(tuned: Tuned, study: str, tuning: Tuning, folder: Path) -> Path:
+    """Write the default with the winner's values, `ESTIMATOR_tuned.yaml`; return its path."""
     option = option_called("estimator", tuned.estimator)
-    return ("# @package estimator\n" if "/" in option else "") + (
-        f"# {tuned.estimator}, tuned: {tuning.trials} trials on seeds {list(tuning.seeds)} of "
+    path = folder / f"{option}_tuned.yaml"
+    write_text(
+        path,
+        ("# @package estimator\n" if "/" in option else "")
+        + f"# {tuned.estimator}, tuned: {tuning.trials} trials on seeds {list(tuning.seeds)} of "
         f"study={study}.\n"
         f"# On {tuned.n_judged} other recordings its error is {tuned.gain.value:.2f} "
         f"[{tuned.gain.low:.2f}, {tuned.gain.high:.2f}] times the default's.\n"
         f"defaults:\n  - {option}\n  - _self_\n"
-        + (yaml.safe_dump(dict(tuned.values), sort_keys=False) if tuned.values else "")
+        + (yaml.safe_dump(dict(tuned.values), sort_keys=False) if tuned.values else ""),
     )
-
-
-def write(tuned: Tuned, study: str, tuning: Tuning, folder: Path) -> Path:
-    """Write the winner's YAML, `ESTIMATOR_tuned.yaml`; return its path."""
-    path = folder / f"{option_called('estimator', tuned.estimator)}_tuned.yaml"
-    write_text(path, yaml_of(tuned, study, tuning))
     return path
 
 
 def trials_table(results: Sequence[Tuned]) -> pd.DataFrame:
     """All trials, a row each."""
-    parts = [tuned.trials.assign(estimator=tuned.estimator) for tuned in results]
-    table = pd.concat(parts, ignore_index=True)
-    return table[["estimator", *(column for column in table if column != "estimator")]]
+    parts = {tuned.estimator: tuned.trials for tuned in results}
+    return pd.concat(parts, names=["estimator"]).reset_index(level=0).reset_index(drop=True)
 
 
 def gains_table(results: Sequence[Tuned]) -> pd.DataFrame:
@@ -200,7 +198,7 @@ def gains_table(results: Sequence[Tuned]) -> pd.DataFrame:
     )
 
 
-def written_beside(table: pd.DataFrame, path: Path, tuning: Tuning) -> pd.DataFrame:
+def merge_into(path: Path, table: pd.DataFrame, order: Sequence[str]) -> pd.DataFrame:
     """Write the rows of the estimators just tuned, and keep those of the study's others.
 
     Returns
@@ -208,48 +206,53 @@ def written_beside(table: pd.DataFrame, path: Path, tuning: Tuning) -> pd.DataFr
     pandas.DataFrame
         All rows, by the study's order of estimators.
     """
-    parts = [table]
     if path.exists():
-        kept = read_rows(path)
-        parts.append(kept[~kept["estimator"].isin(set(table["estimator"]))])
-    both = pd.concat(parts, ignore_index=True)
-    order = [name for name in tuning.estimators if name in set(both["estimator"])]
-    found = pd.concat([both[both["estimator"] == name] for name in order], ignore_index=True)
-    write_frame(found, path, digits=6)
-    return found
+        old = read_rows(path)
+        table = pd.concat([table, old[~old["estimator"].isin(table["estimator"])]])
+    table = table[table["estimator"].isin(order)]
+    table = table.sort_values("estimator", key=lambda s: s.map(order.index), kind="stable")
+    write_frame(table, path, digits=6)
+    return table.reset_index(drop=True)
 
 
 def curves(trials: pd.DataFrame, gains: pd.DataFrame) -> Figure:
     """Draw the best value against the trials, and the gains that were judged."""
-    names = list(gains["estimator"])
     page, (left, right) = subplots(10.0, 3.8, 1, 2)
-    places = np.arange(len(names))[::-1]
-    judged = gains.set_index("estimator")[["low", "tuned_over_default", "high"]]
-    for i, (name, place) in enumerate(zip(names, places, strict=True)):
+    bounds = gains[["estimator", "low", "tuned_over_default", "high"]]
+    for i, name, low, gain, high in bounds.itertuples(name=None):
         rows = trials[trials["estimator"] == name]
         colour, marker = SERIES[i % len(SERIES)]
         style = {"color": colour, "marker": marker, "ms": 6}
         best = rows["best_so_far_m"].to_numpy(float)
         at = [i % len(best)]  # one mark a line, at trials of their own, where lines are the same
         left.step(rows["trial"], best / best[0], where="post", label=name, markevery=at, **style)
-        low, gain, high = judged.loc[name]
-        right.errorbar(gain, place, xerr=[[gain - low], [high - gain]], capsize=3, **style)
+        right.errorbar(gain, -i, xerr=[[gain - low], [high - gain]], capsize=3, **style)
     left.set(
         xlabel="trials", ylabel="best error over the default's,\nseeds of tuning", yscale="log"
     )
     page.legend(loc="outside lower center", ncols=4, fontsize=8)
     right.axvline(1.0, color="0.6", lw=0.8, ls="--")
     right.set(xlabel="error over the default's, other seeds, 95 % interval", xscale="log")
-    right.set_yticks(places, names)
+    right.set_yticks(-np.arange(len(gains)), gains["estimator"])
     plain_log(left.yaxis)
     plain_log(right.xaxis)
     return page
 
 
-def _plan(
-    study: str, name: str, tuning: Tuning, config_dir: str | None
-) -> tuple[list[Experiment], list[Experiment]]:
-    """Experiments to tune on, all worlds of a seed together, and to judge by."""
+@dataclass(frozen=True)
+class _Problem:
+    """An estimator to tune: on which experiments, judged by which, and what may change."""
+
+    name: str
+    trials: int
+    ranges: Mapping[str, Range]
+    drives: Sequence[Experiment]
+    judged: Sequence[Experiment]
+    default: Mapping[str, Any]
+
+
+def _problem(study: str, name: str, tuning: Tuning, config_dir: str | None) -> _Problem:
+    """The problem of one estimator; it is tuned on all worlds of a seed together."""
     common = [
         f"study={study}",
         "sweeps=[]",
@@ -262,53 +265,34 @@ def _plan(
         all(e.seed >= FIRST_JUDGED_SEED for e in judged),
         f"study={study}: its own seeds are judged, and must be {FIRST_JUDGED_SEED} or more",
     )
-    first = drives[0]
-    first.check()
-    for key, allowed in tuning.estimators[name].items():
-        default = _value(first, key)
+    drives[0].check()
+    options, ranges = drives[0].options_of("estimator"), tuning.estimators[name]
+    for key, allowed in ranges.items():
+        require(key in options, f"{name} has no option {key}; it has {', '.join(options)}")
         require(
-            allowed.has(default),
-            f"tune.estimators.{name}.{key} must hold the default, {default!r}, so that it is a "
-            "trial too",
+            allowed.has(options[key]),
+            f"tune.estimators.{name}.{key} must hold the default, {options[key]!r}, so that it is "
+            "a trial too",
         )
-    return drives, judged
+    default = {key: options[key] for key in ranges}
+    return _Problem(name, tuning.trials, ranges, drives, judged, default)
 
 
-def _value(experiment: Experiment, option: str) -> Any:
-    settings = experiment.options_of("estimator")
-    del settings["_target_"]
-    known = f"{experiment.estimator_name} has no option {option}; it has {', '.join(settings)}"
-    require(option in settings, known)
-    return settings[option]
-
-
-def _tuned(
-    study: str,
-    name: str,
-    tuning: Tuning,
-    drives: Sequence[Experiment],
-    judged: Sequence[Experiment],
-    jobs: int,
-) -> Tuned:
-    optuna, ranges = _optuna(), tuning.estimators[name]
-    journal = paths.results() / "tune" / study / f"{name}.journal"
+def _tuned(problem: _Problem, journal: Path, jobs: int) -> Tuned:
     journal.parent.mkdir(parents=True, exist_ok=True)
-    label = _digest(drives, ranges)
-    default = {option: _value(drives[0], option) for option in ranges}
-    opened = _opened(journal, label)
+    opened, default = _opened(journal, problem), problem.default
     if not opened.trials:
         opened.enqueue_trial(default)
-    arguments = (str(journal), label, tuning.trials, ranges, drives)
-    Parallel(n_jobs=jobs)(delayed(_work)(*arguments, worker) for worker in range(jobs))
-    done = _opened(journal, label).get_trials(states=_done())
-    finished = sorted(done, key=lambda t: t.number)[: tuning.trials]  # two processes may make more
-    complete = [t for t in finished if t.state == optuna.trial.TrialState.COMPLETE]
-    best = min(complete, key=lambda t: t.value)
+    Parallel(n_jobs=jobs)(delayed(_work)(journal, problem, worker) for worker in range(jobs))
+    done = _opened(journal, problem).get_trials(states=_done())
+    finished = sorted(done, key=lambda t: t.number)[: problem.trials]  # processes may make more
+    trials = _trials(finished)
+    best = finished[int(trials["mean_log_error"].idxmin())]
     values = {k: v for k, v in best.params.items() if v != default[k]}
-    before, after = (_judged(opened, chosen, judged, jobs) for chosen in (default, values))
+    before, after = (_judged(opened, chosen, problem.judged, jobs) for chosen in (default, values))
     default_m, tuned_m = (math.exp(float(np.mean(np.log(e)))) for e in (before, after))
     gain = log_ratio_interval(after, before)
-    return Tuned(name, values, _trials(finished), gain, default_m, tuned_m, len(judged))
+    return Tuned(problem.name, values, trials, gain, default_m, tuned_m, len(problem.judged))
 
 
 def _judged(
@@ -324,20 +308,12 @@ def _judged(
     return kept[key]
 
 
-def _work(
-    journal: str,
-    label: str,
-    trials: int,
-    ranges: Mapping[str, Range],
-    drives: Sequence[Experiment],
-    worker: int,
-) -> None:
+def _work(journal: Path, problem: _Problem, worker: int) -> None:
     """Run trials until there are enough of them."""
-    optuna = _optuna()
-    study = _opened(Path(journal), label, seed=len(drives) + worker)
-    if len(study.get_trials(deepcopy=False, states=_done())) < trials:
-        enough = optuna.study.MaxTrialsCallback(trials, states=_done())
-        study.optimize(lambda trial: _mean_log_error(trial, ranges, drives), callbacks=[enough])
+    study = _opened(journal, problem, seed=len(problem.drives) + worker)
+    if len(study.get_trials(deepcopy=False, states=_done())) < problem.trials:
+        enough = _optuna().study.MaxTrialsCallback(problem.trials, states=_done())
+        study.optimize(lambda trial: _mean_log_error(trial, problem), callbacks=[enough])
 
 
 def _done() -> tuple[Any, Any]:
@@ -346,24 +322,24 @@ def _done() -> tuple[Any, Any]:
     return states.COMPLETE, states.PRUNED
 
 
-def _mean_log_error(trial: Any, ranges: Mapping[str, Range], drives: Sequence[Experiment]) -> float:
+def _mean_log_error(trial: Any, problem: _Problem) -> float:
     """Mean log error of a trial's values; the trial is pruned when it is clearly not the best."""
-    values = {name: _suggested(trial, name, allowed) for name, allowed in ranges.items()}
+    values = {name: _suggested(trial, name, allowed) for name, allowed in problem.ranges.items()}
     logs = []
-    for i, experiment in enumerate(drives):
+    for i, experiment in enumerate(problem.drives):
         logs.append(math.log(error_m(experiment.with_estimator(**values))))
         trial.report(logs[-1], i)
-        if i + 1 < len(drives) and trial.should_prune():
+        if i + 1 < len(problem.drives) and trial.should_prune():
             raise _optuna().TrialPruned
     return float(np.mean(logs))
 
 
 def _suggested(trial: Any, name: str, allowed: Range) -> Any:
-    if allowed.choice:
+    if allowed.interval is None:
         return trial.suggest_categorical(name, allowed.choice)
-    if allowed.whole:
-        return trial.suggest_int(name, allowed.low, allowed.high, log=allowed.log)
-    return trial.suggest_float(name, allowed.low, allowed.high, log=allowed.log)
+    whole = isinstance(allowed.interval[0], int)
+    suggest = trial.suggest_int if whole else trial.suggest_float
+    return suggest(name, *allowed.interval, log=allowed.log)
 
 
 def error_m(experiment: Experiment) -> float:
@@ -374,10 +350,10 @@ def error_m(experiment: Experiment) -> float:
 
 
 def _answer_m(row: Row) -> float:
-    found = row.get(REVISED + _ERROR, row.get(_ERROR))
-    if row["status"] == Outcome.FAILED or not isinstance(found, float) or not math.isfinite(found):
+    error = row.get(REVISED + _ERROR, row.get(_ERROR))
+    if row["status"] == Outcome.FAILED or not isinstance(error, float) or not math.isfinite(error):
         return FAILED_M
-    return max(found, 1e-9)
+    return max(error, 1e-9)
 
 
 def _trials(finished: Sequence[Any]) -> pd.DataFrame:
@@ -385,14 +361,18 @@ def _trials(finished: Sequence[Any]) -> pd.DataFrame:
 
     Optuna gives that the value of its last recording.
     """
-    rows = []
-    for number, trial in enumerate(finished, start=1):
-        state = trial.state.name.lower()
-        value = trial.value if state == "complete" else math.nan
-        options = json.dumps(trial.params)
-        seconds = trial.duration.total_seconds()
-        rows.append((number, state, seconds, value, options))
-    table = pd.DataFrame(rows, columns=["trial", "state", "seconds", "mean_log_error", "options"])
+    table = pd.DataFrame(
+        [
+            {
+                "trial": number,
+                "state": trial.state.name.lower(),
+                "seconds": trial.duration.total_seconds(),
+                "mean_log_error": trial.value if trial.state.name == "COMPLETE" else math.nan,
+                "options": json.dumps(trial.params),
+            }
+            for number, trial in enumerate(finished, start=1)
+        ]
+    )
     return table.assign(best_so_far_m=np.exp(table["mean_log_error"].cummin().ffill()))
 
 
@@ -402,8 +382,8 @@ def _digest(drives: Sequence[Experiment], ranges: Mapping[str, Range]) -> str:
     return hashlib.sha256(json.dumps(of_all).encode()).hexdigest()[:16]
 
 
-def _opened(journal: Path, label: str, seed: int = 0) -> Any:
-    """The study of this label in a journal; a new one if there is none."""
+def _opened(journal: Path, problem: _Problem, seed: int = 0) -> Any:
+    """The study of a problem in a journal; a new one if there is none."""
     optuna = _optuna()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # parts of Optuna call themselves experimental
@@ -411,7 +391,7 @@ def _opened(journal: Path, label: str, seed: int = 0) -> Any:
             storage=optuna.storages.JournalStorage(
                 optuna.storages.journal.JournalFileBackend(str(journal))
             ),
-            study_name=label,
+            study_name=_digest(problem.drives, problem.ranges),
             load_if_exists=True,
             sampler=optuna.samplers.TPESampler(seed=seed, n_startup_trials=5),
             pruner=optuna.pruners.WilcoxonPruner(p_threshold=_PRUNED_BELOW),

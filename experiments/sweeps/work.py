@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -39,10 +40,9 @@ def run_share(share: Mapping[str, Any]) -> None:
     over = store.ended(path.parent, f"{path.stem}.")  # something if the launcher tries it again
     keys = {*over.done.tolist(), *over.failed}
     with store.journal(path) as journal:
-        for family in share["families"]:
-            for experiment in Family.experiments(family):
-                if not keys or int(experiment.key, 16) not in keys:
-                    run_and_record(experiment, held, journal)
+        for experiment in chain.from_iterable(map(Family.experiments, share["families"])):
+            if not keys or int(experiment.key, 16) not in keys:
+                run_and_record(experiment, held, journal)
     store.compact(path)
 
 
@@ -76,7 +76,7 @@ def run_and_record(experiment: Experiment, held: dict[str, Team], journal: store
         Takes the rows.
     """
     journal.begin(experiment.key)
-    with held_interrupts() as on_step:  # what one causes is no result
+    with held_interrupts() as on_step:  # what one causes is not a result
         try:
             rows = evaluate(
                 experiment,
@@ -110,5 +110,5 @@ def is_there(process: int) -> bool:
     except ProcessLookupError:
         return False
     except PermissionError:  # another user's
-        return True
+        pass
     return True

@@ -241,7 +241,7 @@ def test_a_step_that_returns_no_belief_names_step_and_the_shapes(belief, words):
 
 def test_where_lists_the_columns():
     table = pd.DataFrame({"seed": [0, 1], "robot.kr": [1e-5, 1e-4]})
-    with pytest.raises(InputError, match=r"--where foo: .*columns: seed, robot\.kr"):
+    with pytest.raises(InputError, match=r"condition foo: .*columns: seed, robot\.kr"):
         where(table, ["foo"])
 
 

@@ -93,9 +93,9 @@ def test_grading_finds_the_size_of_a_rise(power, start):
 def pool(rise, n=60):
     """One estimator that draws at random and one that does not, with a fault in either."""
     rng = np.random.default_rng(0)
-    suite = Suite(
-        0, {"g": n}, {"g": ()}, (Entry("a", "a", "g", (4, 2)), Entry("b", "b", "g", (1, 1)))
-    )
+    kinds = {"a": (4, 2), "b": (1, 1)}
+    entries = tuple(Entry(name=k, recordings="g", repeats=n) for k, n in kinds.items())
+    suite = Suite(0, {"g": n}, {"g": ()}, entries)
     hard = np.exp(rng.standard_normal((n, 1)))
 
     def runs(k, shift=0.0, spread=0.1):

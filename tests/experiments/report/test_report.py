@@ -274,7 +274,8 @@ def test_a_damaged_figure_is_named(tmp_path, results):
 @pytest.mark.parametrize("paper", [*contents.PAPERS, *contents.OWN, "real_logs"])
 def test_findings_are_complete(paper):
     about = contents.findings(paper)
-    assert set(about) - {"unit"} == {"title", "about", "claims", "sentences", "figures"}
+    assert set(about) - {"unit"} == {"title", "about", "claims", "own", "sentences", "figures"}
+    assert set(about["own"]) <= set(about["claims"])
     for name, figure in about["figures"].items():
         assert name.startswith(f"{paper}_")
         assert set(figure) - {"table"} == {"title", "alt", "paper", "claims"}

@@ -8,8 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments.cli import main as cli
-from experiments.report import sweep_page
+from experiments.report import of_sweep, sweep_page
 from experiments.report.sweep_page import extremes, picture_path, write_sweep_page
 from experiments.sweeps.again import noted_config_dir
 from experiments.sweeps.averages import averages
@@ -58,33 +57,34 @@ def test_a_sweep_without_a_sound_run_says_why_and_proposes_what_works(
     tmp_path, monkeypatch, capsys
 ):
     table = rows()
-    monkeypatch.setattr("experiments.sweeps.collect.collect", lambda *_args, **_options: table)
-    cli._show_sweep(tmp_path / "mine", len(table))
+    monkeypatch.setattr(of_sweep, "collect", lambda *_args, **_options: table)
+    of_sweep.after_sweep(tmp_path / "mine", len(table))
     assert "estima table mine --against m00 -o" in capsys.readouterr().out
     first = table["choice.estimator"] == "m00"
     bad = table.assign(status=table["status"].mask(first, "failed"))
-    monkeypatch.setattr("experiments.sweeps.collect.collect", lambda *_args, **_options: bad)
-    cli._show_sweep(tmp_path / "mine", len(bad))
+    monkeypatch.setattr(of_sweep, "collect", lambda *_args, **_options: bad)
+    of_sweep.after_sweep(tmp_path / "mine", len(bad))
     assert "--against m00" not in capsys.readouterr().out
     alone = table[table["choice.estimator"] == "m00"]
-    monkeypatch.setattr("experiments.sweeps.collect.collect", lambda *_args, **_options: alone)
-    cli._show_sweep(tmp_path / "mine", len(alone))
+    monkeypatch.setattr(of_sweep, "collect", lambda *_args, **_options: alone)
+    of_sweep.after_sweep(tmp_path / "mine", len(alone))
     assert "estima table mine -o" in capsys.readouterr().out
     table[["status", "status_detail"]] = "failed", "odd"
     table.loc[3:, "status_detail"] = [f"late at {i}.5 s" for i in range(len(table) - 3)]
-    monkeypatch.setattr("experiments.sweeps.collect.collect", lambda *_args, **_options: table)
-    cli._show_sweep(tmp_path / "mine", len(table))
+    monkeypatch.setattr(of_sweep, "collect", lambda *_args, **_options: table)
+    of_sweep.after_sweep(tmp_path / "mine", len(table))
     said = capsys.readouterr().out
     assert f"{len(table)} runs failed, most often ({len(table) - 3}) so: late at ... s" in said
     assert "estima table mine --rows" in said
     assert "plot" not in said
+    panels = of_sweep.Panels(None, "y", [], None, None, "screen", pool=False)
     with pytest.raises(InputError, match=f"all {len(table)} runs failed; `estima table mine`"):
-        cli.plot("mine")
+        of_sweep.plot_of(table, "mine", panels, tmp_path)
 
 
 def test_a_page_too_large_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(sweep_page, "MOST_RUNS", 10)
-    with pytest.raises(InputError, match=r"54 runs; a page holds 10.*--where"):
+    with pytest.raises(InputError, match=r"54 runs; a page holds 10.*condition"):
         write_sweep_page(rows(), "mine", tmp_path, tmp_path / "page.html")
     assert not (tmp_path / "page.html").exists()
 

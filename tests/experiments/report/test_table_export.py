@@ -61,7 +61,7 @@ def test_letters_that_the_output_lacks_are_named(tmp_path, monkeypatch):
     path = tmp_path / "t.csv"
     path.write_text("name\n\u00e9\n", encoding="utf-8")
     monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(io.BytesIO(), encoding="ascii"))
-    with pytest.raises(InputError, match=r"ascii, lacks '\\xe9'; write files with -o"):
+    with pytest.raises(InputError, match=r"ascii, lacks '\\xe9'; write files, or set"):
         export([path], "markdown", None, 4)
     export([path], "markdown", tmp_path, 4)
     assert "\u00e9" in (tmp_path / "t.md").read_text(encoding="utf-8")
@@ -115,4 +115,4 @@ def test_export_from_the_command_line(tmp_path):
     )
     assert (out / "t.tex").read_text().startswith(r"\begin{tabular}{r}")
     wrong = CliRunner().invoke(app, ["export-table", str(tmp_path / "t.csv"), "--format", "x"])
-    assert "--format must be markdown or latex" in str(wrong.exception)
+    assert "the format must be markdown or latex" in str(wrong.exception)

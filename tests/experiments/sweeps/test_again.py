@@ -63,7 +63,7 @@ def test_another_run_than_the_rows_is_refused(results):
         run_again(pd.concat([row.drop("code_version"), pd.Series({"code_version": "other"})]))
     gone = row.copy()
     gone["choice.estimator"] = "nosuch"
-    with pytest.raises(InputError, match=r"^estimator/nosuch is no .*--config-dir.*own\)"):
+    with pytest.raises(InputError, match=r"^estimator/nosuch is not an option.*own\)"):
         run_again(gone, noted="own")
     absent = pd.concat([row, pd.Series({"estimator._target_": "nowhere.Mine"})])
     absent = absent[~absent.index.duplicated(keep="last")]

@@ -269,4 +269,7 @@ def test_the_command_refuses_other_endings_before_it_reads(tmp_path):
     for arguments in (["-o", "x.xlsx"], ["--rows"], ["--rows", "-o", "x.tex"], *sized):
         done = CliRunner().invoke(app, ["table", str(tmp_path / "none"), *arguments])
         assert isinstance(done.exception, InputError)
-        assert re.search(r"a table is \.tex|name the file|no sweep|--size", str(done.exception))
+        assert re.search(
+            r"a table is \.tex|name the file|no sweep|the size|size page|with --rows",
+            str(done.exception),
+        )

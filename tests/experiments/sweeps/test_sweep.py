@@ -1,4 +1,4 @@
-"""Sweeps: what is expanded, composed and packed, and what is left after failures and kills."""
+"""Sweeps as they run, and what is left after failures and kills."""
 
 import contextlib
 import json
@@ -16,10 +16,8 @@ import pandas as pd
 import pytest
 
 from experiments.runs import cache, store
-from experiments.runs.compose import searched
 from experiments.runs.experiment import Experiment
-from experiments.runs.key import files_digest
-from experiments.runs.paths import quoted, results
+from experiments.runs.paths import results
 from experiments.runs.processes import held_interrupts
 from experiments.runs.row import Status, read_rows
 from experiments.runs.store import read_runs
@@ -28,178 +26,8 @@ from experiments.sweeps import launch, plan, work
 from experiments.sweeps.collect import collect
 from sim.errors import InputError
 from tests.experiments.cli.test_cli import QUICK, ROOT, called, estima, refused
+from tests.experiments.sweeps.conftest import ALONE, SHORT, clear, folder, table_of
 from tests.fixtures import kill_sweeps
-
-SHORT = [*QUICK, "route=linear_1"]
-ALONE = [*SHORT, "hydra/launcher=basic"]  # no workers, for what does not depend on them
-
-
-def table_of(name):
-    return collect(name)
-
-
-def folder(name):
-    return results() / "runs" / name
-
-
-@pytest.fixture
-def name(request):
-    """Return a sweep's name of its own, cleared before and after."""
-    own = f"test_{request.node.name}".replace("[", "_").replace("]", "")
-    clear(own)
-    yield own
-    clear(own)
-
-
-def clear(name):
-    for path in sorted(folder(name).rglob("*"), reverse=True):
-        path.rmdir() if path.is_dir() else path.unlink()
-    if folder(name).exists():
-        folder(name).rmdir()
-
-
-def test_the_last_values_of_a_key_are_swept():
-    found = plan.swept(["seed=range(0,3)", "robot.kr=1e-5,1e-4", "seed=7,8", "a=b"])
-    assert found == {"seed": [7, 8], "robot.kr": [1e-5, 1e-4], "a": ["a=b"]}
-    assert plan.swept(["seed=range(0,1000000)"])["seed"] == range(1000000)
-    with pytest.raises(InputError, match=r"interval.*lists and ranges"):
-        plan.swept(["robot.kr=interval(0,1)"])
-
-
-def test_a_million_runs_are_planned_as_each_of_them_alone():
-    every = plan.plan_of(["seed=range(0,1000)", "robot.kr=range(1,101,0.1)", "robot.kl=${robot.kr}",
-                          "simulation.physics=kinematic"])  # fmt: skip
-    assert len(every.keys) == len(np.unique(every.keys)) == 10**6
-    assert len(every.families) == 1
-    for i in (0, 1, 500_123, 999_999):
-        run = every.experiment(i)
-        c = run.config
-        alone = Experiment.compose(
-            [f"seed={i // 1000}", f"robot.kr={c['robot']['kr']}", "robot.kl=${robot.kr}",
-             "simulation.physics=kinematic"]
-        )  # fmt: skip
-        assert c == alone.replaced(picture=False).config
-        assert int(alone.key, 16) == every.keys[i]
-
-
-def test_keys_of_a_plan_are_those_of_its_runs(tmp_path):
-    given = ["estimator=ekf_icp,ekf_icp_paper", "seed=2,1", "simulation.physics=kinematic,bullet",
-             "sensors=lms291", "prior.track_m=null,0.2", "world.n_objects=3,6",
-             "estimator.kr=1e-5,1e-4"]  # fmt: skip
-    every = plan.plan_of(given)
-    assert len(every.keys) == len(np.unique(every.keys)) == 64
-    recordings = {}
-    for i, key in enumerate(every.keys):
-        run = every.experiment(i)
-        assert int(run.key, 16) == key
-        recordings.setdefault(run.recording_key, set()).add(every.recordings[i])
-    assert len(recordings) == 8
-    assert all(len(same) == 1 for same in recordings.values())
-    assert [every.experiment(i).seed for i in range(0, 64, 16)] == [2, 1, 2, 1]
-
-
-def test_the_quick_composer_resolves_as_hydra_does():
-    given = ["world=office", "estimator=ekf_icp,odometry", "sensors=lms291", "robot.kr=1e-6,2e-6"]
-    runs = list(plan.planned([*given, "estimator.window_s=0.1", "study=decristoforis2020/office",
-                               "seed=3,4"]))  # fmt: skip
-    assert len(runs) == 2 * 2 * 2
-    for run in runs:
-        c = run.config
-        lines = [
-            "study=decristoforis2020/office", "world=office", "sensors=lms291",
-            f"estimator={run.choices['estimator']}", f"robot.kr={c['robot']['kr']}",
-            f"seed={c['seed']}", "estimator.window_s=0.1", "picture=false",
-        ]  # fmt: skip
-        assert c == Experiment.compose(lines).config
-        assert c["estimator"]["kr"] == c["robot"]["kr"]  # belief follows truth after the change
-    assert len({run.key for run in runs}) == 8
-
-
-def test_a_study_sweeps_its_own_values_unless_others_are_given():
-    runs = list(plan.planned(["study=decristoforis2020/office"]))
-    assert len(runs) == 20 * 4
-    assert {run.config["seed"] for run in runs} == set(range(1000, 1020))
-    runs = list(plan.planned(["study=decristoforis2020/office", "seed=1", "estimator=odometry"]))
-    assert [run.config["seed"] for run in runs] == [1]
-
-
-def test_unknown_keys_and_options_are_refused():
-    with pytest.raises(InputError, match=r"robot\.krr"):
-        list(plan.planned(["robot.krr=1,2"]))
-    refused(called("run", "-m", "robot.krr=1,2"), "robot.krr")
-    refused(called("run", "-m", "world=nowhere,room"), "nowhere")
-    refused(called("run", "-m", "--frob", "seed=1,2"), "--frob")
-
-
-def test_keys_depend_on_what_decides_the_rows(tmp_path, monkeypatch):
-    experiment = Experiment.compose([])
-    assert experiment.replaced(name="other").key == experiment.key
-    assert experiment.replaced(seed=5).key != experiment.key
-    monkeypatch.syspath_prepend(str(tmp_path))
-    (tmp_path / "package").mkdir()
-    for target, source, beside in (
-        ("mine_for_key.Mine", "mine_for_key.py", "helper_of_mine.py"),
-        ("package.part.Mine", "package/part.py", "package/other.py"),  # without an __init__
-    ):
-        (tmp_path / source).write_text("import helper_of_mine\nclass Mine: pass\n")
-        own = experiment.replaced(estimator={"_target_": target})
-        keys = [own.key]
-        for file in (source, beside):
-            (tmp_path / file).write_text("import helper_of_mine\nclass Mine: x = 1\n")
-            source_digest.cache_clear()
-            keys.append(own.key)
-        assert len(set(keys)) == 3, target
-    with pytest.raises(InputError, match=r"nowhere\.npz"):
-        _ = experiment.replaced(recording="nowhere.npz").recording_key
-
-
-def test_keys_know_the_files_that_a_mapping_names(tmp_path):
-    (tmp_path / "a.npy").write_bytes(b"1")
-    named = {
-        "_target_": "experiments.papers.maximo2024.places.recording_from_files",
-        "positions": f"{tmp_path}/a.npy",
-    }
-    experiment = Experiment.compose([])
-    prior = experiment.config["prior"]
-    for changed in (
-        experiment.replaced(recording=named),
-        experiment.replaced(prior={**prior, "map": named}),
-        experiment.replaced(prior={**prior, "map": {"_target_": "x", "f": str(tmp_path)}}),
-    ):
-        (tmp_path / "a.npy").write_bytes(b"1")
-        before = changed.key
-        (tmp_path / "a.npy").write_bytes(b"2")
-        assert changed.key != before
-    assert files_digest({"a": "none", "b": "x" * 5000, "c": ".", "d": "/"}) == {}
-
-
-def test_keys_know_the_files_that_an_estimators_options_name(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    plain = Experiment.compose(["estimator=topological_mcl"])
-    before_files = plain.key, plain.recording_key
-    for name in ("a.npz", "b.npz", "laser", "stereo", "place", "lidar3d"):  # words are sensors
-        (tmp_path / name).write_bytes(b"1")
-    assert (plain.key, plain.recording_key) == before_files
-    feedback = {"_target_": "estimators.odometry.Odometry", "tables": ["none", "a.npz"]}
-    named = plain.with_estimator(map_path="a.npz")
-    steered = plain.replaced(route={**plain.config["route"], "feedback": feedback})
-    swept = ["estimator=topological_mcl", "estimator.map_path=a.npz,b.npz"]
-    old = named.key, steered.key, steered.recording_key, plan.plan_of(swept).keys[0]
-    (tmp_path / "a.npz").write_bytes(b"2")
-    new = named.key, steered.key, steered.recording_key, plan.plan_of(swept).keys[0]
-    assert all(a != b for a, b in zip(old, new, strict=True))
-    every = plan.plan_of(swept)
-    assert [int(every.experiment(i).key, 16) for i in range(2)] == every.keys.tolist()
-
-
-def test_packing_keeps_recordings_together():
-    every = plan.plan_of(["repeats=1,2", "seed=range(0,6)"])
-    jobs = plan.packed(every.recordings, 3)
-    assert sorted(np.concatenate(jobs)) == list(range(12))
-    assert len(jobs) == 3
-    for job in jobs:
-        assert len({every.experiment(i).seed for i in job}) == 2
-    assert max(len(job) for job in plan.packed(every.recordings, 100)) == 1
 
 
 def test_failed_runs_leave_rows_and_the_rest_goes_on(name, tmp_path):
@@ -298,24 +126,6 @@ def test_rows_of_an_edited_estimator_do_not_mix(name, tmp_path, monkeypatch, cap
     assert len(table_of(name)) == 2
     assert "left out 2 rows" in capsys.readouterr().err
     assert len(collect(name, all_versions=True)) == 4
-
-
-def test_only_what_an_estimator_imports_is_of_its_version(tmp_path, monkeypatch):
-    for module, text in (("tidal", "import tidal_a\n"), ("tidal_a", "from tidal_b import x\n"),
-                         ("tidal_b", "x = 1\n"), ("other", "y = 1\n")):  # fmt: skip
-        (tmp_path / f"{module}.py").write_text(text)
-    monkeypatch.syspath_prepend(str(tmp_path))
-
-    def digest():
-        source_digest.cache_clear()
-        return source_digest("tidal.Own")
-
-    first = digest()
-    (tmp_path / "other.py").write_text("y = 2\n")
-    (tmp_path / "more.py").write_text("def broken(\n")
-    assert digest() == first
-    (tmp_path / "tidal_b.py").write_text("x = 2\n")
-    assert digest() != first
 
 
 @pytest.mark.slow
@@ -451,23 +261,6 @@ def test_a_sweep_that_has_not_ended_says_so(name, monkeypatch, capsys):
     assert not capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["name=a,b", "seed=0"], "one, not several"),
-        (["name=2026", "seed=0,1"], "one word"),
-        (["name=../../evil", "seed=0,1"], "one word"),
-        (["name=null", "seed=0,1"], "one word"),
-        (["seed=range(5,0)"], "empty range"),
-        (["study=maximo2024/own", "seed=0,1"], "data"),
-    ],
-)
-def test_wrong_sweeps_end_in_one_line(arguments, words):
-    refused(called("run", "-m", *SHORT[:2], *arguments), words)
-    for never in ("runs/b", "runs/2026", "runs/None", "../evil"):
-        assert not (results() / never).exists()
-
-
 @pytest.mark.slow
 def test_values_that_no_column_holds_fail_alone(name):
     done = estima("run", "-m", *ALONE, "seed=1,2,99999999999999999999999", f"name={name}",
@@ -504,108 +297,6 @@ def test_a_sweep_without_a_name_has_one_of_its_own(tmp_path):
     for own in folders:
         assert re.fullmatch("sweep_[0-9a-f]{8}", own)
         assert own in first.stderr + other.stderr
-
-
-def test_the_last_value_of_a_key_decides_a_sweeps_own_name():
-    made = plan.plan_of(["seed=0,1"])
-    orders = (["robot.kr=1e-5", "robot.kr=1e-4"], ["robot.kr=1e-4", "robot.kr=1e-5"])
-    forward, back = (launch._name(made, ["seed=0,1", *order], None) for order in orders)
-    assert forward != back
-    assert forward == launch._name(made, ["robot.kr=1e-4", "seed=0,1"], None)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["-m", "hydra/sweeper=optuna"], ["hydra/sweeper", "every combination"]),
-        (["-m", "hydra.sweep.dir=/tmp/x"], ["hydra.sweep.dir", "set name"]),
-        (["hydra.run.dir=/tmp/x"], ["hydra.run.dir", "--results"]),
-        (["hydra.verbose=true"], ["hydra.verbose", "nothing is logged"]),
-        (["-m", "robot.kr=interval(0,1)"], ["interval(0,1)", "range(0,1,0.1)"]),
-        (["-m", "route=glob(nothing*)"], ["empty range or list"]),
-        (["-m", "--info"], ["--info", "--config-dir"]),
-        (["-m", "--cfg", "job"], ["--cfg", "leave out -m"]),
-    ],
-)
-def test_what_hydra_would_ignore_is_refused(arguments, words):
-    refused(called("run", *arguments, *QUICK, "seed=0"), *words)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["seed=range(0,1000000000000)"], "range.0,1000000000000.: .* at most 100,000,000 runs"),
-        (["robot.kr=range(0,1e12,0.1)"], "at most 100,000,000 runs"),
-        (["robot.kr=range(0,inf,0.1)"], "at most 100,000,000 runs"),
-        (["seed=range(0,20000)", "robot.kr=range(0,10000)"], "2e[+]08 runs: a sweep has at most"),
-        (["seed=range(0,5,0)"], "step of a range must not be 0"),
-        (["seed=1,2", "hydra.searchpath=[file:///nope]"], "no folder /nope"),
-    ],
-)
-def test_what_cannot_be_planned_is_refused_before_it_is_listed(arguments, words):
-    with pytest.raises(InputError, match=words):
-        plan.plan_of(arguments)
-
-
-@pytest.mark.parametrize("sweeps", ["3", "[3]", "[[seed]]"])
-def test_the_sweeps_of_a_study_are_a_list_of_mappings(tmp_path, sweeps):
-    option(tmp_path, f"sweeps: {sweeps}")
-    with pytest.raises(InputError, match="sweeps must be a list of mappings"):
-        plan.plan_of(["study=own", "seed=0,1"], str(tmp_path))
-
-
-@pytest.mark.parametrize(
-    ("text", "is_read"),
-    [
-        ("hydra: {sweeper: {params: {seed: '1,2'}}}", True),
-        ("hydra: {sweep: {dir: zzz}, verbose: true}", False),
-        ("hydra: {sweeper: {max_batch_size: 1}}", False),
-        ("hydra: {launcher: {n_jobs: 1}}", False),
-        ("hydra: 3", False),
-        ("hydra: {sweeper: 3}", False),
-        ("defaults: [{override /hydra/launcher: basic}]", False),
-    ],
-)
-def test_a_studys_settings_of_hydra_that_nothing_reads_are_refused(tmp_path, text, is_read):
-    option(tmp_path, text)
-    if is_read:
-        assert len(plan.plan_of(["study=own"], str(tmp_path)).keys) == 2
-        return
-    with pytest.raises(InputError, match=r"own\.yaml: .*hydra\.sweeper\.params alone"):
-        searched(tmp_path)
-
-
-def option(folder_, text):
-    (folder_ / "study").mkdir()
-    (folder_ / "study" / "own.yaml").write_text(f"# @package _global_\n{text}\n")
-
-
-@pytest.mark.parametrize(
-    ("argument", "words"),
-    [("hydra.launcher.n_jobs=0", "or -1 for all"), ("+hydra.sweeper.params={}", "seed=1,2")],
-)
-def test_a_sweeps_wrong_settings_of_hydra(argument, words):
-    with pytest.raises(InputError, match=words):
-        launch.sweep(["seed=1,2", argument])
-
-
-def test_globs_choose_options():
-    runs = list(plan.planned(["route=glob(linear_*)", "simulation.physics=kinematic"]))
-    assert [run.choices["route"] for run in runs] == [f"linear_{i}" for i in range(1, 5)]
-
-
-@pytest.mark.parametrize(
-    "name", ["a\\'b", "q${seed}x", "a\\${x}\\", "\\\\${x}'", "a b,c=[d]{e}", "ä$"]
-)
-def test_any_path_can_be_a_value(name):
-    experiment = Experiment.compose([f"recording={quoted(name)}"])
-    assert experiment.config["recording"] == name
-
-
-def test_a_missing_value_can_be_given_in_a_sweep(tmp_path):
-    runs = list(plan.planned(["study=maximo2024/own", f"data={tmp_path}", "seed=0,1"]))
-    assert len(runs) == 2
-    assert runs[0].config["recording"]["positions"] == f"{tmp_path}/positions.npy"
 
 
 @pytest.mark.slow
@@ -699,15 +390,6 @@ def test_a_bad_combination_in_a_large_family_fails_alone(tmp_path):
     assert rows.loc[100, "status"] != "failed"
     assert rows.loc[5000, "status"] == "failed"
     assert "n_least" in rows.loc[5000, "status_detail"]
-
-
-def test_the_number_of_jobs():
-    runs = plan.plan_of([*QUICK, "seed=range(0,40)"])
-    assert len(plan.packed(runs.recordings, launch._n_jobs(["jobs=20"]))) == 20
-    assert launch._n_jobs([]) == launch._n_jobs(["jobs=null"]) > 0
-    for wrong in (["jobs=0"], ["jobs=many"], ["jobs=1", "jobs=2"]):
-        with pytest.raises(InputError, match="one whole number"):
-            launch._n_jobs(wrong)
 
 
 @pytest.mark.slow

@@ -15,8 +15,9 @@ import yaml
 
 import experiments.sweeps.tune as tuning
 from experiments.runs.experiment import Experiment
-from experiments.sweeps.ranges import Range, Tuning
+from experiments.sweeps.ranges import Tuning
 from sim.errors import InputError
+from sim.options import build
 
 STUDY = """# @package _global_
 defaults:
@@ -127,7 +128,7 @@ def test_seeds_to_tune_and_to_judge_are_apart(study):
     with pytest.raises(InputError, match="1000 or more"):
         list(tuning.tune("toy", config_dir=study[0](judged=20)))
     with pytest.raises(InputError, match=r"tune\.seeds"):
-        Tuning.of("toy", {"trials": 3, "seeds": [1000], "estimators": {}})
+        build(Tuning, {"trials": 3, "seeds": [1000], "estimators": {"a": {"b": 1}}}, "tune")
 
 
 @pytest.mark.parametrize(
@@ -139,21 +140,34 @@ def test_seeds_to_tune_and_to_judge_are_apart(study):
         ({"interval": [0, 1], "log": "yes"}, "true or false"),
         ({"choice": [1]}, "two plain values"),
         ({"choice": "ab"}, "two plain values"),
-        ({"choice": [1, 2], "log": True}, "must be"),
-        ({"range": [0, 1]}, "must be"),
+        ({"choice": [1, 2], "log": True}, "give {interval"),
+        ({}, "give {interval"),
+        ({"range": [0, 1]}, "unknown key"),
         (3, "must be"),
     ],
 )
 def test_wrong_ranges_are_told(settings, complaint):
+    content = {"trials": 2, "seeds": [0], "estimators": {"mcl": {"n_most": settings}}}
     with pytest.raises(InputError, match=complaint) as error:
-        Range.of("tune.estimators.mcl.n_most", settings)
-    assert "tune.estimators.mcl.n_most" in str(error.value)
+        build(Tuning, content, "study=toy: tune")
+    assert "study=toy: tune.estimators.mcl.n_most" in str(error.value)
 
 
-@pytest.mark.parametrize("settings", [None, {}, {"trials": 3, "seeds": [0]}, {"trial": 3}])
-def test_a_study_without_a_tune_is_told(settings):
-    with pytest.raises(InputError, match="tune must hold trials, seeds, estimators"):
-        Tuning.of("toy", settings)
+@pytest.mark.parametrize(
+    ("settings", "complaint"),
+    [
+        (None, "tune must be a mapping"),
+        ({}, "tune.trials is missing"),
+        ({"trials": 3, "seeds": [0]}, "tune.estimators is missing"),
+        ({"trial": 3}, "unknown key tune.trial; known: trials, seeds, estimators"),
+        ({"trials": 3, "seeds": [0], "estimators": {}}, "tune.estimators must be"),
+        ({"trials": 3, "seeds": [0], "estimators": {"a": {}}}, "tune.estimators.* must be"),
+        ({"trials": 3, "seeds": [0, 0], "estimators": {"a": {"b": 1}}}, "twice"),
+    ],
+)
+def test_a_study_without_a_tune_is_refused(settings, complaint):
+    with pytest.raises(InputError, match=complaint):
+        build(Tuning, settings, "tune")
 
 
 def test_what_does_not_fit_the_estimator_is_told_before_any_run(study, tmp_path):
@@ -227,11 +241,10 @@ def test_two_processes_that_are_killed_go_on_to_the_same_budget(tmp_path):
 def test_the_tables_keep_what_was_not_tuned_now(tmp_path):
     path = tmp_path / "t.csv"
     names = {"a": {}, "b": {}, "c": {}}
-    study = Tuning(2, (0,), names)
 
     def write(estimators, value):
         table = pd.DataFrame({"estimator": estimators, "gain": value + 0.5})
-        return tuning.written_beside(table, path, study)
+        return tuning.merge_into(path, table, list(names))
 
     write(["c", "a"], 1.0)
     assert list(write(["b"], 2.0)["estimator"]) == ["a", "b", "c"]
