@@ -40,7 +40,7 @@ from sim.sensors import Laser
 
 _TOLERANCE_S = 0.05
 _ORIGIN = np.zeros(3)
-# Ten times the laser's noise is believed of scans, since walls are not straight and people walk by.
+# Ten times the laser's noise is believed of scans, since walls are not straight and people pass.
 # Chosen when no line was left out yet.
 _OPTIONS: dict[str, Any] = {
     "sigma_range_m": 0.1,
@@ -72,7 +72,7 @@ def scored(
     known_stamps
         Of the scans that may be judged; None for all.
     T_base_judged
-        (3,) the frame that the relations are of, in base_link.
+        (3,) Frame of the relations, in base_link.
     options
         Of `estimators.graph.graph_slam.GraphSlam`, besides those of all logs.
     """

@@ -207,7 +207,7 @@ def test_the_last_value_of_a_key_decides_a_sweeps_own_name():
         (["-m", "hydra/sweeper=optuna"], ["hydra/sweeper", "every combination"]),
         (["-m", "hydra.sweep.dir=/tmp/x"], ["hydra.sweep.dir", "set name"]),
         (["hydra.run.dir=/tmp/x"], ["hydra.run.dir", "--results"]),
-        (["hydra.verbose=true"], ["hydra.verbose", "no log"]),
+        (["hydra.verbose=true"], ["hydra.verbose", "nothing is logged"]),
         (["-m", "robot.kr=interval(0,1)"], ["interval(0,1)", "range(0,1,0.1)"]),
         (["-m", "route=glob(nothing*)"], ["empty range or list"]),
         (["-m", "--info"], ["--info", "--config-dir"]),
@@ -226,7 +226,7 @@ def test_what_hydra_would_ignore_is_refused(arguments, words):
         (["robot.kr=range(0,inf,0.1)"], "at most 100,000,000 runs"),
         (["seed=range(0,20000)", "robot.kr=range(0,10000)"], "2e[+]08 runs: a sweep has at most"),
         (["seed=range(0,5,0)"], "step of a range must not be 0"),
-        (["seed=1,2", "hydra.searchpath=[file:///nope]"], "there is no folder /nope"),
+        (["seed=1,2", "hydra.searchpath=[file:///nope]"], "no folder /nope"),
     ],
 )
 def test_what_cannot_be_planned_is_refused_before_it_is_listed(arguments, words):
