@@ -114,11 +114,16 @@ def run_batch(
     Raises
     ------
     InputError
-        If the robot has slip events.
+        If the robot has slip events, or a law of slip of its own.
     """
     require(
         robot.unmodelled_slip == 0.0,
         "slip events are the simulator's alone; set robot.unmodelled_slip=0",
+    )
+    require(
+        type(robot).start_slip is DifferentialDrive.start_slip,
+        f"a batch knows DifferentialDrive's law of slip alone, and {type(robot).__name__} has its "
+        "own; simulate its runs one by one",
     )
     require(n_runs >= 1, f"n_runs must be at least 1, got {n_runs}")
     commands_m = wheel_commands(robot, route)

@@ -269,6 +269,9 @@ def test_gi1_holds_slam_against_odometry():
     assert headlines(judge.gi1(good, laps())) == ["reproduced", "reproduced"]
     bad = good.assign(revised_ate_rmse_m=2.5)
     assert headlines(judge.gi1(bad, laps(1.5))) == ["not_reproduced", "not_reproduced"]
+    for error_m, verdict in ((1.45, "reproduced"), (1.55, "not_reproduced")):  # odometry's is 3
+        near = judge.gi1(good.assign(revised_ate_rmse_m=error_m), laps())
+        assert headlines(near)[0] == verdict
     ours = pd.concat([laps(), laps(1.5, name="fastslam2")])  # stands beside
     assert headlines(judge.gi1(good, ours)) == ["reproduced", "reproduced"]
     said = concluded("gil2008", judge.gi1(good, laps()))

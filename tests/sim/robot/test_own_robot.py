@@ -7,6 +7,7 @@ from sim.errors import InputError
 from sim.options import Positive, options
 from sim.robot.base import robot_from_config
 from sim.robot.drive import DifferentialDrive
+from sim.robot.kinematic import run_batch
 from sim.routes.route import OpenLoop
 from sim.sensors import Encoder
 from sim.simulate import Member, record
@@ -87,6 +88,9 @@ def test_a_skid_steer_robot(widening):
 def test_another_law_of_slip():
     recording = driven(named("OnIce"), (0.5, 0.0, 2.0))
     assert recording.wheels.position_m[-1] == pytest.approx([1.25, 1.0], rel=1e-3)
+    route = OpenLoop(segments=((0.5, 0.0, 2.0),))
+    with pytest.raises(InputError, match="OnIce has its own; simulate its runs one by one"):
+        run_batch(named("OnIce"), route, 2, np.random.default_rng(0))
 
 
 def test_a_robot_is_what_the_simulator_asks_for():
