@@ -164,7 +164,7 @@ class Estimator(Protocol):
         ...
 
     def step(self, frame: Frame) -> Belief:
-        """Take in one Frame and answer with the belief after it."""
+        """Process one Frame and return the belief after it."""
         ...
 
 
@@ -258,7 +258,7 @@ def revised_by(estimator: Any, n_robots: int) -> Sequence[Estimate | None]:
 def answers_of(
     online: Sequence[Estimate], revised: Sequence[Estimate | None], spent_s: float
 ) -> list[Answer]:
-    """Answer of each robot; they share the processor time by their Frames."""
+    """Results of each robot; processor time is divided in proportion to their Frames."""
     answers: list[Answer] = []
     n_frames = sum(len(own.stamps) for own in online)
     for own, path in zip(online, revised, strict=True):

@@ -20,7 +20,7 @@ _SMALL_ANGLE_RAD = 1e-4
 
 @dataclass(frozen=True)
 class Gaussian:
-    """A pose (3,), m, m, rad, and its covariance (3, 3); or a motion and its."""
+    """A pose (3,), m, m, rad, and its covariance (3, 3); or a motion and its covariance."""
 
     mean: Array
     covariance: Array

@@ -301,7 +301,7 @@ def load_robots(path: Path) -> tuple[Recording, ...]:
 
 @contextmanager
 def blamed(path: Path) -> Iterator[None]:
-    """Turn what a file may be wrong in into one line that names it, and the remedy."""
+    """Turn errors in a file's content into one line that names the file and the remedy."""
     try:
         yield
     except KeyError as error:

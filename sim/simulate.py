@@ -247,7 +247,7 @@ def _bodies_of(
 
 
 class _Drive:
-    """One robot under way."""
+    """The simulation loop of one robot."""
 
     def __init__(
         self,

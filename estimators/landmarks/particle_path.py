@@ -82,7 +82,7 @@ class ParticlePath:
     def moved(
         self, normals: Array, mount: Array | None = None, state: Array | None = None
     ) -> Array:
-        """Poses (5, lanes) after the motion; writes the state of a camera, by default the own."""
+        """Poses (5, lanes) after the motion; writes the state of a camera, by default its own."""
         mount = self._mount if mount is None else mount
         state = self.state if state is None else state
         noise = self.stretch * normals

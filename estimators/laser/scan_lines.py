@@ -41,7 +41,7 @@ _Sums = tuple[float, float, float, float, float]
 
 
 class Segments(NamedTuple):
-    """Straight pieces with ends; what can be matched with.
+    """Line segments, the features that points are matched with.
 
     Attributes
     ----------
@@ -65,7 +65,7 @@ class Segments(NamedTuple):
 
 
 class PreparedScan(NamedTuple):
-    """What registration needs of a scan; K of its N beams saw something.
+    """A scan prepared for registration; K of its N beams have a return.
 
     Attributes
     ----------

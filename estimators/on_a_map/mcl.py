@@ -321,7 +321,7 @@ class Mcl(MclOptions):
         return max(0.0, 1.0 - self._fast / (self.recovery_ratio * self._slow))
 
     def _yielded(self, ends: Floats) -> bool:
-        """Let rivals and defenders see the scan too; whether the belief has given way.
+        """Weight rivals and defenders by the scan; return whether the rivals took over.
 
         Both are as many, and are resampled alike at every scan: a wide cloud explains a scan worse
         than a narrow one at the same place. The scan that draws them does not count.

@@ -1,4 +1,4 @@
-"""A program of any language as an estimator: one JSON line a message, one line each in answer.
+"""An estimator in any language: a child process that replies to each JSON line with one.
 
 docs/programs.md is the protocol. The program never gets the truth: a message holds what a Frame
 does, and the first what the Prior does.
@@ -138,7 +138,7 @@ class External(ExternalOptions):
         if not sound_covariances(found.reshape(-1, 3, 3)).all():
             raise self._wrong(
                 f"must answer with {key}, symmetric and without a negative variance; leave out "
-                "what is not known"
+                "unknown values"
             )
         return found
 

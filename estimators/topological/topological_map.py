@@ -1,6 +1,6 @@
 """A topological map: places with a position, a descriptor and neighbours (maximo2024, sec. 2.2).
 
-It is built from a mapping run, or from arrays of one's own, and kept as an `.npz` without pickles.
+It is built from a mapping run, or from your own arrays, and stored as an `.npz` without pickles.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class TopologicalMap:
         may fall into parts.
     descriptor
         What made the descriptors: a name of `estimators.topological.descriptors.KINDS`, or empty
-        for a network of one's own, compared by Euclidean distance.
+        for your own network, compared by Euclidean distance.
     headings_rad
         (N,) heading of base_link at each node; NaN where it is not known.
     slices_m

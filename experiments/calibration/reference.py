@@ -1,4 +1,4 @@
-"""What a log's wheels are compared with: its truth, else its scans, else its landmarks."""
+"""The reference for a log's wheels: its truth, else its scans, else its landmarks."""
 
 import math
 from dataclasses import dataclass

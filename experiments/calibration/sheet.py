@@ -80,7 +80,7 @@ def read_sheet(path: Path) -> tuple[dict[str, tuple[float, float, float]], dict[
             require(abs(value) <= most, f"{where}: {name} must be at most {most:g}, got {value:g}")
         require(
             duration_s > 0.0 and (v, omega) != (0.0, 0.0),
-            f"{where}: the command must move the robot for a time; leave out what does not",
+            f"{where}: the command must move the robot; remove rows that do not",
         )
         command = commands.setdefault(case, (v, omega, duration_s))
         require(

@@ -1,4 +1,4 @@
-"""Commands that show what there is: options, view, map."""
+"""Commands that display options, runs and maps: options, view, map."""
 
 from __future__ import annotations
 

@@ -59,7 +59,7 @@ def score(
     recording: Annotated[Path, typer.Argument(help="A recording (.npz) or a log with its truth.")],
     trajectories: Annotated[
         list[Path],
-        typer.Argument(help="What programs made of it: .tum, .csv of ours, .mcap, .bag."),
+        typer.Argument(help="Estimated trajectories: .tum, our .csv, .mcap, .bag."),
     ],
     *,
     matching: Matching,

@@ -113,7 +113,7 @@ def in_ellipse(truth: Array, mean: Array, covariance: Array) -> bool:
     """Whether a true position lies in the 95 % ellipse of a pose's (3,) covariance (3, 3).
 
     puzzlebot2024 asks it of the real robot and the ideal one's ellipse. That of a singular
-    covariance, as of particles that are all alike, is a line or a point, and holds nothing.
+    covariance, as of identical particles, is a line or a point, and contains nothing.
     """
     off, block = truth[:2] - mean[:2], covariance[:2, :2]
     if np.linalg.matrix_rank(block, hermitian=True) < 2:

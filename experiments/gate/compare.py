@@ -249,7 +249,7 @@ def by_repeat(rows: pd.DataFrame, error: str) -> Array:
 
 def _same_recordings(estimator: str, name: str, then: pd.DataFrame, now: pd.DataFrame) -> None:
     remedy = "; accept a check with a reason to start a new baseline"
-    require(not then.empty, f"the {name} baseline does not know {estimator}{remedy}")
+    require(not then.empty, f"the {name} baseline has no {estimator}{remedy}")
     before, after = (
         rows.drop_duplicates("recording").set_index("recording") for rows in (then, now)
     )

@@ -1,4 +1,4 @@
-"""What is made of a sweep's rows: a table, a chart or a page, as a text or a file."""
+"""Output from a sweep's rows: a table, a chart or a page, as text or a file."""
 
 from __future__ import annotations
 

@@ -63,7 +63,7 @@ def write_sweep_page(
     folder
         Where the rows lie, for the command that made them.
     config_dir
-        Folder of options of one's own, for the commands that draw runs; by default the sweep's.
+        Folder with your own options, for the commands that draw runs; by default the sweep's.
 
     Raises
     ------

@@ -94,7 +94,7 @@ def write_table(
 ) -> None:
     """Write a summary in the format of the path's ending, with its note where the format has text.
 
-    LaTeX is a `tabular` and a line of small print, for a float of one's own; it needs `booktabs`.
+    LaTeX is a `tabular` and a line of small print, for your own float; it needs `booktabs`.
     One wider than its `size` (of `WIDTHS_PT`, `text` by default) becomes several.
     """
     if path.suffix in (".csv", ".parquet"):

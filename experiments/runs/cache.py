@@ -1,4 +1,4 @@
-"""A cache of recordings, addressed by what decides their bits: a sweep simulates each of them once.
+"""A cache of recordings, addressed by a digest of their inputs: a sweep simulates each once.
 
 It holds at most $ESTIMA_CACHE_GIB (8 unless set); the least recently used go first.
 """

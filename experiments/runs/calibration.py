@@ -1,4 +1,4 @@
-"""What is believed of a real robot: the YAML file of `estima calibrate LOG`, and its use."""
+"""A real robot's calibration: the YAML file of `estima calibrate LOG`, and its use."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -86,7 +86,7 @@ class Calibration:
     sensors: Mapping[str, SensorBelief] = field(default_factory=dict)
 
     def applied(self, recording: Recording) -> Recording:
-        """Return the recording with what is believed in place of what its log says.
+        """Return the recording with the log's values replaced by the calibrated ones.
 
         Raises
         ------

@@ -146,7 +146,7 @@ def _in_defaults(error: BaseException) -> bool:
 
 
 def _refusal(error: BaseException) -> str | None:
-    """Say what Hydra could not find, and what there is; None if the error is another."""
+    """Describe what Hydra could not find, with the alternatives; None for other errors."""
     missing, options = (getattr(error, name, None) for name in ("missing_cfg_file", "options"))
     if not (missing and options):
         return None

@@ -1,4 +1,4 @@
-"""What a configuration names: world, robots, sensors, routes, estimators, recordings and priors."""
+"""Builds what a configuration names: world, robots, estimators, recordings, priors."""
 
 from __future__ import annotations
 

@@ -71,7 +71,7 @@ def run_once(experiment: Experiment, draw: Draw, out: Path | None = None) -> lis
             and experiment.config["calibration"] is None
         ):
             show(
-                f"believed of this real robot: kr={slip[0]:g} and kl={slip[1]:g} m, and the "
+                f"assumed for this real robot: kr={slip[0]:g} and kl={slip[1]:g} m, and the "
                 "geometry that the log's reader assumes; to find its own: "
                 "estima calibrate LOG -o cal.yaml, then calibration=cal.yaml"
             )

@@ -43,7 +43,7 @@ class Again:
             If it is no longer the same.
         """
         read = self.experiment.recordings()
-        require(read.checksum == self.checksum, "the recording of the run is not what it was")
+        require(read.checksum == self.checksum, "the run's recording has changed")
         return read
 
 

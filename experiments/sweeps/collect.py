@@ -59,7 +59,7 @@ def collect(name: str, *, all_versions: bool = False, times: bool = False) -> pd
         require(column in table, f"{path}: not rows of runs, column {column} is missing")
     for column in (*STATUS, *ORIGIN):
         sound = column not in table or pd.api.types.is_string_dtype(table[column])
-        require(sound, f"{path}: not rows of runs, column {column} holds no texts")
+        require(sound, f"{path}: not rows of runs, column {column} is not text")
     if not all_versions:
         mine = _of_this_code(table)
         require(

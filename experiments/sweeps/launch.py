@@ -276,7 +276,7 @@ def _launch(plan: Plan, runs: Numbers, jobs: Jobs, launching: Sequence[str]) -> 
 
 
 def _for_cluster(launching: Sequence[str]) -> list[str]:
-    """What makes Ray's launcher leave out a setting that a running cluster refuses."""
+    """Overrides that make Ray's launcher omit a setting that a running cluster rejects."""
     memory = "hydra.launcher.ray.init.object_store_memory"
     given = {argument.lstrip("+").partition("=")[0] for argument in launching}
     if "hydra.launcher.ray.init.address" in given and memory not in given:

@@ -51,7 +51,7 @@ class Twin:
     stamps, way
         (T,) s from the start of `rest`, and poses (T, 3) that the robot drives through.
     robot
-        As it is on the average of what the calibration leaves open.
+        The robot at the mean of the calibrated parameters.
     sensors, landmarks, grid
         Sensors by name; landmarks (L, 3) m; walls, or None.
     """
@@ -118,7 +118,7 @@ class Twin:
         return math.log(found.high / found.low) / _SIGMAS if found.low > 0.0 else 0.0
 
     def _moved(self, name: str, sensor: Any, rng: np.random.Generator) -> Sensor:
-        """Return a sensor whose mount and scale are off by what is not known of them."""
+        """Return the sensor with mount and scale drawn from their uncertainty."""
 
         def off(key: str) -> float:
             found = self.found.intervals.get(f"sensors.{name}.{key}")
@@ -207,7 +207,7 @@ def _first_frame(recording: Recording, stamps: Array, split: float) -> float:
 
 
 def _cleared(grid: OccupancyGrid, way: Array, robot: DifferentialDrive) -> OccupancyGrid:
-    """Return the grid without what stands where the robot drove: it has since gone."""
+    """Clear the grid's cells where the robot drove: what was there has moved."""
     half = [
         max(robot.body_length_m / 2.0, robot.wheel_radius_m),
         max(robot.body_width_m, robot.track_m) / 2.0,

@@ -41,7 +41,7 @@ def compare_files(
     if log is not None:
         recording = read_any([log])
     else:
-        require(len(given) >= 2, "one trajectory alone: add others, or a recording with the truth")
+        require(len(given) >= 2, "only one trajectory: add another, or a recording with truth")
         reference = next(iter(given))
         recording = reference_of(given.pop(reference))
     found, paths = {}, dict(zip(short, trajectories, strict=True))

@@ -121,7 +121,7 @@ def read_estimate(recording: Recording, path: Path) -> Estimate:
     if path.is_dir():
         require(
             not (path / "estimate_0.csv").exists(),
-            f"{path}: the run of a team; its robots' estimates are {path}/estimate_0.csv and on",
+            f"{path}: a team's run; its estimates are {path}/estimate_0.csv and so on",
         )
         path /= "estimate.csv"
     stamps = recording.frame_stamps

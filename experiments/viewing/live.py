@@ -30,7 +30,7 @@ _BLACK, _BLUE, _RED = (0.1, 0.1, 0.1), (0.0, 0.45, 0.7), (0.84, 0.37, 0.0)
 
 
 def check_display() -> None:
-    """Refuse to open a window where there is nothing to show it on."""
+    """Raise InputError if there is no display for a window."""
     require(
         not sys.platform.startswith("linux") or os.environ.get("DISPLAY"),
         f"no display for a window (DISPLAY is not set); {_REMEDY}",

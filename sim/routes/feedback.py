@@ -83,7 +83,7 @@ class OdometryFeedback:
         return self._pose
 
     def see(self, stamp: float, encoder_m: Array, readings: Mapping[str, Reading]) -> None:
-        """Look at nothing but the encoders."""
+        """Ignore the readings: only the encoders are used."""
 
 
 class EstimatorFeedback:

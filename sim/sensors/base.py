@@ -420,5 +420,5 @@ def _check_fields(schema: Schema, where: str) -> None:
     ragged = [any(field.ragged for field in part.values()) for part in (seen, hidden)]
     require(
         ragged != [False, True],
-        f"{where}: a ragged field of the truth needs one beside it that is seen",
+        f"{where}: a ragged truth field needs a measured ragged field too",
     )

@@ -115,7 +115,7 @@ def check_size(rows: float, columns: float, what: str, remedy: str) -> None:
     """Refuse a grid of too many cells before memory is taken for it."""
     require(
         rows * columns <= MOST_CELLS,
-        f"{what}: {columns:.0f} x {rows:.0f} cells, and {MOST_CELLS} are the most; {remedy}",
+        f"{what}: {columns:.0f} x {rows:.0f} cells; at most {MOST_CELLS} allowed; {remedy}",
     )
 
 

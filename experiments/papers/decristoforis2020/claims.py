@@ -54,7 +54,7 @@ def judge(results: Results) -> list[Claim]:
 def dc1(runs: pd.DataFrame, ordering: pd.DataFrame) -> list[Claim]:
     """DC1: fusion beats ICP, and ICP beats odometry, in position and in heading.
 
-    Headlines are the paper's own forms. Beside stand the heading error over 10 m; ICP started from
+    Headlines are the paper's own forms. Secondary: the heading error over 10 m; ICP started from
     the wheels, as the fusion is, which tells what the start adds from what fusion adds; our fusion;
     and the region of slip and range noise in which the paper's order holds.
     """

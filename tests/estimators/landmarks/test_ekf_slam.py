@@ -355,7 +355,7 @@ def test_wrong_input_is_named():
         ({"errors": "twists"}, "invariant"),
         ({"gate_probability": 1.0}, "gate_probability"),
         ({"repeat_s": -1.0}, "repeat_s"),
-        ({"repeat_s": 0.5, "association": "mahalanobis"}, "repeat_s are of ids"),
+        ({"repeat_s": 0.5, "association": "mahalanobis"}, "repeat_s apply to ids"),
         ({"kr": -1.0}, "kr"),
         ({"sigma_row_px": np.nan}, "sigma_row_px"),
         ({"noise_model": "flat"}, "diagonal"),

@@ -71,7 +71,7 @@ def test_another_run_than_the_rows_is_refused(results):
         run_again(absent)
     changed = row.copy()
     changed["recording_checksum"] = "other"
-    with pytest.raises(InputError, match="not what it was"):
+    with pytest.raises(InputError, match="recording has changed"):
         run_again(changed).recordings()
 
 
