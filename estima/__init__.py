@@ -212,9 +212,9 @@ def run(*given: Any, estimator: str | Estimator | None = None) -> Run:
         f"estima.run makes one run; use estima.sweep for repeats={experiment.repeats}",
     )
     if not (estimator is None or isinstance(estimator, str)):
-        experiment = experiment.using(estimator)
+        experiment = experiment.with_estimator_object(estimator)
     if recording is not None:
-        experiment = experiment.over(recording)
+        experiment = experiment.with_recording(recording)
     found: list[tuple[Recording, Estimate, Estimate | None]] = []
     rows = evaluate(
         experiment,

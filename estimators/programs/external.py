@@ -16,7 +16,7 @@ from estimators.programs.program import (
     ProgramError,
     ProgramOptions,
     Seconds,
-    apart,
+    explain_mismatch,
     map_message,
 )
 from sim.arrays import Array
@@ -90,7 +90,7 @@ class External(ExternalOptions):
             means = self._numbers(answer, "means", (len(stamps), 3))
             if not len(stamps) or (np.diff(stamps) <= 0.0).any():
                 raise self._wrong("must answer with stamps that increase, and some")
-            if why := apart(stamps, self._stamps):
+            if why := explain_mismatch(stamps, self._stamps):
                 raise self._wrong(f"must answer with stamps of the Frames; its path {why}")
             found = Estimate(stamps, means, covariances, "revised")
         assert self._program is not None

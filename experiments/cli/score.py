@@ -38,7 +38,7 @@ class Matching:
 
 
 @dataclass(frozen=True)
-class Made:
+class Origin:
     """How the trajectories were made."""
 
     revised: Annotated[
@@ -63,7 +63,7 @@ def score(
     ],
     *,
     matching: Matching,
-    made: Made,
+    made: Origin,
     name: Annotated[str, typer.Option(help="Folder of the rows in results/runs.")] = "score",
     as_json: Annotated[bool, typer.Option("--json", help="Print the rows as JSON.")] = False,
 ) -> None:

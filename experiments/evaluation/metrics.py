@@ -55,7 +55,7 @@ def alignment(truth: Array, means: Array) -> Array:
     return np.array([*(centre_truth - rotated), angle])
 
 
-def aligned(truth: Array, means: Array) -> Array:
+def align(truth: Array, means: Array) -> Array:
     """Estimated poses (T, 3) after `alignment`."""
     return se2.compose(alignment(truth, means), means)
 
@@ -191,7 +191,7 @@ def path_scores(truth: Array, means: Array, covariances: Array) -> dict[str, flo
 
     Covariances that are all zeros are unknown: their scores are left out.
     """
-    fitted, off = aligned(truth, means), position_errors_m(truth, means)
+    fitted, off = align(truth, means), position_errors_m(truth, means)
     values = nees(truth, means, covariances)
     counted = np.isfinite(values)
     row = {

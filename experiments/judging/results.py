@@ -93,7 +93,7 @@ class Results:
         return self._path("arrays", f"{name}.npz").exists()
 
     @contextmanager
-    def as_found(self) -> Iterator[None]:
+    def blaming_files(self) -> Iterator[None]:
         """Report errors in derived claims and figures as damaged files on disk.
 
         Raises

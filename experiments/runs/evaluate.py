@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager, nullcontext
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
-from estimators.base import Answer, Estimate, Estimator, Prior, run_to_the_end
+from estimators.base import Answer, Estimate, Estimator, Prior, run_and_finish
 from experiments.evaluation.map_quality import landmark_errors
 from experiments.evaluation.metrics import (
     LONGEST_GAP_S,
@@ -93,7 +93,7 @@ def evaluate(
                 answers = answers_of(estimator, repeat, on_step)
             paired = [(r, *answer) for r, answer in zip(read.robots, answers, strict=True)]
             statuses = [status_of(*each) for each in paired]
-            every = [scored(*each, **experiment.config["scoring"]) for each in paired]
+            every = [score_run(*each, **experiment.config["scoring"]) for each in paired]
             status, scores = statuses[0], every[0]
             if experiment.team is not None:
                 status, scores = status_of_team(statuses), scores_of_team(read, every)
@@ -129,7 +129,7 @@ def runner(
         if experiment.team is None:
             keep = (*SCORED_EXTRAS, *experiment.config["keep"])
             return [run_over(read.only, estimator, priors[0], own(repeat), keep, on_step)]
-        with limited_blas():
+        with limit_blas():
             return answers_of_team(experiment, read, priors, repeat, own, on_step)
 
     return answers
@@ -158,11 +158,11 @@ def run_over(
     BLAS uses one thread, or as many as ESTIMA_BLAS_THREADS says: its threads spin while they wait,
     and the matrices of filters are small.
     """
-    with limited_blas():
-        return run_to_the_end(estimator, recording, prior, rng, keep, on_step)
+    with limit_blas():
+        return run_and_finish(estimator, recording, prior, rng, keep, on_step)
 
 
-def limited_blas() -> AbstractContextManager[object]:
+def limit_blas() -> AbstractContextManager[object]:
     """Context in which BLAS uses one thread, or as many as ESTIMA_BLAS_THREADS says.
 
     The variables of BLAS itself do not count: the workers of a sweep find them set by joblib.
@@ -183,7 +183,7 @@ def _blas() -> ThreadpoolController:
     return ThreadpoolController()
 
 
-def scored(
+def score_run(
     recording: Recording,
     online: Estimate,
     revised: Estimate | None,

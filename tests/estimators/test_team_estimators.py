@@ -422,7 +422,7 @@ def test_wrong_teams_are_refused(overrides, complaint):
 def test_first_robots_of_a_simulated_team():
     short = ["study=teams", "route.distance_m=2", "world.n_landmarks=10", "team.size=3"]
     wide = ["sensors.robots.fov_horizontal_rad=3.1", "sensors.robots.max_distance_m=30"]
-    team = Experiment.compose([*short, *wide]).simulated()
+    team = Experiment.compose([*short, *wide]).simulate_team()
     two = team.first(2)
     assert len(two) == 2
     assert set(np.concatenate([r.logs["robots"]["ids"] for r in two.robots])) <= {0, 1}

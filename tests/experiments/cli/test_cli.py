@@ -234,7 +234,7 @@ def test_a_step_that_returns_no_belief_names_step_and_the_shapes(belief, words):
         def step(self, frame):
             return belief
 
-    experiment = Experiment.compose(["simulation.physics=kinematic"]).using(Mine())
+    experiment = Experiment.compose(["simulation.physics=kinematic"]).with_estimator_object(Mine())
     with pytest.raises(InputError, match=rf"Mine.step .*\(3,\).*\(3, 3\).*{words}"):
         evaluate(experiment, lambda: Team((circle(n_frames=3),)))
 

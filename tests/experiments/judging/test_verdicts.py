@@ -14,9 +14,9 @@ from experiments.judging.claim import (
     Role,
     Subject,
     Verdict,
-    banded,
     beside,
     headline_verdict,
+    judge_bounds,
     more_to_settle,
     select,
     select_all,
@@ -45,10 +45,12 @@ from sim.errors import InputError
 
 RESULTS = SOURCE / "results"
 ABOUT = Subject("PB1", "ratio", method="icp", size=3)
-GOOD = banded(ABOUT, "a ratio", Interval(1.0, 0.9, 1.1), 0.8, 1.25)
-BAD = banded(dataclasses.replace(ABOUT, size=4), "another", Interval(2.0, 1.9, 2.1), 0.8, 1.25)
+GOOD = judge_bounds(ABOUT, "a ratio", Interval(1.0, 0.9, 1.1), 0.8, 1.25)
+BAD = judge_bounds(
+    dataclasses.replace(ABOUT, size=4), "another", Interval(2.0, 1.9, 2.1), 0.8, 1.25
+)
 FUSED = dataclasses.replace(ABOUT, method="fusion")
-OPEN = banded(FUSED, "a third", Interval(1.2, 1.1, 1.3), 0.8, 1.25, n=20)
+OPEN = judge_bounds(FUSED, "a third", Interval(1.2, 1.1, 1.3), 0.8, 1.25, n=20)
 
 
 def verdict_of(*claims):

@@ -16,7 +16,7 @@ from experiments.runs.row import Outcome, Status
 from experiments.runs.team import scores_of_team, status_of_team
 from experiments.sweeps.collect import collect
 from experiments.sweeps.launch import sweep
-from experiments.sweeps.plan import plan_of
+from experiments.sweeps.plan import make_plan
 from experiments.viewing.animation import pictures
 from experiments.viewing.estimates import with_estimates
 from experiments.viewing.playback import Playback
@@ -112,7 +112,7 @@ def test_a_team_is_simulated_once_and_a_smaller_one_is_another():
 @pytest.mark.slow
 def test_sweeps_of_teams():
     lines = [*SHORT, "team.size=1,2", "seed=5,6", "estimator.robots=null,robots"]
-    plan = plan_of([*lines, "estimator.kr=1e-5,5e-5"])
+    plan = make_plan([*lines, "estimator.kr=1e-5,5e-5"])
     keys = [int(plan.experiment(i).key, 16) for i in range(len(plan.keys))]
     assert keys == plan.keys.tolist()
     assert len(set(plan.recordings.tolist())) == 4  # by size and seed
