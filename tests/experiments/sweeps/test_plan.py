@@ -23,8 +23,9 @@ def test_the_last_values_of_a_key_are_swept():
 
 
 def test_a_million_runs_are_planned_as_each_of_them_alone():
-    every = plan.make_plan(["seed=range(0,1000)", "robot.kr=range(1,101,0.1)", "robot.kl=${robot.kr}",
-                          "simulation.physics=kinematic"])  # fmt: skip
+    kinematic = "simulation.physics=kinematic"
+    slips = ["robot.kr=range(1,101,0.1)", "robot.kl=${robot.kr}"]
+    every = plan.make_plan(["seed=range(0,1000)", *slips, kinematic])
     assert len(every.keys) == len(np.unique(every.keys)) == 10**6
     assert len(every.families) == 1
     for i in (0, 1, 500_123, 999_999):
@@ -56,8 +57,8 @@ def test_keys_of_a_plan_are_those_of_its_runs(tmp_path):
 
 def test_the_quick_composer_resolves_as_hydra_does():
     given = ["world=office", "estimator=ekf_icp,odometry", "sensors=lms291", "robot.kr=1e-6,2e-6"]
-    runs = list(plan.plan_experiments([*given, "estimator.window_s=0.1", "study=decristoforis2020/office",
-                               "seed=3,4"]))  # fmt: skip
+    study = ["estimator.window_s=0.1", "study=decristoforis2020/office", "seed=3,4"]
+    runs = list(plan.plan_experiments([*given, *study]))
     assert len(runs) == 2 * 2 * 2
     for run in runs:
         c = run.config
