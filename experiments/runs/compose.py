@@ -143,6 +143,12 @@ class Composer:
             for override in targets:
                 set_value(cfg, override.key_or_group, override.value())
             fill(cfg)
+            for override in options:
+                deleted = override.is_delete() and select(cfg, override.key_or_group) is not None
+                require(
+                    not deleted,
+                    f"{override.input_line}: {override.key_or_group} cannot be left out; set it",
+                )
             self._bases[key] = Composed(cfg, choices, dict(params))
         return self._bases[key]
 

@@ -158,7 +158,7 @@ def test_a_run_prints_its_errors_and_leaves_a_row(tmp_path):
         (["estimator=nosuch"], ["no estimator named nosuch", "fastslam, ", "topological_mcl"]),
         (["robot=null"], ["robot=null", "estima options robot"]),
         (["~world"], ["world is missing"]),
-        (["~robot.kr"], ["robot.kr", "estimator.kr"]),
+        (["~robot.kr"], ["robot.kr", "cannot be left out"]),
         (["sensors=lms291", "sensors.laser=foo"], ["sensors.laser", "mapping"]),
         (["recording={_target_:os.getcwd}"], ["os.getcwd must return a Recording", "str"]),
     ],
