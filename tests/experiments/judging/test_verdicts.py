@@ -226,3 +226,12 @@ def test_criteria_hold_the_rule_and_nothing_that_came_out(tracked):
 
 def test_a_claim_says_its_role():
     assert Claim(ABOUT, "s", Interval.exact(1.0), "c", Verdict.REPRODUCED).role is Role.HEADLINE
+
+
+def test_a_claim_is_selected_if_it_is_the_only_match():
+    claims = [shown(Subject("X1", name), "s", Interval(1.0, 0.0, 2.0)) for name in ("a", "a", "b")]
+    assert select(claims, quantity="b") is claims[2]
+    assert select_all(claims, claim="X1", quantity="a") == claims[:2]
+    for wanted, count in (({"quantity": "a"}, 2), ({"quantity": "c"}, 0)):
+        with pytest.raises(LookupError, match=f"{count} statistics with "):
+            select(claims, **wanted)

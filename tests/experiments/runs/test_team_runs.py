@@ -13,6 +13,7 @@ from experiments.gate.suite import draw_run, read_suite, run_suite
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome, Status
+from experiments.runs.seeds import stream
 from experiments.runs.team import scores_of_team, status_of_team
 from experiments.sweeps.collect import collect
 from experiments.sweeps.launch import sweep
@@ -248,3 +249,17 @@ def test_a_suite_may_hold_a_team(tmp_path):
     assert other["fingerprint"].tolist() == again["fingerprint"].tolist()
     assert draw_run(suite, "ekf_slam", 3, tmp_path / "run.png")
     assert write_recordings(suite, tmp_path) == 0
+
+
+def test_each_robot_draws_from_streams_of_its_own(monkeypatch):
+    states = []
+
+    def spy(seed, axis, index=0, **named):
+        rng = stream(seed, axis, index, **named)
+        states.append((axis, str(rng.bit_generator.state)))
+        return rng
+
+    monkeypatch.setattr("experiments.runs.objects.stream", spy)
+    composed("route.distance_m=1").simulated()
+    drawn = [state for state in states if state[0] in ("slip", "sensors")]
+    assert len(drawn) == len(set(drawn)) == 4
