@@ -17,8 +17,8 @@ from estimators.landmarks.stereo import StereoModel
 from estimators.team import Communication, run_team
 from estimators.wheels import WheelPrediction
 from experiments.evaluation.metrics import nees
+from experiments.runs.evaluate import in_range
 from experiments.runs.experiment import Experiment
-from experiments.runs.team import in_range
 from sim import se2
 from sim.errors import InputError
 from sim.recording import Log

@@ -10,11 +10,10 @@ from estima import simulate
 from experiments.evaluation.metrics import position_errors_m, rms
 from experiments.gate.candidate import write_recordings
 from experiments.gate.suite import draw_run, read_suite, run_suite
-from experiments.runs.evaluate import evaluate
+from experiments.runs.evaluate import evaluate, scores_of_team, status_of_team
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome, Status
 from experiments.runs.seeds import stream
-from experiments.runs.team import scores_of_team, status_of_team
 from experiments.sweeps.collect import collect
 from experiments.sweeps.launch import sweep
 from experiments.sweeps.plan import make_plan
@@ -260,6 +259,6 @@ def test_each_robot_draws_from_streams_of_its_own(monkeypatch):
         return rng
 
     monkeypatch.setattr("experiments.runs.objects.stream", spy)
-    composed("route.distance_m=1").simulated()
+    composed("route.distance_m=1").simulate_team()
     drawn = [state for state in states if state[0] in ("slip", "sensors")]
     assert len(drawn) == len(set(drawn)) == 4
