@@ -388,7 +388,7 @@ def test_options_that_make_no_sense_are_named(files, tmp_path, monkeypatch, caps
         ((one, "--tolerance", "-1"), "tolerance_s must be"),
         ((one, "--offset", "nan"), "offset_s must be a number"),
         ((one, "--cpu-seconds", "-1"), "cpu_seconds must be"),
-        ((one, "--topic", "odom"), "a topic was given"),
+        ((one, "--topic", "odom"), "only a bag has topics"),
         ((folder / "est.mcap", "--topic", "none"), "no nav_msgs/Odometry on none"),
         ((one, two), "two trajectories called est"),
         ((one, "--name", "a/b"), "name must be one word"),

@@ -356,7 +356,7 @@ def test_every_column_of_a_row_is_in_the_schema():
     overrides = ["world=rooms", "robot=robocom", "sensors=stereo_pixel", "estimator=smoother"]
     overrides += ["simulation.physics=kinematic", "route.distance_m=12"]
     experiment = Experiment.compose(overrides)
-    (row,) = evaluate(experiment, experiment.simulated)
+    (row,) = evaluate(experiment, experiment.simulate_team)
     others = {name for name in row if not is_setting(name)} - {REPEAT, *STATUS, *ORIGIN}
     assert others <= set(COLUMNS)
     assert {"ate_rmse_m", "rpe_10m_rmse_m", "revised_nees_mean", "step_time_us"} <= others
